@@ -1,0 +1,33 @@
+"""Errors that a user can mend: what is wrong, where, the value found; then what to do.
+
+>>> from mstfilter.errors import InputError
+>>> raise InputError("depth image 000003.png is empty", "record the frame again")
+Traceback (most recent call last):
+...
+mstfilter.errors.InputError: depth image 000003.png is empty
+"""
+
+from __future__ import annotations
+
+__all__ = ["InputError", "MissingLibraryError"]
+
+
+class InputError(ValueError):
+    """Input that cannot be used.
+
+    Parameters
+    ----------
+    message : str
+        One line: what is wrong, where, and the value found.
+    *hints : str
+        One line each: what the user can do about it.
+    """
+
+    def __init__(self, message: str, *hints: str) -> None:
+        super().__init__(message)
+        self.message = message
+        self.hints = hints
+
+
+class MissingLibraryError(InputError):
+    """A library or a system package that a chosen component needs is not there."""

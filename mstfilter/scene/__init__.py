@@ -1,0 +1,1 @@
+"""RGB-D geometry: cameras, frames, clips, voxel grids, hypotheses, recordings. Knows nothing of filters."""

@@ -1,0 +1,208 @@
+"""Pinhole cameras.
+
+>>> import numpy as np
+>>> from mstfilter.scene.camera import Camera
+>>> camera = Camera(np.array([[525, 0, 319.5], [0, 525, 239.5], [0, 0, 1.0]]), 640, 480)
+>>> camera.project(np.array([0.0, 0.0, 1.0]))[0]
+array([319.5, 239.5])
+
+Axes are OpenCV's: x right, y down, z forward. Pixel (u, v) = (column, row) with (0, 0) at the centre of the
+first pixel. A camera without a pose (`T_world_camera=None`) speaks of its own axes as the world.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+from mstfilter.errors import InputError
+from mstfilter.scene.arrays import content_key, read_only
+
+__all__ = ["Camera", "look_at", "rigid_from_matrix"]
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """A pinhole camera without distortion.
+
+    Parameters
+    ----------
+    K : (3, 3) array
+        Intrinsics in pixels: ``[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]``.
+    width, height : int
+        Image size in pixels.
+    T_world_camera : scipy RigidTransform, optional
+        Pose: maps camera axes to world axes (metres).
+    """
+
+    K: np.ndarray
+    width: int
+    height: int
+    T_world_camera: RigidTransform | None = None
+
+    def __post_init__(self) -> None:
+        try:
+            K = np.asarray(self.K, dtype=np.float64)
+        except (TypeError, ValueError) as error:
+            raise InputError(f"camera matrix K is not numeric: {self.K!r}") from error
+        if K.shape == (4,):
+            raise InputError(
+                "camera matrix K has 4 numbers, expected a 3x3 matrix",
+                "build it: Camera.from_intrinsics(fx, fy, cx, cy, width, height)",
+            )
+        if K.shape != (3, 3):
+            raise InputError(f"camera matrix K has shape {K.shape}, expected (3, 3)")
+        if not np.isfinite(K).all():
+            raise InputError(f"camera matrix K holds a value that is not finite: {K.tolist()}")
+        if K[0, 0] <= 0 or K[1, 1] <= 0 or abs(np.linalg.det(K)) < 1e-9:
+            raise InputError(
+                f"camera matrix K is not invertible: {K.tolist()}",
+                "K is [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with fx, fy > 0 in pixels",
+            )
+        if not np.allclose(K[2], (0, 0, 1)) or K[1, 0] != 0:
+            raise InputError(
+                f"camera matrix K is not upper triangular with last row 0 0 1: {K.tolist()}",
+                "some tools store K transposed or row by row",
+            )
+        if int(self.width) < 1 or int(self.height) < 1:
+            raise InputError(f"camera image size is {self.width} x {self.height}, expected at least 1 x 1")
+        if self.T_world_camera is not None:
+            if not isinstance(self.T_world_camera, RigidTransform):
+                raise InputError(
+                    f"T_world_camera is a {type(self.T_world_camera).__name__}, expected a scipy RigidTransform",
+                    "convert a 4x4 matrix with mstfilter.scene.camera.rigid_from_matrix",
+                )
+            if not np.isfinite(self.T_world_camera.as_matrix()).all():
+                raise InputError("camera pose T_world_camera holds a value that is not finite")
+        object.__setattr__(self, "K", read_only(K))
+        object.__setattr__(self, "width", int(self.width))
+        object.__setattr__(self, "height", int(self.height))
+
+    @classmethod
+    def from_intrinsics(
+        cls,
+        fx: float,
+        fy: float,
+        cx: float,
+        cy: float,
+        width: int,
+        height: int,
+        T_world_camera: RigidTransform | None = None,
+    ) -> Camera:
+        """A camera from focal lengths and principal point in pixels."""
+        return cls(np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]]), width, height, T_world_camera)
+
+    @cached_property
+    def key(self) -> bytes:
+        """Name by content."""
+        pose = b"" if self.T_world_camera is None else self.T_world_camera.as_matrix()
+        return content_key("camera", self.K, self.width, self.height, pose)
+
+    @cached_property
+    def pose(self) -> RigidTransform:
+        """`T_world_camera`, the identity where it is not known."""
+        return RigidTransform.identity() if self.T_world_camera is None else self.T_world_camera
+
+    @property
+    def position(self) -> np.ndarray:
+        """Centre of projection in world axes, (3,) metres."""
+        return self.pose.translation
+
+    @cached_property
+    def _ray_grid(self) -> np.ndarray:
+        v, u = np.mgrid[: self.height, : self.width].astype(np.float64)
+        y = (v - self.K[1, 2]) / self.K[1, 1]
+        x = (u - self.K[0, 2] - self.K[0, 1] * y) / self.K[0, 0]
+        return read_only(np.stack([x, y, np.ones_like(x)], axis=-1))
+
+    def rays(self) -> np.ndarray:
+        """(H, W, 3) directions through the pixel centres in camera axes, scaled to z = 1."""
+        return self._ray_grid
+
+    def unproject(self, depth: np.ndarray) -> np.ndarray:
+        """World points (H, W, 3) in metres of a z-depth image (H, W) in metres; NaN where depth is NaN."""
+        if depth.shape != (self.height, self.width):
+            raise InputError(
+                f"depth image is {depth.shape[1]} x {depth.shape[0]}, "
+                f"the camera is {self.width} x {self.height}"
+            )
+        matrix = self.pose.as_matrix()
+        directions = self.rays() @ matrix[:3, :3].T
+        return directions * depth[..., None].astype(np.float64) + matrix[:3, 3]
+
+    def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Where world points fall in the image.
+
+        Parameters
+        ----------
+        points : (..., 3) array
+            World points in metres.
+
+        Returns
+        -------
+        uv : (..., 2) array
+            Pixels (column, row); NaN for points that are not in front of the camera.
+        z : (...) array
+            z-depth in metres.
+        """
+        matrix = self.pose.as_matrix()
+        local = (np.asarray(points, dtype=np.float64) - matrix[:3, 3]) @ matrix[:3, :3]
+        z = local[..., 2]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            inverse = np.where(z > 1e-9, 1.0 / z, np.nan)
+        y = local[..., 1] * inverse
+        x = local[..., 0] * inverse
+        u = self.K[0, 0] * x + self.K[0, 1] * y + self.K[0, 2]
+        v = self.K[1, 1] * y + self.K[1, 2]
+        return np.stack([u, v], axis=-1), z
+
+    def scaled(self, factor: float) -> Camera:
+        """The camera of the same image resized by `factor` (pixel centres stay where they are)."""
+        width, height = round(self.width * factor), round(self.height * factor)
+        K = self.K.copy()
+        K[:2, :2] *= factor
+        K[0, 2] = (self.K[0, 2] + 0.5) * factor - 0.5
+        K[1, 2] = (self.K[1, 2] + 0.5) * factor - 0.5
+        return Camera(K, width, height, self.T_world_camera)
+
+    def at(self, T_world_camera: RigidTransform) -> Camera:
+        """The same camera at another pose."""
+        return replace(self, T_world_camera=T_world_camera)
+
+
+def look_at(position: np.ndarray, target: np.ndarray, up: tuple[float, float, float] = (0, 0, 1)) -> RigidTransform:
+    """Pose `T_world_camera` of a camera at `position` (m) that looks at `target` (m), `up` at the image's top."""
+    position = np.asarray(position, dtype=np.float64)
+    forward = np.asarray(target, dtype=np.float64) - position
+    forward /= np.linalg.norm(forward)
+    right = np.cross(forward, up)
+    right /= np.linalg.norm(right)
+    matrix = np.eye(4)
+    matrix[:3, :3] = np.stack([right, np.cross(forward, right), forward], axis=1)
+    matrix[:3, 3] = position
+    return RigidTransform.from_matrix(matrix)
+
+
+def rigid_from_matrix(matrix: np.ndarray, where: str = "pose") -> RigidTransform:
+    """A RigidTransform from a 4x4 matrix, with one clear error where it is none.
+
+    scipy would silently orthogonalise a matrix with scale or shear; here that is an error.
+    """
+    try:
+        matrix = np.asarray(matrix, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{where} is not numeric") from error
+    if matrix.shape != (4, 4):
+        raise InputError(f"{where} has shape {matrix.shape}, expected (4, 4)")
+    if not np.isfinite(matrix).all():
+        raise InputError(f"{where} holds a value that is not finite (NaN or inf)", "leave the pose out: it is then found from the support plane")
+    R = matrix[:3, :3]
+    if np.abs(R @ R.T - np.eye(3)).max() > 1e-3 or np.linalg.det(R) < 0 or not np.allclose(matrix[3], (0, 0, 0, 1)):
+        raise InputError(
+            f"{where} is not a rigid transform: {matrix.tolist()}",
+            "expected a 4x4 matrix with a rotation in its upper left and last row 0 0 0 1",
+        )
+    return RigidTransform.from_matrix(matrix)

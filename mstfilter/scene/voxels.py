@@ -1,0 +1,283 @@
+"""Voxel grids and the hypotheses that fill them.
+
+A `Hypothesis` is the particle of MST: it says which object every voxel belongs to. World z is up, the
+table is at z = 0.
+
+>>> import numpy as np
+>>> from mstfilter.scene.voxels import Hypothesis, VoxelGrid
+>>> grid = VoxelGrid((-0.5, -0.5, 0.0), 0.01, (100, 100, 50))
+>>> labels = np.zeros(grid.shape, np.uint16)
+>>> labels[40:50, 40:50, :10] = 1
+>>> Hypothesis.from_labels(labels, grid).volumes()
+{1: 1000}
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+from mstfilter.errors import InputError
+from mstfilter.scene.arrays import content_key, read_only
+
+__all__ = ["MAX_LABEL", "Crop", "Hypothesis", "ObjectRecord", "VoxelGrid", "as_labels"]
+
+MAX_LABEL = 65535
+
+
+@dataclass(frozen=True, eq=False)
+class VoxelGrid:
+    """A regular lattice of cubes.
+
+    Parameters
+    ----------
+    origin : (3,) metres
+        Minimum corner of the first voxel.
+    voxel_size : float
+        Edge in metres.
+    shape : (3,) int
+        Voxels along x, y, z.
+    """
+
+    origin: np.ndarray
+    voxel_size: float
+    shape: tuple[int, int, int]
+
+    def __post_init__(self) -> None:
+        origin = np.asarray(self.origin, dtype=np.float64)
+        if origin.shape != (3,) or not np.isfinite(origin).all():
+            raise InputError(f"grid origin is {self.origin!r}, expected three finite numbers in metres")
+        if not (np.isfinite(self.voxel_size) and self.voxel_size > 0):
+            raise InputError(f"voxel size is {self.voxel_size!r}, expected metres > 0")
+        shape = tuple(int(n) for n in self.shape)
+        if len(shape) != 3 or min(shape) < 1:
+            raise InputError(f"grid shape is {self.shape!r}, expected three counts of at least 1")
+        object.__setattr__(self, "origin", read_only(origin))
+        object.__setattr__(self, "voxel_size", float(self.voxel_size))
+        object.__setattr__(self, "shape", shape)
+
+    @classmethod
+    def from_bounds(cls, lower: np.ndarray, upper: np.ndarray, voxel_size: float) -> VoxelGrid:
+        """The grid that covers a box given by two corners in metres."""
+        lower, upper = np.asarray(lower, dtype=np.float64), np.asarray(upper, dtype=np.float64)
+        shape = np.maximum(1, np.ceil((upper - lower) / voxel_size - 1e-6)).astype(int)
+        return cls(lower, voxel_size, tuple(shape))
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, VoxelGrid) and self.key == other.key
+
+    def __hash__(self) -> int:
+        return hash(self.key)
+
+    @cached_property
+    def key(self) -> bytes:
+        """Name by content."""
+        return content_key("grid", self.origin, self.voxel_size, self.shape)
+
+    @property
+    def upper(self) -> np.ndarray:
+        """Maximum corner, (3,) metres."""
+        return self.origin + self.voxel_size * np.array(self.shape)
+
+    def centres(self) -> np.ndarray:
+        """(X, Y, Z, 3) voxel centres in metres."""
+        index = np.stack(np.meshgrid(*(np.arange(n) for n in self.shape), indexing="ij"), axis=-1)
+        return self.centre_of(index)
+
+    def centre_of(self, index: np.ndarray) -> np.ndarray:
+        """Centres (..., 3) in metres of voxel indices (..., 3)."""
+        return self.origin + (np.asarray(index) + 0.5) * self.voxel_size
+
+    def index_of(self, points: np.ndarray) -> np.ndarray:
+        """Voxel indices (..., 3) int64 of world points; they may lie outside the grid. NaN gives -1."""
+        index = np.floor((np.asarray(points) - self.origin) / self.voxel_size)
+        return np.where(np.isfinite(index), index, -1).astype(np.int64)
+
+    def contains(self, index: np.ndarray) -> np.ndarray:
+        """(...) bool: indices (..., 3) that lie in the grid."""
+        index = np.asarray(index)
+        return ((index >= 0) & (index < np.array(self.shape))).all(axis=-1)
+
+
+@dataclass(frozen=True, eq=False)
+class Crop:
+    """Occupied voxels of one object inside a small box of the grid.
+
+    Parameters
+    ----------
+    occupied : (a, b, c) bool
+        The box.
+    offset : (3,) int
+        Index of its first voxel in the grid.
+    """
+
+    occupied: np.ndarray
+    offset: np.ndarray
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "occupied", read_only(np.asarray(self.occupied, dtype=bool)))
+        object.__setattr__(self, "offset", read_only(np.asarray(self.offset, dtype=np.int64)))
+
+    @classmethod
+    def of(cls, mask: np.ndarray) -> Crop:
+        """The tight crop of a boolean grid; an empty mask gives an empty crop."""
+        bounds = []
+        for axis in range(3):
+            others = tuple(a for a in range(3) if a != axis)
+            hit = np.flatnonzero(mask.any(axis=others))
+            if len(hit) == 0:
+                return cls(np.zeros((0, 0, 0), bool), np.zeros(3, np.int64))
+            bounds.append((int(hit[0]), int(hit[-1]) + 1))
+        box = tuple(slice(a, b) for a, b in bounds)
+        return cls(mask[box].copy(), np.array([a for a, _ in bounds]))
+
+    @property
+    def box(self) -> tuple[slice, slice, slice]:
+        """Slices of the crop in the grid."""
+        a, b, c = (slice(int(o), int(o) + n) for o, n in zip(self.offset, self.occupied.shape, strict=True))
+        return a, b, c
+
+
+@dataclass(frozen=True, eq=False)
+class ObjectRecord:
+    """What a hypothesis remembers of an object.
+
+    Parameters
+    ----------
+    label : int
+        Its value in the voxel grid, 1 .. 65535.
+    id : int
+        Stable identity over time within one lineage of hypotheses.
+    birth : int
+        Index of the pause at which it was first proposed.
+    source : Crop, optional
+        Its occupancy when it was last changed by anything but a rigid motion. None: the voxels it has now.
+    motion : RigidTransform
+        Rigid motion in world metres since `source`. The identity where `source` is None.
+    completion_key : str, optional
+        Which segment it was completed from (proposal's own name for it).
+    """
+
+    label: int
+    id: int
+    birth: int = 0
+    source: Crop | None = None
+    motion: RigidTransform = RigidTransform.identity()
+    completion_key: str | None = None
+
+
+def as_labels(labels: np.ndarray, where: str = "label grid") -> np.ndarray:
+    """Integer labels as uint16, with one clear error for anything that is not 0 .. 65535."""
+    labels = np.asarray(labels)
+    if labels.dtype == np.uint16:
+        return labels
+    if labels.dtype == bool:
+        return labels.astype(np.uint16)
+    if not np.issubdtype(labels.dtype, np.integer):
+        raise InputError(f"{where} has type {labels.dtype}, expected integers", "0 is free, objects are 1 .. 65535")
+    if labels.size and (labels.min() < 0 or labels.max() > MAX_LABEL):
+        raise InputError(
+            f"{where} holds labels from {labels.min()} to {labels.max()}, expected 0 .. {MAX_LABEL}",
+            "0 is free; renumber the objects",
+        )
+    return labels.astype(np.uint16)
+
+
+@dataclass(frozen=True, eq=False)
+class Hypothesis:
+    """A 3-D instance segmentation of the workspace: the particle.
+
+    Parameters
+    ----------
+    labels : (X, Y, Z) uint16
+        0 is free or unknown, k >= 1 is an object. Labels may have gaps.
+    grid : VoxelGrid
+        Where the voxels are.
+    objects : tuple of ObjectRecord
+        One for each label that occurs, in ascending order of labels.
+
+    See Also
+    --------
+    Hypothesis.from_labels : builds the records and checks everything.
+    """
+
+    labels: np.ndarray
+    grid: VoxelGrid
+    objects: tuple[ObjectRecord, ...] = ()
+
+    def __post_init__(self) -> None:
+        labels = as_labels(self.labels)
+        if labels.shape != self.grid.shape:
+            raise InputError(f"label grid has shape {labels.shape}, the voxel grid is {self.grid.shape}")
+        object.__setattr__(self, "labels", read_only(labels))
+        numbers = [o.label for o in self.objects]
+        if any(b <= a for a, b in zip(numbers, numbers[1:], strict=False)):
+            raise InputError(f"object records are not in ascending order of labels: {numbers}")
+        if numbers != list(self.volumes()):
+            raise InputError(
+                f"labels in the grid {list(self.volumes())} and in the object records {numbers} differ",
+                "use Hypothesis.from_labels, or with_labels to change a hypothesis",
+            )
+
+    @classmethod
+    def from_labels(cls, labels: np.ndarray, grid: VoxelGrid, birth: int = 0) -> Hypothesis:
+        """A hypothesis whose objects are all new; ids are the labels."""
+        labels = as_labels(labels)
+        if labels.shape != grid.shape:
+            raise InputError(f"label grid has shape {labels.shape}, the voxel grid is {grid.shape}")
+        present = np.flatnonzero(np.bincount(labels.ravel()))
+        records = tuple(ObjectRecord(int(k), int(k), birth) for k in present if k > 0)
+        return cls(labels, grid, records)
+
+    def with_labels(self, labels: np.ndarray) -> Hypothesis:
+        """The same objects with other voxels.
+
+        Objects that keep exactly their voxels keep source and motion; changed ones start anew; vanished
+        ones lose their record. A label without a record is an error.
+        """
+        labels = as_labels(labels)
+        changed = set(np.unique(labels[labels != self.labels]).tolist())
+        changed |= set(np.unique(self.labels[labels != self.labels]).tolist())
+        present = np.bincount(labels.ravel(), minlength=MAX_LABEL + 1) > 0
+        records = []
+        for record in self.objects:
+            if not present[record.label]:
+                continue
+            if record.label in changed:
+                record = replace(record, source=None, motion=RigidTransform.identity())
+            records.append(record)
+        return Hypothesis(labels, self.grid, tuple(records))
+
+    @cached_property
+    def key(self) -> bytes:
+        """Name by content of the voxels."""
+        return content_key("hypothesis", self.labels, self.grid.key)
+
+    @cached_property
+    def _volumes(self) -> Mapping[int, int]:
+        counts = np.bincount(self.labels.ravel())
+        return {int(k): int(counts[k]) for k in np.flatnonzero(counts) if k > 0}
+
+    def volumes(self) -> dict[int, int]:
+        """Number of voxels of each object, by label, ascending."""
+        return dict(self._volumes)
+
+    @property
+    def n_objects(self) -> int:
+        """Number of objects."""
+        return len(self.objects)
+
+    def record(self, label: int) -> ObjectRecord:
+        """The record of a label."""
+        for record in self.objects:
+            if record.label == label:
+                return record
+        raise InputError(f"no object with label {label}; there are {[o.label for o in self.objects]}")
+
+    def mask(self, label: int) -> np.ndarray:
+        """(X, Y, Z) bool: the voxels of an object."""
+        return self.labels == label

@@ -1,0 +1,1 @@
+"""The particle filter itself; knows nothing of images, voxels or robots."""

@@ -1,0 +1,173 @@
+"""Resampling schemes and triggers.
+
+All are unbiased: particle i gets on average n W_i copies, W its normalised weight. They differ in how far the
+number of copies N_i strays from that. Notation: f = frac(n W_i).
+
+============  =============================================  ========================================
+scheme        N_i                                            variance of N_i
+============  =============================================  ========================================
+multinomial   n independent draws                            n W_i (1 - W_i)
+residual      floor(n W_i), the rest multinomially           r_i (1 - r_i / R), r_i = f, R = sum of r
+stratified    one draw in each of n equal strata of [0, 1)   sum over strata of p (1 - p)
+systematic    one draw, shifted to each stratum              f (1 - f)
+============  =============================================  ========================================
+
+>>> import numpy as np
+>>> rng = np.random.default_rng(0)
+>>> Systematic().select(rng, np.log([0.5, 0.25, 0.25]), 4)[0]
+array([0, 0, 1, 2])
+
+Weights may be unnormalised, of any float type, and hold zeros (log weight -inf) anywhere; n may differ from
+their number. A particle of weight zero is never chosen. References: Douc, Cappe, Moulines (2005), "Comparison
+of resampling schemes for particle filtering"; Kitagawa (1996); Liu and Chen (1998).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mstfilter.errors import InputError
+from mstfilter.smc.interfaces import Resampler, Trigger
+from mstfilter.smc.population import Population, effective_sample_size
+
+__all__ = ["Always", "EssBelow", "Every", "Multinomial", "Never", "Residual", "Stratified", "Systematic"]
+
+
+def _cumulative(log_weights: np.ndarray, n: int) -> np.ndarray:
+    """(m,) cumulative weights in float64, last entry exactly the total; checks the input."""
+    lw = np.asarray(log_weights, dtype=np.float64)
+    if lw.ndim != 1 or len(lw) == 0:
+        raise InputError(f"log weights have shape {lw.shape}, expected one number a particle")
+    if n < 1:
+        raise InputError(f"resampling to {n} particles, expected at least 1")
+    top = lw.max()
+    if not np.isfinite(top):
+        at = int(np.flatnonzero(~np.isfinite(lw) & ~np.isneginf(lw))[0]) if not np.isneginf(top) else 0
+        raise InputError(f"log weights cannot be resampled: entry {at} is {lw[at]}, the largest is {top}")
+    return np.cumsum(np.exp(lw - top))
+
+
+def _from_points(cumulative: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Index whose interval of the cumulative weights holds each point of [0, total)."""
+    index = np.searchsorted(cumulative, points, side="right")  # "right" skips weights of zero
+    # A point rounded up to the total belongs to the last particle that has any weight.
+    last = int(np.searchsorted(cumulative, cumulative[-1], side="left"))
+    return np.minimum(index, last)
+
+
+def _from_shifts(cumulative: np.ndarray, n: int, shift: float) -> np.ndarray:
+    """Systematic selection: ancestors at the points (k + shift) / n, in O(m + n) without a search."""
+    total = cumulative[-1]
+    # Number of points below each cumulative weight; at the total it is n by definition, whatever rounding says.
+    ends = np.ceil(cumulative * (n / total) - shift)
+    np.clip(ends, 0, n, out=ends)
+    ends[np.searchsorted(cumulative, total, side="left") :] = n
+    return np.repeat(np.arange(len(cumulative)), np.diff(ends, prepend=0).astype(np.int64))
+
+
+@dataclass(frozen=True)
+class Multinomial(Resampler):
+    """Independent draws by weight (Gordon, Salmond, Smith 1993). The noisiest scheme; an oracle for the others."""
+
+    def select(self, rng: np.random.Generator, log_weights: np.ndarray, n: int) -> tuple[np.ndarray, None]:
+        """Choose by n uniforms that are made in sorted order: O(m + n)."""
+        cumulative = _cumulative(log_weights, n)
+        spacings = np.cumsum(rng.standard_exponential(n + 1))
+        points = spacings[:-1] * (cumulative[-1] / spacings[-1])
+        return _from_points(cumulative, points), None
+
+
+@dataclass(frozen=True)
+class Stratified(Resampler):
+    """One uniform in each of n equal strata (Kitagawa 1996)."""
+
+    def select(self, rng: np.random.Generator, log_weights: np.ndarray, n: int) -> tuple[np.ndarray, None]:
+        """Choose."""
+        cumulative = _cumulative(log_weights, n)
+        points = (np.arange(n) + rng.random(n)) * (cumulative[-1] / n)
+        return _from_points(cumulative, points), None
+
+
+@dataclass(frozen=True)
+class Systematic(Resampler):
+    """One uniform for all strata (Carpenter, Clifford, Fearnhead 1999); N_i is floor or ceil of n W_i."""
+
+    def select(self, rng: np.random.Generator, log_weights: np.ndarray, n: int) -> tuple[np.ndarray, None]:
+        """Choose."""
+        cumulative = _cumulative(log_weights, n)
+        return _from_shifts(cumulative, n, rng.random()), None
+
+
+@dataclass(frozen=True)
+class Residual(Resampler):
+    """floor(n W_i) copies for certain, the rest multinomially (Liu and Chen 1998)."""
+
+    def select(self, rng: np.random.Generator, log_weights: np.ndarray, n: int) -> tuple[np.ndarray, None]:
+        """Choose."""
+        cumulative = _cumulative(log_weights, n)
+        lw = np.asarray(log_weights, dtype=np.float64)
+        expected = np.exp(lw - lw.max()) * (n / cumulative[-1])
+        # n W_i that is a whole number but for rounding counts as whole: else its copy would be left to chance.
+        copies = np.floor(expected + 1e-12 * n)
+        rest = n - int(copies.sum())
+        if rest > 0:
+            remainder = np.clip(expected - copies, 0.0, None)
+            spacings = np.cumsum(rng.standard_exponential(rest + 1))
+            points = np.cumsum(remainder)
+            drawn = _from_points(points, spacings[:-1] * (points[-1] / spacings[-1]))
+            copies += np.bincount(drawn, minlength=len(copies))
+        return np.repeat(np.arange(len(copies)), copies.astype(np.int64)), None
+
+
+@dataclass(frozen=True)
+class EssBelow(Trigger):
+    """Resample where the effective sample size falls below a share of the particles.
+
+    Parameters
+    ----------
+    share : float
+        Of the number of particles, in (0, 1].
+    """
+
+    share: float = 0.5
+
+    def wants(self, population: Population, t: int) -> bool:
+        """True where ESS < share * n."""
+        return effective_sample_size(population.log_weights) < self.share * len(population)
+
+
+@dataclass(frozen=True)
+class Always(Trigger):
+    """Resample at every step."""
+
+    def wants(self, population: Population, t: int) -> bool:
+        """True."""
+        return True
+
+
+@dataclass(frozen=True)
+class Never(Trigger):
+    """Resample only where there are more particles than the filter keeps."""
+
+    def wants(self, population: Population, t: int) -> bool:
+        """False."""
+        return False
+
+
+@dataclass(frozen=True)
+class Every(Trigger):
+    """Resample at every k-th step.
+
+    Parameters
+    ----------
+    k : int
+        Steps from one resampling to the next.
+    """
+
+    k: int = 2
+
+    def wants(self, population: Population, t: int) -> bool:
+        """True where t is a multiple of k."""
+        return t % self.k == 0

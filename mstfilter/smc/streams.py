@@ -1,0 +1,86 @@
+"""Keyed random streams.
+
+Everything random in a run is drawn from a stream that is named by where it is used: (seed, step, slot, index).
+Worker count, order of work and switching a slot off then change nothing elsewhere.
+
+>>> from mstfilter.smc.streams import Key, child
+>>> rng = Key(seed=1).child(3, "transition").generator()     # step 3, slot "transition"
+>>> child(rng, "object", 7).random() == child(rng, "object", 7).random()    # does not consume `rng`
+True
+
+A `Key` is data (an integer and a tuple) and can be stored; a generator is not kept anywhere. Keys stand on
+numpy's SeedSequence with a prefix of our own, so a child never collides with `Generator.spawn`.
+"""
+
+from __future__ import annotations
+
+import zlib
+from dataclasses import dataclass
+
+import numpy as np
+
+from mstfilter.errors import InputError
+
+__all__ = ["Key", "child"]
+
+_PREFIX = 0x6D7374  # "mst": spawn() numbers its children from 0, which would meet a naive key
+
+
+@dataclass(frozen=True)
+class Key:
+    """The name of a random stream.
+
+    Parameters
+    ----------
+    seed : int
+        Not negative.
+    path : tuple of int
+        Where in the run the stream is used.
+    """
+
+    seed: int
+    path: tuple[int, ...] = ()
+
+    def __post_init__(self) -> None:
+        if isinstance(self.seed, bool) or not isinstance(self.seed, (int, np.integer)) or self.seed < 0:
+            raise InputError(f"seed is {self.seed!r}, expected an integer >= 0")
+        object.__setattr__(self, "seed", int(self.seed))
+
+    def child(self, *parts: int | str) -> Key:
+        """The key of a part: a step, a slot by name, an index."""
+        return Key(self.seed, self.path + tuple(_number(p) for p in parts))
+
+    def generator(self) -> np.random.Generator:
+        """A new generator at the start of the stream."""
+        return np.random.Generator(np.random.PCG64(np.random.SeedSequence(self.seed, spawn_key=(_PREFIX, *self.path))))
+
+
+def child(rng: np.random.Generator, *parts: int | str) -> np.random.Generator:
+    """A stream derived from the one that `rng` was made for; `rng` itself is not consumed.
+
+    Parameters
+    ----------
+    rng : Generator
+        Made from a seed (all generators of numpy.random.default_rng and of `Key` are).
+    *parts : int or str
+        Name of the part: for example ``"object", 7``.
+    """
+    return key_of(rng).child(*parts).generator()
+
+
+def key_of(rng: np.random.Generator) -> Key:
+    """The key of the stream that a generator was made for (wherever in the stream it is now)."""
+    sequence = rng.bit_generator.seed_seq
+    if not isinstance(sequence, np.random.SeedSequence) or not isinstance(sequence.entropy, (int, np.integer)):
+        raise InputError(
+            "this generator has no integer seed sequence, so no child stream can be named after it",
+            "make it with numpy.random.default_rng(seed) or Key(seed).generator()",
+        )
+    path = tuple(int(n) for n in sequence.spawn_key)
+    return Key(int(sequence.entropy), path[1:] if path[:1] == (_PREFIX,) else (_PREFIX, *path))
+
+
+def _number(part: int | str) -> int:
+    if isinstance(part, str):
+        return zlib.crc32(part.encode()) | 1 << 32  # names never meet indices below 2^32
+    return int(part)

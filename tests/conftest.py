@@ -1,0 +1,30 @@
+"""Shared fixtures: where the real data lie."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+REPOSITORY = Path(__file__).resolve().parent.parent
+
+
+def shared_folder() -> Path:
+    """The folder of real data: the environment variable MSTFILTER_SHARED, else ``../shared``."""
+    named = os.environ.get("MSTFILTER_SHARED")
+    return Path(named) if named else REPOSITORY.parent / "shared"
+
+
+def find_shared(name: str) -> Path:
+    """A path below the shared folder; the test is skipped, with the reason, where it is absent."""
+    path = shared_folder() / name
+    if not path.exists():
+        pytest.skip(f"real data absent: {name} (set MSTFILTER_SHARED to the folder that holds it)")
+    return path
+
+
+@pytest.fixture
+def shared_data():
+    """``shared_data("r1/quality.npz")`` is the path, or the test is skipped."""
+    return find_shared
