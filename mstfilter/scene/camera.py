@@ -126,8 +126,7 @@ class Camera:
         """World points (H, W, 3) in metres of a z-depth image (H, W) in metres; NaN where depth is NaN."""
         if depth.shape != (self.height, self.width):
             raise InputError(
-                f"depth image is {depth.shape[1]} x {depth.shape[0]}, "
-                f"the camera is {self.width} x {self.height}"
+                f"depth image is {depth.shape[1]} x {depth.shape[0]}, the camera is {self.width} x {self.height}"
             )
         matrix = self.pose.as_matrix()
         directions = self.rays() @ matrix[:3, :3].T
@@ -198,7 +197,10 @@ def rigid_from_matrix(matrix: np.ndarray, where: str = "pose") -> RigidTransform
     if matrix.shape != (4, 4):
         raise InputError(f"{where} has shape {matrix.shape}, expected (4, 4)")
     if not np.isfinite(matrix).all():
-        raise InputError(f"{where} holds a value that is not finite (NaN or inf)", "leave the pose out: it is then found from the support plane")
+        raise InputError(
+            f"{where} holds a value that is not finite (NaN or inf)",
+            "leave the pose out: it is then found from the support plane",
+        )
     R = matrix[:3, :3]
     if np.abs(R @ R.T - np.eye(3)).max() > 1e-3 or np.linalg.det(R) < 0 or not np.allclose(matrix[3], (0, 0, 0, 1)):
         raise InputError(

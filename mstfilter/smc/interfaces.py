@@ -23,6 +23,7 @@ too: it sees the observation, and it adds log f - log q to the log weights.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from dataclasses import replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -89,7 +90,9 @@ class Resampler(Component):
     """
 
     @abstractmethod
-    def select(self, rng: np.random.Generator, log_weights: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray | None]:
+    def select(
+        self, rng: np.random.Generator, log_weights: np.ndarray, n: int
+    ) -> tuple[np.ndarray, np.ndarray | None]:
         """Choose `n` ancestors.
 
         Parameters
@@ -110,12 +113,13 @@ class Resampler(Component):
             keeps the evidence.
         """
 
-    def resample(self, rng: np.random.Generator, population: Population, n: int) -> tuple[Population, np.ndarray]:
-        """Select from a population; the new population and its ancestors (n,)."""
+    def resample(self, rng: np.random.Generator, population: Population, n: int) -> Population:
+        """Select from a population; `parents["ancestor"]` (n,) says which particle each one was."""
         ancestors, log_weights = self.select(rng, population.log_weights, n)
         if log_weights is None:
             log_weights = np.full(len(ancestors), log_mean_exp(population.log_weights))
-        return population.take(ancestors, log_weights), np.asarray(ancestors)
+        chosen = population.take(ancestors, log_weights)
+        return replace(chosen, parents={**chosen.parents, "ancestor": ancestors})
 
 
 class Trigger(ABC):

@@ -157,7 +157,7 @@ class Population:
         Natural log, unnormalised. -inf is a weight of 0; NaN and +inf are errors. None: all 0.
     parents : mapping
         ``"previous"`` and ``"proposed"``: (n,) index of the parent in the previous population or among the
-        proposed particles, -1 for none.
+        proposed particles, -1 for none. A resampler adds ``"ancestor"``: which particle each one was before.
     notes : mapping
         What a component wants recorded: plain numbers, strings and lists.
     """

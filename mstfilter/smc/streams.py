@@ -52,7 +52,9 @@ class Key:
 
     def generator(self) -> np.random.Generator:
         """A new generator at the start of the stream."""
-        return np.random.Generator(np.random.PCG64(np.random.SeedSequence(self.seed, spawn_key=(_PREFIX, *self.path))))
+        return np.random.Generator(
+            np.random.PCG64(np.random.SeedSequence(self.seed, spawn_key=(_PREFIX, *self.path)))
+        )
 
 
 def child(rng: np.random.Generator, *parts: int | str) -> np.random.Generator:

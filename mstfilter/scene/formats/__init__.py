@@ -1,0 +1,1 @@
+"""Recordings on disk: our own folder, and adapters for other layouts."""

@@ -1,0 +1,265 @@
+"""Recordings: an RGB-D video with pauses, on disk or in memory.
+
+>>> recording = Recording.open("recordings/table-7")
+>>> for clip in recording.clips():
+...     clip.before, clip.after                 # Frames, read when they are looked at
+>>> Recording.from_arrays(rgb, depth, K)         # a user's own arrays; depth in metres
+
+On disk a recording is a folder::
+
+    manifest.json        version, generator, seed, frames: [{index, time_s, role: static | action}]
+    camera.json          K, width, height, depth_scale (metres a unit, mandatory), T_world_camera, workspace
+    rgb/000000.png       8-bit RGB         depth/000000.png     16-bit, 0 = no reading
+    instance/000000.png  optional: object number of each pixel      robot/000000.png   optional: robot mask
+    voxels.npz           optional truth: labels (S, X, Y, Z), frame (S,), origin, voxel_size
+    poses.json           optional truth: per frame, per object a 4x4 T_world_object
+
+Frames with role ``static`` are the pauses. Without a pose the world is found from the support plane of the
+first pause; without a workspace a grid is laid around what stands on the table.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any, overload
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+from mstfilter.errors import InputError
+from mstfilter.scene.arrays import content_key
+from mstfilter.scene.camera import Camera, rigid_from_matrix
+from mstfilter.scene.clip import Clip
+from mstfilter.scene.frame import Frame
+from mstfilter.scene.support_plane import fit_support_plane, workspace
+from mstfilter.scene.voxels import VoxelGrid, as_labels
+
+__all__ = ["Recording"]
+
+_KEPT_FRAMES = 40
+
+
+class _Frames(Sequence[Frame]):
+    """Frames that are made when they are looked at; the last few are kept."""
+
+    def __init__(self, read: Callable[[int], Frame], indices: Sequence[int], kept: OrderedDict[int, Frame]) -> None:
+        self._read, self._indices, self._kept = read, list(indices), kept
+
+    def __len__(self) -> int:
+        return len(self._indices)
+
+    @overload
+    def __getitem__(self, position: int) -> Frame: ...
+    @overload
+    def __getitem__(self, position: slice) -> _Frames: ...
+    def __getitem__(self, position: Any) -> Any:
+        if isinstance(position, slice):
+            return _Frames(self._read, self._indices[position], self._kept)
+        index = self._indices[position]
+        if index not in self._kept:
+            self._kept[index] = self._read(index)
+            if len(self._kept) > _KEPT_FRAMES:
+                self._kept.popitem(last=False)
+        self._kept.move_to_end(index)
+        return self._kept[index]
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """An RGB-D video with pauses.
+
+    Parameters
+    ----------
+    frames : sequence of Frame
+        In time order; read when looked at.
+    grid : VoxelGrid
+        Workspace.
+    pauses : tuple of int
+        Indices of the frames at rest, ascending.
+    times : tuple of float
+        Seconds, one a frame.
+    name : str
+        For messages and reports.
+    path : Path, optional
+        The folder it was read from.
+    manifest : dict
+        What manifest.json says, for recordings read from a folder.
+    read_truth, read_instance : callables
+        Where volumes (by pause) and instance images (by frame) come from; they return None where absent.
+    """
+
+    frames: Sequence[Frame]
+    grid: VoxelGrid
+    pauses: tuple[int, ...]
+    times: tuple[float, ...]
+    name: str = "arrays"
+    path: Path | None = None
+    manifest: dict[str, Any] = field(default_factory=dict)
+    read_truth: Callable[[int], np.ndarray | None] = lambda t: None
+    read_instance: Callable[[int], np.ndarray | None] = lambda index: None
+
+    def __post_init__(self) -> None:
+        n, pauses = len(self.frames), tuple(int(p) for p in self.pauses)
+        if n == 0 or not pauses:
+            raise InputError(f"recording {self.name} has {n} frames and {len(pauses)} pauses, expected at least 1")
+        if list(pauses) != sorted(set(pauses)) or pauses[0] < 0 or pauses[-1] >= n:
+            raise InputError(f"pauses of recording {self.name} are {pauses}, expected ascending indices below {n}")
+        if len(self.times) != n or any(b <= a for a, b in zip(self.times, self.times[1:], strict=False)):
+            raise InputError(f"times of recording {self.name} are not {n} ascending numbers")
+        object.__setattr__(self, "pauses", pauses)
+
+    @classmethod
+    def open(cls, path: str | Path) -> Recording:
+        """Read a recording folder; images are read when they are looked at (see `check`)."""
+        from mstfilter.scene.formats.folder import open_folder
+
+        return open_folder(Path(path))
+
+    @classmethod
+    def from_arrays(
+        cls,
+        rgb: np.ndarray,
+        depth: np.ndarray,
+        K: np.ndarray,
+        *,
+        pauses: Sequence[int] | None = None,
+        T_world_camera: np.ndarray | RigidTransform | None = None,
+        grid: VoxelGrid | None = None,
+        robot_masks: np.ndarray | None = None,
+        times: Sequence[float] | None = None,
+        name: str = "arrays",
+    ) -> Recording:
+        """A recording of a user's own arrays.
+
+        Parameters
+        ----------
+        rgb : (H, W, 3) or (T, H, W, 3) uint8
+            One image or a video.
+        depth : (H, W) or (T, H, W) float
+            Metres; NaN or 0 where there is no reading.
+        K : (3, 3) array
+            Intrinsics in pixels.
+        pauses : sequence of int, optional
+            Frames at which nothing moves and the hypotheses are wanted. Default: the first and the last.
+        T_world_camera : (4, 4) array or RigidTransform, optional
+            Camera pose; the table must be at z = 0. Default: from the support plane of the first pause.
+        grid : VoxelGrid, optional
+            Workspace. Default: 1 x 1 x 0.5 m in voxels of 1 cm around what stands on the table.
+        robot_masks : (T, H, W) bool, optional
+            Pixels that show the robot.
+        times : sequence of float, optional
+            Seconds. Default: 0, 1, 2, ...
+        name : str
+            For messages and reports.
+        """
+        rgb, depth = np.asarray(rgb), np.asarray(depth)
+        if rgb.ndim == 3 and depth.ndim == 2:
+            rgb, depth = rgb[None], depth[None]
+            robot_masks = None if robot_masks is None else np.asarray(robot_masks).reshape(depth.shape)
+        if rgb.ndim != 4 or rgb.shape[-1] != 3 or depth.shape != rgb.shape[:3]:
+            raise InputError(
+                f"rgb has shape {rgb.shape} and depth {depth.shape}, expected (T, H, W, 3) and (T, H, W)",
+                "one image is (H, W, 3) and (H, W); depth must be registered to the colour image",
+            )
+        if np.issubdtype(depth.dtype, np.integer):
+            raise InputError(
+                f"depth has type {depth.dtype}, expected metres as float",
+                "multiply raw readings by the depth scale: depth * 0.001 for millimetres",
+            )
+        n, height, width = depth.shape
+        _check_depth(depth, name)
+        if T_world_camera is not None and not isinstance(T_world_camera, RigidTransform):
+            T_world_camera = rigid_from_matrix(T_world_camera, "T_world_camera")
+        camera = Camera(K, width, height, T_world_camera)
+        chosen = tuple(sorted({0, n - 1})) if pauses is None else tuple(int(p) for p in pauses)
+        if not chosen or min(chosen) < 0 or max(chosen) >= n:
+            raise InputError(f"pauses are {chosen}, expected indices of the {n} frames")
+        masks = [None] * n if robot_masks is None else list(np.asarray(robot_masks, dtype=bool))
+        if len(masks) != n:
+            raise InputError(f"there are {len(masks)} robot masks for {n} frames")
+        first = Frame(rgb[chosen[0]], depth[chosen[0]], camera, masks[chosen[0]])
+        camera, grid = _world(first, grid)
+        frames = [Frame(rgb[i], depth[i], camera, masks[i]) for i in range(n)]
+        stamps = tuple(float(t) for t in (times if times is not None else range(n)))
+        return cls(frames, grid, chosen, stamps, name)
+
+    @cached_property
+    def key(self) -> bytes:
+        """Name by content of the pauses, the grid and the number of frames."""
+        return content_key(self.grid.key, len(self), *(self.frames[p].key for p in self.pauses))
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def clips(self) -> tuple[Clip, ...]:
+        """One clip a pause: the first pause alone, then from each pause to the next."""
+        clips = []
+        for t, end in enumerate(self.pauses):
+            start = self.pauses[max(t - 1, 0)]
+            frames = self.frames[start : end + 1]
+            clips.append(Clip(frames, self.grid, t, tuple(self.times[start : end + 1])))
+        return tuple(clips)
+
+    def truth(self, t: int) -> np.ndarray | None:
+        """True labels (X, Y, Z) uint16 at pause `t`, on the recording's grid; None where there is none."""
+        return self.read_truth(t)
+
+    def instance(self, index: int) -> np.ndarray | None:
+        """True label image (H, W) of a frame; None where there is none."""
+        return self.read_instance(index)
+
+    def check(self) -> None:
+        """Look at every image once, so that a broken one is known before a run begins."""
+        for index in range(len(self)):
+            frame = self.frames[index]
+            if not np.isfinite(frame.depth).any():
+                raise InputError(f"depth image of frame {index} of {self.name} has no reading at all")
+
+
+def _check_depth(depth: np.ndarray, name: str) -> None:
+    """Depth that cannot be metres, or holds nothing."""
+    for index, image in enumerate(depth):
+        with np.errstate(invalid="ignore"):
+            good = np.isfinite(image) & (image > 0)
+        if not good.any():
+            raise InputError(
+                f"depth image of frame {index} of {name} has no reading at all",
+                "0 and NaN mean no reading; values are metres",
+            )
+        _check_range(image[good], f"depth image of frame {index} of {name}")
+
+
+def _check_range(metres: np.ndarray, where: str) -> None:
+    median = float(np.median(metres))
+    if not 0.05 < median < 30:
+        raise InputError(
+            f"{where} has a median of {median:g} m, expected between 0.05 and 30 m",
+            "check the depth scale: millimetres need 0.001, TUM images 0.0002",
+        )
+
+
+def _world(first: Frame, grid: VoxelGrid | None) -> tuple[Camera, VoxelGrid]:
+    """Camera with a pose, and a workspace, from what the first pause shows."""
+    camera = first.camera
+    if camera.T_world_camera is None:
+        camera = camera.at(fit_support_plane(first).T_world_camera)
+    if grid is None:
+        grid = workspace(Frame(first.rgb, first.depth, camera, first.robot_mask))
+    return camera, grid
+
+
+def truth_reader(
+    labels: np.ndarray, frames: np.ndarray, pauses: tuple[int, ...]
+) -> Callable[[int], np.ndarray | None]:
+    """A `read_truth` from labels (S, X, Y, Z) at frame indices (S,)."""
+    where = {int(frame): s for s, frame in enumerate(frames)}
+
+    def read(t: int) -> np.ndarray | None:
+        s = where.get(pauses[t])
+        return None if s is None else as_labels(labels[s], "true labels")
+
+    return read
