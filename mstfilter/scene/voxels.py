@@ -15,8 +15,9 @@ table is at z = 0.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
@@ -166,8 +167,12 @@ class ObjectRecord:
     id: int
     birth: int = 0
     source: Crop | None = None
-    motion: RigidTransform = RigidTransform.identity()
+    motion: RigidTransform = field(default_factory=RigidTransform.identity)
     completion_key: str | None = None
+
+    def changed(self) -> ObjectRecord:
+        """The record after something other than a rigid motion has changed the object's voxels."""
+        return replace(self, source=None, motion=RigidTransform.identity())
 
 
 def as_labels(labels: np.ndarray, where: str = "label grid") -> np.ndarray:
@@ -215,7 +220,7 @@ class Hypothesis:
             raise InputError(f"label grid has shape {labels.shape}, the voxel grid is {self.grid.shape}")
         object.__setattr__(self, "labels", read_only(labels))
         numbers = [o.label for o in self.objects]
-        if any(b <= a for a, b in zip(numbers, numbers[1:], strict=False)):
+        if any(b <= a for a, b in pairwise(numbers)):
             raise InputError(f"object records are not in ascending order of labels: {numbers}")
         if numbers != list(self.volumes()):
             raise InputError(
@@ -225,12 +230,15 @@ class Hypothesis:
 
     @classmethod
     def from_labels(cls, labels: np.ndarray, grid: VoxelGrid, birth: int = 0) -> Hypothesis:
-        """A hypothesis whose objects are all new; ids are the labels."""
+        """A hypothesis whose objects are all new.
+
+        An object's id is ``65536 * birth + label``: births at different times never share one.
+        """
         labels = as_labels(labels)
         if labels.shape != grid.shape:
             raise InputError(f"label grid has shape {labels.shape}, the voxel grid is {grid.shape}")
         present = np.flatnonzero(np.bincount(labels.ravel()))
-        records = tuple(ObjectRecord(int(k), int(k), birth) for k in present if k > 0)
+        records = tuple(ObjectRecord(int(k), birth * (MAX_LABEL + 1) + int(k), birth) for k in present if k > 0)
         return cls(labels, grid, records)
 
     def with_labels(self, labels: np.ndarray) -> Hypothesis:
@@ -248,7 +256,7 @@ class Hypothesis:
             if not present[record.label]:
                 continue
             if record.label in changed:
-                record = replace(record, source=None, motion=RigidTransform.identity())
+                record = record.changed()
             records.append(record)
         return Hypothesis(labels, self.grid, tuple(records))
 

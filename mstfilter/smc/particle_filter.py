@@ -157,8 +157,8 @@ class ParticleFilter:
     transition: Transition | None = None
     proposal: Proposal | None = None
     update: Update | None = None
-    resampler: Resampler = Systematic()
-    trigger: Trigger = EssBelow()
+    resampler: Resampler = Systematic()  # noqa: RUF009 (frozen)
+    trigger: Trigger = EssBelow()  # noqa: RUF009 (frozen)
     n: int = 100
     n_proposed: int = 0
     resample: Literal["after", "before"] = "before"
@@ -274,6 +274,7 @@ class ParticleFilter:
         """The last state and the infos of all steps."""
         state = seed if isinstance(seed, State) else self.start(seed)
         infos = []
-        for state, info in self.iterate(observations, state):
+        for observation in observations:
+            state, info = self.step(state, observation)
             infos.append(info)
         return state, infos

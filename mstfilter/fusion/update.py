@@ -1,0 +1,99 @@
+"""The measurement update of MST: predicted x proposed -> fused candidates (paper, section IV-D, Alg. 1).
+
+>>> update = FusionUpdate(eta=5)
+>>> fused = update.update(rng, predicted, proposed, clip)      # |proposed| x |predicted| x eta candidates
+
+Predicted hypotheses are projected onto the free space of the latest frame, which gives each a quality Q. Every
+pair of a proposed sample i and a predicted hypothesis j is crossed `eta` times. The weight of a candidate is
+
+    log w = log w_j + log w_i + lambda log Q_j
+
+and depends only on its pair, so candidates are drawn first and built afterwards: those that resampling does not
+choose are never built.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from mstfilter.fusion.crossover import Crossover
+from mstfilter.fusion.free_space import FreeSpace, Projection
+from mstfilter.scene.clip import Clip
+from mstfilter.scene.voxels import Hypothesis
+from mstfilter.smc.interfaces import Update
+from mstfilter.smc.population import Candidates, Population
+from mstfilter.smc.streams import key_of
+from mstfilter.smc.updates import union
+
+__all__ = ["FusionUpdate"]
+
+_SMALLEST_QUALITY = 1e-3  # a prediction that loses every voxel keeps a weight, lest all are zero
+
+
+@dataclass(frozen=True)
+class FusionUpdate(Update):
+    """Free-space projection and conflict-graph crossover.
+
+    Parameters
+    ----------
+    free_space : Projection
+        Projects the predicted hypotheses onto what the latest frame leaves possible.
+    crossover : Crossover
+        Makes one hypothesis of two.
+    eta : int
+        Candidates of each pair.
+    quality_exponent : float
+        lambda: power of Q in the weight.
+    """
+
+    free_space: Projection = FreeSpace()  # noqa: RUF009 (frozen)
+    crossover: Crossover = Crossover()  # noqa: RUF009 (frozen)
+    eta: int = 5
+    quality_exponent: float = 3.0
+
+    properly_weighted: ClassVar[bool] = False
+
+    def update(
+        self,
+        rng: np.random.Generator,
+        predicted: Population | None,
+        proposed: Population | None,
+        observation: Clip,
+    ) -> Population:
+        """Candidates of all pairs, unbuilt.
+
+        Without a prediction the proposed samples pass unchanged; without a proposal the refined predictions do.
+        """
+        if predicted is None:
+            return union(None, proposed)
+        refined, quality = self._refine(predicted, observation)
+        log_q = self.quality_exponent * np.log(np.maximum(quality, _SMALLEST_QUALITY))
+        notes = {"quality": quality.tolist(), "eta": self.eta}
+        if proposed is None:
+            return Population(refined, predicted.log_weights + log_q, predicted.parents, notes)
+
+        i, j = (
+            index.ravel().repeat(self.eta)
+            for index in np.meshgrid(np.arange(len(proposed)), np.arange(len(predicted)), indexing="ij")
+        )
+        key, samples, crossover = key_of(rng), tuple(proposed.particles), self.crossover
+
+        def build(candidate: int) -> Hypothesis:
+            stream = key.child("candidate", candidate).generator()
+            return crossover.mix(stream, samples[i[candidate]], refined[j[candidate]])
+
+        none_j, none_i = np.full(len(predicted), -1), np.full(len(proposed), -1)
+        parents = {
+            "previous": predicted.parents.get("previous", none_j)[j],
+            "proposed": proposed.parents.get("proposed", none_i)[i],
+        }
+        log_weights = proposed.log_weights[i] + (predicted.log_weights + log_q)[j]
+        return Population(Candidates(build, len(i)), log_weights, parents, notes)
+
+    def _refine(self, predicted: Population, clip: Clip) -> tuple[tuple[Hypothesis, ...], np.ndarray]:
+        """Predicted hypotheses after free-space projection, and their qualities (n,)."""
+        pairs = [self.free_space.project(hypothesis, clip.after) for hypothesis in predicted.particles]
+        return tuple(h for h, _ in pairs), np.array([q for _, q in pairs])
