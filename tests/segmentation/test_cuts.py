@@ -1,0 +1,195 @@
+"""Cut samplers against enumeration."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import stats
+
+from mstfilter.errors import InputError
+from mstfilter.segmentation.gibbs import ExactCuts, best_envelope, gibbs
+from mstfilter.segmentation.mh import MetropolisHastingsCuts
+from mstfilter.segmentation.moves import AuthorsMoves, FeasibleMoves, NodeMoves, SubtreeRedraw
+from mstfilter.segmentation.optimal import OptimalCut, optimal_cut
+from mstfilter.segmentation.tree import Tree
+from tests.segmentation.trees import (
+    all_cuts,
+    random_tree,
+    random_values,
+    stationary,
+    target,
+    transition_matrix,
+)
+
+SMALL = [(5, 2), (7, 2), (9, 2), (9, 4), (8, 3)]
+
+
+def case(leaves: int, most: int, seed: int = 3):
+    rng = np.random.default_rng((seed, leaves, most))
+    tree = random_tree(rng, leaves, most)
+    return tree, random_values(rng, tree)
+
+
+def rules(tree, w, best, s2):
+    return {
+        "node": NodeMoves(),
+        "feasible": FeasibleMoves(),
+        "redraw, fitted surrogate": SubtreeRedraw(best_envelope(tree, w, best, s2)),
+        "redraw, poor surrogate": SubtreeRedraw(gibbs(tree, w * 0.8 - 0.1, 0.3)),
+    }
+
+
+@given(st.integers(0, 10**6), st.integers(1, 9), st.integers(2, 5))
+def test_optimal_cut_is_the_best_of_all(seed, leaves, most):
+    rng = np.random.default_rng(seed)
+    tree = random_tree(rng, leaves, most)
+    w = random_values(rng, tree)
+    cut = optimal_cut(tree, w)
+    assert tree.is_cut(cut)
+    assert w[cut].sum() == pytest.approx(max(w[list(c)].sum() for c in all_cuts(tree)))
+
+
+def test_ties_keep_the_parent():
+    tree = Tree(np.array([2, 2, 2]), np.array([[0, 1]]), np.zeros(3))
+    assert optimal_cut(tree, np.array([1.0, 1.0, 2.0])).tolist() == [2]
+    assert optimal_cut(tree, np.array([0.1, 0.2, 0.1 + 0.2])).tolist() == [2]
+
+
+@pytest.mark.parametrize(("leaves", "most"), SMALL)
+@pytest.mark.parametrize("sigma2", [0.25, 1e-2])
+def test_exact_rules_are_stationary_and_reversible(leaves, most, sigma2):
+    tree, w = case(leaves, most)
+    _, p, best, s2 = target(tree, w, sigma2)
+    for name, rule in rules(tree, w, best, s2).items():
+        T = transition_matrix(tree, w, best, s2, rule)
+        assert np.allclose(T.sum(axis=1), 1, atol=1e-12), name
+        assert 0.5 * np.abs(p @ T - p).sum() < 1e-12, name
+        assert np.abs(p[:, None] * T - (p[:, None] * T).T).max() < 1e-12, name
+        if sigma2 == 0.25:  # one law only: also irreducible, so the solved stationary law is p
+            assert 0.5 * np.abs(stationary(T) - p).sum() < 1e-10, name
+
+
+@pytest.mark.parametrize(("leaves", "most"), SMALL)
+def test_the_authors_rule_is_not_stationary(leaves, most):
+    """Its merges are over-accepted: the notes' trees gave total variations of .23 .28 .54 .35."""
+    tree, w = case(leaves, most)
+    cuts, p, best, s2 = target(tree, w, 0.25)
+    T = transition_matrix(tree, w, best, s2, AuthorsMoves())
+    law = stationary(T)
+    sizes = np.array([len(c) for c in cuts])
+    assert 0.1 < 0.5 * np.abs(law - p).sum() < 0.7
+    assert law @ sizes < p @ sizes  # too coarse
+
+
+def test_the_samplers_chain_follows_the_matrix():
+    """Frequencies of the default sampler's chain against the target; false alarm 1e-4."""
+    tree, w = case(5, 2)
+    cuts, p, _, _ = target(tree, w, 0.05)
+    for rule, redraw in [("node", 0.3), ("node", 0.0), ("feasible", 0.0)]:
+        sampler = MetropolisHastingsCuts(0.05, burn_in=100, thinning=40, rule=rule, redraw_share=redraw)
+        sample = sampler.sample(np.random.default_rng(1), tree, w, 3000)
+        found = _counts(sample.cuts, cuts)
+        assert _chi_square(found, p) > 1e-4, (rule, redraw)
+
+
+def _counts(sampled, cuts):
+    index = {c: i for i, c in enumerate(cuts)}
+    return np.bincount([index[tuple(c.tolist())] for c in sampled], minlength=len(cuts))
+
+
+def _chi_square(found, p):
+    """p value; cells with fewer than 5 expected are pooled."""
+    order = np.argsort(p)
+    expected = p[order] * found.sum()
+    k = int(np.searchsorted(np.cumsum(expected), 5.0)) + 1  # the least likely cuts are one cell
+    f = np.append(found[order][:k].sum(), found[order][k:])
+    e = np.append(expected[:k].sum(), expected[k:])
+    assert len(f) > 1, "the target law is concentrated on one cut: the test says nothing"
+    return stats.chisquare(f, e).pvalue
+
+
+@pytest.mark.parametrize(("leaves", "most"), SMALL)
+@pytest.mark.parametrize("sigma2", [0.25, 1e-2])
+def test_exact_sampler_matches_enumeration(leaves, most, sigma2):
+    """Chi-square, false alarm 1e-4 each."""
+    tree, w = case(leaves, most)
+    cuts, p, _, _ = target(tree, w, sigma2)
+    sample = ExactCuts(sigma2).sample(np.random.default_rng(7), tree, w, 6000)
+    found = _counts(sample.cuts, cuts)
+    assert (found[p == 0] == 0).all()
+    assert _chi_square(found, p) > 1e-4
+    assert np.exp(sample.log_p).max() <= 1
+
+
+@pytest.mark.parametrize(("leaves", "most"), SMALL)
+def test_gibbs_law(leaves, most):
+    tree, w = case(leaves, most)
+    law = gibbs(tree, w, 0.7)
+    cuts = all_cuts(tree)
+    v = np.array([w[list(c)].sum() for c in cuts])
+    p = np.exp(0.7 * v)
+    p /= p.sum()
+    assert np.allclose([np.exp(law.log_prob(list(c), tree.root)) for c in cuts], p, atol=1e-12)
+    assert law.mean[-1] == pytest.approx(p @ v)
+    assert law.expected_size() == pytest.approx(p @ [len(c) for c in cuts])
+
+
+def test_best_envelope_solves_its_equation():
+    tree, w = case(9, 2)
+    _, _, best, s2 = target(tree, w, 1e-2)
+    law = best_envelope(tree, w, best, s2)
+    assert law.b == pytest.approx(2 * (best - law.mean[-1]) / s2, rel=0.03)
+
+
+@settings(max_examples=30)
+@given(st.integers(0, 10**6), st.integers(1, 30), st.integers(2, 4), st.sampled_from([0.25, 1e-3, 1e-8]))
+def test_every_sample_is_a_cut(seed, leaves, most, sigma2):
+    rng = np.random.default_rng(seed)
+    tree = random_tree(rng, leaves, most)
+    w = random_values(rng, tree)
+    samplers = [
+        MetropolisHastingsCuts(sigma2, burn_in=10, thinning=7),
+        MetropolisHastingsCuts(sigma2, 0, 20, redraw_share=0.0),
+        MetropolisHastingsCuts(sigma2, 0, 20, "authors", 0.0, True, True, True),
+        MetropolisHastingsCuts(sigma2, 0, 5, "feasible", 0.0),
+        ExactCuts(sigma2),
+        OptimalCut(),
+    ]
+    for sampler in samplers:
+        sample = sampler.sample(np.random.default_rng(seed), tree, w, 6)
+        again = sampler.sample(np.random.default_rng(seed), tree, w, 6)
+        assert len(sample.cuts) == 6
+        assert all(tree.is_cut(c) for c in sample.cuts)
+        assert np.allclose(sample.values, [w[c].sum() for c in sample.cuts])
+        assert all((a == b).all() for a, b in zip(sample.cuts, again.cuts, strict=True))
+
+
+def test_authors_sampler_begins_with_the_optimal_cut():
+    tree, w = case(9, 2)
+    sampler = MetropolisHastingsCuts(0.25, 0, 20, "authors", 0.0, restart=True, include_optimal=True)
+    sample = sampler.sample(np.random.default_rng(0), tree, w, 5)
+    assert (sample.cuts[0] == optimal_cut(tree, w)).all()
+    assert sample.log_p[0] == 0
+    assert "autocorrelation_steps" not in sample.diagnostics
+
+
+def test_diagnostics():
+    tree, w = case(9, 2)
+    d = MetropolisHastingsCuts(0.25).sample(np.random.default_rng(0), tree, w, 10).diagnostics
+    assert 0 < d["acceptance"] <= 1
+    assert 0 < d["distinct"] <= 1
+    assert 1 <= d["autocorrelation_steps"] < 100
+
+
+def test_bad_fields_are_named():
+    with pytest.raises(InputError, match="move rule 'x'"):
+        MetropolisHastingsCuts(rule="x")
+    with pytest.raises(InputError, match="sigma2"):
+        ExactCuts(sigma2=0)
+    tree, w = case(5, 2)
+    with pytest.raises(InputError, match="node values have shape"):
+        optimal_cut(tree, w[:-1])
+    with pytest.raises(InputError, match="not finite"):
+        optimal_cut(tree, w * np.nan)
