@@ -1,0 +1,91 @@
+"""Assembled filters by name.
+
+>>> import mstfilter
+>>> mst = mstfilter.preset("mst")
+>>> mst = mstfilter.preset("mst", "n=10", "resampler=multinomial", "transition.rule=paper")
+
+``mst`` is our best, ``paper`` the published algorithm, ``authors`` the authors' own program. A preset is a TOML
+file: the fields of `ParticleFilter`, with one table a component.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Iterable, Mapping
+from typing import TYPE_CHECKING, Any
+
+from mstfilter import registry
+from mstfilter.errors import InputError
+from mstfilter.resources import find_preset
+
+if TYPE_CHECKING:
+    from mstfilter.smc.particle_filter import ParticleFilter
+
+__all__ = ["build_filter", "describe_filter", "load_config", "preset"]
+
+_META = ("description", "source")
+_PLAIN = ("n", "n_proposed", "resample")
+_SLOTS = ("initial", "transition", "proposal", "update", "resampler", "trigger")
+
+
+def preset(name: str = "mst", *overrides: str, allow_files: bool = True) -> ParticleFilter:
+    """A filter by preset name (or path of a TOML file) with overrides ``path=value``."""
+    return build_filter(load_config(name, overrides, allow_files=allow_files), allow_files=allow_files)
+
+
+def load_config(name: str, overrides: Iterable[str] = (), *, allow_files: bool = True) -> dict[str, Any]:
+    """The configuration of a preset after overrides, names checked; imports no component."""
+    path = find_preset(name)
+    try:
+        config = tomllib.loads(path.read_text())
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(f"preset {path} is not valid TOML: {error}") from error
+    for override in overrides:
+        _override(config, override)
+    unknown = set(config) - {*_META, *_PLAIN, *_SLOTS}
+    if unknown:
+        raise InputError(f"a filter has no field {sorted(unknown)[0]!r}", f"fields: {', '.join((*_PLAIN, *_SLOTS))}")
+    registry.check_names(config, allow_files)
+    return config
+
+
+def build_filter(config: Mapping[str, Any], *, allow_files: bool = False) -> ParticleFilter:
+    """The filter of a configuration."""
+    from mstfilter.smc.particle_filter import ParticleFilter
+
+    fields = {k: v for k, v in config.items() if k not in _META and v is not None}
+    return registry.make(ParticleFilter, fields, "", allow_files)
+
+
+def describe_filter(filter: ParticleFilter) -> dict[str, Any]:
+    """The full configuration that builds a filter again, defaults included."""
+    config = registry.describe(filter)
+    config.pop("component")
+    return config
+
+
+def _override(config: dict[str, Any], text: str) -> None:
+    """Apply ``path=value``. Naming a component resets its fields; naming a field keeps the others."""
+    path, equals, value = text.partition("=")
+    parts = path.strip().split(".")
+    if not equals or not all(parts) or not value.strip():
+        raise InputError(
+            f"override {text!r} is not of the form path=value",
+            "for example resampler=systematic or transition.rule=paper",
+        )
+    table = config
+    for part in parts[:-1]:
+        inner = table.get(part, {})
+        table[part] = {"component": inner} if isinstance(inner, str) else dict(inner)
+        if not isinstance(inner, (str, Mapping)):
+            raise InputError(f"override {text!r}: {part} is {inner!r}, which has no fields")
+        table = table[part]
+    table[parts[-1]] = _value(value.strip())
+
+
+def _value(text: str) -> Any:
+    """A number, a truth value, or the text itself; TOML's syntax where it applies."""
+    try:
+        return tomllib.loads(f"v = {text}")["v"]
+    except tomllib.TOMLDecodeError:
+        return text

@@ -1,0 +1,262 @@
+"""Components by name, and components from configuration.
+
+>>> build("resampler", "systematic")
+Systematic()
+>>> build("update", {"component": "fusion", "eta": 3, "free_space": "none"})
+
+A configuration is a nested mapping: a component is its name, or a mapping with ``component`` and fields. Names
+are known without importing what they name. A user's own class is found as ``./file.py:Class`` (where files are
+allowed) or by an entry point ``kind.name`` of the group ``mstfilter.components``.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import importlib
+import importlib.util
+import sys
+import typing
+from collections.abc import Mapping
+from importlib.metadata import entry_points
+from pathlib import Path
+from typing import Any
+
+from mstfilter.errors import InputError
+
+__all__ = ["COMPONENTS", "build", "check_names", "describe", "find_class", "known"]
+
+COMPONENTS: dict[str, dict[str, str]] = {
+    "transition": {
+        "tracking": "mstfilter.tracking.transition:TrackingTransition",
+        "identity": "mstfilter.tracking.transition:IdentityTransition",
+    },
+    "proposal": {"tree_cuts": "mstfilter.segmentation.proposal:TreeCutProposal"},
+    "update": {"fusion": "mstfilter.fusion.update:FusionUpdate"},
+    "resampler": {
+        "multinomial": "mstfilter.smc.resampling:Multinomial",
+        "residual": "mstfilter.smc.resampling:Residual",
+        "stratified": "mstfilter.smc.resampling:Stratified",
+        "systematic": "mstfilter.smc.resampling:Systematic",
+        "keep_weights": "mstfilter.smc.kept_weights:KeepWeights",
+    },
+    "trigger": {
+        "always": "mstfilter.smc.resampling:Always",
+        "ess": "mstfilter.smc.resampling:EssBelow",
+        "every": "mstfilter.smc.resampling:Every",
+        "never": "mstfilter.smc.resampling:Never",
+    },
+    "boundary": {"colour_depth": "mstfilter.segmentation.boundary:ColourDepthBoundary"},
+    "tree": {"ucm": "mstfilter.segmentation.tree:UcmTree"},
+    "value": {"scenecut": "mstfilter.segmentation.value:SceneCutObjectness"},
+    "sampler": {
+        "mh": "mstfilter.segmentation.cuts:MetropolisHastingsCuts",
+        "exact": "mstfilter.segmentation.cuts:ExactCuts",
+        "optimal": "mstfilter.segmentation.cuts:OptimalCut",
+    },
+    "completer": {
+        "extrude": "mstfilter.completion.completer:Extrude",
+        "surface": "mstfilter.completion.completer:SurfaceOnly",
+    },
+    "rule": {
+        "authors": "mstfilter.tracking.rules:AuthorsRule",
+        "mst": "mstfilter.tracking.rules:MstRule",
+        "paper": "mstfilter.tracking.rules:PaperRule",
+    },
+    "free_space": {
+        "projective": "mstfilter.fusion.free_space:FreeSpace",
+        "none": "mstfilter.fusion.free_space:NoFreeSpace",
+    },
+    "crossover": {"conflict_graph": "mstfilter.fusion.crossover:Crossover"},
+    "structure": {
+        "random_order": "mstfilter.fusion.structure:RandomOrder",
+        "spanning_tree": "mstfilter.fusion.structure:SpanningTree",
+    },
+    "mode_filter": {"majority": "mstfilter.fusion.mode_filter:ModeFilter"},
+}
+_SAME = {"initial": "proposal", "scheme": "resampler"}
+_GROUP = "mstfilter.components"
+
+
+def known(kind: str) -> dict[str, str]:
+    """Names of a kind and where their classes are, entry points included."""
+    names = dict(COMPONENTS.get(kind, {}))
+    for entry in entry_points(group=_GROUP):
+        slot, _, name = entry.name.partition(".")
+        if slot == kind:
+            names.setdefault(name, entry.value)
+    return names
+
+
+def kind_of(field: str) -> str | None:
+    """The kind of component that a field of this name holds; None for plain values."""
+    kind = _SAME.get(field, field)
+    return kind if kind in COMPONENTS else None
+
+
+def check_names(config: Mapping[str, Any], allow_files: bool = False, where: str = "") -> None:
+    """Find unknown component names in a configuration, without importing any component."""
+    for field, value in config.items():
+        kind = kind_of(field)
+        path = f"{where}{field}"
+        if kind is not None:
+            name = value.get("component") if isinstance(value, Mapping) else value
+            if isinstance(name, str):
+                _locate(kind, name, path, allow_files)
+        if isinstance(value, Mapping):
+            check_names(value, allow_files, f"{path}.")
+
+
+def find_class(kind: str, name: str, where: str | None = None, allow_files: bool = False) -> type:
+    """The class of a component name; imports it."""
+    location = _locate(kind, name, where or kind, allow_files)
+    module, _, attribute = location.partition(":")
+    if module.endswith(".py"):
+        return _from_file(Path(module), attribute)
+    try:
+        found = getattr(importlib.import_module(module), attribute)
+    except ImportError as error:
+        raise InputError(f"{where or kind}: component {name!r} cannot be imported: {error}") from error
+    return found
+
+
+def _locate(kind: str, name: str, where: str, allow_files: bool) -> str:
+    if ".py:" in name:
+        if not allow_files:
+            raise InputError(
+                f"{where}: {name!r} names a file, which is not loaded here", "only run, study and check load files"
+            )
+        if not Path(name.partition(":")[0]).is_file():
+            raise InputError(f"{where}: file does not exist: {name.partition(':')[0]}")
+        return name
+    names = known(kind)
+    if name not in names:
+        close = difflib.get_close_matches(name, names, n=1)
+        hints = [f"did you mean {close[0]}?"] if close else []
+        raise InputError(
+            f"{where}: there is no {kind} {name!r}",
+            *hints,
+            f"there are: {', '.join(sorted(names))}; or ./file.py:Class",
+        )
+    return names[name]
+
+
+def _from_file(path: Path, attribute: str) -> type:
+    name = f"mstfilter_user_{path.stem}"
+    spec = importlib.util.spec_from_file_location(name, path)
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module  # dataclasses look their module up
+    try:
+        spec.loader.exec_module(module)
+    except Exception as error:
+        raise InputError(f"{path} cannot be loaded: {type(error).__name__}: {error}") from error
+    found = getattr(module, attribute, None)
+    if not isinstance(found, type):
+        raise InputError(f"{path} has no class {attribute!r}")
+    found.__mst_file__ = f"{path}:{attribute}"  # type: ignore[attr-defined]
+    return found
+
+
+def build(
+    kind: str, spec: Any, where: str | None = None, allow_files: bool = False, default: type | None = None
+) -> Any:
+    """A component from its name, or from a mapping with ``component`` and fields.
+
+    Parameters
+    ----------
+    kind : str
+        Key of `COMPONENTS`.
+    spec : str or mapping
+        What to build. A mapping without ``component`` changes fields of `default`.
+    where : str, optional
+        Path in the configuration, for messages.
+    allow_files : bool
+        Whether ``./file.py:Class`` is loaded.
+    default : type, optional
+        Class to use where the mapping names none.
+    """
+    where = where or kind
+    if isinstance(spec, str):
+        spec = {"component": spec}
+    if not isinstance(spec, Mapping):
+        raise InputError(f"{where} is {spec!r}, expected the name of a {kind} or a table")
+    fields = dict(spec)
+    name = fields.pop("component", None)
+    if name is None:
+        if default is None:
+            raise InputError(
+                f"{where} names no component", f"add component = one of {', '.join(sorted(known(kind)))}"
+            )
+        cls = default
+    else:
+        cls = find_class(kind, name, where, allow_files)
+    return make(cls, fields, where, allow_files)
+
+
+def make(cls: type, fields: Mapping[str, Any], where: str, allow_files: bool = False) -> Any:
+    """An instance of a dataclass from plain values, nested components included."""
+    if not dataclasses.is_dataclass(cls):
+        raise InputError(f"{where}: {cls.__name__} is not a dataclass, so its fields cannot be configured")
+    own = {f.name: f for f in dataclasses.fields(cls) if f.init}
+    hints = typing.get_type_hints(cls)
+    values = {}
+    for name, value in fields.items():
+        path = f"{where}.{name}" if where else name
+        if name not in own:
+            close = difflib.get_close_matches(name, own, n=1)
+            raise InputError(
+                f"{path}: {cls.__name__} has no field {name!r}",
+                *([f"did you mean {close[0]}?"] if close else []),
+                f"fields: {', '.join(own) or 'none'}",
+            )
+        kind = kind_of(name)
+        if kind is not None and value is not None:
+            default = own[name].default
+            current = None if default is dataclasses.MISSING or default is None else type(default)
+            values[name] = build(kind, value, path, allow_files, current)
+        else:
+            values[name] = _plain(hints[name], value, path)
+    try:
+        return cls(**values)
+    except InputError as error:
+        raise InputError(f"{where}: {error.message}" if where else error.message, *error.hints) from error
+    except TypeError as error:
+        raise InputError(f"{where}: {error}") from error
+
+
+def _plain(hint: Any, value: Any, where: str) -> Any:
+    """A plain value checked against a field's annotation."""
+    from pydantic import TypeAdapter, ValidationError
+
+    try:
+        return TypeAdapter(hint).validate_python(value)
+    except ValidationError as error:
+        raise InputError(f"{where} is {value!r}: {error.errors()[0]['msg'].lower()}") from error
+
+
+def describe(component: Any) -> dict[str, Any]:
+    """The configuration that builds a component again."""
+    cls = type(component)
+    out: dict[str, Any] = {"component": name_of(cls)}
+    for field in dataclasses.fields(component):
+        value = getattr(component, field.name)
+        if dataclasses.is_dataclass(value) and not isinstance(value, type):
+            value = describe(value)
+        elif isinstance(value, tuple):
+            value = [describe(v) if dataclasses.is_dataclass(v) else v for v in value]
+        out[field.name] = value
+    return out
+
+
+def name_of(cls: type) -> str:
+    """The registered name of a class, its file, or its import path."""
+    file = cls.__dict__.get("__mst_file__")
+    if file is not None:
+        return str(file)
+    location = f"{cls.__module__}:{cls.__qualname__}"
+    for names in COMPONENTS.values():
+        for name, where in names.items():
+            if where == location:
+                return name
+    return location

@@ -1,0 +1,137 @@
+"""Run a filter over a recording into a run folder.
+
+>>> folder = execute(recording, load_config("mst"), Path("runs/mine"), seed=0)
+
+Everything that can be wrong with the input is found before the folder is made. A run that was stopped goes on
+where it was, to the same result, when it is started again with the same configuration, seed and recording.
+"""
+
+from __future__ import annotations
+
+import json
+import platform
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import mstfilter
+from mstfilter.errors import InputError
+from mstfilter.presets import build_filter, describe_filter
+from mstfilter.scene.recording import Recording
+from mstfilter.study.run_folder import RunFolder, plain
+
+__all__ = ["Progress", "execute"]
+
+_LIBRARIES = ("numpy", "scipy", "networkx", "opencv-python-headless", "higra", "small_gicp")
+
+
+@dataclass(frozen=True)
+class Progress:
+    """What is reported while a run is going on: pauses done, pauses in all, wall seconds of the last step."""
+
+    done: int
+    total: int
+    seconds: float = 0.0
+
+
+def execute(
+    recording: Recording,
+    config: Mapping[str, Any],
+    path: Path,
+    seed: int = 0,
+    *,
+    allow_files: bool = False,
+    progress: Callable[[Progress], None] = lambda progress: None,
+) -> RunFolder:
+    """Filter a recording; the run folder.
+
+    Parameters
+    ----------
+    recording : Recording
+        What was seen.
+    config : mapping
+        A configuration as `mstfilter.presets.load_config` returns it.
+    path : Path
+        The run folder: new, empty, or one of the same run that was stopped.
+    seed : int
+        Names all random streams.
+    allow_files : bool
+        Whether components may come from ``./file.py:Class``.
+    progress : callable
+        Called before the first step and after every step.
+    """
+    filter = build_filter(config, allow_files=allow_files)
+    recording.check()
+    wanted = plain(
+        {
+            "seed": int(seed),
+            "description": config.get("description", ""),
+            "config": describe_filter(filter),
+            "recording": {
+                "name": recording.name,
+                "key": recording.key.hex(),
+                "pauses": recording.pauses,
+                "times": [recording.times[p] for p in recording.pauses],
+                "generator": recording.manifest.get("generator"),
+            },
+        }
+    )
+    folder = _open(path, wanted)
+    clips, done = recording.clips(), folder.n_pauses
+    state = folder.state(done - 1) if done else filter.start(int(seed))
+    progress(Progress(done, len(clips)))
+    try:
+        for clip in clips[done:]:
+            state, info = filter.step(state, clip)
+            folder.write_pause(clip, state, info, recording.truth(clip.index))
+            progress(Progress(clip.index + 1, len(clips), sum(info.seconds.values())))
+    except KeyboardInterrupt:
+        folder.set_status("interrupted")
+        raise
+    except BaseException:
+        folder.set_status("failed")
+        raise
+    folder.write_metrics()
+    folder.set_status("done")
+    return folder
+
+
+def _open(path: Path, wanted: dict[str, Any]) -> RunFolder:
+    """A new run folder, or that of the same run."""
+    if (path / "run.json").is_file():
+        folder = RunFolder.open(path)
+        for what in ("seed", "config", "recording"):
+            found = folder.description.get(what)
+            if found != wanted[what]:
+                raise InputError(
+                    f"run folder {path} holds another run: its {what} differs{_first_difference(found, wanted[what])}",
+                    "choose another folder, or remove this one",
+                )
+        folder.set_status("running")
+        return folder
+    if path.exists() and (not path.is_dir() or any(path.iterdir())):
+        raise InputError(f"cannot write a run to {path}: it exists and is not an empty folder", "choose another name")
+    return RunFolder.create(path, {**wanted, "versions": versions()})
+
+
+def _first_difference(found: Any, wanted: Any, where: str = "") -> str:
+    """Where two descriptions differ first, in words."""
+    if isinstance(found, dict) and isinstance(wanted, dict):
+        for key in {**found, **wanted}:
+            if found.get(key) != wanted.get(key):
+                return _first_difference(found.get(key), wanted.get(key), f"{where}.{key}" if where else key)
+    short = [json.dumps(v)[:60] for v in (found, wanted)]
+    return f" ({where + ': ' if where else ''}{short[0]} there, {short[1]} now)"
+
+
+def versions() -> dict[str, str]:
+    """Versions of what a result depends on."""
+    found = {"mstfilter": mstfilter.__version__, "python": platform.python_version()}
+    for name in _LIBRARIES:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            found[name] = "absent"
+    return found

@@ -1,0 +1,233 @@
+"""The folder of a run: written pause by pause, enough to report from and to go on from.
+
+>>> run = RunFolder.open("runs/demo")
+>>> run.n_pauses, run.hypotheses(0), run.info(0)
+
+Layout::
+
+    run.json                 what was run: configuration, seed, versions, recording, status
+    recording.json           camera and workspace
+    pauses/000/rgb.png       the image at the pause          pauses/000/hypotheses.npz   particles and log weights
+    pauses/000/info.json     what happened in the step       pauses/000/camera.json      pose at the pause
+    pauses/000/truth.npz     true labels, where known        pauses/000/seconds.json     wall time by part
+    metrics.csv              one row a pause and hypothesis
+
+A pause is written under a temporary name and renamed when it is complete, so a run that was stopped at any
+moment holds whole pauses only. Everything but seconds.json is the same for the same seed.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import shutil
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mstfilter.errors import InputError
+from mstfilter.scene.camera import Camera, rigid_from_matrix
+from mstfilter.scene.clip import Clip
+from mstfilter.scene.images import read_rgb, write_image
+from mstfilter.scene.quality import FORMS, weighted_coverage
+from mstfilter.scene.storage import load_hypotheses, save_hypotheses
+from mstfilter.scene.voxels import Hypothesis
+from mstfilter.smc.particle_filter import Info, State
+from mstfilter.smc.population import Population
+from mstfilter.smc.streams import Key
+
+__all__ = ["RunFolder", "plain", "write_json"]
+
+FORMAT = 1
+
+
+def plain(value: Any) -> Any:
+    """A value as JSON knows it: arrays become lists, numpy numbers numbers, NaN and infinities None."""
+    if isinstance(value, Mapping):
+        return {str(k): plain(v) for k, v in value.items()}
+    if isinstance(value, np.ndarray):
+        return plain(value.tolist())
+    if isinstance(value, (list, tuple)):
+        return [plain(v) for v in value]
+    if isinstance(value, np.generic):
+        return plain(value.item())
+    if isinstance(value, float) and not np.isfinite(value):
+        return None
+    if value is None or isinstance(value, (str, int, float, bool)):
+        return value
+    return str(value)
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Write JSON under a temporary name and rename it."""
+    partial = path.with_name(f".{path.name}.partial")
+    partial.write_text(json.dumps(plain(value), indent=1) + "\n")
+    os.replace(partial, path)
+
+
+def _read_json(path: Path) -> Any:
+    try:
+        return json.loads(path.read_text())
+    except FileNotFoundError:
+        raise InputError(f"not a run folder: {path} is missing", "a run folder is made by `mstfilter run`") from None
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise InputError(f"{path} is not valid JSON: {error}") from error
+
+
+@dataclass(frozen=True)
+class RunFolder:
+    """A run on disk.
+
+    Parameters
+    ----------
+    path : Path
+        The folder.
+    """
+
+    path: Path
+
+    @classmethod
+    def open(cls, path: str | Path) -> RunFolder:
+        """An existing run folder."""
+        folder = cls(Path(path))
+        if folder.description.get("format") != FORMAT:
+            raise InputError(f"{path}: run folder has format {folder.description.get('format')}, expected {FORMAT}")
+        return folder
+
+    @classmethod
+    def create(cls, path: Path, description: Mapping[str, Any]) -> RunFolder:
+        """A new run folder that holds only its description."""
+        try:
+            (path / "pauses").mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise InputError(f"cannot write run folder {path}: {error.strerror}") from error
+        write_json(path / "run.json", {"format": FORMAT, "status": "running", **description})
+        return cls(path)
+
+    @cached_property
+    def description(self) -> dict[str, Any]:
+        """What run.json says."""
+        return dict(_read_json(self.path / "run.json"))
+
+    @property
+    def n_pauses(self) -> int:
+        """Complete pauses."""
+        t = 0
+        while (self.path / "pauses" / f"{t:03d}").is_dir():
+            t += 1
+        return t
+
+    def pause(self, t: int) -> Path:
+        """Folder of a pause."""
+        return self.path / "pauses" / f"{t:03d}"
+
+    def set_status(self, status: str) -> None:
+        """Record how far the run is: running, interrupted, failed, done."""
+        write_json(self.path / "run.json", {**_read_json(self.path / "run.json"), "status": status})
+
+    def write_pause(self, clip: Clip, state: State, info: Info, truth: np.ndarray | None) -> None:
+        """Write a step as a whole, or not at all."""
+        assert state.population is not None
+        t, final = info.t, self.pause(info.t)
+        folder = final.with_name(f".{final.name}.partial")
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir(parents=True)
+        camera = clip.after.camera
+        write_image(folder / "rgb.png", clip.after.rgb)
+        described = {
+            "K": camera.K,
+            "width": camera.width,
+            "height": camera.height,
+            "T_world_camera": camera.pose.as_matrix(),
+        }
+        write_json(folder / "camera.json", described)
+        hypotheses = tuple(state.population.particles)
+        save_hypotheses(
+            folder / "hypotheses.npz",
+            hypotheses,
+            log_weights=state.population.log_weights,
+            **{f"parents_{name}": index for name, index in state.population.parents.items()},
+        )
+        if truth is not None:
+            np.savez_compressed(folder / "truth.npz", labels=truth)
+        record = {
+            "t": t,
+            "n": info.n,
+            "n_frames": len(clip),
+            "n_candidates": info.n_candidates,
+            "ess": info.ess,
+            "resampled": info.resampled,
+            "unique_ancestors": info.unique_ancestors,
+            "ancestors": info.ancestors,
+            "parents": info.parents,
+            "log_weights": info.log_weights,
+            "weights": state.population.weights,
+            "quality": None if truth is None else qualities(hypotheses, truth),
+            "notes": info.notes,
+        }
+        write_json(folder / "info.json", record)
+        write_json(folder / "seconds.json", info.seconds)
+        os.replace(folder, final)
+
+    def info(self, t: int) -> dict[str, Any]:
+        """What happened in the step that ended at pause `t`."""
+        return dict(_read_json(self.pause(t) / "info.json"))
+
+    def seconds(self, t: int) -> dict[str, float]:
+        """Wall time of the step by part."""
+        return dict(_read_json(self.pause(t) / "seconds.json"))
+
+    def rgb(self, t: int) -> np.ndarray:
+        """Image (H, W, 3) at a pause."""
+        return read_rgb(self.pause(t) / "rgb.png")
+
+    def camera(self, t: int) -> Camera:
+        """Camera at a pause."""
+        data = _read_json(self.pause(t) / "camera.json")
+        pose = rigid_from_matrix(np.array(data["T_world_camera"]))
+        return Camera(np.array(data["K"]), data["width"], data["height"], pose)
+
+    def truth(self, t: int) -> np.ndarray | None:
+        """True labels (X, Y, Z) at a pause; None where unknown."""
+        path = self.pause(t) / "truth.npz"
+        if not path.exists():
+            return None
+        with np.load(path, allow_pickle=False) as data:
+            return data["labels"]
+
+    def hypotheses(self, t: int) -> tuple[Hypothesis, ...]:
+        """The particles after the step."""
+        return load_hypotheses(self.pause(t) / "hypotheses.npz")[0]
+
+    def state(self, t: int) -> State:
+        """The state after pause `t`, to go on from."""
+        hypotheses, arrays = load_hypotheses(self.pause(t) / "hypotheses.npz")
+        prefix = "parents_"
+        parents = {name[len(prefix) :]: a for name, a in arrays.items() if name.startswith(prefix)}
+        population = Population(hypotheses, arrays["log_weights"], parents)
+        return State(t + 1, population, Key(int(self.description["seed"])), False)
+
+    def write_metrics(self) -> None:
+        """Write metrics.csv from the pauses."""
+        partial = self.path / ".metrics.csv.partial"
+        with partial.open("w", newline="") as file:
+            writer = csv.writer(file)
+            columns = ["weight", "n_objects", "voxels", *(f"quality_{form}" for form in FORMS)]
+            writer.writerow(["pause", "hypothesis", *columns])
+            for t in range(self.n_pauses):
+                info, hypotheses = self.info(t), self.hypotheses(t)
+                for k, hypothesis in enumerate(hypotheses):
+                    q = ["" if info["quality"] is None else f"{info['quality'][form][k]:.6f}" for form in FORMS]
+                    size = sum(hypothesis.volumes().values())
+                    writer.writerow([t, k, f"{info['weights'][k]:.6g}", hypothesis.n_objects, size, *q])
+        os.replace(partial, self.path / "metrics.csv")
+
+
+def qualities(hypotheses: tuple[Hypothesis, ...], truth: np.ndarray) -> dict[str, list[float]]:
+    """Quality of each hypothesis against the truth, in all forms."""
+    return {form: [weighted_coverage(h.labels, truth, form) for h in hypotheses] for form in FORMS}
