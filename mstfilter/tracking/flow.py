@@ -1,0 +1,286 @@
+"""Dense optical flow through a clip, computed once and shared by every hypothesis.
+
+Two things are chained through all the frames of the clip:
+
+- a grid of POINTS of the first frame, followed forward (for rigid fits);
+- a PULL MAP that says for every pixel of the last frame where it was in the first (for masks: any number
+  of label images of ``clip.before`` becomes label images of ``clip.after`` by one gather each).
+
+>>> tracks = DenseFlow().track(clip)                     # doctest: +SKIP
+>>> labels_after = tracks.warp(project(hypothesis, clip.before.camera))   # doctest: +SKIP
+
+A point or pixel is trusted while the backward flow brings it back (within ``forward_backward`` pixels),
+its depth does not jump, and it does not touch the robot. One flow straight from first to last frame fails
+for what moves far, so the intermediate frames matter.
+"""
+
+from __future__ import annotations
+
+from dataclasses import astuple, dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mstfilter.errors import InputError
+from mstfilter.scene.clip import Clip
+from mstfilter.scene.depth_noise import depth_sigma
+from mstfilter.scene.frame import Frame
+from mstfilter.scene.memo import memo
+
+__all__ = ["ClipTracks", "DenseFlow", "track_labels"]
+
+PRESETS = ("ultrafast", "fast", "medium")
+N_VOTERS = 5
+
+
+@dataclass(frozen=True, eq=False)
+class ClipTracks:
+    """What was followed through a clip.
+
+    Attributes
+    ----------
+    start : (N, 2) int32, pixel (column, row) of each point in the first frame.
+    end : (N, 2) float32, where it is in the last frame; meaningless where lost.
+    alive : (N,) bool, followed to the end and not on the robot there.
+    source : (H, W) int32, flat pixel of the first frame that each pixel of the last frame comes from;
+        -1 where the robot hides it.
+    unchanged : (H, W) bool, depth and colour agree between first and last frame.
+    """
+
+    start: NDArray[np.int32]
+    end: NDArray[np.float32]
+    alive: NDArray[np.bool_]
+    source: NDArray[np.int32]
+    unchanged: NDArray[np.bool_]
+
+    def warp(self, labels: NDArray[np.integer]) -> NDArray[np.integer]:
+        """A label image (H, W) of the first frame as seen in the last; 0 behind the robot."""
+        flat = np.append(labels.ravel(), labels.dtype.type(0))
+        return flat[self.source]
+
+    @cached_property
+    def coherently_unchanged(self) -> NDArray[np.bool_]:
+        """(H, W) like `unchanged`, but a lone changed pixel among unchanged ones counts as noise."""
+        import cv2
+
+        changed = (~self.unchanged).astype(np.uint8)
+        return cv2.morphologyEx(changed, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)) == 0
+
+    def points_in(self, mask: NDArray[np.bool_]) -> NDArray[np.int64]:
+        """Indices of the points that start inside a mask (H, W) and reached the end."""
+        return np.flatnonzero(mask[self.start[:, 1], self.start[:, 0]] & self.alive)
+
+
+@dataclass(frozen=True)
+class DenseFlow:
+    """Dense inverse search flow (Kroeger et al., ECCV 2016; OpenCV's DIS), forward and backward.
+
+    Parameters
+    ----------
+    preset : "ultrafast", "fast" or "medium"
+    scale : float
+        Flow is computed on images resized by this factor (1 = full size).
+    frame_step : int
+        Use every k-th frame; the last one always.
+    grid_step : int
+        Spacing of the followed points in pixels.
+    forward_backward : float
+        Pixels; larger round-trip errors end a track.
+    depth_jump : float
+        Metres between consecutive frames; larger jumps end a track.
+    colour_jump : float
+        Grey levels, largest channel, between consecutive frames (slightly blurred); larger jumps end a track.
+    """
+
+    preset: str = "fast"
+    scale: float = 1.0
+    frame_step: int = 3
+    grid_step: int = 2
+    forward_backward: float = 1.0
+    depth_jump: float = 0.03
+    colour_jump: float = 30.0
+
+    def __post_init__(self) -> None:
+        if self.preset not in PRESETS:
+            raise InputError(f"flow preset {self.preset!r} is unknown", f"one of {', '.join(PRESETS)}")
+        if not 0.0 < self.scale <= 1.0:
+            raise InputError(f"flow scale is {self.scale}, expected 0 < scale <= 1")
+        if self.frame_step < 1 or self.grid_step < 1:
+            raise InputError(f"frame_step {self.frame_step} and grid_step {self.grid_step} must be at least 1")
+
+    def track(self, clip: Clip) -> ClipTracks:
+        """Follow points and pixels through the clip. Memoised by content."""
+        chosen = list(range(0, len(clip.frames) - 1, self.frame_step)) + [len(clip.frames) - 1]
+        frames = [clip.frames[i] for i in chosen]
+        key = (tuple(f.key for f in frames), astuple(self))
+        return memo("clip tracks", key, lambda: _track(frames, self))
+
+
+def track_labels(labels: NDArray[np.integer], clip: Clip, flow: DenseFlow | None = None) -> NDArray[np.integer]:
+    """Label image of ``clip.after`` from one of ``clip.before``: its masks, tracked through the clip."""
+    return (flow or DenseFlow()).track(clip).warp(labels)
+
+
+def _track(frames: list[Frame], settings: DenseFlow) -> ClipTracks:
+    import cv2
+
+    first, last = frames[0], frames[-1]
+    height, width = first.depth.shape
+    columns, rows = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
+    step = settings.grid_step
+    start = np.stack([columns[::step, ::step].ravel(), rows[::step, ::step].ravel()], axis=1)
+    end = start.copy()
+    alive = ~_robot(first)[::step, ::step].ravel()
+    grid = np.stack([columns.ravel(), rows.ravel()], axis=1)
+    pull = grid.copy()  # first-frame position of every pixel of the current frame
+    known = ~_robot(first).ravel()
+    for previous, current in zip(frames, frames[1:], strict=False):
+        forward, backward = _flow(previous, current, settings)
+        end, ok = _advance(end, forward, backward, previous, current, settings)
+        alive &= ok
+        # One step back to the previous frame, then the map so far.
+        back, ok = _advance(grid, backward, forward, current, previous, settings)
+        u, v = _pixel(back, width, height)
+        at = v * width + u
+        pull = pull[at] + (back - grid[at])  # keeps the fraction of a pixel that rounding drops
+        ok &= known[at]
+        same = unchanged_pixels(first, current).ravel()
+        pull[same] = grid[same]
+        ok |= same
+        robot = _robot(current).ravel()
+        voted = np.flatnonzero(~ok & ~robot)
+        known = ~robot
+        pull[voted] = _vote(current, pull, ok, voted)
+    unchanged = unchanged_pixels(first, last)
+    u, v = _pixel(pull, width, height)
+    source = np.where(known, v * width + u, -1).astype(np.int32).reshape(height, width)
+    return ClipTracks(start.astype(np.int32), end, alive, source, unchanged)
+
+
+def _robot(frame: Frame) -> NDArray[np.bool_]:
+    return np.zeros(frame.depth.shape, bool) if frame.robot_mask is None else frame.robot_mask
+
+
+def _flow(a: Frame, b: Frame, settings: DenseFlow) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Flow a -> b and b -> a, (H, W, 2) pixels."""
+    import cv2
+
+    grey = [cv2.cvtColor(f.rgb, cv2.COLOR_RGB2GRAY) for f in (a, b)]
+    if settings.scale < 1.0:
+        grey = [cv2.resize(g, None, fx=settings.scale, fy=settings.scale, interpolation=cv2.INTER_AREA) for g in grey]
+    dis = cv2.DISOpticalFlow_create(PRESETS.index(settings.preset))
+    # The search is split into one stripe a thread and results depend on the split: keep to one.
+    threads = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        fields = [dis.calc(grey[0], grey[1], None), dis.calc(grey[1], grey[0], None)]
+    finally:
+        cv2.setNumThreads(threads)
+    if settings.scale < 1.0:
+        size = (a.depth.shape[1], a.depth.shape[0])
+        factor = np.array([size[0] / grey[0].shape[1], size[1] / grey[0].shape[0]], np.float32)
+        fields = [cv2.resize(f, size, interpolation=cv2.INTER_LINEAR) * factor for f in fields]
+    return fields[0], fields[1]
+
+
+def _sample(field: NDArray[np.float32], at: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Bilinear samples (N, C) of a field (H, W, C) at points (N, 2); the border is repeated."""
+    height, width = field.shape[:2]
+    u, v = np.clip(at[:, 0], 0, width - 1), np.clip(at[:, 1], 0, height - 1)
+    u0, v0 = np.minimum(u.astype(np.int32), width - 2), np.minimum(v.astype(np.int32), height - 2)
+    a, b = (u - u0)[:, None], (v - v0)[:, None]
+    top = field[v0, u0] * (1 - a) + field[v0, u0 + 1] * a
+    bottom = field[v0 + 1, u0] * (1 - a) + field[v0 + 1, u0 + 1] * a
+    return top * (1 - b) + bottom * b
+
+
+def _advance(
+    at: NDArray[np.float32],
+    there: NDArray[np.float32],
+    back: NDArray[np.float32],
+    a: Frame,
+    b: Frame,
+    settings: DenseFlow,
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """Move points from frame a to b; which of them can be trusted."""
+    height, width = a.depth.shape
+    moved = at + _sample(there, at)
+    home = moved + _sample(back, moved)
+    inside = (moved >= 0).all(axis=1) & (moved[:, 0] <= width - 1) & (moved[:, 1] <= height - 1)
+    ok = inside & (((home - at) ** 2).sum(axis=1) < settings.forward_backward**2)
+    ua, va = _pixel(at, width, height)
+    ub, vb = _pixel(moved, width, height)
+    jump = np.abs(b.depth[vb, ub] - a.depth[va, ua])
+    ok &= ~(jump > settings.depth_jump)  # a missing reading (NaN) says nothing
+    ok &= np.abs(_blurred(b)[vb, ub] - _blurred(a)[va, ua]).max(axis=1) <= settings.colour_jump
+    ok &= ~_robot(b)[vb, ub] & ~_robot(a)[va, ua]
+    return moved, ok
+
+
+def _blurred(frame: Frame) -> NDArray[np.int16]:
+    """Slightly blurred colour, (H, W, 3)."""
+    import cv2
+
+    return memo("blurred", (frame.key,), lambda: cv2.GaussianBlur(frame.rgb, (3, 3), 0).astype(np.int16))
+
+
+def _pixel(at: NDArray[np.float32], width: int, height: int) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    u = np.clip(np.rint(at[:, 0]), 0, width - 1).astype(np.int32)
+    v = np.clip(np.rint(at[:, 1]), 0, height - 1).astype(np.int32)
+    return u, v
+
+
+def unchanged_pixels(first: Frame, last: Frame, sigmas: float = 4.0, colour: float = 12.0) -> NDArray[np.bool_]:
+    """Pixels (H, W) where the last frame shows what the first did.
+
+    Depth differs by less than ``sigmas`` standard deviations of a difference, and slightly blurred colour
+    by less than ``colour`` grey levels in every channel. Robot pixels and missing depth are not unchanged.
+    """
+    same_colour = np.abs(_blurred(first) - _blurred(last)).max(axis=2) <= colour
+    limit = sigmas * np.sqrt(2.0) * depth_sigma(first.depth)
+    with np.errstate(invalid="ignore"):
+        same_depth = np.abs(last.depth - first.depth) <= limit
+    return same_depth & same_colour & first.valid & last.valid
+
+
+def _vote(
+    frame: Frame, pull: NDArray[np.float32], known: NDArray[np.bool_], doubtful: NDArray[np.int64]
+) -> NDArray[np.float32]:
+    """First-frame positions (D, 2) for pixels that the flow could not explain.
+
+    Each asks its five nearest explained pixels, by place in space and colour together (12 mm and 20 grey
+    levels weigh the same; without depth 6 pixels), and takes the position that most of them are near to.
+    """
+    import cv2
+    from scipy.ndimage import distance_transform_edt
+    from scipy.spatial import cKDTree
+
+    height, width = frame.depth.shape
+    if not len(doubtful) or not known.any():
+        return pull[doubtful]
+    finite = np.isfinite(frame.depth)
+    rows, columns = np.divmod(np.arange(height * width), width)
+    if finite.any():
+        nearest = distance_transform_edt(~finite, return_distances=False, return_indices=True)
+        place = frame.camera.unproject(frame.depth[tuple(nearest)]).reshape(-1, 3) / 0.012
+    else:
+        place = np.stack([columns, rows], axis=1) / 6.0
+    colour = _blurred(frame).reshape(-1, 3) / 20.0
+    features = np.hstack([place, colour])
+    # Explained pixels far from all doubtful ones are never asked.
+    image = np.zeros((height, width), np.uint8)
+    image.ravel()[doubtful] = 1
+    asked = (cv2.dilate(image, np.ones((25, 25), np.uint8)).ravel() > 0) & known
+    candidates = np.flatnonzero(asked)
+    if len(candidates) < N_VOTERS:
+        candidates = np.flatnonzero(known)
+    tree = cKDTree(features[candidates], balanced_tree=False, compact_nodes=False)
+    _, found = tree.query(features[doubtful], k=min(N_VOTERS, len(candidates)), eps=0.5)
+    voters = candidates[np.asarray(found).reshape(len(doubtful), -1)]
+    # The voter whose motion most others share; its own source, not its motion applied here: table that an
+    # object has just uncovered is still, but where it lies the first frame showed the object.
+    offset = pull[voters] - np.stack([columns[voters], rows[voters]], axis=-1)
+    distance = np.abs(offset[:, :, None] - offset[:, None, :]).sum(axis=-1)
+    choice = np.minimum(distance, 4.0).sum(axis=-1).argmin(axis=1)
+    return pull[voters[np.arange(len(doubtful)), choice]]

@@ -1,0 +1,130 @@
+"""The default motion rule: several candidate motions, judged by one residual.
+
+No single estimator wins everywhere: flow fails on plain surfaces, registration does not see the spin of
+a textured can, features need texture. So each proposes, the robust residual of depth and colour
+(residual.py) decides, and rest is preferred unless a motion is clearly better.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mstfilter.errors import InputError
+from mstfilter.tracking import rigid
+from mstfilter.tracking.features import SiftMatching
+from mstfilter.tracking.registration import centroid_shift, register
+from mstfilter.tracking.residual import Residual
+from mstfilter.tracking.rules import IDENTITY, Candidate, MotionRule, sift_motions
+from mstfilter.tracking.track import Track
+
+__all__ = ["MstRule"]
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class MstRule(MotionRule):
+    """Candidates from flow, registration and features; scored, gated, rest first.
+
+    Parameters
+    ----------
+    select : "map" or "sample"
+        Take the candidate of best score, or draw with probability ~ exp(-n_eff S / 2) for each particle.
+    static_margin : float
+        A motion must beat rest by this much in S.
+    n_eff : float
+        Independent observations that a segment's points are worth when drawing; residuals of neighbouring
+        pixels are correlated, so far below their number.
+    use_flow, use_icp, use_sift : bool
+        Which estimators propose.
+    max_shift : float
+        Metres; a candidate that carries the segment's centre farther is dropped.
+    max_angle : float
+        Radians; a candidate that turns more is dropped.
+    least_overlap : float
+        Share of the moved surface that must meet the tracked surface, for candidates from registration.
+    min_pairs : int
+        Fewest flow tracks or SIFT matches behind a motion.
+    max_sift : int
+        At most so many SIFT motions are considered.
+    sift : SiftMatching
+    residual : Residual
+    """
+
+    select: str = "map"
+    static_margin: float = 0.15
+    n_eff: float = 20.0
+    use_flow: bool = True
+    use_icp: bool = True
+    use_sift: bool = True
+    max_shift: float = 0.6
+    max_angle: float = 2.6
+    least_overlap: float = 0.3
+    min_pairs: int = 6
+    max_sift: int = 3
+    sift: SiftMatching = SiftMatching()
+    residual: Residual = Residual()
+
+    def __post_init__(self) -> None:
+        if self.select not in ("map", "sample"):
+            raise InputError(f"select {self.select!r} is unknown", "one of map, sample")
+
+    def candidates(self, rng: np.random.Generator, track: Track) -> tuple[Candidate, ...]:
+        """Scored motions; the identity comes first."""
+        identity = Candidate("identity", np.eye(4), score=self.residual.score(track, np.eye(4)) - self.static_margin)
+        found = [identity]
+        seen: list[Array] = []
+        for kind, T, support in self._proposals(rng, track):
+            centre = track.points.mean(axis=0)
+            if not np.isfinite(T).all() or rigid.displacement(T, centre) > self.max_shift:
+                continue
+            if rigid.angle(T) > self.max_angle or any(_same(T, other, centre) for other in seen):
+                continue
+            seen.append(T)
+            score = self.residual.score(track, T)
+            if np.isfinite(score):
+                found.append(Candidate(kind, T, support, 0.0, score))
+        return tuple(found)
+
+    def choose(self, rng: np.random.Generator, candidates: tuple[Candidate, ...]) -> Candidate:
+        """The best, or one drawn by score."""
+        scores = np.array([c.score for c in candidates])
+        if not np.isfinite(scores).any():
+            return IDENTITY
+        if self.select == "map":
+            return candidates[int(scores.argmin())]
+        weights = np.exp(-0.5 * self.n_eff * (scores - scores.min()))
+        return candidates[int(rng.choice(len(candidates), p=weights / weights.sum()))]
+
+    def _proposals(self, rng: np.random.Generator, track: Track) -> list[tuple[str, Array, int]]:
+        """Motions (kind, T, support) from every estimator, each also refined by registration."""
+        proposals: list[tuple[str, Array, int]] = []
+        starts: list[tuple[str, Array, int, float]] = []  # kind, motion, support, reach of the refinement
+        if self.use_flow:
+            p, q = track.flow_pairs
+            fit = rigid.ransac(rng, p, q, 0.008) if len(p) >= self.min_pairs else None
+            if fit is not None and fit[1].sum() >= self.min_pairs:
+                T = rigid.refine_robust(fit[0], p, q, 0.004)
+                proposals.append(("flow", T, int(fit[1].sum())))
+                starts.append(("icp", T, int(fit[1].sum()), 0.020))
+        if self.use_sift:
+            for m in sift_motions(rng, track, self.sift, False, 0.010, self.min_pairs, 500)[: self.max_sift]:
+                proposals.append(("sift", m.T, len(m.inliers)))
+                starts.append(("sift", m.T, len(m.inliers), 0.015))
+        source, target = track.surface, track.target_surface
+        if self.use_icp and source is not None and target is not None:
+            starts.append(("icp", centroid_shift(source.points, target.points), len(source.points), 0.030))
+            for kind, start, support, reach in starts:
+                refined = register(source, target, start, reach)
+                if refined is not None and refined.overlap >= self.least_overlap:
+                    proposals.append((kind, refined.T, support))
+        return proposals
+
+
+def _same(a: Array, b: Array, centre: Array) -> bool:
+    """Closer than 0.2 mm and 0.1 degrees: not worth a second score."""
+    change = rigid.invert(a) @ b
+    return bool(rigid.displacement(change, centre) < 2e-4 and rigid.angle(change) < 2e-3)

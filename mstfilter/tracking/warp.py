@@ -1,0 +1,216 @@
+"""Move the objects of a hypothesis by rigid motions.
+
+Pull, not push: every voxel of the transformed bounding box reads the object's source at T^-1 x, where the
+source is its occupancy when it was last changed by anything but a motion, and T all motions since. The shape
+then neither loses voxels nor frays, however often the object moves. (The authors' code splats voxel centres
+forward, `method="splat"`; that costs 3-14 % of the voxels a step.)
+
+>>> moved = Warp().move(hypothesis, {3: T})     # doctest: +SKIP
+>>> moved.hypothesis                            # doctest: +SKIP
+
+Where nothing moves the very same hypothesis comes back.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import RigidTransform
+
+from mstfilter.errors import InputError
+from mstfilter.scene.voxels import Crop, Hypothesis, ObjectRecord, VoxelGrid
+from mstfilter.tracking import rigid
+
+__all__ = ["Moved", "Warp"]
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Moved:
+    """A moved hypothesis and what happened to its voxels.
+
+    Attributes
+    ----------
+    hypothesis : Hypothesis
+    voxels_left : voxels that left the grid.
+    contested : voxels that more than one object claimed.
+    dropped : ids of objects that have no voxel left.
+    """
+
+    hypothesis: Hypothesis
+    voxels_left: int = 0
+    contested: int = 0
+    dropped: tuple[int, ...] = ()
+
+
+@dataclass(eq=False)
+class _Claims:
+    """Which voxels the objects want: one row a voxel and object."""
+
+    index: list[NDArray[np.int64]] = field(default_factory=list)
+    depth: list[Array] = field(default_factory=list)
+    record: list[ObjectRecord] = field(default_factory=list)
+
+    def add(self, record: ObjectRecord, index: NDArray[np.int64], depth: Array) -> None:
+        self.index.append(index)
+        self.depth.append(depth)
+        self.record.append(record)
+
+
+@dataclass(frozen=True)
+class Warp:
+    """How voxels follow a motion.
+
+    Parameters
+    ----------
+    method : "pull" or "splat"
+        Read the source at T^-1 x, or push voxel centres forward and round.
+    collisions : "deepest" or "label"
+        Who gets a voxel that several objects claim: the one of which it is deeper inside (ties: the better
+        residual), or the higher label (the authors' code).
+    """
+
+    method: str = "pull"
+    collisions: str = "deepest"
+
+    def __post_init__(self) -> None:
+        if self.method not in ("pull", "splat"):
+            raise InputError(f"warp method {self.method!r} is unknown", "one of pull, splat")
+        if self.collisions not in ("deepest", "label"):
+            raise InputError(f"collision rule {self.collisions!r} is unknown", "one of deepest, label")
+
+    def move(
+        self,
+        hypothesis: Hypothesis,
+        motions: Mapping[int, Array],
+        residuals: Mapping[int, float] | None = None,
+    ) -> Moved:
+        """Move objects.
+
+        Parameters
+        ----------
+        hypothesis : Hypothesis
+        motions : label -> (4, 4) motion in world metres; objects that are not named stay.
+        residuals : label -> residual of its motion, for ties.
+
+        Returns
+        -------
+        Moved
+        """
+        moving = {k: T for k, T in motions.items() if not np.array_equal(T, np.eye(4))}
+        if not moving:
+            return Moved(hypothesis)
+        grid = hypothesis.grid
+        residuals = residuals or {}
+        labels = hypothesis.labels.copy()
+        labels[np.isin(labels, list(moving))] = 0
+        claims, records, left = _Claims(), {}, 0
+        for record in hypothesis.objects:
+            if record.label not in moving:
+                records[record.label] = record
+                continue
+            index, depth, moved = self._claim(record, hypothesis, moving[record.label])
+            inside = grid.contains(index)
+            left += int((~inside).sum())
+            flat = np.ravel_multi_index(tuple(index[inside].T), grid.shape)
+            claims.add(record, flat.astype(np.int64), depth[inside])
+            records[record.label] = moved
+        disturbed = self._standing_claims(hypothesis, labels, claims)
+        contested = self._paint(labels, claims, residuals)
+        for label in disturbed:
+            record = records[label]
+            if record.source is None and self.method == "pull":
+                # What it lost in the collision comes back when it moves.
+                records[label] = replace(record, source=Crop.of(hypothesis.mask(label)))
+        present = np.bincount(labels.ravel(), minlength=max(records) + 1) > 0
+        kept = tuple(records[k] for k in sorted(records) if present[k])
+        dropped = tuple(records[k].id for k in sorted(records) if not present[k])
+        return Moved(Hypothesis(labels, grid, kept), left, contested, dropped)
+
+    def _claim(
+        self, record: ObjectRecord, hypothesis: Hypothesis, T: Array
+    ) -> tuple[NDArray[np.int64], Array, ObjectRecord]:
+        """Voxels (N, 3) that a moved object wants, how deep each is inside it (voxels), its new record."""
+        grid = hypothesis.grid
+        if self.method == "splat":
+            crop = Crop.of(hypothesis.mask(record.label))
+            index, depth = _push(crop, T, grid)
+            return index, depth, replace(record, source=None, motion=RigidTransform.identity())
+        crop = record.source or Crop.of(hypothesis.mask(record.label))
+        total = T if record.source is None else T @ record.motion.as_matrix()
+        index, depth = _pull(crop, total, grid)
+        if not len(index):  # thinner than a voxel between two centres
+            index, depth = _push(crop, total, grid)
+        return index, depth, replace(record, source=crop, motion=RigidTransform.from_matrix(total))
+
+    def _standing_claims(self, hypothesis: Hypothesis, labels: NDArray[np.uint16], claims: _Claims) -> list[int]:
+        """Add the claims of objects at rest on voxels that moved ones want; their labels."""
+        wanted = np.unique(np.concatenate(claims.index))
+        holder = labels.ravel()[wanted]
+        disturbed = np.unique(holder[holder > 0]).tolist()
+        for label in disturbed:
+            crop = Crop.of(hypothesis.mask(label))
+            flat = wanted[holder == label]
+            local = np.stack(np.unravel_index(flat, hypothesis.grid.shape), axis=1) - crop.offset
+            claims.add(hypothesis.record(label), flat, _depth_inside(crop)[tuple(local.T)])
+        return disturbed
+
+    def _paint(self, labels: NDArray[np.uint16], claims: _Claims, residuals: Mapping[int, float]) -> int:
+        """Give every claimed voxel to one claimant; how many were contested."""
+        index = np.concatenate(claims.index)
+        sizes = [len(i) for i in claims.index]
+        owner = np.repeat([r.label for r in claims.record], sizes)
+        if self.collisions == "label":
+            order = np.lexsort((-owner, index))
+        else:
+            depth = np.round(np.concatenate(claims.depth), 3)
+            residual = np.repeat([residuals.get(r.label, 0.0) for r in claims.record], sizes)
+            identity = np.repeat([r.id for r in claims.record], sizes)
+            order = np.lexsort((identity, residual, -depth, index))
+        index, owner = index[order], owner[order]
+        first = np.append(True, index[1:] != index[:-1])
+        labels.ravel()[index[first]] = owner[first]
+        return int(len(np.unique(index[~first])))
+
+
+def _depth_inside(crop: Crop) -> Array:
+    """Distance of each voxel of a crop to the nearest free voxel centre, in voxels; outside the crop is free."""
+    from scipy.ndimage import distance_transform_edt
+
+    return distance_transform_edt(np.pad(crop.occupied, 1))[1:-1, 1:-1, 1:-1]
+
+
+def _pull(crop: Crop, T: Array, grid: VoxelGrid) -> tuple[NDArray[np.int64], Array]:
+    """Voxels (N, 3), inside the grid or not, whose centre falls into the source moved by T; depth inside."""
+    from scipy.ndimage import map_coordinates
+
+    shape = np.array(crop.occupied.shape)
+    corners = np.array(np.meshgrid(*[(0, n) for n in shape], indexing="ij")).reshape(3, -1).T
+    moved = rigid.apply(T, grid.origin + (corners + crop.offset) * grid.voxel_size)
+    lower = np.floor((moved.min(axis=0) - grid.origin) / grid.voxel_size).astype(np.int64)
+    upper = np.ceil((moved.max(axis=0) - grid.origin) / grid.voxel_size).astype(np.int64)
+    axes = [np.arange(a, b) for a, b in zip(lower, upper, strict=True)]
+    index = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    home = (rigid.apply(rigid.invert(T), grid.centre_of(index)) - grid.origin) / grid.voxel_size - crop.offset
+    # A motion by whole voxels must not be decided by the last digit of a rounding error.
+    cell = np.floor(home + 1e-9).astype(np.int64)
+    inside = ((cell >= 0) & (cell < shape)).all(axis=1)
+    inside[inside] = crop.occupied[tuple(cell[inside].T)]
+    index, home = index[inside], home[inside]
+    depth = map_coordinates(np.pad(_depth_inside(crop), 1), home.T + 0.5, order=1, mode="constant")
+    return index, depth
+
+
+def _push(crop: Crop, T: Array, grid: VoxelGrid) -> tuple[NDArray[np.int64], Array]:
+    """Voxels (N, 3) that the moved centres of the source fall into; the greatest depth of those."""
+    cell = np.argwhere(crop.occupied)
+    depth = _depth_inside(crop)[tuple(cell.T)]
+    index = grid.index_of(rigid.apply(T, grid.centre_of(cell + crop.offset)))
+    order = np.lexsort((-depth, *index.T))
+    index, depth = index[order], depth[order]
+    first = np.append(True, (index[1:] != index[:-1]).any(axis=1)) if len(index) else np.zeros(0, bool)
+    return index[first], depth[first]
