@@ -121,9 +121,7 @@ class Tree:
         """Sums (N, ...) over each node's leaves of values (n_leaves, ...)."""
         leaf_values = np.asarray(leaf_values)
         order, first, last = self._leaf_ranges
-        sums = np.zeros(
-            (self.n_leaves + 1, *leaf_values.shape[1:]), dtype=np.result_type(leaf_values, np.int64)
-        )
+        sums = np.zeros((self.n_leaves + 1, *leaf_values.shape[1:]), dtype=np.result_type(leaf_values, np.int64))
         np.cumsum(leaf_values[order], axis=0, out=sums[1:])
         return sums[last] - sums[first]
 

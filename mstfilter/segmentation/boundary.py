@@ -1,0 +1,136 @@
+"""Where objects end, without learned weights: colour gradients and concave depth edges.
+
+Objects are mostly convex, so where two of them meet, or one meets the table, depth has a *concave* crease or a
+step; the convex creases of a box lie inside one object. Disparity D = 8 f b / z is affine on every plane and its
+noise is the same at every range, so the largest eigenvalue of its Hessian shows creases and steps and nothing
+else. Colour adds borders that depth does not show, at reduced strength because print on a box is not a border.
+
+>>> boundary = ColourDepthBoundary().boundary(frame)       # (H, W) float32 in 0 .. 1
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mstfilter.errors import InputError
+from mstfilter.scene.frame import Frame
+from mstfilter.scene.support_plane import BASELINE
+from mstfilter.segmentation.background import SENSOR_FOCAL, above_table
+from mstfilter.segmentation.interfaces import BoundaryModel
+
+__all__ = ["ColourDepthBoundary"]
+
+
+@dataclass(frozen=True)
+class ColourDepthBoundary(BoundaryModel):
+    """``max(colour_weight * colour, concave)``: colour structure tensor and concave disparity Hessian.
+
+    Parameters
+    ----------
+    colour_weight : float
+        Weight of the colour edges; 0 switches them off.
+    depth_weight : float
+        Weight of the depth edges; 0 switches them off.
+    depth_scale : float
+        Blur before the Hessian in pixels of a 640 px wide image; scales with the width.
+    depth_half : float
+        Hessian response that counts 0.5, in sensor disparity units (1/8 px at f = 525 px).
+    lightness_unit, chroma_unit : float
+        Lab differences that count as one unit of colour strength.
+    quiet_table : float
+        Nothing but table within this many pixels (of a 640 px wide image): no boundary there. Keeps print,
+        grain and shadows on the table out of the tree. Negative: off.
+    table_tolerance : float
+        Readings up to this much above the table are table, in sensor disparity units.
+    """
+
+    colour_weight: float = 0.6
+    depth_weight: float = 1.0
+    depth_scale: float = 2.5
+    depth_half: float = 2.0
+    lightness_unit: float = 20.0
+    chroma_unit: float = 8.0
+    quiet_table: float = 12.0
+    table_tolerance: float = 2.0
+
+    def __post_init__(self) -> None:
+        for name in ("depth_scale", "depth_half", "lightness_unit", "chroma_unit"):
+            if not getattr(self, name) > 0:
+                raise InputError(f"boundary field {name} is {getattr(self, name)!r}, expected a number > 0")
+
+    def boundary(self, frame: Frame) -> np.ndarray:
+        """Boundary strength; robot pixels are 0 inside and 1 at their rim, so nothing merges through them."""
+        import cv2
+
+        resize = frame.camera.width / 640
+        edges = np.zeros(frame.depth.shape, np.float32)
+        if self.colour_weight > 0:
+            edges = self.colour_weight * self._colour(frame.rgb, resize)
+        if self.depth_weight > 0 and frame.valid.any():
+            edges = np.maximum(edges, self.depth_weight * self._concave(frame, resize))
+        if self.quiet_table >= 0 and frame.valid.any():
+            with np.errstate(invalid="ignore"):
+                object_like = (above_table(frame) > self.table_tolerance).astype(np.uint8)
+            # A lone pixel above the table is noise; three by three are not.
+            object_like = cv2.morphologyEx(object_like, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+            reach = 2 * max(1, round(self.quiet_table * resize)) + 1
+            near = cv2.dilate(object_like, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (reach, reach)))
+            edges = np.where(near > 0, edges, 0)
+        if frame.robot_mask is not None and frame.robot_mask.any():
+            robot = frame.robot_mask.astype(np.uint8)
+            inside = cv2.erode(robot, np.ones((3, 3), np.uint8), borderValue=1)
+            edges = np.where(inside > 0, 0, np.where(robot > 0, 1, edges))
+        return np.clip(edges, 0, 1).astype(np.float32)
+
+    def _colour(self, rgb: np.ndarray, resize: float) -> np.ndarray:
+        """e / (1 + e) with e the strength of the Lab structure tensor, averaged over three scales."""
+        import cv2
+
+        lab = cv2.cvtColor(rgb.astype(np.float32) / 255, cv2.COLOR_RGB2Lab)
+        lab /= np.array([self.lightness_unit, self.chroma_unit, self.chroma_unit], np.float32)
+        xx = np.zeros(rgb.shape[:2], np.float32)
+        yy, xy = xx.copy(), xx.copy()
+        for scale in (1.0, 2.0, 4.0):
+            s = max(0.7, scale * resize)
+            smooth = cv2.GaussianBlur(lab, (0, 0), s)
+            # Sobel sums to 8 times a derivative a pixel; times s makes scales comparable.
+            gx = cv2.Sobel(smooth, cv2.CV_32F, 1, 0) * (s / 8)
+            gy = cv2.Sobel(smooth, cv2.CV_32F, 0, 1) * (s / 8)
+            xx += (gx * gx).sum(axis=2) / 3
+            yy += (gy * gy).sum(axis=2) / 3
+            xy += (gx * gy).sum(axis=2) / 3
+        strength = np.sqrt(np.maximum(_largest_eigenvalue(xx, yy, xy), 0))
+        return strength / (1 + strength)
+
+    def _concave(self, frame: Frame, resize: float) -> np.ndarray:
+        """x / (x + depth_half) with x the largest positive curvature of disparity; weak where depth is filled."""
+        import cv2
+
+        holes = ~frame.valid
+        depth = _fill_from_nearest(frame.depth, holes)
+        D = (8 * SENSOR_FOCAL * BASELINE / depth).astype(np.float32)
+        s = max(1.0, self.depth_scale * resize)
+        smooth = cv2.GaussianBlur(D, (0, 0), s)
+        factor = s * s / 4
+        xx = cv2.Sobel(smooth, cv2.CV_32F, 2, 0) * factor
+        yy = cv2.Sobel(smooth, cv2.CV_32F, 0, 2) * factor
+        xy = cv2.Sobel(smooth, cv2.CV_32F, 1, 1) * factor
+        x = np.maximum(_largest_eigenvalue(xx, yy, xy), 0)
+        known = 1 - cv2.GaussianBlur(holes.astype(np.float32), (0, 0), s)
+        return x / (x + self.depth_half) * known
+
+
+def _largest_eigenvalue(xx: np.ndarray, yy: np.ndarray, xy: np.ndarray) -> np.ndarray:
+    return (xx + yy) / 2 + np.sqrt(((xx - yy) / 2) ** 2 + xy * xy)
+
+
+def _fill_from_nearest(depth: np.ndarray, holes: np.ndarray) -> np.ndarray:
+    """Depth with holes filled from the nearest reading."""
+    if not holes.any():
+        return depth
+    from scipy.ndimage import distance_transform_edt
+
+    rows, columns = distance_transform_edt(holes, return_distances=False, return_indices=True)
+    return depth[rows, columns]

@@ -1,0 +1,87 @@
+"""From a cut to objects: which regions are objects at all, and what pixels are theirs.
+
+>>> rule = ObjectRule()
+>>> labels = rule.label_image(tree, cut, frame)      # (H, W): 0 background, k + 1 for the k-th node of the cut
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mstfilter.scene.frame import Frame
+from mstfilter.scene.voxels import VoxelGrid
+from mstfilter.segmentation.background import above_table
+from mstfilter.segmentation.tree import Tree
+
+__all__ = ["ObjectRule", "Segments"]
+
+
+@dataclass(frozen=True, eq=False)
+class Segments:
+    """What every node of a tree shows.
+
+    Parameters
+    ----------
+    own : (H, W) bool
+        Pixels that can belong to an object: a depth reading, not the robot, above the table, in the workspace.
+    readings : (N,) int
+        Depth readings of each node.
+    points : (N,) int
+        Pixels of `own` in each node.
+    is_object : (N,) bool
+        Whether the node, if a cut holds it, is an object.
+    """
+
+    own: np.ndarray
+    readings: np.ndarray
+    points: np.ndarray
+    is_object: np.ndarray
+
+
+@dataclass(frozen=True)
+class ObjectRule:
+    """Which regions are objects.
+
+    A region is background if most of its readings lie on or behind the table or outside the workspace, or if
+    too few are left to make an object of.
+
+    Parameters
+    ----------
+    table_tolerance : float
+        Readings up to this much above the table are table, in sensor disparity units (1/8 px at f = 525 px;
+        one is 3.2 mm of depth at 1 m).
+    object_share : float
+        Smallest share of a region's readings that must lie above the table and in the workspace.
+    min_points : int
+        Smallest number of such readings, in pixels of a 640 x 480 image; scales with the image's area.
+    min_readings : float
+        Smallest share of a region's pixels with a depth reading (the authors' 0.004).
+    """
+
+    table_tolerance: float = 2.0
+    object_share: float = 0.5
+    min_points: int = 60
+    min_readings: float = 0.004
+
+    def segments(self, tree: Tree, frame: Frame, grid: VoxelGrid | None = None) -> Segments:
+        """Judge every node of a tree. Without a grid the workspace is everything above the table."""
+        with np.errstate(invalid="ignore"):
+            own = frame.valid & (above_table(frame) > self.table_tolerance)
+        if grid is not None:
+            own &= grid.contains(grid.index_of(frame.points))
+        readings = tree.accumulate_pixels(frame.valid)
+        points = tree.accumulate_pixels(own)
+        few = max(1.0, self.min_points * own.size / 307200)
+        is_object = (
+            (points >= few) & (points >= self.object_share * readings) & (readings >= self.min_readings * tree.area)
+        )
+        return Segments(own, readings, points, is_object)
+
+    def label_image(self, tree: Tree, cut: np.ndarray, frame: Frame, grid: VoxelGrid | None = None) -> np.ndarray:
+        """(H, W) int32 segments of a cut: 0 is background, k + 1 the k-th node of the cut."""
+        found = self.segments(tree, frame, grid)
+        cut = np.asarray(cut)
+        numbers = np.where(found.is_object[cut], np.arange(1, len(cut) + 1), 0)
+        return np.where(found.own, numbers[tree.label_image(cut)], 0).astype(np.int32)
