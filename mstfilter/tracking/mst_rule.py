@@ -16,6 +16,7 @@ from mstfilter.errors import InputError
 from mstfilter.tracking import rigid
 from mstfilter.tracking.features import SiftMatching
 from mstfilter.tracking.registration import centroid_shift, register
+from mstfilter.tracking.refine import refine
 from mstfilter.tracking.residual import Residual
 from mstfilter.tracking.rules import IDENTITY, Candidate, MotionRule, sift_motions
 from mstfilter.tracking.track import Track
@@ -50,6 +51,8 @@ class MstRule(MotionRule):
         Fewest flow tracks or SIFT matches behind a motion.
     max_sift : int
         At most so many SIFT motions are considered.
+    n_refine : int
+        So many of the best candidates are polished against the whole last frame (refine.py) and compete again.
     sift : SiftMatching
     residual : Residual
     """
@@ -65,6 +68,7 @@ class MstRule(MotionRule):
     least_overlap: float = 0.3
     min_pairs: int = 6
     max_sift: int = 3
+    n_refine: int = 3
     sift: SiftMatching = SiftMatching()
     residual: Residual = Residual()
 
@@ -74,20 +78,28 @@ class MstRule(MotionRule):
 
     def candidates(self, rng: np.random.Generator, track: Track) -> tuple[Candidate, ...]:
         """Scored motions; the identity comes first."""
-        identity = Candidate("identity", np.eye(4), score=self.residual.score(track, np.eye(4)) - self.static_margin)
+        residual = self.residual
+        identity = Candidate("identity", np.eye(4), score=residual.score(track, np.eye(4)) - self.static_margin)
+        if not len(track.segment.support):
+            return (identity,)
         found = [identity]
-        seen: list[Array] = []
+        centre = track.points.mean(axis=0)
         for kind, T, support in self._proposals(rng, track):
-            centre = track.points.mean(axis=0)
-            if not np.isfinite(T).all() or rigid.displacement(T, centre) > self.max_shift:
-                continue
-            if rigid.angle(T) > self.max_angle or any(_same(T, other, centre) for other in seen):
-                continue
-            seen.append(T)
-            score = self.residual.score(track, T)
-            if np.isfinite(score):
-                found.append(Candidate(kind, T, support, 0.0, score))
-        return tuple(found)
+            if self._admissible(T, centre) and not any(_same(T, other.T, centre) for other in found[1:]):
+                found.append(Candidate(kind, T, support, 0.0, residual.score(track, T)))
+        if self.n_refine:
+            ranked = sorted(found[1:], key=lambda c: c.score)[: self.n_refine]
+            for c in ranked:
+                T = refine(track, c.T, residual.depth_scale, residual.colour_scale)
+                if self._admissible(T, centre):
+                    found.append(Candidate(c.kind, T, c.support, 0.0, residual.score(track, T)))
+        return tuple(c for c in found if c is identity or np.isfinite(c.score))
+
+    def _admissible(self, T: Array, centre: Array) -> bool:
+        """Finite, and no farther or more turned than an object can be in a clip."""
+        if not np.isfinite(T).all():
+            return False
+        return bool(rigid.displacement(T, centre) <= self.max_shift and rigid.angle(T) <= self.max_angle)
 
     def choose(self, rng: np.random.Generator, candidates: tuple[Candidate, ...]) -> Candidate:
         """The best, or one drawn by score."""

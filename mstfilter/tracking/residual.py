@@ -6,7 +6,8 @@ Per point, with z the predicted and m the measured depth:
 - predicted well BEHIND what is measured: something is in front, a constant;
 - outside the image: a larger constant;  no reading there, or robot: not counted.
 
-The score S is the mean over counted points. Lower is better.
+The score S is the mean over counted points, plus a share for visible points that land where flow says
+something else came from: depth and colour alone cannot tell an object from its twin. Lower is better.
 """
 
 from __future__ import annotations
@@ -43,6 +44,8 @@ class Residual:
         Share of the points that must be counted, or the motion is not comparable (infinite).
     n_points : int
         At most so many points of a segment are used, evenly spread.
+    track_weight : float
+        Added to S where all visible points land on pixels that flow traces back to another object.
     """
 
     depth_scale: float = 1.5
@@ -53,6 +56,7 @@ class Residual:
     outside_cost: float = 16.0
     least_share: float = 0.3
     n_points: int = 1200
+    track_weight: float = 1.0
 
     def score(self, track: Track, T: NDArray[np.float64]) -> float:
         """S of a motion (4, 4) of a segment; infinite where too little can be compared."""
@@ -79,4 +83,9 @@ class Residual:
         n = n_outside + int(counted.sum())
         if n < self.least_share * len(points):
             return float("inf")
-        return float((cost[counted].sum() + self.outside_cost * n_outside) / n)
+        mean = float((cost[counted].sum() + self.outside_cost * n_outside) / n)
+        with np.errstate(invalid="ignore"):
+            visible = counted & ~(behind > self.occluded_margin)
+        source = track.flow.source[v[visible], u[visible]]
+        from_here = track.mask.ravel()[source[source >= 0]]
+        return mean + self.track_weight * float(1.0 - from_here.mean() if len(from_here) else 0.0)
