@@ -183,8 +183,8 @@ def _read_voxels(path: Path, grid: VoxelGrid, pauses: tuple[int, ...]) -> Any:
         raise InputError(f"true volumes cannot be read: {path} ({error})") from error
     if labels.shape[1:] != grid.shape or not np.allclose(origin, grid.origin) or abs(size - grid.voxel_size) > 1e-9:
         raise InputError(
-            f"{path}: grid {labels.shape[1:]} at {origin.tolist()} with voxels of {size} m differs from the workspace "
-            f"{grid.shape} at {grid.origin.tolist()} with {grid.voxel_size} m"
+            f"{path}: grid {labels.shape[1:]} at {origin.tolist()} with voxels of {size} m differs from "
+            f"the workspace {grid.shape} at {grid.origin.tolist()} with {grid.voxel_size} m"
         )
     return truth_reader(labels, frames, pauses)
 
@@ -281,7 +281,8 @@ class RecordingWriter:
                 continue
             if image.shape[:2] != (self._camera.height, self._camera.width):
                 raise InputError(
-                    f"{part} image of frame {index} has shape {image.shape}, the camera is {self._camera.width} x {self._camera.height}"
+                    f"{part} image of frame {index} has shape {image.shape}, "
+                    f"the camera is {self._camera.width} x {self._camera.height}"
                 )
             (self._folder / part).mkdir(exist_ok=True)
             write_image(self._folder / part / f"{index:06d}.png", image)

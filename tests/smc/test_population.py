@@ -1,0 +1,116 @@
+"""Populations: validation, selection, lazy candidates, streams."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from mstfilter.errors import InputError
+from mstfilter.smc.population import Candidates, Population, effective_sample_size, log_mean_exp
+from mstfilter.smc.streams import Key, child, key_of
+
+
+@pytest.mark.parametrize(
+    "particles",
+    [np.arange(12.0).reshape(4, 3), {"a": np.arange(4), "b": np.ones((4, 2))}, ("w", "x", "y", "z")],
+    ids=["array", "mapping", "objects"],
+)
+def test_take_selects_from_every_kind(particles):
+    population = Population(particles, np.log([1.0, 2.0, 3.0, 4.0]), {"previous": np.arange(4)})
+    chosen = population.take(np.array([3, 3, 0]))
+    assert len(chosen) == 3
+    np.testing.assert_allclose(chosen.weights, [4 / 9, 4 / 9, 1 / 9])
+    np.testing.assert_array_equal(chosen.parents["previous"], [3, 3, 0])
+    if isinstance(particles, tuple):
+        assert chosen.particles == ("z", "z", "w")
+        assert population.best == "z"
+    elif isinstance(particles, dict):
+        np.testing.assert_array_equal(chosen.particles["a"], [3, 3, 0])
+        assert population.best["a"] == 3
+    else:
+        np.testing.assert_array_equal(chosen.particles[:, 0], [9, 9, 0])
+
+
+def test_populations_cannot_be_written_to():
+    population = Population(np.arange(3.0), np.zeros(3))
+    with pytest.raises(ValueError, match="read-only"):
+        population.particles[0] = 1
+    with pytest.raises(ValueError, match="read-only"):
+        population.log_weights[0] = 1
+
+
+@pytest.mark.parametrize(
+    ("lw", "message"),
+    [
+        ([0.0, np.nan], "particle 1 is nan"),
+        ([np.inf, 0.0], "particle 0 is inf"),
+        ([-np.inf, -np.inf], "all 2 log weights"),
+        ([0.0], "expected .2,."),
+    ],
+)
+def test_bad_weights_are_named(lw, message):
+    with pytest.raises(InputError, match=message):
+        Population(np.zeros(2), np.array(lw))
+
+
+def test_no_particles_and_unequal_lengths():
+    with pytest.raises(InputError, match="no particles"):
+        Population(())
+    with pytest.raises(InputError, match="different lengths"):
+        Population({"a": np.zeros(2), "b": np.zeros(3)})
+
+
+def test_weights_survive_extreme_offsets():
+    for offset in (-1e4, 0.0, 1e4):
+        lw = np.log([1.0, 2.0, 5.0]) + offset
+        np.testing.assert_allclose(Population(np.zeros(3), lw).weights, [0.125, 0.25, 0.625])
+        assert log_mean_exp(lw) == pytest.approx(np.log(8 / 3) + offset)
+        assert effective_sample_size(lw) == pytest.approx(64 / 30)
+
+
+def test_candidates_are_built_once_and_only_when_looked_at():
+    built = []
+
+    def build(i):
+        built.append(i)
+        return f"candidate {i}"
+
+    candidates = Candidates(build, 1000)
+    population = Population(candidates, np.zeros(1000)).take(np.array([7, 7, 500]))
+    assert built == []
+    realised = population.realised()
+    assert realised.particles == ("candidate 7", "candidate 7", "candidate 500")
+    assert built == [7, 500]
+    assert candidates[7] == "candidate 7"
+    assert built == [7, 500]
+    assert candidates.n_built == 2
+    mapped = candidates.map(str.upper)
+    assert candidates.n_built == 2
+    assert mapped.take(np.array([500]))[0] == "CANDIDATE 500"
+    assert built == [7, 500]
+
+
+def test_streams_depend_on_their_name_alone():
+    key = Key(4)
+    a = key.child(3, "transition").generator().random(4)
+    np.testing.assert_array_equal(a, Key(4).child(3).child("transition").generator().random(4))
+    assert not np.array_equal(a, key.child(3, "proposal").generator().random(4))
+    rng = key.child("x").generator()
+    before = child(rng, "object", 1).random(3)
+    rng.random(100)
+    np.testing.assert_array_equal(before, child(rng, "object", 1).random(3))
+    assert key_of(rng) == key.child("x")
+
+
+def test_streams_do_not_meet_spawned_or_foreign_ones():
+    plain = np.random.default_rng(7)
+    spawned = plain.spawn(2)
+    drawn = {tuple(g.random(2)) for g in (*spawned, child(plain, 0), child(plain, 1), child(spawned[0], 0))}
+    drawn.add(tuple(Key(7).child(0).generator().random(2)))
+    assert len(drawn) == 6
+
+
+@pytest.mark.parametrize("seed", [-1, 1.5, "a", True])
+def test_bad_seeds(seed):
+    with pytest.raises(InputError, match="seed"):
+        Key(seed)
