@@ -98,7 +98,8 @@ class Camera:
     @cached_property
     def key(self) -> bytes:
         """Name by content."""
-        pose = b"" if self.T_world_camera is None else self.T_world_camera.as_matrix()
+        # To a nanometre: reading a pose back from a file orthogonalises it anew and changes the last bits.
+        pose = b"" if self.T_world_camera is None else np.round(self.T_world_camera.as_matrix(), 9) + 0.0
         return content_key("camera", self.K, self.width, self.height, pose)
 
     @cached_property

@@ -70,7 +70,7 @@ def decode(arrays: dict[str, np.ndarray]) -> tuple[Hypothesis, ...]:
                 int(arrays["id"][row]),
                 int(arrays["birth"][row]),
                 crop,
-                RigidTransform.from_matrix(arrays["motion"][row]),
+                RigidTransform(arrays["motion"][row], normalize=False),  # bit for bit
                 str(arrays["completion_key"][row]) or None,
             )
         )

@@ -1,0 +1,105 @@
+"""Cameras and frames: projection against the formula, and bad input."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from mstfilter.errors import InputError
+from mstfilter.scene.camera import Camera, look_at, rigid_from_matrix
+from mstfilter.scene.frame import Frame
+
+K = np.array([[525.0, 0, 319.5], [0, 525.0, 239.5], [0, 0, 1]])
+CAMERA = Camera(K, 640, 480, look_at((0.05, -0.72, 0.58), (0.02, 0.05, 0.04)))
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.tuples(*[st.floats(-1, 1)] * 3), st.tuples(*[st.floats(-3, 3)] * 6), st.floats(0, 5))
+def test_projection_inverts_unprojection(position, rotation, skew):
+    pose = RigidTransform.from_components(position, Rotation.from_rotvec(rotation[:3]))
+    matrix = K.copy()
+    matrix[0, 1] = skew
+    camera = Camera(matrix, 64, 48, pose)
+    depth = np.random.default_rng(0).uniform(0.3, 3, (48, 64))
+    uv, z = camera.project(camera.unproject(depth))
+    v, u = np.mgrid[:48, :64]
+    np.testing.assert_allclose(uv[..., 0], u, atol=1e-6)
+    np.testing.assert_allclose(uv[..., 1], v, atol=1e-6)
+    np.testing.assert_allclose(z, depth, atol=1e-9)
+
+
+def test_look_at_centres_the_target_with_up_at_the_top():
+    uv, z = CAMERA.project(np.array([0.02, 0.05, 0.04]))
+    np.testing.assert_allclose(uv, [319.5, 239.5], atol=1e-9)
+    assert z == pytest.approx(np.linalg.norm([0.03, 0.77, 0.54]))
+    above, _ = CAMERA.project(np.array([0.02, 0.05, 0.14]))
+    assert above[1] < 239.5
+
+
+def test_points_behind_have_no_pixel():
+    uv, z = CAMERA.project(np.array([[0.05, -2.0, 0.58]]))
+    assert np.isnan(uv).all()
+    assert z[0] < 0
+
+
+def test_scaling_keeps_rays():
+    half = CAMERA.scaled(0.5)
+    point = np.array([0.1, 0.1, 0.05])
+    big, small = CAMERA.project(point)[0], half.project(point)[0]
+    np.testing.assert_allclose((big + 0.5) / 2 - 0.5, small, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("matrix", "message"),
+    [
+        (np.zeros((3, 3)), "not invertible"),
+        (np.diag([525.0, 0.0, 1.0]), "not invertible"),
+        (np.array([525.0, 525, 319.5, 239.5]), "4 numbers"),
+        (np.eye(4), "shape"),
+        (K.T, "upper triangular"),
+        (K * np.nan, "not finite"),
+        ([["a"] * 3] * 3, "numeric"),
+    ],
+)
+def test_bad_intrinsics(matrix, message):
+    with pytest.raises(InputError, match=message):
+        Camera(matrix, 640, 480)
+
+
+def test_bad_poses():
+    bad = np.eye(4)
+    bad[0, 3] = np.nan
+    with pytest.raises(InputError, match="NaN"):
+        rigid_from_matrix(bad)
+    with pytest.raises(InputError, match="rigid"):
+        rigid_from_matrix(np.diag([2.0, 2, 2, 1]))
+    with pytest.raises(InputError, match="rigid"):
+        rigid_from_matrix(np.diag([1.0, 1, -1, 1]))
+    with pytest.raises(InputError, match="RigidTransform"):
+        Camera(K, 640, 480, np.eye(4))
+
+
+def test_frames_check_and_freeze():
+    rgb, depth = np.zeros((480, 640, 3), np.uint8), np.ones((480, 640), np.float32)
+    depth[0, 0], depth[0, 1], depth[0, 2] = 0, np.inf, -1
+    robot = np.zeros((480, 640), bool)
+    robot[5] = True
+    frame = Frame(rgb, depth, CAMERA, robot)
+    assert np.isnan(frame.depth[0, :3]).all()
+    assert frame.valid.sum() == 480 * 640 - 3 - 640
+    with pytest.raises(ValueError, match="read-only"):
+        frame.depth[3, 3] = 1
+    assert frame.key == Frame(rgb.copy(), depth.copy(), CAMERA, robot).key
+    assert frame.key != Frame(rgb, depth, CAMERA).key
+    for wrong, message in (
+        ((rgb[:-1], depth), "colour image"),
+        ((rgb, depth[:-1]), "depth image"),
+        ((rgb.astype(float), depth), "uint8"),
+        ((rgb, np.ones((480, 640), np.uint16)), "metres"),
+        ((rgb, depth, CAMERA, robot[:4]), "robot mask"),
+    ):
+        with pytest.raises(InputError, match=message):
+            Frame(*wrong, *([CAMERA] if len(wrong) == 2 else []))

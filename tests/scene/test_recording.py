@@ -1,0 +1,239 @@
+"""Recordings: round trips, clips, and one clear error for every kind of broken input."""
+
+from __future__ import annotations
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+
+from mstfilter.errors import InputError
+from mstfilter.scene.camera import Camera, look_at
+from mstfilter.scene.formats.folder import RecordingWriter, save
+from mstfilter.scene.formats.paired_images import open_paired
+from mstfilter.scene.recording import Recording
+from mstfilter.scene.support_plane import fit_support_plane, table_residual, workspace
+from mstfilter.scene.voxels import VoxelGrid
+from tests.scene.scenes import CAMERA, GRID, table_scene
+
+
+def write(path, n=5, statics=(0, 2, 4)):
+    with RecordingWriter(path, CAMERA, GRID, generator="test", seed=1) as writer:
+        for index in range(n):
+            rgb, depth, labels = table_scene(shift=index)
+            role = "static" if index in statics else "action"
+            writer.add_frame(rgb, depth, index / 5, role, robot_mask=depth < 0.3 if index == 1 else None)
+            if role == "static":
+                writer.add_voxels(labels)
+    return path
+
+
+@pytest.fixture
+def folder(tmp_path):
+    return write(tmp_path / "recording")
+
+
+def test_round_trip(folder):
+    recording = Recording.open(folder)
+    recording.check()
+    rgb, depth, labels = table_scene(shift=2)
+    np.testing.assert_array_equal(recording.frames[2].rgb, rgb)
+    np.testing.assert_allclose(recording.frames[2].depth, depth, atol=5.1e-4)
+    np.testing.assert_array_equal(recording.truth(1), labels)
+    assert recording.grid == GRID
+    assert recording.frames[1].robot_mask is not None
+    assert [len(c) for c in recording.clips()] == [1, 3, 3]
+    clip = recording.clips()[2]
+    assert (clip.index, clip.times) == (2, (0.4, 0.6, 0.8))
+    assert clip.before.key == recording.clips()[1].after.key
+    assert not list(folder.parent.glob(".*"))
+    again = save(recording, folder.parent / "again", generator="copy")
+    assert Recording.open(again).key == recording.key
+
+
+def test_a_failed_writer_leaves_nothing(tmp_path):
+    with pytest.raises(RuntimeError), RecordingWriter(tmp_path / "r", CAMERA, GRID) as writer:
+        rgb, depth, _ = table_scene()
+        writer.add_frame(rgb, depth, 0.0, "static")
+        raise RuntimeError
+    assert list(tmp_path.iterdir()) == []
+
+
+def change(folder, name, edit):
+    data = json.loads((folder / name).read_text())
+    edit(data)
+    (folder / name).write_text(json.dumps(data))
+
+
+def drop_scale(folder):
+    change(folder, "camera.json", lambda c: c.pop("depth_scale"))
+
+
+def truncate(folder):
+    path = folder / "rgb" / "000003.png"
+    path.write_bytes(path.read_bytes()[:-40])
+
+
+def blank_depth(folder):
+    import cv2
+
+    cv2.imwrite(str(folder / "depth" / "000002.png"), np.zeros((CAMERA.height, CAMERA.width), np.uint16))
+
+
+def small_image(folder):
+    import cv2
+
+    cv2.imwrite(str(folder / "rgb" / "000001.png"), np.zeros((10, 12, 3), np.uint8))
+
+
+def bad_pose(folder):
+    def edit(c):
+        c["T_world_camera"][0][3] = float("nan")
+
+    change(folder, "camera.json", edit)
+
+
+def clear(folder):
+    shutil.rmtree(folder)
+    folder.mkdir()
+
+
+FAULTS = {
+    "missing image": (lambda f: (f / "depth" / "000004.png").unlink(), "image is missing: .*000004"),
+    "all-invalid depth": (blank_depth, "no reading at all"),
+    "wrong image size": (small_image, "12 x 10"),
+    "singular camera": (lambda f: change(f, "camera.json", lambda c: c.update(K=[[0, 0, 0]] * 3)), "not invertible"),
+    "depth scale unset": (drop_scale, "depth_scale: field required"),
+    "depth scale wrong": (lambda f: change(f, "camera.json", lambda c: c.update(depth_scale=1.0)), "median of"),
+    "pose NaN": (bad_pose, "NaN"),
+    "empty folder": (clear, "folder is empty"),
+    "no folder": (shutil.rmtree, "does not exist"),
+    "truncated PNG": (truncate, "truncated"),
+    "no manifest": (lambda f: (f / "manifest.json").unlink(), "manifest.json is missing"),
+    "not JSON": (lambda f: (f / "camera.json").write_text("{"), "not valid JSON"),
+    "no pause": (
+        lambda f: change(f, "manifest.json", lambda m: [e.update(role="action") for e in m["frames"]]),
+        "no frame has role static",
+    ),
+    "other version": (lambda f: change(f, "manifest.json", lambda m: m.update(version=9)), "version is 9"),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_broken_recordings(folder, fault):
+    spoil, message = FAULTS[fault]
+    spoil(folder)
+    with pytest.raises(InputError, match=message):
+        Recording.open(folder).check()
+
+
+def test_arrays_without_pose_find_table_and_workspace():
+    rgb, depth, _ = table_scene()
+    bare = Recording.from_arrays(rgb, depth.astype(float), CAMERA.K)
+    frame = bare.frames[0]
+    known = CAMERA.unproject(depth)
+    found = frame.points
+    # The table is at z = 0 and heights are right, though x and y may be turned.
+    np.testing.assert_allclose(found[..., 2], known[..., 2], atol=3e-3)
+    assert np.nanmax(np.abs(table_residual(frame)[labels_of(depth) == 0])) < 2
+    object_points = found[labels_of(depth) > 0]
+    assert bare.grid.contains(bare.grid.index_of(object_points + [0, 0, 1e-3])).mean() > 0.97
+
+
+def labels_of(depth):
+    from mstfilter.scene.rendering import render
+
+    return render(table_scene()[2], GRID, CAMERA).labels
+
+
+def test_arrays_that_cannot_be_used():
+    rgb, depth, _ = table_scene()
+    K = CAMERA.K
+    for arguments, message in (
+        ((rgb, (depth * 1000).astype(np.uint16), K), "metres"),
+        ((rgb, depth * 1000, K), "median of"),
+        ((rgb, depth[:-1], K), "expected"),
+        ((rgb, np.full_like(depth, np.nan), K), "no reading at all"),
+        ((rgb, depth, np.zeros((3, 3))), "not invertible"),
+    ):
+        with pytest.raises(InputError, match=message):
+            Recording.from_arrays(*arguments)
+    with pytest.raises(InputError, match="pauses"):
+        Recording.from_arrays(rgb, depth, K, pauses=[3])
+    with pytest.raises(InputError, match="NaN"):
+        Recording.from_arrays(rgb, depth, K, T_world_camera=np.full((4, 4), np.nan))
+
+
+def test_support_plane_of_known_pose():
+    """A noisy tilted table and a box: pose and plane come back."""
+    rgb, depth, _ = table_scene(noise=np.random.default_rng(0))
+    recording = Recording.from_arrays(rgb, depth, CAMERA.K)
+    plane = fit_support_plane(recording.frames[0])
+    tilt = np.degrees(
+        np.arccos(np.clip(plane.T_world_camera.as_matrix()[2, :3] @ CAMERA.pose.as_matrix()[2, :3], -1, 1))
+    )
+    assert tilt < 0.3
+    assert abs(plane.T_world_camera.translation[2] - CAMERA.position[2]) < 3e-3
+    truth = labels_of(depth) == 0
+    both = plane.on_or_behind & truth & recording.frames[0].valid
+    assert both.sum() / (plane.on_or_behind | (truth & recording.frames[0].valid)).sum() > 0.97
+
+
+def test_no_plane_is_a_clear_error():
+    from mstfilter.scene.frame import Frame
+
+    depth = np.full((CAMERA.height, CAMERA.width), np.nan)
+    depth[0, :5] = 1
+    with pytest.raises(InputError, match="no support plane"):
+        fit_support_plane(Frame(table_scene()[0], depth, CAMERA))
+    scatter = np.random.default_rng(0).uniform(0.3, 3, depth.shape)
+    with pytest.raises(InputError, match="no support plane"):
+        fit_support_plane(Frame(table_scene()[0], scatter, CAMERA))
+
+
+def test_workspace_of_an_empty_table():
+    rgb, depth, _ = table_scene(empty=True)
+    from mstfilter.scene.frame import Frame
+
+    grid = workspace(Frame(rgb, depth, CAMERA))
+    assert grid.shape == (100, 100, 50)
+    far = Camera(CAMERA.K, CAMERA.width, CAMERA.height, look_at((0, 0, 5), (0, 0.1, 9)))
+    with pytest.raises(InputError, match="no workspace"):
+        workspace(Frame(rgb, depth, far))
+
+
+def test_paired_images(tmp_path, folder):
+    recording = Recording.open(folder)
+    for index in (0, 2):
+        shutil.copy(folder / "rgb" / f"{index:06d}.png", tmp_path / f"f{index}_rgb.png")
+        shutil.copy(folder / "depth" / f"{index:06d}.png", tmp_path / f"f{index}_depth.png")
+    K = CAMERA.K
+    info = {"K": [K[0, 0], K[1, 1], K[0, 2], K[1, 2]], "depth_scale_m": 0.001}
+    (tmp_path / "info.json").write_text(json.dumps(info))
+    pairs = open_paired(tmp_path, ["f2", "f0"])
+    assert pairs.pauses == (0, 1)
+    np.testing.assert_array_equal(pairs.frames[1].rgb, recording.frames[0].rgb)
+    with pytest.raises(InputError, match="no frame 'f9'"):
+        open_paired(tmp_path, ["f9"])
+
+
+def test_real_frames_find_their_table(shared_data):
+    """On 45 real frames the table is found: intersection over union with the labelled table above 0.9 on average."""
+    import cv2
+
+    path = shared_data("real/osd_learn")
+    scores = []
+    for name in ("learn0", "learn9", "learn17", "learn25", "learn33", "learn41"):
+        recording = open_paired(path, [name])
+        label = cv2.imread(str(path / f"{name}_label.png"), cv2.IMREAD_UNCHANGED)
+        table = fit_support_plane(recording.frames[0]).on_or_behind & (label > 0)
+        scores.append((table & (label == 1)).sum() / (table | (label == 1)).sum())
+    assert np.mean(scores) > 0.9
+
+
+def test_grids_of_any_kind_are_kept(tmp_path):
+    rgb, depth, _ = table_scene()
+    grid = VoxelGrid((-0.2, -0.25, -0.01), 0.015, (30, 31, 17))
+    recording = Recording.from_arrays(rgb, depth, CAMERA.K, T_world_camera=CAMERA.pose, grid=grid)
+    assert Recording.open(save(recording, tmp_path / "r")).grid == grid

@@ -1,0 +1,140 @@
+"""Grids, hypotheses and their storage."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+from scipy.spatial.transform import RigidTransform
+
+from mstfilter.errors import InputError
+from mstfilter.scene.storage import load_hypotheses, save_hypotheses
+from mstfilter.scene.voxels import Crop, Hypothesis, ObjectRecord, VoxelGrid
+
+GRID = VoxelGrid((-0.3, -0.3, -0.05), 0.01, (6, 5, 4))
+
+
+def test_centres_and_indices_are_inverse():
+    centres = GRID.centres()
+    np.testing.assert_allclose(centres[0, 0, 0], [-0.295, -0.295, -0.045])
+    index = GRID.index_of(centres)
+    np.testing.assert_array_equal(index[..., 0], np.broadcast_to(np.arange(6)[:, None, None], GRID.shape))
+    assert GRID.contains(index).all()
+    assert not GRID.contains(GRID.index_of(np.array([-0.31, 0, 0])))
+    assert not GRID.contains(GRID.index_of(np.array([np.nan, 0, 0])))
+    assert VoxelGrid.from_bounds(GRID.origin, GRID.upper, 0.01) == GRID
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ((0, 0), 0.01, (1, 1, 1)),
+        ((0, 0, np.nan), 0.01, (1, 1, 1)),
+        ((0, 0, 0), 0, (1, 1, 1)),
+        ((0, 0, 0), 1, (0, 1, 1)),
+    ],
+)
+def test_bad_grids(arguments):
+    with pytest.raises(InputError, match="grid|voxel"):
+        VoxelGrid(*arguments)
+
+
+labels = hnp.arrays(np.uint16, GRID.shape, elements=st.sampled_from([0, 0, 1, 2, 7, 65535]))
+
+
+@settings(max_examples=60, deadline=None)
+@given(labels)
+def test_volumes_and_crops(array):
+    hypothesis = Hypothesis.from_labels(array, GRID, birth=2)
+    assert hypothesis.volumes() == {int(k): int((array == k).sum()) for k in np.unique(array) if k}
+    assert len({o.id for o in hypothesis.objects}) == hypothesis.n_objects
+    for record in hypothesis.objects:
+        crop = Crop.of(array == record.label)
+        back = np.zeros(GRID.shape, bool)
+        back[crop.box] = crop.occupied
+        np.testing.assert_array_equal(back, array == record.label)
+        for axis in range(3):  # tight
+            assert crop.occupied.any(axis=tuple(a for a in range(3) if a != axis))[[0, -1]].all()
+
+
+@settings(max_examples=60, deadline=None)
+@given(labels, labels)
+def test_with_labels_keeps_exactly_what_did_not_change(before, after):
+    start = Hypothesis.from_labels(before, GRID)
+    moved = tuple(
+        replace(o, source=Crop.of(before == o.label), motion=RigidTransform.from_translation([1.0, 0, 0]))
+        for o in start.objects
+    )
+    start = Hypothesis(before, GRID, moved)
+    after = np.where(np.isin(after, list(start.volumes())), after, 0)
+    end = start.with_labels(after)
+    assert [o.label for o in end.objects] == [k for k in np.unique(after) if k]
+    for record in end.objects:
+        same = np.array_equal(before == record.label, after == record.label)
+        assert (record.source is not None) == same
+        assert record.id == start.record(record.label).id
+
+
+@pytest.mark.parametrize(
+    ("array", "message"),
+    [
+        (np.zeros((2, 2, 2), np.uint16), "shape"),
+        (np.zeros(GRID.shape), "integers"),
+        (np.full(GRID.shape, -1), "-1"),
+        (np.full(GRID.shape, 70000), "70000"),
+    ],
+)
+def test_bad_labels(array, message):
+    with pytest.raises(InputError, match=message):
+        Hypothesis.from_labels(array, GRID)
+
+
+def test_records_must_match_the_grid():
+    array = np.zeros(GRID.shape, np.uint16)
+    array[0, 0, 0] = 3
+    with pytest.raises(InputError, match="differ"):
+        Hypothesis(array, GRID)
+    with pytest.raises(InputError, match="ascending"):
+        Hypothesis(array, GRID, (ObjectRecord(3, 3), ObjectRecord(1, 1)))
+
+
+def test_storage_is_lossless_and_reproducible(tmp_path):
+    rng = np.random.default_rng(0)
+    hypotheses = []
+    for n in range(4):
+        array = rng.choice([0, 0, 0, 1, 4], GRID.shape).astype(np.uint16) * (n > 0)
+        h = Hypothesis.from_labels(array, GRID, birth=n)
+        records = tuple(
+            replace(
+                o,
+                source=Crop.of(array == o.label) if o.label == 4 else None,
+                motion=RigidTransform.from_exp_coords(rng.normal(size=6)),
+                completion_key="a" * n,
+            )
+            for o in h.objects
+        )
+        hypotheses.append(Hypothesis(array, GRID, records))
+    save_hypotheses(tmp_path / "a.npz", hypotheses, log_weights=np.arange(4.0))
+    save_hypotheses(tmp_path / "b.npz", hypotheses, log_weights=np.arange(4.0))
+    assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
+    loaded, arrays = load_hypotheses(tmp_path / "a.npz")
+    np.testing.assert_array_equal(arrays["log_weights"], np.arange(4.0))
+    for a, b in zip(hypotheses, loaded, strict=True):
+        np.testing.assert_array_equal(a.labels, b.labels)
+        assert a.grid == b.grid
+        for p, q in zip(a.objects, b.objects, strict=True):
+            assert (p.label, p.id, p.birth, p.completion_key or None) == (q.label, q.id, q.birth, q.completion_key)
+            np.testing.assert_allclose(p.motion.as_matrix(), q.motion.as_matrix(), atol=1e-12)
+            assert (p.source is None) == (q.source is None)
+            if p.source is not None:
+                np.testing.assert_array_equal(p.source.occupied, q.source.occupied)
+                np.testing.assert_array_equal(p.source.offset, q.source.offset)
+    save_hypotheses(tmp_path / "c.npz", loaded, log_weights=np.arange(4.0))
+    assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "c.npz").read_bytes()
+    (tmp_path / "broken.npz").write_bytes((tmp_path / "a.npz").read_bytes()[:200])
+    with pytest.raises(InputError, match="cannot be read"):
+        load_hypotheses(tmp_path / "broken.npz")
