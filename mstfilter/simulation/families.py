@@ -1,0 +1,202 @@
+"""Families of simulated scenes: everything that, with one integer seed, defines a recording.
+
+>>> from mstfilter.simulation.families import scene_family
+>>> scene_family("demo").image_size, scene_family("table").grid().shape
+((320, 240), (100, 100, 50))
+
+A family is a frozen `SceneFamily`; `dataclasses.replace` makes variants. `catalogue` keeps scenes for
+tuning and scenes for reporting apart: they share no size of object and no printed name.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mstfilter.errors import InputError
+from mstfilter.scene.voxels import VoxelGrid
+from mstfilter.simulation.shapes import FAMILIES
+
+__all__ = ["SCENE_FAMILIES", "SceneFamily", "scene_family"]
+
+GENERATOR_VERSION = 1
+"""Raised whenever the same seed gives other bytes."""
+
+
+@dataclass(frozen=True)
+class SceneFamily:
+    """How scenes of one kind are drawn, moved and seen.
+
+    Parameters
+    ----------
+    name : str
+        What to call it.
+    n_objects_min, n_objects_max : int
+        Objects on the table, twins included; drawn evenly.
+    n_twins : int
+        Objects that repeat the shape and texture of another and are put in contact with it.
+    n_stacked : int
+        Objects that are put on top of another, if there is room.
+    contact : float
+        Probability that an object without a twin touches another one; else there is a gap of 1 - 4 cm.
+    shapes : str
+        Families of objects, separated by commas; "all" for every one.
+    catalogue : {"tuning", "reported", "any"}
+        Which sizes and printed names occur: two disjoint sets, or all.
+    n_actions : int
+        Pushes.
+    frames_per_clip : int
+        Frames from one pause to the next, both included.
+    fps : float
+        Frames a second.
+    push_speed : float
+        Of the finger, m/s.
+    min_moved : int
+        Objects that an action should move; one fewer is taken when no candidate moves as many.
+    move_threshold : float
+        Displacement that counts as moved, metres.
+    n_candidates : int
+        Pushes simulated to choose one from, at most.
+    arm : bool
+        Whether an arm is seen behind the finger.
+    width, height : int
+        Of the images, pixels. The camera is a Kinect's (K = 525 at 640 x 480), scaled.
+    supersample : bool
+        Smooth the edges of objects with four rays a pixel.
+    workspace_x, workspace_y, workspace_z : float
+        Edges of the voxel grid, metres; it is centred on the table and stands on it.
+    voxel_size : float
+        Metres.
+    """
+
+    name: str = "table"
+    n_objects_min: int = 5
+    n_objects_max: int = 6
+    n_twins: int = 1
+    n_stacked: int = 0
+    contact: float = 0.6
+    shapes: str = "all"
+    catalogue: str = "any"
+    n_actions: int = 3
+    frames_per_clip: int = 15
+    fps: float = 5.0
+    push_speed: float = 0.10
+    min_moved: int = 2
+    move_threshold: float = 0.02
+    n_candidates: int = 24
+    arm: bool = True
+    width: int = 640
+    height: int = 480
+    supersample: bool = True
+    workspace_x: float = 1.0
+    workspace_y: float = 1.0
+    workspace_z: float = 0.5
+    voxel_size: float = 0.01
+
+    def __post_init__(self) -> None:
+        def need(name: str, good: bool, expected: str) -> None:
+            if not good:
+                raise InputError(
+                    f"scene family {self.name!r}: {name} is {getattr(self, name)!r}, expected {expected}"
+                )
+
+        need("n_objects_min", self.n_objects_min >= 1, "at least 1")
+        need("n_objects_max", self.n_objects_min <= self.n_objects_max <= 40, "n_objects_min .. 40")
+        need("n_twins", 0 <= self.n_twins < self.n_objects_min, "0 .. n_objects_min - 1")
+        need("n_stacked", 0 <= self.n_stacked < self.n_objects_min, "0 .. n_objects_min - 1")
+        need("contact", 0.0 <= self.contact <= 1.0, "a probability")
+        need("catalogue", self.catalogue in ("tuning", "reported", "any"), "tuning, reported or any")
+        need("n_actions", self.n_actions >= 0, "at least 0")
+        need("frames_per_clip", self.frames_per_clip >= 2, "at least 2 (the two pauses)")
+        need("fps", 0.5 <= self.fps <= 60.0, "0.5 .. 60")
+        need("push_speed", 0.01 <= self.push_speed <= 0.5, "0.01 .. 0.5 m/s")
+        need("min_moved", self.min_moved >= 1, "at least 1")
+        need("move_threshold", 0.0 < self.move_threshold <= 0.5, "metres, up to 0.5")
+        need("n_candidates", self.n_candidates >= 1, "at least 1")
+        need("width", 16 <= self.width <= 4096, "16 .. 4096 pixels")
+        need("height", 16 <= self.height <= 4096, "16 .. 4096 pixels")
+        for name in ("workspace_x", "workspace_y", "workspace_z"):
+            need(name, 0.1 <= getattr(self, name) <= 2.0, "0.1 .. 2 m")
+        need("voxel_size", 0.001 <= self.voxel_size <= 0.1, "0.001 .. 0.1 m")
+        self.shape_families()
+        if self.n_actions and self.action_seconds < 1.0:
+            raise InputError(
+                f"scene family {self.name!r}: an action lasts {self.action_seconds:.2f} s "
+                f"({self.frames_per_clip} frames at {self.fps} fps), too short to push anything",
+                "use more frames a clip or fewer frames a second: at least 1 s",
+            )
+
+    @property
+    def action_seconds(self) -> float:
+        """From one pause to the next, settling apart."""
+        return (self.frames_per_clip - 1) / self.fps
+
+    @property
+    def image_size(self) -> tuple[int, int]:
+        """Width and height."""
+        return self.width, self.height
+
+    @property
+    def n_frames(self) -> int:
+        """Frames of a whole recording."""
+        return 1 + self.n_actions * (self.frames_per_clip - 1)
+
+    @property
+    def size_range(self) -> tuple[float, float]:
+        """Factors by which sizes are scaled."""
+        return {"tuning": (0.90, 0.995), "reported": (1.005, 1.10), "any": (0.90, 1.10)}[self.catalogue]
+
+    @property
+    def word_half(self) -> int | None:
+        """Which half of the printed names is used."""
+        return {"tuning": 0, "reported": 1, "any": None}[self.catalogue]
+
+    def shape_families(self) -> tuple[str, ...]:
+        """Names of the families of objects."""
+        names = FAMILIES if self.shapes.strip() == "all" else tuple(s.strip() for s in self.shapes.split(","))
+        unknown = [name for name in names if name not in FAMILIES]
+        if unknown:
+            raise InputError(
+                f"scene family {self.name!r}: no family of shapes is called {unknown[0]!r}",
+                f"there are {', '.join(FAMILIES)}; or all",
+            )
+        return names
+
+    def grid(self) -> VoxelGrid:
+        """The workspace."""
+        x, y, z = self.workspace_x, self.workspace_y, self.workspace_z
+        return VoxelGrid.from_bounds(np.array([-x / 2, -y / 2, 0.0]), np.array([x / 2, y / 2, z]), self.voxel_size)
+
+
+SCENE_FAMILIES: dict[str, SceneFamily] = {
+    "demo": SceneFamily(
+        name="demo",
+        n_objects_min=5,
+        n_objects_max=5,
+        n_actions=2,
+        frames_per_clip=8,
+        fps=4.0,
+        push_speed=0.12,
+        width=320,
+        height=240,
+        workspace_x=0.8,
+        workspace_y=0.8,
+        workspace_z=0.3,
+    ),
+    "table": SceneFamily(name="table"),
+}
+"""The named families."""
+
+
+def scene_family(name: str) -> SceneFamily:
+    """A named family.
+
+    Raises
+    ------
+    InputError
+        If there is none of that name.
+    """
+    if name not in SCENE_FAMILIES:
+        raise InputError(f"no scene family is called {name!r}", f"there are {', '.join(SCENE_FAMILIES)}")
+    return SCENE_FAMILIES[name]
