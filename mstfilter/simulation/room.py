@@ -86,7 +86,7 @@ def draw_room(rng: np.random.Generator, texel: float) -> Room:
     tile = 1.0 + 0.06 * printing.noise(rng, (256, 256), (40, 40), 5)
     # The exposure meter: the table comes out at a middle to light tone, with some error.
     light = 1.05
-    tone = float(rng.uniform(0.36, 0.52)) if table.mean() > 0.25 else float(rng.uniform(0.22, 0.32))
+    tone = float(rng.uniform(0.42, 0.58)) if table.mean() > 0.25 else float(rng.uniform(0.24, 0.36))
     gain = tone / (float(table.mean()) * light)
     balance = rng.uniform(0.96, 1.04, 3)
     grey = rng.uniform(0.16, 0.4) * rng.uniform(0.92, 1.08, 3)

@@ -178,7 +178,9 @@ def _bowl(rng: np.random.Generator, scale: Callable[[], float]) -> Shape:
     rim, height, foot = 0.0795 * scale(), 0.053 * scale(), 0.042 * scale()
     knee = foot + 0.68 * (rim - foot)
     walls = ring([(foot - WALL, foot, 0.0), (knee - WALL, knee, 0.45 * height), (rim - WALL, rim, height)])
-    floor = cylinder(foot - 0.5 * WALL, WALL / 2, (0, 0, WALL / 2))
+    # The floor's rim lies in the middle of the sloping wall.
+    middle = foot - 0.5 * WALL
+    floor = frustum((middle, 0.0), (middle + (knee - foot) * WALL / (0.45 * height), WALL))
     return _make("bowl", "bowl", [floor, *walls], 0.25, "lathe", ((UP_Z, 0.8), (DOWN_Z, 0.2)), ("ceramic",))
 
 

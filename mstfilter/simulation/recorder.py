@@ -1,0 +1,195 @@
+"""Simulate a recording: one call, one integer seed, one folder.
+
+>>> from mstfilter.simulation.families import scene_family
+>>> from mstfilter.simulation.recorder import simulate
+>>> recording = simulate(scene_family("demo"), seed=7, path="recordings/demo-7")  # doctest: +SKIP
+>>> recording.truth(0).shape  # doctest: +SKIP
+(80, 80, 30)
+
+The same family and seed give the same bytes (on one machine and build of the libraries). Every part draws
+from its own stream, named after the part and its index.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mstfilter.errors import InputError
+from mstfilter.scene.camera import Camera, look_at
+from mstfilter.scene.formats.folder import RecordingWriter
+from mstfilter.scene.recording import Recording
+from mstfilter.simulation.actions import Effect, Push, advance, choose_push, effect, finish
+from mstfilter.simulation.arrangement import Things, arrange, draw_things
+from mstfilter.simulation.families import GENERATOR_VERSION, SceneFamily
+from mstfilter.simulation.renderer import Renderer, seen_texel
+from mstfilter.simulation.room import Room, draw_room
+from mstfilter.simulation.sensor import ColourSensor, DepthSensor
+from mstfilter.simulation.truth import label_voxels
+from mstfilter.simulation.world import FINGER_ID, World
+
+__all__ = ["Progress", "Scene", "camera_of", "simulate"]
+
+Progress = Callable[[int, int, str], None]
+"""Called with frames done, frames in all, and what is being done."""
+
+_CAMERA_AT, _CAMERA_LOOKS_AT = np.array([0.05, -0.72, 0.58]), np.array([0.02, 0.05, 0.04])
+
+
+def camera_of(family: SceneFamily) -> Camera:
+    """A Kinect's camera, 0.9 m from the middle of the table, scaled to the family's images."""
+    kinect = Camera.from_intrinsics(525.0, 525.0, 319.5, 239.5, 640, 480, look_at(_CAMERA_AT, _CAMERA_LOOKS_AT))
+    factor = family.width / 640.0
+    scaled = kinect.scaled(factor)
+    # Other proportions than 4 : 3 see more or less above and below, about the same middle.
+    K = scaled.K.copy()
+    K[1, 2] += (family.height - scaled.height) / 2
+    return Camera(K, family.width, family.height, kinect.T_world_camera)
+
+
+def _stream(seed: int, name: str, index: int = 0) -> np.random.Generator:
+    """An own stream for each part; parts do not disturb one another."""
+    word = int.from_bytes(hashlib.sha256(name.encode()).digest()[:8], "little")
+    return np.random.default_rng([seed, word, index])
+
+
+class Scene:
+    """A world with its look and its sensors: what `simulate` records, for use step by step.
+
+    Parameters
+    ----------
+    family : SceneFamily
+    seed : int
+        Not negative.
+    """
+
+    def __init__(self, family: SceneFamily, seed: int) -> None:
+        if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
+            raise InputError(f"seed is {seed!r}, expected an integer of at least 0")
+        self.family, self.seed = family, int(seed)
+        self.camera, self.grid = camera_of(family), family.grid()
+        self.things: Things = draw_things(_stream(self.seed, "things"), family)
+        self.world = World(self.things.shapes, family.arm)
+        arrange(_stream(self.seed, "arrangement"), self.world, family, self.things.twin_of)
+        self.room: Room = draw_room(_stream(self.seed, "room"), seen_texel(self.camera))
+        self._renderer = Renderer(self.world, self.things.skins, self.room, self.camera, family.supersample)
+        self._colour, self._depth = ColourSensor(), DepthSensor()
+
+    def choose(self, action: int) -> Push:
+        """The push of action `action`, from the world as it is now."""
+        return choose_push(_stream(self.seed, "push", action), self.world, self.family)
+
+    def see(self, frame: int) -> dict[str, np.ndarray]:
+        """What frame number `frame` shows of the world as it is now: rgb, depth, instance, robot_mask."""
+        view = self._renderer.render()
+        return {
+            "rgb": self._colour.read(_stream(self.seed, "colour", frame), view.colour * self.room.exposure),
+            "depth": self._depth.read(_stream(self.seed, "depth", frame), view.depth, view.slant),
+            "instance": view.instance,
+            "robot_mask": view.instance == FINGER_ID,
+        }
+
+    def truth(self) -> np.ndarray:
+        """(X, Y, Z) uint16 labels of the world as it is now."""
+        return label_voxels(self.things.shapes, self.world.poses(), self.grid)
+
+    def describe(self) -> dict[str, Any]:
+        """What the manifest says of the scene."""
+        objects = [
+            {
+                "id": k + 1,
+                "family": s.family,
+                "name": s.name,
+                "half_m": s.half.tolist(),
+                "twin_of": t + 1 if t >= 0 else None,
+            }
+            for k, (s, t) in enumerate(zip(self.things.shapes, self.things.twin_of, strict=True))
+        ]
+        return {
+            "generator": "mstfilter.simulation",
+            "generator_version": GENERATOR_VERSION,
+            "seed": self.seed,
+            "family": asdict(self.family),
+            "objects": objects,
+        }
+
+
+def simulate(family: SceneFamily, seed: int, path: str | Path, progress: Progress | None = None) -> Recording:
+    """Simulate a scene, record it and write the recording.
+
+    Parameters
+    ----------
+    family : SceneFamily
+        What kind of scene; see `families.scene_family`.
+    seed : int
+        Decides everything else. Not negative.
+    path : path
+        The recording's folder; it must not exist or be empty. Nothing is left behind on failure.
+    progress : callable, optional
+        Called after each frame.
+
+    Returns
+    -------
+    Recording
+        Opened from the folder.
+
+    Raises
+    ------
+    InputError
+        If the folder cannot be written, or the objects cannot be arranged or pushed.
+    """
+    scene = Scene(family, seed)
+    with RecordingWriter(path, scene.camera, scene.grid, **scene.describe()) as writer:
+        _record(scene, writer, progress or (lambda done, total, what: None))
+    return Recording.open(path)
+
+
+def _record(scene: Scene, writer: RecordingWriter, progress: Progress) -> None:
+    family, world = scene.family, scene.world
+    start, index = world.time, 0
+    _pause(scene, writer, index, 0.0)
+    progress(1, family.n_frames, "pause 0")
+    for action in range(family.n_actions):
+        push = scene.choose(action)
+        before, turn, began = world.positions(), world.rotations(), world.time
+        for step in range(1, family.frames_per_clip - 1):
+            index += 1
+            advance(world, push, (step - 1) / family.fps, step / family.fps)
+            _frame(scene, writer, index, began + step / family.fps - start, "action", action=action)
+            progress(index + 1, family.n_frames, f"action {action}")
+        index += 1
+        advance(world, push, (family.frames_per_clip - 2) / family.fps, push.seconds)
+        settled = finish(world)
+        result = effect(world, before, turn, settled)
+        _pause(scene, writer, index, world.time - start, action=action, push=_as_json(push, result))
+        progress(index + 1, family.n_frames, f"pause {action + 1}")
+
+
+def _frame(scene: Scene, writer: RecordingWriter, index: int, time_s: float, role: Any, **entry: Any) -> None:
+    seen = scene.see(index)
+    visible = np.bincount(seen["instance"].ravel(), minlength=256)[1 : scene.world.n_objects + 1]
+    poses = {str(k + 1): pose for k, pose in enumerate(scene.world.poses())}
+    entry["visible_pixels"] = visible.tolist()
+    writer.add_frame(time_s=round(time_s, 6), role=role, poses=poses, **seen, **entry)
+
+
+def _pause(scene: Scene, writer: RecordingWriter, index: int, time_s: float, **entry: Any) -> None:
+    contacts = [[c.first + 1, c.second + 1] for c in scene.world.contacts()]
+    _frame(scene, writer, index, time_s, "static", contacts=contacts, **entry)
+    writer.add_voxels(scene.truth())
+
+
+def _as_json(push: Push, result: Effect) -> dict[str, Any]:
+    return {
+        "start_m": list(push.start),
+        "end_m": list(push.end),
+        "displacement_m": [round(float(d), 6) for d in result.displacement],
+        "turned_rad": [round(float(a), 6) for a in result.turned],
+        "settled": result.settled,
+        "all_kept": result.kept,
+    }
