@@ -65,7 +65,7 @@ def test_the_authors_real_estimates_are_fixed_points(shared_data):
 def book_and_rod():
     labels = np.zeros((30, 30, 30), np.uint16)
     labels[5:25, 5:20, 4:14] = 1
-    labels[5:25, 5:20, 14:16] = 2  # a 2 cm book on a box
+    labels[8:22, 8:17, 14:16] = 2  # a 2 cm book on a larger box
     labels[27, 27, 4:24] = 3  # an upright rod, one voxel thick
     return labels
 
@@ -74,7 +74,7 @@ def test_everywhere_eats_the_book_and_the_rod_disputed_does_not():
     labels = book_and_rod()
     eaten = ModeFilter(scope="everywhere").apply(labels)
     assert 3 not in eaten
-    assert (eaten == 2).sum() < 0.2 * (labels == 2).sum()
+    assert 2 not in eaten
     kept = ModeFilter(scope="disputed").apply(labels, np.zeros(labels.shape, bool))
     np.testing.assert_array_equal(kept, labels)
     np.testing.assert_array_equal(ModeFilter(scope="disputed").apply(labels), labels)
