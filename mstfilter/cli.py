@@ -198,10 +198,14 @@ def _lines(kind: str) -> Iterator[str]:
             yield f"{name:<18}{tomllib.loads(find_preset(name).read_text()).get('description', '')}"
         return
     if kind == "families":
-        from mstfilter.simulation.families import FAMILIES
+        from mstfilter.simulation.families import SCENE_FAMILIES
 
-        for name, family in FAMILIES.items():
-            yield f"{name:<18}{_first_line(type(family))}"
+        for name, f in SCENE_FAMILIES.items():
+            objects = f"{f.n_objects_min}-{f.n_objects_max}" if f.n_objects_min < f.n_objects_max else f.n_objects_max
+            yield (
+                f"{name:<18}{objects} objects, {f.n_actions} actions of {f.frames_per_clip} frames, "
+                f"{f.width} x {f.height}, voxels {' x '.join(map(str, f.grid().shape))}"
+            )
         return
     for name in registry.known(kind):
         cls = registry.find_class(kind, name)
@@ -216,11 +220,11 @@ def _fields(cls: type) -> str:
     """Fields of a component with their defaults."""
     import dataclasses
 
-    from mstfilter.registry import name_of
+    from mstfilter.registry import default_of, name_of
 
     parts = []
     for field in dataclasses.fields(cls):  # type: ignore[arg-type]
-        value: Any = field.default
+        value: Any = default_of(field)
         if value is dataclasses.MISSING:
             parts.append(field.name)
         elif dataclasses.is_dataclass(value):
@@ -256,10 +260,12 @@ def _bar(what: str) -> Iterator[Callable[[int, int], None]]:
 
 
 def _simulate(family: str, out: Path, seed: int) -> None:
+    from mstfilter.simulation.families import scene_family
     from mstfilter.simulation.recorder import simulate
 
+    chosen = scene_family(family)
     with _bar("simulate") as advance:
-        simulate(family, seed, out, progress=advance)
+        simulate(chosen, seed, out, progress=lambda done, total, what: advance(done, total))
     print(f"recording   {out}")
 
 

@@ -47,20 +47,23 @@ COMPONENTS: dict[str, dict[str, str]] = {
         "never": "mstfilter.smc.resampling:Never",
     },
     "boundary": {"colour_depth": "mstfilter.segmentation.boundary:ColourDepthBoundary"},
-    "tree": {"ucm": "mstfilter.segmentation.tree:UcmTree"},
-    "value": {"scenecut": "mstfilter.segmentation.value:SceneCutObjectness"},
+    "tree": {"ucm": "mstfilter.segmentation.ucm:UcmTree"},
+    "value": {
+        "scenecut": "mstfilter.segmentation.value:SceneCutObjectness",
+        "merge_log_odds": "mstfilter.segmentation.value:MergeLogOdds",
+    },
     "sampler": {
-        "mh": "mstfilter.segmentation.cuts:MetropolisHastingsCuts",
-        "exact": "mstfilter.segmentation.cuts:ExactCuts",
-        "optimal": "mstfilter.segmentation.cuts:OptimalCut",
+        "mh": "mstfilter.segmentation.mh:MetropolisHastingsCuts",
+        "exact": "mstfilter.segmentation.gibbs:ExactCuts",
+        "optimal": "mstfilter.segmentation.optimal:OptimalCut",
     },
     "completer": {
-        "extrude": "mstfilter.completion.completer:Extrude",
-        "surface": "mstfilter.completion.completer:SurfaceOnly",
+        "extrude": "mstfilter.completion.extrude:Extrude",
+        "surface": "mstfilter.completion.extrude:SurfaceOnly",
     },
     "rule": {
         "authors": "mstfilter.tracking.rules:AuthorsRule",
-        "mst": "mstfilter.tracking.rules:MstRule",
+        "mst": "mstfilter.tracking.mst_rule:MstRule",
         "paper": "mstfilter.tracking.rules:PaperRule",
     },
     "free_space": {
@@ -210,11 +213,14 @@ def make(cls: type, fields: Mapping[str, Any], where: str, allow_files: bool = F
                 *([f"did you mean {close[0]}?"] if close else []),
                 f"fields: {', '.join(own) or 'none'}",
             )
-        kind = kind_of(name)
+        kind, current = kind_of(name), type(default_of(own[name]))
         if kind is not None and value is not None:
-            default = own[name].default
-            current = None if default is dataclasses.MISSING or default is None else type(default)
-            values[name] = build(kind, value, path, allow_files, current)
+            preset = current if dataclasses.is_dataclass(current) else None
+            values[name] = build(kind, value, path, allow_files, preset)
+        elif dataclasses.is_dataclass(current) and isinstance(value, Mapping):
+            # Part of a component that is no component itself: it has fields, but nothing can replace it.
+            inner = {k: v for k, v in value.items() if k != "component"}
+            values[name] = make(current, inner, path, allow_files)
         else:
             values[name] = _plain(hints[name], value, path)
     try:
@@ -223,6 +229,11 @@ def make(cls: type, fields: Mapping[str, Any], where: str, allow_files: bool = F
         raise InputError(f"{where}: {error.message}" if where else error.message, *error.hints) from error
     except TypeError as error:
         raise InputError(f"{where}: {error}") from error
+
+
+def default_of(field: dataclasses.Field[Any]) -> Any:
+    """The default of a dataclass field, made if it has a factory; MISSING where there is none."""
+    return field.default if field.default_factory is dataclasses.MISSING else field.default_factory()
 
 
 def _plain(hint: Any, value: Any, where: str) -> Any:

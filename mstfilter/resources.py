@@ -21,7 +21,7 @@ def models_folder() -> Path:
         if (folder / "mst.toml").is_file():
             return folder
     raise InputError(
-        f"the folder of presets is missing: neither {package / '_models'} nor {package.parent / 'models'} has mst.toml",
+        f"presets are missing: no mst.toml in {package / '_models'} nor in {package.parent / 'models'}",
         "install the package again",
     )
 

@@ -170,6 +170,11 @@ class ObjectRecord:
     motion: RigidTransform = field(default_factory=RigidTransform.identity)
     completion_key: str | None = None
 
+    @classmethod
+    def born(cls, label: int, birth: int, completion_key: str | None = None) -> ObjectRecord:
+        """A new object's record; its id is ``65536 * birth + label``: births at different times never share one."""
+        return cls(label, birth * (MAX_LABEL + 1) + label, birth, completion_key=completion_key)
+
     def changed(self) -> ObjectRecord:
         """The record after something other than a rigid motion has changed the object's voxels."""
         return replace(self, source=None, motion=RigidTransform.identity())
@@ -230,15 +235,12 @@ class Hypothesis:
 
     @classmethod
     def from_labels(cls, labels: np.ndarray, grid: VoxelGrid, birth: int = 0) -> Hypothesis:
-        """A hypothesis whose objects are all new.
-
-        An object's id is ``65536 * birth + label``: births at different times never share one.
-        """
+        """A hypothesis whose objects are all new."""
         labels = as_labels(labels)
         if labels.shape != grid.shape:
             raise InputError(f"label grid has shape {labels.shape}, the voxel grid is {grid.shape}")
         present = np.flatnonzero(np.bincount(labels.ravel()))
-        records = tuple(ObjectRecord(int(k), birth * (MAX_LABEL + 1) + int(k), birth) for k in present if k > 0)
+        records = tuple(ObjectRecord.born(int(k), birth) for k in present if k > 0)
         return cls(labels, grid, records)
 
     def with_labels(self, labels: np.ndarray) -> Hypothesis:
