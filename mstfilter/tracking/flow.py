@@ -16,6 +16,8 @@ for what moves far, so the intermediate frames matter.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import astuple, dataclass
 from functools import cached_property
 
@@ -83,6 +85,9 @@ class DenseFlow:
         Flow is computed on images resized by this factor (1 = full size).
     frame_step : int
         Use every k-th frame; the last one always.
+    motion_share : float
+        Skip frames while what moves has moved less than this share of the image width since the last one
+        used: fewer links in the chain lose less, but flow fails on long jumps. 0 uses every frame.
     grid_step : int
         Spacing of the followed points in pixels.
     forward_backward : float
@@ -93,9 +98,10 @@ class DenseFlow:
         Grey levels, largest channel, between consecutive frames (slightly blurred); larger jumps end a track.
     """
 
-    preset: str = "fast"
+    preset: str = "ultrafast"
     scale: float = 1.0
-    frame_step: int = 3
+    frame_step: int = 1
+    motion_share: float = 0.03
     grid_step: int = 2
     forward_backward: float = 1.0
     depth_jump: float = 0.03
@@ -114,7 +120,7 @@ class DenseFlow:
         chosen = list(range(0, len(clip.frames) - 1, self.frame_step)) + [len(clip.frames) - 1]
         frames = [clip.frames[i] for i in chosen]
         key = (tuple(f.key for f in frames), astuple(self))
-        return memo("clip tracks", key, lambda: _track(frames, self))
+        return memo("clip tracks", key, lambda: _track(_thinned(frames, self.motion_share), self))
 
 
 def track_labels(labels: NDArray[np.integer], clip: Clip, flow: DenseFlow | None = None) -> NDArray[np.integer]:
@@ -158,6 +164,55 @@ def _track(frames: list[Frame], settings: DenseFlow) -> ClipTracks:
     return ClipTracks(start.astype(np.int32), end, alive, source, unchanged)
 
 
+def _thinned(frames: list[Frame], motion_share: float) -> list[Frame]:
+    """Leave out frames in which little has happened since the last one kept."""
+    import cv2
+
+    if motion_share <= 0 or len(frames) < 3:
+        return frames
+    shape = frames[0].depth.shape
+    factor = 160.0 / shape[1]
+    dis = cv2.DISOpticalFlow_create(PRESETS.index("ultrafast"))
+    small = [
+        cv2.resize(cv2.cvtColor(f.rgb, cv2.COLOR_RGB2GRAY), None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
+        for f in frames
+    ]
+    kept, moved = [frames[0]], 0.0
+    for i in range(1, len(frames) - 1):
+        with _one_thread():
+            flow = dis.calc(small[i - 1], small[i], None)
+            following = dis.calc(small[i], small[i + 1], None)
+        # The robot moves fast and is not followed.
+        moved += _speed(flow, frames[i - 1]) / 160.0
+        if moved + _speed(following, frames[i]) / 160.0 > motion_share:
+            kept.append(frames[i])
+            moved = 0.0
+    return [*kept, frames[-1]]
+
+
+def _speed(flow: NDArray[np.float32], frame: Frame) -> float:
+    """Length of flow that one pixel in two hundred, robot aside, exceeds."""
+    import cv2
+
+    length = np.hypot(flow[..., 0], flow[..., 1])
+    robot = cv2.resize(_robot(frame).astype(np.uint8), length.shape[::-1], interpolation=cv2.INTER_AREA)
+    seen = length[cv2.dilate(robot, np.ones((5, 5), np.uint8)) == 0]
+    return float(np.quantile(seen, 0.995)) if len(seen) else 0.0
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """OpenCV splits the flow's search into one stripe a thread, and results depend on the split."""
+    import cv2
+
+    threads = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        yield
+    finally:
+        cv2.setNumThreads(threads)
+
+
 def _robot(frame: Frame) -> NDArray[np.bool_]:
     return np.zeros(frame.depth.shape, bool) if frame.robot_mask is None else frame.robot_mask
 
@@ -170,13 +225,8 @@ def _flow(a: Frame, b: Frame, settings: DenseFlow) -> tuple[NDArray[np.float32],
     if settings.scale < 1.0:
         grey = [cv2.resize(g, None, fx=settings.scale, fy=settings.scale, interpolation=cv2.INTER_AREA) for g in grey]
     dis = cv2.DISOpticalFlow_create(PRESETS.index(settings.preset))
-    # The search is split into one stripe a thread and results depend on the split: keep to one.
-    threads = cv2.getNumThreads()
-    cv2.setNumThreads(1)
-    try:
+    with _one_thread():
         fields = [dis.calc(grey[0], grey[1], None), dis.calc(grey[1], grey[0], None)]
-    finally:
-        cv2.setNumThreads(threads)
     if settings.scale < 1.0:
         size = (a.depth.shape[1], a.depth.shape[0])
         factor = np.array([size[0] / grey[0].shape[1], size[1] / grey[0].shape[0]], np.float32)
@@ -185,14 +235,14 @@ def _flow(a: Frame, b: Frame, settings: DenseFlow) -> tuple[NDArray[np.float32],
 
 
 def _sample(field: NDArray[np.float32], at: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Bilinear samples (N, C) of a field (H, W, C) at points (N, 2); the border is repeated."""
-    height, width = field.shape[:2]
-    u, v = np.clip(at[:, 0], 0, width - 1), np.clip(at[:, 1], 0, height - 1)
-    u0, v0 = np.minimum(u.astype(np.int32), width - 2), np.minimum(v.astype(np.int32), height - 2)
-    a, b = (u - u0)[:, None], (v - v0)[:, None]
-    top = field[v0, u0] * (1 - a) + field[v0, u0 + 1] * a
-    bottom = field[v0 + 1, u0] * (1 - a) + field[v0 + 1, u0 + 1] * a
-    return top * (1 - b) + bottom * b
+    """Bilinear samples (N, 2) of a field (H, W, 2) at points (N, 2); the border is repeated."""
+    import cv2
+
+    # OpenCV's images have at most 32767 rows: fold the list of points into a picture.
+    folded = np.zeros((-(-len(at) // 1024), 1024, 2), np.float32)
+    folded.reshape(-1, 2)[: len(at)] = at
+    sampled = cv2.remap(field, folded, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return sampled.reshape(-1, 2)[: len(at)]
 
 
 def _advance(
@@ -273,6 +323,8 @@ def _vote(
     image.ravel()[doubtful] = 1
     asked = (cv2.dilate(image, np.ones((25, 25), np.uint8)).ravel() > 0) & known
     candidates = np.flatnonzero(asked)
+    if len(candidates) > 20000:  # every other row and column tell enough
+        candidates = candidates[(rows[candidates] % 2 == 0) & (columns[candidates] % 2 == 0)]
     if len(candidates) < N_VOTERS:
         candidates = np.flatnonzero(known)
     tree = cKDTree(features[candidates], balanced_tree=False, compact_nodes=False)
