@@ -26,9 +26,9 @@ from numpy.typing import NDArray
 
 from mstfilter.errors import InputError
 from mstfilter.scene.clip import Clip
-from mstfilter.scene.depth_noise import depth_sigma
 from mstfilter.scene.frame import Frame
 from mstfilter.scene.memo import memo
+from mstfilter.tracking.photometry import matched_colour, same_depth, smooth_colour
 
 __all__ = ["ClipTracks", "DenseFlow", "track_labels"]
 
@@ -263,16 +263,9 @@ def _advance(
     ub, vb = _pixel(moved, width, height)
     jump = np.abs(b.depth[vb, ub] - a.depth[va, ua])
     ok &= ~(jump > settings.depth_jump)  # a missing reading (NaN) says nothing
-    ok &= np.abs(_blurred(b)[vb, ub] - _blurred(a)[va, ua]).max(axis=1) <= settings.colour_jump
+    ok &= np.abs(smooth_colour(b)[vb, ub] - smooth_colour(a)[va, ua]).max(axis=1) <= settings.colour_jump
     ok &= ~_robot(b)[vb, ub] & ~_robot(a)[va, ua]
     return moved, ok
-
-
-def _blurred(frame: Frame) -> NDArray[np.int16]:
-    """Slightly blurred colour, (H, W, 3)."""
-    import cv2
-
-    return memo("blurred", (frame.key,), lambda: cv2.GaussianBlur(frame.rgb, (3, 3), 0).astype(np.int16))
 
 
 def _pixel(at: NDArray[np.float32], width: int, height: int) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
@@ -285,13 +278,10 @@ def unchanged_pixels(first: Frame, last: Frame, sigmas: float = 4.0, colour: flo
     """Pixels (H, W) where the last frame shows what the first did.
 
     Depth differs by less than ``sigmas`` standard deviations of a difference, and slightly blurred colour
-    by less than ``colour`` grey levels in every channel. Robot pixels and missing depth are not unchanged.
+    by less than ``colour`` grey levels in every channel, a change of exposure aside. Robot pixels and missing depth are not unchanged.
     """
-    same_colour = np.abs(_blurred(first) - _blurred(last)).max(axis=2) <= colour
-    limit = sigmas * np.sqrt(2.0) * depth_sigma(first.depth)
-    with np.errstate(invalid="ignore"):
-        same_depth = np.abs(last.depth - first.depth) <= limit
-    return same_depth & same_colour & first.valid & last.valid
+    change = np.abs(smooth_colour(first) - matched_colour(last, first)).max(axis=2)
+    return same_depth(first, last, sigmas) & (change <= colour)
 
 
 def _vote(
@@ -316,7 +306,7 @@ def _vote(
         place = frame.camera.unproject(frame.depth[tuple(nearest)]).reshape(-1, 3) / 0.012
     else:
         place = np.stack([columns, rows], axis=1) / 6.0
-    colour = _blurred(frame).reshape(-1, 3) / 20.0
+    colour = smooth_colour(frame).reshape(-1, 3) / 20.0
     features = np.hstack([place, colour])
     # Explained pixels far from all doubtful ones are never asked.
     image = np.zeros((height, width), np.uint8)

@@ -15,7 +15,7 @@ from mstfilter.scene.depth_noise import depth_sigma
 from mstfilter.scene.frame import Frame
 from mstfilter.scene.memo import memo
 from mstfilter.tracking import rigid
-from mstfilter.tracking.track import Track, smooth_colour
+from mstfilter.tracking.track import Track
 
 __all__ = ["normals", "refine"]
 
@@ -51,15 +51,15 @@ def normals(frame: Frame) -> NDArray[np.float32]:
     return memo("normals", (frame.key,), compute)
 
 
-def _gradients(frame: Frame) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-    """Smoothed grey image and its derivatives along columns and rows, grey levels a pixel."""
+def _gradients(track: Track) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+    """Smoothed grey last image and its derivatives along columns and rows, grey levels a pixel."""
 
     def compute() -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-        grey = smooth_colour(frame).mean(axis=2)
+        grey = track.colour_after.mean(axis=2)
         down, across = np.gradient(grey)
         return grey, across, down
 
-    return memo("grey gradients", (frame.key,), compute)
+    return memo("grey gradients", (track.clip.after.key, track.clip.before.key), compute)
 
 
 def refine(track: Track, T: Array, depth_scale: float = 1.5, colour_scale: float = 25.0) -> Array:
@@ -71,7 +71,7 @@ def refine(track: Track, T: Array, depth_scale: float = 1.5, colour_scale: float
     """
     points, colours = track.sample(N_POINTS)
     after = track.clip.after
-    surface_normals, (grey, across, down) = normals(after), _gradients(after)
+    surface_normals, (grey, across, down) = normals(after), _gradients(track)
     before_grey = colours.mean(axis=1)
     height, width = after.depth.shape
     K, world_to_camera = after.camera.K, after.camera.pose.as_matrix()[:3, :3].T

@@ -12,10 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mstfilter.scene.clip import Clip
-from mstfilter.scene.frame import Frame
-from mstfilter.scene.memo import memo
 from mstfilter.tracking.features import SiftMatching
 from mstfilter.tracking.flow import ClipTracks
+from mstfilter.tracking.photometry import matched_colour, smooth_colour
 from mstfilter.tracking.registration import Surface, prepare
 from mstfilter.tracking.segments import Segment
 
@@ -99,22 +98,15 @@ class Track:
         """At most n supported points, evenly spread, and their slightly blurred colours, (n, 3) each."""
         chosen = np.unique(np.linspace(0, len(self.segment.support) - 1, n).astype(np.int64))
         chosen = chosen[chosen >= 0]
-        colours = smooth_colour(self.clip.before).reshape(-1, 3)[self.segment.support[chosen]]
+        colours = smooth_colour(self.clip.before, 5).reshape(-1, 3)[self.segment.support[chosen]]
         return self.points[chosen], colours.astype(np.float64)
 
     @property
     def colour_after(self) -> NDArray[np.float32]:
-        """Slightly blurred colour of the last frame, (H, W, 3)."""
-        return smooth_colour(self.clip.after)
+        """Slightly blurred colour of the last frame in the exposure of the first, (H, W, 3)."""
+        return matched_colour(self.clip.after, self.clip.before, 5)
 
     def _image(self, pixels: NDArray[np.int64]) -> NDArray[np.bool_]:
         image = np.zeros(self.clip.before.depth.shape, bool)
         image.ravel()[pixels] = True
         return image
-
-
-def smooth_colour(frame: Frame) -> NDArray[np.float32]:
-    """Colour (H, W, 3) blurred by about a pixel, so that a shift below a pixel costs little."""
-    import cv2
-
-    return memo("smooth colour", (frame.key,), lambda: cv2.GaussianBlur(frame.rgb, (5, 5), 0).astype(np.float32))
