@@ -1,0 +1,1 @@
+"""Completion: from the visible part of an object to the space it fills (paper IV-B)."""

@@ -1,0 +1,1 @@
+"""Segmentation: image -> boundaries -> tree -> cuts -> hypotheses (paper IV-B)."""

@@ -46,7 +46,7 @@ class ColourDepthBoundary(BoundaryModel):
         Readings up to this much above the table are table, in sensor disparity units.
     """
 
-    colour_weight: float = 0.6
+    colour_weight: float = 0.4
     depth_weight: float = 1.0
     depth_scale: float = 2.5
     depth_half: float = 2.0

@@ -9,7 +9,7 @@ The paper's law, exp(-(v* - v)^2 / s2), lies below a scaled Gibbs law for any b,
 ``exp(-(d - b s2 / 2)^2 / s2)`` are exact and independent: `ExactCuts`. The b that accepts most often solves
 ``b = 2 E_b[d] / s2``.
 
->>> sample = ExactCuts(sigma2=1e-4).sample(np.random.default_rng(0), tree, w, 10)
+>>> sample = ExactCuts().sample(np.random.default_rng(0), tree, w, 10)
 """
 
 from __future__ import annotations
@@ -132,7 +132,7 @@ class ExactCuts(CutSampler):
         Gibbs draws for each wanted cut before giving up.
     """
 
-    sigma2: float = 1e-4
+    sigma2: float = 1e-3
     max_tries: int = 100000
 
     def __post_init__(self) -> None:

@@ -4,9 +4,9 @@ The chain starts at the optimal cut c* and aims at ``p(c) = exp(-(v(c*) - v(c))^
 ``s2 = sigma2 v(c*)^2``.
 
 =========  ============================================================================================
-``mst``    ``MetropolisHastingsCuts()``: one chain, MoveNode mixed with subtree redraws, s2 = 1e-4 v*^2
+``mst``    ``MetropolisHastingsCuts()``: one chain, MoveNode mixed with subtree redraws, s2 = 1e-3 v*^2
 ``paper``  ``MetropolisHastingsCuts(0.25, burn_in=0, thinning=20, redraw_share=0)``
-``authors``  ``MetropolisHastingsCuts(0.25, burn_in=0, thinning=20, rule="authors", redraw_share=0,
+``authors``  ``MetropolisHastingsCuts(0.25, burn_in=0, thinning=20, moves="authors", redraw_share=0,
            restart=True, include_optimal=True, redraw_repeated=True)``
 =========  ============================================================================================
 
@@ -106,7 +106,7 @@ class MetropolisHastingsCuts(CutSampler):
         Steps before the first sample (on top of `thinning`), once a chain.
     thinning : int
         Steps from one sample to the next.
-    rule : {"node", "feasible", "authors"}
+    moves : {"node", "feasible", "authors"}
         Local moves: uniform node then direction (the paper; exact), uniform over possible moves (exact), or
         the authors' program, whose forward probability is faulty.
     redraw_share : float
@@ -119,18 +119,18 @@ class MetropolisHastingsCuts(CutSampler):
         A cut that was drawn before is drawn once more, then kept whatever it is.
     """
 
-    sigma2: float = 1e-4
+    sigma2: float = 1e-3
     burn_in: int = 1000
     thinning: int = 500
-    rule: str = "node"
+    moves: str = "node"
     redraw_share: float = 0.3
     restart: bool = False
     include_optimal: bool = False
     redraw_repeated: bool = False
 
     def __post_init__(self) -> None:
-        if self.rule not in RULES:
-            raise InputError(f"move rule {self.rule!r} is not known", f"there are: {', '.join(RULES)}")
+        if self.moves not in RULES:
+            raise InputError(f"move rule {self.moves!r} is not known", f"there are: {', '.join(RULES)}")
         if not self.sigma2 > 0:
             raise InputError(f"sigma2 is {self.sigma2!r}, expected a number > 0")
         if self.burn_in < 0 or self.thinning < 1:
@@ -143,7 +143,7 @@ class MetropolisHastingsCuts(CutSampler):
         optimal = optimal_cut(tree, w)
         best = float(w[optimal].sum())
         s2 = max(self.sigma2 * best**2, 1e-300)
-        local = RULES[self.rule]()
+        local = RULES[self.moves]()
         redraw = SubtreeRedraw(best_envelope(tree, w, best, s2)) if self.redraw_share > 0 else None
         random = _uniforms(rng)
 

@@ -150,7 +150,5 @@ def _hypothesis(completions: list[Completion], grid: VoxelGrid, birth: int, thre
     """Objects numbered 1 .. in the order given; those that fill no voxel get no record."""
     labels = arbitrate(completions, grid, threshold)
     present = np.bincount(labels.ravel(), minlength=len(completions) + 1)
-    records = tuple(
-        ObjectRecord.born(k, birth, one.key) for k, one in enumerate(completions, start=1) if present[k]
-    )
+    records = tuple(ObjectRecord.born(k, birth, one.key) for k, one in enumerate(completions, start=1) if present[k])
     return Hypothesis(labels, grid, records)

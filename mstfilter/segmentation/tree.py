@@ -150,6 +150,22 @@ class Tree:
         order[first[: self.n_leaves]] = np.arange(self.n_leaves)
         return order, first, first + np.array(count)
 
+    @cached_property
+    def leaf_place(self) -> np.ndarray:
+        """(n_leaves,) place of every leaf in depth-first order, in which the leaves of a node are neighbours."""
+        return read_only(self._leaf_ranges[1][: self.n_leaves].copy())
+
+    def lowest_common(self, first: np.ndarray, last: np.ndarray) -> np.ndarray:
+        """The lowest nodes (k,) that hold the leaves at places `first` (k,) to `last` (k,), first <= last."""
+        order, _, end = self._leaf_ranges
+        node = order[np.asarray(first)]
+        last = np.asarray(last)
+        while True:
+            short = end[node] <= last
+            if not short.any():
+                return node
+            node = np.where(short, self.parent[node], node)
+
     def leaves_of(self, node: int) -> np.ndarray:
         """The leaves under a node."""
         order, first, last = self._leaf_ranges

@@ -25,6 +25,9 @@ __all__ = ["UcmTree"]
 class UcmTree(TreeBuilder):
     """Oriented watershed, average linkage by mean boundary strength, pruned to the strongest merges.
 
+    The curve and the colour weight of `ColourDepthBoundary` were fitted together on the 45 `learn` frames of mOSD
+    (experiments/osd_frames reports what they reach on set-ups that they were not fitted on).
+
     Parameters
     ----------
     max_leaves : int
@@ -33,11 +36,14 @@ class UcmTree(TreeBuilder):
         Merge height (mean boundary strength 0 .. 1) that means P(boundary) = 0.5.
     slope : float
         Steepness of the logistic there, per unit of height.
+    calibrate : bool
+        False leaves the merge heights as they are.
     """
 
     max_leaves: int = 501
-    centre: float = 0.30
-    slope: float = 20.0
+    centre: float = 0.55
+    slope: float = 12.0
+    calibrate: bool = True
 
     def __post_init__(self) -> None:
         if self.max_leaves < 1:
@@ -54,7 +60,8 @@ class UcmTree(TreeBuilder):
         parent, altitude, leaves = prune(parent, altitude, leaves, self.max_leaves)
         n_leaves = int(leaves.max()) + 1
         start = np.zeros(len(parent))
-        start[n_leaves:] = self.probability(altitude[n_leaves:])
+        heights = altitude[n_leaves:]
+        start[n_leaves:] = self.probability(heights) if self.calibrate else heights
         return Tree(parent, leaves, start)
 
     def probability(self, height: np.ndarray) -> np.ndarray:

@@ -88,7 +88,7 @@ def test_the_samplers_chain_follows_the_matrix():
     tree, w = case(5, 2)
     cuts, p, _, _ = target(tree, w, 0.05)
     for rule, redraw in [("node", 0.3), ("node", 0.0), ("feasible", 0.0)]:
-        sampler = MetropolisHastingsCuts(0.05, burn_in=100, thinning=40, rule=rule, redraw_share=redraw)
+        sampler = MetropolisHastingsCuts(0.05, burn_in=100, thinning=40, moves=rule, redraw_share=redraw)
         sample = sampler.sample(np.random.default_rng(1), tree, w, 3000)
         found = _counts(sample.cuts, cuts)
         assert _chi_square(found, p) > 1e-4, (rule, redraw)
@@ -185,7 +185,7 @@ def test_diagnostics():
 
 def test_bad_fields_are_named():
     with pytest.raises(InputError, match="move rule 'x'"):
-        MetropolisHastingsCuts(rule="x")
+        MetropolisHastingsCuts(moves="x")
     with pytest.raises(InputError, match="sigma2"):
         ExactCuts(sigma2=0)
     tree, w = case(5, 2)

@@ -38,9 +38,7 @@ def all_cuts(tree: Tree) -> list[tuple[int, ...]]:
     return [tuple(sorted(c)) for c in cuts_below(tree, tree.root)]
 
 
-def target(
-    tree: Tree, w: np.ndarray, sigma2: float
-) -> tuple[list[tuple[int, ...]], np.ndarray, float, float]:
+def target(tree: Tree, w: np.ndarray, sigma2: float) -> tuple[list[tuple[int, ...]], np.ndarray, float, float]:
     """All cuts with their probabilities under exp(-(v* - v)^2 / s2), written out; v* and s2."""
     cuts = all_cuts(tree)
     v = np.array([w[list(c)].sum() for c in cuts])

@@ -1,0 +1,241 @@
+"""How well one image is segmented: optimal cut, sampled cuts and floors on 45 real frames, held out by set-up.
+
+    python experiments/osd_frames/run.py
+
+Needs the frames in MSTFILTER_SHARED (default ../shared) under real/osd_learn. Writes results/*.csv beside this file.
+Constants (colour weight, centre and slope of the calibration) are fitted on the frames of the other camera set-ups.
+"""
+
+from __future__ import annotations
+
+import csv
+import itertools
+import os
+import time
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+
+from mstfilter.scene.camera import Camera
+from mstfilter.scene.frame import Frame
+from mstfilter.scene.quality import weighted_coverage
+from mstfilter.segmentation.boundary import ColourDepthBoundary
+from mstfilter.segmentation.gibbs import ExactCuts
+from mstfilter.segmentation.mh import MetropolisHastingsCuts
+from mstfilter.segmentation.optimal import optimal_cut
+from mstfilter.segmentation.segments import ObjectRule, Segments
+from mstfilter.segmentation.tree import Tree
+from mstfilter.segmentation.ucm import UcmTree
+from mstfilter.segmentation.value import SceneCutObjectness
+
+HERE = Path(__file__).resolve().parent
+SHARED = Path(os.environ.get("MSTFILTER_SHARED", HERE.parents[2] / "shared"))
+
+# Frames of one camera set-up (inclusive); the others stand alone.
+GROUPS = [(0, 1), (2, 4), (5, 5), (6, 16), (17, 24), (25, 26), (27, 29), (30, 30), (31, 32), (33, 44)]
+COLOUR_WEIGHTS = (0.0, 0.2, 0.4, 0.6)
+CENTRES = (0.4, 0.45, 0.5, 0.55, 0.6)
+SLOPES = (8.0, 12.0, 20.0)
+# Constants that no label was used for: colour weight of the notes; logistic through .15 and .8 at the .9 and .995
+# quantiles of the merge heights of each tree.
+NOTES_COLOUR = 0.6
+
+SAMPLERS = {
+    "mst": MetropolisHastingsCuts(),
+    "mst, sigma2 1e-4": MetropolisHastingsCuts(1e-4),
+    "mst, sigma2 1e-2": MetropolisHastingsCuts(1e-2),
+    "exact, same law as mst": ExactCuts(1e-3),
+    "paper": MetropolisHastingsCuts(0.25, burn_in=0, thinning=20, redraw_share=0.0),
+    "authors": MetropolisHastingsCuts(0.25, 0, 20, "authors", 0.0, True, True, True),
+}
+
+RULE = ObjectRule()
+VALUE = SceneCutObjectness()
+
+
+@dataclass
+class Case:
+    """A frame with its truth and the trees of all colour weights, heights not yet calibrated."""
+
+    name: str
+    frame: Frame
+    truth: np.ndarray
+    ignored: np.ndarray
+    touching: bool
+    trees: dict[float, tuple[Tree, Segments]]
+
+    def score(self, labels: np.ndarray) -> float:
+        """Objects quality; pixels without label count on neither side."""
+        return weighted_coverage(np.where(self.ignored, 0, labels), self.truth, form="objects")
+
+    def score_cut(self, tree: Tree, found: Segments, cut: np.ndarray) -> float:
+        numbers = np.where(found.is_object[cut], np.arange(1, len(cut) + 1), 0)
+        return self.score(np.where(found.own, numbers[tree.label_image(cut)], 0))
+
+
+def touching(label: np.ndarray) -> bool:
+    """Whether two objects share a border: pixels of both labels (>= 2) within 3 px of each other."""
+    objects = label >= 2
+    square = np.ones((7, 7), np.uint8)
+    return any(
+        (cv2.dilate((label == k).astype(np.uint8), square).astype(bool) & objects & (label != k)).any()
+        for k in np.unique(label[objects])
+    )
+
+
+def load(number: int) -> Case:
+    stem = str(SHARED / "real" / "osd_learn" / f"learn{number}")
+    rgb = np.ascontiguousarray(cv2.imread(f"{stem}_rgb.png")[..., ::-1])
+    depth = cv2.imread(f"{stem}_depth.png", cv2.IMREAD_UNCHANGED) * np.float32(0.001)
+    label = cv2.imread(f"{stem}_label.png", cv2.IMREAD_UNCHANGED).astype(np.int64)
+    frame = Frame(rgb, depth, Camera.from_intrinsics(525, 525, 319.5, 239.5, 640, 480))
+    trees = {}
+    for weight in COLOUR_WEIGHTS:
+        boundary = ColourDepthBoundary(colour_weight=weight).boundary(frame)
+        tree = UcmTree(calibrate=False).build(boundary)
+        trees[weight] = (tree, RULE.segments(tree, frame))
+    truth = np.where(label >= 2, label - 1, 0)
+    return Case(f"learn{number}", frame, truth, label == 0, touching(label), trees)
+
+
+def calibrated(tree: Tree, centre: float, slope: float) -> Tree:
+    start = tree.start.copy()
+    start[tree.n_leaves :] = UcmTree(centre=centre, slope=slope).probability(start[tree.n_leaves :])
+    return Tree(tree.parent, tree.leaves, start)
+
+
+def without_labels(tree: Tree) -> Tree:
+    """The notes' calibration by quantiles of the heights, which needs no labelled frame."""
+    low, high = np.quantile(tree.start[tree.n_leaves :], (0.9, 0.995))
+    slope = (np.log(0.8 / 0.2) - np.log(0.15 / 0.85)) / (high - low)
+    return calibrated(tree, low - np.log(0.15 / 0.85) / slope, slope)
+
+
+def components(case: Case, step: float = np.inf) -> np.ndarray:
+    """Floor: what stands above the table, 4-connected; neighbours whose depth differs by `step` m are not joined."""
+    own = case.trees[COLOUR_WEIGHTS[0]][1].own
+    index = np.arange(own.size).reshape(own.shape)
+    depth = np.where(own, case.frame.depth, 0)
+    links = []
+    for a, b in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
+        joined = own[a] & own[b] & (np.abs(depth[a] - depth[b]) < step)
+        links.append((index[a][joined], index[b][joined]))
+    rows, columns = (np.concatenate(x) for x in zip(*links, strict=True))
+    graph = coo_matrix((np.ones(len(rows), bool), (rows, columns)), shape=(own.size, own.size))
+    label = connected_components(graph, directed=False)[1].reshape(own.shape) + 1
+    label[~own] = 0
+    sizes = np.bincount(label.ravel())
+    label[sizes[label] < RULE.min_points] = 0
+    return np.unique(label, return_inverse=True)[1].reshape(label.shape)
+
+
+def write(name: str, header: list[str], rows: Iterable[Iterable]) -> None:
+    target = HERE / "results" / f"{name}.csv"
+    target.parent.mkdir(exist_ok=True)
+    temporary = target.with_suffix(".partial")
+    with temporary.open("w", newline="") as file:
+        csv.writer(file, lineterminator="\n").writerows([header, *rows])
+    temporary.replace(target)
+
+
+def main() -> None:
+    began = time.time()
+    cases = [load(number) for number in range(45)]
+    setup = np.array([next(g for g, (a, b) in enumerate(GROUPS) if a <= i <= b) for i in range(45)])
+    near = np.array([case.touching for case in cases])
+    print(
+        f"{len(cases)} frames, {len(GROUPS)} set-ups, {near.sum()} with touching objects, {time.time() - began:.0f} s"
+    )
+
+    grid = list(itertools.product(COLOUR_WEIGHTS, CENTRES, SLOPES))
+    scores = np.zeros((len(grid), len(cases)))
+    for k, (weight, centre, slope) in enumerate(grid):
+        for i, case in enumerate(cases):
+            tree, found = case.trees[weight]
+            tree = calibrated(tree, centre, slope)
+            scores[k, i] = case.score_cut(tree, found, optimal_cut(tree, VALUE.values(tree, case.frame)))
+
+    chosen = {g: int(scores[:, setup != g].mean(axis=1).argmax()) for g in range(len(GROUPS))}
+    arms: dict[str, np.ndarray] = {
+        "optimal cut, constants held out": np.array([scores[chosen[setup[i]], i] for i in range(45)]),
+        "optimal cut, constants of all frames": scores[scores.mean(axis=1).argmax()],
+    }
+    unlabelled, unlabelled_best, best_node = [], [], []
+    for case in cases:
+        for weight, sink in ((NOTES_COLOUR, unlabelled), (0.4, unlabelled_best)):
+            tree, found = case.trees[weight]
+            tree = without_labels(tree)
+            sink.append(case.score_cut(tree, found, optimal_cut(tree, VALUE.values(tree, case.frame))))
+        tree, found = case.trees[0.4]
+        pixels = tree.accumulate_pixels(found.own & ~case.ignored)
+        recall = []
+        for k in range(1, case.truth.max() + 1):
+            inside = tree.accumulate_pixels((case.truth == k) & found.own)
+            recall.append((inside / (pixels + (case.truth == k).sum() - inside)).max())
+        best_node.append(np.mean(recall))
+    arms["optimal cut, no labels used (colour 0.6)"] = np.array(unlabelled)
+    arms["optimal cut, no labels used (colour 0.4)"] = np.array(unlabelled_best)
+    arms["floor: plane + components"] = np.array([c.score(components(c)) for c in cases])
+    arms["floor: plane + components cut at 1 cm steps"] = np.array([c.score(components(c, 0.01)) for c in cases])
+    arms["floor: one blob"] = np.array([c.score(components(c) > 0) for c in cases])
+    arms["IoU of the best node of the tree, mean over objects"] = np.array(best_node)
+
+    sampled = []
+    for name, sampler in SAMPLERS.items():
+        rows = []
+        for i, case in enumerate(cases):
+            weight, centre, slope = grid[chosen[setup[i]]]
+            tree, found = case.trees[weight]
+            tree = calibrated(tree, centre, slope)
+            w = VALUE.values(tree, case.frame)
+            sample = sampler.sample(np.random.default_rng((1, i)), tree, w, 10)
+            objects = [cut[found.is_object[cut]] for cut in sample.cuts]
+            q = [case.score_cut(tree, found, cut) for cut in sample.cuts]
+            distinct = len({o.tobytes() for o in objects})
+            rows.append((np.mean(q), np.max(q), np.mean([len(o) for o in objects]), distinct))
+        table = np.array(rows)
+        arms[f"samples, {name}: mean of 10"] = table[:, 0]
+        arms[f"samples, {name}: best of 10"] = table[:, 1]
+        sampled.append([name, *np.round(table[:, 2:].mean(axis=0), 2)])
+
+    print(f"\n{'objects quality, mean':58s} all   touching  apart")
+    summary = [[n, *(f"{x:.3f}" for x in (v.mean(), v[near].mean(), v[~near].mean()))] for n, v in arms.items()]
+    for name, a, b, c in summary:
+        print(f"{name:58s} {a}  {b}     {c}")
+    print(
+        "\nsampler                    objects a sample, distinct sets of objects in 10 (truth: "
+        f"{np.mean([c.truth.max() for c in cases]):.2f} objects)"
+    )
+    for name, objects, distinct in sampled:
+        print(f"{name:26s} {objects:5.2f} {distinct:5.2f}")
+    print("\nconstants (colour weight, centre, slope) fitted without each set-up:")
+    for g, (a, b) in enumerate(GROUPS):
+        print(f"  learn{a}-{b}: {grid[chosen[g]]}")
+    print(f"  on all frames: {grid[int(scores.mean(axis=1).argmax())]}")
+    print(f"{time.time() - began:.0f} s")
+
+    write("summary", ["arm", "all", "touching", "apart"], summary)
+    write("samplers", ["sampler", "objects", "distinct_of_10"], sampled)
+    names = list(arms)
+    write(
+        "frames",
+        ["frame", "set_up", "touching", "objects", *names],
+        (
+            [c.name, int(setup[i]), int(near[i]), int(c.truth.max()), *(f"{arms[n][i]:.3f}" for n in names)]
+            for i, c in enumerate(cases)
+        ),
+    )
+    write(
+        "constants",
+        ["set_up", "frames", "colour_weight", "centre", "slope"],
+        ([g, f"learn{a}-{b}", *grid[chosen[g]]] for g, (a, b) in enumerate(GROUPS)),
+    )
+
+
+if __name__ == "__main__":
+    main()
