@@ -76,9 +76,9 @@ def _override(config: dict[str, Any], text: str) -> None:
     table = config
     for part in parts[:-1]:
         inner = table.get(part, {})
-        table[part] = {"component": inner} if isinstance(inner, str) else dict(inner)
         if not isinstance(inner, (str, Mapping)):
             raise InputError(f"override {text!r}: {part} is {inner!r}, which has no fields")
+        table[part] = {"component": inner} if isinstance(inner, str) else dict(inner)
         table = table[part]
     table[parts[-1]] = _value(value.strip())
 

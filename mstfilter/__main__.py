@@ -1,0 +1,5 @@
+"""``python -m mstfilter``: the command line."""
+
+from mstfilter.cli import main
+
+main()

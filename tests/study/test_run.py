@@ -1,0 +1,212 @@
+"""Runs: folders, resuming, reproducibility, and the presets on small real pipelines."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from mstfilter import registry
+from mstfilter.errors import InputError
+from mstfilter.presets import build_filter, describe_filter, load_config
+from mstfilter.resources import preset_names
+from mstfilter.scene.formats.folder import RecordingWriter
+from mstfilter.scene.quality import weighted_coverage
+from mstfilter.scene.recording import Recording
+from mstfilter.study.run import execute
+from mstfilter.study.run_folder import RunFolder
+from tests.scene.scenes import CAMERA, GRID, table_scene
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory):
+    """Three pauses; box 1 slides 2 voxels to the right between them."""
+    path = tmp_path_factory.mktemp("recordings") / "slide"
+    rng = np.random.default_rng(0)
+    with RecordingWriter(path, CAMERA, GRID) as writer:
+        for index, shift in enumerate((0, 1, 2, 3, 4)):
+            rgb, depth, labels = table_scene(shift, rng)
+            writer.add_frame(rgb, depth, index / 5, "action" if index % 2 else "static")
+            if index % 2 == 0:
+                writer.add_voxels(labels)
+    return Recording.open(path)
+
+
+def content(folder):
+    """Bytes of every file of a run but times."""
+    files = sorted(p for p in folder.rglob("*") if p.is_file() and p.name not in ("seconds.json", "report.html"))
+    return {str(p.relative_to(folder)): p.read_bytes() for p in files}
+
+
+@pytest.mark.parametrize("name", ["mst", "paper", "authors"])
+def test_every_preset_runs_and_its_description_builds_it_again(recording, tmp_path, name):
+    run = execute(recording, load_config(name), tmp_path / "run", seed=1)
+    assert run.n_pauses == 3
+    assert run.description["status"] == "done" or RunFolder.open(run.path).description["status"] == "done"
+    config = RunFolder.open(run.path).description["config"]
+    assert describe_filter(build_filter(config)) == describe_filter(build_filter(load_config(name)))
+    for t in range(3):
+        info, hypotheses = run.info(t), run.hypotheses(t)
+        assert len(hypotheses) == info["n"] == 5
+        truth = run.truth(t)
+        for k, hypothesis in enumerate(hypotheses):
+            assert info["quality"]["objects"][k] == weighted_coverage(hypothesis.labels, truth)
+        assert sum(info["weights"]) == pytest.approx(1.0)
+        assert set(run.seconds(t)) >= {"proposal", "update"}
+    rows = (run.path / "metrics.csv").read_text().splitlines()
+    assert len(rows) == 1 + 15
+    # The two boxes stand apart: anything that works finds them.
+    assert np.mean(run.info(2)["quality"]["objects"]) > 0.6
+
+
+def test_the_same_seed_gives_the_same_bytes(recording, tmp_path):
+    from mstfilter.scene import memo
+
+    execute(recording, load_config("mst"), tmp_path / "a", seed=7)
+    memo.clear()
+    execute(Recording.open(recording.path), load_config("mst"), tmp_path / "b", seed=7)
+    a, b = content(tmp_path / "a"), content(tmp_path / "b")
+    assert a.keys() == b.keys()
+    assert [k for k in a if a[k] != b[k]] == []
+    execute(recording, load_config("mst"), tmp_path / "c", seed=8)
+    c = content(tmp_path / "c")
+    assert any(a[k] != c[k] for k in a if k.endswith("hypotheses.npz"))
+
+
+@pytest.mark.parametrize("stop", [0, 1, 2])
+def test_an_interrupted_run_goes_on_to_the_same_result(recording, tmp_path, stop):
+    execute(recording, load_config("mst"), tmp_path / "whole", seed=2)
+
+    def interrupt(progress):
+        if progress.done == stop and not (tmp_path / "stopped").exists():
+            (tmp_path / "stopped").touch()
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        execute(recording, load_config("mst"), tmp_path / "part", seed=2, progress=interrupt)
+    left = RunFolder.open(tmp_path / "part")
+    assert left.n_pauses == stop
+    (tmp_path / "part" / "pauses" / f".{stop:03d}.partial").mkdir(exist_ok=True)  # what a kill leaves behind
+    execute(recording, load_config("mst"), tmp_path / "part", seed=2)
+    whole, part = content(tmp_path / "whole"), content(tmp_path / "part")
+    assert whole.keys() == part.keys()
+    assert [k for k in whole if whole[k] != part[k]] == []
+
+
+def test_a_folder_of_another_run_is_refused(recording, tmp_path):
+    execute(recording, load_config("mst"), tmp_path / "run", seed=2)
+    before = content(tmp_path / "run")
+    with pytest.raises(InputError, match=r"its seed differs \(2 there, 3 now\)"):
+        execute(recording, load_config("mst"), tmp_path / "run", seed=3)
+    with pytest.raises(InputError, match=r"its config differs \(n: 5 there, 4 now\)"):
+        execute(recording, load_config("mst", ["n=4"]), tmp_path / "run", seed=2)
+    assert content(tmp_path / "run") == before
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "precious.txt").write_text("x")
+    with pytest.raises(InputError, match="not an empty folder"):
+        execute(recording, load_config("mst"), tmp_path / "other", seed=3)
+
+
+def test_broken_input_makes_no_folder(recording, tmp_path):
+    broken = tmp_path / "broken"
+    shutil.copytree(recording.path, broken)
+    image = broken / "depth" / "000004.png"
+    image.write_bytes(image.read_bytes()[:-50])
+    with pytest.raises(InputError, match="truncated"):
+        execute(Recording.open(broken), load_config("mst"), tmp_path / "run")
+    with pytest.raises(InputError, match="n is 0"):
+        execute(recording, load_config("mst", ["n=0"]), tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_failing_component_leaves_whole_pauses(recording, tmp_path):
+    source = tmp_path / "mine.py"
+    source.write_text(
+        "from dataclasses import dataclass\n"
+        "from mstfilter.tracking.transition import IdentityTransition\n"
+        "from mstfilter.smc.interfaces import Transition\n"
+        "@dataclass(frozen=True)\n"
+        "class Breaks(Transition):\n"
+        "    at: int = 2\n"
+        "    def predict(self, rng, population, observation):\n"
+        "        if observation.index == self.at:\n"
+        "            raise RuntimeError('broke')\n"
+        "        return population\n"
+    )
+    config = load_config("mst", [f"transition={source}:Breaks"])
+    with pytest.raises(RuntimeError, match="broke"):
+        execute(recording, config, tmp_path / "run", allow_files=True)
+    run = RunFolder.open(tmp_path / "run")
+    assert run.n_pauses == 2
+    assert run.description["status"] == "failed"
+    assert run.description["config"]["transition"]["component"] == f"{source}:Breaks"
+    with pytest.raises(InputError, match="not loaded here"):
+        load_config("mst", [f"transition={source}:Breaks"], allow_files=False)
+
+
+OVERRIDES = {
+    "resampler=sistematic": "did you mean systematic",
+    "transition.rule=mzt": "there is no rule",
+    "update.etaa=3": "did you mean eta",
+    "update.eta=many": "update.eta is 'many'",
+    "n=-2": "n is -2",
+    "colour=blue": "no field 'colour'",
+    "update": "path=value",
+    "n.x=3": "has no fields",
+    "update.crossover.mode_filter.window=4": "window is 4",
+    "resampler=./nowhere.py:Mine": "does not exist",
+}
+
+
+@pytest.mark.parametrize("override", OVERRIDES)
+def test_wrong_overrides_are_one_clear_error(override):
+    with pytest.raises(InputError) as caught:
+        build_filter(load_config("mst", [override]), allow_files=True)
+    assert OVERRIDES[override] in " ".join([caught.value.message, *caught.value.hints])
+
+
+def test_overrides_change_what_they_name():
+    filter = build_filter(
+        load_config(
+            "mst", ["n=7", "resampler=residual", "update.eta=2", "transition.rule=paper", "update.free_space=none"]
+        )
+    )
+    assert filter.n == 7
+    assert type(filter.resampler).__name__ == "Residual"
+    assert filter.update.eta == 2
+    assert type(filter.transition.rule).__name__ == "PaperRule"
+    assert type(filter.update.free_space).__name__ == "NoFreeSpace"
+    assert filter.update.crossover == build_filter(load_config("mst")).update.crossover
+    with pytest.raises(InputError, match="there is no preset 'best'"):
+        load_config("best")
+
+
+@pytest.mark.parametrize("kind", registry.COMPONENTS)
+def test_every_registered_component_can_be_built_and_described(kind):
+    for name in registry.COMPONENTS[kind]:
+        component = registry.build(kind, name)
+        described = json.loads(json.dumps(registry.describe(component)))
+        assert described["component"] == name
+        assert registry.build(kind, described) == component
+
+
+def test_entry_points_add_components(monkeypatch):
+    @dataclass(frozen=True)
+    class Entry:
+        name: str
+        value: str
+
+    monkeypatch.setattr(
+        registry, "entry_points", lambda group: [Entry("resampler.mine", "mstfilter.smc.resampling:Residual")]
+    )
+    assert type(registry.build("resampler", "mine")).__name__ == "Residual"
+    assert "mine" not in registry.known("trigger")
+
+
+def test_presets_are_complete():
+    assert preset_names() == ["authors", "mst", "paper"]
+    for name in preset_names():
+        assert not build_filter(load_config(name)).properly_weighted

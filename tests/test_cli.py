@@ -1,0 +1,181 @@
+"""The command line: exit codes, messages, a light start, and the default path without open3d and torch."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from mstfilter.cli import main
+from mstfilter.study.run_folder import RunFolder
+from tests.scene.test_recording import FAULTS, write
+
+HEAVY = ("torch", "open3d", "cv2", "scipy", "higra", "mujoco", "matplotlib")
+
+
+def call(*arguments, capsys):
+    """Exit code, standard output and standard error of a command."""
+    code = 0
+    try:
+        main([str(a) for a in arguments])
+    except SystemExit as end:
+        code = end.code or 0
+    out = capsys.readouterr()
+    return code, out.out, out.err
+
+
+@pytest.fixture
+def recording(tmp_path):
+    return write(tmp_path / "slide")
+
+
+def test_run_and_report(recording, tmp_path, capsys):
+    run = tmp_path / "run"
+    code, out, err = call("run", recording, "n=3", "--out", run, "--seed", 4, capsys=capsys)
+    assert code == 0, err
+    assert "pause 2     3 hypotheses" in out
+    assert RunFolder.open(run).description["seed"] == 4
+    report = (run / "report.html").read_text()
+    assert "<html" in report
+    code, out, err = call("report", run, "--out", tmp_path / "r.html", "--export", tmp_path / "x", capsys=capsys)
+    assert code == 0, err
+    assert (tmp_path / "r.html").is_file()
+    assert list((tmp_path / "x").rglob("*.ply"))
+    assert list((tmp_path / "x").rglob("*.png"))
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_bad_recordings_are_one_clear_error(recording, tmp_path, capsys, fault):
+    """One line `error:`, exit code 2, no traceback, no half-written run folder."""
+    FAULTS[fault][0](recording)
+    code, out, err = call("run", recording, "--out", tmp_path / "run", capsys=capsys)
+    assert code == 2
+    lines = [line for line in err.splitlines() if line.strip()]
+    assert lines[0].startswith("error: "), err
+    assert all(line.startswith("hint: ") for line in lines[1:]), err
+    assert "Traceback" not in err + out
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("run", "nowhere"), "does not exist"),
+        (("run", "nowhere", "resampler=sistematic"), "there is no resampler 'sistematic'"),
+        (("run", "nowhere", "--preset", "best"), "there is no preset 'best'"),
+        (("simulate", "kitchen", "out"), "kitchen"),
+        (("report", "nowhere"), "not a run folder"),
+        (("list", "spoons"), "there is no kind"),
+    ],
+)
+def test_wrong_arguments(tmp_path, monkeypatch, capsys, arguments, message):
+    monkeypatch.chdir(tmp_path)
+    code, _, err = call(*arguments, capsys=capsys)
+    assert code == 2
+    assert err.startswith("error: ")
+    assert message in err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_unknown_commands_are_usage_errors(capsys):
+    code, _, err = call("florp", capsys=capsys)
+    assert code == 2
+    assert "florp" in err
+
+
+def test_list_shows_components_and_fields(capsys):
+    code, out, _ = call("list", "resamplers", capsys=capsys)
+    assert code == 0
+    assert "systematic" in out
+    assert "keep_weights" in out
+    assert "scheme=multinomial" in out
+    code, out, _ = call("list", capsys=capsys)
+    assert {"presets:", "families:", "transition:", "sampler:"} <= set(out.splitlines())
+
+
+def test_a_demo_folder_with_foreign_files_is_left_alone(tmp_path, capsys):
+    (tmp_path / "thesis.tex").write_text("x")
+    code, _, err = call("demo", "--out", tmp_path, capsys=capsys)
+    assert code == 2
+    assert "thesis.tex" in err
+    assert (tmp_path / "thesis.tex").exists()
+
+
+def python(code, *arguments):
+    return subprocess.run(
+        [sys.executable, "-c", code, *map(str, arguments)], capture_output=True, text=True, timeout=300
+    )
+
+
+@pytest.mark.parametrize("arguments", [["--help"], ["florp"], ["run", "x", "resampler=none-such"], ["run", "--help"]])
+def test_a_light_start(arguments):
+    """Help and unknown names answer before any heavy library is imported."""
+    done = python(
+        "import sys\n"
+        "from mstfilter.cli import main\n"
+        "try: main(sys.argv[1:])\n"
+        "except SystemExit: pass\n"
+        f"print('heavy:', sorted(set({HEAVY!r}) & set(sys.modules)))",
+        *arguments,
+    )
+    assert "heavy: []" in done.stdout, done.stdout + done.stderr
+
+
+def test_the_default_path_needs_neither_open3d_nor_torch(recording, tmp_path):
+    """A run with the default preset and a report, with both made unimportable."""
+    done = python(
+        "import sys\n"
+        "class Blocked:\n"
+        "    def find_spec(self, name, path=None, target=None):\n"
+        "        if name.partition('.')[0] in ('open3d', 'torch'):\n"
+        "            raise ImportError(f'{name} is blocked')\n"
+        "sys.meta_path.insert(0, Blocked())\n"
+        "from mstfilter.cli import main\n"
+        "main(sys.argv[1:])",
+        "run",
+        recording,
+        "--out",
+        tmp_path / "run",
+    )
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "run" / "report.html").is_file()
+
+
+def test_a_kill_at_any_moment_leaves_a_run_that_resumes(recording, tmp_path):
+    """The process is killed mid-run; the same command ends with the same bytes as an undisturbed run."""
+    import time
+
+    from tests.study.test_run import content
+
+    command = [sys.executable, "-m", "mstfilter", "run", str(recording), "--no-report"]
+    subprocess.run([*command, "--out", tmp_path / "whole"], check=True, capture_output=True, timeout=300)
+    part = tmp_path / "part"
+    process = subprocess.Popen([*command, "--out", part], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    deadline = time.monotonic() + 120
+    while not (part / "pauses" / "000").exists() and process.poll() is None and time.monotonic() < deadline:
+        time.sleep(0.01)
+    process.kill()
+    process.wait()
+    subprocess.run([*command, "--out", part], check=True, capture_output=True, timeout=300)
+    whole, resumed = content(tmp_path / "whole"), content(part)
+    assert whole.keys() == resumed.keys()
+    assert [k for k in whole if whole[k] != resumed[k]] == []
+
+
+def test_convert(recording, tmp_path, capsys):
+    pairs = tmp_path / "pairs"
+    pairs.mkdir()
+    for index in (0, 4):
+        shutil.copy(recording / "rgb" / f"{index:06d}.png", pairs / f"v{index}_rgb.png")
+        shutil.copy(recording / "depth" / f"{index:06d}.png", pairs / f"v{index}_depth.png")
+    (pairs / "info.json").write_text('{"K": [131, 131, 79.5, 59.5], "depth_scale_m": 0.001}')
+    code, _, err = call("convert", pairs, tmp_path / "out", "--frames", "v4,v0", capsys=capsys)
+    assert code == 0, err
+    assert (tmp_path / "out" / "manifest.json").is_file()
+    code, _, err = call("convert", pairs, tmp_path / "out", capsys=capsys)
+    assert code == 2
+    assert "not an empty folder" in err
+    assert Path(tmp_path / "out" / "manifest.json").is_file()
