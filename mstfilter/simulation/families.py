@@ -63,7 +63,7 @@ class SceneFamily:
     width, height : int
         Of the images, pixels. The camera is a Kinect's (K = 525 at 640 x 480), scaled.
     supersample : bool
-        Smooth the edges of objects with four rays a pixel.
+        Smooth the edges of objects with three rays a pixel.
     workspace_x, workspace_y, workspace_z : float
         Edges of the voxel grid, metres; it is centred on the table and stands on it.
     voxel_size : float

@@ -283,8 +283,8 @@ def glaze(
     image = _canvas(width, height, colours[0])
     h, w = image.shape[:2]
     if motif == 1:
-        for at in (0.16, 0.26, 0.8):
-            cv2.rectangle(image, (0, int(at * h)), (w, int((at + 0.06) * h)), colours[1], -1)
+        for band in (0.16, 0.26, 0.8):
+            cv2.rectangle(image, (0, int(band * h)), (w, int((band + 0.06) * h)), colours[1], -1)
     elif motif == 2:
         columns = max(3, round(width / 0.03))
         for i in range(columns):

@@ -24,6 +24,7 @@ __all__ = ["Renderer", "View", "seen_texel"]
 _CASTERS = (OBJECT_GROUP, FINGER_GROUP)
 _BIAS = 0.0012  # metres off the surface, against shadows on itself
 _MAP_LOW, _MAP_HIGH = np.array([-0.62, -0.55]), np.array([0.62, 0.66])
+_OFFSETS = ((-0.34, 0.14), (0.34, -0.14))  # of further rays within a pixel on an edge
 _FINGER_COLOUR = np.array([0.09, 0.095, 0.105], np.float32)
 
 
@@ -55,15 +56,28 @@ def seen_texel(camera: Camera) -> float:
 
 
 class _Map:
-    """Visibility of lights from a raster of points on the table."""
+    """Light on the table from some lamps, at a raster of its points."""
 
-    def __init__(self, spacing: float) -> None:
-        self._spacing = spacing
+    def __init__(self, spacing: float, lights: np.ndarray) -> None:
+        self._spacing, self._lights = spacing, lights
         nx, ny = (np.ceil((_MAP_HIGH - _MAP_LOW) / spacing).astype(int) + 1).tolist()
         x, y = _MAP_LOW[0] + spacing * np.arange(nx), _MAP_LOW[1] + spacing * np.arange(ny)
         grid = np.meshgrid(x, y, indexing="ij")
-        self.points = np.stack([grid[0].ravel(), grid[1].ravel(), np.full(nx * ny, _BIAS)], axis=1)
+        self._rays = np.stack([grid[0].ravel(), grid[1].ravel(), np.full(nx * ny, _BIAS)], axis=1) - lights[:, None]
+        length = np.linalg.norm(self._rays, axis=2, keepdims=True)
+        self._unit = (self._rays / length).astype(np.float32)
+        self._cosine = -self._unit[:, :, 2]
         self.shape = (nx, ny)
+
+    def shine(self, world: World, centres: np.ndarray, radii: np.ndarray) -> np.ndarray:
+        """(n,) mean over lights of cosine times visibility; spheres bound all that throws a shadow."""
+        total = self._cosine.sum(axis=0)
+        for light, rays, unit, cosine in zip(self._lights, self._rays, self._unit, self._cosine, strict=True):
+            maybe = np.flatnonzero(_meets(unit, centres - light, radii))
+            _, distance, _ = world.cast(light, rays[maybe], _CASTERS)
+            dark = maybe[(distance >= 0) & (distance <= 1.0 - 1e-6)]
+            total[dark] -= cosine[dark]
+        return total / len(self._lights)
 
     def sample(self, values: np.ndarray, xy: np.ndarray) -> np.ndarray:
         """Bilinear values (n,) at places (n, 2) of the table; the border's value beyond it."""
@@ -75,6 +89,13 @@ class _Map:
         flat = flat + self.shape[1]
         high = values[flat] * (1 - f[:, 1]) + values[flat + 1] * f[:, 1]
         return low * (1 - f[:, 0]) + high * f[:, 0]
+
+
+def _meets(unit: np.ndarray, centres: np.ndarray, radii: np.ndarray) -> np.ndarray:
+    """(n,) bool: rays of directions (n, 3) from the origin that meet one of the spheres."""
+    along = unit @ centres.T.astype(np.float32)
+    least = ((centres**2).sum(axis=1) - radii**2).astype(np.float32)
+    return ((along > 0) & (along * along > least)).any(axis=1) | bool((least < 0).any())
 
 
 class Renderer:
@@ -91,7 +112,7 @@ class Renderer:
     camera : Camera
         With a pose.
     supersample : bool
-        Four rays for pixels on edges.
+        Further rays for pixels on edges.
     """
 
     def __init__(
@@ -106,12 +127,12 @@ class Renderer:
         self._steepness = np.linalg.norm(self._directions, axis=1)
         self._unit = (self._directions / self._steepness[:, None]).astype(np.float32)
         fine = max(0.004, 2.0 / float(camera.K[0, 0]))
-        self._lamp_map, self._sky_map = _Map(fine), _Map(2 * fine)
+        self._lamp_map, self._sky_map = _Map(fine, room.lamp), _Map(2 * fine, room.sky)
         self._background()
 
     def _background(self) -> None:
         """The room without objects: constant from frame to frame but for the light on the table."""
-        geom, z, normal = self.world.cast(self._eye, self._directions, (ROOM_GROUP,), normals=True)
+        geom, z, normal = self.world.cast(self._eye, self._directions, (ROOM_GROUP,))
         points = self._eye + self._directions * z[:, None]
         self._room_depth = np.where(geom >= 0, z, np.nan).astype(np.float32)
         self._room_slant = self._slant(np.arange(len(z)), normal)
@@ -151,29 +172,26 @@ class Renderer:
         light = 0.5 * self.room.sky_colour + self.room.ambient + self.room.lamp_colour * cosine[:, None] * fall
         return np.nan_to_num(light).astype(np.float32)
 
-    def _shining(self, lights: np.ndarray, points: np.ndarray, normal: np.ndarray | None) -> np.ndarray:
-        """(n,) mean over lights of cosine times visibility; the normal None stands for straight up."""
+    def _shining(self, lights: np.ndarray, points: np.ndarray, normal: np.ndarray) -> np.ndarray:
+        """(n,) mean over lights of cosine times visibility."""
         total = np.zeros(len(points), np.float32)
         for light in lights:
             ray = points - light
             length = np.linalg.norm(ray, axis=1)
-            cosine = (-ray[:, 2] if normal is None else -(ray * normal).sum(axis=1)) / length
+            cosine = -(ray * normal).sum(axis=1) / length
             lit = np.flatnonzero(cosine > 0.0)
             _, distance, _ = self.world.cast(light, ray[lit], _CASTERS)
             visible = (distance < 0) | (distance > 1.0 - 1e-6)
             total[lit[visible]] += cosine[lit[visible]]
         return total / len(lights)
 
-    def _near(self) -> np.ndarray:
-        """Pixels whose ray comes near an object, the finger or the arm."""
-        model, data = self.world.model, self.world.data
-        found = np.zeros(len(self._unit), bool)
-        for geom in np.flatnonzero(self.world.geom_object > 0):
-            centre = (data.geom_xpos[geom] - self._eye).astype(np.float32)
-            radius = float(model.geom_rbound[geom]) + 0.002
-            along = self._unit @ centre
-            found |= (along > 0) & (along * along > centre @ centre - radius**2)
-        return np.flatnonzero(found)
+    def _bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Centres (k, 3) and radii (k,) of spheres that bound objects, finger and arm."""
+        world = self.world
+        limbs = np.flatnonzero(world.geom_object == FINGER_ID)
+        centres = np.concatenate([world.positions(), world.data.geom_xpos[limbs]])
+        radii = np.concatenate([[shape.radius for shape in world.shapes], world.model.geom_rbound[limbs]])
+        return centres, radii + 0.002
 
     def render(self) -> View:
         """The picture of the world as it is now (after `World.forward`)."""
@@ -181,14 +199,15 @@ class Renderer:
         depth, slant = self._room_depth.copy(), self._room_slant.copy()
         normal = self._room_normal.copy()
         instance = np.zeros(h * w, np.uint8)
-        lamp = self._shining(self.room.lamp, self._lamp_map.points, None)
-        sky = self._shining(self.room.sky, self._sky_map.points, None)
+        centres, radii = self._bounds()
+        lamp = self._lamp_map.shine(self.world, centres, radii)
+        sky = self._sky_map.shine(self.world, centres, radii)
         light = self._room_light.copy()
         light[self._on_table] = self._table_light(lamp, sky, self._table_xy)
         colour = self._room_albedo * light
 
-        near = self._near()
-        geom, z, found = self.world.cast(self._eye, self._directions[near], _CASTERS, normals=True)
+        near = np.flatnonzero(_meets(self._unit, centres - self._eye, radii))
+        geom, z, found = self.world.cast(self._eye, self._directions[near], _CASTERS)
         front = (geom >= 0) & ~(z > depth[near])
         hit, geom, z, found = near[front], geom[front], z[front], found[front]
         depth[hit], normal[hit], slant[hit] = z, found, self._slant(hit, found)
@@ -246,7 +265,7 @@ class Renderer:
     def _smooth(
         self, colour: np.ndarray, instance: np.ndarray, normal: np.ndarray, lamp: np.ndarray, sky: np.ndarray
     ) -> None:
-        """Replace pixels on edges by the mean of four rays."""
+        """Mix further rays into pixels on edges."""
         h, w = self.camera.height, self.camera.width
         ids, n = instance.reshape(h, w), normal.reshape(h, w, 3)
         edge = np.zeros((h, w), bool)
@@ -262,11 +281,11 @@ class Renderer:
         total = np.zeros((len(pixels), 3), np.float32)
         row, column = np.divmod(pixels, w)
         K, turn = self.camera.K, self.camera.pose.as_matrix()[:3, :3]
-        for dv, du in ((-0.25, -0.25), (-0.25, 0.25), (0.25, -0.25), (0.25, 0.25)):
+        for dv, du in _OFFSETS:
             y = (row + dv - K[1, 2]) / K[1, 1]
             x = (column + du - K[0, 2]) / K[0, 0]
             ray = np.stack([x, y, np.ones_like(x)], axis=1) @ turn.T
-            geom, z, found = self.world.cast(self._eye, ray, normals=True)
+            geom, z, found = self.world.cast(self._eye, ray)
             points = self._eye + ray * z[:, None]
             thing = self.world.geom_object[geom] > 0
             part = np.empty_like(total)
@@ -277,8 +296,8 @@ class Renderer:
             table = (geom[room] == 0) & (found[room][:, 2] > 0.5)
             light[table] = self._table_light(lamp, sky, points[room][table, :2])
             part[room] = albedo * light
-            total += part / 4
-        colour[pixels] = total
+            total += part
+        colour[pixels] = (colour[pixels] + total) / (1 + len(_OFFSETS))
 
 
 def _round_off(shape: Shape, points: np.ndarray, normal: np.ndarray, plain: np.ndarray) -> np.ndarray:

@@ -78,8 +78,8 @@ def draw_room(rng: np.random.Generator, texel: float) -> Room:
     table = srgb_to_linear(_table_top(rng, texel).astype(np.float32) / 255.0)
     side = -1.0 if rng.uniform() < 0.5 else 1.0
     centre = np.array([side * rng.uniform(0.35, 0.8), rng.uniform(-0.7, 0.1), rng.uniform(1.3, 1.7)])
-    spread = rng.uniform(0.10, 0.16)
-    corners = np.array([[1, 1, 0], [1, -1, 0], [-1, -1, 0], [-1, 1, 0]]) * spread
+    spread = rng.uniform(0.06, 0.10)
+    corners = np.array([[1, 1, 0], [1, -1, 0], [-1, -1, 0], [-1, 1, 0], [0, 0, 0]]) * spread
     angle = np.arange(5) * (2 * np.pi / 5) + rng.uniform(0, 2 * np.pi)
     ring = np.stack([1.6 * np.cos(angle), 1.6 * np.sin(angle), np.full(5, 1.5)], axis=1)
     warm = np.array([1.0, rng.uniform(0.93, 1.0), rng.uniform(0.82, 0.98)])

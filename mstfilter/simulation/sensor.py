@@ -1,6 +1,6 @@
 """What a structured-light sensor makes of a noiseless picture.
 
-Depth: each pixel looks up to a pixel aside; Gaussian noise in disparity, rounded to eighths of a pixel of a
+Depth: pixels on depth edges look a little aside; Gaussian noise in disparity, rounded to eighths of a pixel of a
 Kinect's own raster (f = 525 pixels, baseline 75 mm), which gives sigma = 1.85 mm (z / m)^2 as measured on
 real table tops; no reading at some depth edges, on surfaces seen at a grazing angle, or out of range.
 Colour: exposure, a slight blur of the optics, photon noise, the display curve.
@@ -38,9 +38,10 @@ class DepthSensor:
     disparity_noise : float
         Standard deviation in eighths of a pixel, before rounding.
     lateral : float
-        Standard deviation of the shift aside, pixels of the sensor's own raster.
+        Standard deviation of the shift aside on depth edges, pixels of the sensor's own raster.
     edge_dropout : float
-        Probability of no reading within a pixel of a depth edge.
+        Probability of no reading within a pixel of a depth edge. Chosen so that on and around objects as
+        many readings are missing as on 45 real frames (4.3 %).
     edge_step : float
         Relative difference of depth between neighbours that makes an edge.
     grazing : float
@@ -53,7 +54,7 @@ class DepthSensor:
     baseline: float = 0.075
     disparity_noise: float = 0.5
     lateral: float = 0.5
-    edge_dropout: float = 0.28
+    edge_dropout: float = 0.30
     edge_step: float = 0.02
     grazing: float = 1.4
     nearest: float = 0.4
@@ -87,10 +88,12 @@ class DepthSensor:
             Cosine of the angle of incidence.
         """
         h, w = depth.shape
-        # The raster is that of 640 pixels a row; smaller images are made from it.
-        shift = self.lateral * w / 640.0
-        rows = np.arange(h)[:, None] + np.rint(rng.normal(0.0, shift, (h, w))).astype(np.int64)
-        columns = np.arange(w)[None, :] + np.rint(rng.normal(0.0, shift, (h, w))).astype(np.int64)
+        edge = self._edges(depth)
+        # The raster is that of 640 pixels a row; smaller images are made from it. Looking aside frays
+        # edges; within a surface it is part of the axial noise, which was measured on tilted tables.
+        shift = self.lateral * w / 640.0 * edge
+        rows = np.arange(h)[:, None] + np.rint(rng.standard_normal((h, w)) * shift).astype(np.int64)
+        columns = np.arange(w)[None, :] + np.rint(rng.standard_normal((h, w)) * shift).astype(np.int64)
         at = np.clip(rows, 0, h - 1), np.clip(columns, 0, w - 1)
         z, cosine = depth[at], slant[at]
         scale = 8.0 * self.focal * self.baseline
@@ -98,7 +101,7 @@ class DepthSensor:
         with np.errstate(invalid="ignore", divide="ignore"):
             units = np.rint(scale / z + noise)
             reading = scale / np.maximum(units, 1.0)
-        lost = self._edges(depth) & (rng.uniform(size=(h, w)) < self.edge_dropout)
+        lost = edge & (rng.uniform(size=(h, w)) < self.edge_dropout)
         lost |= (cosine < np.cos(self.grazing)) | (reading < self.nearest) | (reading > self.farthest)
         return np.where(lost | ~np.isfinite(z), np.nan, reading).astype(np.float32)
 

@@ -10,13 +10,13 @@ bounding box, z up in its main pose), the poses in which it rests, its mass and 
 (1, 'can')
 
 Sizes follow the objects of the YCB set (Calli et al., "The YCB object and model set", 2015) as commonly
-quoted; each draw scales them by up to 10 %. Walls of bowl and mug are 7 mm, thicker than the real ones,
-so that they leave a trace in a grid of 1 cm voxels.
+quoted; each draw scales them by up to 10 %. Walls of bowl and mug are 1 cm, thicker than the real ones: a
+thinner wall falls between the centres of 1 cm voxels and would be missing from the truth.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
@@ -28,7 +28,7 @@ from mstfilter.simulation.solids import Piece, box, capsule, cylinder, ellipsoid
 
 __all__ = ["FAMILIES", "Shape", "draw_shape"]
 
-WALL = 0.007
+WALL = 0.010
 
 # Rest poses: which body axis points up (sign * (axis + 1)).
 UP_X, UP_Y, UP_Z, DOWN_Z = 1, 2, 3, -3
@@ -119,7 +119,7 @@ def _make(
     return Shape(family, name, moved, half, mass, print_as, rests, finish, rolling)
 
 
-def _choose(rng: np.random.Generator, table: dict[str, tuple[float, ...]]) -> tuple[str, tuple[float, ...]]:
+def _choose(rng: np.random.Generator, table: Mapping[str, tuple[float, ...]]) -> tuple[str, tuple[float, ...]]:
     name = list(table)[int(rng.integers(len(table)))]
     return name, table[name]
 
@@ -142,10 +142,10 @@ def _carton(rng: np.random.Generator, scale: Callable[[], float]) -> Shape:
 def _brick(rng: np.random.Generator, scale: Callable[[], float]) -> Shape:
     table = {"cube": (0.07, 0.07, 0.07), "brick": (0.05, 0.076, 0.10), "plank": (0.03, 0.09, 0.15)}
     name, edges = _choose(rng, table)
-    half = tuple(edge * scale() / 2 for edge in edges)
-    mass = 600.0 * 8.0 * half[0] * half[1] * half[2]
+    x, y, z = (edge * scale() / 2 for edge in edges)
+    mass = 600.0 * 8.0 * x * y * z
     rests = ((UP_X, 0.5), (UP_Y, 0.3), (UP_Z, 0.2))
-    return _make("brick", name, [box(half)], mass, "box", rests, ("wood", "cloth", "speckle"))
+    return _make("brick", name, [box((x, y, z))], mass, "box", rests, ("wood", "cloth", "speckle"))
 
 
 def _can(rng: np.random.Generator, scale: Callable[[], float]) -> Shape:
@@ -190,9 +190,9 @@ def _mug(rng: np.random.Generator, scale: Callable[[], float]) -> Shape:
     pieces.append(cylinder(radius - 0.5 * WALL, WALL / 2, (0, 0, WALL / 2)))
     # Half a torus, as a chain of capsules; its ends reach into the wall.
     turn = np.linspace(-np.pi / 2, np.pi / 2, 6)
-    reach, tall = 0.030, 0.32 * height
+    reach, tall = 0.032, 0.32 * height
     path = [(radius - 0.003 + reach * np.cos(a), 0.0, height / 2 + tall * np.sin(a)) for a in turn]
-    pieces += [capsule(a, b, 0.0055, plain=True) for a, b in pairwise(path)]
+    pieces += [capsule(a, b, 0.0075, plain=True) for a, b in pairwise(path)]
     return _make("mug", "mug", pieces, 0.20, "lathe", ((UP_Z, 0.85), (DOWN_Z, 0.15)), ("ceramic",))
 
 
@@ -204,8 +204,8 @@ def _ball(rng: np.random.Generator, scale: Callable[[], float]) -> Shape:
 
 def _soap(rng: np.random.Generator, scale: Callable[[], float]) -> Shape:
     # A superellipsoid |x/a|^e + |y/b|^e + |z/c|^e = 1: a bar of soap or a rounded flask.
-    name, half = _choose(rng, {"bar": (0.048, 0.032, 0.020), "flask": (0.042, 0.026, 0.075)})
-    half = np.array([h * scale() for h in half])
+    name, measures = _choose(rng, {"bar": (0.048, 0.032, 0.020), "flask": (0.042, 0.026, 0.075)})
+    half = np.array([h * scale() for h in measures])
     azimuth, height = np.linspace(-np.pi, np.pi, 24, endpoint=False), np.linspace(-np.pi / 2, np.pi / 2, 13)
     a, b = np.meshgrid(azimuth, height[1:-1])
     round_ = np.stack([np.cos(b) * np.cos(a), np.cos(b) * np.sin(a), np.sin(b)], axis=-1).reshape(-1, 3)

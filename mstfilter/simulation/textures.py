@@ -141,7 +141,7 @@ def draw_skin(rng: np.random.Generator, shape: Shape, half: int | None = None) -
         ]
     elif style == "wood":
         tone = printing.wood(rng, 0.01, 0.01)[0, 0]
-        charts = [printing.wood(rng, w, h, tuple(int(c) for c in tone)) for w, h in sizes]
+        charts = [printing.wood(rng, w, h, (int(tone[0]), int(tone[1]), int(tone[2]))) for w, h in sizes]
     elif style == "cloth":
         state = rng.bit_generator.state
         charts = []
@@ -174,7 +174,11 @@ class Atlas:
         import cv2
 
         shrink = printing.DOT / texel
-        first, width, height, texels, start = [], [], [], [], 0
+        first: list[int] = []
+        width: list[int] = []
+        height: list[int] = []
+        texels: list[np.ndarray] = []
+        start = 0
         self.base: list[int] = []
         self.gloss = [skin.gloss for skin in skins]
         for skin in skins:

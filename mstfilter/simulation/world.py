@@ -57,7 +57,7 @@ class Contact:
     depth: float
 
 
-def _numbers(values: ArrayLike) -> str:
+def _numbers(values: ArrayLike | None) -> str:
     return " ".join(repr(float(v)) for v in np.asarray(values).ravel())
 
 
@@ -100,13 +100,13 @@ def _model_xml(shapes: Sequence[Shape], arm: bool) -> str:
         )
     gains = 'kp="2500" kv="70.710678"'
     motors = "".join(f'<position joint="{a}" {gains}/>' for a in "xyz")
-    half, at = TABLE
+    half, middle = TABLE
     return f"""<mujoco>
 <compiler angle="radian"/>
 <option timestep="{TIME_STEP}" integrator="implicitfast" cone="elliptic" impratio="5"/>
 <asset>{"".join(meshes)}</asset>
 <worldbody>
-<geom type="box" size="{_numbers(half)}" pos="{_numbers(at)}" group="{ROOM_GROUP}" condim="4"
+<geom type="box" size="{_numbers(half)}" pos="{_numbers(middle)}" group="{ROOM_GROUP}" condim="4"
  friction="0.6 0.01 0.0005"/>
 <geom type="plane" size="0 0 1" pos="0 0 {FLOOR}" group="{ROOM_GROUP}" contype="0" conaffinity="0"/>
 <geom type="plane" size="0 0 1" pos="0 {WALL} 0" zaxis="0 -1 0" group="{ROOM_GROUP}" contype="0" conaffinity="0"/>
@@ -268,8 +268,8 @@ class World:
         self.forward()
 
     def cast(
-        self, origin: ArrayLike, directions: np.ndarray, groups: Sequence[int] = (0, 1, 2), normals: bool = False
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+        self, origin: ArrayLike, directions: np.ndarray, groups: Sequence[int] = (0, 1, 2)
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Rays from one point.
 
         Parameters
@@ -279,17 +279,15 @@ class World:
             Of any length.
         groups : sequence of int
             Which geoms are seen: 0 the room, 1 objects, 2 finger and arm.
-        normals : bool
-            Whether to return them.
 
         Returns
         -------
         geom (n,) int32, -1 where nothing is hit; distance (n,) in units of each direction's length; normal
-        (n, 3) or None.
+        (n, 3).
         """
         n = len(directions)
         geom, distance = np.full(n, -1, np.int32), np.full(n, -1.0)
-        normal = np.zeros((n, 3)) if normals else None
+        normal = np.zeros((n, 3))
         if n:
             seen = np.isin(np.arange(6), groups).astype(np.uint8)
             self._mj.mj_multiRay(
@@ -302,7 +300,7 @@ class World:
                 -1,
                 geom,
                 distance,
-                None if normal is None else normal.reshape(-1),
+                normal.reshape(-1),
                 n,
                 1e6,
             )

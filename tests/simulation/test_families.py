@@ -1,0 +1,56 @@
+"""Configurations: defaults hold, mistakes give one clear error."""
+
+from dataclasses import replace
+
+import pytest
+
+from mstfilter.errors import InputError
+from mstfilter.simulation.families import SCENE_FAMILIES, SceneFamily, scene_family
+
+
+def test_named_families():
+    demo, table = scene_family("demo"), scene_family("table")
+    assert (demo.image_size, demo.frames_per_clip, demo.n_actions) == ((320, 240), 8, 2)
+    assert (table.image_size, table.frames_per_clip, table.n_actions) == ((640, 480), 15, 3)
+    assert table.grid().shape == (100, 100, 50)
+    assert table.n_frames == 1 + 3 * 14
+    assert table.grid().origin[2] == 0.0
+
+
+def test_catalogues_share_no_size():
+    tuning, reported = (
+        replace(SCENE_FAMILIES["table"], catalogue="tuning"),
+        replace(SCENE_FAMILIES["table"], catalogue="reported"),
+    )
+    assert tuning.size_range[1] < reported.size_range[0]
+    assert {tuning.word_half, reported.word_half} == {0, 1}
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("n_objects_min", 0),
+        ("n_objects_max", 2),
+        ("n_twins", 9),
+        ("contact", 1.5),
+        ("catalogue", "mine"),
+        ("frames_per_clip", 1),
+        ("fps", 0.0),
+        ("push_speed", 9.0),
+        ("width", 0),
+        ("voxel_size", -0.01),
+        ("workspace_z", 9.0),
+        ("shapes", "can, teapot"),
+        ("n_candidates", 0),
+        ("fps", 30.0),
+    ],
+)
+def test_bad_fields(field, value):
+    with pytest.raises(InputError):
+        replace(SceneFamily(), **{field: value})
+
+
+def test_unknown_name_lists_what_exists():
+    with pytest.raises(InputError) as caught:
+        scene_family("kitchen")
+    assert "demo" in caught.value.hints[0]

@@ -1,0 +1,172 @@
+"""Whole recordings: determinism, truth, and that pictures and truth tell the same story."""
+
+import hashlib
+import subprocess
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from mstfilter.errors import InputError
+from mstfilter.scene.recording import Recording
+from mstfilter.scene.rendering import render
+from mstfilter.scene.voxels import VoxelGrid
+from mstfilter.simulation.families import scene_family
+from mstfilter.simulation.recorder import Scene, camera_of, simulate
+from mstfilter.simulation.shapes import FAMILIES, draw_shape
+from mstfilter.simulation.truth import label_voxels
+from mstfilter.simulation.world import FINGER_ID
+
+SMALL = replace(scene_family("demo"), width=160, height=120, frames_per_clip=6, fps=3.0)
+
+
+def digest(folder):
+    files = sorted(p for p in folder.rglob("*") if p.is_file())
+    return {str(p.relative_to(folder)): hashlib.sha256(p.read_bytes()).hexdigest() for p in files}
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory):
+    return simulate(SMALL, 3, tmp_path_factory.mktemp("sim") / "three")
+
+
+def test_same_seed_same_bytes_in_another_process_and_another_seed_differs(recording, tmp_path):
+    program = (
+        "from dataclasses import replace\n"
+        "from mstfilter.simulation.families import scene_family\n"
+        "from mstfilter.simulation.recorder import simulate\n"
+        "f = replace(scene_family('demo'), width=160, height=120, frames_per_clip=6, fps=3.0)\n"
+        f"simulate(f, 3, {str(tmp_path / 'again')!r})\n"
+    )
+    subprocess.run([sys.executable, "-c", program], check=True, timeout=120)
+    assert digest(tmp_path / "again") == digest(recording.path)
+    other = simulate(SMALL, 4, tmp_path / "other")
+    assert digest(other.path)["rgb/000000.png"] != digest(recording.path)["rgb/000000.png"]
+    assert (other.truth(0) != recording.truth(0)).any()
+
+
+def test_layout_of_the_recording(recording):
+    assert len(recording) == SMALL.n_frames == 11
+    assert recording.pauses == (0, 5, 10)
+    assert [len(clip.frames) for clip in recording.clips()] == [1, 6, 6]
+    assert recording.grid == SMALL.grid()
+    manifest = recording.manifest
+    assert manifest["seed"] == 3 and manifest["family"]["name"] == "demo" and len(manifest["objects"]) == 5
+    for pause in recording.pauses[1:]:
+        push = manifest["frames"][pause]["push"]
+        assert max(push["displacement_m"]) > SMALL.move_threshold and push["all_kept"] and push["settled"]
+    recording.check()
+
+
+def test_the_finger_is_seen_in_actions_and_away_at_pauses(recording):
+    seen = [(recording.instance(i) == FINGER_ID).sum() for i in range(len(recording))]
+    assert all(seen[p] == 0 for p in recording.pauses)
+    assert sum(n > 0 for n in seen) >= 4
+    for i in range(len(recording)):
+        np.testing.assert_array_equal(recording.frames[i].robot_mask, recording.instance(i) == FINGER_ID)
+
+
+def test_instance_images_agree_with_the_projected_voxels(recording):
+    for t, pause in enumerate(recording.pauses):
+        labels = recording.truth(t)
+        drawn = render(labels, recording.grid, recording.frames[pause].camera).labels
+        instance = recording.instance(pause)
+        # Voxels of 1 cm are 6 pixels wide here: a pixel or two of border may differ.
+        both = (drawn > 0) & (instance > 0)
+        assert (drawn[both] == instance[both]).mean() > 0.9
+        for k in np.unique(instance[instance > 0]):
+            seen = instance == k
+            if seen.sum() > 150:
+                assert (drawn[seen] == k).mean() > 0.6, (t, k)
+        union = (drawn > 0) | (instance > 0)
+        assert both.sum() / union.sum() > 0.7
+
+
+def test_depth_readings_lie_on_the_true_objects(recording):
+    frame, truth, grid = recording.frames[0], recording.truth(0), recording.grid
+    instance = recording.instance(0)
+    from scipy.ndimage import binary_dilation, binary_erosion
+
+    near = {k: binary_dilation(truth == k, iterations=2) for k in np.unique(truth[truth > 0])}
+    points = frame.points
+    for k, region in near.items():
+        on = binary_erosion(instance == k) & frame.valid
+        if on.sum() < 60:
+            continue
+        index = grid.index_of(points[on])
+        index = index[grid.contains(index)]
+        assert region[tuple(index.T)].mean() > 0.95, k
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_voxel_truth_has_the_analytic_volume(family):
+    shape = draw_shape(np.random.default_rng(1), family)
+    rng = np.random.default_rng(2)
+    grid = VoxelGrid((-0.15, -0.15, -0.15), 0.002, (150, 150, 150))
+    pose = np.eye(4)
+    # Turned, so that no face is parallel to the raster.
+    pose[:3, :3] = Rotation.from_euler("xyz", (0.4, 0.7, 0.3)).as_matrix()
+    voxels = (label_voxels([shape], pose[None], grid) == 1).sum() * 0.002**3
+    points = rng.uniform(-shape.half, shape.half, (60_000, 3))
+    share = shape.inside(points).mean()
+    whole = 8 * np.prod(shape.half)
+    # Five deviations of the Monte Carlo share, and 1 % for the raster.
+    slack = 5 * whole * np.sqrt(share * (1 - share) / len(points)) + 0.01 * share * whole
+    assert voxels == pytest.approx(share * whole, abs=slack)
+    if shape.n_pieces == 1:
+        assert voxels == pytest.approx(shape.pieces[0].volume, rel=0.02)
+
+
+def test_truth_holds_objects_that_are_hidden(recording):
+    for t in range(len(recording.pauses)):
+        assert set(np.unique(recording.truth(t))) == {0, 1, 2, 3, 4, 5}
+
+
+def test_objects_beyond_the_grid_are_left_out():
+    shape = draw_shape(np.random.default_rng(0), "can")
+    pose = np.eye(4)
+    pose[:3, 3] = (5.0, 0, 0)
+    assert label_voxels([shape], pose[None], SMALL.grid()).sum() == 0
+
+
+def test_progress_is_called_once_a_frame_and_failures_leave_nothing(tmp_path):
+    calls = []
+
+    def progress(done, total, what):
+        calls.append((done, total))
+        if done == 3:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        simulate(SMALL, 5, tmp_path / "cut", progress)
+    assert calls == [(1, 11), (2, 11), (3, 11)]
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("seed", [-1, 1.5, "seven", True])
+def test_bad_seed(seed, tmp_path):
+    with pytest.raises(InputError, match="seed"):
+        Scene(SMALL, seed)
+
+
+def test_existing_folder_is_kept(recording):
+    before = digest(recording.path)
+    with pytest.raises(InputError):
+        simulate(SMALL, 3, recording.path)
+    assert digest(recording.path) == before
+
+
+def test_camera_of_families():
+    table = camera_of(scene_family("table"))
+    np.testing.assert_allclose(table.K, [[525, 0, 319.5], [0, 525, 239.5], [0, 0, 1]])
+    demo = camera_of(scene_family("demo"))
+    np.testing.assert_allclose(demo.K[0], [262.5, 0, 159.5], atol=0.3)
+    uv, _ = table.project(np.array([0.02, 0.05, 0.04]))
+    np.testing.assert_allclose(uv, [319.5, 239.5], atol=1e-6)
+
+
+def test_reopened(recording):
+    again = Recording.open(recording.path)
+    np.testing.assert_array_equal(again.truth(2), recording.truth(2))

@@ -1,0 +1,96 @@
+"""Pieces and shapes against closed forms and against MuJoCo."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mstfilter.errors import InputError
+from mstfilter.simulation.shapes import FAMILIES, draw_shape
+from mstfilter.simulation.solids import box, capsule, cylinder, ellipsoid, frustum, hull, ring
+from mstfilter.simulation.world import World
+
+PIECES = {
+    "box": (box((0.02, 0.03, 0.05), (0.1, 0, 0)), 8 * 0.02 * 0.03 * 0.05),
+    "cylinder": (cylinder(0.03, 0.05), np.pi * 0.03**2 * 0.1),
+    "ellipsoid": (ellipsoid((0.02, 0.03, 0.04)), 4 / 3 * np.pi * 0.02 * 0.03 * 0.04),
+    "capsule": (capsule((0, 0, 0), (0.03, 0.04, 0), 0.01), np.pi * 0.01**2 * (0.05 + 4 / 3 * 0.01)),
+    "frustum": (frustum((0.04, 0.0), (0.02, 0.05), 64), np.pi * 0.05 / 3 * (0.04**2 + 0.04 * 0.02 + 0.02**2)),
+}
+
+
+@pytest.mark.parametrize("name", PIECES)
+def test_volume_matches_closed_form_and_monte_carlo(name):
+    piece, volume = PIECES[name]
+    assert piece.volume == pytest.approx(volume, rel=4e-3)
+    low, high = piece.bounds()
+    points = np.random.default_rng(0).uniform(low, high, (40_000, 3))
+    share = piece.inside(points).mean()
+    whole = float(np.prod(high - low))
+    # Five standard deviations of the share: a false alarm in a million.
+    assert share * whole == pytest.approx(piece.volume, abs=1e-12 + 5 * whole * np.sqrt(share * (1 - share) / 40_000))
+
+
+@pytest.mark.parametrize("name", PIECES)
+def test_nothing_outside_the_bounds(name):
+    piece, _ = PIECES[name]
+    low, high = piece.bounds()
+    points = np.random.default_rng(1).uniform(low - 0.03, high + 0.03, (20_000, 3))
+    outside = ((points < low - 1e-9) | (points > high + 1e-9)).any(axis=1)
+    assert not piece.inside(points[outside]).any()
+
+
+def test_wedges_fill_the_ring_without_gaps():
+    wedges = ring([(0.03, 0.04, 0.0), (0.03, 0.04, 0.05)], 24)
+    assert sum(w.volume for w in wedges) == pytest.approx(
+        0.05 * 24 / 2 * np.sin(2 * np.pi / 24) * (0.04**2 - 0.03**2), rel=1e-9
+    )
+    rng = np.random.default_rng(2)
+    angle, r = rng.uniform(-np.pi, np.pi, 5000), rng.uniform(0.0301, 0.0395, 5000)
+    points = np.stack([r * np.cos(angle), r * np.sin(angle), rng.uniform(0, 0.05, 5000)], axis=1)
+    assert np.any([w.inside(points) for w in wedges], axis=0).all()
+
+
+def test_hull_of_a_box_is_the_box():
+    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-2, 2) for z in (0, 3)]) * 0.01
+    points = np.random.default_rng(3).uniform(-0.04, 0.04, (5000, 3))
+    expected = box((0.01, 0.02, 0.015), (0, 0, 0.015)).inside(points)
+    np.testing.assert_array_equal(hull(corners).inside(points), expected)
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+@settings(max_examples=5, deadline=None)
+@given(seed=st.integers(0, 10_000))
+def test_shapes_are_centred_of_plausible_size_and_fill_their_box(family, seed):
+    shape = draw_shape(np.random.default_rng(seed), family)
+    bounds = [piece.bounds() for piece in shape.pieces]
+    np.testing.assert_allclose(np.max([b[1] for b in bounds], axis=0), shape.half, atol=1e-9)
+    np.testing.assert_allclose(np.min([b[0] for b in bounds], axis=0), -shape.half, atol=1e-9)
+    assert shape.half.min() > 0.01 and shape.half.max() < 0.125
+    assert 0.05 < shape.mass < 1.2
+    outside = shape.half * np.array([1.01, 0, 0])
+    assert not shape.inside(outside[None])[0]
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_rays_meet_the_surface_of_the_analytic_shape(family):
+    shape = draw_shape(np.random.default_rng(4), family)
+    world = World([shape], arm=False)
+    world.place(0, (0.0, 0.0, 0.5), np.eye(3))
+    world.forward()
+    rng = np.random.default_rng(5)
+    eye = np.array([0.3, -0.4, 0.9])
+    aim = np.array([0.0, 0.0, 0.5]) + rng.uniform(-1, 1, (500, 3)) * shape.half - eye
+    geom, distance, _ = world.cast(eye, aim, (1,))
+    hit = geom >= 0
+    assert hit.sum() > 50
+    surface = eye + aim[hit] * distance[hit, None] - np.array([0.0, 0.0, 0.5])
+    unit = aim[hit] / np.linalg.norm(aim[hit], axis=1, keepdims=True)
+    assert not shape.inside(surface - 2e-5 * unit).any()
+    # A ray may cut an edge so finely that 20 micrometres on it is out again.
+    assert shape.inside(surface + 2e-5 * unit).mean() > 0.97
+
+
+def test_unknown_family():
+    with pytest.raises(InputError, match="teapot"):
+        draw_shape(np.random.default_rng(0), "teapot")

@@ -1,0 +1,113 @@
+"""Physics: rest, contact, determinism, pushes."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mstfilter.errors import InputError
+from mstfilter.simulation.actions import Push, choose_push, play
+from mstfilter.simulation.arrangement import arrange, draw_things
+from mstfilter.simulation.families import scene_family
+from mstfilter.simulation.shapes import FAMILIES, draw_shape
+from mstfilter.simulation.world import FINGER_ID, World
+
+DEMO = scene_family("demo")
+
+
+def arranged(seed, family=DEMO):
+    rng = np.random.default_rng(seed)
+    things = draw_things(rng, family)
+    world = World(things.shapes)
+    arrange(rng, world, family, things.twin_of)
+    return world, things, rng
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_every_shape_rests_in_its_rest_poses(family):
+    from mstfilter.simulation.arrangement import _rest
+
+    shape = draw_shape(np.random.default_rng(0), family)
+    for k, rest in enumerate(shape.rests):
+        world = World([replace(shape, rests=(rest,))])
+        rotation, height = _rest(np.random.default_rng(k), world.shapes[0])
+        world.place(0, (0, 0, height + 2e-4), rotation)
+        assert world.settle(), rest
+        position, turned = world.positions()[0], world.rotations()[0]
+        assert np.linalg.norm(position - (0, 0, height)) < 0.01
+        assert np.arccos(np.clip((np.trace(turned.T @ rotation) - 1) / 2, -1, 1)) < 0.3
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_arranged_scenes_are_settled_without_interpenetration_and_twins_touch(seed):
+    world, things, _ = arranged(seed)
+    assert world.deepest_overlap() < 0.002
+    before = world.positions()
+    world.step(250)
+    assert np.linalg.norm(world.positions() - before, axis=1).max() < 0.002
+    pairs = {(c.first, c.second) for c in world.contacts()}
+    for k, twin in enumerate(things.twin_of):
+        if twin >= 0:
+            assert things.shapes[k] is things.shapes[twin] and things.skins[k] is things.skins[twin]
+            assert (twin, k) in pairs
+
+
+def test_a_restored_state_goes_on_bit_by_bit():
+    world, _, _ = arranged(0)
+    saved = world.save()
+    push = Push((0.0, -0.3), (0.0, 0.1), 1.5)
+    play(world, push)
+    first = world.poses()
+    world.restore(saved)
+    play(world, push)
+    np.testing.assert_array_equal(world.poses(), first)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_chosen_push_moves_something_and_drops_nothing(seed):
+    world, _, rng = arranged(seed)
+    before = world.poses()
+    push = choose_push(rng, world, DEMO)
+    np.testing.assert_array_equal(world.poses(), before)
+    result = play(world, push)
+    assert result.moved(DEMO.move_threshold) >= 1
+    assert result.settled and result.kept
+    assert (world.positions()[:, 2] > 0).all()
+    moved = np.linalg.norm(world.positions() - before[:, :3, 3], axis=1)
+    np.testing.assert_allclose(result.displacement, moved)
+    # The finger is away again: no ray from the camera's side of the table meets it.
+    assert world.finger_position()[1] < -2
+
+
+def test_the_finger_pushes_a_box_by_what_it_travels():
+    shape = draw_shape(np.random.default_rng(0), "brick")
+    world = World([shape], arm=False)
+    world.place(0, (0, 0, shape.half[2] + 2e-4), np.eye(3))
+    assert world.settle()
+    result = play(world, Push((0.0, -shape.half[1] - 0.05), (0.0, 0.0), 2.0))
+    # 50 mm of way to the box less the finger's radius of 11 mm, then it is carried along.
+    travelled = shape.half[1] + 0.011
+    assert result.displacement[0] == pytest.approx(travelled, abs=0.006)
+
+
+def test_no_objects_and_too_many():
+    shape = draw_shape(np.random.default_rng(0), "can")
+    with pytest.raises(InputError):
+        World([])
+    with pytest.raises(InputError):
+        World([shape] * FINGER_ID)
+
+
+def test_objects_that_cannot_be_arranged_are_one_clear_error():
+    crowd = replace(DEMO, n_objects_min=40, n_objects_max=40, shapes="carton", n_twins=0)
+    rng = np.random.default_rng(0)
+    things = draw_things(rng, crowd)
+    import mstfilter.simulation.arrangement as arrangement
+
+    kept = arrangement._ATTEMPTS
+    arrangement._ATTEMPTS = 2
+    try:
+        with pytest.raises(InputError, match="could not be arranged"):
+            arrange(rng, World(things.shapes), crowd, things.twin_of)
+    finally:
+        arrangement._ATTEMPTS = kept
