@@ -223,7 +223,7 @@ def _fields(cls: type) -> str:
     from mstfilter.registry import default_of, name_of
 
     parts = []
-    for field in dataclasses.fields(cls):  # type: ignore[arg-type]
+    for field in dataclasses.fields(cls):
         value: Any = default_of(field)
         if value is dataclasses.MISSING:
             parts.append(field.name)

@@ -13,6 +13,7 @@ from __future__ import annotations
 import zipfile
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
@@ -79,7 +80,8 @@ def decode(arrays: dict[str, np.ndarray]) -> tuple[Hypothesis, ...]:
 
 def save_hypotheses(path: Path, hypotheses: Sequence[Hypothesis], **extra: np.ndarray) -> None:
     """Write hypotheses and further arrays as a compressed .npz."""
-    np.savez_compressed(path, **encode(hypotheses), **extra)
+    arrays: dict[str, Any] = {**encode(hypotheses), **extra}
+    np.savez_compressed(path, **arrays)
 
 
 def load_hypotheses(path: Path) -> tuple[tuple[Hypothesis, ...], dict[str, np.ndarray]]:

@@ -101,7 +101,7 @@ class VoxelGrid:
     def contains(self, index: np.ndarray) -> np.ndarray:
         """(...) bool: indices (..., 3) that lie in the grid."""
         index = np.asarray(index)
-        return ((index >= 0) & (index < np.array(self.shape))).all(axis=-1)
+        return np.asarray(((index >= 0) & (index < np.array(self.shape))).all(axis=-1))
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,0 +1,48 @@
+"""Every Python example of the README and the documentation runs."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pytest
+
+from tests.conftest import REPOSITORY
+from tests.scene.scenes import CAMERA, GRID, table_scene
+
+PAGES = [
+    p for p in [REPOSITORY / "README.md", *sorted((REPOSITORY / "docs").glob("*.md"))] if "```python" in p.read_text()
+]
+
+
+def blocks(page):
+    return re.findall(r"```python\n(.*?)```", page.read_text(), flags=re.DOTALL)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)
+def test_examples_run(page, tmp_path, capsys):
+    """One namespace a page, in order, as a reader would type them; the reader's own data are given."""
+    from mstfilter.scene.recording import Recording
+    from mstfilter.scene.voxels import Hypothesis
+
+    noise = np.random.default_rng(0)
+    scenes = [table_scene(shift, noise) for shift in (0, 1, 2)]
+    given = {
+        "rgb": np.stack([s[0] for s in scenes]),
+        "depth": np.stack([s[1] for s in scenes]),
+        "K": CAMERA.K,
+        "tmp_path": tmp_path,
+        "hypotheses": [Hypothesis.from_labels(s[2], GRID) for s in scenes],
+    }
+    given["clips"] = Recording.from_arrays(given["rgb"], given["depth"], CAMERA.K).clips()
+    for number, block in enumerate(blocks(page)):
+        exec(compile(block, f"{page.name}, example {number + 1}", "exec"), given)
+    assert "nan" not in capsys.readouterr().out
+
+
+def test_the_first_example_of_the_readme_is_short():
+    """A user's own arrays give weighted hypotheses in at most six lines."""
+    first = next(b for b in blocks(REPOSITORY / "README.md") if "from_arrays" in b)
+    lines = [line for line in first.splitlines() if line.strip() and not line.strip().startswith("#")]
+    assert len(lines) <= 6
+    assert "weights" in first
