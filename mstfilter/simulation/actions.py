@@ -25,9 +25,6 @@ HIGH = LOW + 0.26
 # Shares of an action's time: coming down, pushing, going up; the rest belongs to settling.
 DOWN, PUSH, UP = 0.17, 0.60, 0.15
 
-# Where objects may end, so that they stay in view and on the table.
-_KEEP = np.array([0.40, 0.40])
-
 
 @dataclass(frozen=True)
 class Push:
@@ -71,7 +68,7 @@ class Effect:
     settled : bool
         Whether all came to rest.
     kept : bool
-        Whether all are still on the table and in view.
+        Whether all are still on the table, in the workspace and in view.
     """
 
     displacement: np.ndarray
@@ -105,19 +102,19 @@ def finish(world: World) -> bool:
     return world.settle()
 
 
-def play(world: World, push: Push) -> Effect:
+def play(world: World, push: Push, family: SceneFamily) -> Effect:
     """Carry out a whole push and wait until all is at rest."""
     before, turn = world.positions(), world.rotations()
     advance(world, push, 0.0, push.seconds)
     settled = finish(world)
-    return effect(world, before, turn, settled)
+    return effect(world, before, turn, settled, family)
 
 
-def effect(world: World, before: np.ndarray, turn: np.ndarray, settled: bool) -> Effect:
+def effect(world: World, before: np.ndarray, turn: np.ndarray, settled: bool, family: SceneFamily) -> Effect:
     """The effect of a push, from positions (n, 3) and rotations (n, 3, 3) before it."""
     after = world.positions()
     trace = np.einsum("nij,nij->n", turn, world.rotations())
-    kept = bool((np.abs(after[:, :2]) < _KEEP).all() and (after[:, 2] > 0.0).all())
+    kept = bool(family.holds(after).all())
     moved = np.linalg.norm(after - before, axis=1)
     return Effect(moved, np.arccos(np.clip((trace - 1) / 2, -1, 1)), settled, kept)
 
@@ -172,7 +169,7 @@ def choose_push(rng: np.random.Generator, world: World, family: SceneFamily) -> 
         push = _candidate(rng, world, family)
         if not _clear(world, push.start):
             continue
-        result = play(world, push)
+        result = play(world, push, family)
         world.restore(saved)
         if not (result.kept and result.settled):
             continue

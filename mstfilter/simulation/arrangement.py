@@ -51,8 +51,8 @@ def draw_things(rng: np.random.Generator, family: SceneFamily) -> Things:
     bag: list[str] = []
     while len(shapes) < count - family.n_twins:
         if not bag:
-            # Packaging is what lies on tables: cartons and cans come twice in the bag.
-            often = [name for name in names if name in ("carton", "can")]
+            # Packaging is what lies on tables: cartons and cans come more often.
+            often = [name for name in names for _ in range({"carton": 3, "can": 2}.get(name, 0))]
             bag = [str(name) for name in rng.permutation(names + often)]
         shape = draw_shape(rng, bag.pop(), family.size_range)
         shapes.append(shape)
@@ -175,11 +175,7 @@ def _try(rng: np.random.Generator, world: World, family: SceneFamily, twin_of: t
     if not world.settle():
         return False
     at = world.positions()
-    if (
-        (np.abs(at[:, :2] - CENTRE) > _farthest(world) + 0.06).any()
-        or (at[:, 2] < 0).any()
-        or world.deepest_overlap() > 0.0015
-    ):
+    if not family.holds(at).all() or world.deepest_overlap() > 0.0015:
         return False
     touching = {(c.first, c.second) for c in world.contacts()}
     return sum((min(k, t), max(k, t)) in touching for k, t in enumerate(twin_of) if t >= 0) >= need

@@ -15,10 +15,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from mstfilter.errors import InputError
+from mstfilter.scene.camera import Camera, look_at
 from mstfilter.scene.voxels import VoxelGrid
 from mstfilter.simulation.shapes import FAMILIES
 
 __all__ = ["SCENE_FAMILIES", "SceneFamily", "scene_family"]
+
+_LOOKS_AT = np.array([0.02, 0.05, 0.04])
+_TOWARDS_CAMERA = np.array([0.03, -0.77, 0.54]) / np.linalg.norm([0.03, -0.77, 0.54])
 
 GENERATOR_VERSION = 1
 """Raised whenever the same seed gives other bytes."""
@@ -64,6 +68,8 @@ class SceneFamily:
         Of the images, pixels. The camera is a Kinect's (K = 525 at 640 x 480), scaled.
     supersample : bool
         Smooth the edges of objects with three rays a pixel.
+    camera_distance : float
+        From the camera to the middle of the table, metres.
     workspace_x, workspace_y, workspace_z : float
         Edges of the voxel grid, metres; it is centred on the table and stands on it.
     voxel_size : float
@@ -89,6 +95,7 @@ class SceneFamily:
     width: int = 640
     height: int = 480
     supersample: bool = True
+    camera_distance: float = 0.8
     workspace_x: float = 1.0
     workspace_y: float = 1.0
     workspace_z: float = 0.5
@@ -116,6 +123,7 @@ class SceneFamily:
         need("n_candidates", self.n_candidates >= 1, "at least 1")
         need("width", 16 <= self.width <= 4096, "16 .. 4096 pixels")
         need("height", 16 <= self.height <= 4096, "16 .. 4096 pixels")
+        need("camera_distance", 0.5 <= self.camera_distance <= 2.0, "0.5 .. 2 m")
         for name in ("workspace_x", "workspace_y", "workspace_z"):
             need(name, 0.1 <= getattr(self, name) <= 2.0, "0.1 .. 2 m")
         need("voxel_size", 0.001 <= self.voxel_size <= 0.1, "0.001 .. 0.1 m")
@@ -162,6 +170,25 @@ class SceneFamily:
                 f"there are {', '.join(FAMILIES)}; or all",
             )
         return names
+
+    def camera(self) -> Camera:
+        """A Kinect's camera that looks down on the middle of the table, scaled to the family's images."""
+        eye = _LOOKS_AT + self.camera_distance * _TOWARDS_CAMERA
+        kinect = Camera.from_intrinsics(525.0, 525.0, 319.5, 239.5, 640, 480, look_at(eye, _LOOKS_AT))
+        scaled = kinect.scaled(self.width / 640.0)
+        # Other proportions than 4 : 3 see more or less above and below, about the same middle.
+        K = scaled.K.copy()
+        K[1, 2] += (self.height - scaled.height) / 2
+        return Camera(K, self.width, self.height, kinect.T_world_camera)
+
+    def holds(self, points: np.ndarray) -> np.ndarray:
+        """(n,) bool: points (n, 3) above the table that are in the workspace and in view, with a margin."""
+        uv, depth = self.camera().project(points)
+        size = np.array(self.image_size)
+        with np.errstate(invalid="ignore"):
+            seen = (depth > 0) & ((uv > 0.05 * size) & (uv < 0.95 * size)).all(axis=1)
+        reach = np.array([self.workspace_x, self.workspace_y]) / 2 - 0.05
+        return seen & (np.abs(points[:, :2]) < reach).all(axis=1) & (points[:, 2] > 0)
 
     def grid(self) -> VoxelGrid:
         """The workspace."""

@@ -39,7 +39,7 @@ _KINDS = (
 # fmt: on
 
 
-def shade(rng: np.random.Generator, light: tuple[float, float] = (0.45, 0.9), rich: float = 0.6) -> Colour:
+def shade(rng: np.random.Generator, light: tuple[float, float] = (0.45, 0.9), rich: float = 0.5) -> Colour:
     """A colour of random hue; every third is all but white or grey."""
     hue = float(rng.uniform())
     r, g, b = colorsys.hsv_to_rgb(

@@ -21,7 +21,6 @@ from typing import Any
 import numpy as np
 
 from mstfilter.errors import InputError
-from mstfilter.scene.camera import Camera, look_at
 from mstfilter.scene.formats.folder import RecordingWriter
 from mstfilter.scene.recording import Recording
 from mstfilter.simulation.actions import Effect, Push, advance, choose_push, effect, finish
@@ -33,23 +32,10 @@ from mstfilter.simulation.sensor import ColourSensor, DepthSensor
 from mstfilter.simulation.truth import label_voxels
 from mstfilter.simulation.world import FINGER_ID, World
 
-__all__ = ["Progress", "Scene", "camera_of", "simulate"]
+__all__ = ["Progress", "Scene", "simulate"]
 
 Progress = Callable[[int, int, str], None]
 """Called with frames done, frames in all, and what is being done."""
-
-_CAMERA_AT, _CAMERA_LOOKS_AT = np.array([0.05, -0.72, 0.58]), np.array([0.02, 0.05, 0.04])
-
-
-def camera_of(family: SceneFamily) -> Camera:
-    """A Kinect's camera, 0.9 m from the middle of the table, scaled to the family's images."""
-    kinect = Camera.from_intrinsics(525.0, 525.0, 319.5, 239.5, 640, 480, look_at(_CAMERA_AT, _CAMERA_LOOKS_AT))
-    factor = family.width / 640.0
-    scaled = kinect.scaled(factor)
-    # Other proportions than 4 : 3 see more or less above and below, about the same middle.
-    K = scaled.K.copy()
-    K[1, 2] += (family.height - scaled.height) / 2
-    return Camera(K, family.width, family.height, kinect.T_world_camera)
 
 
 def _stream(seed: int, name: str, index: int = 0) -> np.random.Generator:
@@ -72,7 +58,7 @@ class Scene:
         if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
             raise InputError(f"seed is {seed!r}, expected an integer of at least 0")
         self.family, self.seed = family, int(seed)
-        self.camera, self.grid = camera_of(family), family.grid()
+        self.camera, self.grid = family.camera(), family.grid()
         self.things: Things = draw_things(_stream(self.seed, "things"), family)
         self.world = World(self.things.shapes, family.arm)
         arrange(_stream(self.seed, "arrangement"), self.world, family, self.things.twin_of)
@@ -165,7 +151,7 @@ def _record(scene: Scene, writer: RecordingWriter, progress: Progress) -> None:
         index += 1
         advance(world, push, (family.frames_per_clip - 2) / family.fps, push.seconds)
         settled = finish(world)
-        result = effect(world, before, turn, settled)
+        result = effect(world, before, turn, settled, family)
         _pause(scene, writer, index, world.time - start, action=action, push=_as_json(push, result))
         progress(index + 1, family.n_frames, f"pause {action + 1}")
 

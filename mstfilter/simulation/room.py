@@ -4,7 +4,7 @@
 >>> from mstfilter.simulation.room import draw_room
 >>> room = draw_room(np.random.default_rng(0), texel=0.004)
 >>> room.table.ndim, room.lamp.shape
-(3, (4, 3))
+(3, (5, 3))
 """
 
 from __future__ import annotations

@@ -115,7 +115,7 @@ def draw_skin(rng: np.random.Generator, shape: Shape, half: int | None = None) -
     """
     style = shape.finish[int(rng.integers(len(shape.finish)))]
     sizes = chart_sizes(shape)
-    pair = (printing.shade(rng), printing.shade(rng, (0.55, 0.95), 0.7))
+    pair = (printing.shade(rng), printing.shade(rng, (0.55, 0.95), 0.65))
     words = printing.brand(rng, half)
     gloss = {"label": 0.30, "ceramic": 0.35, "carton": 0.12}.get(style, 0.04)
     if style == "carton":

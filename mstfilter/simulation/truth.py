@@ -4,10 +4,10 @@
 >>> from mstfilter.scene.voxels import VoxelGrid
 >>> from mstfilter.simulation.shapes import draw_shape
 >>> from mstfilter.simulation.truth import label_voxels
->>> can = draw_shape(np.random.default_rng(0), "can")
+>>> ball = draw_shape(np.random.default_rng(0), "ball")
 >>> grid = VoxelGrid((-0.2, -0.2, -0.2), 0.01, (40, 40, 40))
->>> labels = label_voxels([can], np.eye(4)[None], grid)
->>> bool(abs(labels.sum() * 1e-6 / can.pieces[0].volume - 1) < 0.1)
+>>> labels = label_voxels([ball], np.eye(4)[None], grid)
+>>> bool(abs(labels.sum() * 1e-6 / ball.pieces[0].volume - 1) < 0.1)
 True
 """
 

@@ -14,7 +14,7 @@ from mstfilter.scene.recording import Recording
 from mstfilter.scene.rendering import render
 from mstfilter.scene.voxels import VoxelGrid
 from mstfilter.simulation.families import scene_family
-from mstfilter.simulation.recorder import Scene, camera_of, simulate
+from mstfilter.simulation.recorder import Scene, simulate
 from mstfilter.simulation.shapes import FAMILIES, draw_shape
 from mstfilter.simulation.truth import label_voxels
 from mstfilter.simulation.world import FINGER_ID
@@ -159,9 +159,9 @@ def test_existing_folder_is_kept(recording):
 
 
 def test_camera_of_families():
-    table = camera_of(scene_family("table"))
+    table = scene_family("table").camera()
     np.testing.assert_allclose(table.K, [[525, 0, 319.5], [0, 525, 239.5], [0, 0, 1]])
-    demo = camera_of(scene_family("demo"))
+    demo = scene_family("demo").camera()
     np.testing.assert_allclose(demo.K[0], [262.5, 0, 159.5], atol=0.3)
     uv, _ = table.project(np.array([0.02, 0.05, 0.04]))
     np.testing.assert_allclose(uv, [319.5, 239.5], atol=1e-6)

@@ -56,10 +56,10 @@ def test_a_restored_state_goes_on_bit_by_bit():
     world, _, _ = arranged(0)
     saved = world.save()
     push = Push((0.0, -0.3), (0.0, 0.1), 1.5)
-    play(world, push)
+    play(world, push, DEMO)
     first = world.poses()
     world.restore(saved)
-    play(world, push)
+    play(world, push, DEMO)
     np.testing.assert_array_equal(world.poses(), first)
 
 
@@ -69,7 +69,7 @@ def test_a_chosen_push_moves_something_and_drops_nothing(seed):
     before = world.poses()
     push = choose_push(rng, world, DEMO)
     np.testing.assert_array_equal(world.poses(), before)
-    result = play(world, push)
+    result = play(world, push, DEMO)
     assert result.moved(DEMO.move_threshold) >= 1
     assert result.settled and result.kept
     assert (world.positions()[:, 2] > 0).all()
@@ -84,7 +84,7 @@ def test_the_finger_pushes_a_box_by_what_it_travels():
     world = World([shape], arm=False)
     world.place(0, (0, 0, shape.half[2] + 2e-4), np.eye(3))
     assert world.settle()
-    result = play(world, Push((0.0, -shape.half[1] - 0.05), (0.0, 0.0), 2.0))
+    result = play(world, Push((0.0, -shape.half[1] - 0.05), (0.0, 0.0), 2.0), DEMO)
     # 50 mm of way to the box less the finger's radius of 11 mm, then it is carried along.
     travelled = shape.half[1] + 0.011
     assert result.displacement[0] == pytest.approx(travelled, abs=0.006)
