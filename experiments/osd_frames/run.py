@@ -74,6 +74,7 @@ class Case:
         return weighted_coverage(np.where(self.ignored, 0, labels), self.truth, form="objects")
 
     def score_cut(self, tree: Tree, found: Segments, cut: np.ndarray) -> float:
+        """Quality of a cut, its background taken away."""
         numbers = np.where(found.is_object[cut], np.arange(1, len(cut) + 1), 0)
         return self.score(np.where(found.own, numbers[tree.label_image(cut)], 0))
 

@@ -72,6 +72,7 @@ def _settle(
     voxels = np.argwhere(tied)
     at = tuple(voxels.T)
     nearest = np.full(len(voxels), np.inf)
+    taken = np.zeros(len(voxels), dtype=bool)
     for k in sorted(range(len(completions)), key=lambda k: completions[k].key):
         one = completions[k]
         local = voxels - one.offset
@@ -84,10 +85,12 @@ def _settle(
         points = np.where(p >= threshold, one.points[place], 0)
         contends = (p >= threshold) & (p == best[at][here]) & (points == most[at][here])
         here = here[contends]
-        surface = np.argwhere(one.points > 0)
-        if len(here) == 0 or len(surface) == 0:
+        if len(here) == 0:
             continue
-        distance, _ = cKDTree(surface + one.offset).query(voxels[here])
-        nearer = distance < nearest[here] - 1e-9
+        distance = np.full(len(here), np.inf)
+        if (one.points > 0).any():
+            distance, _ = cKDTree(np.argwhere(one.points > 0) + one.offset).query(voxels[here])
+        nearer = ~taken[here] | (distance < nearest[here] - 1e-9)
         nearest[here[nearer]] = distance[nearer]
+        taken[here[nearer]] = True
         labels[tuple(voxels[here[nearer]].T)] = k + 1

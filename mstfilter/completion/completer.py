@@ -68,13 +68,14 @@ class Evidence:
     points : (a, b, c) int32
         Readings of the mask in each voxel.
     own : (a, b, c) bool
-        Visible surface of the mask: enough readings, or the best voxel of its column.
+        Visible surface of the mask: the centre's pixel is in the mask, and the centre is at the measured surface
+        or just behind it. A mask so small that no centre falls into it has the voxel with most readings.
     other : (a, b, c) bool
-        Visible surface of anything else.
+        Visible surface of anything else, likewise.
     free : (a, b, c) bool
-        Seen through, and without a reading of the mask: surely not the object.
+        Seen through: surely not the object.
     behind : (a, b, c) bool
-        Behind a reading of the mask.
+        The centre's pixel is in the mask and the centre is behind the measured surface.
     height : (c,) float
         Height of the voxel centres above the table in metres.
     """
@@ -93,15 +94,18 @@ class Completer(ABC):
 
     Parameters
     ----------
-    min_points : int
-        Readings that make a voxel visible surface; the best voxel of a column always is.
+    in_front, depth : float
+        A voxel is visible surface if its centre is at most `in_front` voxels in front of the measured surface and
+        less than `depth` voxels behind it, along the optical axis. Asking for the centre rather than for any
+        reading keeps objects from growing by half a voxel all round.
     free_margin : float
         A voxel is seen through if its centre is this far in front of the measured surface, in voxels.
     free_sigmas : float
         ... and also this far, in standard deviations of the depth reading.
     """
 
-    min_points: int = 2
+    in_front: float = 0.2
+    depth: float = 1.5
     free_margin: float = 0.5
     free_sigmas: float = 3.0
 
@@ -133,8 +137,8 @@ class Completer(ABC):
         Returns
         -------
         list of Completion
-            One a mask. What was seen as free has probability 0; what is visible surface is kept as the completer
-            decides, but at least one voxel of each visible column is 1, so the object shows in its own mask.
+            One a mask. What was seen as free has probability 0. A mask with any reading in the grid has at least
+            one voxel of probability 1, so every visible object exists.
         """
         return [self._one(rng, frame, np.asarray(mask, dtype=bool), grid) for mask in masks]
 
@@ -144,12 +148,11 @@ class Completer(ABC):
         name = content_key("mask", np.packbits(mask), frame.key, grid.key, self._key())
 
         def compute() -> Completion:
-            offset, seen = evidence(
-                frame, mask, grid, self.min_points, self.free_margin, self.free_sigmas, self.padding
-            )
+            offset, seen = evidence(frame, mask, grid, self)
             p = np.array(self.fill(rng, seen), dtype=np.float32)
             p[seen.free] = 0
-            p[_best_of_column(seen.points)] = 1
+            if p.size and not (p == 1).any():
+                p[seen.own] = 1
             return Completion(read_only(offset), read_only(p), read_only(seen.points), name.hex()[:16])
 
         return compute() if self.stochastic else memo("completion", name, compute)
@@ -159,17 +162,13 @@ class Completer(ABC):
         return f"{type(self).__module__}.{type(self).__qualname__}{values}"
 
 
-def _frame_points(frame: Frame, grid: VoxelGrid) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Flat pixels with a reading inside the grid, their voxels, and the number of readings of every voxel."""
+def _frame_points(frame: Frame, grid: VoxelGrid) -> tuple[np.ndarray, np.ndarray]:
+    """Flat pixels with a reading inside the grid (k,), and their voxels (k, 3)."""
 
-    def compute() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def compute() -> tuple[np.ndarray, np.ndarray]:
         index = grid.index_of(frame.points)
-        inside = frame.valid & grid.contains(index)
-        pixels = np.flatnonzero(inside)
-        voxels = index.reshape(-1, 3)[pixels]
-        flat = np.ravel_multi_index(tuple(voxels.T), grid.shape)
-        count = np.bincount(flat, minlength=int(np.prod(grid.shape))).reshape(grid.shape)
-        return read_only(pixels), read_only(voxels.astype(np.int32)), read_only(count.astype(np.int32))
+        pixels = np.flatnonzero(frame.valid & grid.contains(index))
+        return read_only(pixels), read_only(index.reshape(-1, 3)[pixels].astype(np.int32))
 
     return memo("frame_points", (frame.key, grid.key), compute)
 
@@ -183,51 +182,38 @@ def _free(frame: Frame, grid: VoxelGrid, margin: float, sigmas: float) -> np.nda
     return memo("seen_free", (frame.key, grid.key, margin, sigmas), compute)
 
 
-def evidence(
-    frame: Frame,
-    mask: np.ndarray,
-    grid: VoxelGrid,
-    min_points: int = 2,
-    free_margin: float = 0.5,
-    free_sigmas: float = 3.0,
-    padding: int = 0,
-) -> tuple[np.ndarray, Evidence]:
+def evidence(frame: Frame, mask: np.ndarray, grid: VoxelGrid, rule: Completer) -> tuple[np.ndarray, Evidence]:
     """What a frame says about the box of a mask: offset (3,) and the evidence in it.
 
-    The box holds the mask's readings, everything below them, and `padding` voxels around.
+    The box holds the mask's readings, everything below them, and the margin that `rule` asks for; `rule` also
+    says what counts as visible surface and as free.
     """
-    pixels, voxels, count = _frame_points(frame, grid)
+    pixels, voxels = _frame_points(frame, grid)
     mine = voxels[mask.ravel()[pixels]]
     if len(mine) == 0:
         empty = np.zeros((0, 0, 0))
         no = empty.astype(bool)
         return np.zeros(3, np.int64), Evidence(empty.astype(np.int32), no, no, no, no, np.zeros(0))
-    low = np.maximum(mine.min(axis=0) - padding, 0).astype(np.int64)
+    # The surface may reach `depth` voxels behind the readings.
+    margin = max(rule.padding, int(np.ceil(rule.depth)))
+    low = np.maximum(mine.min(axis=0) - margin, 0).astype(np.int64)
     low[2] = 0
-    high = np.minimum(mine.max(axis=0) + 1 + padding, grid.shape)
+    high = np.minimum(mine.max(axis=0) + 1 + margin, grid.shape)
     box = tuple(slice(int(a), int(b)) for a, b in zip(low, high, strict=True))
     shape = tuple(int(n) for n in high - low)
-    points = (
-        np.bincount(np.ravel_multi_index(tuple((mine - low).T), shape), minlength=int(np.prod(shape)))
-        .reshape(shape)
-        .astype(np.int32)
-    )
-    others = count[box] - points
-    own = ((points >= min_points) & (points >= others)) | _best_of_column(points)
-    other = (others >= min_points) & ~own
+    flat = np.ravel_multi_index(tuple((mine - low).T), shape)
+    points = np.bincount(flat, minlength=int(np.prod(shape))).reshape(shape).astype(np.int32)
+
     geometry = frame_geometry(frame, grid)
-    pixel = geometry.pixel[box]
+    pixel, signed = geometry.pixel[box], geometry.signed[box]
+    inside = (pixel >= 0) & mask.ravel()[np.maximum(pixel, 0)]
     with np.errstate(invalid="ignore"):
-        behind = (pixel >= 0) & mask.ravel()[np.maximum(pixel, 0)] & (geometry.signed[box] > 0)
-    free = _free(frame, grid, free_margin, free_sigmas)[box] & (points == 0)
+        surface = (signed >= -rule.in_front * grid.voxel_size) & (signed < rule.depth * grid.voxel_size)
+        behind = inside & (signed > 0)
+    own = surface & inside
+    free = _free(frame, grid, rule.free_margin, rule.free_sigmas)[box]
+    if not own.any():
+        own[np.unravel_index(points.argmax(), shape)] = True
+        free = free & ~own
     height = grid.origin[2] + (np.arange(shape[2]) + 0.5) * grid.voxel_size
-    return low, Evidence(points, own, other, free, behind, height)
-
-
-def _best_of_column(points: np.ndarray) -> np.ndarray:
-    """The voxel with most readings of each vertical column that has any; the highest of equals."""
-    best = np.zeros(points.shape, dtype=bool)
-    if points.size:
-        top = points.shape[2] - 1 - points[:, :, ::-1].argmax(axis=2)
-        np.put_along_axis(best, top[..., None], points.max(axis=2)[..., None] > 0, axis=2)
-    return best
+    return low, Evidence(points, own, surface & ~inside & ~own, free, behind, height)

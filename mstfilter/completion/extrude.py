@@ -1,7 +1,6 @@
 """Completion without weights: the visible surface, extruded down to what carries it.
 
-Most things on a table stand on it: below a visible top or side there is more of the object. On procedural scenes
-this reaches .62 - .64 volumetric IoU, against .17 for the surface alone.
+Most things on a table stand on it: below a visible top or side there is more of the object.
 
 >>> completions = Extrude().complete(rng, frame, masks, grid)
 """

@@ -65,7 +65,7 @@ class ColourDepthBoundary(BoundaryModel):
         import cv2
 
         resize = frame.camera.width / 640
-        edges = np.zeros(frame.depth.shape, np.float32)
+        edges: np.ndarray = np.zeros(frame.depth.shape, np.float32)
         if self.colour_weight > 0:
             edges = self.colour_weight * self._colour(frame.rgb, resize)
         if self.depth_weight > 0 and frame.valid.any():

@@ -140,6 +140,7 @@ class ExactCuts(CutSampler):
             raise InputError(f"sigma2 is {self.sigma2!r}, expected a number > 0")
 
     def sample(self, rng: np.random.Generator, tree: Tree, w: np.ndarray, n: int) -> CutSample:
+        """`n` independent cuts."""
         best = float(check_values(tree, w)[optimal_cut(tree, w)].sum())
         s2 = max(self.sigma2 * best**2, 1e-300)
         law = best_envelope(tree, w, best, s2)

@@ -139,6 +139,7 @@ class MetropolisHastingsCuts(CutSampler):
             raise InputError(f"redraw_share is {self.redraw_share!r}, expected a share 0 .. 1")
 
     def sample(self, rng: np.random.Generator, tree: Tree, w: np.ndarray, n: int) -> CutSample:
+        """`n` cuts from the chain."""
         w = check_values(tree, w)
         optimal = optimal_cut(tree, w)
         best = float(w[optimal].sum())

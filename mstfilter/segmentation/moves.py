@@ -19,7 +19,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
-from math import inf, log
+from math import exp, inf, log
 from typing import Any, NamedTuple
 
 from mstfilter.segmentation.gibbs import Gibbs
@@ -127,10 +127,12 @@ class NodeMoves(MoveRule):
     """A node of the cut uniformly, then up or down by a fair coin; what is impossible stays (the paper)."""
 
     def choose(self, random: Uniform, state: CutState) -> tuple[int, bool]:
+        """A node of the cut and whether to go up."""
         draw = random() * 2 * len(state.nodes)
         return state.nodes[int(draw) >> 1], bool(int(draw) & 1)
 
     def outcome(self, state: CutState, choice: tuple[int, bool]) -> Move | None:
+        """The move with its exact ratio."""
         node, upward = choice
         n = len(state.nodes)
         if upward:
@@ -147,6 +149,7 @@ class NodeMoves(MoveRule):
         return Move((node,), children, log(m * n / (n + m - 1)))
 
     def choices(self, state: CutState) -> list[tuple[float, tuple[int, bool]]]:
+        """Every node and direction."""
         share = 0.5 / len(state.nodes)
         return [(share, (node, upward)) for node in state.nodes for upward in (False, True)]
 
@@ -166,10 +169,12 @@ class FeasibleMoves(MoveRule):
     """Uniform over the moves that are possible, with the exact ratio."""
 
     def choose(self, random: Uniform, state: CutState) -> tuple[int, bool] | None:
+        """A node of the cut and whether to go up."""
         moves = _feasible(state, collapse=False)
         return moves[int(random() * len(moves))] if moves else None
 
     def outcome(self, state: CutState, choice: tuple[int, bool] | None) -> Move | None:
+        """The move with its exact ratio, by counting the moves there and back."""
         if choice is None:
             return None
         node, upward = choice
@@ -184,6 +189,7 @@ class FeasibleMoves(MoveRule):
         return Move(removed, added, log(here / (ways * there)))
 
     def choices(self, state: CutState) -> list[tuple[float, tuple[int, bool] | None]]:
+        """Every node and direction."""
         moves = _feasible(state, collapse=False)
         return [(1 / len(moves), move) for move in moves] or [(1.0, None)]
 
@@ -198,10 +204,12 @@ class AuthorsMoves(MoveRule):
     """
 
     def choose(self, random: Uniform, state: CutState) -> tuple[int, bool] | None:
+        """A node of the cut and whether to go up."""
         moves = _feasible(state, collapse=True)
         return moves[int(random() * len(moves))] if moves else None
 
     def outcome(self, state: CutState, choice: tuple[int, bool] | None) -> Move | None:
+        """The move with the authors' ratio."""
         if choice is None:
             return None
         node, upward = choice
@@ -228,6 +236,7 @@ class AuthorsMoves(MoveRule):
         return (0 if is_root else n) + splittable
 
     def choices(self, state: CutState) -> list[tuple[float, tuple[int, bool] | None]]:
+        """Every node and direction."""
         moves = _feasible(state, collapse=True)
         return [(1 / len(moves), move) for move in moves] or [(1.0, None)]
 
@@ -248,6 +257,7 @@ class SubtreeRedraw(MoveRule):
     law: Gibbs
 
     def choose(self, random: Uniform, state: CutState) -> tuple[int, list[int]]:
+        """An inner node, and new nodes for what lies below it."""
         tree = self.law.tree
         inner = tree.n_nodes - tree.n_leaves
         if inner == 0:
@@ -258,6 +268,7 @@ class SubtreeRedraw(MoveRule):
         return node, self.law.draw(random, node)
 
     def outcome(self, state: CutState, choice: tuple[int, list[int]]) -> Move | None:
+        """The move with the ratio of the surrogate law."""
         node, added = choice
         if not added or state.covered_from_above(node):
             return None
@@ -267,8 +278,7 @@ class SubtreeRedraw(MoveRule):
         return Move(removed, added, self.law.b * (old - new))
 
     def choices(self, state: CutState) -> list[tuple[float, tuple[int, list[int]]]]:
-        from math import exp
-
+        """Every inner node with every cut below it: for small trees only."""
         tree = self.law.tree
         inner = range(tree.n_leaves, tree.n_nodes)
         if len(inner) == 0:

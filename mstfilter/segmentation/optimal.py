@@ -62,6 +62,7 @@ class OptimalCut(CutSampler):
     """No sampling: the optimal cut, `n` times. The single-frame baseline (SceneCut)."""
 
     def sample(self, rng: np.random.Generator, tree: Tree, w: np.ndarray, n: int) -> CutSample:
+        """The optimal cut, `n` times; draws nothing."""
         cut = optimal_cut(tree, w)
         value = float(np.asarray(w, dtype=np.float64)[cut].sum())
         return CutSample((cut,) * n, np.full(n, value), np.zeros(n), {"size_of_best": len(cut)})

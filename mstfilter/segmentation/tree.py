@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 
@@ -111,7 +112,7 @@ class Tree:
     def child_tuples(self) -> tuple[tuple[int, ...], ...]:
         """Children of every node as Python integers: for loops, which numpy scalars slow down."""
         offsets, flat = self.child_offsets.tolist(), self.child_list.tolist()
-        return tuple(tuple(flat[a:b]) for a, b in zip(offsets, offsets[1:], strict=False))
+        return tuple(tuple(flat[a:b]) for a, b in pairwise(offsets))
 
     def children(self, node: int) -> np.ndarray:
         """Children of a node, ascending; empty for a leaf."""
@@ -141,11 +142,11 @@ class Tree:
         count = [1] * self.n_leaves + [0] * (n - self.n_leaves)
         for i in range(n - 1):
             count[parent[i]] += count[i]
-        first, free = [0] * n, [0] * n
+        begin, free = [0] * n, [0] * n
         for i in range(n - 2, -1, -1):
-            first[i] = free[i] = free[parent[i]]
+            begin[i] = free[i] = free[parent[i]]
             free[parent[i]] += count[i]
-        first = np.array(first)
+        first = np.array(begin)
         order = np.empty(self.n_leaves, dtype=np.int64)
         order[first[: self.n_leaves]] = np.arange(self.n_leaves)
         return order, first, first + np.array(count)

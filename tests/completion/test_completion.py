@@ -1,0 +1,205 @@
+"""Completers and arbitration: promises that hold for any completer, and what extrusion gives."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mstfilter.completion.arbitration import arbitrate
+from mstfilter.completion.completer import Completer, Completion, Evidence
+from mstfilter.completion.extrude import Extrude, SurfaceOnly
+from mstfilter.errors import InputError
+from mstfilter.scene import memo
+from mstfilter.scene.frame import Frame
+from mstfilter.scene.frame_geometry import frame_geometry
+from mstfilter.scene.rendering import render
+from mstfilter.scene.voxels import VoxelGrid
+from tests.segmentation.scenes import GRID, TWO, boxes, frame_of
+
+RNG = np.random.default_rng(0)
+
+
+@dataclass(frozen=True)
+class Greedy(Completer):
+    """Claims its whole box: what it gets is what the veto leaves."""
+
+    padding: ClassVar[int] = 3
+
+    def fill(self, rng: np.random.Generator, seen: Evidence) -> np.ndarray:
+        return np.ones(seen.points.shape)
+
+
+COMPLETERS = [Extrude(), SurfaceOnly(), Greedy()]
+STACK = boxes(((22, 22, 0), (38, 38, 6)), ((26, 26, 6), (34, 34, 14)))
+
+
+def masks_of(scene: np.ndarray, frame: Frame) -> list[np.ndarray]:
+    seen = render(scene, GRID, frame.camera).labels
+    return [seen == k for k in range(1, int(scene.max()) + 1)]
+
+
+def placed(one: Completion, grid: VoxelGrid = GRID) -> np.ndarray:
+    full = np.zeros(grid.shape, np.float32)
+    full[one.box] = one.probability
+    return full
+
+
+def iou(a: np.ndarray, b: np.ndarray) -> float:
+    return (a & b).sum() / (a | b).sum()
+
+
+@pytest.mark.parametrize("completer", COMPLETERS)
+@pytest.mark.parametrize("scene", [TWO, STACK])
+def test_nothing_is_where_the_frame_saw_free_space(completer, scene):
+    frame = frame_of(scene, noise=0.3)
+    free = frame_geometry(frame, GRID).known_free(0.01)
+    for mask in masks_of(scene, frame):
+        one = completer.complete(RNG, frame, [mask], GRID)[0]
+        assert not ((placed(one) > 0) & free).any()
+        assert one.points.sum() == GRID.contains(GRID.index_of(frame.points))[mask & frame.valid].sum()
+
+
+@pytest.mark.parametrize("completer", COMPLETERS)
+@pytest.mark.parametrize("scene", [TWO, STACK])
+def test_objects_show_in_their_own_masks(completer, scene):
+    frame = frame_of(scene, width=640, noise=0.3)
+    masks = masks_of(scene, frame)
+    completions = completer.complete(RNG, frame, masks, GRID)
+    shown = render(arbitrate(completions, GRID), GRID, frame.camera).labels
+    for k, mask in enumerate(masks, start=1):
+        assert (shown[mask] == k).mean() > 0.8
+
+
+def test_extrusion_recovers_boxes():
+    frame = frame_of(TWO, width=640)
+    for k, one in enumerate(Extrude().complete(RNG, frame, masks_of(TWO, frame), GRID), start=1):
+        assert iou(placed(one) >= 0.5, k == TWO) > 0.8
+        assert 0.8 < (placed(one) >= 0.5).sum() / (k == TWO).sum() < 1.2
+        surface = SurfaceOnly().complete(RNG, frame, [masks_of(TWO, frame)[k - 1]], GRID)[0]
+        assert iou(placed(surface) >= 0.5, k == TWO) < 0.6
+
+
+def test_extrusion_stops_at_another_surface():
+    """The upper box of a stack must not claim the front of the lower one, nor the space below that."""
+    frame = frame_of(STACK, width=640)
+    lower, upper = Extrude().complete(RNG, frame, masks_of(STACK, frame), GRID)
+    seen_lower = np.zeros(GRID.shape, bool)
+    seen_lower[lower.box] = lower.points >= 20
+    below = placed(upper)[:, :, :6] > 0
+    assert (below & seen_lower[:, :, :6]).sum() < 0.05 * seen_lower.sum()
+    assert below[STACK[:, :, :6] == 1].mean() < 0.3  # at most what is hidden under the upper box
+
+
+def test_the_answer_depends_on_frame_and_mask_alone():
+    frame = frame_of(TWO, noise=0.3)
+    a, b = masks_of(TWO, frame)
+    for completer in COMPLETERS:
+        together = completer.complete(RNG, frame, [a, b], GRID)
+        memo.clear()
+        alone = completer.complete(RNG, frame, [b], GRID) + completer.complete(RNG, frame, [a], GRID)
+        for x, y in zip(together, alone[::-1], strict=True):
+            assert np.array_equal(x.probability, y.probability)
+            assert np.array_equal(x.offset, y.offset)
+            assert x.key == y.key
+
+
+@pytest.mark.parametrize("turns", [1, 2, 3])
+def test_extrusion_turns_with_its_evidence(turns):
+    rng = np.random.default_rng(5)
+    points = rng.integers(0, 3, (7, 6, 5)).astype(np.int32) * (rng.random((7, 6, 5)) < 0.2)
+    fields = [points, points > 1, (rng.random(points.shape) < 0.1) & (points < 2), points < -1, points < -1]
+    height = np.arange(5) * 0.01 + 0.005
+    for completer in (Extrude(), SurfaceOnly()):
+        straight = completer.fill(rng, Evidence(*fields, height))
+        turned = completer.fill(rng, Evidence(*(np.rot90(f, turns) for f in fields), height))
+        assert np.array_equal(np.rot90(straight, turns), turned)
+
+
+def test_masks_without_anything():
+    """Empty, one pixel, without depth, outside the grid: no error, at most one voxel."""
+    frame = frame_of(TWO)
+    nothing = np.zeros(frame.depth.shape, bool)
+    pixel = nothing.copy()
+    row, column = np.argwhere(masks_of(TWO, frame)[0])[40]
+    pixel[row, column] = True
+    depth = frame.depth.copy()
+    depth[row, column] = np.nan
+    far = VoxelGrid((5.0, 5.0, 0.0), 0.01, (10, 10, 10))
+    for completer in COMPLETERS:
+        assert completer.complete(RNG, frame, [nothing], GRID)[0].probability.size == 0
+        assert completer.complete(RNG, frame, [], GRID) == []
+        assert (completer.complete(RNG, frame, [pixel], GRID)[0].probability == 1).any()
+        holed = Frame(frame.rgb, depth, frame.camera)
+        assert completer.complete(RNG, holed, [pixel], GRID)[0].probability.size == 0
+        robot = Frame(frame.rgb, frame.depth, frame.camera, pixel)
+        assert completer.complete(RNG, robot, [pixel], GRID)[0].probability.size == 0
+        assert completer.complete(RNG, frame, [pixel], far)[0].probability.size == 0
+
+
+def test_objects_at_the_border_and_floating():
+    scene = boxes(((0, 0, 0), (9, 9, 9)), ((25, 25, 10), (35, 35, 16)))
+    frame = frame_of(scene)
+    for completer in COMPLETERS:
+        for one in completer.complete(RNG, frame, masks_of(scene, frame), GRID):
+            assert (np.array(one.offset) >= 0).all()
+            assert (one.offset + one.probability.shape <= np.array(GRID.shape)).all()
+
+
+def test_wrong_mask_size():
+    frame = frame_of(TWO)
+    with pytest.raises(InputError, match="mask has shape"):
+        Extrude().complete(RNG, frame, [np.zeros((3, 3), bool)], GRID)
+
+
+SMALL = VoxelGrid((0, 0, 0), 1.0, (6, 6, 4))
+
+
+def random_completions(rng: np.random.Generator, n: int) -> list[Completion]:
+    made = []
+    for k in range(n):
+        low = rng.integers(0, 4, 3) % np.array([4, 4, 2])
+        shape = rng.integers(1, np.array(SMALL.shape) - low + 1)
+        p = rng.choice([0.0, 0.3, 0.6, 0.6, 1.0], shape).astype(np.float32)
+        points = (rng.integers(0, 3, shape) * (rng.random(shape) < 0.2)).astype(np.int32)
+        made.append(Completion(low, p, points, f"{rng.integers(1 << 30)}-{k}"))
+    return made
+
+
+@settings(max_examples=60)
+@given(st.integers(0, 10**6), st.integers(1, 6))
+def test_renumbering_objects_renumbers_the_result(seed, n):
+    rng = np.random.default_rng(seed)
+    completions = random_completions(rng, n)
+    order = rng.permutation(n)
+    straight = arbitrate(completions, SMALL)
+    shuffled = arbitrate([completions[k] for k in order], SMALL)
+    assert np.array_equal(np.concatenate([[0], order + 1])[shuffled], straight)
+
+
+@settings(max_examples=60)
+@given(st.integers(0, 10**6), st.integers(1, 5))
+def test_arbitration_by_its_definition(seed, n):
+    """Voxel by voxel: readings first, then probability; ties only by distance to the visible surface."""
+    completions = random_completions(np.random.default_rng(seed), n)
+    labels = arbitrate(completions, SMALL)
+    for voxel in np.ndindex(SMALL.shape):
+        rank = []
+        for k, one in enumerate(completions):
+            at = np.array(voxel) - one.offset
+            if (at >= 0).all() and (at < one.probability.shape).all() and one.probability[tuple(at)] >= 0.5:
+                surface = np.argwhere(one.points > 0) + one.offset
+                gap = np.sqrt(((surface - voxel) ** 2).sum(axis=1)).min() if len(surface) else np.inf
+                rank.append((one.points[tuple(at)], one.probability[tuple(at)], -round(gap, 6), k + 1))
+        assert (labels[voxel] > 0) == bool(rank)
+        if rank:
+            best = max(r[:3] for r in rank)
+            assert labels[voxel] in {r[3] for r in rank if r[:3] == best}
+
+
+def test_nothing_to_arbitrate():
+    assert not arbitrate([], SMALL).any()
