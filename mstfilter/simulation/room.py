@@ -66,9 +66,9 @@ def _table_top(rng: np.random.Generator, texel: float) -> np.ndarray:
         grey = int(rng.uniform(150, 205))
         tones = ((grey, grey, int(grey * 0.97)), (grey + 8, grey + 7, grey + 4))
         return printing.speckle(rng, width, depth, tones, texel)
-    beech, oak, walnut = (222, 200, 176), (196, 168, 134), (122, 94, 72)
+    beech, oak, walnut = (222, 200, 176), (196, 168, 134), (124, 102, 82)
     colour = (beech, oak, walnut)[kind]
-    jitter = rng.uniform(0.94, 1.05, 3)
+    jitter = rng.uniform(0.94, 1.05) * rng.uniform(0.985, 1.015, 3)
     r, g, b = (int(min(255.0, c * j)) for c, j in zip(colour, jitter, strict=True))
     return printing.wood(rng, width, depth, (r, g, b), texel)
 
@@ -88,7 +88,7 @@ def draw_room(rng: np.random.Generator, texel: float) -> Room:
     light = 1.05
     tone = float(rng.uniform(0.42, 0.58)) if table.mean() > 0.25 else float(rng.uniform(0.24, 0.36))
     gain = tone / (float(table.mean()) * light)
-    balance = rng.uniform(0.96, 1.04, 3)
+    balance = rng.uniform(0.97, 1.03, 3)
     grey = rng.uniform(0.16, 0.4) * rng.uniform(0.92, 1.08, 3)
 
     def single(values: np.ndarray) -> np.ndarray:
