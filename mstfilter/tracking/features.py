@@ -90,7 +90,7 @@ def _features(frame: Frame) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
         import cv2
 
         grey = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
-        keypoints, descriptors = cv2.SIFT_create().detectAndCompute(grey, None)
+        keypoints, descriptors = cv2.SIFT_create().detectAndCompute(grey, None)  # type: ignore[attr-defined]
         if descriptors is None:
             return np.empty((0, 2), np.int32), np.empty((0, 128), np.float32)
         height, width = frame.depth.shape
@@ -119,6 +119,12 @@ def _match(before: Frame, after: Frame, settings: SiftMatching) -> Matches:
         if len(i) > settings.max_pairs:
             best = np.sort(np.argsort(distance[i, j], kind="stable")[: settings.max_pairs])
             i, j = i[best], j[best]
+        if settings.mutual:
+            # SIFT lists a point once for every strong orientation: one point is one inlier.
+            order = np.argsort(distance[i, j], kind="stable")
+            _, first = np.unique(pixel_a[i[order]], axis=0, return_index=True)
+            chosen = np.sort(order[first])
+            i, j = i[chosen], j[chosen]
     a, b = pixel_a[i], pixel_b[j]
     return Matches(a, b, before.points[a[:, 1], a[:, 0]], after.points[b[:, 1], b[:, 0]])
 

@@ -20,6 +20,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import astuple, dataclass
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -98,7 +99,7 @@ class DenseFlow:
         Grey levels, largest channel, between consecutive frames (slightly blurred); larger jumps end a track.
     """
 
-    preset: str = "ultrafast"
+    preset: str = "medium"
     scale: float = 1.0
     frame_step: int = 1
     motion_share: float = 0.03
@@ -129,8 +130,6 @@ def track_labels(labels: NDArray[np.integer], clip: Clip, flow: DenseFlow | None
 
 
 def _track(frames: list[Frame], settings: DenseFlow) -> ClipTracks:
-    import cv2
-
     first, last = frames[0], frames[-1]
     height, width = first.depth.shape
     columns, rows = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
@@ -141,7 +140,7 @@ def _track(frames: list[Frame], settings: DenseFlow) -> ClipTracks:
     grid = np.stack([columns.ravel(), rows.ravel()], axis=1)
     pull = grid.copy()  # first-frame position of every pixel of the current frame
     known = ~_robot(first).ravel()
-    for previous, current in zip(frames, frames[1:], strict=False):
+    for previous, current in pairwise(frames):
         forward, backward = _flow(previous, current, settings)
         end, ok = _advance(end, forward, backward, previous, current, settings)
         alive &= ok
@@ -172,7 +171,7 @@ def _thinned(frames: list[Frame], motion_share: float) -> list[Frame]:
         return frames
     shape = frames[0].depth.shape
     factor = 160.0 / shape[1]
-    dis = cv2.DISOpticalFlow_create(PRESETS.index("ultrafast"))
+    dis = cv2.DISOpticalFlow_create(PRESETS.index("ultrafast"))  # type: ignore[attr-defined]
     small = [
         cv2.resize(cv2.cvtColor(f.rgb, cv2.COLOR_RGB2GRAY), None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
         for f in frames
@@ -224,7 +223,7 @@ def _flow(a: Frame, b: Frame, settings: DenseFlow) -> tuple[NDArray[np.float32],
     grey = [cv2.cvtColor(f.rgb, cv2.COLOR_RGB2GRAY) for f in (a, b)]
     if settings.scale < 1.0:
         grey = [cv2.resize(g, None, fx=settings.scale, fy=settings.scale, interpolation=cv2.INTER_AREA) for g in grey]
-    dis = cv2.DISOpticalFlow_create(PRESETS.index(settings.preset))
+    dis = cv2.DISOpticalFlow_create(PRESETS.index(settings.preset))  # type: ignore[attr-defined]
     with _one_thread():
         fields = [dis.calc(grey[0], grey[1], None), dis.calc(grey[1], grey[0], None)]
     if settings.scale < 1.0:
@@ -277,8 +276,9 @@ def _pixel(at: NDArray[np.float32], width: int, height: int) -> tuple[NDArray[np
 def unchanged_pixels(first: Frame, last: Frame, sigmas: float = 4.0, colour: float = 12.0) -> NDArray[np.bool_]:
     """Pixels (H, W) where the last frame shows what the first did.
 
-    Depth differs by less than ``sigmas`` standard deviations of a difference, and slightly blurred colour
-    by less than ``colour`` grey levels in every channel, a change of exposure aside. Robot pixels and missing depth are not unchanged.
+    Depth differs by less than ``sigmas`` standard deviations of a difference, and slightly blurred colour by
+    less than ``colour`` grey levels in every channel, a change of exposure aside. Robot pixels and missing depth
+    are not unchanged.
     """
     change = np.abs(smooth_colour(first) - matched_colour(last, first)).max(axis=2)
     return same_depth(first, last, sigmas) & (change <= colour)

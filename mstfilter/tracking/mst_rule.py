@@ -7,7 +7,7 @@ a textured can, features need texture. So each proposes, the robust residual of 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from mstfilter.errors import InputError
 from mstfilter.tracking import rigid
 from mstfilter.tracking.features import SiftMatching
-from mstfilter.tracking.registration import centroid_shift, register
 from mstfilter.tracking.refine import refine
+from mstfilter.tracking.registration import centroid_shift, register
 from mstfilter.tracking.residual import Residual
 from mstfilter.tracking.rules import IDENTITY, Candidate, MotionRule, sift_motions
 from mstfilter.tracking.track import Track
@@ -69,8 +69,8 @@ class MstRule(MotionRule):
     min_pairs: int = 6
     max_sift: int = 3
     n_refine: int = 3
-    sift: SiftMatching = SiftMatching()
-    residual: Residual = Residual()
+    sift: SiftMatching = field(default_factory=SiftMatching)
+    residual: Residual = field(default_factory=Residual)
 
     def __post_init__(self) -> None:
         if self.select not in ("map", "sample"):

@@ -99,7 +99,11 @@ def refine(track: Track, T: Array, depth_scale: float = 1.5, colour_scale: float
         r_colour = (grey[v, u] + gx * du + gy * dv - before_grey[rows]) / colour_scale
         camera_x = (x - after.camera.position) @ world_to_camera.T
         per_pixel = np.stack(
-            [gx * K[0, 0], gx * K[0, 1] + gy * K[1, 1], -(gx * K[0, 0] * camera_x[:, 0] + gy * K[1, 1] * camera_x[:, 1]) / z],
+            [
+                gx * K[0, 0],
+                gx * K[0, 1] + gy * K[1, 1],
+                -(gx * K[0, 0] * camera_x[:, 0] + gy * K[1, 1] * camera_x[:, 1]) / z,
+            ],
             axis=1,
         )
         j_colour = per_pixel @ world_to_camera / (z * colour_scale)[:, None]

@@ -15,7 +15,7 @@ hypotheses; `choose` picks one for each particle, which may draw.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -120,7 +120,7 @@ class PaperRule(MotionRule):
     icp_start: str = "centroid"
     icp_reach: float = 0.03
     icp_iterations: int = 30
-    sift: SiftMatching = SiftMatching()
+    sift: SiftMatching = field(default_factory=SiftMatching)
     eps: float = 0.010
     n_models: int = 500
 
@@ -149,6 +149,11 @@ class PaperRule(MotionRule):
         if self.order == "best" and moving:
             return min(moving, key=lambda c: c.score)
         return candidates[0]
+
+
+def _one_to_many() -> SiftMatching:
+    """All pairs within the radii of the authors' program (200, 1000 pixels, 1 m)."""
+    return SiftMatching(mutual=False, descriptor_radius=200.0, search_share=10.0, search_distance=1.0)
 
 
 @dataclass(frozen=True)
@@ -180,9 +185,7 @@ class AuthorsRule(MotionRule):
     max_mean_square: float = 0.002
     icp_iterations: int = 20
     icp_reach: float = 10.0
-    sift: SiftMatching = SiftMatching(
-        mutual=False, descriptor_radius=200.0, search_share=10.0, search_distance=1.0, max_pairs=20000
-    )
+    sift: SiftMatching = field(default_factory=_one_to_many)
     eps: float = 0.010
     n_models: int = 1000
 

@@ -48,7 +48,7 @@ class Track:
     @cached_property
     def target_mask(self) -> NDArray[np.bool_]:
         """(H, W) where flow carries them in the last frame."""
-        return self.flow.warp(self.mask)
+        return self.flow.warp(self.mask.astype(np.uint8)) > 0
 
     @cached_property
     def points(self) -> Array:

@@ -12,7 +12,7 @@ clip; a segment on which several hypotheses agree is tracked once.
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import ClassVar
 
 import numpy as np
@@ -62,10 +62,10 @@ class TrackingTransition(Transition):
         Objects with fewer pixels that agree with the depth image are not tracked (they stay).
     """
 
-    rule: MotionRule = MstRule()
-    flow: DenseFlow = DenseFlow()
-    static: StaticTest = StaticTest()
-    warp: Warp = Warp()
+    rule: MotionRule = field(default_factory=MstRule)
+    flow: DenseFlow = field(default_factory=DenseFlow)
+    static: StaticTest = field(default_factory=StaticTest)
+    warp: Warp = field(default_factory=Warp)
     min_support: int = 12
 
     properly_weighted: ClassVar[bool] = False

@@ -162,6 +162,8 @@ class Warp:
     def _paint(self, labels: NDArray[np.uint16], claims: _Claims, residuals: Mapping[int, float]) -> int:
         """Give every claimed voxel to one claimant; how many were contested."""
         index = np.concatenate(claims.index)
+        if not len(index):
+            return 0
         sizes = [len(i) for i in claims.index]
         owner = np.repeat([r.label for r in claims.record], sizes)
         if self.collisions == "label":
@@ -174,7 +176,7 @@ class Warp:
         index, owner = index[order], owner[order]
         first = np.append(True, index[1:] != index[:-1])
         labels.ravel()[index[first]] = owner[first]
-        return int(len(np.unique(index[~first])))
+        return len(np.unique(index[~first]))
 
 
 def _depth_inside(crop: Crop) -> Array:

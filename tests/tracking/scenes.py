@@ -211,7 +211,9 @@ def rigid_transform(T: np.ndarray) -> RigidTransform:
     return RigidTransform.from_matrix(T)
 
 
-def standard(n_frames: int = 12, texture: float = 0.5, size: tuple[int, int] = (320, 240), plain_table: bool = False) -> Scene:
+def standard(
+    n_frames: int = 12, texture: float = 0.5, size: tuple[int, int] = (320, 240), plain_table: bool = False
+) -> Scene:
     """Six solids: 1 box pushed 12 cm and 25 deg, 2 cylinder 6 cm and 40 deg of spin, 3, 4, 6 static, 5 twin of 4
     that slides away 9 cm and 30 deg, 7 the pusher (robot)."""
     solids = [
@@ -232,6 +234,10 @@ def standard(n_frames: int = 12, texture: float = 0.5, size: tuple[int, int] = (
         (at(0.02, -0.16, 0.02), at(0.02, -0.16, 0.02)),
     ]
     tracks = [slide(a, b, n_frames) for a, b in ends]
-    tracks.append([at(-0.30, -0.02, 0.3)] + slide(at(-0.28, -0.0, 0.14), at(-0.17, -0.05, 0.14), n_frames - 2) + [at(-0.30, 0.0, 0.5)])
+    tracks.append(
+        [at(-0.30, -0.02, 0.3)]
+        + slide(at(-0.28, -0.0, 0.14), at(-0.17, -0.05, 0.14), n_frames - 2)
+        + [at(-0.30, 0.0, 0.5)]
+    )
     poses = [[track[i] for track in tracks] for i in range(n_frames)]
     return Scene(solids, poses, size, 0.0 if plain_table else 0.25, robot=6)

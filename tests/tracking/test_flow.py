@@ -1,0 +1,112 @@
+import numpy as np
+import pytest
+
+from mstfilter.errors import InputError
+from mstfilter.scene import memo
+from mstfilter.scene.clip import Clip
+from mstfilter.scene.frame import Frame
+from mstfilter.tracking.flow import DenseFlow, track_labels
+from tests.tracking.scenes import Box, Scene, at, iou, slide
+
+MOVERS, RESTING = (1, 2, 5), (3, 4, 6)
+
+
+def label_images(scene):
+    images = []
+    for poses in (scene.poses[0], scene.poses[-1]):
+        ids = scene.trace(poses)[1]
+        ids[ids == 7] = 0
+        images.append(ids.astype(np.uint16))
+    return images
+
+
+@pytest.mark.parametrize("kind", ["textured", "plain"])
+def test_masks_follow_what_moves_and_stay_on_what_rests(kind, request):
+    scene, clip = request.getfixturevalue(kind)
+    before, after = label_images(scene)
+    tracked = track_labels(before, clip)
+    standing = np.mean([iou(before == k, after == k) for k in MOVERS])
+    moving = np.mean([iou(tracked == k, after == k) for k in MOVERS])
+    assert standing < 0.35
+    assert moving > 0.68
+    # A label bleeds between touching twins (4 and 5): that is why rest is tested first.
+    assert min(iou(tracked == k, after == k) for k in RESTING) > 0.7
+
+
+def test_a_clip_in_which_nothing_happens_returns_the_masks_unchanged():
+    frame = Scene([Box((0.1, 0.1, 0.1))], [[at(0, 0, 0.05)]]).frame(np.random.default_rng(0), [at(0, 0, 0.05)])
+    clip = Clip((frame, frame, frame), Scene([], [[]]).grid)
+    labels = np.random.default_rng(1).integers(0, 9, frame.depth.shape).astype(np.uint16)
+    seen = np.isfinite(frame.depth)
+    np.testing.assert_array_equal(track_labels(labels, clip)[seen], labels[seen])
+
+
+def test_a_mask_does_not_depend_on_the_other_masks(textured):
+    scene, clip = textured
+    before, _ = label_images(scene)
+    alone = track_labels(np.where(before == 5, before, 0), clip)
+    np.testing.assert_array_equal(alone == 5, track_labels(before, clip) == 5)
+
+
+def test_the_robot_is_never_followed(textured):
+    _, clip = textured
+    tracks = DenseFlow().track(clip)
+    start_on_robot = clip.before.robot_mask[tracks.start[:, 1], tracks.start[:, 0]]
+    assert not (tracks.alive & start_on_robot).any()
+    assert (tracks.source[clip.after.robot_mask] == -1).all()
+    everything = np.ones(tracks.source.shape, np.uint16)
+    assert (tracks.warp(everything)[clip.after.robot_mask] == 0).all()
+
+
+def test_points_end_where_the_surface_went():
+    scene = Scene(
+        [Box((0.14, 0.12, 0.08), texture=0.6)], [[p] for p in slide(at(-0.05, 0, 0.04), at(0.04, 0.03, 0.04, 12), 6)]
+    )
+    clip = scene.clip(0)
+    tracks = DenseFlow().track(clip)
+    ids = scene.trace(scene.poses[0])[1]
+    chosen = tracks.points_in(ids == 1)
+    u, v = tracks.start[chosen].T
+    truth, _ = clip.after.camera.project(
+        clip.before.points[v, u] @ scene.motions()[1][:3, :3].T + scene.motions()[1][:3, 3]
+    )
+    error = np.linalg.norm(tracks.end[chosen] - truth, axis=1)
+    assert len(chosen) > 100
+    assert np.nanmedian(error) < 2.0
+
+
+def test_colour_alone_is_enough():
+    scene = Scene(
+        [Box((0.14, 0.12, 0.08), texture=0.6)], [[p] for p in slide(at(-0.04, 0, 0.04), at(0.03, 0.0, 0.04), 5)]
+    )
+    clip = scene.clip(0)
+    blind = [Frame(f.rgb, np.full_like(f.depth, np.nan), f.camera) for f in clip.frames]
+    before, after = (scene.trace(p)[1].astype(np.uint16) for p in (scene.poses[0], scene.poses[-1]))
+    tracked = track_labels(before, Clip(blind, clip.grid))
+    assert iou(tracked == 1, after == 1) > 0.8 > iou(before == 1, after == 1)
+
+
+def test_a_change_of_exposure_is_not_a_change_of_the_scene():
+    scene = Scene([Box((0.1, 0.1, 0.08))], [[at(0, 0, 0.04)]] * 2)
+    clip = scene.clip(0)
+    dimmed = np.clip(clip.after.rgb * np.array([0.8, 0.85, 0.9]) + 6, 0, 255).astype(np.uint8)
+    after = Frame(dimmed, clip.after.depth, clip.after.camera)
+    tracks = DenseFlow().track(Clip((clip.before, after), clip.grid))
+    both = clip.before.valid & after.valid
+    assert tracks.unchanged[both].mean() > 0.98
+
+
+def test_same_answer_after_the_store_is_emptied(textured):
+    _, clip = textured
+    first = DenseFlow().track(clip)
+    memo.clear()
+    again = DenseFlow().track(clip)
+    assert first is not again
+    np.testing.assert_array_equal(first.source, again.source)
+    np.testing.assert_array_equal(first.end, again.end)
+
+
+@pytest.mark.parametrize("fields", [{"preset": "slow"}, {"scale": 0.0}, {"frame_step": 0}])
+def test_senseless_settings_are_refused(fields):
+    with pytest.raises(InputError):
+        DenseFlow(**fields)

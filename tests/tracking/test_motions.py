@@ -1,0 +1,175 @@
+"""Registration, residual, refinement, features and the static test on one segment at a time."""
+
+import numpy as np
+import pytest
+
+from mstfilter.scene.clip import Clip
+from mstfilter.scene.frame import Frame
+from mstfilter.tracking.features import SiftMatching
+from mstfilter.tracking.flow import DenseFlow
+from mstfilter.tracking.refine import normals, refine
+from mstfilter.tracking.registration import assess, centroid_shift, prepare, register
+from mstfilter.tracking.residual import Residual
+from mstfilter.tracking.segments import segments_of
+from mstfilter.tracking.static import StaticTest
+from mstfilter.tracking.track import Track
+from tests.tracking.scenes import Box, Cylinder, Scene, at, errors, slide, standard
+
+RESTING, MOVING = (3, 4, 6), (1, 2, 5)
+
+
+def tracks_of(scene, clip):
+    flow = DenseFlow().track(clip)
+    return {k: Track(s, clip, flow) for k, s in segments_of(scene.hypothesis(), clip.before).items()}
+
+
+def corner(rng, n=1500):
+    """Points on three faces of a box: every motion is observable."""
+    p = rng.uniform(0, 0.1, (n, 3))
+    p[np.arange(n), np.arange(n) % 3] = 0.0
+    return p + 0.0005 * rng.normal(size=p.shape)
+
+
+def test_registration_finds_a_small_motion():
+    rng = np.random.default_rng(0)
+    T = at(0.01, -0.006, 0.004, 6)
+    source, target = prepare(corner(rng)), prepare(corner(rng) @ T[:3, :3].T + T[:3, 3])
+    fit = register(source, target, np.eye(4), 0.03)
+    mm, deg = errors(fit.T, T, np.full(3, 0.03))
+    assert mm < 0.5 and deg < 0.5
+    assert fit.overlap > 0.95 and fit.median < 0.004
+    again = register(source, target, np.eye(4), 0.03)
+    np.testing.assert_array_equal(fit.T, again.T)
+
+
+def test_registration_from_the_centroid_reaches_far_motions():
+    rng = np.random.default_rng(1)
+    T = at(0.2, 0.1, 0.0, 12)
+    a, b = corner(rng), corner(rng) @ T[:3, :3].T + T[:3, 3]
+    fit = register(prepare(a), prepare(b), centroid_shift(a, b), 0.03)
+    assert errors(fit.T, T, np.full(3, 0.03))[0] < 1.0
+    assert assess(prepare(a), prepare(b), np.eye(4), 0.03).overlap < 0.5
+
+
+@pytest.mark.parametrize("n", [0, 1, 11])
+def test_too_few_points_cannot_be_registered(n):
+    assert prepare(np.random.default_rng(0).normal(size=(n, 3))) is None
+
+
+def test_what_rests_is_found_at_rest_and_what_moves_is_not(textured, plain):
+    for scene, clip in (textured, plain):
+        tracks = tracks_of(scene, clip)
+        assert [k for k, t in tracks.items() if StaticTest().rests(t)] == list(RESTING)
+        assert not any(StaticTest(enabled=False).rests(t) for t in tracks.values())
+
+
+def test_an_object_that_something_moved_in_front_of_still_rests():
+    wall = slide(at(-0.22, -0.12, 0.06), at(-0.03, -0.12, 0.06), 5)
+    scene = Scene(
+        [Box((0.12, 0.1, 0.1)), Box((0.05, 0.04, 0.12), (60, 120, 60))], [[at(0, 0.05, 0.05), p] for p in wall]
+    )
+    tracks = tracks_of(scene, scene.clip(0))
+    assert StaticTest().rests(tracks[1])
+    assert not StaticTest().rests(tracks[2])
+
+
+@pytest.mark.parametrize("shift", [0.004, 0.01])
+def test_small_shifts_are_not_rest(shift):
+    scene = Scene([Box((0.1, 0.08, 0.07))], [[at(0, 0, 0.035)], [at(shift, 0, 0.035)]])
+    assert not StaticTest().rests(tracks_of(scene, scene.clip(0))[1])
+
+
+def test_the_true_motion_has_the_least_residual(textured):
+    scene, clip = textured
+    residual = Residual()
+    for k in (1, 5):
+        track, truth = tracks_of(scene, clip)[k], scene.motions()[k]
+        centre = track.points.mean(axis=0)
+        best = residual.score(track, truth)
+        for step in (at(0.01, 0, 0), at(0, 0.01, 0), at(0, 0, 0.01), at(-0.02, 0.02, 0)):
+            assert residual.score(track, step @ truth) > best
+        turn = at(0, 0, 0, 8)
+        turn[:3, 3] = centre - turn[:3, :3] @ centre
+        assert residual.score(track, truth @ turn) > best
+        assert residual.score(track, np.eye(4)) > best + 5
+
+
+def test_residual_knows_a_twin_by_where_flow_comes_from():
+    scene = standard(9, size=(480, 360))
+    track = tracks_of(scene, scene.clip(0))[5]
+    onto_twin = scene.poses[0][3] @ np.linalg.inv(scene.poses[0][4])  # object 5 to where its twin, 4, rests
+    truth = scene.motions()[5]
+    assert Residual().score(track, truth) < Residual().score(track, onto_twin)
+    by_look = Residual(track_weight=0.0)
+    assert by_look.score(track, onto_twin) < by_look.score(track, truth) + 0.5
+
+
+def test_hidden_points_cost_a_constant_and_points_outside_more(textured):
+    scene, clip = textured
+    track, residual = tracks_of(scene, clip)[1], Residual(track_weight=0.0)
+    assert residual.score(track, at(0, 0, -0.5)) == pytest.approx(residual.occluded_cost)
+    assert residual.score(track, at(30, 0, 0)) == pytest.approx(residual.outside_cost)
+
+
+def test_nothing_to_compare_is_infinite(textured):
+    scene, clip = textured
+    blank = Frame(clip.after.rgb, np.full_like(clip.after.depth, np.nan), clip.after.camera)
+    blind = Clip((clip.before, blank), clip.grid)
+    assert tracks_of(scene, blind)[1].target_points.shape == (0, 3)
+    assert Residual().score(tracks_of(scene, blind)[1], np.eye(4)) == np.inf
+
+
+def test_refinement_pulls_a_wrong_motion_in(textured, plain):
+    for kind, (scene, clip) in (("textured", textured), ("plain", plain)):
+        for k in (1, 5):
+            track, truth = tracks_of(scene, clip)[k], scene.motions()[k]
+            centre = track.points.mean(axis=0)
+            off = at(0.006, -0.005, 0.004, 3)
+            off[:3, 3] += centre - off[:3, :3] @ centre
+            refined = refine(track, truth @ off)
+            mm, deg = errors(refined, truth, centre)
+            assert deg < 1.2
+            assert Residual().score(track, refined) < 0.6 * Residual().score(track, truth @ off)
+            if kind == "textured":  # along a plain face neither depth nor colour says anything
+                assert mm < 2.0
+
+
+def test_refinement_uses_colour_for_the_spin_of_a_can():
+    poses = [[at(0, 0, 0.06)], [at(0.0, 0.0, 0.06, 6)]]
+    scene = Scene([Cylinder((0.09, 0.09, 0.12), texture=0.7)], poses, (640, 480))
+    track = tracks_of(scene, scene.clip(0))[1]
+    T = refine(track, np.eye(4))
+    assert errors(T, scene.motions()[1], track.points.mean(axis=0))[1] < 1.5
+
+
+def test_normals_are_those_of_the_table(plain):
+    scene, clip = plain
+    table = scene.trace(scene.poses[-1])[1] == 0
+    n = normals(clip.after)[table]
+    up = np.nanmedian(n[:, 2])
+    assert up > 0.95
+    assert np.nanmax(np.abs(np.linalg.norm(n, axis=1) - 1)) < 1e-4
+
+
+def test_sift_matches_follow_a_textured_box():
+    scene = Scene(
+        [Box((0.16, 0.14, 0.08), texture=0.7)], [[at(-0.04, 0, 0.04)], [at(0.03, 0.02, 0.04, 8)]], (640, 480)
+    )
+    clip = scene.clip(0)
+    m = SiftMatching().match(clip.before, clip.after)
+    chosen = m.within(scene.trace(scene.poses[0])[1] == 1, scene.trace(scene.poses[1])[1] == 1)
+    T = scene.motions()[1]
+    error = np.linalg.norm(m.p[chosen] @ T[:3, :3].T + T[:3, 3] - m.q[chosen], axis=1)
+    assert len(chosen) >= 20
+    assert np.median(error) < 0.005
+
+
+def test_search_radii_bound_the_matches(textured):
+    _, clip = textured
+    near = SiftMatching(search_share=0.05, search_distance=0.03).match(clip.before, clip.after)
+    assert (np.linalg.norm(near.before - near.after, axis=1) <= 16).all()
+    assert (np.linalg.norm(near.p - near.q, axis=1) <= 0.03).all()
+    many = SiftMatching(mutual=False).match(clip.before, clip.after)
+    one = SiftMatching().match(clip.before, clip.after)
+    assert len(many.p) > len(one.p)
+    assert len(np.unique(one.before, axis=0)) == len(one.before)

@@ -1,0 +1,139 @@
+import numpy as np
+import pytest
+
+from mstfilter.errors import InputError
+from mstfilter.tracking.flow import DenseFlow
+from mstfilter.tracking.mst_rule import MstRule
+from mstfilter.tracking.rules import IDENTITY, AuthorsRule, Candidate, PaperRule
+from mstfilter.tracking.segments import segments_of
+from mstfilter.tracking.track import Track
+from tests.tracking.scenes import Box, Scene, at, errors, slide
+
+
+def track_of(scene, clip, label=1):
+    return Track(segments_of(scene.hypothesis(), clip.before)[label], clip, DenseFlow().track(clip))
+
+
+@pytest.fixture(scope="module")
+def printed_box():
+    """A well textured box near the camera's centre that moves 5 cm and 8 degrees."""
+    poses = slide(at(-0.03, 0, 0.04), at(0.02, 0.01, 0.04, 8), 4)
+    scene = Scene([Box((0.16, 0.14, 0.08), texture=0.7)], [[p] for p in poses], (480, 360))
+    return scene, scene.clip(0)
+
+
+def test_paper_takes_sift_with_enough_inliers(printed_box):
+    scene, clip = printed_box
+    rng = np.random.default_rng(0)
+    track = track_of(scene, clip)
+    rule = PaperRule()
+    chosen = rule.choose(rng, rule.candidates(rng, track))
+    assert chosen.kind == "sift" and chosen.support > 5
+    mm, deg = errors(chosen.T, scene.motions()[1], track.points.mean(axis=0))
+    assert mm < 4 and deg < 3
+
+
+def test_papers_millimetre_is_below_the_noise(printed_box, plain):
+    """As printed ICP is not accepted, and without texture everything becomes the identity."""
+    rng = np.random.default_rng(0)
+    scene, clip = plain
+    for label in (1, 2, 5):
+        rule = PaperRule()
+        assert [c.kind for c in rule.candidates(rng, track_of(scene, clip, label))] == ["identity"]
+        loose = PaperRule(max_error=0.02)
+        assert loose.candidates(rng, track_of(scene, clip, label))[0].kind == "icp"
+
+
+def test_papers_two_orders():
+    sift, icp = Candidate("sift", np.eye(4), 9, 0.004, 0.004), Candidate("icp", np.eye(4), 100, 0.0008, 0.0008)
+    rng = np.random.default_rng(0)
+    assert PaperRule().choose(rng, (sift, icp, IDENTITY)) is sift
+    assert PaperRule(order="best").choose(rng, (sift, icp, IDENTITY)) is icp
+    assert PaperRule(order="best").choose(rng, (IDENTITY,)) is IDENTITY
+
+
+def test_authors_rule_uses_a_cluster_as_often_as_its_size_says():
+    """Binomial checks; each bound is 4.4 standard deviations, false alarm below 1e-4 in all."""
+    n = 4000
+    icp = Candidate("icp", np.eye(4), 100)
+    for support, p in ((3, 0.1), (6, 0.35), (9, 0.65), (30, 0.9)):
+        cluster = Candidate("sift", np.eye(4), support)
+        rng = np.random.default_rng(support)
+        used = sum(AuthorsRule().choose(rng, (cluster, icp, IDENTITY)) is cluster for _ in range(n))
+        assert abs(used - n * p) < 4.4 * np.sqrt(n * p * (1 - p))
+
+
+def test_authors_rule_draws_clusters_by_size():
+    a, b = Candidate("sift", np.eye(4), 30), Candidate("sift", np.eye(4), 10)
+    rng = np.random.default_rng(1)
+    drawn = [AuthorsRule(lowest=1.0, highest=1.0).choose(rng, (a, b, IDENTITY)) for _ in range(4000)]
+    assert abs(sum(c is a for c in drawn) - 3000) < 4.4 * np.sqrt(4000 * 0.75 * 0.25)
+
+
+def test_authors_rule_falls_back_to_icp_then_identity():
+    rng = np.random.default_rng(2)
+    icp = Candidate("icp", np.eye(4), 100)
+    assert AuthorsRule().choose(rng, (icp, IDENTITY)) is icp
+    assert AuthorsRule().choose(rng, (IDENTITY,)) is IDENTITY
+
+
+@pytest.mark.parametrize("kind", ["textured", "plain"])
+def test_mst_rule_finds_the_motion_of_boxes(kind, request):
+    scene, clip = request.getfixturevalue(kind)
+    rule, rng = MstRule(), np.random.default_rng(0)
+    for label in (1, 5):
+        track = track_of(scene, clip, label)
+        chosen = rule.choose(rng, rule.candidates(rng, track))
+        mm, deg = errors(chosen.T, scene.motions()[label], track.points.mean(axis=0))
+        assert mm < (3 if kind == "textured" else 9) and deg < 2
+
+
+def test_mst_rule_places_a_cylinder_whatever_its_spin(textured, plain):
+    for scene, clip in (textured, plain):
+        track, truth = track_of(scene, clip, 2), scene.motions()[2]
+        rule, rng = MstRule(), np.random.default_rng(0)
+        chosen = rule.choose(rng, rule.candidates(rng, track))
+        axis = np.append(scene.poses[0][1][:3, 3], 1.0)
+        assert np.linalg.norm((chosen.T @ axis - truth @ axis)[:3]) < 0.008
+
+
+def test_mst_rule_is_not_worse_than_registration_from_the_centroid(textured, plain):
+    rng = np.random.default_rng(0)
+    baseline = MstRule(use_flow=False, use_sift=False, n_refine=0)
+    for scene, clip in (textured, plain):
+        for label in (1, 2, 5):
+            track = track_of(scene, clip, label)
+            ours, simple = (min(c.score for c in rule.candidates(rng, track)) for rule in (MstRule(), baseline))
+            assert ours <= simple + 1e-9
+
+
+def test_rest_is_kept_unless_a_motion_is_clearly_better():
+    rest, better, best = (
+        Candidate(k, np.eye(4), 0, 0.0, s) for k, s in (("identity", 0.85), ("icp", 0.9), ("icp", 0.8))
+    )
+    rng = np.random.default_rng(0)
+    assert MstRule().choose(rng, (rest, better)) is rest
+    assert MstRule().choose(rng, (rest, best)) is best
+    nothing = Candidate("identity", np.eye(4), 0, 0.0, np.inf)
+    assert MstRule().choose(rng, (nothing,)).kind == "identity"
+
+
+def test_sampling_follows_the_scores():
+    a, b = Candidate("identity", np.eye(4), 0, 0.0, 1.0), Candidate("icp", np.eye(4), 0, 0.0, 1.2)
+    rule, rng, n = MstRule(select="sample", n_eff=10.0), np.random.default_rng(3), 4000
+    p = 1 / (1 + np.exp(-0.5 * 10 * 0.2))
+    drawn = sum(rule.choose(rng, (a, b)) is a for _ in range(n))
+    assert abs(drawn - n * p) < 4.4 * np.sqrt(n * p * (1 - p))
+
+
+def test_candidates_too_far_or_too_turned_are_dropped(printed_box):
+    scene, clip = printed_box
+    rng = np.random.default_rng(0)
+    assert len(MstRule(max_shift=0.01).candidates(rng, track_of(scene, clip))) == 1
+    assert all(c.kind == "identity" for c in MstRule(max_angle=0.01).candidates(rng, track_of(scene, clip)))
+
+
+def test_unknown_choices_are_refused():
+    for make in (lambda: PaperRule(order="last"), lambda: PaperRule(icp_start="far"), lambda: MstRule(select="all")):
+        with pytest.raises(InputError):
+            make()

@@ -1,0 +1,223 @@
+import json
+
+import numpy as np
+import pytest
+
+from mstfilter.scene.clip import Clip
+from mstfilter.scene.frame import Frame
+from mstfilter.scene.voxels import Hypothesis
+from mstfilter.smc.population import Population
+from mstfilter.tracking.mst_rule import MstRule
+from mstfilter.tracking.rules import AuthorsRule, PaperRule
+from mstfilter.tracking.static import StaticTest
+from mstfilter.tracking.transition import IdentityTransition, TrackingTransition
+from mstfilter.tracking.warp import Warp
+from tests.tracking.scenes import Box, Cylinder, Scene, at, errors, iou, slide
+
+RULES = {"mst": MstRule(), "paper": PaperRule(), "authors": AuthorsRule()}
+
+
+def population(*hypotheses):
+    return Population(tuple(hypotheses), np.arange(len(hypotheses)) / 10.0)
+
+
+def predict(clip, *hypotheses, seed=0, transition=None):
+    return (transition or TrackingTransition()).predict(np.random.default_rng(seed), population(*hypotheses), clip)
+
+
+def merged(h, a, b):
+    """The same scene with object a counted to b."""
+    return Hypothesis.from_labels(np.where(h.labels == a, b, h.labels), h.grid)
+
+
+@pytest.mark.parametrize("kind", ["textured", "plain"])
+def test_hypotheses_follow_the_scene(kind, request):
+    scene, clip = request.getfixturevalue(kind)
+    h, truth = scene.hypothesis(), scene.labels(scene.poses[-1])
+    moved = predict(clip, h).particles[0]
+    for k in (1, 2, 5):
+        assert iou(h.labels == k, truth == k) < 0.1
+        assert iou(moved.labels == k, truth == k) > 0.75
+    for k in (3, 4, 6):
+        np.testing.assert_array_equal(moved.labels == k, h.labels == k)
+
+
+@pytest.mark.parametrize("rule", RULES)
+def test_a_static_clip_changes_no_byte(rule):
+    poses = [[at(-0.1, 0, 0.04, 20), at(0.08, 0, 0.05)]] * 4
+    scene = Scene([Box((0.1, 0.08, 0.08)), Cylinder((0.08, 0.08, 0.1), texture=0.0)], poses)
+    h = scene.hypothesis()
+    moved = predict(scene.clip(0), h, transition=TrackingTransition(RULES[rule]))
+    assert moved.particles[0] is h
+    assert moved.notes["motions"] == {"static": 2}
+
+
+def test_population_bookkeeping(textured):
+    scene, clip = textured
+    h = scene.hypothesis()
+    moved = predict(clip, h, merged(h, 4, 5), h)
+    np.testing.assert_array_equal(moved.log_weights, [0.0, 0.1, 0.2])
+    np.testing.assert_array_equal(moved.parents["previous"], [0, 1, 2])
+    assert json.loads(json.dumps(moved.notes)) == moved.notes
+    assert sum(moved.notes["motions"].values()) == 6 + 5 + 6
+    assert moved.notes["segments"] == 7  # six, and the merged one
+    assert not TrackingTransition.properly_weighted
+    assert [r.id for r in moved.particles[0].objects] == [1, 2, 3, 4, 5, 6]
+
+
+@pytest.mark.parametrize("rule", RULES)
+def test_the_order_of_hypotheses_changes_nothing(rule, textured):
+    scene, clip = textured
+    h = scene.hypothesis()
+    hs = [h, merged(h, 4, 5), merged(h, 3, 1)]
+    transition = TrackingTransition(RULES[rule])
+    forward, backward = predict(clip, *hs, transition=transition), predict(clip, *hs[::-1], transition=transition)
+    for a, b in zip(forward.particles, backward.particles[::-1], strict=True):
+        np.testing.assert_array_equal(a.labels, b.labels)
+    assert forward.notes == backward.notes
+
+
+def test_a_stochastic_rule_moves_copies_differently_and_repeats_with_the_seed(textured):
+    scene, clip = textured
+    transition = TrackingTransition(MstRule(select="sample", n_eff=0.5))
+    hs = [scene.hypothesis()] * 12
+    a, b, c = (predict(clip, *hs, seed=s, transition=transition) for s in (0, 0, 1))
+    grids = [p.labels.tobytes() for p in a.particles]
+    assert len(set(grids)) > 1
+    assert grids == [p.labels.tobytes() for p in b.particles]
+    assert grids != [p.labels.tobytes() for p in c.particles]
+
+
+def test_a_hundred_copies_are_tracked_once(textured):
+    scene, clip = textured
+    moved = predict(clip, *[scene.hypothesis()] * 100)
+    assert len(moved) == 100 and moved.notes["segments"] == 6
+    assert len({p.labels.tobytes() for p in moved.particles}) == 1
+
+
+def test_without_video_nothing_moves(textured):
+    scene, clip = textured
+    h = scene.hypothesis()
+    single = Clip((clip.before,), clip.grid)
+    for observation in (single, None):
+        assert predict(observation, h).particles[0] is h
+    assert IdentityTransition().predict(np.random.default_rng(0), population(h), clip).particles[0] is h
+
+
+def test_an_empty_hypothesis_stays_empty(textured):
+    scene, clip = textured
+    empty = Hypothesis.from_labels(np.zeros(scene.grid.shape, np.uint16), scene.grid)
+    assert predict(clip, empty).particles[0].n_objects == 0
+
+
+def test_an_object_that_cannot_be_seen_stays():
+    """Box 2 is hidden behind box 1 all the time."""
+    poses = [[at(0, -0.05, 0.09), at(0.0, 0.06, 0.02)]] * 2
+    scene = Scene([Box((0.3, 0.06, 0.18)), Box((0.05, 0.05, 0.04))], poses)
+    moved = predict(scene.clip(0), scene.hypothesis())
+    assert moved.notes["motions"] == {"invisible": 1, "static": 1}
+
+
+@pytest.mark.parametrize("rule", RULES)
+def test_full_occlusion_at_the_end_leaves_the_object_where_it_was(rule):
+    screen = slide(at(-0.3, -0.12, 0.12), at(0.0, -0.12, 0.12), 7)
+    scene = Scene(
+        [Box((0.06, 0.06, 0.05)), Box((0.2, 0.03, 0.24), (60, 120, 60))], [[at(0, 0.05, 0.025), p] for p in screen]
+    )
+    h = scene.hypothesis()
+    moved = predict(scene.clip(0), h, transition=TrackingTransition(RULES[rule])).particles[0]
+    assert iou(moved.labels == 1, h.labels == 1) > 0.9
+
+
+def test_an_object_that_leaves_the_workspace_is_counted_out():
+    scene = Scene([Box((0.08, 0.08, 0.06))], [[p] for p in slide(at(0.30, 0, 0.03), at(0.40, 0, 0.03), 6)])
+    moved = predict(scene.clip(0), scene.hypothesis())
+    volume = scene.hypothesis().volumes()[1]
+    assert moved.notes["voxels_left"] > 0.3 * volume
+    assert moved.particles[0].volumes()[1] < 0.7 * volume
+
+
+def test_an_object_that_leaves_the_view_does_no_harm():
+    scene = Scene(
+        [Box((0.08, 0.08, 0.06)), Box((0.08, 0.08, 0.06), (60, 120, 60))],
+        [[p, at(0, 0.1, 0.03)] for p in slide(at(-0.1, -0.12, 0.03), at(-0.1, -0.5, 0.03), 6)],
+    )
+    moved = predict(scene.clip(0), scene.hypothesis())
+    np.testing.assert_array_equal(moved.particles[0].labels == 2, scene.hypothesis().labels == 2)
+
+
+@pytest.mark.parametrize("rule", RULES)
+def test_a_mask_without_depth_stays(rule, textured):
+    scene, clip = textured
+    h = scene.hypothesis()
+    hole = np.array(clip.before.depth)
+    hole[scene.trace(scene.poses[0])[1] == 1] = np.nan
+    blind = Clip(
+        (Frame(clip.before.rgb, hole, clip.before.camera, clip.before.robot_mask), *clip.frames[1:]), clip.grid
+    )
+    moved = predict(blind, h, transition=TrackingTransition(RULES[rule]))
+    assert moved.notes["motions"]["unsupported"] >= 1
+    np.testing.assert_array_equal(moved.particles[0].record(1).motion.as_matrix(), np.eye(4))
+
+
+@pytest.mark.parametrize("rule", RULES)
+def test_no_depth_at_all_moves_nothing(rule, textured):
+    scene, clip = textured
+    h = scene.hypothesis()
+    blind = [Frame(f.rgb, np.full_like(f.depth, np.nan), f.camera) for f in clip.frames]
+    assert predict(Clip(blind, clip.grid), h, transition=TrackingTransition(RULES[rule])).particles[0] is h
+
+
+@pytest.mark.parametrize("rule", RULES)
+def test_one_voxel_is_no_trouble(rule, textured):
+    scene, clip = textured
+    labels = scene.labels(scene.poses[0])
+    x, y, z = np.argwhere(labels == 1)[-1]
+    labels[labels == 1] = 0
+    labels[x, y, z] = 1
+    h = Hypothesis.from_labels(labels, scene.grid)
+    moved = predict(clip, h, transition=TrackingTransition(RULES[rule], min_support=1)).particles[0]
+    assert moved.n_objects >= 5
+
+
+def test_twins_are_not_exchanged():
+    """4 and 5 look alike and touch; 5 slides away, 4 rests."""
+    poses = [[at(-0.04, 0, 0.04), p] for p in slide(at(0.041, 0, 0.04), at(0.11, 0.05, 0.04, 25), 8)]
+    twins = [Box((0.08, 0.08, 0.08), texture=0.6, seed=4)] * 2
+    scene = Scene(twins, poses, (480, 360))
+    h, truth = scene.hypothesis(), scene.labels(poses[-1])
+    moved = predict(scene.clip(0), h, transition=TrackingTransition(static=StaticTest(False))).particles[0]
+    assert iou(moved.labels == 1, truth == 1) > 0.8
+    assert iou(moved.labels == 2, truth == 2) > 0.8
+
+
+def test_half_of_an_object_moves_like_the_whole(plain):
+    scene, clip = plain
+    labels = scene.labels(scene.poses[0])
+    where = np.argwhere(labels == 1)
+    half = where[where[:, 2] >= 5]
+    labels[tuple(half.T)] = 9
+    moved = predict(clip, Hypothesis.from_labels(labels, scene.grid)).particles[0]
+    truth = scene.labels(scene.poses[-1]) == 1
+    assert iou(np.isin(moved.labels, (1, 9)), truth) > 0.7
+
+
+def test_records_carry_the_composed_motion(textured):
+    scene, clip = textured
+    h = scene.hypothesis()
+    once = predict(clip, h).particles[0]
+    record = once.record(1)
+    centre = np.array([*scene.poses[0][0][:2, 3], 0.1])
+    mm, deg = errors(record.motion.as_matrix(), scene.motions()[1], centre)
+    assert mm < 5 and deg < 2
+    np.testing.assert_array_equal(h.labels[record.source.box] == 1, record.source.occupied)
+    back = Clip(tuple(reversed(clip.frames)), clip.grid)
+    twice = predict(back, once).particles[0]
+    assert iou(twice.labels == 1, h.labels == 1) > 0.9  # and not 0.9 of 0.9
+
+
+def test_splat_forgets_the_source(textured):
+    scene, clip = textured
+    transition = TrackingTransition(warp=Warp("splat", "label"))
+    moved = predict(clip, scene.hypothesis(), transition=transition).particles[0]
+    assert all(r.source is None for r in moved.objects)

@@ -1,0 +1,142 @@
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from mstfilter.errors import InputError
+from mstfilter.scene.voxels import Hypothesis, VoxelGrid
+from mstfilter.tracking.warp import Warp
+from tests.tracking.scenes import at, iou
+
+GRID = VoxelGrid((-0.3, -0.3, 0.0), 0.01, (60, 60, 30))
+
+
+def hypothesis(*boxes):
+    labels = np.zeros(GRID.shape, np.uint16)
+    for label, (low, high) in enumerate(boxes, start=1):
+        labels[tuple(slice(a, b) for a, b in zip(low, high, strict=True))] = label
+    return Hypothesis.from_labels(labels, GRID)
+
+
+BOX = ((20, 20, 0), (30, 28, 6))
+OTHER = ((40, 20, 0), (48, 28, 6))
+
+
+def turn(deg, shift=(0, 0, 0), centre=(-0.05, -0.06, 0.0)):
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_euler("z", deg, degrees=True).as_matrix()
+    T[:3, 3] = np.array(shift) + centre - T[:3, :3] @ centre
+    return T
+
+
+@pytest.mark.parametrize("warp", [Warp(), Warp("splat", "label")])
+def test_identity_returns_the_same_bytes(warp):
+    h = hypothesis(BOX, OTHER)
+    moved = warp.move(h, {1: np.eye(4), 2: np.eye(4)})
+    assert moved.hypothesis is h
+    assert (moved.voxels_left, moved.contested, moved.dropped) == (0, 0, ())
+
+
+@settings(max_examples=40, deadline=None)
+@given(shift=st.tuples(*[st.integers(-8, 8)] * 2, st.integers(0, 8)), splat=st.booleans())
+def test_whole_voxel_shift_is_exact(shift, splat):
+    h = hypothesis(BOX)
+    moved = Warp("splat" if splat else "pull").move(h, {1: at(*np.array(shift) * 0.01)})
+    np.testing.assert_array_equal(moved.hypothesis.labels, np.roll(h.labels, shift, (0, 1, 2)))
+
+
+@settings(max_examples=25, deadline=None)
+@given(seed=st.integers(0, 10**6))
+def test_many_small_turns_keep_the_volume_and_equal_one_turn(seed):
+    rng = np.random.default_rng(seed)
+    h = hypothesis(BOX)
+    volume = h.volumes()[1]
+    total = np.eye(4)
+    for _ in range(6):
+        T = turn(rng.uniform(-15, 15), (*rng.uniform(-0.01, 0.01, 2), 0))
+        total = T @ total
+        h = Warp().move(h, {1: T}).hypothesis
+    assert abs(h.volumes()[1] / volume - 1) < 0.1  # one resampling's rounding, not six
+    once = Warp().move(hypothesis(BOX), {1: total}).hypothesis
+    np.testing.assert_array_equal(h.labels, once.labels)
+    np.testing.assert_allclose(h.record(1).motion.as_matrix(), total, atol=1e-9)
+    assert h.record(1).source.occupied.sum() == volume
+
+
+def test_pull_matches_the_exactly_voxelised_box_better_than_splat():
+    T = turn(27, (0.013, 0.006, 0))
+    centres = GRID.centres()
+    local = (centres - T[:3, 3]) @ T[:3, :3]
+    low, high = GRID.origin + np.array(BOX[0]) * 0.01, GRID.origin + np.array(BOX[1]) * 0.01
+    truth = ((local >= low) & (local < high)).all(-1)
+    pull, splat = (Warp(m).move(hypothesis(BOX), {1: T}).hypothesis.labels == 1 for m in ("pull", "splat"))
+    assert iou(pull, truth) == 1.0  # one pull of a solid box IS its voxelisation
+    assert iou(splat, truth) < 0.95
+
+
+def test_voxels_that_leave_are_counted_and_a_lost_object_is_dropped():
+    h = hypothesis(BOX, OTHER)
+    moved = Warp().move(h, {2: at(0.15, 0, 0)})
+    assert moved.voxels_left == 3 * 8 * 6
+    assert moved.hypothesis.volumes() == {1: 480, 2: 5 * 8 * 6}
+    gone = Warp().move(h, {2: at(0.5, 0, 0)})
+    assert gone.hypothesis.volumes() == {1: 480}
+    assert gone.dropped == (2,) and gone.voxels_left == 384
+    # What left comes back with the object.
+    back = Warp().move(moved.hypothesis, {2: at(-0.15, 0, 0)})
+    np.testing.assert_array_equal(back.hypothesis.labels, h.labels)
+
+
+@pytest.mark.parametrize("swap", [False, True])
+def test_a_contested_voxel_goes_to_the_object_it_is_deeper_in(swap):
+    boxes = (OTHER, BOX) if swap else (BOX, OTHER)
+    mover, rest = (2, 1) if swap else (1, 2)
+    moved = Warp().move(hypothesis(*boxes), {mover: at(0.12, 0, 0)}).hypothesis
+    assert moved.labels[40, 24, 2] == rest or moved.labels[40, 24, 2] == mover
+    line = moved.labels[30:50, 24, 2]
+    # The overlap is 40..41; each keeps its own side of it.
+    assert line[41 - 30] == rest
+    assert line[39 - 30] == mover
+    assert moved.volumes()[1] + moved.volumes()[2] == 480 + 384 - 2 * 8 * 6
+
+
+def test_collisions_do_not_depend_on_label_order():
+    def run(order):
+        boxes = [((20, 20, 0), (30, 28, 6)), ((31, 20, 0), (39, 28, 6)), ((22, 30, 0), (29, 38, 6))]
+        T = [turn(20, (0.03, 0.0, 0)), turn(-10, (-0.02, 0.01, 0)), turn(0, (0, -0.03, 0))]
+        h = hypothesis(*[boxes[i] for i in order])
+        moved = Warp().move(
+            h, {n + 1: T[i] for n, i in enumerate(order)}, {n + 1: 0.1 * i for n, i in enumerate(order)}
+        )
+        lookup = np.array([0, *[i + 1 for i in order]])
+        return lookup[moved.hypothesis.labels]
+
+    np.testing.assert_array_equal(run([0, 1, 2]), run([2, 1, 0]))
+    np.testing.assert_array_equal(run([0, 1, 2]), run([1, 2, 0]))
+
+
+def test_what_an_object_at_rest_lost_in_a_collision_comes_back():
+    h = hypothesis(BOX, OTHER)
+    bitten = Warp().move(h, {1: at(0.13, 0, 0)}).hypothesis
+    assert bitten.volumes()[2] < 384
+    apart = Warp().move(bitten, {1: at(-0.13, 0, 0), 2: at(0.02, 0, 0)}).hypothesis
+    assert apart.volumes() == {1: 480, 2: 384}
+
+
+def test_authors_collision_rule_gives_the_higher_label_precedence():
+    moved = Warp("splat", "label").move(hypothesis(BOX, OTHER), {1: at(0.14, 0, 0)}).hypothesis
+    assert moved.volumes()[2] == 384
+
+
+def test_single_voxels_survive_any_turn():
+    h = hypothesis(((10, 10, 3), (11, 11, 4)))
+    for deg in range(0, 90, 7):
+        assert Warp().move(h, {1: turn(deg, (0.0132, 0.0047, 0))}).hypothesis.n_objects == 1
+
+
+def test_unknown_choices_are_refused():
+    with pytest.raises(InputError):
+        Warp("push")
+    with pytest.raises(InputError):
+        Warp(collisions="random")
