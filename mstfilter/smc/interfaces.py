@@ -17,12 +17,18 @@ particles.
 ...         return Population(population.particles + step, population.log_weights)
 
 A guided move, which draws from q(x_t | x_{t-1}, y_t) instead of the model's f(x_t | x_{t-1}), is a Transition
-too: it sees the observation, and it adds log f - log q to the log weights.
+too: it sees the observation, and it adds log f - log q to the log weights
+(`mstfilter.smc.state_space.GuidedTransition` does so for any model and proposal with densities).
+
+Needed by every filter: Proposal (or an initial one), Transition, Update, Resampler, Trigger. Optional: `Size`
+(how many particles to keep), `Lookahead` (auxiliary filter), `Rejuvenation` (resample-move), `Codec` (how
+particles of your own are stored). A further ability is a further interface: `DensityTransition`.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, ClassVar
 
@@ -30,7 +36,19 @@ import numpy as np
 
 from mstfilter.smc.population import Population, log_mean_exp
 
-__all__ = ["Component", "Proposal", "Resampler", "Transition", "Trigger", "Update"]
+__all__ = [
+    "Codec",
+    "Component",
+    "DensityTransition",
+    "Lookahead",
+    "Proposal",
+    "Rejuvenation",
+    "Resampler",
+    "Size",
+    "Transition",
+    "Trigger",
+    "Update",
+]
 
 
 class Component(ABC):
@@ -55,6 +73,27 @@ class Transition(Component):
     @abstractmethod
     def predict(self, rng: np.random.Generator, population: Population, observation: Any) -> Population:
         """Move all particles. `observation` is None where it is missing."""
+
+
+class DensityTransition(Transition):
+    """A transition whose density is known, for moves, smoothing and importance weights."""
+
+    @abstractmethod
+    def log_prob(self, previous: Any, new: Any, observation: Any) -> np.ndarray:
+        """Log density of each move.
+
+        Parameters
+        ----------
+        previous, new : n particles each
+            Paired rows: row i of `new` was reached from row i of `previous`.
+        observation : Any
+            The observation that `predict` was given with the move; None where it is missing.
+
+        Returns
+        -------
+        (n,) float64
+            log f(new_i | previous_i); -inf where the move is impossible.
+        """
 
 
 class Update(Component):
@@ -128,3 +167,70 @@ class Trigger(ABC):
     @abstractmethod
     def wants(self, population: Population, t: int) -> bool:
         """True to resample."""
+
+
+class Size(ABC):
+    """Decides how many particles a resampling makes."""
+
+    @abstractmethod
+    def choose(self, population: Population) -> int:
+        """Number of particles (at least 1), from the weighted particles that are about to be resampled.
+
+        The filter's `n` is then only the number that it starts with.
+        """
+
+
+class Lookahead(Component):
+    """A glance at the next observation before particles are selected: the auxiliary filter.
+
+    The driver selects by log weight + priority and takes the priority off the selected weights again, so any
+    priority leaves the filter exact; a good one is close to log p(y_t | x_{t-1}).
+    """
+
+    @abstractmethod
+    def log_priority(self, population: Population, observation: Any) -> np.ndarray:
+        """(n,) log priority of each particle x_{t-1} given y_t. Finite: -inf would bias the filter."""
+
+
+class Rejuvenation(Component):
+    """Moves particles at the end of a step that resampled, by a kernel that keeps their law: resample-move."""
+
+    @abstractmethod
+    def move(
+        self,
+        rng: np.random.Generator,
+        population: Population,
+        previous: Population | None,
+        observation: Any,
+    ) -> Population:
+        """Move x_t without changing what it is distributed as.
+
+        Parameters
+        ----------
+        rng : Generator
+            For whatever is drawn.
+        population : Population
+            Weighted particles x_t after the observation.
+        previous : Population or None
+            Their x_{t-1}, row by row; None at the first step.
+        observation : Any
+            y_t; None where it is missing.
+
+        Returns
+        -------
+        Population
+            As many particles in the same order, moved by a kernel that leaves p(x_t | x_{t-1}, y_t) invariant;
+            log weights unchanged.
+        """
+
+
+class Codec(ABC):
+    """Stores particles as named arrays and makes them again, bit for bit. No pickle."""
+
+    @abstractmethod
+    def encode(self, particles: Any) -> Mapping[str, np.ndarray]:
+        """Named arrays (no object arrays) of a population's particles."""
+
+    @abstractmethod
+    def decode(self, arrays: Mapping[str, np.ndarray]) -> Any:
+        """The particles of `encode`."""
