@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from mstfilter.errors import InputError
@@ -54,3 +55,9 @@ def test_unknown_name_lists_what_exists():
     with pytest.raises(InputError) as caught:
         scene_family("kitchen")
     assert "demo" in caught.value.hints[0]
+
+
+def test_what_the_family_holds():
+    demo = SCENE_FAMILIES["demo"]
+    inside = demo.holds(np.array([[0.0, 0.0, 0.05], [0.6, 0.0, 0.05], [0.0, -0.45, 0.05], [0.0, 0.0, -0.5]]))
+    assert inside.tolist() == [True, False, False, False]
