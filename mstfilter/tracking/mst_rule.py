@@ -53,6 +53,10 @@ class MstRule(MotionRule):
         At most so many SIFT motions are considered.
     n_refine : int
         So many of the best candidates are polished against the whole last frame (refine.py) and compete again.
+    search_above : float
+        Where every candidate scores worse, the object is looked for around its old place; negative: never.
+    search_radius, search_step : float
+        Metres; how far and how finely.
     sift : SiftMatching
     residual : Residual
     """
@@ -69,6 +73,9 @@ class MstRule(MotionRule):
     min_pairs: int = 6
     max_sift: int = 3
     n_refine: int = 3
+    search_above: float = 4.0
+    search_radius: float = 0.14
+    search_step: float = 0.01
     sift: SiftMatching = field(default_factory=SiftMatching)
     residual: Residual = field(default_factory=Residual)
 
@@ -93,7 +100,28 @@ class MstRule(MotionRule):
                 T = refine(track, c.T, residual.depth_scale, residual.colour_scale)
                 if self._admissible(T, centre):
                     found.append(Candidate(c.kind, T, c.support, 0.0, residual.score(track, T)))
+        if self.search_above >= 0 and min(c.score for c in found) > self.search_above:
+            found.extend(self._search(track, centre))
         return tuple(c for c in found if c is identity or np.isfinite(c.score))
+
+    def _search(self, track: Track, centre: Array) -> list[Candidate]:
+        """Where else on the table could it be? Shifts and turns on a lattice, the best ones polished."""
+        n = round(self.search_radius / self.search_step)
+        shifts = self.search_step * np.stack(np.meshgrid(*[np.arange(-n, n + 1)] * 2), axis=-1).reshape(-1, 2)
+        shifts = shifts[np.hypot(*shifts.T) <= self.search_radius]
+        found = []
+        for yaw in (-0.35, 0.0, 0.35):
+            motions = np.tile(np.eye(4), (len(shifts), 1, 1))
+            c, s = np.cos(yaw), np.sin(yaw)
+            motions[:, :2, :2] = [[c, -s], [s, c]]
+            motions[:, :3, 3] = centre - motions[0, :3, :3] @ centre
+            motions[:, :2, 3] += shifts
+            scores = self.residual.scores(track, motions, 150)
+            for k in np.argsort(scores, kind="stable")[:2]:
+                T = refine(track, motions[k], self.residual.depth_scale, self.residual.colour_scale)
+                if np.isfinite(scores[k]) and self._admissible(T, centre):
+                    found.append(Candidate("search", T, 0, 0.0, self.residual.score(track, T)))
+        return found
 
     def _admissible(self, T: Array, centre: Array) -> bool:
         """Finite, and no farther or more turned than an object can be in a clip."""

@@ -60,32 +60,35 @@ class Residual:
 
     def score(self, track: Track, T: NDArray[np.float64]) -> float:
         """S of a motion (4, 4) of a segment; infinite where too little can be compared."""
-        points, colours = track.sample(self.n_points)
+        return float(self.scores(track, T[None])[0])
+
+    def scores(self, track: Track, motions: NDArray[np.float64], n_points: int | None = None) -> NDArray[np.float64]:
+        """S of many motions (K, 4, 4) of a segment, (K,), on at most ``n_points`` points."""
+        points, colours = track.sample(n_points or self.n_points)
         if not len(points):
-            return float("inf")
+            return np.full(len(motions), np.inf)
         after = track.clip.after
         height, width = after.depth.shape
-        uv, z = after.camera.project(rigid.apply(T, points))
-        inside = np.isfinite(uv).all(axis=1)
-        pixel = np.rint(np.where(inside[:, None], uv, -1.0))
-        inside &= (pixel >= 0).all(axis=1) & (pixel[:, 0] < width) & (pixel[:, 1] < height)
-        u, v = pixel[inside].astype(np.int64).T
+        uv, z = after.camera.project(rigid.apply(motions, points))
+        pixel = np.rint(np.where(np.isfinite(uv), uv, -1.0))
+        inside = (pixel >= 0).all(axis=-1) & (pixel[..., 0] < width) & (pixel[..., 1] < height)
+        u, v = np.moveaxis(np.where(inside[..., None], pixel, 0.0).astype(np.int64), -1, 0)
         measured = after.depth[v, u].astype(np.float64)
-        counted = after.valid[v, u]
-        behind = z[inside] - measured
+        counted = inside & after.valid[v, u]
+        behind = z - measured
         scale = self.depth_scale * np.sqrt(2.0) * depth_sigma(measured)
-        colour = np.linalg.norm(track.colour_after[v, u] - colours[inside], axis=1)
+        colour = np.linalg.norm(track.colour_after[v, u] - colours, axis=-1)
         with np.errstate(invalid="ignore"):
+            hidden = behind > self.occluded_margin
             cost = np.minimum(np.abs(behind) / scale, self.cap) ** 2
             cost = cost + np.minimum(colour / self.colour_scale, self.cap) ** 2
-            cost = np.where(behind > self.occluded_margin, self.occluded_cost, cost)
-        n_outside = int((~inside).sum())
-        n = n_outside + int(counted.sum())
-        if n < self.least_share * len(points):
-            return float("inf")
-        mean = float((cost[counted].sum() + self.outside_cost * n_outside) / n)
-        with np.errstate(invalid="ignore"):
-            visible = counted & ~(behind > self.occluded_margin)
-        source = track.flow.source[v[visible], u[visible]]
-        from_here = track.mask.ravel()[source[source >= 0]]
-        return mean + self.track_weight * float(1.0 - from_here.mean() if len(from_here) else 0.0)
+        cost = np.where(hidden, self.occluded_cost, cost)
+        n_outside = (~inside).sum(axis=-1)
+        n = n_outside + counted.sum(axis=-1)
+        total = np.where(counted, cost, 0.0).sum(axis=-1) + self.outside_cost * n_outside
+        # Of the visible points, the share that lands where flow says that something else came from.
+        source = track.flow.source[v, u]
+        traced = counted & ~hidden & (source >= 0)
+        foreign = (traced & ~track.mask.ravel()[source]).sum(axis=-1) / np.maximum(traced.sum(axis=-1), 1)
+        mean = total / np.maximum(n, 1)
+        return np.where(n >= max(self.least_share * len(points), 1), mean + self.track_weight * foreign, np.inf)

@@ -28,8 +28,6 @@ from mstfilter.tracking.track import Track
 
 __all__ = ["AuthorsRule", "Candidate", "MotionRule", "PaperRule"]
 
-KINDS = ("identity", "flow", "icp", "sift")
-
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
@@ -37,7 +35,7 @@ class Candidate:
 
     Attributes
     ----------
-    kind : "identity", "flow", "icp" or "sift".
+    kind : "identity", "flow", "icp", "sift" or "search".
     T : (4, 4) motion, world metres.
     support : matches or points behind it.
     error : metres, how well it fits its own evidence (rms unless the rule says otherwise).

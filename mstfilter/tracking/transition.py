@@ -75,7 +75,7 @@ class TrackingTransition(Transition):
 
         Notes
         -----
-        `notes` counts, over all hypotheses and objects: ``motions`` (static / identity / flow / icp / sift /
+        `notes` counts, over all hypotheses and objects: ``motions`` (static / identity / flow / icp / sift / search /
         invisible / unsupported / lost), ``segments`` (distinct ones tracked), ``voxels_left`` the grid,
         ``voxels_contested``, ``objects_dropped``. *invisible*: hidden in the first frame; *unsupported*: the
         depth image does not show it where the hypothesis has it; *lost*: nothing of it found in the last

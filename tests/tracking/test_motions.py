@@ -111,6 +111,14 @@ def test_hidden_points_cost_a_constant_and_points_outside_more(textured):
     assert residual.score(track, at(30, 0, 0)) == pytest.approx(residual.outside_cost)
 
 
+def test_many_motions_are_scored_like_one(textured):
+    scene, clip = textured
+    track, rng = tracks_of(scene, clip)[1], np.random.default_rng(0)
+    motions = np.stack([at(*rng.uniform(-0.1, 0.1, 3), 10 * rng.normal()) for _ in range(20)])
+    together = Residual().scores(track, motions)
+    np.testing.assert_array_equal(together, [Residual().score(track, T) for T in motions])
+
+
 def test_nothing_to_compare_is_infinite(textured):
     scene, clip = textured
     blank = Frame(clip.after.rgb, np.full_like(clip.after.depth, np.nan), clip.after.camera)

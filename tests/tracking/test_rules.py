@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 
 from mstfilter.errors import InputError
+from mstfilter.tracking import rigid
 from mstfilter.tracking.flow import DenseFlow
 from mstfilter.tracking.mst_rule import MstRule
 from mstfilter.tracking.rules import IDENTITY, AuthorsRule, Candidate, PaperRule
@@ -129,8 +130,24 @@ def test_sampling_follows_the_scores():
 def test_candidates_too_far_or_too_turned_are_dropped(printed_box):
     scene, clip = printed_box
     rng = np.random.default_rng(0)
-    assert len(MstRule(max_shift=0.01).candidates(rng, track_of(scene, clip))) == 1
-    assert all(c.kind == "identity" for c in MstRule(max_angle=0.01).candidates(rng, track_of(scene, clip)))
+    centre = track_of(scene, clip).points.mean(axis=0)
+    assert len(MstRule(max_shift=0.005).candidates(rng, track_of(scene, clip))) < 3
+    for c in MstRule(max_shift=0.02, max_angle=0.05).candidates(rng, track_of(scene, clip)):
+        assert rigid.displacement(c.T, centre) <= 0.02 and rigid.angle(c.T) <= 0.05
+
+
+def test_an_object_that_flow_lost_is_searched_for():
+    """Two frames, a jump of 12 cm: no flow can follow, the look of the box can."""
+    scene = Scene([Box((0.1, 0.08, 0.07), (170, 80, 60))], [[at(-0.06, 0, 0.035)], [at(0.06, 0.0, 0.035, 8)]])
+    clip = scene.clip(0)
+    track = track_of(scene, clip)
+    rng = np.random.default_rng(0)
+    rule = MstRule(use_flow=False, use_icp=False, use_sift=False)
+    chosen = rule.choose(rng, rule.candidates(rng, track))
+    assert chosen.kind == "search"
+    assert errors(chosen.T, scene.motions()[1], track.points.mean(axis=0))[0] < 5
+    never = MstRule(use_flow=False, use_icp=False, use_sift=False, search_above=-1.0)
+    assert [c.kind for c in never.candidates(rng, track)] == ["identity"]
 
 
 def test_unknown_choices_are_refused():
