@@ -16,6 +16,7 @@ import numpy as np
 
 from mstfilter.report.palette import GREY, Colour
 from mstfilter.scene.camera import Camera, look_at
+from mstfilter.scene.memo import memo
 from mstfilter.scene.rendering import render
 from mstfilter.scene.voxels import Hypothesis, VoxelGrid
 
@@ -30,7 +31,7 @@ def png_bytes(image: np.ndarray) -> bytes:
     import cv2
 
     order = [2, 1, 0, 3][: image.shape[2]]
-    return bytes(cv2.imencode(".png", np.ascontiguousarray(image[..., order]), [cv2.IMWRITE_PNG_COMPRESSION, 9])[1])
+    return bytes(cv2.imencode(".png", np.ascontiguousarray(image[..., order]), [cv2.IMWRITE_PNG_COMPRESSION, 6])[1])
 
 
 def jpeg_bytes(image: np.ndarray, quality: int = 90) -> bytes:
@@ -72,7 +73,7 @@ def layer(
     (scale H, scale W, 4) uint8
         RGBA, not premultiplied.
     """
-    labels = np.kron(labels, np.ones((scale, scale), labels.dtype)) if scale > 1 else labels
+    labels = labels.repeat(scale, axis=0).repeat(scale, axis=1)
     inside = labels > 0
     edge = np.zeros(labels.shape, bool)
     for axis in (0, 1):
@@ -105,8 +106,8 @@ def overlay(
 def viewpoint(
     hypotheses: Iterable[Hypothesis | tuple[np.ndarray, VoxelGrid]],
     camera: Camera | None = None,
-    width: int = 640,
-    height: int = 480,
+    width: int = 600,
+    height: int = 450,
 ) -> Camera:
     """A camera that looks down obliquely at all occupied voxels of all hypotheses and fits them all.
 
@@ -119,20 +120,16 @@ def viewpoint(
     width, height : int
         Pixels of the picture.
     """
-    lower, upper = np.full(3, np.inf), np.full(3, -np.inf)
+    occupied: dict[bytes, tuple[np.ndarray, VoxelGrid]] = {}
     for item in hypotheses:
         labels, grid = (item.labels, item.grid) if isinstance(item, Hypothesis) else item
-        for axis in range(3):
-            hit = np.flatnonzero((labels > 0).any(axis=tuple(a for a in range(3) if a != axis)))
-            if len(hit):
-                lower[axis] = min(lower[axis], grid.origin[axis] + hit[0] * grid.voxel_size)
-                upper[axis] = max(upper[axis], grid.origin[axis] + (hit[-1] + 1) * grid.voxel_size)
-    if not np.isfinite(lower).all():
-        middle = (grid.origin + grid.upper) / 2
-        lower, upper = middle - 0.15, middle + 0.15
-        lower[2], upper[2] = 0.0, 0.1
-    lower[2] = min(lower[2], 0.0)
-    target = (lower + upper) / 2
+        seen = occupied.get(grid.key)
+        occupied[grid.key] = ((labels > 0) if seen is None else seen[0] | (labels > 0), grid)
+    points = np.concatenate([g.centre_of(np.argwhere(mask)) for mask, g in occupied.values()])
+    if len(points) == 0:
+        points = (grid.origin + grid.upper) / 2 * [1, 1, 0] + [[-0.15, -0.15, 0], [0.15, 0.15, 0.1]]
+    points = np.concatenate([points, points * [1, 1, 0]])  # what stands under an object belongs to the picture
+    target = (points.min(axis=0) + points.max(axis=0)) / 2
 
     away = np.array([0.0, -1.0, 0.0]) if camera is None else camera.position - target
     azimuth = np.arctan2(away[1], away[0]) - np.radians(35 if camera is not None else 0)
@@ -140,21 +137,17 @@ def viewpoint(
     direction = np.array(
         [np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)]
     )
-    corners = np.array(np.meshgrid(*zip(lower, upper, strict=True), indexing="ij")).reshape(3, -1).T
     focal = 2.6 * width  # a long lens: nearly parallel, calm edges
-    pose = look_at(target + direction, target)
-    local = (corners - target) @ pose.rotation.as_matrix()
-    # Far enough for every corner to fall inside the picture with a margin.
-    half = 0.5 * np.array([width, height]) * 0.88
+    axes = look_at(target + direction, target).rotation.as_matrix()
+    local = (points - target) @ axes
+    middle = (local.min(axis=0) + local.max(axis=0)) / 2 * [1, 1, 0]
+    target, local = target + axes @ middle, local - middle
+    # Far enough for every voxel to fall inside the picture with a margin.
+    half = 0.5 * np.array([width, height]) * 0.8
     distance = max(float((focal * np.abs(local[:, :2]) / half - local[:, 2:]).max()), 0.2)
+    centre = ((width - 1) / 2, (height - 1) / 2)
     return Camera.from_intrinsics(
-        focal,
-        focal,
-        (width - 1) / 2,
-        (height - 1) / 2,
-        width,
-        height,
-        look_at(target + direction * distance, target),
+        focal, focal, *centre, width, height, look_at(target + direction * distance, target)
     )
 
 
@@ -196,7 +189,7 @@ def voxel_picture(
         n = np.zeros_like(p)
         n[np.arange(len(p)), np.abs(normal) - 1] = np.sign(normal)
         diffuse = 0.5 + 0.5 * (n @ light)
-        open_sky = 1.0 - 0.62 * shade.at(p + n * 1.6 * grid.voxel_size, "near")
+        open_sky = 1.0 - 0.62 * shade.at(p + n * 1.6 * grid.voxel_size)
         value = (0.50 + 0.58 * diffuse) * open_sky
         base = _painted(seen.labels[hit], colours)
         bright = np.clip(value, 0, 1.12)[:, None]
@@ -206,8 +199,7 @@ def voxel_picture(
         side[hit] = normal + 8 * np.floor(np.abs(p[np.arange(len(p)), np.abs(normal) - 1]) / grid.voxel_size + 0.5)
         crease, border = _lines(seen.labels, side, hit)
         colour *= np.where(border, 0.42, np.where(crease, 0.86, 1.0))[..., None]
-    _table(colour, alpha, hit, camera, rays, grid, shade)
-    return _reduced(colour, alpha, supersample)
+    return _over(_reduced(colour, alpha, supersample), _table(view, grid, shade))
 
 
 def _view_axes(camera: Camera) -> np.ndarray:
@@ -233,18 +225,28 @@ class _Shade:
         from scipy.ndimage import gaussian_filter
 
         self._pad = 12
-        solid = np.pad((labels > 0).astype(np.float32), self._pad)
         self._grid = grid
+        solid = np.pad((labels > 0).astype(np.float32), self._pad)
         self._near = gaussian_filter(solid, 1.8, truncate=3)
-        self._far = gaussian_filter(solid, 4.0, truncate=3)
+        # On the table, the first layers above it say it all.
+        floor = self._pad + int(np.clip(round(-grid.origin[2] / grid.voxel_size), 0, labels.shape[2] - 1))
+        far = gaussian_filter(solid[:, :, floor : floor + 8].max(axis=2), 4.0, truncate=3)
+        self._ground = 0.35 * far + 0.65 * self._near[:, :, floor]
 
-    def at(self, points: np.ndarray, reach: str) -> np.ndarray:
+    def at(self, points: np.ndarray) -> np.ndarray:
         """Occupancy (n,) in [0, 1] around points (n, 3) in metres."""
         from scipy.ndimage import map_coordinates
 
-        volume = self._near if reach == "near" else self._far
         u = (points - self._grid.origin) / self._grid.voxel_size - 0.5 + self._pad
-        return map_coordinates(volume, u.T, order=1, mode="nearest")
+        return map_coordinates(self._near, u.T, order=1, mode="nearest")
+
+    def on_table(self, points: np.ndarray) -> np.ndarray:
+        """Shadow (H, W) in [0, 1] at points (H, W, 2) of the table in metres."""
+        import cv2
+
+        u = ((points - self._grid.origin[:2]) / self._grid.voxel_size - 0.5 + self._pad).astype(np.float32)
+        ground = np.ascontiguousarray(self._ground, np.float32)
+        return cv2.remap(ground, u[..., 1], u[..., 0], cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
 
 
 def _lines(labels: np.ndarray, side: np.ndarray, hit: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -262,33 +264,33 @@ def _lines(labels: np.ndarray, side: np.ndarray, hit: np.ndarray) -> tuple[np.nd
     return crease & ~border, border
 
 
-def _table(
-    colour: np.ndarray,
-    alpha: np.ndarray,
-    hit: np.ndarray,
-    camera: Camera,
-    rays: np.ndarray,
-    grid: VoxelGrid,
-    shade: _Shade,
-) -> None:
-    """Draw the plane z = 0 where nothing stands before it: soft shadows, a line every 10 cm, fading outwards."""
-    free = ~hit & (rays[..., 2] < -1e-6)
-    if not free.any():
-        return
-    r = rays[free]
-    along = -camera.position[2] / r[:, 2]
-    p = camera.position + r * along[:, None]
-    size = grid.voxel_size
-    shadow = 0.55 * shade.at(p + [0, 0, 1.2 * size], "far") + 0.45 * shade.at(p + [0, 0, 0.8 * size], "near")
-    width = 0.75 * along / camera.K[0, 0]
-    to_line = np.abs(p[:, :2] / 0.1 - np.rint(p[:, :2] / 0.1)).min(axis=1) * 0.1
-    value = (1 - 0.75 * np.clip(shadow * 1.5, 0, 1)) * np.where(to_line < width, 0.93, 1.0)
-    colour[free] = _TABLE * value[:, None]
-    # Fades out with the distance from the middle of the picture, where the table has no edge to show.
-    rows, columns = np.nonzero(free)
-    x = (columns / (hit.shape[1] - 1) - 0.5) * 2
-    y = (rows / (hit.shape[0] - 1) - 0.5) * 2
-    alpha[free] = np.clip((1.0 - np.hypot(x, y)) / 0.22, 0, 1)
+def _table(view: Camera, grid: VoxelGrid, shade: _Shade) -> np.ndarray:
+    """The plane z = 0, (H, W, 4) float: soft shadows, a line every 10 cm, fading towards the rim of the picture."""
+
+    def bare() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        rays = view.rays() @ view.pose.rotation.as_matrix().T
+        below = rays[..., 2] < -1e-6
+        along = np.where(below, -view.position[2] / np.where(below, rays[..., 2], -1), 0)
+        xy = (view.position + rays * along[..., None])[..., :2]
+        # A line is a pixel wide, softened by half a pixel on both sides.
+        pixel = along / view.K[0, 0]
+        to_line = np.abs(xy / 0.1 - np.rint(xy / 0.1)).min(axis=-1) * 0.1
+        line = np.clip(1.2 - to_line / np.maximum(pixel, 1e-9), 0, 1)
+        y, x = np.mgrid[-1 : 1 : view.height * 1j, -1 : 1 : view.width * 1j]
+        fade = np.clip((1.0 - np.hypot(x, y)) / 0.25, 0, 1)
+        return xy, 1 - 0.07 * line, np.where(below, fade * fade * (3 - 2 * fade), 0)
+
+    xy, value, alpha = memo("report_table", (view.key,), bare)
+    value = value * (1 - 0.8 * np.clip(shade.on_table(xy) * 1.3, 0, 1))
+    return np.concatenate([_TABLE * value[..., None], 255 * alpha[..., None]], axis=-1)
+
+
+def _over(front: np.ndarray, back: np.ndarray) -> np.ndarray:
+    """One RGBA picture (H, W, 4) float over another, as uint8."""
+    a, b = front[..., 3:] / 255, back[..., 3:] / 255
+    alpha = a + b * (1 - a)
+    rgb = (front[..., :3] * a + back[..., :3] * b * (1 - a)) / np.maximum(alpha, 1e-9)
+    return np.rint(np.concatenate([np.clip(rgb, 0, 255), 255 * alpha], axis=-1)).astype(np.uint8)
 
 
 def _reduced(colour: np.ndarray, alpha: np.ndarray, factor: int) -> np.ndarray:
@@ -298,5 +300,4 @@ def _reduced(colour: np.ndarray, alpha: np.ndarray, factor: int) -> np.ndarray:
     opacity = alpha.reshape(blocks).mean(axis=(1, 3))
     weighted = (colour * alpha[..., None]).reshape(*blocks, 3).mean(axis=(1, 3))
     rgb = weighted / np.maximum(opacity, 1e-9)[..., None]
-    out = np.concatenate([np.clip(rgb, 0, 255), 255 * opacity[..., None]], axis=-1)
-    return np.rint(out).astype(np.uint8)
+    return np.concatenate([rgb, 255 * opacity[..., None]], axis=-1)

@@ -1,0 +1,171 @@
+"""Palette, identities and pictures against what can be known without looking."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+
+from mstfilter.report.cards import close_up
+from mstfilter.report.identities import TRUTH, identity_colours
+from mstfilter.report.palette import GREY, PALETTE, colour
+from mstfilter.report.pictures import layer, overlay, png_bytes, viewpoint, voxel_picture
+from mstfilter.report.tables import counts, flatten, note_rows, shown
+from mstfilter.scene.rendering import project, render
+from mstfilter.scene.voxels import Hypothesis
+from tests.report.runs import CAMERA, GRID, labels_of, make_run
+
+# Machado, Oliveira, Fernandes 2009, severity 1, on linear RGB.
+VIEWS = {
+    "usual": np.eye(3),
+    "protanopia": [[0.152286, 1.052583, -0.204868], [0.114503, 0.786281, 0.099216], [-0.003882, -0.048116, 1.051998]],
+    "deuteranopia": [[0.367322, 0.860646, -0.227968], [0.280085, 0.672501, 0.047413], [-0.01182, 0.04294, 0.968881]],
+}
+
+
+def oklab(linear):
+    """Oklab (Ottosson 2020) of linear sRGB."""
+    lms = np.array([[0.4122214708, 0.5363325363, 0.0514459929], [0.2119034982, 0.6806995451, 0.1073969566]])
+    lms = np.concatenate([lms, [[0.0883024619, 0.2817188376, 0.6299787005]]])
+    lab = np.array([[0.2104542553, 0.793617785, -0.0040720468], [1.9779984951, -2.428592205, 0.4505937099]])
+    lab = np.concatenate([lab, [[0.0259040371, 0.7827717662, -0.808675766]]])
+    return np.cbrt(linear @ lms.T) @ lab.T
+
+
+@pytest.mark.parametrize("view", VIEWS)
+def test_palette_is_distinct_for_every_eye(view):
+    x = np.array(PALETTE) / 255
+    linear = np.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4)
+    lab = oklab(np.clip(linear @ np.transpose(VIEWS[view]), 0, 1))
+    distance = [float(np.linalg.norm(a - b)) for a, b in itertools.combinations(lab, 2)]
+    assert len(PALETTE) == 20 and min(distance) > 0.06  # about three just noticeable differences
+    assert min(float(np.linalg.norm(a - b)) for a, b in itertools.combinations(lab[:6], 2)) > 0.09
+    assert colour(21) == PALETTE[1] and colour(-1) == GREY
+
+
+def test_identities_follow_objects_through_relabelling_and_time(tmp_path):
+    run = make_run(tmp_path / "run")
+    identities = identity_colours(run)
+    for t in range(run.n_pauses):
+        truth = identities.of(t, TRUTH)
+        assert truth == {1: 0, 2: 1}
+        for k, h in enumerate(run.hypotheses(t)):
+            own = identities.of(t, k)
+            assert set(own) == {o.label for o in h.objects}
+            assert len(set(own.values())) == len(own), "two objects of a hypothesis never share an identity"
+            if h.n_objects == 2:
+                assert own == truth
+            assert identities.colours(t, k) == {label: colour(i) for label, i in own.items()}
+
+
+def test_identity_of_a_moved_object_comes_from_its_line_of_descent(tmp_path):
+    from mstfilter.report.identities import _Book
+
+    book = _Book()
+    first = Hypothesis.from_labels(labels_of((1, 1, 3), (12, 12, 3)), GRID)
+    # Both have moved to where neither was; labels are swapped, ids are kept.
+    moved = labels_of((7, 2, 3), (2, 8, 3))
+    second = Hypothesis(
+        np.array([0, 2, 1], np.uint16)[moved],
+        GRID,
+        tuple(type(o)(3 - o.label, o.id) for o in reversed(first.objects)),
+    )
+    book.add(0, (first,), [1.0], None, None)
+    book.add(1, (second,), [1.0], [0], None)
+    assert book.table[0, 0] == {1: 0, 2: 1}
+    assert book.table[1, 0] == {2: 0, 1: 1}
+
+
+def test_overlay_touches_objects_only():
+    rgb = np.random.default_rng(0).integers(0, 255, (20, 30, 3), dtype=np.uint8)
+    labels = np.zeros((20, 30), np.uint16)
+    labels[5:15, 5:20] = 3
+    labels[5:15, 20:25] = 7
+    colours = {3: (255, 0, 0), 7: (0, 0, 255)}
+    picture = overlay(rgb, labels, colours, fill=0.5, line=1)
+    np.testing.assert_array_equal(picture[labels == 0], rgb[labels == 0])
+    np.testing.assert_array_equal(picture[5, 5:20], np.tile([255, 0, 0], (15, 1)))
+    np.testing.assert_array_equal(picture[6:14, 20], np.tile([0, 0, 255], (8, 1)))
+    inside = rgb[10, 10] * 0.5 + np.array([127.5, 0, 0])
+    assert np.abs(picture[10, 10] - inside).max() <= 1
+    big = layer(labels, colours, scale=3)
+    assert big.shape == (60, 90, 4)
+    assert ((big[..., 3] > 0) == (labels > 0).repeat(3, 0).repeat(3, 1)).all()
+
+
+def test_objects_at_the_rim_have_no_contour_from_the_other_side():
+    labels = np.zeros((8, 8), np.uint16)
+    labels[:, 0] = 1
+    alpha = layer(labels, {}, line=2)[..., 3]
+    assert (alpha[:, 0] == 255).all()  # its right neighbour is free
+    labels[:] = 1
+    assert (layer(labels, {}, line=2)[..., 3] < 255).all()
+
+
+def test_viewpoint_holds_every_voxel():
+    hypotheses = [Hypothesis.from_labels(labels_of((2, 3, 8), (14, 15, 2)), GRID)]
+    for camera in (None, CAMERA):
+        view = viewpoint(hypotheses, camera)
+        uv, z = view.project(GRID.centre_of(np.argwhere(hypotheses[0].labels > 0)))
+        assert (z > 0).all()
+        assert (uv > 10).all() and (uv < np.array([view.width, view.height]) - 10).all()
+        share = (uv.max(axis=0) - uv.min(axis=0)) / [view.width, view.height]
+        assert share.max() > 0.6
+
+
+def test_voxel_picture_shows_what_the_camera_would_see():
+    labels = labels_of((4, 4, 5), (12, 8, 2))
+    view = viewpoint([(labels, GRID)], CAMERA, 160, 120)
+    picture = voxel_picture(labels, GRID, view, {1: (200, 0, 0), 2: (0, 0, 200)})
+    assert picture.shape == (120, 160, 4) and picture.dtype == np.uint8
+    seen = render(labels, GRID, view).labels
+    from scipy.ndimage import binary_erosion
+
+    for label, strong, weak in ((1, 0, 2), (2, 2, 0)):
+        inside = binary_erosion(seen == label, iterations=3)
+        assert inside.sum() > 50
+        assert (picture[inside][:, 3] == 255).all()
+        assert (picture[inside][:, strong] > picture[inside][:, weak].astype(int) + 40).all()
+    # Tops are lighter than sides, and the table is there around them.
+    top = picture[binary_erosion(seen == 1, iterations=3)][:, 0]
+    assert top.max() > 1.3 * top.min()
+    assert picture[118, 80, 3] < 40 and picture[60, 80, 3] == 255
+    again = voxel_picture(labels, GRID, view, {1: (200, 0, 0), 2: (0, 0, 200)})
+    assert png_bytes(again) == png_bytes(picture)
+
+
+def test_an_empty_grid_is_a_bare_table():
+    labels = np.zeros(GRID.shape, np.uint16)
+    view = viewpoint([(labels, GRID)], CAMERA, 80, 60)
+    picture = voxel_picture(labels, GRID, view, {})
+    assert (picture[25:35, 35:45, 3] == 255).all()
+    assert np.ptp(picture[25:35, 35:45, :3].astype(int), axis=2).max() < 12
+
+
+def test_close_up_holds_the_objects_and_keeps_the_proportions():
+    labels = labels_of((8, 8, 4))
+    x, y, width, height = close_up([(labels, GRID)], CAMERA)
+    assert width / height == pytest.approx(CAMERA.width / CAMERA.height, rel=0.02)
+    rows, columns = np.nonzero(project(Hypothesis.from_labels(labels, GRID), CAMERA))
+    assert x <= columns.min() and columns.max() <= x + width and y <= rows.min() and rows.max() <= y + height
+    assert x >= 0 and y >= 0 and x + width <= CAMERA.width + 0.1 and y + height <= CAMERA.height + 0.1
+    assert close_up([(np.zeros_like(labels), GRID)], CAMERA) == (0, 0, CAMERA.width, CAMERA.height)
+
+
+def test_tables():
+    assert flatten({"a": {"b": 1, "c": {}}, "d": [1]}) == {"a.b": 1, "d": [1]}
+    assert [shown(v) for v in (None, True, 3, 0.123456, "x", [], [2, 2, 2])] == [
+        "–",
+        "yes",
+        "3",
+        "0.1235",
+        "x",
+        "none",
+        "2 (all 3)",
+    ]
+    assert shown(list(range(100))) == "median 49.5, 0 to 99"
+    assert note_rows([{"a": 1}, {"b": {"c": 2}}]) == [("a", ["1", ""]), ("b.c", ["", "2"])]
+    assert counts([{"m": {"icp": 2}, "r": {"x": 0.5}}, {"m": {"flow": 1}}, {}]) == {
+        "m": [{"icp": 2}, {"flow": 1}, {}]
+    }

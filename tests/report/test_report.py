@@ -1,0 +1,217 @@
+"""The report: self-contained, made from the folder alone, the same every time, for every kind of run."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from html.parser import HTMLParser
+from importlib.resources import files
+
+import numpy as np
+import pytest
+
+from mstfilter.errors import InputError
+from mstfilter.report.content import numbers_of
+from mstfilter.report.html import write_report
+from mstfilter.scene.quality import weighted_coverage
+from mstfilter.study.run_folder import RunFolder
+from tests.report.runs import make_run
+
+
+class Page(HTMLParser):
+    """Checks that tags match; collects text, ids and whatever is referred to."""
+
+    VOID = frozenset({"meta", "img", "br", "link", "input", "hr"})
+
+    def __init__(self, text):
+        super().__init__()
+        self.stack, self.tags, self.ids, self.links, self.words = [], [], [], [], []
+        self.feed(text)
+        self.close()
+        assert not self.stack, self.stack
+        self.text = " ".join(" ".join(self.words).split())
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append(tag)
+        self._note(attrs)
+        if tag not in self.VOID:
+            self.stack.append(tag)
+
+    def handle_startendtag(self, tag, attrs):
+        self.tags.append(tag)
+        self._note(attrs)
+
+    def handle_endtag(self, tag):
+        assert self.stack.pop() == tag
+
+    def handle_data(self, data):
+        if self.stack and self.stack[-1] != "style":
+            self.words.append(data)
+
+    def _note(self, attrs):
+        for name, value in attrs:
+            if name == "id":
+                self.ids.append(value)
+            if name in ("href", "src", "xlink:href", "srcset", "action", "data"):
+                self.links.append(value)
+
+
+def read(path):
+    text = path.read_text(encoding="utf-8")
+    return text, Page(text)
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    run = make_run(tmp_path_factory.mktemp("report") / "run")
+    return run, write_report(run)
+
+
+def test_it_stands_alone(finished):
+    run, path = finished
+    assert path == run.path / "report.html"
+    text, page = read(path)
+    assert "script" not in page.tags and "link" not in page.tags and "iframe" not in page.tags
+    for link in page.links:
+        assert link.startswith(("data:image/", "#")), link[:80]
+        if link.startswith("#"):
+            assert link[1:] in page.ids
+    bare = re.sub(r'xmlns(:\w+)?="[^"]*"', "", text)
+    bare = re.sub(r"data:image/\w+;base64,[A-Za-z0-9+/=]+", "", bare)
+    assert not re.search(r"https?:|file:|//\w|@import|\burl\((?!#)", bare)
+    assert str(run.path) not in text and str(run.path.parent) not in text
+
+
+def test_it_says_what_happened(finished):
+    _run, path = finished
+    text, page = read(path)
+    assert "two boxes" in page.text and "seed 7" in page.text
+    assert "3 hypotheses" in page.text and "after 3 pauses" in page.text
+    for words in ("static 6", "icp 2", "nothing moved", "sampler.acceptance", "transition", "one blob", "Genealogy"):
+        assert words in page.text
+    assert "connected components" in page.text and "own.py:Stay" in page.text
+    # One picture of the camera a pause, used by every card of it; truth and heaviest are drawn at the top too.
+    assert text.count("data:image/jpeg") == 3
+    assert text.count("Truth</b>") == 3
+
+
+def test_text_of_a_user_is_no_markup(finished):
+    _, path = finished
+    text, page = read(path)
+    assert "<b>odd" not in text and "</script>" not in text
+    assert "<b>odd & named</b>" in page.text
+
+
+def test_it_is_the_same_after_the_folder_moved(finished, tmp_path):
+    run, path = finished
+    moved = tmp_path / "elsewhere"
+    shutil.copytree(run.path, moved)
+    (moved / "report.html").unlink()
+    again = write_report(str(moved), tmp_path / "deep" / "page.html")
+    assert again.read_bytes() == path.read_bytes()
+    assert [p.name for p in again.parent.iterdir()] == ["page.html"]
+
+
+def test_only_times_differ_between_equal_runs(finished, tmp_path):
+    _run, path = finished
+    again = make_run(tmp_path / "again")
+    assert write_report(again).read_bytes() == path.read_bytes()
+    (again.pause(1) / "seconds.json").write_text(json.dumps({"transition": 60.5, "proposal": 1.0}))
+    other = read(write_report(again))[1].text
+    assert other != read(path)[1].text and "62 s" in other
+    pictures = [re.findall(r"data:image[^\"]*", p.read_text()) for p in (path, again.path / "report.html")]
+    assert pictures[0] == pictures[1]
+
+
+def test_floors_are_the_quality_of_what_is_occupied(finished):
+    run, _ = finished
+    numbers = numbers_of(run)
+    for t, step in enumerate(numbers.steps):
+        truth, expected = run.truth(t), 0.0
+        for h, w in zip(run.hypotheses(t), step.weights, strict=True):
+            expected += w * weighted_coverage((h.labels > 0).astype(int), truth)
+        assert step.floors["one blob"] == pytest.approx(expected)
+        assert step.mean() == pytest.approx(np.dot(step.quality["objects"], step.weights))
+        assert step.true_objects == 2
+
+
+@pytest.mark.parametrize(
+    "kind", [{"truth": False}, {"pauses": 1}, {"empty": True}, {"pauses": 1, "truth": False, "empty": True}]
+)
+def test_kinds_of_runs(kind, tmp_path):
+    _text, page = read(write_report(make_run(tmp_path / "run", **kind)))
+    if not kind.get("truth", True):
+        assert "no truth" in page.text and "one blob" not in page.text and "Truth" not in page.text
+    if kind.get("pauses") == 1:
+        assert "after 1 pause," in page.text
+    if kind.get("empty"):
+        assert "holding 0 objects" in page.text
+
+
+def test_truth_at_some_pauses_only(tmp_path):
+    run = make_run(tmp_path / "run")
+    (run.pause(2) / "truth.npz").unlink()
+    info = run.info(2)
+    (run.pause(2) / "info.json").write_text(json.dumps({**info, "quality": None}))
+    _, page = read(write_report(run))
+    assert "Quality against the truth" in page.text
+
+
+def test_interrupted_runs(tmp_path):
+    run = make_run(tmp_path / "run", done=False)
+    shutil.rmtree(run.pause(2))
+    run.set_status("interrupted")
+    _, page = read(write_report(run))
+    assert "The run was interrupted: 2 of 3 pauses are here." in page.text
+    shutil.rmtree(run.path / "pauses")
+    _, page = read(write_report(run))
+    assert "0 of 3 pauses" in page.text and "Full configuration" in page.text
+
+
+def test_notes_of_any_shape(tmp_path):
+    run = make_run(tmp_path / "run", pauses=2)
+    info = run.info(1)
+    info["notes"] = {
+        "update": {"deep": {"er": [[1, 2], "x", None]}},
+        "own slot": {"n": 1e-9, "none": [], "flag": True},
+    }
+    (run.pause(1) / "info.json").write_text(json.dumps(info))
+    _, page = read(write_report(run))
+    assert "deep.er" in page.text and "own slot" in page.text and "1e-09" in page.text
+
+
+def test_many_particles_are_cut_to_the_heaviest(tmp_path):
+    run = make_run(tmp_path / "run", pauses=1)
+    from dataclasses import replace
+
+    from mstfilter.scene.storage import save_hypotheses
+
+    first = run.hypotheses(0)[0]
+    many = []
+    for k in range(20):
+        labels = np.zeros(first.labels.shape, np.uint16)
+        labels[k % 15, 3:6, :2] = 1
+        labels[15 - k % 15, 9:12, : 1 + k // 15] = 2
+        many.append(replace(first, labels=labels, objects=type(first).from_labels(labels, first.grid).objects))
+    save_hypotheses(run.pause(0) / "hypotheses.npz", many)
+    info = run.info(0)
+    info |= {"weights": [1 / 20] * 20, "n": 20, "quality": {f: [0.5] * 20 for f in info["quality"]}}
+    info["parents"] = {"proposed": list(range(20))}
+    (run.pause(0) / "info.json").write_text(json.dumps(info))
+    _, page = read(write_report(run))
+    assert "The 12 heaviest are shown; the others hold 40 % of the weight." in page.text
+
+
+def test_errors(tmp_path):
+    with pytest.raises(InputError, match="not a run folder"):
+        write_report(tmp_path)
+    run = make_run(tmp_path / "run", pauses=1)
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match="cannot write report"):
+        write_report(RunFolder.open(run.path), tmp_path / "file" / "report.html")
+
+
+def test_templates_are_part_of_the_package():
+    folder = files("mstfilter.report") / "templates"
+    assert {p.name for p in folder.iterdir()} >= {"report.html", "style.css"}
