@@ -97,7 +97,8 @@ class Completer(ABC):
     in_front, depth : float
         A voxel is visible surface if its centre is at most `in_front` voxels in front of the measured surface and
         less than `depth` voxels behind it, along the optical axis. Asking for the centre rather than for any
-        reading keeps objects from growing by half a voxel all round.
+        reading keeps objects from growing by half a voxel all round (rendered boxes: volume 1.13 of the truth
+        instead of 1.41, quality .82 instead of .71; the two values were chosen on these).
     free_margin : float
         A voxel is seen through if its centre is this far in front of the measured surface, in voxels.
     free_sigmas : float
