@@ -75,10 +75,7 @@ class FusionUpdate(Update):
         if proposed is None:
             return Population(refined, predicted.log_weights + log_q, predicted.parents, notes)
 
-        i, j = (
-            index.ravel().repeat(self.eta)
-            for index in np.meshgrid(np.arange(len(proposed)), np.arange(len(predicted)), indexing="ij")
-        )
+        i, j = _pairs(len(proposed), len(predicted), self.eta)
         key, samples, crossover = key_of(rng), tuple(proposed.particles), self.crossover
 
         def build(candidate: int) -> Hypothesis:
@@ -97,3 +94,13 @@ class FusionUpdate(Update):
         """Predicted hypotheses after free-space projection, and their qualities (n,)."""
         pairs = [self.free_space.project(hypothesis, clip.after) for hypothesis in predicted.particles]
         return tuple(h for h, _ in pairs), np.array([q for _, q in pairs])
+
+
+def _pairs(n_proposed: int, n_predicted: int, eta: int) -> tuple[np.ndarray, np.ndarray]:
+    """Sample i and prediction j of each candidate, every pair `eta` times in a row.
+
+    Each sample meets the predictions from another one onwards. In a plain order, equal strides through nearly
+    equal weights, as systematic resampling makes them, meet one and the same prediction again and again.
+    """
+    i, k = np.divmod(np.arange(n_proposed * n_predicted), n_predicted)
+    return i.repeat(eta), ((i + k) % n_predicted).repeat(eta)

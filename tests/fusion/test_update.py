@@ -222,3 +222,17 @@ def test_the_authors_real_particles(shared_data):
     assert len(kept) == 5
     assert all(isinstance(h, Hypothesis) and h.objects for h in kept.particles)
     np.testing.assert_array_equal(kept.log_weights, fused.log_weights[kept.parents["ancestor"]])
+
+
+def test_systematic_resampling_reaches_all_parents():
+    """With equal weights, 5 of 125 candidates come from 5 different samples and 5 different predictions."""
+    from mstfilter.smc.resampling import Systematic
+
+    hypothesis = Hypothesis.from_labels(np.ones(SMALL.shape, np.uint16), SMALL)
+    predicted = Population((hypothesis,) * 5, None, {"previous": np.arange(5)})
+    proposed = Population((hypothesis,) * 5, None, {"proposed": np.arange(5)})
+    fused = FusionUpdate(free_space=NoFreeSpace()).update(np.random.default_rng(0), predicted, proposed, clip())
+    for seed in range(20):
+        chosen = Systematic().resample(np.random.default_rng(seed), fused, 5)
+        assert set(chosen.parents["previous"].tolist()) == set(range(5))
+        assert set(chosen.parents["proposed"].tolist()) == set(range(5))
