@@ -137,18 +137,19 @@ def _card(
 
 
 def _tags(image: np.ndarray, identity: Mapping[int, int]) -> list[Tag]:
-    """A number in the middle of the widest place of every object that shows enough of itself."""
+    """A number in the widest place of every object that shows enough of itself; larger objects go first."""
     from scipy.ndimage import distance_transform_edt, find_objects
 
-    least = 0.009 * image.shape[1]
-    tags = []
+    least, apart = 0.009 * image.shape[1], 0.03 * image.shape[1]
+    places = []
     for label, box in enumerate(find_objects(image.astype(np.int32)), 1):
         if box is None or label not in identity:
             continue
         inside = distance_transform_edt(np.pad(image[box] == label, 1))[1:-1, 1:-1]
         row, column = np.unravel_index(int(inside.argmax()), inside.shape)
-        if inside[row, column] < least:
-            continue
-        x, y = float(column + box[1].start), float(row + box[0].start)
-        tags.append(Tag(str(identity[label] + 1), hexadecimal(colour(identity[label])), x + 0.5, y + 0.5))
+        places.append((float(inside[row, column]), label, float(column + box[1].start), float(row + box[0].start)))
+    tags: list[Tag] = []
+    for radius, label, x, y in sorted(places, reverse=True):
+        if radius >= least and all(np.hypot(tag.x - x, tag.y - y) > apart for tag in tags):
+            tags.append(Tag(str(identity[label] + 1), hexadecimal(colour(identity[label])), x + 0.5, y + 0.5))
     return tags

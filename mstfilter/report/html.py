@@ -141,6 +141,8 @@ def _figures(numbers: Numbers) -> dict[str, Any]:
         floors = {name: [steps[t].floors[name] for t in known] for name in steps[known[0]].floors or ()}  # type: ignore[index]
         qualities = [steps[t].quality["objects"] for t in known]  # type: ignore[index]
         found["quality"] = quality_figure(known, qualities, [steps[t].weights for t in known], floors)
+    if len(steps) == 1:  # the tiles say it all
+        return {name: Markup(svg) for name, svg in found.items()}
     found["health"] = health_figure(
         range(len(steps)),
         [(step.info["ess"], step.info["n_candidates"]) for step in steps],

@@ -23,7 +23,7 @@ from mstfilter.scene.voxels import Hypothesis, VoxelGrid
 __all__ = ["layer", "overlay", "png_bytes", "viewpoint", "voxel_picture"]
 
 _LIGHT = np.array([-0.35, -0.45, 0.82])  # towards the light, in axes of the view: right, towards the eye, up
-_TABLE = np.array([236.0, 234.0, 229.0])
+_TABLE = 128.0  # grey of the table
 
 
 def png_bytes(image: np.ndarray) -> bytes:
@@ -34,7 +34,7 @@ def png_bytes(image: np.ndarray) -> bytes:
     return bytes(cv2.imencode(".png", np.ascontiguousarray(image[..., order]), [cv2.IMWRITE_PNG_COMPRESSION, 6])[1])
 
 
-def jpeg_bytes(image: np.ndarray, quality: int = 90) -> bytes:
+def jpeg_bytes(image: np.ndarray, quality: int = 92) -> bytes:
     """JPEG of (H, W, 3) RGB uint8."""
     import cv2
 
@@ -278,11 +278,15 @@ def _table(view: Camera, grid: VoxelGrid, shade: _Shade) -> np.ndarray:
         line = np.clip(1.2 - to_line / np.maximum(pixel, 1e-9), 0, 1)
         y, x = np.mgrid[-1 : 1 : view.height * 1j, -1 : 1 : view.width * 1j]
         fade = np.clip((1.0 - np.hypot(x, y)) / 0.25, 0, 1)
-        return xy, 1 - 0.07 * line, np.where(below, fade * fade * (3 - 2 * fade), 0)
+        return xy, line, np.where(below, fade * fade * (3 - 2 * fade), 0)
 
-    xy, value, alpha = memo("report_table", (view.key,), bare)
-    value = value * (1 - 0.8 * np.clip(shade.on_table(xy) * 1.3, 0, 1))
-    return np.concatenate([_TABLE * value[..., None], 255 * alpha[..., None]], axis=-1)
+    xy, line, fade = memo("report_table", (view.key,), bare)
+    shadow = 0.85 * np.clip(shade.on_table(xy) * 1.35, 0, 1)
+    wash = 0.13 + 0.16 * line
+    # Black shadow over a grey wash, both translucent: it suits a light and a dark page.
+    alpha = shadow + wash * (1 - shadow)
+    grey = _TABLE * (wash * (1 - shadow) / alpha)
+    return np.concatenate([np.repeat(grey[..., None], 3, axis=-1), 255 * (alpha * fade)[..., None]], axis=-1)
 
 
 def _over(front: np.ndarray, back: np.ndarray) -> np.ndarray:

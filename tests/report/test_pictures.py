@@ -130,7 +130,7 @@ def test_voxel_picture_shows_what_the_camera_would_see():
     # Tops are lighter than sides, and the table is there around them.
     top = picture[binary_erosion(seen == 1, iterations=3)][:, 0]
     assert top.max() > 1.3 * top.min()
-    assert picture[118, 80, 3] < 40 and picture[60, 80, 3] == 255
+    assert picture[118, 80, 3] < 10 and picture[60, 80, 3] > 25
     again = voxel_picture(labels, GRID, view, {1: (200, 0, 0), 2: (0, 0, 200)})
     assert png_bytes(again) == png_bytes(picture)
 
@@ -139,8 +139,9 @@ def test_an_empty_grid_is_a_bare_table():
     labels = np.zeros(GRID.shape, np.uint16)
     view = viewpoint([(labels, GRID)], CAMERA, 80, 60)
     picture = voxel_picture(labels, GRID, view, {})
-    assert (picture[25:35, 35:45, 3] == 255).all()
-    assert np.ptp(picture[25:35, 35:45, :3].astype(int), axis=2).max() < 12
+    middle = picture[25:35, 35:45].astype(int)
+    assert (middle[..., 3] > 25).all() and (middle[..., 3] < 100).all(), "translucent: light and dark pages"
+    assert np.ptp(middle[..., :3], axis=2).max() == 0 and picture[0, 0, 3] == 0
 
 
 def test_close_up_holds_the_objects_and_keeps_the_proportions():
