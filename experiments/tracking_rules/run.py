@@ -1,0 +1,93 @@
+"""Motion rules against volumetric truth: start from the true labels, predict one clip, compare.
+
+python experiments/tracking_rules/run.py demo 0 12 table 3 7
+"""
+
+from __future__ import annotations
+
+import csv
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+
+from mstfilter.scene.voxels import Hypothesis
+from mstfilter.simulation.families import scene_family
+from mstfilter.simulation.recorder import simulate
+from mstfilter.smc.population import Population
+from mstfilter.tracking.flow import DenseFlow
+from mstfilter.tracking.mst_rule import MstRule
+from mstfilter.tracking.rules import AuthorsRule, PaperRule
+from mstfilter.tracking.static import StaticTest
+from mstfilter.tracking.transition import IdentityTransition, TrackingTransition
+from mstfilter.tracking.warp import Warp
+
+PUBLISHED = {"static": StaticTest(enabled=False), "warp": Warp("splat", "label")}
+CENTROID = MstRule(use_flow=False, use_sift=False, n_refine=0, search_above=-1.0)
+ARMS = {
+    "identity": IdentityTransition(),
+    "small_gicp from centroid": TrackingTransition(CENTROID),
+    "paper": TrackingTransition(PaperRule(), **PUBLISHED),
+    "paper, ICP accepted to 20 mm": TrackingTransition(PaperRule(max_error=0.02), **PUBLISHED),
+    "authors": TrackingTransition(AuthorsRule(), **PUBLISHED),
+    "mst": TrackingTransition(),
+    "mst, splat": TrackingTransition(warp=Warp("splat", "deepest")),
+    "mst, no search": TrackingTransition(MstRule(search_above=-1.0)),
+    "mst, no refinement": TrackingTransition(MstRule(n_refine=0)),
+    "mst, no twin term": TrackingTransition(MstRule(residual=type(MstRule().residual)(track_weight=0.0))),
+    "mst, no static test": TrackingTransition(static=StaticTest(enabled=False)),
+    "mst, flow fast": TrackingTransition(flow=DenseFlow("fast")),
+    "mst, flow ultrafast": TrackingTransition(flow=DenseFlow("ultrafast")),
+}
+
+
+def iou(a: np.ndarray, b: np.ndarray) -> float:
+    return float((a & b).sum() / max((a | b).sum(), 1))
+
+
+def main(families: list[tuple[str, int, int]], out: Path) -> None:
+    rows = []
+    for name, first, last in families:
+        scores: dict[str, dict[str, list[float]]] = {arm: {"moved": [], "rest": [], "s": []} for arm in ARMS}
+        for seed in range(first, last):
+            with tempfile.TemporaryDirectory() as folder:
+                recording = simulate(scene_family(name), seed=seed, path=Path(folder) / "recording")
+                for i, clip in enumerate(recording.clips()):
+                    if i == 0:
+                        continue
+                    before, after = recording.truth(i - 1), recording.truth(i)
+                    hypothesis = Hypothesis.from_labels(before, clip.grid)
+                    for arm, transition in ARMS.items():
+                        began = time.perf_counter()
+                        rng = np.random.default_rng(seed)
+                        moved = transition.predict(rng, Population((hypothesis,), np.zeros(1)), clip).particles[0]
+                        scores[arm]["s"].append(time.perf_counter() - began)
+                        for k in hypothesis.volumes():
+                            kind = "rest" if iou(before == k, after == k) >= 0.9 else "moved"
+                            scores[arm][kind].append(iou(moved.labels == k, after == k))
+        for arm, s in scores.items():
+            rows.append(
+                {
+                    "family": name,
+                    "seeds": f"{first}-{last - 1}",
+                    "arm": arm,
+                    "n_moved": len(s["moved"]),
+                    "iou_moved": f"{np.mean(s['moved']):.3f}",
+                    "moved_below_half": sum(x < 0.5 for x in s["moved"]),
+                    "n_rest": len(s["rest"]),
+                    "iou_rest": f"{np.mean(s['rest']):.3f}",
+                    "iou_rest_worst": f"{min(s['rest']):.2f}",
+                }
+            )
+    with out.open("w", newline="") as file:
+        writer = csv.DictWriter(file, list(rows[0]))
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+if __name__ == "__main__":
+    arguments = sys.argv[1:] or ["demo", "0", "12", "table", "3", "7"]
+    triples = [(arguments[i], int(arguments[i + 1]), int(arguments[i + 2])) for i in range(0, len(arguments), 3)]
+    main(triples, Path(__file__).with_name("results.csv"))
