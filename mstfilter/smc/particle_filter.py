@@ -11,118 +11,57 @@ A step moves the particles, proposes new ones, fuses the two with the observatio
     fused     = update.update(predicted, proposed, y)
     next      = resampler.resample(fused, n)
 
-Textbook filters leave `proposal` out; MST (Price, Huang, Berenson 2021, Alg. 1) uses all four. `step` is a
-pure function of a `State`, so a run can be stopped, stored and resumed anywhere; `run` and `iterate` are loops
+Textbook filters leave `proposal` out; MST (Price, Huang, Berenson 2021, Alg. 1) uses all four. Guided filters have
+a transition that weighs its moves, auxiliary filters a `lookahead`, resample-move filters a `rejuvenation`. `step`
+is a pure function of a `State`, so a run can be stopped, stored and resumed anywhere; `run` and `iterate` are loops
 over it.
 """
 
 from __future__ import annotations
 
-import time
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from functools import lru_cache
+from itertools import islice
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 from mstfilter.errors import InputError
-from mstfilter.smc.interfaces import Component, Proposal, Resampler, Transition, Trigger, Update
-from mstfilter.smc.population import Population, log_mean_exp
+from mstfilter.smc.interfaces import (
+    Codec,
+    Component,
+    Lookahead,
+    Proposal,
+    Rejuvenation,
+    Resampler,
+    Size,
+    Transition,
+    Trigger,
+    Update,
+)
+from mstfilter.smc.population import Population
 from mstfilter.smc.resampling import EssBelow, Systematic
+from mstfilter.smc.state import Info, State
 from mstfilter.smc.streams import Key
+from mstfilter.smc.watch import Watch
 
-__all__ = ["Info", "ParticleFilter", "State"]
+if TYPE_CHECKING:
+    from mstfilter.smc.checkpoint import Checkpoint
 
+__all__ = ["Info", "ParticleFilter", "SLOTS", "State"]
 
-@dataclass(frozen=True, eq=False)
-class State:
-    """All that is needed to go on.
-
-    Parameters
-    ----------
-    t : int
-        Number of observations seen so far.
-    population : Population or None
-        The particles after the last of them; None before the first.
-    key : Key
-        Names the random streams of the run.
-    properly_weighted : bool
-        Whether the weights are those of an exact filter.
-    """
-
-    t: int
-    population: Population | None
-    key: Key
-    properly_weighted: bool = True
-
-    @property
-    def log_evidence(self) -> float | None:
-        """Log of the unbiased estimate of p(y_1 .. y_t); None where a component is not properly weighted."""
-        if not self.properly_weighted:
-            return None
-        return 0.0 if self.population is None else log_mean_exp(self.population.log_weights)
+#: Fields of a filter that hold components whose weights matter.
+SLOTS = ("initial", "transition", "proposal", "update", "resampler", "lookahead", "rejuvenation")
 
 
-@dataclass(frozen=True, eq=False)
-class Info:
-    """What happened in a step.
-
-    Parameters
-    ----------
-    t : int
-        Index of the observation, from 0.
-    n : int
-        Particles after the step.
-    n_candidates : int
-        Particles after the update, before resampling.
-    ess : float
-        Effective sample size after the update, before resampling.
-    resampled : bool
-        Whether the resampler was called in this step.
-    ancestors : (n,) int
-        Where it was called after the update: which candidate each particle was; else 0 .. n-1.
-    parents : mapping
-        ``"previous"`` and ``"proposed"`` parents of the particles after the step, where they are known.
-    log_weights : (n,) float
-        After the step.
-    notes : mapping
-        What each component recorded, by slot.
-    seconds : mapping
-        Wall time by slot. Not reproducible.
-    """
-
-    t: int
-    n: int
-    n_candidates: int
-    ess: float
-    resampled: bool
-    ancestors: np.ndarray
-    parents: Mapping[str, np.ndarray]
-    log_weights: np.ndarray
-    notes: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
-    seconds: Mapping[str, float] = field(default_factory=dict)
-
-    @property
-    def unique_ancestors(self) -> int:
-        """How many different particles of the previous population have descendants (proposals not counted)."""
-        previous = self.parents.get("previous")
-        return 0 if previous is None else len(set(previous[previous >= 0].tolist()))
-
-
-class _Stopwatch:
-    """Times the parts of a step and collects their notes."""
-
-    def __init__(self) -> None:
-        self.seconds: dict[str, float] = {}
-        self.notes: dict[str, Mapping[str, Any]] = {}
-        self._last = time.perf_counter()
-
-    def lap(self, slot: str, population: Population | None = None) -> None:
-        now = time.perf_counter()
-        self.seconds[slot] = self.seconds.get(slot, 0.0) + now - self._last
-        self._last = now
-        if population is not None and population.notes:
-            self.notes[slot] = population.notes
+@lru_cache(maxsize=8)
+def _identity(n: int) -> np.ndarray:
+    """0 .. n-1, read-only and shared: the parents of particles that stayed in place."""
+    index = np.arange(n)
+    index.flags.writeable = False
+    return index
 
 
 @dataclass(frozen=True)
@@ -140,13 +79,19 @@ class ParticleFilter:
     proposal : Proposal, optional
         New particles at every step.
     update : Update
-        Brings in the observation.
+        Brings in the observation. Left out where the transition weighs particles itself (probabilistic programs).
     resampler : Resampler
         Selection.
     trigger : Trigger
         When to resample. More than `n` particles are resampled in any case.
+    lookahead : Lookahead, optional
+        Auxiliary filter: selects by weight times priority. Needs ``resample="before"``.
+    rejuvenation : Rejuvenation, optional
+        Resample-move: moves the particles at the end of a step that resampled.
+    size : Size, optional
+        How many particles a resampling makes; `n` where left out.
     n : int
-        Particles to keep.
+        Particles to start with, and to keep.
     n_proposed : int
         Particles that the proposal is asked for at each step (`n` where 0).
     resample : {"after", "before"}
@@ -159,6 +104,9 @@ class ParticleFilter:
     update: Update | None = None
     resampler: Resampler = Systematic()  # noqa: RUF009 (frozen)
     trigger: Trigger = EssBelow()  # noqa: RUF009 (frozen)
+    lookahead: Lookahead | None = None
+    rejuvenation: Rejuvenation | None = None
+    size: Size | None = None
     n: int = 100
     n_proposed: int = 0
     resample: Literal["after", "before"] = "before"
@@ -170,11 +118,16 @@ class ParticleFilter:
             raise InputError("the filter has neither `initial` nor `proposal`: no particles to start from")
         if self.resample not in ("after", "before"):
             raise InputError(f'resample is {self.resample!r}, expected "after" or "before"')
+        if self.lookahead is not None and self.resample == "after":
+            raise InputError(
+                'a lookahead sees the next observation, which resample="after" comes before',
+                'use resample="before"',
+            )
 
     @property
     def properly_weighted(self) -> bool:
         """Whether every component is."""
-        parts = (self.initial, self.transition, self.proposal, self.update, self.resampler)
+        parts = (getattr(self, slot) for slot in SLOTS)
         return all(part.properly_weighted for part in parts if isinstance(part, Component))
 
     def start(self, seed: int | Key = 0) -> State:
@@ -182,35 +135,39 @@ class ParticleFilter:
         return State(0, None, seed if isinstance(seed, Key) else Key(seed), self.properly_weighted)
 
     def step(self, state: State, observation: Any) -> tuple[State, Info]:
-        """Assimilate one observation (None: it is missing, the particles are only moved)."""
-        t, watch = state.t, _Stopwatch()
-        streams = state.key.child("step", t)
-        predicted, before = self._predict(state, observation, streams, watch)
+        """Assimilate one observation (None: it is missing, the particles are only moved).
+
+        Raises
+        ------
+        InputError
+            What a component could not work with, with the step and the slot.
+        """
+        watch = Watch()
+        try:
+            return self._step(state, observation, watch)
+        except InputError as error:
+            raise type(error)(f"step {state.t}, {watch.slot}: {error.message}", *error.hints) from error
+
+    def _step(self, state: State, observation: Any, watch: Watch) -> tuple[State, Info]:
+        streams = state.key.child("step", state.t)
+        past, before = self._select_before(state, observation, streams, watch)
+        predicted = self._predict(past, observation, streams, watch)
         proposed = self._propose(predicted, observation, streams, watch)
-
-        if observation is None or self.update is None:
-            fused = predicted if predicted is not None else proposed
-            assert fused is not None
-        else:
-            fused = self.update.update(streams.child("update").generator(), predicted, proposed, observation)
-            watch.lap("update", fused)
-
-        chosen, ancestors = fused, np.arange(len(fused))
-        late = self.resample == "after" and self.trigger.wants(fused, t)
-        if len(fused) > self.n or late:
-            chosen = self.resampler.resample(streams.child("resampler").generator(), fused, self.n)
-            ancestors = np.asarray(chosen.parents.get("ancestor", np.full(len(chosen), -1)))
-            watch.lap("resampler", chosen if chosen.notes is not fused.notes else None)
+        fused = self._fuse(predicted, proposed, observation, streams, watch)
+        chosen, ancestors = self._select_after(fused, past, state.t, streams, watch)
+        if self.rejuvenation is not None and "resampler" in watch.seconds:
+            chosen = self._rejuvenate(self.rejuvenation, chosen, past, observation, streams, watch)
+        watch.enter("build")
         chosen = chosen.realised()
-        watch.lap("build")
+        watch.leave()
 
         parents = {name: index for name, index in chosen.parents.items() if name != "ancestor"}
         if before is not None and "previous" in parents:
-            previous = parents["previous"]
-            parents["previous"] = np.where(previous >= 0, before[previous], -1)
-        population = Population(chosen.particles, chosen.log_weights, parents)
+            old = parents["previous"]
+            parents["previous"] = before if old is _identity(len(before)) else np.where(old >= 0, before[old], -1)
+        population = chosen.labelled(parents)
         info = Info(
-            t=t,
+            t=state.t,
             n=len(population),
             n_candidates=len(fused),
             ess=fused.ess,
@@ -221,60 +178,202 @@ class ParticleFilter:
             notes=watch.notes,
             seconds=watch.seconds,
         )
-        return State(t + 1, population, state.key, state.properly_weighted), info
+        return State(state.t + 1, population, state.key, state.properly_weighted), info
 
-    def _predict(
-        self, state: State, observation: Any, streams: Key, watch: _Stopwatch
+    def _select_before(
+        self, state: State, observation: Any, streams: Key, watch: Watch
     ) -> tuple[Population | None, np.ndarray | None]:
-        """Predicted particles, and which previous ones survived a resampling before (None: not resampled)."""
-        if state.population is None:
+        """x_{t-1} as it goes into the prediction, and which ones survived a resampling (None: there was none)."""
+        if state.population is None or self.resample == "after":
+            return state.population, None
+        population, priority = state.population, None
+        if self.lookahead is not None and observation is not None:
+            watch.enter("lookahead")
+            priority = self._priority(self.lookahead, population, observation)
+            population = population.reweighted(priority)
+            watch.leave()
+        watch.enter("resampler")
+        if not self.trigger.wants(population, state.t):
+            return state.population, None
+        n = self.n if self.size is None else self.size.choose(population)
+        selected = self.resampler.resample(streams.child("resampler").generator(), population.labelled({}), n)
+        ancestors = selected.parents.get("ancestor")
+        if priority is not None:
+            if ancestors is None:
+                raise InputError("a lookahead needs a resampler that reports ancestors, and this one does not")
+            selected = selected.reweighted(-priority[ancestors])
+        watch.leave(selected)
+        return selected, np.full(len(selected), -1) if ancestors is None else ancestors
+
+    @staticmethod
+    def _priority(lookahead: Lookahead, population: Population, observation: Any) -> np.ndarray:
+        priority = np.asarray(lookahead.log_priority(population, observation), dtype=np.float64)
+        if priority.shape != (len(population),):
+            raise InputError(f"log priorities have shape {priority.shape}, expected ({len(population)},)")
+        wrong = np.flatnonzero(~np.isfinite(priority))
+        if len(wrong):
+            raise InputError(
+                f"log priority of particle {wrong[0]} is {priority[wrong[0]]} ({len(wrong)} of {len(priority)} are "
+                "not finite)",
+                "a particle that is never selected would bias the filter: bound the priority from below",
+            )
+        return priority
+
+    def _predict(self, past: Population | None, observation: Any, streams: Key, watch: Watch) -> Population | None:
+        """Predicted particles; None at the first step of a filter that starts from its proposal."""
+        if past is None:
             if self.initial is None or self.initial is self.proposal:
-                return None, None
-            rng = streams.child("initial").generator()
-            population = self.initial.sample(rng, observation, self.n)
-            watch.lap("initial", population)
-            return population, None
-        population, before = state.population, None
-        if self.resample == "before" and self.trigger.wants(population, state.t):
-            population = self.resampler.resample(streams.child("resampler").generator(), population, self.n)
-            before = np.asarray(population.parents.get("ancestor", np.full(len(population), -1)))
-            watch.lap("resampler")
-        identity = {"previous": np.arange(len(population))}
-        population = replace(population.realised(), parents=identity, notes={})
-        if self.transition is not None:
-            moved = self.transition.predict(streams.child("transition").generator(), population, observation)
-            if "previous" not in moved.parents and len(moved) == len(population):
-                moved = replace(moved, parents={**moved.parents, **identity})
-            watch.lap("transition", moved)
-            population = moved
-        return population, before
+                return None
+            watch.enter("initial")
+            population = self.initial.sample(streams.child("initial").generator(), observation, self.n)
+            watch.leave(population)
+            return population
+        identity = {"previous": _identity(len(past))}
+        population = past.realised().labelled(identity)
+        if self.transition is None:
+            return population
+        watch.enter("transition")
+        moved = self.transition.predict(streams.child("transition").generator(), population, observation)
+        if "previous" not in moved.parents and len(moved) == len(population):
+            moved = moved.labelled({**moved.parents, **identity}, moved.notes)
+        watch.leave(moved)
+        return moved
 
     def _propose(
-        self, predicted: Population | None, observation: Any, streams: Key, watch: _Stopwatch
+        self, predicted: Population | None, observation: Any, streams: Key, watch: Watch
     ) -> Population | None:
         """Particles from the observation; None where there is no proposal or nothing was observed."""
         if self.proposal is None or (observation is None and predicted is not None):
             return None
+        watch.enter("proposal")
         if observation is None:
             raise InputError("the first observation is missing and the filter starts from its proposal")
         n = self.n_proposed or self.n
         proposed = self.proposal.sample(streams.child("proposal").generator(), observation, n)
-        proposed = replace(proposed, parents={"proposed": np.arange(len(proposed))})
-        watch.lap("proposal", proposed)
+        proposed = proposed.labelled({"proposed": _identity(len(proposed))}, proposed.notes)
+        watch.leave(proposed)
         return proposed
 
-    def iterate(self, observations: Iterable[Any], state: State | int = 0) -> Iterator[tuple[State, Info]]:
-        """States and infos, one an observation; `state` is one to go on from, or a seed."""
-        current = state if isinstance(state, State) else self.start(state)
+    def _fuse(
+        self,
+        predicted: Population | None,
+        proposed: Population | None,
+        observation: Any,
+        streams: Key,
+        watch: Watch,
+    ) -> Population:
+        """What the update makes of predicted and proposed particles."""
+        if observation is None or self.update is None:
+            fused = predicted if predicted is not None else proposed
+            assert fused is not None
+            return fused
+        watch.enter("update")
+        fused = self.update.update(streams.child("update").generator(), predicted, proposed, observation)
+        watch.leave(fused)
+        return fused
+
+    def _select_after(
+        self, fused: Population, past: Population | None, t: int, streams: Key, watch: Watch
+    ) -> tuple[Population, np.ndarray]:
+        """The particles to keep, and which candidates they were."""
+        watch.enter("resampler")
+        after, n, limit = self.resample == "after", self.n, self.n
+        if self.size is not None:
+            # Before the prediction the size was chosen already; only particles beyond that are taken away.
+            limit = max(self.n, 0 if past is None else len(past))
+            if after or len(fused) > limit:
+                n = self.size.choose(fused)
+                limit = n if after else limit
+        if len(fused) <= limit and not (after and self.trigger.wants(fused, t)):
+            return fused, _identity(len(fused))
+        chosen = self.resampler.resample(streams.child("resampler").generator(), fused, n)
+        watch.leave(chosen if chosen.notes is not fused.notes else None)
+        return chosen, np.asarray(chosen.parents.get("ancestor", np.full(len(chosen), -1)))
+
+    def _rejuvenate(
+        self,
+        rejuvenation: Rejuvenation,
+        chosen: Population,
+        past: Population | None,
+        observation: Any,
+        streams: Key,
+        watch: Watch,
+    ) -> Population:
+        """Particles after the move, with the parents they had."""
+        watch.enter("rejuvenation")
+        population, previous = chosen.realised(), None
+        if past is not None:
+            index = population.parents.get("previous")
+            if index is None or (index < 0).any():
+                raise InputError("rejuvenation needs a parent for every particle, and some have none")
+            previous = past if index is _identity(len(past)) else past.take(index)
+        moved = rejuvenation.move(streams.child("rejuvenation").generator(), population, previous, observation)
+        if len(moved) != len(population):
+            raise InputError(f"a move returned {len(moved)} of {len(population)} particles, expected all in order")
+        watch.leave(moved if moved.notes is not population.notes else None)
+        return moved.labelled(population.parents, moved.notes)
+
+    def iterate(
+        self,
+        observations: Iterable[Any],
+        state: State | int = 0,
+        *,
+        checkpoint: str | Path | None = None,
+        codec: Codec | None = None,
+    ) -> Iterator[tuple[State, Info]]:
+        """States and infos, one an observation, as they come in.
+
+        Parameters
+        ----------
+        observations : iterable
+            One a step; None where one is missing.
+        state : State or int
+            Where to go on from, or a seed.
+        checkpoint : path, optional
+            A file that holds the state after every step. Where it exists, the run goes on from it: as many of the
+            `observations` are skipped as it has seen, and the end is that of a run that was never stopped.
+        codec : Codec, optional
+            Stores particles other than arrays, mappings of arrays and dataclasses of arrays.
+        """
+        observations, current, store = self._begin(observations, state, checkpoint, codec)
         for observation in observations:
             current, info = self.step(current, observation)
+            if store is not None:
+                store.save(self, current)
             yield current, info
 
-    def run(self, observations: Iterable[Any], seed: int | State = 0) -> tuple[State, list[Info]]:
-        """The last state and the infos of all steps."""
-        state = seed if isinstance(seed, State) else self.start(seed)
+    def run(
+        self,
+        observations: Iterable[Any],
+        seed: int | State = 0,
+        *,
+        checkpoint: str | Path | None = None,
+        codec: Codec | None = None,
+    ) -> tuple[State, list[Info]]:
+        """The last state and the infos of all steps; parameters as in `iterate`.
+
+        The infos of a run that went on from a checkpoint are those of the steps made now.
+        """
+        observations, state, store = self._begin(observations, seed, checkpoint, codec)
         infos = []
         for observation in observations:
             state, info = self.step(state, observation)
+            if store is not None:
+                store.save(self, state)
             infos.append(info)
         return state, infos
+
+    def _begin(
+        self, observations: Iterable[Any], state: State | int, checkpoint: str | Path | None, codec: Codec | None
+    ) -> tuple[Iterable[Any], State, Checkpoint | None]:
+        """What is left to observe, the state to go on from, and where to store it."""
+        current = state if isinstance(state, State) else self.start(state)
+        if checkpoint is None:
+            return observations, current, None
+        from mstfilter.smc.checkpoint import Checkpoint
+
+        store = Checkpoint(Path(checkpoint), codec)
+        stored = store.load(self, current)
+        if stored is None:
+            return observations, current, store
+        return islice(observations, stored.t - current.t, None), stored, store

@@ -209,7 +209,9 @@ class Population:
     @property
     def ess(self) -> float:
         """Effective sample size."""
-        return effective_sample_size(self.log_weights)
+        if "_ess" not in self.__dict__:  # asked for by the trigger and by the record of the step
+            object.__setattr__(self, "_ess", effective_sample_size(self.log_weights))
+        return float(self.__dict__["_ess"])
 
     @property
     def best(self) -> Any:
@@ -228,6 +230,12 @@ class Population:
             {name: index[indices] for name, index in self.parents.items()},
             self.notes,
         )
+
+    def labelled(self, parents: Mapping[str, np.ndarray], notes: Mapping[str, Any] | None = None) -> Population:
+        """The same particles and weights with other parents ((n,) int64 arrays) and notes (none by default)."""
+        new = object.__new__(Population)  # nothing that was checked has changed
+        new.__dict__.update(self.__dict__, parents=parents, notes=notes or {})
+        return new
 
     def realised(self) -> Population:
         """The same population with every candidate built."""

@@ -1,10 +1,20 @@
-"""State-space models written as densities and samplers, and the components made from them.
+"""State-space models written as samplers and densities, and the components made from them.
 
->>> model = linear_gaussian(F=[[0.9]], Q=[[0.5]], H=[[1.0]], R=[[1.0]], m0=[0.0], P0=[[1.0]])
->>> filter = bootstrap(model, n=1000)
->>> state, infos = filter.run(observations, seed=0)
+>>> model = StateSpaceModel.of(
+...     initial=Normal(0.0, 1.0),
+...     transition=lambda x: Normal(0.9 * x, 0.5),
+...     observation=lambda x: Normal(x, 1.0),
+... )
+>>> state, infos = bootstrap(model, n=1000).run(observations, seed=0)
 
-The first observation updates the initial state before any prediction.
+The first observation updates the initial state before any prediction. A guided proposal q(x_t | x_{t-1}, y_t) is a
+function of x_{t-1} and y_t that returns a distribution; `GuidedTransition` makes a transition of it, which draws from
+q and adds log f - log q to the log weights:
+
+>>> filter = guided(model, lambda x, y: Normal(0.5 * (0.9 * x + y), 0.4), n=100)
+
+`guided` and the other filters (`auxiliary`, `resample_move`) are in `mstfilter.smc.filters`, all the same driver with
+other parts.
 """
 
 from __future__ import annotations
@@ -15,13 +25,23 @@ from typing import Any
 
 import numpy as np
 
-from mstfilter.smc.interfaces import Proposal, Resampler, Transition, Trigger
+from mstfilter.errors import InputError
+from mstfilter.smc.adapters import as_distribution
+from mstfilter.smc.interfaces import DensityTransition, Proposal, Resampler, Trigger
 from mstfilter.smc.particle_filter import ParticleFilter
 from mstfilter.smc.population import Population
 from mstfilter.smc.resampling import EssBelow, Systematic
-from mstfilter.smc.updates import Reweight
+from mstfilter.smc.updates import Reweight, n_of
 
-__all__ = ["Dynamics", "Prior", "StateSpaceModel", "bootstrap", "linear_gaussian"]
+__all__ = [
+    "Dynamics",
+    "GuidedInitial",
+    "GuidedTransition",
+    "Prior",
+    "StateSpaceModel",
+    "bootstrap",
+    "linear_gaussian",
+]
 
 
 @dataclass(frozen=True)
@@ -36,11 +56,52 @@ class StateSpaceModel:
         ``(rng, particles) -> particles`` draws x_t given x_{t-1}.
     log_likelihood : callable
         ``(particles, y) -> (n,)`` log p(y_t | x_t).
+    log_initial : callable, optional
+        ``(particles) -> (n,)`` log p(x_0). Guided filters and moves need it.
+    log_transition : callable, optional
+        ``(previous, new) -> (n,)`` log f(x_t | x_{t-1}) of paired rows. Guided filters and moves need it.
     """
 
     sample_initial: Callable[[np.random.Generator, int], Any]
     sample_transition: Callable[[np.random.Generator, Any], Any]
     log_likelihood: Callable[[Any, Any], np.ndarray]
+    log_initial: Callable[[Any], np.ndarray] | None = None
+    log_transition: Callable[[Any, Any], np.ndarray] | None = None
+
+    @classmethod
+    def of(cls, initial: Any, transition: Callable[[Any], Any], observation: Callable[[Any], Any]) -> StateSpaceModel:
+        """A model from distributions: ours, frozen ones of scipy.stats, or those of torch.
+
+        Parameters
+        ----------
+        initial : distribution
+            Of x_0.
+        transition : callable
+            ``(particles) -> distribution`` of x_t, one row a particle.
+        observation : callable
+            ``(particles) -> distribution`` of y_t.
+        """
+        first = as_distribution(initial)
+        return cls(
+            first.sample,
+            lambda rng, x: as_distribution(transition(x)).sample(rng, n_of(x)),
+            lambda x, y: as_distribution(observation(x)).log_prob(y),
+            first.log_prob,
+            lambda previous, new: as_distribution(transition(previous)).log_prob(new),
+        )
+
+    def density(self, which: str) -> Callable[..., np.ndarray]:
+        """``log_initial`` or ``log_transition``.
+
+        Raises
+        ------
+        InputError
+            Where the model was made without it.
+        """
+        found = self.log_initial if which == "log_initial" else self.log_transition
+        if found is None:
+            raise InputError(f"the model has no {which}", "give StateSpaceModel its log densities, or use .of()")
+        return found
 
 
 @dataclass(frozen=True)
@@ -55,7 +116,7 @@ class Prior(Proposal):
 
 
 @dataclass(frozen=True)
-class Dynamics(Transition):
+class Dynamics(DensityTransition):
     """Moves by the model's own transition."""
 
     model: StateSpaceModel
@@ -67,6 +128,67 @@ class Dynamics(Transition):
             population.log_weights,
             population.parents,
         )
+
+    def log_prob(self, previous: Any, new: Any, observation: Any) -> np.ndarray:
+        """Log density of the model's transition."""
+        return self.model.density("log_transition")(previous, new)
+
+
+@dataclass(frozen=True)
+class GuidedInitial(Proposal):
+    """First particles from q(x_0 | y_0), weighted by p(x_0) / q.
+
+    Parameters
+    ----------
+    model : StateSpaceModel
+        With `log_initial`.
+    proposal : callable
+        ``(y) -> distribution`` of x_0.
+    """
+
+    model: StateSpaceModel
+    proposal: Callable[[Any], Any]
+
+    def sample(self, rng: np.random.Generator, observation: Any, n: int) -> Population:
+        """Draw `n`; from the prior where the observation is missing."""
+        if observation is None:
+            return Population(self.model.sample_initial(rng, n))
+        q = as_distribution(self.proposal(observation))
+        x = q.sample(rng, n)
+        return Population(x, self.model.density("log_initial")(x) - q.log_prob(x))
+
+
+@dataclass(frozen=True)
+class GuidedTransition(DensityTransition):
+    """Moves by q(x_t | x_{t-1}, y_t) and adds log f - log q to the log weights.
+
+    Parameters
+    ----------
+    model : StateSpaceModel
+        With `log_transition`.
+    proposal : callable
+        ``(particles, y) -> distribution`` of x_t, one row a particle. Its tails must not be lighter than those of
+        f(x_t | x_{t-1}) p(y_t | x_t).
+    """
+
+    model: StateSpaceModel
+    proposal: Callable[[Any, Any], Any]
+
+    def predict(self, rng: np.random.Generator, population: Population, observation: Any) -> Population:
+        """Move all particles; by the model's own transition where the observation is missing."""
+        old = population.particles
+        if observation is None:
+            return Population(self.model.sample_transition(rng, old), population.log_weights, population.parents)
+        q = as_distribution(self.proposal(old, observation))
+        new = q.sample(rng, len(population))
+        gain = self.model.density("log_transition")(old, new) - q.log_prob(new)
+        return Population(new, population.log_weights + gain, population.parents)
+
+    def log_prob(self, previous: Any, new: Any, observation: Any) -> np.ndarray:
+        """Log density of the move that is made: q, or f where the observation is missing."""
+        if observation is None:
+            return self.model.density("log_transition")(previous, new)
+        return as_distribution(self.proposal(previous, observation)).log_prob(new)
 
 
 def bootstrap(
@@ -91,8 +213,16 @@ def linear_gaussian(F: Any, Q: Any, H: Any, R: Any, m0: Any, P0: Any) -> StateSp
     """x_0 ~ N(m0, P0), x_t = F x_{t-1} + N(0, Q), y_t = H x_t + N(0, R); particles are (n, d)."""
     F, Q, H, R, m0, P0 = (np.asarray(a, dtype=np.float64) for a in (F, Q, H, R, m0, P0))
     root_Q, root_P = np.linalg.cholesky(Q), np.linalg.cholesky(P0)
-    whiten = np.linalg.inv(np.linalg.cholesky(R))
-    constant = np.log(np.diag(whiten)).sum() - 0.5 * len(R) * np.log(2 * np.pi)
+
+    def log_normal(cov: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
+        whiten = np.linalg.inv(np.linalg.cholesky(cov))
+        constant = np.log(np.diag(whiten)).sum() - 0.5 * len(cov) * np.log(2 * np.pi)
+
+        def of(residual: np.ndarray) -> np.ndarray:
+            z = residual @ whiten.T
+            return constant - 0.5 * np.einsum("ij,ij->i", z, z)
+
+        return of
 
     def initial(rng: np.random.Generator, n: int) -> np.ndarray:
         return m0 + rng.standard_normal((n, len(m0))) @ root_P.T
@@ -100,8 +230,11 @@ def linear_gaussian(F: Any, Q: Any, H: Any, R: Any, m0: Any, P0: Any) -> StateSp
     def transition(rng: np.random.Generator, x: np.ndarray) -> np.ndarray:
         return x @ F.T + rng.standard_normal(x.shape) @ root_Q.T
 
-    def log_likelihood(x: np.ndarray, y: Any) -> np.ndarray:
-        residual = (np.atleast_1d(y) - x @ H.T) @ whiten.T
-        return constant - 0.5 * np.einsum("ij,ij->i", residual, residual)
-
-    return StateSpaceModel(initial, transition, log_likelihood)
+    of_R, of_P, of_Q = log_normal(R), log_normal(P0), log_normal(Q)
+    return StateSpaceModel(
+        initial,
+        transition,
+        lambda x, y: of_R(np.atleast_1d(y) - x @ H.T),
+        lambda x: of_P(x - m0),
+        lambda old, new: of_Q(new - old @ F.T),
+    )

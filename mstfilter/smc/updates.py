@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,7 +15,7 @@ from mstfilter.errors import InputError
 from mstfilter.smc.interfaces import Update
 from mstfilter.smc.population import Population
 
-__all__ = ["Chain", "Reweight", "union"]
+__all__ = ["Chain", "Reweight", "n_of", "union"]
 
 
 @dataclass(frozen=True)
@@ -67,6 +67,11 @@ class Chain(Update):
         return union(predicted, proposed)
 
 
+def n_of(particles: Any) -> int:
+    """How many particles there are."""
+    return len(next(iter(particles.values()))) if isinstance(particles, Mapping) else len(particles)
+
+
 def union(predicted: Population | None, proposed: Population | None) -> Population:
     """Predicted and proposed particles side by side, weights and parents kept; either may be None."""
     if predicted is None or proposed is None:
@@ -78,7 +83,7 @@ def union(predicted: Population | None, proposed: Population | None) -> Populati
     particles: Any
     if isinstance(a, np.ndarray) and isinstance(b, np.ndarray):
         particles = np.concatenate([a, b])
-    elif isinstance(a, dict) and isinstance(b, dict):
+    elif isinstance(a, Mapping) and isinstance(b, Mapping):
         particles = {name: np.concatenate([a[name], b[name]]) for name in a}
     else:
         particles = (*a, *b)

@@ -1,0 +1,154 @@
+"""Light distributions against scipy.stats; adapters; layout of rows."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from mstfilter.errors import InputError
+from mstfilter.smc.adapters import as_distribution
+from mstfilter.smc.distributions import (
+    Bernoulli,
+    Categorical,
+    Gamma,
+    MultivariateNormal,
+    Normal,
+    Poisson,
+    Student,
+    Uniform,
+)
+
+COV = np.array([[2.0, 0.6], [0.6, 0.5]])
+CASES = [
+    (Normal(0.3, 2.0), stats.norm(0.3, 2.0)),
+    (Student(4.0, -1.0, 0.5), stats.t(4.0, -1.0, 0.5)),
+    (Uniform(-1.0, 2.5), stats.uniform(-1.0, 3.5)),
+    (Gamma(2.5, 3.0), stats.gamma(2.5, scale=1 / 3.0)),
+    (Poisson(3.7), stats.poisson(3.7)),
+    (Bernoulli(0.3), stats.bernoulli(0.3)),
+    (Categorical([0.2, 0.0, 0.5, 0.3]), stats.rv_discrete(values=(np.arange(4), [0.2, 0.0, 0.5, 0.3]))),
+]
+IDS = [type(ours).__name__ for ours, _ in CASES]
+
+
+@pytest.mark.parametrize(("ours", "theirs"), CASES, ids=IDS)
+def test_log_prob_is_that_of_scipy(ours, theirs):
+    values = np.concatenate([[-2.0, -1.0, 0.0, 0.4, 1.0, 2.0, 3.0, 40.0], np.linspace(-1, 5, 13)])
+    if ours.discrete:
+        values = np.floor(values)
+        expected = theirs.logpmf(values)
+    else:
+        values = values[(values != 2.5) & (values != 0.0)]  # ends of a support: a matter of convention
+        expected = theirs.logpdf(values)
+    with np.errstate(divide="ignore"):
+        np.testing.assert_allclose(ours.log_prob(values), expected, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize(("ours", "theirs"), CASES, ids=IDS)
+def test_draws_have_the_law(ours, theirs):
+    """Kolmogorov-Smirnov, or chi-square for discrete ones, at a false-alarm rate of 1e-4."""
+    x = ours.sample(np.random.default_rng(5), 4000)
+    assert x.shape == (4000,)
+    if not ours.discrete:
+        assert stats.kstest(x, theirs.cdf).pvalue > 1e-4
+    else:
+        counts = np.bincount(x.astype(int), minlength=9)[:9]
+        p = np.append(theirs.pmf(np.arange(8)), theirs.sf(7))
+        counts[8] = len(x) - counts[:8].sum()
+        assert counts[p == 0].sum() == 0
+        assert stats.chisquare(counts[p > 0], len(x) * p[p > 0]).pvalue > 1e-4
+    if not isinstance(ours, Student):
+        np.testing.assert_allclose(ours.mean, theirs.mean())
+        np.testing.assert_allclose(ours.sd, theirs.std())
+
+
+def test_gaussian_vectors():
+    rng = np.random.default_rng(1)
+    shared = MultivariateNormal([1.0, -1.0], COV)
+    x = shared.sample(rng, 20000)
+    np.testing.assert_allclose(x.mean(axis=0), [1, -1], atol=0.06)
+    np.testing.assert_allclose(np.cov(x.T), COV, atol=0.08)
+    expected = stats.multivariate_normal([1.0, -1.0], COV).logpdf(x[:50])
+    np.testing.assert_allclose(shared.log_prob(x[:50]), expected)
+    each = MultivariateNormal(np.tile([1.0, -1.0], (50, 1)), np.tile(COV, (50, 1, 1)))
+    np.testing.assert_allclose(each.log_prob(x[:50]), expected)
+    np.testing.assert_allclose(each.log_prob(x[0]), np.full(50, expected[0]))
+    np.testing.assert_allclose(
+        MultivariateNormal(x[:50], COV).log_prob(np.zeros(2)),
+        [stats.multivariate_normal(m, COV).logpdf(np.zeros(2)) for m in x[:50]],
+    )
+    assert each.sample(rng, 50).shape == (50, 2)
+    with pytest.raises(InputError, match="positive definite"):
+        MultivariateNormal([0.0, 0.0], [[1.0, 2.0], [2.0, 1.0]])
+
+
+def test_rows():
+    rng = np.random.default_rng(0)
+    assert Normal(np.zeros((1, 3)), 1.0).sample(rng, 5).shape == (5, 3)
+    assert Normal(np.zeros((5, 3)), 1.0).log_prob(np.ones((5, 3))).shape == (5,)
+    assert Normal(0.0, 1.0).log_prob(0.2).shape == ()
+    with pytest.raises(InputError, match="do not fit 5 particles"):
+        Normal(np.zeros(4), 1.0).sample(rng, 5)
+    p = rng.dirichlet([1, 1, 1], size=6000)
+    k = Categorical(p).sample(rng, 6000)
+    np.testing.assert_allclose(np.exp(Categorical(p).log_prob(k)), p[np.arange(6000), k])
+    # Each row by its own probabilities: the residual of every category sums to nearly 0 (5 standard deviations).
+    for j in range(3):
+        assert abs(((k == j) - p[:, j]).sum()) < 5 * np.sqrt((p[:, j] * (1 - p[:, j])).sum())
+    with pytest.raises(InputError, match="categorical"):
+        Categorical([0.0, 0.0])
+
+
+def test_log_prob_does_not_write_to_its_argument():
+    x = np.linspace(-1, 1, 5)
+    kept = x.copy()
+    for d in (Normal(0.0, 2.0), Student(3.0), Uniform(-2, 2), Gamma(2.0), MultivariateNormal([0.0], [[1.0]])):
+        d.log_prob(x if not isinstance(d, MultivariateNormal) else x[:, None])
+        np.testing.assert_array_equal(x, kept)
+
+
+@pytest.mark.parametrize(
+    "frozen",
+    [stats.norm(1.0, 2.0), stats.poisson(3.0), stats.Normal(mu=1.0, sigma=2.0)],
+    ids=["old", "discrete", "new"],
+)
+def test_scipy_distributions(frozen):
+    d = as_distribution(frozen)
+    a, b = (d.sample(np.random.default_rng(3), 3000) for _ in range(2))
+    np.testing.assert_array_equal(a, b)
+    assert a.shape == (3000,)
+    mean, sd = float(d.mean), float(d.sd)
+    assert abs(a.mean() - mean) < 5 * sd / np.sqrt(3000)
+    expected = Poisson(3.0) if d.discrete else Normal(1.0, 2.0)
+    np.testing.assert_allclose(d.log_prob(a[:20]), expected.log_prob(a[:20]))
+
+
+def test_scipy_rows_and_vectors():
+    rng, loc = np.random.default_rng(0), np.arange(7.0)
+    for frozen in (stats.norm(loc, 1e-9), stats.Normal(mu=loc, sigma=np.full(7, 1e-9))):
+        np.testing.assert_allclose(as_distribution(frozen).sample(rng, 7), loc, atol=1e-6)
+    vectors = as_distribution(stats.multivariate_normal([0.0, 5.0], COV))
+    assert vectors.sample(rng, 1).shape == (1, 2)
+    x = vectors.sample(rng, 9)
+    np.testing.assert_allclose(vectors.log_prob(x), MultivariateNormal([0.0, 5.0], COV).log_prob(x))
+
+
+def test_torch_distributions():
+    torch = pytest.importorskip("torch")
+    d = as_distribution(torch.distributions.Normal(torch.tensor(1.0, dtype=torch.float64), 2.0))
+    a = d.sample(np.random.default_rng(3), 3000)
+    np.testing.assert_array_equal(a, d.sample(np.random.default_rng(3), 3000))
+    assert stats.kstest(a, stats.norm(1, 2).cdf).pvalue > 1e-4
+    np.testing.assert_allclose(d.log_prob(a), stats.norm(1, 2).logpdf(a))
+    k = as_distribution(torch.distributions.Categorical(torch.tensor([0.2, 0.8]))).sample(
+        np.random.default_rng(0), 50
+    )
+    assert set(k) == {0, 1}
+    with pytest.raises(InputError, match="no icdf"):
+        as_distribution(torch.distributions.Gamma(2.0, 1.0)).sample(np.random.default_rng(0), 3)
+
+
+def test_other_things_are_refused():
+    with pytest.raises(InputError, match="expected a distribution, found a builtins.float"):
+        as_distribution(3.0)
