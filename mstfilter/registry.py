@@ -38,6 +38,16 @@ COMPONENTS: dict[str, dict[str, str]] = {
         "residual": "mstfilter.smc.resampling:Residual",
         "stratified": "mstfilter.smc.resampling:Stratified",
         "systematic": "mstfilter.smc.resampling:Systematic",
+        "residual_systematic": "mstfilter.smc.resampling_rounding:ResidualSystematic",
+        "ssp": "mstfilter.smc.resampling_rounding:Ssp",
+        "killing": "mstfilter.smc.resampling_rounding:Killing",
+        "fearnhead_clifford": "mstfilter.smc.resampling_optimal:FearnheadClifford",
+        "clusters": "mstfilter.smc.resampling_clusters:ClusterStratified",
+        "kdpp": "mstfilter.smc.resampling_dpp:KDpp",
+        "greedy_diverse": "mstfilter.smc.resampling_greedy:GreedyDiverse",
+        "coalesced": "mstfilter.smc.resampling_wrappers:Coalesced",
+        "tempered": "mstfilter.smc.resampling_wrappers:Tempered",
+        "shuffled": "mstfilter.smc.resampling_wrappers:Shuffled",
         "keep_weights": "mstfilter.smc.kept_weights:KeepWeights",
     },
     "trigger": {
@@ -45,6 +55,19 @@ COMPONENTS: dict[str, dict[str, str]] = {
         "ess": "mstfilter.smc.resampling:EssBelow",
         "every": "mstfilter.smc.resampling:Every",
         "never": "mstfilter.smc.resampling:Never",
+    },
+    "size": {
+        "fixed": "mstfilter.smc.sizes:Fixed",
+        "kld": "mstfilter.smc.sizes:Kld",
+    },
+    "similarity": {
+        "gaussian": "mstfilter.smc.similarity:Gaussian",
+        "weighted_coverage": "mstfilter.fusion.similarity:WeightedCoverage",
+    },
+    "equivalence": {
+        "bins": "mstfilter.smc.similarity:Bins",
+        "exact": "mstfilter.smc.similarity:Exact",
+        "same_segmentation": "mstfilter.fusion.similarity:SameSegmentation",
     },
     "boundary": {"colour_depth": "mstfilter.segmentation.boundary:ColourDepthBoundary"},
     "tree": {"ucm": "mstfilter.segmentation.ucm:UcmTree"},
@@ -161,9 +184,7 @@ def _from_file(path: Path, attribute: str) -> type:
     return found
 
 
-def build(
-    kind: str, spec: Any, where: str | None = None, allow_files: bool = False, default: type | None = None
-) -> Any:
+def build(kind: str, spec: Any, where: str | None = None, allow_files: bool = False, default: Any = None) -> Any:
     """A component from its name, or from a mapping with ``component`` and fields.
 
     Parameters
@@ -176,8 +197,8 @@ def build(
         Path in the configuration, for messages.
     allow_files : bool
         Whether ``./file.py:Class`` is loaded.
-    default : type, optional
-        Class to use where the mapping names none.
+    default : component, optional
+        What a mapping that names no component changes.
     """
     where = where or kind
     if isinstance(spec, str):
@@ -191,14 +212,12 @@ def build(
             raise InputError(
                 f"{where} names no component", f"add component = one of {', '.join(sorted(known(kind)))}"
             )
-        cls = default
-    else:
-        cls = find_class(kind, name, where, allow_files)
-    return make(cls, fields, where, allow_files)
+        return make(type(default), fields, where, allow_files, default)
+    return make(find_class(kind, name, where, allow_files), fields, where, allow_files)
 
 
-def make(cls: type, fields: Mapping[str, Any], where: str, allow_files: bool = False) -> Any:
-    """An instance of a dataclass from plain values, nested components included."""
+def make(cls: type, fields: Mapping[str, Any], where: str, allow_files: bool = False, base: Any = None) -> Any:
+    """An instance of a dataclass from plain values, nested components included; other fields are those of `base`."""
     if not dataclasses.is_dataclass(cls):
         raise InputError(f"{where}: {cls.__name__} is not a dataclass, so its fields cannot be configured")
     own = {f.name: f for f in dataclasses.fields(cls) if f.init}
@@ -213,18 +232,19 @@ def make(cls: type, fields: Mapping[str, Any], where: str, allow_files: bool = F
                 *([f"did you mean {close[0]}?"] if close else []),
                 f"fields: {', '.join(own) or 'none'}",
             )
-        kind, current = kind_of(name), type(default_of(own[name]))
+        kind = kind_of(name)
+        current = default_of(own[name]) if base is None else getattr(base, name)
+        part = current if dataclasses.is_dataclass(current) else None
         if kind is not None and value is not None:
-            preset = current if dataclasses.is_dataclass(current) else None
-            values[name] = build(kind, value, path, allow_files, preset)
-        elif dataclasses.is_dataclass(current) and isinstance(value, Mapping):
+            values[name] = build(kind, value, path, allow_files, part)
+        elif part is not None and isinstance(value, Mapping):
             # Part of a component that is no component itself: it has fields, but nothing can replace it.
             inner = {k: v for k, v in value.items() if k != "component"}
-            values[name] = make(current, inner, path, allow_files)
+            values[name] = make(type(part), inner, path, allow_files, part)
         else:
             values[name] = _plain(hints[name], value, path)
     try:
-        return cls(**values)
+        return cls(**values) if base is None else dataclasses.replace(base, **values)
     except InputError as error:
         raise InputError(f"{where}: {error.message}" if where else error.message, *error.hints) from error
     except TypeError as error:

@@ -97,6 +97,7 @@ class Scene:
             for k, (s, t) in enumerate(zip(self.things.shapes, self.things.twin_of, strict=True))
         ]
         return {
+            "name": f"{self.family.name}-{self.seed}",
             "generator": "mstfilter.simulation",
             "generator_version": GENERATOR_VERSION,
             "seed": self.seed,

@@ -180,6 +180,10 @@ def test_overrides_change_what_they_name():
     assert type(filter.transition.rule).__name__ == "PaperRule"
     assert type(filter.update.free_space).__name__ == "NoFreeSpace"
     assert filter.update.crossover == build_filter(load_config("mst")).update.crossover
+    authors = build_filter(load_config("authors", ["transition.rule.sift.descriptor_radius=200"])).transition.rule
+    plain = build_filter(load_config("authors")).transition.rule
+    assert authors.sift.descriptor_radius == 200
+    assert authors.sift.mutual == plain.sift.mutual  # the rule's own default, not the part's
     with pytest.raises(InputError, match="there is no preset 'best'"):
         load_config("best")
 

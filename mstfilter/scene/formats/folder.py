@@ -162,7 +162,7 @@ def open_folder(path: Path) -> Recording:
         grid,
         pauses,
         tuple(e.time_s for e in entries),
-        name=path.name,
+        name=str(raw.get("name") or path.name),
         path=path,
         manifest=raw,
         read_truth=_read_voxels(truth, grid, pauses) if truth.exists() else lambda t: None,
