@@ -195,7 +195,7 @@ def _lines(kind: str) -> Iterator[str]:
 
     if kind == "presets":
         for name in preset_names():
-            yield f"{name:<18}{tomllib.loads(find_preset(name).read_text()).get('description', '')}"
+            yield f"{name:<20}{tomllib.loads(find_preset(name).read_text()).get('description', '')}"
         return
     if kind == "families":
         from mstfilter.simulation.families import SCENE_FAMILIES
@@ -203,13 +203,13 @@ def _lines(kind: str) -> Iterator[str]:
         for name, f in SCENE_FAMILIES.items():
             objects = f"{f.n_objects_min}-{f.n_objects_max}" if f.n_objects_min < f.n_objects_max else f.n_objects_max
             yield (
-                f"{name:<18}{objects} objects, {f.n_actions} actions of {f.frames_per_clip} frames, "
+                f"{name:<20}{objects} objects, {f.n_actions} actions of {f.frames_per_clip} frames, "
                 f"{f.width} x {f.height}, voxels {' x '.join(map(str, f.grid().shape))}"
             )
         return
     for name in registry.known(kind):
         cls = registry.find_class(kind, name)
-        yield f"{name:<18}{_first_line(cls)}  [{_fields(cls)}]"
+        yield f"{name:<20}{_first_line(cls)}  [{_fields(cls)}]"
 
 
 def _first_line(cls: type) -> str:

@@ -128,6 +128,9 @@ class Resampler(Component):
     Override `resample` instead where the scheme looks at the particles.
     """
 
+    #: Whether `n` particles come out in any case. A scheme without duplicates returns fewer where fewer have weight.
+    exact_size: ClassVar[bool] = True
+
     @abstractmethod
     def select(
         self, rng: np.random.Generator, log_weights: np.ndarray, n: int

@@ -1,4 +1,4 @@
-"""Resampling schemes and triggers.
+"""Classical resampling schemes, and triggers.
 
 All are unbiased: particle i gets on average n W_i copies, W its normalised weight. They differ in how far the
 number of copies N_i strays from that. Notation: f = frac(n W_i).
@@ -7,7 +7,7 @@ number of copies N_i strays from that. Notation: f = frac(n W_i).
 scheme        N_i                                            variance of N_i
 ============  =============================================  ========================================
 multinomial   n independent draws                            n W_i (1 - W_i)
-residual      floor(n W_i), the rest multinomially           r_i (1 - r_i / R), r_i = f, R = sum of r
+residual      floor(n W_i), the rest by another scheme       r_i (1 - r_i / R), r_i = f, R = sum of r
 stratified    one draw in each of n equal strata of [0, 1)   sum over strata of p (1 - p)
 systematic    one draw, shifted to each stratum              f (1 - f)
 ============  =============================================  ========================================
@@ -17,14 +17,23 @@ systematic    one draw, shifted to each stratum              f (1 - f)
 >>> Systematic().select(rng, np.log([0.5, 0.25, 0.25]), 4)[0]
 array([0, 0, 1, 2])
 
-Weights may be unnormalised, of any float type, and hold zeros (log weight -inf) anywhere; n may differ from
-their number. A particle of weight zero is never chosen. References: Douc, Cappe, Moulines (2005), "Comparison
-of resampling schemes for particle filtering"; Kitagawa (1996); Liu and Chen (1998).
+(The variance of residual is that of its default, the multinomial remainder.) Weights may be unnormalised, of any
+float type, and hold zeros (log weight -inf) anywhere; n may differ from their number. A particle of weight zero
+is never chosen; NaN, +inf or nothing but zeros is an `InputError`.
+
+More schemes: `mstfilter.smc.resampling_rounding` (SSP, residual-systematic, killing),
+`mstfilter.smc.resampling_optimal` (Fearnhead-Clifford: no duplicates), `mstfilter.smc.resampling_clusters`,
+`mstfilter.smc.resampling_dpp` and `mstfilter.smc.resampling_greedy` (diverse selections, which see the particles),
+`mstfilter.smc.resampling_wrappers` (coalescing, tempering, shuffling).
+
+References: Douc, Cappe, Moulines (2005), "Comparison of resampling schemes for particle filtering"; Kitagawa
+(1996); Liu and Chen (1998).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
@@ -32,11 +41,27 @@ from mstfilter.errors import InputError
 from mstfilter.smc.interfaces import Resampler, Trigger
 from mstfilter.smc.population import Population, effective_sample_size
 
-__all__ = ["Always", "EssBelow", "Every", "Multinomial", "Never", "Residual", "Stratified", "Systematic"]
+__all__ = [
+    "Always",
+    "EssBelow",
+    "Every",
+    "Multinomial",
+    "Never",
+    "Residual",
+    "Stratified",
+    "Systematic",
+    "checked_weights",
+]
 
 
-def _cumulative(log_weights: np.ndarray, n: int) -> np.ndarray:
-    """(m,) cumulative weights in float64, last entry exactly the total; checks the input."""
+def checked_weights(log_weights: np.ndarray, n: int) -> np.ndarray:
+    """(m,) float64 weights whose largest is 1, from log weights of any float type.
+
+    Raises
+    ------
+    InputError
+        Not one number a particle, a NaN, +inf, nothing but -inf, or n < 1.
+    """
     lw = np.asarray(log_weights, dtype=np.float64)
     if lw.ndim != 1 or len(lw) == 0:
         raise InputError(f"log weights have shape {lw.shape}, expected one number a particle")
@@ -46,7 +71,26 @@ def _cumulative(log_weights: np.ndarray, n: int) -> np.ndarray:
     if not np.isfinite(top):
         at = int(np.flatnonzero(~np.isfinite(lw) & ~np.isneginf(lw))[0]) if not np.isneginf(top) else 0
         raise InputError(f"log weights cannot be resampled: entry {at} is {lw[at]}, the largest is {top}")
-    return np.cumsum(np.exp(lw - top))
+    return np.exp(lw - top)
+
+
+def _cumulative(log_weights: np.ndarray, n: int) -> np.ndarray:
+    """(m,) cumulative weights in float64, last entry exactly the total; checks the input."""
+    return np.cumsum(checked_weights(log_weights, n))
+
+
+def whole_copies(weights: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray, int]:
+    """floor(n W_i) as (m,) int64, the fractions left (m,), and how many copies these are to make."""
+    expected = weights * (n / weights.sum())
+    # What is a whole number but for rounding counts as whole: else its copy would be left to chance.
+    copies = np.floor(expected * (1 + 1e-13))
+    return copies.astype(np.int64), np.clip(expected - copies, 0.0, None), n - int(copies.sum())
+
+
+def ordered_uniforms(rng: np.random.Generator, n: int) -> np.ndarray:
+    """(n,) uniforms on [0, 1] in ascending order, in O(n): normalised exponential spacings."""
+    spacings = np.cumsum(rng.standard_exponential(n + 1))
+    return spacings[:-1] / spacings[-1]
 
 
 def _from_points(cumulative: np.ndarray, points: np.ndarray) -> np.ndarray:
@@ -74,9 +118,7 @@ class Multinomial(Resampler):
     def select(self, rng: np.random.Generator, log_weights: np.ndarray, n: int) -> tuple[np.ndarray, None]:
         """Choose by n uniforms that are made in sorted order: O(m + n)."""
         cumulative = _cumulative(log_weights, n)
-        spacings = np.cumsum(rng.standard_exponential(n + 1))
-        points = spacings[:-1] * (cumulative[-1] / spacings[-1])
-        return _from_points(cumulative, points), None
+        return _from_points(cumulative, ordered_uniforms(rng, n) * cumulative[-1]), None
 
 
 @dataclass(frozen=True)
@@ -102,23 +144,35 @@ class Systematic(Resampler):
 
 @dataclass(frozen=True)
 class Residual(Resampler):
-    """floor(n W_i) copies for certain, the rest multinomially (Liu and Chen 1998)."""
+    """floor(n W_i) copies for certain, the rest by another scheme (Liu and Chen 1998).
+
+    Parameters
+    ----------
+    remainder : {"multinomial", "stratified", "systematic"}
+        How the fractions frac(n W_i) make the remaining copies. Systematic has the least variance, f (1 - f).
+    """
+
+    remainder: Literal["multinomial", "stratified", "systematic"] = "multinomial"
+
+    def __post_init__(self) -> None:
+        if self.remainder not in ("multinomial", "stratified", "systematic"):
+            raise InputError(
+                f"remainder is {self.remainder!r}", "there are: multinomial, stratified and systematic remainders"
+            )
 
     def select(self, rng: np.random.Generator, log_weights: np.ndarray, n: int) -> tuple[np.ndarray, None]:
         """Choose."""
-        cumulative = _cumulative(log_weights, n)
-        lw = np.asarray(log_weights, dtype=np.float64)
-        expected = np.exp(lw - lw.max()) * (n / cumulative[-1])
-        # n W_i that is a whole number but for rounding counts as whole: else its copy would be left to chance.
-        copies = np.floor(expected + 1e-12 * n)
-        rest = n - int(copies.sum())
+        copies, fractions, rest = whole_copies(checked_weights(log_weights, n), n)
         if rest > 0:
-            remainder = np.clip(expected - copies, 0.0, None)
-            spacings = np.cumsum(rng.standard_exponential(rest + 1))
-            points = np.cumsum(remainder)
-            drawn = _from_points(points, spacings[:-1] * (points[-1] / spacings[-1]))
+            cumulative = np.cumsum(fractions)
+            if self.remainder == "systematic":
+                drawn = _from_shifts(cumulative, rest, rng.random())
+            elif self.remainder == "stratified":
+                drawn = _from_points(cumulative, (np.arange(rest) + rng.random(rest)) * (cumulative[-1] / rest))
+            else:
+                drawn = _from_points(cumulative, ordered_uniforms(rng, rest) * cumulative[-1])
             copies += np.bincount(drawn, minlength=len(copies))
-        return np.repeat(np.arange(len(copies)), copies.astype(np.int64)), None
+        return np.repeat(np.arange(len(copies)), copies), None
 
 
 @dataclass(frozen=True)

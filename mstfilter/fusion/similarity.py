@@ -1,0 +1,106 @@
+"""Which hypotheses are alike: weighted coverage of all pairs, and equality up to the names of labels.
+
+>>> WeightedCoverage().matrix(population.particles)      # (n, n), 1 on the diagonal
+>>> SameSegmentation().classes(population.particles)     # (n,) classes of equal segmentations
+
+For the resamplers of `mstfilter.smc` that see particles: ``KDpp(similarity=WeightedCoverage())``,
+``Coalesced(equivalence=SameSegmentation())``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from mstfilter.errors import InputError
+from mstfilter.scene.voxels import Hypothesis
+from mstfilter.smc.similarity import Equivalence, Similarity, first_seen
+
+__all__ = ["SameSegmentation", "WeightedCoverage", "canonical"]
+
+
+def canonical(labels: np.ndarray) -> np.ndarray:
+    """The same segmentation with labels 1, 2, ... in the order of their first voxel; 0 stays."""
+    flat = np.asarray(labels).ravel()
+    present, first = np.unique(flat, return_index=True)
+    order = np.argsort(np.where(present == 0, -1, first), kind="stable")
+    table = np.zeros(int(flat.max(initial=0)) + 1, np.uint16)
+    table[present[order]] = np.arange(len(present)) + (0 if present[0] == 0 else 1)
+    return table[flat].reshape(np.shape(labels))
+
+
+@dataclass(frozen=True)
+class SameSegmentation(Equivalence):
+    """Hypotheses with the same regions, whatever their labels are called."""
+
+    def classes(self, particles: Sequence[Hypothesis]) -> np.ndarray:
+        """(n,) classes; particles that share their label grid are looked at once."""
+        known: dict[int, bytes] = {}
+
+        def key(hypothesis: Hypothesis) -> bytes:
+            name = id(hypothesis.labels)
+            if name not in known:
+                known[name] = canonical(hypothesis.labels).tobytes()
+            return known[name]
+
+        return first_seen((key(h), h.grid.key) for h in particles)
+
+
+@dataclass(frozen=True)
+class WeightedCoverage(Similarity):
+    """Quality of one hypothesis against the other (form ``objects`` of `mstfilter.scene.quality`), for all pairs.
+
+    Parameters
+    ----------
+    stride : int
+        Look at every stride-th voxel along each axis: faster by stride^3.
+    """
+
+    stride: int = 1
+
+    def __post_init__(self) -> None:
+        if self.stride < 1:
+            raise InputError(f"stride is {self.stride} voxels, expected at least 1")
+
+    def matrix(self, particles: Sequence[Hypothesis]) -> np.ndarray:
+        """(n, n); each row is one contingency table against the objects of all hypotheses together."""
+        step = slice(None, None, self.stride)
+        grids = [h.labels[step, step, step] for h in particles]
+        if len({g.shape for g in grids}) != 1:
+            raise InputError("hypotheses have label grids of different shapes, expected the same for all")
+        occupied = np.zeros(grids[0].shape, bool)
+        for grid in grids:
+            occupied |= grid > 0
+        # (n, voxels) labels numbered through over all hypotheses; number start[i] is the free space of i.
+        flat = np.empty((len(grids), int(occupied.sum())), np.int64)
+        start = np.zeros(len(grids) + 1, np.int64)
+        for i, grid in enumerate(grids):
+            present, compact = np.unique(np.append(grid[occupied], 0), return_inverse=True)
+            flat[i] = compact[:-1] + start[i]
+            start[i + 1] = start[i] + len(present)
+        return _coverage(flat, start)
+
+
+def _coverage(flat: np.ndarray, start: np.ndarray) -> np.ndarray:
+    n, total = len(flat), int(start[-1])
+    sizes = np.bincount(flat.ravel(), minlength=total)
+    is_object = np.ones(total, bool)
+    is_object[start[:-1]] = False
+    volumes = np.add.reduceat(np.where(is_object, sizes, 0), start[:-1])
+    side = np.zeros((n, n))  # side[i, j]: how well the objects of i are covered by those of j
+    for i in range(n):
+        own = int(start[i + 1] - start[i])
+        pairs = (flat[i] - start[i])[None, :] * total + flat
+        counts = np.bincount(pairs.ravel(), minlength=own * total).reshape(own, total)[1:]
+        own_sizes = sizes[start[i] + 1 : start[i + 1]]
+        jaccard = counts / np.maximum(own_sizes[:, None] + sizes[None, :] - counts, 1)
+        jaccard[:, ~is_object] = 0.0
+        best = np.maximum.reduceat(jaccard, start[:-1], axis=1) if own > 1 else np.zeros((0, n))
+        side[i] = own_sizes @ best / max(int(volumes[i]), 1)
+    quality = (side + side.T) / 2
+    # Nothing against nothing is alike, nothing against something is not.
+    empty = volumes == 0
+    quality[np.ix_(empty, empty)] = 1.0
+    return quality
