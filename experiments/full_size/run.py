@@ -1,0 +1,74 @@
+"""Time and memory of `mst` at full size: 640 x 480, 15 frames a clip, 100 x 100 x 50 voxels, 5 hypotheses, 10 samples, eta 5.
+
+    python experiments/full_size/run.py [--seed 1]
+
+Filters a simulated recording of the scene `table` in a process of its own with one thread a library, prints seconds by
+part of every step and the peak memory, and writes results/full_size.csv.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import os
+import platform
+import resource
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+from mstfilter.simulation.families import scene_family
+from mstfilter.simulation.recorder import simulate
+from mstfilter.study.run_folder import RunFolder
+
+HERE = Path(__file__).parent
+
+
+def main(seed: int) -> None:
+    """Simulate, run, report."""
+    with tempfile.TemporaryDirectory() as folder:
+        recording, run = Path(folder) / "recording", Path(folder) / "run"
+        simulate(scene_family("table"), seed, recording)
+        command = [sys.executable, "-m", "mstfilter", "run", str(recording), "n=5", "n_proposed=10", "update.eta=5"]
+        threads = {name: "1" for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")}
+        subprocess.run(
+            [*command, "--out", str(run), "--no-report"],
+            check=True,
+            env={**os.environ, **threads},
+            stdout=subprocess.DEVNULL,
+        )
+        peak = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 2**20
+        done = RunFolder.open(run)
+        rows = []
+        for t in range(done.n_pauses):
+            seconds = done.seconds(t)
+            info = done.info(t)
+            rows.append(
+                {
+                    "pause": t,
+                    "frames": info["n_frames"],
+                    "candidates": info["n_candidates"],
+                    **{f"{slot}_s": round(seconds.get(slot, 0.0), 3) for slot in SLOTS},
+                    "step_s": round(sum(seconds.values()), 3),
+                    "quality_mean": round(sum(info["quality"]["objects"]) / info["n"], 3),
+                }
+            )
+    with (HERE / "results" / "full_size.csv").open("w", newline="") as file:
+        writer = csv.DictWriter(file, rows[0], lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+    print("  ".join(f"{name:>12}" for name in rows[0]))
+    for row in rows:
+        print("  ".join(f"{value:>12}" for value in row.values()))
+    print(
+        f"peak memory {peak:.2f} GiB; {platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}"
+    )
+
+
+SLOTS = ("transition", "proposal", "update", "resampler", "build")
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seed", type=int, default=1)
+    main(parser.parse_args().seed)
