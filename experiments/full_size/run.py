@@ -1,9 +1,9 @@
-"""Time and memory of `mst` at full size: 640 x 480, 15 frames a clip, 100 x 100 x 50 voxels, 5 hypotheses, 10 samples, eta 5.
+"""Time and memory of `mst` at full size: 640 x 480, 15 frames a clip, 100 x 100 x 50 voxels, 5 x 10 x 5 candidates.
 
     python experiments/full_size/run.py [--seed 1]
 
-Filters a simulated recording of the scene `table` in a process of its own with one thread a library, prints seconds by
-part of every step and the peak memory, and writes results/full_size.csv.
+Filters a simulated recording of the scene `table` in a process of its own with one thread a library, prints seconds
+by part of every step and the peak memory, and writes results/full_size.csv.
 """
 
 from __future__ import annotations
@@ -62,7 +62,8 @@ def main(seed: int) -> None:
     for row in rows:
         print("  ".join(f"{value:>12}" for value in row.values()))
     print(
-        f"peak memory {peak:.2f} GiB; {platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}"
+        f"peak memory {peak:.2f} GiB; {platform.machine()}, {os.cpu_count()} cores, "
+        f"Python {platform.python_version()}"
     )
 
 
