@@ -186,6 +186,58 @@ def list_(
             print(f"  {line}")
 
 
+@app.command()
+def check(
+    component: Annotated[str, typer.Argument(help="./file.py:Class, or KIND.NAME such as resampler.systematic.")],
+    overrides: Annotated[
+        list[str] | None, typer.Argument(metavar="[FIELD=VALUE]...", help="Fields that are not the default.")
+    ] = None,
+) -> None:
+    """Test whether a component keeps what its interface promises, and say in words what it does not."""
+    from mstfilter import registry
+    from mstfilter.presets import settings
+    from mstfilter.testing import verify
+    from mstfilter.testing.properties import FALSE_ALARM
+    from mstfilter.testing.starters import example_of
+
+    kind, _, name = ("", "", component) if ".py:" in component else component.partition(".")
+    if ".py:" not in component and kind not in registry.COMPONENTS:
+        raise InputError(
+            f"{component!r} is no component", "give ./file.py:Class, or KIND.NAME as `mstfilter list` shows"
+        )
+    cls = registry.find_class(kind, name, component, allow_files=True)
+    made = registry.make(cls, settings(overrides or ()), "", allow_files=True)
+    failed = statistical = 0
+    for outcome in verify(made, example_of(cls)):
+        state = "broken" if outcome.broken else "skipped" if outcome.skipped else "holds"
+        print(f"{state:<9}{outcome.property.says}")
+        if outcome.broken or outcome.skipped:
+            print(f"{'':<9}  {outcome.broken or outcome.skipped}  [{outcome.property.name}]")
+        failed += outcome.broken is not None
+        statistical += outcome.property.statistical and not outcome.skipped
+    if statistical:
+        print(
+            f"{statistical} of these are statistical: each alarms falsely with probability {FALSE_ALARM:.0e} at most"
+        )
+    print(f"{cls.__name__}: {f'{failed} properties are broken' if failed else 'all properties hold'}")
+    if failed:
+        raise typer.Exit(1)
+
+
+@app.command()
+def new(
+    kind: Annotated[str, typer.Argument(help="resampler, transition, proposal or update.")],
+    path: Annotated[Path, typer.Argument(help="Python file to make, for example mine.py.")],
+) -> None:
+    """Write a commented component of your own that works, and its test."""
+    from mstfilter.testing.starters import write_starter
+
+    file, test = write_starter(kind, path)
+    print(f"component   {file}")
+    print(f"test        {test}")
+    print(f"next        mstfilter check {path.parent}/{path.name}:My{kind.capitalize()}")
+
+
 def _lines(kind: str) -> Iterator[str]:
     """One line a preset, family or component."""
     import tomllib

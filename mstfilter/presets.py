@@ -64,6 +64,14 @@ def describe_filter(filter: ParticleFilter) -> dict[str, Any]:
     return config
 
 
+def settings(overrides: Iterable[str]) -> dict[str, Any]:
+    """Nested settings of ``path=value`` texts alone."""
+    config: dict[str, Any] = {}
+    for override in overrides:
+        _override(config, override)
+    return config
+
+
 def _override(config: dict[str, Any], text: str) -> None:
     """Apply ``path=value``. Naming a component resets its fields; naming a field keeps the others."""
     path, equals, value = text.partition("=")

@@ -1,0 +1,44 @@
+"""A proposal of my own: new particles from an observation alone.
+
+mstfilter check ./proposal.py:MyProposal                what holds and what does not, in words
+mstfilter run RECORDING proposal=./proposal.py:MyProposal
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from mstfilter.smc.interfaces import Proposal
+from mstfilter.smc.population import Population
+
+
+@dataclass(frozen=True)
+class MyProposal(Proposal):
+    """Particles around the observation. Fields, with annotation and default, are settings.
+
+    Parameters
+    ----------
+    spread : float
+        Standard deviation around the observation, in its units.
+    """
+
+    spread: float = 1.0
+
+    # Say False where the weights are not those of draws from the model (heuristic scores, for example).
+    properly_weighted = False
+
+    def sample(self, rng: np.random.Generator, observation: Any, n: int) -> Population:
+        """Draw n particles: exactly n, repeated where there are too few different ones."""
+        # All that is random comes from rng.
+        centre = np.asarray(observation, dtype=np.float64)
+        particles = centre + self.spread * rng.standard_normal((n, *centre.shape))
+        # Log weights: 0 for draws from the prior, log prior - log density of the draw where that is known.
+        return Population(particles, np.zeros(n))
+
+
+def example(rng: np.random.Generator, n: int) -> tuple[Population, Any]:
+    """What the checks let it work on: a population (not used here) and an observation."""
+    return Population(rng.standard_normal((n, 2))), np.array([0.3, -0.1])

@@ -1,0 +1,167 @@
+"""Resamplers with one fault each, and a correct one: what `mstfilter check` has to tell apart."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mstfilter.smc.interfaces import Resampler
+from mstfilter.smc.population import log_mean_exp, normalise
+
+
+def systematic(rng, weights, n):
+    """A correct scheme, written as a user would."""
+    points = (np.arange(n) + rng.random()) / n
+    cumulative = np.cumsum(weights)
+    last = np.flatnonzero(weights)[-1]
+    return np.minimum(np.searchsorted(cumulative, points * cumulative[-1], side="right"), last)
+
+
+@dataclass(frozen=True)
+class Correct(Resampler):
+    def select(self, rng, log_weights, n):
+        return systematic(rng, normalise(log_weights), n), None
+
+
+@dataclass(frozen=True)
+class CorrectWeighted(Resampler):
+    """Select evenly among the positive ones and keep the weights: proper, with unequal output weights."""
+
+    def select(self, rng, log_weights, n):
+        even = (log_weights > -np.inf) / 1.0
+        ancestors = systematic(rng, even, n)
+        return ancestors, log_weights[ancestors] + np.log(even.mean())
+
+
+@dataclass(frozen=True)
+class BiasedResidual(Resampler):
+    """The remainder is drawn from W - copies instead of n W - copies: light particles hardly survive."""
+
+    def select(self, rng, log_weights, n):
+        W = normalise(log_weights)
+        copies = np.floor(n * W)
+        rest = np.maximum(W - copies, 0) if (np.maximum(W - copies, 0) > 0).any() else W
+        drawn = systematic(rng, rest, int(n - copies.sum())) if n > copies.sum() else np.array([], int)
+        return np.concatenate([np.repeat(np.arange(len(W)), copies.astype(int)), drawn]), None
+
+
+@dataclass(frozen=True)
+class IgnoresN(Resampler):
+    def select(self, rng, log_weights, n):
+        return systematic(rng, normalise(log_weights), len(log_weights)), None
+
+
+@dataclass(frozen=True)
+class PicksZeroWeights(Resampler):
+    """Gives what rounding leaves over to the last particle, whatever it weighs."""
+
+    def select(self, rng, log_weights, n):
+        W = normalise(log_weights)
+        copies = np.floor(n * W).astype(int)
+        copies[-1] += n - copies.sum()
+        return np.repeat(np.arange(len(W)), copies), None
+
+
+@dataclass(frozen=True)
+class GlobalGenerator(Resampler):
+    def select(self, rng, log_weights, n):
+        return systematic(np.random, normalise(log_weights), n), None
+
+
+@dataclass(frozen=True)
+class OldWeightsKept(Resampler):
+    """Chosen by weight, and the weight kept: the same evidence twice."""
+
+    def select(self, rng, log_weights, n):
+        ancestors = systematic(rng, normalise(log_weights), n)
+        return ancestors, log_weights[ancestors]
+
+
+@dataclass(frozen=True)
+class WeightsForgotten(Resampler):
+    """Equal weights, but not those that keep the evidence."""
+
+    def select(self, rng, log_weights, n):
+        return systematic(rng, normalise(log_weights), n), np.full(n, -np.log(n))
+
+
+@dataclass(frozen=True)
+class OffByOne(Resampler):
+    """Counts particles from 1."""
+
+    def select(self, rng, log_weights, n):
+        return systematic(rng, normalise(log_weights), n) + 1, None
+
+
+@dataclass(frozen=True)
+class OffByOneClipped(Resampler):
+    """The neighbour of the particle that was meant, inside the range."""
+
+    def select(self, rng, log_weights, n):
+        return (systematic(rng, normalise(log_weights), n) + 1) % len(log_weights), None
+
+
+@dataclass(frozen=True)
+class OrderMatters(Resampler):
+    """Sorts by weight and forgets to sort back."""
+
+    def select(self, rng, log_weights, n):
+        return systematic(rng, np.sort(normalise(log_weights))[::-1], n), None
+
+
+@dataclass(frozen=True)
+class ChangesInput(Resampler):
+    def select(self, rng, log_weights, n):
+        log_weights -= log_mean_exp(log_weights)
+        return systematic(rng, np.exp(log_weights), n), None
+
+
+@dataclass(frozen=True)
+class SinglePrecisionOverflow(Resampler):
+    """exp in single precision overflows at 88."""
+
+    def select(self, rng, log_weights, n):
+        weights = np.exp(log_weights.astype(np.float32))
+        return systematic(rng, weights / weights.sum(), n), None
+
+
+@dataclass(frozen=True)
+class SinglePrecisionSum(Resampler):
+    """Cumulated in single precision: light particles vanish behind a heavy one."""
+
+    def select(self, rng, log_weights, n):
+        return systematic(rng, normalise(log_weights).astype(np.float32), n), None
+
+
+@dataclass(frozen=True)
+class SeedIgnored(Resampler):
+    def select(self, rng, log_weights, n):
+        return systematic(np.random.default_rng(0), normalise(log_weights), n), None
+
+
+@dataclass(frozen=True)
+class OwnGenerator(Resampler):
+    """A new generator of unknown seed at each call."""
+
+    def select(self, rng, log_weights, n):
+        return systematic(np.random.default_rng(), normalise(log_weights), n), None
+
+
+#: Fault -> a property that it breaks, and words that the message says.
+FAULTS = {
+    BiasedResidual: ("mean_number_of_copies", "copies are biased"),
+    IgnoresN: ("gives_n_particles", "asked to make"),
+    PicksZeroWeights: ("zero_weights_are_never_chosen", "weight 0"),
+    GlobalGenerator: ("leaves_global_generators_alone", "global generator"),
+    OldWeightsKept: ("output_weights", "output weights are wrong"),
+    WeightsForgotten: ("output_weights", "mean weight after selection"),
+    OffByOne: ("ancestors_in_range", "off by one"),
+    OffByOneClipped: ("mean_number_of_copies", "off by one"),
+    OrderMatters: ("order_of_particles_is_irrelevant", "depends on the order"),
+    ChangesInput: ("leaves_input_alone", "in place"),
+    SinglePrecisionOverflow: ("scale_of_weights_is_irrelevant", "overflow"),
+    SinglePrecisionSum: ("many_particles", "single precision"),
+    SeedIgnored: ("listens_to_the_generator", "ignores `rng`"),
+    OwnGenerator: ("repeats_with_the_same_generator", "does not come from `rng`"),
+}

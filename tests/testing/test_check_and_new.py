@@ -1,0 +1,78 @@
+"""The commands check and new."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+from mstfilter.testing.starters import KINDS
+from tests.conftest import REPOSITORY
+from tests.test_cli import call
+
+FAULTS_FILE = REPOSITORY / "tests" / "testing" / "faults.py"
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_new_component_passes_its_check_and_its_test(kind, tmp_path, capsys):
+    mine = tmp_path / "mine.py"
+    code, out, err = call("new", kind, mine, capsys=capsys)
+    assert code == 0, err
+    assert f"check {mine}:My{kind.capitalize()}" in out
+    assert f"mstfilter check ./mine.py:My{kind.capitalize()}" in mine.read_text()
+    code, out, err = call("check", f"{mine}:My{kind.capitalize()}", capsys=capsys)
+    assert code == 0, out + err
+    assert "all properties hold" in out
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "test_mine.py"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "passed" in done.stdout
+
+
+def test_the_resampler_to_start_from_has_three_lines_of_logic(tmp_path, capsys):
+    call("new", "resampler", tmp_path / "mine.py", capsys=capsys)
+    body = (tmp_path / "mine.py").read_text().split("def select(")[1].split('"""')[2]
+    logic = [line for line in body.splitlines() if line.strip() and not line.strip().startswith("#")]
+    assert len(logic) == 4  # three and the return
+
+
+def test_nothing_is_overwritten(tmp_path, capsys):
+    (tmp_path / "test_mine.py").write_text("x")
+    code, _, err = call("new", "resampler", tmp_path / "mine.py", capsys=capsys)
+    assert code == 2
+    assert "test_mine.py is there already" in err
+    assert [p.name for p in tmp_path.iterdir()] == ["test_mine.py"]
+    for kind, name, message in (
+        ("spoon", "mine.py", "there are: resampler"),
+        ("update", "my-own.py", "cannot be imported"),
+        ("update", "mine.txt", "cannot be imported"),
+    ):
+        code, _, err = call("new", kind, tmp_path / name, capsys=capsys)
+        assert code == 2
+        assert message in err
+
+
+def test_check_names_what_is_broken(capsys):
+    code, out, _ = call("check", f"{FAULTS_FILE}:BiasedResidual", capsys=capsys)
+    assert code == 1
+    assert "broken   a particle gets n W_i copies on average" in out
+    assert "copies are biased" in out
+    assert "1e-06" in out
+    assert "BiasedResidual: 1 properties are broken" in out
+
+
+def test_check_of_registered_components_with_fields(capsys):
+    code, out, _ = call("check", "resampler.tempered", "power=0.25", "scheme=ssp", capsys=capsys)
+    assert code == 0
+    assert "Tempered: all properties hold" in out
+    for arguments, message in (
+        (("resampler.systematik",), "did you mean"),
+        (("systematic",), "KIND.NAME"),
+        (("./nowhere.py:X",), "file does not exist"),
+        (("resampler.tempered", "power=2"), "[0, 1]"),
+        (("boundary.colour_depth",), "no component"),
+    ):
+        code, _, err = call("check", *arguments, capsys=capsys)
+        assert code == 2
+        assert message in err

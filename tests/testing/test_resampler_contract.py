@@ -1,0 +1,81 @@
+"""Planted faults are found and named; correct resamplers, ours among them, pass.
+
+False alarms: each contract has three statistical properties at 1e-6, so below 1e-4 for this file.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from mstfilter import registry
+from mstfilter.smc.population import Population
+from mstfilter.smc.resampling import Residual
+from mstfilter.smc.resampling_clusters import ClusterStratified
+from mstfilter.smc.resampling_dpp import KDpp
+from mstfilter.smc.resampling_optimal import FearnheadClifford
+from mstfilter.smc.resampling_wrappers import Coalesced, Shuffled, Tempered
+from mstfilter.smc.similarity import Gaussian
+from mstfilter.testing import ResamplerContract, verify
+from tests.testing.faults import FAULTS, Correct, CorrectWeighted
+
+
+class TestCorrect(ResamplerContract):
+    def make(self):
+        return Correct()
+
+
+class TestCorrectWeighted(ResamplerContract):
+    def make(self):
+        return CorrectWeighted()
+
+
+@pytest.mark.parametrize("fault", FAULTS, ids=lambda f: f.__name__)
+def test_planted_faults_are_named(fault):
+    name, words = FAULTS[fault]
+    broken = {o.property.name: o.broken for o in verify(fault()) if o.broken}
+    assert name in broken, broken
+    assert words in broken[name]
+
+
+def test_the_global_generators_are_put_back():
+    from tests.testing.faults import GlobalGenerator
+
+    before = np.random.get_state()[1].copy()  # noqa: NPY002
+    list(verify(GlobalGenerator()))
+    np.testing.assert_array_equal(before, np.random.get_state()[1])  # noqa: NPY002
+
+
+OURS = {
+    **{name: registry.build("resampler", name) for name in registry.COMPONENTS["resampler"]},
+    "residual, stratified": Residual("stratified"),
+    "residual, systematic": Residual("systematic"),
+    "kdpp, wide": KDpp(Gaussian(5.0)),
+    "clusters, optimal inside": ClusterStratified(Gaussian(0.5), 0.3, FearnheadClifford()),
+    "clusters, tempered inside": ClusterStratified(Gaussian(0.5), 0.3, Tempered()),
+    "tempered clusters": Tempered(ClusterStratified(), 0.3),
+    "shuffled clusters": Shuffled(ClusterStratified()),
+    "coalesced systematic": Coalesced(Residual()),
+    "tempered optimal": Tempered(FearnheadClifford(), 0.0),
+}
+
+
+@pytest.mark.parametrize("name", OURS)
+def test_our_own(name):
+    assert [(o.property.name, o.broken) for o in verify(OURS[name]) if o.broken or o.skipped] == []
+
+
+def test_ours_on_other_particles():
+    """Vectors, mappings and objects."""
+
+    def vectors(rng, n):
+        return Population(rng.standard_normal((n, 2))), None
+
+    def mapping(rng, n):
+        return Population({"x": rng.standard_normal(n), "k": rng.integers(0, 5, n)}), None
+
+    def objects(rng, n):
+        return Population(tuple(f"particle {i}" for i in range(n))), None
+
+    for scheme, example in ((KDpp(), vectors), (Coalesced(), mapping), (Coalesced(), objects)):
+        assert [o.broken for o in verify(scheme, example) if o.broken] == []
