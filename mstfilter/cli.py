@@ -219,7 +219,7 @@ def check(
         print(
             f"{statistical} of these are statistical: each alarms falsely with probability {FALSE_ALARM:.0e} at most"
         )
-    print(f"{cls.__name__}: {f'{failed} properties are broken' if failed else 'all properties hold'}")
+    print(f"{cls.__name__}: {f'{failed} properties are broken' if failed else 'all properties that apply hold'}")
     if failed:
         raise typer.Exit(1)
 

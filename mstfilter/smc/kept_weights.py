@@ -6,12 +6,13 @@ here to reproduce published behaviour.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
 
 from mstfilter.smc.interfaces import Resampler
+from mstfilter.smc.population import Population
 from mstfilter.smc.resampling import Multinomial
 
 __all__ = ["KeepWeights"]
@@ -31,7 +32,17 @@ class KeepWeights(Resampler):
 
     properly_weighted: ClassVar[bool] = False
 
+    @property
+    def exact_size(self) -> bool:  # type: ignore[override]
+        """As the scheme inside."""
+        return self.scheme.exact_size
+
     def select(self, rng: np.random.Generator, log_weights: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
         """Choose."""
         ancestors, _ = self.scheme.select(rng, log_weights, n)
         return ancestors, np.asarray(log_weights, dtype=np.float64)[ancestors]
+
+    def resample(self, rng: np.random.Generator, population: Population, n: int) -> Population:
+        """Choose; also for schemes that see the particles."""
+        chosen = self.scheme.resample(rng, population, n)
+        return replace(chosen, log_weights=population.log_weights[chosen.parents["ancestor"]])

@@ -51,8 +51,8 @@ class Kld(Size):
     With k bins occupied that takes n = chi2_{k-1}(1 - delta) / (2 epsilon) draws (Fox 2003, "Adapting the sample
     size in particle filters through KLD-sampling"). Fox counts bins while he draws; but all bins and their masses
     W_b are known before, so here n is the least number with n >= bound(sum_b 1 - (1 - W_b)^n), the bins that n
-    draws are expected to meet. That serves any resampling scheme, and gives slightly more than drawing one by one, which
-    stops at the first lucky moment.
+    draws are expected to meet. That serves any resampling scheme, and gives slightly more than drawing one by one,
+    which stops at the first lucky moment.
 
     Parameters
     ----------

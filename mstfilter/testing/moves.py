@@ -13,10 +13,12 @@ from mstfilter.testing.properties import (
     FALSE_ALARM,
     Broken,
     Example,
+    NotApplicable,
     Suite,
     Untouched,
     add_generator_properties,
     guarded,
+    needs_proper_weights,
     only_in_place,
     same,
 )
@@ -82,8 +84,7 @@ add_generator_properties(
 @TRANSITION.property("multiplying all weights by a constant multiplies them afterwards and changes nothing else")
 def scale_of_weights_is_irrelevant(component: Transition, example: Example) -> None:
     """Log weights + c in, the same + c out (components that are properly weighted)."""
-    if not component.properly_weighted:
-        return
+    needs_proper_weights(component)
     population, observation = example(_rng(), _N)
     a = _predict(component, population, observation)
     for shift in (50.0, -50.0):
@@ -100,8 +101,10 @@ def order_of_particles_is_irrelevant(component: Transition, example: Example) ->
     from mstfilter.smc.similarity import as_matrix
 
     population, observation = example(_rng(), _N)
-    if not isinstance(population.particles, (np.ndarray, dict)) or len(_predict(component, population, None)) != _N:
-        return
+    if not isinstance(population.particles, (np.ndarray, dict)):
+        raise NotApplicable("moves of objects are not compared")
+    if len(_predict(component, population, observation)) != _N:
+        raise NotApplicable("the number of particles changes")
     order = np.arange(_N)[::-1]
     samples: list[list[np.ndarray]] = [[], []]
     for seed in range(300):
@@ -225,8 +228,7 @@ add_generator_properties(UPDATE, _run_update)
 @UPDATE.property("multiplying all weights by a constant multiplies them afterwards and changes nothing else")
 def update_scales_with_weights(component: Update, example: Example) -> None:
     """Log weights + c in, the same + c out (components that are properly weighted)."""
-    if not component.properly_weighted:
-        return
+    needs_proper_weights(component)
     predicted, _, observation = _pair(example)
     a = _update(component, predicted, None, observation)
     for shift in (50.0, -50.0):

@@ -25,7 +25,7 @@ import numpy as np
 from mstfilter.errors import InputError
 from mstfilter.smc.population import Population
 
-__all__ = ["Broken", "Example", "Outcome", "Property", "Suite", "example", "guarded", "same"]
+__all__ = ["Broken", "Example", "NotApplicable", "Outcome", "Property", "Suite", "example", "guarded", "same"]
 
 Example = Callable[[np.random.Generator, int], tuple[Population, Any]]
 
@@ -35,6 +35,16 @@ FALSE_ALARM = 1e-6
 
 class Broken(AssertionError):
     """A property does not hold; the message says how."""
+
+
+class NotApplicable(Exception):
+    """A property says nothing about this component; the message says why."""
+
+
+def needs_proper_weights(component: Any) -> None:
+    """Leave a property aside where the component does not promise proper weights."""
+    if not component.properly_weighted:
+        raise NotApplicable("the component says that it is not properly weighted")
 
 
 @dataclass(frozen=True)
@@ -105,11 +115,13 @@ class Suite:
         stopped = False
         for prop in self.properties:
             if stopped:
-                yield Outcome(prop, skipped="not looked at")
+                yield Outcome(prop, skipped="not looked at: first mend what is broken above")
                 continue
             try:
                 with _global_state():
                     prop.check(component, example)
+            except NotApplicable as reason:
+                yield Outcome(prop, skipped=f"not looked at: {reason}")
             except Broken as broken:
                 words = str(broken)
                 stopped = prop.essential
@@ -129,7 +141,7 @@ def guarded(what: str) -> Iterator[None]:
     """Turn whatever a component raises into `Broken`, in words."""
     try:
         yield
-    except Broken:
+    except (Broken, NotApplicable):
         raise
     except ValueError as error:
         if "read-only" in str(error):

@@ -20,10 +20,12 @@ from mstfilter.testing.properties import (
     FALSE_ALARM,
     Broken,
     Example,
+    NotApplicable,
     Suite,
     Untouched,
     add_generator_properties,
     guarded,
+    needs_proper_weights,
     only_in_place,
 )
 
@@ -159,8 +161,7 @@ add_generator_properties(RESAMPLER, _run)
 @RESAMPLER.property("different generators give different results")
 def listens_to_the_generator(resampler: Resampler, example: Example) -> None:
     """A proper scheme has to leave something to chance where n W_i are no whole numbers."""
-    if not resampler.properly_weighted:
-        return
+    needs_proper_weights(resampler)
     population = _population(example, _log((0.41, 0.24, 0.2, 0.1, 0.05)))
     results = {
         tuple(_resample(resampler, population, 2, np.random.default_rng(seed)).parents["ancestor"].tolist())
@@ -205,8 +206,8 @@ def many_particles(resampler: Resampler, example: Example) -> None:
                     ancestors, out = resampler.select(rng, lw.copy(), 100_000)
                     chosen = population.take(ancestors, out)
                     ancestors = np.asarray(ancestors)
-                except InputError:  # it sees the particles: a matrix of similarities is not for so many
-                    return
+                except InputError as error:
+                    raise NotApplicable("it sees the particles, and there are no similarities of so many") from error
         except Broken as broken:
             raise Broken(f"cumulated in single precision? {broken}") from broken
         if (ancestors < 0).any() or (ancestors >= m).any():
@@ -300,11 +301,11 @@ _COMPARISONS = sum(len(weights) for weights, _ in _LAWS)
 @RESAMPLER.property("a particle gets n W_i copies on average, where all copies weigh the same", statistical=True)
 def mean_number_of_copies(resampler: Resampler, example: Example) -> None:
     """Against the exact mean; false alarm below 1e-6."""
-    if not resampler.properly_weighted:
-        return
-    for law, n in _laws(resampler, example):
-        if not law.equal:
-            continue
+    needs_proper_weights(resampler)
+    laws = [(law, n) for law, n in _laws(resampler, example) if law.equal]
+    if not laws:
+        raise NotApplicable("copies have different weights")
+    for law, n in laws:
         mean, expected = law.copies.mean(axis=0), n * law.expected
         off = np.abs(mean - expected) - _tolerance(law.copies, 1.0, _COMPARISONS)
         if off.max() > 0:
@@ -322,8 +323,7 @@ def mean_number_of_copies(resampler: Resampler, example: Example) -> None:
 @RESAMPLER.property("the output weights make the mean of w f(x) unbiased", statistical=True)
 def output_weights(resampler: Resampler, example: Example) -> None:
     """What a particle carries is W_i on average; equal weights keep their mean exactly. False alarm below 1e-6."""
-    if not resampler.properly_weighted:
-        return
+    needs_proper_weights(resampler)
     for law, n in _laws(resampler, example):
         total = law.carried.sum(axis=1)
         if law.equal:
@@ -345,8 +345,7 @@ def output_weights(resampler: Resampler, example: Example) -> None:
 @RESAMPLER.property("the order of the particles does not matter", statistical=True)
 def order_of_particles_is_irrelevant(resampler: Resampler, example: Example) -> None:
     """A particle carries as much on average wherever it stands; false alarm below 1e-6."""
-    if not resampler.properly_weighted:
-        return
+    needs_proper_weights(resampler)
     weights, n = np.array(_LAWS[1][0]), 4
     samples = [
         _sample(resampler, example, weights, n, np.asarray(order), seed).carried

@@ -77,6 +77,12 @@ def write_starter(kind: str, path: Path) -> tuple[Path, Path]:
 
 
 def example_of(cls: type) -> Example | None:
-    """The function ``example(rng, n)`` beside a class, in its module; None where there is none."""
+    """The function ``example(rng, n)`` in the module of a class; the scene for components of scenes; else None."""
     found = getattr(sys.modules.get(cls.__module__), "example", None)
-    return found if callable(found) else None
+    if callable(found):
+        return found
+    if cls.__module__.startswith("mstfilter.") and not cls.__module__.startswith("mstfilter.smc."):
+        from mstfilter.testing.scenes import example
+
+        return example
+    return None

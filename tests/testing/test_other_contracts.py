@@ -24,6 +24,7 @@ from mstfilter.testing import (
     UpdateContract,
     verify,
 )
+from mstfilter.testing.starters import example_of
 
 MODEL = linear_gaussian(F=[[0.9]], Q=[[0.5]], H=[[1.0]], R=[[1.0]], m0=[0.0], P0=[[1.0]])
 
@@ -73,11 +74,11 @@ class TestBins(EquivalenceContract):
         return registry.build("equivalence", "bins")
 
 
-@pytest.mark.parametrize("kind", ["trigger", "size", "similarity", "equivalence"])
+@pytest.mark.parametrize("kind", ["trigger", "size", "similarity", "equivalence", "transition", "proposal", "update"])
 def test_our_own(kind):
-    for name, where in registry.COMPONENTS[kind].items():
-        if ".smc." in where:
-            assert [o.broken for o in verify(registry.build(kind, name)) if o.broken or o.skipped] == [], name
+    for name in registry.COMPONENTS[kind]:
+        component = registry.build(kind, name)
+        assert [o.broken for o in verify(component, example_of(type(component))) if o.broken] == [], name
 
 
 # -- planted faults --------------------------------------------------------------------------------------------------
