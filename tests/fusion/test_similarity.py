@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from mstfilter import registry
 from mstfilter.errors import InputError
 from mstfilter.fusion.similarity import SameSegmentation, WeightedCoverage, canonical
 from mstfilter.scene.quality import weighted_coverage
@@ -12,6 +13,7 @@ from mstfilter.scene.voxels import Hypothesis, VoxelGrid
 from mstfilter.smc.population import Population
 from mstfilter.smc.resampling_dpp import KDpp
 from mstfilter.smc.resampling_wrappers import Coalesced
+from mstfilter.testing.scenes import example
 
 GRID = VoxelGrid(np.zeros(3), 0.01, (6, 5, 4))
 
@@ -70,3 +72,19 @@ def test_resamplers_of_hypotheses():
     chosen = KDpp(similarity=WeightedCoverage()).resample(rng, population, 3)
     assert len(set(SameSegmentation().classes(chosen.particles).tolist())) == 3
     assert chosen.notes["kdpp"].endswith("of 3")
+
+
+def test_diverse_resampling_from_configuration():
+    """As a preset file names it."""
+    config = {
+        "component": "coalesced",
+        "equivalence": "same_segmentation",
+        "scheme": {"component": "kdpp", "similarity": {"component": "weighted_coverage", "stride": 2}},
+    }
+    scheme = registry.build("resampler", config)
+    assert scheme == Coalesced(KDpp(WeightedCoverage(2)), SameSegmentation())
+    assert registry.build("resampler", registry.describe(scheme)) == scheme
+    population, _ = example(np.random.default_rng(0), 40)
+    chosen = scheme.resample(np.random.default_rng(1), population, 3)
+    assert chosen.notes["distinct"] == len(set(SameSegmentation().classes(population.particles).tolist()))
+    assert len(set(SameSegmentation().classes(chosen.particles).tolist())) == 3
