@@ -29,12 +29,11 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import Any, ClassVar
 
 import numpy as np
 
-from mstfilter.smc.population import Population, log_mean_exp
+from mstfilter.smc.population import Population
 
 __all__ = [
     "Codec",
@@ -57,6 +56,8 @@ class Component(ABC):
     #: Whether the weights that it leaves behind are those of an exact filter (in expectation). The log evidence
     #: is reported only where all components say so.
     properly_weighted: ClassVar[bool] = True
+    #: Whether it draws at all. One that says False is given a generator of fixed seed, which it must not use.
+    draws: ClassVar[bool] = True
 
 
 class Proposal(Component):
@@ -159,9 +160,9 @@ class Resampler(Component):
         """Select from a population; `parents["ancestor"]` (n,) says which particle each one was."""
         ancestors, log_weights = self.select(rng, population.log_weights, n)
         if log_weights is None:
-            log_weights = np.full(len(ancestors), log_mean_exp(population.log_weights))
+            log_weights = np.full(len(ancestors), population.log_mean_weight)
         chosen = population.take(ancestors, log_weights)
-        return replace(chosen, parents={**chosen.parents, "ancestor": ancestors})
+        return chosen.labelled({**chosen.parents, "ancestor": np.asarray(ancestors, dtype=np.int64)}, chosen.notes)
 
 
 class Trigger(ABC):

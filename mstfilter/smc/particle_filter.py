@@ -64,6 +64,12 @@ def _identity(n: int) -> np.ndarray:
     return index
 
 
+@lru_cache(maxsize=1)
+def _unused() -> np.random.Generator:
+    """For components that draw nothing: making a stream for them would be for nothing too."""
+    return Key(0).child("unused").generator()
+
+
 @dataclass(frozen=True)
 class ParticleFilter:
     """A particle filter assembled from components.
@@ -165,12 +171,13 @@ class ParticleFilter:
         if before is not None and "previous" in parents:
             old = parents["previous"]
             parents["previous"] = before if old is _identity(len(before)) else np.where(old >= 0, before[old], -1)
+        ess = fused.ess  # kept by the population: the trigger of the next step asks again
         population = chosen.labelled(parents)
         info = Info(
             t=state.t,
             n=len(population),
             n_candidates=len(fused),
-            ess=fused.ess,
+            ess=ess,
             resampled="resampler" in watch.seconds,
             ancestors=ancestors,
             parents=parents,
@@ -268,7 +275,8 @@ class ParticleFilter:
             assert fused is not None
             return fused
         watch.enter("update")
-        fused = self.update.update(streams.child("update").generator(), predicted, proposed, observation)
+        rng = streams.child("update").generator() if self.update.draws else _unused()
+        fused = self.update.update(rng, predicted, proposed, observation)
         watch.leave(fused)
         return fused
 

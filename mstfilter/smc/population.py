@@ -15,6 +15,7 @@ are read-only and shared, never copied, so a duplicate costs a reference.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Generic, TypeVar
@@ -32,9 +33,10 @@ U = TypeVar("U")
 def log_mean_exp(log_weights: np.ndarray) -> float:
     """``log(mean(exp(log_weights)))`` without overflow; -inf where all are."""
     top = np.max(log_weights)
-    if np.isneginf(top):
+    if top == -np.inf:
         return -np.inf
-    return float(top + np.log(np.mean(np.exp(log_weights - top))))
+    shifted = np.exp(log_weights - top)
+    return float(top + math.log(shifted.sum() / len(shifted)))
 
 
 def normalise(log_weights: np.ndarray) -> np.ndarray:
@@ -47,7 +49,8 @@ def normalise(log_weights: np.ndarray) -> np.ndarray:
 def effective_sample_size(log_weights: np.ndarray) -> float:
     """``(sum w)^2 / sum w^2``, between 1 and n."""
     lw = np.asarray(log_weights, dtype=np.float64)
-    weights = np.exp(lw - lw.max())
+    weights = lw - lw.max()
+    np.exp(weights, out=weights)
     return float(weights.sum() ** 2 / (weights @ weights))
 
 
@@ -182,7 +185,7 @@ class Population:
             raise InputError(
                 f"log weight of particle {wrong[0]} is {lw[wrong[0]]} ({len(wrong)} of {n} are NaN or +inf)"
             )
-        if np.isneginf(top):
+        if top == -np.inf:
             raise InputError(
                 f"all {n} log weights are -inf: no particle explains the observation",
                 "more particles, a wider proposal, or a likelihood with heavier tails",
@@ -209,9 +212,23 @@ class Population:
     @property
     def ess(self) -> float:
         """Effective sample size."""
-        if "_ess" not in self.__dict__:  # asked for by the trigger and by the record of the step
-            object.__setattr__(self, "_ess", effective_sample_size(self.log_weights))
-        return float(self.__dict__["_ess"])
+        return self._summary()[0]
+
+    @property
+    def log_mean_weight(self) -> float:
+        """``log(mean(exp(log_weights)))``."""
+        return self._summary()[1]
+
+    def _summary(self) -> tuple[float, float]:
+        """Effective sample size and log mean weight, from one pass; asked for by several parts of a step."""
+        if "_both" not in self.__dict__:
+            top = self.log_weights.max()
+            weights = self.log_weights - top
+            np.exp(weights, out=weights)
+            total = float(weights.sum())
+            both = (total**2 / float(weights @ weights), float(top) + math.log(total / len(weights)))
+            object.__setattr__(self, "_both", both)
+        return self.__dict__["_both"]
 
     @property
     def best(self) -> Any:
@@ -245,4 +262,4 @@ class Population:
 
     def reweighted(self, log_factors: np.ndarray) -> Population:
         """The same particles, log weights plus `log_factors`."""
-        return replace(self, log_weights=self.log_weights + log_factors)
+        return Population(self.particles, self.log_weights + log_factors, self.parents, self.notes)

@@ -39,7 +39,7 @@ import numpy as np
 
 from mstfilter.errors import InputError
 from mstfilter.smc.interfaces import Resampler, Trigger
-from mstfilter.smc.population import Population, effective_sample_size
+from mstfilter.smc.population import Population
 
 __all__ = [
     "Always",
@@ -68,7 +68,7 @@ def checked_weights(log_weights: np.ndarray, n: int) -> np.ndarray:
     if n < 1:
         raise InputError(f"resampling to {n} particles, expected at least 1")
     top = lw.max()
-    if not np.isfinite(top):
+    if not -np.inf < top < np.inf:
         at = int(np.flatnonzero(~np.isfinite(lw) & ~np.isneginf(lw))[0]) if not np.isneginf(top) else 0
         raise InputError(f"log weights cannot be resampled: entry {at} is {lw[at]}, the largest is {top}")
     return np.exp(lw - top)
@@ -105,10 +105,15 @@ def _from_shifts(cumulative: np.ndarray, n: int, shift: float) -> np.ndarray:
     """Systematic selection: ancestors at the points (k + shift) / n, in O(m + n) without a search."""
     total = cumulative[-1]
     # Number of points below each cumulative weight; at the total it is n by definition, whatever rounding says.
-    ends = np.ceil(cumulative * (n / total) - shift)
-    np.clip(ends, 0, n, out=ends)
-    ends[np.searchsorted(cumulative, total, side="left") :] = n
-    return np.repeat(np.arange(len(cumulative)), np.diff(ends, prepend=0).astype(np.int64))
+    points = cumulative * (n / total)
+    points -= shift
+    np.ceil(points, out=points)
+    np.maximum(points, 0.0, out=points)
+    np.minimum(points, n, out=points)
+    points[cumulative.searchsorted(total, side="left") :] = n
+    # Place k has the particle before which k points lie: counting is quicker than repeating at random numbers.
+    ends = points[:-1].astype(np.int64)
+    return np.bincount(ends, minlength=n)[:n].cumsum()
 
 
 @dataclass(frozen=True)
@@ -189,7 +194,7 @@ class EssBelow(Trigger):
 
     def wants(self, population: Population, t: int) -> bool:
         """True where ESS < share * n."""
-        return effective_sample_size(population.log_weights) < self.share * len(population)
+        return population.ess < self.share * len(population)
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from mstfilter.smc.population import Population, log_mean_exp
+from mstfilter.smc.population import Population
 from mstfilter.smc.streams import Key
 
 __all__ = ["Info", "State"]
@@ -48,7 +48,7 @@ class State:
         """Log of the unbiased estimate of p(y_1 .. y_t); None where a component is not properly weighted."""
         if not self.properly_weighted:
             return None
-        return 0.0 if self.population is None else log_mean_exp(self.population.log_weights)
+        return 0.0 if self.population is None else self.population.log_mean_weight
 
 
 @dataclass(frozen=True, eq=False)

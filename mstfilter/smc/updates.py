@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -29,6 +29,8 @@ class Reweight(Update):
     """
 
     log_likelihood: Callable[[Any, Any], np.ndarray]
+
+    draws: ClassVar[bool] = False
 
     def update(
         self,

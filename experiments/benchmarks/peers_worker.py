@@ -1,0 +1,55 @@
+"""Times `particles` 0.4 in its own environment; run by speed.py, one command a line on standard input.
+
+Commands: ``filter SEED`` (bootstrap AR(1)) and ``systematic SEED N``; the answer is JSON. The first answers compile.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+
+import numpy as np
+import particles
+from particles import distributions as dists
+from particles import resampling
+from particles import state_space_models as ssm
+
+model = json.loads(sys.argv[1])
+
+
+class AR1(ssm.StateSpaceModel):
+    """x_t = rho x_{t-1} + N(0, sigma^2), y_t = x_t + N(0, tau^2)."""
+
+    def PX0(self):  # noqa: D102
+        return dists.Normal(scale=model["sigma"] / np.sqrt(1 - model["rho"] ** 2))
+
+    def PX(self, t, xp):  # noqa: D102
+        return dists.Normal(loc=model["rho"] * xp, scale=model["sigma"])
+
+    def PY(self, t, xp, x):  # noqa: D102
+        return dists.Normal(loc=x, scale=model["tau"])
+
+
+def bootstrap(seed: int, n: int) -> tuple[float, float]:
+    np.random.seed(seed)  # noqa: NPY002 (its only generator)
+    data = np.array(model["ys"])
+    start = time.perf_counter()
+    pf = particles.SMC(fk=ssm.Bootstrap(ssm=AR1(), data=data), N=n, resampling="systematic", ESSrmin=0.5)
+    pf.run()
+    return time.perf_counter() - start, float(pf.logLt)
+
+
+for line in sys.stdin:
+    what, seed, n = line.split()
+    if what == "filter":
+        seconds, log_evidence = bootstrap(int(seed), int(n))
+        answer = {"seconds": seconds, "log_evidence": log_evidence}
+    else:
+        np.random.seed(int(seed))  # noqa: NPY002
+        w = np.random.exponential(size=int(n))  # noqa: NPY002
+        w /= w.sum()
+        start = time.perf_counter()
+        resampling.systematic(w, M=int(n))
+        answer = {"seconds": time.perf_counter() - start}
+    print(json.dumps(answer), flush=True)

@@ -1,0 +1,196 @@
+"""Speed beside peers, in one interleaved run; see README.md for the command. Writes speed.csv and evidence.csv."""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import json
+import math
+import subprocess
+import time
+from collections import deque
+from pathlib import Path
+
+import numpy as np
+from loop import bootstrap_loop
+
+from mstfilter.smc.distributions import Normal
+from mstfilter.smc.filters import bootstrap
+from mstfilter.smc.interfaces import Proposal, Transition
+from mstfilter.smc.particle_filter import ParticleFilter
+from mstfilter.smc.population import Population
+from mstfilter.smc.programs import Program, observe, sample
+from mstfilter.smc.resampling import Always, Systematic
+from mstfilter.smc.state_space import StateSpaceModel
+from mstfilter.smc.updates import Reweight
+
+RHO, SIGMA, TAU = 0.9, 0.6, 0.4
+SD0 = SIGMA / math.sqrt(1 - RHO**2)
+HERE = Path(__file__).parent
+MODEL = StateSpaceModel.of(Normal(0.0, SD0), lambda x: Normal(RHO * x, SIGMA), lambda x: Normal(x, TAU))
+
+
+def program(previous, y):
+    """The same as a program."""
+    x = sample("x", Normal(0.0, SD0) if previous is None else Normal(RHO * previous["x"], SIGMA))
+    observe("y", Normal(x, TAU), y)
+
+
+def data(T: int) -> list[float]:
+    """Observations of the model."""
+    rng, ys = np.random.default_rng(4), []
+    x = rng.normal(0, SD0)
+    for _ in range(T):
+        ys.append(float(rng.normal(x, TAU)))
+        x = rng.normal(RHO * x, SIGMA)
+    return ys
+
+
+class Box:
+    """A particle that is an object."""
+
+
+class Boxes(Proposal):
+    """The same objects always."""
+
+    def sample(self, rng, observation, n):
+        """Draw."""
+        return Population(tuple(Box() for _ in range(n)))
+
+
+class Stay(Transition):
+    """Moves nothing."""
+
+    def predict(self, rng, population, observation):
+        """Move."""
+        return Population(population.particles, population.log_weights, population.parents)
+
+
+def timed(work) -> float:
+    """Seconds of a call."""
+    start = time.perf_counter()
+    work()
+    return time.perf_counter() - start
+
+
+def through(filter: ParticleFilter, ys: list[float], seed: int) -> float:
+    """The log evidence; like the loop and `particles`, keeps no history."""
+    last = deque(filter.iterate(ys, seed), maxlen=1)
+    return last[0][0].log_evidence
+
+
+def main() -> None:
+    """Measure."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--peers", type=Path, help="python of the environment that has particles 0.4")
+    parser.add_argument("--rounds", type=int, default=15)
+    parser.add_argument("--out", type=Path, default=HERE)
+    options = parser.parse_args()
+    ys, n = data(100), 10_000
+    worker = None
+    if options.peers:
+        described = json.dumps({"rho": RHO, "sigma": SIGMA, "tau": TAU, "ys": ys})
+        worker = subprocess.Popen(
+            [str(options.peers), str(HERE / "peers_worker.py"), described],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+
+    def peer(what: str, seed: int, size: int) -> dict:
+        worker.stdin.write(f"{what} {seed} {size}\n")
+        worker.stdin.flush()
+        return json.loads(worker.stdout.readline())
+
+    arrays, programs = bootstrap(MODEL, n), Program(program).bootstrap(n)
+    objects = ParticleFilter(
+        initial=Boxes(),
+        transition=Stay(),
+        update=Reweight(lambda particles, y: np.arange(len(particles)) * 0.1),
+        trigger=Always(),
+        n=5,
+    )
+    scheme, big = Systematic(), np.random.default_rng(0).exponential(size=1_000_000)
+    log_big = np.log(big)
+
+    def systematic(seed: int) -> float:
+        rng = np.random.default_rng(seed)
+        return timed(lambda: scheme.select(rng, log_big, len(log_big)))
+
+    order = np.random.default_rng(0)
+
+    def one_round(seed: int) -> dict[str, float]:
+        work = {
+            "loop": lambda: timed(lambda: bootstrap_loop(np.random.default_rng(seed), ys, n, RHO, SIGMA, TAU)),
+            "arrays": lambda: timed(lambda: through(arrays, ys, seed)),
+            "arrays_kept": lambda: timed(lambda: arrays.run(ys, seed)),
+            "program": lambda: timed(lambda: through(programs, ys, seed)),
+            "step_of_5_objects": lambda: timed(lambda: objects.run(range(200), seed)) / 200,
+        }
+        if worker:
+            work["particles"] = lambda: peer("filter", seed, n)["seconds"]
+        names = list(work)
+        order.shuffle(names)  # what runs before leaves its mark on the memory of the process
+        return {name: work[name]() for name in names}
+
+    rows = [one_round(seed) for seed in range(options.rounds + 2)][2:]  # the first two warm up
+    big_rows: list[dict] = []
+    for seed in range(options.rounds):
+        big_rows.append({"systematic_1e6": systematic(seed)})
+        if worker:
+            big_rows[-1]["particles_systematic_1e6"] = peer("systematic", seed, 1_000_000)["seconds"]
+    for row, more in zip(rows, big_rows, strict=True):
+        row.update(more)
+    median = {name: float(np.median([r[name] for r in rows])) for name in rows[0]}
+
+    def ratio(a: str, b: str) -> str:
+        return f"{median[a] / median[b]:.2f}" if a in median and b in median else "not measured"
+
+    table = [
+        ("bootstrap AR(1) T=100 n=1e4: minimal numpy loop", "ms", f"{1e3 * median['loop']:.1f}", ""),
+        ("the same with array components", "ms", f"{1e3 * median['arrays']:.1f}", ""),
+        ("the same, infos of all steps kept (run)", "ms", f"{1e3 * median['arrays_kept']:.1f}", ""),
+        ("the same as a program", "ms", f"{1e3 * median['program']:.1f}", ""),
+        ("array components / minimal loop", "ratio", ratio("arrays", "loop"), "<= 1.3"),
+        ("program / array components", "ratio", ratio("program", "arrays"), "<= 1.5"),
+        ("array components / particles 0.4", "ratio", ratio("arrays", "particles"), "<= 0.6"),
+        ("systematic n=1e6", "ms", f"{1e3 * median['systematic_1e6']:.1f}", ""),
+        ("systematic n=1e6 / particles' numba", "ratio", ratio("systematic_1e6", "particles_systematic_1e6"), "<= 2"),
+        ("a step with 5 object particles", "ms", f"{1e3 * median['step_of_5_objects']:.3f}", "<= 0.5"),
+    ]
+    with (options.out / "speed.csv").open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(["what", "unit", "median", "target"])
+        writer.writerows(table)
+    for row in table:
+        print(f"{row[0]:52s} {row[2]:>12s} {row[1]:6s} {row[3]}")
+    if worker:
+        ys8 = ys[:20]
+        worker.stdin.close()
+        worker.wait()
+        evidence(options, ys8)
+
+
+def evidence(options: argparse.Namespace, ys: list[float]) -> None:
+    """Standard deviation of the log evidence, ours and theirs, T=20, n=200, 1000 seeds."""
+    described = json.dumps({"rho": RHO, "sigma": SIGMA, "tau": TAU, "ys": ys})
+    seeds, n = range(1000), 200
+    answer = subprocess.run(
+        [str(options.peers), str(HERE / "peers_worker.py"), described],
+        input="".join(f"filter {s} {n}\n" for s in seeds),
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    theirs = [json.loads(line)["log_evidence"] for line in answer.stdout.splitlines()]
+    ours = [bootstrap(MODEL, n).run(ys, s)[0].log_evidence for s in seeds]
+    with (options.out / "evidence.csv").open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(["filter", "T", "n", "seeds", "mean_log_evidence", "sd_log_evidence"])
+        for name, logs in (("mstfilter", ours), ("particles 0.4", theirs)):
+            writer.writerow([name, len(ys), n, len(logs), f"{np.mean(logs):.6f}", f"{np.std(logs, ddof=1):.6f}"])
+            print(f"{name:15s} mean {np.mean(logs):.4f} sd {np.std(logs, ddof=1):.4f}")
+
+
+if __name__ == "__main__":
+    main()

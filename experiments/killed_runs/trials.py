@@ -1,0 +1,63 @@
+"""Kill a run at random moments and take it up again, many times; every end must be that of a run never killed."""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+
+HERE = Path(__file__).parent
+
+
+def same(a: Path, b: Path) -> bool:
+    """Whether two checkpoints hold the same arrays, bit for bit."""
+    with np.load(a) as x, np.load(b) as y:
+        return x.files == y.files and all(x[n].tobytes() == y[n].tobytes() for n in x.files)
+
+
+def main() -> None:
+    """Run the trials."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--trials", type=int, default=100)
+    options = parser.parse_args()
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    command = [sys.executable, str(HERE / "victim.py")]
+    rng, rows = np.random.default_rng(0), []
+    with tempfile.TemporaryDirectory() as folder:
+        whole = Path(folder) / "whole.npz"
+        start = time.perf_counter()
+        subprocess.run([*command, str(whole)], check=True, env=environment, stdout=subprocess.DEVNULL)
+        for trial in range(options.trials):
+            path = Path(folder) / f"run{trial}.npz"
+            process = subprocess.Popen([*command, str(path)], env=environment, stdout=subprocess.PIPE)
+            process.stdout.readline()
+            delay = rng.uniform(0, 0.25)
+            time.sleep(delay)
+            process.send_signal(signal.SIGKILL)
+            ended = process.wait() == 0
+            process.stdout.close()
+            t = -1
+            if path.exists():
+                with np.load(path) as data:
+                    t = str(data["head"]).split('"t": ')[1].split(",")[0]
+            subprocess.run([*command, str(path)], check=True, env=environment, stdout=subprocess.DEVNULL)
+            rows.append([trial, f"{delay:.4f}", int(ended), t, int(same(whole, path))])
+    with (HERE / "trials.csv").open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(["trial", "killed_after_s", "had_ended", "steps_stored_at_kill", "identical"])
+        writer.writerows(rows)
+    killed = [r for r in rows if not r[2]]
+    print(f"{len(rows)} trials, {len(killed)} killed while running, {sum(r[4] for r in rows)} ended identically")
+    print(f"{time.perf_counter() - start:.0f} s")
+
+
+if __name__ == "__main__":
+    main()

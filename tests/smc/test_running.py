@@ -1,0 +1,249 @@
+"""Collectors, many runs, checkpoints."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from mstfilter.errors import InputError, MissingLibraryError
+from mstfilter.smc import collect as collectors
+from mstfilter.smc.checkpoint import load_state, save_state
+from mstfilter.smc.codecs import ArrayCodec
+from mstfilter.smc.collect import collect
+from mstfilter.smc.filters import bootstrap
+from mstfilter.smc.interfaces import Codec
+from mstfilter.smc.many import run_many
+from mstfilter.smc.population import Population
+from mstfilter.smc.programs import Program, observe, per_particle, sample
+from mstfilter.smc.resampling import Multinomial
+from mstfilter.smc.state import State
+from mstfilter.smc.streams import Key
+from mstfilter.smc.trace import Trace
+from tests.conftest import REPOSITORY
+from tests.smc.models import AR1, SYMBOLS, Box, ar1_observations, hmm
+
+YS = ar1_observations(10)
+
+
+# --- collectors ---------------------------------------------------------------------------------------------------
+def test_collectors():
+    history = collect(
+        bootstrap(AR1, 64).iterate(YS, 3),
+        ess=collectors.ess,
+        unique=collectors.unique_ancestors,
+        entropy=collectors.weight_entropy,
+        evidence=collectors.log_evidence,
+        mean=collectors.mean,
+        own=lambda state, info: [info.t, 2 * info.t],
+    )
+    state, infos = bootstrap(AR1, 64).run(YS, 3)
+    assert set(history) == {"ess", "unique", "entropy", "evidence", "mean", "own"}
+    np.testing.assert_array_equal(history["ess"], [i.ess for i in infos])
+    np.testing.assert_array_equal(history["own"], [[t, 2 * t] for t in range(10)])
+    assert history["evidence"][-1] == state.log_evidence == history.state.log_evidence
+    assert (history["entropy"] <= np.log(64) + 1e-12).all() and (
+        history["entropy"] >= np.log(history["ess"]) - 1e-9
+    ).all()
+    assert history["mean"][-1] == state.population.weights @ state.population.particles
+    with pytest.raises(KeyError, match="nothing was collected as 'es'"):
+        history["es"]
+    with pytest.raises(InputError, match="different shapes"):
+        collect(bootstrap(AR1, 4).iterate(YS, 0), odd=lambda state, info: np.zeros(info.t))
+
+
+def test_to_xarray(monkeypatch):
+    history = collect(bootstrap(AR1, 8).iterate(YS, 3), ess=collectors.ess)
+    xarray = pytest.importorskip("xarray")
+    runs = run_many({"a": bootstrap(AR1, 8)}, YS, [1, 2], ess=collectors.ess, two=lambda s, i: np.zeros(2))
+    table = runs.to_xarray()
+    assert isinstance(table, xarray.Dataset)
+    assert table["ess"].dims == ("arm", "seed", "time")
+    assert table["two"].shape == (1, 2, 10, 2)
+    monkeypatch.setitem(sys.modules, "xarray", None)
+    with pytest.raises(MissingLibraryError, match="needs the library xarray"):
+        history.to_xarray()
+
+
+# --- many runs ----------------------------------------------------------------------------------------------------
+def test_results_do_not_depend_on_workers_or_on_other_arms():
+    arms = {"systematic": bootstrap(AR1, 50), "multinomial": bootstrap(AR1, 50, Multinomial())}
+    kept = {"log_evidence": collectors.log_evidence, "mean": collectors.mean}
+    one = run_many(arms, YS, range(6), **kept)
+    four = run_many(arms, YS, range(6), workers=4, **kept)
+    alone = run_many({"multinomial": arms["multinomial"]}, YS, [4], workers=2, **kept)
+    more = run_many({"third": bootstrap(AR1, 7), **arms}, YS, range(6), workers=3, **kept)
+    for name in kept:
+        np.testing.assert_array_equal(one[name], four[name])
+        np.testing.assert_array_equal(one[name], more[name][1:])
+        np.testing.assert_array_equal(one[name][1, 4], alone[name][0, 0])
+    # Paired: both arms start from the same draws, so the first step is the same.
+    np.testing.assert_array_equal(one["mean"][0, :, 0], one["mean"][1, :, 0])
+
+
+def test_errors_in_workers_name_the_run():
+    def broken(state, info):
+        raise InputError("no")
+
+    for workers in (1, 2):
+        with pytest.raises(InputError, match="arm 'a', seed 5: no"):
+            run_many({"a": bootstrap(AR1, 4)}, YS, [5], workers=workers, x=broken)
+    with pytest.raises(InputError, match="workers is 0"):
+        run_many({"a": bootstrap(AR1, 4)}, YS, [5], workers=0)
+
+
+# --- codecs -------------------------------------------------------------------------------------------------------
+@dataclass(frozen=True)
+class Thing:
+    grid: np.ndarray
+    name: str
+    size: float
+    where: tuple
+    count: np.int32
+    parent: int | None = None
+
+
+THINGS = tuple(
+    Thing(np.arange(k + 1, dtype=np.uint16), f"t{k}", 0.1 * k, (k, (1.5, "a")), np.int32(k)) for k in range(3)
+)
+
+
+@pytest.mark.parametrize(
+    "particles",
+    [
+        np.random.default_rng(0).normal(size=(4, 2)).astype(np.float32),
+        {"x": np.arange(3.0), "k": np.array([True, False, True])},
+        (THINGS[1], THINGS[0], THINGS[1], THINGS[2]),
+        (Trace({"n": 2, "x": np.float64(0.1)}), Trace({"n": 0})),
+        (Box((1, 1)), Box((2, 2))),
+    ],
+    ids=["array", "mapping", "dataclasses", "traces", "boxes"],
+)
+def test_states_come_back_bit_for_bit(particles, tmp_path):
+    n = len(next(iter(particles.values()))) if isinstance(particles, dict) else len(particles)
+    population = Population(particles, np.linspace(-1e4, 1, n), {"previous": np.arange(n)})
+    save_state(tmp_path / "s.npz", State(7, population, Key(3), False))
+    state, _ = load_state(tmp_path / "s.npz")
+    found = state.population.particles
+    assert (state.t, state.key, state.properly_weighted) == (7, Key(3), False)
+    np.testing.assert_array_equal(state.population.log_weights, population.log_weights)
+    np.testing.assert_array_equal(state.population.parents["previous"], np.arange(n))
+    if isinstance(particles, np.ndarray):
+        assert found.dtype == particles.dtype
+        np.testing.assert_array_equal(found, particles)
+    elif isinstance(particles, dict):
+        assert {k: a.dtype for k, a in found.items()} == {k: a.dtype for k, a in particles.items()}
+        np.testing.assert_array_equal(found["x"], particles["x"])
+    elif isinstance(particles[0], Thing):
+        for a, b in zip(found, particles, strict=True):
+            np.testing.assert_array_equal(a.grid, b.grid)
+            assert (a.grid.dtype, a.name, a.size, a.where, a.count, a.parent) == (
+                np.uint16, b.name, b.size, b.where, b.count, b.parent,
+            )  # fmt: skip
+            assert type(a.count) is np.int32
+        assert found[0] is found[2], "shared particles are shared again"
+    elif isinstance(particles[0], Trace):
+        assert [dict(a) for a in found] == [dict(b) for b in particles]
+    else:
+        assert found == particles
+
+
+def test_what_cannot_be_stored_is_one_clear_error(tmp_path):
+    @dataclass(frozen=True)
+    class Local:
+        x: int
+
+    def save(particles, codec=None):
+        save_state(tmp_path / "s.npz", State(1, Population(particles), Key(0)), codec)
+
+    with pytest.raises(InputError, match="particles of type complex cannot be stored"):
+        save((1j, 2j))
+    with pytest.raises(InputError, match="cannot be found by its name"):
+        save((Local(1),))
+    with pytest.raises(InputError, match="array of Python objects"):
+        save(np.array([object()]))
+    with pytest.raises(InputError, match="several types"):
+        save((Box((1,)), THINGS[0]))
+    with pytest.raises(InputError, match="field 'name' of Thing is of type dict"):
+        save((Thing(np.zeros(1), {}, 1.0, (), np.int32(0)),))
+    assert not list(tmp_path.iterdir()), "nothing is left behind"
+    save((Local(1), Local(2)), ArrayCodec(Local))
+    state, _ = load_state(tmp_path / "s.npz", ArrayCodec(Local))
+    assert state.population.particles == (Local(1), Local(2))
+
+    class Halves(Codec):
+        def encode(self, particles):
+            return {"halves": np.array([p.imag for p in particles])}
+
+        def decode(self, arrays):
+            return tuple(1j * v for v in arrays["halves"])
+
+    save((1j, 2j), Halves())
+    assert load_state(tmp_path / "s.npz", Halves())[0].population.particles == (1j, 2j)
+    (tmp_path / "s.npz").write_bytes(b"PK nonsense")
+    with pytest.raises(InputError, match="checkpoint cannot be read"):
+        load_state(tmp_path / "s.npz")
+    with pytest.raises(InputError, match="checkpoint is missing"):
+        load_state(tmp_path / "t.npz")
+
+
+# --- checkpoints of runs ------------------------------------------------------------------------------------------
+@per_particle
+def walk(previous, y):
+    from mstfilter.smc.distributions import Normal
+
+    x = sample("x", Normal(0.0 if previous is None else previous["x"], 1.0))
+    observe("y", Normal(x, 1.0), y)
+
+
+@pytest.mark.parametrize(
+    ("filter", "ys"),
+    [(bootstrap(AR1, 30), YS), (bootstrap(hmm("objects"), 30), SYMBOLS), (Program(walk).bootstrap(8), YS)],
+    ids=["arrays", "objects", "traces"],
+)
+def test_a_run_goes_on_from_its_checkpoint(filter, ys, tmp_path):
+    whole, _ = filter.run(ys, 5)
+    path = tmp_path / "run.npz"
+    _, first = filter.run(ys[:4], 5, checkpoint=path)
+    state, rest = filter.run(ys, 5, checkpoint=path)
+    assert [i.t for i in (*first, *rest)] == list(range(len(ys)))
+    again, none = filter.run(ys, 5, checkpoint=path)
+    assert none == []
+    for other in (state, again):
+        assert other.log_evidence == whole.log_evidence and other.t == len(ys)
+        for a, b in zip(other.population.particles, whole.population.particles, strict=True):
+            assert a == b
+    with pytest.raises(InputError, match="its seed is"):
+        filter.run(ys, 6, checkpoint=path)
+    with pytest.raises(InputError, match="its filter is"):
+        bootstrap(AR1, 31).run(YS, 5, checkpoint=path)
+    with pytest.raises(InputError, match="folder of the checkpoint"):
+        filter.run(ys, 5, checkpoint=tmp_path / "no" / "run.npz")
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="kills a process by a signal")
+def test_a_killed_run_ends_as_one_that_was_not(tmp_path):
+    """Eight kills at random moments; experiments/killed_runs has a hundred."""
+    script = REPOSITORY / "experiments" / "killed_runs" / "victim.py"
+    environment = {**os.environ, "PYTHONPATH": str(REPOSITORY), "OMP_NUM_THREADS": "1"}
+    reference = tmp_path / "whole.npz"
+    subprocess.run([sys.executable, script, reference], check=True, env=environment)
+    rng, path = np.random.default_rng(1), tmp_path / "run.npz"
+    for _ in range(8):
+        process = subprocess.Popen([sys.executable, script, path], env=environment, stdout=subprocess.PIPE)
+        process.stdout.readline()  # the run has begun
+        time.sleep(rng.uniform(0, 0.12))
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+        process.stdout.close()
+    subprocess.run([sys.executable, script, path], check=True, env=environment)
+    with np.load(reference) as a, np.load(path) as b:
+        assert a.files == b.files
+        for name in a.files:
+            np.testing.assert_array_equal(a[name], b[name])
