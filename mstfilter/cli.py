@@ -219,7 +219,10 @@ def check(
         print(
             f"{statistical} of these are statistical: each alarms falsely with probability {FALSE_ALARM:.0e} at most"
         )
-    print(f"{cls.__name__}: {f'{failed} properties are broken' if failed else 'all properties that apply hold'}")
+    verdict = {0: "all properties that apply hold", 1: "1 property is broken"}.get(
+        failed, f"{failed} properties are broken"
+    )
+    print(f"{cls.__name__}: {verdict}")
     if failed:
         raise typer.Exit(1)
 

@@ -13,7 +13,7 @@ from mstfilter.smc.population import Population
 from mstfilter.smc.similarity import Equivalence, Similarity
 from mstfilter.testing import choices, moves, properties
 from mstfilter.testing.properties import Example, NotApplicable, Outcome, Property, Suite
-from mstfilter.testing.resampling import RESAMPLER
+from mstfilter.testing.resampling_law import RESAMPLER
 
 __all__ = [
     "Contract",

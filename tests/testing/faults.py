@@ -64,6 +64,46 @@ class PicksZeroWeights(Resampler):
 
 
 @dataclass(frozen=True)
+class ZeroAtTheEdge(Resampler):
+    """Picks a leading weight of zero where the uniform is exactly 0."""
+
+    def select(self, rng, log_weights, n):
+        points = (np.arange(n) + rng.random()) / n
+        return np.searchsorted(np.cumsum(normalise(log_weights)), points, side="left"), None
+
+
+@dataclass(frozen=True)
+class RemainderFromWeights(Resampler):
+    """Residual as one library has it: W - copies, negative numbers and all."""
+
+    def select(self, rng, log_weights, n):
+        W = normalise(log_weights)
+        copies = np.floor(n * W).astype(int)
+        rest = W - copies
+        with np.errstate(all="ignore"):
+            cumulative = np.cumsum(rest / rest.sum())
+        cumulative[-1] = 1.0
+        drawn = np.searchsorted(cumulative, rng.random(n - copies.sum()))
+        return np.concatenate([np.repeat(np.arange(len(W)), copies), drawn]), None
+
+
+@dataclass(frozen=True)
+class FirstAlwaysStays(Resampler):
+    """Elitism by place."""
+
+    def select(self, rng, log_weights, n):
+        drawn = systematic(rng, normalise(log_weights), max(n - 1, 1))
+        return np.concatenate([[np.flatnonzero(log_weights > -np.inf)[0]], drawn])[:n], None
+
+
+@dataclass(frozen=True)
+class GreedyCalledProper(Resampler):
+    def select(self, rng, log_weights, n):
+        best = np.argsort(-log_weights)[: np.isfinite(log_weights).sum()]
+        return best[np.arange(n) % len(best)], None
+
+
+@dataclass(frozen=True)
 class GlobalGenerator(Resampler):
     def select(self, rng, log_weights, n):
         return systematic(np.random, normalise(log_weights), n), None
@@ -153,6 +193,10 @@ FAULTS = {
     BiasedResidual: ("mean_number_of_copies", "copies are biased"),
     IgnoresN: ("gives_n_particles", "asked to make"),
     PicksZeroWeights: ("zero_weights_are_never_chosen", "weight 0"),
+    ZeroAtTheEdge: ("copes_with_extreme_uniforms", 'side="right"'),
+    RemainderFromWeights: ("mean_number_of_copies", "copies are biased"),
+    FirstAlwaysStays: ("order_of_particles_is_irrelevant", "depends on the order"),
+    GreedyCalledProper: ("mean_number_of_copies", "copies are biased"),
     GlobalGenerator: ("leaves_global_generators_alone", "global generator"),
     OldWeightsKept: ("output_weights", "output weights are wrong"),
     WeightsForgotten: ("output_weights", "mean weight after selection"),

@@ -59,7 +59,7 @@ def test_check_names_what_is_broken(capsys):
     assert "broken   a particle gets n W_i copies on average" in out
     assert "copies are biased" in out
     assert "1e-06" in out
-    assert "BiasedResidual: 1 properties are broken" in out
+    assert "BiasedResidual: 1 property is broken" in out
 
 
 def test_check_of_registered_components_with_fields(capsys):
