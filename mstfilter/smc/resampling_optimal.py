@@ -27,8 +27,8 @@ from mstfilter.smc.resampling import _from_shifts, checked_weights
 __all__ = ["FearnheadClifford", "threshold"]
 
 
-def threshold(weights: np.ndarray, n: int) -> tuple[float, int]:
-    """c with sum min(1, w_i / c) = n, and how many weights are kept for certain.
+def threshold(weights: np.ndarray, n: int) -> tuple[float, np.ndarray]:
+    """c with sum min(1, w_i / c) = n, and which weights are kept for certain.
 
     Parameters
     ----------
@@ -36,14 +36,26 @@ def threshold(weights: np.ndarray, n: int) -> tuple[float, int]:
         Positive, m > n.
     n : int
         How many to choose.
+
+    Returns
+    -------
+    c : float
+        Weight of each light particle that is chosen.
+    heavy : (m,) bool
+        Fewer than n.
     """
-    ordered = np.sort(weights)[::-1]
-    tails = np.cumsum(ordered[::-1])[::-1]  # summed from the smallest on
-    candidates = tails[:n] / (n - np.arange(n))
-    # A light weight is lighter than c by more than rounding, so that no interval of it can hold two points.
-    light = np.flatnonzero(ordered[:n] < candidates * (1 - 1e-9))
-    kept = int(light[0]) if len(light) else n - 1
-    return float(candidates[kept]), kept
+    heavy, kept, c = np.zeros(len(weights), bool), 0, float(weights.sum()) / n
+    while True:  # c falls and the heavy ones grow in number, until the light ones are all below c: a few rounds
+        # Light is lighter than c by more than rounding, so that no interval of a light one can hold two points.
+        heavy |= weights >= c * (1 - 1e-9)
+        if int(heavy.sum()) == kept:
+            return c, heavy
+        kept = int(heavy.sum())
+        if kept >= n:  # rounding only: the light ones together are nothing beside the n-th heaviest
+            heavy = np.zeros(len(weights), bool)
+            heavy[np.argsort(-weights, kind="stable")[: n - 1]] = True
+            return float(weights[~heavy].sum()), heavy
+        c = float(weights[~heavy].sum()) / (n - kept)
 
 
 @dataclass(frozen=True)
@@ -65,11 +77,10 @@ class FearnheadClifford(Resampler):
         if len(positive) <= n:
             return positive, lw[positive] + np.log(len(positive) / len(lw))
         w = weights[positive]
-        c, kept = threshold(w, n)
-        order = np.argsort(-w, kind="stable")
-        light = np.sort(order[kept:])
-        chosen = light[_from_shifts(np.cumsum(w[light]), n - kept, rng.random())]
-        out = np.concatenate([order[:kept], chosen])
-        log_out = np.concatenate([lw[positive[order[:kept]]], np.full(len(chosen), lw.max() + np.log(c))])
-        ranks = np.argsort(out, kind="stable")
-        return positive[out[ranks]], log_out[ranks] + np.log(n / len(lw))
+        c, heavy = threshold(w, n)
+        light = np.flatnonzero(~heavy)
+        log_out = np.where(heavy, lw[positive], lw.max() + np.log(c))
+        chosen = heavy
+        scaled = w[light] / w[light].max()  # they may be as small as numbers get
+        chosen[light[_from_shifts(np.cumsum(scaled), n - int(heavy.sum()), rng.random())]] = True
+        return positive[chosen], log_out[chosen] + np.log(n / len(lw))
