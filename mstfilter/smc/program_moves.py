@@ -10,7 +10,8 @@ import numpy as np
 from mstfilter.errors import InputError
 from mstfilter.smc.distributions import Normal
 from mstfilter.smc.population import Particles
-from mstfilter.smc.program_runs import PerParticle, Score, Site, _kept, _run
+from mstfilter.smc.program_runs import PerParticle, Score, Site, kept, run_once
+from mstfilter.smc.program_sites import Run
 from mstfilter.smc.rejuvenation import accept, choose
 from mstfilter.smc.streams import child
 from mstfilter.smc.trace import Trace
@@ -33,11 +34,10 @@ def metropolis(
         return _move(rng, model, particles, previous, observation, n, scale, steps, False)
     moved, shares = [], []
     for i, particle in enumerate(particles):
-        rows = {name: np.asarray(value)[None] for name, value in particle.items()}
         past = None if previous is None else previous[i]
         own = child(rng, "particle", i)
-        row, share = _move(own, model.function, rows, past, observation, 1, scale, steps, True)
-        moved.append(Trace({name: a[0] for name, a in row.items()}))
+        new, share = _move(own, model.function, particle, past, observation, 1, scale, steps, True)
+        moved.append(Trace(new))
         shares.append(share)
     return tuple(moved), float(np.mean(shares))
 
@@ -45,38 +45,41 @@ def metropolis(
 def _move(
     rng: np.random.Generator,
     model: Callable[[Any, Any], Any],
-    particles: Mapping[str, np.ndarray],
+    particles: Mapping[str, Any],
     previous: Any,
     observation: Any,
     n: int,
     scale: float,
     steps: int,
     single: bool,
-) -> tuple[Mapping[str, np.ndarray], float]:
-    def score(values: Mapping[str, np.ndarray]) -> tuple[Mapping[str, np.ndarray], np.ndarray, list[Site]]:
-        handler = Score(values)
-        run = _run(model, handler, previous, observation, n, single)
-        return _kept(run), run.gain, handler.sites
+) -> tuple[Mapping[str, Any], float]:
+    """Steps of all particles at once, or of a single one."""
 
-    x, taken = particles, 0
-    _, log_p, sites = score(x)
+    def score(values: Mapping[str, Any], bare: bool = False) -> tuple[Run, list[Site]]:
+        handler = Score(values, bare)
+        return run_once(model, handler, previous, observation, n, single), handler.sites
+
+    now, sites = score(particles, single)
+    taken = 0
     for _ in range(steps):
-        values, forward = _propose(rng, x, sites, scale, n)
+        values, forward = _propose(rng, now.values, sites, scale, n)
         try:
-            new, new_log_p, new_sites = score(values)
+            new, new_sites = score(values)
         except InputError:
             if not single:
                 raise
             continue  # a particle of another structure, for which there are no values: refused both ways
         if [s.name for s in new_sites] != [s.name for s in sites]:
             continue
-        backward = _log_density(values, x, new_sites, scale, n)
+        backward = _log_density(values, now.values, new_sites, scale, n)
         with np.errstate(invalid="ignore"):
-            yes = accept(rng, new_log_p - log_p + backward - forward)
-        x, log_p, taken = choose(yes, new, x), np.where(yes, new_log_p, log_p), taken + int(yes.sum())
-        if taken and steps > 1:
-            _, log_p, sites = score(x)
-    return x, taken / (steps * n)
+            yes = accept(rng, new.gain - now.gain + backward - forward)
+        taken += int(yes.sum())
+        if yes.all():
+            now, sites = new, new_sites
+        elif yes.any():
+            now, sites = score(choose(yes, new.values, now.values))
+    return kept(now), taken / (steps * n)
 
 
 def _propose(

@@ -18,7 +18,19 @@ from mstfilter.smc.program_sites import _RUN, Handler, Run
 from mstfilter.smc.streams import child
 from mstfilter.smc.trace import Trace
 
-__all__ = ["Centre", "Draw", "Guide", "PerParticle", "Replay", "Score", "Site", "execute", "per_particle"]
+__all__ = [
+    "Centre",
+    "Draw",
+    "Guide",
+    "PerParticle",
+    "Replay",
+    "Score",
+    "Site",
+    "execute",
+    "kept",
+    "per_particle",
+    "run_once",
+]
 
 
 @dataclass(frozen=True)
@@ -139,8 +151,8 @@ class Site:
 class Score(Handler):
     """Takes given values, weighs them by their density, and remembers the sites."""
 
-    def __init__(self, values: Mapping[str, Any]) -> None:
-        self.values = values
+    def __init__(self, values: Mapping[str, Any], single: bool = False) -> None:
+        self.values, self.single = values, single  # single: values of one particle, without the particle axis
         self.sites: list[Site] = []
 
     def site(
@@ -150,7 +162,8 @@ class Score(Handler):
         if name not in self.values:
             raise InputError(f"there is no value for site {name!r}")
         self.sites.append(Site(name, distribution, rows, branch))
-        value = self.values[name] if rows is None else self.values[name][rows]
+        value = np.asarray(self.values[name])[None] if self.single else self.values[name]
+        value = value if rows is None else value[rows]
         return value, distribution.log_prob(value)
 
     def row(self, index: int) -> Score:
@@ -194,18 +207,19 @@ def execute(
     if isinstance(model, PerParticle) != isinstance(other, PerParticle):
         raise InputError("model and guide must both be per_particle, or neither")
     if not isinstance(model, PerParticle):
-        run = _run(model, handler, previous, observation, n, False)
-        return _kept(run), run.gain
+        run = run_once(model, handler, previous, observation, n, False)
+        return kept(run), run.gain
     runs = [
-        _run(model.function, handler.row(i), None if previous is None else previous[i], observation, 1, True)
+        run_once(model.function, handler.row(i), None if previous is None else previous[i], observation, 1, True)
         for i in range(n)
     ]
-    return tuple(Trace({k: v[0] for k, v in _kept(r).items()}) for r in runs), np.concatenate([r.gain for r in runs])
+    return tuple(Trace(kept(r)) for r in runs), np.concatenate([r.gain for r in runs])
 
 
-def _run(
+def run_once(
     function: Callable[[Any, Any], Any], handler: Handler, previous: Any, observation: Any, n: int, single: bool
 ) -> Run:
+    """One pass of a function, `single` without the particle axis."""
     run = Run(handler, n, single)
     if isinstance(handler, Guide):
         handler.n = n
@@ -226,8 +240,8 @@ def _run(
     return run
 
 
-def _returned(returned: Any, n: int, single: bool) -> dict[str, np.ndarray]:
-    """What a program returns, one row a particle."""
+def _returned(returned: Any, n: int, single: bool) -> dict[str, Any]:
+    """What a program returns: one row a particle, or a single particle's values as they are."""
     if returned is None:
         return {}
     if not isinstance(returned, Mapping):
@@ -235,7 +249,7 @@ def _returned(returned: Any, n: int, single: bool) -> dict[str, np.ndarray]:
             f"a program returned a {type(returned).__qualname__}, expected None or a mapping of values to keep"
         )
     if single:
-        return {str(name): np.asarray(value)[None] for name, value in returned.items()}
+        return {str(name): value for name, value in returned.items()}
     out = {}
     for name, value in returned.items():
         array = np.asarray(value)
@@ -245,8 +259,10 @@ def _returned(returned: Any, n: int, single: bool) -> dict[str, np.ndarray]:
     return out
 
 
-def _kept(run: Run) -> dict[str, np.ndarray]:
-    particles = {**run.values, **run.returned}
+def kept(run: Run) -> dict[str, Any]:
+    """What a particle (or all of them) is after a run: values of the sites, and what was returned."""
+    values = {name: a[0] for name, a in run.values.items()} if run.single else run.values
+    particles = {**values, **run.returned}
     if not particles:
         raise InputError("the program sampled nothing and returned nothing: a particle would be empty")
     return particles

@@ -57,7 +57,7 @@ class Run:
     def __init__(self, handler: Handler, n: int, single: bool = False) -> None:
         self.handler, self.n, self.single = handler, n, single
         self.values: dict[str, np.ndarray] = {}
-        self.returned: dict[str, np.ndarray] = {}
+        self.returned: dict[str, Any] = {}
         self.gain = np.zeros(n)
         self._rows: np.ndarray | None = None
         self._split: set[str] = set()  # sites that were met inside a branch
