@@ -1,0 +1,220 @@
+"""Filters on the miniature world: the proper ones are exact in the limit, those of MST run on the same data.
+
+A statistical bound of 4 standard errors fails a right filter with probability 6e-5.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import mstfilter
+from mstfilter.errors import InputError
+from mstfilter.oracles.miniature.calibration import DRAWS, rank, statistics, uniformity
+from mstfilter.oracles.miniature.exact import exact_filter
+from mstfilter.oracles.miniature.filters import GuidedPush, Push, bootstrap_filter, guided_filter
+from mstfilter.oracles.miniature.measures import class_weights, measure, total_variation
+from mstfilter.oracles.miniature.shrunk import SampledCuts, SeenThrough, cut_law, shrink
+from mstfilter.oracles.miniature.weighting import ScoredFusion, balanced_filter, predictive_law
+from mstfilter.oracles.miniature.world import Glance, Miniature
+from mstfilter.smc.population import Population
+from mstfilter.smc.resampling import Always
+from mstfilter.smc.resampling_optimal import FearnheadClifford
+from mstfilter.smc.updates import Reweight
+from tests.oracles.test_miniature_world import FALSE_ALARM, chi_square, ids, state_of
+
+WORLD = Miniature((3, 2))
+PROPER = {"bootstrap": bootstrap_filter, "guided": guided_filter, "balanced": balanced_filter}
+RULES = {"paper": ("p", False), "authors": ("p", True), "mst": ("equal", False)}
+
+
+def preset(name, world, n):
+    return shrink(mstfilter.preset(name), world, n, *RULES[name])
+
+
+@pytest.mark.parametrize("name", RULES)
+def test_the_rules_are_those_of_the_presets(name):
+    proposal = mstfilter.preset(name).proposal
+    assert (proposal.weight_rule, proposal.sampler.include_optimal) == RULES[name]
+
+
+@ids
+def test_one_step_of_the_guided_filter_has_the_exact_evidence(world):
+    _, glances = world.simulate(np.random.default_rng(0), 1)
+    exact = exact_filter(world, glances)
+    for n in (1, 7):
+        state, _ = guided_filter(world, n).run(glances, 1)
+        assert state.log_evidence == pytest.approx(exact.log_evidence[0], abs=1e-10)
+
+
+@pytest.mark.parametrize("name", PROPER)
+@ids
+def test_the_evidence_is_unbiased(name, world):
+    """On data whose estimates are not skewed (spread below a half), so that few runs show their mean."""
+    _, glances = world.simulate(np.random.default_rng(4), 4)
+    exact = exact_filter(world, glances).log_evidence[-1]
+    n = {"bootstrap": 2000, "guided": 60, "balanced": 300}[name]
+    for extra in ({}, {"resampler": FearnheadClifford(), "trigger": Always()}):
+        filter = PROPER[name](world, n, **extra)
+        ratio = np.exp([filter.run(glances, seed)[0].log_evidence - exact for seed in range(80)])
+        assert ratio.std() < 0.5
+        assert abs(ratio.mean() - 1) < 4 * ratio.std(ddof=1) / np.sqrt(len(ratio))
+
+
+@pytest.mark.parametrize("name", PROPER)
+@ids
+def test_proper_filters_converge(name, world):
+    """The distance falls like 1 / sqrt(n) once n is large: 16 times the particles, a quarter of it (0.4 allowed)."""
+    sizes, distances = (1000, 16_000), []
+    for n in sizes:
+        tv = []
+        for seed in range(8):
+            _, glances = world.simulate(np.random.default_rng(seed), 3)
+            state, _ = PROPER[name](world, n).run(glances, seed)
+            exact = exact_filter(world, glances).posterior[-1]
+            tv.append(total_variation(class_weights(world, state.population), exact))
+        distances.append(np.mean(tv))
+    assert distances[1] < 0.4 * distances[0]
+    assert distances[1] < 0.15
+
+
+def test_a_guided_move_is_an_importance_draw_of_the_motion_model():
+    """log q sums to one; f / q is the weight that `predict` adds, up to the likelihood."""
+    _, glances = WORLD.simulate(np.random.default_rng(4), 2)
+    y, S = glances[1], len(WORLD.states)
+    hypotheses = WORLD.states.hypotheses
+    old = (hypotheses[321],) * S
+    log_q = GuidedPush(WORLD).log_prob(old, hypotheses, y)
+    assert np.exp(log_q).sum() == pytest.approx(1)
+    moved = GuidedPush(WORLD).predict(np.random.default_rng(0), Population(old), y)
+    x = WORLD.states.index(moved.particles)
+    gain = Push(WORLD).log_prob(old, moved.particles, y) - log_q[x]
+    np.testing.assert_allclose(moved.log_weights, gain, atol=1e-10)
+    assert chi_square(x, np.exp(log_q)) > FALSE_ALARM
+
+
+def test_a_missing_observation_moves_the_particles_only():
+    _, glances = WORLD.simulate(np.random.default_rng(5), 3)
+    glances = [glances[0], None, glances[2]]
+    exact = exact_filter(WORLD, glances)
+    for make in (bootstrap_filter, guided_filter):
+        ratio = np.exp([make(WORLD, 500).run(glances, s)[0].log_evidence - exact.log_evidence[-1] for s in range(60)])
+        assert abs(ratio.mean() - 1) < 4 * ratio.std(ddof=1) / np.sqrt(60)
+
+
+# --- MST on the same world ----------------------------------------------------------------------------------------
+@ids
+def test_cuts_follow_their_law(world):
+    _, glances = world.simulate(np.random.default_rng(8), 1)
+    law = cut_law(world, glances[0], 0.4)
+    assert law.probability.sum() == pytest.approx(1)
+    assert law.log_cut.max() == 0
+    proposal = SampledCuts(world, prior_share=0.2)
+    drawn = proposal.sample(np.random.default_rng(0), glances[0], 4000)
+    assert proposal.law(glances[0]).sum() == pytest.approx(1)
+    assert chi_square(world.states.index(drawn.particles), proposal.law(glances[0])) > FALSE_ALARM
+
+
+def test_cuts_on_a_picture():
+    """Two pixels with a surface, sensed as joined: one object or two, in the proportion of the error rates."""
+    world = Miniature((3, 2), split=0.2, merge=0.1)
+    law = cut_law(world, Glance(np.array([1, 1, 2]), np.array([True, False])), 0.4)
+    assert dict(zip(law.states.tolist(), law.probability.tolist(), strict=True)) == pytest.approx(
+        {state_of(world, ["01", "01", "00"]): 8 / 9, state_of(world, ["01", "02", "00"]): 1 / 9}
+    )
+    deep = cut_law(world, Glance(np.array([0, 2, 2]), np.array([True, True])), 0.4)
+    assert dict(zip(deep.states.tolist(), deep.probability.tolist(), strict=True)) == pytest.approx(
+        {state_of(world, ["10", "00", "00"]): 0.6, state_of(world, ["11", "00", "00"]): 0.4}
+    )
+
+
+def test_what_is_seen_through_is_cleared():
+    hypothesis = WORLD.states.hypotheses[state_of(WORLD, ["11", "02", "30"])]
+    refined, quality = SeenThrough().project(hypothesis, Glance(np.array([1, 0, 2]), np.array([False, False])))
+    assert WORLD.states.index([refined])[0] == state_of(WORLD, ["01", "02", "00"])
+    assert quality == pytest.approx(2 / 4)
+
+
+@pytest.mark.parametrize("name", RULES)
+def test_presets_run_and_report_no_evidence(name):
+    _, glances = WORLD.simulate(np.random.default_rng(0), 3)
+    filter = preset(name, WORLD, 5)
+    a, _ = filter.run(glances, 3)
+    b, _ = filter.run(glances, 3)
+    assert len(a.population) == 5 and a.log_evidence is None
+    np.testing.assert_array_equal(a.population.log_weights, b.population.log_weights)
+    np.testing.assert_array_equal(
+        [h.labels for h in a.population.particles], [h.labels for h in b.population.particles]
+    )
+    assert class_weights(WORLD, a.population).sum() == pytest.approx(1)
+
+
+def test_other_updates_cannot_be_shrunk():
+    filter = replace(mstfilter.preset("mst"), update=Reweight(lambda p, y: np.zeros(len(p))))
+    with pytest.raises(InputError, match="expected a FusionUpdate"):
+        shrink(filter, WORLD, 5)
+
+
+def test_scored_candidates_count_once_and_carry_prediction_times_likelihood():
+    _, glances = WORLD.simulate(np.random.default_rng(1), 2)
+    rng, y = np.random.default_rng(2), glances[1]
+    proposed = SampledCuts(WORLD).sample(rng, y, 10)
+    predicted = Population(WORLD.states.take(WORLD.draw_prior(rng, 10)), np.log(np.arange(1.0, 11.0)))
+    law = predictive_law(WORLD, predicted)
+    assert law.sum() == pytest.approx(1)
+    rule = ScoredFusion(WORLD, preset("mst", WORLD, 10).update, distinct=True, predictive=True, parents=True)
+    fused = rule.update(np.random.default_rng(0), predicted, proposed, y)
+    states = WORLD.states.index(fused.particles)
+    assert len(set(states.tolist())) == len(states)
+    assert set(WORLD.states.index(predicted.particles)) <= set(states)
+    expected = np.log(law) + WORLD.log_likelihood(y)
+    np.testing.assert_allclose(np.diff(fused.log_weights), np.diff(expected[states]), atol=1e-10)
+
+
+def test_measures_of_the_exact_law_are_zero_and_of_a_wrong_one_known():
+    truth, glances = WORLD.simulate(np.random.default_rng(1), 1)
+    p = exact_filter(WORLD, glances).posterior[0]
+    found = measure(WORLD, p, p, truth[0])
+    assert found["tv"] == found["same_object_error"] == found["occupancy_error"] == 0
+    assert found["p_truth"] == p[truth[0]]
+    sure = np.eye(len(p))[truth[0]]
+    found = measure(WORLD, sure, p, truth[0])
+    assert found["tv"] == pytest.approx(1 - p[truth[0]])
+    assert found["same_object_brier"] == found["occupancy_brier"] == 0
+
+
+# --- calibration ---------------------------------------------------------------------------------------------------
+def ranks_of(filter, world, n_worlds):
+    """{statistic: ranks}; one simulated world each."""
+    scalars, out = statistics(world), {}
+    for seed in range(n_worlds):
+        truth, glances = world.simulate(np.random.default_rng([seed, 77]), 3)
+        p = filter(glances, seed)
+        for name, scalar in scalars.items():
+            out.setdefault(name, []).append(rank(np.random.default_rng([seed, 78]), scalar, p, truth[-1]))
+    return {name: np.array(r) for name, r in out.items()}
+
+
+@pytest.mark.parametrize("name", ["exact", "guided", "balanced"])
+def test_ranks_of_a_proper_filter_are_uniform(name):
+    """Four statistics: together they reject a right filter with probability 4 FALSE_ALARM."""
+
+    def answer(glances, seed):
+        if name == "exact":
+            return exact_filter(WORLD, glances).posterior[-1]
+        state, _ = PROPER[name](WORLD, 400).run(glances, seed)
+        return class_weights(WORLD, state.population)
+
+    for ranks in ranks_of(answer, WORLD, 400).values():
+        assert ranks.min() >= 0 and ranks.max() <= DRAWS
+        assert uniformity(ranks) > FALSE_ALARM
+
+
+def test_ranks_find_a_filter_that_counts_its_evidence_twice():
+    def twice(glances, seed):
+        p = exact_filter(WORLD, glances).posterior[-1] ** 3
+        return p / p.sum()
+
+    assert min(uniformity(r) for r in ranks_of(twice, WORLD, 400).values()) < FALSE_ALARM
