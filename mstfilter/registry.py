@@ -98,6 +98,10 @@ COMPONENTS: dict[str, dict[str, str]] = {
         "random_order": "mstfilter.fusion.structure:RandomOrder",
         "spanning_tree": "mstfilter.fusion.structure:SpanningTree",
     },
+    "evidence": {
+        "boundaries": "mstfilter.segmentation.evidence:BoundaryAgreement",
+        "motions": "mstfilter.tracking.evidence:MotionAgreement",
+    },
     "mode_filter": {"majority": "mstfilter.fusion.mode_filter:ModeFilter"},
 }
 _SAME = {"initial": "proposal", "scheme": "resampler"}
@@ -127,8 +131,10 @@ def check_names(config: Mapping[str, Any], allow_files: bool = False, where: str
         path = f"{where}{field}"
         if kind is not None:
             name = value.get("component") if isinstance(value, Mapping) else value
-            if isinstance(name, str):
-                _locate(kind, name, path, allow_files)
+            for item in value if isinstance(value, list) else [name]:
+                inner = item.get("component") if isinstance(item, Mapping) else item
+                if isinstance(inner, str):
+                    _locate(kind, inner, path, allow_files)
         if isinstance(value, Mapping):
             check_names(value, allow_files, f"{path}.")
 
@@ -235,7 +241,9 @@ def make(cls: type, fields: Mapping[str, Any], where: str, allow_files: bool = F
         kind = kind_of(name)
         current = default_of(own[name]) if base is None else getattr(base, name)
         part = current if dataclasses.is_dataclass(current) else None
-        if kind is not None and value is not None:
+        if kind is not None and isinstance(value, list):
+            values[name] = tuple(build(kind, item, f"{path}[{k}]", allow_files) for k, item in enumerate(value))
+        elif kind is not None and value is not None:
             values[name] = build(kind, value, path, allow_files, part)
         elif part is not None and isinstance(value, Mapping):
             # Part of a component that is no component itself: it has fields, but nothing can replace it.

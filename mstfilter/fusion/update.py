@@ -10,6 +10,9 @@ pair of a proposed sample i and a predicted hypothesis j is crossed `eta` times.
 
 and depends only on its pair, so candidates are drawn first and built afterwards: those that resampling does not
 choose are never built.
+
+With `evidence` the built candidates themselves are judged, in two stages: some are drawn by the weight above, built
+and scored; what the first stage has used is divided out, so a drawn candidate's weight is its score.
 """
 
 from __future__ import annotations
@@ -22,9 +25,11 @@ import numpy as np
 from mstfilter.fusion.crossover import Crossover
 from mstfilter.fusion.free_space import FreeSpace, Projection
 from mstfilter.scene.clip import Clip
+from mstfilter.scene.evidence import Evidence
 from mstfilter.scene.voxels import Hypothesis
 from mstfilter.smc.interfaces import Update
 from mstfilter.smc.population import Candidates, Population
+from mstfilter.smc.resampling import Systematic
 from mstfilter.smc.streams import key_of
 from mstfilter.smc.updates import union
 
@@ -47,12 +52,18 @@ class FusionUpdate(Update):
         Candidates of each pair.
     quality_exponent : float
         lambda: power of Q in the weight.
+    evidence : tuple of Evidence
+        Terms by which built candidates are scored; none: candidates are weighted by their pair alone.
+    n_scored : int
+        Candidates that are built and scored; 0 is four for each predicted hypothesis.
     """
 
     free_space: Projection = FreeSpace()  # noqa: RUF009 (frozen)
     crossover: Crossover = Crossover()  # noqa: RUF009 (frozen)
     eta: int = 5
     quality_exponent: float = 3.0
+    evidence: tuple[Evidence, ...] = ()
+    n_scored: int = 0
 
     properly_weighted: ClassVar[bool] = False
 
@@ -88,7 +99,17 @@ class FusionUpdate(Update):
             "proposed": proposed.parents.get("proposed", none_i)[i],
         }
         log_weights = proposed.log_weights[i] + (predicted.log_weights + log_q)[j]
-        return Population(Candidates(build, len(i)), log_weights, parents, notes)
+        fused = Population(Candidates(build, len(i)), log_weights, parents, notes)
+        return self._scored(rng, fused, observation, self.n_scored or 4 * len(predicted)) if self.evidence else fused
+
+    def _scored(self, rng: np.random.Generator, fused: Population, clip: Clip, n: int) -> Population:
+        """Second stage: `n` candidates drawn by pair weight, weighted by their score."""
+        drawn = Systematic().resample(rng, fused, n).realised()
+        scores = {type(term).__name__: term.log_score(tuple(drawn.particles), clip) for term in self.evidence}
+        log_weights = drawn.log_weights + np.sum(list(scores.values()), axis=0)
+        parents = {name: index for name, index in drawn.parents.items() if name != "ancestor"}
+        notes = {**fused.notes, "scores": {name: score.round(3).tolist() for name, score in scores.items()}}
+        return Population(drawn.particles, log_weights, parents, notes)
 
     def _refine(self, predicted: Population, clip: Clip) -> tuple[tuple[Hypothesis, ...], np.ndarray]:
         """Predicted hypotheses after free-space projection, and their qualities (n,)."""
