@@ -16,7 +16,7 @@ from mstfilter.oracles.miniature.calibration import DRAWS, rank, statistics, uni
 from mstfilter.oracles.miniature.exact import exact_filter
 from mstfilter.oracles.miniature.filters import GuidedPush, Push, bootstrap_filter, guided_filter
 from mstfilter.oracles.miniature.measures import class_weights, measure, total_variation
-from mstfilter.oracles.miniature.shrunk import SampledCuts, SeenThrough, cut_law, shrink
+from mstfilter.oracles.miniature.shrunk import ReadingEvidence, SampledCuts, SeenThrough, cut_law, shrink
 from mstfilter.oracles.miniature.weighting import ScoredFusion, balanced_filter, predictive_law
 from mstfilter.oracles.miniature.world import Glance, Miniature
 from mstfilter.smc.population import Population
@@ -149,6 +149,18 @@ def test_presets_run_and_report_no_evidence(name):
         [h.labels for h in a.population.particles], [h.labels for h in b.population.particles]
     )
     assert class_weights(WORLD, a.population).sum() == pytest.approx(1)
+
+
+def test_scoring_terms_become_the_likelihood_of_the_reading():
+    mst = mstfilter.preset("mst")
+    scored = replace(mst, update=replace(mst.update, evidence=(ReadingEvidence(Miniature((2, 2))),), n_scored=99))
+    filter = shrink(scored, WORLD, 10)
+    _, glances = WORLD.simulate(np.random.default_rng(1), 2)
+    _, info = filter.step(filter.run(glances[:1], 0)[0], glances[1])
+    assert info.n_candidates == 40
+    assert len(info.notes["update"]["scores"]["ReadingEvidence"]) == 40
+    score = ReadingEvidence(WORLD).log_score(WORLD.states.hypotheses, glances[1])
+    np.testing.assert_array_equal(score, WORLD.log_likelihood(glances[1]))
 
 
 def test_other_updates_cannot_be_shrunk():

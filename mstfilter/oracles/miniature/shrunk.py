@@ -4,12 +4,14 @@
 >>> state, infos = filter.run(glances, seed=0)
 
 What the images feed is replaced: tracking by the motion model, tree cuts by cuts of the segmentation that the sensor
-reports, free space by the cells in front of the depth reading. What fuses and selects is the preset's own; only the
-mode filter is sized to the grid.
+reports, free space by the cells in front of the depth reading, and what scores built candidates (where the preset has
+such terms) by the likelihood of the reading. What fuses and selects is the preset's own; only the mode filter is sized
+to the grid.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from typing import Any, Literal
@@ -21,12 +23,13 @@ from mstfilter.fusion.free_space import Projection
 from mstfilter.fusion.update import FusionUpdate
 from mstfilter.oracles.miniature.filters import Push
 from mstfilter.oracles.miniature.world import Glance, Miniature, draw
+from mstfilter.scene.evidence import Evidence
 from mstfilter.scene.voxels import Hypothesis
 from mstfilter.smc.interfaces import Proposal
 from mstfilter.smc.particle_filter import ParticleFilter
 from mstfilter.smc.population import Population
 
-__all__ = ["CutLaw", "SampledCuts", "SeenThrough", "cut_law", "shrink"]
+__all__ = ["CutLaw", "ReadingEvidence", "SampledCuts", "SeenThrough", "cut_law", "shrink"]
 
 
 @dataclass(frozen=True)
@@ -43,6 +46,22 @@ class SeenThrough(Projection):
         return hypothesis.with_labels(np.where(hit, 0, hypothesis.labels).astype(np.uint16)), float(
             1.0 - hit.sum() / occupied.sum()
         )
+
+
+@dataclass(frozen=True)
+class ReadingEvidence(Evidence):
+    """Scores a candidate by the exact log likelihood of the whole reading, depth and segmentation.
+
+    Parameters
+    ----------
+    world : Miniature
+    """
+
+    world: Miniature
+
+    def log_score(self, hypotheses: Sequence[Hypothesis], clip: Any) -> np.ndarray:
+        """(n,) log p(y | x); `clip` is a `Glance`."""
+        return self.world.log_likelihood(clip)[self.world.states.index(hypotheses)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,7 +195,14 @@ def shrink(
         )
     crossover = filter.update.crossover
     small = replace(crossover.mode_filter, window=3, isolation=27)  # the window holds 27 cells: none is isolated
-    update = replace(filter.update, free_space=SeenThrough(), crossover=replace(crossover, mode_filter=small))
+    evidence = (ReadingEvidence(world),) if filter.update.evidence else ()
+    update = replace(
+        filter.update,
+        free_space=SeenThrough(),
+        crossover=replace(crossover, mode_filter=small),
+        evidence=evidence,
+        n_scored=0,
+    )
     return replace(
         filter,
         transition=Push(world, rearranged=False),
