@@ -3,10 +3,10 @@
 >>> filter = shrink(mstfilter.preset("paper"), world, n=5, weight_rule="p")
 >>> state, infos = filter.run(glances, seed=0)
 
-What the images feed is replaced: tracking by the motion model, tree cuts by cuts of the segmentation that the sensor
-reports, free space by the cells in front of the depth reading, and what scores built candidates (where the preset has
-such terms) by the likelihood of the reading. What fuses and selects is the preset's own; only the mode filter is sized
-to the grid.
+What the images feed is replaced: tracking by the motion model, tree cuts by cuts of the segmentation that the
+sensor reports, free space by the cells in front of the depth reading, and what scores built candidates (where the
+preset has such terms) by the likelihood of the reading. What fuses and selects is the preset's own; only the mode
+filter is sized to the grid.
 """
 
 from __future__ import annotations
