@@ -25,7 +25,7 @@ __all__ = ["build_filter", "describe_filter", "load_config", "preset"]
 
 _META = ("description", "source")
 _PLAIN = ("n", "n_proposed", "resample")
-_SLOTS = ("initial", "transition", "proposal", "update", "resampler", "trigger")
+_SLOTS = ("initial", "transition", "proposal", "update", "resampler", "trigger", "size")
 
 
 def preset(name: str = "mst", *overrides: str, allow_files: bool = True) -> ParticleFilter:

@@ -19,6 +19,9 @@ _HALF_LOG_2PI = 0.5 * math.log(2 * math.pi)
 def _standardised(value: Any, loc: Any, scale: Any) -> np.ndarray:
     """(value - loc) / scale with one temporary array."""
     z = np.asarray(np.subtract(value, loc), dtype=np.float64)
+    if z.ndim and isinstance(scale, float):
+        z /= scale
+        return z
     if z.ndim and np.ndim(scale) <= z.ndim and np.broadcast_shapes(z.shape, np.shape(scale)) == z.shape:
         np.divide(z, scale, out=z)
         return z

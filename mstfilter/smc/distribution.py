@@ -44,6 +44,9 @@ class Distribution(ABC):
 
 def value_shape(size: int, *parameters: Any) -> tuple[int, ...]:
     """Shape of `size` rows of values with these parameters."""
+    plain = (size,)
+    if all(np.shape(p) in ((), plain) for p in parameters):  # nearly always
+        return plain
     inner: tuple[int, ...] = np.broadcast_shapes(*(np.shape(p) for p in parameters))
     rows = (size,) + (1,) * (len(inner) - 1)
     try:

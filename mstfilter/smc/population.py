@@ -254,6 +254,15 @@ class Population:
         new.__dict__.update(self.__dict__, parents=parents, notes=notes or {})
         return new
 
+    def moved(self, particles: Particles) -> Population:
+        """Other particles, as many, with the same weights and parents; notes are dropped."""
+        particles = _freeze(particles)
+        if _count(particles) != len(self):
+            raise InputError(f"{len(self)} particles became {_count(particles)}, expected as many")
+        new = self.labelled(self.parents)
+        new.__dict__["particles"] = particles
+        return new
+
     def realised(self) -> Population:
         """The same population with every candidate built."""
         if isinstance(self.particles, Candidates):

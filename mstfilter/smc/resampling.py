@@ -71,12 +71,14 @@ def checked_weights(log_weights: np.ndarray, n: int) -> np.ndarray:
     if not -np.inf < top < np.inf:
         at = int(np.flatnonzero(~np.isfinite(lw) & ~np.isneginf(lw))[0]) if not np.isneginf(top) else 0
         raise InputError(f"log weights cannot be resampled: entry {at} is {lw[at]}, the largest is {top}")
-    return np.exp(lw - top)
+    weights = lw - top
+    return np.exp(weights, out=weights)
 
 
 def _cumulative(log_weights: np.ndarray, n: int) -> np.ndarray:
     """(m,) cumulative weights in float64, last entry exactly the total; checks the input."""
-    return np.cumsum(checked_weights(log_weights, n))
+    weights = checked_weights(log_weights, n)
+    return np.cumsum(weights, out=weights)
 
 
 def whole_copies(weights: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray, int]:
@@ -107,8 +109,7 @@ def _from_shifts(cumulative: np.ndarray, n: int, shift: float) -> np.ndarray:
     # Number of points below each cumulative weight; at the total it is n by definition, whatever rounding says.
     points = cumulative * (n / total)
     points -= shift
-    np.ceil(points, out=points)
-    np.maximum(points, 0.0, out=points)
+    np.ceil(points, out=points)  # above -1 before, so not negative now
     np.minimum(points, n, out=points)
     points[cumulative.searchsorted(total, side="left") :] = n
     # Place k has the particle before which k points lie: counting is quicker than repeating at random numbers.

@@ -123,11 +123,7 @@ class Dynamics(DensityTransition):
 
     def predict(self, rng: np.random.Generator, population: Population, observation: Any) -> Population:
         """Move all particles; weights stay."""
-        return Population(
-            self.model.sample_transition(rng, population.particles),
-            population.log_weights,
-            population.parents,
-        )
+        return population.moved(self.model.sample_transition(rng, population.particles))
 
     def log_prob(self, previous: Any, new: Any, observation: Any) -> np.ndarray:
         """Log density of the model's transition."""
@@ -178,7 +174,7 @@ class GuidedTransition(DensityTransition):
         """Move all particles; by the model's own transition where the observation is missing."""
         old = population.particles
         if observation is None:
-            return Population(self.model.sample_transition(rng, old), population.log_weights, population.parents)
+            return population.moved(self.model.sample_transition(rng, old))
         q = as_distribution(self.proposal(old, observation))
         new = q.sample(rng, len(population))
         gain = self.model.density("log_transition")(old, new) - q.log_prob(new)

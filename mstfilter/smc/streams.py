@@ -61,7 +61,9 @@ class Key:
 
     def child(self, *parts: int | str) -> Key:
         """The key of a part: a step, a slot by name, an index."""
-        return Key(self.seed, self.path + tuple(_number(p) for p in parts))
+        new = object.__new__(Key)  # the seed has been checked
+        new.__dict__.update(seed=self.seed, path=self.path + tuple([_number(p) for p in parts]))
+        return new
 
     def generator(self) -> np.random.Generator:
         """A new generator at the start of the stream."""
@@ -69,7 +71,10 @@ class Key:
         words += [0] * (4 - len(words))  # as numpy does before a spawn key
         words.append(_PREFIX)
         for number in self.path:
-            words += _words(number)
+            if number < 1 << 32:
+                words.append(number)
+            else:
+                words += _words(number)
         sequence = _KeyedSequence(np.array(words, dtype=np.uint32))
         sequence.key = self
         return np.random.Generator(np.random.PCG64(sequence))

@@ -1,0 +1,35 @@
+"""Streams made of words are numpy's own; spawning and copying keep their names."""
+
+from __future__ import annotations
+
+import copy
+
+import numpy as np
+import pytest
+
+from mstfilter.errors import InputError
+from mstfilter.smc.population import Population
+from mstfilter.smc.streams import _PREFIX, Key, child, key_of
+
+
+@pytest.mark.parametrize("seed", [0, 3, 2**31, 2**32, 2**40 + 5, 2**130 + 7])
+@pytest.mark.parametrize("path", [(), (0,), (5, "update"), (2**33,), ("transition", 3, 0)])
+def test_the_stream_of_a_key_is_that_of_its_seed_sequence(seed, path):
+    key = Key(seed).child(*path)
+    ours = key.generator()
+    numpys = np.random.Generator(np.random.PCG64(np.random.SeedSequence(seed, spawn_key=(_PREFIX, *key.path))))
+    assert key_of(ours) == key_of(numpys) == key == key_of(copy.deepcopy(ours))
+    np.testing.assert_array_equal(child(ours, "a").random(3), child(numpys, "a").random(3))
+    for a, b in zip(ours.spawn(2) + ours.spawn(1), numpys.spawn(2) + numpys.spawn(1), strict=True):
+        np.testing.assert_array_equal(a.random(3), b.random(3))
+    np.testing.assert_array_equal(ours.random(5), numpys.random(5))
+
+
+def test_moved_particles_keep_weights_and_parents():
+    population = Population(np.zeros(3), np.log([1.0, 2.0, 3.0]), {"previous": np.arange(3)}, {"note": 1})
+    moved = population.moved(np.ones((3, 2)))
+    assert moved.ess == population.ess and moved.notes == {} and moved.parents is population.parents
+    with pytest.raises(ValueError, match="read-only"):
+        moved.particles[0] = 2
+    with pytest.raises(InputError, match="3 particles became 2"):
+        population.moved(np.zeros(2))
