@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import contextlib
+import re
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -94,7 +95,7 @@ def run(
     config = load_config(preset, overrides or ())
     source = _open(recording, frames)
     name = Path(preset).stem
-    folder = out or Path("runs") / f"{source.name}-{name}-{seed}"
+    folder = out or Path("runs") / f"{_safe(source.name)}-{_safe(name)}-{seed}"
     _execute(source, config, folder, seed)
     if report:
         _report(folder, None)
@@ -114,6 +115,8 @@ def demo(
     from mstfilter.presets import load_config
     from mstfilter.scene.recording import Recording
 
+    if out.exists() and not out.is_dir():
+        raise InputError(f"{out} is a file, expected a folder for the demo")
     if out.exists() and any(out.iterdir()):
         known = {"recording", "run", "report.html"}
         strange = sorted(p.name for p in out.iterdir() if p.name.lstrip(".").removesuffix(".partial") not in known)
@@ -287,6 +290,11 @@ def _fields(cls: type) -> str:
         else:
             parts.append(f"{field.name}={value}")
     return ", ".join(parts)
+
+
+def _safe(name: str) -> str:
+    """A name as part of a file name; nothing in it leads to another folder."""
+    return re.sub(r"[^\w.-]+", "-", name).strip(".-") or "recording"
 
 
 def _open(path: Path, frames: str = "") -> Any:

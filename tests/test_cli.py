@@ -158,7 +158,8 @@ def test_a_kill_at_any_moment_leaves_a_run_that_resumes(recording, tmp_path):
     while not (part / "pauses" / "000").exists() and process.poll() is None and time.monotonic() < deadline:
         time.sleep(0.01)
     process.kill()
-    process.wait()
+    assert process.wait() != 0, "the run was over before it could be killed"
+    assert not (part / "metrics.csv").exists()
     subprocess.run([*command, "--out", part], check=True, capture_output=True, timeout=300)
     whole, resumed = content(tmp_path / "whole"), content(part)
     assert whole.keys() == resumed.keys()

@@ -15,13 +15,13 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
-from typing import Any, ClassVar
+from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
 from mstfilter.errors import InputError
-from mstfilter.scene.arrays import content_key, read_only
+from mstfilter.scene.arrays import component_key, content_key, read_only
 from mstfilter.scene.depth_noise import depth_sigma
 from mstfilter.scene.frame import Frame
 from mstfilter.scene.frame_geometry import frame_geometry
@@ -158,9 +158,8 @@ class Completer(ABC):
 
         return compute() if self.stochastic else memo("completion", name, compute)
 
-    def _key(self) -> str:
-        values: list[Any] = [(f.name, getattr(self, f.name)) for f in fields(self)]
-        return f"{type(self).__module__}.{type(self).__qualname__}{values}"
+    def _key(self) -> bytes:
+        return component_key(self)
 
 
 def _frame_points(frame: Frame, grid: VoxelGrid) -> tuple[np.ndarray, np.ndarray]:

@@ -13,6 +13,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from mstfilter.errors import InputError
+from mstfilter.scene.arrays import component_key, read_only
 from mstfilter.scene.depth_noise import depth_sigma
 from mstfilter.scene.frame import Frame
 from mstfilter.scene.frame_geometry import frame_geometry
@@ -61,10 +63,18 @@ class FreeSpace(Projection):
     margin_sigmas: float = 3.0
     table_height: float = 0.0
 
+    def __post_init__(self) -> None:
+        margins = (self.margin_voxels, self.margin_sigmas)
+        if not (np.isfinite([*margins, self.table_height]).all() and min(margins) >= 0):
+            raise InputError(
+                f"free space has margin_voxels {self.margin_voxels}, margin_sigmas {self.margin_sigmas} and "
+                f"table_height {self.table_height}, expected finite numbers, margins >= 0"
+            )
+
     def known_free(self, frame: Frame, grid: VoxelGrid) -> np.ndarray:
         """(X, Y, Z) bool: voxels that cannot be occupied. Memoised by content."""
-        key = (frame.key, grid.key, self.margin_voxels, self.margin_sigmas, self.table_height)
-        return memo("known_free", key, lambda: self._known_free(frame, grid))
+        key = (frame.key, grid.key, component_key(self))
+        return memo("known_free", key, lambda: read_only(self._known_free(frame, grid)))
 
     def _known_free(self, frame: Frame, grid: VoxelGrid) -> np.ndarray:
         geometry = frame_geometry(frame, grid)

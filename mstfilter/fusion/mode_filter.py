@@ -49,6 +49,8 @@ class ModeFilter:
     def __post_init__(self) -> None:
         if self.window < 1 or self.window % 2 == 0:
             raise InputError(f"mode filter window is {self.window}, expected an odd number of voxels")
+        if self.max_sweeps < 1:
+            raise InputError(f"mode filter has max_sweeps {self.max_sweeps}, expected at least 1")
         if self.scope not in ("everywhere", "disputed"):
             raise InputError(f'mode filter scope is {self.scope!r}, expected "everywhere" or "disputed"')
 

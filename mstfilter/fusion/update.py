@@ -22,6 +22,7 @@ from typing import ClassVar
 
 import numpy as np
 
+from mstfilter.errors import InputError
 from mstfilter.fusion.crossover import Crossover
 from mstfilter.fusion.free_space import FreeSpace, Projection
 from mstfilter.scene.clip import Clip
@@ -30,7 +31,7 @@ from mstfilter.scene.voxels import Hypothesis
 from mstfilter.smc.interfaces import Update
 from mstfilter.smc.population import Candidates, Population
 from mstfilter.smc.resampling import Systematic
-from mstfilter.smc.streams import key_of
+from mstfilter.smc.streams import child, key_of
 from mstfilter.smc.updates import union
 
 __all__ = ["FusionUpdate"]
@@ -67,6 +68,12 @@ class FusionUpdate(Update):
 
     properly_weighted: ClassVar[bool] = False
 
+    def __post_init__(self) -> None:
+        if self.eta < 1 or self.n_scored < 0:
+            raise InputError(f"eta is {self.eta} and n_scored {self.n_scored}, expected at least 1 and 0 candidates")
+        if not (np.isfinite(self.quality_exponent) and self.quality_exponent >= 0):
+            raise InputError(f"quality_exponent is {self.quality_exponent}, expected a number >= 0")
+
     def update(
         self,
         rng: np.random.Generator,
@@ -86,7 +93,7 @@ class FusionUpdate(Update):
         if proposed is None:
             return Population(refined, predicted.log_weights + log_q, predicted.parents, notes)
 
-        i, j = _pairs(len(proposed), len(predicted), self.eta)
+        i, j = _pairs(child(rng, "order"), len(proposed), len(predicted), self.eta)
         key, samples, crossover = key_of(rng), tuple(proposed.particles), self.crossover
 
         def build(candidate: int) -> Hypothesis:
@@ -117,11 +124,14 @@ class FusionUpdate(Update):
         return tuple(h for h, _ in pairs), np.array([q for _, q in pairs])
 
 
-def _pairs(n_proposed: int, n_predicted: int, eta: int) -> tuple[np.ndarray, np.ndarray]:
+def _pairs(rng: np.random.Generator, n_proposed: int, n_predicted: int, eta: int) -> tuple[np.ndarray, np.ndarray]:
     """Sample i and prediction j of each candidate, every pair `eta` times in a row.
 
-    Each sample meets the predictions from another one onwards. In a plain order, equal strides through nearly
-    equal weights, as systematic resampling makes them, meet one and the same prediction again and again.
+    Each sample meets the predictions in cyclic order from one of its own, which the samples draw without replacement
+    as long as there are any. In one fixed order, equal strides through nearly equal weights, as systematic
+    resampling makes them, would meet one and the same prediction again and again.
     """
+    rounds = -(-n_proposed // n_predicted)
+    first = np.concatenate([rng.permutation(n_predicted) for _ in range(rounds)])[:n_proposed]
     i, k = np.divmod(np.arange(n_proposed * n_predicted), n_predicted)
-    return i.repeat(eta), ((i + k) % n_predicted).repeat(eta)
+    return i.repeat(eta), ((first[i] + k) % n_predicted).repeat(eta)

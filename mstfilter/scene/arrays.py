@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
+from collections.abc import Mapping
 
 import numpy as np
 
-__all__ = ["content_key", "read_only"]
+__all__ = ["component_key", "content_key", "frozen", "read_only"]
 
 
 def read_only(array: np.ndarray) -> np.ndarray:
@@ -14,6 +16,32 @@ def read_only(array: np.ndarray) -> np.ndarray:
     view = array.view()
     view.flags.writeable = False
     return view
+
+
+def frozen(array: np.ndarray) -> np.ndarray:
+    """A read-only array that nobody else can write to: copied unless its memory is read-only already."""
+    owner: object = array
+    while isinstance(owner, np.ndarray):
+        if owner.flags.writeable:
+            own = array.copy()
+            own.flags.writeable = False
+            return own
+        owner = owner.base
+    return array
+
+
+def component_key(component: object) -> bytes:
+    """Name by content of a component: its class, its file where it has one, and its fields, arrays included."""
+    if dataclasses.is_dataclass(component) and not isinstance(component, type):
+        cls = type(component)
+        source = getattr(cls, "__mst_source__", "")
+        fields = [component_key(getattr(component, f.name)) for f in dataclasses.fields(component)]
+        return content_key(cls.__module__, cls.__qualname__, source, *fields)
+    if isinstance(component, (tuple, list)):
+        return content_key(type(component).__name__, *(component_key(part) for part in component))
+    if isinstance(component, Mapping):
+        return content_key(*(part for k, v in component.items() for part in (k, component_key(v))))
+    return content_key(component)
 
 
 def content_key(*parts: object) -> bytes:

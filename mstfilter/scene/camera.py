@@ -19,7 +19,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from mstfilter.errors import InputError
-from mstfilter.scene.arrays import content_key, read_only
+from mstfilter.scene.arrays import content_key, frozen, read_only
 
 __all__ = ["Camera", "look_at", "rigid_from_matrix"]
 
@@ -77,7 +77,7 @@ class Camera:
                 )
             if not np.isfinite(self.T_world_camera.as_matrix()).all():
                 raise InputError("camera pose T_world_camera holds a value that is not finite")
-        object.__setattr__(self, "K", read_only(K))
+        object.__setattr__(self, "K", frozen(K))
         object.__setattr__(self, "width", int(self.width))
         object.__setattr__(self, "height", int(self.height))
 

@@ -12,7 +12,7 @@ from functools import cached_property
 import numpy as np
 
 from mstfilter.errors import InputError
-from mstfilter.scene.arrays import content_key, read_only
+from mstfilter.scene.arrays import content_key, frozen, read_only
 from mstfilter.scene.camera import Camera
 
 __all__ = ["Frame"]
@@ -57,13 +57,13 @@ class Frame:
         depth = depth.astype(np.float32, copy=True)
         with np.errstate(invalid="ignore"):
             depth[~(np.isfinite(depth) & (depth > 0))] = np.nan
-        object.__setattr__(self, "rgb", read_only(rgb))
+        object.__setattr__(self, "rgb", frozen(rgb))
         object.__setattr__(self, "depth", read_only(depth))
         if self.robot_mask is not None:
             robot = np.asarray(self.robot_mask, dtype=bool)
             if robot.shape != shape:
                 raise InputError(f"robot mask has shape {robot.shape}, expected {shape}")
-            object.__setattr__(self, "robot_mask", read_only(robot))
+            object.__setattr__(self, "robot_mask", frozen(robot))
 
     @cached_property
     def key(self) -> bytes:

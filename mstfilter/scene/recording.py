@@ -108,7 +108,11 @@ class Recording:
             raise InputError(f"recording {self.name} has {n} frames and {len(pauses)} pauses, expected at least 1")
         if list(pauses) != sorted(set(pauses)) or pauses[0] < 0 or pauses[-1] >= n:
             raise InputError(f"pauses of recording {self.name} are {pauses}, expected ascending indices below {n}")
-        if len(self.times) != n or any(b <= a for a, b in zip(self.times, self.times[1:], strict=False)):
+        if (
+            len(self.times) != n
+            or not np.isfinite(self.times).all()
+            or any(b <= a for a, b in zip(self.times, self.times[1:], strict=False))
+        ):
             raise InputError(f"times of recording {self.name} are not {n} ascending numbers")
         object.__setattr__(self, "pauses", pauses)
 
@@ -159,7 +163,7 @@ class Recording:
         rgb, depth = np.asarray(rgb), np.asarray(depth)
         if rgb.ndim == 3 and depth.ndim == 2:
             rgb, depth = rgb[None], depth[None]
-            robot_masks = None if robot_masks is None else np.asarray(robot_masks).reshape(depth.shape)
+            robot_masks = None if robot_masks is None else np.asarray(robot_masks)[None]
         if rgb.ndim != 4 or rgb.shape[-1] != 3 or depth.shape != rgb.shape[:3]:
             raise InputError(
                 f"rgb has shape {rgb.shape} and depth {depth.shape}, expected (T, H, W, 3) and (T, H, W)",
@@ -179,8 +183,11 @@ class Recording:
         if not chosen or min(chosen) < 0 or max(chosen) >= n:
             raise InputError(f"pauses are {chosen}, expected indices of the {n} frames")
         masks = [None] * n if robot_masks is None else list(np.asarray(robot_masks, dtype=bool))
-        if len(masks) != n:
-            raise InputError(f"there are {len(masks)} robot masks for {n} frames")
+        if len(masks) != n or any(m is not None and m.shape != (height, width) for m in masks):
+            found = np.shape(robot_masks)
+            raise InputError(
+                f"robot masks have shape {found}, expected {(n, height, width)} as the depth images have"
+            )
         first = Frame(rgb[chosen[0]], depth[chosen[0]], camera, masks[chosen[0]])
         camera, grid = _world(first, grid)
         frames = [Frame(rgb[i], depth[i], camera, masks[i]) for i in range(n)]
@@ -189,8 +196,14 @@ class Recording:
 
     @cached_property
     def key(self) -> bytes:
-        """Name by content of the pauses, the grid and the number of frames."""
-        return content_key(self.grid.key, len(self), *(self.frames[p].key for p in self.pauses))
+        """Name by content of every frame, the grid, the pauses and the times. Looks at every image (see `check`)."""
+        keys = []
+        for index in range(len(self)):
+            frame = self.frames[index]
+            if not np.isfinite(frame.depth).any():
+                raise InputError(f"depth image of frame {index} of {self.name} has no reading at all")
+            keys.append(frame.key)
+        return content_key(self.grid.key, self.pauses, self.times, *keys)
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -214,10 +227,7 @@ class Recording:
 
     def check(self) -> None:
         """Look at every image once, so that a broken one is known before a run begins."""
-        for index in range(len(self)):
-            frame = self.frames[index]
-            if not np.isfinite(frame.depth).any():
-                raise InputError(f"depth image of frame {index} of {self.name} has no reading at all")
+        _ = self.key
 
 
 def _check_depth(depth: np.ndarray, name: str) -> None:

@@ -81,7 +81,8 @@ def decode(arrays: dict[str, np.ndarray]) -> tuple[Hypothesis, ...]:
 def save_hypotheses(path: Path, hypotheses: Sequence[Hypothesis], **extra: np.ndarray) -> None:
     """Write hypotheses and further arrays as a compressed .npz."""
     arrays: dict[str, Any] = {**encode(hypotheses), **extra}
-    np.savez_compressed(path, **arrays)
+    with Path(path).open("wb") as file:  # by handle: numpy would add .npz to another name
+        np.savez_compressed(file, **arrays)
 
 
 def load_hypotheses(path: Path) -> tuple[tuple[Hypothesis, ...], dict[str, np.ndarray]]:
@@ -93,4 +94,7 @@ def load_hypotheses(path: Path) -> tuple[tuple[Hypothesis, ...], dict[str, np.nd
         raise InputError(f"file of hypotheses is missing: {path}") from None
     except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
         raise InputError(f"file of hypotheses cannot be read: {path} ({error})") from error
-    return decode(arrays), arrays
+    try:
+        return decode(arrays), arrays
+    except (KeyError, IndexError, ValueError) as error:
+        raise InputError(f"not a file of hypotheses: {path} ({error!r})") from error

@@ -5,7 +5,8 @@
 >>> grid = workspace(frame_with_that_camera)              # voxels around what stands on it
 
 Disparity D = 8 f b / z is affine in pixel coordinates on a plane and its noise is the same everywhere, so the
-plane is a least-squares fit of D = a u + b v + c (f in pixels, b = 0.075 m: units of 1/8 pixel of a Kinect).
+plane is a least-squares fit of D = a u + b v + c. Units are those of a Kinect (f = 525 pixels, b = 0.075 m, 1/8
+pixel) whatever the size of the image, so that thresholds mean the same noise.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from mstfilter.scene.voxels import VoxelGrid
 __all__ = ["BASELINE", "SupportPlane", "disparity", "fit_support_plane", "table_residual", "workspace"]
 
 BASELINE = 0.075  # metres between projector and camera of a Kinect v1; only sets the unit of disparity
+FOCAL = 525.0  # its focal length in pixels, likewise
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,9 +55,9 @@ class SupportPlane:
     inlier_share: float
 
 
-def disparity(depth: np.ndarray, camera: Camera) -> np.ndarray:
-    """Disparity (H, W) float64 in units of 1/8 pixel from depth in metres; NaN stays NaN."""
-    return 8.0 * camera.K[0, 0] * BASELINE / np.asarray(depth, dtype=np.float64)
+def disparity(depth: np.ndarray) -> np.ndarray:
+    """Disparity (H, W) float64 in 1/8 pixel of a Kinect from depth in metres; NaN stays NaN."""
+    return 8.0 * FOCAL * BASELINE / np.asarray(depth, dtype=np.float64)
 
 
 def fit_support_plane(
@@ -81,7 +83,7 @@ def fit_support_plane(
 
 
 def _fit(frame: Frame, inlier: float, tolerance: float, n_trials: int, min_share: float) -> SupportPlane:
-    D = disparity(np.where(frame.valid, frame.depth, np.nan), frame.camera)
+    D = disparity(np.where(frame.valid, frame.depth, np.nan))
     v, u = np.nonzero(np.isfinite(D))
     if len(v) < 100:
         raise InputError(
@@ -95,7 +97,7 @@ def _fit(frame: Frame, inlier: float, tolerance: float, n_trials: int, min_share
     few = rng.choice(len(d), size=min(len(d), 4000), replace=False)
     triples = rng.integers(0, len(few), size=(n_trials, 3))
     A = design[few][triples]
-    sound = np.abs(np.linalg.det(A)) > 1e3
+    sound = np.abs(np.linalg.det(A)) > 3e-3 * D.size  # twice the area of the triangle in pixels
     planes = np.linalg.solve(A[sound], d[few][triples[sound]][..., None])[..., 0]
     if len(planes) == 0:
         raise InputError("no support plane: all readings lie on one line of the image")
@@ -121,7 +123,7 @@ def _fit(frame: Frame, inlier: float, tolerance: float, n_trials: int, min_share
 
 def _pose(camera: Camera, plane: np.ndarray, pixels: np.ndarray) -> RigidTransform:
     """World frame of a plane given by its disparity: camera pose with z up and the plane at z = 0."""
-    scale = 8.0 * camera.K[0, 0] * BASELINE
+    scale = 8.0 * FOCAL * BASELINE
     # D = p . (u, v, 1) and (u, v, 1) = K X / z  =>  scale = p K X: the plane in camera axes.
     normal = plane @ camera.K
     offset = scale / np.linalg.norm(normal)
@@ -152,8 +154,8 @@ def table_residual(frame: Frame) -> np.ndarray:
         direction = camera.rays() @ camera.pose.as_matrix()[2, :3]
         with np.errstate(divide="ignore", invalid="ignore"):
             depth = -camera.position[2] / direction
-            table = np.where((direction < 0) & (depth > 0), disparity(depth, camera), -np.inf)
-        residual = disparity(np.where(frame.valid, frame.depth, np.nan), camera) - table
+            table = np.where((direction < 0) & (depth > 0), disparity(depth), -np.inf)
+        residual = disparity(np.where(frame.valid, frame.depth, np.nan)) - table
         return read_only(residual.astype(np.float32))
 
     return memo("table_residual", frame.key, compute)

@@ -23,11 +23,12 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from mstfilter.errors import InputError
-from mstfilter.scene.arrays import content_key, read_only
+from mstfilter.scene.arrays import content_key, frozen
 
 __all__ = ["MAX_LABEL", "Crop", "Hypothesis", "ObjectRecord", "VoxelGrid", "as_labels"]
 
 MAX_LABEL = 65535
+MAX_VOXELS = 2**28
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +58,12 @@ class VoxelGrid:
         shape = tuple(int(n) for n in self.shape)
         if len(shape) != 3 or min(shape) < 1:
             raise InputError(f"grid shape is {self.shape!r}, expected three counts of at least 1")
-        object.__setattr__(self, "origin", read_only(origin))
+        if shape[0] * shape[1] * shape[2] > MAX_VOXELS:
+            raise InputError(
+                f"a grid of {shape[0]} x {shape[1]} x {shape[2]} voxels of {self.voxel_size:g} m is too large",
+                "workspace and voxel size are in metres",
+            )
+        object.__setattr__(self, "origin", frozen(origin))
         object.__setattr__(self, "voxel_size", float(self.voxel_size))
         object.__setattr__(self, "shape", shape)
 
@@ -65,6 +71,13 @@ class VoxelGrid:
     def from_bounds(cls, lower: np.ndarray, upper: np.ndarray, voxel_size: float) -> VoxelGrid:
         """The grid that covers a box given by two corners in metres."""
         lower, upper = np.asarray(lower, dtype=np.float64), np.asarray(upper, dtype=np.float64)
+        if not (
+            np.isfinite(voxel_size) and voxel_size > 0 and (upper > lower).all() and np.isfinite(upper - lower).all()
+        ):
+            raise InputError(
+                f"workspace from {lower.tolist()} to {upper.tolist()} in voxels of {voxel_size} m holds nothing",
+                "min must be below max in all three axes, in metres",
+            )
         shape = np.maximum(1, np.ceil((upper - lower) / voxel_size - 1e-6)).astype(int)
         return cls(lower, voxel_size, tuple(shape))
 
@@ -120,8 +133,8 @@ class Crop:
     offset: np.ndarray
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "occupied", read_only(np.asarray(self.occupied, dtype=bool)))
-        object.__setattr__(self, "offset", read_only(np.asarray(self.offset, dtype=np.int64)))
+        object.__setattr__(self, "occupied", frozen(np.asarray(self.occupied, dtype=bool)))
+        object.__setattr__(self, "offset", frozen(np.asarray(self.offset, dtype=np.int64)))
 
     @classmethod
     def of(cls, mask: np.ndarray) -> Crop:
@@ -223,7 +236,7 @@ class Hypothesis:
         labels = as_labels(self.labels)
         if labels.shape != self.grid.shape:
             raise InputError(f"label grid has shape {labels.shape}, the voxel grid is {self.grid.shape}")
-        object.__setattr__(self, "labels", read_only(labels))
+        object.__setattr__(self, "labels", frozen(labels))
         numbers = [o.label for o in self.objects]
         if any(b <= a for a, b in pairwise(numbers)):
             raise InputError(f"object records are not in ascending order of labels: {numbers}")

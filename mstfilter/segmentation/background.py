@@ -27,4 +27,4 @@ def above_table(frame: Frame) -> np.ndarray:
         residual = fit_support_plane(frame).residual
     else:
         residual = table_residual(frame)
-    return residual * np.float32(SENSOR_FOCAL / frame.camera.K[0, 0])
+    return residual

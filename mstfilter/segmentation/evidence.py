@@ -19,6 +19,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from mstfilter.scene.arrays import component_key
 from mstfilter.scene.clip import Clip
 from mstfilter.scene.evidence import Evidence
 from mstfilter.scene.frame import Frame
@@ -69,7 +70,7 @@ class BoundaryAgreement(Evidence):
     def log_score(self, hypotheses: Sequence[Hypothesis], clip: Clip) -> np.ndarray:
         """`strength` times the mean log probability a pixel of border."""
         frame = clip.after
-        key = (frame.key, repr(self))
+        key = (frame.key, component_key(self))
         borders = memo("borders", key, lambda: self._borders(frame))
         valid = frame.valid.ravel()
         n = int(borders.leaves.max()) + 1

@@ -120,6 +120,8 @@ class ParticleFilter:
     def __post_init__(self) -> None:
         if self.n < 1:
             raise InputError(f"n is {self.n}, expected at least one particle")
+        if self.n_proposed < 0:
+            raise InputError(f"n_proposed is {self.n_proposed}, expected at least 0")
         if self.initial is None and self.proposal is None:
             raise InputError("the filter has neither `initial` nor `proposal`: no particles to start from")
         if self.resample not in ("after", "before"):
@@ -132,7 +134,9 @@ class ParticleFilter:
 
     @property
     def properly_weighted(self) -> bool:
-        """Whether every component is."""
+        """Whether every component is, and no proposal adds particles to weights that carry the evidence so far."""
+        if self.proposal is not None:
+            return False
         parts = (getattr(self, slot) for slot in SLOTS)
         return all(part.properly_weighted for part in parts if isinstance(part, Component))
 
@@ -229,7 +233,7 @@ class ParticleFilter:
     def _predict(self, past: Population | None, observation: Any, streams: Key, watch: Watch) -> Population | None:
         """Predicted particles; None at the first step of a filter that starts from its proposal."""
         if past is None:
-            if self.initial is None or self.initial is self.proposal:
+            if self.initial is None or self.initial == self.proposal:
                 return None
             watch.enter("initial")
             population = self.initial.sample(streams.child("initial").generator(), observation, self.n)

@@ -228,6 +228,10 @@ class Every(Trigger):
 
     k: int = 2
 
+    def __post_init__(self) -> None:
+        if self.k < 1:
+            raise InputError(f"resampling at every k-th step: k is {self.k}, expected at least 1")
+
     def wants(self, population: Population, t: int) -> bool:
         """True where t is a multiple of k."""
         return t % self.k == 0

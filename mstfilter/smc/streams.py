@@ -104,7 +104,9 @@ def key_of(rng: np.random.Generator) -> Key:
             "make it with numpy.random.default_rng(seed) or Key(seed).generator()",
         )
     path = tuple(int(n) for n in sequence.spawn_key)
-    return Key(int(sequence.entropy), path[1:] if path[:1] == (_PREFIX,) else (_PREFIX, *path))
+    if path[:1] == (_PREFIX,):
+        return Key(int(sequence.entropy), path[1:])
+    return Key(int(sequence.entropy), (_PREFIX, len(path), *path))  # its length: a child is no sibling's namesake
 
 
 def _words(number: int) -> list[int]:

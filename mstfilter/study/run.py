@@ -8,6 +8,7 @@ where it was, to the same result, when it is started again with the same configu
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import platform
 from collections.abc import Callable, Mapping
@@ -69,6 +70,7 @@ def execute(
             "seed": int(seed),
             "description": config.get("description", ""),
             "config": describe_filter(filter),
+            "files": _files(filter),
             "recording": {
                 "name": recording.name,
                 "key": recording.key.hex(),
@@ -76,44 +78,67 @@ def execute(
                 "times": [recording.times[p] for p in recording.pauses],
                 "generator": recording.manifest.get("generator"),
             },
+            "versions": versions(),
         }
     )
-    folder = _open(path, wanted)
-    clips, done = recording.clips(), folder.n_pauses
-    state = folder.state(done - 1) if done else filter.start(int(seed))
+    folder = _existing(path, wanted)
+    clips = recording.clips()
+    done = 0 if folder is None else folder.n_pauses
+    state = folder.state(done - 1) if folder is not None and done else filter.start(int(seed))
     progress(Progress(done, len(clips)))
     try:
         for clip in clips[done:]:
             state, info = filter.step(state, clip)
+            if folder is None:  # what fails at the first step leaves nothing behind
+                folder = RunFolder.create(path, wanted)
             folder.write_pause(clip, state, info, recording.truth(clip.index))
             progress(Progress(clip.index + 1, len(clips), sum(info.seconds.values())))
     except KeyboardInterrupt:
-        folder.set_status("interrupted")
+        if folder is not None:
+            folder.set_status("interrupted")
         raise
     except BaseException:
-        folder.set_status("failed")
+        if folder is not None:
+            folder.set_status("failed")
         raise
+    assert folder is not None
     folder.write_metrics()
     folder.set_status("done")
     return folder
 
 
-def _open(path: Path, wanted: dict[str, Any]) -> RunFolder:
-    """A new run folder, or that of the same run."""
+def _existing(path: Path, wanted: dict[str, Any]) -> RunFolder | None:
+    """The folder of the same run, to go on with; None where there is none yet."""
     if (path / "run.json").is_file():
         folder = RunFolder.open(path)
-        for what in ("seed", "config", "recording"):
+        for what in ("seed", "config", "files", "recording", "versions"):
             found = folder.description.get(what)
             if found != wanted[what]:
                 raise InputError(
-                    f"run folder {path} holds another run: its {what} differs{_first_difference(found, wanted[what])}",
+                    f"run folder {path} holds another run: its {what} differs"
+                    + _first_difference(found, wanted[what]),
                     "choose another folder, or remove this one",
                 )
         folder.set_status("running")
         return folder
     if path.exists() and (not path.is_dir() or any(path.iterdir())):
         raise InputError(f"cannot write a run to {path}: it exists and is not an empty folder", "choose another name")
-    return RunFolder.create(path, {**wanted, "versions": versions()})
+    return None
+
+
+def _files(component: Any) -> dict[str, str]:
+    """Content hashes of the users' files that components come from."""
+    found = {}
+    if dataclasses.is_dataclass(component):
+        cls = type(component)
+        if "__mst_source__" in cls.__dict__:
+            found[cls.__dict__["__mst_file__"]] = cls.__dict__["__mst_source__"]
+        for field in dataclasses.fields(component):
+            found.update(_files(getattr(component, field.name)))
+    elif isinstance(component, tuple):
+        for part in component:
+            found.update(_files(part))
+    return found
 
 
 def _first_difference(found: Any, wanted: Any, where: str = "") -> str:

@@ -6,7 +6,6 @@
 Layout::
 
     run.json                 what was run: configuration, seed, versions, recording, status
-    recording.json           camera and workspace
     pauses/000/rgb.png       the image at the pause          pauses/000/hypotheses.npz   particles and log weights
     pauses/000/info.json     what happened in the step       pauses/000/camera.json      pose at the pause
     pauses/000/truth.npz     true labels, where known        pauses/000/seconds.json     wall time by part
@@ -103,7 +102,7 @@ class RunFolder:
     def create(cls, path: Path, description: Mapping[str, Any]) -> RunFolder:
         """A new run folder that holds only its description."""
         try:
-            (path / "pauses").mkdir(parents=True, exist_ok=True)
+            path.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise InputError(f"cannot write run folder {path}: {error.strerror}") from error
         write_json(path / "run.json", {"format": FORMAT, "status": "running", **description})

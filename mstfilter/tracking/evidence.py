@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from mstfilter.scene.arrays import component_key
 from mstfilter.scene.clip import Clip
 from mstfilter.scene.evidence import Evidence
 from mstfilter.scene.memo import memo
@@ -60,7 +61,7 @@ class MotionAgreement(Evidence):
             return np.zeros(len(hypotheses))
         p, q, pixel = memo(
             "followed points",
-            (clip.before.key, clip.after.key, len(clip), repr(self.flow)),
+            (clip.before.key, clip.after.key, len(clip), component_key(self.flow)),
             lambda: self._points(clip),
         )
         return np.array([self._score(project(h, clip.after.camera), p, q, pixel) for h in hypotheses])

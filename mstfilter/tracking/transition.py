@@ -22,7 +22,7 @@ from mstfilter.scene.voxels import Hypothesis
 from mstfilter.smc.interfaces import Transition
 from mstfilter.smc.population import Population
 from mstfilter.smc.streams import child
-from mstfilter.tracking.flow import DenseFlow
+from mstfilter.tracking.flow import ClipTracks, DenseFlow
 from mstfilter.tracking.mst_rule import MstRule
 from mstfilter.tracking.rules import IDENTITY, Candidate, MotionRule
 from mstfilter.tracking.segments import Segment, segments_of
@@ -85,6 +85,7 @@ class TrackingTransition(Transition):
         if observation is None or len(observation.frames) < 2:
             return _successor(population, particles, {"motions": {}, "segments": 0})
         clip = observation
+        tracks = self.flow.track(clip)  # once: asking reads every frame of a long clip
         cache: dict[bytes, tuple[str, tuple[Candidate, ...]]] = {}
         occurrences: Counter[bytes] = Counter()
         counts: Counter[str] = Counter()
@@ -96,7 +97,7 @@ class TrackingTransition(Transition):
             segments = segments_of(hypothesis, clip.before) if hypothesis.n_objects else {}
             motions, scores = {}, {}
             for record in hypothesis.objects:
-                fate, candidates = self._track(rng, clip, segments.get(record.label), cache)
+                fate, candidates = self._track(rng, clip, tracks, segments.get(record.label), cache)
                 chosen = IDENTITY
                 if candidates:
                     chosen = self.rule.choose(child(own, "object", record.label), candidates)
@@ -117,6 +118,7 @@ class TrackingTransition(Transition):
         self,
         rng: np.random.Generator,
         clip: Clip,
+        tracks: ClipTracks,
         segment: Segment | None,
         cache: dict[bytes, tuple[str, tuple[Candidate, ...]]],
     ) -> tuple[str, tuple[Candidate, ...]]:
@@ -124,15 +126,15 @@ class TrackingTransition(Transition):
         if segment is None:
             return "invisible", ()
         if segment.key not in cache:
-            cache[segment.key] = self._track_anew(rng, clip, segment)
+            cache[segment.key] = self._track_anew(rng, clip, tracks, segment)
         return cache[segment.key]
 
     def _track_anew(
-        self, rng: np.random.Generator, clip: Clip, segment: Segment
+        self, rng: np.random.Generator, clip: Clip, tracks: ClipTracks, segment: Segment
     ) -> tuple[str, tuple[Candidate, ...]]:
         if len(segment.support) < self.min_support:
             return "unsupported", ()
-        track = Track(segment, clip, self.flow.track(clip))
+        track = Track(segment, clip, tracks)
         if self.static.rests(track):
             return "static", ()
         candidates = self.rule.candidates(child(rng, "segment", _number(segment.key)), track)

@@ -60,3 +60,24 @@ def test_table_and_none():
     assert NoFreeSpace().project(TRUTH, FRAME) == (TRUTH, 1.0)
     nothing = Hypothesis.from_labels(np.zeros(GRID.shape, np.uint16), GRID)
     assert FreeSpace().project(nothing, FRAME) == (nothing, 1.0)
+
+
+def test_the_margin_covers_the_noise():
+    """Without the margin for noise, a noisy image eats into what stands there; with it, hardly."""
+    noisy = Frame(RGB, table_scene(noise=np.random.default_rng(1))[1], CAMERA)
+    labels = LABELS.copy()
+    labels[:, :, 0][labels[:, :, 0] == 0] = 9  # a mat one voxel thick: most of its centres lie just above the reading
+    mat = Hypothesis.from_labels(labels, GRID)
+    strict = FreeSpace(margin_voxels=0.45, margin_sigmas=0.0).project(mat, noisy)[1]
+    kind = FreeSpace(margin_voxels=0.45, margin_sigmas=3.0).project(mat, noisy)[1]
+    assert strict < kind - 0.02
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"margin_sigmas": float("nan")}, {"margin_voxels": -1.0}, {"table_height": float("inf")}]
+)
+def test_wrong_fields(wrong):
+    from mstfilter.errors import InputError
+
+    with pytest.raises(InputError):
+        FreeSpace(**wrong)

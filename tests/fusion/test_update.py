@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -13,7 +13,7 @@ from scipy.spatial.transform import RigidTransform
 
 from mstfilter.errors import InputError
 from mstfilter.fusion.crossover import Crossover
-from mstfilter.fusion.free_space import NoFreeSpace
+from mstfilter.fusion.free_space import NoFreeSpace, Projection
 from mstfilter.fusion.mode_filter import ModeFilter
 from mstfilter.fusion.structure import RandomOrder, SpanningTree
 from mstfilter.fusion.update import FusionUpdate
@@ -194,9 +194,9 @@ def test_the_authors_real_particles(shared_data):
     config = load_config("authors", ["update.free_space=none"])
     update = build("update", config["update"])
     assert isinstance(update.free_space, NoFreeSpace)
-    # There is no depth, so Q comes with the data: it enters through the weights.
-    carried = measured["weight"][0, :5] + update.quality_exponent * np.log(quality)
-    predicted = Population(predictions, carried, {"previous": np.arange(5)})
+    # There is no depth: the projection is off and hands out the Q that came with the data.
+    update = replace(update, free_space=ShippedQuality({h.key: q for h, q in zip(predictions, quality, strict=True)}))
+    predicted = Population(predictions, measured["weight"][0, :5], {"previous": np.arange(5)})
     rgb, depth, _ = table_scene()
     fused = update.update(np.random.default_rng(0), predicted, proposed, Clip((Frame(rgb, depth, CAMERA),), grid, 1))
     assert len(fused) == 125
@@ -224,15 +224,79 @@ def test_the_authors_real_particles(shared_data):
     np.testing.assert_array_equal(kept.log_weights, fused.log_weights[kept.parents["ancestor"]])
 
 
-def test_systematic_resampling_reaches_all_parents():
-    """With equal weights, 5 of 125 candidates come from 5 different samples and 5 different predictions."""
+@pytest.mark.parametrize(
+    ("n", "n_proposed"), [(2, 4), (3, 10), (5, 5), (5, 10), (5, 25), (5, 50), (10, 20), (10, 50)]
+)
+def test_systematic_resampling_reaches_many_parents(n, n_proposed):
+    """With equal weights, no stride through the candidates meets one prediction again and again.
+
+    n independent draws would reach n (1 - (1 - 1/n)^n) predictions on average; ours must reach as many, within 4
+    standard errors of 60 runs (false alarm below 1e-4 a case), and all of them where there are as many samples.
+    """
     from mstfilter.smc.resampling import Systematic
 
     hypothesis = Hypothesis.from_labels(np.ones(SMALL.shape, np.uint16), SMALL)
-    predicted = Population((hypothesis,) * 5, None, {"previous": np.arange(5)})
-    proposed = Population((hypothesis,) * 5, None, {"proposed": np.arange(5)})
-    fused = FusionUpdate(free_space=NoFreeSpace()).update(np.random.default_rng(0), predicted, proposed, clip())
-    for seed in range(20):
-        chosen = Systematic().resample(np.random.default_rng(seed), fused, 5)
-        assert set(chosen.parents["previous"].tolist()) == set(range(5))
-        assert set(chosen.parents["proposed"].tolist()) == set(range(5))
+    predicted = Population((hypothesis,) * n, None, {"previous": np.arange(n)})
+    proposed = Population((hypothesis,) * n_proposed, None, {"proposed": np.arange(n_proposed)})
+    reached = []
+    for seed in range(60):
+        fused = FusionUpdate(free_space=NoFreeSpace()).update(
+            np.random.default_rng(seed), predicted, proposed, clip()
+        )
+        chosen = Systematic().resample(np.random.default_rng(seed), fused, n)
+        assert len(set(chosen.parents["proposed"].tolist())) == min(n, n_proposed)
+        reached.append(len(set(chosen.parents["previous"].tolist())))
+    if n_proposed == n:
+        assert set(reached) == {n}
+    assert np.mean(reached) > n * (1 - (1 - 1 / n) ** n) - 4 * max(np.std(reached), 0.3) / np.sqrt(60)
+
+
+@dataclass(frozen=True)
+class ShippedQuality(Projection):
+    """Hands out the quality that came with the data, by the particle's own voxels."""
+
+    by_key: dict
+
+    def project(self, hypothesis, frame):
+        return hypothesis, self.by_key[hypothesis.key]
+
+
+def test_the_drop_rule_loses_late_loose_objects_and_only_on_request():
+    """An unconflicted object whose first voxel comes after those of all conflicting ones."""
+    a, b = np.zeros(SMALL.shape, np.uint16), np.zeros(SMALL.shape, np.uint16)
+    a[0, 0, 0], b[:2, 0, 0], b[4, 3, 2] = 1, 1, 2  # label 2 stands alone, at the end of the scan
+    proposed, predicted = Hypothesis.from_labels(a, SMALL, 1), Hypothesis.from_labels(b, SMALL)
+    for drop, left in ((False, True), (True, False)):
+        crossover = Crossover(mode_filter=NO_FILTER, drop_rule=drop)
+        child = crossover.mix(np.random.default_rng(0), proposed, predicted)
+        assert bool(child.labels[4, 3, 2]) == left
+    b[4, 3, 2], b[0, 3, 2] = 0, 0
+    a[4, 0, 0] = 1  # the conflict now reaches beyond nothing loose: nothing to drop
+    same = Crossover(mode_filter=NO_FILTER, drop_rule=True).mix(
+        np.random.default_rng(0), Hypothesis.from_labels(a, SMALL, 1), Hypothesis.from_labels(b, SMALL)
+    )
+    assert ((same.labels > 0) == ((a > 0) | (b > 0))).all()
+
+
+def test_history_ends_where_fusion_changes_voxels():
+    """A predicted object that gains or loses a voxel starts anew."""
+    b = np.zeros(SMALL.shape, np.uint16)
+    b[:2, :2] = 1
+    moved = RigidTransform.from_translation([0.01, 0, 0])
+    predicted = Hypothesis.from_labels(b, SMALL)
+    record = replace(predicted.objects[0], source=Crop.of(b == 1), motion=moved)
+    predicted = Hypothesis(b, SMALL, (record,))
+    a = np.zeros(SMALL.shape, np.uint16)
+    a[1:3, :2] = 1
+    child = Crossover(merge="always", mode_filter=NO_FILTER).mix(
+        np.random.default_rng(0), Hypothesis.from_labels(a, SMALL, 1), predicted
+    )
+    assert child.objects[0].id == record.id
+    assert child.objects[0].source is None
+    assert np.allclose(child.objects[0].motion.as_matrix(), np.eye(4))
+
+
+@pytest.mark.parametrize("wrong", [{"eta": 0}, {"eta": -1}, {"quality_exponent": float("nan")}, {"n_scored": -1}])
+def test_wrong_fields(wrong):
+    with pytest.raises(InputError):
+        FusionUpdate(**wrong)

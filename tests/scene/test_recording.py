@@ -237,3 +237,79 @@ def test_grids_of_any_kind_are_kept(tmp_path):
     grid = VoxelGrid((-0.2, -0.25, -0.01), 0.015, (30, 31, 17))
     recording = Recording.from_arrays(rgb, depth, CAMERA.K, T_world_camera=CAMERA.pose, grid=grid)
     assert Recording.open(save(recording, tmp_path / "r")).grid == grid
+
+
+def test_a_moving_camera_keeps_its_poses(tmp_path):
+    """Poses by frame are read, used, and written again."""
+    from scipy.spatial.transform import RigidTransform
+
+    with RecordingWriter(tmp_path / "r", CAMERA, GRID) as writer:
+        for index in range(3):
+            rgb, depth, _ = table_scene(shift=index)
+            turned = RigidTransform.from_translation([0.01 * index, 0, 0]) * CAMERA.pose
+            extra = {"T_world_camera": turned.as_matrix().tolist()} if index else {}
+            writer.add_frame(rgb, depth, index / 5, "static", **extra)
+    recording = Recording.open(tmp_path / "r")
+    positions = [recording.frames[k].camera.position for k in range(3)]
+    np.testing.assert_allclose(np.diff(positions, axis=0), [[0.01, 0, 0]] * 2, atol=1e-12)
+    np.testing.assert_allclose(
+        recording.frames[2].points[40, 40] - recording.frames[2].camera.position,
+        Recording.open(tmp_path / "r").frames[0].camera.at(CAMERA.pose).unproject(recording.frames[2].depth)[40, 40]
+        - CAMERA.position,
+        atol=1e-9,
+    )
+    again = Recording.open(save(recording, tmp_path / "again"))
+    np.testing.assert_allclose([again.frames[k].camera.position for k in range(3)], positions, atol=1e-12)
+
+
+def test_what_was_recorded_cannot_be_changed_from_outside():
+    """A buffer that is used again for the next image does not reach into the last one."""
+    from mstfilter.scene.frame import Frame
+
+    rgb, depth, _ = table_scene()
+    robot = np.zeros(depth.shape, bool)
+    frame = Frame(rgb, depth, CAMERA, robot)
+    before = frame.rgb.copy()
+    rgb[:], depth[:], robot[:] = 0, 9, True
+    np.testing.assert_array_equal(frame.rgb, before)
+    assert not frame.robot_mask.any()
+    assert np.nanmax(frame.depth) < 9
+    again = Frame(frame.rgb, frame.depth, CAMERA)
+    assert np.shares_memory(again.rgb, frame.rgb)  # what is frozen already is shared
+
+
+MORE_FAULTS = {
+    "ragged K": (lambda f: change(f, "camera.json", lambda c: c.update(K=[[1, 2], [3]])), "K"),
+    "workspace upside down": (
+        lambda f: change(f, "camera.json", lambda c: c["workspace"].update(min=[1, 1, 1], max=[0, 0, 0])),
+        "holds nothing",
+    ),
+    "workspace in mm": (
+        lambda f: change(f, "camera.json", lambda c: c["workspace"].update(min=[-500] * 3, max=[500] * 3)),
+        "too large",
+    ),
+    "truncated truth": (
+        lambda f: (f / "voxels.npz").write_bytes((f / "voxels.npz").read_bytes()[:300]),
+        "cannot be read",
+    ),
+    "time NaN": (
+        lambda f: change(f, "manifest.json", lambda m: m["frames"][1].update(time_s=float("nan"))),
+        "ascending",
+    ),
+}
+
+
+@pytest.mark.parametrize("fault", MORE_FAULTS)
+def test_more_broken_recordings(folder, fault):
+    spoil, message = MORE_FAULTS[fault]
+    spoil(folder)
+    with pytest.raises(InputError, match=message):
+        Recording.open(folder).check()
+
+
+def test_small_images_find_their_table_too():
+    """Thresholds are in units of the sensor, not of pixels: a quarter of the size, the same plane."""
+    rgb, depth, _ = table_scene(noise=np.random.default_rng(0))
+    small = CAMERA.scaled(0.5)
+    recording = Recording.from_arrays(rgb[::2, ::2], depth[::2, ::2], small.K)
+    assert abs(recording.frames[0].camera.position[2] - CAMERA.position[2]) < 6e-3

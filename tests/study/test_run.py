@@ -87,9 +87,12 @@ def test_an_interrupted_run_goes_on_to_the_same_result(recording, tmp_path, stop
 
     with pytest.raises(KeyboardInterrupt):
         execute(recording, load_config("mst"), tmp_path / "part", seed=2, progress=interrupt)
-    left = RunFolder.open(tmp_path / "part")
-    assert left.n_pauses == stop
-    (tmp_path / "part" / "pauses" / f".{stop:03d}.partial").mkdir(exist_ok=True)  # what a kill leaves behind
+    if stop == 0:
+        assert not (tmp_path / "part").exists()  # nothing was done: nothing is there
+    else:
+        assert RunFolder.open(tmp_path / "part").n_pauses == stop
+        assert RunFolder.open(tmp_path / "part").description["status"] == "interrupted"
+        (tmp_path / "part" / "pauses" / f".{stop:03d}.partial").mkdir(exist_ok=True)  # what a kill leaves behind
     execute(recording, load_config("mst"), tmp_path / "part", seed=2)
     whole, part = content(tmp_path / "whole"), content(tmp_path / "part")
     assert whole.keys() == part.keys()
@@ -214,3 +217,33 @@ def test_presets_are_complete():
     assert preset_names() == ["authors", "mst", "paper"]
     for name in preset_names():
         assert not build_filter(load_config(name)).properly_weighted
+
+
+def test_what_a_run_was_made_of_is_remembered(recording, tmp_path):
+    """Another image between the pauses, another component file: another run."""
+    source = tmp_path / "mine.py"
+    text = (
+        "from dataclasses import dataclass\n"
+        "from mstfilter.smc.resampling import Systematic\n"
+        "@dataclass(frozen=True)\n"
+        "class Mine(Systematic):\n"
+        "    pass\n"
+    )
+    source.write_text(text)
+    config = load_config("mst", [f"resampler={source}:Mine"])
+    execute(recording, config, tmp_path / "run", allow_files=True)
+    execute(recording, config, tmp_path / "run", allow_files=True)  # the same: nothing to do
+    source.write_text(text + "# another\n")
+    with pytest.raises(InputError, match="its files differs"):
+        execute(recording, config, tmp_path / "run", allow_files=True)
+    changed = tmp_path / "changed"
+    shutil.copytree(recording.path, changed)
+    shutil.copy(changed / "rgb" / "000000.png", changed / "rgb" / "000001.png")
+    assert Recording.open(changed).key != recording.key
+
+
+@pytest.mark.parametrize("override", ["update.eta=0", "n_proposed=-1", "update.quality_exponent=nan", "trigger.k=0"])
+def test_useless_settings_make_no_folder(recording, tmp_path, override):
+    with pytest.raises(InputError):
+        execute(recording, load_config("mst", ["trigger=every", override]), tmp_path / "run")
+    assert not (tmp_path / "run").exists()

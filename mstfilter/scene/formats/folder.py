@@ -12,6 +12,7 @@ from __future__ import annotations
 import json
 import math
 import shutil
+import zipfile
 from collections import OrderedDict
 from pathlib import Path
 from types import TracebackType
@@ -72,6 +73,8 @@ def _load(path: Path, model: type[BaseModel]) -> Any:
         ) from None
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
         raise InputError(f"{path} is not valid JSON: {error}") from error
+    except OSError as error:
+        raise InputError(f"{path} cannot be read: {error.strerror}") from error
     try:
         return model.model_validate(data), data
     except ValidationError as error:
@@ -111,8 +114,8 @@ def open_folder(path: Path) -> Recording:
         raise InputError(f"{path / 'manifest.json'}: there are no frames")
 
     where = f"{path / 'camera.json'}: T_world_camera"
-    pose = None if described.T_world_camera is None else rigid_from_matrix(np.array(described.T_world_camera), where)
-    camera = Camera(np.array(described.K), described.width, described.height, pose)
+    pose = None if described.T_world_camera is None else rigid_from_matrix(described.T_world_camera, where)
+    camera = Camera(described.K, described.width, described.height, pose)
     grid = None
     if described.workspace is not None:
         w = described.workspace
@@ -122,9 +125,7 @@ def open_folder(path: Path) -> Recording:
         raise InputError(f"{path / 'manifest.json'}: no frame has role static, so there is no pause to segment")
 
     poses = {
-        e.index: rigid_from_matrix(
-            np.array(e.T_world_camera), f"{path / 'manifest.json'}: T_world_camera of frame {e.index}"
-        )
+        e.index: rigid_from_matrix(e.T_world_camera, f"{path / 'manifest.json'}: T_world_camera of frame {e.index}")
         for e in entries
         if e.T_world_camera is not None
     }
@@ -179,14 +180,16 @@ def _read_voxels(path: Path, grid: VoxelGrid, pauses: tuple[int, ...]) -> Any:
                 data["origin"],
                 float(data["voxel_size"]),
             )
-    except (OSError, ValueError, KeyError) as error:
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
         raise InputError(f"true volumes cannot be read: {path} ({error})") from error
     if labels.shape[1:] != grid.shape or not np.allclose(origin, grid.origin) or abs(size - grid.voxel_size) > 1e-9:
         raise InputError(
             f"{path}: grid {labels.shape[1:]} at {origin.tolist()} with voxels of {size} m differs from "
             f"the workspace {grid.shape} at {grid.origin.tolist()} with {grid.voxel_size} m"
         )
-    return truth_reader(labels, frames, pauses)
+    if len(labels) != len(frames):
+        raise InputError(f"{path}: there are {len(labels)} label grids for {len(frames)} frames")
+    return truth_reader(as_labels(labels, f"{path}: labels"), frames, pauses)
 
 
 class RecordingWriter:
@@ -353,11 +356,13 @@ class RecordingWriter:
 
 
 def save(recording: Recording, path: str | Path, **manifest: Any) -> Path:
-    """Write any recording as a folder of our own."""
-    with RecordingWriter(path, recording.frames[0].camera, recording.grid, **manifest) as writer:
+    """Write any recording as a folder of our own; a camera that moves keeps its pose in every frame."""
+    home = recording.frames[recording.pauses[0]].camera
+    with RecordingWriter(path, home, recording.grid, **manifest) as writer:
         for index in range(len(recording)):
             frame = recording.frames[index]
             pause = index in recording.pauses
+            moved = {} if frame.camera.key == home.key else {"T_world_camera": frame.camera.pose.as_matrix().tolist()}
             writer.add_frame(
                 frame.rgb,
                 frame.depth,
@@ -365,6 +370,7 @@ def save(recording: Recording, path: str | Path, **manifest: Any) -> Path:
                 "static" if pause else "action",
                 instance=recording.instance(index),
                 robot_mask=frame.robot_mask,
+                **moved,
             )
             truth = recording.truth(recording.pauses.index(index)) if pause else None
             if truth is not None:
