@@ -185,6 +185,21 @@ def test_scored_candidates_count_once_and_carry_prediction_times_likelihood():
     np.testing.assert_allclose(np.diff(fused.log_weights), np.diff(expected[states]), atol=1e-10)
 
 
+def test_scoring_without_crossover_keeps_to_the_parents():
+    _, glances = WORLD.simulate(np.random.default_rng(1), 2)
+    proposed = SampledCuts(WORLD).sample(np.random.default_rng(2), glances[1], 6)
+    predicted = Population(WORLD.states.take(WORLD.draw_prior(np.random.default_rng(3), 6)))
+    fusion = preset("mst", WORLD, 6).update
+    fused = ScoredFusion(WORLD, fusion, first=0, parents=True).update(
+        np.random.default_rng(0), predicted, proposed, glances[1]
+    )
+    np.testing.assert_array_equal(
+        WORLD.states.index(fused.particles), WORLD.states.index([*predicted.particles, *proposed.particles])
+    )
+    with pytest.raises(InputError, match="no candidates"):
+        ScoredFusion(WORLD, fusion, first=0)
+
+
 def test_measures_of_the_exact_law_are_zero_and_of_a_wrong_one_known():
     truth, glances = WORLD.simulate(np.random.default_rng(1), 1)
     p = exact_filter(WORLD, glances).posterior[0]

@@ -16,6 +16,7 @@ With all three, and candidates that cover what is probable, the weights are thos
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import reduce
 from typing import ClassVar
 
 import numpy as np
@@ -55,7 +56,7 @@ class ScoredFusion(Update):
     fusion : FusionUpdate
         Makes the candidates.
     first : int
-        Candidates that are built, as a multiple of the predicted particles.
+        Candidates that are built, as a multiple of the predicted particles. 0: no crossover (with `parents`).
     distinct : bool
         Each distinct candidate counts once.
     predictive : bool
@@ -73,6 +74,10 @@ class ScoredFusion(Update):
 
     properly_weighted: ClassVar[bool] = False
 
+    def __post_init__(self) -> None:
+        if self.first < 0 or (self.first == 0 and not self.parents):
+            raise InputError(f"first is {self.first}, and without parents there would be no candidates")
+
     def update(
         self,
         rng: np.random.Generator,
@@ -85,15 +90,17 @@ class ScoredFusion(Update):
         if predicted is None or proposed is None:
             built = union(predicted, proposed)
         else:
-            # Q is of the reading, which the score knows better; the first stage draws by the parents alone.
-            fusion = replace(self.fusion, quality_exponent=0.0)
-            candidates = fusion.update(rng, predicted, proposed, observation)  # type: ignore[arg-type]
-            m = self.first * len(predicted)
-            chosen, _ = Multinomial().select(child(rng, "first stage"), candidates.log_weights, m)
-            built = candidates.take(chosen, np.zeros(m)).realised()
+            parts = []
+            if self.first > 0:
+                # Q is of the reading, which the score knows better; the first stage draws by the parents alone.
+                fusion = replace(self.fusion, quality_exponent=0.0, evidence=())
+                candidates = fusion.update(rng, predicted, proposed, observation)  # type: ignore[arg-type]
+                m = self.first * len(predicted)
+                chosen, _ = Multinomial().select(child(rng, "first stage"), candidates.log_weights, m)
+                parts.append(candidates.take(chosen, np.zeros(m)).realised())
             if self.parents:
-                level = [replace(p, log_weights=np.zeros(len(p))) for p in (predicted, proposed)]
-                built = union(built, union(*level))
+                parts += [replace(p, log_weights=np.zeros(len(p))) for p in (predicted, proposed)]
+            built = reduce(union, parts)
         states = world.states.index(built.particles)
         score = world.log_likelihood(observation)[states]
         if self.predictive:
@@ -116,7 +123,9 @@ class BalancedUpdate(Update):
     ----------
     world : Miniature
     samples : SampledCuts
-        The filter's own proposal, with `prior_share` > 0 so that it reaches every state.
+        Draws as many samples as there are moved hypotheses, where the filter brings none; with `prior_share` > 0, so
+        that they reach every state. A filter with a proposal of its own does not count as properly weighted, since
+        the driver cannot know that its density is divided out.
     share : float
         Of the samples in the mixture.
     """
@@ -134,8 +143,10 @@ class BalancedUpdate(Update):
     ) -> Population:
         """Weighted union; the log mean of the weights goes on to be the log evidence."""
         world = self.world
-        if predicted is None or proposed is None:
-            raise InputError("the balanced update mixes moved hypotheses with samples, and one of the two is missing")
+        if predicted is None:
+            raise InputError("the balanced update mixes samples with moved hypotheses, and there are none")
+        if proposed is None:
+            proposed = self.samples.sample(child(rng, "samples"), observation, len(predicted))
         log_g = world.log_likelihood(observation)
         if observation.action < 0:  # no past: the prior, of which the first particles are draws
             past = followed = world.prior
@@ -160,12 +171,10 @@ def balanced_filter(
 
     No observation may be missing.
     """
-    samples = SampledCuts(world, prior_share=0.1)
     return ParticleFilter(
         initial=Prior(world),
         transition=Push(world, rearranged=False),
-        proposal=samples,
-        update=BalancedUpdate(world, samples),
+        update=BalancedUpdate(world, SampledCuts(world, prior_share=0.1)),
         resampler=resampler if resampler is not None else Systematic(),
         trigger=trigger if trigger is not None else EssBelow(0.5),
         n=n,
