@@ -3,7 +3,7 @@
 For every region of one segmentation take the region of the other that overlaps it best (Jaccard index J),
 and average by size:
 
-    side(A -> B) = sum_{a in A} |a| max_{b in B} J(a, b)
+    side(A -> B) = sum_{a in A} size(a) max_{b in B} J(a, b)
 
 Three forms, by name:
 

@@ -184,9 +184,10 @@ class Recording:
             raise InputError(f"pauses are {chosen}, expected indices of the {n} frames")
         masks = [None] * n if robot_masks is None else list(np.asarray(robot_masks, dtype=bool))
         if len(masks) != n or any(m is not None and m.shape != (height, width) for m in masks):
-            found = np.shape(robot_masks)
+            found = sorted({np.shape(m) for m in masks if m is not None})
             raise InputError(
-                f"robot masks have shape {found}, expected {(n, height, width)} as the depth images have"
+                f"there are {len(masks)} robot masks of shape {found}, expected {n} of {(height, width)}",
+                "one mask a frame, of the size of the images",
             )
         first = Frame(rgb[chosen[0]], depth[chosen[0]], camera, masks[chosen[0]])
         camera, grid = _world(first, grid)

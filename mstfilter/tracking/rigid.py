@@ -164,7 +164,7 @@ def minimal_models(rng: np.random.Generator, p: Array, q: Array, eps: float, n_m
 
 
 def residuals(models: Array, p: Array, q: Array) -> Array:
-    """Distances |R_k p_i + t_k - q_i|, (N, M), metres."""
+    """Distances between ``R_k p_i + t_k`` and ``q_i``, (N, M), metres."""
     moved = np.einsum("kij,nj->nki", models[:, :3, :3], p) + models[None, :, :3, 3]
     return np.linalg.norm(moved - q[:, None, :], axis=-1)
 
