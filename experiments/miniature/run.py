@@ -1,0 +1,203 @@
+"""How far the filters are from the exact posterior of the miniature world.
+
+python experiments/miniature/run.py [--smoke] [--out results]
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+from scipy import stats
+
+import mstfilter
+from mstfilter.oracles.miniature.calibration import DRAWS, rank, statistics, uniformity
+from mstfilter.oracles.miniature.exact import exact_filter
+from mstfilter.oracles.miniature.filters import bootstrap_filter, guided_filter
+from mstfilter.oracles.miniature.measures import MEASURES, class_weights, iid_population, measure
+from mstfilter.oracles.miniature.shrunk import ReadingEvidence, shrink
+from mstfilter.oracles.miniature.weighting import ScoredFusion, balanced_filter
+from mstfilter.oracles.miniature.world import Miniature
+from mstfilter.smc.kept_weights import KeepWeights
+from mstfilter.smc.particle_filter import ParticleFilter
+from mstfilter.smc.resampling import Multinomial
+from mstfilter.smc.resampling_optimal import FearnheadClifford
+
+HERE = Path(__file__).resolve().parent
+WORLDS = {"shelf": Miniature((3, 2)), "row": Miniature((6, 1))}
+PROPER = {"bootstrap": bootstrap_filter, "guided": guided_filter, "balanced": balanced_filter}
+PRESETS = {"paper": ("p", False), "authors": ("p", True), "mst": ("equal", False)}
+LADDER = ("+ score", "+ distinct", "+ predictive", "+ parents", "+ optimal", "+ cover")
+FAULTS = ("mst, p twice", "mst, weights kept", "mst, no Q", "mst, evidence")
+UNIONS = {"union, optimal": "+ optimal", "union, cover": "+ cover"}  # the same without crossover
+T = 6
+
+
+@cache
+def preset(name: str) -> ParticleFilter:
+    """A preset of MST, read once."""
+    return mstfilter.preset(name)
+
+
+def arm(name: str, world: Miniature, n: int) -> ParticleFilter:
+    """A filter by the name of its arm."""
+    if name in PROPER:
+        return PROPER[name](world, n)
+    if name in PRESETS:
+        return shrink(preset(name), world, n, *PRESETS[name])
+    mst = shrink(preset("mst"), world, n, *PRESETS["mst"])
+    if name == "mst, p twice":
+        return replace(mst, proposal=replace(mst.proposal, weight_rule="p"))
+    if name == "mst, weights kept":
+        return replace(mst, resampler=KeepWeights(Multinomial()))
+    if name == "mst, no Q":
+        return replace(mst, update=replace(mst.update, quality_exponent=0.0))
+    if name == "mst, evidence":  # the update's own two stages, with the best evidence that there can be
+        return replace(mst, update=replace(mst.update, evidence=(ReadingEvidence(world),)))
+    if name in UNIONS:
+        filter = arm(UNIONS[name], world, n)
+        return replace(filter, update=replace(filter.update, first=0))
+    rung = LADDER.index(name)  # each rung keeps what those below it brought
+    rule = ScoredFusion(world, mst.update, distinct=rung >= 1, predictive=rung >= 2, parents=rung >= 3)
+    filter = replace(mst, update=rule)
+    if rung >= 4:
+        filter = replace(filter, resampler=FearnheadClifford())
+    return replace(filter, proposal=replace(mst.proposal, prior_share=0.2)) if rung >= 5 else filter
+
+
+def distances(plan: list[tuple[tuple[str, ...], int, int]]) -> list[dict[str, object]]:
+    """One row a world, arm, size and step. `plan`: (arms, n, number of worlds)."""
+    rows = []
+    for shape, world in WORLDS.items():
+        for arms, n, n_worlds in plan:
+            for seed in range(n_worlds):
+                truth, glances = world.simulate(np.random.default_rng([seed, 11]), T)
+                exact = exact_filter(world, glances).posterior
+                answers: dict[str, list[np.ndarray]] = {
+                    "exact": list(exact),
+                    "n exact draws": [iid_population(np.random.default_rng([seed, 12]), p, n) for p in exact],
+                }
+                for name in arms:
+                    steps = arm(name, world, n).iterate(glances, seed)
+                    answers[name] = [class_weights(world, state.population) for state, _ in steps]
+                for name, laws in answers.items():
+                    for t, p in enumerate(laws):
+                        found = measure(world, p, exact[t], int(truth[t]))
+                        rows.append({"world": shape, "arm": name, "n": n, "seed": seed, "t": t, **found})
+            print(shape, n, n_worlds, "worlds", flush=True)
+    return rows
+
+
+def interval(values: np.ndarray) -> tuple[float, float]:
+    """Mean and half width of its 95 % t interval; one value a world."""
+    if len(values) < 2:
+        return float(values.mean()), float("nan")
+    return float(values.mean()), float(stats.sem(values) * stats.t.ppf(0.975, len(values) - 1))
+
+
+def by_world(rows: list[dict], key: Callable[[dict], tuple], measure: str) -> dict[tuple, np.ndarray]:
+    """Means over steps, one a world, by key."""
+    groups: dict[tuple, dict[int, list[float]]] = {}
+    for row in rows:
+        groups.setdefault(key(row), {}).setdefault(row["seed"], []).append(row[measure])
+    return {k: np.array([np.mean(v[s]) for s in sorted(v)]) for k, v in groups.items()}
+
+
+def summarise(rows: list[dict], out: Path) -> None:
+    """distances.csv (over all steps), over_time.csv (tv by step), paired.csv (differences by world)."""
+    table = {}
+    for m in MEASURES:
+        for key, values in by_world(rows, lambda r: (r["world"], r["n"], r["arm"]), m).items():
+            mean, half = interval(values)
+            entry = table.setdefault(key, {"world": key[0], "n": key[1], "arm": key[2], "worlds": len(values)})
+            entry |= {m: round(mean, 4), f"{m}_pm": round(half, 4)}
+    write(out / "distances.csv", list(table.values()))
+
+    steps = by_world(rows, lambda r: (r["world"], r["n"], r["arm"], r["t"]), "tv")
+    write(
+        out / "over_time.csv",
+        [
+            {"world": w, "n": n, "arm": a, "t": t, "tv": round(interval(v)[0], 4), "tv_pm": round(interval(v)[1], 4)}
+            for (w, n, a, t), v in steps.items()
+        ],
+    )
+    paired = []
+    means = {m: by_world(rows, lambda r: (r["world"], r["n"], r["arm"]), m) for m in ("tv", "same_object_error")}
+    for (world, n, name), _ in means["tv"].items():
+        for other in ("paper", "authors", "mst", "+ optimal", "+ cover"):
+            if (world, n, other) not in means["tv"] or other == name or name in ("exact", "n exact draws"):
+                continue
+            row: dict[str, object] = {"world": world, "n": n, "arm": name, "against": other}
+            for m, values in means.items():
+                mean, half = interval(values[world, n, name] - values[world, n, other])
+                row |= {m: round(mean, 4), f"{m}_pm": round(half, 4)}
+            paired.append(row)
+    write(out / "paired.csv", paired)
+
+
+def calibrate(arms: dict[str, int], n_worlds: int, steps: int, out: Path) -> None:
+    """Ranks of true scalars in the answers after `steps` observations of the shelf."""
+    world = WORLDS["shelf"]
+    scalars, rows = statistics(world), []
+    for name, n in arms.items():
+        ranks: dict[str, list[int]] = {s: [] for s in scalars}
+        for seed in range(n_worlds):
+            truth, glances = world.simulate(np.random.default_rng([seed, 13]), steps)
+            if name == "exact":
+                p = exact_filter(world, glances).posterior[-1]
+            else:
+                p = class_weights(world, arm(name, world, n).run(glances, seed)[0].population)
+            for s, scalar in scalars.items():
+                ranks[s].append(rank(np.random.default_rng([seed, 14]), scalar, p, int(truth[-1])))
+        for s, found in ranks.items():
+            counts = np.bincount(found, minlength=DRAWS + 1).tolist()
+            row = {
+                "arm": name,
+                "n": n,
+                "statistic": s,
+                "worlds": n_worlds,
+                "p_value": f"{uniformity(np.array(found)):.2g}",
+            }
+            rows.append(row | {f"rank_{k}": c for k, c in enumerate(counts)})
+        print("calibration", name, flush=True)
+    write(out / "calibration.csv", rows)
+
+
+def write(path: Path, rows: list[dict]) -> None:
+    """A CSV of rows with the same keys."""
+    with path.open("w", newline="") as file:
+        writer = csv.DictWriter(file, rows[0].keys(), lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def main() -> None:
+    """Run what is asked for."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--smoke", action="store_true", help="two worlds, few particles: a minute")
+    parser.add_argument("--out", type=Path, default=HERE / "results")
+    options = parser.parse_args()
+    options.out.mkdir(parents=True, exist_ok=True)
+    every = (*PROPER, *PRESETS, *FAULTS, *LADDER, *UNIONS)
+    if options.smoke:
+        plan, ranked, n_worlds = [(every, 5, 2), (every, 20, 2)], {"exact": 0, "guided": 50, "mst": 5}, 20
+    else:
+        few = (*PROPER, *PRESETS, "+ parents", "+ cover", "union, cover")
+        plan = [(every, 5, 100), (every, 20, 100), (every, 100, 50), (few, 500, 24)]
+        ranked = {"exact": 0, "bootstrap": 1000, "guided": 500, "balanced": 500, "paper": 20, "authors": 20}
+        ranked |= {"mst": 20, "+ cover": 20}
+        n_worlds = 400
+    summarise(distances(plan), options.out)
+    calibrate(ranked, n_worlds, 3, options.out)
+    from figure import draw
+
+    draw(options.out)
+
+
+if __name__ == "__main__":
+    main()
