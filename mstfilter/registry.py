@@ -70,7 +70,10 @@ COMPONENTS: dict[str, dict[str, str]] = {
         "same_segmentation": "mstfilter.fusion.similarity:SameSegmentation",
     },
     "boundary": {"colour_depth": "mstfilter.segmentation.boundary:ColourDepthBoundary"},
-    "tree": {"ucm": "mstfilter.segmentation.ucm:UcmTree"},
+    "tree": {
+        "learned": "mstfilter.segmentation.learned_tree:LearnedTree",
+        "ucm": "mstfilter.segmentation.ucm:UcmTree",
+    },
     "value": {
         "scenecut": "mstfilter.segmentation.value:SceneCutObjectness",
         "merge_log_odds": "mstfilter.segmentation.value:MergeLogOdds",

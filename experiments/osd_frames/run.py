@@ -3,7 +3,8 @@
     python experiments/osd_frames/run.py
 
 Needs the frames in MSTFILTER_SHARED (default ../shared) under real/osd_learn. Writes results/*.csv beside this file.
-Constants (colour weight, centre and slope of the calibration) are fitted on the frames of the other camera set-ups.
+The learned tree was fitted on simulated scenes alone. SceneCut's constants (colour weight, centre and slope of the
+calibration) are fitted on the frames of the other camera set-ups, and so is the colour weight of the first row.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ import csv
 import itertools
 import os
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -26,12 +27,14 @@ from mstfilter.scene.frame import Frame
 from mstfilter.scene.quality import weighted_coverage
 from mstfilter.segmentation.boundary import ColourDepthBoundary
 from mstfilter.segmentation.gibbs import ExactCuts
+from mstfilter.segmentation.interfaces import CutSampler, TreeBuilder
+from mstfilter.segmentation.learned_tree import LearnedTree
 from mstfilter.segmentation.mh import MetropolisHastingsCuts
 from mstfilter.segmentation.optimal import optimal_cut
 from mstfilter.segmentation.segments import ObjectRule, Segments
 from mstfilter.segmentation.tree import Tree
 from mstfilter.segmentation.ucm import UcmTree
-from mstfilter.segmentation.value import SceneCutObjectness
+from mstfilter.segmentation.value import MergeLogOdds, SceneCutObjectness
 
 HERE = Path(__file__).resolve().parent
 SHARED = Path(os.environ.get("MSTFILTER_SHARED", HERE.parents[2] / "shared"))
@@ -45,17 +48,26 @@ SLOPES = (8.0, 12.0, 20.0)
 # quantiles of the merge heights of each tree.
 NOTES_COLOUR = 0.6
 
-SAMPLERS = {
-    "mst": MetropolisHastingsCuts(),
-    "mst, sigma2 1e-4": MetropolisHastingsCuts(1e-4),
-    "mst, sigma2 1e-2": MetropolisHastingsCuts(1e-2),
-    "exact, same law as mst": ExactCuts(1e-3),
-    "paper": MetropolisHastingsCuts(0.25, burn_in=0, thinning=20, redraw_share=0.0),
-    "authors": MetropolisHastingsCuts(0.25, 0, 20, "authors", 0.0, True, True, True),
+# Samplers under the learned tree's log odds, and under SceneCut's value on the contour tree.
+LEARNED_SAMPLERS = {
+    "mst": MetropolisHastingsCuts(temperature=1.0),
+    "mst, temperature 0.5": MetropolisHastingsCuts(temperature=0.5),
+    "mst, temperature 2": MetropolisHastingsCuts(temperature=2.0),
+    "exact, same law as mst": ExactCuts(temperature=1.0),
+}
+PAPER = MetropolisHastingsCuts(0.25, burn_in=0, thinning=20, redraw_share=0.0)
+AUTHORS = MetropolisHastingsCuts(0.25, 0, 20, "authors", 0.0, True, True, True)
+SCENECUT_SAMPLERS = {
+    "scenecut, s2 = 1e-3 v*^2": (MetropolisHastingsCuts(), SceneCutObjectness()),
+    "paper": (PAPER, SceneCutObjectness()),
+    "paper, table at full weight": (PAPER, SceneCutObjectness(background_weight=1.0)),
+    "authors": (AUTHORS, SceneCutObjectness()),
+    "authors, table at full weight": (AUTHORS, SceneCutObjectness(background_weight=1.0)),
 }
 
 RULE = ObjectRule()
 VALUE = SceneCutObjectness()
+ODDS = MergeLogOdds()
 
 
 @dataclass
@@ -68,6 +80,7 @@ class Case:
     ignored: np.ndarray
     touching: bool
     trees: dict[float, tuple[Tree, Segments]]
+    learned: dict[float, tuple[Tree, Segments]]
 
     def score(self, labels: np.ndarray) -> float:
         """Objects quality; pixels without label count on neither side."""
@@ -77,6 +90,16 @@ class Case:
         """Quality of a cut, its background taken away."""
         numbers = np.where(found.is_object[cut], np.arange(1, len(cut) + 1), 0)
         return self.score(np.where(found.own, numbers[tree.label_image(cut)], 0))
+
+
+@dataclass(frozen=True)
+class _Given(TreeBuilder):
+    """A tree that is there already: both front ends begin with the same leaves."""
+
+    tree: Tree
+
+    def build(self, boundary: np.ndarray, frame: Frame | None = None) -> Tree:
+        return self.tree
 
 
 def touching(label: np.ndarray) -> bool:
@@ -95,13 +118,15 @@ def load(number: int) -> Case:
     depth = cv2.imread(f"{stem}_depth.png", cv2.IMREAD_UNCHANGED) * np.float32(0.001)
     label = cv2.imread(f"{stem}_label.png", cv2.IMREAD_UNCHANGED).astype(np.int64)
     frame = Frame(rgb, depth, Camera.from_intrinsics(525, 525, 319.5, 239.5, 640, 480))
-    trees = {}
+    trees, learned = {}, {}
     for weight in COLOUR_WEIGHTS:
         boundary = ColourDepthBoundary(colour_weight=weight).boundary(frame)
         tree = UcmTree(calibrate=False).build(boundary)
         trees[weight] = (tree, RULE.segments(tree, frame))
+        tree = LearnedTree(leaves=_Given(tree)).build(boundary, frame)
+        learned[weight] = (tree, RULE.segments(tree, frame))
     truth = np.where(label >= 2, label - 1, 0)
-    return Case(f"learn{number}", frame, truth, label == 0, touching(label), trees)
+    return Case(f"learn{number}", frame, truth, label == 0, touching(label), trees, learned)
 
 
 def calibrated(tree: Tree, centre: float, slope: float) -> Tree:
@@ -162,58 +187,89 @@ def main() -> None:
             scores[k, i] = case.score_cut(tree, found, optimal_cut(tree, VALUE.values(tree, case.frame)))
 
     chosen = {g: int(scores[:, setup != g].mean(axis=1).argmax()) for g in range(len(GROUPS))}
+    judged = np.zeros((len(COLOUR_WEIGHTS), len(cases)))
+    for k, weight in enumerate(COLOUR_WEIGHTS):
+        for i, case in enumerate(cases):
+            tree, found = case.learned[weight]
+            judged[k, i] = case.score_cut(tree, found, optimal_cut(tree, ODDS.values(tree, case.frame)))
+    picked = {g: int(judged[:, setup != g].mean(axis=1).argmax()) for g in range(len(GROUPS))}
+    default = COLOUR_WEIGHTS.index(0.4)
     arms: dict[str, np.ndarray] = {
-        "optimal cut, constants held out": np.array([scores[chosen[setup[i]], i] for i in range(45)]),
-        "optimal cut, constants of all frames": scores[scores.mean(axis=1).argmax()],
+        "learned tree, optimal cut, colour weight held out": np.array(
+            [judged[picked[setup[i]], i] for i in range(45)]
+        ),
+        "learned tree, optimal cut, colour 0.4 (default)": judged[default],
+        "learned tree, optimal cut, colour 0.6 (no labels used)": judged[COLOUR_WEIGHTS.index(NOTES_COLOUR)],
+        "scenecut, optimal cut, constants held out": np.array([scores[chosen[setup[i]], i] for i in range(45)]),
+        "scenecut, optimal cut, constants of all frames": scores[scores.mean(axis=1).argmax()],
     }
-    unlabelled, unlabelled_best, best_node = [], [], []
+    unlabelled, unlabelled_best = [], []
+    best_node: dict[str, list[float]] = {"learned": [], "contour": []}
     for case in cases:
         for weight, sink in ((NOTES_COLOUR, unlabelled), (0.4, unlabelled_best)):
             tree, found = case.trees[weight]
             tree = without_labels(tree)
             sink.append(case.score_cut(tree, found, optimal_cut(tree, VALUE.values(tree, case.frame))))
-        tree, found = case.trees[0.4]
-        pixels = tree.accumulate_pixels(found.own & ~case.ignored)
-        recall = []
-        for k in range(1, case.truth.max() + 1):
-            inside = tree.accumulate_pixels((case.truth == k) & found.own)
-            recall.append((inside / (pixels + (case.truth == k).sum() - inside)).max())
-        best_node.append(np.mean(recall))
-    arms["optimal cut, no labels used (colour 0.6)"] = np.array(unlabelled)
-    arms["optimal cut, no labels used (colour 0.4)"] = np.array(unlabelled_best)
+        for name, trees in (("learned", case.learned), ("contour", case.trees)):
+            tree, found = trees[0.4]
+            pixels = tree.accumulate_pixels(found.own & ~case.ignored)
+            recall = []
+            for k in range(1, case.truth.max() + 1):
+                inside = tree.accumulate_pixels((case.truth == k) & found.own)
+                recall.append((inside / (pixels + (case.truth == k).sum() - inside)).max())
+            best_node[name].append(float(np.mean(recall)))
+    arms["scenecut, optimal cut, no labels used (colour 0.6)"] = np.array(unlabelled)
+    arms["scenecut, optimal cut, no labels used (colour 0.4)"] = np.array(unlabelled_best)
     arms["floor: plane + components"] = np.array([c.score(components(c)) for c in cases])
     arms["floor: plane + components cut at 1 cm steps"] = np.array([c.score(components(c, 0.01)) for c in cases])
     arms["floor: one blob"] = np.array([c.score(components(c) > 0) for c in cases])
-    arms["IoU of the best node of the tree, mean over objects"] = np.array(best_node)
+    for name, values in best_node.items():
+        arms[f"IoU of the best node of the {name} tree, mean over objects"] = np.array(values)
 
     sampled = []
-    for name, sampler in SAMPLERS.items():
+
+    def sample(name: str, sampler: CutSampler, parts: Callable[[int], tuple[Tree, Segments, np.ndarray]]) -> None:
         rows = []
         for i, case in enumerate(cases):
-            weight, centre, slope = grid[chosen[setup[i]]]
-            tree, found = case.trees[weight]
-            tree = calibrated(tree, centre, slope)
-            w = VALUE.values(tree, case.frame)
-            sample = sampler.sample(np.random.default_rng((1, i)), tree, w, 10)
-            objects = [cut[found.is_object[cut]] for cut in sample.cuts]
-            q = [case.score_cut(tree, found, cut) for cut in sample.cuts]
-            distinct = len({o.tobytes() for o in objects})
-            rows.append((np.mean(q), np.max(q), np.mean([len(o) for o in objects]), distinct))
+            tree, found, w = parts(i)
+            drawn = sampler.sample(np.random.default_rng((1, i)), tree, w, 10)
+            objects = [cut[found.is_object[cut]] for cut in drawn.cuts]
+            q = [case.score_cut(tree, found, cut) for cut in drawn.cuts]
+            rows.append(
+                (np.mean(q), np.max(q), np.mean([len(o) for o in objects]), len({o.tobytes() for o in objects}))
+            )
         table = np.array(rows)
         arms[f"samples, {name}: mean of 10"] = table[:, 0]
         arms[f"samples, {name}: best of 10"] = table[:, 1]
         sampled.append([name, *np.round(table[:, 2:].mean(axis=0), 2)])
 
-    print(f"\n{'objects quality, mean':58s} all   touching  apart")
+    def learned_parts(i: int) -> tuple[Tree, Segments, np.ndarray]:
+        tree, found = cases[i].learned[0.4]
+        return tree, found, ODDS.values(tree, cases[i].frame)
+
+    for name, sampler in LEARNED_SAMPLERS.items():
+        sample(name, sampler, learned_parts)
+    for name, (sampler, value) in SCENECUT_SAMPLERS.items():
+
+        def scenecut_parts(i: int, value: SceneCutObjectness = value) -> tuple[Tree, Segments, np.ndarray]:
+            weight, centre, slope = grid[chosen[setup[i]]]
+            tree, found = cases[i].trees[weight]
+            tree = calibrated(tree, centre, slope)
+            return tree, found, value.values(tree, cases[i].frame)
+
+        sample(name, sampler, scenecut_parts)
+
+    print(f"\n{'objects quality, mean':66s} all   touching  apart")
     summary = [[n, *(f"{x:.3f}" for x in (v.mean(), v[near].mean(), v[~near].mean()))] for n, v in arms.items()]
     for name, a, b, c in summary:
-        print(f"{name:58s} {a}  {b}     {c}")
+        print(f"{name:66s} {a}  {b}     {c}")
     print(
         "\nsampler                    objects a sample, distinct sets of objects in 10 (truth: "
         f"{np.mean([c.truth.max() for c in cases]):.2f} objects)"
     )
     for name, objects, distinct in sampled:
-        print(f"{name:26s} {objects:5.2f} {distinct:5.2f}")
+        print(f"{name:32s} {objects:5.2f} {distinct:5.2f}")
+    print("\ncolour weight of the learned tree without each set-up:", [COLOUR_WEIGHTS[k] for k in picked.values()])
     print("\nconstants (colour weight, centre, slope) fitted without each set-up:")
     for g, (a, b) in enumerate(GROUPS):
         print(f"  learn{a}-{b}: {grid[chosen[g]]}")
@@ -233,8 +289,8 @@ def main() -> None:
     )
     write(
         "constants",
-        ["set_up", "frames", "colour_weight", "centre", "slope"],
-        ([g, f"learn{a}-{b}", *grid[chosen[g]]] for g, (a, b) in enumerate(GROUPS)),
+        ["set_up", "frames", "colour_weight", "centre", "slope", "colour_weight_learned"],
+        ([g, f"learn{a}-{b}", *grid[chosen[g]], COLOUR_WEIGHTS[picked[g]]] for g, (a, b) in enumerate(GROUPS)),
     )
 
 

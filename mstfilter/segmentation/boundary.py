@@ -109,7 +109,7 @@ class ColourDepthBoundary(BoundaryModel):
         import cv2
 
         holes = ~frame.valid
-        depth = _fill_from_nearest(frame.depth, holes)
+        depth = fill_from_nearest(frame.depth, holes)
         D = (8 * SENSOR_FOCAL * BASELINE / depth).astype(np.float32)
         s = max(1.0, self.depth_scale * resize)
         smooth = cv2.GaussianBlur(D, (0, 0), s)
@@ -126,7 +126,7 @@ def _largest_eigenvalue(xx: np.ndarray, yy: np.ndarray, xy: np.ndarray) -> np.nd
     return (xx + yy) / 2 + np.sqrt(((xx - yy) / 2) ** 2 + xy * xy)
 
 
-def _fill_from_nearest(depth: np.ndarray, holes: np.ndarray) -> np.ndarray:
+def fill_from_nearest(depth: np.ndarray, holes: np.ndarray) -> np.ndarray:
     """Depth with holes filled from the nearest reading."""
     if not holes.any():
         return depth

@@ -122,7 +122,7 @@ def best_envelope(tree: Tree, w: np.ndarray, best: float, s2: float) -> Gibbs:
 
 @dataclass(frozen=True)
 class ExactCuts(CutSampler):
-    """Independent exact draws from exp(-(v* - v)^2 / s2).
+    """Independent exact draws from exp(-(v* - v)^2 / s2), or from exp(v / temperature).
 
     Parameters
     ----------
@@ -130,20 +130,26 @@ class ExactCuts(CutSampler):
         s2 relative to the squared value of the optimal cut: ``s2 = sigma2 v*^2``. No unit.
     max_tries : int
         Gibbs draws for each wanted cut before giving up.
+    temperature : float
+        0: the law of the paper. Above: the Gibbs law, in units of value; nothing is rejected, sigma2 plays no part.
     """
 
     sigma2: float = 1e-3
     max_tries: int = 100000
+    temperature: float = 0.0
 
     def __post_init__(self) -> None:
         if not self.sigma2 > 0:
             raise InputError(f"sigma2 is {self.sigma2!r}, expected a number > 0")
+        if self.temperature < 0:
+            raise InputError(f"temperature is {self.temperature!r}, expected a number >= 0")
 
     def sample(self, rng: np.random.Generator, tree: Tree, w: np.ndarray, n: int) -> CutSample:
         """`n` independent cuts."""
         best = float(check_values(tree, w)[optimal_cut(tree, w)].sum())
         s2 = max(self.sigma2 * best**2, 1e-300)
-        law = best_envelope(tree, w, best, s2)
+        warm = self.temperature > 0
+        law = gibbs(tree, w, 1 / self.temperature) if warm else best_envelope(tree, w, best, s2)
         cuts: list[np.ndarray] = []
         values: list[float] = []
         tries = 0
@@ -156,7 +162,7 @@ class ExactCuts(CutSampler):
                 )
             cut = law.draw(rng.random, tree.root)
             d = best - sum(law.w[x] for x in cut)
-            if rng.random() < exp(-((d - law.b * s2 / 2) ** 2) / s2):
+            if warm or rng.random() < exp(-((d - law.b * s2 / 2) ** 2) / s2):
                 cuts.append(np.sort(np.array(cut, dtype=np.int64)))
                 values.append(best - d)
         v = np.array(values)
@@ -164,4 +170,5 @@ class ExactCuts(CutSampler):
             "acceptance": n / tries if tries else 1.0,
             "distinct": len({c.tobytes() for c in cuts}) / max(n, 1),
         }
-        return CutSample(tuple(cuts), v, -((best - v) ** 2) / s2, diagnostics)
+        log_p = (v - best) / self.temperature if warm else -((best - v) ** 2) / s2
+        return CutSample(tuple(cuts), v, log_p, diagnostics)

@@ -34,8 +34,8 @@ class TreeBuilder(ABC):
     """A hierarchy of regions from boundary strengths."""
 
     @abstractmethod
-    def build(self, boundary: np.ndarray) -> Tree:
-        """The tree of a boundary map (H, W)."""
+    def build(self, boundary: np.ndarray, frame: Frame | None = None) -> Tree:
+        """The tree of a boundary map (H, W); some builders also look at the frame it was made from."""
 
 
 class CutValue(ABC):
@@ -57,7 +57,7 @@ class CutSample:
     values : (n,) float
         v(c) of each.
     log_p : (n,) float
-        Log of the sampler's target law relative to the optimal cut, ``-(v* - v)^2 / s2``.
+        Log of the sampler's target law relative to the optimal cut.
     diagnostics : dict
         Numbers about the draw, fit for JSON.
     """

@@ -1,10 +1,11 @@
 """Segmentations drawn from a tree by Metropolis-Hastings (paper IV-B, Algorithm 1).
 
 The chain starts at the optimal cut c* and aims at ``p(c) = exp(-(v(c*) - v(c))^2 / s2)`` with
-``s2 = sigma2 v(c*)^2``.
+``s2 = sigma2 v(c*)^2``. Values that are log odds (`MergeLogOdds`) have natural units and need no such scale: with a
+`temperature` the chain aims at ``p(c) = exp((v(c) - v(c*)) / temperature)``, at 1 the law that the odds stand for.
 
 =========  ============================================================================================
-``mst``    ``MetropolisHastingsCuts()``: one chain, MoveNode mixed with subtree redraws, s2 = 1e-3 v*^2
+``mst``    ``MetropolisHastingsCuts(temperature=1)``: one chain, MoveNode mixed with subtree redraws
 ``paper``  ``MetropolisHastingsCuts(0.25, burn_in=0, thinning=20, redraw_share=0)``
 ``authors``  ``MetropolisHastingsCuts(0.25, burn_in=0, thinning=20, moves="authors", redraw_share=0,
            restart=True, include_optimal=True, redraw_repeated=True)``
@@ -23,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from mstfilter.errors import InputError
-from mstfilter.segmentation.gibbs import best_envelope
+from mstfilter.segmentation.gibbs import best_envelope, gibbs
 from mstfilter.segmentation.interfaces import CutSample, CutSampler
 from mstfilter.segmentation.moves import (
     AuthorsMoves,
@@ -55,17 +56,23 @@ class CutChain:
         Scale of the target law, in squared units of value.
     cut : array of int
         Where it starts.
+    temperature : float
+        If > 0, the target is the Gibbs law at this temperature, in units of value, and s2 plays no part.
     """
 
-    def __init__(self, tree: Tree, w: np.ndarray, best: float, s2: float, cut: np.ndarray) -> None:
+    def __init__(
+        self, tree: Tree, w: np.ndarray, best: float, s2: float, cut: np.ndarray, temperature: float = 0.0
+    ) -> None:
         self.state = CutState(tree, cut.tolist())
         self.w = w.tolist()
-        self.best, self.s2 = best, s2
+        self.best, self.s2, self.temperature = best, s2, temperature
         self.value = sum(self.w[x] for x in self.state.nodes)
         self.steps = self.accepted = 0
 
     def log_target(self, value: float) -> float:
         """Unnormalised log p of a cut of this value."""
+        if self.temperature > 0:
+            return (value - self.best) / self.temperature
         return -((self.best - value) ** 2) / self.s2
 
     def judge(self, rule: MoveRule, choice: Any) -> tuple[Any, float, float]:
@@ -101,7 +108,7 @@ class MetropolisHastingsCuts(CutSampler):
     Parameters
     ----------
     sigma2 : float
-        s2 relative to the squared value of the optimal cut. No unit.
+        s2 relative to the squared value of the optimal cut. No unit. Unused with a temperature.
     burn_in : int
         Steps before the first sample (on top of `thinning`), once a chain.
     thinning : int
@@ -117,6 +124,8 @@ class MetropolisHastingsCuts(CutSampler):
         The first sample is the optimal cut itself.
     redraw_repeated : bool
         A cut that was drawn before is drawn once more, then kept whatever it is.
+    temperature : float
+        0: the law of the paper. Above: the Gibbs law exp(v / temperature), in units of value.
     """
 
     sigma2: float = 1e-3
@@ -127,12 +136,15 @@ class MetropolisHastingsCuts(CutSampler):
     restart: bool = False
     include_optimal: bool = False
     redraw_repeated: bool = False
+    temperature: float = 0.0
 
     def __post_init__(self) -> None:
         if self.moves not in RULES:
             raise InputError(f"move rule {self.moves!r} is not known", f"there are: {', '.join(RULES)}")
         if not self.sigma2 > 0:
             raise InputError(f"sigma2 is {self.sigma2!r}, expected a number > 0")
+        if self.temperature < 0:
+            raise InputError(f"temperature is {self.temperature!r}, expected a number >= 0")
         if self.burn_in < 0 or self.thinning < 1:
             raise InputError(f"burn_in {self.burn_in!r} must be >= 0 and thinning {self.thinning!r} >= 1")
         if not 0 <= self.redraw_share <= 1:
@@ -145,10 +157,14 @@ class MetropolisHastingsCuts(CutSampler):
         best = float(w[optimal].sum())
         s2 = max(self.sigma2 * best**2, 1e-300)
         local = RULES[self.moves]()
-        redraw = SubtreeRedraw(best_envelope(tree, w, best, s2)) if self.redraw_share > 0 else None
+        redraw = None
+        if self.redraw_share > 0:
+            warm = self.temperature > 0
+            law = gibbs(tree, w, 1 / self.temperature) if warm else best_envelope(tree, w, best, s2)
+            redraw = SubtreeRedraw(law)
         random = _uniforms(rng)
 
-        chain = CutChain(tree, w, best, s2, optimal)
+        chain = CutChain(tree, w, best, s2, optimal, self.temperature)
         trace: list[float] = []
         steps = accepted = 0
 
@@ -164,7 +180,7 @@ class MetropolisHastingsCuts(CutSampler):
             nonlocal chain, steps, accepted
             if self.restart:
                 steps, accepted = steps + chain.steps, accepted + chain.accepted
-                chain = CutChain(tree, w, best, s2, optimal)
+                chain = CutChain(tree, w, best, s2, optimal, self.temperature)
                 advance(self.burn_in)
             advance(self.thinning)
             return chain.cut()
@@ -189,7 +205,7 @@ class MetropolisHastingsCuts(CutSampler):
         }
         if not self.restart:
             diagnostics["autocorrelation_steps"] = _autocorrelation(np.array(trace[self.burn_in :]))
-        return CutSample(tuple(cuts), v, -((best - v) ** 2) / s2, diagnostics)
+        return CutSample(tuple(cuts), v, np.array([chain.log_target(float(x)) for x in v]), diagnostics)
 
 
 def _uniforms(rng: np.random.Generator, block: int = 1024) -> Any:

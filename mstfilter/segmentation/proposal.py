@@ -19,18 +19,19 @@ from mstfilter.completion.arbitration import arbitrate
 from mstfilter.completion.completer import Completer, Completion
 from mstfilter.completion.extrude import Extrude
 from mstfilter.errors import InputError
+from mstfilter.scene.arrays import component_key
 from mstfilter.scene.clip import Clip
 from mstfilter.scene.frame import Frame
 from mstfilter.scene.memo import memo
 from mstfilter.scene.voxels import Hypothesis, ObjectRecord, VoxelGrid
 from mstfilter.segmentation.boundary import ColourDepthBoundary
 from mstfilter.segmentation.interfaces import BoundaryModel, CutSampler, CutValue, TreeBuilder
+from mstfilter.segmentation.learned_tree import LearnedTree
 from mstfilter.segmentation.mh import MetropolisHastingsCuts
 from mstfilter.segmentation.optimal import optimal_cut
 from mstfilter.segmentation.segments import ObjectRule, Segments
 from mstfilter.segmentation.tree import Tree
-from mstfilter.segmentation.ucm import UcmTree
-from mstfilter.segmentation.value import SceneCutObjectness
+from mstfilter.segmentation.value import MergeLogOdds
 from mstfilter.smc.interfaces import Proposal
 from mstfilter.smc.population import Population
 from mstfilter.smc.streams import child
@@ -50,6 +51,7 @@ class TreeCutProposal(Proposal):
     tree : TreeBuilder
     value : CutValue
     sampler : CutSampler
+        Its width must suit the value: a `temperature` for log odds, `sigma2` for `SceneCutObjectness`.
     objects : ObjectRule
         What of a cut is background.
     completer : Completer
@@ -63,9 +65,9 @@ class TreeCutProposal(Proposal):
     """
 
     boundary: BoundaryModel = field(default_factory=ColourDepthBoundary)
-    tree: TreeBuilder = field(default_factory=UcmTree)
-    value: CutValue = field(default_factory=SceneCutObjectness)
-    sampler: CutSampler = field(default_factory=MetropolisHastingsCuts)
+    tree: TreeBuilder = field(default_factory=LearnedTree)
+    value: CutValue = field(default_factory=MergeLogOdds)
+    sampler: CutSampler = field(default_factory=lambda: MetropolisHastingsCuts(temperature=1.0))
     objects: ObjectRule = field(default_factory=ObjectRule)
     completer: Completer = field(default_factory=Extrude)
     weight_rule: str = "equal"
@@ -84,10 +86,10 @@ class TreeCutProposal(Proposal):
         """The tree of a frame and its node values (N,); computed once a frame."""
 
         def compute() -> tuple[Tree, np.ndarray]:
-            tree = self.tree.build(self.boundary.boundary(frame))
+            tree = self.tree.build(self.boundary.boundary(frame), frame)
             return tree, self.value.values(tree, frame)
 
-        return memo("segmentation_tree", (frame.key, repr((self.boundary, self.tree, self.value))), compute)
+        return memo("segmentation_tree", (frame.key, component_key((self.boundary, self.tree, self.value))), compute)
 
     def label_image(self, frame: Frame, cut: np.ndarray | None = None) -> np.ndarray:
         """(H, W) int32 segments of a cut, 0 background, k + 1 its k-th node; the optimal cut by default."""
@@ -104,7 +106,7 @@ class TreeCutProposal(Proposal):
             cuts[0], log_p[0] = optimal_cut(tree, w), 0.0
         found = memo(
             "segments",
-            (frame.key, grid.key, tree.key, repr(self.objects)),
+            (frame.key, grid.key, tree.key, component_key(self.objects)),
             lambda: self.objects.segments(tree, frame, grid),
         )
         kept = [cut[found.is_object[cut]] for cut in cuts]

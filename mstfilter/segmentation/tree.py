@@ -41,11 +41,15 @@ class Tree:
     start : (N,) float
         Strength of the weakest boundary at which the region forms, 0 .. 1: P(boundary) of the merge that makes
         it. Leaves 0. Non-decreasing towards the root.
+    odds : (N,) float, optional
+        Log odds that the merge that makes the node joins different objects, where the builder judges every merge
+        by itself; they need not grow towards the root. Leaves 0.
     """
 
     parent: np.ndarray
     leaves: np.ndarray
     start: np.ndarray
+    odds: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         parent = np.array(self.parent, dtype=np.int64)
@@ -66,6 +70,11 @@ class Tree:
             raise InputError("tree nodes are not ordered: leaves must come before all inner nodes")
         if leaves.ndim != 2 or leaves.size == 0 or leaves.min() < 0 or leaves.max() >= n_leaves:
             raise InputError(f"leaf image must be 2-D with values 0 .. {n_leaves - 1}")
+        if self.odds is not None:
+            odds = np.array(self.odds, dtype=np.float64)
+            if odds.shape != (n,) or not np.isfinite(odds).all():
+                raise InputError(f"tree log odds have shape {odds.shape}, expected {(n,)} finite numbers")
+            object.__setattr__(self, "odds", read_only(odds))
         object.__setattr__(self, "parent", read_only(parent))
         object.__setattr__(self, "leaves", read_only(leaves))
         object.__setattr__(self, "start", read_only(start))
@@ -88,7 +97,8 @@ class Tree:
     @cached_property
     def key(self) -> bytes:
         """Name by content."""
-        return content_key("tree", self.parent, self.leaves, self.start)
+        odds = () if self.odds is None else (self.odds,)
+        return content_key("tree", self.parent, self.leaves, self.start, *odds)
 
     @cached_property
     def end(self) -> np.ndarray:

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mstfilter.errors import InputError
+from mstfilter.scene.frame import Frame
 from mstfilter.segmentation.interfaces import TreeBuilder
 from mstfilter.segmentation.tree import Tree
 
@@ -49,7 +50,7 @@ class UcmTree(TreeBuilder):
         if self.max_leaves < 1:
             raise InputError(f"max_leaves is {self.max_leaves!r}, expected at least 1")
 
-    def build(self, boundary: np.ndarray) -> Tree:
+    def build(self, boundary: np.ndarray, frame: Frame | None = None) -> Tree:
         """The tree of a boundary map (H, W) with values 0 .. 1."""
         boundary = np.asarray(boundary)
         if boundary.ndim != 2 or boundary.size == 0:

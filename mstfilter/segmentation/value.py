@@ -84,7 +84,9 @@ class MergeLogOdds(CutValue):
     """Each merge of the tree judged by itself: the log likelihood of independent splits.
 
     ``w(n) = -sum of logit P(boundary) over the merges inside n``: exp(v(c)) is, up to a constant, the
-    probability that exactly the merges above the cut join different objects. Additive, without a scale sigma.
+    probability that exactly the merges above the cut join different objects. Additive, in natural units: cuts are
+    sampled at a temperature, without a scale sigma. Where the tree carries log odds of its own (`LearnedTree`),
+    they are taken; else the strength `start` counts as the probability.
 
     Parameters
     ----------
@@ -96,8 +98,12 @@ class MergeLogOdds(CutValue):
 
     def values(self, tree: Tree, frame: Frame) -> np.ndarray:
         """Sums of minus the log odds of all merges inside each node."""
-        p = np.clip(tree.start, self.clip, 1 - self.clip)
-        own = -(np.log(p) - np.log1p(-p))
+        if tree.odds is None:
+            p = np.clip(tree.start, self.clip, 1 - self.clip)
+            own = -(np.log(p) - np.log1p(-p))
+        else:
+            bound = np.log1p(-self.clip) - np.log(self.clip)
+            own = -np.clip(tree.odds, -bound, bound)
         own[: tree.n_leaves] = 0.0
         total = own.tolist()
         parent = tree.parent.tolist()

@@ -193,3 +193,28 @@ def test_bad_fields_are_named():
         optimal_cut(tree, w[:-1])
     with pytest.raises(InputError, match="not finite"):
         optimal_cut(tree, w * np.nan)
+
+
+@pytest.mark.parametrize(("leaves", "most"), SMALL)
+def test_samplers_at_a_temperature_follow_the_gibbs_law(leaves, most):
+    """Chain and exact draws against enumeration, chi-square, false alarm 1e-4 each; the odds are not rescaled."""
+    tree, w = case(leaves, most)
+    cuts = all_cuts(tree)
+    v = np.array([w[list(c)].sum() for c in cuts])
+    p = np.exp((v - v.max()) / 2.0)
+    p /= p.sum()
+    samplers = [
+        MetropolisHastingsCuts(burn_in=100, thinning=40, redraw_share=0.0, temperature=2.0),
+        MetropolisHastingsCuts(burn_in=100, thinning=40, temperature=2.0),
+        ExactCuts(temperature=2.0),
+    ]
+    for sampler in samplers:
+        sample = sampler.sample(np.random.default_rng(3), tree, w, 2000)
+        assert _chi_square(_counts(sample.cuts, cuts), p) > 1e-4
+        assert np.allclose(sample.log_p, (sample.values - v.max()) / 2.0)
+
+
+def test_a_negative_temperature_is_named():
+    for sampler in (MetropolisHastingsCuts, ExactCuts):
+        with pytest.raises(InputError, match="temperature is -1"):
+            sampler(temperature=-1)

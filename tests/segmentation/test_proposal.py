@@ -14,10 +14,12 @@ from mstfilter.scene.frame import Frame
 from mstfilter.scene.quality import weighted_coverage
 from mstfilter.scene.rendering import render
 from mstfilter.segmentation.boundary import ColourDepthBoundary
+from mstfilter.segmentation.learned_tree import LearnedTree
 from mstfilter.segmentation.mh import MetropolisHastingsCuts
 from mstfilter.segmentation.optimal import OptimalCut, optimal_cut
 from mstfilter.segmentation.proposal import TreeCutProposal
 from mstfilter.segmentation.segments import ObjectRule, _core
+from mstfilter.segmentation.ucm import UcmTree
 from mstfilter.segmentation.value import MergeLogOdds, SceneCutObjectness
 from tests.segmentation.scenes import GRID, TOUCHING, TWO, clip_of, frame_of
 from tests.segmentation.trees import random_tree
@@ -105,11 +107,19 @@ def test_each_object_shows_in_its_own_mask():
         assert (shown[image == segment] == k).mean() > 0.9
 
 
-@pytest.mark.parametrize("value", [SceneCutObjectness(), SceneCutObjectness(background_weight=1.0), MergeLogOdds()])
+@pytest.mark.parametrize(
+    ("tree", "value"),
+    [
+        (UcmTree(), SceneCutObjectness()),
+        (UcmTree(), SceneCutObjectness(background_weight=1.0)),
+        (UcmTree(), MergeLogOdds()),
+        (LearnedTree(), MergeLogOdds()),
+    ],
+)
 @pytest.mark.parametrize("rule", ["equal", "p"])
-def test_parts_are_swappable(value, rule):
+def test_parts_are_swappable(tree, value, rule):
     sampler = MetropolisHastingsCuts(0.25, 0, 20, "authors", 0.0, True, True, True)
-    proposal = TreeCutProposal(value=value, sampler=sampler, completer=SurfaceOnly(), weight_rule=rule)
+    proposal = TreeCutProposal(tree=tree, value=value, sampler=sampler, completer=SurfaceOnly(), weight_rule=rule)
     population = proposal.sample(np.random.default_rng(0), clip_of(TOUCHING, width=640, noise=0.6), 5)
     assert population.log_weights[0] == 0
     assert (population.log_weights <= 0).all()

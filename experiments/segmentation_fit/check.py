@@ -1,0 +1,82 @@
+"""Both front ends on simulated first pauses that nothing was fitted on: quality in the image and in space.
+
+    python experiments/segmentation_fit/check.py
+
+Writes results/quality.csv beside this file.
+"""
+
+from __future__ import annotations
+
+import csv
+import sys
+from pathlib import Path
+
+import numpy as np
+from scenes import CHECKED_SEEDS, first_pause
+
+from mstfilter.completion.extrude import Extrude
+from mstfilter.scene.clip import Clip
+from mstfilter.scene.quality import weighted_coverage
+from mstfilter.segmentation.learned_tree import LearnedTree
+from mstfilter.segmentation.mh import MetropolisHastingsCuts
+from mstfilter.segmentation.optimal import OptimalCut, optimal_cut
+from mstfilter.segmentation.proposal import TreeCutProposal
+from mstfilter.segmentation.ucm import UcmTree
+from mstfilter.segmentation.value import MergeLogOdds, SceneCutObjectness
+from mstfilter.simulation.families import SCENE_FAMILIES
+
+OLD = {"tree": UcmTree(), "value": SceneCutObjectness()}
+NEW = {"tree": LearnedTree(), "value": MergeLogOdds()}
+ARMS = {
+    "scenecut, optimal cut": TreeCutProposal(**OLD, sampler=OptimalCut()),
+    "scenecut, samples": TreeCutProposal(**OLD, sampler=MetropolisHastingsCuts()),
+    "learned, optimal cut": TreeCutProposal(**NEW, sampler=OptimalCut()),
+    "learned, samples at temperature 0.5": TreeCutProposal(**NEW, sampler=MetropolisHastingsCuts(temperature=0.5)),
+    "learned, samples at temperature 1": TreeCutProposal(**NEW, sampler=MetropolisHastingsCuts(temperature=1.0)),
+    "learned, samples at temperature 2": TreeCutProposal(**NEW, sampler=MetropolisHastingsCuts(temperature=2.0)),
+}
+N = 10
+
+
+def main() -> None:
+    rows = []
+    for name, family in SCENE_FAMILIES.items():
+        table: dict[str, list[tuple[float, ...]]] = {arm: [] for arm in [*ARMS, "true masks"]}
+        for seed in CHECKED_SEEDS:
+            pause = first_pause(family, seed)
+            clip = Clip((pause.frame,), pause.grid, 0)
+            for arm, proposal in ARMS.items():
+                n = 1 if isinstance(proposal.sampler, OptimalCut) else N
+                population = proposal.sample(np.random.default_rng(seed), clip, n)
+                tree, w = proposal.tree_of(pause.frame)
+                image = np.nan
+                if n == 1:
+                    labels = proposal.objects.label_image(tree, optimal_cut(tree, w), pause.frame, pause.grid)
+                    image = weighted_coverage(labels, pause.image)
+                q = [weighted_coverage(h.labels, pause.volume) for h in population.particles]
+                distinct = population.notes["distinct_hypotheses"]
+                table[arm].append(
+                    (image, float(np.mean(q)), float(np.max(q)), distinct, np.mean(population.notes["objects"]))
+                )
+            table["true masks"].append(_true_masks(pause))
+        for arm, found in table.items():
+            mean = [f"{x:.3f}" for x in np.array(found).mean(axis=0)]
+            rows.append([name, arm, *mean])
+            print(name, arm, *mean)
+    target = Path(__file__).resolve().parent / "results" / "quality.csv"
+    with target.open("w", newline="") as file:
+        header = ["family", "arm", "image", "space_mean", "space_best", "distinct", "objects"]
+        csv.writer(file, lineterminator="\n").writerows([header, *rows])
+
+
+def _true_masks(pause) -> tuple[float, ...]:
+    from mstfilter.completion.arbitration import arbitrate
+
+    masks = [pause.image == k for k in range(1, int(pause.image.max()) + 1) if (pause.image == k).any()]
+    completions = Extrude().complete(np.random.default_rng(0), pause.frame, masks, pause.grid)
+    q = weighted_coverage(arbitrate(completions, pause.grid), pause.volume)
+    return 1.0, q, q, 1, len(masks)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

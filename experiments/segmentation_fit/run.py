@@ -1,0 +1,124 @@
+"""Fit the weights of `mstfilter.segmentation.join_weights` on simulated scenes; no real image is used.
+
+    python experiments/segmentation_fit/run.py
+
+Regions of each scene merge best first under the present weights. A pair of different objects is noted and kept
+apart, a pair of one object is noted and merged, so the pairs are those that the tree meets. Three rounds; each fits a
+logistic regression to the pairs of all rounds so far.
+"""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import numpy as np
+from scenes import FITTED, FITTED_SEEDS, first_pause
+from scipy.optimize import minimize
+
+from mstfilter.segmentation import join_weights
+from mstfilter.segmentation.agglomerate import Agglomeration
+from mstfilter.segmentation.boundary import ColourDepthBoundary
+from mstfilter.segmentation.joins import FEATURES, features
+from mstfilter.segmentation.learned_tree import LearnedTree
+from mstfilter.segmentation.regions import REGION, Regions
+
+ROUNDS = 3
+PURE = 0.8  # regions that mix objects teach nothing
+RIDGE = 1.0
+
+Pairs = tuple[list[np.ndarray], list[bool], list[float]]
+
+
+def measured() -> list[tuple[Regions, np.ndarray, float]]:
+    """Regions of every scene, their pixels of each true object (R, K), and the image scale."""
+    found = []
+    for family in FITTED.values():
+        for seed in FITTED_SEEDS:
+            try:
+                pause = first_pause(family, seed)
+            except RuntimeError as error:  # no room for that many objects
+                print(family.name, seed, error)
+                continue
+            boundary = ColourDepthBoundary().boundary(pause.frame)
+            tree, regions = LearnedTree().regions(boundary, pause.frame)
+            n, k = len(regions.sums), int(pause.image.max()) + 1
+            code = regions.of_leaf[tree.leaves] * k + pause.image
+            pixels = np.bincount(code.ravel(), minlength=n * k).reshape(n, k).astype(np.float64)
+            pixels[:, 0] += 0.1  # no region is empty
+            found.append((regions, pixels, pause.frame.camera.width / 640))
+    return found
+
+
+def episode(regions: Regions, pixels: np.ndarray, scale: float, weights: np.ndarray, pairs: Pairs) -> None:
+    """Merge the regions of one scene with the truth at hand, and note what is met."""
+    growing = Agglomeration(regions, lambda *pair: features(*pair, scale) @ weights)
+    true = np.zeros((2 * len(pixels), pixels.shape[1]))
+    true[: len(pixels)] = pixels
+    while (pair := growing.pop()) is not None:
+        odds, i, j = pair
+        rows = growing.sums[[i]], growing.sums[[j]], growing.borders[i][j][None]
+        x = features(*rows, growing.table[i][None], growing.table[j][None], scale)[0]
+        first, second = (int(true[r].argmax()) for r in (i, j))
+        if all(true[r].max() >= PURE * true[r].sum() for r in (i, j)):
+            size = growing.sums[[i, j], REGION["pixels"].start].min() / scale**2
+            # Large mistakes cost more; noise that no object shows, less.
+            weight = min(size / 200, 5) ** 0.5 * (1.0 if first and second else 0.3)
+            for sink, value in zip(pairs, (x, first != second, weight), strict=True):
+                sink.append(value)
+        if first != second:
+            growing.forget(i, j)
+        else:
+            new = growing.merge(i, j, odds)
+            true[new] = true[i] + true[j]
+
+
+def logistic(pairs: Pairs) -> np.ndarray:
+    """Weights of the ridge logistic regression, features standardised for the penalty."""
+    X, different, weight = (np.array(part) for part in pairs)
+    mean, scale = X.mean(axis=0), X.std(axis=0) + 1e-9
+    mean[0], scale[0] = 0.0, 1.0
+    Z, sign = (X - mean) / scale, np.where(different, 1.0, -1.0)
+
+    def loss(b: np.ndarray) -> tuple[float, np.ndarray]:
+        margin = -sign * (Z @ b)
+        penalty = np.append(0.0, b[1:])
+        value = (weight * np.logaddexp(0, margin)).sum() + RIDGE / 2 * (penalty**2).sum()
+        return value, Z.T @ (-sign * weight / (1 + np.exp(-margin))) + RIDGE * penalty
+
+    b = minimize(loss, np.zeros(X.shape[1]), jac=True, method="L-BFGS-B", options={"maxiter": 500}).x / scale
+    b[0] -= (b[1:] * mean[1:]).sum()
+    return b
+
+
+def write(weights: np.ndarray) -> None:
+    """Put the table into the package."""
+    path = Path(join_weights.__file__)
+    head = path.read_text().split("JOIN_WEIGHTS", 1)[0]
+    rows = "".join(f'    "{name}": {value:.4g},\n' for name, value in zip(FEATURES, weights, strict=True))
+    path.write_text(f"{head}JOIN_WEIGHTS: dict[str, float] = {{\n{rows}}}\n")
+
+
+def main() -> None:
+    began = time.time()
+    scenes = measured()
+    print(f"{len(scenes)} scenes measured, {time.time() - began:.0f} s")
+    weights = np.zeros(len(FEATURES))
+    weights[:2] = -6.0, 12.0  # to begin with: the strength of the border
+    pairs: Pairs = ([], [], [])
+    for _ in range(ROUNDS):
+        before = len(pairs[0])
+        for regions, pixels, scale in scenes:
+            episode(regions, pixels, scale, weights, pairs)
+        weights = logistic(pairs)
+        X, different = np.array(pairs[0][before:]), np.array(pairs[1][before:])
+        wrong = ((X @ weights > 0) != different).mean()
+        print(
+            f"{len(X)} pairs, {different.mean():.3f} different, {wrong:.4f} judged wrongly, "
+            f"{time.time() - began:.0f} s"
+        )
+    write(weights)
+
+
+if __name__ == "__main__":
+    main()

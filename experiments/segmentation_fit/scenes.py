@@ -1,0 +1,48 @@
+"""Simulated first pauses with their true labels: what the judgement of joins is fitted and checked on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from mstfilter.scene.camera import Camera
+from mstfilter.scene.frame import Frame
+from mstfilter.scene.voxels import VoxelGrid
+from mstfilter.simulation.families import SCENE_FAMILIES, SceneFamily
+from mstfilter.simulation.recorder import Scene
+
+_TABLE, _DEMO = SCENE_FAMILIES["table"], SCENE_FAMILIES["demo"]
+
+#: To fit on: sizes and printed names of the tuning catalogue only; 3 - 9 objects, alone, touching and stacked.
+FITTED = {
+    "mix": replace(_TABLE, name="mix", catalogue="tuning", n_objects_min=3, n_objects_max=7, n_stacked=1),
+    "small": replace(_DEMO, name="mixd", catalogue="tuning", n_objects_min=2, n_objects_max=6),
+    "crowd": replace(
+        _TABLE, name="mixc", catalogue="tuning", n_objects_min=6, n_objects_max=9, n_stacked=2, contact=0.9
+    ),
+}
+FITTED_SEEDS = range(20, 100)
+#: To check on: the named families, seeds that nothing was fitted on.
+CHECKED_SEEDS = range(16)
+
+
+@dataclass(frozen=True, eq=False)
+class Pause:
+    """A frame with its truth in the image (H, W) and in space (X, Y, Z); 0 is no object."""
+
+    frame: Frame
+    image: np.ndarray
+    grid: VoxelGrid
+    volume: np.ndarray
+
+
+def first_pause(family: SceneFamily, seed: int) -> Pause:
+    """The scene before anything moves."""
+    scene = Scene(family, seed)
+    seen = scene.see(0)
+    robot = seen["robot_mask"]
+    camera: Camera = scene.camera
+    frame = Frame(seen["rgb"], seen["depth"], camera, robot if robot.any() else None)
+    image = np.where(robot, 0, seen["instance"]).astype(np.int64)
+    return Pause(frame, image, scene.grid, scene.truth())
