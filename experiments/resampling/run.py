@@ -1,0 +1,214 @@
+"""All resampling schemes on models with known answers and on candidates of MST.
+
+    python experiments/resampling/run.py [--smoke] [--out results]
+
+Every part that is finished is kept in OUT/parts; the same command goes on with the others.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+from populations import Candidates, choose, of_world, real, simulated
+from schemes import BASE, schemes
+from scipy import stats
+from worlds import World, branching, plain, worlds
+
+from mstfilter.errors import InputError
+from mstfilter.smc.population import Population
+from mstfilter.smc.similarity import Exact, Gaussian
+
+HERE = Path(__file__).resolve().parent
+Row = dict[str, object]
+FIELDS = ("part", "setting", "scheme", "measure", "unit", "value")
+FULL = {
+    "seeds": 40,
+    "n": 50,
+    "few": 20,
+    "reference": 50_000,
+    "populations": 10,
+    "draws": 50,
+    "scenes": 3,
+    "rounds": 8,
+}
+SMOKE = {"seeds": 2, "n": 12, "few": 5, "reference": 500, "populations": 2, "draws": 3, "scenes": 0, "rounds": 1}
+
+
+def filtered(name: str, world: World, size: dict[str, int]) -> Iterator[Row]:
+    """Both filters of a model with every scheme; a unit is a seed, which names data and streams for all schemes."""
+    arms = schemes(world.similarity, world.equivalence)
+    for setting, make, n in (("plain", plain, size["n"]), ("branching", branching, size["few"])):
+        for scheme, resampler in arms.items():
+            filter = make(world, resampler, n)
+            for seed in range(size["seeds"]):
+                data = world.data(seed)
+                errors, unique, state = [], [], None
+                try:
+                    for state, info in filter.iterate(data.observations, seed):
+                        errors.append(world.error(state.population, data.answers[info.t]))
+                        if info.resampled:
+                            kept = info.unique_ancestors if setting == "plain" else len(np.unique(info.ancestors))
+                            unique.append(kept)
+                except InputError:  # no particle explains what is seen: the run is lost, its evidence is 0
+                    yield from rows(name, f"{setting} n={n}", scheme, seed, {"lost": 1.0, "evidence_ratio": 0.0})
+                    continue
+                found = {"lost": 0.0, "state_error": float(np.mean(errors))}
+                if unique:
+                    found["unique_ancestors"] = float(np.mean(unique))
+                if state is not None and state.log_evidence is not None:
+                    found["log_evidence_error"] = state.log_evidence - data.log_evidence
+                    found["evidence_ratio"] = float(np.exp(found["log_evidence_error"]))
+                yield from rows(name, f"{setting} n={n}", scheme, seed, found)
+
+
+def rows(part: str, setting: str, scheme: str, unit: int, found: dict[str, float]) -> Iterator[Row]:
+    """One a measure."""
+    for measure, value in found.items():
+        yield dict(zip(FIELDS, (part, setting, scheme, measure, unit, value), strict=True))
+
+
+def chosen(part: str, setting: str, unit: int, candidates: Candidates, n: int, draws: int) -> Iterator[Row]:
+    """Measures of one population."""
+    for scheme, found in choose(candidates, n, draws, unit).items():
+        yield from rows(part, setting, scheme, unit, found)
+
+
+def from_worlds(all_worlds: dict[str, World], size: dict[str, int]) -> Iterator[Row]:
+    """Candidates of the four models; a unit is a population."""
+    for name, world in all_worlds.items():
+        for seed in range(size["populations"]):
+            candidates = of_world(world, size["few"], 500 + seed)
+            yield from chosen(f"select: {name}", "4 n to n", seed, candidates, size["few"], size["draws"])
+
+
+def from_real(size: dict[str, int]) -> Iterator[Row]:
+    """The real candidates; a unit is a batch of draws, so intervals are about chance in the draws alone."""
+    candidates = real()
+    if candidates is None:
+        print("real candidates left out: no folder r1 (MSTFILTER_SHARED names the folder that holds it)")
+        return
+    for batch in range(size["populations"]):
+        yield from chosen("select: real", "125 to 5", batch, candidates, 5, size["draws"])
+
+
+def timed(size: dict[str, int]) -> Iterator[Row]:
+    """Seconds a call over those of systematic in the same round; schemes take turns."""
+    for m, n in ((100, 20), (1000, 250)):
+        rng = np.random.default_rng(m)
+        population = Population(rng.normal(size=m), rng.normal(size=m))
+        arms = schemes(Gaussian(0.1), Exact())
+        for unit in range(size["rounds"]):
+            seconds = {}
+            for scheme, resampler in arms.items():
+                best = np.inf  # the shortest of three: the machine has other work
+                for _ in range(3 if m == 100 else 2):
+                    start = time.perf_counter()
+                    resampler.resample(np.random.default_rng(unit), population, n)
+                    best = min(best, time.perf_counter() - start)
+                seconds[scheme] = best
+            for scheme, value in seconds.items():
+                yield from rows("time", f"{m} to {n}", scheme, unit, {"relative_time": value / seconds[BASE]})
+
+
+def interval(values: np.ndarray) -> tuple[float, float, float]:
+    """Mean and its 95 % t interval."""
+    mean = float(values.mean())
+    if len(values) < 2:
+        return mean, float("nan"), float("nan")
+    half = float(stats.sem(values) * stats.t.ppf(0.975, len(values) - 1))
+    return mean, mean - half, mean + half
+
+
+def summarise(found: list[dict[str, str]], out: Path) -> None:
+    """summary.csv: means with intervals, paired differences from systematic, and what can be claimed."""
+    table: dict[tuple[str, str, str], dict[str, dict[int, float]]] = {}
+    for r in found:
+        key = (r["part"], r["setting"], r["measure"])
+        table.setdefault(key, {}).setdefault(r["scheme"], {})[int(r["unit"])] = float(r["value"])
+    for part, setting, measure in [k for k in table if k[2] == "log_evidence_error"]:
+        errors = table[part, setting, measure]
+        centre = {s: np.mean(list(v.values())) for s, v in errors.items()}
+        table[part, setting, "log_evidence_variance"] = {
+            s: {u: (e - centre[s]) ** 2 * len(v) / max(len(v) - 1, 1) for u, e in v.items()}
+            for s, v in errors.items()
+        }
+    lines = []
+    for (part, setting, measure), by_scheme in sorted(table.items()):
+        for scheme, values in by_scheme.items():
+            mean, low, high = interval(np.array(list(values.values())))
+            both = [u for u in values if u in by_scheme.get(BASE, {})]
+            line = {"part": part, "setting": setting, "measure": measure, "scheme": scheme, "units": len(values)}
+            line |= {"mean": f"{mean:.4g}", "low": f"{low:.4g}", "high": f"{high:.4g}", "paired_units": len(both)}
+            claim = ""
+            if scheme != BASE and both:
+                d, d_low, d_high = interval(np.array([values[u] - by_scheme[BASE][u] for u in both]))
+                line |= {"minus_systematic": f"{d:.4g}", "diff_low": f"{d_low:.4g}", "diff_high": f"{d_high:.4g}"}
+                claim = "higher" if d_low > 0 else "lower" if d_high < 0 else "no difference can be claimed"
+            else:
+                line |= {"minus_systematic": "", "diff_low": "", "diff_high": ""}
+            lines.append(line | {"claim": claim})
+    write(out / "summary.csv", lines)
+
+
+def write(path: Path, lines: list) -> None:
+    """A CSV that is there in full or not at all."""
+    partial = path.with_suffix(".partial")
+    with partial.open("w", newline="") as file:
+        writer = csv.DictWriter(file, lines[0] if lines else FIELDS, lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(lines)
+    partial.replace(path)
+
+
+def read(path: Path) -> list[dict[str, str]]:
+    """Rows of a CSV."""
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def main() -> None:
+    """Run the parts that are missing, then summarise and draw."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--smoke", action="store_true", help="tiny, a few seconds; needs --out")
+    parser.add_argument("--out", type=Path, default=HERE / "results")
+    parser.add_argument("--only", default="", help="parts whose names begin so (to share work between processes)")
+    options = parser.parse_args()
+    size = SMOKE if options.smoke else FULL
+    if options.smoke and options.out == HERE / "results":
+        parser.error("--smoke would overwrite the results: name another folder with --out")
+    everything = worlds(size["reference"])
+    parts: dict[str, Callable[[], Iterator[Row]]] = {
+        f"filter-{name}": lambda name=name, world=world: filtered(name, world, size)
+        for name, world in everything.items()
+    }
+    parts |= {"select-worlds": lambda: from_worlds(everything, size), "select-real": lambda: from_real(size)}
+    for seed in range(size["scenes"]):
+        parts[f"select-demo-{seed}"] = lambda seed=seed: chosen(
+            "select: simulated", "last step of mst to 5", seed, simulated(seed), 5, size["draws"]
+        )
+    parts["time"] = lambda: timed(size)
+    folder = options.out / "parts"
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, part in parts.items():
+        path = folder / f"{name}.csv"
+        if name.startswith(options.only) and not path.exists():
+            start = time.perf_counter()
+            write(path, list(part()))
+            print(f"{name}  {time.perf_counter() - start:.0f} s", flush=True)
+    missing = [name for name in parts if not (folder / f"{name}.csv").exists()]
+    if missing:
+        print("not yet there:", ", ".join(missing))
+        return
+    summarise([row for name in parts for row in read(folder / f"{name}.csv")], options.out)
+    from figure import draw
+
+    draw(options.out)
+
+
+if __name__ == "__main__":
+    main()

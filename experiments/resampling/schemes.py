@@ -1,0 +1,64 @@
+"""The schemes that are compared: every resampler in the registry, with what it needs to see particles."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from mstfilter.smc.interfaces import Resampler
+from mstfilter.smc.kept_weights import KeepWeights
+from mstfilter.smc.resampling import Multinomial, Residual, Stratified, Systematic
+from mstfilter.smc.resampling_clusters import ClusterStratified
+from mstfilter.smc.resampling_dpp import KDpp
+from mstfilter.smc.resampling_greedy import GreedyDiverse
+from mstfilter.smc.resampling_optimal import FearnheadClifford
+from mstfilter.smc.resampling_rounding import Killing, ResidualSystematic, Ssp
+from mstfilter.smc.resampling_wrappers import Coalesced, Shuffled, Tempered
+from mstfilter.smc.similarity import Equivalence, Similarity
+
+BASE = "systematic"  # what all others are compared with
+
+
+def schemes(similarity: Similarity, equivalence: Equivalence) -> dict[str, Resampler]:
+    """By registered name; wrappers around the scheme that they have by default."""
+    return {
+        BASE: Systematic(),
+        "residual_systematic": ResidualSystematic(),
+        "ssp": Ssp(),
+        "shuffled": Shuffled(),
+        "residual": Residual(),
+        "stratified": Stratified(),
+        "killing": Killing(),
+        "multinomial": Multinomial(),
+        "tempered": Tempered(),
+        "fearnhead_clifford": FearnheadClifford(),
+        "coalesced": Coalesced(equivalence=equivalence),
+        "clusters": ClusterStratified(similarity),
+        "kdpp": KDpp(similarity),
+        "greedy_diverse": GreedyDiverse(similarity),
+        "keep_weights": KeepWeights(),
+    }
+
+
+@dataclass(frozen=True, eq=False)
+class Table(Similarity):
+    """Similarity of particles that are row numbers of a known matrix."""
+
+    known: np.ndarray
+
+    def matrix(self, particles: Any) -> np.ndarray:
+        """(n, n)."""
+        return self.known[np.ix_(particles, particles)]
+
+
+@dataclass(frozen=True, eq=False)
+class Names(Equivalence):
+    """Classes of particles that are row numbers of a known list of classes."""
+
+    known: np.ndarray
+
+    def classes(self, particles: Any) -> np.ndarray:
+        """(n,)."""
+        return self.known[particles]

@@ -1,0 +1,227 @@
+"""The four models with a known answer: data, filter, and how far an estimate is from the answer."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+from typing import Any
+
+import numpy as np
+from scipy import stats
+
+from mstfilter.fusion.similarity import SameSegmentation, WeightedCoverage
+from mstfilter.oracles.miniature.exact import exact_filter
+from mstfilter.oracles.miniature.filters import bootstrap_filter
+from mstfilter.oracles.miniature.measures import class_weights
+from mstfilter.oracles.miniature.world import Miniature
+from mstfilter.smc.distributions import Normal, Student
+from mstfilter.smc.interfaces import Resampler, Transition
+from mstfilter.smc.particle_filter import ParticleFilter
+from mstfilter.smc.population import Population
+from mstfilter.smc.resampling import EssBelow, Never
+from mstfilter.smc.similarity import Equivalence, Exact, Gaussian, Similarity
+from mstfilter.smc.state_space import StateSpaceModel, bootstrap
+
+BRANCHES = 4
+
+
+@dataclass(frozen=True, eq=False)
+class Data:
+    """Observations, log p(y) and the filtering answers (T, ...)."""
+
+    observations: Sequence[Any]
+    log_evidence: float
+    answers: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class World:
+    """A model: its bootstrap filter, its data by seed, the estimate (...) that is compared with the answers."""
+
+    filter: Callable[[int], ParticleFilter]
+    data: Callable[[int], Data]
+    estimate: Callable[[Population], np.ndarray]
+    similarity: Similarity
+    equivalence: Equivalence
+
+    def error(self, population: Population, answer: np.ndarray) -> float:
+        """Absolute error of a mean; total variation of a law."""
+        difference = np.abs(self.estimate(population) - answer)
+        return float(difference if difference.ndim == 0 else 0.5 * difference.sum())
+
+
+@dataclass(frozen=True)
+class Branch(Transition):
+    """Every particle moves several times, independently: more candidates than places, as in MST."""
+
+    inner: Transition
+    branches: int = BRANCHES
+
+    def predict(self, rng: np.random.Generator, population: Population, observation: Any) -> Population:
+        """(n * branches) candidates, those of one particle side by side."""
+        index = np.repeat(np.arange(len(population)), self.branches)
+        return self.inner.predict(rng, population.take(index), observation)
+
+
+def plain(world: World, resampler: Resampler, n: int) -> ParticleFilter:
+    """The bootstrap filter: n in, n out, before the next prediction where the ESS is below n / 2."""
+    return replace(world.filter(n), resampler=resampler, trigger=EssBelow(0.5), resample="before")
+
+
+def branching(world: World, resampler: Resampler, n: int) -> ParticleFilter:
+    """n particles, BRANCHES * n candidates at every step, of which the resampler keeps n."""
+    filter = world.filter(n)
+    return replace(
+        filter, transition=Branch(filter.transition), resampler=resampler, trigger=Never(), resample="after"
+    )
+
+
+# --- AR(1) in noise, Kalman ----------------------------------------------------------------------------------------
+R, S, Q, STEPS = 0.9, 0.6, 0.4, 25
+S0 = S / np.sqrt(1 - R**2)
+
+
+def kalman(seed: int) -> Data:
+    """Data of a seed, their log evidence and filtered means by the Kalman filter."""
+    rng = np.random.default_rng([seed, 21])
+    x, ys = rng.normal(0, S0), []
+    for _ in range(STEPS):
+        ys.append(float(rng.normal(x, Q)))
+        x = rng.normal(R * x, S)
+    m, v, total, means = 0.0, S0**2, 0.0, []
+    for t, y in enumerate(ys):
+        if t:
+            m, v = R * m, R**2 * v + S**2
+        total += stats.norm.logpdf(y, m, np.sqrt(v + Q**2))
+        gain = v / (v + Q**2)
+        m, v = m + gain * (y - m), (1 - gain) * v
+        means.append(m)
+    return Data(ys, float(total), np.array(means))
+
+
+AR1 = StateSpaceModel.of(Normal(0.0, S0), lambda x: Normal(R * x, S), lambda x: Normal(x, Q))
+
+# --- stochastic volatility, reference by big runs ------------------------------------------------------------------
+VOLATILITY = StateSpaceModel.of(
+    Normal(-1.0, 0.5 / np.sqrt(1 - 0.9**2)),
+    lambda h: Normal(-1.0 + 0.9 * (h + 1.0), 0.5),
+    lambda h: Student(8.0, 0.0, np.exp(h / 2)),
+)
+
+
+def volatility_data(reference: int) -> Callable[[int], Data]:
+    """The same data for all seeds; answers are the mean of four runs with `reference` particles."""
+
+    @cache
+    def known() -> Data:
+        rng = np.random.default_rng(22)
+        h, ys = rng.normal(-1.0, 0.5 / np.sqrt(1 - 0.9**2)), []
+        for _ in range(STEPS):
+            ys.append(float(np.exp(h / 2) * rng.standard_t(8)))
+            h = -1.0 + 0.9 * (h + 1.0) + 0.5 * rng.normal()
+        evidence, means = [], []
+        for seed in range(4):
+            steps = [
+                (s.log_evidence, mean(s.population))
+                for s, _ in bootstrap(VOLATILITY, reference).iterate(ys, 9000 + seed)
+            ]
+            evidence.append(steps[-1][0])
+            means.append([m for _, m in steps])
+        top = max(evidence)
+        return Data(ys, top + float(np.log(np.mean(np.exp(np.array(evidence) - top)))), np.mean(means, axis=0))
+
+    return lambda seed: known()
+
+
+def mean(population: Population) -> np.ndarray:
+    """Weighted mean of a scalar state."""
+    return np.asarray(population.weights @ population.particles)
+
+
+# --- shelves of boxes, forward algorithm ---------------------------------------------------------------------------
+CHANGE, COLOURS, SEEN, ROOM = np.array([0.5, 0.3, 0.2]), np.array([0.5, 0.3, 0.2]), 0.8, 26
+
+
+def change(rng: np.random.Generator, shelf: tuple[int, ...]) -> tuple[int, ...]:
+    """One step of one shelf, a sorted tuple of colours."""
+    u = rng.random()
+    if u < CHANGE[1]:
+        return tuple(sorted((*shelf, int(np.searchsorted(np.cumsum(COLOURS), rng.random())))))
+    if u < CHANGE[1] + CHANGE[2] and shelf:
+        gone = int(rng.integers(len(shelf)))
+        return shelf[:gone] + shelf[gone + 1 :]
+    return shelf
+
+
+def shelf_data(seed: int) -> Data:
+    """Counts; only the number of boxes matters for them, a birth-death chain that is summed exactly."""
+    rng = np.random.default_rng([seed, 23])
+    shelf: tuple[int, ...] = ()
+    counts = []
+    for _ in range(STEPS):
+        shelf = change(rng, shelf)
+        counts.append(int(rng.binomial(len(shelf), SEEN)))
+    moves = CHANGE[0] * np.eye(ROOM) + CHANGE[1] * np.eye(ROOM, k=1) + CHANGE[2] * np.eye(ROOM, k=-1)
+    moves[0, 0] += CHANGE[2]
+    p, total, means = np.eye(ROOM)[0], 0.0, []
+    for count in counts:
+        p = p @ moves * stats.binom.pmf(count, np.arange(ROOM), SEEN)
+        total += np.log(p.sum())
+        p = p / p.sum()
+        means.append(p @ np.arange(ROOM))
+    return Data(counts, float(total), np.array(means))
+
+
+_LOG_SEEN = stats.binom.logpmf(np.arange(ROOM)[:, None], np.arange(ROOM)[None, :], SEEN)
+SHELF = StateSpaceModel(
+    lambda rng, n: tuple(change(rng, ()) for _ in range(n)),
+    lambda rng, shelves: tuple(change(rng, shelf) for shelf in shelves),
+    lambda shelves, count: _LOG_SEEN[count, [len(shelf) for shelf in shelves]],
+)
+
+
+@dataclass(frozen=True)
+class SameBoxes(Similarity):
+    """Boxes in common over boxes in either, by colour; 1 for two empty shelves."""
+
+    def matrix(self, particles: Any) -> np.ndarray:
+        """(n, n)."""
+        have = np.array([np.bincount(np.array(p, dtype=int), minlength=len(COLOURS)) for p in particles])
+        both = np.minimum(have[:, None], have[None]).sum(axis=2)
+        either = np.maximum(have[:, None], have[None]).sum(axis=2)
+        return np.where(either == 0, 1.0, both / np.maximum(either, 1))
+
+
+def n_boxes(population: Population) -> np.ndarray:
+    """Expected number of boxes."""
+    return np.asarray(population.weights @ np.array([len(p) for p in population.particles]))
+
+
+# --- the miniature MST, enumerated ---------------------------------------------------------------------------------
+TABLE = Miniature((3, 2))
+
+
+def table_data(seed: int) -> Data:
+    """Six glances at a table; all configurations are enumerated."""
+    _, glances = TABLE.simulate(np.random.default_rng([seed, 24]), 6)
+    exact = exact_filter(TABLE, glances)
+    return Data(glances, float(exact.log_evidence[-1]), exact.posterior)
+
+
+def worlds(reference: int) -> dict[str, World]:
+    """By name."""
+    return {
+        "linear_gaussian": World(lambda n: bootstrap(AR1, n), kalman, mean, Gaussian(0.3), Exact()),
+        "stochastic_volatility": World(
+            lambda n: bootstrap(VOLATILITY, n), volatility_data(reference), mean, Gaussian(0.3), Exact()
+        ),
+        "object_hmm": World(lambda n: bootstrap(SHELF, n), shelf_data, n_boxes, SameBoxes(), Exact()),
+        "miniature_mst": World(
+            lambda n: bootstrap_filter(TABLE, n),
+            table_data,
+            lambda population: class_weights(TABLE, population),
+            WeightedCoverage(),
+            SameSegmentation(),
+        ),
+    }
