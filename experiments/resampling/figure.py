@@ -6,7 +6,7 @@ import csv
 from pathlib import Path
 
 PANELS = (
-    ("linear_gaussian", "plain", "log_evidence_variance"),
+    ("stochastic_volatility", "branching", "state_error"),
     ("miniature_mst", "branching", "state_error"),
     ("select: real", "125", "diversity"),
     ("select: real", "125", "mass_error"),
