@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import hashlib
 import importlib
 import importlib.util
 import sys
@@ -190,6 +191,7 @@ def _from_file(path: Path, attribute: str) -> type:
     if not isinstance(found, type):
         raise InputError(f"{path} has no class {attribute!r}")
     found.__mst_file__ = f"{path}:{attribute}"  # type: ignore[attr-defined]
+    found.__mst_source__ = hashlib.sha256(path.read_bytes()).hexdigest()  # type: ignore[attr-defined]
     return found
 
 
