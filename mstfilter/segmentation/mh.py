@@ -4,12 +4,10 @@ The chain starts at the optimal cut c* and aims at ``p(c) = exp(-(v(c*) - v(c))^
 ``s2 = sigma2 v(c*)^2``. Values that are log odds (`MergeLogOdds`) have natural units and need no such scale: with a
 `temperature` the chain aims at ``p(c) = exp((v(c) - v(c*)) / temperature)``, at 1 the law that the odds stand for.
 
-=========  ============================================================================================
-``mst``    ``MetropolisHastingsCuts(temperature=1)``: one chain, MoveNode mixed with subtree redraws
-``paper``  ``MetropolisHastingsCuts(0.25, burn_in=0, thinning=20, redraw_share=0)``
-``authors``  ``MetropolisHastingsCuts(0.25, burn_in=0, thinning=20, moves="authors", redraw_share=0,
-           restart=True, include_optimal=True, redraw_repeated=True)``
-=========  ============================================================================================
+- ``mst``: ``MetropolisHastingsCuts(temperature=1)``: one chain, MoveNode mixed with subtree redraws.
+- ``paper``: ``MetropolisHastingsCuts(0.25, burn_in=0, thinning=20, redraw_share=0)``.
+- ``authors``: ``MetropolisHastingsCuts(0.25, burn_in=0, thinning=20, moves="authors", redraw_share=0, restart=True,
+  include_optimal=True, redraw_repeated=True)``.
 
 >>> sample = MetropolisHastingsCuts().sample(np.random.default_rng(0), tree, w, 5)
 >>> sample.diagnostics["acceptance"], sample.diagnostics["autocorrelation_steps"]

@@ -13,11 +13,8 @@ the number of workers nor another arm changes anything. Each worker keeps the nu
 
 from __future__ import annotations
 
-import multiprocessing
-import os
 import sys
 from collections.abc import Iterable, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -27,9 +24,6 @@ from mstfilter.smc.collect import Collector, History, collect, log_evidence
 from mstfilter.smc.particle_filter import ParticleFilter
 
 __all__ = ["run_many"]
-
-_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS")
-_JOB: dict[str, Any] = {}  # what forked workers inherit: models may be closures, which cannot be sent
 
 
 def run_many(
@@ -88,39 +82,21 @@ def _one(job: Mapping[str, Any], arm: str, seed: int) -> dict[str, np.ndarray]:
 
 
 def _in_pool(job: dict[str, Any], tasks: list[tuple[str, int]], workers: int) -> list[dict[str, np.ndarray]]:
-    """Results in order. Forked workers inherit the job; where there is no fork it is sent, and must be picklable."""
-    fork = "fork" in multiprocessing.get_all_start_methods() and sys.platform != "darwin"
-    context = multiprocessing.get_context("fork" if fork else "spawn")
-    kept = {name: os.environ.get(name) for name in _THREADS}
-    os.environ.update(dict.fromkeys(_THREADS, "1"))
-    _JOB.clear()
-    _JOB.update(job)
-    try:
-        with ProcessPoolExecutor(
-            min(workers, len(tasks)), context, initializer=_start, initargs=() if fork else (job,)
-        ) as pool:
-            return list(pool.map(_task, tasks, chunksize=max(1, len(tasks) // (8 * workers))))
-    finally:
-        _JOB.clear()
-        for name, value in kept.items():
-            if value is None:
-                os.environ.pop(name, None)
-            else:
-                os.environ[name] = value
+    """Results in order. Fresh processes, not forks: a fork of a process whose libraries run threads may never return.
+    The job is sent once to each batch; closures and classes of a notebook travel too (cloudpickle)."""
+    from joblib import Parallel, delayed, parallel_config
+
+    batches = [tasks[k :: 4 * workers] for k in range(min(4 * workers, len(tasks)))]
+    with parallel_config("loky", n_jobs=min(workers, len(batches)), inner_max_num_threads=1):
+        done = Parallel(batch_size=1)(delayed(_batch)(job, batch) for batch in batches)
+    found = dict(pair for results in done for pair in results)
+    return [found[task] for task in tasks]
 
 
-def _start(job: dict[str, Any] | None = None) -> None:
-    """In a worker: one thread a library, the job where it was sent."""
-    if job is not None:
-        _JOB.update(job)
-    from threadpoolctl import threadpool_limits
-
-    _JOB["limits"] = threadpool_limits(1)
+def _batch(job: dict[str, Any], tasks: list[tuple[str, int]]) -> list[tuple[tuple[str, int], dict[str, np.ndarray]]]:
+    """In a worker: one thread a library. Those that read no environment variable are told."""
     if "torch" in sys.modules:
         sys.modules["torch"].set_num_threads(1)
     if "cv2" in sys.modules:
         sys.modules["cv2"].setNumThreads(1)
-
-
-def _task(task: tuple[str, int]) -> dict[str, np.ndarray]:
-    return _one(_JOB, *task)
+    return [(task, _one(job, *task)) for task in tasks]
