@@ -1,0 +1,40 @@
+"""The command line: parses, calls, prints.
+
+``mstfilter demo`` makes a simulated recording, filters it and writes a report. ``mstfilter --help`` lists the rest.
+Each module holds one group of commands; importing it registers them with `mstfilter.cli.root.app`.
+"""
+
+from __future__ import annotations
+
+import sys
+
+from mstfilter.cli import running, data, components  # isort: skip (the order of the help page)
+from mstfilter.cli.root import app
+from mstfilter.errors import InputError
+
+__all__ = ["app", "components", "data", "main", "running"]
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Run the command line; bad input is one clear error and exit code 2."""
+    given = sys.argv[1:] if arguments is None else list(arguments)
+    debug = "--debug" in given
+    given = [a for a in given if a != "--debug"]
+    try:
+        app(given, prog_name="mstfilter")
+    except InputError as error:
+        if debug:
+            raise
+        print(f"error: {error.message}", file=sys.stderr)
+        for hint in error.hints:
+            print(f"hint: {hint}", file=sys.stderr)
+        sys.exit(2)
+    except KeyboardInterrupt:
+        print("interrupted: the same command goes on from here", file=sys.stderr)
+        sys.exit(130)
+    except Exception as error:
+        if debug:
+            raise
+        print(f"error: {type(error).__name__}: {error}", file=sys.stderr)
+        print("hint: this is a fault of the program; --debug shows where it happened", file=sys.stderr)
+        sys.exit(1)

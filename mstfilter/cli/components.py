@@ -1,0 +1,134 @@
+"""Commands about components: list, check, new."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from mstfilter.cli.root import app
+from mstfilter.errors import InputError
+
+__all__ = ["check", "list_", "new"]
+
+
+@app.command("list")
+def list_(
+    kind: Annotated[str, typer.Argument(help="One kind only: resampler, rule, ..., presets or families.")] = "",
+) -> None:
+    """List presets, scene families and components with their fields."""
+    from mstfilter import registry
+
+    kinds = ["presets", "families", *registry.COMPONENTS]
+    wanted = kind.removesuffix("s") if kind.removesuffix("s") in registry.COMPONENTS else kind
+    if wanted and wanted not in kinds:
+        raise InputError(f"there is no kind of component {kind!r}", f"there are: {', '.join(kinds)}")
+    for name in [wanted] if wanted else kinds:
+        print(f"{name}:")
+        for line in _lines(name):
+            print(f"  {line}")
+
+
+@app.command()
+def check(
+    component: Annotated[str, typer.Argument(help="./file.py:Class, or KIND.NAME such as resampler.systematic.")],
+    overrides: Annotated[
+        list[str] | None, typer.Argument(metavar="[FIELD=VALUE]...", help="Fields that are not the default.")
+    ] = None,
+) -> None:
+    """Test whether a component keeps what its interface promises, and say in words what it does not."""
+    from mstfilter import registry
+    from mstfilter.presets import settings
+    from mstfilter.testing import verify
+    from mstfilter.testing.properties import FALSE_ALARM
+    from mstfilter.testing.starters import example_of
+
+    kind, _, name = ("", "", component) if ".py:" in component else component.partition(".")
+    if ".py:" not in component and kind not in registry.COMPONENTS:
+        raise InputError(
+            f"{component!r} is no component", "give ./file.py:Class, or KIND.NAME as `mstfilter list` shows"
+        )
+    cls = registry.find_class(kind, name, component, allow_files=True)
+    made = registry.make(cls, settings(overrides or ()), "", allow_files=True)
+    failed = statistical = 0
+    for outcome in verify(made, example_of(cls)):
+        state = "broken" if outcome.broken else "skipped" if outcome.skipped else "holds"
+        print(f"{state:<9}{outcome.property.says}")
+        if outcome.broken or outcome.skipped:
+            print(f"{'':<9}  {outcome.broken or outcome.skipped}  [{outcome.property.name}]")
+        failed += outcome.broken is not None
+        statistical += outcome.property.statistical and not outcome.skipped
+    if statistical:
+        print(
+            f"{statistical} of these are statistical: each alarms falsely with probability {FALSE_ALARM:.0e} at most"
+        )
+    verdict = {0: "all properties that apply hold", 1: "1 property is broken"}.get(
+        failed, f"{failed} properties are broken"
+    )
+    print(f"{cls.__name__}: {verdict}")
+    if failed:
+        raise typer.Exit(1)
+
+
+@app.command()
+def new(
+    kind: Annotated[str, typer.Argument(help="resampler, transition, proposal or update.")],
+    path: Annotated[Path, typer.Argument(help="Python file to make, for example mine.py.")],
+) -> None:
+    """Write a commented component of your own that works, and its test."""
+    from mstfilter.testing.starters import write_starter
+
+    file, test = write_starter(kind, path)
+    print(f"component   {file}")
+    print(f"test        {test}")
+    print(f"next        mstfilter check {path.parent}/{path.name}:My{kind.capitalize()}")
+
+
+def _lines(kind: str) -> Iterator[str]:
+    """One line a preset, family or component."""
+    import tomllib
+
+    from mstfilter import registry
+    from mstfilter.resources import find_preset, preset_names
+
+    if kind == "presets":
+        for name in preset_names():
+            yield f"{name:<20}{tomllib.loads(find_preset(name).read_text()).get('description', '')}"
+        return
+    if kind == "families":
+        from mstfilter.simulation.families import SCENE_FAMILIES
+
+        for name, f in SCENE_FAMILIES.items():
+            objects = f"{f.n_objects_min}-{f.n_objects_max}" if f.n_objects_min < f.n_objects_max else f.n_objects_max
+            yield (
+                f"{name:<20}{objects} objects, {f.n_actions} actions of {f.frames_per_clip} frames, "
+                f"{f.width} x {f.height}, voxels {' x '.join(map(str, f.grid().shape))}"
+            )
+        return
+    for name in registry.known(kind):
+        cls = registry.find_class(kind, name)
+        yield f"{name:<20}{_first_line(cls)}  [{_fields(cls)}]"
+
+
+def _first_line(cls: type) -> str:
+    return (cls.__doc__ or "").strip().split("\n")[0].rstrip(".")
+
+
+def _fields(cls: type) -> str:
+    """Fields of a component with their defaults."""
+    import dataclasses
+
+    from mstfilter.registry import default_of, name_of
+
+    parts = []
+    for field in dataclasses.fields(cls):
+        value: Any = default_of(field)
+        if value is dataclasses.MISSING:
+            parts.append(field.name)
+        elif dataclasses.is_dataclass(value):
+            parts.append(f"{field.name}={name_of(type(value))}")
+        else:
+            parts.append(f"{field.name}={value}")
+    return ", ".join(parts)

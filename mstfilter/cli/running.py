@@ -1,0 +1,121 @@
+"""Commands that filter recordings: run, demo, simulate, report."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from mstfilter.cli.root import Overrides, Seed, app
+from mstfilter.cli.shared import bar, open_recording, safe_name, summary
+from mstfilter.errors import InputError
+
+__all__ = ["demo", "report", "run", "simulate"]
+
+
+@app.command()
+def run(
+    recording: Annotated[
+        Path, typer.Argument(help="Recording folder, or a folder of NAME_rgb.png / NAME_depth.png pairs.")
+    ],
+    overrides: Overrides = None,
+    preset: Annotated[str, typer.Option(help="mst, paper, authors, or the path of a .toml file.")] = "mst",
+    out: Annotated[Path | None, typer.Option(help="Run folder. Default: runs/RECORDING-PRESET-SEED.")] = None,
+    seed: Seed = 0,
+    frames: Annotated[str, typer.Option(help="Frames of a folder of pairs, separated by commas.")] = "",
+    report: Annotated[bool, typer.Option(help="Write report.html into the run folder.")] = True,
+) -> None:
+    """Filter a recording into a run folder. A run that was stopped goes on."""
+    from mstfilter.presets import load_config
+
+    config = load_config(preset, overrides or ())
+    source = open_recording(recording, frames)
+    name = Path(preset).stem
+    folder = out or Path("runs") / f"{safe_name(source.name)}-{safe_name(name)}-{seed}"
+    _execute(source, config, folder, seed)
+    if report:
+        _report(folder, None)
+    summary(folder)
+
+
+@app.command()
+def demo(
+    out: Annotated[
+        Path, typer.Option(help="Folder for recording, run and report; an earlier demo there is replaced.")
+    ] = Path("demo"),
+    seed: Seed = 3,
+) -> None:
+    """Simulate a robot at a cluttered table, filter the recording, write a report."""
+    import shutil
+
+    from mstfilter.presets import load_config
+    from mstfilter.scene.recording import Recording
+
+    if out.exists() and not out.is_dir():
+        raise InputError(f"{out} is a file, expected a folder for the demo")
+    if out.exists() and any(out.iterdir()):
+        known = {"recording", "run", "report.html"}
+        strange = sorted(p.name for p in out.iterdir() if p.name.lstrip(".").removesuffix(".partial") not in known)
+        if strange:
+            raise InputError(
+                f"{out} holds something that is not a demo: {strange[0]}", "choose another folder with --out"
+            )
+        shutil.rmtree(out)
+    _simulate("demo", out / "recording", seed)
+    _execute(Recording.open(out / "recording"), load_config("mst"), out / "run", 0)
+    _report(out / "run", out / "report.html")
+    summary(out / "run")
+
+
+@app.command()
+def simulate(
+    family: Annotated[str, typer.Argument(help="Kind of scene; `mstfilter list families` shows them.")],
+    out: Annotated[Path, typer.Argument(help="Recording folder to make.")],
+    seed: Seed = 0,
+) -> None:
+    """Simulate a recording with its true volumes."""
+    _simulate(family, out, seed)
+
+
+@app.command()
+def report(
+    run: Annotated[Path, typer.Argument(help="Run folder.")],
+    out: Annotated[Path | None, typer.Option(help="HTML file. Default: report.html in the run folder.")] = None,
+    export: Annotated[
+        Path | None, typer.Option(help="Also write PLY meshes and label images into this folder.")
+    ] = None,
+) -> None:
+    """Write the report of a run folder, finished or not."""
+    _report(run, out)
+    if export is not None:
+        from mstfilter.report.export import export_run
+        from mstfilter.study.run_folder import RunFolder
+
+        export_run(RunFolder.open(run), export)
+        print(f"hypotheses  {export}")
+
+
+def _simulate(family: str, out: Path, seed: int) -> None:
+    from mstfilter.simulation.families import scene_family
+    from mstfilter.simulation.recorder import simulate
+
+    chosen = scene_family(family)
+    with bar("simulate") as advance:
+        simulate(chosen, seed, out, progress=lambda done, total, what: advance(done, total))
+    print(f"recording   {out}")
+
+
+def _execute(recording: Any, config: dict[str, Any], folder: Path, seed: int) -> None:
+    from mstfilter.study.run import execute
+
+    with bar("filter") as advance:
+        execute(recording, config, folder, seed, allow_files=True, progress=lambda p: advance(p.done, p.total))
+    print(f"run         {folder}")
+
+
+def _report(run: Path, out: Path | None) -> None:
+    from mstfilter.report.html import write_report
+    from mstfilter.study.run_folder import RunFolder
+
+    print(f"report      {write_report(RunFolder.open(run), out)}")
