@@ -4,13 +4,14 @@
 >>> scene_family("demo").image_size, scene_family("table").grid().shape
 ((320, 240), (100, 100, 50))
 
-A family is a frozen `SceneFamily`; `dataclasses.replace` makes variants. `catalogue` keeps scenes for
-tuning and scenes for reporting apart: they share no size of object and no printed name.
+A family is a frozen `SceneFamily`; `dataclasses.replace` makes variants. `s1`, `s2` and `s3` are the families
+of the studies: about 5, 9 and 15 - 20 objects with the same camera, sensor, textures and ways of touching.
+`catalogue` keeps scenes for tuning and scenes for reporting apart; in `s1` - `s3` the seed decides.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -24,8 +25,13 @@ __all__ = ["SCENE_FAMILIES", "SceneFamily", "scene_family"]
 _LOOKS_AT = np.array([0.02, 0.05, 0.04])
 _TOWARDS_CAMERA = np.array([0.03, -0.77, 0.54]) / np.linalg.norm([0.03, -0.77, 0.54])
 
-GENERATOR_VERSION = 1
+GENERATOR_VERSION = 2
 """Raised whenever the same seed gives other bytes."""
+
+FIRST_REPORTED_SEED = 1000
+"""Seeds from here on draw from the reported pool where the catalogue goes by the seed."""
+
+_CATALOGUES = ("tuning", "reported", "any", "by seed")
 
 
 @dataclass(frozen=True)
@@ -46,8 +52,9 @@ class SceneFamily:
         Probability that an object without a twin touches another one; else there is a gap of 1 - 4 cm.
     shapes : str
         Families of objects, separated by commas; "all" for every one.
-    catalogue : {"tuning", "reported", "any"}
-        Which sizes and printed names occur: two disjoint sets, or all.
+    catalogue : {"tuning", "reported", "any", "by seed"}
+        Which sizes and textures occur: one of two disjoint pools, or all. "by seed": the tuning pool for seeds
+        below 1000, the reported pool from 1000 on.
     n_actions : int
         Pushes.
     frames_per_clip : int
@@ -113,7 +120,7 @@ class SceneFamily:
         need("n_twins", 0 <= self.n_twins < self.n_objects_min, "0 .. n_objects_min - 1")
         need("n_stacked", 0 <= self.n_stacked < self.n_objects_min, "0 .. n_objects_min - 1")
         need("contact", 0.0 <= self.contact <= 1.0, "a probability")
-        need("catalogue", self.catalogue in ("tuning", "reported", "any"), "tuning, reported or any")
+        need("catalogue", self.catalogue in _CATALOGUES, ", ".join(_CATALOGUES))
         need("n_actions", self.n_actions >= 0, "at least 0")
         need("frames_per_clip", self.frames_per_clip >= 2, "at least 2 (the two pauses)")
         need("fps", 0.5 <= self.fps <= 60.0, "0.5 .. 60")
@@ -150,15 +157,21 @@ class SceneFamily:
         """Frames of a whole recording."""
         return 1 + self.n_actions * (self.frames_per_clip - 1)
 
+    def for_seed(self, seed: int) -> SceneFamily:
+        """This family with the catalogue that a seed draws from."""
+        if self.catalogue != "by seed":
+            return self
+        return replace(self, catalogue="tuning" if seed < FIRST_REPORTED_SEED else "reported")
+
     @property
     def size_range(self) -> tuple[float, float]:
         """Factors by which sizes are scaled."""
-        return {"tuning": (0.90, 0.995), "reported": (1.005, 1.10), "any": (0.90, 1.10)}[self.catalogue]
+        return {"tuning": (0.90, 0.995), "reported": (1.005, 1.10)}.get(self.catalogue, (0.90, 1.10))
 
     @property
     def word_half(self) -> int | None:
         """Which half of the printed names is used."""
-        return {"tuning": 0, "reported": 1, "any": None}[self.catalogue]
+        return {"tuning": 0, "reported": 1}.get(self.catalogue)
 
     def shape_families(self) -> tuple[str, ...]:
         """Names of the families of objects."""
@@ -196,6 +209,17 @@ class SceneFamily:
         return VoxelGrid.from_bounds(np.array([-x / 2, -y / 2, 0.0]), np.array([x / 2, y / 2, z]), self.voxel_size)
 
 
+_STUDIED = SceneFamily(
+    name="s1",
+    n_objects_min=5,
+    n_objects_max=5,
+    n_twins=1,
+    n_stacked=1,
+    contact=0.8,
+    catalogue="by seed",
+    n_actions=4,
+)
+
 SCENE_FAMILIES: dict[str, SceneFamily] = {
     "demo": SceneFamily(
         name="demo",
@@ -212,6 +236,9 @@ SCENE_FAMILIES: dict[str, SceneFamily] = {
         workspace_z=0.3,
     ),
     "table": SceneFamily(name="table"),
+    "s1": _STUDIED,
+    "s2": replace(_STUDIED, name="s2", n_objects_min=9, n_objects_max=9, n_twins=2, n_stacked=2, min_moved=3),
+    "s3": replace(_STUDIED, name="s3", n_objects_min=15, n_objects_max=20, n_twins=4, n_stacked=4, min_moved=3),
 }
 """The named families."""
 

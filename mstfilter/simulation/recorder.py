@@ -59,7 +59,7 @@ class Scene:
             raise InputError(f"seed is {seed!r}, expected an integer of at least 0")
         self.family, self.seed = family, int(seed)
         self.camera, self.grid = family.camera(), family.grid()
-        self.things: Things = draw_things(_stream(self.seed, "things"), family)
+        self.things: Things = draw_things(_stream(self.seed, "things"), family.for_seed(self.seed))
         self.world = World(self.things.shapes, family.arm)
         arrange(_stream(self.seed, "arrangement"), self.world, family, self.things.twin_of)
         self.room: Room = draw_room(_stream(self.seed, "room"), seen_texel(self.camera))
