@@ -88,8 +88,8 @@ class Recording:
         The folder it was read from.
     manifest : dict
         What manifest.json says, for recordings read from a folder.
-    read_truth, read_instance : callables
-        Where volumes (by pause) and instance images (by frame) come from; they return None where absent.
+    read_truth, read_instance, read_poses : callables
+        Where volumes (by pause), instance images and poses (by frame) come from; they return None where absent.
     """
 
     frames: Sequence[Frame]
@@ -101,6 +101,7 @@ class Recording:
     manifest: dict[str, Any] = field(default_factory=dict)
     read_truth: Callable[[int], np.ndarray | None] = lambda t: None
     read_instance: Callable[[int], np.ndarray | None] = lambda index: None
+    read_poses: Callable[[int], dict[int, np.ndarray] | None] = lambda index: None
 
     def __post_init__(self) -> None:
         n, pauses = len(self.frames), tuple(int(p) for p in self.pauses)
@@ -225,6 +226,10 @@ class Recording:
     def instance(self, index: int) -> np.ndarray | None:
         """True label image (H, W) of a frame; None where there is none."""
         return self.read_instance(index)
+
+    def poses(self, index: int) -> dict[int, np.ndarray] | None:
+        """True T_world_object (4, 4) of each object of a frame, by label; None where there are none."""
+        return self.read_poses(index)
 
     def check(self) -> None:
         """Look at every image once, so that a broken one is known before a run begins."""

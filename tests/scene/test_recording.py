@@ -52,6 +52,26 @@ def test_round_trip(folder):
     assert Recording.open(again).key == recording.key
 
 
+def test_true_poses_come_back_and_broken_ones_are_one_clear_error(tmp_path):
+    assert Recording.open(write(tmp_path / "none")).poses(0) is None
+    pose = look_at((0.3, 0.1, 0.5), (0, 0, 0)).as_matrix()
+    with RecordingWriter(tmp_path / "r", CAMERA, GRID) as writer:
+        for index in range(2):
+            rgb, depth, _ = table_scene(index)
+            writer.add_frame(rgb, depth, index / 5, "static", poses={"3": pose} if index else None)
+    for recording in (
+        Recording.open(tmp_path / "r"),
+        Recording.open(save(Recording.open(tmp_path / "r"), tmp_path / "s")),
+    ):
+        assert recording.poses(0) is None
+        assert list(recording.poses(1)) == [3]
+        np.testing.assert_allclose(recording.poses(1)[3], pose, atol=1e-12)
+    for text in ("[{}]", "[", '[{"frame": 0, "T_world_object": {"1": [[1, 2], [3, 4]]}}]', '{"frame": 0}'):
+        (tmp_path / "r" / "poses.json").write_text(text)
+        with pytest.raises(InputError, match=r"true poses cannot be read: .*poses\.json"):
+            Recording.open(tmp_path / "r").poses(0)
+
+
 def test_a_failed_writer_leaves_nothing(tmp_path):
     with pytest.raises(RuntimeError), RecordingWriter(tmp_path / "r", CAMERA, GRID) as writer:
         rgb, depth, _ = table_scene()

@@ -14,6 +14,8 @@ import math
 import shutil
 import zipfile
 from collections import OrderedDict
+from collections.abc import Mapping
+from functools import cache
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal
@@ -157,7 +159,7 @@ def open_folder(path: Path) -> Recording:
         file = path / "instance" / f"{index:06d}.png"
         return read_labels(file) if file.exists() else None
 
-    truth = path / "voxels.npz"
+    truth, true_poses = path / "voxels.npz", path / "poses.json"
     return Recording(
         _Frames(read_posed, range(len(entries)), OrderedDict()),
         grid,
@@ -168,7 +170,22 @@ def open_folder(path: Path) -> Recording:
         manifest=raw,
         read_truth=_read_voxels(truth, grid, pauses) if truth.exists() else lambda t: None,
         read_instance=read_instance,
+        read_poses=_read_poses(true_poses) if true_poses.exists() else lambda index: None,
     )
+
+
+def _read_poses(path: Path) -> Any:
+    """A `read_poses`; the file is looked at when it is first asked for."""
+
+    @cache
+    def load() -> dict[int, dict[int, np.ndarray]]:
+        try:
+            entries = {int(e["frame"]): dict(e["T_world_object"]) for e in json.loads(path.read_text())}
+            return {i: {int(k): rigid_from_matrix(T).as_matrix() for k, T in e.items()} for i, e in entries.items()}
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise InputError(f"true poses cannot be read: {path} ({error})") from error
+
+    return lambda index: load().get(index)
 
 
 def _read_voxels(path: Path, grid: VoxelGrid, pauses: tuple[int, ...]) -> Any:
@@ -247,7 +264,7 @@ class RecordingWriter:
         *,
         instance: np.ndarray | None = None,
         robot_mask: np.ndarray | None = None,
-        poses: dict[str, Any] | None = None,
+        poses: Mapping[Any, Any] | None = None,
         **entry: Any,
     ) -> int:
         """Add a frame; its index.
@@ -370,6 +387,7 @@ def save(recording: Recording, path: str | Path, **manifest: Any) -> Path:
                 "static" if pause else "action",
                 instance=recording.instance(index),
                 robot_mask=frame.robot_mask,
+                poses=recording.poses(index),
                 **moved,
             )
             truth = recording.truth(recording.pauses.index(index)) if pause else None
