@@ -10,6 +10,7 @@ several objects of a hypothesis claim are settled hypothesis by hypothesis.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import ClassVar
 
@@ -36,7 +37,7 @@ from mstfilter.smc.interfaces import Proposal
 from mstfilter.smc.population import Population
 from mstfilter.smc.streams import child
 
-__all__ = ["TreeCutProposal"]
+__all__ = ["TreeCutProposal", "hypothesis_of"]
 
 WEIGHT_RULES = ("equal", "p")
 
@@ -115,7 +116,7 @@ class TreeCutProposal(Proposal):
         for nodes in kept:
             if nodes.tobytes() not in built:
                 chosen = [completed[node] for node in nodes.tolist()]
-                built[nodes.tobytes()] = _hypothesis(chosen, grid, observation.index, self.threshold)
+                built[nodes.tobytes()] = hypothesis_of(chosen, grid, observation.index, self.threshold)
         particles = tuple(built[nodes.tobytes()] for nodes in kept)
         notes = {
             "sampler": drawn.diagnostics,
@@ -148,8 +149,21 @@ class TreeCutProposal(Proposal):
         return completed
 
 
-def _hypothesis(completions: list[Completion], grid: VoxelGrid, birth: int, threshold: float) -> Hypothesis:
-    """Objects numbered 1 .. in the order given; those that fill no voxel get no record."""
+def hypothesis_of(
+    completions: Sequence[Completion], grid: VoxelGrid, birth: int = 0, threshold: float = 0.5
+) -> Hypothesis:
+    """Completed segments as one hypothesis: objects numbered 1 .. in order; those that fill no voxel get no record.
+
+    Parameters
+    ----------
+    completions : sequence of Completion
+        Of one frame; what several claim is settled by `mstfilter.completion.arbitration`.
+    grid : VoxelGrid
+    birth : int
+        Index of the pause.
+    threshold : float
+        Probability from which a completed voxel is occupied.
+    """
     labels = arbitrate(completions, grid, threshold)
     present = np.bincount(labels.ravel(), minlength=len(completions) + 1)
     records = tuple(ObjectRecord.born(k, birth, one.key) for k, one in enumerate(completions, start=1) if present[k])

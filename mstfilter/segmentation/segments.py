@@ -75,12 +75,17 @@ class ObjectRule:
     core_radius: int = 2
     min_readings: float = 0.004
 
-    def segments(self, tree: Tree, frame: Frame, grid: VoxelGrid | None = None) -> Segments:
-        """Judge every node of a tree. Without a grid the workspace is everything above the table."""
+    def own(self, frame: Frame, grid: VoxelGrid | None = None) -> np.ndarray:
+        """(H, W) bool: pixels that can belong to an object, as `Segments.own`."""
         with np.errstate(invalid="ignore"):
             own = frame.valid & (above_table(frame) > self.table_tolerance)
         if grid is not None:
             own &= grid.contains(grid.index_of(frame.points))
+        return own
+
+    def segments(self, tree: Tree, frame: Frame, grid: VoxelGrid | None = None) -> Segments:
+        """Judge every node of a tree. Without a grid the workspace is everything above the table."""
+        own = self.own(frame, grid)
         readings = tree.accumulate_pixels(frame.valid)
         points = tree.accumulate_pixels(own)
         core = _core(tree, own, max(1, round(self.core_radius * frame.camera.width / 640)))
