@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import sys
 
-from mstfilter.cli import running, data, components  # isort: skip (the order of the help page)
+from mstfilter.cli import running, studying, data, components  # isort: skip (the order of the help page)
 from mstfilter.cli.root import app
 from mstfilter.errors import InputError
 
-__all__ = ["app", "components", "data", "main", "running"]
+__all__ = ["app", "components", "data", "main", "running", "studying"]
 
 
 def main(arguments: list[str] | None = None) -> None:

@@ -70,7 +70,7 @@ def execute(
             "seed": int(seed),
             "description": config.get("description", ""),
             "config": describe_filter(filter),
-            "files": _files(filter),
+            "files": files_of(filter),
             "recording": {
                 "name": recording.name,
                 "key": recording.key.hex(),
@@ -126,7 +126,7 @@ def _existing(path: Path, wanted: dict[str, Any]) -> RunFolder | None:
     return None
 
 
-def _files(component: Any) -> dict[str, str]:
+def files_of(component: Any) -> dict[str, str]:
     """Content hashes of the users' files that components come from."""
     found = {}
     if dataclasses.is_dataclass(component):
@@ -134,10 +134,10 @@ def _files(component: Any) -> dict[str, str]:
         if "__mst_source__" in cls.__dict__:
             found[cls.__dict__["__mst_file__"]] = cls.__dict__["__mst_source__"]
         for field in dataclasses.fields(component):
-            found.update(_files(getattr(component, field.name)))
+            found.update(files_of(getattr(component, field.name)))
     elif isinstance(component, tuple):
         for part in component:
-            found.update(_files(part))
+            found.update(files_of(part))
     return found
 
 

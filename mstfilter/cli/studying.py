@@ -1,0 +1,96 @@
+"""Commands about many runs: study."""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from mstfilter.cli.root import app
+
+__all__ = ["study"]
+
+
+@app.command()
+def study(
+    config: Annotated[Path, typer.Argument(help="TOML file that says what is compared.")],
+    overrides: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="[PATH=VALUE]...", help="Changes to every arm; a comma makes a grid: update.eta=3,5"),
+    ] = None,
+    out: Annotated[Path | None, typer.Option(help="Study folder. Default: studies/NAME.")] = None,
+    workers: Annotated[int, typer.Option(min=0, help="Processes; 0 is one a core.")] = 0,
+    smoke: Annotated[
+        bool, typer.Option("--smoke", help="The small form that the file's table [smoke] describes.")
+    ] = False,
+) -> None:
+    """Compare filters on many scenes. A study that was stopped goes on; what is done is never repeated."""
+    from mstfilter.study.config import load_study
+    from mstfilter.study.local import Local
+    from mstfilter.study.study import run_study
+
+    wanted = load_study(config, smoke=smoke)
+    folder = out or Path("studies") / f"{wanted.name}{'-smoke' if smoke else ''}"
+    executor = Local(workers, wanted.tries, wanted.timeout_s, folder / "logs")
+    with _shown() as progress:
+        result = run_study(wanted, folder, executor, overrides or (), progress=progress)
+    print(f"study       {folder}")
+    print(f"runs        {result.done} done, {result.repeated} of them before; table {folder / 'runs.csv'}")
+    for name, outcome in result.failed:
+        print(f"failed      {name}: {outcome.error}")
+    if result.failed:
+        print(f"hint: the same command repeats what failed; more in {folder / 'failures.csv'}", file=sys.stderr)
+        raise typer.Exit(1)
+
+
+@contextlib.contextmanager
+def _shown() -> Iterator[Callable[[Any], None]]:
+    """Bars on standard error: one for the whole, one for every run that is going on."""
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+    )
+    bars = Progress(*columns, console=Console(stderr=True))
+    whole: dict[str, Any] = {}
+    parts: dict[str, Any] = {}
+
+    def tell(p: Any) -> None:
+        bars.start()
+        if p.what not in whole:
+            whole[p.what] = bars.add_task(p.what, total=p.total)
+        failed = f", {p.failed} failed" if p.failed else ""
+        bars.update(whole[p.what], completed=p.done + p.failed, description=f"{p.what}{failed}")
+        if p.event is None:
+            return
+        if p.event.kind == "begun":
+            parts[p.name] = bars.add_task(f"  {p.name}", total=None)
+        elif p.event.kind == "step" and p.name in parts:
+            bars.update(parts[p.name], completed=p.event.done, total=p.event.total)
+        elif p.event.kind in ("ended", "lost") and p.name in parts:
+            bars.remove_task(parts.pop(p.name))
+        if p.event.kind == "lost":
+            bars.console.print(f"a worker died in {p.name}")
+        elif p.event.outcome is not None and p.event.outcome.status != "done":
+            bars.console.print(f"failed: {p.name}: {p.event.outcome.error}", markup=False)
+
+    try:
+        yield tell
+    finally:
+        bars.stop()

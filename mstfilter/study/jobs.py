@@ -1,0 +1,123 @@
+"""What a worker does: make a recording, run a filter on one, or measure a run again.
+
+>>> perform({"kind": "run", "name": "mst on demo-0", ...}, step=lambda done, total: None)
+Outcome(status='done')
+
+A job is plain values and needs nothing else, so that a process on another machine can do it. A run is written
+under a name of its own and renamed when it is whole: two workers with the same run do not disturb each other,
+and what a killed one leaves is never taken for a result.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import shutil
+import time
+import traceback
+import uuid
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from mstfilter.errors import InputError
+from mstfilter.scene.recording import Recording
+from mstfilter.study.executors import Job, Outcome
+from mstfilter.study.memory import peak_megabytes, reset_peak
+from mstfilter.study.results import RESULT, read_result
+from mstfilter.study.run_folder import RunFolder, write_json
+
+__all__ = ["failed", "open_scene", "perform"]
+
+Step = Callable[[int, int], None]
+
+
+def perform(job: Job, step: Step = lambda done, total: None) -> Outcome:
+    """Do a job; whatever goes wrong in it becomes its outcome.
+
+    Parameters
+    ----------
+    job : mapping
+        See `study.jobs_of`.
+    step : callable
+        Told steps done and steps in all.
+    """
+    try:
+        {"record": _record, "run": _run, "measure": _measure}[job["kind"]](job, step)
+    except Exception as error:
+        return failed(error)
+    return Outcome("done")
+
+
+def failed(error: Exception) -> Outcome:
+    """What an exception says to a user."""
+    trace = "".join(traceback.format_exception(error))
+    if isinstance(error, InputError):
+        return Outcome("failed", error.message, error.hints, trace)
+    if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
+        return Outcome("failed", f"no space left: {error}", ("make room; the same command repeats this run",), trace)
+    if isinstance(error, MemoryError):
+        return Outcome("failed", "out of memory", ("use fewer workers",), trace)
+    return Outcome("failed", f"{type(error).__name__}: {error}", ("a fault of the program or of a component",), trace)
+
+
+def open_scene(source: dict[str, Any], recordings: str | None) -> Recording:
+    """The recording of a scene; a simulated one is made if it is missing."""
+    if "folder" in source:
+        return Recording.open(source["folder"])
+    from mstfilter.simulation.cache import cached_recording
+
+    folder = None if recordings is None else Path(recordings)
+    return Recording.open(cached_recording(source["family"], source["seed"], folder, **source["set"]))
+
+
+def _record(job: Job, step: Step) -> None:
+    open_scene(job["source"], job["recordings"])
+
+
+def _run(job: Job, step: Step) -> None:
+    from mstfilter.study.run import execute
+
+    final = Path(job["folder"])
+    work = final.with_name(f".{final.name}.{uuid.uuid4().hex[:8]}.partial")
+    costs: list[dict[str, float]] = []
+    began = time.process_time()
+    reset_peak()
+
+    def progress(p: Any) -> None:
+        nonlocal began
+        now = time.process_time()
+        if p.done:
+            costs.append({"seconds": p.seconds, "core_seconds": now - began, "peak_mb": peak_megabytes()})
+            reset_peak()
+        began = time.process_time()
+        step(p.done, p.total)
+
+    try:
+        recording = open_scene(job["source"], job["recordings"])
+        began = time.process_time()
+        run = execute(recording, job["config"], work, job["seed"], allow_files=job["allow_files"], progress=progress)
+        stages = [{f"seconds_{k}": v for k, v in run.seconds(t).items()} for t in range(run.n_pauses)]
+        _write(run, recording, job, [{**cost, **stage} for cost, stage in zip(costs, stages, strict=True)])
+        if job["keep"] == "tables":
+            shutil.rmtree(run.path / "pauses")
+        if final.exists():  # what failed there before
+            shutil.rmtree(final)
+        os.replace(work, final)
+    finally:
+        shutil.rmtree(work, ignore_errors=True)
+
+
+def _measure(job: Job, step: Step) -> None:
+    """Figures of a run that is done already, by what they mean now."""
+    folder = Path(job["folder"])
+    recording = open_scene(job["source"], job["recordings"])
+    _write(RunFolder.open(folder), recording, job, read_result(folder)["costs"])
+
+
+def _write(run: RunFolder, recording: Recording, job: Job, costs: list[dict[str, float]]) -> None:
+    from mstfilter.study.metrics import measure
+
+    rows = [measure(run, recording, t) for t in range(run.n_pauses)]
+    result = {"identity": job["identity"], "metrics": job["metrics"], "status": "done", "rows": rows, "costs": costs}
+    write_json(run.path / RESULT, result)

@@ -1,0 +1,253 @@
+"""From a study to its runs: grids multiplied out, everything checked, every run named by all it depends on.
+
+>>> plan = make_plan(load_study("study.toml"))
+>>> [run.name for run in plan.runs]
+
+A run's identity is a hash of its resolved configuration, what recording it reads (the recipe of a simulated one,
+the content of a folder), its seed, and the version of the code and the libraries that it reaches. Two studies
+that share a run share its identity; a run whose identity is unchanged is never repeated.
+"""
+
+from __future__ import annotations
+
+import glob
+import hashlib
+import itertools
+import json
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, fields, is_dataclass
+from pathlib import Path
+from typing import Any
+
+from mstfilter.errors import InputError
+from mstfilter.presets import build_filter, describe_filter, load_config
+from mstfilter.scene.recording import Recording
+from mstfilter.study.code_version import code_version
+from mstfilter.study.config import ArmEntry, SceneEntry, StudyConfig
+from mstfilter.study.run import files_of, versions
+from mstfilter.study.run_folder import plain
+
+__all__ = ["Arm", "Plan", "Run", "Scene", "make_plan", "split_grid"]
+
+# What every run goes through besides its components.
+_ALWAYS = ("mstfilter.smc.particle_filter", "mstfilter.scene.recording", "mstfilter.study.codec")
+
+
+@dataclass(frozen=True)
+class Arm:
+    """A filter to compare.
+
+    Parameters
+    ----------
+    name : str
+    config : dict
+        Resolved: every field of every component.
+    key : str
+        Hash of the configuration, users' files and code.
+    """
+
+    name: str
+    config: dict[str, Any]
+    key: str
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A recording to filter.
+
+    Parameters
+    ----------
+    name : str
+    group : str
+        Its family in the tables.
+    source : dict
+        ``{"family", "seed", "set"}`` of a simulated one, ``{"folder"}`` of any other.
+    key : str
+        Names recipe or content.
+    """
+
+    name: str
+    group: str
+    source: dict[str, Any]
+    key: str
+
+
+@dataclass(frozen=True)
+class Run:
+    """An arm on a scene with a seed of the filter."""
+
+    arm: Arm
+    scene: Scene
+    seed: int
+    identity: str
+
+    @property
+    def name(self) -> str:
+        """For people."""
+        return f"{self.arm.name} on {self.scene.name}, seed {self.seed}"
+
+    @property
+    def folder(self) -> str:
+        """Name of its folder: readable, and one a run."""
+        words = re.sub(r"[^\w.=-]+", "-", f"{self.arm.name}_{self.scene.name}_{self.seed}").strip(".-")
+        return f"{words[:100]}_{self.identity[:10]}"
+
+
+@dataclass(frozen=True)
+class Plan:
+    """All runs of a study, scene by scene."""
+
+    config: StudyConfig
+    arms: tuple[Arm, ...]
+    scenes: tuple[Scene, ...]
+    runs: tuple[Run, ...]
+
+    @property
+    def reference(self) -> str:
+        """The arm that the others are compared with."""
+        return self.config.reference or self.arms[0].name
+
+
+def make_plan(study: StudyConfig, overrides: Sequence[str] = (), *, allow_files: bool = True) -> Plan:
+    """The runs of a study.
+
+    Parameters
+    ----------
+    study : StudyConfig
+    overrides : sequence of str
+        Applied to every arm after its own; a comma makes a grid.
+    allow_files : bool
+        Whether components may come from ``./file.py:Class``.
+
+    Raises
+    ------
+    InputError
+        A wrong arm, two arms that are the same, a grid without runs, a recording that cannot be read.
+    """
+    arms = tuple(arm for entry in study.arms for arm in _arms(entry, overrides, allow_files))
+    for what, found in (("arm", arms), ("scene", study.scenes), ("seed", study.seeds)):
+        if not found:
+            raise InputError(f"study {study.name} has no {what}, so there is nothing to run")
+    _all_different("arms", [(arm.name, arm.key) for arm in arms])
+    scenes = tuple(scene for entry in study.scenes for scene in _scenes(entry, study.folder))
+    _all_different("scenes", [(scene.name, scene.key) for scene in scenes])
+    if len(set(study.seeds)) < len(study.seeds):
+        raise InputError(f"study {study.name} names a seed twice: {list(study.seeds)}")
+    if study.reference and study.reference not in [arm.name for arm in arms]:
+        raise InputError(
+            f"reference is {study.reference!r}, which is no arm", f"there are: {', '.join(a.name for a in arms)}"
+        )
+    runs = tuple(
+        Run(arm, scene, seed, _hash([arm.key, scene.key, seed]))
+        for scene in scenes
+        for seed in study.seeds
+        for arm in arms
+    )
+    return Plan(study, arms, scenes, runs)
+
+
+def split_grid(text: str) -> list[str]:
+    """``"path=a,b"`` as ``["path=a", "path=b"]``; commas inside brackets and quotes part nothing."""
+    path, equals, values = text.partition("=")
+    if not equals:
+        return [text]
+    parts, depth, quote, begin = [], 0, "", 0
+    for k, letter in enumerate(values):
+        if quote:
+            quote = "" if letter == quote else quote
+        elif letter in "\"'":
+            quote = letter
+        elif letter in "[{(":
+            depth += 1
+        elif letter in "]})":
+            depth -= 1
+        elif letter == "," and depth == 0:
+            parts.append(values[begin:k])
+            begin = k + 1
+    parts.append(values[begin:])
+    if any(not part.strip() for part in parts):
+        raise InputError(f"override {text!r} has an empty value", "for example resampler=systematic,residual")
+    return [f"{path.strip()}={part.strip()}" for part in parts]
+
+
+def _arms(entry: ArmEntry, overrides: Sequence[str], allow_files: bool) -> Iterator[Arm]:
+    presets = [name.strip() for text in entry.preset for name in text.split(",")]
+    grids = [split_grid(text) for text in (*entry.set, *overrides)]
+    if not presets or not all(presets):
+        raise InputError(f"an arm names no preset: {list(entry.preset)}")
+    varied = [k for k, grid in enumerate(grids) if len(grid) > 1]
+    for preset in presets:
+        for chosen in itertools.product(*grids):
+            if entry.name:
+                words = [entry.name, *([_stem(preset)] if len(presets) > 1 else []), *(chosen[k] for k in varied)]
+            else:
+                told = [k for k in range(len(grids)) if k < len(entry.set) or k in varied]
+                words = [_stem(preset), *(chosen[k] for k in told)]
+            name = " ".join(words)
+            try:
+                filter = build_filter(load_config(preset, chosen, allow_files=allow_files), allow_files=allow_files)
+            except InputError as error:
+                raise InputError(f"arm {name!r}: {error.message}", *error.hints) from error
+            config = plain(describe_filter(filter))
+            code = code_version([*_modules(filter), *_ALWAYS])
+            yield Arm(name, config, _hash([config, files_of(filter), versions(), code]))
+
+
+def _stem(preset: str) -> str:
+    return Path(preset).stem if preset.endswith(".toml") else preset
+
+
+def _scenes(entry: SceneEntry, folder: Path) -> Iterator[Scene]:
+    if entry.family:
+        from dataclasses import replace
+
+        from mstfilter.simulation.cache import recipe_key
+        from mstfilter.simulation.families import scene_family
+
+        family = scene_family(entry.family)
+        unknown = sorted(set(entry.set) - {f.name for f in fields(family)})
+        if unknown:
+            raise InputError(f"scene family {entry.family!r} has no field {unknown[0]!r}")
+        family = replace(family, **entry.set)
+        group = entry.group or entry.family
+        for seed in entry.seeds:
+            source = {"family": entry.family, "seed": seed, "set": dict(entry.set)}
+            yield Scene(f"{group}-{seed}", group, source, recipe_key(family, seed))
+        return
+    for pattern in entry.recordings:
+        paths = sorted(glob.glob(str(folder / pattern)))
+        if not paths:
+            raise InputError(f"recording does not exist: {folder / pattern}")
+        for path in paths:
+            recording = Recording.open(path)
+            name = Path(path).name
+            yield Scene(name, entry.group or "recordings", {"folder": str(Path(path).resolve())}, recording.key.hex())
+
+
+def _all_different(what: str, named: list[tuple[str, str]]) -> None:
+    """No name and no key twice."""
+    seen: dict[str, str] = {}
+    for name, key in named:
+        if key in seen:
+            raise InputError(
+                f"two {what} are the same: {seen[key]!r} and {name!r}", "leave one out, or change what it sets"
+            )
+        if name in seen.values():
+            raise InputError(
+                f"two {what} are called {name!r}", "give each a name" if what == "arms" else "give each a group"
+            )
+        seen[key] = name
+
+
+def _modules(component: Any) -> set[str]:
+    """Modules of a component's class and of those of its parts."""
+    if isinstance(component, tuple):
+        return set().union(*(_modules(part) for part in component))
+    if not is_dataclass(component):
+        return set()
+    return {type(component).__module__}.union(*(_modules(getattr(component, f.name)) for f in fields(component)))
+
+
+def _hash(value: Any) -> str:
+    return hashlib.sha256(json.dumps(plain(value), sort_keys=True).encode()).hexdigest()[:32]

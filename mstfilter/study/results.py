@@ -1,0 +1,148 @@
+"""The folder of a study and its tables.
+
+>>> folder = StudyFolder.open("studies/first")
+>>> folder.description["reference"], len(folder.rows())
+
+Layout::
+
+    study.json       what was asked: description, arms with their configuration, scenes, seeds, every run's folder
+    runs/NAME/       one folder a run (see `run_folder`); result.json holds its figures, or why it failed
+    runs.csv         one row a pause and run: figures first, time and memory last
+    summary.csv      one row a family, arm and figure
+    failures.csv     runs that failed, and why
+    logs/            what workers printed
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from mstfilter.errors import InputError
+from mstfilter.study.executors import Outcome
+from mstfilter.study.run_folder import plain, write_json
+
+__all__ = ["RESULT", "StudyFolder", "cost_columns", "read_result", "write_table"]
+
+FORMAT = 1
+RESULT = "result.json"  # in a run's folder
+
+
+def read_result(folder: Path) -> dict[str, Any]:
+    """What result.json of a run's folder says; empty where there is none that can be read."""
+    try:
+        return dict(json.loads((folder / RESULT).read_text()))
+    except (OSError, ValueError):
+        return {}
+
+
+@dataclass(frozen=True)
+class StudyFolder:
+    """A study on disk.
+
+    Parameters
+    ----------
+    path : Path
+    """
+
+    path: Path
+
+    @classmethod
+    def open(cls, path: str | Path) -> StudyFolder:
+        """An existing study folder."""
+        folder = cls(Path(path))
+        if folder.description.get("format") != FORMAT:
+            raise InputError(f"{path}: study has format {folder.description.get('format')}, expected {FORMAT}")
+        return folder
+
+    @cached_property
+    def description(self) -> dict[str, Any]:
+        """What study.json says."""
+        try:
+            return dict(json.loads((self.path / "study.json").read_text()))
+        except FileNotFoundError:
+            raise InputError(
+                f"not a study folder: {self.path / 'study.json'} is missing", "`mstfilter study` makes one"
+            ) from None
+        except (OSError, ValueError) as error:
+            raise InputError(f"{self.path / 'study.json'} cannot be read: {error}") from error
+
+    def run(self, folder: str) -> Path:
+        """A run's folder."""
+        return self.path / "runs" / folder
+
+    def is_done(self, folder: str, identity: str) -> bool:
+        """Whether a run is there, whole, and the one that is meant."""
+        result = read_result(self.run(folder))
+        return result.get("status") == "done" and result.get("identity") == identity
+
+    def fail(self, run: Mapping[str, Any], outcome: Outcome) -> None:
+        """Write down why a run failed; the folder of an earlier failure is reused."""
+        folder = self.run(run["folder"])
+        folder.mkdir(parents=True, exist_ok=True)
+        record = {"identity": run["identity"], "status": "failed", "error": outcome.error, "hints": outcome.hints}
+        write_json(folder / RESULT, {**record, "tries": outcome.tries, "trace": outcome.trace})
+
+    def failures(self) -> list[dict[str, Any]]:
+        """Runs that failed: name, error, hints, tries, folder; those of this study as it is now."""
+        found = []
+        for run in self.description["runs"]:
+            result = read_result(self.run(run["folder"]))
+            if result.get("status") == "failed" and result.get("identity") == run["identity"]:
+                found.append({**run, **{k: result.get(k) for k in ("error", "hints", "tries", "trace")}})
+        return found
+
+    def rows(self) -> list[dict[str, Any]]:
+        """One row a pause and run of all runs that are done, in the order of the study."""
+        rows = []
+        for run in self.description["runs"]:
+            result = read_result(self.run(run["folder"]))
+            if result.get("status") != "done" or result.get("identity") != run["identity"]:
+                continue
+            named = {"family": run["group"], "scene": run["scene"], "arm": run["arm"], "seed": run["seed"]}
+            for row, cost in zip(result["rows"], result["costs"], strict=True):
+                rows.append({**named, **row, **cost})
+        return rows
+
+    def write_tables(self) -> None:
+        """Write runs.csv and failures.csv from the runs."""
+        rows = self.rows()
+        costs = cost_columns(rows)
+        columns = [*(c for c in _columns(rows) if c not in costs), *costs]
+        write_table(self.path / "runs.csv", columns, rows)
+        failed = [{"run": f["name"], **f, "hints": "; ".join(f["hints"] or ())} for f in self.failures()]
+        write_table(self.path / "failures.csv", ["run", "error", "hints", "tries", "folder"], failed)
+
+
+def cost_columns(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Columns of time and memory: the only ones that may differ between two times of running the same study."""
+    return [c for c in _columns(rows) if c in ("core_seconds", "peak_mb") or c.startswith("seconds")]
+
+
+def _columns(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    return list(dict.fromkeys(name for row in rows for name in row))
+
+
+def write_table(path: Path, columns: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> None:
+    """Write a CSV file under a temporary name and rename it; numbers with six digits, nothing for what is missing."""
+    partial = path.with_name(f".{path.name}.partial")
+    with partial.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(columns)
+        for row in rows:
+            writer.writerow([_text(plain(row.get(c))) for c in columns])
+    os.replace(partial, path)
+
+
+def _text(value: Any) -> str:
+    if value is None:
+        return ""
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    return str(value)

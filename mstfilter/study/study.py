@@ -1,0 +1,299 @@
+"""Run a study: everything checked first, then every run that is not done yet, then the tables.
+
+>>> result = run_study(load_study("study.toml"), Path("studies/first"), Local(workers=2))
+>>> result.done, result.failed
+
+A study that was stopped, killed or changed is run again by the same call: runs whose identity is unchanged are not
+repeated, and the tables come out the same.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from mstfilter.errors import InputError
+from mstfilter.study.code_version import code_version
+from mstfilter.study.config import StudyConfig
+from mstfilter.study.executors import Event, Executor, Job, Outcome
+from mstfilter.study.local import Local
+from mstfilter.study.plan import Plan, Run, make_plan
+from mstfilter.study.results import FORMAT, StudyFolder, read_result
+from mstfilter.study.run_folder import write_json
+
+__all__ = ["Progress", "StudyResult", "run_study"]
+
+
+@dataclass(frozen=True)
+class Progress:
+    """What is reported while a study is going on.
+
+    Parameters
+    ----------
+    what : {"recordings", "runs"}
+    event : Event, optional
+        What happened last; None at the beginning of a part.
+    name : str
+        Of the job it happened to.
+    done, failed, total : int
+        Jobs of this part; those that were done before count as done.
+    """
+
+    what: str
+    event: Event | None
+    name: str
+    done: int
+    failed: int
+    total: int
+
+
+@dataclass(frozen=True)
+class StudyResult:
+    """What became of a study.
+
+    Parameters
+    ----------
+    folder : StudyFolder
+    done : int
+        Runs that are done, earlier ones included.
+    repeated : int
+        Runs that were done before.
+    failed : tuple of (str, Outcome)
+        Names of the runs that failed, and why.
+    """
+
+    folder: StudyFolder
+    done: int
+    repeated: int
+    failed: tuple[tuple[str, Outcome], ...]
+
+
+def run_study(
+    study: StudyConfig,
+    path: Path,
+    executor: Executor | None = None,
+    overrides: Sequence[str] = (),
+    *,
+    allow_files: bool = True,
+    recordings: Path | None = None,
+    progress: Callable[[Progress], None] = lambda progress: None,
+) -> StudyResult:
+    """Run a study into a folder.
+
+    Parameters
+    ----------
+    study : StudyConfig
+    path : Path
+        New, empty, or of an earlier call.
+    executor : Executor, optional
+        Default: one process a core of this machine.
+    overrides : sequence of str
+        Applied to every arm; a comma makes a grid.
+    allow_files : bool
+        Whether components may come from ``./file.py:Class``.
+    recordings : Path, optional
+        Where simulated recordings are kept. Default: the user's cache folder.
+    progress : callable
+        Called for everything that happens.
+
+    Raises
+    ------
+    InputError
+        For whatever is wrong with the study or the folder, before any run begins. Runs that fail raise nothing.
+    """
+    plan = make_plan(study, overrides, allow_files=allow_files)
+    with _held(path) as folder:
+        executor = executor or Local(tries=study.tries, timeout_s=study.timeout_s, logs=path / "logs")
+        write_json(path / "study.json", _described(plan))
+        jobs = _Jobs(plan, folder, allow_files, None if recordings is None else str(recordings))
+        failed = _recordings(jobs, executor, progress)
+        waiting, before = jobs.runs()
+        lost = {run.name: failed[run.scene.key] for run in plan.runs if run.scene.key in failed}
+        for run in plan.runs:
+            if run.name in lost and run.folder not in before:
+                _note(folder, run, lost[run.name])
+        waiting = [(run, job) for run, job in waiting if run.name not in lost]
+        counted = _Counted(progress, "runs", [run.name for run, _ in waiting], len(before), len(plan.runs), len(lost))
+
+        def tell(event: Event) -> None:
+            if event.outcome is not None and event.outcome.status != "done":
+                _note(folder, waiting[event.job][0], event.outcome)
+            counted(event)
+
+        outcomes = executor.run([job for _, job in waiting], tell)
+        folder = StudyFolder.open(path)
+        try:
+            folder.write_tables()
+        except OSError as error:
+            raise InputError(
+                f"cannot write the tables of {path}: {error.strerror}", "make room and repeat"
+            ) from error
+    ended = [(run.name, outcome) for (run, _), outcome in zip(waiting, outcomes, strict=True)]
+    bad = [*((n, o) for n, o in lost.items()), *((n, o) for n, o in ended if o.status != "done")]
+    return StudyResult(folder, len(plan.runs) - len(bad), len(before), tuple(bad))
+
+
+@contextlib.contextmanager
+def _held(path: Path) -> Iterator[StudyFolder]:
+    """The study's folder, made if need be, for this process alone."""
+    if path.exists() and not (path / "study.json").exists() and (not path.is_dir() or any(_visible(path))):
+        raise InputError(
+            f"cannot run a study in {path}: it exists and is no study folder", "choose another with --out"
+        )
+    try:
+        (path / "runs").mkdir(parents=True, exist_ok=True)
+        (path / "logs").mkdir(exist_ok=True)
+        lock = (path / ".lock").open("w")
+    except OSError as error:
+        raise InputError(
+            f"cannot write study folder {path}: {error.strerror}", "choose another with --out"
+        ) from error
+    with lock:
+        try:
+            import fcntl
+
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except ImportError:
+            pass  # a system without such locks
+        except OSError:
+            raise InputError(
+                f"another process is running the study in {path}", "wait for it, or choose --out"
+            ) from None
+        for left in (path / "runs").glob(".*.partial"):  # by workers that were killed
+            shutil.rmtree(left, ignore_errors=True)
+        yield StudyFolder(path)
+
+
+def _visible(path: Path) -> Iterator[Path]:
+    return (p for p in path.iterdir() if p.name not in (".lock", "logs", "runs"))
+
+
+def _described(plan: Plan) -> dict[str, Any]:
+    study = plan.config
+    return {
+        "format": FORMAT,
+        "name": study.name,
+        "description": study.description,
+        "reference": plan.reference,
+        "arms": [{"name": arm.name, "config": arm.config} for arm in plan.arms],
+        "scenes": [{"name": s.name, "group": s.group, "source": s.source, "key": s.key} for s in plan.scenes],
+        "seeds": study.seeds,
+        "runs": [
+            {
+                "name": run.name,
+                "folder": run.folder,
+                "identity": run.identity,
+                "arm": run.arm.name,
+                "scene": run.scene.name,
+                "group": run.scene.group,
+                "seed": run.seed,
+            }
+            for run in plan.runs
+        ],
+    }
+
+
+def _note(folder: StudyFolder, run: Run, outcome: Outcome) -> None:
+    """Write a failure down; where not even that is possible it is told at the end all the same."""
+    with contextlib.suppress(OSError):
+        folder.fail({"folder": run.folder, "identity": run.identity}, outcome)
+
+
+@dataclass(frozen=True)
+class _Jobs:
+    """The jobs of a plan."""
+
+    plan: Plan
+    folder: StudyFolder
+    allow_files: bool
+    recordings: str | None
+
+    def runs(self) -> tuple[list[tuple[Run, Job]], set[str]]:
+        """Runs to do with their jobs, and the folders of those that are done."""
+        metrics = code_version(["mstfilter.study.metrics"])
+        waiting, done = [], set()
+        for run in self.plan.runs:
+            kind = self._needed(run, metrics)
+            if kind is None:
+                done.add(run.folder)
+            else:
+                waiting.append((run, self._job(run, kind, metrics)))
+        return waiting, done
+
+    def _needed(self, run: Run, metrics: str) -> str | None:
+        path = self.folder.run(run.folder)
+        if not self.folder.is_done(run.folder, run.identity):
+            return "run"
+        if read_result(path).get("metrics") == metrics:
+            return None
+        return "measure" if (path / "pauses").is_dir() else "run"
+
+    def _job(self, run: Run, kind: str, metrics: str) -> Job:
+        return {
+            "kind": kind,
+            "name": run.name,
+            "share": run.scene.key,
+            "folder": str(self.folder.run(run.folder).absolute()),
+            "identity": run.identity,
+            "metrics": metrics,
+            "config": {**run.arm.config, "description": run.arm.name},
+            "source": run.scene.source,
+            "seed": run.seed,
+            "keep": self.plan.config.keep,
+            "allow_files": self.allow_files,
+            "recordings": self.recordings,
+        }
+
+    def records(self) -> tuple[list[str], list[Job]]:
+        """Keys and jobs of simulated recordings that are needed and missing."""
+        waiting, _ = self.runs()
+        scenes = {run.scene.key: run.scene for run, _ in waiting if "family" in run.scene.source}
+        missing = [s for s in scenes.values() if not _is_made(s.source, self.recordings)]
+        jobs: list[Job] = [
+            {"kind": "record", "name": s.name, "share": s.key, "source": s.source, "recordings": self.recordings}
+            for s in missing
+        ]
+        return [s.key for s in missing], jobs
+
+
+def _is_made(source: dict[str, Any], recordings: str | None) -> bool:
+    from dataclasses import replace
+
+    from mstfilter.simulation.cache import cache_folder, recipe_key
+    from mstfilter.simulation.families import scene_family
+
+    family = replace(scene_family(source["family"]), **source["set"])
+    home = cache_folder() / "recordings" if recordings is None else Path(recordings)
+    return (home / f"{family.name}-{source['seed']}-{recipe_key(family, source['seed'])}" / "manifest.json").is_file()
+
+
+def _recordings(jobs: _Jobs, executor: Executor, progress: Callable[[Progress], None]) -> dict[str, Outcome]:
+    """Make what is missing; why it could not be made, by the scene's key."""
+    keys, records = jobs.records()
+    if not records:
+        return {}
+    counted = _Counted(progress, "recordings", [job["name"] for job in records], 0, len(records), 0)
+    outcomes = executor.run(records, counted)
+    return {key: outcome for key, outcome in zip(keys, outcomes, strict=True) if outcome.status != "done"}
+
+
+class _Counted:
+    """Events as progress."""
+
+    def __init__(
+        self, progress: Callable[[Progress], None], what: str, names: list[str], done: int, total: int, failed: int
+    ) -> None:
+        self._progress, self._what, self._names, self._total = progress, what, names, total
+        self._done, self._failed = done, failed
+        progress(Progress(what, None, "", done, failed, total))
+
+    def __call__(self, event: Event) -> None:
+        if event.outcome is not None:
+            good = event.outcome.status == "done"
+            self._done, self._failed = self._done + good, self._failed + (not good)
+        name = self._names[event.job]
+        self._progress(Progress(self._what, event, name, self._done, self._failed, self._total))

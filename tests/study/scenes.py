@@ -1,0 +1,20 @@
+"""Small recordings for studies."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mstfilter.scene.formats.folder import RecordingWriter
+from tests.scene.scenes import CAMERA, GRID, table_scene
+
+
+def slide(path, seed=0, pauses=3):
+    """Three pauses; box 1 slides 2 voxels to the right between them."""
+    rng = np.random.default_rng(seed)
+    with RecordingWriter(path, CAMERA, GRID) as writer:
+        for index in range(2 * pauses - 1):
+            rgb, depth, labels = table_scene(index, rng)
+            writer.add_frame(rgb, depth, index / 5, "action" if index % 2 else "static")
+            if index % 2 == 0:
+                writer.add_voxels(labels)
+    return path

@@ -1,0 +1,83 @@
+"""Studies: grids, identity, resuming, isolation of what fails."""
+
+from __future__ import annotations
+
+import csv
+import json
+
+import pytest
+
+from mstfilter.study.config import load_study
+from mstfilter.study.local import Local
+from mstfilter.study.plan import make_plan, split_grid
+from mstfilter.study.study import run_study
+from tests.study.scenes import slide
+
+BASE = """
+description = "test"
+seeds = [0, 1]
+[[scenes]]
+recordings = "slide-*"
+group = "slide"
+[[arms]]
+preset = "mst"
+set = ["transition=identity", "update.eta=1,2"]
+[smoke]
+seeds = 3
+"""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Two recordings of three pauses, and a study file beside them."""
+    path = tmp_path_factory.mktemp("study")
+    for k in range(2):
+        slide(path / f"slide-{k}", seed=k)
+    (path / "base.toml").write_text(BASE)
+    return path
+
+
+def table(path, costs=False):
+    with path.open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    kept = [k for k in rows[0] if costs or not (k.startswith("seconds") or k in ("core_seconds", "peak_mb"))]
+    return [{k: row[k] for k in kept} for row in rows]
+
+
+def test_a_study_runs_resumes_and_repeats_nothing(folder, tmp_path):
+    study = load_study(folder / "base.toml")
+    first = run_study(study, tmp_path / "out", Local(2))
+    assert (first.done, first.repeated, first.failed) == (8, 0, ())
+    rows = table(tmp_path / "out" / "runs.csv")
+    assert len(rows) == 2 * 2 * 2 * 3
+    assert {r["arm"] for r in rows} == {
+        "mst transition=identity update.eta=1",
+        "mst transition=identity update.eta=2",
+    }
+    assert {(r["scene"], r["family"]) for r in rows} == {("slide-0", "slide"), ("slide-1", "slide")}
+    made = {p: p.stat().st_mtime_ns for p in (tmp_path / "out" / "runs").rglob("result.json")}
+    before = (tmp_path / "out" / "runs.csv").read_bytes()
+    again = run_study(study, tmp_path / "out", Local(1))
+    assert (again.done, again.repeated) == (8, 8)
+    assert {p: p.stat().st_mtime_ns for p in (tmp_path / "out" / "runs").rglob("result.json")} == made
+    assert (tmp_path / "out" / "runs.csv").read_bytes() == before
+
+
+def test_split_grid():
+    assert split_grid("n=1,2") == ["n=1", "n=2"]
+    assert split_grid("a.b = x , y") == ["a.b=x", "a.b=y"]
+    assert split_grid('a=[1, 2],"x,y"') == ["a=[1, 2]", 'a="x,y"']
+
+
+def test_smoke_replaces(folder):
+    assert load_study(folder / "base.toml", smoke=True).seeds == (3,)
+
+
+def test_identity_is_of_what_matters(folder):
+    study = load_study(folder / "base.toml")
+    runs = make_plan(study).runs
+    assert len({run.identity for run in runs}) == len(runs) == 8
+    assert [run.identity for run in make_plan(study).runs] == [run.identity for run in runs]
+    other = make_plan(study, ["n=4"]).runs
+    assert not {run.identity for run in other} & {run.identity for run in runs}
+    assert json.loads(json.dumps(runs[0].arm.config)) == runs[0].arm.config
