@@ -38,12 +38,12 @@ from mstfilter.scene.frame import Frame
 from mstfilter.scene.support_plane import fit_support_plane, workspace
 from mstfilter.scene.voxels import VoxelGrid, as_labels
 
-__all__ = ["Recording"]
+__all__ = ["LazyFrames", "Recording", "check_range", "find_world"]
 
 _KEPT_FRAMES = 40
 
 
-class _Frames(Sequence[Frame]):
+class LazyFrames(Sequence[Frame]):
     """Frames that are made when they are looked at; the last few are kept."""
 
     def __init__(self, read: Callable[[int], Frame], indices: Sequence[int], kept: OrderedDict[int, Frame]) -> None:
@@ -55,10 +55,10 @@ class _Frames(Sequence[Frame]):
     @overload
     def __getitem__(self, position: int) -> Frame: ...
     @overload
-    def __getitem__(self, position: slice) -> _Frames: ...
+    def __getitem__(self, position: slice) -> LazyFrames: ...
     def __getitem__(self, position: Any) -> Any:
         if isinstance(position, slice):
-            return _Frames(self._read, self._indices[position], self._kept)
+            return LazyFrames(self._read, self._indices[position], self._kept)
         index = self._indices[position]
         if index not in self._kept:
             self._kept[index] = self._read(index)
@@ -85,7 +85,9 @@ class Recording:
     name : str
         For messages and reports.
     path : Path, optional
-        The folder it was read from.
+        The folder or file it was read from.
+    depth_scale : float
+        Metres a unit of the stored depth images; what `save` writes.
     manifest : dict
         What manifest.json says, for recordings read from a folder.
     read_truth, read_instance, read_poses : callables
@@ -98,6 +100,7 @@ class Recording:
     times: tuple[float, ...]
     name: str = "arrays"
     path: Path | None = None
+    depth_scale: float = 0.001
     manifest: dict[str, Any] = field(default_factory=dict)
     read_truth: Callable[[int], np.ndarray | None] = lambda t: None
     read_instance: Callable[[int], np.ndarray | None] = lambda index: None
@@ -191,7 +194,7 @@ class Recording:
                 "one mask a frame, of the size of the images",
             )
         first = Frame(rgb[chosen[0]], depth[chosen[0]], camera, masks[chosen[0]])
-        camera, grid = _world(first, grid)
+        camera, grid = find_world(first, grid)
         frames = [Frame(rgb[i], depth[i], camera, masks[i]) for i in range(n)]
         stamps = tuple(float(t) for t in (times if times is not None else range(n)))
         return cls(frames, grid, chosen, stamps, name)
@@ -246,10 +249,11 @@ def _check_depth(depth: np.ndarray, name: str) -> None:
                 f"depth image of frame {index} of {name} has no reading at all",
                 "0 and NaN mean no reading; values are metres",
             )
-        _check_range(image[good], f"depth image of frame {index} of {name}")
+        check_range(image[good], f"depth image of frame {index} of {name}")
 
 
-def _check_range(metres: np.ndarray, where: str) -> None:
+def check_range(metres: np.ndarray, where: str) -> None:
+    """Readings (n,) whose median cannot be metres of a table seen by a camera."""
     median = float(np.median(metres))
     if not 0.05 < median < 30:
         raise InputError(
@@ -258,7 +262,7 @@ def _check_range(metres: np.ndarray, where: str) -> None:
         )
 
 
-def _world(first: Frame, grid: VoxelGrid | None) -> tuple[Camera, VoxelGrid]:
+def find_world(first: Frame, grid: VoxelGrid | None) -> tuple[Camera, VoxelGrid]:
     """Camera with a pose, and a workspace, from what the first pause shows."""
     camera = first.camera
     if camera.T_world_camera is None:
