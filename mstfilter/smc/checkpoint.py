@@ -163,4 +163,4 @@ def _outline(filter: ParticleFilter) -> dict[str, Any]:
     )
     parts = {slot: getattr(filter, slot) for slot in slots}
     names = {slot: type(part).__qualname__ for slot, part in parts.items() if part is not None}
-    return {**names, "n": filter.n, "n_proposed": filter.n_proposed, "resample": filter.resample}
+    return {**names, "n": int(filter.n), "n_proposed": int(filter.n_proposed), "resample": filter.resample}

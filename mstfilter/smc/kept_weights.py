@@ -11,6 +11,7 @@ from typing import ClassVar
 
 import numpy as np
 
+from mstfilter.smc.fields import part
 from mstfilter.smc.interfaces import Resampler
 from mstfilter.smc.population import Population
 from mstfilter.smc.resampling import Multinomial
@@ -31,6 +32,9 @@ class KeepWeights(Resampler):
     scheme: Resampler = Multinomial()  # noqa: RUF009 (frozen)
 
     properly_weighted: ClassVar[bool] = False
+
+    def __post_init__(self) -> None:
+        part("scheme", self.scheme, Resampler)
 
     @property
     def exact_size(self) -> bool:  # type: ignore[override]

@@ -29,6 +29,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from mstfilter.errors import InputError
+from mstfilter.smc.fields import part, whole
 from mstfilter.smc.interfaces import (
     Codec,
     Component,
@@ -54,6 +55,17 @@ __all__ = ["Info", "ParticleFilter", "SLOTS", "State"]
 
 #: Fields of a filter that hold components whose weights matter.
 SLOTS = ("initial", "transition", "proposal", "update", "resampler", "lookahead", "rejuvenation")
+_INTERFACES: dict[str, type] = {
+    "initial": Proposal,
+    "transition": Transition,
+    "proposal": Proposal,
+    "update": Update,
+    "resampler": Resampler,
+    "trigger": Trigger,
+    "lookahead": Lookahead,
+    "rejuvenation": Rejuvenation,
+    "size": Size,
+}
 
 
 @lru_cache(maxsize=8)
@@ -118,10 +130,10 @@ class ParticleFilter:
     resample: Literal["after", "before"] = "before"
 
     def __post_init__(self) -> None:
-        if self.n < 1:
-            raise InputError(f"n is {self.n}, expected at least one particle")
-        if self.n_proposed < 0:
-            raise InputError(f"n_proposed is {self.n_proposed}, expected at least 0")
+        whole("n", self.n)
+        whole("n_proposed", self.n_proposed, at_least=0)
+        for name, interface in _INTERFACES.items():
+            part(name, getattr(self, name), interface, optional=name not in ("resampler", "trigger"))
         if self.initial is None and self.proposal is None:
             raise InputError("the filter has neither `initial` nor `proposal`: no particles to start from")
         if self.resample not in ("after", "before"):

@@ -9,8 +9,12 @@ array([0.25, 0.25, 0.5 ])
 2.667
 
 Particles are an array (n, ...), a mapping of arrays (n, ...), a tuple of frozen objects, or `Candidates` that
-are built only when someone looks at them. `take` selects from any of them. Populations are immutable: arrays
-are read-only and shared, never copied, so a duplicate costs a reference.
+are built only when someone looks at them. `take` selects from any of them: rows of arrays are copied, objects are
+shared, so a duplicate costs a reference.
+
+Nobody can write to a population, but it does not copy what it is made of: its arrays are read-only views. Who keeps
+an array, makes a population of it, and writes to that array afterwards changes the population too. Components make
+new arrays at every step; hand in ``array.copy()`` where you go on writing to yours.
 """
 
 from __future__ import annotations
@@ -155,7 +159,7 @@ class Population:
     Parameters
     ----------
     particles : ndarray (n, ...) | mapping of ndarray (n, ...) | sequence of n objects | Candidates
-        Treated as immutable.
+        Treated as immutable; shared, not copied.
     log_weights : (n,) float
         Natural log, unnormalised. -inf is a weight of 0; NaN and +inf are errors. None: all 0.
     parents : mapping
@@ -193,7 +197,8 @@ class Population:
         lw.flags.writeable = False
         parents = {}
         for name, index in self.parents.items():
-            index = np.asarray(index, dtype=np.int64)
+            index = np.asarray(index, dtype=np.int64).view()
+            index.flags.writeable = False
             if index.shape != (n,):
                 raise InputError(f'parents "{name}" have shape {index.shape}, expected ({n},)')
             parents[name] = index

@@ -31,6 +31,7 @@ from typing import Any
 
 import numpy as np
 
+from mstfilter.smc.fields import number, whole
 from mstfilter.smc.interfaces import Lookahead, Proposal, Rejuvenation, Resampler, Transition, Trigger
 from mstfilter.smc.particle_filter import ParticleFilter
 from mstfilter.smc.population import Population
@@ -205,6 +206,9 @@ class ProgramLookahead(Lookahead):
     model: Model
     power: float = 1.0
 
+    def __post_init__(self) -> None:
+        number("power", self.power, at_least=0)
+
     def log_priority(self, population: Population, observation: Any) -> np.ndarray:
         """(n,) log of what would be observed; bounded so that no particle is ruled out."""
         _, priority = execute(self.model, Centre(), population.particles, observation, len(population))
@@ -236,6 +240,10 @@ class ProgramMove(Rejuvenation):
     model: Model
     scale: float = 0.5
     steps: int = 1
+
+    def __post_init__(self) -> None:
+        number("scale", self.scale, above=0)
+        whole("steps", self.steps)
 
     def move(
         self,

@@ -14,6 +14,8 @@ from typing import Any
 
 import numpy as np
 
+from mstfilter.errors import InputError
+from mstfilter.smc.fields import part, whole
 from mstfilter.smc.interfaces import Rejuvenation
 from mstfilter.smc.population import Particles, Population
 from mstfilter.smc.state_space import StateSpaceModel
@@ -50,6 +52,13 @@ class RandomWalkMove(Rejuvenation):
     model: StateSpaceModel
     scale: Any = 1.0
     steps: int = 1
+
+    def __post_init__(self) -> None:
+        part("model", self.model, StateSpaceModel)
+        whole("steps", self.steps)
+        scale = np.asarray(self.scale, dtype=np.float64)
+        if not (np.isfinite(scale).all() and (scale > 0).all()):
+            raise InputError(f"scale is {self.scale!r}, expected positive finite numbers")
 
     def move(
         self,

@@ -38,6 +38,7 @@ from typing import Literal
 import numpy as np
 
 from mstfilter.errors import InputError
+from mstfilter.smc.fields import number, whole
 from mstfilter.smc.interfaces import Resampler, Trigger
 from mstfilter.smc.population import Population
 
@@ -193,6 +194,10 @@ class EssBelow(Trigger):
 
     share: float = 0.5
 
+    def __post_init__(self) -> None:
+        hint = "a share of the particles, not their number: 0.5 resamples below half of them"
+        number("share", self.share, f"{hint}; the triggers Always and Never do one or the other", above=0, at_most=1)
+
     def wants(self, population: Population, t: int) -> bool:
         """True where ESS < share * n."""
         return population.ess < self.share * len(population)
@@ -229,8 +234,7 @@ class Every(Trigger):
     k: int = 2
 
     def __post_init__(self) -> None:
-        if self.k < 1:
-            raise InputError(f"resampling at every k-th step: k is {self.k}, expected at least 1")
+        whole("resampling at every k-th step: k", self.k)
 
     def wants(self, population: Population, t: int) -> bool:
         """True where t is a multiple of k."""

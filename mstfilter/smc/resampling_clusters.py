@@ -20,6 +20,7 @@ from typing import ClassVar
 import numpy as np
 
 from mstfilter.errors import InputError
+from mstfilter.smc.fields import number, part
 from mstfilter.smc.interfaces import Resampler
 from mstfilter.smc.population import Population, log_mean_exp
 from mstfilter.smc.resampling import Systematic, checked_weights
@@ -79,8 +80,9 @@ class ClusterStratified(Resampler):
         return self.scheme.properly_weighted
 
     def __post_init__(self) -> None:
-        if not 0 < self.at_least <= 1:
-            raise InputError(f"at_least is {self.at_least}, expected a similarity in (0, 1]")
+        part("similarity", self.similarity, Similarity)
+        part("scheme", self.scheme, Resampler)
+        number("at_least", self.at_least, above=0, at_most=1, unit="similarity")
 
     def select(self, rng: np.random.Generator, log_weights: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
         """Not possible without the particles."""

@@ -24,6 +24,7 @@ from typing import ClassVar
 import numpy as np
 
 from mstfilter.errors import InputError
+from mstfilter.smc.fields import part
 from mstfilter.smc.interfaces import Resampler
 from mstfilter.smc.population import Population, log_mean_exp
 from mstfilter.smc.resampling import checked_weights
@@ -151,6 +152,10 @@ class KDpp(Resampler):
 
     similarity: Similarity = Gaussian()  # noqa: RUF009 (frozen)
     scheme: Resampler = FearnheadClifford()  # noqa: RUF009 (frozen)
+
+    def __post_init__(self) -> None:
+        part("similarity", self.similarity, Similarity)
+        part("scheme", self.scheme, Resampler)
 
     @property
     def properly_weighted(self) -> bool:  # type: ignore[override]

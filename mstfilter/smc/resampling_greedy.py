@@ -19,6 +19,7 @@ from typing import ClassVar
 import numpy as np
 
 from mstfilter.errors import InputError
+from mstfilter.smc.fields import part
 from mstfilter.smc.interfaces import Resampler
 from mstfilter.smc.population import Population
 from mstfilter.smc.resampling import checked_weights
@@ -47,6 +48,9 @@ class GreedyDiverse(Resampler):
 
     properly_weighted: ClassVar[bool] = False
     exact_size: ClassVar[bool] = False
+
+    def __post_init__(self) -> None:
+        part("similarity", self.similarity, Similarity)
 
     def select(self, rng: np.random.Generator, log_weights: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
         """Not possible without the particles."""

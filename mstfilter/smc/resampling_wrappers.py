@@ -17,6 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mstfilter.errors import InputError
+from mstfilter.smc.fields import number, part
 from mstfilter.smc.interfaces import Resampler
 from mstfilter.smc.population import Population, log_mean_exp
 from mstfilter.smc.resampling import Systematic, checked_weights
@@ -61,6 +62,10 @@ class Coalesced(Resampler):
 
     scheme: Resampler = FearnheadClifford()  # noqa: RUF009 (frozen)
     equivalence: Equivalence = Exact()  # noqa: RUF009 (frozen)
+
+    def __post_init__(self) -> None:
+        part("scheme", self.scheme, Resampler)
+        part("equivalence", self.equivalence, Equivalence)
 
     @property
     def properly_weighted(self) -> bool:  # type: ignore[override]
@@ -107,8 +112,8 @@ class Tempered(Resampler):
     power: float = 0.5
 
     def __post_init__(self) -> None:
-        if not 0 <= self.power <= 1:
-            raise InputError(f"power is {self.power}, expected a number in [0, 1]")
+        part("scheme", self.scheme, Resampler)
+        number("power", self.power, at_least=0, at_most=1)
 
     @property
     def properly_weighted(self) -> bool:  # type: ignore[override]
@@ -154,6 +159,9 @@ class Shuffled(Resampler):
     """
 
     scheme: Resampler = Systematic()  # noqa: RUF009 (frozen)
+
+    def __post_init__(self) -> None:
+        part("scheme", self.scheme, Resampler)
 
     @property
     def properly_weighted(self) -> bool:  # type: ignore[override]

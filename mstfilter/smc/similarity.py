@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 
 from mstfilter.errors import InputError
+from mstfilter.smc.fields import number
 
 __all__ = ["Bins", "Equivalence", "Exact", "Gaussian", "Similarity", "as_matrix", "first_seen"]
 
@@ -73,8 +74,7 @@ class Gaussian(Similarity):
     scale: float = 1.0
 
     def __post_init__(self) -> None:
-        if not self.scale > 0:
-            raise InputError(f"scale is {self.scale}, expected a positive distance")
+        number("scale", self.scale, above=0, unit="distance")
 
     def matrix(self, particles: Any) -> np.ndarray:
         """(n, n)."""
@@ -121,8 +121,7 @@ class Bins(Equivalence):
     width: float = 1.0
 
     def __post_init__(self) -> None:
-        if not self.width > 0:
-            raise InputError(f"width is {self.width}, expected a positive side of a cell")
+        number("width", self.width, above=0, unit="side of a cell")
 
     def classes(self, particles: Any) -> np.ndarray:
         """(n,)."""

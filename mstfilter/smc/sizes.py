@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mstfilter.errors import InputError
+from mstfilter.smc.fields import number, part, whole
 from mstfilter.smc.interfaces import Size
 from mstfilter.smc.population import Population
 from mstfilter.smc.similarity import Bins, Equivalence
@@ -36,8 +36,7 @@ class Fixed(Size):
     n: int = 100
 
     def __post_init__(self) -> None:
-        if self.n < 1:
-            raise InputError(f"n is {self.n}, expected at least one particle")
+        whole("n", self.n)
 
     def choose(self, population: Population) -> int:
         """`n`."""
@@ -73,10 +72,11 @@ class Kld(Size):
     n_max: int = 100_000
 
     def __post_init__(self) -> None:
-        if not self.epsilon > 0 or not 0 < self.delta < 1:
-            raise InputError(f"epsilon is {self.epsilon} and delta {self.delta}, expected epsilon > 0, 0 < delta < 1")
-        if not 1 <= self.n_min <= self.n_max:
-            raise InputError(f"n_min is {self.n_min} and n_max {self.n_max}, expected 1 <= n_min <= n_max")
+        part("equivalence", self.equivalence, Equivalence)
+        number("epsilon", self.epsilon, above=0, unit="distance in nats")
+        number("delta", self.delta, above=0, below=1, unit="probability")
+        whole("n_min", self.n_min)
+        whole("n_max", self.n_max, f"n_min is {self.n_min}", at_least=self.n_min)
 
     def choose(self, population: Population) -> int:
         """The least sufficient number within the bounds."""

@@ -82,6 +82,11 @@ class StateSpaceModel:
             ``(particles) -> distribution`` of y_t.
         """
         first = as_distribution(initial)
+        for name, function in (("transition", transition), ("observation", observation)):
+            if not callable(function):
+                raise InputError(
+                    f"{name} is {function!r}, expected a function of the particles that returns a distribution"
+                )
         return cls(
             first.sample,
             lambda rng, x: as_distribution(transition(x)).sample(rng, n_of(x)),

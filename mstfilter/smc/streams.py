@@ -10,6 +10,10 @@ True
 
 A `Key` is data (an integer and a tuple) and can be stored; a generator is not kept anywhere. Keys stand on
 numpy's SeedSequence with a prefix of our own, so a child never collides with `Generator.spawn`.
+
+A name stands for two words of the spawn key, its CRC-32 and 1. So a name is no single index below 2^32, but it is the
+same stream as that pair of indices: ``key.child("a")`` draws what ``key.child(zlib.crc32(b"a"), 1)`` draws. Two names
+with the same CRC-32 share a stream as well (of a hundred names two do so with a chance of one in a million).
 """
 
 from __future__ import annotations
@@ -128,4 +132,4 @@ def _number(part: int | str) -> int:
 
 @lru_cache(maxsize=256)
 def _named(name: str) -> int:
-    return zlib.crc32(name.encode()) | 1 << 32  # names never meet indices below 2^32
+    return zlib.crc32(name.encode()) | 1 << 32  # two words, so no single index below 2^32 is its namesake

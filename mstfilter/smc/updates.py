@@ -12,6 +12,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from mstfilter.errors import InputError
+from mstfilter.smc.fields import part
 from mstfilter.smc.interfaces import Update
 from mstfilter.smc.population import Population
 
@@ -49,6 +50,10 @@ class Chain(Update):
     """Several updates in order. The first takes the proposed particles, the others see none."""
 
     updates: tuple[Update, ...]
+
+    def __post_init__(self) -> None:
+        for k, update in enumerate(self.updates):
+            part(f"updates[{k}]", update, Update)
 
     @property
     def properly_weighted(self) -> bool:  # type: ignore[override]

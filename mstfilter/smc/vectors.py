@@ -17,6 +17,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from mstfilter.errors import InputError
+from mstfilter.smc.fields import number
 from mstfilter.smc.interfaces import Update
 from mstfilter.smc.population import Population
 from mstfilter.smc.updates import union
@@ -83,6 +84,9 @@ class CrossVectors(Update):
     log_likelihood: Callable[[Any, Any], np.ndarray]
     share: float = 0.5
     among: bool = False
+
+    def __post_init__(self) -> None:
+        number("share", self.share, above=0)
 
     #: Children have no known density. Evidence is not reported even where none were made.
     properly_weighted: ClassVar[bool] = False

@@ -37,6 +37,26 @@ def test_populations_cannot_be_written_to():
         population.particles[0] = 1
     with pytest.raises(ValueError, match="read-only"):
         population.log_weights[0] = 1
+    parents = Population(np.arange(3.0), None, {"previous": np.arange(3)}).parents
+    with pytest.raises(ValueError, match="read-only"):
+        parents["previous"][0] = 1
+
+
+def test_arrays_are_shared_and_selections_of_them_are_copies():
+    """What is handed in is viewed, not copied; who writes to the original writes to the population."""
+    x, lw, named, thing = np.arange(3.0), np.zeros(3), {"a": np.arange(3)}, object()
+    population, mapping = Population(x, lw), Population(named)
+    chosen = population.take(np.array([0, 0, 1]))
+    x[0], lw[0], named["a"][0] = 7.0, -1.0, 7
+    assert population.particles[0] == 7.0
+    assert population.log_weights[0] == -1.0
+    assert mapping.particles["a"][0] == 7
+    named["b"] = np.arange(3)
+    assert list(mapping.particles) == ["a"]
+    np.testing.assert_array_equal(chosen.particles, [0.0, 0.0, 1.0])
+    assert x.flags.writeable and lw.flags.writeable, "the original stays yours"
+    objects = Population((thing, "b")).take(np.array([0, 0]))
+    assert objects.particles[0] is objects.particles[1] is thing
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import zlib
 
 import numpy as np
 import pytest
@@ -33,3 +34,13 @@ def test_moved_particles_keep_weights_and_parents():
         moved.particles[0] = 2
     with pytest.raises(InputError, match="3 particles became 2"):
         population.moved(np.zeros(2))
+
+
+def test_what_a_name_shares_its_stream_with():
+    """As the docstring says: with the pair of indices (CRC-32, 1), and with no single index."""
+    key, number = Key(3), zlib.crc32(b"transition")
+    named = key.child("transition").generator().random(4)
+    np.testing.assert_array_equal(named, key.child(number, 1).generator().random(4))
+    for other in ((number,), (number, 0), (1, number)):
+        assert not np.array_equal(named, key.child(*other).generator().random(4))
+    assert not np.array_equal(key.child(0).generator().random(4), key.child(0, 0).generator().random(4))

@@ -70,7 +70,7 @@ def test_check_of_registered_components_with_fields(capsys):
         (("resampler.systematik",), "did you mean"),
         (("systematic",), "KIND.NAME"),
         (("./nowhere.py:X",), "file does not exist"),
-        (("resampler.tempered", "power=2"), "[0, 1]"),
+        (("resampler.tempered", "power=2"), "of at most 1"),
         (("boundary.colour_depth",), "no component"),
     ):
         code, _, err = call("check", *arguments, capsys=capsys)

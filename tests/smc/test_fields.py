@@ -1,0 +1,93 @@
+"""Fields out of range and parts of the wrong kind are one clear error, when the component is made."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mstfilter.errors import InputError
+from mstfilter.smc.distributions import Normal
+from mstfilter.smc.filters import bootstrap
+from mstfilter.smc.particle_filter import ParticleFilter
+from mstfilter.smc.programs import ProgramLookahead, ProgramMove
+from mstfilter.smc.rejuvenation import RandomWalkMove
+from mstfilter.smc.resampling import EssBelow, Every, Systematic
+from mstfilter.smc.resampling_clusters import ClusterStratified
+from mstfilter.smc.resampling_dpp import KDpp
+from mstfilter.smc.resampling_greedy import GreedyDiverse
+from mstfilter.smc.resampling_wrappers import Coalesced, Shuffled, Tempered
+from mstfilter.smc.similarity import Bins, Gaussian
+from mstfilter.smc.sizes import Fixed, Kld
+from mstfilter.smc.state_space import StateSpaceModel
+from mstfilter.smc.updates import Chain, Reweight
+from mstfilter.smc.vectors import CrossVectors
+from tests.smc.models import AR1
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: EssBelow(2), "share is 2, expected a finite number above 0 and of at most 1"),
+        (lambda: EssBelow(0), "share is 0"),
+        (lambda: EssBelow(np.nan), "share is nan"),
+        (lambda: EssBelow("half"), "share is 'half'"),
+        (lambda: EssBelow(True), "share is True"),
+        (lambda: Every(0), "k is 0, expected a whole number of at least 1"),
+        (lambda: Every(2.5), r"k is 2\.5"),
+        (lambda: Fixed(10.0), r"n is 10\.0, expected a whole number"),
+        (lambda: Kld(epsilon=np.inf), "epsilon is inf, expected a finite distance in nats above 0"),
+        (lambda: Kld(delta=1.0), r"delta is 1\.0, expected a finite probability above 0 and below 1"),
+        (lambda: Kld(n_min=0), "n_min is 0"),
+        (lambda: Kld(n_min=7, n_max=6), "n_max is 6, expected a whole number of at least 7"),
+        (lambda: Kld(equivalence=Gaussian()), "equivalence is Gaussian"),
+        (lambda: Gaussian(np.inf), "scale is inf"),
+        (lambda: Bins(np.nan), "width is nan"),
+        (lambda: Tempered(power=-0.1), r"power is -0\.1"),
+        (lambda: Tempered(Systematic, 0.5), "scheme is the class Systematic, expected a Resampler"),
+        (lambda: Shuffled("systematic"), "scheme is 'systematic'"),
+        (lambda: Coalesced(equivalence=Gaussian()), "expected an Equivalence"),
+        (lambda: ClusterStratified(at_least=2.0), r"at_least is 2\.0"),
+        (lambda: KDpp(Bins()), "similarity is Bins"),
+        (lambda: GreedyDiverse(Bins()), "similarity is Bins"),
+        (lambda: RandomWalkMove(AR1, steps=0), "steps is 0"),
+        (lambda: RandomWalkMove(AR1, scale=-1.0), "scale is -1"),
+        (lambda: RandomWalkMove(AR1, scale=[1.0, np.nan]), "scale is"),
+        (lambda: ProgramMove(print, scale=0.0), r"scale is 0\.0"),
+        (lambda: ProgramLookahead(print, power=-1), "power is -1"),
+        (lambda: CrossVectors(print, share=0), "share is 0"),
+        (lambda: Chain((Reweight(print), Systematic())), r"updates\[1\] is Systematic"),
+        (lambda: bootstrap(AR1, 2.0), r"n is 2\.0"),
+        (lambda: replace(bootstrap(AR1, 2), n_proposed=-1), "n_proposed is -1"),
+        (lambda: bootstrap(AR1, 5, Systematic), "resampler is the class Systematic"),
+        (lambda: replace(bootstrap(AR1, 5), trigger=0.5), r"trigger is 0\.5, expected a Trigger"),
+        (lambda: replace(bootstrap(AR1, 5), resampler=None), "resampler is None"),
+        (lambda: ParticleFilter(initial=AR1), "initial is StateSpaceModel"),
+        (lambda: StateSpaceModel.of(Normal(0, 1), Normal(0, 1), lambda x: Normal(x, 1)), "transition is Normal"),
+    ],
+)
+def test_nonsense_is_refused(make, message):
+    with pytest.raises(InputError, match=message):
+        make()
+
+
+def test_hints_say_what_was_meant():
+    with pytest.raises(InputError) as raised:
+        EssBelow(50)
+    assert "a share of the particles, not their number" in raised.value.hints[0]
+    with pytest.raises(InputError) as raised:
+        bootstrap(AR1, 5, Systematic)
+    assert raised.value.hints == ("pass an instance: resampler=Systematic(...)",)
+
+
+def test_sense_is_not_refused():
+    for part in (
+        EssBelow(1),
+        EssBelow(np.float32(0.25)),
+        Every(np.int64(3)),
+        Kld(n_min=5, n_max=5),
+        Tempered(power=0),
+    ):
+        assert part == part
+    assert len(bootstrap(AR1, np.int64(7)).run([0.1], 0)[0].population) == 7
