@@ -31,9 +31,16 @@ COMPONENTS: dict[str, dict[str, str]] = {
     "transition": {
         "tracking": "mstfilter.tracking.transition:TrackingTransition",
         "identity": "mstfilter.tracking.transition:IdentityTransition",
+        "true_motions": "mstfilter.oracles.motion:TrueMotions",
     },
-    "proposal": {"tree_cuts": "mstfilter.segmentation.proposal:TreeCutProposal"},
-    "update": {"fusion": "mstfilter.fusion.update:FusionUpdate"},
+    "proposal": {
+        "tree_cuts": "mstfilter.segmentation.proposal:TreeCutProposal",
+        "true_masks": "mstfilter.oracles.masks:TrueMasks",
+    },
+    "update": {
+        "fusion": "mstfilter.fusion.update:FusionUpdate",
+        "true_fusion": "mstfilter.oracles.choice:TrueFusion",
+    },
     "resampler": {
         "multinomial": "mstfilter.smc.resampling:Multinomial",
         "residual": "mstfilter.smc.resampling:Residual",
@@ -50,6 +57,7 @@ COMPONENTS: dict[str, dict[str, str]] = {
         "tempered": "mstfilter.smc.resampling_wrappers:Tempered",
         "shuffled": "mstfilter.smc.resampling_wrappers:Shuffled",
         "keep_weights": "mstfilter.smc.kept_weights:KeepWeights",
+        "true_best": "mstfilter.oracles.choice:TrueBest",
     },
     "trigger": {
         "always": "mstfilter.smc.resampling:Always",
@@ -70,7 +78,10 @@ COMPONENTS: dict[str, dict[str, str]] = {
         "exact": "mstfilter.smc.similarity:Exact",
         "same_segmentation": "mstfilter.fusion.similarity:SameSegmentation",
     },
-    "boundary": {"colour_depth": "mstfilter.segmentation.boundary:ColourDepthBoundary"},
+    "boundary": {
+        "colour_depth": "mstfilter.segmentation.boundary:ColourDepthBoundary",
+        "true_boundary": "mstfilter.oracles.masks:TrueBoundary",
+    },
     "tree": {
         "learned": "mstfilter.segmentation.learned_tree:LearnedTree",
         "ucm": "mstfilter.segmentation.ucm:UcmTree",
@@ -87,6 +98,7 @@ COMPONENTS: dict[str, dict[str, str]] = {
     "completer": {
         "extrude": "mstfilter.completion.extrude:Extrude",
         "surface": "mstfilter.completion.extrude:SurfaceOnly",
+        "true_completion": "mstfilter.oracles.completion:TrueCompletion",
     },
     "rule": {
         "authors": "mstfilter.tracking.rules:AuthorsRule",
@@ -96,6 +108,7 @@ COMPONENTS: dict[str, dict[str, str]] = {
     "free_space": {
         "projective": "mstfilter.fusion.free_space:FreeSpace",
         "none": "mstfilter.fusion.free_space:NoFreeSpace",
+        "true_free_space": "mstfilter.oracles.choice:TrueFreeSpace",
     },
     "crossover": {"conflict_graph": "mstfilter.fusion.crossover:Crossover"},
     "structure": {
@@ -105,6 +118,7 @@ COMPONENTS: dict[str, dict[str, str]] = {
     "evidence": {
         "boundaries": "mstfilter.segmentation.evidence:BoundaryAgreement",
         "motions": "mstfilter.tracking.evidence:MotionAgreement",
+        "true_quality": "mstfilter.oracles.choice:TrueQuality",
     },
     "mode_filter": {"majority": "mstfilter.fusion.mode_filter:ModeFilter"},
 }

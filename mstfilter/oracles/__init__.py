@@ -1,1 +1,1 @@
-"""Small worlds whose exact answers are known: what a filter ought to say, to hold it against what it says."""
+"""What is known to be right: worlds with an exact answer, and stages replaced by the truth of a recording."""

@@ -1,0 +1,167 @@
+"""Masks made worse to a set quality: objects split, touching objects merged, borders displaced.
+
+>>> worse = degrade(rng, labels, quality=0.8, over=0.35, under=0.35)
+>>> abs(weighted_coverage(worse, labels) - 0.8) < 0.01
+True
+
+The loss 1 - quality is spent in this order: splits by random lines until `over` of it is gone, merges of touching
+objects until `under` is, then a smooth random displacement of all borders, as strong as the rest asks for. Splits and
+displacements are found by bisection, so the quality is met whatever the image; merges cannot be dosed, and one that
+costs too much is not made.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from mstfilter.scene.quality import weighted_coverage
+
+__all__ = ["degrade"]
+
+_TRIES = 30
+_REACH = 60.0  # largest displacement in pixels of a 640 px wide image
+_SMOOTH = 5.0  # of the displacement, pixels of a 640 px wide image
+
+
+def degrade(
+    rng: np.random.Generator,
+    labels: np.ndarray,
+    quality: float,
+    over: float = 0.35,
+    under: float = 0.35,
+    tolerance: float = 0.01,
+) -> np.ndarray:
+    """A worse label image.
+
+    Parameters
+    ----------
+    rng : Generator
+        For the draws.
+    labels : (H, W) int
+        True objects, 0 elsewhere.
+    quality : float
+        Weighted coverage (form ``objects``) that the result is to have against `labels`.
+    over, under : float
+        Shares of the loss that splits and merges may take.
+    tolerance : float
+        Distance from `quality` at which the search ends.
+
+    Returns
+    -------
+    (H, W) int32
+        An image without objects comes back unchanged.
+    """
+    labels = np.asarray(labels, dtype=np.int32)
+    if quality >= 1 or not labels.any():
+        return labels
+    inside = np.nonzero(labels)
+    margin = 8
+    box = tuple(slice(max(int(k.min()) - margin, 0), int(k.max()) + margin + 1) for k in inside)
+    true = labels[box]
+    worse = _split(rng, true, true, 1 - over * (1 - quality), tolerance)
+    worse = _merge(rng, true, worse, 1 - (over + under) * (1 - quality), tolerance)
+    if over + under < 1 or weighted_coverage(worse, true) > quality + tolerance:
+        worse = _displace(rng, true, worse, quality, tolerance, labels.shape[1] / 640)
+    out = np.zeros_like(labels)
+    out[box] = worse
+    return out
+
+
+def _split(rng: np.random.Generator, true: np.ndarray, labels: np.ndarray, target: float, tol: float) -> np.ndarray:
+    """Cut objects in two until the quality is `target`; the last cut takes as little as is needed."""
+    for _ in range(_TRIES):
+        if weighted_coverage(labels, true) <= target + tol / 2:
+            break
+        sizes = np.bincount(labels.ravel())
+        sizes[0] = 0
+        chosen = int(rng.choice(len(sizes), p=sizes / sizes.sum()))
+        where = np.nonzero(labels == chosen)
+        angle = rng.uniform(0, np.pi)
+        along = np.cos(angle) * where[1] + np.sin(angle) * where[0]
+        rank = np.argsort(np.argsort(along, kind="stable"), kind="stable") / max(len(along), 1)
+
+        def cut(
+            share: float, at: tuple[np.ndarray, ...] = where, rank: np.ndarray = rank, old: np.ndarray = labels
+        ) -> np.ndarray:
+            new = old.copy()
+            new[at[0][rank < share], at[1][rank < share]] = old.max() + 1
+            return new
+
+        half = cut(0.5)
+        if weighted_coverage(half, true) >= target - tol / 2:
+            labels = half
+            continue
+
+        def left(share: float, cut: Callable[[float], np.ndarray] = cut) -> float:
+            return weighted_coverage(cut(share), true)
+
+        labels = cut(_bisect(left, 0.0, 0.5, target, tol / 2))
+    return labels
+
+
+def _merge(rng: np.random.Generator, true: np.ndarray, labels: np.ndarray, target: float, tol: float) -> np.ndarray:
+    """Join touching objects while the quality stays at `target` or above."""
+    refused: set[tuple[int, int]] = set()
+    for _ in range(_TRIES):
+        if weighted_coverage(labels, true) <= target + tol / 2:
+            break
+        pairs = sorted(_touching(labels) - refused)
+        if not pairs:
+            break
+        a, b = pairs[int(rng.integers(len(pairs)))]
+        new = np.where(labels == b, a, labels)
+        if weighted_coverage(new, true) < target - tol / 2:
+            refused.add((a, b))
+        else:
+            labels = new
+    return labels
+
+
+def _touching(labels: np.ndarray, gap: int = 3) -> set[tuple[int, int]]:
+    """Pairs (a, b), a < b, of objects at most `gap` pixels apart along a row or a column."""
+    found: set[tuple[int, int]] = set()
+    for image in (labels, labels.T):
+        for step in range(1, gap + 1):
+            a, b = image[:, :-step].ravel(), image[:, step:].ravel()
+            touch = (a != b) & (a > 0) & (b > 0)
+            found.update(zip(np.minimum(a, b)[touch].tolist(), np.maximum(a, b)[touch].tolist(), strict=True))
+    return found
+
+
+def _displace(
+    rng: np.random.Generator, true: np.ndarray, labels: np.ndarray, target: float, tol: float, resize: float
+) -> np.ndarray:
+    """Move every pixel's label along a smooth random field, as far as the quality asks for."""
+    from scipy.ndimage import gaussian_filter
+
+    field = np.stack([gaussian_filter(rng.standard_normal(true.shape), max(1.0, _SMOOTH * resize)) for _ in range(2)])
+    field /= field.std()
+    rows, columns = np.indices(true.shape)
+    seen = true > 0
+
+    def moved(reach: float) -> np.ndarray:
+        r = np.clip(np.rint(rows + reach * field[0]), 0, true.shape[0] - 1).astype(int)
+        c = np.clip(np.rint(columns + reach * field[1]), 0, true.shape[1] - 1).astype(int)
+        return np.where(seen, labels[r, c], 0)  # only these pixels can belong to an object
+
+    return moved(_bisect(lambda reach: weighted_coverage(moved(reach), true), 0.0, _REACH * resize, target, tol / 2))
+
+
+def _bisect(quality: Callable[[float], float], low: float, high: float, target: float, tol: float) -> float:
+    """Where a (nearly) falling quality meets the target: of all places looked at, the closest."""
+    best, closest = low, np.inf
+    for k in range(24):
+        at = high if k == 0 else (low + high) / 2
+        value = quality(at)
+        if abs(value - target) < closest:
+            best, closest = at, abs(value - target)
+        if closest <= tol:
+            break
+        if k == 0:
+            if value > target:
+                break  # not even the strongest reaches it
+            continue
+        low, high = (at, high) if value > target else (low, at)
+    return best

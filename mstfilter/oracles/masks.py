@@ -1,0 +1,126 @@
+"""Perfect masks, and masks of a set quality: the front end replaced by the truth.
+
+>>> proposal = TrueMasks()                       # every sample is the true segmentation of the image
+>>> proposal = TrueMasks(quality=0.8)            # every sample is wrong in its own way, with quality 0.8
+>>> boundary = TrueBoundary()                    # or the boundary map alone, below an ordinary tree
+
+What objects look like is all that is replaced: masks are completed by an ordinary completer.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+import numpy as np
+
+from mstfilter.completion.completer import Completer
+from mstfilter.completion.extrude import Extrude
+from mstfilter.errors import InputError
+from mstfilter.oracles.degradation import degrade
+from mstfilter.oracles.truth import Need, UsesTruth
+from mstfilter.scene.clip import Clip
+from mstfilter.scene.frame import Frame
+from mstfilter.scene.object_status import MIN_PIXELS
+from mstfilter.scene.quality import weighted_coverage
+from mstfilter.scene.voxels import Hypothesis
+from mstfilter.segmentation.interfaces import BoundaryModel
+from mstfilter.segmentation.proposal import hypothesis_of
+from mstfilter.segmentation.segments import ObjectRule
+from mstfilter.smc.interfaces import Proposal
+from mstfilter.smc.population import Population
+from mstfilter.smc.streams import child
+
+__all__ = ["TrueBoundary", "TrueMasks"]
+
+
+@dataclass(frozen=True)
+class TrueMasks(UsesTruth, Proposal):
+    """Hypotheses from the true masks of the clip's last frame.
+
+    Parameters
+    ----------
+    completer : Completer
+    quality : float
+        2-D quality (form ``objects``) of each sample's masks against the true ones, 0.3 .. 1. Below 1 every sample
+        is degraded in its own way.
+    over, under : float
+        Shares of the lost quality that come from splitting and from merging objects, 0 .. 1 together at most. The
+        rest comes from displaced borders, and what splitting and merging could not reach too.
+    tolerance : float
+        Largest deviation from the set quality.
+    min_pixels : float
+        Objects with fewer pixels in a 640 x 480 image are not seen; scales with the image's area.
+    objects : ObjectRule
+        Which pixels can belong to an object (its `own` alone is used).
+    threshold : float
+        Probability from which a completed voxel is occupied.
+    """
+
+    completer: Completer = field(default_factory=Extrude)
+    quality: float = 1.0
+    over: float = 0.35
+    under: float = 0.35
+    tolerance: float = 0.01
+    min_pixels: float = MIN_PIXELS
+    objects: ObjectRule = field(default_factory=ObjectRule)
+    threshold: float = 0.5
+
+    properly_weighted: ClassVar[bool] = False
+    needs: ClassVar[tuple[Need, ...]] = ("voxels", "instance")
+
+    def __post_init__(self) -> None:
+        if not 0.3 <= self.quality <= 1:
+            raise InputError(f"quality of masks is {self.quality}, expected 0.3 .. 1")
+        if min(self.over, self.under) < 0 or self.over + self.under > 1:
+            raise InputError(f"over is {self.over} and under {self.under}, expected shares that sum to at most 1")
+        if not self.tolerance > 0:
+            raise InputError(f"tolerance of masks is {self.tolerance}, expected > 0")
+
+    def masks(self, frame: Frame, clip: Clip) -> np.ndarray:
+        """(H, W) int32 true objects of the clip's last frame where they are seen, 0 elsewhere."""
+        image = self.truth.instance(clip.index)
+        counts = np.bincount(image.ravel())
+        enough = counts >= max(1.0, self.min_pixels * image.size / 307200)
+        enough[0] = False
+        return np.where(enough[image] & self.objects.own(frame, clip.grid), image, 0).astype(np.int32)
+
+    def sample(self, rng: np.random.Generator, observation: Clip, n: int) -> Population:
+        """`n` hypotheses about the scene at the end of the clip; equal ones where quality is 1."""
+        frame, grid = observation.after, observation.grid
+        true = self.masks(frame, observation)
+        particles: list[Hypothesis] = []
+        reached: list[float] = []
+        for i in range(n):
+            masks = true
+            if self.quality < 1:
+                masks = degrade(child(rng, "masks", i), true, self.quality, self.over, self.under, self.tolerance)
+            reached.append(round(weighted_coverage(masks, true), 4) if self.quality < 1 else 1.0)
+            if particles and self.quality == 1:
+                particles.append(particles[0])
+                continue
+            numbers = [int(k) for k in np.unique(masks) if k > 0]
+            completed = [
+                self.completer.complete(child(rng, "completion", i, k), frame, [masks == k], grid)[0] for k in numbers
+            ]
+            particles.append(hypothesis_of(completed, grid, observation.index, self.threshold))
+        notes = {"mask_quality": reached, "objects": [h.n_objects for h in particles]}
+        return Population(tuple(particles), notes=notes)
+
+
+@dataclass(frozen=True)
+class TrueBoundary(UsesTruth, BoundaryModel):
+    """1 on both sides of every border between true objects, and around the robot; 0 elsewhere."""
+
+    needs: ClassVar[tuple[Need, ...]] = ("voxels", "instance")
+
+    def boundary(self, frame: Frame) -> np.ndarray:
+        """(H, W) float32; the frame must be at a pause."""
+        image = self.truth.instance(self.truth.pause_of(frame))
+        if frame.robot_mask is not None:
+            image = np.where(frame.robot_mask, -1, image)
+        edge = np.zeros(image.shape, np.float32)
+        across, down = image[:, 1:] != image[:, :-1], image[1:] != image[:-1]
+        edge[:, 1:][across] = edge[:, :-1][across] = 1
+        edge[1:][down] = edge[:-1][down] = 1
+        return edge

@@ -1,0 +1,171 @@
+"""Components that use the truth of a recording, and how they get it.
+
+A component sees a clip, and a clip holds no truth. One that inherits `UsesTruth` is bound to a recording before a
+run; `bind_truth` finds all of them in a filter, however deep they stand:
+
+>>> filter = mstfilter.preset("mst", "proposal=true_masks", "transition=true_motions")
+>>> filter = bind_truth(filter, recording)            # the same filter where nothing uses truth
+>>> state, infos = filter.run(recording.clips(), seed=0)
+
+``mstfilter run`` and studies do so by themselves. The truth is no hyperparameter: it is no field, so a component's
+description, its content key and its equality are those of the unbound one.
+"""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+from typing import Any, ClassVar, Literal, TypeVar
+
+import numpy as np
+
+from mstfilter.errors import InputError
+from mstfilter.scene.frame import Frame
+from mstfilter.scene.recording import Recording
+
+__all__ = ["Need", "Truth", "UsesTruth", "bind_truth", "uses_truth"]
+
+Need = Literal["voxels", "instance", "poses"]
+_WORDS: dict[Need, str] = {"voxels": "true voxels", "instance": "instance image", "poses": "true poses"}
+
+T = TypeVar("T")
+
+
+class Truth:
+    """What is true at the pauses of a recording.
+
+    Parameters
+    ----------
+    recording : Recording
+        One that was simulated, or otherwise knows.
+    """
+
+    def __init__(self, recording: Recording) -> None:
+        self.recording = recording
+        self._instance: dict[int, np.ndarray] = {}
+        self._pauses: dict[bytes, int] | None = None
+        self._objects: np.ndarray | None = None
+
+    def check(self, needs: tuple[Need, ...], who: str) -> None:
+        """One clear error if something that a component needs is missing at any pause."""
+        recording = self.recording
+        look = {
+            "voxels": recording.truth,
+            "instance": lambda t: recording.instance(recording.pauses[t]),
+            "poses": lambda t: recording.poses(recording.pauses[t]),
+        }
+        for need in needs:
+            for t in range(len(recording.pauses)):
+                if look[need](t) is None:
+                    raise InputError(
+                        f"{who} uses the truth, and recording {recording.name} has no {_WORDS[need]} at pause {t}",
+                        "simulated recordings have all: `mstfilter simulate`",
+                    )
+
+    def labels(self, t: int) -> np.ndarray:
+        """(X, Y, Z) uint16 true labels at pause `t`."""
+        labels = self.recording.truth(t)
+        if labels is None:
+            raise InputError(f"recording {self.recording.name} has no true voxels at pause {t}")
+        return labels
+
+    def instance(self, t: int) -> np.ndarray:
+        """(H, W) int32 true object of each pixel at pause `t`; 0 for all that is no object with true voxels."""
+        if t not in self._instance:
+            image = self.recording.instance(self.recording.pauses[t])
+            if image is None:
+                raise InputError(f"recording {self.recording.name} has no instance image at pause {t}")
+            if self._objects is None:
+                pauses = range(len(self.recording.pauses))
+                self._objects = np.unique(np.concatenate([np.unique(self.labels(k)) for k in pauses]))
+            self._instance[t] = np.where(np.isin(image, self._objects), image, 0).astype(np.int32)
+        return self._instance[t]
+
+    def motions(self, t: int) -> dict[int, np.ndarray]:
+        """(4, 4) motion in world metres of each object from pause `t` - 1 to pause `t`, by label."""
+        pauses = self.recording.pauses
+        before, after = (self.recording.poses(pauses[k]) for k in (t - 1, t))
+        if before is None or after is None:
+            raise InputError(f"recording {self.recording.name} has no true poses at pause {t - (before is None)}")
+        return {k: after[k] @ np.linalg.inv(before[k]) for k in before.keys() & after.keys()}
+
+    def pause_of(self, frame: Frame) -> int:
+        """The pause that a frame was taken at, known by its content."""
+        if self._pauses is None:
+            self._pauses = {}
+            for t, index in enumerate(self.recording.pauses):
+                self._pauses.setdefault(self.recording.frames[index].key, t)
+        if frame.key not in self._pauses:
+            raise InputError(
+                f"a frame is none of the {len(self.recording.pauses)} pauses of recording {self.recording.name}",
+                "components that use the truth work on the recording that they were bound to",
+            )
+        return self._pauses[frame.key]
+
+
+class UsesTruth:
+    """A component that knows the truth; inherited beside the interface that it implements."""
+
+    #: What it asks a recording for.
+    needs: ClassVar[tuple[Need, ...]] = ("voxels",)
+
+    def bind(self: T, truth: Truth) -> T:
+        """The same component, knowing this truth."""
+        bound = copy.copy(self)
+        object.__setattr__(bound, "_truth", truth)  # components are frozen
+        return bound
+
+    @property
+    def truth(self) -> Truth:
+        """The truth it was bound to."""
+        truth = self.__dict__.get("_truth")
+        if truth is None:
+            raise InputError(
+                f"{type(self).__name__} uses the truth of a recording and was not told which",
+                "mstfilter.oracles.truth.bind_truth(filter, recording) does",
+            )
+        return truth
+
+
+def uses_truth(component: Any) -> list[str]:
+    """Class names of all parts of a component that use the truth, in the order they are found."""
+    found = [type(component).__name__] if isinstance(component, UsesTruth) else []
+    for part in _parts(component).values():
+        for inner in part if isinstance(part, tuple) else (part,):
+            found.extend(uses_truth(inner))
+    return found
+
+
+def bind_truth(component: T, recording: Recording) -> T:
+    """The same filter (or component) with every part that uses the truth bound to a recording.
+
+    Raises
+    ------
+    InputError
+        If the recording lacks what a part needs, at any pause.
+    """
+    return _bind(component, Truth(recording)) if uses_truth(component) else component
+
+
+def _bind(component: Any, truth: Truth) -> Any:
+    changed = {}
+    for name, part in _parts(component).items():
+        new = tuple(_bind(inner, truth) for inner in part) if isinstance(part, tuple) else _bind(part, truth)
+        if new is not part and (
+            not isinstance(part, tuple) or any(a is not b for a, b in zip(new, part, strict=True))
+        ):
+            changed[name] = new
+    if changed:
+        component = dataclasses.replace(component, **changed)
+    if isinstance(component, UsesTruth):
+        truth.check(component.needs, type(component).__name__)
+        component = component.bind(truth)
+    return component
+
+
+def _parts(component: Any) -> dict[str, Any]:
+    """Fields of a component that are components, or tuples of them."""
+    if not dataclasses.is_dataclass(component) or isinstance(component, type):
+        return {}
+    values = {f.name: getattr(component, f.name) for f in dataclasses.fields(component) if f.init}
+    return {k: v for k, v in values.items() if isinstance(v, tuple) or dataclasses.is_dataclass(v)}
