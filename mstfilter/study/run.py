@@ -19,6 +19,7 @@ from typing import Any
 
 import mstfilter
 from mstfilter.errors import InputError
+from mstfilter.oracles.truth import bind_truth
 from mstfilter.presets import build_filter, describe_filter
 from mstfilter.scene.recording import Recording
 from mstfilter.study.run_folder import RunFolder, plain
@@ -65,6 +66,7 @@ def execute(
     """
     filter = build_filter(config, allow_files=allow_files)
     recording.check()
+    running = bind_truth(filter, recording)
     wanted = plain(
         {
             "seed": int(seed),
@@ -84,11 +86,11 @@ def execute(
     folder = _existing(path, wanted)
     clips = recording.clips()
     done = 0 if folder is None else folder.n_pauses
-    state = folder.state(done - 1) if folder is not None and done else filter.start(int(seed))
+    state = folder.state(done - 1) if folder is not None and done else running.start(int(seed))
     progress(Progress(done, len(clips)))
     try:
         for clip in clips[done:]:
-            state, info = filter.step(state, clip)
+            state, info = running.step(state, clip)
             if folder is None:  # what fails at the first step leaves nothing behind
                 folder = RunFolder.create(path, wanted)
             folder.write_pause(clip, state, info, recording.truth(clip.index))
