@@ -121,6 +121,22 @@ COMPONENTS: dict[str, dict[str, str]] = {
         "true_quality": "mstfilter.oracles.choice:TrueQuality",
     },
     "mode_filter": {"majority": "mstfilter.fusion.mode_filter:ModeFilter"},
+    "format": {
+        "recording": "mstfilter.scene.formats.folder:RecordingFolder",
+        "pairs": "mstfilter.scene.formats.paired_images:PairedImages",
+        "tum": "mstfilter.scene.formats.tum:Tum",
+        "bop": "mstfilter.scene.formats.bop:Bop",
+        "redwood": "mstfilter.scene.formats.redwood:Redwood",
+        "dsr": "mstfilter.scene.formats.dsr:Dsr",
+        "bag": "mstfilter.scene.formats.bag:Bag",
+    },
+    "pauses": {
+        "still": "mstfilter.scene.formats.still:Still",
+        "at": "mstfilter.scene.formats.pauses:At",
+        "listed": "mstfilter.scene.formats.pauses:Listed",
+        "ends": "mstfilter.scene.formats.pauses:Ends",
+        "every": "mstfilter.scene.formats.pauses:Every",
+    },
 }
 _SAME = {"initial": "proposal", "scheme": "resampler"}
 _GROUP = "mstfilter.components"

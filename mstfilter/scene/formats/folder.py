@@ -11,6 +11,7 @@ import json
 import math
 import zipfile
 from collections import OrderedDict
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any, Literal
@@ -20,13 +21,14 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from mstfilter.errors import InputError
 from mstfilter.scene.camera import Camera, rigid_from_matrix
+from mstfilter.scene.formats.interfaces import Format
 from mstfilter.scene.formats.writer import VERSION, RecordingWriter, save
 from mstfilter.scene.frame import Frame
 from mstfilter.scene.images import read_depth, read_labels, read_rgb
 from mstfilter.scene.recording import LazyFrames, Recording, check_range, find_world, truth_reader
 from mstfilter.scene.voxels import VoxelGrid, as_labels
 
-__all__ = ["RecordingWriter", "open_folder", "save"]
+__all__ = ["RecordingFolder", "RecordingWriter", "open_folder", "save"]
 
 
 class _Workspace(BaseModel):
@@ -83,6 +85,20 @@ def _load(path: Path, model: type[BaseModel]) -> Any:
         found = first["input"]
         value = "nothing" if first["type"] == "missing" else repr(found)[:80]
         raise InputError(f"{path}: {where}: {first['msg'].lower()}, found {value}", hint) from error
+
+
+@dataclass(frozen=True)
+class RecordingFolder(Format):
+    """Our own recording folder: manifest.json, camera.json, rgb/, depth/."""
+
+    @classmethod
+    def detects(cls, path: Path) -> bool:
+        """See `Format`."""
+        return (path / "manifest.json").is_file()
+
+    def open(self, path: Path) -> Recording:
+        """See `Format`."""
+        return open_folder(path)
 
 
 def open_folder(path: Path) -> Recording:

@@ -10,20 +10,39 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from mstfilter.errors import InputError
+from mstfilter.scene.formats.interfaces import Format
 from mstfilter.scene.images import read_depth, read_rgb
 from mstfilter.scene.recording import Recording
 
-__all__ = ["is_paired", "open_paired"]
+__all__ = ["PairedImages", "open_paired"]
 
 
-def is_paired(path: Path) -> bool:
-    """Whether a folder has this layout."""
-    return (path / "info.json").is_file() and any(path.glob("*_rgb.png"))
+@dataclass(frozen=True)
+class PairedImages(Format):
+    """A folder of pairs NAME_rgb.png, NAME_depth.png with an info.json; every frame is a pause.
+
+    Parameters
+    ----------
+    frames : tuple of str
+        Names of frames in order. Default: all, sorted by name.
+    """
+
+    frames: tuple[str, ...] = ()
+
+    @classmethod
+    def detects(cls, path: Path) -> bool:
+        """See `Format`."""
+        return (path / "info.json").is_file() and any(path.glob("*_rgb.png"))
+
+    def open(self, path: Path) -> Recording:
+        """See `Format`."""
+        return open_paired(path, self.frames)
 
 
 def open_paired(path: Path, names: Sequence[str] = ()) -> Recording:

@@ -1,0 +1,98 @@
+"""Pauses found by image motion.
+
+>>> Still(hold_s=0.5).find(times, read_rgb)
+(7, 64, 131)
+
+The rule, for a camera that stands still: images become grey blocks; two images differ where a block changes by more
+than its noise, and there is motion where more than a small share of the blocks differ. A still interval is a run of
+frames in which none differs from the frame before nor from the first of the run (slow motion adds up). Each
+interval of at least `hold_s` seconds gives one pause, its middle frame. Changes that all blocks share (exposure,
+flicker of the light) do not count. The noise is measured on the video itself: a quarter of it has to be at rest.
+
+A robot that holds still within the picture, or that works slower than a grey level in a whole interval, looks like a
+pause too: look at the pauses found, and name them yourself where they are wrong.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from mstfilter.errors import InputError
+from mstfilter.scene.formats.pauses import PauseRule
+
+__all__ = ["Still", "grey_blocks"]
+
+_ACROSS = 80  # blocks
+
+
+def grey_blocks(rgb: np.ndarray) -> np.ndarray:
+    """Mean grey level of square blocks, about 80 across: (h, w) float32 of an image (H, W, 3)."""
+    grey = np.asarray(rgb, dtype=np.float32).mean(axis=2)
+    side = max(1, grey.shape[1] // _ACROSS)
+    h, w = grey.shape[0] // side, grey.shape[1] // side
+    return grey[: h * side, : w * side].reshape(h, side, w, side).mean(axis=(1, 3))
+
+
+def _changes(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """(...) absolute change of each block from a to b less what all share."""
+    difference = b - a
+    return np.abs(difference - np.median(difference))
+
+
+@dataclass(frozen=True)
+class Still(PauseRule):
+    """Middle frames of the intervals in which the image does not change.
+
+    Parameters
+    ----------
+    hold_s : float
+        Shortest interval, in seconds.
+    share : float
+        More blocks than this share that differ are motion.
+    levels : float
+        A block differs from here on, in grey levels of 255, or from six times the noise if that is more.
+    """
+
+    hold_s: float = 0.5
+    share: float = 0.001
+    levels: float = 3.0
+
+    def find(self, times: tuple[float, ...], read_rgb: Callable[[int], np.ndarray]) -> tuple[int, ...]:
+        """See `PauseRule`."""
+        intervals = self.intervals(times, read_rgb)
+        if not intervals:
+            raise InputError(
+                f"no pause found: nowhere in {len(times)} frames ({times[-1] - times[0]:.1f} s) does the image hold "
+                f"still for {self.hold_s:g} s",
+                "does the camera move? name the pauses: --pauses 0,40,85 (frames) or --pauses 0s,4.2s",
+                "a shorter interval: pauses.hold_s=0.2; first and last frame only: --pauses ends",
+            )
+        return tuple((first + last) // 2 for first, last in intervals)
+
+    def intervals(
+        self, times: tuple[float, ...], read_rgb: Callable[[int], np.ndarray]
+    ) -> tuple[tuple[int, int], ...]:
+        """First and last frame of each still interval."""
+        images = [grey_blocks(read_rgb(index)) for index in range(len(times))]
+        if len({image.shape for image in images}) > 1:
+            raise InputError(f"images differ in size: {sorted({image.shape for image in images})} blocks")
+        if len(images) == 1:
+            return ((0, 0),)
+        typical = [float(np.median(_changes(a, b))) for a, b in pairwise(images)]
+        noise = 1.4826 * float(np.quantile(typical, 0.25))
+        limit, allowed = max(self.levels, 6 * noise), self.share * images[0].size
+        runs, first = [], 0
+        for index in range(1, len(images) + 1):
+            if index < len(images):
+                moved = max(
+                    int((_changes(images[other], images[index]) > limit).sum()) for other in (first, index - 1)
+                )
+                if moved <= allowed:
+                    continue
+            runs.append((first, index - 1))
+            first = index
+        return tuple((a, b) for a, b in runs if b > a and times[b] - times[a] >= self.hold_s - 1e-9)
