@@ -74,7 +74,12 @@ def check(
 
 @app.command()
 def new(
-    kind: Annotated[str, typer.Argument(help="resampler, transition, proposal or update.")],
+    kind: Annotated[
+        str,
+        typer.Argument(
+            help="resampler, transition, proposal, update, trigger, size, lookahead, rejuvenation or codec."
+        ),
+    ],
     path: Annotated[Path, typer.Argument(help="Python file to make, for example mine.py.")],
 ) -> None:
     """Write a commented component of your own that works, and its test."""

@@ -13,9 +13,12 @@ not hold; `verify` does so from Python.
 """
 
 from mstfilter.testing.contracts import (
+    CodecContract,
     Contract,
     EquivalenceContract,
+    LookaheadContract,
     ProposalContract,
+    RejuvenationContract,
     ResamplerContract,
     SimilarityContract,
     SizeContract,
@@ -28,11 +31,14 @@ from mstfilter.testing.properties import Broken, Outcome, Property, Suite, examp
 
 __all__ = [
     "Broken",
+    "CodecContract",
     "Contract",
     "EquivalenceContract",
+    "LookaheadContract",
     "Outcome",
     "Property",
     "ProposalContract",
+    "RejuvenationContract",
     "ResamplerContract",
     "SimilarityContract",
     "SizeContract",

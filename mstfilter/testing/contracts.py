@@ -2,23 +2,37 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Iterator
 from typing import Any, ClassVar
 
 import numpy as np
 
 from mstfilter.errors import InputError
-from mstfilter.smc.interfaces import Proposal, Resampler, Size, Transition, Trigger, Update
+from mstfilter.smc.interfaces import (
+    Codec,
+    Lookahead,
+    Proposal,
+    Rejuvenation,
+    Resampler,
+    Size,
+    Transition,
+    Trigger,
+    Update,
+)
 from mstfilter.smc.population import Population
 from mstfilter.smc.similarity import Equivalence, Similarity
-from mstfilter.testing import choices, moves, properties
-from mstfilter.testing.properties import Example, NotApplicable, Outcome, Property, Suite
+from mstfilter.testing import choices, moves, optional, properties
+from mstfilter.testing.properties import Exact, Example, NotApplicable, Outcome, Property, Suite
 from mstfilter.testing.resampling_law import RESAMPLER
 
 __all__ = [
+    "CodecContract",
     "Contract",
     "EquivalenceContract",
+    "LookaheadContract",
     "ProposalContract",
+    "RejuvenationContract",
     "ResamplerContract",
     "SimilarityContract",
     "SizeContract",
@@ -49,11 +63,15 @@ class Contract:
         """A population of `n` particles that the component works on, and an observation. Default: numbers."""
         return properties.example(rng, n)
 
+    def _exact(self) -> Exact | None:
+        """Exact draws, where a contract has use for them and they are given."""
+        return None
+
 
 def _test_of(prop: Property) -> Callable[[Contract], None]:
     def test(self: Contract) -> None:
         try:
-            prop.check(self.make(), self.example)
+            prop.look(self.make(), self.example, self._exact())
         except NotApplicable as reason:
             import pytest
 
@@ -88,6 +106,28 @@ class SizeContract(Contract, suite=choices.SIZE):
     """What every `Size` keeps."""
 
 
+class LookaheadContract(Contract, suite=optional.LOOKAHEAD):
+    """What every `Lookahead` keeps."""
+
+
+class RejuvenationContract(Contract, suite=optional.REJUVENATION):
+    """What every `Rejuvenation` keeps. The one statistical test alarms falsely with probability 1e-6 at most.
+
+    It needs `exact`: a kernel that does not keep the law cannot be told from one that does without draws from it.
+    """
+
+    def exact(self, rng: np.random.Generator, n: int) -> tuple[Population | None, Population, Any]:
+        """`n` rows of x_{t-1} (None: the first step), exact draws of x_t given them and y_t, and y_t."""
+        raise NotImplementedError
+
+    def _exact(self) -> Exact | None:
+        return None if type(self).exact is RejuvenationContract.exact else self.exact
+
+
+class CodecContract(Contract, suite=optional.CODEC):
+    """What every `Codec` keeps."""
+
+
 class SimilarityContract(Contract, suite=choices.SIMILARITY):
     """What every `Similarity` keeps."""
 
@@ -103,6 +143,9 @@ _SUITES: dict[type, Suite] = {
     Update: moves.UPDATE,
     Trigger: choices.TRIGGER,
     Size: choices.SIZE,
+    Lookahead: optional.LOOKAHEAD,
+    Rejuvenation: optional.REJUVENATION,
+    Codec: optional.CODEC,
     Similarity: choices.SIMILARITY,
     Equivalence: choices.EQUIVALENCE,
 }
@@ -117,7 +160,7 @@ def kind_of_class(cls: type) -> str:
     raise InputError(f"{cls.__name__} is no component", f"inherit one of {names}")
 
 
-def verify(component: Any, example: Example | None = None) -> Iterator[Outcome]:
+def verify(component: Any, example: Example | None = None, exact: Exact | None = None) -> Iterator[Outcome]:
     """Look at all properties of a component, one after the other.
 
     Parameters
@@ -126,6 +169,9 @@ def verify(component: Any, example: Example | None = None) -> Iterator[Outcome]:
         Of any kind that has a contract.
     example : callable, optional
         ``(rng, n) -> (population, observation)`` that the component works on. Default: numbers.
+    exact : callable, optional
+        For a `Rejuvenation`: ``(rng, n) -> (previous, population, observation)``, rows of x_{t-1} and exact draws of
+        x_t given them and the observation. Default: the function ``exact`` in the module of its class, if any.
 
     Yields
     ------
@@ -134,4 +180,7 @@ def verify(component: Any, example: Example | None = None) -> Iterator[Outcome]:
     """
     kind = kind_of_class(type(component))
     suite = next(s for s in _SUITES.values() if s.kind == kind)
-    yield from suite.run(component, example or properties.example)
+    if exact is None:
+        found = getattr(sys.modules.get(type(component).__module__), "exact", None)
+        exact = found if callable(found) else None
+    yield from suite.run(component, example or properties.example, exact)

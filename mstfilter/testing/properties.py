@@ -25,9 +25,23 @@ import numpy as np
 from mstfilter.errors import InputError
 from mstfilter.smc.population import Population
 
-__all__ = ["Broken", "Example", "NotApplicable", "Outcome", "Property", "Suite", "example", "guarded", "same"]
+__all__ = [
+    "Broken",
+    "Exact",
+    "Example",
+    "NotApplicable",
+    "Outcome",
+    "Property",
+    "Suite",
+    "example",
+    "guarded",
+    "same",
+]
 
 Example = Callable[[np.random.Generator, int], tuple[Population, Any]]
+
+#: Exact draws: ``(rng, n) -> (previous, population, observation)``.
+Exact = Callable[[np.random.Generator, int], tuple[Population | None, Population, Any]]
 
 #: False-alarm rate of each statistical property: how often a correct component is said to break it, at most.
 FALSE_ALARM = 1e-6
@@ -58,18 +72,27 @@ class Property:
     says : str
         The property in words.
     check : callable
-        ``(component, example) -> None``; raises `Broken`.
+        ``(component, example) -> None``; raises `Broken`. With `needs_exact` it gets exact draws for the example.
     statistical : bool
         Whether it looks at random samples; then it alarms falsely with a probability of at most `FALSE_ALARM`.
     essential : bool
         Whether nothing else can be judged where it does not hold.
+    needs_exact : bool
+        Whether it compares with exact draws; it is left aside where there are none.
     """
 
     name: str
     says: str
-    check: Callable[[Any, Example], None]
+    check: Callable[[Any, Any], None]
     statistical: bool = False
     essential: bool = False
+    needs_exact: bool = False
+
+    def look(self, component: Any, example: Example, exact: Exact | None) -> None:
+        """Check it; raises `Broken` or `NotApplicable`."""
+        if self.needs_exact and exact is None:
+            raise NotApplicable("there are no exact draws to compare with: write exact(rng, n)")
+        self.check(component, exact if self.needs_exact else example)
 
 
 @dataclass(frozen=True)
@@ -99,17 +122,17 @@ class Suite:
     properties: list[Property] = field(default_factory=list)
 
     def property(
-        self, says: str, statistical: bool = False, essential: bool = False
-    ) -> Callable[[Callable[[Any, Example], None]], Callable[[Any, Example], None]]:
+        self, says: str, statistical: bool = False, essential: bool = False, needs_exact: bool = False
+    ) -> Callable[[Callable[[Any, Any], None]], Callable[[Any, Any], None]]:
         """Decorator: the function becomes a property of this kind."""
 
-        def add(check: Callable[[Any, Example], None]) -> Callable[[Any, Example], None]:
-            self.properties.append(Property(check.__name__, says, check, statistical, essential))
+        def add(check: Callable[[Any, Any], None]) -> Callable[[Any, Any], None]:
+            self.properties.append(Property(check.__name__, says, check, statistical, essential, needs_exact))
             return check
 
         return add
 
-    def run(self, component: Any, example: Example) -> Iterator[Outcome]:
+    def run(self, component: Any, example: Example, exact: Exact | None = None) -> Iterator[Outcome]:
         """Look at all properties, until one that the others need does not hold; the same fault is told only once."""
         told: set[str] = set()
         stopped = False
@@ -119,7 +142,7 @@ class Suite:
                 continue
             try:
                 with _global_state():
-                    prop.check(component, example)
+                    prop.look(component, example, exact)
             except NotApplicable as reason:
                 yield Outcome(prop, skipped=f"not looked at: {reason}")
             except Broken as broken:

@@ -16,7 +16,17 @@ from mstfilter.testing.properties import Example
 __all__ = ["KINDS", "example_of", "write_starter"]
 
 #: Kinds of which there is a starting file.
-KINDS = ("resampler", "transition", "proposal", "update")
+KINDS = (
+    "resampler",
+    "transition",
+    "proposal",
+    "update",
+    "trigger",
+    "size",
+    "lookahead",
+    "rejuvenation",
+    "codec",
+)
 
 _TEST = '''"""{component} keeps what its interface promises."""
 
@@ -29,10 +39,13 @@ class Test{component}({contract}):
     def make(self):
         return {component}()
 '''
-_EXAMPLE = """
-    def example(self, rng, n):
-        return example(rng, n)
+_EXTRAS = {
+    name: f"""
+    def {name}(self, rng, n):
+        return {name}(rng, n)
 """
+    for name in ("example", "exact")
+}
 
 
 def write_starter(kind: str, path: Path) -> tuple[Path, Path]:
@@ -65,8 +78,9 @@ def write_starter(kind: str, path: Path) -> tuple[Path, Path]:
             raise InputError(f"{file} is there already", "choose another name; nothing was written")
     text = files("mstfilter.testing").joinpath("templates", f"{kind}.py").read_text(encoding="utf-8")
     component = f"My{kind.capitalize()}"
-    imports = f"{component}, example" if "\ndef example(" in text else component
-    body = _TEST + (_EXAMPLE if "example" in imports else "")
+    extras = {name: body for name, body in _EXTRAS.items() if f"\ndef {name}(" in text}
+    imports = ", ".join([component, *extras])
+    body = _TEST + "".join(extras.values())
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(re.sub(rf"\./{kind}\.py:", f"./{path.name}:", text), encoding="utf-8")
     contract = f"{kind.capitalize()}Contract"

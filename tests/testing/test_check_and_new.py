@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-from mstfilter.testing.starters import KINDS
+from mstfilter.testing.starters import KINDS, write_starter
 from tests.conftest import REPOSITORY
 from tests.test_cli import call
 
@@ -15,7 +15,7 @@ FAULTS_FILE = REPOSITORY / "tests" / "testing" / "faults.py"
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_new_component_passes_its_check_and_its_test(kind, tmp_path, capsys):
+def test_a_new_component_passes_its_check(kind, tmp_path, capsys):
     mine = tmp_path / "mine.py"
     code, out, err = call("new", kind, mine, capsys=capsys)
     assert code == 0, err
@@ -24,10 +24,18 @@ def test_a_new_component_passes_its_check_and_its_test(kind, tmp_path, capsys):
     code, out, err = call("check", f"{mine}:My{kind.capitalize()}", capsys=capsys)
     assert code == 0, out + err
     assert "all properties that apply hold" in out
-    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "test_mine.py"]
+    assert "exact draws" not in out, "the starting file gives those that its law is tested with"
+
+
+def test_new_components_pass_their_tests(tmp_path):
+    """All in one run of pytest, which takes its time to start."""
+    for kind in KINDS:
+        write_starter(kind, tmp_path / f"my_{kind}.py")
+    command = [sys.executable, "-m", "pytest", "-q", "-rs", "-p", "no:cacheprovider", str(tmp_path)]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stdout + done.stderr
     assert "passed" in done.stdout
+    assert "exact draws" not in done.stdout
 
 
 def test_the_resampler_to_start_from_has_three_lines_of_logic(tmp_path, capsys):

@@ -1,0 +1,34 @@
+"""A trigger of my own: when to resample.
+
+mstfilter check ./trigger.py:MyTrigger                  what holds and what does not, in words
+mstfilter run RECORDING trigger=./trigger.py:MyTrigger
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from mstfilter.errors import InputError
+from mstfilter.smc.interfaces import Trigger
+from mstfilter.smc.population import Population
+
+
+@dataclass(frozen=True)
+class MyTrigger(Trigger):
+    """Resamples where one particle has more than a share of all weight. Fields are settings.
+
+    Parameters
+    ----------
+    share : float
+        Of the total weight, in (0, 1).
+    """
+
+    share: float = 0.5
+
+    def __post_init__(self) -> None:
+        if not 0 < self.share < 1:
+            raise InputError(f"share is {self.share}, expected a number in (0, 1)")
+
+    def wants(self, population: Population, t: int) -> bool:
+        """True to resample; t counts observations from 0. Weights are normalised, log weights are not."""
+        return bool(population.weights.max() > self.share)
