@@ -40,11 +40,43 @@ def study(
         result = run_study(wanted, folder, executor, overrides or (), progress=progress)
     print(f"study       {folder}")
     print(f"runs        {result.done} done, {result.repeated} of them before; table {folder / 'runs.csv'}")
+    _print_summary(result.folder.summary())
     for name, outcome in result.failed:
         print(f"failed      {name}: {outcome.error}")
     if result.failed:
         print(f"hint: the same command repeats what failed; more in {folder / 'failures.csv'}", file=sys.stderr)
         raise typer.Exit(1)
+
+
+def _print_summary(summary: Any) -> None:
+    """The primary endpoint by family and arm, and how the reference compares."""
+    from rich.console import Console
+    from rich.table import Table
+
+    if not summary.figures or "quality" not in summary.names:
+        return
+    table = Table(
+        "family", "arm", "n", "quality, t >= 1", "95 %", f"{summary.reference} - arm", "95 %", "slope", "s a step"
+    )
+    for family in summary.families:
+        compared = {one.second: one.difference for one in summary.compared() if one.family == family}
+        for arm in summary.arms:
+            figure, d = summary.figure(family, arm), compared.get(arm)
+            if figure is None:
+                continue
+            slope, seconds = (summary.figure(family, arm, name) for name in ("quality_slope", "core_seconds"))
+            table.add_row(
+                family,
+                arm,
+                str(len(figure.by_scene)),
+                f"{figure.mean:.3f}",
+                "{:.3f} .. {:.3f}".format(*figure.interval),
+                "" if d is None else f"{d.mean:+.3f}",
+                "" if d is None else f"{d.low:+.3f} .. {d.high:+.3f}",
+                "" if slope is None else f"{slope.mean:+.3f}",
+                "" if seconds is None else f"{seconds.mean:.2f}",
+            )
+    Console(width=140 if not sys.stdout.isatty() else None).print(table)
 
 
 @contextlib.contextmanager

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from mstfilter.report.floors import components, one_blob
+from mstfilter.scene.floors import components, one_blob
 from mstfilter.scene.quality import weighted_coverage
 from mstfilter.study.run_folder import RunFolder
 

@@ -33,7 +33,7 @@ import numpy as np
 from mstfilter.errors import InputError
 from mstfilter.scene.voxels import as_labels
 
-__all__ = ["FORMS", "Form", "Overlap", "overlap", "weighted_coverage"]
+__all__ = ["FORMS", "Form", "Overlap", "overlap", "quality_of", "weighted_coverage"]
 
 Form = Literal["objects", "paper", "authors"]
 FORMS: tuple[Form, ...] = get_args(Form)
@@ -101,9 +101,13 @@ def weighted_coverage(a: np.ndarray, b: np.ndarray, form: Form = "objects") -> f
         See the module. Two segmentations without objects are perfectly alike (1); one without against one
         with objects scores 0.
     """
+    return quality_of(overlap(a, b), form)
+
+
+def quality_of(table: Overlap, form: Form = "objects") -> float:
+    """`weighted_coverage` of two segmentations whose contingency table is known."""
     if form not in FORMS:
         raise InputError(f"quality has no form {form!r}", f"there are: {', '.join(FORMS)}")
-    table = overlap(a, b)
     if form == "paper":
         best = table.jaccard()
         total = table.counts.sum()

@@ -8,7 +8,8 @@ Layout::
     study.json       what was asked: description, arms with their configuration, scenes, seeds, every run's folder
     runs/NAME/       one folder a run (see `run_folder`); result.json holds its figures, or why it failed
     runs.csv         one row a pause and run: figures first, time and memory last
-    summary.csv      one row a family, arm and figure
+    summary.csv      one row a family, arm and figure: mean over scenes and its interval
+    differences.csv  the reference against every other arm: paired differences, intervals, p values, conclusions
     failures.csv     runs that failed, and why
     logs/            what workers printed
 """
@@ -27,11 +28,17 @@ from typing import Any
 from mstfilter.errors import InputError
 from mstfilter.study.executors import Outcome
 from mstfilter.study.run_folder import plain, write_json
+from mstfilter.study.summary import Summary, summarise
 
 __all__ = ["RESULT", "StudyFolder", "cost_columns", "read_result", "write_table"]
 
 FORMAT = 1
 RESULT = "result.json"  # in a run's folder
+_FIGURES = ("family", "arm", "figure", "n", "mean", "low", "high")
+_DIFFERENCES = (
+    *("family", "first", "second", "figure", "n", "mean", "low", "high"),
+    *("low_bootstrap", "high_bootstrap", "p", "p_holm", "conclusion"),
+)
 
 
 def read_result(folder: Path) -> dict[str, Any]:
@@ -110,12 +117,20 @@ class StudyFolder:
                 rows.append({**named, **row, **cost})
         return rows
 
+    def summary(self) -> Summary:
+        """What the runs that are done say together."""
+        rows = self.rows()
+        return summarise(rows, self.description["reference"], cost_columns(rows))
+
     def write_tables(self) -> None:
-        """Write runs.csv and failures.csv from the runs."""
+        """Write all tables from the runs."""
         rows = self.rows()
         costs = cost_columns(rows)
         columns = [*(c for c in _columns(rows) if c not in costs), *costs]
         write_table(self.path / "runs.csv", columns, rows)
+        found = summarise(rows, self.description["reference"], costs)
+        write_table(self.path / "summary.csv", _FIGURES, found.figure_rows())
+        write_table(self.path / "differences.csv", _DIFFERENCES, found.difference_rows())
         failed = [{"run": f["name"], **f, "hints": "; ".join(f["hints"] or ())} for f in self.failures()]
         write_table(self.path / "failures.csv", ["run", "error", "hints", "tries", "folder"], failed)
 

@@ -214,7 +214,9 @@ def test_entry_points_add_components(monkeypatch):
 
 
 def test_presets_are_complete():
-    assert preset_names() == ["authors", "mst", "paper"]
+    assert {"authors", "mst", "paper", "samples_only", "single_frame", "tracking_only", "union"} <= set(
+        preset_names()
+    )
     for name in preset_names():
         assert not build_filter(load_config(name)).properly_weighted
 

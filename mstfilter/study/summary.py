@@ -1,0 +1,210 @@
+"""From one row a pause to what a study says: means by family and arm, and paired differences.
+
+>>> found = summarise(folder.rows(), reference="mst")
+>>> found.figure("s1", "mst", "quality").mean, found.differences[0].words
+
+The primary endpoint is the mean over pauses t >= 1 of the unweighted mean ``objects`` quality; other figures are
+averaged the same way, so that all rows of a table are about the same pauses. Filter seeds are averaged before scenes.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from mstfilter.study.statistics import Difference, compare, holm, interval, said, slope
+
+__all__ = ["ENDPOINT", "SLOPE", "Compared", "Figure", "Summary", "summarise"]
+
+ENDPOINT = "quality"
+SLOPE = "quality_slope"  # a pause, over all pauses, t = 0 included
+_NAMES = ("family", "scene", "arm", "seed", "pause", "time_s")
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A figure of an arm on the scenes of a family.
+
+    Parameters
+    ----------
+    family, arm, name : str
+    by_scene : mapping
+        Scene -> mean over filter seeds; scenes where it is not defined are left out.
+    """
+
+    family: str
+    arm: str
+    name: str
+    by_scene: Mapping[str, float]
+
+    @property
+    def mean(self) -> float:
+        """Over scenes; NaN if there are none."""
+        return float(np.mean(list(self.by_scene.values()))) if self.by_scene else float("nan")
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """t interval of the mean over scenes."""
+        return interval(np.array(list(self.by_scene.values())))
+
+
+@dataclass(frozen=True)
+class Compared:
+    """The reference minus another arm on a family.
+
+    Parameters
+    ----------
+    family, first, second, figure : str
+    difference : Difference
+        p adjusted over all families and arms of the primary endpoint; not adjusted for other figures.
+    """
+
+    family: str
+    first: str
+    second: str
+    figure: str
+    difference: Difference
+
+    @property
+    def words(self) -> str:
+        """A conclusion."""
+        return said(self.difference, self.first, self.second, self.family)
+
+
+@dataclass(frozen=True)
+class Summary:
+    """What a study says.
+
+    Parameters
+    ----------
+    families, arms, names : tuple of str
+        In the order of the study; `names` are those of the figures.
+    reference : str
+    figures : tuple of Figure
+    differences : tuple of Compared
+        Primary endpoint first, then the slope, then all other figures.
+    """
+
+    families: tuple[str, ...]
+    arms: tuple[str, ...]
+    names: tuple[str, ...]
+    reference: str
+    figures: tuple[Figure, ...]
+    differences: tuple[Compared, ...]
+
+    def figure(self, family: str, arm: str, name: str = ENDPOINT) -> Figure | None:
+        """A figure; None where there is none."""
+        for one in self.figures:
+            if (one.family, one.arm, one.name) == (family, arm, name):
+                return one
+        return None
+
+    def compared(self, name: str = ENDPOINT) -> list[Compared]:
+        """Differences of a figure."""
+        return [one for one in self.differences if one.figure == name]
+
+    def figure_rows(self) -> list[dict[str, Any]]:
+        """For summary.csv."""
+        rows = []
+        for one in self.figures:
+            low, high = one.interval
+            named = {"family": one.family, "arm": one.arm, "figure": one.name}
+            rows.append({**named, "n": len(one.by_scene), "mean": one.mean, "low": low, "high": high})
+        return rows
+
+    def difference_rows(self) -> list[dict[str, Any]]:
+        """For differences.csv."""
+        rows = []
+        for one in self.differences:
+            d = one.difference
+            row = {"family": one.family, "first": one.first, "second": one.second, "figure": one.figure, "n": d.n}
+            row |= {"mean": d.mean, "low": d.low, "high": d.high, "p": d.p, "p_holm": d.p_holm}
+            row |= {"low_bootstrap": d.low_bootstrap, "high_bootstrap": d.high_bootstrap}
+            rows.append({**row, "conclusion": one.words if one.figure == ENDPOINT else ""})
+        return rows
+
+
+def summarise(rows: Sequence[Mapping[str, Any]], reference: str, cost: Sequence[str] = ()) -> Summary:
+    """The summary of rows as `StudyFolder.rows` returns them.
+
+    Parameters
+    ----------
+    rows : sequence of mapping
+    reference : str
+        The arm that others are compared with.
+    cost : sequence of str
+        Columns of time and memory: averaged over all pauses, never compared.
+    """
+    families, arms = (tuple(dict.fromkeys(str(row[k]) for row in rows)) for k in ("family", "arm"))
+    named = list(dict.fromkeys(k for row in rows for k in row if k not in _NAMES))
+    measured = [name for name in named if name not in cost]
+    values = _by_scene(rows, measured, lambda row: row["pause"] >= 1)
+    values.update(_by_scene(rows, [k for k in named if k in cost], lambda row: True))
+    if ENDPOINT in measured:
+        values.update(_slopes(rows))
+        measured.insert(1 + measured.index(ENDPOINT), SLOPE)
+    names = tuple([*measured, *(k for k in named if k in cost)])
+    figures = tuple(
+        Figure(family, arm, name, values[family, arm, name])
+        for family in families
+        for arm in arms
+        for name in names
+        if values.get((family, arm, name))
+    )
+    # What is compared first stands first; all else is exploration.
+    order = sorted(measured, key=lambda name: (name != ENDPOINT, name != SLOPE))
+    differences = []
+    for name in order:
+        table = [
+            Compared(family, reference, arm, name, compare(values.get((family, reference, name), {}), others))
+            for family in families
+            for arm in arms
+            if arm != reference and (others := values.get((family, arm, name), {}))
+        ]
+        if name == ENDPOINT:
+            p = holm([one.difference.p for one in table])
+            table = [
+                replace(one, difference=replace(one.difference, p_holm=float(q)))
+                for one, q in zip(table, p, strict=True)
+            ]
+        differences.extend(table)
+    return Summary(families, arms, names, reference, figures, tuple(differences))
+
+
+_Values = dict[tuple[str, str, str], dict[str, float]]
+
+
+def _by_scene(rows: Sequence[Mapping[str, Any]], names: Sequence[str], wanted: Any) -> _Values:
+    """(family, arm, figure) -> scene -> mean over seeds of the mean over pauses."""
+    runs: dict[tuple[str, str, str, str], dict[Any, list[float]]] = defaultdict(lambda: defaultdict(list))
+    for row in rows:
+        if not wanted(row):
+            continue
+        for name in names:
+            value = row.get(name)
+            if value is not None and np.isfinite(value):
+                runs[row["family"], row["arm"], name, row["scene"]][row["seed"]].append(value)
+    values: _Values = defaultdict(dict)
+    for (family, arm, name, scene), seeds in runs.items():
+        values[family, arm, name][scene] = float(np.mean([np.mean(of_pauses) for of_pauses in seeds.values()]))
+    return dict(values)
+
+
+def _slopes(rows: Sequence[Mapping[str, Any]]) -> _Values:
+    """Slope of quality over the pauses of each run, averaged over seeds."""
+    runs: dict[tuple[str, str, str, Any], list[tuple[float, float]]] = defaultdict(list)
+    for row in rows:
+        if row.get(ENDPOINT) is not None:
+            runs[row["family"], row["arm"], row["scene"], row["seed"]].append((row["pause"], row[ENDPOINT]))
+    seeds: dict[tuple[str, str, str], list[float]] = defaultdict(list)
+    for (family, arm, scene, _), points in runs.items():
+        if len(points) > 1:
+            seeds[family, arm, scene].append(slope(*np.array(points).T))
+    values: _Values = defaultdict(dict)
+    for (family, arm, scene), slopes in seeds.items():
+        values[family, arm, SLOPE][scene] = float(np.mean(slopes))
+    return dict(values)

@@ -1,0 +1,132 @@
+"""Every figure against a plain oracle that counts voxel by voxel."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from mstfilter.scene.quality import overlap, weighted_coverage
+from mstfilter.study.metrics import coverage_of, diversity, errors_of, figures, object_f, occupancy_iou, pair_brier
+
+SMALL = hnp.arrays(np.uint16, (3, 3, 2), elements=st.integers(0, 3))
+WORLDS = st.tuples(st.lists(SMALL, min_size=1, max_size=4), SMALL)
+
+
+def regions(labels):
+    """Object -> set of voxels."""
+    found = {}
+    for where, k in np.ndenumerate(labels):
+        if k:
+            found.setdefault(int(k), set()).add(where)
+    return found
+
+
+def plain_figures(hypothesis, truth):
+    """One hypothesis, by sets."""
+    A, B = regions(hypothesis), regions(truth)
+    iou = {(a, b): len(A[a] & B[b]) / len(A[a] | B[b]) for a in A for b in B}
+    all_a, all_b = set().union(*A.values()), set().union(*B.values())
+    lies = {(a, b) for a in A for b in B if 2 * len(A[a] & B[b]) > len(A[a])}
+    holds = {(a, b) for a in A for b in B if 2 * len(A[a] & B[b]) > len(B[b])}
+    return {
+        "occupancy": len(all_a & all_b) / len(all_a | all_b) if all_a | all_b else 1.0,
+        "object_f": 2 * sum(v > 0.5 for v in iou.values()) / (len(A) + len(B)) if A or B else 1.0,
+        "split": sum(sum((a, b) in lies and 10 * len(A[a]) >= len(B[b]) for a in A) >= 2 for b in B),
+        "merged": sum(sum((a, b) in holds for b in B) >= 2 for a in A),
+        "missed": sum(not any((a, b) in lies | holds for a in A) for b in B),
+        "invented": sum(not any((a, b) in lies | holds for b in B) for a in A),
+        "coverage": {b: (len(B[b]), max([iou[a, b] for a in A], default=0.0)) for b in B},
+    }
+
+
+def plain_brier(labels, weights, truth):
+    """Pair by pair."""
+    errors, joined = [], 0
+    voxels = list(np.ndindex(truth.shape))
+    for u, v in itertools.combinations(voxels, 2):
+        same = [one[u] == one[v] > 0 for one in labels]
+        joined += any(same)
+        if any(same) and not all(same):
+            errors.append((sum(w for w, s in zip(weights, same, strict=True) if s) - (truth[u] == truth[v] > 0)) ** 2)
+    return (float(np.mean(errors)) if errors else math.nan), (len(errors) / joined if joined else math.nan)
+
+
+@settings(max_examples=60, deadline=None, derandomize=True)
+@given(WORLDS)
+def test_against_sets(world):
+    labels, truth = world
+    for one in labels:
+        table, expected = overlap(one, truth), plain_figures(one, truth)
+        assert occupancy_iou(table) == pytest.approx(expected["occupancy"])
+        assert object_f(table) == pytest.approx(expected["object_f"])
+        assert errors_of(table) == {k: expected[k] for k in ("split", "merged", "missed", "invented")}
+        some = [b for b in expected["coverage"] if b != 2]
+        if some:
+            sizes, best = np.array([expected["coverage"][b] for b in some]).T
+            assert coverage_of(table, some) == pytest.approx((sizes * best).sum() / sizes.sum())
+        else:
+            assert math.isnan(coverage_of(table, some))
+
+
+@settings(max_examples=25, deadline=None, derandomize=True)
+@given(WORLDS, st.integers(0, 1000))
+def test_brier_and_diversity_against_pairs(world, seed):
+    labels, truth = world
+    weights = np.random.default_rng(seed).dirichlet(np.ones(len(labels)))
+    assert pair_brier(labels, weights, truth) == pytest.approx(
+        plain_brier(labels, weights, truth), rel=1e-5, abs=1e-6, nan_ok=True
+    )
+    pairs = [1 - weighted_coverage(a, b) for a, b in itertools.combinations(labels, 2)]
+    assert diversity(labels) == pytest.approx(np.mean(pairs) if pairs else math.nan, nan_ok=True)
+
+
+def test_brier_in_blocks_is_the_same(monkeypatch):
+    rng = np.random.default_rng(0)
+    labels, truth = [rng.integers(0, 4, (6, 6, 4)) for _ in range(4)], rng.integers(0, 3, (6, 6, 4))
+    whole = pair_brier(labels, np.full(4, 0.25), truth)
+    monkeypatch.setattr("mstfilter.study.metrics._PAIRS_AT_ONCE", 1000)
+    assert pair_brier(labels, np.full(4, 0.25), truth) == pytest.approx(whole)
+    assert whole == pytest.approx(plain_brier(labels, np.full(4, 0.25), truth), rel=1e-5)
+
+
+def test_known_errors():
+    """A row of cells: one object split in two, two merged into one, one missed, one invented."""
+    truth = np.array([1] * 6 + [2] * 3 + [3] * 3 + [4] * 3 + [0] * 3)
+    found = np.array([5] * 3 + [6] * 3 + [7] * 6 + [0] * 3 + [8] * 3)
+    table = overlap(found, truth)
+    assert errors_of(table) == {"split": 1, "merged": 1, "missed": 1, "invented": 1}
+    assert object_f(table) == 0.0
+    assert occupancy_iou(table) == 12 / 18
+
+
+def test_figures_of_a_population():
+    truth = np.zeros((6, 6, 3), int)
+    truth[:2], truth[3:5], truth[5] = 1, 2, 3
+    worse = np.where(truth == 2, 1, truth)
+    row = figures([truth, truth, worse], np.array([0.2, 0.2, 0.6]), truth, {1: "visible", 2: "hidden", 3: "unseen"})
+    q = weighted_coverage(worse, truth)
+    assert row["quality"] == pytest.approx((2 + q) / 3)
+    assert row["quality_top"] == q
+    assert row["quality_best"] == 1.0
+    assert row["quality_weighted"] == pytest.approx(0.4 + 0.6 * q)
+    assert (row["quality_visible"], row["quality_hidden"]) == (pytest.approx((2 + 0.5) / 3), pytest.approx(2.5 / 3))
+    assert row["quality_unseen"] == 1.0
+    assert row["merged"] == pytest.approx(1 / 3)
+    assert row["brier"] == pytest.approx(0.36)  # the heavier hypothesis is wrong about every disputed pair
+    assert row["quality_one_blob"] == pytest.approx(weighted_coverage((truth > 0).astype(int), truth))
+    assert (row["n_visible"], row["n_hidden"], row["n_unseen"], row["true_objects"]) == (1, 1, 1, 3)
+    one = figures([truth], np.ones(1), truth, {})
+    assert math.isnan(one["diversity"]) and math.isnan(one["brier"]) and math.isnan(one["quality_hidden"])
+
+
+def test_empty_worlds():
+    nothing, some = np.zeros((2, 2, 2), int), np.ones((2, 2, 2), int)
+    assert figures([nothing], np.ones(1), nothing, {})["quality"] == 1.0
+    assert figures([nothing], np.ones(1), some, {1: "visible"})["missed"] == 1
+    assert figures([some], np.ones(1), nothing, {})["invented"] == 1
