@@ -5,7 +5,11 @@
 >>> mst = mstfilter.preset("mst", "n=10", "resampler=multinomial", "transition.rule=paper")
 
 ``mst`` is our best, ``paper`` the published algorithm, ``authors`` the authors' own program. A preset is a TOML
-file: the fields of `ParticleFilter`, with one table a component.
+file: the fields of `ParticleFilter`, with one table a component. It may stand on another one:
+
+    base = "mst"                            # everything else as there
+    wrap = ["update.fusion=union"]          # the base's update becomes the field `fusion` of the component union
+    overrides = ["transition=identity"]     # changes, as on the command line
 """
 
 from __future__ import annotations
@@ -35,17 +39,41 @@ def preset(name: str = "mst", *overrides: str, allow_files: bool = True) -> Part
 
 def load_config(name: str, overrides: Iterable[str] = (), *, allow_files: bool = True) -> dict[str, Any]:
     """The configuration of a preset after overrides, names checked; imports no component."""
-    path = find_preset(name)
-    try:
-        config = tomllib.loads(path.read_text())
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"preset {path} is not valid TOML: {error}") from error
+    config = _read(name)
     for override in overrides:
         _override(config, override)
     unknown = set(config) - {*_META, *_PLAIN, *_SLOTS}
     if unknown:
         raise InputError(f"a filter has no field {sorted(unknown)[0]!r}", f"fields: {', '.join((*_PLAIN, *_SLOTS))}")
     registry.check_names(config, allow_files)
+    return config
+
+
+def _read(name: str, above: tuple[str, ...] = ()) -> dict[str, Any]:
+    """What a preset's file says, on top of what its base says."""
+    path = find_preset(name)
+    try:
+        config = tomllib.loads(path.read_text())
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(f"preset {path} is not valid TOML: {error}") from error
+    base, wraps, changes = config.pop("base", ""), config.pop("wrap", []), config.pop("overrides", [])
+    if not isinstance(base, str) or any(not isinstance(v, list) for v in (wraps, changes)):
+        raise InputError(f"preset {path}: base must be a name, wrap and overrides lists of path=value")
+    if base in (*above, name):
+        raise InputError(f"preset {path} stands on itself: {' -> '.join((*above, name, base))}")
+    if base:
+        config = {**_read(base, (*above, name)), **config}
+    for wrap in wraps:
+        path_text, _, component = str(wrap).partition("=")
+        slot, _, field = path_text.partition(".")
+        if slot not in config or not field or not component:
+            raise InputError(
+                f"preset {path}: wrap {wrap!r} is not slot.field=component of a slot that is set",
+                "for example update.fusion=union",
+            )
+        config[slot] = {"component": component, field: config[slot]}
+    for change in changes:
+        _override(config, str(change))
     return config
 
 

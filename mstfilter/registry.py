@@ -35,10 +35,17 @@ COMPONENTS: dict[str, dict[str, str]] = {
     },
     "proposal": {
         "tree_cuts": "mstfilter.segmentation.proposal:TreeCutProposal",
+        "first_pause": "mstfilter.baselines.proposals:FirstPause",
+        "image_components": "mstfilter.baselines.proposals:ImageComponents",
+        "occupied_components": "mstfilter.baselines.proposals:OccupiedComponents",
+        "one_blob": "mstfilter.baselines.proposals:OneBlob",
         "true_masks": "mstfilter.oracles.masks:TrueMasks",
     },
     "update": {
         "fusion": "mstfilter.fusion.update:FusionUpdate",
+        "samples_only": "mstfilter.baselines.updates:SamplesOnly",
+        "tracking_only": "mstfilter.baselines.updates:TrackingOnly",
+        "union": "mstfilter.baselines.updates:Union",
         "true_fusion": "mstfilter.oracles.choice:TrueFusion",
     },
     "resampler": {
@@ -138,7 +145,7 @@ COMPONENTS: dict[str, dict[str, str]] = {
         "every": "mstfilter.scene.formats.pauses:Every",
     },
 }
-_SAME = {"initial": "proposal", "scheme": "resampler"}
+_SAME = {"initial": "proposal", "scheme": "resampler", "fusion": "update"}
 _GROUP = "mstfilter.components"
 
 

@@ -1,0 +1,166 @@
+"""Floors, and a proposal that proposes once.
+
+>>> FirstPause(TreeCutProposal())      # objects of the first pause; afterwards nothing new
+>>> OneBlob()                          # all that stands on the table is one object
+>>> OccupiedComponents()               # connected parts of the occupied space
+>>> ImageComponents()                  # connected parts of the image above the table
+
+The floors use the pixels above the table and the completer, and no segmentation: what scores no better than they
+do has not understood the scene.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+import numpy as np
+
+from mstfilter.completion.completer import Completer
+from mstfilter.completion.extrude import Extrude
+from mstfilter.scene.clip import Clip
+from mstfilter.scene.floors import components, one_blob
+from mstfilter.scene.frame import Frame
+from mstfilter.scene.voxels import Hypothesis
+from mstfilter.segmentation.proposal import TreeCutProposal, hypothesis_of
+from mstfilter.segmentation.segments import ObjectRule
+from mstfilter.smc.interfaces import Proposal
+from mstfilter.smc.population import Population
+from mstfilter.smc.streams import child
+
+__all__ = ["FirstPause", "ImageComponents", "OccupiedComponents", "OneBlob"]
+
+
+@dataclass(frozen=True)
+class FirstPause(Proposal):
+    """Another proposal's samples at the first pause; afterwards hypotheses without objects, at no cost.
+
+    Parameters
+    ----------
+    proposal : Proposal
+        Asked at the first pause, with the same random stream as if it stood here itself.
+    """
+
+    proposal: Proposal = field(default_factory=TreeCutProposal)
+
+    properly_weighted: ClassVar[bool] = False
+
+    def sample(self, rng: np.random.Generator, observation: Clip, n: int) -> Population:
+        """Draw `n` hypotheses."""
+        if observation.index == 0:
+            return self.proposal.sample(rng, observation, n)
+        empty = Hypothesis(np.zeros(observation.grid.shape, np.uint16), observation.grid)
+        return Population((empty,) * n)
+
+
+@dataclass(frozen=True)
+class OneBlob(Proposal):
+    """One object: everything above the table, completed.
+
+    Parameters
+    ----------
+    completer : Completer
+    objects : ObjectRule
+        Which pixels are above the table (its `own`).
+    threshold : float
+        Probability from which a completed voxel is occupied.
+    """
+
+    completer: Completer = field(default_factory=Extrude)
+    objects: ObjectRule = field(default_factory=ObjectRule)
+    threshold: float = 0.5
+
+    properly_weighted: ClassVar[bool] = False
+
+    def sample(self, rng: np.random.Generator, observation: Clip, n: int) -> Population:
+        """The same hypothesis, `n` times."""
+        labels = one_blob(_occupied(self, rng, observation))
+        return Population((Hypothesis.from_labels(labels, observation.grid, observation.index),) * n)
+
+
+@dataclass(frozen=True)
+class OccupiedComponents(Proposal):
+    """Connected components of the occupied space: what stands apart is an object.
+
+    Parameters
+    ----------
+    completer, objects, threshold
+        As in `OneBlob`.
+    min_voxels : int
+        Smaller components are noise.
+    """
+
+    completer: Completer = field(default_factory=Extrude)
+    objects: ObjectRule = field(default_factory=ObjectRule)
+    threshold: float = 0.5
+    min_voxels: int = 8
+
+    properly_weighted: ClassVar[bool] = False
+
+    def sample(self, rng: np.random.Generator, observation: Clip, n: int) -> Population:
+        """The same hypothesis, `n` times."""
+        labels = components(_occupied(self, rng, observation))
+        kept = np.bincount(labels.ravel()) >= self.min_voxels
+        kept[0] = False
+        numbers = np.where(kept, np.cumsum(kept), 0)
+        return Population(
+            (Hypothesis.from_labels(numbers[labels].astype(np.uint16), observation.grid, observation.index),) * n
+        )
+
+
+@dataclass(frozen=True)
+class ImageComponents(Proposal):
+    """Support plane and connected components of what the image shows above it, each completed.
+
+    Parameters
+    ----------
+    completer, objects, threshold
+        As in `OneBlob`; `objects` also says how small a component may be (`min_points`).
+    max_step : float
+        Metres; neighbouring pixels whose depths differ by more are not connected.
+    """
+
+    completer: Completer = field(default_factory=Extrude)
+    objects: ObjectRule = field(default_factory=ObjectRule)
+    threshold: float = 0.5
+    max_step: float = 0.02
+
+    properly_weighted: ClassVar[bool] = False
+
+    def sample(self, rng: np.random.Generator, observation: Clip, n: int) -> Population:
+        """The same hypothesis, `n` times."""
+        frame, grid = observation.after, observation.grid
+        labels = self.label_image(frame, self.objects.own(frame, grid))
+        completed = [
+            self.completer.complete(child(rng, "completion", k), frame, [labels == k], grid)[0]
+            for k in range(1, int(labels.max(initial=0)) + 1)
+        ]
+        return Population((hypothesis_of(completed, grid, observation.index, self.threshold),) * n)
+
+    def label_image(self, frame: Frame, own: np.ndarray) -> np.ndarray:
+        """(H, W) int32 components 1 .. of the pixels `own` (H, W); 0 elsewhere."""
+        from scipy.sparse import coo_array
+        from scipy.sparse.csgraph import connected_components
+
+        pixel = np.arange(own.size).reshape(own.shape)
+        first, second = [], []
+        for a, b in (((slice(None), slice(None, -1)), (slice(None), slice(1, None))),
+                     ((slice(None, -1),), (slice(1, None),))):  # fmt: skip
+            with np.errstate(invalid="ignore"):
+                joined = own[a] & own[b] & (np.abs(frame.depth[a] - frame.depth[b]) <= self.max_step)
+            first.append(pixel[a][joined])
+            second.append(pixel[b][joined])
+        edges = np.concatenate(first), np.concatenate(second)
+        graph = coo_array((np.ones(len(edges[0]), bool), edges), shape=(own.size, own.size))
+        part = connected_components(graph, directed=False)[1].reshape(own.shape)
+        sizes = np.bincount(part[own], minlength=int(part.max()) + 1)
+        kept = sizes >= max(1.0, self.objects.min_points * own.size / 307200)
+        numbers = np.where(kept, np.cumsum(kept), 0)
+        return np.where(own, numbers[part], 0).astype(np.int32)
+
+
+def _occupied(rule: OneBlob | OccupiedComponents, rng: np.random.Generator, clip: Clip) -> np.ndarray:
+    """(X, Y, Z) labels: 1 where the completed surface above the table is."""
+    own = rule.objects.own(clip.after, clip.grid)
+    completed = rule.completer.complete(child(rng, "completion"), clip.after, [own], clip.grid)
+    return hypothesis_of(completed, clip.grid, clip.index, rule.threshold).labels

@@ -1,0 +1,126 @@
+"""Updates without crossover: samples alone, predictions alone, both side by side.
+
+They stand where `FusionUpdate` stands in MST and leave everything else, random streams included, as it is:
+
+>>> mstfilter.preset("samples_only"), mstfilter.preset("tracking_only"), mstfilter.preset("union")
+
+At the first pause there is no prediction, and all of them, like fusion, return the proposed samples.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+import numpy as np
+
+from mstfilter.errors import InputError
+from mstfilter.fusion.free_space import FreeSpace, Projection
+from mstfilter.fusion.update import FusionUpdate
+from mstfilter.scene.clip import Clip
+from mstfilter.scene.voxels import Hypothesis
+from mstfilter.smc.interfaces import Update
+from mstfilter.smc.population import Population
+from mstfilter.smc.updates import union
+
+__all__ = ["SamplesOnly", "TrackingOnly", "Union"]
+
+_SMALLEST_QUALITY = 1e-3  # as in fusion: a prediction that loses every voxel keeps a weight
+
+
+@dataclass(frozen=True)
+class SamplesOnly(Update):
+    """The proposed samples, as if there were no past."""
+
+    properly_weighted: ClassVar[bool] = False
+    draws: ClassVar[bool] = False
+
+    def update(
+        self,
+        rng: np.random.Generator,
+        predicted: Population | None,
+        proposed: Population | None,
+        observation: Clip,
+    ) -> Population:
+        """The proposed population itself; where nothing was proposed, the last one stays."""
+        return union(predicted if proposed is None else None, proposed)
+
+
+@dataclass(frozen=True)
+class TrackingOnly(Update):
+    """The predicted hypotheses: objects of the first pause tracked on.
+
+    Parameters
+    ----------
+    free_space : Projection
+        Clears what the latest image shows to be free; ``none`` leaves predictions as they are.
+    """
+
+    free_space: Projection = field(default_factory=FreeSpace)
+
+    properly_weighted: ClassVar[bool] = False
+    draws: ClassVar[bool] = False
+
+    def update(
+        self,
+        rng: np.random.Generator,
+        predicted: Population | None,
+        proposed: Population | None,
+        observation: Clip,
+    ) -> Population:
+        """The refined predictions with their weights; the proposed samples at the first pause."""
+        if predicted is None:
+            return union(None, proposed)
+        refined, quality = _refine(self.free_space, predicted, observation)
+        return Population(refined, predicted.log_weights, predicted.parents, {"quality": quality.tolist()})
+
+
+@dataclass(frozen=True)
+class Union(Update):
+    """Predicted and proposed hypotheses side by side, weighted as fusion weighs, none crossed.
+
+    A prediction has log weight ``log w + lambda log Q``, a sample ``log w``; both populations have mean weight 1
+    before. Evidence, where fusion has some, scores all of them.
+
+    Parameters
+    ----------
+    fusion : FusionUpdate
+        Its free space, weights and evidence are used, its crossover is not.
+    """
+
+    fusion: FusionUpdate = field(default_factory=FusionUpdate)
+
+    properly_weighted: ClassVar[bool] = False
+    draws: ClassVar[bool] = False
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.fusion, FusionUpdate):
+            raise InputError(f"union weighs as a fusion does, and {type(self.fusion).__name__} is none")
+
+    def update(
+        self,
+        rng: np.random.Generator,
+        predicted: Population | None,
+        proposed: Population | None,
+        observation: Clip,
+    ) -> Population:
+        """All predicted and proposed hypotheses."""
+        if predicted is None or proposed is None:
+            return self.fusion.update(rng, predicted, proposed, observation)
+        refined, quality = _refine(self.fusion.free_space, predicted, observation)
+        log_q = self.fusion.quality_exponent * np.log(np.maximum(quality, _SMALLEST_QUALITY))
+        weighed = predicted.log_weights - predicted.log_mean_weight + log_q
+        both = union(
+            Population(refined, weighed, predicted.parents),
+            Population(proposed.particles, proposed.log_weights - proposed.log_mean_weight, proposed.parents),
+        )
+        scores = {type(term).__name__: term.log_score(both.particles, observation) for term in self.fusion.evidence}
+        log_weights = both.log_weights + np.sum(list(scores.values()), axis=0) if scores else both.log_weights
+        notes = {"quality": quality.tolist(), "scores": {k: v.round(3).tolist() for k, v in scores.items()}}
+        return Population(both.particles, log_weights, both.parents, notes)
+
+
+def _refine(free_space: Projection, predicted: Population, clip: Clip) -> tuple[tuple[Hypothesis, ...], np.ndarray]:
+    """Predicted hypotheses on what the latest image leaves possible, and their qualities (n,)."""
+    pairs = [free_space.project(hypothesis, clip.after) for hypothesis in predicted.particles]
+    return tuple(h for h, _ in pairs), np.array([q for _, q in pairs])
