@@ -10,6 +10,7 @@ import sys
 
 from mstfilter.cli import running, studying, data, components  # isort: skip (the order of the help page)
 from mstfilter.cli.root import app
+from mstfilter.cli.shared import warnings_as_lines
 from mstfilter.errors import InputError
 
 __all__ = ["app", "components", "data", "main", "running", "studying"]
@@ -21,7 +22,8 @@ def main(arguments: list[str] | None = None) -> None:
     debug = "--debug" in given
     given = [a for a in given if a != "--debug"]
     try:
-        app(given, prog_name="mstfilter")
+        with warnings_as_lines():
+            app(given, prog_name="mstfilter")
     except InputError as error:
         if debug:
             raise

@@ -8,7 +8,7 @@ import typer
 
 from mstfilter import __version__
 
-__all__ = ["Overrides", "Seed", "app"]
+__all__ = ["Format", "Options", "Overrides", "Pauses", "Seed", "app"]
 
 app = typer.Typer(
     add_completion=False,
@@ -22,6 +22,21 @@ Overrides = Annotated[
     list[str] | None,
     typer.Argument(
         metavar="[PATH=VALUE]...", help="Changes to the preset: n=10 resampler=multinomial transition.rule=paper"
+    ),
+]
+Format = Annotated[
+    str, typer.Option(metavar="NAME", help="Format, or ./file.py:Class. Default: detected; `mstfilter list format`.")
+]
+Options = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--option", "-o", metavar="FIELD=VALUE", help="A field of the format, such as K=525,525,319.5,239.5."
+    ),
+]
+Pauses = Annotated[
+    str,
+    typer.Option(
+        metavar="RULE", help="Pauses of a video: still, ends, every, frames 0,40,85, seconds 0s,4.2s, a file."
     ),
 ]
 Seed = Annotated[int, typer.Option(min=0, help="Names all random streams.")]

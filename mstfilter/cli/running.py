@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from mstfilter.cli.root import Overrides, Seed, app
+from mstfilter.cli.root import Format, Options, Overrides, Pauses, Seed, app
 from mstfilter.cli.shared import bar, open_recording, safe_name, summary
 from mstfilter.errors import InputError
 
@@ -17,12 +17,15 @@ __all__ = ["demo", "report", "run", "simulate"]
 @app.command()
 def run(
     recording: Annotated[
-        Path, typer.Argument(help="Recording folder, or a folder of NAME_rgb.png / NAME_depth.png pairs.")
+        Path, typer.Argument(help="Recording folder, or data of any format that `mstfilter list format` shows.")
     ],
     overrides: Overrides = None,
     preset: Annotated[str, typer.Option(help="mst, paper, authors, or the path of a .toml file.")] = "mst",
     out: Annotated[Path | None, typer.Option(help="Run folder. Default: runs/RECORDING-PRESET-SEED.")] = None,
     seed: Seed = 0,
+    format: Format = "",
+    option: Options = None,
+    pauses: Pauses = "",
     frames: Annotated[str, typer.Option(help="Frames of a folder of pairs, separated by commas.")] = "",
     report: Annotated[bool, typer.Option(help="Write report.html into the run folder.")] = True,
 ) -> None:
@@ -30,7 +33,7 @@ def run(
     from mstfilter.presets import load_config
 
     config = load_config(preset, overrides or ())
-    source = open_recording(recording, frames)
+    source = open_recording(recording, format, option, pauses, frames)
     name = Path(preset).stem
     folder = out or Path("runs") / f"{safe_name(source.name)}-{safe_name(name)}-{seed}"
     _execute(source, config, folder, seed)

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import contextlib
 import re
+import sys
+import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
-from mstfilter.errors import InputError
+from mstfilter.errors import InputWarning
 
-__all__ = ["bar", "open_recording", "safe_name", "summary"]
+__all__ = ["bar", "open_recording", "safe_name", "summary", "warnings_as_lines"]
 
 
 def safe_name(name: str) -> str:
@@ -18,17 +20,39 @@ def safe_name(name: str) -> str:
     return re.sub(r"[^\w.-]+", "-", name).strip(".-") or "recording"
 
 
-def open_recording(path: Path, frames: str = "") -> Any:
-    """A recording of our own or of a known layout."""
-    from mstfilter.scene.formats.paired_images import is_paired, open_paired
-    from mstfilter.scene.recording import Recording
+def open_recording(path: Path, format: str, options: list[str] | None, pauses: str, frames: str = "") -> Any:
+    """A recording of any format that is read."""
+    from mstfilter.study.sources import open_source
 
-    names = [name.strip() for name in frames.split(",") if name.strip()]
-    if path.is_dir() and is_paired(path):
-        return open_paired(path, names)
-    if names:
-        raise InputError(f"--frames is for folders of image pairs; {path} is none")
-    return Recording.open(path)
+    names = ",".join(name.strip() for name in frames.split(",") if name.strip())
+    chosen = [*(options or []), *([f"frames={names},"] if names else [])]
+    return open_source(path, format, chosen, pauses)
+
+
+@contextlib.contextmanager
+def warnings_as_lines() -> Iterator[None]:
+    """Show what a user should know of the input as one ``warning:`` line and its hints; other warnings as ever."""
+    with warnings.catch_warnings():
+        usual = warnings.showwarning
+        warnings.simplefilter("always", InputWarning)
+
+        def show(
+            message: Warning | str,
+            category: type[Warning],
+            filename: str,
+            lineno: int,
+            file: TextIO | None = None,
+            line: str | None = None,
+        ) -> None:
+            if not isinstance(message, InputWarning):
+                usual(message, category, filename, lineno, file, line)
+                return
+            print(f"warning: {message.message}", file=sys.stderr)
+            for hint in message.hints:
+                print(f"hint: {hint}", file=sys.stderr)
+
+        warnings.showwarning = show
+        yield
 
 
 @contextlib.contextmanager

@@ -24,10 +24,19 @@ from mstfilter.scene.images import write_image
 from mstfilter.scene.recording import Recording
 from mstfilter.scene.voxels import VoxelGrid, as_labels
 
-__all__ = ["VERSION", "RecordingWriter", "save"]
+__all__ = ["VERSION", "RecordingWriter", "check_writable", "save"]
 
 VERSION = 1
 """Version of the layout."""
+
+
+def check_writable(path: Path) -> None:
+    """Whether a new recording may be called so: nothing is there, or an empty folder."""
+    if path.exists() and (not path.is_dir() or any(path.iterdir())):
+        raise InputError(
+            f"cannot write a recording to {path}: it exists and is not an empty folder",
+            "choose another name, or remove it",
+        )
 
 
 class RecordingWriter:
@@ -57,11 +66,7 @@ class RecordingWriter:
         **manifest: Any,
     ) -> None:
         self.path = Path(path)
-        if self.path.exists() and (not self.path.is_dir() or any(self.path.iterdir())):
-            raise InputError(
-                f"cannot write a recording to {self.path}: it exists and is not an empty folder",
-                "choose another name, or remove it",
-            )
+        check_writable(self.path)
         self._camera, self._grid, self._scale = camera, grid, depth_scale
         self._manifest = {"version": VERSION, **manifest}
         self._frames: list[dict[str, Any]] = []

@@ -1,0 +1,109 @@
+"""Recordings from whatever is on disk: which format it is, with what options.
+
+>>> open_source(Path("session.mcap"))
+>>> open_source(Path("rgbd_dataset"), options=["K=525,525,319.5,239.5"], pauses="0s,4.2s")
+
+Options are fields of the format (``mstfilter list format`` shows them) in the syntax of overrides; a comma makes a
+list. ``--format ./file.py:Class`` is a reader of the user's own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from mstfilter import registry
+from mstfilter.errors import InputError
+from mstfilter.presets import settings
+from mstfilter.scene.formats.interfaces import Format
+from mstfilter.scene.recording import Recording
+
+__all__ = ["detect_format", "format_settings", "open_source"]
+
+
+def open_source(
+    path: Path, format: str = "", options: Sequence[str] = (), pauses: str = "", *, allow_files: bool = True
+) -> Recording:
+    """A recording of any format.
+
+    Parameters
+    ----------
+    path : Path
+        File or folder.
+    format : str
+        Name of a format, or ``./file.py:Class``. Empty: detected.
+    options : sequence of str
+        ``FIELD=VALUE`` of the format.
+    pauses : str
+        Where a video is cut: see `mstfilter.scene.formats.pauses.pauses_from_text`. Empty: the format's default.
+    allow_files : bool
+        Whether ``./file.py:Class`` is loaded.
+    """
+    fields = format_settings(options)
+    if pauses:
+        from mstfilter.scene.formats.pauses import pauses_from_text
+
+        rule = pauses_from_text(pauses)
+        more = fields.get("pauses")
+        fields["pauses"] = {**rule, **more} if isinstance(more, dict) else rule
+    name = format or detect_format(path)
+    cls = _reader(name, allow_files)
+    if not path.exists():
+        raise InputError(f"recording does not exist: {path}")
+    reader = registry.make(cls, fields, "", allow_files)
+    opened: Recording = reader.open(path)
+    return opened
+
+
+def _reader(name: str, allow_files: bool = False) -> type[Format]:
+    """The class of a format."""
+    cls = registry.find_class("format", name, "format", allow_files)
+    if not issubclass(cls, Format):
+        raise InputError(f"{name} is no reader of recordings", "subclass mstfilter.scene.formats.interfaces.Format")
+    return cls
+
+
+def detect_format(path: Path) -> str:
+    """The one format that a file or folder looks like."""
+    if not path.exists():
+        raise InputError(f"recording folder or file does not exist: {path}")
+    names = registry.known("format")
+    found = [name for name in names if _reader(name).detects(path)]
+    if len(found) == 1:
+        return found[0]
+    if found:
+        raise InputError(
+            f"{path} looks like {' and like '.join(found)}", f"choose one: --format {' or --format '.join(found)}"
+        )
+    if path.is_dir() and (
+        not any(path.iterdir()) or any((path / n).exists() for n in ("camera.json", "rgb", "depth"))
+    ):
+        return "recording"  # its reader says what is missing
+    raise InputError(
+        f"{path} is of no format that is known here",
+        f"known are {', '.join(names)}; `mstfilter list format` says what each looks like",
+        "from Python, any arrays will do: mstfilter.Recording.from_arrays",
+    )
+
+
+def format_settings(options: Sequence[str]) -> dict[str, Any]:
+    """Fields of a format from ``FIELD=VALUE`` texts."""
+    return settings(_with_lists(text) for text in options)
+
+
+def _with_lists(text: str) -> str:
+    """``K=1,2,3`` as ``K=[1,2,3]``; words become strings."""
+    path, equals, value = text.partition("=")
+    if not equals or "," not in value or value.strip()[:1] in "[{\"'":
+        return text
+    words = [word.strip() for word in value.split(",") if word.strip()]
+    return f"{path}=[{', '.join(word if _is_number(word) else repr(word) for word in words)}]"
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
