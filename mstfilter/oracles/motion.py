@@ -38,7 +38,7 @@ class TrueMotions(UsesTruth, Transition):
         little.
     """
 
-    warp: Warp = field(default_factory=Warp)
+    warp: Warp = field(default_factory=lambda: Warp("smooth"))
     rest: float = 0.0005
 
     properly_weighted: ClassVar[bool] = False
