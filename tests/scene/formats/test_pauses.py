@@ -1,0 +1,120 @@
+"""Where a video is cut: given pauses, and pauses found by image motion on simulated recordings."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from mstfilter.errors import InputError
+from mstfilter.scene.formats.pauses import At, Ends, Every, Listed, pauses_from_text
+from mstfilter.scene.formats.still import Still, grey_blocks
+from tests.scene.formats.layouts import PAUSES, video
+
+TIMES = tuple(10 + k / 10 for k in range(40))
+
+
+def none(index):
+    raise AssertionError("no image is needed")
+
+
+def test_given_pauses(tmp_path):
+    assert At(frames=(30, 0, -1)).find(TIMES, none) == (0, 30, 39)
+    assert At(seconds=(0.0, 1.52, 3.9)).find(TIMES, none) == (0, 15, 39)
+    assert Ends().find(TIMES, none) == (0, 39)
+    assert Ends().find(TIMES[:1], none) == (0,)
+    assert Every(15).find(TIMES, none) == (0, 15, 30)
+    file = tmp_path / "pauses.txt"
+    file.write_text("# first the empty table\n0\n12, 20  # seconds too\n3.5s\n")
+    assert Listed(str(file)).find(TIMES, none) == (0, 12, 20, 35)
+    for rule, message in (
+        (At(), "no pause"),
+        (At(frames=(40,)), "frame 40: the video has 40"),
+        (At(seconds=(9.0,)), "lasts from 0 to 3.9 s"),
+        (Listed(str(tmp_path / "none")), "cannot be read"),
+    ):
+        with pytest.raises(InputError, match=message):
+            rule.find(TIMES, none)
+    file.write_text("0 twelve\n")
+    with pytest.raises(InputError, match=r"pauses.txt: .*twelve"):
+        Listed(str(file)).find(TIMES, none)
+
+
+def test_pauses_as_text(tmp_path):
+    assert pauses_from_text("0,40,85") == {"component": "at", "frames": (0, 40, 85)}
+    assert pauses_from_text("0s, 4.2s,9") == {"component": "at", "seconds": (0.0, 4.2), "frames": (9,)}
+    assert pauses_from_text("-1") == {"component": "at", "frames": (-1,)}
+    assert pauses_from_text("still") == {"component": "still"}
+    file = tmp_path / "p.txt"
+    file.write_text("0")
+    assert pauses_from_text(str(file)) == {"component": "listed", "file": str(file)}
+    with pytest.raises(InputError, match="1.5"):
+        pauses_from_text("0,1.5")
+
+
+def times_of(images, fps=10.0):
+    return tuple(k / fps for k in range(len(images)))
+
+
+def test_still_intervals_of_an_exact_video():
+    rgb, _, _ = video()
+    assert Still().intervals(times_of(rgb), lambda k: rgb[k]) == ((0, 5), (10, 16))
+    assert Still().find(times_of(rgb), lambda k: rgb[k]) == PAUSES
+    assert Still(hold_s=0.6).find(times_of(rgb), lambda k: rgb[k]) == (13,)
+    with pytest.raises(InputError, match="no pause found: nowhere in 17 frames"):
+        Still(hold_s=0.7).find(times_of(rgb), lambda k: rgb[k])
+    assert Still().find((0.0,), lambda k: rgb[k]) == (0,)
+
+
+def test_what_all_pixels_share_is_no_motion_and_slow_motion_is():
+    """Exposure that drifts and flickers, with noise, changes nothing; a pixel a frame at the box's edge does."""
+    rng = np.random.default_rng(0)
+    rgb, _, _ = video()
+    flicker = rng.uniform(-6, 6, len(rgb)) + np.linspace(0, 12, len(rgb))
+    noisy = [
+        np.clip(image + level + rng.normal(size=image.shape) * 4, 0, 255).astype(np.uint8)
+        for image, level in zip(rgb, flicker, strict=True)
+    ]
+    assert Still().intervals(times_of(noisy), lambda k: noisy[k]) == ((0, 5), (10, 16))
+    slow = [np.roll(rgb[0], k // 3, axis=1) for k in range(30)]  # a third of a pixel a frame
+    assert max(b - a for a, b in Still(hold_s=0.1).intervals(times_of(slow), lambda k: slow[k])) <= 3
+
+
+def test_blocks_are_means():
+    image = np.random.default_rng(0).integers(0, 255, (48, 163, 3), dtype=np.uint8)
+    blocks = grey_blocks(image)
+    assert blocks.shape == (24, 81)
+    np.testing.assert_allclose(blocks[3, 5], image[6:8, 10:12].mean(), rtol=1e-6)
+
+
+@pytest.mark.parametrize("seed", [3, 8])
+def test_still_intervals_of_a_simulated_recording(seed):
+    """Pushes with sensor noise, each pause held for a second: every pause is found, in order, and nothing else.
+
+    The truth is the simulator's: a frame belongs to a pause if it was drawn from the world at rest.
+    """
+    from mstfilter.simulation.actions import advance, finish
+    from mstfilter.simulation.families import scene_family
+    from mstfilter.simulation.recorder import Scene
+
+    family = scene_family("demo")
+    scene = Scene(family, seed)
+    images, pause_of = [], []
+
+    def see(pause):
+        images.append(scene.see(len(images))["rgb"])
+        pause_of.append(pause)
+
+    fps = 6.0
+    for action in range(family.n_actions + 1):
+        for _ in range(7):
+            see(action)
+        if action == family.n_actions:
+            break
+        push = scene.choose(action)
+        for step in range(int(push.seconds * fps)):
+            advance(scene.world, push, step / fps, (step + 1) / fps)
+            see(None)
+        advance(scene.world, push, int(push.seconds * fps) / fps, push.seconds)
+        finish(scene.world)
+    found = Still(hold_s=0.8).find(times_of(images, fps), lambda k: images[k])
+    assert [pause_of[k] for k in found] == list(range(family.n_actions + 1))
