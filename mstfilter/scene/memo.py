@@ -9,20 +9,22 @@ from, so hypotheses share them, and a repeated run on the same data in one proce
 9
 
 The store is bounded (`LIMIT_BYTES`); what was used longest ago is dropped first. Values must be treated as
-read-only.
+read-only. `beneath` puts a further layer below it, such as a `DiskMemo`.
 """
 
 from __future__ import annotations
 
+import contextlib
 import threading
+from abc import ABC, abstractmethod
 from collections import OrderedDict
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Iterator
 from dataclasses import fields, is_dataclass
 from typing import Any, TypeVar
 
 import numpy as np
 
-__all__ = ["LIMIT_BYTES", "clear", "memo"]
+__all__ = ["LIMIT_BYTES", "Layer", "beneath", "clear", "memo"]
 
 LIMIT_BYTES = 768 * 2**20
 
@@ -31,6 +33,32 @@ T = TypeVar("T")
 _lock = threading.RLock()
 _store: OrderedDict[tuple[str, Hashable], tuple[Any, int]] = OrderedDict()
 _used = 0
+
+
+class Layer(ABC):
+    """Where values are looked for that the store has not, and kept when they are computed."""
+
+    @abstractmethod
+    def find(self, name: str, key: Hashable) -> Any:
+        """The value; None where it is not known."""
+
+    @abstractmethod
+    def keep(self, name: str, key: Hashable, value: Any) -> None:
+        """A value that was computed; what a layer does not want it leaves."""
+
+
+_layer: Layer | None = None
+
+
+@contextlib.contextmanager
+def beneath(layer: Layer | None) -> Iterator[None]:
+    """Use a layer below the store, for all threads of this process, in place of the one there was."""
+    global _layer
+    before, _layer = _layer, layer
+    try:
+        yield
+    finally:
+        _layer = before
 
 
 def memo(name: str, key: Hashable, compute: Callable[[], T]) -> T:
@@ -51,7 +79,11 @@ def memo(name: str, key: Hashable, compute: Callable[[], T]) -> T:
         if full in _store:
             _store.move_to_end(full)
             return _store[full][0]
-    value = compute()
+    layer = _layer
+    found = None if layer is None else layer.find(name, key)
+    value = compute() if found is None else found
+    if layer is not None and found is None:
+        layer.keep(name, key, value)
     size = _size_of(value)
     if size > LIMIT_BYTES:
         return value

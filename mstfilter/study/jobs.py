@@ -26,6 +26,7 @@ from mstfilter.study.executors import Job, Outcome
 from mstfilter.study.memory import peak_megabytes, reset_peak
 from mstfilter.study.results import RESULT, read_result
 from mstfilter.study.run_folder import RunFolder, write_json
+from mstfilter.study.shared_work import shared_work
 
 __all__ = ["failed", "open_scene", "perform"]
 
@@ -61,14 +62,13 @@ def failed(error: Exception) -> Outcome:
     return Outcome("failed", f"{type(error).__name__}: {error}", ("a fault of the program or of a component",), trace)
 
 
-def open_scene(source: dict[str, Any], recordings: str | None) -> Recording:
+def open_scene(source: dict[str, Any], recordings: str) -> Recording:
     """The recording of a scene; a simulated one is made if it is missing."""
     if "folder" in source:
         return Recording.open(source["folder"])
     from mstfilter.simulation.cache import cached_recording
 
-    folder = None if recordings is None else Path(recordings)
-    return Recording.open(cached_recording(source["family"], source["seed"], folder, **source["set"]))
+    return Recording.open(cached_recording(source["family"], source["seed"], Path(recordings), **source["set"]))
 
 
 def _record(job: Job, step: Step) -> None:
@@ -96,7 +96,10 @@ def _run(job: Job, step: Step) -> None:
     try:
         recording = open_scene(job["source"], job["recordings"])
         began = time.process_time()
-        run = execute(recording, job["config"], work, job["seed"], allow_files=job["allow_files"], progress=progress)
+        with shared_work(job["work"]):
+            run = execute(
+                recording, job["config"], work, job["seed"], allow_files=job["allow_files"], progress=progress
+            )
         stages = [{f"seconds_{k}": v for k, v in run.seconds(t).items()} for t in range(run.n_pauses)]
         _write(run, recording, job, [{**cost, **stage} for cost, stage in zip(costs, stages, strict=True)])
         if job["keep"] == "tables":

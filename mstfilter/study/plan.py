@@ -45,11 +45,14 @@ class Arm:
         Resolved: every field of every component.
     key : str
         Hash of the configuration, users' files and code.
+    ours : bool
+        Whether all components are of this package or of a file, so that their version is known.
     """
 
     name: str
     config: dict[str, Any]
     key: str
+    ours: bool
 
 
 @dataclass(frozen=True)
@@ -125,7 +128,7 @@ def make_plan(study: StudyConfig, overrides: Sequence[str] = (), *, allow_files:
     InputError
         A wrong arm, two arms that are the same, a grid without runs, a recording that cannot be read.
     """
-    arms = tuple(arm for entry in study.arms for arm in _arms(entry, overrides, allow_files))
+    arms = tuple(arm for entry in study.arms for arm in _arms(entry, study.folder, overrides, allow_files))
     for what, found in (("arm", arms), ("scene", study.scenes), ("seed", study.seeds)):
         if not found:
             raise InputError(f"study {study.name} has no {what}, so there is nothing to run")
@@ -171,8 +174,13 @@ def split_grid(text: str) -> list[str]:
     return [f"{path.strip()}={part.strip()}" for part in parts]
 
 
-def _arms(entry: ArmEntry, overrides: Sequence[str], allow_files: bool) -> Iterator[Arm]:
-    presets = [name.strip() for text in entry.preset for name in text.split(",")]
+def _beside(folder: Path, name: str) -> str:
+    """A preset's file beside the study's, where there is one."""
+    return str(folder / name) if name.endswith(".toml") and (folder / name).is_file() else name
+
+
+def _arms(entry: ArmEntry, folder: Path, overrides: Sequence[str], allow_files: bool) -> Iterator[Arm]:
+    presets = [_beside(folder, name.strip()) for text in entry.preset for name in text.split(",")]
     grids = [split_grid(text) for text in (*entry.set, *overrides)]
     if not presets or not all(presets):
         raise InputError(f"an arm names no preset: {list(entry.preset)}")
@@ -191,7 +199,8 @@ def _arms(entry: ArmEntry, overrides: Sequence[str], allow_files: bool) -> Itera
                 raise InputError(f"arm {name!r}: {error.message}", *error.hints) from error
             config = plain(describe_filter(filter))
             code = code_version([*_modules(filter), *_ALWAYS])
-            yield Arm(name, config, _hash([config, files_of(filter), versions(), code]))
+            ours = all(module.split(".")[0].startswith("mstfilter") for module in _modules(filter))
+            yield Arm(name, config, _hash([config, files_of(filter), versions(), code]), ours)
 
 
 def _stem(preset: str) -> str:

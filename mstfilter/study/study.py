@@ -79,7 +79,7 @@ def run_study(
     overrides: Sequence[str] = (),
     *,
     allow_files: bool = True,
-    recordings: Path | None = None,
+    cache: Path | None = None,
     progress: Callable[[Progress], None] = lambda progress: None,
 ) -> StudyResult:
     """Run a study into a folder.
@@ -95,8 +95,8 @@ def run_study(
         Applied to every arm; a comma makes a grid.
     allow_files : bool
         Whether components may come from ``./file.py:Class``.
-    recordings : Path, optional
-        Where simulated recordings are kept. Default: the user's cache folder.
+    cache : Path, optional
+        Where simulated recordings and shared work are kept. Default: the user's cache folder.
     progress : callable
         Called for everything that happens.
 
@@ -105,11 +105,14 @@ def run_study(
     InputError
         For whatever is wrong with the study or the folder, before any run begins. Runs that fail raise nothing.
     """
+    from mstfilter.simulation.cache import cache_folder
+
     plan = make_plan(study, overrides, allow_files=allow_files)
+    cache = cache or cache_folder()
     with _held(path) as folder:
         executor = executor or Local(tries=study.tries, timeout_s=study.timeout_s, logs=path / "logs")
         write_json(path / "study.json", _described(plan))
-        jobs = _Jobs(plan, folder, allow_files, None if recordings is None else str(recordings))
+        jobs = _Jobs(plan, folder, allow_files, cache)
         failed = _recordings(jobs, executor, progress)
         waiting, before = jobs.runs()
         lost = {run.name: failed[run.scene.key] for run in plan.runs if run.scene.key in failed}
@@ -210,7 +213,12 @@ class _Jobs:
     plan: Plan
     folder: StudyFolder
     allow_files: bool
-    recordings: str | None
+    cache: Path
+
+    @property
+    def recordings(self) -> str:
+        """Where simulated recordings are kept."""
+        return str((self.cache / "recordings").absolute())
 
     def runs(self) -> tuple[list[tuple[Run, Job]], set[str]]:
         """Runs to do with their jobs, and the folders of those that are done."""
@@ -246,7 +254,14 @@ class _Jobs:
             "keep": self.plan.config.keep,
             "allow_files": self.allow_files,
             "recordings": self.recordings,
+            "work": self._work(run),
         }
+
+    def _work(self, run: Run) -> dict[str, Any] | None:
+        """The folder of shared work; none for an arm with installed components of others, whose version we do not
+        know."""
+        gb = self.plan.config.cache_gb
+        return {"folder": str((self.cache / "work").absolute()), "gb": gb} if gb and run.arm.ours else None
 
     def records(self) -> tuple[list[str], list[Job]]:
         """Keys and jobs of simulated recordings that are needed and missing."""
@@ -260,15 +275,16 @@ class _Jobs:
         return [s.key for s in missing], jobs
 
 
-def _is_made(source: dict[str, Any], recordings: str | None) -> bool:
+def _is_made(source: dict[str, Any], recordings: str) -> bool:
     from dataclasses import replace
 
-    from mstfilter.simulation.cache import cache_folder, recipe_key
+    from mstfilter.simulation.cache import recipe_key
     from mstfilter.simulation.families import scene_family
 
     family = replace(scene_family(source["family"]), **source["set"])
-    home = cache_folder() / "recordings" if recordings is None else Path(recordings)
-    return (home / f"{family.name}-{source['seed']}-{recipe_key(family, source['seed'])}" / "manifest.json").is_file()
+    return (
+        Path(recordings) / f"{family.name}-{source['seed']}-{recipe_key(family, source['seed'])}" / "manifest.json"
+    ).is_file()
 
 
 def _recordings(jobs: _Jobs, executor: Executor, progress: Callable[[Progress], None]) -> dict[str, Outcome]:

@@ -46,7 +46,7 @@ def table(path, costs=False):
 
 def test_a_study_runs_resumes_and_repeats_nothing(folder, tmp_path):
     study = load_study(folder / "base.toml")
-    first = run_study(study, tmp_path / "out", Local(2))
+    first = run_study(study, tmp_path / "out", Local(2), cache=tmp_path / "cache")
     assert (first.done, first.repeated, first.failed) == (8, 0, ())
     rows = table(tmp_path / "out" / "runs.csv")
     assert len(rows) == 2 * 2 * 2 * 3
@@ -57,7 +57,7 @@ def test_a_study_runs_resumes_and_repeats_nothing(folder, tmp_path):
     assert {(r["scene"], r["family"]) for r in rows} == {("slide-0", "slide"), ("slide-1", "slide")}
     made = {p: p.stat().st_mtime_ns for p in (tmp_path / "out" / "runs").rglob("result.json")}
     before = (tmp_path / "out" / "runs.csv").read_bytes()
-    again = run_study(study, tmp_path / "out", Local(1))
+    again = run_study(study, tmp_path / "out", Local(1), cache=tmp_path / "cache")
     assert (again.done, again.repeated) == (8, 8)
     assert {p: p.stat().st_mtime_ns for p in (tmp_path / "out" / "runs").rglob("result.json")} == made
     assert (tmp_path / "out" / "runs.csv").read_bytes() == before
