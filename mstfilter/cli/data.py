@@ -10,7 +10,7 @@ import typer
 from mstfilter.cli.root import Format, Options, Pauses, app
 from mstfilter.cli.shared import bar, open_recording
 
-__all__ = ["convert"]
+__all__ = ["convert", "quality"]
 
 
 @app.command()
@@ -34,3 +34,32 @@ def convert(
     marks = ", ".join(f"{p} ({recording.times[p]:.1f} s)" for p in recording.pauses[:12])
     more = ", ..." if len(recording.pauses) > 12 else ""
     print(f"pauses      {len(recording.pauses)} of {len(recording)} frames: {marks}{more}")
+
+
+@app.command()
+def quality(
+    run: Annotated[Path, typer.Argument(help="Run folder, or label volumes (.npz or .npy).")],
+    truth: Annotated[Path, typer.Argument(help="Recording that holds the truth, or its voxels.npz.")],
+    csv: Annotated[Path | None, typer.Option(help="Also write the table into this file.")] = None,
+    format: Format = "",
+    option: Options = None,
+) -> None:
+    """Score the hypotheses of a run against the truth, beside trivial baselines."""
+    from statistics import fmean
+
+    from mstfilter.study.scoring import read_estimate, read_truth, score, write_csv
+
+    volumes = truth.is_file() and truth.suffix in (".npz", ".npy")
+    known = truth if volumes else open_recording(truth, format, option, "")
+    rows = score(read_estimate(run), read_truth(known))
+    if csv is not None:
+        write_csv(csv, rows)
+    names = ("mean", "weighted", "best", "top", "one_blob", "components")
+    print(f"{'pause':<7}{'form':<9}{'n':>4}" + "".join(f"{name:>12}" for name in names))
+    for row in rows:
+        print(f"{row.pause:<7}{row.form:<9}{row.n:>4}" + "".join(f"{getattr(row, name):>12.3f}" for name in names))
+    for form in dict.fromkeys(row.form for row in rows):
+        these = [row for row in rows if row.form == form]
+        print(f"{'all':<7}{form:<9}{'':>4}" + "".join(f"{fmean(getattr(r, n) for r in these):>12.3f}" for n in names))
+    if rows[0].where == "image":
+        print("scored in the image: hypotheses are projected, hidden parts do not count")

@@ -1,0 +1,244 @@
+"""Quality of a run, or of any label volumes, against the truth.
+
+>>> rows = score(read_estimate(Path("runs/mine")), read_truth(Path("recordings/mine")))
+>>> rows[0].form, rows[0].mean, rows[0].best, rows[0].one_blob
+
+One row a pause and form of weighted coverage (`mstfilter.scene.quality`): mean over the hypotheses, mean by weight,
+best, that of the heaviest one; beside them the floors of the same hypotheses: their occupied voxels as one blob and as
+connected components. Where the truth has instance images and no volumes, hypotheses are projected into the image and
+compared there (``where`` says image); pixels of the robot (255) do not count.
+"""
+
+from __future__ import annotations
+
+import csv
+import os
+import zipfile
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+
+import numpy as np
+
+from mstfilter.errors import InputError
+from mstfilter.scene.camera import Camera
+from mstfilter.scene.floors import components, one_blob
+from mstfilter.scene.quality import FORMS, weighted_coverage
+from mstfilter.scene.recording import Recording
+from mstfilter.scene.rendering import render
+from mstfilter.scene.voxels import VoxelGrid, as_labels
+from mstfilter.study.run_folder import RunFolder
+
+__all__ = ["Estimate", "Row", "Truth", "read_estimate", "read_truth", "score", "write_csv"]
+
+_ROBOT = 255
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """Hypotheses at one pause.
+
+    Parameters
+    ----------
+    labels : sequence of (X, Y, Z) arrays
+        One a hypothesis.
+    weights : (n,) array
+        They sum to 1.
+    frame : int, optional
+        Frame of the recording at this pause, where known.
+    grid : VoxelGrid, optional
+        Where the voxels are, where known.
+    """
+
+    labels: Sequence[np.ndarray]
+    weights: np.ndarray
+    frame: int | None = None
+    grid: VoxelGrid | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """True labels at one pause: volumes, or an image with its camera.
+
+    Parameters
+    ----------
+    labels : (X, Y, Z) array, or (H, W) where `camera` is given
+        0 is no object.
+    frame : int, optional
+        Frame of the recording, where known.
+    grid : VoxelGrid, optional
+        Of volumes, where known.
+    camera : Camera, optional
+        Of an image.
+    """
+
+    labels: np.ndarray
+    frame: int | None = None
+    grid: VoxelGrid | None = None
+    camera: Camera | None = None
+
+
+@dataclass(frozen=True)
+class Row:
+    """Quality at one pause in one form."""
+
+    pause: int
+    where: str
+    form: str
+    n: int
+    mean: float
+    weighted: float
+    best: float
+    top: float
+    one_blob: float
+    components: float
+
+
+def read_estimate(path: Path) -> list[Estimate]:
+    """Hypotheses of a run folder, or label volumes: .npz with ``labels`` as voxels.npz has them, or .npy."""
+    if not path.is_dir():
+        volumes, frames, grid = _read_volumes(path, "label volumes")
+        return [Estimate([one], np.ones(1), frame, grid) for one, frame in zip(volumes, frames, strict=True)]
+    run = RunFolder.open(path)
+    if run.n_pauses == 0:
+        raise InputError(f"{path}: the run has no complete pause yet")
+    frames = list(run.description.get("recording", {}).get("pauses", [])) or [None] * run.n_pauses
+    found = []
+    for t in range(run.n_pauses):
+        hypotheses, weights = run.hypotheses(t), np.asarray(run.info(t)["weights"], dtype=float)
+        found.append(Estimate([h.labels for h in hypotheses], weights, frames[t], hypotheses[0].grid))
+    return found
+
+
+def read_truth(source: Path | Recording) -> list[Truth]:
+    """Truth of a recording (its volumes, else its instance images), or of a .npz or .npy file of volumes."""
+    if isinstance(source, Path):
+        volumes, frames, grid = _read_volumes(source, "true volumes")
+        return [Truth(one, frame, grid) for one, frame in zip(volumes, frames, strict=True)]
+    found = []
+    for t, index in enumerate(source.pauses):
+        volume, image = source.truth(t), source.instance(index)
+        if volume is not None:
+            found.append(Truth(volume, index, source.grid))
+        elif image is not None:
+            found.append(Truth(image, index, None, source.frames[index].camera))
+    if not found:
+        raise InputError(
+            f"recording {source.name} holds no truth: neither volumes (voxels.npz) nor instance images",
+            "give volumes as .npz: labels (S, X, Y, Z), frame (S,), origin (3,), voxel_size",
+        )
+    return found
+
+
+def _read_volumes(path: Path, what: str) -> tuple[np.ndarray, list[int | None], VoxelGrid | None]:
+    """Labels (S, X, Y, Z), frame of each or None, and the grid where it is known."""
+    if not path.exists():
+        raise InputError(f"{what}: there is no {path}")
+    try:
+        loaded = np.load(path, allow_pickle=False)
+        data: Mapping[str, np.ndarray] = {"labels": loaded} if isinstance(loaded, np.ndarray) else dict(loaded)
+        labels = data["labels"]
+    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile) as error:
+        raise InputError(
+            f"{what} cannot be read: {path} ({error})", "expected .npz with an array `labels` (S, X, Y, Z), or .npy"
+        ) from error
+    labels = as_labels(labels, f"{path}: labels")
+    labels = labels[None] if labels.ndim == 3 else labels
+    if labels.ndim != 4 or len(labels) == 0:
+        raise InputError(f"{path}: labels have shape {labels.shape}, expected (S, X, Y, Z), one volume a pause")
+    if "owner" in data:
+        raise InputError(
+            f"{path} holds {len(labels)} hypotheses of one pause, not one volume a pause", "give the run folder"
+        )
+    frames: list[int | None] = [int(f) for f in data["frame"]] if "frame" in data else [None] * len(labels)
+    if len(frames) != len(labels):
+        raise InputError(f"{path}: there are {len(labels)} label grids for {len(frames)} frames")
+    grid = None
+    if "origin" in data and "voxel_size" in data:
+        grid = VoxelGrid(data["origin"], float(data["voxel_size"]), labels.shape[1:])
+    return labels, frames, grid
+
+
+def score(estimates: Sequence[Estimate], truths: Sequence[Truth]) -> list[Row]:
+    """Rows of quality of each pause that both know; pauses are matched by frame where both tell it, else in order."""
+    by_frame = {t.frame: t for t in truths}
+    named = None not in by_frame and all(e.frame is not None for e in estimates)
+    if not named and len(estimates) != len(truths):
+        raise InputError(
+            f"there are {len(estimates)} pauses with hypotheses and {len(truths)} with truth, and no frame numbers",
+            "an array `frame` (S,) in the .npz files says which belong together",
+        )
+    rows = []
+    for pause, estimate in enumerate(estimates):
+        truth = by_frame.get(estimate.frame) if named else truths[pause]
+        if truth is not None:
+            rows += _score_pause(pause, estimate, truth)
+    if not rows:
+        raise InputError(
+            f"no pause has both: hypotheses are at frames {[e.frame for e in estimates]}, truth at {list(by_frame)}",
+            "is it the truth of another recording?",
+        )
+    return rows
+
+
+def _score_pause(pause: int, estimate: Estimate, truth: Truth) -> list[Row]:
+    true = truth.labels
+    if truth.camera is not None:
+        if estimate.grid is None:
+            raise InputError(
+                "label volumes without a grid cannot be projected", "add origin and voxel_size to the .npz"
+            )
+        known = true != _ROBOT
+        camera, grid = truth.camera, estimate.grid
+        true = true[known]
+
+        def seen(labels: np.ndarray) -> np.ndarray:
+            return render(labels, grid, camera).labels[known]
+    else:
+        if estimate.grid is not None and truth.grid is not None and not _same(estimate.grid, truth.grid):
+            raise InputError(
+                f"pause {pause}: hypotheses are on a grid {_words(estimate.grid)}, truth on {_words(truth.grid)}",
+                "run the filter on the recording that holds the truth, or give it the same workspace",
+            )
+
+        def seen(labels: np.ndarray) -> np.ndarray:
+            return labels
+
+    found = [seen(labels) for labels in estimate.labels]
+    floors = [
+        [seen(floor(labels).astype(np.uint16)) for labels in estimate.labels] for floor in (one_blob, components)
+    ]
+    w = np.asarray(estimate.weights, dtype=float)
+    rows = []
+    for form in FORMS:
+        q = np.array([weighted_coverage(labels, true, form) for labels in found])
+        low = [float(w @ [weighted_coverage(labels, true, form) for labels in floor]) for floor in floors]
+        where = "volume" if truth.camera is None else "image"
+        figures = float(q.mean()), float(w @ q), float(q.max()), float(q[w.argmax()])
+        rows.append(Row(pause, where, form, len(q), *figures, *low))
+    return rows
+
+
+def _same(a: VoxelGrid, b: VoxelGrid) -> bool:
+    return (
+        a.shape == b.shape and np.allclose(a.origin, b.origin, atol=1e-6) and abs(a.voxel_size - b.voxel_size) < 1e-9
+    )
+
+
+def _words(grid: VoxelGrid) -> str:
+    return f"{' x '.join(map(str, grid.shape))} at {np.round(grid.origin, 4).tolist()} of {grid.voxel_size:g} m"
+
+
+def write_csv(path: Path, rows: Sequence[Row]) -> None:
+    """Rows as a table, written under a temporary name and renamed."""
+    partial = path.with_name(f".{path.name}.partial")
+    try:
+        with partial.open("w", newline="") as file:
+            writer = csv.DictWriter(file, [f.name for f in fields(Row)])
+            writer.writeheader()
+            for row in rows:
+                writer.writerow({k: f"{v:.6f}" if isinstance(v, float) else v for k, v in asdict(row).items()})
+        os.replace(partial, path)
+    except OSError as error:
+        partial.unlink(missing_ok=True)
+        raise InputError(f"cannot write {path}: {error.strerror}") from error
