@@ -139,7 +139,7 @@ def sample_kdpp(rng: np.random.Generator, spectrum: Spectrum, k: int) -> np.ndar
 
 @dataclass(frozen=True)
 class KDpp(Resampler):
-    """n heavy and mutually unlike particles, with weights w_i / pi_i: diverse and unbiased.
+    """n heavy and mutually unlike particles, with weights w_i / pi_i: diverse and unbiased. Wants more than n.
 
     Parameters
     ----------

@@ -64,7 +64,8 @@ class FearnheadClifford(Resampler):
 
     c solves sum min(1, w_i / c) = n. The light ones are chosen systematically, in order, so there are no
     duplicates. The total weight is kept exactly. Where n or fewer particles have any weight, all of these
-    are kept as they are, and fewer than n come out.
+    are kept as they are, and fewer than n come out: a filter that selects n of n particles degenerates (give it more
+    candidates than places, `mstfilter.smc.branching`).
     """
 
     exact_size: ClassVar[bool] = False

@@ -52,6 +52,8 @@ def coalesce(log_weights: np.ndarray, classes: np.ndarray) -> tuple[np.ndarray, 
 class Coalesced(Resampler):
     """Merges equal particles before it selects: lossless, and no place is wasted on a copy.
 
+    The population shrinks by what is merged; only what makes more candidates than places lets it grow again.
+
     Parameters
     ----------
     scheme : Resampler

@@ -1,0 +1,234 @@
+"""Smoothers against the exact answers: RTS and the joint Gaussian, and all paths of a hidden chain.
+
+Means over independent runs at 5 standard errors and a bias of order 1 / n: false alarm below 1e-4 for the file.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from itertools import pairwise, product
+
+import numpy as np
+import pytest
+from filterpy.kalman import KalmanFilter
+
+from mstfilter.errors import InputError
+from mstfilter.smc.filters import auxiliary, bootstrap, guided, resample_move
+from mstfilter.smc.interfaces import Proposal
+from mstfilter.smc.population import Population
+from mstfilter.smc.rejuvenation import RandomWalkMove
+from mstfilter.smc.resampling import Always
+from mstfilter.smc.smoothing import backward_paths, fixed_lag, genealogy, keep
+from mstfilter.smc.state_space import Dynamics, GuidedTransition
+from tests.smc.models import (
+    AR1,
+    EMIT,
+    MOVES,
+    RHO,
+    SD0,
+    SIGMA,
+    START,
+    SYMBOLS,
+    TAU,
+    ar1_observations,
+    hmm,
+    kalman_ar1,
+    optimal,
+    optimal_initial,
+    predictive,
+    states_of,
+)
+
+YS = [*ar1_observations(3), None, *ar1_observations(8)[4:]]
+T = len(YS)
+
+
+def smoothed():
+    """Means, variances and covariances of neighbours given all that was seen, by the joint Gaussian."""
+    cov = SD0**2 * RHO ** np.abs(np.subtract.outer(np.arange(T), np.arange(T)))
+    seen = [t for t, y in enumerate(YS) if y is not None]
+    gain = cov[:, seen] @ np.linalg.inv(cov[np.ix_(seen, seen)] + TAU**2 * np.eye(len(seen)))
+    posterior = cov - gain @ cov[seen]
+    return gain @ np.array([YS[t] for t in seen]), np.diag(posterior), np.diag(posterior, 1)
+
+
+def test_the_oracles_agree():
+    kf = KalmanFilter(dim_x=1, dim_z=1)
+    kf.F, kf.Q = np.array([[RHO]]), np.array([[SIGMA**2]])
+    moments, _ = kalman_ar1(YS)
+    mean, variance, *_ = kf.rts_smoother(moments[:, :1, None], moments[:, 1:, None])
+    np.testing.assert_allclose(mean[:, 0, 0], smoothed()[0], atol=1e-10)
+    np.testing.assert_allclose(variance[:, 0, 0], smoothed()[1], atol=1e-10)
+
+
+def moments(paths):
+    """(3, T): means, mean squares around the exact mean, and products of neighbours (0 at the end)."""
+    w = paths[0].weights
+    away = np.array([p.particles for p in paths]) - smoothed()[0][:, None]
+    return np.array([away @ w, away**2 @ w, np.append(away[:-1] * away[1:] @ w, 0.0)])
+
+
+def agrees(found, n):
+    mean, variance, neighbours = smoothed()
+    wanted = np.array([0 * mean, variance, np.append(neighbours, 0.0)])
+    error = np.std(found, axis=0, ddof=1) / np.sqrt(len(found))
+    return (np.abs(np.mean(found, axis=0) - wanted) <= 5 * error + 3 / n).all()
+
+
+N = 300
+FILTERS = {
+    "bootstrap": bootstrap(AR1, N),
+    "always": bootstrap(AR1, N, trigger=Always()),
+    "after": replace(bootstrap(AR1, N), resample="after"),
+    "guided": guided(AR1, optimal, N, optimal_initial),
+    "auxiliary": auxiliary(AR1, predictive, N, optimal),
+    "resample-move": resample_move(AR1, RandomWalkMove(AR1, 0.6), N, trigger=Always()),
+}
+
+
+@pytest.mark.parametrize("name", FILTERS)
+def test_smoothers_agree_with_the_joint_gaussian(name):
+    traced, drawn = [], []
+    for seed in range(60):
+        record = keep(FILTERS[name], YS, seed)
+        traced.append(moments(genealogy(record)))
+        paths = backward_paths(np.random.default_rng(seed), record, Dynamics(AR1), 100)
+        assert all(len(p) == 100 for p in paths)
+        drawn.append(moments(paths))
+    assert agrees(traced, N)
+    assert agrees(drawn, N)
+    # What backward sampling is for: far less noise where the paths of the genealogy have grown together.
+    if name == "always":
+        noise = np.std(traced, axis=0)[0, 0] / np.std(drawn, axis=0)[0, 0]
+        assert noise > 1.3
+
+
+def test_the_density_of_a_proposal_would_be_seen():
+    """Backward paths need f; with q of a guided filter in its place they are wrong, and this test can tell."""
+    wrong = []
+    for seed in range(60):
+        record = keep(FILTERS["guided"], YS, seed)
+        wrong.append(
+            moments(backward_paths(np.random.default_rng(seed), record, GuidedTransition(AR1, optimal), 100))
+        )
+    assert not agrees(wrong, N)
+
+
+def exact_chain(symbols):
+    """(T, 3) marginals and (T - 1, 3, 3) pairs given all symbols, over all paths."""
+    paths = np.array(list(product(range(3), repeat=len(symbols))))
+    p = START[paths[:, 0]] * EMIT[paths[:, 0], symbols[0]]
+    for t in range(1, len(symbols)):
+        p = p * MOVES[paths[:, t - 1], paths[:, t]]
+        if symbols[t] is not None:
+            p = p * EMIT[paths[:, t], symbols[t]]
+    p /= p.sum()
+    single = np.array([np.bincount(paths[:, t], p, 3) for t in range(len(symbols))])
+    pairs = [np.bincount(3 * paths[:, t] + paths[:, t + 1], p, 9) for t in range(len(symbols) - 1)]
+    return single, np.array(pairs).reshape(-1, 3, 3)
+
+
+@pytest.mark.parametrize("kind", ["vector", "mapping", "objects"])
+def test_a_hidden_chain_of_any_kind_of_particle(kind):
+    symbols, n = [*SYMBOLS[:3], None, *SYMBOLS[4:6]], 150
+    single, pairs = exact_chain(symbols)
+    model = hmm(kind)
+    found: dict[str, list] = {"backward": [], "genealogy": []}
+    for seed in range(60):
+        record = keep(bootstrap(model, n), symbols, seed)
+        rng = np.random.default_rng(seed)
+        for name, paths in (
+            ("backward", backward_paths(rng, record, Dynamics(model), 40)),
+            ("genealogy", genealogy(record)),
+        ):
+            w, k = paths[0].weights, np.array([states_of(p.particles) for p in paths])
+            marginals = [np.bincount(row, w, 3) for row in k]
+            both = [np.bincount(3 * a + b, w, 9) for a, b in pairwise(k)]
+            found[name].append(np.concatenate([np.ravel(marginals), np.ravel(both)]))
+    wanted = np.concatenate([single.ravel(), pairs.ravel()])
+    for values in found.values():
+        error = np.std(values, axis=0, ddof=1) / np.sqrt(len(values))
+        assert (np.abs(np.mean(values, axis=0) - wanted) <= 5 * error + 2 / n).all()
+
+
+def test_fixed_lag_lies_between_the_filter_and_the_genealogy():
+    record = keep(bootstrap(AR1, 200, trigger=Always()), YS, 3)
+    for population, own in zip(fixed_lag(record, 0), record.populations, strict=True):
+        np.testing.assert_array_equal(population.particles, own.particles)
+        np.testing.assert_array_equal(population.log_weights, own.log_weights)
+    for a, b in zip(fixed_lag(record, T), genealogy(record), strict=True):
+        np.testing.assert_array_equal(a.particles, b.particles)
+    distinct = [len(set(s[0].particles.tolist())) for s in (fixed_lag(record, 2), genealogy(record))]
+    assert distinct[0] > 1.3 * distinct[1]
+    # A lag of three forgets little here: close to the exact smoothed means.
+    means = np.array(
+        [[p.weights @ p.particles for p in fixed_lag(keep(bootstrap(AR1, 200), YS, s), 3)] for s in range(40)]
+    )
+    assert np.abs(means.mean(axis=0) - smoothed()[0]).max() < 0.05
+    filtered = kalman_ar1(YS)[0][:, 0]
+    assert np.abs(filtered - smoothed()[0]).max() > 0.1
+
+
+def test_paths_are_paths():
+    """Each row of the genealogy leads from parent to child."""
+    record = keep(bootstrap(AR1, 50), YS, 1)
+    paths = genealogy(record)
+    for k in range(50):
+        i = k
+        for t in range(T - 1, 0, -1):
+            assert paths[t].particles[k] == record.populations[t].particles[i]
+            i = record.parents(t)[i]
+        assert paths[0].particles[k] == record.populations[0].particles[i]
+
+
+def test_a_large_run_is_done_in_blocks(monkeypatch):
+    record = keep(bootstrap(AR1, 40), YS, 1)
+    whole = backward_paths(np.random.default_rng(0), record, Dynamics(AR1), 30)
+    monkeypatch.setattr("mstfilter.smc.smoothing._PAIRS", 100)
+    parts = backward_paths(np.random.default_rng(0), record, Dynamics(AR1), 30)
+    for a, b in zip(whole, parts, strict=True):
+        np.testing.assert_array_equal(a.particles, b.particles)
+
+
+@dataclass(frozen=True)
+class Listening(Dynamics):
+    """Notes what it is told to have been observed."""
+
+    heard: list = field(default_factory=list)
+
+    def log_prob(self, previous, new, observation):
+        self.heard.append(observation)
+        return super().log_prob(previous, new, observation)
+
+
+def test_the_density_is_asked_with_the_observation_of_its_move():
+    listening = Listening(AR1)
+    backward_paths(np.random.default_rng(0), keep(bootstrap(AR1, 20), YS, 1), listening, 5)
+    assert listening.heard == YS[:0:-1]
+
+
+@dataclass(frozen=True)
+class Fresh(Proposal):
+    def sample(self, rng, observation, n):
+        return Population(rng.standard_normal(n))
+
+
+def test_what_cannot_be_smoothed():
+    record = keep(bootstrap(AR1, 20), YS, 1)
+    rng = np.random.default_rng(0)
+    mixed = keep(replace(bootstrap(AR1, 20), proposal=Fresh()), YS[:3], 1)
+    with pytest.raises(InputError, match="step 2: not every particle says what it came from"):
+        genealogy(mixed)
+    with pytest.raises(InputError, match="transition is StateSpaceModel"):
+        backward_paths(rng, record, AR1, 5)
+    with pytest.raises(InputError, match="lag is -1"):
+        fixed_lag(record, -1)
+    with pytest.raises(InputError, match="no observations"):
+        keep(bootstrap(AR1, 20), [], 1)
+    for bad, message in (
+        (lambda old, new: np.full(len(old), -np.inf), "from step 6 to 7: no particle can have led"),
+        (lambda old, new: np.full(len(old), np.nan), "from step 6 to 7"),
+        (lambda old, new: np.zeros(3), r"log_prob returned shape \(3,\)"),
+    ):
+        with pytest.raises(InputError, match=message):
+            backward_paths(rng, record, Dynamics(replace(AR1, log_transition=bad)), 5)

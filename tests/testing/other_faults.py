@@ -1,0 +1,304 @@
+"""Planted faults of components other than resamplers, and the property that must name each."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from mstfilter.smc.interfaces import Codec, Lookahead, Proposal, Rejuvenation, Size, Transition, Trigger, Update
+from mstfilter.smc.population import Population
+from mstfilter.smc.similarity import Equivalence, Similarity
+from tests.smc.models import optimal
+
+
+@dataclass(frozen=True)
+class DropsParticles(Transition):
+    def predict(self, rng, population, observation):
+        return population.take(np.arange(len(population) // 2 + 1), None).labelled({})
+
+
+@dataclass(frozen=True)
+class NeedsObservation(Transition):
+    def predict(self, rng, population, observation):
+        return replace(population, particles=population.particles + float(observation))
+
+
+@dataclass(frozen=True)
+class MovesInPlace(Transition):
+    def predict(self, rng, population, observation):
+        population.particles.setflags(write=True) if population.particles.flags.owndata else None
+        particles = population.particles
+        particles += 1
+        return Population(particles, population.log_weights)
+
+
+@dataclass(frozen=True)
+class FirstIsSpecial(Transition):
+    def predict(self, rng, population, observation):
+        step = rng.standard_normal(len(population))
+        step[0] *= 4
+        return replace(population, particles=population.particles + step)
+
+
+@dataclass(frozen=True)
+class NormalisesWeights(Transition):
+    def predict(self, rng, population, observation):
+        return replace(population, log_weights=np.log(population.weights))
+
+
+@dataclass(frozen=True)
+class GlobalMove(Transition):
+    def predict(self, rng, population, observation):
+        return replace(population, particles=population.particles + np.random.randn())  # noqa: NPY002
+
+
+@dataclass(frozen=True)
+class OneTooFew(Proposal):
+    def sample(self, rng, observation, n):
+        return Population(rng.standard_normal(max(n - 1, 1)))
+
+
+@dataclass(frozen=True)
+class Remembers(Proposal):
+    calls: list = field(default_factory=list)
+
+    def sample(self, rng, observation, n):
+        self.calls.append(n)
+        return Population(rng.standard_normal(n) + len(self.calls))
+
+
+@dataclass(frozen=True)
+class NeedsPrediction(Update):
+    def update(self, rng, predicted, proposed, observation):
+        return predicted.reweighted(np.zeros(len(predicted)))
+
+
+@dataclass(frozen=True)
+class StrangeParents(Update):
+    def update(self, rng, predicted, proposed, observation):
+        population = predicted if predicted is not None else proposed
+        return replace(population, parents={"proposed": np.full(len(population), 99)})
+
+
+@dataclass(frozen=True)
+class AbsoluteWeight(Trigger):
+    def wants(self, population, t):
+        return population.log_weights.max() < 0
+
+
+@dataclass(frozen=True)
+class MaybeTrigger(Trigger):
+    def wants(self, population, t):
+        return population.ess
+
+
+@dataclass(frozen=True)
+class HalfSize(Size):
+    def choose(self, population):
+        return len(population) // 2
+
+
+@dataclass(frozen=True)
+class Distance(Similarity):
+    def matrix(self, particles):
+        return np.abs(particles[:, None] - particles[None, :])
+
+
+@dataclass(frozen=True)
+class RelativeSimilarity(Similarity):
+    def matrix(self, particles):
+        d = np.abs(particles[:, None] - particles[None, :])
+        return 1 - d / max(d.max(), 1e-12)
+
+
+@dataclass(frozen=True)
+class OneSided(Similarity):
+    def matrix(self, particles):
+        return np.tril(np.ones((len(particles), len(particles))))
+
+
+@dataclass(frozen=True)
+class CountsFromOne(Equivalence):
+    def classes(self, particles):
+        return np.arange(1, len(particles) + 1)
+
+
+@dataclass(frozen=True)
+class AllDifferent(Equivalence):
+    def classes(self, particles):
+        return np.arange(len(particles))
+
+
+@dataclass(frozen=True)
+class LooksAtWeights(Lookahead):
+    def log_priority(self, population, observation):
+        return population.log_weights + population.particles
+
+
+@dataclass(frozen=True)
+class RulesOut(Lookahead):
+    def log_priority(self, population, observation):
+        return np.where(population.particles > 1, -np.inf, 0.0)
+
+
+@dataclass(frozen=True)
+class OneForAll(Lookahead):
+    def log_priority(self, population, observation):
+        return np.zeros(1)
+
+
+@dataclass(frozen=True)
+class ByPlace(Lookahead):
+    def log_priority(self, population, observation):
+        return 0.1 * np.arange(len(population))
+
+
+@dataclass(frozen=True)
+class Counts(Lookahead):
+    calls: list = field(default_factory=list)
+
+    def log_priority(self, population, observation):
+        self.calls.append(1)
+        return population.particles * len(self.calls)
+
+
+@dataclass(frozen=True)
+class PriorityInPlace(Lookahead):
+    def log_priority(self, population, observation):
+        particles = population.particles.base if population.particles.base is not None else population.particles
+        particles *= 2
+        return particles
+
+
+@dataclass(frozen=True)
+class MovesAll(Rejuvenation):
+    """Accepts every step: no Metropolis."""
+
+    def move(self, rng, population, previous, observation):
+        return replace(population, particles=population.particles + 0.5 * rng.standard_normal(len(population)))
+
+
+@dataclass(frozen=True)
+class ForgetsTheParent(Rejuvenation):
+    """Draws from p(x_t | y_t) for x_{t-1} as exact_ar1 draws it: right alone, wrong beside its parent."""
+
+    def move(self, rng, population, previous, observation):
+        if previous is None or observation is None:
+            return population
+        parents = rng.normal(0.2, 1.0, len(population))
+        return replace(population, particles=optimal(parents, observation).sample(rng, len(population)))
+
+
+@dataclass(frozen=True)
+class WeighsMoves(Rejuvenation):
+    def move(self, rng, population, previous, observation):
+        return population.reweighted(rng.standard_normal(len(population)))
+
+
+@dataclass(frozen=True)
+class NeedsAPast(Rejuvenation):
+    def move(self, rng, population, previous, observation):
+        return replace(population, particles=population.particles + 0 * previous.particles)
+
+
+@dataclass(frozen=True)
+class LosesOne(Rejuvenation):
+    def move(self, rng, population, previous, observation):
+        return population.take(np.arange(max(1, len(population) - 1)))
+
+
+@dataclass(frozen=True)
+class GlobalRejuvenation(Rejuvenation):
+    def move(self, rng, population, previous, observation):
+        return replace(population, particles=population.particles + np.random.randn())  # noqa: NPY002
+
+
+@dataclass(frozen=True)
+class SinglePrecision(Codec):
+    def encode(self, particles):
+        return {"x": particles.astype(np.float32)}
+
+    def decode(self, arrays):
+        return arrays["x"].astype(np.float64)
+
+
+@dataclass(frozen=True)
+class Pickles(Codec):
+    def encode(self, particles):
+        return {"x": np.array(list(particles), dtype=object)}
+
+    def decode(self, arrays):
+        return arrays["x"]
+
+
+@dataclass(frozen=True)
+class Keeps(Codec):
+    """Decodes what it has kept: a new process has nothing."""
+
+    kept: list = field(default_factory=list)
+
+    def encode(self, particles):
+        self.kept.append(particles)
+        return {"x": np.zeros(1)}
+
+    def decode(self, arrays):
+        return self.kept[-1]
+
+
+@dataclass(frozen=True)
+class Sorts(Codec):
+    def encode(self, particles):
+        return {"x": np.sort(particles)}
+
+    def decode(self, arrays):
+        return arrays["x"]
+
+
+@dataclass(frozen=True)
+class Lists(Codec):
+    def encode(self, particles):
+        return {"x": particles.tolist()}
+
+    def decode(self, arrays):
+        return arrays["x"]
+
+
+#: Fault, property that must be broken, words of its message.
+FAULTS = [
+    (LooksAtWeights, "priority_ignores_scale_and_order", "changes the priorities"),
+    (RulesOut, "priorities_are_finite", "-inf"),
+    (OneForAll, "priorities_are_finite", "shape (1,)"),
+    (ByPlace, "priority_ignores_scale_and_order", "in another order"),
+    (Counts, "lookahead_has_no_memory", "asked again"),
+    (PriorityInPlace, "lookahead_leaves_input_alone", "in place"),
+    (MovesAll, "move_keeps_the_law", "exact draws are no longer exact"),
+    (ForgetsTheParent, "move_keeps_the_law", "x_t - x_{t-1}"),
+    (WeighsMoves, "move_keeps_number_and_weights", "log weights are others"),
+    (NeedsAPast, "move_keeps_number_and_weights", "no previous ones"),
+    (LosesOne, "move_keeps_number_and_weights", "2 particles became 1"),
+    (GlobalRejuvenation, "leaves_global_generators_alone", "global generator"),
+    (SinglePrecision, "particles_come_back", "not the same"),
+    (Pickles, "encodes_as_arrays", "Python objects"),
+    (Keeps, "particles_come_back", "not the same"),
+    (Sorts, "particles_come_back", "not the same"),
+    (Lists, "encodes_as_arrays", "gives a list"),
+    (DropsParticles, "says_where_particles_come_from", 'parents "previous"'),
+    (NeedsObservation, "takes_a_missing_observation", "observation None"),
+    (MovesInPlace, "leaves_input_alone", "in place"),
+    (FirstIsSpecial, "order_of_particles_is_irrelevant", "moves differently"),
+    (NormalisesWeights, "scale_of_weights_is_irrelevant", "log weights + 50"),
+    (GlobalMove, "leaves_global_generators_alone", "global generator"),
+    (OneTooFew, "gives_n_particles", "asked for 2 particles it returns 1"),
+    (Remembers, "has_no_memory", "keeps something"),
+    (NeedsPrediction, "takes_any_of_its_inputs", "proposed particles"),
+    (StrangeParents, "parents_exist", "99"),
+    (AbsoluteWeight, "trigger_ignores_scale_and_order", "adding"),
+    (MaybeTrigger, "answers_yes_or_no", "True or False"),
+    (HalfSize, "answers_a_number", "at least 1"),
+    (Distance, "similarities_are_shares", "to itself"),
+    (RelativeSimilarity, "similarity_of_pairs", "four of nine"),
+    (OneSided, "similarity_is_symmetric", "like"),
+    (CountsFromOne, "classes_are_numbered", "classes are"),
+    (AllDifferent, "copies_are_equal", "copy"),
+]
