@@ -65,7 +65,7 @@ class _Entry(BaseModel):
 
 
 class SceneEntry(_Entry):
-    """Scenes: a family with seeds, or folders of recordings.
+    """Scenes: a family with seeds, or recordings of any format that `mstfilter run` reads.
 
     Parameters
     ----------
@@ -76,7 +76,9 @@ class SceneEntry(_Entry):
     set : table
         Fields of the family.
     recordings : list of str
-        Folders; a ``*`` stands for any text.
+        Files or folders; a ``*`` stands for any text.
+    format, options, pauses
+        How they are read, as for `mstfilter run`; by default they say it themselves.
     group : str
         What the tables call the family. Default: the family's name, ``recordings`` for folders.
     """
@@ -85,6 +87,9 @@ class SceneEntry(_Entry):
     seeds: Seeds = ()
     set: dict[str, Any] = Field(default_factory=dict)
     recordings: Texts = ()
+    format: str = ""
+    options: Texts = ()
+    pauses: str = ""
     group: str = ""
 
     @model_validator(mode="after")

@@ -16,7 +16,7 @@ import shutil
 import time
 import traceback
 import uuid
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +27,7 @@ from mstfilter.study.memory import peak_megabytes, reset_peak
 from mstfilter.study.results import RESULT, read_result
 from mstfilter.study.run_folder import RunFolder, write_json
 from mstfilter.study.shared_work import shared_work
+from mstfilter.study.sources import open_source
 
 __all__ = ["failed", "open_scene", "perform"]
 
@@ -62,10 +63,10 @@ def failed(error: Exception) -> Outcome:
     return Outcome("failed", f"{type(error).__name__}: {error}", ("a fault of the program or of a component",), trace)
 
 
-def open_scene(source: dict[str, Any], recordings: str) -> Recording:
+def open_scene(source: Mapping[str, Any], recordings: str) -> Recording:
     """The recording of a scene; a simulated one is made if it is missing."""
-    if "folder" in source:
-        return Recording.open(source["folder"])
+    if "path" in source:
+        return open_source(Path(source["path"]), source["format"], source["options"], source["pauses"])
     from mstfilter.simulation.cache import cached_recording
 
     return Recording.open(cached_recording(source["family"], source["seed"], Path(recordings), **source["set"]))

@@ -22,11 +22,11 @@ from typing import Any
 
 from mstfilter.errors import InputError
 from mstfilter.presets import build_filter, describe_filter, load_config
-from mstfilter.scene.recording import Recording
 from mstfilter.study.code_version import code_version
 from mstfilter.study.config import ArmEntry, SceneEntry, StudyConfig
 from mstfilter.study.run import files_of, versions
 from mstfilter.study.run_folder import plain
+from mstfilter.study.sources import open_source
 
 __all__ = ["Arm", "Plan", "Run", "Scene", "make_plan", "split_grid"]
 
@@ -65,7 +65,7 @@ class Scene:
     group : str
         Its family in the tables.
     source : dict
-        ``{"family", "seed", "set"}`` of a simulated one, ``{"folder"}`` of any other.
+        ``{"family", "seed", "set"}`` of a simulated one, path and how it is read of any other.
     key : str
         Names recipe or content.
     """
@@ -133,7 +133,7 @@ def make_plan(study: StudyConfig, overrides: Sequence[str] = (), *, allow_files:
         if not found:
             raise InputError(f"study {study.name} has no {what}, so there is nothing to run")
     _all_different("arms", [(arm.name, arm.key) for arm in arms])
-    scenes = tuple(scene for entry in study.scenes for scene in _scenes(entry, study.folder))
+    scenes = tuple(scene for entry in study.scenes for scene in _scenes(entry, study.folder, allow_files))
     _all_different("scenes", [(scene.name, scene.key) for scene in scenes])
     if len(set(study.seeds)) < len(study.seeds):
         raise InputError(f"study {study.name} names a seed twice: {list(study.seeds)}")
@@ -207,7 +207,7 @@ def _stem(preset: str) -> str:
     return Path(preset).stem if preset.endswith(".toml") else preset
 
 
-def _scenes(entry: SceneEntry, folder: Path) -> Iterator[Scene]:
+def _scenes(entry: SceneEntry, folder: Path, allow_files: bool) -> Iterator[Scene]:
     if entry.family:
         from dataclasses import replace
 
@@ -229,9 +229,10 @@ def _scenes(entry: SceneEntry, folder: Path) -> Iterator[Scene]:
         if not paths:
             raise InputError(f"recording does not exist: {folder / pattern}")
         for path in paths:
-            recording = Recording.open(path)
-            name = Path(path).name
-            yield Scene(name, entry.group or "recordings", {"folder": str(Path(path).resolve())}, recording.key.hex())
+            source = {"path": str(Path(path).resolve()), "format": entry.format, "pauses": entry.pauses}
+            source |= {"options": list(entry.options)}
+            recording = open_source(Path(path), entry.format, entry.options, entry.pauses, allow_files=allow_files)
+            yield Scene(Path(path).name, entry.group or "recordings", source, recording.key.hex())
 
 
 def _all_different(what: str, named: list[tuple[str, str]]) -> None:

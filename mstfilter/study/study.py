@@ -17,13 +17,13 @@ from pathlib import Path
 from typing import Any
 
 from mstfilter.errors import InputError
-from mstfilter.study.code_version import code_version
 from mstfilter.study.config import StudyConfig
-from mstfilter.study.executors import Event, Executor, Job, Outcome
+from mstfilter.study.executors import Event, Executor, Outcome
 from mstfilter.study.local import Local
 from mstfilter.study.plan import Plan, Run, make_plan
-from mstfilter.study.results import FORMAT, StudyFolder, read_result
+from mstfilter.study.results import FORMAT, StudyFolder
 from mstfilter.study.run_folder import write_json
+from mstfilter.study.todo import ToDo
 
 __all__ = ["Progress", "StudyResult", "run_study"]
 
@@ -111,10 +111,11 @@ def run_study(
     cache = cache or cache_folder()
     with _held(path) as folder:
         executor = executor or Local(tries=study.tries, timeout_s=study.timeout_s, logs=path / "logs")
+        todo = ToDo(plan, folder, allow_files, cache)
+        todo.check_space()
         write_json(path / "study.json", _described(plan))
-        jobs = _Jobs(plan, folder, allow_files, cache)
-        failed = _recordings(jobs, executor, progress)
-        waiting, before = jobs.runs()
+        failed = _recordings(todo, executor, progress)
+        waiting, before = todo.runs()
         lost = {run.name: failed[run.scene.key] for run in plan.runs if run.scene.key in failed}
         for run in plan.runs:
             if run.name in lost and run.folder not in before:
@@ -206,90 +207,9 @@ def _note(folder: StudyFolder, run: Run, outcome: Outcome) -> None:
         folder.fail({"folder": run.folder, "identity": run.identity}, outcome)
 
 
-@dataclass(frozen=True)
-class _Jobs:
-    """The jobs of a plan."""
-
-    plan: Plan
-    folder: StudyFolder
-    allow_files: bool
-    cache: Path
-
-    @property
-    def recordings(self) -> str:
-        """Where simulated recordings are kept."""
-        return str((self.cache / "recordings").absolute())
-
-    def runs(self) -> tuple[list[tuple[Run, Job]], set[str]]:
-        """Runs to do with their jobs, and the folders of those that are done."""
-        metrics = code_version(["mstfilter.study.metrics"])
-        waiting, done = [], set()
-        for run in self.plan.runs:
-            kind = self._needed(run, metrics)
-            if kind is None:
-                done.add(run.folder)
-            else:
-                waiting.append((run, self._job(run, kind, metrics)))
-        return waiting, done
-
-    def _needed(self, run: Run, metrics: str) -> str | None:
-        path = self.folder.run(run.folder)
-        if not self.folder.is_done(run.folder, run.identity):
-            return "run"
-        if read_result(path).get("metrics") == metrics:
-            return None
-        return "measure" if (path / "pauses").is_dir() else "run"
-
-    def _job(self, run: Run, kind: str, metrics: str) -> Job:
-        return {
-            "kind": kind,
-            "name": run.name,
-            "share": run.scene.key,
-            "folder": str(self.folder.run(run.folder).absolute()),
-            "identity": run.identity,
-            "metrics": metrics,
-            "config": {**run.arm.config, "description": run.arm.name},
-            "source": run.scene.source,
-            "seed": run.seed,
-            "keep": self.plan.config.keep,
-            "allow_files": self.allow_files,
-            "recordings": self.recordings,
-            "work": self._work(run),
-        }
-
-    def _work(self, run: Run) -> dict[str, Any] | None:
-        """The folder of shared work; none for an arm with installed components of others, whose version we do not
-        know."""
-        gb = self.plan.config.cache_gb
-        return {"folder": str((self.cache / "work").absolute()), "gb": gb} if gb and run.arm.ours else None
-
-    def records(self) -> tuple[list[str], list[Job]]:
-        """Keys and jobs of simulated recordings that are needed and missing."""
-        waiting, _ = self.runs()
-        scenes = {run.scene.key: run.scene for run, _ in waiting if "family" in run.scene.source}
-        missing = [s for s in scenes.values() if not _is_made(s.source, self.recordings)]
-        jobs: list[Job] = [
-            {"kind": "record", "name": s.name, "share": s.key, "source": s.source, "recordings": self.recordings}
-            for s in missing
-        ]
-        return [s.key for s in missing], jobs
-
-
-def _is_made(source: dict[str, Any], recordings: str) -> bool:
-    from dataclasses import replace
-
-    from mstfilter.simulation.cache import recipe_key
-    from mstfilter.simulation.families import scene_family
-
-    family = replace(scene_family(source["family"]), **source["set"])
-    return (
-        Path(recordings) / f"{family.name}-{source['seed']}-{recipe_key(family, source['seed'])}" / "manifest.json"
-    ).is_file()
-
-
-def _recordings(jobs: _Jobs, executor: Executor, progress: Callable[[Progress], None]) -> dict[str, Outcome]:
+def _recordings(todo: ToDo, executor: Executor, progress: Callable[[Progress], None]) -> dict[str, Outcome]:
     """Make what is missing; why it could not be made, by the scene's key."""
-    keys, records = jobs.records()
+    keys, records = todo.records()
     if not records:
         return {}
     counted = _Counted(progress, "recordings", [job["name"] for job in records], 0, len(records), 0)

@@ -1,0 +1,125 @@
+"""What of a plan is left to do, as jobs that a worker can do knowing nothing else.
+
+>>> todo = ToDo(plan, folder, allow_files=True, cache=Path("cache"))
+>>> todo.check_space()
+>>> waiting, done = todo.runs()
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from mstfilter.study.code_version import code_version
+from mstfilter.study.executors import Job
+from mstfilter.study.plan import Plan, Run
+from mstfilter.study.results import StudyFolder, read_result
+from mstfilter.study.space import check_space, recording_bytes, run_bytes
+
+__all__ = ["ToDo"]
+
+_WORK_A_SCENE = 5e7  # bytes that are shared on disk, about
+
+
+@dataclass(frozen=True)
+class ToDo:
+    """The jobs of a plan.
+
+    Parameters
+    ----------
+    plan : Plan
+    folder : StudyFolder
+    allow_files : bool
+        Whether components may come from ``./file.py:Class``.
+    cache : Path
+        Holds ``recordings`` and ``work``.
+    """
+
+    plan: Plan
+    folder: StudyFolder
+    allow_files: bool
+    cache: Path
+
+    @property
+    def recordings(self) -> str:
+        """Where simulated recordings are kept."""
+        return str((self.cache / "recordings").absolute())
+
+    def runs(self) -> tuple[list[tuple[Run, Job]], set[str]]:
+        """Runs to do with their jobs, and the folders of those that are done."""
+        metrics = code_version(["mstfilter.study.metrics"])
+        waiting, done = [], set()
+        for run in self.plan.runs:
+            kind = self._needed(run, metrics)
+            if kind is None:
+                done.add(run.folder)
+            else:
+                waiting.append((run, self._job(run, kind, metrics)))
+        return waiting, done
+
+    def _needed(self, run: Run, metrics: str) -> str | None:
+        path = self.folder.run(run.folder)
+        if not self.folder.is_done(run.folder, run.identity):
+            return "run"
+        if read_result(path).get("metrics") == metrics:
+            return None
+        return "measure" if (path / "pauses").is_dir() else "run"
+
+    def _job(self, run: Run, kind: str, metrics: str) -> Job:
+        return {
+            "kind": kind,
+            "name": run.name,
+            "share": run.scene.key,
+            "folder": str(self.folder.run(run.folder).absolute()),
+            "identity": run.identity,
+            "metrics": metrics,
+            "config": {**run.arm.config, "description": run.arm.name},
+            "source": run.scene.source,
+            "seed": run.seed,
+            "keep": self.plan.config.keep,
+            "allow_files": self.allow_files,
+            "recordings": self.recordings,
+            "work": self._work(run),
+        }
+
+    def _work(self, run: Run) -> dict[str, Any] | None:
+        """The folder of shared work; none for an arm with installed components of others, whose version we do not
+        know."""
+        gb = self.plan.config.cache_gb
+        return {"folder": str((self.cache / "work").absolute()), "gb": gb} if gb and run.arm.ours else None
+
+    def check_space(self) -> None:
+        """Raise InputError if what is left to do will not fit on the disk."""
+        waiting = [run for run, job in self.runs()[0] if job["kind"] == "run"]
+        keep = self.plan.config.keep
+        runs = sum(run_bytes(run.scene.source, int(run.arm.config["n"]), keep) for run in waiting)
+        check_space(runs, self.folder.path, "the study")
+        records = sum(recording_bytes(job["source"]) for job in self.records()[1])
+        work = self.plan.config.cache_gb * 1e9 if waiting else 0.0
+        check_space(
+            records + min(work, 0.05e9 * len(self.plan.scenes)), self.cache, "the cache of recordings and work"
+        )
+
+    def records(self) -> tuple[list[str], list[Job]]:
+        """Keys and jobs of simulated recordings that are needed and missing."""
+        waiting, _ = self.runs()
+        scenes = {run.scene.key: run.scene for run, _ in waiting if "family" in run.scene.source}
+        missing = [s for s in scenes.values() if not _is_made(s.source, self.recordings)]
+        jobs: list[Job] = [
+            {"kind": "record", "name": s.name, "share": s.key, "source": s.source, "recordings": self.recordings}
+            for s in missing
+        ]
+        return [s.key for s in missing], jobs
+
+
+def _is_made(source: dict[str, Any], recordings: str) -> bool:
+    from dataclasses import replace
+
+    from mstfilter.simulation.cache import recipe_key
+    from mstfilter.simulation.families import scene_family
+
+    family = replace(scene_family(source["family"]), **source["set"])
+    return (
+        Path(recordings) / f"{family.name}-{source['seed']}-{recipe_key(family, source['seed'])}" / "manifest.json"
+    ).is_file()
