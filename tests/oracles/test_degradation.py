@@ -1,0 +1,97 @@
+"""Masks of a set quality: the quality is met, by the means that were asked for."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mstfilter.errors import InputError
+from mstfilter.oracles.degradation import degrade
+from mstfilter.oracles.masks import TrueMasks
+from mstfilter.oracles.truth import bind_truth
+from mstfilter.scene.quality import overlap, weighted_coverage
+from tests.baselines.scenes import slide
+
+
+def picture(rng, n=6):
+    """Boxes side by side, some touching, at 160 x 120."""
+    image = np.zeros((120, 160), np.int32)
+    for k in range(1, n + 1):
+        row, column = 20 + 40 * ((k - 1) // 3), 15 + 42 * ((k - 1) % 3)
+        height, width = rng.integers(14, 38), rng.integers(20, 42)
+        image[row : row + height, column : column + width] = k
+    return image
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    seed=st.integers(0, 10**6),
+    quality=st.sampled_from([0.5, 0.6, 0.7, 0.8, 0.9, 0.95]),
+    shares=st.sampled_from([(0.35, 0.35), (1.0, 0.0), (0.0, 0.0), (0.5, 0.5), (0.0, 1.0)]),
+)
+def test_the_set_quality_is_met(seed, quality, shares):
+    rng = np.random.default_rng(seed)
+    true = picture(rng)
+    worse = degrade(rng, true, quality, *shares, tolerance=0.01)
+    reached = weighted_coverage(worse, true)
+    assert abs(reached - quality) <= 0.011, reached
+    assert worse.shape == true.shape
+    assert not worse[true == 0].any()
+
+
+def test_each_means_does_what_it_says():
+    rng = np.random.default_rng(1)
+    true = picture(rng)
+    table = overlap(degrade(rng, true, 0.8, 1.0, 0.0), true)
+    inner = table.counts[table.labels_a > 0][:, table.labels_b > 0]
+    assert len(inner) > 6 and ((inner > 0).sum(axis=1) == 1).all()  # splits alone: no object holds two
+    assert inner.sum() == (true > 0).sum()
+    merged = degrade(rng, true, 0.7, 0.0, 1.0)
+    assert len(np.unique(merged[merged > 0])) < 6
+    moved = degrade(rng, true, 0.8, 0.0, 0.0)
+    assert len(np.unique(moved[moved > 0])) == 6
+    assert (moved > 0).sum() < (true > 0).sum()
+
+
+def test_perfect_masks_and_empty_images_come_back_unchanged():
+    true = picture(np.random.default_rng(0))
+    assert (degrade(np.random.default_rng(0), true, 1.0) == true).all()
+    assert not degrade(np.random.default_rng(0), true * 0, 0.5).any()
+
+
+def test_the_same_stream_makes_the_same_masks():
+    true = picture(np.random.default_rng(0))
+    a, b, c = (degrade(np.random.default_rng(s), true, 0.7) for s in (1, 1, 2))
+    assert (a == b).all() and (a != c).any()
+
+
+def test_samples_are_wrong_each_in_its_own_way_and_calibrated(tmp_path):
+    recording = slide(tmp_path / "r")
+    clip = recording.clips()[0]
+    found = {}
+    for quality in (0.9, 0.6):
+        proposal = bind_truth(TrueMasks(quality=quality), recording)
+        population = proposal.sample(np.random.default_rng(0), clip, 4)
+        assert len({h.key for h in population.particles}) > 1
+        np.testing.assert_allclose(population.notes["mask_quality"], quality, atol=0.011)
+        true = recording.truth(0)
+        found[quality] = np.mean([weighted_coverage(h.labels, true) for h in population.particles])
+        # A sample does not depend on how many are drawn.
+        fewer = proposal.sample(np.random.default_rng(0), clip, 2)
+        assert [h.key for h in fewer.particles] == [h.key for h in population.particles[:2]]
+    assert found[0.9] > found[0.6] + 0.1
+
+
+@pytest.mark.parametrize(
+    "fields, says",
+    [
+        ({"quality": 1.2}, "quality of masks is 1.2"),
+        ({"over": 0.7, "under": 0.5}, "shares"),
+        ({"tolerance": 0}, "> 0"),
+    ],
+)
+def test_useless_fields_are_one_clear_error(fields, says):
+    with pytest.raises(InputError, match=says):
+        TrueMasks(**fields)

@@ -1,0 +1,359 @@
+"""Stages replaced by the truth: binding, what each gives, and what it leaves alone."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mstfilter.errors import InputError
+from mstfilter.fusion.update import FusionUpdate
+from mstfilter.oracles.choice import TrueBest, TrueFreeSpace, TrueFusion, TrueQuality, best_of_both
+from mstfilter.oracles.completion import TrueCompletion
+from mstfilter.oracles.masks import TrueBoundary, TrueMasks
+from mstfilter.oracles.motion import TrueMotions
+from mstfilter.oracles.truth import Truth, UsesTruth, bind_truth, uses_truth
+from mstfilter.presets import build_filter, describe_filter, load_config
+from mstfilter.scene.quality import weighted_coverage
+from mstfilter.scene.voxels import Hypothesis
+from mstfilter.smc.population import Population
+from mstfilter.smc.streams import Key
+from mstfilter.study.run import execute
+from tests.baselines.scenes import slide
+
+ALL = (
+    'proposal={component="true_masks", completer="true_completion"}',
+    "transition=true_motions",
+    'update={component="true_fusion", free_space="true_free_space"}',
+    "resampler=true_best",
+)
+RNG = np.random.default_rng(0)
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory):
+    return slide(tmp_path_factory.mktemp("oracles") / "slide")
+
+
+def bound(component, recording):
+    return bind_truth(component, recording)
+
+
+# Binding
+
+
+def test_every_part_is_found_and_bound_and_nothing_else_changes(recording):
+    filter = build_filter(load_config("mst", [*ALL[:2], 'update.evidence=["true_quality"]', ALL[3]]))
+    assert uses_truth(filter) == ["TrueMotions", "TrueMasks", "TrueCompletion", "TrueQuality", "TrueBest"]
+    ready = bind_truth(filter, recording)
+    assert ready == filter
+    assert describe_filter(ready) == describe_filter(filter)
+    for part in (
+        ready.transition,
+        ready.proposal,
+        ready.proposal.completer,
+        ready.update.evidence[0],
+        ready.resampler,
+    ):
+        assert part.truth.recording is recording
+    with pytest.raises(InputError, match="was not told which"):
+        filter.resampler.truth  # noqa: B018 (the unbound one stays unbound)
+    plain = build_filter(load_config("mst"))
+    assert bind_truth(plain, recording) is plain
+
+
+@pytest.mark.parametrize(
+    "lacking, override, says",
+    [
+        ("read_poses", "transition=true_motions", "TrueMotions uses the truth, and .* has no true poses at pause 0"),
+        ("read_instance", "proposal=true_masks", "TrueMasks uses the truth, and .* has no instance image at pause 0"),
+        ("read_truth", "resampler=true_best", "TrueBest uses the truth, and .* has no true voxels at pause 0"),
+        ("read_truth", "update.free_space=true_free_space", "TrueFreeSpace uses the truth"),
+    ],
+)
+def test_a_recording_without_truth_is_one_clear_error_before_anything_is_written(
+    recording, tmp_path, lacking, override, says
+):
+    blind = replace(recording, **{lacking: lambda index: None})
+    with pytest.raises(InputError, match=says):
+        execute(blind, load_config("mst", [override]), tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+def test_the_truth_of_one_recording_says_nothing_of_another(recording, tmp_path):
+    other = slide(tmp_path / "other", (5, 6, 7))
+    with pytest.raises(InputError, match="is none of the 3 pauses"):
+        bound(TrueBoundary(), recording).boundary(other.frames[0])
+
+
+def test_a_run_by_the_truth_goes_on_after_a_stop(recording, tmp_path):
+    config = load_config("mst", ALL)
+    execute(recording, config, tmp_path / "a", seed=1)
+
+    def stop(progress):
+        if progress.done == 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        execute(recording, config, tmp_path / "b", seed=1, progress=stop)
+    execute(recording, config, tmp_path / "b", seed=1)
+    for t in range(3):
+        name = f"pauses/{t:03d}/hypotheses.npz"
+        assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
+
+
+# Streams
+
+
+class _Watch:
+    def enter(self, slot):
+        pass
+
+    def leave(self, population=None):
+        pass
+
+
+def samples_of(recording, *overrides):
+    """Keys of what the proposal draws at each pause of a run."""
+    config = load_config("mst", ["proposal.sampler.temperature=8", "update.eta=1", *overrides])
+    filter, drawn = bind_truth(build_filter(config), recording), []
+    state = filter.start(2)
+    for clip in recording.clips():
+        proposed = filter._propose(None, clip, state.key.child("step", state.t), _Watch())
+        drawn.append([h.key for h in proposed.particles])
+        state, _ = filter.step(state, clip)
+    return drawn
+
+
+@pytest.fixture(scope="module")
+def plain_samples(recording):
+    return samples_of(recording)
+
+
+@pytest.mark.parametrize("override", ["transition=true_motions", "resampler=true_best"])
+def test_an_oracle_leaves_the_streams_of_other_stages_alone(recording, plain_samples, override):
+    """The samples of every pause are those of the filter without it."""
+    assert samples_of(recording, override) == plain_samples
+
+
+@pytest.mark.parametrize("make", [TrueMasks, TrueMotions, TrueFusion, TrueBest, lambda: TrueMasks(quality=0.8)])
+def test_no_oracle_uses_up_its_generator(recording, make):
+    """Whatever they draw comes from children, so the stream they are given stands where it stood."""
+    component, clip = bound(make(), recording), recording.clips()[1]
+    rng = Key(0).child("step", 1, "x").generator()
+    before = rng.bit_generator.state
+    truth = Hypothesis.from_labels(recording.truth(0), recording.grid)
+    population = Population((truth, truth))
+    if isinstance(component, TrueMasks):
+        component.sample(rng, clip, 2)
+    elif isinstance(component, TrueMotions):
+        component.predict(rng, population, clip)
+    elif isinstance(component, TrueFusion):
+        component.update(rng, population, population, clip).realised()
+    else:
+        component.resample(rng, population, 2)
+    assert rng.bit_generator.state == before
+
+
+# All together
+
+
+def test_with_every_stage_true_visible_objects_are_exact(recording):
+    filter = bind_truth(build_filter(load_config("mst", ALL)), recording)
+    state = filter.start(0)
+    for clip in recording.clips():
+        state, _ = filter.step(state, clip)
+        for hypothesis in state.population.particles:
+            assert weighted_coverage(hypothesis.labels, recording.truth(clip.index)) >= 0.97
+
+
+def test_a_hidden_object_is_remembered_where_it_was_carried(tmp_path):
+    """Box 2 is not in the last images at all; what was known of it follows its true motion."""
+    made = slide(tmp_path / "r")
+    last = len(made.frames) - 1
+    blind = replace(
+        made, read_instance=lambda index: np.where(made.instance(index) == 2, 0, made.instance(index))
+        if index == last else made.instance(index)
+    )  # fmt: skip
+    filter = bind_truth(build_filter(load_config("mst", ALL)), blind)
+    state = filter.start(0)
+    for clip in blind.clips():
+        state, _ = filter.step(state, clip)
+    for hypothesis in state.population.particles:
+        best = max((hypothesis.mask(o.label) & (made.truth(2) == 2)).sum() for o in hypothesis.objects)
+        assert best / (made.truth(2) == 2).sum() > 0.88
+
+
+# Masks, boundary, completion
+
+
+def test_true_masks_are_the_instance_image_where_the_sensor_sees(recording):
+    proposal, clip = bound(TrueMasks(), recording), recording.clips()[0]
+    masks = proposal.masks(clip.after, clip)
+    instance = recording.instance(0)
+    assert set(np.unique(masks)) == {0, 1, 2}
+    assert (masks[masks > 0] == instance[masks > 0]).all()
+    assert (masks > 0).sum() > 0.8 * (instance > 0).sum()
+    population = proposal.sample(RNG, clip, 3)
+    assert len({h.key for h in population.particles}) == 1
+    assert population.particles[0].n_objects == 2
+    assert proposal.masks(clip.after, clip) is not None
+    few = bound(TrueMasks(min_pixels=1e9), recording)
+    assert few.sample(RNG, clip, 1).particles[0].n_objects == 0
+
+
+def test_the_robot_is_no_object(recording):
+    """255 in an instance image stands for the robot; it has no true voxels."""
+
+    def with_robot(index):
+        image = recording.instance(index).copy()
+        image[:20] = 255
+        return image
+
+    truth = Truth(replace(recording, read_instance=with_robot))
+    assert set(np.unique(truth.instance(0))) == {0, 1, 2}
+
+
+def test_a_true_boundary_lies_on_both_sides_of_every_border(recording):
+    boundary = bound(TrueBoundary(), recording).boundary(recording.frames[0])
+    image = recording.instance(0)
+    for a, b in ((np.s_[:, 1:], np.s_[:, :-1]), (np.s_[1:], np.s_[:-1])):
+        differ = image[a] != image[b]
+        assert (boundary[a][differ] == 1).all() and (boundary[b][differ] == 1).all()
+    assert set(np.unique(boundary)) == {0, 1}
+    assert (boundary > 0).mean() < 0.1
+
+
+def test_true_completion_gives_a_mask_what_it_shows(recording):
+    completer, frame, grid = bound(TrueCompletion(), recording), recording.frames[0], recording.grid
+    true, image = recording.truth(0), recording.instance(0)
+
+    def voxels(mask):
+        one = completer.complete(RNG, frame, [mask], grid)[0]
+        out = np.zeros(grid.shape, bool)
+        out[one.box] = one.probability >= 0.5
+        return out
+
+    whole = voxels(image == 1)
+    np.testing.assert_array_equal(whole, true == 1)  # the hidden side too
+    left = image == 1
+    left[:, : int(np.nonzero(left)[1].mean())] = False
+    parts = voxels(left), voxels((image == 1) & ~left)
+    assert not (parts[0] & parts[1]).any()
+    np.testing.assert_array_equal(parts[0] | parts[1], true == 1)
+    assert 0.2 < parts[0].sum() / whole.sum() < 0.8
+    np.testing.assert_array_equal(voxels(image > 0), true > 0)
+    table = np.zeros(image.shape, bool)
+    table[-15:, 40:120] = True
+    assert not (voxels(table & (image == 0)) & (true > 0)).any()
+
+
+# Motions
+
+
+def test_objects_move_as_the_true_object_in_them(recording):
+    clip, transition = recording.clips()[1], bound(TrueMotions(), recording)
+    before, after = recording.truth(0), recording.truth(1)
+    labels = np.where(before == 1, 5, np.where(before == 2, 9, 0)).astype(np.uint16)
+    labels[2:4, 2:4, 2:4] = 3  # an object that is not there
+    moved = transition.predict(RNG, Population((Hypothesis.from_labels(labels, recording.grid),)), clip)
+    found = moved.particles[0].labels
+    np.testing.assert_array_equal(found == 5, after == 1)  # two voxels to the right, exactly
+    np.testing.assert_array_equal(found == 9, after == 2)
+    np.testing.assert_array_equal(found == 3, labels == 3)
+    assert moved.notes["motions"] == {"true": 1, "rest": 1, "no object": 1}
+    first = recording.clips()[0]
+    same = transition.predict(RNG, moved, first)
+    assert same.particles[0] is moved.particles[0]
+
+
+# Free space, fusion, selection
+
+
+def test_true_free_space_clears_what_is_free_and_seen(recording):
+    true = recording.truth(0)
+    labels = true.copy()
+    labels[:, :, 20:25] = 3  # in the air
+    labels[true > 0] = true[true > 0]
+    hypothesis = Hypothesis.from_labels(labels, recording.grid)
+    frame = recording.frames[0]
+    seen, share = bound(TrueFreeSpace(), recording).project(hypothesis, frame)
+    all_, share_all = bound(TrueFreeSpace(hidden=True), recording).project(hypothesis, frame)
+    np.testing.assert_array_equal(all_.labels, true)
+    assert (seen.labels[true > 0] == true[true > 0]).all()  # nothing true is lost at any border
+    assert (seen.labels == 3).sum() < 0.5 * (labels == 3).sum()
+    assert share_all <= share < 1
+    exact = Hypothesis.from_labels(true, recording.grid)
+    assert bound(TrueFreeSpace(), recording).project(exact, frame) == (exact, 1.0)
+
+
+def test_the_best_of_both_parents(recording):
+    true, grid = recording.truth(0), recording.grid
+    split = true.copy()
+    split[true == 1] = 1
+    split[15:20][split[15:20] == 1] = 7  # box 1 in two halves
+    wrong = np.where(true == 2, 2, 0).astype(np.uint16)
+    wrong[0:3, 0:3, 0:3] = 4  # invented
+    proposed, predicted = Hypothesis.from_labels(split, grid, birth=1), Hypothesis.from_labels(wrong, grid)
+    fused = best_of_both(proposed, predicted, true)
+    assert weighted_coverage(fused.labels, true) == 1.0  # halves merged, box 2 kept, invention dropped
+    kept = {o.id for o in fused.objects}
+    assert predicted.record(2).id in kept
+    assert best_of_both(proposed, proposed, np.zeros_like(true)).n_objects == 0
+    assert best_of_both(Hypothesis.from_labels(true * 0, grid), predicted, true).n_objects == 1
+
+
+def test_choice_and_selection_prefer_true_quality(recording):
+    true, grid, clip = recording.truth(1), recording.grid, recording.clips()[1]
+    worse = true.copy()
+    worse[worse == 2] = 0
+    blob = (true > 0).astype(np.uint16)
+    hypotheses = tuple(Hypothesis.from_labels(x, grid) for x in (blob, true, worse, blob))
+    score = bound(TrueQuality(), recording).log_score(hypotheses, clip)
+    assert score.argmax() == 1
+    np.testing.assert_allclose(score / 1e4, [weighted_coverage(h.labels, true) for h in hypotheses])
+    population = Population(hypotheses, np.log([1.0, 1e-9, 2.0, 1.0]))
+    rng = Key(4).child("step", 1, "resampler").generator()
+    chosen = bound(TrueBest(), recording).resample(rng, population, 2)
+    order = np.argsort(-score, kind="stable")
+    assert chosen.parents["ancestor"].tolist() == order[:2].tolist()
+    assert chosen.log_mean_weight == pytest.approx(population.log_mean_weight)
+    with pytest.raises(InputError, match="belongs to no step of a filter"):
+        bound(TrueBest(), recording).resample(np.random.default_rng(0), population, 2)
+
+
+def test_the_best_of_fusions_own_candidates_is_kept(recording):
+    config = load_config("mst", ['update.evidence=["true_quality"]', "update.n_scored=50"])
+    filter = bind_truth(build_filter(config), recording)
+    plain = build_filter(load_config("mst"))
+    quality = {}
+    for name, one in (("plain", plain), ("oracle", filter)):
+        state = one.start(0)
+        for clip in recording.clips():
+            state, _ = one.step(state, clip)
+        true = recording.truth(2)
+        quality[name] = np.mean([weighted_coverage(h.labels, true) for h in state.population.particles])
+    assert quality["oracle"] >= quality["plain"]
+
+
+def test_true_fusion_keeps_parents_and_passes_single_parents(recording):
+    update, clip = bound(TrueFusion(), recording), recording.clips()[1]
+    true = Hypothesis.from_labels(recording.truth(1), recording.grid)
+    predicted = Population((true, true), np.log([1.0, 3.0]), {"previous": np.array([4, 5])})
+    proposed = Population((true,) * 3, np.log([1.0, 2.0, 3.0]), {"proposed": np.arange(3)})
+    fused = update.update(RNG, predicted, proposed, clip)
+    assert len(fused) == 6
+    np.testing.assert_allclose(np.exp(fused.log_weights), [1, 3, 2, 6, 3, 9])
+    assert fused.parents["previous"].tolist() == [4, 5, 4, 5, 4, 5]
+    assert fused.parents["proposed"].tolist() == [0, 0, 1, 1, 2, 2]
+    assert len(update.update(RNG, None, proposed, clip)) == 3
+    assert len(update.update(RNG, predicted, None, clip)) == 2
+
+
+def test_oracles_are_components_like_any_other():
+    for cls in UsesTruth.__subclasses__():
+        assert dataclasses.is_dataclass(cls) and cls.__dataclass_params__.frozen, cls
+        assert cls() == cls()
+    assert FusionUpdate(evidence=(TrueQuality(),)) == FusionUpdate(evidence=(TrueQuality(),))
