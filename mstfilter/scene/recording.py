@@ -35,6 +35,7 @@ from mstfilter.scene.arrays import content_key
 from mstfilter.scene.camera import Camera, rigid_from_matrix
 from mstfilter.scene.clip import Clip
 from mstfilter.scene.frame import Frame
+from mstfilter.scene.missed import warn_if_missed
 from mstfilter.scene.support_plane import fit_support_plane, workspace
 from mstfilter.scene.voxels import VoxelGrid, as_labels
 
@@ -194,9 +195,12 @@ class Recording:
                 "one mask a frame, of the size of the images",
             )
         first = Frame(rgb[chosen[0]], depth[chosen[0]], camera, masks[chosen[0]])
+        given = grid is not None
         camera, grid = find_world(first, grid)
         frames = [Frame(rgb[i], depth[i], camera, masks[i]) for i in range(n)]
         stamps = tuple(float(t) for t in (times if times is not None else range(n)))
+        if given:
+            warn_if_missed((frames[p] for p in chosen), grid, f"recording {name}")
         return cls(frames, grid, chosen, stamps, name)
 
     @cached_property
@@ -235,8 +239,9 @@ class Recording:
         return self.read_poses(index)
 
     def check(self) -> None:
-        """Look at every image once, so that a broken one is known before a run begins."""
+        """Look at every image once, so that a broken one is known before a run begins; warn of a misplaced grid."""
         _ = self.key
+        warn_if_missed((self.frames[p] for p in self.pauses), self.grid, f"recording {self.name}")
 
 
 def _check_depth(depth: np.ndarray, name: str) -> None:

@@ -4,9 +4,9 @@
 >>> rows[0].form, rows[0].mean, rows[0].best, rows[0].one_blob
 
 One row a pause and form of weighted coverage (`mstfilter.scene.quality`): mean over the hypotheses, mean by weight,
-best, that of the heaviest one; beside them the floors of the same hypotheses: their occupied voxels as one blob and as
-connected components. Where the truth has instance images and no volumes, hypotheses are projected into the image and
-compared there (``where`` says image); pixels of the robot (255) do not count.
+best, that of the heaviest one; beside them the floors of the same hypotheses: their occupied voxels as one blob and
+as connected components. Where the truth has instance images and no volumes, hypotheses are projected into the image
+and compared there (``where`` says image); pixels of the robot (255) do not count.
 """
 
 from __future__ import annotations

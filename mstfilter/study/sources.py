@@ -98,12 +98,14 @@ def _with_lists(text: str) -> str:
     if not equals or "," not in value or value.strip()[:1] in "[{\"'":
         return text
     words = [word.strip() for word in value.split(",") if word.strip()]
-    return f"{path}=[{', '.join(word if _is_number(word) else repr(word) for word in words)}]"
+    return f"{path}=[{', '.join(map(_quoted, words))}]"
 
 
-def _is_number(word: str) -> bool:
-    try:
-        float(word)
-    except ValueError:
-        return False
-    return True
+def _quoted(word: str) -> str:
+    """A number or a text as TOML writes it."""
+    for kind in (int, float):
+        try:
+            return repr(kind(word))
+        except ValueError:
+            continue
+    return repr(word)

@@ -21,6 +21,7 @@ import numpy as np
 from mstfilter.errors import InputError
 from mstfilter.scene.camera import Camera
 from mstfilter.scene.images import write_image
+from mstfilter.scene.missed import warn_if_missed
 from mstfilter.scene.recording import Recording
 from mstfilter.scene.voxels import VoxelGrid, as_labels
 
@@ -246,4 +247,5 @@ def save(
             if truth is not None:
                 writer.add_voxels(truth)
             progress(index + 1, total)
+    warn_if_missed((recording.frames[p] for p in recording.pauses), recording.grid, f"recording {recording.name}")
     return writer.path

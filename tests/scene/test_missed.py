@@ -1,0 +1,52 @@
+"""A workspace that misses the scene is told, one that holds it is not."""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from mstfilter.errors import InputWarning
+from mstfilter.scene.formats.folder import RecordingWriter, save
+from mstfilter.scene.recording import Recording
+from mstfilter.scene.voxels import VoxelGrid
+from tests.scene.scenes import CAMERA, GRID, table_scene
+
+ELSEWHERE = VoxelGrid((3.0, 3.0, 0.0), 0.01, (60, 60, 30))
+
+
+def arrays(grid, pose=CAMERA.pose, noise=None):
+    rgb, depth, _ = table_scene(noise=noise)
+    return Recording.from_arrays(rgb, depth, CAMERA.K, T_world_camera=pose, grid=grid)
+
+
+@pytest.mark.parametrize("grid", [ELSEWHERE, VoxelGrid((-0.3, -0.3, 0.2), 0.01, (60, 60, 30))])
+def test_a_misplaced_grid(grid, tmp_path):
+    with pytest.warns(InputWarning, match="holds nothing above the table") as told:
+        recording = arrays(grid)
+    assert len(told) == 1
+    assert "is the pose right" in told[0].message.hints[1]
+    for look in (recording.check, lambda: save(recording, tmp_path / "r")):
+        with pytest.warns(InputWarning, match=r"spans x .* depth readings span x -"):
+            look()
+
+
+def test_an_upside_down_pose():
+    flipped = RigidTransform.from_rotation(Rotation.from_rotvec([np.pi, 0, 0])) * CAMERA.pose
+    with pytest.warns(InputWarning, match="holds nothing"):
+        arrays(GRID, flipped)
+
+
+def test_good_grids_are_not_told(tmp_path):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for grid in (GRID, None):
+            arrays(grid, noise=np.random.default_rng(0)).check()
+        # Empty at the first pause, objects at the second.
+        with RecordingWriter(tmp_path / "r", CAMERA, GRID) as writer:
+            for k, empty in enumerate((True, False)):
+                rgb, depth, _ = table_scene(empty=empty)
+                writer.add_frame(rgb, depth, float(k), "static")
+        Recording.open(tmp_path / "r").check()

@@ -1,0 +1,105 @@
+"""Which format it is, its options, and a reader of the user's own."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from mstfilter import registry
+from mstfilter.errors import InputError
+from mstfilter.study.sources import detect_format, format_settings, open_source
+from tests.scene.formats import layouts
+from tests.scene.test_recording import write
+
+WRITERS = {
+    "tum": layouts.write_tum,
+    "bop": layouts.write_bop,
+    "redwood": layouts.write_redwood,
+    "dsr": layouts.write_dsr,
+    "recording": write,
+}
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_formats_are_detected(tmp_path, name):
+    """Each by exactly one reader; every registered format has a test here or among the bags and pairs."""
+    path = WRITERS[name](tmp_path / "data")
+    assert detect_format(path) == name
+    assert set(registry.known("format")) == {*WRITERS, "bag", "pairs"}
+
+
+def test_unknown_and_ambiguous(tmp_path):
+    (tmp_path / "notes").mkdir()
+    (tmp_path / "notes" / "a.txt").write_text("x")
+    (tmp_path / "video.mp4").write_bytes(b"x")
+    for name in ("notes", "video.mp4"):
+        with pytest.raises(InputError, match="no format that is known") as caught:
+            open_source(tmp_path / name)
+        assert "tum, bop, redwood, dsr, bag" in caught.value.hints[0]
+    path = layouts.write_redwood(layouts.write_tum(tmp_path / "both") / "x").rename(tmp_path / "both2")
+    for part in ("rgb.txt", "depth.txt"):
+        (path / part).write_text("0 a.png\n")
+    with pytest.raises(InputError, match="looks like tum and like redwood"):
+        open_source(path)
+    assert len(open_source(path, "redwood", ["fps=10"])) == len(layouts.SHIFTS)
+    with pytest.raises(InputError, match="there is no format 'tom'"):
+        open_source(path, "tom")
+    with pytest.raises(InputError, match="does not exist"):
+        open_source(tmp_path / "none")
+
+
+def test_options_as_text():
+    assert format_settings(
+        ["K=525,525,319.5,239.5", "world.workspace=-1,-1,0,1,1,.5", "frames=a,b,", "moving=false"]
+    ) == {
+        "K": [525, 525, 319.5, 239.5],
+        "world": {"workspace": [-1, -1, 0, 1, 1, 0.5]},
+        "frames": ["a", "b"],
+        "moving": False,
+    }
+
+
+def test_options_reach_the_reader(tmp_path):
+    path = layouts.write_tum(tmp_path / "tum")
+    options = ["K=131,131,79.5,59.5", "world.workspace=-0.3,-0.3,0,0.3,0.3,0.2", "world.voxel_size=0.02"]
+    recording = open_source(path, options=options, pauses="0,8,16")
+    assert recording.pauses == (0, 8, 16)
+    assert recording.grid.shape == (30, 30, 10)
+    assert open_source(path, options=options, pauses="0s,0.52s").pauses == (0, 5)
+    assert open_source(path, options=[*options, "pauses.hold_s=0.6"], pauses="still").pauses == (13,)
+    assert open_source(path, options=[*options, "pauses.hold_s=0.6"]).pauses == (13,)
+    for wrong, message in (
+        (["K=1,2,x,4"], "K is"),
+        (["k=1,2,3,4"], "no field 'k'"),
+        (["pauses=never"], "no pauses 'never'"),
+        (["depth_scale"], "path=value"),
+    ):
+        with pytest.raises(InputError, match=message):
+            open_source(path, options=wrong)
+
+
+def test_a_reader_of_ones_own(tmp_path):
+    """A layout that nobody else has: one class in a file, named like any component."""
+    rgb, depth, _ = layouts.video((0, 2))
+    np.savez(tmp_path / "mine.npz", rgb=rgb, depth=depth.astype(np.float32))
+    (tmp_path / "mine.py").write_text(
+        "from dataclasses import dataclass\n"
+        "import numpy as np\n"
+        "from mstfilter.scene.formats.interfaces import Format\n"
+        "from mstfilter.scene.recording import Recording\n"
+        "@dataclass(frozen=True)\n"
+        "class Mine(Format):\n"
+        "    '''Arrays in one file.'''\n"
+        "    f: float = 1.0\n"
+        "    @classmethod\n"
+        "    def detects(cls, path):\n"
+        "        return path.suffix == '.npz'\n"
+        "    def open(self, path):\n"
+        "        data = np.load(path)\n"
+        "        K = np.array([[self.f, 0, 79.5], [0, self.f, 59.5], [0, 0, 1]])\n"
+        "        return Recording.from_arrays(data['rgb'], data['depth'], K, name='mine')\n"
+    )
+    recording = open_source(tmp_path / "mine.npz", f"{tmp_path}/mine.py:Mine", ["f=131"])
+    assert (recording.name, len(recording)) == ("mine", 2)
+    with pytest.raises(InputError, match="which is not loaded here"):
+        open_source(tmp_path / "mine.npz", f"{tmp_path}/mine.py:Mine", allow_files=False)

@@ -1,0 +1,199 @@
+"""convert, quality, and run on data of other formats, from the command line."""
+
+from __future__ import annotations
+
+import csv
+import shutil
+
+import numpy as np
+import pytest
+
+from mstfilter.scene.formats.folder import RecordingWriter
+from mstfilter.scene.recording import Recording
+from mstfilter.scene.voxels import VoxelGrid
+from tests.scene.formats import layouts
+from tests.scene.formats.bags import COLOUR, DEPTH, Messages, scene_messages
+from tests.scene.formats.bags import write as write_bag
+from tests.scene.scenes import CAMERA, table_scene
+from tests.scene.test_recording import write
+from tests.test_cli import call
+
+K = "K=131,131,79.5,59.5"
+
+
+def clear_error(err):
+    """One line `error:`, then hints, nothing else but a bar of progress."""
+    lines = [line for line in err.splitlines() if line.strip() and not line.startswith("convert   ")]
+    assert lines, "there is no message"
+    assert lines[0].startswith("error: "), err
+    assert all(line.startswith("hint: ") for line in lines[1:]), err
+    assert "Traceback" not in err
+
+
+CASES = {
+    "tum": (lambda p: layouts.write_tum(p), ["-o", K], layouts.PAUSES),
+    "redwood": (lambda p: layouts.write_redwood(p), ["-o", "fps=10"], layouts.PAUSES),
+    "bop": (lambda p: layouts.write_bop(p), [], (0, 1, 2)),
+    "dsr": (lambda p: layouts.write_dsr(p), [], (0, 1, 2)),
+    "bag": (lambda p: write_bag(p, "bag", scene_messages(True)), ["--pauses", "0,9"], (0, 9)),
+    "mcap": (lambda p: write_bag(p, "mcap", scene_messages(False)), ["--pauses", "0s,1.6s"], (0, 16)),
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_convert(tmp_path, capsys, name):
+    make, options, pauses = CASES[name]
+    path = make(tmp_path / "data")
+    code, out, err = call("convert", path, tmp_path / "out", *options, capsys=capsys)
+    assert code == 0, err
+    assert "error" not in err
+    assert f"pauses      {len(pauses)} of" in out
+    recording = Recording.open(tmp_path / "out")
+    recording.check()
+    assert recording.pauses == pauses
+    assert sorted(p.name for p in tmp_path.iterdir() if p.name.startswith(".")) == []
+
+
+def truncated(path):
+    target = write_bag(path, "bag", scene_messages(True))
+    target.write_bytes(target.read_bytes()[:20000])
+    return target
+
+
+def uneven(path):
+    layouts.write_redwood(path)
+    next((path / "depth").iterdir()).unlink()
+    return path
+
+
+def late_fault(path):
+    """Only the last image is broken: most is written before that is seen."""
+    layouts.write_redwood(path)
+    file = max((path / "depth").iterdir())
+    file.write_bytes(file.read_bytes()[:-20])
+    return path
+
+
+def small_depth(path):
+    make, messages = Messages(True), scene_messages(True, (0, 1), depth=None)
+    images = [(DEPTH, t, make.image(t, np.full((60, 80), 700, np.uint16), "16UC1")) for _, t, _ in messages]
+    return write_bag(path, "bag", messages + images)
+
+
+def photos(path):
+    path.mkdir()
+    (path / "IMG_1.JPG").write_bytes(b"x")
+    return path
+
+
+def bag(**more):
+    return lambda path: write_bag(path, "bag", scene_messages(True, (0, 1), **more))
+
+
+ERRORS = {
+    "truncated bag": (truncated, [], "bag cannot be read"),
+    "mismatched numbers of images": (uneven, [], "17 colour images and 16 depth images"),
+    "missing intrinsics": (layouts.write_tum, [], "intrinsics are missing"),
+    "table 1 km away": (layouts.write_redwood, ["-o", "depth_scale=1.25"], "expected between 0.05 and 30 m"),
+    "table 1 mm away": (layouts.write_redwood, ["-o", "depth_scale=1.25e-6"], "expected between 0.05 and 30 m"),
+    "unknown format": (photos, [], "no format that is known"),
+    "wrong format": (layouts.write_redwood, ["--format", "tum"], "not a TUM folder"),
+    "wrong topic": (bag(), ["-o", "colour=/rgb"], "no image topic '/rgb'"),
+    "sizes differ": (small_depth, [], "differ in size"),
+    "unregistered depth": (bag(frame="depth_frame"), [], "not registered"),
+    "no depth at all": (bag(depth=None), [], "no depth topic"),
+    "no pause": (layouts.write_redwood, [], "no pause found"),  # at 30 fps nothing holds still for half a second
+    "broken at the end": (late_fault, ["-o", "fps=10"], "image is truncated"),
+    "unknown option": (layouts.write_redwood, ["-o", "scale=2"], "no field 'scale'"),
+}
+
+
+@pytest.mark.parametrize("fault", ERRORS)
+@pytest.mark.parametrize("command", ["convert", "run"])
+def test_errors_leave_nothing_behind(tmp_path, capsys, command, fault):
+    make, options, message = ERRORS[fault]
+    path = make(tmp_path / "data")
+    before = sorted(tmp_path.iterdir())
+    arguments = [tmp_path / "out"] if command == "convert" else ["--out", tmp_path / "out"]
+    code, _, err = call(command, path, *arguments, *options, capsys=capsys)
+    assert code == 2, err
+    clear_error(err)
+    assert message in err
+    assert sorted(tmp_path.iterdir()) == before
+
+
+def test_topics_are_listed(tmp_path, capsys):
+    messages = scene_messages(True, (0, 1))
+    again = [("/left" + topic, t, m) for topic, t, m in messages if topic == COLOUR]
+    path = write_bag(tmp_path / "two", "bag", messages + again)
+    code, _, err = call("convert", path, tmp_path / "out", capsys=capsys)
+    assert code == 2
+    clear_error(err)
+    assert f"/left{COLOUR} (2 x rgb8, 160 x 120" in err
+    assert "choose one: colour=TOPIC" in err
+
+
+def test_an_occupied_name_is_known_before_anything_is_read(tmp_path, capsys):
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "thesis.tex").write_text("x")
+    code, _, err = call("convert", truncated(tmp_path / "data"), tmp_path / "out", capsys=capsys)
+    assert code == 2
+    assert "not an empty folder" in err
+    assert (tmp_path / "out" / "thesis.tex").exists()
+
+
+def test_run_reads_a_bag_as_its_conversion(tmp_path, capsys):
+    """The same hypotheses whether the data were converted before or not."""
+    path = write_bag(tmp_path / "data", "mcap", scene_messages(False))
+    options = ["--no-report", "n=3"]
+    code, out, err = call("run", path, "--out", tmp_path / "direct", *options, capsys=capsys)
+    assert code == 0, err
+    assert "pause 1     3 hypotheses" in out
+    assert call("convert", path, tmp_path / "r", capsys=capsys)[0] == 0
+    assert call("run", tmp_path / "r", "--out", tmp_path / "later", *options, capsys=capsys)[0] == 0
+    for t in ("000", "001"):
+        a, b = (np.load(tmp_path / run / "pauses" / t / "hypotheses.npz")["labels"] for run in ("direct", "later"))
+        np.testing.assert_array_equal(a, b)
+
+
+def test_quality(tmp_path, capsys):
+    recording = write(tmp_path / "slide")
+    code, _, err = call("run", recording, "n=3", "--out", tmp_path / "run", "--no-report", capsys=capsys)
+    assert code == 0, err
+    code, out, err = call("quality", tmp_path / "run", recording, "--csv", tmp_path / "q.csv", capsys=capsys)
+    assert code == 0, err
+    lines = out.splitlines()
+    assert lines[0].split() == ["pause", "form", "n", "mean", "weighted", "best", "top", "one_blob", "components"]
+    assert len(lines) == 1 + 3 * 3 + 3
+    table = list(csv.DictReader((tmp_path / "q.csv").open()))
+    means = [float(row["mean"]) for row in table if row["form"] == "objects"]
+    assert float(lines[-3].split()[2]) == pytest.approx(np.mean(means), abs=6e-4)
+    code, again, _ = call("quality", tmp_path / "run", recording / "voxels.npz", capsys=capsys)
+    assert (code, again) == (0, out)
+    code, perfect, _ = call("quality", recording / "voxels.npz", recording, capsys=capsys)
+    assert perfect.splitlines()[-3].split()[2] == "1.000"
+    for arguments, message in (
+        ((tmp_path / "run", tmp_path / "none"), "does not exist"),
+        ((tmp_path, recording), "not a run folder"),
+        ((tmp_path / "run", tmp_path / "q.csv"), "no format that is known"),
+    ):
+        code, _, err = call("quality", *arguments, capsys=capsys)
+        assert code == 2
+        clear_error(err)
+        assert message in err
+
+
+def test_a_workspace_that_misses_is_one_warning(tmp_path, capsys):
+    with RecordingWriter(tmp_path / "r", CAMERA, VoxelGrid((5, 5, 0), 0.01, (30, 30, 20))) as writer:
+        rgb, depth, _ = table_scene()
+        writer.add_frame(rgb, depth, 0.0, "static")
+    code, out, err = call("run", tmp_path / "r", "n=2", "--out", tmp_path / "run", "--no-report", capsys=capsys)
+    assert code == 0, err
+    told = [line for line in err.splitlines() if line.startswith("warning: ")]
+    assert len(told) == 1
+    assert "holds nothing above the table" in told[0]
+    assert "hint: give a workspace" in err
+    assert "hypotheses of 0" in out
+    shutil.rmtree(tmp_path / "run")
+    with pytest.warns(UserWarning):
+        Recording.open(tmp_path / "r").check()
