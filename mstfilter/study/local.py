@@ -137,7 +137,7 @@ class _Crew:
             "if memory ran out: fewer workers, or a smaller scene",
             *([f"log: {self._log(worker)}"] if self._log(worker) else []),
         )
-        return Outcome("failed", f"its worker died {n} times{why}", hints, tries=n)
+        return Outcome("failed", f"its worker died {n} time{'s' if n > 1 else ''}{why}", hints, tries=n)
 
     def _once(self, worker: int, k: int) -> tuple[Outcome | None, str]:
         """One try; no outcome, and why, if the worker died."""

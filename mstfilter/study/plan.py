@@ -20,6 +20,7 @@ from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
+from mstfilter import registry
 from mstfilter.errors import InputError
 from mstfilter.presets import build_filter, describe_filter, load_config
 from mstfilter.study.code_version import code_version
@@ -209,19 +210,15 @@ def _stem(preset: str) -> str:
 
 def _scenes(entry: SceneEntry, folder: Path, allow_files: bool) -> Iterator[Scene]:
     if entry.family:
-        from dataclasses import replace
-
         from mstfilter.simulation.cache import recipe_key
         from mstfilter.simulation.families import scene_family
 
         family = scene_family(entry.family)
-        unknown = sorted(set(entry.set) - {f.name for f in fields(family)})
-        if unknown:
-            raise InputError(f"scene family {entry.family!r} has no field {unknown[0]!r}")
-        family = replace(family, **entry.set)
+        family = registry.make(type(family), entry.set, f"scene family {entry.family!r}", base=family)
+        changed = {name: getattr(family, name) for name in entry.set}
         group = entry.group or entry.family
         for seed in entry.seeds:
-            source = {"family": entry.family, "seed": seed, "set": dict(entry.set)}
+            source = {"family": entry.family, "seed": seed, "set": changed}
             yield Scene(f"{group}-{seed}", group, source, recipe_key(family, seed))
         return
     for pattern in entry.recordings:

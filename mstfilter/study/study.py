@@ -124,6 +124,8 @@ def run_study(
         counted = _Counted(progress, "runs", [run.name for run, _ in waiting], len(before), len(plan.runs), len(lost))
 
         def tell(event: Event) -> None:
+            if event.kind == "lost":
+                _sweep(path, waiting[event.job][0].folder)
             if event.outcome is not None and event.outcome.status != "done":
                 _note(folder, waiting[event.job][0], event.outcome)
             counted(event)
@@ -167,9 +169,17 @@ def _held(path: Path) -> Iterator[StudyFolder]:
             raise InputError(
                 f"another process is running the study in {path}", "wait for it, or choose --out"
             ) from None
-        for left in (path / "runs").glob(".*.partial"):  # by workers that were killed
-            shutil.rmtree(left, ignore_errors=True)
-        yield StudyFolder(path)
+        _sweep(path, "*")  # what workers left that were killed with their study
+        try:
+            yield StudyFolder(path)
+        finally:
+            _sweep(path, "*")
+
+
+def _sweep(path: Path, folder: str) -> None:
+    """Remove what a worker that died has left of a run."""
+    for left in (path / "runs").glob(f".{folder}.*.partial"):
+        shutil.rmtree(left, ignore_errors=True)
 
 
 def _visible(path: Path) -> Iterator[Path]:

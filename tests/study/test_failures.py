@@ -1,0 +1,215 @@
+"""What goes wrong in one run harms no other; what is wrong with the study is said before any run."""
+
+from __future__ import annotations
+
+import csv
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from mstfilter.errors import InputError
+from mstfilter.study.config import load_study, study_of
+from mstfilter.study.local import Local
+from mstfilter.study.study import run_study
+from tests.study.scenes import slide
+
+BROKEN = Path(__file__).parent / "broken.py"
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    path = tmp_path_factory.mktemp("failing")
+    slide(path / "slide", pauses=2)
+    return path
+
+
+def study(folder, *arms, **more):
+    """Arms of one recording: ``good`` ones, and ones whose transition breaks in a way."""
+    entries = []
+    for arm in arms:
+        how, _, marker = arm.partition("@")
+        rule = [f"transition={BROKEN}:Breaks", f"transition.how={how}", f'transition.marker="{marker}"']
+        entries.append({"name": how, "set": ["transition=identity"] if how == "good" else rule})
+    data = {"name": "test", "folder": folder, "scenes": [{"recordings": "slide"}], "seeds": [0, 1], "arms": entries}
+    return study_of({**data, **more})
+
+
+def table(path, name="runs.csv"):
+    with (path / name).open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def figures(path):
+    """The table without time and memory."""
+    cost = ("core_seconds", "peak_mb")
+    return [{k: v for k, v in r.items() if k not in cost and not k.startswith("seconds")} for r in table(path)]
+
+
+def test_failures_are_isolated_listed_and_explained(folder, tmp_path):
+    out = tmp_path / "out"
+    result = run_study(study(folder, "good", "raise", "full", "die", "print"), out, Local(2), cache=tmp_path)
+    assert result.done == 4
+    errors = {(r["run"], r["tries"]): r["error"] for r in table(out, "failures.csv")}
+    for seed in (0, 1):
+        assert "RuntimeError: the component broke" in errors[f"raise on slide, seed {seed}", "1"]
+        assert "no space left" in errors[f"full on slide, seed {seed}", "1"]
+        assert errors[f"die on slide, seed {seed}", "3"] == "its worker died 3 times, the last time by signal 9"
+    assert len(errors) == 6
+    assert {r["arm"] for r in table(out)} == {"good", "print"}  # what a component prints confuses nobody
+    trace = next(f["trace"] for f in result.folder.failures() if f["arm"] == "raise")
+    assert "broken.py" in trace
+    assert not list((out / "runs").glob(".*"))  # nothing half done is left
+    for log in (out / "logs").glob("*"):
+        assert log.name.startswith("worker-")
+
+
+def test_what_failed_is_repeated_and_what_is_done_is_not(folder, tmp_path):
+    marker = tmp_path / "once"
+    wanted, out = study(folder, "good", f"raise@{marker}", seeds=[0]), tmp_path / "out"
+    first = run_study(wanted, out, Local(1), cache=tmp_path)
+    assert (first.done, len(first.failed)) == (1, 1)
+    again = run_study(wanted, out, Local(1), cache=tmp_path)
+    assert (again.done, again.repeated, again.failed) == (2, 1, ())
+    assert table(out, "failures.csv") == []
+
+
+@pytest.mark.parametrize("how", ["die", "exit"])
+def test_a_run_whose_worker_died_is_begun_again(folder, tmp_path, how):
+    seen = []
+    wanted = study(folder, f"{how}@{tmp_path / 'once'}", seeds=[0])
+    result = run_study(
+        wanted, tmp_path / "out", Local(1), cache=tmp_path, progress=lambda p: seen.append(p.event and p.event.kind)
+    )
+    assert result.failed == () and result.done == 1
+    assert seen.count("begun") == 2 and seen.count("lost") == 1
+
+
+def test_a_run_that_takes_too_long_is_named(folder, tmp_path):
+    result = run_study(
+        study(folder, "hang", "good", seeds=[0]), tmp_path / "out", Local(2, tries=1, timeout_s=8), cache=tmp_path
+    )
+    assert [(n, o.error) for n, o in result.failed] == [
+        ("hang on slide, seed 0", "its worker died 1 time, the last time because it took longer than 8 s")
+    ]
+
+
+def test_a_recording_that_cannot_be_made_fails_its_runs_only(folder, tmp_path):
+    impossible = {"family": "demo", "seeds": 0, "group": "no", "set": {"workspace_x": 0.1, "workspace_y": 0.1}}
+    wanted = study(folder, "good", scenes=[{"recordings": "slide"}, impossible], seeds=[0])
+    result = run_study(wanted, tmp_path / "out", Local(1), cache=tmp_path)
+    assert result.done == 1
+    ((name, outcome),) = result.failed
+    assert name == "good on no-0, seed 0" and outcome.error
+    assert table(tmp_path / "out", "failures.csv")[0]["run"] == name
+
+
+def test_killing_the_study_and_resuming_ends_with_the_same_table(folder, tmp_path):
+    """SIGKILL to the study alone: its workers end too, and the same command goes on."""
+    config = tmp_path / "study.toml"
+    config.write_text(
+        f'seeds = "0-5"\nscenes = [{{recordings = "{folder / "slide"}"}}]\narms = [{{set = "transition=identity"}}]\n'
+    )
+    command = [
+        sys.executable,
+        "-m",
+        "mstfilter",
+        "study",
+        str(config),
+        "--workers",
+        "1",
+        "--out",
+        str(tmp_path / "out"),
+    ]
+    environment = {**os.environ, "MSTFILTER_CACHE": str(tmp_path / "cache")}
+    process = subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    deadline = time.monotonic() + 120
+    while len(list(tmp_path.glob("out/runs/*/result.json"))) < 2 and time.monotonic() < deadline:
+        time.sleep(0.02)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    done = {p: p.stat().st_mtime_ns for p in tmp_path.glob("out/runs/*/result.json")}
+    assert 2 <= len(done) < 6
+    assert not (tmp_path / "out" / "runs.csv").exists()
+    resumed = run_study(load_study(config), tmp_path / "out", Local(2), cache=tmp_path / "cache")
+    assert resumed.repeated >= len(done) and resumed.done == 6
+    assert {p: p.stat().st_mtime_ns for p in done} == done
+    whole = run_study(load_study(config), tmp_path / "whole", Local(1), cache=tmp_path / "cache")
+    assert whole.repeated == 0
+    assert figures(tmp_path / "out") == figures(tmp_path / "whole")
+    assert not list((tmp_path / "out" / "runs").glob(".*"))
+
+
+def test_one_process_a_study(folder, tmp_path):
+    fcntl = pytest.importorskip("fcntl")
+    out = tmp_path / "out"
+    run_study(study(folder, "good", seeds=[0]), out, Local(1), cache=tmp_path)
+    with (out / ".lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        with pytest.raises(InputError, match="another process"):
+            run_study(study(folder, "good", seeds=[0]), out, Local(1), cache=tmp_path)
+
+
+WRONG = {
+    'arms = [{set = "resampler=sistematic"}]': "did you mean systematic",
+    'arms = [{preset = "mzt"}]': "there is no preset 'mzt'",
+    'arms = [{set = "n=3,"}]': "empty value",
+    "arms = []": "has no arm",
+    "scenes = []": "has no scene",
+    "seeds = []": "has no seed",
+    'seeds = "3-1"': "has no seed",
+    'seeds = "x"': "not of the form 0-4, 7",
+    "seeds = [1, 1]": "names a seed twice",
+    'arms = [{set = "n=5"}, {name = "same"}]': "two arms are the same: 'mst n=5' and 'same'",
+    'arms = [{name = "a"}, {name = "a", set = "n=4"}]': "two arms are called 'a'",
+    'arms = [{set = "n=4,4"}]': "two arms are the same",
+    'scenes = [{family = "demo", seeds = [1, 1]}]': "two scenes are the same",
+    'scenes = [{family = "nowhere", seeds = 1}]': "no scene family is called 'nowhere'",
+    'scenes = [{family = "demo", seeds = 1, set = {height_m = 2}}]': "has no field 'height_m'",
+    'scenes = [{family = "demo", seeds = 1, set = {fps = "fast"}}]': "fps",
+    'scenes = [{recordings = "absent-*"}]': "recording does not exist",
+    'scenes = [{family = "demo"}]': "has no seeds",
+    "scenes = [{seeds = 1}]": "needs either family",
+    'reference = "mine"': "reference is 'mine', which is no arm",
+    "colour = 1": "fields of a study",
+    'keep = "some"': "keep",
+    "= 3": "not valid TOML",
+}
+
+
+@pytest.mark.parametrize("line", WRONG)
+def test_a_wrong_study_is_one_clear_error_before_any_run(folder, tmp_path, line):
+    base = {
+        "seeds": "seeds = [0]",
+        "scenes": f'scenes = [{{recordings = "{folder / "slide"}"}}]',
+        "arms": 'arms = [{set = "transition=identity"}]',
+    }
+    kept = [text for name, text in base.items() if not line.startswith(name)]
+    (tmp_path / "study.toml").write_text("\n".join([*kept, line]))
+    with pytest.raises(InputError) as caught:
+        run_study(load_study(tmp_path / "study.toml"), tmp_path / "out", cache=tmp_path / "cache")
+    assert WRONG[line] in " ".join([caught.value.message, *caught.value.hints])
+    assert not (tmp_path / "out").exists()
+
+
+def test_folders_that_will_not_do(folder, tmp_path, monkeypatch):
+    (tmp_path / "file").write_text("x")
+    with pytest.raises(InputError, match="no study folder"):
+        run_study(study(folder, "good"), tmp_path / "file", cache=tmp_path)
+    with pytest.raises(InputError, match="cannot write study folder"):
+        run_study(study(folder, "good"), tmp_path / "file" / "below", cache=tmp_path)
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "precious.txt").write_text("x")
+    with pytest.raises(InputError, match="no study folder"):
+        run_study(study(folder, "good"), tmp_path / "mine", cache=tmp_path)
+    assert [p.name for p in (tmp_path / "mine").iterdir()] == ["precious.txt"]
+    monkeypatch.setattr("mstfilter.study.space.shutil.disk_usage", lambda path: SimpleNamespace(free=1000))
+    begun = []
+    with pytest.raises(InputError, match=r"the study needs about .* GB in .*, where 1e-06 GB are free"):
+        run_study(study(folder, "good"), tmp_path / "full", cache=tmp_path, progress=begun.append)
+    assert begun == []
