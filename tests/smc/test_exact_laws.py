@@ -1,0 +1,212 @@
+"""Laws of resampling schemes by enumeration of every outcome, for few particles: no sampling, only rounding.
+
+Weights are small whole numbers, so that what the single uniforms decide changes at multiples of 1 / cells only.
+"""
+
+from __future__ import annotations
+
+from itertools import combinations, product
+
+import numpy as np
+import pytest
+
+from mstfilter.smc import resampling, resampling_dpp, resampling_rounding
+from mstfilter.smc.population import Population
+from mstfilter.smc.resampling import Multinomial, Residual, Stratified, Systematic
+from mstfilter.smc.resampling_clusters import ClusterStratified
+from mstfilter.smc.resampling_dpp import KDpp
+from mstfilter.smc.resampling_optimal import FearnheadClifford
+from mstfilter.smc.resampling_rounding import Killing, ResidualSystematic, Ssp
+from mstfilter.smc.resampling_wrappers import Coalesced, Shuffled, Tempered
+from mstfilter.smc.similarity import Gaussian
+from tests.smc.enumeration import outcomes
+
+
+def log_of(weights):
+    with np.errstate(divide="ignore"):
+        return np.log(np.asarray(weights, dtype=np.float64))
+
+
+def copies_law(scheme, weights, n, cells=1, coins=False):
+    """Mean (m,) and covariance (m, m) of the numbers of copies, and all numbers that occur."""
+    m = len(weights)
+    found = list(
+        outcomes(lambda rng: np.bincount(scheme.select(rng, log_of(weights), n)[0], minlength=m), cells, coins)
+    )
+    p, counts = np.array([q for q, _ in found]), np.array([c for _, c in found])
+    mean = p @ counts
+    return mean, (counts - mean).T @ (p[:, None] * (counts - mean)), counts[p > 0]
+
+
+CASES = [
+    ((1, 3, 2, 2), 4),
+    ((1, 3, 2, 2), 3),
+    ((1, 3, 2, 2), 6),
+    ((5, 0, 1, 2), 1),
+    ((1, 1, 1), 2),
+    ((3, 1), 5),
+    ((2,), 3),
+]
+
+
+def expected_of(weights, n):
+    W = np.array(weights) / np.sum(weights)
+    return W, n * W, n * W - np.floor(n * W + 1e-12)
+
+
+@pytest.mark.parametrize(("weights", "n"), CASES)
+def test_ssp(weights, n):
+    """Mean n W, variance f (1 - f), floor or ceil, and no two numbers lean on each other: all exactly."""
+    mean, cov, counts = copies_law(Ssp(), weights, n, coins=True)
+    _, expected, f = expected_of(weights, n)
+    np.testing.assert_allclose(mean, expected, atol=1e-12)
+    np.testing.assert_allclose(np.diag(cov), f * (1 - f), atol=1e-12)
+    assert (counts.sum(axis=1) == n).all()
+    assert ((counts >= np.floor(expected + 1e-9)) & (counts <= np.ceil(expected - 1e-9))).all()
+    assert (cov - np.diag(np.diag(cov)) <= 1e-12).all()
+
+
+@pytest.fixture
+def enumerated_uniforms(monkeypatch):
+    """Sorted uniforms as the multiset of the particles that they fall to, with its probability."""
+
+    def ordered(weights):
+        W = np.array(weights) / np.sum(weights)
+        middle = np.cumsum(W) - W / 2
+
+        def draw(rng, k):
+            return np.sort([middle[rng.digit(W)] for _ in range(k)])
+
+        for module in (resampling, resampling_rounding):
+            monkeypatch.setattr(module, "ordered_uniforms", draw)
+
+    return ordered
+
+
+@pytest.mark.parametrize(("weights", "n"), [case for case in CASES if case[1] * len(case[0]) < 21])
+def test_killing(weights, n, enumerated_uniforms):
+    """Mean n W for any n; for n = m the variance of its docstring."""
+    enumerated_uniforms(weights)
+    mean, cov, counts = copies_law(Killing(), weights, n, coins=True)
+    W, expected, _ = expected_of(weights, n)
+    np.testing.assert_allclose(mean, expected, atol=1e-12)
+    assert (counts.sum(axis=1) == n).all()
+    if n == len(W):
+        p = W / W.max()
+        alive = p * (1 - p)
+        variance = alive * (1 - 2 * W) + W**2 * alive.sum() + (n - p.sum()) * W * (1 - W)
+        np.testing.assert_allclose(np.diag(cov), variance, atol=1e-12)
+
+
+@pytest.mark.parametrize(("weights", "n"), CASES)
+def test_multinomial_and_residual(weights, n, enumerated_uniforms):
+    enumerated_uniforms(weights)
+    W, expected, f = expected_of(weights, n)
+    mean, cov, _ = copies_law(Multinomial(), weights, min(n, 5))
+    np.testing.assert_allclose(mean, min(n, 5) * W, atol=1e-12)
+    np.testing.assert_allclose(cov, min(n, 5) * (np.diag(W) - np.outer(W, W)), atol=1e-12)
+    if f.sum() > 1e-9:
+        enumerated_uniforms(f)
+    mean, cov, _ = copies_law(Residual(), weights, n)
+    np.testing.assert_allclose(mean, expected, atol=1e-12)
+    np.testing.assert_allclose(np.diag(cov), f * (1 - f / max(f.sum(), 1e-12)), atol=1e-9)
+
+
+@pytest.mark.parametrize(("weights", "n"), CASES)
+@pytest.mark.parametrize(
+    "scheme",
+    [Systematic(), ResidualSystematic(), Residual("systematic"), Stratified(), Residual("stratified")],
+    ids=["systematic", "rsr", "residual-systematic", "stratified", "residual-stratified"],
+)
+def test_schemes_of_uniforms(scheme, weights, n):
+    """One uniform, or one a stratum; jumps at multiples of one over the total weight."""
+    if isinstance(scheme, Stratified) or scheme == Residual("stratified"):
+        n = min(n, 4)
+    mean, cov, counts = copies_law(scheme, weights, n, cells=int(np.sum(weights)))
+    _, expected, f = expected_of(weights, n)
+    np.testing.assert_allclose(mean, expected, atol=1e-12)
+    assert (counts.sum(axis=1) == n).all()
+    if not isinstance(scheme, Stratified) and scheme != Residual("stratified"):
+        np.testing.assert_allclose(np.diag(cov), f * (1 - f), atol=1e-12)
+
+
+def carried(scheme, population, n, **how):
+    """(m,) expectation of what each particle carries: the output weights of its copies, by the number of all."""
+    m, total = len(population), np.zeros(len(population))
+
+    def run(rng):
+        chosen = scheme.resample(rng, population, n)
+        return np.bincount(chosen.parents["ancestor"], np.exp(chosen.log_weights), minlength=m) / len(chosen)
+
+    for p, found in outcomes(run, **how):
+        total += p * found
+    return total
+
+
+def of(x, weights):
+    return Population(np.array(x), log_of(weights))
+
+
+GROUPS = of([0.0, 0.1, 5.0, 5.1, 9.0], [3.0, 1.0, 1.0, 1.0, 2.0])  # clusters of mass 4, 2 and 2: jumps at quarters
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 4, 5, 8])
+def test_clusters(n):
+    """Fewer places than clusters, as many, and more: what a particle carries is its weight."""
+    scheme = ClusterStratified(Gaussian(1.0))
+    found = carried(scheme, GROUPS, n, cells=4)
+    np.testing.assert_allclose(found, np.exp(GROUPS.log_weights) / 5, atol=1e-12)
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 4])
+def test_fearnhead_clifford_and_tempered_optimal(n):
+    population = of(np.arange(4.0), [1.0, 4.0, 1.0, 2.0])
+    want = np.exp(population.log_weights) / 4
+    np.testing.assert_allclose(carried(FearnheadClifford(), population, n, cells=24), want, atol=1e-12)
+    flat = Tempered(FearnheadClifford(), 0.0)
+    np.testing.assert_allclose(carried(flat, population, n, cells=24), want, atol=1e-12)
+    # Square roots of these weights are whole numbers as well.
+    squares = of(np.arange(4.0), [1.0, 4.0, 9.0, 4.0])
+    root = Tempered(Systematic(), 0.5)
+    np.testing.assert_allclose(carried(root, squares, n, cells=8), np.exp(squares.log_weights) / 4, atol=1e-12)
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 5])
+def test_shuffled_and_coalesced(n):
+    """All orders of the particles; equal ones merged, whose weight the heaviest carries."""
+    population = of([1.0, 2.0, 1.0, 3.0], [1.0, 2.0, 3.0, 2.0])
+    found = carried(Shuffled(), population, n, cells=8)
+    np.testing.assert_allclose(found, np.exp(population.log_weights) / 4, atol=1e-12)
+    found = carried(Coalesced(Systematic()), population, n, cells=8)
+    np.testing.assert_allclose(found, np.array([0.0, 2.0, 4.0, 2.0]) / 4, atol=1e-12)
+
+
+@pytest.mark.parametrize("k", [1, 2, 3, 4])
+def test_kdpp(k, monkeypatch):
+    """Every set with its probability by determinants, with the weights that resample gives it."""
+    rng = np.random.default_rng(2)
+    population = Population(rng.standard_normal((5, 2)), np.log(rng.random(5)) - 700)
+    scheme = KDpp(Gaussian(1.0))
+    L = scheme.likelihood(population)
+    total, found = 0.0, np.zeros(5)
+    for chosen_set in combinations(range(5), k):
+        determinant = np.linalg.det(L[np.ix_(chosen_set, chosen_set)])
+        monkeypatch.setattr(resampling_dpp, "sample_kdpp", lambda *_, s=chosen_set: np.array(s))
+        chosen = scheme.resample(rng, population, k)
+        assert chosen.notes["kdpp"] == f"rank 5 of {k}"
+        found[list(chosen_set)] += determinant * np.exp(chosen.log_weights + 700) / k
+        total += determinant
+    np.testing.assert_allclose(found / total, np.exp(population.log_weights + 700) / 5, rtol=1e-9)
+
+
+def test_enumeration_would_see_a_bias():
+    """The harness on schemes that are wrong by little: it is exact, so every bias is seen."""
+
+    class Off(Systematic):
+        def select(self, rng, log_weights, n):
+            return super().select(rng, log_weights + np.array([0.01, 0.0, 0.0, 0.0]), n)
+
+    mean, _, _ = copies_law(Off(), (1, 3, 2, 2), 3, cells=800)
+    assert np.abs(mean - 3 * np.array([1, 3, 2, 2]) / 8).max() > 1e-3
+    pairs = list(product(range(2), repeat=2))
+    assert [r for _, r in outcomes(lambda rng: (rng.digit([1, 1]), rng.digit([1, 1])))] == pairs
