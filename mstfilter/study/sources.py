@@ -102,10 +102,11 @@ def _with_lists(text: str) -> str:
 
 
 def _quoted(word: str) -> str:
-    """A number or a text as TOML writes it."""
-    for kind in (int, float):
-        try:
-            return repr(kind(word))
-        except ValueError:
-            continue
-    return repr(word)
+    """A number or a text as TOML writes it; 007 is a name."""
+    try:
+        number = float(word)
+    except ValueError:
+        return repr(word)
+    if word.lstrip("+-").isdigit():
+        return word if str(int(word)) == word else repr(word)
+    return repr(number)

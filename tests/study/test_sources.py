@@ -50,11 +50,11 @@ def test_unknown_and_ambiguous(tmp_path):
 
 def test_options_as_text():
     assert format_settings(
-        ["K=525,525,319.5,239.5", "world.workspace=-1,-1,0,1,1,.5", "frames=a,b,", "moving=false"]
+        ["K=525,525,319.5,239.5", "world.workspace=-1,-1,0,1,1,.5", "frames=a,007,8", "moving=false"]
     ) == {
         "K": [525, 525, 319.5, 239.5],
         "world": {"workspace": [-1, -1, 0, 1, 1, 0.5]},
-        "frames": ["a", "b"],
+        "frames": ["a", "007", 8],
         "moving": False,
     }
 

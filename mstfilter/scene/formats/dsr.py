@@ -39,7 +39,7 @@ class Dsr(Format):
 
     Parameters
     ----------
-    sequence : str
+    sequence : str or int
         Which sequence, the part of the file names before the last ``_``. Default: the only one.
     voxel_size : float
         Metres.
@@ -47,7 +47,7 @@ class Dsr(Format):
         World x, y, z (metres) of voxel 0, 0, 0; its z is the table's.
     """
 
-    sequence: str = ""
+    sequence: str | int = ""
     voxel_size: float = 0.004
     origin: tuple[float, ...] = (0.244, -0.256, 0.0)
 
@@ -96,12 +96,13 @@ class Dsr(Format):
         names = sorted({p.stem.rpartition("_")[0] for p in path.glob("*_*.hdf5")}, key=lambda s: (len(s), s))
         if not names:
             raise InputError(f"not a DSR-Net folder: {path} holds no ID_k.hdf5")
-        if not self.sequence and len(names) > 1:
+        wanted = str(self.sequence)
+        if not wanted and len(names) > 1:
             raise InputError(
                 f"{path} holds {len(names)} sequences: {', '.join(names[:8])}{', ...' if len(names) > 8 else ''}",
                 f"choose one: sequence={names[0]}",
             )
-        chosen = self.sequence or names[0]
+        chosen = wanted or names[0]
         if chosen not in names:
             raise InputError(f"{path} has no sequence {chosen!r}; there are {len(names)}: {', '.join(names[:8])}")
         found = {int(k): p for p in path.glob(f"{chosen}_*.hdf5") if (k := p.stem.rpartition("_")[2]).isdigit()}

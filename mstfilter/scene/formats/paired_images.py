@@ -29,11 +29,11 @@ class PairedImages(Format):
 
     Parameters
     ----------
-    frames : tuple of str
+    frames : tuple of str or int
         Names of frames in order. Default: all, sorted by name.
     """
 
-    frames: tuple[str, ...] = ()
+    frames: tuple[str | int, ...] = ()
 
     @classmethod
     def detects(cls, path: Path) -> bool:
@@ -42,7 +42,7 @@ class PairedImages(Format):
 
     def open(self, path: Path) -> Recording:
         """See `Format`."""
-        return open_paired(path, self.frames)
+        return open_paired(path, [str(name) for name in self.frames])
 
 
 def open_paired(path: Path, names: Sequence[str] = ()) -> Recording:

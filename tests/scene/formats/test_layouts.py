@@ -303,6 +303,8 @@ def test_pairs_of_stamps():
     with pytest.warns(InputWarning, match="30 of 60"):
         half = pair_stamps(colour, colour[::2] + 0.001, 0.02, "bag")
     assert half == tuple((2 * k, k) for k in range(30))
+    with pytest.warns(InputWarning):  # no depth image is used twice, however wide the limit
+        assert pair_stamps(colour, colour[::2] + 0.001, 0.05, "bag") == half
     assert pair_stamps([5.0], [5.01], 0.02, "bag") == ((0, 0),)
     with pytest.raises(InputError, match="0.5 s apart"):
         pair_stamps([5.0], [5.5], 0.02, "bag")
