@@ -11,10 +11,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from mstfilter.errors import InputError
+from mstfilter.scene.camera import Camera
 from mstfilter.simulation.families import SceneFamily
 from mstfilter.simulation.shapes import Shape, draw_shape
 from mstfilter.simulation.textures import Skin, draw_skin
-from mstfilter.simulation.world import World
+from mstfilter.simulation.world import OBJECT_GROUP, World
 
 __all__ = ["Things", "arrange", "draw_things"]
 
@@ -23,6 +24,9 @@ TOUCH = 0.0003
 
 CENTRE = np.array([0.02, 0.02])
 _ATTEMPTS = 30
+_HIGHEST = 0.30  # of a stack, metres: the camera still sees its top
+_PATIENCE = 4  # attempts before fewer twins need touch
+_HIDING_PLACES = 8
 
 
 @dataclass(frozen=True)
@@ -54,9 +58,9 @@ def draw_things(rng: np.random.Generator, family: SceneFamily) -> Things:
             # Packaging is what lies on tables: cartons and cans come more often.
             often = [name for name in names for _ in range({"carton": 3, "can": 2}.get(name, 0))]
             bag = [str(name) for name in rng.permutation(names + often)]
-        shape = draw_shape(rng, bag.pop(), family.size_range)
+        shape = draw_shape(rng, bag.pop(), family.pool)
         shapes.append(shape)
-        skins.append(draw_skin(rng, shape, family.word_half))
+        skins.append(draw_skin(rng, shape, family.pool))
     twin_of = [-1] * len(shapes)
     # Twins are of kinds that print makes recognisable and that stand firmly.
     fit = [k for k, s in enumerate(shapes) if s.family not in ("bowl", "ball")] or list(range(len(shapes)))
@@ -111,14 +115,27 @@ def _farthest(world: World) -> float:
     return min(0.32, 0.20 + 0.012 * world.n_objects)
 
 
-def _beside(rng: np.random.Generator, world: World, k: int, neighbours: list[int], gap: float) -> bool:
-    """Put object k next to one of its `neighbours`, `gap` metres from what it meets first."""
+def _beside(
+    rng: np.random.Generator,
+    world: World,
+    k: int,
+    neighbours: list[int],
+    gap: float,
+    towards: np.ndarray | None = None,
+    attempts: int = _ATTEMPTS,
+) -> bool:
+    """Put object k next to one of its `neighbours`, `gap` metres from what it meets first.
+
+    `towards` (2,): about in which direction from the neighbour; by default any.
+    """
     start = world.positions()[k].copy()
-    for _ in range(_ATTEMPTS):
+    for _ in range(attempts):
         near = neighbours[int(rng.integers(len(neighbours)))]
         goal = world.positions()[near, :2]
         rotation, height = _rest(rng, world.shapes[k])
         angle = float(rng.uniform(0, 2 * np.pi))
+        if towards is not None:
+            angle = float(np.arctan2(towards[1], towards[0]) + rng.normal(0.0, 0.2))
         distance = _slide_in(world, k, goal, angle, height + 0.0002, rotation)
         place = goal + (distance + gap) * np.array([np.cos(angle), np.sin(angle)])
         world.place(k, (*place, height + 0.0002), rotation)
@@ -137,9 +154,9 @@ def _on_top(rng: np.random.Generator, world: World, k: int, placed: list[int]) -
     for j in rng.permutation(flat) if flat else []:
         below = world.poses()[j]
         top = below[2, 3] + float(np.abs(below[2, :3]) @ world.shapes[j].half)
-        if top > 0.16:
-            continue
         rotation, height = _rest(rng, world.shapes[k])
+        if top > 0.16 or top + 2 * height > _HIGHEST:
+            continue
         place = below[:2, 3] + rng.uniform(-0.01, 0.01, 2)
         world.place(k, (*place, top + height + 0.0005), rotation)
         world.forward()
@@ -149,22 +166,62 @@ def _on_top(rng: np.random.Generator, world: World, k: int, placed: list[int]) -
     return False
 
 
+def _height(world: World, k: int) -> float:
+    """How high above the table an object reaches, metres."""
+    pose = world.poses()[k]
+    return float(pose[2, 3] + np.abs(pose[2, :3]) @ world.shapes[k].half)
+
+
+def _visible(world: World, k: int, camera: Camera) -> int:
+    """Pixels of object k that a camera sees."""
+    turn = camera.pose.as_matrix()[:3, :3]
+    geom, _, _ = world.cast(np.array(camera.position), camera.rays().reshape(-1, 3) @ turn.T, (OBJECT_GROUP,))
+    return int((world.geom_object[geom[geom >= 0]] == k + 1).sum())
+
+
+def _behind(rng: np.random.Generator, world: World, k: int, placed: list[int], camera: Camera) -> bool:
+    """Put object k behind one of the tallest where the camera sees it least, if there is room."""
+    start, best = world.positions()[k].copy(), None
+    tallest = sorted(placed, key=lambda j: -_height(world, j))[:5]
+    for _ in range(_HIDING_PLACES):
+        near = tallest[int(rng.integers(len(tallest)))]
+        away = world.positions()[near, :2] - np.array(camera.position)[:2]
+        if not _beside(rng, world, k, [near], TOUCH, away, attempts=1):
+            continue
+        seen = _visible(world, k, camera)
+        if best is None or seen < best[0]:
+            best = (seen, world.positions()[k].copy(), world.rotations()[k])
+        if seen == 0:
+            break
+    world.place(k, *(best[1:] if best else (start, np.eye(3))))
+    world.forward()
+    return best is not None
+
+
 def _try(rng: np.random.Generator, world: World, family: SceneFamily, twin_of: tuple[int, ...], need: int) -> bool:
     originals = [int(k) for k in rng.permutation([k for k, t in enumerate(twin_of) if t < 0])]
     twins = [k for k, t in enumerate(twin_of) if t >= 0]
     stacked = originals[len(originals) - min(family.n_stacked, len(originals) - 1) :] if family.n_stacked else []
+    # What is to be hidden is small and stands on the table; it comes when the tall ones are there.
+    lone = [k for k in originals if k not in stacked and k not in twin_of]
+    hidden = sorted(lone, key=lambda k: world.shapes[k].radius)[: min(family.n_hidden, len(lone) - 1)]
+    camera = family.camera().scaled(160 / family.width)
     placed: list[int] = []
     order: list[int] = []
     for k in originals:
-        if k not in stacked:
+        if k not in stacked and k not in hidden:
             order += [k, *(t for t in twins if twin_of[t] == k)]
     order += [t for k in stacked for t in (k, *(t for t in twins if twin_of[t] == k))]
+    order += hidden
     for k in order:
         if not placed:
             rotation, height = _rest(rng, world.shapes[k])
             world.place(k, (*(CENTRE + rng.uniform(-0.05, 0.05, 2)), height + 0.0002), rotation)
         elif twin_of[k] >= 0:
             if not _beside(rng, world, k, [twin_of[k]], TOUCH):
+                return False
+        elif k in hidden:
+            if not (_behind(rng, world, k, placed, camera) or _beside(rng, world, k, placed, TOUCH)):
                 return False
         elif not (k in stacked and _on_top(rng, world, k, placed)):
             gap = TOUCH if rng.uniform() < family.contact else float(rng.uniform(0.01, 0.04))
@@ -193,8 +250,9 @@ def arrange(rng: np.random.Generator, world: World, family: SceneFamily, twin_of
     twins = sum(t >= 0 for t in twin_of)
     for attempt in range(_ATTEMPTS):
         world.restore(empty)
-        # In a dense heap settling may part some twins: after a while half of them must do.
-        if _try(rng, world, family, twin_of, twins if attempt < _ATTEMPTS // 3 else (twins + 1) // 2):
+        # In a dense heap settling may part some twins: then all but one, after a while half of them must touch.
+        need = (twins + 1) // 2 if attempt >= _PATIENCE else twins if twins < 3 else twins - 1
+        if _try(rng, world, family, twin_of, need):
             return
     raise InputError(
         f"scene family {family.name!r}: {world.n_objects} objects could not be arranged in {_ATTEMPTS} attempts",

@@ -18,6 +18,7 @@ import numpy as np
 from mstfilter.errors import InputError
 from mstfilter.scene.camera import Camera, look_at
 from mstfilter.scene.voxels import VoxelGrid
+from mstfilter.simulation.pools import ANY, REPORTED, TUNING, Pool
 from mstfilter.simulation.shapes import FAMILIES
 
 __all__ = ["SCENE_FAMILIES", "SceneFamily", "scene_family"]
@@ -25,7 +26,7 @@ __all__ = ["SCENE_FAMILIES", "SceneFamily", "scene_family"]
 _LOOKS_AT = np.array([0.02, 0.05, 0.04])
 _TOWARDS_CAMERA = np.array([0.03, -0.77, 0.54]) / np.linalg.norm([0.03, -0.77, 0.54])
 
-GENERATOR_VERSION = 2
+GENERATOR_VERSION = 3
 """Raised whenever the same seed gives other bytes."""
 
 FIRST_REPORTED_SEED = 1000
@@ -48,6 +49,8 @@ class SceneFamily:
         Objects that repeat the shape and texture of another and are put in contact with it.
     n_stacked : int
         Objects that are put on top of another, if there is room.
+    n_hidden : int
+        Small objects that are put behind a tall one, seen from the camera.
     contact : float
         Probability that an object without a twin touches another one; else there is a gap of 1 - 4 cm.
     shapes : str
@@ -88,6 +91,7 @@ class SceneFamily:
     n_objects_max: int = 6
     n_twins: int = 1
     n_stacked: int = 0
+    n_hidden: int = 0
     contact: float = 0.6
     shapes: str = "all"
     catalogue: str = "any"
@@ -119,6 +123,7 @@ class SceneFamily:
         need("n_objects_max", self.n_objects_min <= self.n_objects_max <= 40, "n_objects_min .. 40")
         need("n_twins", 0 <= self.n_twins < self.n_objects_min, "0 .. n_objects_min - 1")
         need("n_stacked", 0 <= self.n_stacked < self.n_objects_min, "0 .. n_objects_min - 1")
+        need("n_hidden", 0 <= self.n_hidden < self.n_objects_min, "0 .. n_objects_min - 1")
         need("contact", 0.0 <= self.contact <= 1.0, "a probability")
         need("catalogue", self.catalogue in _CATALOGUES, ", ".join(_CATALOGUES))
         need("n_actions", self.n_actions >= 0, "at least 0")
@@ -164,14 +169,9 @@ class SceneFamily:
         return replace(self, catalogue="tuning" if seed < FIRST_REPORTED_SEED else "reported")
 
     @property
-    def size_range(self) -> tuple[float, float]:
-        """Factors by which sizes are scaled."""
-        return {"tuning": (0.90, 0.995), "reported": (1.005, 1.10)}.get(self.catalogue, (0.90, 1.10))
-
-    @property
-    def word_half(self) -> int | None:
-        """Which half of the printed names is used."""
-        return {"tuning": 0, "reported": 1}.get(self.catalogue)
+    def pool(self) -> Pool:
+        """What sizes and textures are drawn from."""
+        return {"tuning": TUNING, "reported": REPORTED}.get(self.catalogue, ANY)
 
     def shape_families(self) -> tuple[str, ...]:
         """Names of the families of objects."""
@@ -237,8 +237,12 @@ SCENE_FAMILIES: dict[str, SceneFamily] = {
     ),
     "table": SceneFamily(name="table"),
     "s1": _STUDIED,
-    "s2": replace(_STUDIED, name="s2", n_objects_min=9, n_objects_max=9, n_twins=2, n_stacked=2, min_moved=3),
-    "s3": replace(_STUDIED, name="s3", n_objects_min=15, n_objects_max=20, n_twins=4, n_stacked=4, min_moved=3),
+    "s2": replace(
+        _STUDIED, name="s2", n_objects_min=9, n_objects_max=9, n_twins=2, n_stacked=2, n_hidden=1, min_moved=3
+    ),
+    "s3": replace(
+        _STUDIED, name="s3", n_objects_min=15, n_objects_max=20, n_twins=4, n_stacked=4, n_hidden=3, min_moved=3
+    ),
 }
 """The named families."""
 

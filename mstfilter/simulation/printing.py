@@ -16,6 +16,8 @@ import colorsys
 
 import numpy as np
 
+from mstfilter.simulation.pools import ANY, Pool
+
 __all__ = ["DOT", "carton_face", "cloth", "glaze", "label_side", "lid", "noise", "peel", "speckle", "wood"]
 
 DOT = 0.0004
@@ -39,9 +41,11 @@ _KINDS = (
 # fmt: on
 
 
-def shade(rng: np.random.Generator, light: tuple[float, float] = (0.45, 0.9), rich: float = 0.5) -> Colour:
+def shade(
+    rng: np.random.Generator, light: tuple[float, float] = (0.45, 0.9), rich: float = 0.5, pool: Pool = ANY
+) -> Colour:
     """A colour of random hue; every third is all but white or grey."""
-    hue = float(rng.uniform())
+    hue = pool.hue(rng)
     r, g, b = colorsys.hsv_to_rgb(
         hue, float(rng.uniform(0.2, rich)) * (0.25 if rng.uniform() < 0.33 else 1.0), float(rng.uniform(*light))
     )
@@ -117,11 +121,11 @@ def _barcode(rng: np.random.Generator, image: np.ndarray, box: tuple[int, int, i
     image[y + 4 : y + height - 4, x : x + width][:, bars] = 30
 
 
-def _picture(rng: np.random.Generator, image: np.ndarray, centre: tuple[int, int], radius: int) -> None:
+def _picture(rng: np.random.Generator, image: np.ndarray, centre: tuple[int, int], radius: int, pool: Pool) -> None:
     """A plate of something: a heap of shaded blobs."""
     import cv2
 
-    ground = shade(rng, (0.7, 0.95), 0.35)
+    ground = shade(rng, (0.7, 0.95), 0.35, pool)
     cv2.ellipse(image, centre, (radius, int(0.72 * radius)), 0, 0, 360, ground, -1, cv2.LINE_AA)
     r, g, b = colorsys.hsv_to_rgb(
         float(rng.uniform(0.0, 0.2)), float(rng.uniform(0.35, 0.8)), float(rng.uniform(0.45, 0.9))
@@ -139,10 +143,9 @@ def _picture(rng: np.random.Generator, image: np.ndarray, centre: tuple[int, int
         cv2.ellipse(image, at, axes, turn, 0, 360, light, -1, cv2.LINE_AA)
 
 
-def brand(rng: np.random.Generator, half: int | None = None) -> tuple[str, str]:
-    """A made-up name and what is inside; `half` 0 or 1 keeps to disjoint halves of the names."""
-    words = _WORDS if half is None else _WORDS[half::2]
-    return words[int(rng.integers(len(words)))], _KINDS[int(rng.integers(len(_KINDS)))]
+def brand(rng: np.random.Generator, pool: Pool = ANY) -> tuple[str, str]:
+    """A made-up name and what is inside."""
+    return pool.name(rng, _WORDS), pool.name(rng, _KINDS)
 
 
 def carton_face(
@@ -152,6 +155,7 @@ def carton_face(
     colours: tuple[Colour, Colour],
     words: tuple[str, str],
     role: str,
+    pool: Pool = ANY,
 ) -> np.ndarray:
     """One face of a printed carton; `role` is "front", "back", "side" or "end"."""
     import cv2
@@ -168,11 +172,11 @@ def carton_face(
         cv2.fillPoly(image, [corners], second, cv2.LINE_AA)
         if role == "front":
             middle = h * (0.64 if top < h / 2 else 0.32)
-            _picture(rng, image, (int(w * rng.uniform(0.4, 0.6)), int(middle)), int(0.46 * min(w, 0.8 * h)))
+            _picture(rng, image, (int(w * rng.uniform(0.4, 0.6)), int(middle)), int(0.46 * min(w, 0.8 * h)), pool)
         else:
             first = top + band + abs(slope) + 8 if top < h / 2 else int(0.06 * h)
             _lines(rng, image, (int(0.08 * w), first, int(0.5 * w), int(0.45 * h)), ink)
-            _picture(rng, image, (int(0.78 * w), first + h // 4), int(0.17 * w))
+            _picture(rng, image, (int(0.78 * w), first + h // 4), int(0.17 * w), pool)
         _write(image, words[0], (int(0.06 * w), top + slope // 2, int(0.88 * w), band), _ink(second))
         _write(image, words[1], (w // 4, int(0.90 * h) - 4, w // 2, int(0.09 * h)), ink, bold=False)
     elif role == "side":
@@ -189,7 +193,12 @@ def carton_face(
 
 
 def label_side(
-    rng: np.random.Generator, width: float, height: float, colours: tuple[Colour, Colour], words: tuple[str, str]
+    rng: np.random.Generator,
+    width: float,
+    height: float,
+    colours: tuple[Colour, Colour],
+    words: tuple[str, str],
+    pool: Pool = ANY,
 ) -> np.ndarray:
     """The unrolled label of a can or bottle: metal rims, bands, the name twice around, a picture, small print."""
     import cv2
@@ -210,7 +219,7 @@ def label_side(
         _write(image, words[1], (x, int(0.02 * h), int(0.3 * w), int(low * h * 0.8)), ink, bold=False)
         if k == 0:
             room = max(0.10, 1 - high) * h
-            _picture(rng, image, (x + int(0.2 * w), int((high + (1 - high) / 2) * h)), int(0.9 * room))
+            _picture(rng, image, (x + int(0.2 * w), int((high + (1 - high) / 2) * h)), int(0.9 * room), pool)
         else:
             _lines(rng, image, (x, int(high * h) + 8, int(0.3 * w), int((0.94 - high) * h)), ink)
     rim = max(2, round(0.003 / DOT))
@@ -218,7 +227,7 @@ def label_side(
     return image
 
 
-def lid(rng: np.random.Generator, size: float, colour: Colour, ridges: bool) -> np.ndarray:
+def lid(rng: np.random.Generator, size: float, colour: Colour, ridges: bool, pool: Pool = ANY) -> np.ndarray:
     """The round end of a can: concentric ridges, or a plain printed lid."""
     import cv2
 
@@ -229,7 +238,7 @@ def lid(rng: np.random.Generator, size: float, colour: Colour, ridges: bool) -> 
         r = np.hypot(x, y) / (n / 2)
         image = _tint(image, 0.10 * np.sin(40 * r) * (r < 0.85) - 0.25 * ((r > 0.88) & (r < 0.93)))
     else:
-        cv2.circle(image, (n // 2, n // 2), int(0.3 * n), shade(rng), -1, cv2.LINE_AA)
+        cv2.circle(image, (n // 2, n // 2), int(0.3 * n), shade(rng, pool=pool), -1, cv2.LINE_AA)
         cv2.circle(image, (n // 2, n // 2), int(0.44 * n), _ink(colour), max(2, n // 90), cv2.LINE_AA)
     return image
 
@@ -250,9 +259,9 @@ def wood(
     return _tint(image, 0.035 * rings + 0.03 * fibre + 0.02 * bend)
 
 
-def cloth(rng: np.random.Generator, width: float, height: float) -> np.ndarray:
+def cloth(rng: np.random.Generator, width: float, height: float, pool: Pool = ANY) -> np.ndarray:
     """A checked weave."""
-    ground, second = shade(rng, (0.5, 0.9), 0.5), shade(rng, (0.3, 0.8), 0.6)
+    ground, second = shade(rng, (0.5, 0.9), 0.5, pool), shade(rng, (0.3, 0.8), 0.6, pool)
     image = _canvas(width, height, ground)
     h, w = image.shape[:2]
     step = rng.uniform(0.010, 0.022) / DOT

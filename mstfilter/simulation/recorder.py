@@ -34,6 +34,9 @@ from mstfilter.simulation.world import FINGER_ID, World
 
 __all__ = ["Progress", "Scene", "simulate"]
 
+TOLERANCE = 0.0002
+"""Metres by which what is recorded (pictures, poses and volumes alike) may lag behind trembling physics."""
+
 Progress = Callable[[int, int, str], None]
 """Called with frames done, frames in all, and what is being done."""
 
@@ -63,7 +66,9 @@ class Scene:
         self.world = World(self.things.shapes, family.arm)
         arrange(_stream(self.seed, "arrangement"), self.world, family, self.things.twin_of)
         self.room: Room = draw_room(_stream(self.seed, "room"), seen_texel(self.camera))
-        self._renderer = Renderer(self.world, self.things.skins, self.room, self.camera, family.supersample)
+        self._renderer = Renderer(
+            self.world, self.things.skins, self.room, self.camera, family.supersample, TOLERANCE
+        )
         self._colour, self._depth = ColourSensor(), DepthSensor()
 
     def choose(self, action: int) -> Push:
@@ -82,7 +87,12 @@ class Scene:
 
     def truth(self) -> np.ndarray:
         """(X, Y, Z) uint16 labels of the world as it is now."""
-        return label_voxels(self.things.shapes, self.world.poses(), self.grid)
+        return label_voxels(self.things.shapes, self.poses(), self.grid)
+
+    def poses(self) -> np.ndarray:
+        """(n, 4, 4) T_world_object of the world as it is shown now."""
+        self._renderer.stage.follow()
+        return self._renderer.stage.poses
 
     def describe(self) -> dict[str, Any]:
         """What the manifest says of the scene."""
@@ -160,7 +170,7 @@ def _record(scene: Scene, writer: RecordingWriter, progress: Progress) -> None:
 def _frame(scene: Scene, writer: RecordingWriter, index: int, time_s: float, role: Any, **entry: Any) -> None:
     seen = scene.see(index)
     visible = np.bincount(seen["instance"].ravel(), minlength=256)[1 : scene.world.n_objects + 1]
-    poses = {str(k + 1): pose for k, pose in enumerate(scene.world.poses())}
+    poses = {str(k + 1): pose for k, pose in enumerate(scene.poses())}
     entry["visible_pixels"] = visible.tolist()
     writer.add_frame(time_s=round(time_s, 6), role=role, poses=poses, **seen, **entry)
 

@@ -4,7 +4,7 @@
 >>> from mstfilter.simulation.room import draw_room
 >>> room = draw_room(np.random.default_rng(0), texel=0.004)
 >>> room.table.ndim, room.lamp.shape
-(3, (5, 3))
+(3, (4, 3))
 """
 
 from __future__ import annotations
@@ -79,9 +79,9 @@ def draw_room(rng: np.random.Generator, texel: float) -> Room:
     side = -1.0 if rng.uniform() < 0.5 else 1.0
     centre = np.array([side * rng.uniform(0.35, 0.8), rng.uniform(-0.7, 0.1), rng.uniform(1.3, 1.7)])
     spread = rng.uniform(0.06, 0.10)
-    corners = np.array([[1, 1, 0], [1, -1, 0], [-1, -1, 0], [-1, 1, 0], [0, 0, 0]]) * spread
-    angle = np.arange(5) * (2 * np.pi / 5) + rng.uniform(0, 2 * np.pi)
-    ring = np.stack([1.6 * np.cos(angle), 1.6 * np.sin(angle), np.full(5, 1.5)], axis=1)
+    corners = np.array([[1, 1, 0], [1, -1, 0], [-1, -1, 0], [-1, 1, 0]]) * spread
+    angle = np.arange(4) * (2 * np.pi / 4) + rng.uniform(0, 2 * np.pi)
+    ring = np.stack([1.6 * np.cos(angle), 1.6 * np.sin(angle), np.full(4, 1.5)], axis=1)
     warm = np.array([1.0, rng.uniform(0.93, 1.0), rng.uniform(0.82, 0.98)])
     tile = 1.0 + 0.06 * printing.noise(rng, (256, 256), (40, 40), 5)
     # The exposure meter: the table comes out at a middle to light tone, with some error.

@@ -24,6 +24,7 @@ from itertools import pairwise
 import numpy as np
 
 from mstfilter.errors import InputError
+from mstfilter.simulation.pools import ANY, Pool
 from mstfilter.simulation.solids import Piece, box, capsule, cylinder, ellipsoid, frustum, hull, ring
 
 __all__ = ["FAMILIES", "Shape", "draw_shape"]
@@ -254,7 +255,7 @@ FAMILIES: tuple[str, ...] = tuple(_MAKERS)
 """Names that `draw_shape` knows."""
 
 
-def draw_shape(rng: np.random.Generator, family: str, sizes: tuple[float, float] = (0.9, 1.1)) -> Shape:
+def draw_shape(rng: np.random.Generator, family: str, pool: Pool = ANY) -> Shape:
     """A new member of a family.
 
     Parameters
@@ -263,8 +264,8 @@ def draw_shape(rng: np.random.Generator, family: str, sizes: tuple[float, float]
         Draws the member and its measures.
     family : str
         One of FAMILIES.
-    sizes : (float, float)
-        Each measure is scaled by a factor drawn from this range.
+    pool : Pool
+        Each measure is scaled by a factor drawn from it.
 
     Raises
     ------
@@ -273,4 +274,4 @@ def draw_shape(rng: np.random.Generator, family: str, sizes: tuple[float, float]
     """
     if family not in _MAKERS:
         raise InputError(f"no family of shapes is called {family!r}", f"there are {', '.join(FAMILIES)}")
-    return _MAKERS[family](rng, lambda: float(rng.uniform(*sizes)))
+    return _MAKERS[family](rng, lambda: pool.factor(rng))

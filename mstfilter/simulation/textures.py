@@ -19,6 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mstfilter.simulation import printing
+from mstfilter.simulation.pools import ANY, Pool
 from mstfilter.simulation.shapes import Shape
 
 __all__ = ["Atlas", "Skin", "draw_skin", "locate", "srgb_to_linear"]
@@ -101,7 +102,7 @@ def locate(shape: Shape, points: np.ndarray, normals: np.ndarray, plain: np.ndar
     return np.where(plain, 4, chart), place
 
 
-def draw_skin(rng: np.random.Generator, shape: Shape, half: int | None = None) -> Skin:
+def draw_skin(rng: np.random.Generator, shape: Shape, pool: Pool = ANY) -> Skin:
     """A texture that suits the shape.
 
     Parameters
@@ -110,13 +111,13 @@ def draw_skin(rng: np.random.Generator, shape: Shape, half: int | None = None) -
         Draws everything.
     shape : Shape
         For the charts' sizes and the styles that suit it.
-    half : {None, 0, 1}
-        Keep to one half of the made-up names, so that two sets of scenes share none.
+    pool : Pool
+        Which hues and names occur.
     """
     style = shape.finish[int(rng.integers(len(shape.finish)))]
     sizes = chart_sizes(shape)
-    pair = (printing.shade(rng), printing.shade(rng, (0.55, 0.95), 0.65))
-    words = printing.brand(rng, half)
+    pair = (printing.shade(rng, pool=pool), printing.shade(rng, (0.55, 0.95), 0.65, pool))
+    words = printing.brand(rng, pool)
     gloss = {"label": 0.30, "ceramic": 0.35, "carton": 0.12}.get(style, 0.04)
     if style == "carton":
         # The two broadest faces carry front and back, the narrow upright ones the sides.
@@ -124,17 +125,18 @@ def draw_skin(rng: np.random.Generator, shape: Shape, half: int | None = None) -
         charts = []
         for k, (w, h) in enumerate(sizes):
             role = "end" if k >= 4 else ("front" if k == wide[0] else "back" if k == wide[1] else "side")
-            charts.append(printing.carton_face(rng, w, h, pair, words, role))
+            charts.append(printing.carton_face(rng, w, h, pair, words, role, pool))
     elif style == "label":
         metal = (176, 176, 180)
         ends = [
-            printing.lid(rng, w, metal if k == 0 else pair[1], k == 0) for k, (w, _) in enumerate([sizes[TOP]] * 2)
+            printing.lid(rng, w, metal if k == 0 else pair[1], k == 0, pool)
+            for k, (w, _) in enumerate([sizes[TOP]] * 2)
         ]
         top = ends[int(rng.integers(2))]
-        charts = [printing.label_side(rng, *sizes[SIDE], pair, words), top, ends[0]]
+        charts = [printing.label_side(rng, *sizes[SIDE], pair, words, pool), top, ends[0]]
         charts.append(printing.glaze(rng, *sizes[INSIDE], pair, 0))
     elif style == "ceramic":
-        pale = printing.shade(rng, (0.7, 0.95), 0.45)
+        pale = printing.shade(rng, (0.7, 0.95), 0.45, pool)
         motif = int(rng.integers(3))
         charts = [
             printing.glaze(rng, w, h, (pale, pair[0]), motif if k == SIDE else 0) for k, (w, h) in enumerate(sizes)
@@ -147,7 +149,7 @@ def draw_skin(rng: np.random.Generator, shape: Shape, half: int | None = None) -
         charts = []
         for w, h in sizes:
             rng.bit_generator.state = state  # the same weave on every face
-            charts.append(printing.cloth(rng, w, h))
+            charts.append(printing.cloth(rng, w, h, pool))
     elif style == "peel":
         ripe = (int(rng.uniform(205, 228)), int(rng.uniform(175, 195)), int(rng.uniform(60, 95)))
         charts = [printing.peel(rng, w, h, ripe) for w, h in sizes]

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -25,7 +26,7 @@ from mstfilter.errors import InputError
 from mstfilter.simulation.shapes import Shape
 from mstfilter.simulation.solids import Piece
 
-__all__ = ["FINGER_ID", "PARKED", "TABLE", "TIME_STEP", "Contact", "World"]
+__all__ = ["FINGER_ID", "PARKED", "TABLE", "TIME_STEP", "Contact", "World", "cast"]
 
 TIME_STEP = 0.002
 FINGER_ID = 255
@@ -270,7 +271,7 @@ class World:
     def cast(
         self, origin: ArrayLike, directions: np.ndarray, groups: Sequence[int] = (0, 1, 2)
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Rays from one point.
+        """Rays from one point through the world as it is after `forward`.
 
         Parameters
         ----------
@@ -285,23 +286,29 @@ class World:
         geom (n,) int32, -1 where nothing is hit; distance (n,) in units of each direction's length; normal
         (n, 3).
         """
-        n = len(directions)
-        geom, distance = np.full(n, -1, np.int32), np.full(n, -1.0)
-        normal = np.zeros((n, 3))
-        if n:
-            seen = np.isin(np.arange(6), groups).astype(np.uint8)
-            self._mj.mj_multiRay(
-                self.model,
-                self.data,
-                np.asarray(origin, dtype=np.float64),
-                np.ascontiguousarray(directions, dtype=np.float64).reshape(-1),
-                seen,
-                True,
-                -1,
-                geom,
-                distance,
-                normal.reshape(-1),
-                n,
-                1e6,
-            )
-        return geom, distance, normal
+        return cast(self.model, self.data, origin, directions, groups)
+
+    def qpos_of(self, k: int) -> slice:
+        """Where object k's place and orientation stand among the coordinates."""
+        return slice(int(self._qpos[k]), int(self._qpos[k]) + 7)
+
+    def another_data(self) -> tuple[Any, Any]:
+        """MuJoCo's module and a further state of the same model, which physics never touches."""
+        return self._mj, self._mj.MjData(self.model)
+
+
+def cast(
+    model: Any, data: Any, origin: ArrayLike, directions: np.ndarray, groups: Sequence[int]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Rays from one point through a state whose kinematics are up to date; see `World.cast`."""
+    import mujoco
+
+    n = len(directions)
+    geom, distance = np.full(n, -1, np.int32), np.full(n, -1.0)
+    normal = np.zeros((n, 3))
+    if n:
+        seen = np.isin(np.arange(6), groups).astype(np.uint8)
+        start = np.asarray(origin, dtype=np.float64)
+        rays = np.ascontiguousarray(directions, dtype=np.float64).reshape(-1)
+        mujoco.mj_multiRay(model, data, start, rays, seen, True, -1, geom, distance, normal.reshape(-1), n, 1e6)
+    return geom, distance, normal

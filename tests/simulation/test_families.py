@@ -7,6 +7,7 @@ import pytest
 
 from mstfilter.errors import InputError
 from mstfilter.simulation.families import SCENE_FAMILIES, SceneFamily, scene_family
+from mstfilter.simulation.pools import ANY, REPORTED, TUNING
 
 
 def test_named_families():
@@ -18,13 +19,22 @@ def test_named_families():
     assert table.grid().origin[2] == 0.0
 
 
-def test_catalogues_share_no_size():
-    tuning, reported = (
-        replace(SCENE_FAMILIES["table"], catalogue="tuning"),
-        replace(SCENE_FAMILIES["table"], catalogue="reported"),
-    )
-    assert tuning.size_range[1] < reported.size_range[0]
-    assert {tuning.word_half, reported.word_half} == {0, 1}
+def test_the_seed_decides_the_catalogue_of_the_studied_families():
+    for name in ("s1", "s2", "s3"):
+        family = scene_family(name)
+        assert {family.for_seed(seed).catalogue for seed in (0, 99, 999)} == {"tuning"}
+        assert {family.for_seed(seed).catalogue for seed in (1000, 5000)} == {"reported"}
+        assert family.for_seed(5).pool == TUNING and family.for_seed(5000).pool == REPORTED
+    table = scene_family("table")
+    assert table.for_seed(0) is table and table.pool == ANY
+
+
+def test_families_differ_in_what_lies_on_the_table_only():
+    s1, s2, s3 = (scene_family(name) for name in ("s1", "s2", "s3"))
+    number = ("name", "n_objects_min", "n_objects_max", "n_twins", "n_stacked", "n_hidden", "min_moved")
+    for other in (s2, s3):
+        assert replace(s1, **{field: getattr(other, field) for field in number}) == other
+    assert (s1.n_objects_min, s2.n_objects_min, s3.n_objects_min, s3.n_objects_max) == (5, 9, 15, 20)
 
 
 @pytest.mark.parametrize(
@@ -33,6 +43,7 @@ def test_catalogues_share_no_size():
         ("n_objects_min", 0),
         ("n_objects_max", 2),
         ("n_twins", 9),
+        ("n_hidden", 5),
         ("contact", 1.5),
         ("catalogue", "mine"),
         ("frames_per_clip", 1),
