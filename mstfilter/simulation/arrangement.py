@@ -25,8 +25,8 @@ TOUCH = 0.0003
 CENTRE = np.array([0.02, 0.02])
 _ATTEMPTS = 30
 _HIGHEST = 0.30  # of a stack, metres: the camera still sees its top
-_PATIENCE = 4  # attempts before fewer twins need touch
-_HIDING_PLACES = 8
+_PATIENCE = 4  # attempts before less is asked for
+_HIDING_PLACES = 24
 
 
 @dataclass(frozen=True)
@@ -172,11 +172,11 @@ def _height(world: World, k: int) -> float:
     return float(pose[2, 3] + np.abs(pose[2, :3]) @ world.shapes[k].half)
 
 
-def _visible(world: World, k: int, camera: Camera) -> int:
-    """Pixels of object k that a camera sees."""
+def _visible(world: World, camera: Camera) -> np.ndarray:
+    """(n,) pixels of each object that a camera sees."""
     turn = camera.pose.as_matrix()[:3, :3]
     geom, _, _ = world.cast(np.array(camera.position), camera.rays().reshape(-1, 3) @ turn.T, (OBJECT_GROUP,))
-    return int((world.geom_object[geom[geom >= 0]] == k + 1).sum())
+    return np.bincount(world.geom_object[geom[geom >= 0]], minlength=world.n_objects + 1)[1 : world.n_objects + 1]
 
 
 def _behind(rng: np.random.Generator, world: World, k: int, placed: list[int], camera: Camera) -> bool:
@@ -188,7 +188,7 @@ def _behind(rng: np.random.Generator, world: World, k: int, placed: list[int], c
         away = world.positions()[near, :2] - np.array(camera.position)[:2]
         if not _beside(rng, world, k, [near], TOUCH, away, attempts=1):
             continue
-        seen = _visible(world, k, camera)
+        seen = int(_visible(world, camera)[k])
         if best is None or seen < best[0]:
             best = (seen, world.positions()[k].copy(), world.rotations()[k])
         if seen == 0:
@@ -198,7 +198,9 @@ def _behind(rng: np.random.Generator, world: World, k: int, placed: list[int], c
     return best is not None
 
 
-def _try(rng: np.random.Generator, world: World, family: SceneFamily, twin_of: tuple[int, ...], need: int) -> bool:
+def _try(
+    rng: np.random.Generator, world: World, family: SceneFamily, twin_of: tuple[int, ...], need: tuple[int, int]
+) -> bool:
     originals = [int(k) for k in rng.permutation([k for k, t in enumerate(twin_of) if t < 0])]
     twins = [k for k, t in enumerate(twin_of) if t >= 0]
     stacked = originals[len(originals) - min(family.n_stacked, len(originals) - 1) :] if family.n_stacked else []
@@ -234,8 +236,10 @@ def _try(rng: np.random.Generator, world: World, family: SceneFamily, twin_of: t
     at = world.positions()
     if not family.holds(at).all() or world.deepest_overlap() > 0.0015:
         return False
+    if family.n_hidden and (_visible(world, camera) == 0).sum() < need[1]:
+        return False
     touching = {(c.first, c.second) for c in world.contacts()}
-    return sum((min(k, t), max(k, t)) in touching for k, t in enumerate(twin_of) if t >= 0) >= need
+    return sum((min(k, t), max(k, t)) in touching for k, t in enumerate(twin_of) if t >= 0) >= need[0]
 
 
 def arrange(rng: np.random.Generator, world: World, family: SceneFamily, twin_of: tuple[int, ...]) -> None:
@@ -250,8 +254,11 @@ def arrange(rng: np.random.Generator, world: World, family: SceneFamily, twin_of
     twins = sum(t >= 0 for t in twin_of)
     for attempt in range(_ATTEMPTS):
         world.restore(empty)
-        # In a dense heap settling may part some twins: then all but one, after a while half of them must touch.
-        need = (twins + 1) // 2 if attempt >= _PATIENCE else twins if twins < 3 else twins - 1
+        # In a dense heap settling may part some twins or show what was hidden: then fewer will do.
+        patient = attempt < _PATIENCE
+        touching = (twins if twins < 3 else twins - 1) if patient else (twins + 1) // 2
+        hidden = (family.n_hidden + 1) // 2 if attempt < 2 * _PATIENCE else 0
+        need = touching, hidden
         if _try(rng, world, family, twin_of, need):
             return
     raise InputError(
