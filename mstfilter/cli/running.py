@@ -83,13 +83,20 @@ def simulate(
 
 @app.command()
 def report(
-    run: Annotated[Path, typer.Argument(help="Run folder.")],
-    out: Annotated[Path | None, typer.Option(help="HTML file. Default: report.html in the run folder.")] = None,
+    run: Annotated[Path, typer.Argument(help="Run folder, or study folder.")],
+    out: Annotated[Path | None, typer.Option(help="HTML file. Default: report.html in the folder.")] = None,
     export: Annotated[
         Path | None, typer.Option(help="Also write PLY meshes and label images into this folder.")
     ] = None,
 ) -> None:
-    """Write the report of a run folder, finished or not."""
+    """Write the report of a run or a study, finished or not."""
+    if (run / "study.json").is_file():
+        from mstfilter.report.study import write_study_report
+
+        if export is not None:
+            raise InputError(f"{run} is a study, only runs can be exported", f"export one of {run / 'runs'}")
+        print(f"report      {write_study_report(run, out)}")
+        return
     _report(run, out)
     if export is not None:
         from mstfilter.report.export import export_run

@@ -8,102 +8,19 @@ in, so that it follows a light or a dark theme. The same values give the same te
 
 from __future__ import annotations
 
-import io
-import re
 from collections.abc import Mapping, Sequence
-from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from collections.abc import Iterator
+from mstfilter.report.svg import ACCENT, FLOOR, INK, LINE, MUTED, new_figure, style, svg_text
 
+if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 __all__ = ["genealogy_figure", "health_figure", "quality_figure"]
 
-# Stand-ins that are replaced by the page's own colours.
-_INK, _MUTED, _LINE, _ACCENT, _FLOOR = "#010203", "#020304", "#030405", "#040506", "#050607"
-_PAGE = {
-    _INK: "currentColor",
-    _MUTED: "var(--muted)",
-    _LINE: "var(--line)",
-    _ACCENT: "var(--accent)",
-    _FLOOR: "var(--floor)",
-}
 _MOST_NAMED = 24  # particles of a pause that are still named in a genealogy
-
-
-@contextmanager
-def _style(name: str) -> Iterator[None]:
-    import matplotlib
-
-    settings = {
-        "svg.fonttype": "none",
-        "svg.hashsalt": f"mstfilter {name}",
-        "font.size": 9.5,
-        "axes.edgecolor": _LINE,
-        "axes.labelcolor": _MUTED,
-        "axes.titlecolor": _INK,
-        "axes.titlesize": 10,
-        "axes.titlelocation": "left",
-        "axes.spines.top": False,
-        "axes.spines.right": False,
-        "axes.spines.left": False,
-        "axes.axisbelow": True,
-        "text.color": _INK,
-        "xtick.color": _LINE,
-        "ytick.color": _LINE,
-        "xtick.labelcolor": _MUTED,
-        "ytick.labelcolor": _MUTED,
-        "ytick.left": False,
-        "grid.color": _LINE,
-        "grid.linewidth": 0.7,
-        "legend.frameon": False,
-        "legend.labelcolor": _MUTED,
-    }
-    with matplotlib.rc_context(settings):
-        yield
-
-
-def _new(width: float, height: float, n: int = 1) -> tuple[Figure, list[Axes]]:
-    from matplotlib.backends.backend_svg import FigureCanvasSVG
-    from matplotlib.figure import Figure
-
-    figure = Figure((width, height), layout="constrained")
-    FigureCanvasSVG(figure)
-    figure.patch.set_alpha(0)
-    axes = [figure.add_subplot(1, n, k + 1) for k in range(n)]
-    for a in axes:
-        a.patch.set_alpha(0)
-        a.grid(axis="y")
-    return figure, axes
-
-
-def _svg(figure: Figure, title: str) -> str:
-    """The figure as an element to stand in a page, without prolog, links, size or fonts of its own."""
-    buffer = io.StringIO()
-    figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
-    text = buffer.getvalue()
-    text = text[text.index("<svg") :]
-    text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.S)
-    view = re.search(r'viewBox="([^"]*)"', text)
-    assert view is not None
-    head = f'<svg class="figure" viewBox="{view[1]}" role="img" aria-label="{title}">'
-    text = head + text[text.index(">") + 1 :]
-    text = re.sub(r"font(-family)?: ?[^;\"]*'[^;\"]*(;|(?=\"))", _font, text)
-    text = text.replace("xlink:href", "href")
-    for mark, colour in _PAGE.items():
-        text = text.replace(mark, colour)
-    return text.strip()
-
-
-def _font(match: re.Match[str]) -> str:
-    """Keep the size of a ``font`` shorthand, drop the family."""
-    size = re.search(r"([\d.]+)px", match[0])
-    return "" if size is None else f"font-size: {size[1]}px;"
 
 
 def _pauses(axes: Axes, times: Sequence[int]) -> None:
@@ -130,21 +47,21 @@ def quality_figure(
     floors : mapping
         Name to one value a pause.
     """
-    with _style("quality"):
-        figure, (axes,) = _new(6.6, 3.3)
+    with style("quality"):
+        figure, (axes,) = new_figure(6.6, 3.3)
         mean = [float(np.dot(q, w) / np.sum(w)) for q, w in zip(qualities, weights, strict=True)]
         for (name, values), dash in zip(floors.items(), ((4, 2), (1, 2)), strict=False):
-            axes.plot(times, values, color=_FLOOR, lw=1.3, dashes=dash, marker="_", ms=12, label=name)
+            axes.plot(times, values, color=FLOOR, lw=1.3, dashes=dash, marker="_", ms=12, label=name)
         for t, q, w in zip(times, qualities, weights, strict=True):
             offset = np.linspace(-0.09, 0.09, len(q)) if len(q) > 1 else np.zeros(1)
-            axes.scatter(t + offset, q, s=16 + 130 * np.asarray(w), color=_ACCENT, alpha=0.4, lw=0)
-        axes.plot(times, mean, color=_ACCENT, lw=2, marker="o", ms=4.5, label="weighted mean")
-        axes.scatter([], [], s=30, color=_ACCENT, alpha=0.4, lw=0, label="hypothesis")
+            axes.scatter(t + offset, q, s=16 + 130 * np.asarray(w), color=ACCENT, alpha=0.4, lw=0)
+        axes.plot(times, mean, color=ACCENT, lw=2, marker="o", ms=4.5, label="weighted mean")
+        axes.scatter([], [], s=30, color=ACCENT, alpha=0.4, lw=0, label="hypothesis")
         axes.set_ylim(0, 1.02)
         _pauses(axes, times)
         axes.set_title("Quality against the truth")
         figure.legend(loc="outside lower center", ncols=4, fontsize=8.5, handlelength=2.2, columnspacing=1.4)
-        return _svg(figure, "Quality of the hypotheses over time")
+        return svg_text(figure, "Quality of the hypotheses over time")
 
 
 def health_figure(
@@ -161,15 +78,15 @@ def health_figure(
     ess, ancestors : sequence of (value, most) or None
         Drawn as a share of the most there can be; None where there is nothing to count.
     """
-    with _style("health"):
-        figure, axes = _new(6.6, 2.3, 2)
+    with style("health"):
+        figure, axes = new_figure(6.6, 2.3, 2)
         both = (("Effective sample size", ess), ("Previous particles with descendants", ancestors))
         for a, (title, values) in zip(axes, both, strict=True):
             known = [(t, *pair) for t, pair in zip(times, values, strict=True) if pair is not None]
             at = [t for t, _, _ in known]
             share = [100 * value / max(most, 1) for _, value, most in known]
-            a.bar(at, 100, width=0.62, color=_LINE, lw=0, alpha=0.55)
-            a.bar(at, share, width=0.62, color=_ACCENT, lw=0, alpha=0.85)
+            a.bar(at, 100, width=0.62, color=LINE, lw=0, alpha=0.55)
+            a.bar(at, share, width=0.62, color=ACCENT, lw=0, alpha=0.85)
             _pauses(a, times)
             a.set_ylim(0, 116)
             a.set_yticks([0, 50, 100], ["0", "50 %", "100 %"])
@@ -178,7 +95,7 @@ def health_figure(
                     text = f"{value:.3g} of {most}"
                     a.annotate(text, (t, s), (0, 2), textcoords="offset points", ha="center", fontsize=8)
             a.set_title(title)
-        return _svg(figure, "Effective sample size and unique ancestors over time")
+        return svg_text(figure, "Effective sample size and unique ancestors over time")
 
 
 def genealogy_figure(
@@ -200,19 +117,19 @@ def genealogy_figure(
     n = max(len(w) for w in weights)
     named = n <= _MOST_NAMED
     line = _lineage(weights, previous)
-    with _style("genealogy"):
-        figure, (axes,) = _new(6.6, float(np.clip(1.0 + 0.62 * n, 2.2, 6.2)))
+    with style("genealogy"):
+        figure, (axes,) = new_figure(6.6, float(np.clip(1.0 + 0.62 * n, 2.2, 6.2)))
         axes.grid(visible=False)
         for t, parents in enumerate(previous):
             for k, parent in enumerate(parents or ()):
                 if t and 0 <= parent < len(weights[t - 1]):
                     own = line.get(t) == k
                     x, y = _bend(t - 1, parent, t, k)
-                    axes.plot(x, y, color=_ACCENT if own else _MUTED, lw=2.2 if own else 1, alpha=1 if own else 0.45)
+                    axes.plot(x, y, color=ACCENT if own else MUTED, lw=2.2 if own else 1, alpha=1 if own else 0.45)
         for t, indices in enumerate(proposed):
             for k, index in enumerate(indices or ()):
                 if index >= 0:
-                    axes.plot([t - 0.11, t], [k - 0.26, k], color=_FLOOR, lw=1, solid_capstyle="round")
+                    axes.plot([t - 0.11, t], [k - 0.26, k], color=FLOOR, lw=1, solid_capstyle="round")
                     if named:
                         axes.annotate(
                             f"p{index}",
@@ -220,22 +137,22 @@ def genealogy_figure(
                             ha="right",
                             va="center",
                             fontsize=7.5,
-                            color=_FLOOR,
+                            color=FLOOR,
                         )
         for t, w in enumerate(weights):
             share = np.asarray(w) / np.sum(w)
             on = np.array([line.get(t) == k for k in range(len(w))])
             size = (18 if named else 4) + (260 if named else 60) * share
-            for mask, colour in ((~on, _INK), (on, _ACCENT)):
+            for mask, colour in ((~on, INK), (on, ACCENT)):
                 axes.scatter(np.full(mask.sum(), t), np.flatnonzero(mask), s=size[mask], color=colour, lw=0, zorder=3)
             if named:
                 for k in range(len(w)):
-                    axes.annotate(f"#{k}", (t, k), (7, 6), textcoords="offset points", fontsize=8, color=_MUTED)
+                    axes.annotate(f"#{k}", (t, k), (7, 6), textcoords="offset points", fontsize=8, color=MUTED)
         axes.set_ylim(n - 0.4, -0.75)
         axes.set_yticks([])
         _pauses(axes, range(len(weights)))
         axes.set_title("Genealogy")
-        return _svg(figure, "Genealogy of the particles")
+        return svg_text(figure, "Genealogy of the particles")
 
 
 def _lineage(weights: Sequence[Sequence[float]], previous: Sequence[Sequence[int] | None]) -> dict[int, int]:

@@ -38,7 +38,10 @@ _PAIRS_AT_ONCE = 2**22
 
 
 def measure(run: RunFolder, recording: Recording, t: int) -> dict[str, Any]:
-    """One row: the figures of the hypotheses of a run at pause `t`; without true volumes only what needs none."""
+    """One row: the figures of the hypotheses of a run at pause `t`; without true volumes only what needs none.
+
+    The list ``qualities``, one a hypothesis, is for figures; tables leave it out.
+    """
     info, hypotheses = run.info(t), run.hypotheses(t)
     labels, weights = [h.labels for h in hypotheses], np.array(info["weights"], dtype=float)
     row: dict[str, Any] = {"pause": t, "time_s": recording.times[recording.pauses[t]], "n": info["n"]}
@@ -47,7 +50,8 @@ def measure(run: RunFolder, recording: Recording, t: int) -> dict[str, Any]:
     if truth is None:
         return {**row, "diversity": diversity(labels)}
     known = all(recording.instance(p) is not None for p in recording.pauses[: t + 1])
-    return {**row, **figures(labels, weights, truth, object_status(recording, t) if known else {})}
+    found = figures(labels, weights, truth, object_status(recording, t) if known else {})
+    return {**row, **found, "qualities": [weighted_coverage(one, truth) for one in labels]}
 
 
 def figures(

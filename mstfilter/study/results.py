@@ -105,8 +105,8 @@ class StudyFolder:
                 found.append({**run, **{k: result.get(k) for k in ("error", "hints", "tries", "trace")}})
         return found
 
-    def rows(self) -> list[dict[str, Any]]:
-        """One row a pause and run of all runs that are done, in the order of the study."""
+    def records(self) -> list[dict[str, Any]]:
+        """As `rows`, with the lists that are no columns: ``qualities``, one a hypothesis."""
         rows = []
         for run in self.description["runs"]:
             result = read_result(self.run(run["folder"]))
@@ -116,6 +116,10 @@ class StudyFolder:
             for row, cost in zip(result["rows"], result["costs"], strict=True):
                 rows.append({**named, **row, **cost})
         return rows
+
+    def rows(self) -> list[dict[str, Any]]:
+        """One row a pause and run of all runs that are done, in the order of the study: figures, time and memory."""
+        return [{k: v for k, v in row.items() if not isinstance(v, list)} for row in self.records()]
 
     def summary(self) -> Summary:
         """What the runs that are done say together."""

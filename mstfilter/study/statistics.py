@@ -46,7 +46,7 @@ class Difference:
     low, high : float
         t interval; NaN for one scene.
     low_bootstrap, high_bootstrap : float
-        Studentised bootstrap; NaN below four scenes.
+        Studentised bootstrap; NaN below five scenes.
     p : float
         Of sign flips, two-sided; NaN for one scene.
     n : int
@@ -94,12 +94,12 @@ def interval(values: np.ndarray, level: float = LEVEL) -> tuple[float, float]:
 
 
 def studentised(values: np.ndarray, level: float = LEVEL, n_resamples: int = N_BOOTSTRAP) -> tuple[float, float]:
-    """Studentised bootstrap interval of the mean (Efron, Tibshirani 1993, section 12.5); NaN below four values.
+    """Studentised bootstrap interval of the mean (Efron, Tibshirani 1993, section 12.5); NaN below five values.
 
     The same values give the same interval. Resamples in which all values are equal have no scale and are left out.
     """
     n = len(values)
-    if n < 4:
+    if n < 5:
         return float("nan"), float("nan")
     spread = values.std(ddof=1)
     if spread <= 1e-12 * max(1.0, np.abs(values).max()):

@@ -137,13 +137,15 @@ def summarise(rows: Sequence[Mapping[str, Any]], reference: str, cost: Sequence[
     reference : str
         The arm that others are compared with.
     cost : sequence of str
-        Columns of time and memory: averaged over all pauses, never compared.
+        Columns of time and memory: averaged over all pauses, where a stage that a pause lacks took no time; never
+        compared.
     """
     families, arms = (tuple(dict.fromkeys(str(row[k]) for row in rows)) for k in ("family", "arm"))
     named = list(dict.fromkeys(k for row in rows for k in row if k not in _NAMES))
     measured = [name for name in named if name not in cost]
     values = _by_scene(rows, measured, lambda row: row["pause"] >= 1)
-    values.update(_by_scene(rows, [k for k in named if k in cost], lambda row: True))
+    spent = [k for k in named if k in cost]
+    values.update(_by_scene([{**dict.fromkeys(spent, 0.0), **row} for row in rows], spent, lambda row: True))
     if ENDPOINT in measured:
         values.update(_slopes(rows))
         measured.insert(1 + measured.index(ENDPOINT), SLOPE)

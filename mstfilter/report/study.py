@@ -1,0 +1,169 @@
+"""The report of a study: one HTML file that needs nothing beside it.
+
+>>> write_study_report("studies/first")                     # studies/first/report.html
+
+It is made from the study's folder alone, finished or not, and runs no code of a user. Conclusions are in words that
+claim no more than the scenes show.
+"""
+
+from __future__ import annotations
+
+import os
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+from mstfilter.errors import InputError
+from mstfilter.report.content import seconds_text
+from mstfilter.report.study_figures import differences_figure, time_figure
+from mstfilter.report.tables import flatten, shown
+from mstfilter.study.results import StudyFolder
+from mstfilter.study.statistics import CLAIM
+from mstfilter.study.summary import ENDPOINT, SLOPE, Summary
+
+__all__ = ["write_study_report"]
+
+#: Columns of the table of figures: name in the study, heading.
+_FIGURES = (
+    (ENDPOINT, "quality"),
+    (SLOPE, "slope a pause"),
+    ("quality_top", "heaviest"),
+    ("quality_best", "best of n"),
+    ("quality_visible", "visible objects"),
+    ("quality_hidden", "hidden, seen before"),
+    ("quality_unseen", "never seen"),
+    ("occupancy", "occupancy IoU"),
+    ("object_f", "object F"),
+    ("split", "split"),
+    ("merged", "merged"),
+    ("missed", "missed"),
+    ("invented", "invented"),
+    ("diversity", "diversity"),
+    ("brier", "Brier"),
+    ("quality_authors", "authors' form"),
+    ("quality_paper", "paper's form"),
+    ("quality_one_blob", "floor: one blob"),
+    ("quality_components", "floor: components"),
+)
+
+
+def write_study_report(study: StudyFolder | str | Path, out: str | Path | None = None) -> Path:
+    """Write the report of a study folder.
+
+    Parameters
+    ----------
+    study : StudyFolder or path
+        Finished or not.
+    out : path, optional
+        The HTML file. Default: ``report.html`` in the study's folder.
+
+    Raises
+    ------
+    InputError
+        The folder is no study, or the file cannot be written.
+    """
+    study = StudyFolder.open(study.path if isinstance(study, StudyFolder) else study)
+    path = study.path / "report.html" if out is None else Path(out)
+    text = _page(study)
+    partial = path.with_name(f".{path.name}.partial")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        partial.write_text(text, encoding="utf-8")
+        os.replace(partial, path)
+    except OSError as error:
+        raise InputError(f"cannot write report {path}: {error.strerror}", "choose another file") from error
+    return path
+
+
+def _page(study: StudyFolder) -> str:
+    from jinja2 import Environment, FunctionLoader, StrictUndefined
+
+    folder = files("mstfilter.report") / "templates"
+    environment = Environment(
+        loader=FunctionLoader(lambda name: (folder / name).read_text(encoding="utf-8")),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters.update(seconds=seconds_text, number=_number, signed=lambda x: _number(x, "+"))
+    records, summary, failures = study.records(), study.summary(), study.failures()
+    sources: list[dict[str, Any]] = [scene["source"] for scene in study.description["scenes"]]
+    return environment.get_template("study.html").render(
+        study=study.description,
+        n_done=len({(r["scene"], r["arm"], r["seed"]) for r in records}),
+        summary=summary,
+        simulated=bool([source for source in sources if "family" in source]),
+        scenes={group: _scenes(study, group) for group in _groups(study)},
+        claim=CLAIM,
+        compared=[one for one in summary.compared() if one.difference.n],
+        columns=[(name, heading) for name, heading in _FIGURES if name in summary.names],
+        figures=_drawn(records, summary),
+        costs=_costs(summary),
+        arms=_arms(study.description),
+        failures=failures,
+        style=(folder / "style.css").read_text(encoding="utf-8"),
+    )
+
+
+def _number(value: float | None, sign: str = "") -> str:
+    """Three digits; a dash for what is not known."""
+    return "–" if value is None or value != value else f"{value:{sign}.3f}"
+
+
+def _groups(study: StudyFolder) -> list[str]:
+    return list(dict.fromkeys(scene["group"] for scene in study.description["scenes"]))
+
+
+def _scenes(study: StudyFolder, group: str) -> list[str]:
+    return [scene["name"] for scene in study.description["scenes"] if scene["group"] == group]
+
+
+def _drawn(records: Sequence[Mapping[str, Any]], summary: Summary) -> dict[str, Any]:
+    """Inline SVG by name."""
+    from markupsafe import Markup
+
+    values: dict[str, dict[str, dict[int, list[float]]]] = defaultdict(lambda: defaultdict(lambda: defaultdict(list)))
+    for row in records:
+        if row.get("qualities"):
+            values[row["family"]][row["arm"]][row["pause"]].extend(row["qualities"])
+    found = {}
+    if values:
+        found["time"] = Markup(time_figure(values, summary.arms))
+    compared = [one for one in summary.compared() if one.difference.n]
+    if compared:
+        found["differences"] = Markup(differences_figure(compared, summary.arms))
+    return found
+
+
+def _costs(summary: Summary) -> dict[str, Any]:
+    """Seconds by stage and family, core seconds and memory, means over pauses."""
+    stages = [n.removeprefix("seconds_") for n in summary.names if n.startswith("seconds_")]
+    rows: list[dict[str, Any]] = []
+    for family in summary.families:
+        for arm in summary.arms:
+            cells = {
+                name: figure.mean
+                for name in ("seconds", "core_seconds", "peak_mb", *(f"seconds_{s}" for s in stages))
+                if (figure := summary.figure(family, arm, name)) is not None
+            }
+            if cells:
+                rows.append({"family": family, "arm": arm, **cells})
+    most = max((sum(float(r.get(f"seconds_{s}", 0.0)) for s in stages) for r in rows), default=1.0)
+    return {"stages": stages, "rows": rows, "most": most or 1.0}
+
+
+def _arms(description: Mapping[str, Any]) -> list[tuple[str, list[tuple[str, str]]]]:
+    """Every arm and where its configuration differs from the reference's."""
+    flat = {arm["name"]: flatten(arm["config"]) for arm in description["arms"]}
+    base = flat[description["reference"]]
+    found = []
+    for name, config in flat.items():
+        keys = [k for k in {**base, **config} if config.get(k) != base.get(k)]
+        # A component that is another one says enough: its fields go without saying.
+        slots = [k.removesuffix("component") for k in keys if k.endswith("component")]
+        told = [k for k in keys if k.endswith("component") or not k.startswith(tuple(slots))]
+        found.append((name, [(k.removesuffix(".component"), shown(config.get(k))) for k in told]))
+    return found

@@ -1,0 +1,104 @@
+"""The report of a study: from its folder alone, with conclusions that claim no more than they may."""
+
+from __future__ import annotations
+
+import json
+import re
+
+import numpy as np
+import pytest
+
+from mstfilter.errors import InputError
+from mstfilter.report.study import write_study_report
+from mstfilter.study.results import RESULT, StudyFolder
+from tests.test_cli import call
+
+
+def make_study(path, n_scenes=4, arms=("ours", "<theirs>"), groups=("s1", "s2"), fail=True):
+    """A study folder written by hand: ours is better by 0.1."""
+    rng, runs = np.random.default_rng(0), []
+    scenes = [
+        {"name": f"{g}-{k}", "group": g, "source": {"family": g, "seed": k, "set": {}}, "key": f"{g}{k}"}
+        for g in groups
+        for k in range(n_scenes)
+    ]
+    for scene in scenes:
+        for arm in arms:
+            for seed in (0, 1):
+                folder = f"{arms.index(arm)}_{scene['name']}_{seed}"
+                name = f"{arm} on {scene['name']}, seed {seed}"
+                named = {"arm": arm, "scene": scene["name"], "group": scene["group"], "seed": seed}
+                runs.append({"name": name, "folder": folder, "identity": folder, **named})
+                (path / "runs" / folder).mkdir(parents=True)
+                if fail and arm != arms[0] and scene is scenes[-1] and seed:
+                    failed = {
+                        "status": "failed",
+                        "error": "it <broke>",
+                        "hints": ["mend it"],
+                        "tries": 3,
+                        "trace": "x",
+                    }
+                    (path / "runs" / folder / RESULT).write_text(json.dumps({"identity": folder, **failed}))
+                    continue
+                q = 0.6 + 0.1 * (arm == arms[0]) + 0.01 * rng.random((3, 5))
+                rows = [
+                    {"pause": t, "n": 5, "quality": float(q[t].mean()), "quality_one_blob": 0.3,
+                     "quality_hidden": None, "qualities": q[t].tolist()}
+                    for t in range(3)
+                ]  # fmt: skip
+                costs = [{"seconds": 2.0, "core_seconds": 1.5, "peak_mb": 300.0, "seconds_update": 2.0}] * 3
+                done = {"identity": folder, "status": "done", "metrics": "", "rows": rows, "costs": costs}
+                (path / "runs" / folder / RESULT).write_text(json.dumps(done))
+    config = {"n": 5, "resampler": {"component": "systematic"}}
+    described = [{"name": arm, "config": {**config, "n": 5 + k}} for k, arm in enumerate(arms)]
+    description = {"format": 1, "name": "a study", "description": "", "reference": arms[0], "arms": described}
+    (path / "study.json").write_text(json.dumps({**description, "scenes": scenes, "seeds": [0, 1], "runs": runs}))
+    return path
+
+
+def test_it_says_what_was_found(tmp_path):
+    study = make_study(tmp_path)
+    text = write_study_report(study).read_text()
+    assert "ours is above &lt;theirs&gt; on s1" in text and "no claim below 20 scenes" in text
+    assert "31 of 32 runs" in text and "1 failed" in text
+    assert "it &lt;broke&gt;" in text and "mend it" in text and "<broke>" not in text
+    assert "made by this program itself" in text
+    assert text.count('<svg class="figure"') == 2
+    assert not re.search(r"(src|href)=\"(http|//)", text) and "<script" not in text
+    assert "n = 6" in text  # where the arms differ
+    mean = StudyFolder.open(study).summary().figure("s1", "ours").mean
+    assert f"<b>{mean:.3f}</b>" in text
+
+
+def test_enough_scenes_allow_a_claim(tmp_path):
+    text = write_study_report(make_study(tmp_path, n_scenes=20, groups=("s1",), fail=False)).read_text()
+    assert re.search(r"ours is above &lt;theirs&gt; on s1 \(\+0\.1\d\d, 95 % interval", text)
+    assert "first look" not in text
+
+
+def test_the_same_study_gives_the_same_page(tmp_path):
+    study = make_study(tmp_path)
+    first = write_study_report(study, tmp_path / "a.html").read_bytes()
+    assert write_study_report(study, tmp_path / "b.html").read_bytes() == first
+
+
+@pytest.mark.parametrize("arms", [("ours",), tuple("abcdefghijk")])
+def test_few_and_many_arms(tmp_path, arms):
+    text = write_study_report(make_study(tmp_path, n_scenes=2, arms=arms, groups=("s1",), fail=False)).read_text()
+    assert ("Paired differences" in text) == (len(arms) > 1)
+
+
+def test_a_study_without_results_has_a_page(tmp_path):
+    study = make_study(tmp_path)
+    for path in study.rglob(RESULT):
+        path.unlink()
+    assert "0 of 32 runs" in write_study_report(study).read_text()
+
+
+def test_command(tmp_path, capsys):
+    code, out, _ = call("report", make_study(tmp_path / "s"), "--out", tmp_path / "r.html", capsys=capsys)
+    assert code == 0 and "r.html" in out
+    code, _, error = call("report", tmp_path / "s", "--export", tmp_path / "e", capsys=capsys)
+    assert code == 2 and "only runs can be exported" in error
+    with pytest.raises(InputError, match="not a study folder"):
+        write_study_report(tmp_path)
