@@ -83,6 +83,8 @@ def camera_to_world(k):
 def check_motion(recording):
     """Relative to the first pause the camera moves as the trajectory says."""
     home = recording.pauses[0]
+    # At the first pause the pose is the one that the table gives, not the trajectory's.
+    assert abs(recording.frames[home].camera.position[2] - CAMERA.position[2]) < 5e-3
     for k in (0, 5, len(recording) - 1):
         expected = camera_to_world(home).inv() * camera_to_world(k)
         found = recording.frames[home].camera.pose.inv() * recording.frames[k].camera.pose
@@ -336,6 +338,12 @@ def test_distorted_images_are_read_straight(tmp_path):
     bent = Tum(K=K, pauses=Ends(), world=WORLD).open(path).frames[0]
     assert (straight.rgb != bent.rgb).mean() > 0.02
     np.testing.assert_allclose(straight.rgb[50:70, 70:90].astype(int), bent.rgb[50:70, 70:90], atol=4)
+    u, v = np.moveaxis(np.rint(Lens.of(CAMERA, (0.3, 0.0, 0.0, 0.0)).source).astype(int), -1, 0)
+    inside = (u >= 0) & (u < 160) & (v >= 0) & (v < 120)
+    picked = bent.depth[v.clip(0, 119), u.clip(0, 159)]
+    assert (straight.depth[inside] == picked[inside]).mean() > 0.99  # halves of a pixel may round the other way
+    assert (straight.depth != bent.depth).mean() > 0.3
+    assert np.isnan(straight.depth[~inside]).all()
 
 
 def test_depth_beyond_the_file_is_no_reading(tmp_path):
