@@ -43,6 +43,7 @@ COMPONENTS: dict[str, dict[str, str]] = {
     },
     "update": {
         "fusion": "mstfilter.fusion.update:FusionUpdate",
+        "object_fusion": "mstfilter.baselines.object_fusion:ObjectFusion",
         "samples_only": "mstfilter.baselines.updates:SamplesOnly",
         "tracking_only": "mstfilter.baselines.updates:TrackingOnly",
         "union": "mstfilter.baselines.updates:Union",

@@ -201,7 +201,7 @@ def _pull(crop: Crop, T: Array, grid: VoxelGrid) -> tuple[NDArray[np.int64], Arr
     index, home = _moved_box(crop, T, grid)
     # A motion by whole voxels must not be decided by the last digit of a rounding error.
     cell = np.floor(home + 1e-9).astype(np.int64)
-    inside = ((cell >= 0) & (cell < shape)).all(axis=1)
+    inside: NDArray[np.bool_] = np.asarray(((cell >= 0) & (cell < shape)).all(axis=1))
     inside[inside] = crop.occupied[tuple(cell[inside].T)]
     index, home = index[inside], home[inside]
     depth = map_coordinates(np.pad(_depth_inside(crop), 1), home.T + 0.5, order=1, mode="constant")
