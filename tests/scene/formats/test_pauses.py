@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
@@ -65,18 +67,29 @@ def test_still_intervals_of_an_exact_video():
     assert Still().find((0.0,), lambda k: rgb[k]) == (0,)
 
 
-def test_what_all_pixels_share_is_no_motion_and_slow_motion_is():
-    """Exposure that drifts and flickers, with noise, changes nothing; a pixel a frame at the box's edge does."""
+def test_what_all_pixels_share_is_no_motion():
+    """Exposure that drifts, flickers and steps, with noise, hides no pause."""
     rng = np.random.default_rng(0)
     rgb, _, _ = video()
+    steady = np.zeros(len(rgb))
+    steps = np.where(np.arange(len(rgb)) > 2, 20.0, 0.0)
     flicker = rng.uniform(-6, 6, len(rgb)) + np.linspace(0, 12, len(rgb))
-    noisy = [
-        np.clip(image + level + rng.normal(size=image.shape) * 4, 0, 255).astype(np.uint8)
-        for image, level in zip(rgb, flicker, strict=True)
-    ]
-    assert Still().intervals(times_of(noisy), lambda k: noisy[k]) == ((0, 5), (10, 16))
-    slow = [np.roll(rgb[0], k // 3, axis=1) for k in range(30)]  # a third of a pixel a frame
-    assert max(b - a for a, b in Still(hold_s=0.1).intervals(times_of(slow), lambda k: slow[k])) <= 3
+    for levels, noise in ((steady, 4.0), (steps, 0.5), (flicker, 4.0)):
+        noisy = [
+            np.clip(image * 0.8 + level + rng.normal(size=image.shape) * noise, 0, 255).astype(np.uint8)
+            for image, level in zip(rgb, levels, strict=True)
+        ]
+        assert Still().intervals(times_of(noisy), lambda k, v=noisy: v[k]) == ((0, 5), (10, 16))
+
+
+def test_slow_motion_adds_up():
+    """A twentieth of a pixel a frame changes no block by three levels, ten frames of it do."""
+    image = video((0,))[0][0].astype(float)
+    slow = [(1 - f) * image + f * np.roll(image, 1, axis=1) for f in np.arange(20) * 0.05]
+    changes = [np.abs(grey_blocks(b) - grey_blocks(a)).max() for a, b in pairwise(slow)]
+    assert max(changes) < 3
+    assert max(b - a for a, b in Still(hold_s=0.1).intervals(times_of(slow), lambda k: slow[k])) < 10
+    assert Still(hold_s=1.9, levels=100).intervals(times_of(slow), lambda k: slow[k]) == ((0, 19),)
 
 
 def test_blocks_are_means():
