@@ -177,7 +177,9 @@ def _frame(scene: Scene, writer: RecordingWriter, index: int, time_s: float, rol
 
 def _pause(scene: Scene, writer: RecordingWriter, index: int, time_s: float, **entry: Any) -> None:
     contacts = [[c.first + 1, c.second + 1] for c in scene.world.contacts()]
-    _frame(scene, writer, index, time_s, "static", contacts=contacts, **entry)
+    # Objects beyond the workspace have no (or only some) voxels in the truth, whose extent is fixed.
+    away = np.flatnonzero(~scene.family.holds(scene.poses()[:, :3, 3])) + 1
+    _frame(scene, writer, index, time_s, "static", contacts=contacts, left_workspace=away.tolist(), **entry)
     writer.add_voxels(scene.truth())
 
 

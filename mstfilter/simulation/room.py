@@ -78,7 +78,7 @@ def draw_room(rng: np.random.Generator, texel: float) -> Room:
     table = srgb_to_linear(_table_top(rng, texel).astype(np.float32) / 255.0)
     side = -1.0 if rng.uniform() < 0.5 else 1.0
     centre = np.array([side * rng.uniform(0.35, 0.8), rng.uniform(-0.7, 0.1), rng.uniform(1.3, 1.7)])
-    spread = rng.uniform(0.06, 0.10)
+    spread = rng.uniform(0.08, 0.14)
     corners = np.array([[1, 1, 0], [1, -1, 0], [-1, -1, 0], [-1, 1, 0]]) * spread
     angle = np.arange(4) * (2 * np.pi / 4) + rng.uniform(0, 2 * np.pi)
     ring = np.stack([1.6 * np.cos(angle), 1.6 * np.sin(angle), np.full(4, 1.5)], axis=1)
@@ -101,9 +101,9 @@ def draw_room(rng: np.random.Generator, texel: float) -> Room:
         wall=single(rng.uniform(0.45, 0.65) * rng.uniform(0.95, 1.05, 3)),
         carpet=single(tile),
         lamp=centre + corners,
-        lamp_colour=single(rng.uniform(0.75, 1.05) * warm),
+        lamp_colour=single(rng.uniform(0.45, 0.8) * warm),
         sky=np.concatenate([ring, [[0.0, 0.0, 2.2]]]),
-        sky_colour=single(0.42 * rng.uniform(0.96, 1.04, 3)),
+        sky_colour=single(0.60 * rng.uniform(0.96, 1.04, 3)),
         ambient=single(np.full(3, 0.12)),
         exposure=single(gain * balance),
     )

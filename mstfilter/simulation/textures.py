@@ -154,7 +154,9 @@ def draw_skin(rng: np.random.Generator, shape: Shape, pool: Pool = ANY) -> Skin:
         ripe = (int(rng.uniform(205, 228)), int(rng.uniform(175, 195)), int(rng.uniform(60, 95)))
         charts = [printing.peel(rng, w, h, ripe) for w, h in sizes]
     else:
-        charts = [printing.speckle(rng, w, h, pair) for w, h in sizes]
+        # Stone and foam: tones of one colour, not camouflage.
+        r, g, b = (int(0.65 * first + 0.35 * second) for first, second in zip(*pair, strict=True))
+        charts = [printing.speckle(rng, w, h, (pair[0], (r, g, b))) for w, h in sizes]
     plain = np.ascontiguousarray(np.broadcast_to(charts[0].reshape(-1, 3).mean(axis=0).astype(np.uint8), (2, 2, 3)))
     if style == "ceramic":
         plain = np.ascontiguousarray(np.broadcast_to(charts[INSIDE][0, 0], (2, 2, 3)))
