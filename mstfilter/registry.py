@@ -25,13 +25,12 @@ from typing import Any
 
 from mstfilter.errors import InputError
 
-__all__ = ["COMPONENTS", "build", "check_names", "describe", "find_class", "known"]
+__all__ = ["COMPONENTS", "ORACLES", "build", "check_names", "describe", "find_class", "known"]
 
 COMPONENTS: dict[str, dict[str, str]] = {
     "transition": {
         "tracking": "mstfilter.tracking.transition:TrackingTransition",
         "identity": "mstfilter.tracking.transition:IdentityTransition",
-        "true_motions": "mstfilter.oracles.motion:TrueMotions",
     },
     "proposal": {
         "tree_cuts": "mstfilter.segmentation.proposal:TreeCutProposal",
@@ -39,7 +38,6 @@ COMPONENTS: dict[str, dict[str, str]] = {
         "image_components": "mstfilter.baselines.proposals:ImageComponents",
         "occupied_components": "mstfilter.baselines.proposals:OccupiedComponents",
         "one_blob": "mstfilter.baselines.proposals:OneBlob",
-        "true_masks": "mstfilter.oracles.masks:TrueMasks",
     },
     "update": {
         "fusion": "mstfilter.fusion.update:FusionUpdate",
@@ -47,7 +45,6 @@ COMPONENTS: dict[str, dict[str, str]] = {
         "samples_only": "mstfilter.baselines.updates:SamplesOnly",
         "tracking_only": "mstfilter.baselines.updates:TrackingOnly",
         "union": "mstfilter.baselines.updates:Union",
-        "true_fusion": "mstfilter.oracles.choice:TrueFusion",
     },
     "resampler": {
         "multinomial": "mstfilter.smc.resampling:Multinomial",
@@ -65,7 +62,6 @@ COMPONENTS: dict[str, dict[str, str]] = {
         "tempered": "mstfilter.smc.resampling_wrappers:Tempered",
         "shuffled": "mstfilter.smc.resampling_wrappers:Shuffled",
         "keep_weights": "mstfilter.smc.kept_weights:KeepWeights",
-        "true_best": "mstfilter.oracles.choice:TrueBest",
     },
     "trigger": {
         "always": "mstfilter.smc.resampling:Always",
@@ -88,7 +84,6 @@ COMPONENTS: dict[str, dict[str, str]] = {
     },
     "boundary": {
         "colour_depth": "mstfilter.segmentation.boundary:ColourDepthBoundary",
-        "true_boundary": "mstfilter.oracles.masks:TrueBoundary",
     },
     "tree": {
         "learned": "mstfilter.segmentation.learned_tree:LearnedTree",
@@ -106,7 +101,6 @@ COMPONENTS: dict[str, dict[str, str]] = {
     "completer": {
         "extrude": "mstfilter.completion.extrude:Extrude",
         "surface": "mstfilter.completion.extrude:SurfaceOnly",
-        "true_completion": "mstfilter.oracles.completion:TrueCompletion",
     },
     "rule": {
         "authors": "mstfilter.tracking.rules:AuthorsRule",
@@ -116,17 +110,19 @@ COMPONENTS: dict[str, dict[str, str]] = {
     "free_space": {
         "projective": "mstfilter.fusion.free_space:FreeSpace",
         "none": "mstfilter.fusion.free_space:NoFreeSpace",
-        "true_free_space": "mstfilter.oracles.choice:TrueFreeSpace",
     },
     "crossover": {"conflict_graph": "mstfilter.fusion.crossover:Crossover"},
     "structure": {
         "random_order": "mstfilter.fusion.structure:RandomOrder",
         "spanning_tree": "mstfilter.fusion.structure:SpanningTree",
     },
+    "division": {
+        "none": "mstfilter.fusion.division:NoDivision",
+        "rigid_motions": "mstfilter.tracking.rigid_motions:RigidMotions",
+    },
     "evidence": {
         "boundaries": "mstfilter.segmentation.evidence:BoundaryAgreement",
         "motions": "mstfilter.tracking.evidence:MotionAgreement",
-        "true_quality": "mstfilter.oracles.choice:TrueQuality",
     },
     "mode_filter": {"majority": "mstfilter.fusion.mode_filter:ModeFilter"},
     "format": {
@@ -146,13 +142,25 @@ COMPONENTS: dict[str, dict[str, str]] = {
         "every": "mstfilter.scene.formats.pauses:Every",
     },
 }
+#: Stages replaced by the truth of a recording (`mstfilter.oracles`): found by name as the others are, but of no use
+#: without a recording that knows.
+ORACLES: dict[str, dict[str, str]] = {
+    "transition": {"true_motions": "mstfilter.oracles.motion:TrueMotions"},
+    "proposal": {"true_masks": "mstfilter.oracles.masks:TrueMasks"},
+    "update": {"true_fusion": "mstfilter.oracles.choice:TrueFusion"},
+    "resampler": {"true_best": "mstfilter.oracles.choice:TrueBest"},
+    "boundary": {"true_boundary": "mstfilter.oracles.masks:TrueBoundary"},
+    "completer": {"true_completion": "mstfilter.oracles.completion:TrueCompletion"},
+    "free_space": {"true_free_space": "mstfilter.oracles.choice:TrueFreeSpace"},
+    "evidence": {"true_quality": "mstfilter.oracles.choice:TrueQuality"},
+}
 _SAME = {"initial": "proposal", "scheme": "resampler", "fusion": "update"}
 _GROUP = "mstfilter.components"
 
 
 def known(kind: str) -> dict[str, str]:
     """Names of a kind and where their classes are, entry points included."""
-    names = dict(COMPONENTS.get(kind, {}))
+    names = {**COMPONENTS.get(kind, {}), **ORACLES.get(kind, {})}
     for entry in entry_points(group=_GROUP):
         slot, _, name = entry.name.partition(".")
         if slot == kind:
@@ -337,7 +345,7 @@ def name_of(cls: type) -> str:
     if file is not None:
         return str(file)
     location = f"{cls.__module__}:{cls.__qualname__}"
-    for names in COMPONENTS.values():
+    for names in (*COMPONENTS.values(), *ORACLES.values()):
         for name, where in names.items():
             if where == location:
                 return name
