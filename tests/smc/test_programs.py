@@ -86,22 +86,37 @@ def test_a_guide_gives_the_draws_of_the_guided_filter():
 )
 def test_filters_of_a_program_agree_with_kalman(make, trigger):
     """Within 4 standard errors (false alarm 6e-5 a case); 2 % of bias would be seen."""
-    mean, standard, _ = mean_ratio(make(Program(ar1), trigger), YS, EXACT, range(300))
+    mean, standard, _ = mean_ratio(make(Program(ar1), trigger), YS, EXACT, range(500))
     assert abs(mean - 1) < 4 * standard
-    assert standard < 0.008
+    assert standard < 0.005
+
+
+@per_particle
+def mild_one_by_one(previous, y):
+    """Much noise, so that few particles give little spread."""
+    x = sample("x", Normal(0.0, 1.0) if previous is None else Normal(RHO * previous["x"], SIGMA))
+    observe("y", Normal(x, 2.0), y)
+
+
+def mild_guide(previous, y):
+    sample("x", Normal(0.2 * y, 1.0) if previous is None else Normal(0.8 * previous["x"] + 0.1 * y, 0.7))
 
 
 def test_a_program_that_is_run_particle_by_particle():
+    """Within 4 standard errors (false alarm 6e-5 a case); 2 % of bias would be seen."""
+    cov = np.array([[1.0, RHO], [RHO, RHO**2 + SIGMA**2]]) + 4.0 * np.eye(2)
+    exact_mild = float(stats.multivariate_normal(np.zeros(2), cov).logpdf(YS[:2]))
     for make in (
         lambda p, guide: p.bootstrap(60),
         lambda p, guide: p.guided(guide, 30),
         lambda p, guide: p.auxiliary(60, power=0.5),
         lambda p, guide: p.resample_move(40, steps=1),
     ):
-        filter = make(Program(ar1_one_by_one), per_particle(best))
-        mean, standard, _ = mean_ratio(filter, YS[:3], kalman_ar1(YS[:3])[1], range(60))
+        filter = make(Program(mild_one_by_one), per_particle(mild_guide))
+        mean, standard, _ = mean_ratio(filter, YS[:2], exact_mild, range(300))
         assert abs(mean - 1) < 4 * standard
-    state, _ = filter.run(YS, 0)
+        assert standard < 0.005
+    state, _ = Program(ar1_one_by_one).bootstrap(5).run(YS, 0)
     assert np.ndim(state.population.particles[0]["x"]) == 0
     with pytest.raises(InputError, match="both be per_particle"):
         Program(ar1_one_by_one).guided(best, 5).run(YS, 0)
@@ -166,15 +181,15 @@ def test_switch_agrees_with_enumeration(kind):
 
     program = Program(regimes)
     filter = {
-        "bootstrap": program.bootstrap(1500),
-        "guided": program.guided(guide, 1500),
-        "auxiliary": program.auxiliary(1500, power=0.3),
-        "resample-move": program.resample_move(1500, steps=2),
+        "bootstrap": program.bootstrap(3000),
+        "guided": program.guided(guide, 3000),
+        "auxiliary": program.auxiliary(3000, power=0.3),
+        "resample-move": program.resample_move(3000, steps=2),
     }[kind]
     exact, calm = exact_regimes(TRACK)
     mean, standard, _ = mean_ratio(filter, TRACK, exact, range(200))
     assert abs(mean - 1) < 4 * standard
-    assert standard < 0.01
+    assert standard < 0.005
     shares = []
     for seed in range(60):
         population = filter.run(TRACK, seed)[0].population
@@ -191,9 +206,9 @@ def test_a_hidden_chain_as_a_program():
         observe("y", Categorical(EMIT[k]), y)
 
     for filter in (Program(chain).bootstrap(1000), Program(chain).resample_move(1000)):
-        mean, standard, _ = mean_ratio(filter, SYMBOLS, forward()[1], range(200))
+        mean, standard, _ = mean_ratio(filter, SYMBOLS, forward()[1], range(400))
         assert abs(mean - 1) < 4 * standard
-        assert standard < 0.008
+        assert standard < 0.005
 
 
 @per_particle
@@ -209,15 +224,18 @@ def births(previous, count):
 
 
 def test_changing_structure_agrees_with_enumeration():
-    counts = [1, 3, 2]
+    counts = [1, 1, 2]
     total = 0.0
     for path in product((0, 1), repeat=3):
         n = np.cumsum(path)
         total += np.prod([0.3 if b else 0.7 for b in path]) * stats.poisson.pmf(counts, 0.5 + 2.0 * n).prod()
-    for filter in (Program(births).bootstrap(50), Program(births).resample_move(50, trigger=Always())):
-        mean, standard, _ = mean_ratio(filter, counts, np.log(total), range(100))
+    for filter, seeds, bound in (
+        (Program(births).bootstrap(50), 400, 0.005),
+        (Program(births).resample_move(50, trigger=Always()), 120, 0.01),  # slow: a run a particle and move
+    ):
+        mean, standard, _ = mean_ratio(filter, counts, np.log(total), range(seeds))
         assert abs(mean - 1) < 4 * standard
-        assert standard < 0.03
+        assert standard < bound
     state, _ = Program(births).bootstrap(60).run(counts, 0)
     names = {frozenset(p) for p in state.population.particles}
     assert names == {frozenset({"born", "n"}), frozenset({"born", "n", "strength"})}
