@@ -4,7 +4,9 @@
 >>> from mstfilter.simulation.recorder import simulate
 >>> recording = simulate(scene_family("demo"), seed=7, path="recordings/demo-7")  # doctest: +SKIP
 
+`cache.cached_recording` keeps what was simulated; the families of the studies are `s1`, `s2` and `s3`.
+
 What is missing, so that nobody is misled: camera motion, glossy and transparent surfaces, light that bounces
-between objects, articulated and soft objects, a hand. Depth noise is calibrated to real frames; spatially
-correlated noise is not modelled.
+between objects, articulated and soft objects, a hand. Depth noise, the projector's shadow and losses at edges are
+calibrated to real frames; within surfaces noise is not correlated from pixel to pixel.
 """
