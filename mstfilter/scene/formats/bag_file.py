@@ -84,8 +84,9 @@ class BagFile:
         except InputError:
             raise
         except Exception as error:  # rosbags lets errors of storage and compression libraries through
+            said = " ".join(str(error).split())[:160]  # one line
             raise InputError(
-                f"bag cannot be read: {self.path} ({type(error).__name__}: {str(error)[:200]})",
+                f"bag cannot be read: {self.path} ({type(error).__name__}: {said})",
                 "was it closed properly? copy it again, or mend it: rosbag reindex, ros2 bag reindex, mcap recover",
             ) from error
 
@@ -96,8 +97,10 @@ class BagFile:
                 yield logged, self._reader.deserialize(raw, connection.msgtype)
 
     def first(self, topic: str) -> Any:
-        """The first message of a topic, None where there is none."""
-        return next((message for _, message in self._messages(topic)), None)
+        """The first message of a topic."""
+        for _, message in self._messages(topic):
+            return message
+        raise InputError(f"bag {self.path} says it holds messages of {topic}, and there are none", "is it damaged?")
 
     def index(self, topic: str) -> list[Entry]:
         """Every message of a topic with a header, in the order of the file. Reads all of them once."""

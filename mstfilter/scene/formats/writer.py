@@ -9,9 +9,10 @@ written under a temporary name and renamed when it is complete.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import shutil
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal
@@ -80,7 +81,7 @@ class RecordingWriter:
                 shutil.rmtree(self._folder)
             self._folder.mkdir(parents=True)
         except OSError as error:
-            raise InputError(f"cannot write a recording to {self.path}: {error.strerror}") from error
+            raise InputError(f"cannot write recording {self.path}: {error.strerror}") from error
 
     def add_frame(
         self,
@@ -132,8 +133,9 @@ class RecordingWriter:
                     f"{part} image of frame {index} has shape {image.shape}, "
                     f"the camera is {self._camera.width} x {self._camera.height}"
                 )
-            (self._folder / part).mkdir(exist_ok=True)
-            write_image(self._folder / part / f"{index:06d}.png", image)
+            with self._writing():
+                (self._folder / part).mkdir(exist_ok=True)
+                write_image(self._folder / part / f"{index:06d}.png", image)
         self._frames.append({"index": index, "time_s": float(time_s), "role": role, **entry})
         if poses is not None:
             objects = {str(k): np.asarray(T, dtype=float).tolist() for k, T in poses.items()}
@@ -166,6 +168,11 @@ class RecordingWriter:
                 "max": self._grid.upper.tolist(),
                 "voxel": self._grid.voxel_size,
             }
+        with self._writing():
+            self._finish(described)
+        return self.path
+
+    def _finish(self, described: dict[str, Any]) -> None:
         (self._folder / "camera.json").write_text(json.dumps(described, indent=1))
         (self._folder / "manifest.json").write_text(json.dumps({**self._manifest, "frames": self._frames}, indent=1))
         if self._poses:
@@ -182,7 +189,16 @@ class RecordingWriter:
         if self.path.exists():
             self.path.rmdir()
         self._folder.rename(self.path)
-        return self.path
+
+    @contextlib.contextmanager
+    def _writing(self) -> Iterator[None]:
+        """A disk that is full or not writable is the user's to mend."""
+        try:
+            yield
+        except OSError as error:
+            raise InputError(
+                f"cannot write recording {self.path}: {error.strerror}", "nothing of it is left behind"
+            ) from error
 
     def discard(self) -> None:
         """Leave nothing behind."""
@@ -194,10 +210,14 @@ class RecordingWriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if kind is None:
-            self.close()
-        else:
+        if kind is not None:
             self.discard()
+            return
+        try:
+            self.close()
+        except BaseException:
+            self.discard()
+            raise
 
 
 def save(
