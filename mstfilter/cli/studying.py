@@ -24,18 +24,26 @@ def study(
     ] = None,
     out: Annotated[Path | None, typer.Option(help="Study folder. Default: studies/NAME.")] = None,
     workers: Annotated[int, typer.Option(min=0, help="Processes; 0 is one a core.")] = 0,
+    scheduler: Annotated[
+        str, typer.Option(help="Address of a running Dask scheduler, tcp://HOST:PORT, in place of own processes.")
+    ] = "",
     smoke: Annotated[
         bool, typer.Option("--smoke", help="The small form that the file's table [smoke] describes.")
     ] = False,
 ) -> None:
     """Compare filters on many scenes. A study that was stopped goes on; what is done is never repeated."""
     from mstfilter.study.config import load_study
+    from mstfilter.study.executors import Executor
     from mstfilter.study.local import Local
     from mstfilter.study.study import run_study
 
     wanted = load_study(config, smoke=smoke)
     folder = out or Path("studies") / f"{wanted.name}{'-smoke' if smoke else ''}"
-    executor = Local(workers, wanted.tries, wanted.timeout_s, folder / "logs")
+    executor: Executor = Local(workers, wanted.tries, wanted.timeout_s, folder / "logs")
+    if scheduler:
+        from mstfilter.study.cluster import Cluster
+
+        executor = Cluster(scheduler)
     with _shown() as progress:
         result = run_study(wanted, folder, executor, overrides or (), progress=progress)
     print(f"study       {folder}")

@@ -11,6 +11,7 @@ and what a killed one leaves is never taken for a result.
 from __future__ import annotations
 
 import errno
+import importlib
 import os
 import shutil
 import time
@@ -22,6 +23,7 @@ from typing import Any
 
 from mstfilter.errors import InputError
 from mstfilter.scene.recording import Recording
+from mstfilter.study.code_version import code_version, reached
 from mstfilter.study.executors import Job, Outcome
 from mstfilter.study.memory import peak_megabytes, reset_peak
 from mstfilter.study.results import RESULT, read_result
@@ -76,9 +78,30 @@ def _record(job: Job, step: Step) -> None:
     open_scene(job["source"], job["recordings"])
 
 
+_verified: set[str] = set()
+
+
+def _verify(job: Job) -> None:
+    """Raise InputError unless this process runs the code that the study was planned with.
+
+    Once is enough: all of it is imported then, and later changes of the files change nothing here.
+    """
+    if job["code"] in _verified:
+        return
+    if code_version(job["modules"]) != job["code"]:
+        raise InputError(
+            "the code has changed since the study began",
+            "the same command begins these runs with the code as it is now",
+        )
+    for module in sorted(reached(job["modules"])):
+        importlib.import_module(module)
+    _verified.add(job["code"])
+
+
 def _run(job: Job, step: Step) -> None:
     from mstfilter.study.run import execute
 
+    _verify(job)
     final = Path(job["folder"])
     work = final.with_name(f".{final.name}.{uuid.uuid4().hex[:8]}.partial")
     costs: list[dict[str, float]] = []

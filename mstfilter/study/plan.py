@@ -48,12 +48,18 @@ class Arm:
         Hash of the configuration, users' files and code.
     ours : bool
         Whether all components are of this package or of a file, so that their version is known.
+    code : str
+        Version of the code that its runs reach.
+    modules : tuple of str
+        Where that code begins.
     """
 
     name: str
     config: dict[str, Any]
     key: str
     ours: bool
+    code: str
+    modules: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -199,9 +205,11 @@ def _arms(entry: ArmEntry, folder: Path, overrides: Sequence[str], allow_files: 
             except InputError as error:
                 raise InputError(f"arm {name!r}: {error.message}", *error.hints) from error
             config = plain(describe_filter(filter))
-            code = code_version([*_modules(filter), *_ALWAYS])
+            modules = (*sorted(_modules(filter)), *_ALWAYS)
+            code = code_version(modules)
             ours = all(module.split(".")[0].startswith("mstfilter") for module in _modules(filter))
-            yield Arm(name, config, _hash([config, files_of(filter), versions(), code]), ours)
+            key = _hash([config, files_of(filter), versions(), code])
+            yield Arm(name, config, key, ours, code, modules)
 
 
 def _stem(preset: str) -> str:

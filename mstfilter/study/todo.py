@@ -74,6 +74,8 @@ class ToDo:
             "folder": str(self.folder.run(run.folder).absolute()),
             "identity": run.identity,
             "metrics": metrics,
+            "code": run.arm.code,
+            "modules": run.arm.modules,
             "config": {**run.arm.config, "description": run.arm.name},
             "source": run.scene.source,
             "seed": run.seed,
