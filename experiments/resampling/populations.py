@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import tempfile
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ from schemes import Names, Table, schemes
 from worlds import World, branching
 
 import mstfilter
+from mstfilter.errors import InputError
 from mstfilter.fusion.free_space import NoFreeSpace
 from mstfilter.fusion.similarity import SameSegmentation, WeightedCoverage
 from mstfilter.presets import load_config
@@ -22,11 +24,13 @@ from mstfilter.scene.clip import Clip
 from mstfilter.scene.frame import Frame
 from mstfilter.scene.quality import weighted_coverage
 from mstfilter.scene.voxels import Hypothesis, VoxelGrid
+from mstfilter.segmentation.evidence import BoundaryAgreement
 from mstfilter.simulation.families import scene_family
 from mstfilter.simulation.recorder import simulate
 from mstfilter.smc.interfaces import Resampler
 from mstfilter.smc.population import Population
 from mstfilter.smc.resampling import Systematic
+from mstfilter.tracking.evidence import MotionAgreement
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,14 +72,15 @@ class Catch(Resampler):
 
 
 def of_world(world: World, n: int, seed: int) -> Candidates:
-    """Candidates of the last step of the branching filter."""
+    """Candidates of the last step of the branching filter; where the run is lost, of the last before."""
     catch = Catch()
-    branching(world, catch, n).run(world.data(seed).observations, seed)
+    with suppress(InputError):
+        branching(world, catch, n).run(world.data(seed).observations, seed)
     return Candidates.of(catch.seen[0], world.similarity, world.equivalence)
 
 
-def real() -> Candidates | None:
-    """The 125 candidates of the preset `authors` on the authors' real particles; None where these are absent."""
+def real(eta: int = 5) -> Candidates | None:
+    """The 25 * eta candidates of the preset `authors` on the authors' real particles; None where these are absent."""
     named = os.environ.get("MSTFILTER_SHARED")
     shared = Path(named) if named else Path(__file__).resolve().parents[3] / "shared"
     folder = shared / "r1"
@@ -87,7 +92,7 @@ def real() -> Candidates | None:
     predictions = tuple(Hypothesis.from_labels(m, grid) for m in refined["labels"][0])
     proposed = Population(samples, measured["weight"][1, :5], {"proposed": np.arange(5)})
     # There is no depth image. The quality Q of the projection came with the data and enters as log Q^3, by hand.
-    update = build("update", load_config("authors", ["update.free_space=none"])["update"])
+    update = build("update", load_config("authors", ["update.free_space=none", f"update.eta={eta}"])["update"])
     update = replace(update, free_space=NoFreeSpace())
     log_weights = measured["weight"][0, :5] + update.quality_exponent * np.log(refined["weight"][0])
     predicted = Population(predictions, log_weights, {"previous": np.arange(5)})
@@ -103,17 +108,35 @@ def real() -> Candidates | None:
     return Candidates.of(fused, WeightedCoverage(), SameSegmentation(), quality)
 
 
-def simulated(seed: int) -> Candidates:
-    """Candidates of the last step of `mst` on a simulated recording of the family `demo`."""
+#: Filters whose candidates of simulated scenes are kept. `scored` is `mst` with evidence for built candidates.
+SIMULATED = ("mst", "scored", "paper")
+
+
+def simulated(seed: int, small: bool = False) -> dict[str, Candidates]:
+    """Candidates of the last step of three filters on a simulated recording of the family `demo`, by filter.
+
+    A small recording has two objects, one push and a quarter of the pixels, and gives 25 candidates or less.
+    """
+    family = scene_family("demo")
+    if small:
+        size = {"n_objects_min": 2, "n_objects_max": 2, "n_twins": 0, "n_actions": 1, "min_moved": 1}
+        family = replace(family, **size, n_candidates=6, width=160, height=120, supersample=False)
+    out = {}
     with tempfile.TemporaryDirectory() as folder:
-        recording = simulate(scene_family("demo"), seed, Path(folder) / "recording")
-        catch = Catch()
+        recording = simulate(family, seed, Path(folder) / "recording")
         clips = recording.clips()
-        replace(mstfilter.preset("mst"), resampler=catch).run(clips, 0)
         truth = recording.truth(clips[-1].index)
-        return Candidates.of(
-            catch.seen[0], WeightedCoverage(2), SameSegmentation(), lambda h: weighted_coverage(h.labels, truth)
-        )
+        for name in SIMULATED:
+            filter = mstfilter.preset("mst" if name == "scored" else name, *(["update.eta=1"] if small else []))
+            if name == "scored":
+                terms = (BoundaryAgreement(), MotionAgreement())
+                filter = replace(filter, update=replace(filter.update, evidence=terms, n_scored=12 if small else 60))
+            catch = Catch()
+            replace(filter, resampler=catch).run(clips, 0)
+            out[name] = Candidates.of(
+                catch.seen[0], WeightedCoverage(2), SameSegmentation(), lambda h: weighted_coverage(h.labels, truth)
+            )
+    return out
 
 
 def choose(candidates: Candidates, n: int, draws: int, seed: int) -> dict[str, dict[str, float]]:

@@ -20,50 +20,52 @@ from scipy import stats
 from worlds import World, branching, plain, worlds
 
 from mstfilter.errors import InputError
+from mstfilter.smc.particle_filter import ParticleFilter
 from mstfilter.smc.population import Population
 from mstfilter.smc.similarity import Exact, Gaussian
 
 HERE = Path(__file__).resolve().parent
 Row = dict[str, object]
 FIELDS = ("part", "setting", "scheme", "measure", "unit", "value")
-FULL = {
-    "seeds": 40,
-    "n": 50,
-    "few": 20,
-    "reference": 50_000,
-    "populations": 10,
-    "draws": 50,
-    "scenes": 3,
-    "rounds": 8,
-}
-SMOKE = {"seeds": 2, "n": 12, "few": 5, "reference": 500, "populations": 2, "draws": 3, "scenes": 0, "rounds": 1}
+FULL = {"seeds": 500, "reference": 50_000, "populations": 30, "draws": 50, "scenes": 20, "eta": 5, "rounds": 8}
+SMOKE = {"seeds": 2, "reference": 500, "populations": 2, "draws": 3, "scenes": 1, "eta": 1, "rounds": 1}
 
 
-def filtered(name: str, world: World, size: dict[str, int]) -> Iterator[Row]:
-    """Both filters of a model with every scheme; a unit is a seed, which names data and streams for all schemes."""
+def filtered(name: str, world: World, setting: str, size: dict[str, int]) -> Iterator[Row]:
+    """A filter of a model with every scheme; a unit is a seed, which names data and streams for all schemes."""
     arms = schemes(world.similarity, world.equivalence)
-    for setting, make, n in (("plain", plain, size["n"]), ("branching", branching, size["few"])):
-        for scheme, resampler in arms.items():
-            filter = make(world, resampler, n)
-            for seed in range(size["seeds"]):
-                data = world.data(seed)
-                errors, unique, state = [], [], None
-                try:
-                    for state, info in filter.iterate(data.observations, seed):
-                        errors.append(world.error(state.population, data.answers[info.t]))
-                        if info.resampled:
-                            kept = info.unique_ancestors if setting == "plain" else len(np.unique(info.ancestors))
-                            unique.append(kept)
-                except InputError:  # no particle explains what is seen: the run is lost, its evidence is 0
-                    yield from rows(name, f"{setting} n={n}", scheme, seed, {"lost": 1.0, "evidence_ratio": 0.0})
-                    continue
-                found = {"lost": 0.0, "state_error": float(np.mean(errors))}
-                if unique:
-                    found["unique_ancestors"] = float(np.mean(unique))
-                if state is not None and state.log_evidence is not None:
-                    found["log_evidence_error"] = state.log_evidence - data.log_evidence
-                    found["evidence_ratio"] = float(np.exp(found["log_evidence_error"]))
-                yield from rows(name, f"{setting} n={n}", scheme, seed, found)
+    make, full, small = {"plain": (plain, world.sizes[0], 12), "branching": (branching, world.sizes[1], 5)}[setting]
+    n = full if size is FULL else small
+    for scheme, resampler in arms.items():
+        filter = make(world, resampler, n)
+        for seed in range(size["seeds"]):
+            found = one_run(world, filter, seed)
+            yield from rows(name, f"{setting} n={n}", scheme, seed, found)
+
+
+def one_run(world: World, filter: ParticleFilter, seed: int) -> dict[str, float]:
+    """Measures of a run."""
+    data, state = world.data(seed), None
+    errors, unique, fallbacks = [], [], []
+    try:
+        for state, info in filter.iterate(data.observations, seed):
+            errors.append(world.error(state.population, data.answers[info.t]))
+            if info.resampled:
+                before = filter.resample == "before"
+                unique.append(info.unique_ancestors if before else len(np.unique(info.ancestors)))
+                note = info.notes.get("resampler", {}).get("kdpp")
+                fallbacks += [] if note is None else [note.endswith("fallback")]
+    except InputError:  # no particle explains what is seen: the run is lost, its evidence is 0
+        return {"lost": 1.0} | ({"evidence_ratio": 0.0} if filter.properly_weighted else {})
+    found = {"lost": 0.0, "state_error": float(np.mean(errors))}
+    if unique:
+        found["unique_ancestors"] = float(np.mean(unique))
+    if fallbacks:
+        found["fallback"] = float(np.mean(fallbacks))
+    if state is not None and state.log_evidence is not None:
+        found["log_evidence_error"] = state.log_evidence - data.log_evidence
+        found["evidence_ratio"] = float(np.exp(found["log_evidence_error"]))
+    return found
 
 
 def rows(part: str, setting: str, scheme: str, unit: int, found: dict[str, float]) -> Iterator[Row]:
@@ -82,18 +84,25 @@ def from_worlds(all_worlds: dict[str, World], size: dict[str, int]) -> Iterator[
     """Candidates of the four models; a unit is a population."""
     for name, world in all_worlds.items():
         for seed in range(size["populations"]):
-            candidates = of_world(world, size["few"], 500 + seed)
-            yield from chosen(f"select: {name}", "4 n to n", seed, candidates, size["few"], size["draws"])
+            n = world.sizes[1] if size is FULL else 5
+            yield from chosen(f"select: {name}", "4 n to n", seed, of_world(world, n, 5000 + seed), n, size["draws"])
 
 
 def from_real(size: dict[str, int]) -> Iterator[Row]:
     """The real candidates; a unit is a batch of draws, so intervals are about chance in the draws alone."""
-    candidates = real()
+    candidates = real(size["eta"])
     if candidates is None:
         print("real candidates left out: no folder r1 (MSTFILTER_SHARED names the folder that holds it)")
         return
     for batch in range(size["populations"]):
-        yield from chosen("select: real", "125 to 5", batch, candidates, 5, size["draws"])
+        m = len(candidates.log_weights)
+        yield from chosen("select: real", f"{m} to 5", batch, candidates, 5, size["draws"])
+
+
+def from_scene(seed: int, size: dict[str, int]) -> Iterator[Row]:
+    """Candidates of a simulated scene, of each filter; a unit is a scene."""
+    for name, candidates in simulated(seed, small=size is SMOKE).items():
+        yield from chosen("select: simulated", f"candidates of {name} to 5", seed, candidates, 5, size["draws"])
 
 
 def timed(size: dict[str, int]) -> Iterator[Row]:
@@ -124,6 +133,23 @@ def interval(values: np.ndarray) -> tuple[float, float, float]:
     return mean, mean - half, mean + half
 
 
+def p_value(difference: np.ndarray) -> float:
+    """Of a paired t test that the mean difference is zero."""
+    error = stats.sem(difference) if len(difference) > 1 else np.nan
+    if not error > 0:  # one unit, or the same difference in all of them
+        return 0.0 if error == 0 and difference[0] != 0 else 1.0
+    return float(2 * stats.t.sf(abs(difference.mean()) / error, len(difference) - 1))
+
+
+def holm(p: np.ndarray, level: float = 0.05) -> np.ndarray:
+    """Which hypotheses of a family are rejected at a level for all of them together (Holm 1979)."""
+    order = np.argsort(p, kind="stable")
+    below = p[order] <= level / np.arange(len(p), 0, -1)
+    rejected = np.zeros(len(p), bool)
+    rejected[order] = np.cumprod(below).astype(bool)
+    return rejected
+
+
 def summarise(found: list[dict[str, str]], out: Path) -> None:
     """summary.csv: means with intervals, paired differences from systematic, and what can be claimed."""
     table: dict[tuple[str, str, str], dict[str, dict[int, float]]] = {}
@@ -139,19 +165,21 @@ def summarise(found: list[dict[str, str]], out: Path) -> None:
         }
     lines = []
     for (part, setting, measure), by_scheme in sorted(table.items()):
+        base, group = by_scheme.get(BASE, {}), []
         for scheme, values in by_scheme.items():
             mean, low, high = interval(np.array(list(values.values())))
-            both = [u for u in values if u in by_scheme.get(BASE, {})]
+            both = [u for u in values if u in base] if scheme != BASE else []
             line = {"part": part, "setting": setting, "measure": measure, "scheme": scheme, "units": len(values)}
             line |= {"mean": f"{mean:.4g}", "low": f"{low:.4g}", "high": f"{high:.4g}", "paired_units": len(both)}
-            claim = ""
-            if scheme != BASE and both:
-                d, d_low, d_high = interval(np.array([values[u] - by_scheme[BASE][u] for u in both]))
+            line |= {"minus_systematic": "", "diff_low": "", "diff_high": "", "claim": ""}
+            if both:
+                difference = np.array([values[u] - base[u] for u in both])
+                d, d_low, d_high = interval(difference)
                 line |= {"minus_systematic": f"{d:.4g}", "diff_low": f"{d_low:.4g}", "diff_high": f"{d_high:.4g}"}
-                claim = "higher" if d_low > 0 else "lower" if d_high < 0 else "no difference can be claimed"
-            else:
-                line |= {"minus_systematic": "", "diff_low": "", "diff_high": ""}
-            lines.append(line | {"claim": claim})
+                group.append((line, d, p_value(difference)))
+            lines.append(line)
+        for (line, d, _), certain in zip(group, holm(np.array([p for _, _, p in group])), strict=True):
+            line["claim"] = ("higher" if d > 0 else "lower") if certain else "no difference can be claimed"
     write(out / "summary.csv", lines)
 
 
@@ -183,14 +211,13 @@ def main() -> None:
         parser.error("--smoke would overwrite the results: name another folder with --out")
     everything = worlds(size["reference"])
     parts: dict[str, Callable[[], Iterator[Row]]] = {
-        f"filter-{name}": lambda name=name, world=world: filtered(name, world, size)
+        f"{setting}-{name}": lambda name=name, world=world, setting=setting: filtered(name, world, setting, size)
+        for setting in ("plain", "branching")
         for name, world in everything.items()
     }
     parts |= {"select-worlds": lambda: from_worlds(everything, size), "select-real": lambda: from_real(size)}
     for seed in range(size["scenes"]):
-        parts[f"select-demo-{seed}"] = lambda seed=seed: chosen(
-            "select: simulated", "last step of mst to 5", seed, simulated(seed), 5, size["draws"]
-        )
+        parts[f"select-demo-{seed}"] = lambda seed=seed: from_scene(seed, size)
     parts["time"] = lambda: timed(size)
     folder = options.out / "parts"
     folder.mkdir(parents=True, exist_ok=True)

@@ -15,8 +15,9 @@ from mstfilter.oracles.miniature.exact import exact_filter
 from mstfilter.oracles.miniature.filters import bootstrap_filter
 from mstfilter.oracles.miniature.measures import class_weights
 from mstfilter.oracles.miniature.world import Miniature
+from mstfilter.smc.branching import Branching
 from mstfilter.smc.distributions import Normal, Student
-from mstfilter.smc.interfaces import Resampler, Transition
+from mstfilter.smc.interfaces import Resampler
 from mstfilter.smc.particle_filter import ParticleFilter
 from mstfilter.smc.population import Population
 from mstfilter.smc.resampling import EssBelow, Never
@@ -37,31 +38,22 @@ class Data:
 
 @dataclass(frozen=True, eq=False)
 class World:
-    """A model: its bootstrap filter, its data by seed, the estimate (...) that is compared with the answers."""
+    """A model: its bootstrap filter, its data by seed, the estimate (...) that is compared with the answers.
+
+    `sizes` are the particles of the plain and of the branching filter.
+    """
 
     filter: Callable[[int], ParticleFilter]
     data: Callable[[int], Data]
     estimate: Callable[[Population], np.ndarray]
     similarity: Similarity
     equivalence: Equivalence
+    sizes: tuple[int, int] = (100, 20)
 
     def error(self, population: Population, answer: np.ndarray) -> float:
         """Absolute error of a mean; total variation of a law."""
         difference = np.abs(self.estimate(population) - answer)
         return float(difference if difference.ndim == 0 else 0.5 * difference.sum())
-
-
-@dataclass(frozen=True)
-class Branch(Transition):
-    """Every particle moves several times, independently: more candidates than places, as in MST."""
-
-    inner: Transition
-    branches: int = BRANCHES
-
-    def predict(self, rng: np.random.Generator, population: Population, observation: Any) -> Population:
-        """(n * branches) candidates, those of one particle side by side."""
-        index = np.repeat(np.arange(len(population)), self.branches)
-        return self.inner.predict(rng, population.take(index), observation)
 
 
 def plain(world: World, resampler: Resampler, n: int) -> ParticleFilter:
@@ -73,7 +65,11 @@ def branching(world: World, resampler: Resampler, n: int) -> ParticleFilter:
     """n particles, BRANCHES * n candidates at every step, of which the resampler keeps n."""
     filter = world.filter(n)
     return replace(
-        filter, transition=Branch(filter.transition), resampler=resampler, trigger=Never(), resample="after"
+        filter,
+        transition=Branching(filter.transition, BRANCHES),
+        resampler=resampler,
+        trigger=Never(),
+        resample="after",
     )
 
 
@@ -82,6 +78,7 @@ R, S, Q, STEPS = 0.9, 0.6, 0.4, 25
 S0 = S / np.sqrt(1 - R**2)
 
 
+@cache
 def kalman(seed: int) -> Data:
     """Data of a seed, their log evidence and filtered means by the Kalman filter."""
     rng = np.random.default_rng([seed, 21])
@@ -154,6 +151,7 @@ def change(rng: np.random.Generator, shelf: tuple[int, ...]) -> tuple[int, ...]:
     return shelf
 
 
+@cache
 def shelf_data(seed: int) -> Data:
     """Counts; only the number of boxes matters for them, a birth-death chain that is summed exactly."""
     rng = np.random.default_rng([seed, 23])
@@ -202,6 +200,7 @@ def n_boxes(population: Population) -> np.ndarray:
 TABLE = Miniature((3, 2))
 
 
+@cache
 def table_data(seed: int) -> Data:
     """Six glances at a table; all configurations are enumerated."""
     _, glances = TABLE.simulate(np.random.default_rng([seed, 24]), 6)
@@ -223,5 +222,6 @@ def worlds(reference: int) -> dict[str, World]:
             lambda population: class_weights(TABLE, population),
             WeightedCoverage(),
             SameSegmentation(),
+            (200, 20),
         ),
     }
