@@ -49,11 +49,15 @@ def reached(modules: Iterable[str]) -> set[str]:
 
 @lru_cache(maxsize=4096)
 def _path(module: str) -> Path | None:
-    try:
-        spec = find_spec(module)
-    except (ImportError, ValueError):
+    """The file of a module of the package, found without importing anything; None where there is none."""
+    root = find_spec(_PACKAGE)
+    if root is None or root.origin is None:
         return None
-    return Path(spec.origin) if spec is not None and spec.origin else None
+    place = Path(root.origin).parent.joinpath(*module.split(".")[1:])
+    for path in (place.with_suffix(".py"), place / "__init__.py"):
+        if path.is_file():
+            return path
+    return None
 
 
 @lru_cache(maxsize=4096)
