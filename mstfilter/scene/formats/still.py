@@ -7,7 +7,8 @@ The rule, for a camera that stands still: images become grey blocks; two images 
 than its noise, and there is motion where more than a small share of the blocks differ. A still interval is a run of
 frames in which none differs from the frame before nor from the first of the run (slow motion adds up). Each
 interval of at least `hold_s` seconds gives one pause, its middle frame. Changes that all blocks share (exposure,
-flicker of the light) do not count. The noise is measured on the video itself: a quarter of it has to be at rest.
+flicker of the light) do not count. The noise of each block is measured on the video itself (edges shimmer more than
+planes): a quarter of the video has to be at rest.
 
 A robot that holds still within the picture, or that works slower than a grey level in a whole interval, looks like a
 pause too: look at the pauses found, and name them yourself where they are wrong.
@@ -27,6 +28,7 @@ from mstfilter.scene.formats.pauses import PauseRule
 __all__ = ["Still", "grey_blocks"]
 
 _ACROSS = 80  # blocks
+_MOST = 4.0  # times `levels`: a block that never rests must not hide motion
 
 
 def grey_blocks(rgb: np.ndarray) -> np.ndarray:
@@ -54,12 +56,20 @@ class Still(PauseRule):
     share : float
         More blocks than this share that differ are motion.
     levels : float
-        A block differs from here on, in grey levels of 255, or from six times the noise if that is more.
+        A block differs from here on, in grey levels of 255, or from six times its noise if that is more.
+    region : tuple of 4 float
+        Part of the image that is looked at: left, top, right, bottom as shares of its width and height. Leaves out
+        people behind the table.
     """
 
     hold_s: float = 0.5
     share: float = 0.001
     levels: float = 3.0
+    region: tuple[float, ...] = (0.0, 0.0, 1.0, 1.0)
+
+    def __post_init__(self) -> None:
+        if len(self.region) != 4:
+            raise InputError(f"region has {len(self.region)} numbers, expected left, top, right, bottom from 0 to 1")
 
     def find(self, times: tuple[float, ...], read_rgb: Callable[[int], np.ndarray]) -> tuple[int, ...]:
         """See `PauseRule`."""
@@ -69,7 +79,8 @@ class Still(PauseRule):
                 f"no pause found: nowhere in {len(times)} frames ({times[-1] - times[0]:.1f} s) does the image hold "
                 f"still for {self.hold_s:g} s",
                 "does the camera move? name the pauses: --pauses 0,40,85 (frames) or --pauses 0s,4.2s",
-                "a shorter interval: pauses.hold_s=0.2; first and last frame only: --pauses ends",
+                "does something else move (people, shadows)? look at a part: -o pauses.region=0.2,0.1,0.8,0.9",
+                "a shorter interval: -o pauses.hold_s=0.2; first and last frame only: --pauses ends",
             )
         return tuple((first + last) // 2 for first, last in intervals)
 
@@ -77,14 +88,12 @@ class Still(PauseRule):
         self, times: tuple[float, ...], read_rgb: Callable[[int], np.ndarray]
     ) -> tuple[tuple[int, int], ...]:
         """First and last frame of each still interval."""
-        images = [grey_blocks(read_rgb(index)) for index in range(len(times))]
+        images = [self._part(grey_blocks(read_rgb(index))) for index in range(len(times))]
         if len({image.shape for image in images}) > 1:
             raise InputError(f"images differ in size: {sorted({image.shape for image in images})} blocks")
         if len(images) == 1:
             return ((0, 0),)
-        typical = [float(np.median(_changes(a, b))) for a, b in pairwise(images)]
-        noise = 1.4826 * float(np.quantile(typical, 0.25))
-        limit, allowed = max(self.levels, 6 * noise), self.share * images[0].size
+        limit, allowed = self._limit(images), self.share * images[0].size
         runs, first = [], 0
         for index in range(1, len(images) + 1):
             if index < len(images):
@@ -96,3 +105,21 @@ class Still(PauseRule):
             runs.append((first, index - 1))
             first = index
         return tuple((a, b) for a, b in runs if b > a and times[b] - times[a] >= self.hold_s - 1e-9)
+
+    def _part(self, blocks: np.ndarray) -> np.ndarray:
+        """The blocks of the region."""
+        h, w = blocks.shape
+        left, top, right, bottom = self.region
+        part = blocks[int(top * h) : int(np.ceil(bottom * h)), int(left * w) : int(np.ceil(right * w))]
+        if part.size == 0:
+            raise InputError(f"region {self.region} of the image is empty", "left, top, right, bottom from 0 to 1")
+        return part
+
+    def _limit(self, images: list[np.ndarray]) -> np.ndarray:
+        """Change (h, w) in grey levels from which a block differs: some multiples of its own noise at rest."""
+        changes = np.stack([_changes(a, b) for a, b in pairwise(images)])
+        quarter = np.quantile(changes, 0.25, axis=0) / 0.3186  # of |x| for x normal with deviation 1
+        whole = 1.4826 * np.quantile(np.median(changes, axis=(1, 2)), 0.25)
+        limit = np.clip(6 * np.maximum(quarter, whole), self.levels, None)
+        most: np.ndarray = np.minimum(limit, max(_MOST * self.levels, 6 * whole))
+        return most

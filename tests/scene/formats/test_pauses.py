@@ -82,6 +82,30 @@ def test_what_all_pixels_share_is_no_motion():
         assert Still().intervals(times_of(noisy), lambda k, v=noisy: v[k]) == ((0, 5), (10, 16))
 
 
+def test_a_region_leaves_out_what_moves_elsewhere():
+    """Somebody walks behind the table through every frame."""
+    rgb, _, _ = video()
+    walking = rgb.copy()
+    for k, image in enumerate(walking):
+        image[:15, 5 * k : 5 * k + 12] = 0
+    assert Still().intervals(times_of(rgb), lambda k: walking[k]) == ()
+    table = Still(region=(0.0, 0.2, 1.0, 1.0))
+    assert table.intervals(times_of(rgb), lambda k: walking[k]) == ((0, 5), (10, 16))
+    for wrong in ((0.5, 0.2, 0.5, 1.0), (0.1, 0.2)):
+        with pytest.raises(InputError, match="region"):
+            Still(region=wrong).intervals(times_of(rgb), lambda k: rgb[k])
+
+
+def test_blocks_that_shimmer_have_a_noise_of_their_own():
+    """A shimmering edge, which is a percent of the image, is no motion; a box that moves beside it is."""
+    rng = np.random.default_rng(0)
+    rgb, _, _ = video()
+    shimmer = [image.astype(float) for image in rgb]
+    for image in shimmer:
+        image[100:102] += rng.normal(size=(1, 160, 1)) * 3
+    assert Still().intervals(times_of(rgb), lambda k: shimmer[k]) == ((0, 5), (10, 16))
+
+
 def test_slow_motion_adds_up():
     """A twentieth of a pixel a frame changes no block by three levels, ten frames of it do."""
     image = video((0,))[0][0].astype(float)
