@@ -1,0 +1,36 @@
+"""The error budget and the study of mask quality run from end to end in their small form."""
+
+from __future__ import annotations
+
+import csv
+
+import pytest
+
+from tests.conftest import REPOSITORY
+
+
+@pytest.mark.parametrize("name, arms", [("study", 3), ("mask_quality", 4)])
+def test_smoke(tmp_path, monkeypatch, name, arms):
+    from mstfilter.cli import main
+
+    monkeypatch.setenv("MSTFILTER_CACHE", str(tmp_path / "cache"))
+    folder = tmp_path / "study"
+    config = REPOSITORY / "experiments/error_budget" / f"{name}.toml"
+    main_ok(main, ["study", str(config), "--smoke", "--workers", "1", "--out", str(folder)])
+    with (folder / "runs.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert len({row["arm"] for row in rows}) == arms
+    quality = {row["arm"]: float(row["quality"]) for row in rows}
+    if name == "study":
+        assert quality["all true"] >= 0.97 > quality["mst"]
+    else:
+        best = [q for arm, q in quality.items() if "1.0" in arm]
+        assert min(best) > max(q for arm, q in quality.items() if "0.7" in arm)
+
+
+def main_ok(main, arguments):
+    """The command line ends by itself where all went well."""
+    try:
+        main(arguments)
+    except SystemExit as end:
+        assert not end.code

@@ -1,0 +1,79 @@
+"""Arms of the error budget: each changes its stage of mst and nothing else, and the experiment holds all of them."""
+
+from __future__ import annotations
+
+import tomllib
+
+import pytest
+
+from mstfilter import registry
+from mstfilter.oracles.stages import ALL, STAGES, budget_arms, overrides_of
+from mstfilter.oracles.truth import uses_truth
+from mstfilter.presets import build_filter, describe_filter, load_config
+from tests.baselines.test_presets import differences
+from tests.conftest import REPOSITORY
+
+MST = describe_filter(build_filter(load_config("mst")))
+
+WHERE = {
+    "boundary": ["proposal.boundary"],
+    "masks": ["proposal"],
+    "completion": ["proposal.completer"],
+    "motions": ["transition"],
+    "warp": ["transition.warp.method"],
+    "choice": ["update.evidence", "update.n_scored"],
+    "fusion": ["update"],
+    "free space": ["update.free_space"],
+    "selection": ["resampler"],
+}
+
+
+def described(*overrides):
+    return describe_filter(build_filter(load_config("mst", overrides)))
+
+
+@pytest.mark.parametrize("stage", STAGES)
+def test_a_stage_changes_itself_alone(stage):
+    config = described(*overrides_of(stage))
+    assert sorted(differences(config, MST)) == sorted(WHERE[stage])
+    for slot, fields in {
+        "proposal": ("completer", "objects", "threshold"),
+        "transition": ("warp",),
+        "update": ("free_space",),
+    }.items():
+        if [slot] == WHERE[stage]:  # another component stands there: what both have is the same
+            for field in fields:
+                assert config[slot][field] == MST[slot][field], (slot, field)
+
+
+def test_with_all_stages_true_nothing_is_estimated():
+    filter = build_filter(load_config("mst", overrides_of(*ALL)))
+    assert set(uses_truth(filter)) == {
+        "TrueMotions",
+        "TrueMasks",
+        "TrueCompletion",
+        "TrueFusion",
+        "TrueFreeSpace",
+        "TrueBest",
+    }
+    assert filter.transition.warp.method == "smooth"
+    for left in ALL:
+        fewer = described(*overrides_of(*(s for s in ALL if s != left)))
+        assert differences(fewer, describe_filter(filter)), left
+
+
+def test_the_experiment_holds_all_arms():
+    """Write the arms of study.toml anew from `budget_arms` where they differ."""
+    data = tomllib.loads((REPOSITORY / "experiments/error_budget/study.toml").read_text())
+    assert {arm["name"]: tuple(arm.get("set", ())) for arm in data["arms"]} == budget_arms()
+    assert data["reference"] == "mst"
+
+
+def test_every_oracle_has_a_name_and_comes_back_from_its_description():
+    for kind, names in registry.ORACLES.items():
+        for name in names:
+            assert name.startswith("true_") and name not in registry.COMPONENTS[kind]
+            component = registry.build(kind, name)
+            described_ = registry.describe(component)
+            assert described_["component"] == name
+            assert registry.build(kind, described_) == component
