@@ -7,6 +7,7 @@ that contact is designed and not left to chance; then physics settles the whole.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
@@ -18,6 +19,9 @@ from mstfilter.simulation.textures import Skin, draw_skin
 from mstfilter.simulation.world import OBJECT_GROUP, World
 
 __all__ = ["Things", "arrange", "draw_things"]
+
+Stance = Literal["any", "tall", "low"]
+"""Which of its rest poses a shape takes."""
 
 TOUCH = 0.0003
 """Gap left between objects put in contact, metres; settling closes it."""
@@ -72,17 +76,25 @@ def draw_things(rng: np.random.Generator, family: SceneFamily) -> Things:
     return Things(tuple(shapes), tuple(skins), tuple(twin_of))
 
 
-def _rest(rng: np.random.Generator, shape: Shape) -> tuple[np.ndarray, float]:
+def _rest(rng: np.random.Generator, shape: Shape, stance: Stance = "any") -> tuple[np.ndarray, float]:
     """An orientation in which the shape rests, and the height of its origin above what it stands on."""
     from scipy.spatial.transform import Rotation
 
     weights = np.array([w for _, w in shape.rests])
     up = shape.rests[int(rng.choice(len(weights), p=weights / weights.sum()))][0]
+    if stance != "any":
+        ordered = sorted((axis for axis, _ in shape.rests), key=lambda axis: shape.half[abs(axis) - 1])
+        up = ordered[-1 if stance == "tall" else 0]
     axis = abs(up) - 1
     turn = {0: ("y", -90.0), 1: ("x", 90.0), 2: ("x", 0.0 if up > 0 else 180.0)}[axis]
     lay = Rotation.from_euler(turn[0], turn[1], degrees=True)
     yaw = Rotation.from_euler("z", float(rng.uniform(0, 2 * np.pi)))
     return (yaw * lay).as_matrix(), float(shape.half[axis])
+
+
+def _standing_height(shape: Shape) -> float:
+    """How high the shape is at most, at rest, metres."""
+    return 2 * max(float(shape.half[abs(axis) - 1]) for axis, _ in shape.rests)
 
 
 def _slide_in(world: World, k: int, goal: np.ndarray, angle: float, height: float, rotation: np.ndarray) -> float:
@@ -123,6 +135,7 @@ def _beside(
     gap: float,
     towards: np.ndarray | None = None,
     attempts: int = _ATTEMPTS,
+    stance: Stance = "any",
 ) -> bool:
     """Put object k next to one of its `neighbours`, `gap` metres from what it meets first.
 
@@ -132,7 +145,7 @@ def _beside(
     for _ in range(attempts):
         near = neighbours[int(rng.integers(len(neighbours)))]
         goal = world.positions()[near, :2]
-        rotation, height = _rest(rng, world.shapes[k])
+        rotation, height = _rest(rng, world.shapes[k], stance)
         angle = float(rng.uniform(0, 2 * np.pi))
         if towards is not None:
             angle = float(np.arctan2(towards[1], towards[0]) + rng.normal(0.0, 0.2))
@@ -186,7 +199,7 @@ def _behind(rng: np.random.Generator, world: World, k: int, placed: list[int], c
     for _ in range(_HIDING_PLACES):
         near = tallest[int(rng.integers(len(tallest)))]
         away = world.positions()[near, :2] - np.array(camera.position)[:2]
-        if not _beside(rng, world, k, [near], TOUCH, away, attempts=1):
+        if not _beside(rng, world, k, [near], TOUCH, away, 1, "low"):
             continue
         seen = int(_visible(world, camera)[k])
         if best is None or seen < best[0]:
@@ -207,6 +220,8 @@ def _try(
     # What is to be hidden is small and stands on the table; it comes when the tall ones are there.
     lone = [k for k in originals if k not in stacked and k not in twin_of]
     hidden = sorted(lone, key=lambda k: world.shapes[k].radius)[: min(family.n_hidden, len(lone) - 1)]
+    standing = [k for k in originals if k not in stacked and k not in hidden]
+    walls = sorted(standing, key=lambda k: -_standing_height(world.shapes[k]))[: len(hidden)]
     camera = family.camera().scaled(160 / family.width)
     placed: list[int] = []
     order: list[int] = []
@@ -217,7 +232,7 @@ def _try(
     order += hidden
     for k in order:
         if not placed:
-            rotation, height = _rest(rng, world.shapes[k])
+            rotation, height = _rest(rng, world.shapes[k], "tall" if k in walls else "any")
             world.place(k, (*(CENTRE + rng.uniform(-0.05, 0.05, 2)), height + 0.0002), rotation)
         elif twin_of[k] >= 0:
             if not _beside(rng, world, k, [twin_of[k]], TOUCH):
@@ -227,7 +242,7 @@ def _try(
                 return False
         elif not (k in stacked and _on_top(rng, world, k, placed)):
             gap = TOUCH if rng.uniform() < family.contact else float(rng.uniform(0.01, 0.04))
-            if not _beside(rng, world, k, placed, gap):
+            if not _beside(rng, world, k, placed, gap, stance="tall" if k in walls else "any"):
                 return False
         placed.append(k)
     world.forward()

@@ -26,7 +26,7 @@ __all__ = ["SCENE_FAMILIES", "SceneFamily", "scene_family"]
 _LOOKS_AT = np.array([0.02, 0.05, 0.04])
 _TOWARDS_CAMERA = np.array([0.03, -0.77, 0.54]) / np.linalg.norm([0.03, -0.77, 0.54])
 
-GENERATOR_VERSION = 5
+GENERATOR_VERSION = 6
 """Raised whenever the same seed gives other bytes."""
 
 FIRST_REPORTED_SEED = 1000

@@ -12,9 +12,9 @@ bounding box, z up in its main pose), the poses in which it rests, its mass and 
 Sizes and masses follow objects of the YCB set (B. Calli, A. Walsman, A. Singh, S. Srinivasa, P. Abbeel, A. M. Dollar,
 "Benchmarking in manipulation research: the YCB object and model set", IEEE Robotics & Automation Magazine 22(3),
 2015, table of objects), rounded: cracker, sugar, pudding and gelatin box, soup, tuna and coffee can, mug, bowl,
-banana, ball. Crisps are cut to 0.20 m (the set's can has 0.25 m). Tea, biscuits, bricks, bottle, soap and angle are of
-our own making, of like size. Each measure is scaled by up to 10 %. Walls of bowl and mug are 1 cm, thicker than the
-real ones: a thinner wall falls between the centres of 1 cm voxels and would be missing from the truth.
+banana, ball. Crisps are cut to 0.20 m (the set's can has 0.25 m). Tea, biscuits, bricks, bottle, soap and angle are
+of our own making, of like size. Each measure is scaled by up to 10 %. Walls of bowl and mug are 1 cm, thicker than
+the real ones: a thinner wall falls between the centres of 1 cm voxels and would be missing from the truth.
 """
 
 from __future__ import annotations
