@@ -78,13 +78,18 @@ def _print_summary(summary: Any) -> None:
                 arm,
                 str(len(figure.by_scene)),
                 f"{figure.mean:.3f}",
-                "{:.3f} .. {:.3f}".format(*figure.interval),
+                _range(*figure.interval),
                 "" if d is None else f"{d.mean:+.3f}",
-                "" if d is None else f"{d.low:+.3f} .. {d.high:+.3f}",
+                "" if d is None else _range(d.low, d.high, "+"),
                 "" if slope is None else f"{slope.mean:+.3f}",
                 "" if seconds is None else f"{seconds.mean:.2f}",
             )
     Console(width=140 if not sys.stdout.isatty() else None).print(table)
+
+
+def _range(low: float, high: float, sign: str = "") -> str:
+    """An interval; a dash where there is none."""
+    return "–" if low != low else f"{low:{sign}.3f} .. {high:{sign}.3f}"
 
 
 @contextlib.contextmanager

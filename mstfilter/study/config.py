@@ -114,11 +114,14 @@ class ArmEntry(_Entry):
         ``path=value`` each, as `mstfilter run` takes them; ``path=a,b`` is two arms.
     name : str
         What the tables call it. Default: the preset and what the grid varies.
+    beside : bool
+        Shown beside the others (a floor, a ceiling), and no part of the comparisons that are adjusted together.
     """
 
     preset: Texts = ("mst",)
     set: Texts = ()
     name: str = ""
+    beside: bool = False
 
 
 class StudyConfig(_Entry):

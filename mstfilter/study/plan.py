@@ -52,6 +52,8 @@ class Arm:
         Version of the code that its runs reach.
     modules : tuple of str
         Where that code begins.
+    beside : bool
+        No part of the comparisons that are adjusted together.
     """
 
     name: str
@@ -60,6 +62,7 @@ class Arm:
     ours: bool
     code: str
     modules: tuple[str, ...]
+    beside: bool = False
 
 
 @dataclass(frozen=True)
@@ -209,7 +212,7 @@ def _arms(entry: ArmEntry, folder: Path, overrides: Sequence[str], allow_files: 
             code = code_version(modules)
             ours = all(module.split(".")[0].startswith("mstfilter") for module in _modules(filter))
             key = _hash([config, files_of(filter), versions(), code])
-            yield Arm(name, config, key, ours, code, modules)
+            yield Arm(name, config, key, ours, code, modules, entry.beside)
 
 
 def _stem(preset: str) -> str:

@@ -124,7 +124,8 @@ class StudyFolder:
     def summary(self) -> Summary:
         """What the runs that are done say together."""
         rows = self.rows()
-        return summarise(rows, self.description["reference"], cost_columns(rows))
+        beside = [arm["name"] for arm in self.description["arms"] if arm.get("beside")]
+        return summarise(rows, self.description["reference"], cost_columns(rows), beside)
 
     def write_tables(self) -> None:
         """Write all tables from the runs."""
@@ -132,7 +133,7 @@ class StudyFolder:
         costs = cost_columns(rows)
         columns = [*(c for c in _columns(rows) if c not in costs), *costs]
         write_table(self.path / "runs.csv", columns, rows)
-        found = summarise(rows, self.description["reference"], costs)
+        found = self.summary()
         write_table(self.path / "summary.csv", _FIGURES, found.figure_rows())
         write_table(self.path / "differences.csv", _DIFFERENCES, found.difference_rows())
         failed = [{"run": f["name"], **f, "hints": "; ".join(f["hints"] or ())} for f in self.failures()]

@@ -193,7 +193,7 @@ def _described(plan: Plan) -> dict[str, Any]:
         "name": study.name,
         "description": study.description,
         "reference": plan.reference,
-        "arms": [{"name": arm.name, "config": arm.config} for arm in plan.arms],
+        "arms": [{"name": arm.name, "beside": arm.beside, "config": arm.config} for arm in plan.arms],
         "scenes": [{"name": s.name, "group": s.group, "source": s.source, "key": s.key} for s in plan.scenes],
         "seeds": study.seeds,
         "runs": [

@@ -10,7 +10,7 @@ averaged the same way, so that all rows of a table are about the same pauses. Fi
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -60,7 +60,9 @@ class Compared:
     ----------
     family, first, second, figure : str
     difference : Difference
-        p adjusted over all families and arms of the primary endpoint; not adjusted for other figures.
+        p adjusted over all families and methods of the primary endpoint; not adjusted for other figures.
+    beside : bool
+        The other arm is a floor or a ceiling: no part of the adjustment, and nothing is said of it.
     """
 
     family: str
@@ -68,6 +70,7 @@ class Compared:
     second: str
     figure: str
     difference: Difference
+    beside: bool = False
 
     @property
     def words(self) -> str:
@@ -124,11 +127,13 @@ class Summary:
             row = {"family": one.family, "first": one.first, "second": one.second, "figure": one.figure, "n": d.n}
             row |= {"mean": d.mean, "low": d.low, "high": d.high, "p": d.p, "p_holm": d.p_holm}
             row |= {"low_bootstrap": d.low_bootstrap, "high_bootstrap": d.high_bootstrap}
-            rows.append({**row, "conclusion": one.words if one.figure == ENDPOINT else ""})
+            rows.append({**row, "conclusion": "" if one.beside or one.figure != ENDPOINT else one.words})
         return rows
 
 
-def summarise(rows: Sequence[Mapping[str, Any]], reference: str, cost: Sequence[str] = ()) -> Summary:
+def summarise(
+    rows: Sequence[Mapping[str, Any]], reference: str, cost: Sequence[str] = (), beside: Collection[str] = ()
+) -> Summary:
     """The summary of rows as `StudyFolder.rows` returns them.
 
     Parameters
@@ -139,6 +144,8 @@ def summarise(rows: Sequence[Mapping[str, Any]], reference: str, cost: Sequence[
     cost : sequence of str
         Columns of time and memory: averaged over all pauses, where a stage that a pause lacks took no time; never
         compared.
+    beside : collection of str
+        Arms that are floors or ceilings.
     """
     families, arms = (tuple(dict.fromkeys(str(row[k]) for row in rows)) for k in ("family", "arm"))
     named = list(dict.fromkeys(k for row in rows for k in row if k not in _NAMES))
@@ -162,13 +169,20 @@ def summarise(rows: Sequence[Mapping[str, Any]], reference: str, cost: Sequence[
     differences = []
     for name in order:
         table = [
-            Compared(family, reference, arm, name, compare(values.get((family, reference, name), {}), others))
+            Compared(
+                family,
+                reference,
+                arm,
+                name,
+                compare(values.get((family, reference, name), {}), others),
+                arm in beside,
+            )
             for family in families
             for arm in arms
             if arm != reference and (others := values.get((family, arm, name), {}))
         ]
         if name == ENDPOINT:
-            p = holm([one.difference.p for one in table])
+            p = holm([float("nan") if one.beside else one.difference.p for one in table])
             table = [
                 replace(one, difference=replace(one.difference, p_holm=float(q)))
                 for one, q in zip(table, p, strict=True)

@@ -65,6 +65,18 @@ def test_differences_are_paired_and_adjusted_together():
     assert {d.figure for d in found.differences} == {"quality", "quality_slope", "quality_hidden"}
 
 
+def test_floors_take_no_part_in_the_adjustment():
+    table = list(rows())
+    floor = [{**r, "arm": "floor"} for r in table if r["arm"] == "theirs"]
+    with_floor = summarise([*table, *floor], "ours", beside=["floor"])
+    assert [d.difference.p_holm for d in with_floor.compared() if not d.beside] == [
+        d.difference.p_holm for d in summarise(table, "ours").compared()
+    ]
+    beside = [d for d in with_floor.compared() if d.beside]
+    assert [d.second for d in beside] == ["floor", "floor"] and np.isnan(beside[0].difference.p_holm)
+    assert not [r for r in with_floor.difference_rows() if r["second"] == "floor" and r["conclusion"]]
+
+
 def test_a_scene_that_one_arm_lacks_is_left_out_of_the_pairs():
     table = [r for r in rows() if not (r["arm"] == "theirs" and r["scene"] == "f1")]
     found = summarise(table, "ours")
