@@ -57,6 +57,7 @@ def test_layout_of_the_recording(recording):
     for pause in recording.pauses[1:]:
         push = manifest["frames"][pause]["push"]
         assert max(push["displacement_m"]) > SMALL.move_threshold and push["all_kept"] and push["settled"]
+    assert all(manifest["frames"][pause]["left_workspace"] == [] for pause in recording.pauses)
     recording.check()
 
 
@@ -170,3 +171,27 @@ def test_camera_of_families():
 def test_reopened(recording):
     again = Recording.open(recording.path)
     np.testing.assert_array_equal(again.truth(2), recording.truth(2))
+
+
+def test_objects_that_left_the_workspace_are_named_and_the_truth_keeps_its_extent(tmp_path):
+    from mstfilter.simulation import recorder
+
+    scene = Scene(replace(SMALL, n_actions=0), 3)
+    scene.world.place(1, (0.0, 5.0, 0.1), np.eye(3))
+    scene.world.forward()
+    with recorder.RecordingWriter(tmp_path / "away", scene.camera, scene.grid, **scene.describe()) as writer:
+        recorder._pause(scene, writer, 0, 0.0)
+    away = Recording.open(tmp_path / "away")
+    assert away.manifest["frames"][0]["left_workspace"] == [2]
+    assert away.truth(0).shape == SMALL.grid().shape
+    assert set(np.unique(away.truth(0))) == {0, 1, 3, 4, 5}
+
+
+def test_pictures_poses_and_volumes_agree(recording):
+    import json
+
+    poses = json.loads((recording.path / "poses.json").read_text())
+    scene = Scene(SMALL, 3)
+    for t, pause in enumerate(recording.pauses):
+        shown = np.array([poses[pause]["T_world_object"][str(k + 1)] for k in range(5)])
+        np.testing.assert_array_equal(label_voxels(scene.things.shapes, shown, recording.grid), recording.truth(t))

@@ -9,6 +9,7 @@ from mstfilter.errors import InputError
 from mstfilter.simulation.actions import Push, choose_push, play
 from mstfilter.simulation.arrangement import arrange, draw_things
 from mstfilter.simulation.families import scene_family
+from mstfilter.simulation.recorder import Scene
 from mstfilter.simulation.shapes import FAMILIES, draw_shape
 from mstfilter.simulation.world import FINGER_ID, World
 
@@ -50,6 +51,16 @@ def test_arranged_scenes_are_settled_without_interpenetration_and_twins_touch(se
         if twin >= 0:
             assert things.shapes[k] is things.shapes[twin] and things.skins[k] is things.skins[twin]
             assert (twin, k) in pairs
+
+
+def test_hidden_objects_are_not_seen():
+    family = replace(scene_family("s2"), width=160, height=120, n_stacked=0)
+    for seed in range(2):
+        scene = Scene(family, seed)
+        camera = scene.camera
+        rays = camera.rays().reshape(-1, 3) @ camera.pose.as_matrix()[:3, :3].T
+        geom, _, _ = scene.world.cast(np.array(camera.position), rays, (1,))
+        assert len(np.unique(scene.world.geom_object[geom[geom >= 0]])) < 9
 
 
 def test_a_restored_state_goes_on_bit_by_bit():

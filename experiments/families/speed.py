@@ -1,0 +1,83 @@
+"""Seconds a frame of the renderer with and without keeping what cannot have changed; the pictures are compared.
+
+    OMP_NUM_THREADS=1 python experiments/families/speed.py            # five minutes on one core
+    python experiments/families/speed.py --smoke                      # some seconds
+
+Both renderers see the same states of the same scenes, in turns, so that other work on the machine disturbs both.
+Trust the ratio; the seconds are those of the machine. Writes speed.csv.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from mstfilter.simulation.actions import advance, finish
+from mstfilter.simulation.families import scene_family
+from mstfilter.simulation.recorder import TOLERANCE, Scene
+from mstfilter.simulation.renderer import Renderer
+
+HEADER = ("family", "seed", "frames", "kept_s", "full_s", "ratio", "sensor_s", "kept_cpu_s", "full_cpu_s")
+
+
+def states(scene: Scene, actions: int) -> Iterator[None]:
+    """The world as it is at every frame of a recording."""
+    family = scene.family
+    yield
+    for action in range(actions):
+        push = scene.choose(action)
+        for step in range(1, family.frames_per_clip):
+            advance(scene.world, push, (step - 1) / family.fps, step / family.fps)
+            if step == family.frames_per_clip - 1:
+                finish(scene.world)
+            yield
+
+
+def measure(name: str, seed: int, actions: int, small: dict[str, int]) -> list[str]:
+    scene = Scene(replace(scene_family(name), **small), seed)
+    arguments = (scene.world, scene.things.skins, scene.room, scene.camera, scene.family.supersample, TOLERANCE)
+    renderers = Renderer(*arguments), Renderer(*arguments, reuse=False)
+    spent, cpu, sensor, frames = np.zeros(2), np.zeros(2), 0.0, 0
+    for _ in states(scene, actions):
+        views = []
+        for k, renderer in enumerate(renderers):
+            wall, busy = time.perf_counter(), time.process_time()
+            views.append(renderer.render())
+            spent[k] += time.perf_counter() - wall
+            cpu[k] += time.process_time() - busy
+        for part in ("colour", "depth", "instance", "slant"):
+            np.testing.assert_array_equal(*(getattr(view, part) for view in views))
+        wall = time.perf_counter()
+        scene._colour.read(np.random.default_rng(0), views[0].colour)
+        scene._depth.read(np.random.default_rng(0), views[0].depth, views[0].slant)
+        sensor += time.perf_counter() - wall
+        frames += 1
+    ratio = cpu[1] / cpu[0]
+    figures = (*spent / frames, ratio, sensor / frames, *cpu / frames)
+    return [name, str(seed), str(frames), *(f"{x:.3f}" for x in figures)]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--smoke", action="store_true")
+    parser.add_argument("--out", type=Path, default=Path(__file__).resolve().parent / "results")
+    options = parser.parse_args()
+    options.out.mkdir(parents=True, exist_ok=True)
+    small = {"width": 160, "height": 120} if options.smoke else {}
+    jobs = [("s1", 0)] if options.smoke else [(name, seed) for name in ("s1", "s2", "s3") for seed in (0, 3)]
+    rows = []
+    for name, seed in jobs:
+        rows.append(measure(name, seed, 1 if options.smoke else 2, small))
+        print(*(f"{k} {v}" for k, v in zip(HEADER, rows[-1], strict=True)), flush=True)
+    with (options.out / "speed.csv").open("w", newline="") as file:
+        csv.writer(file, lineterminator="\n").writerows([HEADER, *rows])
+
+
+if __name__ == "__main__":
+    main()
