@@ -152,6 +152,21 @@ def take(particles: Particles, indices: np.ndarray) -> Particles:
     return tuple(particles[int(i)] for i in indices)
 
 
+def _check_log_weights(lw: np.ndarray, n: int) -> None:
+    if lw.shape != (n,):
+        raise InputError(f"log weights have shape {lw.shape}, expected ({n},) as there are {n} particles")
+    # One pass finds all three faults: NaN poisons the maximum.
+    top = lw.max()
+    if not top < np.inf:
+        wrong = np.flatnonzero(~(lw < np.inf))
+        raise InputError(f"log weight of particle {wrong[0]} is {lw[wrong[0]]} ({len(wrong)} of {n} are NaN or +inf)")
+    if top == -np.inf:
+        raise InputError(
+            f"all {n} log weights are -inf: no particle explains the observation",
+            "more particles, a wider proposal, or a likelihood with heavier tails",
+        )
+
+
 @dataclass(frozen=True, eq=False)
 class Population:
     """Weighted particles and where they come from.
@@ -180,20 +195,7 @@ class Population:
         if n == 0:
             raise InputError("a population has no particles", "a proposal must return at least one")
         lw = np.zeros(n) if self.log_weights is None else np.asarray(self.log_weights, dtype=np.float64).view()
-        if lw.shape != (n,):
-            raise InputError(f"log weights have shape {lw.shape}, expected ({n},) as there are {n} particles")
-        # One pass finds all three faults: NaN poisons the maximum.
-        top = lw.max()
-        if not top < np.inf:
-            wrong = np.flatnonzero(~(lw < np.inf))
-            raise InputError(
-                f"log weight of particle {wrong[0]} is {lw[wrong[0]]} ({len(wrong)} of {n} are NaN or +inf)"
-            )
-        if top == -np.inf:
-            raise InputError(
-                f"all {n} log weights are -inf: no particle explains the observation",
-                "more particles, a wider proposal, or a likelihood with heavier tails",
-            )
+        _check_log_weights(lw, n)
         lw.flags.writeable = False
         parents = {}
         for name, index in self.parents.items():
@@ -276,4 +278,10 @@ class Population:
 
     def reweighted(self, log_factors: np.ndarray) -> Population:
         """The same particles, log weights plus `log_factors`."""
-        return Population(self.particles, self.log_weights + log_factors, self.parents, self.notes)
+        lw = np.asarray(self.log_weights + log_factors, dtype=np.float64)
+        _check_log_weights(lw, len(self))
+        lw.flags.writeable = False
+        new = self.labelled(self.parents, self.notes)  # particles and parents have been checked
+        new.__dict__["log_weights"] = lw
+        new.__dict__.pop("_both", None)
+        return new
