@@ -142,6 +142,30 @@ def test_an_occupied_name_is_known_before_anything_is_read(tmp_path, capsys):
     assert (tmp_path / "out" / "thesis.tex").exists()
 
 
+@pytest.mark.parametrize(
+    ("stop", "expected"), [(KeyboardInterrupt(), 130), (OSError(28, "No space left on device"), 2)]
+)
+def test_what_stops_in_the_middle_leaves_nothing(tmp_path, capsys, monkeypatch, stop, expected):
+    """An interruption, and a disk that is full at the fifth image."""
+    from mstfilter.scene.formats import writer
+
+    count, usual = [], writer.write_image
+
+    def write_image(path, image):
+        count.append(path)
+        if len(count) == 5:
+            raise stop
+        usual(path, image)
+
+    monkeypatch.setattr(writer, "write_image", write_image)
+    data = layouts.write_redwood(tmp_path / "data")
+    code, _, err = call("convert", data, tmp_path / "out", "-o", "fps=10", capsys=capsys)
+    assert code == expected
+    assert ("interrupted: nothing" if expected == 130 else "No space left on device") in err
+    assert len(count) == 5
+    assert list(tmp_path.iterdir()) == [data]
+
+
 def test_run_reads_a_bag_as_its_conversion(tmp_path, capsys):
     """The same hypotheses whether the data were converted before or not."""
     path = write_bag(tmp_path / "data", "mcap", scene_messages(False))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -28,8 +29,12 @@ def convert(
     check_writable(out)
     recording = open_recording(source, format, option, pauses, frames)
     generator = recording.manifest.get("generator") or f"converted from {source.name}"
-    with bar("convert") as advance:
-        save(recording, out, progress=advance, generator=generator)
+    try:
+        with bar("convert") as advance:
+            save(recording, out, progress=advance, generator=generator)
+    except KeyboardInterrupt:
+        print("interrupted: nothing was written", file=sys.stderr)
+        raise typer.Exit(130) from None
     print(f"recording   {out}")
     marks = ", ".join(f"{p} ({recording.times[p]:.1f} s)" for p in recording.pauses[:12])
     more = ", ..." if len(recording.pauses) > 12 else ""

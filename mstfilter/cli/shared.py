@@ -26,7 +26,10 @@ def open_recording(path: Path, format: str, options: list[str] | None, pauses: s
 
     names = ",".join(name.strip() for name in frames.split(",") if name.strip())
     chosen = [*(options or []), *([f"frames={names},"] if names else [])]
-    return open_source(path, format, chosen, pauses)
+    from rich.console import Console
+
+    with Console(stderr=True).status(f"reading {path.name}"):  # shown on a terminal only
+        return open_source(path, format, chosen, pauses)
 
 
 @contextlib.contextmanager

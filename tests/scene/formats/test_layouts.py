@@ -77,7 +77,7 @@ def test_the_pose_is_found_and_the_workspace_can_be_given(tmp_path):
 
 def camera_to_world(k):
     """The true pose at frame k of a moving camera, in a world of its own."""
-    return RigidTransform.from_components([1 + 0.01 * k, -2, 0.5], Rotation.from_rotvec([0.3, -0.2, 0.02 * k]))
+    return RigidTransform.from_components([1 + 0.01 * k, -2, 0.9], Rotation.from_rotvec([0.3, -0.2, 0.02 * k]))
 
 
 def check_motion(recording):
