@@ -48,10 +48,8 @@ class Arm:
         Hash of the configuration, users' files and code.
     ours : bool
         Whether all components are of this package or of a file, so that their version is known.
-    code : str
-        Version of the code that its runs reach.
     modules : tuple of str
-        Where that code begins.
+        Where the code begins that its runs reach.
     beside : bool
         No part of the comparisons that are adjusted together.
     """
@@ -60,7 +58,6 @@ class Arm:
     config: dict[str, Any]
     key: str
     ours: bool
-    code: str
     modules: tuple[str, ...]
     beside: bool = False
 
@@ -212,7 +209,7 @@ def _arms(entry: ArmEntry, folder: Path, overrides: Sequence[str], allow_files: 
             code = code_version(modules)
             ours = all(module.split(".")[0].startswith("mstfilter") for module in _modules(filter))
             key = _hash([config, files_of(filter), versions(), code])
-            yield Arm(name, config, key, ours, code, modules, entry.beside)
+            yield Arm(name, config, key, ours, modules, entry.beside)
 
 
 def _stem(preset: str) -> str:

@@ -8,6 +8,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -46,6 +47,12 @@ class ToDo:
         """Where simulated recordings are kept."""
         return str((self.cache / "recordings").absolute())
 
+    @cached_property
+    def _code(self) -> dict[str, Any]:
+        """The code of all arms. A worker makes sure of it once, so that later changes of files meet no part of it."""
+        modules = sorted({module for arm in self.plan.arms for module in arm.modules})
+        return {"modules": modules, "code": code_version(modules)}
+
     def runs(self) -> tuple[list[tuple[Run, Job]], set[str]]:
         """Runs to do with their jobs, and the folders of those that are done."""
         metrics = code_version(["mstfilter.study.metrics"])
@@ -74,8 +81,7 @@ class ToDo:
             "folder": str(self.folder.run(run.folder).absolute()),
             "identity": run.identity,
             "metrics": metrics,
-            "code": run.arm.code,
-            "modules": run.arm.modules,
+            **self._code,
             "config": {**run.arm.config, "description": run.arm.name},
             "source": run.scene.source,
             "seed": run.seed,
