@@ -66,6 +66,12 @@ def uneven(path):
     return path
 
 
+def unnamed(path):
+    layouts.write_redwood(path)
+    (path / "intrinsic.json").unlink()
+    return path
+
+
 def late_fault(path):
     """Only the last image is broken: most is written before that is seen."""
     layouts.write_redwood(path)
@@ -94,6 +100,7 @@ ERRORS = {
     "truncated bag": (truncated, [], "bag cannot be read"),
     "mismatched numbers of images": (uneven, [], "17 colour images and 16 depth images"),
     "missing intrinsics": (layouts.write_tum, [], "intrinsics are missing"),
+    "intrinsics lost": (unnamed, [], "intrinsics are missing"),
     "table 1 km away": (layouts.write_redwood, ["-o", "depth_scale=1.25"], "expected between 0.05 and 30 m"),
     "table 1 mm away": (layouts.write_redwood, ["-o", "depth_scale=1.25e-6"], "expected between 0.05 and 30 m"),
     "unknown format": (photos, [], "no format that is known"),

@@ -10,6 +10,7 @@ and same ``frame_id``. Transforms (tf) are not read: the camera stands still, it
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -67,6 +68,8 @@ class Bag(Format):
         A colour and a depth image at most this far apart are one frame.
     registered : bool
         Take depth as registered to colour although its frame_id or camera matrix differs.
+    start_s, stop_s : float
+        Part of the video that is used, in seconds after its first frame.
     pauses : PauseRule
         Where the video is cut.
     world : World
@@ -80,6 +83,8 @@ class Bag(Format):
     depth_scale: float = 0.001
     tolerance_s: float = 0.02
     registered: bool = False
+    start_s: float = 0.0
+    stop_s: float = math.inf
     pauses: PauseRule = field(default_factory=Still)
     world: World = field(default_factory=World)
 
@@ -113,16 +118,20 @@ class Bag(Format):
             metres = depth_of(bag.message(topic.name, entries[1][k]), topic.compressed, self.depth_scale, where)
             return Images(read_rgb(index), metres, f"colour message {pairs[index][0]} of {colour.topic.name}", where)
 
-        return Video(
-            path.resolve().stem,
-            tuple(stamps[0][i] for i, _ in pairs),
-            read,
-            K,
-            path,
-            self.depth_scale if depth.encoding != "32FC1" else 0.00025,
-            read_rgb=read_rgb,
-            distortion=distortion,
-        ).recording(self.pauses, self.world)
+        return (
+            Video(
+                path.resolve().stem,
+                tuple(stamps[0][i] for i, _ in pairs),
+                read,
+                K,
+                path,
+                self.depth_scale if depth.encoding != "32FC1" else 0.00025,
+                read_rgb=read_rgb,
+                distortion=distortion,
+            )
+            .part(self.start_s, self.stop_s)
+            .recording(self.pauses, self.world)
+        )
 
     def _depth(self, path: Path, colour: _Stream, streams: list[_Stream]) -> _Stream:
         found = [s for s in streams if s.encoding in DEPTH]

@@ -10,6 +10,7 @@ of their names. Depth is in millimetres unless said otherwise. Format: http://re
 from __future__ import annotations
 
 import json
+import math
 import re
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -48,6 +49,8 @@ class Redwood(Format):
         The layout has no times: frame k is at k / fps seconds.
     moving : bool
         Use the trajectory where there is one.
+    start_s, stop_s : float
+        Part of the video that is used, in seconds after its first frame.
     pauses : PauseRule
         Where the video is cut.
     world : World
@@ -59,6 +62,8 @@ class Redwood(Format):
     depth_scale: float = 0.001
     fps: float = 30.0
     moving: bool = True
+    start_s: float = 0.0
+    stop_s: float = math.inf
     pauses: PauseRule = field(default_factory=Still)
     world: World = field(default_factory=World)
 
@@ -66,7 +71,8 @@ class Redwood(Format):
     def detects(cls, path: Path) -> bool:
         """See `Format`."""
         known = any((path / name).is_file() for name in _INTRINSICS) or any(path.glob("*.log"))
-        return known and (path / "depth").is_dir() and any((path / name).is_dir() for name in _COLOUR)
+        folders = _COLOUR if known else _COLOUR[:2]  # rgb/ and depth/ alone may be anything
+        return (path / "depth").is_dir() and any((path / name).is_dir() for name in folders)
 
     def open(self, path: Path) -> Recording:
         """See `Format`."""
@@ -85,17 +91,21 @@ class Redwood(Format):
         logs = sorted(path.glob("*.log")) if self.moving else []
         if len(logs) > 1:
             raise InputError(f"{path} holds {len(logs)} trajectories: {', '.join(p.name for p in logs)}", "keep one")
-        return Video(
-            path.resolve().name,
-            tuple(k / self.fps for k in range(len(colour))),
-            read,
-            self.K or _intrinsics(path),
-            path,
-            self.depth_scale,
-            read_rgb=lambda index: read_rgb(colour[index]),
-            motion=_trajectory(logs[0], len(colour)) if logs else None,
-            distortion=self.distortion,
-        ).recording(self.pauses, self.world)
+        return (
+            Video(
+                path.resolve().name,
+                tuple(k / self.fps for k in range(len(colour))),
+                read,
+                self.K or _intrinsics(path),
+                path,
+                self.depth_scale,
+                read_rgb=lambda index: read_rgb(colour[index]),
+                motion=_trajectory(logs[0], len(colour)) if logs else None,
+                distortion=self.distortion,
+            )
+            .part(self.start_s, self.stop_s)
+            .recording(self.pauses, self.world)
+        )
 
 
 def _numbered(folder: Path) -> list[Path]:

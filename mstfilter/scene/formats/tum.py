@@ -8,6 +8,7 @@ present, says how the camera moved. The layout holds no intrinsics: they have to
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -41,6 +42,8 @@ class Tum(Format):
         A colour and a depth image at most this far apart are one frame.
     moving : bool
         Use groundtruth.txt where it is present.
+    start_s, stop_s : float
+        Part of the video that is used, in seconds after its first frame.
     pauses : PauseRule
         Where the video is cut.
     world : World
@@ -52,6 +55,8 @@ class Tum(Format):
     depth_scale: float = 0.0002
     tolerance_s: float = 0.02
     moving: bool = True
+    start_s: float = 0.0
+    stop_s: float = math.inf
     pauses: PauseRule = field(default_factory=Still)
     world: World = field(default_factory=World)
 
@@ -82,17 +87,21 @@ class Tum(Format):
 
         times = tuple(stamps[0][i] for i, _ in pairs)
         truth = path / "groundtruth.txt"
-        return Video(
-            path.resolve().name,
-            times,
-            read,
-            self.K,
-            path,
-            self.depth_scale,
-            read_rgb=lambda index: read_rgb(path / colour[pairs[index][0]][1]),
-            motion=_motion(truth, times) if self.moving and truth.is_file() else None,
-            distortion=self.distortion,
-        ).recording(self.pauses, self.world)
+        return (
+            Video(
+                path.resolve().name,
+                times,
+                read,
+                self.K,
+                path,
+                self.depth_scale,
+                read_rgb=lambda index: read_rgb(path / colour[pairs[index][0]][1]),
+                motion=_motion(truth, times) if self.moving and truth.is_file() else None,
+                distortion=self.distortion,
+            )
+            .part(self.start_s, self.stop_s)
+            .recording(self.pauses, self.world)
+        )
 
 
 def _table(path: Path, columns: int) -> list[list[str]]:

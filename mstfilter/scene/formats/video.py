@@ -13,7 +13,7 @@ from __future__ import annotations
 import warnings
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -143,6 +143,26 @@ class Video:
     read_instance: Callable[[int], np.ndarray | None] = field(default=lambda index: None)
     distortion: tuple[float, ...] = ()
 
+    def part(self, start_s: float, stop_s: float) -> Video:
+        """The frames from `start_s` to `stop_s` seconds after the first."""
+        kept = [k for k, t in enumerate(self.times) if start_s <= t - self.times[0] <= stop_s]
+        if len(kept) == len(self.times):
+            return self
+        if not kept:
+            raise InputError(
+                f"{self.path}: no frame lies between start_s={start_s:g} and stop_s={stop_s:g}; the video lasts "
+                f"{self.times[-1] - self.times[0]:.1f} s"
+            )
+        look = self.read_rgb
+        return replace(
+            self,
+            times=tuple(self.times[k] for k in kept),
+            read=lambda index: self.read(kept[index]),
+            read_rgb=None if look is None else lambda index: look(kept[index]),
+            motion=None if self.motion is None else [self.motion[k] for k in kept],
+            read_instance=lambda index: self.read_instance(kept[index]),
+        )
+
     def recording(self, pauses: PauseRule, world: World) -> Recording:
         """The recording; pose and workspace are found now, images are read when they are looked at."""
         if not self.times:
@@ -198,7 +218,10 @@ class Video:
             raise InputError(f"{images.rgb_name} is {w} x {h}, the first is {camera.width} x {camera.height}")
         readings = images.depth[np.isfinite(images.depth) & (images.depth > 0)]
         if readings.size == 0:
-            raise InputError(f"{images.depth_name} has no reading at all")
+            raise InputError(
+                f"{images.depth_name} has no reading at all",
+                "leave the start out with start_s=1, or the end with stop_s",
+            )
         check_range(readings, f"{images.depth_name} with {self.depth_scale:g} m a unit")
         return Frame(lens.smooth(images.rgb), lens.nearest(images.depth, np.nan), camera)
 

@@ -359,6 +359,28 @@ def test_depth_beyond_the_file_is_no_reading(tmp_path):
     assert units(depth, 0.002).max() == 40000
 
 
+def test_a_part_of_a_video(tmp_path):
+    """A sensor that shows nothing at first; the trajectory and the times go with the frames."""
+    path = write_redwood(tmp_path / "redwood")
+    lines = [
+        f"{k} {k} {k + 1}\n" + "\n".join(" ".join(map(repr, row)) for row in camera_to_world(k).as_matrix().tolist())
+        for k in range(len(SHIFTS))
+    ]
+    (path / "trajectory.log").write_text("\n".join(lines) + "\n")
+    write_image(first_file(path, "depth"), np.zeros((120, 160), np.uint16))
+    with pytest.raises(InputError, match="no reading at all") as caught:
+        Redwood(fps=FPS).open(path)
+    assert "start_s" in caught.value.hints[0]
+    recording = Redwood(fps=FPS, start_s=0.35, stop_s=1.45, pauses=Ends(), world=WORLD).open(path)
+    assert (len(recording), recording.pauses, recording.times[0]) == (11, (0, 10), 0.0)
+    np.testing.assert_array_equal(recording.frames[3].rgb, video((SHIFTS[7],))[0][0])
+    expected = camera_to_world(4).inv() * camera_to_world(9)
+    found = recording.frames[0].camera.pose.inv() * recording.frames[5].camera.pose
+    np.testing.assert_allclose(found.as_matrix(), expected.as_matrix(), atol=1e-9)
+    with pytest.raises(InputError, match=r"lasts 1\.6 s"):
+        Redwood(fps=FPS, start_s=9).open(path)
+
+
 def test_every_nth_image(tmp_path):
     path = write_redwood(tmp_path / "redwood")
     assert Redwood(pauses=Every(8)).open(path).pauses == (0, 8, 16)
