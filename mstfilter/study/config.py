@@ -3,6 +3,8 @@
 >>> study = load_study("experiments/main/study.toml")
 >>> study.arms[0].preset, study.scenes[0].family
 
+The file::
+
     description = "does a quicker resampler cost quality?"
     seeds = "0-2"                          # of the filter; the same for all arms
 
