@@ -9,10 +9,10 @@ the seed and the step alone, so the rest of the run is that of a run that was ne
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 import zipfile
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -102,7 +102,7 @@ def _below(arrays: dict[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:
     return {name[len(prefix) :]: a for name, a in arrays.items() if name.startswith(prefix)}
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class Checkpoint:
     """Where a run keeps its state.
 
@@ -127,40 +127,56 @@ class Checkpoint:
         Raises
         ------
         InputError
-            Where the file is of another run: other seed, other components, or earlier than `start`.
+            Where the file is of another run: other seed, other components or fields, or earlier than `start`. Functions
+            and observations are not compared.
         """
         if not self.path.exists():
             if not self.path.parent.is_dir():
                 raise InputError(f"folder of the checkpoint does not exist: {self.path.parent}")
             return None
         state, head = load_state(self.path, self.codec)
-        for what, found, wanted in (
-            ("seed", state.key, start.key),
-            ("filter", head.get("filter"), _outline(filter)),
-        ):
-            if found != wanted:
-                raise InputError(
-                    f"checkpoint {self.path} is of another run: its {what} is {found}, that of this run {wanted}",
-                    "choose another file, or remove this one",
-                )
+        wrong = _difference("seed", state.key, start.key)
+        wrong = wrong or _difference("filter", head.get("filter"), _outline(filter))
+        if wrong is not None:
+            what, found, wanted = wrong
+            raise InputError(
+                f"checkpoint {self.path} is of another run: its {what} is {found}, that of this run {wanted}",
+                "choose another file, or remove this one",
+            )
         if state.t < start.t:
             raise InputError(f"checkpoint {self.path} is at step {state.t}, before the state to go on from")
         return state
 
 
 def _outline(filter: ParticleFilter) -> dict[str, Any]:
-    """What can be said of a filter without knowing its models: classes of its components and its sizes."""
-    slots = (
-        "initial",
-        "transition",
-        "proposal",
-        "update",
-        "resampler",
-        "trigger",
-        "lookahead",
-        "rejuvenation",
-        "size",
-    )
-    parts = {slot: getattr(filter, slot) for slot in slots}
-    names = {slot: type(part).__qualname__ for slot, part in parts.items() if part is not None}
-    return {**names, "n": int(filter.n), "n_proposed": int(filter.n_proposed), "resample": filter.resample}
+    """What can be said of a filter without knowing its models: its components with their plain fields, its sizes."""
+    return {
+        field.name: _plain(value)
+        for field in dataclasses.fields(filter)
+        if (value := getattr(filter, field.name)) is not None
+    }
+
+
+def _plain(value: Any) -> Any:
+    """A value as JSON keeps it; of what it cannot keep (functions, arrays) the type."""
+    if isinstance(value, np.generic):
+        return _plain(value.item())
+    if value is None or isinstance(value, (bool, int, float, str)):
+        return value
+    if isinstance(value, (tuple, list)):
+        return [_plain(v) for v in value]
+    if dataclasses.is_dataclass(value):
+        fields = {f.name: _plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
+        return {"class": type(value).__qualname__, **fields}
+    return type(value).__qualname__
+
+
+def _difference(what: str, found: Any, wanted: Any) -> tuple[str, Any, Any] | None:
+    """The first entry that differs, by name."""
+    if isinstance(found, dict) and isinstance(wanted, dict):
+        for name in {**found, **wanted}:
+            first = _difference(f"{what}.{name}", found.get(name), wanted.get(name))
+            if first is not None:
+                return first
+        return None
+    return None if found == wanted else (what, found, wanted)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from mstfilter.errors import InputError
-from mstfilter.smc.distribution import Distribution, sum_rows, value_shape
+from mstfilter.smc.distribution import Distribution, positive, sum_rows, value_shape
 
 __all__ = ["Gamma", "MultivariateNormal", "Normal", "Student", "Uniform"]
 
@@ -40,6 +40,9 @@ class Normal(Distribution):
 
     loc: Any = 0.0
     scale: Any = 1.0
+
+    def __post_init__(self) -> None:
+        positive("scale of a Normal", self.scale)
 
     def sample(self, rng: np.random.Generator, size: int) -> np.ndarray:
         """Draw."""
@@ -85,6 +88,10 @@ class Student(Distribution):
     loc: Any = 0.0
     scale: Any = 1.0
 
+    def __post_init__(self) -> None:
+        positive("df of a Student", self.df)
+        positive("scale of a Student", self.scale)
+
     def sample(self, rng: np.random.Generator, size: int) -> np.ndarray:
         """Draw."""
         return self.loc + self.scale * rng.standard_t(self.df, value_shape(size, self.df, self.loc, self.scale))
@@ -121,6 +128,10 @@ class Uniform(Distribution):
     low: Any = 0.0
     high: Any = 1.0
 
+    def __post_init__(self) -> None:
+        if isinstance(self.low, (int, float)) and isinstance(self.high, (int, float)):
+            positive(f"width of a Uniform from {self.low} to {self.high}", self.high - self.low)
+
     def sample(self, rng: np.random.Generator, size: int) -> np.ndarray:
         """Draw."""
         u = rng.random(value_shape(size, self.low, self.high))
@@ -155,6 +166,10 @@ class Gamma(Distribution):
 
     shape: Any
     rate: Any = 1.0
+
+    def __post_init__(self) -> None:
+        positive("shape of a Gamma", self.shape)
+        positive("rate of a Gamma", self.rate)
 
     def sample(self, rng: np.random.Generator, size: int) -> np.ndarray:
         """Draw."""

@@ -9,7 +9,7 @@ import numpy as np
 
 from mstfilter.errors import InputError
 
-__all__ = ["Distribution", "sum_rows", "value_shape"]
+__all__ = ["Distribution", "positive", "sum_rows", "value_shape"]
 
 
 class Distribution(ABC):
@@ -40,6 +40,12 @@ class Distribution(ABC):
     def centre(self) -> np.ndarray:
         """One value in place of a draw: the mean, or the mode of a discrete distribution."""
         return self.mean
+
+
+def positive(what: str, value: Any) -> None:
+    """A parameter that is one number must be positive; wrong rows of an array make weights NaN, which is an error."""
+    if isinstance(value, (int, float)) and not 0 < value < np.inf:
+        raise InputError(f"{what} is {value}, expected a positive number")
 
 
 def value_shape(size: int, *parameters: Any) -> tuple[int, ...]:

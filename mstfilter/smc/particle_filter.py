@@ -259,6 +259,8 @@ class ParticleFilter:
                 return None
             watch.enter("initial")
             population = self.initial.sample(streams.child("initial").generator(), observation, self.n)
+            if len(population) != self.n:
+                raise InputError(f"asked for {self.n} particles it returned {len(population)}")
             watch.leave(population)
             return population
         identity = {"previous": _identity(len(past))}

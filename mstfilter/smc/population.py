@@ -159,7 +159,10 @@ def _check_log_weights(lw: np.ndarray, n: int) -> None:
     top = lw.max()
     if not top < np.inf:
         wrong = np.flatnonzero(~(lw < np.inf))
-        raise InputError(f"log weight of particle {wrong[0]} is {lw[wrong[0]]} ({len(wrong)} of {n} are NaN or +inf)")
+        raise InputError(
+            f"log weight of particle {wrong[0]} is {lw[wrong[0]]} ({len(wrong)} of {n} are NaN or +inf)",
+            *(["is the observation NaN? one that is missing is None"] if np.isnan(lw).all() else []),
+        )
     if top == -np.inf:
         raise InputError(
             f"all {n} log weights are -inf: no particle explains the observation",

@@ -226,6 +226,13 @@ def run_once(
     token = _RUN.set(run)
     try:
         returned = function(previous, observation)
+    except ValueError as error:
+        if single or "truth value of an array" not in str(error):
+            raise
+        raise InputError(
+            "the program decides by an array that holds all particles (if, and, or, while)",
+            "use switch(name, probs, branches), numpy.where, or mark the program with @per_particle",
+        ) from error
     finally:
         _RUN.reset(token)
     if isinstance(handler, Guide):

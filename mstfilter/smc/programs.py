@@ -31,6 +31,7 @@ from typing import Any
 
 import numpy as np
 
+from mstfilter.errors import InputError
 from mstfilter.smc.fields import number, whole
 from mstfilter.smc.interfaces import Lookahead, Proposal, Rejuvenation, Resampler, Transition, Trigger
 from mstfilter.smc.particle_filter import ParticleFilter
@@ -66,6 +67,12 @@ class Program:
     """
 
     model: Model
+
+    def __post_init__(self) -> None:
+        if not callable(self.model):
+            raise InputError(
+                f"model is {self.model!r}, expected a function of the previous state and the observation"
+            )
 
     def bootstrap(self, n: int, resampler: Resampler | None = None, trigger: Trigger | None = None) -> ParticleFilter:
         """Bootstrap filter: draws from the model, weighs by what is observed."""

@@ -66,8 +66,8 @@ def checked_weights(log_weights: np.ndarray, n: int) -> np.ndarray:
     lw = np.asarray(log_weights, dtype=np.float64)
     if lw.ndim != 1 or len(lw) == 0:
         raise InputError(f"log weights have shape {lw.shape}, expected one number a particle")
-    if n < 1:
-        raise InputError(f"resampling to {n} particles, expected at least 1")
+    if not isinstance(n, (int, np.integer)) or n < 1:
+        raise InputError(f"resampling to {n} particles, expected a whole number of at least 1")
     top = lw.max()
     if not -np.inf < top < np.inf:
         at = int(np.flatnonzero(~np.isfinite(lw) & ~np.isneginf(lw))[0]) if not np.isneginf(top) else 0

@@ -213,6 +213,16 @@ def bootstrap(
 def linear_gaussian(F: Any, Q: Any, H: Any, R: Any, m0: Any, P0: Any) -> StateSpaceModel:
     """x_0 ~ N(m0, P0), x_t = F x_{t-1} + N(0, Q), y_t = H x_t + N(0, R); particles are (n, d)."""
     F, Q, H, R, m0, P0 = (np.asarray(a, dtype=np.float64) for a in (F, Q, H, R, m0, P0))
+    if m0.ndim != 1:
+        raise InputError(f"m0 has shape {m0.shape}, expected one number an entry of the state: (d,)")
+    d, k = m0.shape, H.shape[:1]
+    shapes = {"F": (F, d * 2), "Q": (Q, d * 2), "H": (H, k + d), "R": (R, k * 2), "m0": (m0, d), "P0": (P0, d * 2)}
+    for name, (array, shape) in shapes.items():
+        if array.shape != shape:
+            raise InputError(f"{name} has shape {array.shape}, expected {shape} as m0 has {d[0]} entries")
+    for name, cov in (("Q", Q), ("R", R), ("P0", P0)):
+        if not np.allclose(cov, cov.T) or not (np.linalg.eigvalsh(cov) > 0).all():
+            raise InputError(f"{name} is {cov.tolist()}, expected a covariance: symmetric and positive definite")
     root_Q, root_P = np.linalg.cholesky(Q), np.linalg.cholesky(P0)
 
     def log_normal(cov: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:

@@ -42,7 +42,12 @@ class Reweight(Update):
     ) -> Population:
         """Weigh the predicted particles; proposed ones join them where there are any."""
         population = union(predicted, proposed)
-        return population.reweighted(np.asarray(self.log_likelihood(population.particles, observation)))
+        found = np.asarray(self.log_likelihood(population.particles, observation))
+        if found.shape != (len(population),):
+            raise InputError(
+                f"log likelihood has shape {found.shape}, expected ({len(population)},): one number a particle"
+            )
+        return population.reweighted(found)
 
 
 @dataclass(frozen=True)

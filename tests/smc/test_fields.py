@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from mstfilter.errors import InputError
-from mstfilter.smc.distributions import Normal
+from mstfilter.smc.distributions import Gamma, Normal, Student, Uniform
 from mstfilter.smc.filters import bootstrap
 from mstfilter.smc.particle_filter import ParticleFilter
-from mstfilter.smc.programs import ProgramLookahead, ProgramMove
+from mstfilter.smc.programs import Program, ProgramLookahead, ProgramMove, observe, sample
 from mstfilter.smc.rejuvenation import RandomWalkMove
 from mstfilter.smc.resampling import EssBelow, Every, Systematic
 from mstfilter.smc.resampling_clusters import ClusterStratified
@@ -20,7 +20,7 @@ from mstfilter.smc.resampling_greedy import GreedyDiverse
 from mstfilter.smc.resampling_wrappers import Coalesced, Shuffled, Tempered
 from mstfilter.smc.similarity import Bins, Gaussian
 from mstfilter.smc.sizes import Fixed, Kld
-from mstfilter.smc.state_space import StateSpaceModel
+from mstfilter.smc.state_space import StateSpaceModel, linear_gaussian
 from mstfilter.smc.updates import Chain, Reweight
 from mstfilter.smc.vectors import CrossVectors
 from tests.smc.models import AR1
@@ -72,7 +72,52 @@ def test_nonsense_is_refused(make, message):
         make()
 
 
+LG = {"F": [[0.9]], "Q": [[0.5]], "H": [[1.0]], "R": [[1.0]], "m0": [0.0], "P0": [[1.0]]}
+
+
+def first_steps(**changes):
+    """Two steps of a bootstrap filter of a changed AR(1) model."""
+    return bootstrap(replace(AR1, **changes), 5).run([0.1, 0.2], 0)
+
+
+def decides(previous, y):
+    x = sample("x", Normal(0.0, 1.0))
+    if x > 0:
+        observe("y", Normal(x, 1.0), y)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Normal(0.0, -1.0), r"scale of a Normal is -1\.0, expected a positive number"),
+        (lambda: Student(0.0), "df of a Student"),
+        (lambda: Gamma(1.0, 0), "rate of a Gamma is 0"),
+        (lambda: Uniform(1.0, 1.0), "width of a Uniform"),
+        (lambda: Program(3), "model is 3, expected a function"),
+        (lambda: Program(decides).bootstrap(5).run([0.1], 0), "step 0, initial: the program decides by an array"),
+        (lambda: linear_gaussian(**{**LG, "Q": [[-1.0]]}), "Q is .*positive definite"),
+        (lambda: linear_gaussian(**{**LG, "F": np.eye(2)}), r"F has shape \(2, 2\), expected \(1, 1\)"),
+        (lambda: linear_gaussian(**{**LG, "m0": 0.0}), "m0 has shape"),
+        (lambda: first_steps(log_likelihood=lambda x, y: -1.0), r"log likelihood has shape \(\), expected \(5,\)"),
+        (lambda: first_steps(log_likelihood=lambda x, y: x[:, None]), r"log likelihood has shape \(5, 1\)"),
+        (
+            lambda: first_steps(sample_initial=lambda rng, n: np.zeros(n + 1)),
+            "step 0, initial: asked for 5 .* returned 6",
+        ),
+        (lambda: first_steps(sample_transition=lambda rng, x: x[:3]), "step 1, transition: 5 particles became 3"),
+        (lambda: Systematic().select(np.random.default_rng(0), np.zeros(3), 2.5), r"resampling to 2\.5 particles"),
+    ],
+)
+def test_faults_of_models_are_named(make, message):
+    with pytest.raises(InputError, match=message):
+        make()
+
+
 def test_hints_say_what_was_meant():
+    with pytest.raises(InputError) as raised:
+        bootstrap(AR1, 5).run([0.1, np.nan], 0)
+    assert raised.value.hints == ("is the observation NaN? one that is missing is None",)
+
     with pytest.raises(InputError) as raised:
         EssBelow(50)
     assert "a share of the particles, not their number" in raised.value.hints[0]

@@ -7,7 +7,7 @@ import signal
 import subprocess
 import sys
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -22,7 +22,8 @@ from mstfilter.smc.interfaces import Codec
 from mstfilter.smc.many import run_many
 from mstfilter.smc.population import Population
 from mstfilter.smc.programs import Program, observe, per_particle, sample
-from mstfilter.smc.resampling import Multinomial
+from mstfilter.smc.resampling import EssBelow, Multinomial
+from mstfilter.smc.resampling_wrappers import Tempered
 from mstfilter.smc.state import State
 from mstfilter.smc.streams import Key
 from mstfilter.smc.trace import Trace
@@ -221,10 +222,23 @@ def test_a_run_goes_on_from_its_checkpoint(filter, ys, tmp_path):
             assert a == b
     with pytest.raises(InputError, match="its seed is"):
         filter.run(ys, 6, checkpoint=path)
-    with pytest.raises(InputError, match="its filter is"):
+    with pytest.raises(InputError, match="is of another run: its filter"):
         bootstrap(AR1, 31).run(YS, 5, checkpoint=path)
     with pytest.raises(InputError, match="folder of the checkpoint"):
         filter.run(ys, 5, checkpoint=tmp_path / "no" / "run.npz")
+    # A field of a component that changed would give neither run.
+    for other, message in (
+        (replace(filter, trigger=EssBelow(0.9)), r"its filter.trigger.share is 0.5, that of this run 0.9"),
+        (
+            replace(filter, resampler=Tempered(power=0.5)),
+            "filter.resampler.class is Systematic, that of this run Temp",
+        ),
+        (replace(filter, n=31), "its filter.n is 30|its filter.n is 8"),
+    ):
+        with pytest.raises(InputError, match=message):
+            other.run(ys, 5, checkpoint=path)
+    same = replace(filter, n=np.int64(filter.n))
+    assert same.run(ys, 5, checkpoint=path)[1] == []
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="kills a process by a signal")
