@@ -5,10 +5,9 @@
 
 The rule, for a camera that stands still: images become grey blocks; two images differ where a block changes by more
 than its noise, and there is motion where more than a small share of the blocks differ. A still interval is a run of
-frames in which none differs from the frame before nor from the first of the run (slow motion adds up). Each
-interval of at least `hold_s` seconds gives one pause, its middle frame. Changes that all blocks share (exposure,
-flicker of the light) do not count. The noise of each block is measured on the video itself (edges shimmer more than
-planes): a quarter of the video has to be at rest.
+frames in which none differs from the first, so slow motion adds up. Each interval of at least `hold_s` seconds gives
+one pause, its middle frame. Changes that all blocks share (exposure, flicker of the light) do not count. The noise of
+each block is measured on the video itself (edges shimmer more than planes): a quarter of it has to be at rest.
 
 A robot that holds still within the picture, or that works slower than a grey level in a whole interval, looks like a
 pause too: look at the pauses found, and name them yourself where they are wrong.
@@ -96,12 +95,8 @@ class Still(PauseRule):
         limit, allowed = self._limit(images), self.share * images[0].size
         runs, first = [], 0
         for index in range(1, len(images) + 1):
-            if index < len(images):
-                moved = max(
-                    int((_changes(images[other], images[index]) > limit).sum()) for other in (first, index - 1)
-                )
-                if moved <= allowed:
-                    continue
+            if index < len(images) and (_changes(images[first], images[index]) > limit).sum() <= allowed:
+                continue
             runs.append((first, index - 1))
             first = index
         return tuple((a, b) for a, b in runs if b > a and times[b] - times[a] >= self.hold_s - 1e-9)

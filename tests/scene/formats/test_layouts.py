@@ -359,6 +359,20 @@ def test_depth_beyond_the_file_is_no_reading(tmp_path):
     assert units(depth, 0.002).max() == 40000
 
 
+def test_a_disk_that_is_full_at_the_end(tmp_path, monkeypatch):
+    """The last files do not fit: nothing is left of those before."""
+    from mstfilter.scene.formats.writer import RecordingWriter
+
+    def full(self, described):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(RecordingWriter, "_finish", full)
+    rgb, depth, _ = video((0,))
+    with pytest.raises(InputError, match="No space left"), RecordingWriter(tmp_path / "r", CAMERA) as writer:
+        writer.add_frame(rgb[0], depth[0], 0.0, "static")
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_a_part_of_a_video(tmp_path):
     """A sensor that shows nothing at first; the trajectory and the times go with the frames."""
     path = write_redwood(tmp_path / "redwood")
