@@ -373,6 +373,18 @@ def test_a_disk_that_is_full_at_the_end(tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_two_camera_matrices_do_not_fit_into_one_folder(tmp_path):
+    from dataclasses import replace
+
+    rgb, depth, _ = video((0, 1))
+    recording = Recording.from_arrays(rgb, depth, CAMERA.K)
+    other = replace(recording.frames[1].camera, K=CAMERA.K * [[1.1], [1.1], [1.0]])
+    mixed = replace(recording, frames=[recording.frames[0], replace(recording.frames[1], camera=other)])
+    with pytest.raises(InputError, match="frame 1 .* camera matrix"):
+        save(mixed, tmp_path / "r")
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_a_part_of_a_video(tmp_path):
     """A sensor that shows nothing at first; the trajectory and the times go with the frames."""
     path = write_redwood(tmp_path / "redwood")
