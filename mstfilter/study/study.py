@@ -131,6 +131,9 @@ def run_study(
             counted(event)
 
         outcomes = executor.run([job for _, job in waiting], tell)
+        for (run, _), outcome in zip(waiting, outcomes, strict=True):
+            if outcome.status != "done":
+                _note(folder, run, outcome)  # again: the disk that was full then may not be so now
         folder = StudyFolder.open(path)
         try:
             folder.write_tables()

@@ -16,6 +16,7 @@ import pytest
 from mstfilter.errors import InputError
 from mstfilter.study.config import load_study, study_of
 from mstfilter.study.local import Local
+from mstfilter.study.results import StudyFolder
 from mstfilter.study.study import run_study
 from tests.study.scenes import slide
 
@@ -77,6 +78,20 @@ def test_what_failed_is_repeated_and_what_is_done_is_not(folder, tmp_path):
     again = run_study(wanted, out, Local(1), cache=tmp_path)
     assert (again.done, again.repeated, again.failed) == (2, 1, ())
     assert table(out, "failures.csv") == []
+
+
+def test_a_failure_that_could_not_be_written_down_is_written_later(folder, tmp_path, monkeypatch):
+    fail, tries = StudyFolder.fail, []
+
+    def full_at_first(self, run, outcome):
+        tries.append(run)
+        if len(tries) == 1:
+            raise OSError(28, "No space left on device")
+        fail(self, run, outcome)
+
+    monkeypatch.setattr(StudyFolder, "fail", full_at_first)
+    run_study(study(folder, "full", seeds=[0]), tmp_path / "out", Local(1), cache=tmp_path)
+    assert "no space left" in table(tmp_path / "out", "failures.csv")[0]["error"]
 
 
 @pytest.mark.parametrize("how", ["die", "exit"])
