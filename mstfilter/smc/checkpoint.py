@@ -127,8 +127,8 @@ class Checkpoint:
         Raises
         ------
         InputError
-            Where the file is of another run: other seed, other components or fields, or earlier than `start`. Functions
-            and observations are not compared.
+            Where the file is of another run: other seed, other components or fields, or earlier than `start`.
+            Functions and observations are not compared.
         """
         if not self.path.exists():
             if not self.path.parent.is_dir():
