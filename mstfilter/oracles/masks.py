@@ -10,7 +10,7 @@ What objects look like is all that is replaced: masks are completed by an ordina
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 import numpy as np
 
@@ -24,6 +24,7 @@ from mstfilter.scene.frame import Frame
 from mstfilter.scene.object_status import MIN_PIXELS
 from mstfilter.scene.quality import weighted_coverage
 from mstfilter.scene.voxels import Hypothesis
+from mstfilter.segmentation.boundary import ColourDepthBoundary
 from mstfilter.segmentation.interfaces import BoundaryModel
 from mstfilter.segmentation.proposal import hypothesis_of
 from mstfilter.segmentation.segments import ObjectRule
@@ -110,9 +111,30 @@ class TrueMasks(UsesTruth, Proposal):
 
 @dataclass(frozen=True)
 class TrueBoundary(UsesTruth, BoundaryModel):
-    """1 on both sides of every border between true objects, and around the robot; 0 elsewhere."""
+    """True borders between objects in the image.
+
+    Parameters
+    ----------
+    form : {"crisp", "cleaned"}
+        *crisp*: 1 on both sides of every true border, 0 elsewhere, as `UcmTree` wants it. *cleaned*: the measured
+        strength near true borders, 0 elsewhere, for trees that were fitted to measured strengths: the learned one
+        merges whole objects across borders of strength 1 (quality of its best cut on 16 simulated images: measured
+        .914, crisp .485, cleaned .952; of the best cut of `UcmTree`: .868, .998, .901).
+    measured : BoundaryModel
+        What is cleaned.
+    reach : float
+        How near, in pixels of a 640 px wide image.
+    """
+
+    form: Literal["crisp", "cleaned"] = "crisp"
+    measured: BoundaryModel = field(default_factory=ColourDepthBoundary)
+    reach: float = 4.0
 
     needs: ClassVar[tuple[Need, ...]] = ("voxels", "instance")
+
+    def __post_init__(self) -> None:
+        if self.form not in ("crisp", "cleaned"):
+            raise InputError(f"true boundary has form {self.form!r}", "there are: crisp, cleaned")
 
     def boundary(self, frame: Frame) -> np.ndarray:
         """(H, W) float32; the frame must be at a pause."""
@@ -123,4 +145,10 @@ class TrueBoundary(UsesTruth, BoundaryModel):
         across, down = image[:, 1:] != image[:, :-1], image[1:] != image[:-1]
         edge[:, 1:][across] = edge[:, :-1][across] = 1
         edge[1:][down] = edge[:-1][down] = 1
-        return edge
+        if self.form == "crisp":
+            return edge
+        import cv2
+
+        size = 2 * max(1, round(self.reach * frame.camera.width / 640)) + 1
+        near = cv2.dilate(edge, np.ones((size, size), np.uint8)) > 0
+        return np.where(near, self.measured.boundary(frame), 0).astype(np.float32)

@@ -14,7 +14,7 @@ __all__ = ["ALL", "STAGES", "budget_arms", "overrides_of"]
 
 #: Changes to the preset ``mst`` by stage. Fields that are named beside a component keep those of ``mst``.
 STAGES: dict[str, tuple[str, ...]] = {
-    "boundary": ("proposal.boundary=true_boundary",),
+    "boundary": ('proposal.boundary={component="true_boundary", form="cleaned"}',),
     "masks": ("proposal=true_masks",),
     "completion": ("proposal.completer=true_completion",),
     "motions": ("transition=true_motions", "transition.warp.method=pull"),

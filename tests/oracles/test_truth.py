@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.ndimage import distance_transform_edt
 
 from mstfilter.errors import InputError
 from mstfilter.fusion.update import FusionUpdate
@@ -18,6 +19,7 @@ from mstfilter.oracles.truth import Truth, UsesTruth, bind_truth, uses_truth
 from mstfilter.presets import build_filter, describe_filter, load_config
 from mstfilter.scene.quality import weighted_coverage
 from mstfilter.scene.voxels import Hypothesis
+from mstfilter.segmentation.boundary import ColourDepthBoundary
 from mstfilter.smc.population import Population
 from mstfilter.smc.streams import Key
 from mstfilter.study.run import execute
@@ -224,6 +226,18 @@ def test_a_true_boundary_lies_on_both_sides_of_every_border(recording):
         assert (boundary[a][differ] == 1).all() and (boundary[b][differ] == 1).all()
     assert set(np.unique(boundary)) == {0, 1}
     assert (boundary > 0).mean() < 0.1
+
+
+def test_a_cleaned_boundary_is_the_measured_one_near_true_borders(recording):
+    frame = recording.frames[0]
+    crisp = bound(TrueBoundary(), recording).boundary(frame)
+    model = TrueBoundary("cleaned", ColourDepthBoundary(quiet_table=-1))
+    cleaned, measured = bound(model, recording).boundary(frame), model.measured.boundary(frame)
+    np.testing.assert_array_equal(cleaned[crisp > 0], measured[crisp > 0])
+    far = distance_transform_edt(crisp == 0) > 3
+    assert (measured[far] > 0).any() and not cleaned[far].any()
+    with pytest.raises(InputError, match="form 'soft'"):
+        TrueBoundary("soft")
 
 
 def test_true_completion_gives_a_mask_what_it_shows(recording):
