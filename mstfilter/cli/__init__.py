@@ -31,6 +31,10 @@ def main(arguments: list[str] | None = None) -> None:
         for hint in error.hints:
             print(f"hint: {hint}", file=sys.stderr)
         sys.exit(2)
+    except SystemExit as end:
+        if end.code == 130:  # Ctrl-C, as the application tells it
+            print("interrupted: the same command goes on from here", file=sys.stderr)
+        raise
     except KeyboardInterrupt:
         print("interrupted: the same command goes on from here", file=sys.stderr)
         sys.exit(130)

@@ -33,11 +33,14 @@ def study(
 ) -> None:
     """Compare filters on many scenes. A study that was stopped goes on; what is done is never repeated."""
     from mstfilter.study.config import load_study
+    from mstfilter.study.grid import check_names
+
+    wanted = load_study(config, smoke=smoke)
+    check_names(wanted, overrides or ())  # a slip is answered before anything heavy is imported
     from mstfilter.study.executors import Executor
     from mstfilter.study.local import Local
     from mstfilter.study.study import run_study
 
-    wanted = load_study(config, smoke=smoke)
     folder = out or Path("studies") / f"{wanted.name}{'-smoke' if smoke else ''}"
     executor: Executor = Local(workers, wanted.tries, wanted.timeout_s, folder / "logs")
     if scheduler:
@@ -84,7 +87,7 @@ def _print_summary(summary: Any) -> None:
                 "" if slope is None else f"{slope.mean:+.3f}",
                 "" if seconds is None else f"{seconds.mean:.2f}",
             )
-    Console(width=140 if not sys.stdout.isatty() else None).print(table)
+    Console(width=None if sys.stdout.isatty() else 180).print(table)
 
 
 def _range(low: float, high: float, sign: str = "") -> str:

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import glob
 import hashlib
-import itertools
 import json
 import re
 from collections.abc import Iterator, Sequence
@@ -22,14 +21,15 @@ from typing import Any
 
 from mstfilter import registry
 from mstfilter.errors import InputError
-from mstfilter.presets import build_filter, describe_filter, load_config
+from mstfilter.presets import build_filter, describe_filter
 from mstfilter.study.code_version import code_version
-from mstfilter.study.config import ArmEntry, SceneEntry, StudyConfig
+from mstfilter.study.config import SceneEntry, StudyConfig
+from mstfilter.study.grid import Asked, expand
 from mstfilter.study.run import files_of, versions
 from mstfilter.study.run_folder import plain
 from mstfilter.study.sources import open_source
 
-__all__ = ["Arm", "Plan", "Run", "Scene", "make_plan", "split_grid"]
+__all__ = ["Arm", "Plan", "Run", "Scene", "make_plan"]
 
 # What every run goes through besides its components.
 _ALWAYS = ("mstfilter.smc.particle_filter", "mstfilter.scene.recording", "mstfilter.study.codec")
@@ -135,7 +135,7 @@ def make_plan(study: StudyConfig, overrides: Sequence[str] = (), *, allow_files:
     InputError
         A wrong arm, two arms that are the same, a grid without runs, a recording that cannot be read.
     """
-    arms = tuple(arm for entry in study.arms for arm in _arms(entry, study.folder, overrides, allow_files))
+    arms = tuple(_arm(asked, allow_files) for asked in expand(study, overrides))
     for what, found in (("arm", arms), ("scene", study.scenes), ("seed", study.seeds)):
         if not found:
             raise InputError(f"study {study.name} has no {what}, so there is nothing to run")
@@ -157,63 +157,14 @@ def make_plan(study: StudyConfig, overrides: Sequence[str] = (), *, allow_files:
     return Plan(study, arms, scenes, runs)
 
 
-def split_grid(text: str) -> list[str]:
-    """``"path=a,b"`` as ``["path=a", "path=b"]``; commas inside brackets and quotes part nothing."""
-    path, equals, values = text.partition("=")
-    if not equals:
-        return [text]
-    parts, depth, quote, begin = [], 0, "", 0
-    for k, letter in enumerate(values):
-        if quote:
-            quote = "" if letter == quote else quote
-        elif letter in "\"'":
-            quote = letter
-        elif letter in "[{(":
-            depth += 1
-        elif letter in "]})":
-            depth -= 1
-        elif letter == "," and depth == 0:
-            parts.append(values[begin:k])
-            begin = k + 1
-    parts.append(values[begin:])
-    if any(not part.strip() for part in parts):
-        raise InputError(f"override {text!r} has an empty value", "for example resampler=systematic,residual")
-    return [f"{path.strip()}={part.strip()}" for part in parts]
-
-
-def _beside(folder: Path, name: str) -> str:
-    """A preset's file beside the study's, where there is one."""
-    return str(folder / name) if name.endswith(".toml") and (folder / name).is_file() else name
-
-
-def _arms(entry: ArmEntry, folder: Path, overrides: Sequence[str], allow_files: bool) -> Iterator[Arm]:
-    presets = [_beside(folder, name.strip()) for text in entry.preset for name in text.split(",")]
-    grids = [split_grid(text) for text in (*entry.set, *overrides)]
-    if not presets or not all(presets):
-        raise InputError(f"an arm names no preset: {list(entry.preset)}")
-    varied = [k for k, grid in enumerate(grids) if len(grid) > 1]
-    for preset in presets:
-        for chosen in itertools.product(*grids):
-            if entry.name:
-                words = [entry.name, *([_stem(preset)] if len(presets) > 1 else []), *(chosen[k] for k in varied)]
-            else:
-                told = [k for k in range(len(grids)) if k < len(entry.set) or k in varied]
-                words = [_stem(preset), *(chosen[k] for k in told)]
-            name = " ".join(words)
-            try:
-                filter = build_filter(load_config(preset, chosen, allow_files=allow_files), allow_files=allow_files)
-            except InputError as error:
-                raise InputError(f"arm {name!r}: {error.message}", *error.hints) from error
-            config = plain(describe_filter(filter))
-            modules = (*sorted(_modules(filter)), *_ALWAYS)
-            code = code_version(modules)
-            ours = all(module.split(".")[0].startswith("mstfilter") for module in _modules(filter))
-            key = _hash([config, files_of(filter), versions(), code])
-            yield Arm(name, config, key, ours, modules, entry.beside)
-
-
-def _stem(preset: str) -> str:
-    return Path(preset).stem if preset.endswith(".toml") else preset
+def _arm(asked: Asked, allow_files: bool) -> Arm:
+    with asked.named():
+        filter = build_filter(asked.config(allow_files), allow_files=allow_files)
+    config = plain(describe_filter(filter))
+    modules = (*sorted(_modules(filter)), *_ALWAYS)
+    ours = all(module.split(".")[0].startswith("mstfilter") for module in modules)
+    key = _hash([config, files_of(filter), versions(), code_version(modules)])
+    return Arm(asked.name, config, key, ours, modules, asked.beside)
 
 
 def _scenes(entry: SceneEntry, folder: Path, allow_files: bool) -> Iterator[Scene]:

@@ -8,8 +8,9 @@ import json
 import pytest
 
 from mstfilter.study.config import load_study
+from mstfilter.study.grid import split_grid
 from mstfilter.study.local import Local
-from mstfilter.study.plan import make_plan, split_grid
+from mstfilter.study.plan import make_plan
 from mstfilter.study.study import run_study
 from tests.study.scenes import slide
 
