@@ -54,6 +54,20 @@ def test_baselines_differ_from_mst_only_where_they_must():
     assert differences(described("mst", "update.crossover.merge=always"), MST) == ["update.crossover.merge"]
 
 
+@pytest.mark.parametrize(
+    "overrides, where",
+    [
+        (["update.crossover.merge=always"], ["update.crossover.merge"]),
+        (["update.crossover.merge=never"], ["update.crossover.merge"]),
+        (["update.quality_exponent=0", "update.evidence=[]"], ["update.evidence", "update.quality_exponent"]),
+        (["n=1", "update.eta=25"], ["n", "update.eta"]),
+    ],
+)
+def test_arms_that_are_changes_to_mst_change_no_more(overrides, where):
+    """As documented; what mst does so already is no difference."""
+    assert set(differences(described("mst", *overrides), MST)) <= set(where)
+
+
 def test_changes_to_mst_reach_the_baselines(tmp_path, monkeypatch):
     """A preset holds its differences alone: another base, and it is a baseline of that one."""
     from mstfilter import resources
