@@ -251,8 +251,10 @@ def _try(
     at = world.positions()
     if not family.holds(at).all() or world.deepest_overlap() > 0.0015:
         return False
-    if family.n_hidden and (_visible(world, camera) == 0).sum() < need[1]:
-        return False
+    if family.n_hidden:
+        unseen = int((_visible(world, camera) == 0).sum())
+        if unseen < need[1] or unseen > world.n_objects / 3:
+            return False
     touching = {(c.first, c.second) for c in world.contacts()}
     return sum((min(k, t), max(k, t)) in touching for k, t in enumerate(twin_of) if t >= 0) >= need[0]
 
