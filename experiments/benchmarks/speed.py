@@ -90,7 +90,12 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=15)
     parser.add_argument("--out", type=Path, default=HERE)
     parser.add_argument("--clock", choices=CLOCKS, default="wall", help="cpu: of the process, where others work too")
+    parser.add_argument("--smoke", action="store_true", help="one round without peers; needs --out")
     options = parser.parse_args()
+    if options.smoke:
+        if options.out == HERE:
+            parser.error("--smoke would overwrite the results: name another folder with --out")
+        options.rounds, options.peers = 1, None
     ys, n = data(100), 10_000
     time_of = partial(timed, clock=CLOCKS[options.clock])
     worker = None
