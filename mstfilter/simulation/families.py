@@ -50,8 +50,8 @@ class SceneFamily:
     n_stacked : int
         Objects that are put on top of another, if there is room.
     n_hidden : int
-        Small objects that are put behind a tall one, seen from the camera; if there are any, a third of all objects is
-        hidden at first at most.
+        Small objects that are put behind a tall one, seen from the camera; if there are any, at most a third of all
+        objects is hidden at first.
     contact : float
         Probability that an object without a twin touches another one; else there is a gap of 1 - 4 cm.
     shapes : str
