@@ -121,6 +121,7 @@ COMPONENTS: dict[str, dict[str, str]] = {
         "rigid_motions": "mstfilter.tracking.rigid_motions:RigidMotions",
     },
     "evidence": {
+        "agreement": "mstfilter.fusion.similarity:Agreement",
         "boundaries": "mstfilter.segmentation.evidence:BoundaryAgreement",
         "motions": "mstfilter.tracking.evidence:MotionAgreement",
     },

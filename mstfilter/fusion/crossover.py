@@ -9,6 +9,7 @@ earlier. Whatever has no conflict is inserted as it is. Then a mode filter takes
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -16,12 +17,16 @@ import numpy as np
 
 from mstfilter.errors import InputError
 from mstfilter.fusion.conflict_graph import PREDICTED, PROPOSED, ConflictGraph, conflict_graph
+from mstfilter.fusion.division import part_like, remember_like
 from mstfilter.fusion.merging import MergeRule, merge_probability
 from mstfilter.fusion.mode_filter import ModeFilter
 from mstfilter.fusion.structure import SpanningTree, Structure
 from mstfilter.scene.voxels import Hypothesis, ObjectRecord
 
 __all__ = ["Crossover", "Draw"]
+
+Strangers = Mapping[int, set[int]]
+_NONE: set[int] = set()
 
 
 class Draw(NamedTuple):
@@ -57,9 +62,16 @@ class Crossover:
     mode_filter: ModeFilter = ModeFilter(scope="disputed")  # noqa: RUF009 (frozen)
     drop_rule: bool = False
 
-    def mix(self, rng: np.random.Generator, proposed: Hypothesis, predicted: Hypothesis) -> Hypothesis:
+    def mix(
+        self,
+        rng: np.random.Generator,
+        proposed: Hypothesis,
+        predicted: Hypothesis,
+        from_predicted: np.ndarray | None = None,
+    ) -> Hypothesis:
         """A hypothesis made of both parents.
 
+        In the voxels `from_predicted` (X, Y, Z) bool, predicted objects are painted last, whatever the order.
         A parent without objects leaves the other one unchanged. An object keeps the identity of the largest
         predicted object in it, and its motion history where its voxels are exactly those predicted.
         """
@@ -73,14 +85,18 @@ class Crossover:
             return proposed
         if not proposed.objects:
             return predicted
+        proposed = part_like(proposed, predicted)
         graph = conflict_graph(proposed.labels, predicted.labels)
-        draw = self.draw(rng, graph)
-        labels, disputed = self.paint(graph, draw, proposed.labels, predicted.labels)
+        draw = self.draw(rng, graph, _strangers(graph, proposed, predicted))
+        labels, disputed = self.paint(graph, draw, proposed.labels, predicted.labels, from_predicted)
         labels = self.mode_filter.apply(labels, disputed)
         return _with_records(labels, graph, draw, proposed, predicted)
 
-    def draw(self, rng: np.random.Generator, graph: ConflictGraph) -> Draw:
-        """Draw a resolution of all conflicts of a graph."""
+    def draw(self, rng: np.random.Generator, graph: ConflictGraph, strangers: Strangers | None = None) -> Draw:
+        """Draw a resolution of all conflicts of a graph.
+
+        `strangers` names the vertices of each vertex' own side that it must not be merged with.
+        """
         components = graph.components()
         conflicted = {v for component in components for v in component}
         group = np.arange(len(graph))
@@ -102,11 +118,16 @@ class Crossover:
             common = np.array([intersection[edge] for edge in edges])
             chance = merge_probability(self.merge, common, graph.size[child], graph.size[parent])
             merged = rng.random(len(edges)) < chance
-            _unite(group, [e for e, yes in zip(edges, merged, strict=True) if yes], painted)
+            _unite(group, [e for e, yes in zip(edges, merged, strict=True) if yes], painted, strangers or {})
         return Draw(order, group)
 
     def paint(
-        self, graph: ConflictGraph, draw: Draw, proposed: np.ndarray, predicted: np.ndarray
+        self,
+        graph: ConflictGraph,
+        draw: Draw,
+        proposed: np.ndarray,
+        predicted: np.ndarray,
+        from_predicted: np.ndarray | None = None,
     ) -> tuple[np.ndarray, np.ndarray]:
         """Labels (X, Y, Z) uint16, group k painted as k + 1, and the voxels that stay disputed.
 
@@ -125,7 +146,10 @@ class Crossover:
             ranks[graph.label[kept]] = rank[kept]
             group_of.append(table[labels])
             rank_of.append(ranks[labels])
-        out = np.where(rank_of[PREDICTED] > rank_of[PROPOSED], group_of[PREDICTED], group_of[PROPOSED])
+        later = rank_of[PREDICTED] > rank_of[PROPOSED]
+        if from_predicted is not None:
+            later |= from_predicted & (group_of[PREDICTED] > 0)
+        out = np.where(later, group_of[PREDICTED], group_of[PROPOSED])
         differ = group_of[PROPOSED] != group_of[PREDICTED]
         clash = differ & (group_of[PROPOSED] > 0) & (group_of[PREDICTED] > 0)
         involved = np.zeros(len(graph) + 2, bool)
@@ -134,9 +158,29 @@ class Crossover:
         return out.astype(np.uint16), differ & involved[out]
 
 
-def _unite(group: np.ndarray, merges: list[tuple[int, int]], order: list[int]) -> None:
-    """Merge groups along child -> parent edges; the vertex painted last represents its group."""
+def _strangers(graph: ConflictGraph, proposed: Hypothesis, predicted: Hypothesis) -> Strangers:
+    """For each vertex, those of its own side that it came apart from."""
+    vertex: dict[tuple[int, int], int] = {}
+    records = []
+    for v in range(len(graph)):
+        side = int(graph.side[v])
+        record = (predicted if side == PREDICTED else proposed).record(int(graph.label[v]))
+        vertex[side, record.id] = v
+        records.append((side, record))
+    return {
+        v: {vertex[side, other] for other in record.apart if (side, other) in vertex}
+        for v, (side, record) in enumerate(records)
+        if record.apart
+    }
+
+
+def _unite(group: np.ndarray, merges: list[tuple[int, int]], order: list[int], strangers: Strangers) -> None:
+    """Merge groups along child -> parent edges; the vertex painted last represents its group.
+
+    A merge that would bring strangers together is left out.
+    """
     place = {v: k for k, v in enumerate(order)}
+    members = {v: {v} for v in order}
 
     def find(v: int) -> int:
         while group[v] != v:
@@ -147,7 +191,10 @@ def _unite(group: np.ndarray, merges: list[tuple[int, int]], order: list[int]) -
         a, b = find(child), find(parent)
         if a != b:
             low, high = sorted((a, b), key=place.__getitem__)
+            if any(strangers.get(v, _NONE) & members[high] for v in members[low]):
+                continue
             group[low] = high
+            members[high] |= members.pop(low)
     for v in order:
         group[v] = find(v)
 
@@ -160,17 +207,24 @@ def _with_records(
     present = [int(k) for k in np.flatnonzero(sizes) if k > 0]
     compact = np.zeros(len(sizes), np.uint16)
     compact[present] = np.arange(1, len(present) + 1)
-    volumes = (proposed.volumes(), predicted.volumes())
+    parents, volumes = (proposed, predicted), (proposed.volumes(), predicted.volumes())
     records: list[ObjectRecord] = []
+    number_of: dict[tuple[int, int], int] = {}  # side and label of a parent's object -> its number in the child
     for number, painted in enumerate(present, start=1):
         members = np.flatnonzero(draw.group == painted - 1)
         # The largest predicted member gives the identity; where there is none, the largest proposed one.
         best = max(members, key=lambda v: (graph.side[v], graph.size[v], -v))
         side, label = int(graph.side[best]), int(graph.label[best])
-        parent = predicted if side == PREDICTED else proposed
+        parent = parents[side]
         record = parent.record(label)
+        for v in members.tolist():
+            number_of[int(graph.side[v]), int(graph.label[v])] = number
         whole = sizes[painted] == volumes[side][label]
         unchanged = whole and bool((labels[parent.labels == label] == painted).all())
         record = replace(record, label=number)
         records.append(record if unchanged else record.changed())
-    return Hypothesis(compact[labels], predicted.grid, tuple(records))
+    child = Hypothesis(compact[labels], predicted.grid, tuple(replace(r, apart=frozenset()) for r in records))
+    for side, parent in enumerate(parents):
+        own = {label: number for (s, label), number in number_of.items() if s == side}
+        child = remember_like(child, parent, own)
+    return child

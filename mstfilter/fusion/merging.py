@@ -10,6 +10,8 @@ rule           probability                    source
 ``printed``    min(1, IoU n2 / n1^2)          the formula as printed (paper, section IV-D); its dimension
                                               is 1 / voxels, so it practically never merges
 ``iou``        IoU                            a plain alternative
+``match``      1 if IoU > 1/2, else 0         an object overlaps at most one other so much: the same thing
+                                              seen twice
 ``always``     1                              a control
 ``never``      0                              a control
 =============  =============================  ========================================================
@@ -25,7 +27,7 @@ from mstfilter.errors import InputError
 
 __all__ = ["MERGE_RULES", "MergeRule", "merge_probability"]
 
-MergeRule = Literal["share", "printed", "iou", "always", "never"]
+MergeRule = Literal["share", "printed", "iou", "match", "always", "never"]
 MERGE_RULES: tuple[MergeRule, ...] = get_args(MergeRule)
 
 
@@ -49,6 +51,8 @@ def merge_probability(
         return np.minimum(1.0, iou * n2 / n1**2)
     if rule == "iou":
         return iou
+    if rule == "match":
+        return (iou > 0.5).astype(np.float64)
     if rule == "always":
         return np.ones_like(iou)
     if rule == "never":

@@ -18,15 +18,17 @@ and scored; what the first stage has used is divided out, so a drawn candidate's
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 import numpy as np
 
 from mstfilter.errors import InputError
 from mstfilter.fusion.crossover import Crossover
+from mstfilter.fusion.division import NoDivision, PartRule, take_apart
 from mstfilter.fusion.free_space import FreeSpace, Projection
 from mstfilter.scene.clip import Clip
-from mstfilter.scene.evidence import Evidence
+from mstfilter.scene.evidence import Division, Evidence
+from mstfilter.scene.frame_geometry import frame_geometry
 from mstfilter.scene.voxels import Hypothesis
 from mstfilter.smc.interfaces import Update
 from mstfilter.smc.population import Candidates, Population
@@ -36,6 +38,7 @@ from mstfilter.smc.updates import union
 
 __all__ = ["FusionUpdate"]
 
+_SURFACE_VOXELS = 1.5  # how far behind the reading a voxel still counts as surface, as in completion
 _SMALLEST_QUALITY = 1e-3  # a prediction that loses every voxel keeps a weight, lest all are zero
 
 
@@ -53,6 +56,16 @@ class FusionUpdate(Update):
         Candidates of each pair.
     quality_exponent : float
         lambda: power of Q in the weight.
+    division : Division
+        Objects of both sides that hold what has moved apart in the clip are parted first, and remembered as such.
+    parts : PartRule
+        When a part is worth an object.
+    surface : {"both", "sample"}
+        Whose objects may fill voxels at the surface that the last frame measures: those of both, or of the
+        sample alone, which has seen it. What a prediction has there is mostly a voxel or two of misplacement.
+    hidden : {"order", "prediction"}
+        Whose objects get voxels behind the measured surface that both claim: the one painted later, or the
+        prediction, which may have seen them; the sample's completion has not.
     evidence : tuple of Evidence
         Terms by which built candidates are scored; none: candidates are weighted by their pair alone.
     n_scored : int
@@ -63,6 +76,10 @@ class FusionUpdate(Update):
     crossover: Crossover = Crossover()  # noqa: RUF009 (frozen)
     eta: int = 5
     quality_exponent: float = 3.0
+    division: Division = NoDivision()  # noqa: RUF009 (frozen)
+    parts: PartRule = PartRule()  # noqa: RUF009 (frozen)
+    surface: Literal["both", "sample"] = "both"
+    hidden: Literal["order", "prediction"] = "order"
     evidence: tuple[Evidence, ...] = ()
     n_scored: int = 0
 
@@ -88,17 +105,26 @@ class FusionUpdate(Update):
         if predicted is None:
             return union(None, proposed)
         refined, quality = self._refine(predicted, observation)
+        refined = self._parted(refined, observation, proposed=False)
         log_q = self.quality_exponent * np.log(np.maximum(quality, _SMALLEST_QUALITY))
         notes = {"quality": quality.tolist(), "eta": self.eta}
         if proposed is None:
             return Population(refined, predicted.log_weights + log_q, predicted.parents, notes)
 
         i, j = _pairs(child(rng, "order"), len(proposed), len(predicted), self.eta)
-        key, samples, crossover = key_of(rng), tuple(proposed.particles), self.crossover
+        key, crossover = key_of(rng), self.crossover
+        samples = self._parted(tuple(proposed.particles), observation, proposed=True)
+
+        simple = self.surface == "both" and self.hidden == "order"
+        exposed = np.zeros(0, bool) if simple else self._exposed(observation)
 
         def build(candidate: int) -> Hypothesis:
             stream = key.child("candidate", candidate).generator()
-            return crossover.mix(stream, samples[i[candidate]], refined[j[candidate]])
+            sample, prediction = samples[i[candidate]], refined[j[candidate]]
+            if self.surface == "sample" and sample.n_objects:
+                unseen = exposed & (sample.labels == 0) & (prediction.labels != 0)
+                prediction = prediction.with_labels(np.where(unseen, 0, prediction.labels).astype(np.uint16))
+            return crossover.mix(stream, sample, prediction, ~exposed if self.hidden == "prediction" else None)
 
         none_j, none_i = np.full(len(predicted), -1), np.full(len(proposed), -1)
         parents = {
@@ -117,6 +143,21 @@ class FusionUpdate(Update):
         parents = {name: index for name, index in drawn.parents.items() if name != "ancestor"}
         notes = {**fused.notes, "scores": {name: score.round(3).tolist() for name, score in scores.items()}}
         return Population(drawn.particles, log_weights, parents, notes)
+
+    def _parted(self, hypotheses: tuple[Hypothesis, ...], clip: Clip, proposed: bool) -> tuple[Hypothesis, ...]:
+        """Taken apart by what has moved apart; the same hypothesis once."""
+        motions = self.division.divide(clip)
+        if motions is None:
+            return hypotheses
+        known = {id(h): h for h in hypotheses}
+        parted = {name: take_apart(h, motions, clip, self.parts, proposed) for name, h in known.items()}
+        return tuple(parted[id(h)] for h in hypotheses)
+
+    def _exposed(self, clip: Clip) -> np.ndarray:
+        """(X, Y, Z) bool: voxels at or before the measured surface, which nothing hides."""
+        grid, frame = clip.grid, clip.after
+        with np.errstate(invalid="ignore"):
+            return frame_geometry(frame, grid).signed < _SURFACE_VOXELS * grid.voxel_size
 
     def _refine(self, predicted: Population, clip: Clip) -> tuple[tuple[Hypothesis, ...], np.ndarray]:
         """Predicted hypotheses after free-space projection, and their qualities (n,)."""

@@ -16,7 +16,7 @@ import numpy as np
 from mstfilter.scene.clip import Clip
 from mstfilter.scene.voxels import Hypothesis
 
-__all__ = ["Evidence"]
+__all__ = ["Division", "Evidence"]
 
 
 class Evidence(ABC):
@@ -25,3 +25,14 @@ class Evidence(ABC):
     @abstractmethod
     def log_score(self, hypotheses: Sequence[Hypothesis], clip: Clip) -> np.ndarray:
         """(n,) log score of hypotheses about the end of a clip, in nats up to a common constant."""
+
+
+class Division(ABC):
+    """Tells apart what a clip has shown to be different things."""
+
+    @abstractmethod
+    def divide(self, clip: Clip) -> np.ndarray | None:
+        """(H, W) int32 of the clip's last frame: pixels with different numbers >= 0 are not one thing; -1 unknown.
+
+        None where it can say nothing at all.
+        """

@@ -4,8 +4,9 @@
 >>> hypotheses, extra = load_hypotheses(path)
 
 Arrays of the file: ``labels`` (n, X, Y, Z) uint16, ``origin`` (3,), ``voxel_size`` (), and one row an object:
-``owner`` (which hypothesis), ``label``, ``id``, ``birth``, ``motion`` (4, 4), ``completion_key``; the source crops
-as ``has_source``, ``source_offset`` (3,), ``source_shape`` (3,) and all their bits one after another.
+``owner`` (which hypothesis), ``label``, ``id``, ``birth``, ``motion`` (4, 4), ``completion_key``, ``apart`` (ids,
+comma separated); the source crops as ``has_source``, ``source_offset`` (3,), ``source_shape`` (3,) and all their
+bits one after another.
 """
 
 from __future__ import annotations
@@ -42,6 +43,7 @@ def encode(hypotheses: Sequence[Hypothesis]) -> dict[str, np.ndarray]:
         "birth": np.array([r.birth for _, r in rows], np.int64),
         "motion": np.array([r.motion.as_matrix() for _, r in rows], np.float64).reshape(-1, 4, 4),
         "completion_key": np.array([r.completion_key or "" for _, r in rows], np.str_),
+        "apart": np.array([",".join(map(str, sorted(r.apart))) for _, r in rows], np.str_),
         "has_source": np.array([c is not None for c in crops], bool),
         "source_offset": np.array([(0, 0, 0) if c is None else c.offset for c in crops], np.int64).reshape(-1, 3),
         "source_shape": np.array([(0, 0, 0) if c is None else c.occupied.shape for c in crops], np.int64).reshape(
@@ -73,6 +75,7 @@ def decode(arrays: dict[str, np.ndarray]) -> tuple[Hypothesis, ...]:
                 crop,
                 RigidTransform(arrays["motion"][row], normalize=False),  # bit for bit
                 str(arrays["completion_key"][row]) or None,
+                frozenset(int(other) for other in str(arrays["apart"][row]).split(",") if other),
             )
         )
     return tuple(Hypothesis(grid_labels, grid, tuple(r)) for grid_labels, r in zip(labels, records, strict=True))

@@ -174,6 +174,8 @@ class ObjectRecord:
         Rigid motion in world metres since `source`. The identity where `source` is None.
     completion_key : str, optional
         Which segment it was completed from (proposal's own name for it).
+    apart : frozenset of int
+        Ids of objects of the same hypothesis that it has been seen to move apart from: they are surely not one.
     """
 
     label: int
@@ -182,6 +184,7 @@ class ObjectRecord:
     source: Crop | None = None
     motion: RigidTransform = field(default_factory=RigidTransform.identity)
     completion_key: str | None = None
+    apart: frozenset[int] = frozenset()
 
     @classmethod
     def born(cls, label: int, birth: int, completion_key: str | None = None) -> ObjectRecord:

@@ -16,14 +16,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mstfilter.scene.arrays import component_key
 from mstfilter.scene.clip import Clip
 from mstfilter.scene.evidence import Evidence
-from mstfilter.scene.memo import memo
 from mstfilter.scene.rendering import project
 from mstfilter.scene.voxels import Hypothesis
 from mstfilter.tracking.flow import DenseFlow
 from mstfilter.tracking.rigid import Array, apply, kabsch
+from mstfilter.tracking.rigid_motions import followed_points
 
 __all__ = ["MotionAgreement"]
 
@@ -59,26 +58,9 @@ class MotionAgreement(Evidence):
         """Minus `strength` times the mean cost of the points of objects that moved; 0 where nothing moved."""
         if len(clip.frames) < 2:
             return np.zeros(len(hypotheses))
-        p, q, pixel = memo(
-            "followed points",
-            (clip.before.key, clip.after.key, len(clip), component_key(self.flow)),
-            lambda: self._points(clip),
-        )
-        return np.array([self._score(project(h, clip.after.camera), p, q, pixel) for h in hypotheses])
-
-    def _points(self, clip: Clip) -> tuple[Array, Array, NDArray[np.int64]]:
-        """World points before and after (n, 3), and the flat pixel of the last frame where each ends."""
-        tracks = self.flow.track(clip)
-        start, end = tracks.start[tracks.alive], np.rint(tracks.end[tracks.alive]).astype(np.int64)
-        height, width = clip.after.depth.shape
-        inside = ((end >= 0) & (end < [width, height])).all(axis=1)
-        start, end = start[inside], end[inside]
-        p = clip.before.points[start[:, 1], start[:, 0]]
-        q = clip.after.points[end[:, 1], end[:, 0]]
-        known = np.isfinite(p).all(axis=1) & np.isfinite(q).all(axis=1)
-        known &= clip.after.valid[end[:, 1], end[:, 0]] & clip.before.valid[start[:, 1], start[:, 0]]
-        known &= clip.grid.contains(clip.grid.index_of(q))
-        return p[known], q[known], end[known, 1] * width + end[known, 0]
+        points = followed_points(clip, self.flow)
+        pixel = points.row * clip.after.depth.shape[1] + points.column
+        return np.array([self._score(project(h, clip.after.camera), points.p, points.q, pixel) for h in hypotheses])
 
     def _score(self, labels: np.ndarray, p: Array, q: Array, pixel: NDArray[np.int64]) -> float:
         label = labels.ravel()[pixel].astype(np.int64)

@@ -1,0 +1,243 @@
+"""What moved apart: the pixels of a clip's last frame, grouped by rigid motion.
+
+>>> RigidMotions().divide(clip)        # (H, W) int32: 0 at rest, 1, 2, ... what moved together, -1 unknown
+
+Points that the optical flow followed through the clip are binned into small cells of the last image, and
+neighbouring cells are joined while one rigid motion explains them both, the pair with the smallest misfit first
+(Ward's rule; the sums of `rigid.statistics` make each trial one 3 x 3 SVD). Two objects that touch and look alike
+come apart here as soon as one has been pushed past the other.
+
+Data used: the optical flow of the clip, and the depth of its first and last frame.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from heapq import heappop, heappush
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mstfilter.scene.arrays import component_key, read_only
+from mstfilter.scene.clip import Clip
+from mstfilter.scene.evidence import Division
+from mstfilter.scene.memo import memo
+from mstfilter.tracking.flow import DenseFlow
+from mstfilter.tracking.rigid import Array, apply, fit_statistics, statistics
+
+__all__ = ["FollowedPoints", "RigidMotions", "followed_points"]
+
+Ints = NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class FollowedPoints:
+    """Points that were followed through a clip and have depth at both ends.
+
+    Attributes
+    ----------
+    p, q : (n, 3) world metres, before and after.
+    column, row : (n,) pixel of the last frame where each ends.
+    """
+
+    p: Array
+    q: Array
+    column: Ints
+    row: Ints
+
+
+def followed_points(clip: Clip, flow: DenseFlow) -> FollowedPoints:
+    """The points of a clip's flow that lie in the workspace at the end. Memoised by content."""
+
+    def compute() -> FollowedPoints:
+        tracks = flow.track(clip)
+        start, end = tracks.start[tracks.alive], np.rint(tracks.end[tracks.alive]).astype(np.int64)
+        height, width = clip.after.depth.shape
+        inside = ((end >= 0) & (end < [width, height])).all(axis=1)
+        start, end = start[inside], end[inside]
+        p = clip.before.points[start[:, 1], start[:, 0]]
+        q = clip.after.points[end[:, 1], end[:, 0]]
+        known = np.isfinite(p).all(axis=1) & np.isfinite(q).all(axis=1)
+        known &= clip.after.valid[end[:, 1], end[:, 0]] & clip.before.valid[start[:, 1], start[:, 0]]
+        known &= clip.grid.contains(clip.grid.index_of(q))
+        return FollowedPoints(p[known], q[known], end[known, 0], end[known, 1])
+
+    return memo("followed points", (clip.before.key, clip.after.key, len(clip), component_key(flow)), compute)
+
+
+@dataclass(frozen=True)
+class RigidMotions(Division):
+    """Cells of the image joined while one rigid motion explains them.
+
+    Parameters
+    ----------
+    cell : int
+        Edge of a cell in pixels.
+    moved : float
+        A cell whose points went less than this on average (metres) is at rest.
+    misfit : float
+        Two neighbours are joined while the points of the smaller one lie within this (root mean square, metres) of
+        the common motion, beyond what they do under their own.
+    noisy : float
+        A cell whose points do not follow any rigid motion within this (metres) is left out.
+    reach : float
+        Neighbouring cells further apart than this in space (metres) are not neighbours.
+    min_points : int
+        Cells and motions with fewer points are left out.
+    flow : DenseFlow
+        Follows the points; the same as the transition's is computed once.
+    """
+
+    cell: int = 10
+    moved: float = 0.008
+    misfit: float = 0.008
+    noisy: float = 0.006
+    reach: float = 0.04
+    min_points: int = 40
+    flow: DenseFlow = field(default_factory=DenseFlow)
+
+    def divide(self, clip: Clip) -> NDArray[np.int32] | None:
+        """(H, W) number of the motion of each pixel of the last frame; None for a single frame. Memoised."""
+        if len(clip.frames) < 2:
+            return None
+        key = (clip.before.key, clip.after.key, len(clip), component_key(self))
+        return memo("rigid motions", key, lambda: read_only(self._divide(clip)))
+
+    def _divide(self, clip: Clip) -> NDArray[np.int32]:
+        points = followed_points(clip, self.flow)
+        height, width = clip.after.depth.shape
+        out = np.full((height, width), -1, np.int32)
+        if not len(points.p):
+            return out
+        went = np.linalg.norm(points.q - points.p, axis=1) >= self.moved
+        # Points at rest and points that moved never share a cell.
+        across, down = (-(-n // self.cell) for n in (width, height))
+        place = (points.row // self.cell) * across + points.column // self.cell
+        cells, cell = np.unique(2 * place + went, return_inverse=True)
+        origin = points.q.mean(axis=0)
+        sums = statistics(points.p - origin, points.q - origin, cell, len(cells))
+        _, error = fit_statistics(sums)
+        clean = error <= sums[:, 0] * self.noisy**2
+        pairs = _neighbours(cells, across, down, sums, self.reach)
+        near = np.zeros(len(cells), bool)  # what rests matters only beside what moved
+        touched = (cells[pairs] % 2 == 1).any(axis=1)
+        near[pairs[touched].ravel()] = True
+        used = clean & (near | (cells % 2 == 1))
+        group = _join(sums, pairs[used[pairs].all(axis=1)], self.misfit)
+        group[~used] = -1
+        group[(cells % 2 == 0) & ~near] = -2  # surely at rest
+        motions, group = self._motions(sums, group)
+        number = _best(points, cell, pairs, group, motions, origin, 3 * self.misfit)
+        out[points.row, points.column] = number
+        return out
+
+    def _motions(self, sums: Array, group: Ints) -> tuple[Array, Ints]:
+        """Motions (k, 4, 4), 0 the identity, and each cell's number; small ones are dropped."""
+        motions, number = [np.eye(4)], np.full(len(group), -1)
+        number[group == -2] = 0
+        for g in np.unique(group[group >= 0]):
+            own = group == g
+            total = sums[own].sum(axis=0)
+            T, _ = fit_statistics(total)
+            trace = total[7] + total[11] + total[15]
+            if total[16] + total[17] - 2 * trace < total[0] * self.moved**2:
+                number[own] = 0
+            elif total[0] >= self.min_points:
+                number[own] = len(motions)
+                motions.append(T)
+        return np.array(motions), number
+
+
+def _neighbours(cells: Ints, across: int, down: int, sums: Array, reach: float) -> Ints:
+    """(m, 2) pairs of cells that touch in the image and in space."""
+    place, centre = cells // 2, sums[:, 4:7] / sums[:, :1]
+    index = np.full((2, (down + 2) * (across + 2)), -1)
+    padded = (place // across + 1) * (across + 2) + place % across + 1
+    index[cells % 2, padded] = np.arange(len(cells))
+    found = []
+    for step in (0, 1, across + 1, across + 2, across + 3):
+        for kind in (0, 1):
+            other = index[kind, padded + step]
+            here = np.flatnonzero(other >= 0)
+            if step == 0:
+                here = here[other[here] > here]
+            found.append(np.stack([here, other[here]], axis=1))
+    pairs = np.concatenate(found)
+    close = np.linalg.norm(centre[pairs[:, 0]] - centre[pairs[:, 1]], axis=1) < reach
+    return np.asarray(pairs[close], dtype=np.int64)
+
+
+def _misfit(a: Array, b: Array, error_a: Array, error_b: Array) -> Array:
+    """Distance in metres by which two groups disagree: sqrt(rise of the squared error x (n_a + n_b) / (n_a n_b))."""
+    _, error = fit_statistics(a + b)
+    na, nb = a[..., 0], b[..., 0]
+    return np.sqrt(np.maximum(error - error_a - error_b, 0.0) * (na + nb) / (na * nb))
+
+
+def _join(sums: Array, pairs: Ints, limit: float) -> Ints:
+    """Group number of each cell after joining neighbours, the least misfit first."""
+    n = len(sums)
+    group = np.arange(n)
+    sums = sums.copy()
+    _, error = fit_statistics(sums)
+    adjacent: list[set[int]] = [set() for _ in range(n)]
+    for a, b in pairs.tolist():
+        adjacent[a].add(b)
+        adjacent[b].add(a)
+    stamp = np.zeros(n, np.int64)
+    heap: list[tuple[float, int, int, int, int]] = []
+
+    def offer(a: int, others: list[int]) -> None:
+        if not others:
+            return
+        d = _misfit(sums[a], sums[others], error[a], error[others])
+        for b, value in zip(others, d.tolist(), strict=True):
+            if value <= limit:
+                heappush(heap, (value, a, b, int(stamp[a]), int(stamp[b])))
+
+    for a in range(n):
+        offer(a, sorted(b for b in adjacent[a] if b > a))
+    members: list[list[int]] = [[k] for k in range(n)]
+    while heap:
+        _, a, b, sa, sb = heappop(heap)
+        if stamp[a] != sa or stamp[b] != sb:
+            continue
+        if len(members[a]) < len(members[b]):
+            a, b = b, a
+        members[a] += members[b]
+        group[members[b]] = a
+        members[b] = []
+        sums[a] += sums[b]
+        error[a] = fit_statistics(sums[a])[1]
+        stamp[a] += 1
+        stamp[b] = -1
+        for c in adjacent[b] - {a}:
+            adjacent[c].discard(b)
+            adjacent[c].add(a)
+            adjacent[a].add(c)
+        adjacent[a].discard(b)
+        adjacent[b] = set()
+        offer(a, sorted(adjacent[a]))
+    return np.asarray(group, dtype=np.int64)
+
+
+def _best(
+    points: FollowedPoints, cell: Ints, pairs: Ints, number: Ints, motions: Array, origin: Array, limit: float
+) -> NDArray[np.int32]:
+    """Of the motions in its cell and those around it, the one that takes each point nearest to where it went."""
+    p, q = points.p - origin, points.q - origin
+    best, least = np.full(len(p), -1, np.int32), np.full(len(p), limit)
+    n = len(number)
+    around: list[set[int]] = [{int(number[k])} for k in range(n)]
+    for a, b in pairs.tolist():
+        around[a].add(int(number[b]))
+        around[b].add(int(number[a]))
+    sure = np.array([len(s) == 1 and 0 in s for s in around])
+    best[sure[cell]] = 0
+    for k in range(len(motions)):
+        has = np.array([k in s for s in around]) & ~sure
+        here = np.flatnonzero(has[cell])
+        distance = np.linalg.norm(apply(motions[k], p[here]) - q[here], axis=1)
+        better = distance < least[here]
+        best[here[better]], least[here[better]] = k, distance[better]
+    return best

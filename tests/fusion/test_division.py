@@ -1,0 +1,148 @@
+"""Objects that were seen to move apart become two, and stay two."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mstfilter.fusion.crossover import Crossover
+from mstfilter.fusion.division import NoDivision, PartRule, part_like, take_apart
+from mstfilter.fusion.update import FusionUpdate
+from mstfilter.scene.quality import weighted_coverage
+from mstfilter.scene.storage import decode, encode
+from mstfilter.scene.voxels import Hypothesis, ObjectRecord, VoxelGrid
+from mstfilter.smc.population import Population
+from mstfilter.tracking.rigid_motions import RigidMotions
+from tests.tracking.scenes import standard
+
+GRID = VoxelGrid(np.zeros(3), 0.01, (20, 10, 5))
+
+
+@pytest.fixture(scope="module")
+def pushed():
+    """Six textured solids: 1, 2 and 5 are moved apart, 3, 4 and 6 rest. 4 and 5 look alike."""
+    scene = standard(8)
+    return scene.clip(0), scene.labels(scene.poses[-1])
+
+
+def merged(truth, *pairs):
+    for keep, gone in pairs:
+        truth = np.where(truth == gone, keep, truth)
+    return truth.astype(np.uint16)
+
+
+def record_at(hypothesis, where):
+    return hypothesis.record(int(np.bincount(hypothesis.labels[where])[1:].argmax()) + 1)
+
+
+def test_what_moved_apart_is_taken_apart_and_remembered(pushed):
+    clip, truth = pushed
+    motions = RigidMotions().divide(clip)
+    one = Hypothesis.from_labels(merged(truth, (4, 5)), clip.grid)
+    two = take_apart(one, motions, clip)
+    assert two.n_objects == one.n_objects + 1
+    assert weighted_coverage(two.labels, truth) > 0.97 > weighted_coverage(one.labels, truth)
+    a, b = record_at(two, truth == 4), record_at(two, truth == 5)
+    assert b.id in a.apart and a.id in b.apart
+    assert len({r.id for r in two.objects}) == two.n_objects
+    resting = record_at(two, truth == 3)
+    assert a.id not in resting.apart  # both rest: nothing is known
+    assert b.id in resting.apart  # 5 moved, 3 did not
+
+
+def test_what_moved_as_one_stays_as_it_is(pushed):
+    clip, truth = pushed
+    motions = RigidMotions().divide(clip)
+    right = take_apart(Hypothesis.from_labels(truth, clip.grid), motions, clip)
+    np.testing.assert_array_equal(right.labels, truth)
+    resting = Hypothesis.from_labels(merged(truth, (3, 4)), clip.grid)
+    np.testing.assert_array_equal(take_apart(resting, motions, clip).labels, resting.labels)
+    nothing = Hypothesis.from_labels(np.zeros_like(truth), clip.grid)
+    assert take_apart(nothing, motions, clip) is nothing
+
+
+def test_small_parts_are_left(pushed):
+    clip, truth = pushed
+    one = Hypothesis.from_labels(merged(truth, (4, 5)), clip.grid)
+    kept = take_apart(one, RigidMotions().divide(clip), clip, PartRule(min_pixels=10**6))
+    np.testing.assert_array_equal(kept.labels, one.labels)
+
+
+def bars(*labels):
+    """Bars of five voxels' width along x: labels of each."""
+    grid = np.zeros(GRID.shape, np.uint16)
+    for k, label in enumerate(labels):
+        grid[5 * k : 5 * k + 5, 2:8, :3] = label
+    return grid
+
+
+def strangers(labels, *pairs):
+    """A predicted hypothesis in which pairs of labels came apart."""
+    h = Hypothesis.from_labels(labels, GRID)
+    ids = {r.label: r.id for r in h.objects}
+    apart = {r.label: set() for r in h.objects}
+    for a, b in pairs:
+        apart[a].add(ids[b])
+        apart[b].add(ids[a])
+    return Hypothesis(h.labels, GRID, tuple(replace(r, apart=frozenset(apart[r.label])) for r in h.objects))
+
+
+def test_a_sample_that_has_them_as_one_is_parted():
+    sample = Hypothesis.from_labels(bars(1, 1, 2, 2), GRID, birth=1)
+    parted = part_like(sample, strangers(bars(1, 2, 3, 4), (1, 2)))
+    assert parted.n_objects == 3
+    assert weighted_coverage(parted.labels, bars(1, 2, 3, 3)) == 1.0
+    assert part_like(sample, strangers(bars(1, 2, 3, 4))) is sample
+    three = part_like(Hypothesis.from_labels(bars(1, 1, 1, 1), GRID, 1), strangers(bars(1, 2, 3, 0), (1, 2), (2, 3)))
+    assert weighted_coverage(three.labels, bars(1, 2, 3, 3)) == 1.0  # the rest goes to the nearest
+
+
+@pytest.mark.parametrize("merge", ["always", "share", "match", "never"])
+def test_crossover_never_makes_one_of_strangers(merge):
+    predicted = strangers(bars(1, 2, 3, 4), (1, 2), (3, 4))
+    for seed in range(50):
+        rng = np.random.default_rng(seed)
+        labels = rng.integers(0, 3, 4)
+        child = Crossover(merge=merge).mix(rng, Hypothesis.from_labels(bars(*labels), GRID, 1), predicted)
+        for a, b in (((2, 4, 1), (7, 4, 1)), ((12, 4, 1), (17, 4, 1))):
+            assert child.labels[a] != child.labels[b]
+            one, other = child.record(int(child.labels[a])), child.record(int(child.labels[b]))
+            assert other.id in one.apart and one.id in other.apart
+        assert len({r.id for r in child.objects}) == child.n_objects
+
+
+def test_without_memory_always_merging_does_make_one():
+    """The check above can fail: the same crossover without memory."""
+    child = Crossover(merge="always").mix(
+        np.random.default_rng(0),
+        Hypothesis.from_labels(bars(1, 1, 2, 2), GRID, 1),
+        Hypothesis.from_labels(bars(1, 2, 3, 4), GRID),
+    )
+    assert child.labels[2, 4, 1] == child.labels[7, 4, 1]
+
+
+def test_memory_survives_files():
+    h = strangers(bars(1, 2, 3, 4), (1, 2), (1, 4))
+    (back,) = decode(encode([h]))
+    assert [r.apart for r in back.objects] == [r.apart for r in h.objects]
+    assert ObjectRecord.born(1, 0).apart == frozenset()
+
+
+def test_in_the_update_twins_come_apart_whatever_the_parents_say(pushed):
+    clip, truth = pushed
+    one = Hypothesis.from_labels(merged(truth, (4, 5)), clip.grid)
+    predicted = Population((one,), np.zeros(1), {"previous": np.zeros(1, int)})
+    proposed = Population(
+        (Hypothesis.from_labels(one.labels, clip.grid, 1),), np.zeros(1), {"proposed": np.zeros(1, int)}
+    )
+    joined = FusionUpdate(eta=1).update(np.random.default_rng(0), predicted, proposed, clip).particles[0]
+    assert joined.n_objects == one.n_objects
+    for seed in range(5):
+        update = FusionUpdate(eta=1, division=RigidMotions())
+        child = update.update(np.random.default_rng(seed), predicted, proposed, clip).particles[0]
+        assert child.n_objects == one.n_objects + 1
+        assert weighted_coverage(child.labels, truth) > 0.95
+
+
+def test_no_division_says_nothing(pushed):
+    assert NoDivision().divide(pushed[0]) is None
