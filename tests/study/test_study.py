@@ -5,9 +5,10 @@ from __future__ import annotations
 import csv
 import json
 
+import numpy as np
 import pytest
 
-from mstfilter.study.config import load_study
+from mstfilter.study.config import load_study, study_of
 from mstfilter.study.grid import split_grid
 from mstfilter.study.local import Local
 from mstfilter.study.plan import make_plan
@@ -82,3 +83,58 @@ def test_identity_is_of_what_matters(folder):
     other = make_plan(study, ["n=4"]).runs
     assert not {run.identity for run in other} & {run.identity for run in runs}
     assert json.loads(json.dumps(runs[0].arm.config)) == runs[0].arm.config
+
+
+def test_a_study_that_grows_runs_what_is_new(folder, tmp_path):
+    study = load_study(folder / "base.toml", smoke=True)
+    assert run_study(study, tmp_path / "out", Local(1), cache=tmp_path / "cache").done == 4
+    more = run_study(study, tmp_path / "out", Local(1), ["n=5,4"], cache=tmp_path / "cache")
+    assert (more.done, more.repeated) == (8, 4)  # n = 5 it was before, whoever says so
+    assert len({r["arm"] for r in table(tmp_path / "out" / "runs.csv")}) == 4
+
+
+def test_figures_that_are_defined_anew_are_measured_again(folder, tmp_path):
+    """Not run again, where the hypotheses were kept; run again where they were not. Costs are those of the run."""
+    study = load_study(folder / "base.toml", smoke=True)
+    for keep in ("all", "tables"):
+        out = tmp_path / keep
+        chosen = study.model_copy(update={"keep": keep, "arms": study.arms[:1]})
+        run_study(chosen, out, Local(1), cache=tmp_path / "cache")
+        assert all((path / "pauses").exists() == (keep == "all") for path in (out / "runs").iterdir())
+        before, kept = table(out / "runs.csv", costs=True), {}
+        for path in (out / "runs").glob("*/result.json"):
+            found = json.loads(path.read_text())
+            path.write_text(json.dumps({**found, "metrics": "earlier", "rows": [{"pause": 0, "quality": 0.0}] * 3}))
+            kept[path] = found["costs"]
+        run_study(chosen, out, Local(1), cache=tmp_path / "cache")
+        assert table(out / "runs.csv") == table(out / "runs.csv")
+        after = table(out / "runs.csv", costs=True)
+        assert [r["quality"] for r in after] == [r["quality"] for r in before]
+        same = [json.loads(path.read_text())["costs"] == costs for path, costs in kept.items()]
+        assert same == [keep == "all"] * len(same)
+
+
+def test_shared_work_changes_no_result(folder, tmp_path):
+    """Without it, writing it, finding it, and finding it broken."""
+    data = {"name": "s", "folder": folder, "scenes": [{"recordings": "slide-0"}], "arms": [{}], "seeds": [0]}
+    found, cache = {}, tmp_path / "cache"
+    for case in ("none", "written", "found", "broken"):
+        if case == "broken":
+            for path in cache.rglob("*.npz"):
+                path.write_bytes(path.read_bytes()[:-40])
+        study = study_of({**data, "cache_gb": 0 if case == "none" else 1})
+        run_study(study, tmp_path / case, Local(1), cache=cache)
+        found[case] = (tmp_path / case / "runs.csv").read_text() and table(tmp_path / case / "runs.csv")
+        assert (cache / "work").exists() == (case != "none")
+    assert {p.name for p in (cache / "work").iterdir()} >= {"clip_tracks", "segmentation_tree", "completion"}
+    assert found["none"] == found["written"] == found["found"] == found["broken"]
+
+
+def test_peak_memory():
+    from mstfilter.study.memory import peak_megabytes, reset_peak
+
+    reset_peak()
+    before = peak_megabytes()
+    held = np.ones(40 * 2**20 // 8)
+    assert peak_megabytes() >= before + 35
+    del held

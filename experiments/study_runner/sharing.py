@@ -1,0 +1,71 @@
+"""What work that is shared on disk saves: core seconds a step without it, when it is written, when it is there.
+
+``python experiments/study_runner/sharing.py [--smoke]`` writes sharing.csv beside this file.
+
+Each row is a study of its own in a fresh worker, so nothing is found in memory.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+from mstfilter.simulation.cache import cache_folder
+from mstfilter.study.config import study_of
+from mstfilter.study.local import Local
+from mstfilter.study.results import write_table
+from mstfilter.study.study import run_study
+
+HERE = Path(__file__).parent
+ARMS = ["mst", "paper"]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--smoke", action="store_true")
+    parser.add_argument("--out", type=Path, default=HERE)
+    options = parser.parse_args()
+    families = ["demo"] if options.smoke else ["s1", "s2", "s3"]
+    small = {"width": 160, "height": 120, "n_actions": 1} if options.smoke else {}
+    rows = []
+    with tempfile.TemporaryDirectory() as name:
+        cache = Path(name) / "cache"
+        cache.mkdir()
+        (cache_folder() / "recordings").mkdir(parents=True, exist_ok=True)
+        (cache / "recordings").symlink_to(cache_folder() / "recordings")
+        for family in families:
+            for arm in ARMS:
+                for sharing in ("none", "written", "found"):
+                    scenes = [{"family": family, "seeds": 0, "set": small}]
+                    data = {"name": "sharing", "scenes": scenes, "arms": [{"preset": arm}], "seeds": 0}
+                    study = study_of({**data, "cache_gb": 0 if sharing == "none" else 4})
+                    folder = Path(name) / f"{family}-{arm}-{sharing}"
+                    result = run_study(study, folder, Local(1), cache=cache)
+                    if result.failed:
+                        raise SystemExit(f"failed: {result.failed[0][0]}: {result.failed[0][1].trace}")
+                    found = result.folder.rows()
+                    later = [row for row in found if row["pause"]]
+                    work = sum(p.stat().st_size for p in (cache / "work").rglob("*.npz")) / 1e6
+                    rows.append(
+                        {
+                            "family": family,
+                            "arm": arm,
+                            "shared_work": sharing,
+                            "core_s_a_step": float(np.mean([row["core_seconds"] for row in later])),
+                            "core_s_worst_step": max(row["core_seconds"] for row in later),
+                            "peak_mb": max(row["peak_mb"] for row in later),
+                            "work_mb": work,
+                            "quality": float(np.mean([row["quality"] for row in later])),
+                        }
+                    )
+                    print(rows[-1], flush=True)
+                assert len({row["quality"] for row in rows[-3:]}) == 1, "shared work changed a result"
+    options.out.mkdir(parents=True, exist_ok=True)
+    write_table(options.out / "sharing.csv", list(rows[0]), rows)
+
+
+if __name__ == "__main__":
+    main()

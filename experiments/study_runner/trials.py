@@ -1,0 +1,128 @@
+"""The study runner under load: parallel efficiency, and workers that are killed.
+
+``python experiments/study_runner/trials.py [--smoke]`` writes results.csv beside this file.
+
+Efficiency is that of a machine, so 1 and 2 workers run the same study of short runs in turn, several times. Where
+others use the machine too, two workers cannot have two cores; so what others used is recorded, and beside the
+efficiency by the clock stands what the runner itself decides: the share of the time in which workers are at a run,
+times the core seconds of the study with one worker over those with two.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import os
+import resource
+import shutil
+import tempfile
+import threading
+import time
+from pathlib import Path
+
+import psutil
+
+from mstfilter.simulation.cache import cached_recording
+from mstfilter.study.config import study_of
+from mstfilter.study.local import Local
+from mstfilter.study.study import run_study
+
+HERE = Path(__file__).parent
+SCENE = {"width": 160, "height": 120, "n_actions": 1, "frames_per_clip": 8, "voxel_size": 0.02}
+
+
+def short_study(n_runs: int, n_scenes: int = 4):
+    """Runs of about a second, as they are: each opens its recording, filters two pauses and measures them."""
+    seeds = list(range(n_runs // n_scenes))
+    scenes = [{"family": "demo", "seeds": list(range(n_scenes)), "set": SCENE}]
+    arms = [{"preset": "mst"}]
+    return study_of({"name": "short", "scenes": scenes, "arms": arms, "seeds": seeds, "tries": 3, "cache_gb": 0})
+
+
+def run(n_runs: int, workers: int, folder: Path, cache: Path, kill_every: float = 0.0) -> dict[str, float]:
+    """A study of short runs; wall time and how much processor time its workers had."""
+    stop = threading.Event()
+    killed: list[int] = []
+    if kill_every:
+        threading.Thread(target=killer, args=(kill_every, stop, killed), daemon=True).start()
+    begun: dict[str, float] = {}
+    spent: list[float] = []
+
+    def watch(p) -> None:
+        if p.event is not None and p.event.kind == "begun":
+            begun[p.name] = time.perf_counter()
+        elif p.event is not None and p.event.kind in ("ended", "lost"):
+            spent.append(time.perf_counter() - begun[p.name])
+
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    busy = psutil.cpu_times()
+    began = time.perf_counter()
+    try:
+        result = run_study(short_study(n_runs), folder, Local(workers), cache=cache, progress=watch)
+    finally:
+        stop.set()
+    wall = time.perf_counter() - began
+    after, later = resource.getrusage(resource.RUSAGE_CHILDREN), psutil.cpu_times()
+    own = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    machine = sum(later) - later.idle - later.iowait - (sum(busy) - busy.idle - busy.iowait)
+    shutil.rmtree(folder)
+    return {
+        "runs": n_runs,
+        "workers": workers,
+        "killed_every_s": kill_every,
+        "killed": len(killed),
+        "done": result.done,
+        "failed": len(result.failed),
+        "wall_s": round(wall, 2),
+        "at_runs": round(sum(spent) / (workers * wall), 3),
+        "core_s": round(own, 2),
+        "others_core_s": round(max(0.0, machine - own), 2),
+        "cores": len(os.sched_getaffinity(0)),
+    }
+
+
+def killer(every: float, stop: threading.Event, killed: list[int]) -> None:
+    """Kill one of this process's workers every so often."""
+    while not stop.wait(every):
+        workers = [p for p in psutil.Process().children() if "mstfilter.study.worker" in " ".join(p.cmdline())]
+        if workers:
+            chosen = workers[len(killed) % len(workers)]
+            chosen.kill()
+            killed.append(chosen.pid)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--smoke", action="store_true")
+    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--out", type=Path, default=HERE)
+    options = parser.parse_args()
+    n, rounds = (8, 1) if options.smoke else (200, options.rounds)
+    rows = []
+    with tempfile.TemporaryDirectory() as name:
+        folder, cache = Path(name) / "study", Path(name) / "cache"
+        for seed in range(4):
+            cached_recording("demo", seed, cache / "recordings", **SCENE)
+        for round_ in range(rounds):
+            for workers in (1, 2):
+                rows.append({"round": round_, **run(n, workers, folder, cache)})
+                print(rows[-1], flush=True)
+        rows.append({"round": 0, **run(n, 2, folder, cache, kill_every=5.0 if options.smoke else 10.0)})
+        print(rows[-1])
+    options.out.mkdir(parents=True, exist_ok=True)
+    with (options.out / "results.csv").open("w", newline="") as file:
+        writer = csv.DictWriter(file, rows[0])
+        writer.writeheader()
+        writer.writerows(rows)
+    for round_ in range(rounds):
+        one, two = (r for r in rows if r["round"] == round_ and not r["killed_every_s"])
+        print(f"round {round_}: {one['wall_s']} s with one worker, {two['wall_s']} s with two: ", end="")
+        print(
+            f"efficiency {one['wall_s'] / 2 / two['wall_s']:.2f}, others used {two['others_core_s']:.0f} core-seconds"
+        )
+    last = rows[-1]
+    print(f"{last['killed']} workers killed: {last['done']} of {last['runs']} runs done, {last['failed']} failed")
+
+
+if __name__ == "__main__":
+    main()
