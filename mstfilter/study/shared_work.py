@@ -40,7 +40,7 @@ def shared_work(where: Mapping[str, Any] | None) -> Iterator[None]:
 def kinds() -> dict[str, Any]:
     """The names that are kept on disk, what their entries are, and the version of their code."""
     from mstfilter.completion.completer import Completion
-    from mstfilter.registry import COMPONENTS
+    from mstfilter.registry import COMPONENTS, ORACLES
     from mstfilter.scene.disk_memo import Kind
     from mstfilter.segmentation.tree import Tree
     from mstfilter.study.code_version import code_version
@@ -52,7 +52,8 @@ def kinds() -> dict[str, Any]:
 
     def version(*slots: str, module: str) -> str:
         """Of a module and of all components that may stand in these slots."""
-        found = [where.partition(":")[0] for slot in slots for where in COMPONENTS[slot].values()]
+        named = [where for slot in slots for names in (COMPONENTS, ORACLES) for where in names.get(slot, {}).values()]
+        found = [where.partition(":")[0] for where in named]
         return code_version([module, *found]) + libraries
 
     segmentation = version("boundary", "tree", "value", module="mstfilter.segmentation.proposal")
