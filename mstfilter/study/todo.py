@@ -55,6 +55,7 @@ class ToDo:
 
     def runs(self) -> tuple[list[tuple[Run, Job]], set[str]]:
         """Runs to do with their jobs, and the folders of those that are done."""
+        self._adopt()
         metrics = code_version(["mstfilter.study.metrics"])
         waiting, done = [], set()
         for run in self.plan.runs:
@@ -64,6 +65,17 @@ class ToDo:
             else:
                 waiting.append((run, self._job(run, kind, metrics)))
         return waiting, done
+
+    def _adopt(self) -> None:
+        """Give runs that are done under another name, that of a renamed arm or scene, the name they have now."""
+        folders = {run.identity: self.folder.run(run.folder) for run in self.plan.runs}
+        for path in (self.folder.path / "runs").glob("*"):
+            if path in folders.values():
+                continue
+            found = read_result(path)
+            wanted = folders.get(found.get("identity", ""))
+            if wanted is not None and found.get("status") == "done" and not wanted.exists():
+                path.rename(wanted)
 
     def _needed(self, run: Run, metrics: str) -> str | None:
         path = self.folder.run(run.folder)
