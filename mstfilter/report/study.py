@@ -88,7 +88,7 @@ def _page(study: StudyFolder) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters.update(seconds=seconds_text, number=_number, signed=lambda x: _number(x, "+"))
+    environment.filters.update(seconds=seconds_text, number=_number, signed=lambda x: _number(x, "+"), range=_range)
     records, summary, failures = study.records(), study.summary(), study.failures()
     sources: list[dict[str, Any]] = [scene["source"] for scene in study.description["scenes"]]
     return environment.get_template("study.html").render(
@@ -100,7 +100,7 @@ def _page(study: StudyFolder) -> str:
         claim=CLAIM,
         compared=[one for one in summary.compared() if one.difference.n],
         columns=[(name, heading) for name, heading in _FIGURES if name in summary.names],
-        figures=_drawn(records, summary),
+        figures=_drawn(records, summary, [arm["name"] for arm in study.description["arms"] if arm.get("beside")]),
         costs=_costs(summary),
         arms=_arms(study.description),
         failures=failures,
@@ -113,6 +113,11 @@ def _number(value: float | None, sign: str = "") -> str:
     return "–" if value is None or value != value else f"{value:{sign}.3f}"
 
 
+def _range(ends: tuple[float, float], sign: str = "") -> str:
+    """An interval; a dash where there is none."""
+    return "–" if ends[0] != ends[0] else f"{ends[0]:{sign}.3f} to {ends[1]:{sign}.3f}"
+
+
 def _groups(study: StudyFolder) -> list[str]:
     return list(dict.fromkeys(scene["group"] for scene in study.description["scenes"]))
 
@@ -121,7 +126,7 @@ def _scenes(study: StudyFolder, group: str) -> list[str]:
     return [scene["name"] for scene in study.description["scenes"] if scene["group"] == group]
 
 
-def _drawn(records: Sequence[Mapping[str, Any]], summary: Summary) -> dict[str, Any]:
+def _drawn(records: Sequence[Mapping[str, Any]], summary: Summary, beside: Sequence[str]) -> dict[str, Any]:
     """Inline SVG by name."""
     from markupsafe import Markup
 
@@ -130,12 +135,21 @@ def _drawn(records: Sequence[Mapping[str, Any]], summary: Summary) -> dict[str, 
         if row.get("qualities"):
             values[row["family"]][row["arm"]][row["pause"]].extend(row["qualities"])
     found = {}
+    arms = [arm for arm in summary.arms if arm not in beside]
     if values:
-        found["time"] = Markup(time_figure(values, summary.arms))
+        found["time"] = Markup(time_figure(_of(values, arms), arms))
+    ends = [summary.reference, *(arm for arm in summary.arms if arm in beside)]
+    if values and len(ends) > 1:
+        found["ends"] = Markup(time_figure(_of(values, ends), ends))
     compared = [one for one in summary.compared() if one.difference.n]
     if compared:
         found["differences"] = Markup(differences_figure(compared, summary.arms))
     return found
+
+
+def _of(values: Mapping[str, Mapping[str, Any]], arms: Sequence[str]) -> dict[str, dict[str, Any]]:
+    """Those of some arms."""
+    return {family: {arm: v for arm, v in of_arms.items() if arm in arms} for family, of_arms in values.items()}
 
 
 def _costs(summary: Summary) -> dict[str, Any]:

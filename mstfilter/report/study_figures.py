@@ -18,11 +18,11 @@ if TYPE_CHECKING:
 
 __all__ = ["colour_of", "differences_figure", "time_figure"]
 
-_MOST_BOXES = 8  # arms at a pause that are still told apart as boxes; more are lines
+_MOST_BOXES = 12  # arms at a pause that are still told apart as boxes; more are lines
 
 
 def colour_of(arms: Sequence[str]) -> dict[str, str]:
-    """A colour for every arm; they repeat after eight."""
+    """A colour for every arm; they repeat after twelve."""
     return {arm: SERIES[k % len(SERIES)] for k, arm in enumerate(arms)}
 
 
@@ -36,17 +36,19 @@ def time_figure(values: Mapping[str, Mapping[str, Mapping[int, Sequence[float]]]
     arms : sequence of str
         In the order in which they stand beside each other.
 
-    Boxes hold the middle half of the hypotheses, the bar is their median, whiskers reach the 5th and 95th per cent;
-    points are hypotheses, lines join the means.
+    Arms that the values lack are left out. Boxes hold the middle half of the hypotheses, the bar is their median,
+    whiskers reach the 5th and 95th per cent; points are hypotheses, lines join the means.
     """
     colours, n = colour_of(arms), len(values)
+    shown = [arm for arm in arms if any(arm in of_arms for of_arms in values.values())]
     with style("study over time"):
-        figure, panels = new_figure(max(6.6, 1.1 + 0.42 * _slots(values, len(arms))), 3.4 * n, n, below=True)
+        figure, panels = new_figure(max(6.6, 1.1 + 0.42 * _slots(values, len(shown))), 3.4 * n, n, below=True)
         for axes, (family, of_arms) in zip(panels, values.items(), strict=True):
-            shown = [arm for arm in arms if arm in of_arms]
             pauses = sorted({t for by_pause in of_arms.values() for t in by_pause})
             width = 0.84 / max(len(shown), 1)
             for k, arm in enumerate(shown):
+                if arm not in of_arms:
+                    continue
                 at = {t: t + (k - (len(shown) - 1) / 2) * width for t in of_arms[arm]}
                 if len(shown) <= _MOST_BOXES:
                     _boxes(axes, at, of_arms[arm], width, colours[arm])
@@ -68,7 +70,7 @@ def time_figure(values: Mapping[str, Mapping[str, Mapping[int, Sequence[float]]]
             [handles[arm] for arm in arms if arm in handles],
             [arm for arm in arms if arm in handles],
             loc="outside lower center",
-            ncols=min(4, len(arms)),
+            ncols=min(4, len(shown)),
             fontsize=8.5,
         )
         return svg_text(figure, "Quality of the hypotheses over time by family and method")

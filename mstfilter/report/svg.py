@@ -26,7 +26,7 @@ __all__ = ["ACCENT", "FLOOR", "INK", "LINE", "MUTED", "SERIES", "new_figure", "s
 # Stand-ins that are replaced by the page's own colours.
 INK, MUTED, LINE, ACCENT, FLOOR = "#010203", "#020304", "#030405", "#040506", "#050607"
 #: Colours of things that are compared.
-SERIES = tuple(f"#06{k:02x}08" for k in range(8))
+SERIES = tuple(f"#06{k:02x}08" for k in range(12))
 _PAGE = {
     INK: "currentColor",
     MUTED: "var(--muted)",

@@ -14,7 +14,7 @@ from mstfilter.study.results import RESULT, StudyFolder
 from tests.test_cli import call
 
 
-def make_study(path, n_scenes=4, arms=("ours", "<theirs>"), groups=("s1", "s2"), fail=True):
+def make_study(path, n_scenes=4, arms=("ours", "<theirs>"), groups=("s1", "s2"), fail=True, beside=()):
     """A study folder written by hand: ours is better by 0.1."""
     rng, runs = np.random.default_rng(0), []
     scenes = [
@@ -50,7 +50,9 @@ def make_study(path, n_scenes=4, arms=("ours", "<theirs>"), groups=("s1", "s2"),
                 done = {"identity": folder, "status": "done", "metrics": "", "rows": rows, "costs": costs}
                 (path / "runs" / folder / RESULT).write_text(json.dumps(done))
     config = {"n": 5, "resampler": {"component": "systematic"}}
-    described = [{"name": arm, "config": {**config, "n": 5 + k}} for k, arm in enumerate(arms)]
+    described = [
+        {"name": arm, "beside": arm in beside, "config": {**config, "n": 5 + k}} for k, arm in enumerate(arms)
+    ]
     description = {"format": 1, "name": "a study", "description": "", "reference": arms[0], "arms": described}
     (path / "study.json").write_text(json.dumps({**description, "scenes": scenes, "seeds": [0, 1], "runs": runs}))
     return path
@@ -86,6 +88,15 @@ def test_the_same_study_gives_the_same_page(tmp_path):
 def test_few_and_many_arms(tmp_path, arms):
     text = write_study_report(make_study(tmp_path, n_scenes=2, arms=arms, groups=("s1",), fail=False)).read_text()
     assert ("Paired differences" in text) == (len(arms) > 1)
+
+
+def test_floors_stand_beside_and_are_not_spoken_of(tmp_path):
+    arms = ("ours", "theirs", "floor")
+    text = write_study_report(
+        make_study(tmp_path, arms=arms, groups=("s1",), fail=False, beside=("floor",))
+    ).read_text()
+    assert "Beside floors and ceilings" in text and text.count('<svg class="figure"') == 3
+    assert "ours is above theirs" in text and "ours is above floor" not in text
 
 
 def test_a_study_without_results_has_a_page(tmp_path):
