@@ -15,6 +15,7 @@ from typing import ClassVar
 import numpy as np
 
 from mstfilter.errors import InputError
+from mstfilter.fusion.division import take_apart
 from mstfilter.fusion.free_space import FreeSpace, Projection
 from mstfilter.fusion.update import FusionUpdate
 from mstfilter.scene.clip import Clip
@@ -85,7 +86,7 @@ class Union(Update):
     Parameters
     ----------
     fusion : FusionUpdate
-        Its free space, weights and evidence are used, its crossover is not.
+        Its free space, division, weights and evidence are used, its crossover is not.
     """
 
     fusion: FusionUpdate = field(default_factory=FusionUpdate)
@@ -108,16 +109,25 @@ class Union(Update):
         if predicted is None or proposed is None:
             return self.fusion.update(rng, predicted, proposed, observation)
         refined, quality = _refine(self.fusion.free_space, predicted, observation)
+        refined = self._parted(refined, observation, proposed=False)
+        samples = self._parted(tuple(proposed.particles), observation, proposed=True)
         log_q = self.fusion.quality_exponent * np.log(np.maximum(quality, _SMALLEST_QUALITY))
         weighed = predicted.log_weights - predicted.log_mean_weight + log_q
         both = union(
             Population(refined, weighed, predicted.parents),
-            Population(proposed.particles, proposed.log_weights - proposed.log_mean_weight, proposed.parents),
+            Population(samples, proposed.log_weights - proposed.log_mean_weight, proposed.parents),
         )
         scores = {type(term).__name__: term.log_score(both.particles, observation) for term in self.fusion.evidence}
         log_weights = both.log_weights + np.sum(list(scores.values()), axis=0) if scores else both.log_weights
         notes = {"quality": quality.tolist(), "scores": {k: v.round(3).tolist() for k, v in scores.items()}}
         return Population(both.particles, log_weights, both.parents, notes)
+
+    def _parted(self, hypotheses: tuple[Hypothesis, ...], clip: Clip, proposed: bool) -> tuple[Hypothesis, ...]:
+        """Hypotheses whose objects fusion would take apart first, taken apart."""
+        motions = self.fusion.division.divide(clip)
+        if motions is None:
+            return hypotheses
+        return tuple(take_apart(h, motions, clip, self.fusion.parts, proposed) for h in hypotheses)
 
 
 def _refine(free_space: Projection, predicted: Population, clip: Clip) -> tuple[tuple[Hypothesis, ...], np.ndarray]:

@@ -9,7 +9,7 @@ from mstfilter.baselines.updates import SamplesOnly, TrackingOnly, Union
 from mstfilter.fusion.free_space import FreeSpace, NoFreeSpace
 from mstfilter.fusion.update import FusionUpdate
 from mstfilter.presets import build_filter, load_config
-from mstfilter.scene.evidence import Evidence
+from mstfilter.scene.evidence import Division, Evidence
 from mstfilter.scene.voxels import Hypothesis
 from mstfilter.smc.population import Population
 from mstfilter.testing import UpdateContract
@@ -137,6 +137,26 @@ def test_a_union_holds_both_populations_weighted_as_fusion_weighs():
     judged = Union(FusionUpdate(quality_exponent=2.0, evidence=(Objects(),))).update(rng, predicted, proposed, clip)
     n = np.array([h.n_objects for h in both.particles])
     np.testing.assert_allclose(judged.log_weights - both.log_weights, n)
+
+
+def test_a_union_takes_apart_what_fusion_takes_apart():
+    """All of fusion but its crossover: the left and the right half of the image are said to be different things."""
+
+    class Halves(Division):
+        def divide(self, clip):
+            motions = np.zeros(clip.after.depth.shape, np.int32)
+            motions[:, motions.shape[1] // 2 :] = 1
+            return motions
+
+    predicted, proposed, clip = two()
+    merged = np.where(predicted.particles[0].labels > 0, 1, 0).astype(np.uint16)
+    predicted = Population((Hypothesis.from_labels(merged, clip.grid),))
+    rng = np.random.default_rng(0)
+    plain = Union(FusionUpdate()).update(rng, predicted, proposed, clip)
+    parted = Union(FusionUpdate(division=Halves())).update(rng, predicted, proposed, clip)
+    assert plain.particles[0].n_objects == 1
+    assert parted.particles[0].n_objects == 2
+    assert len(parted) == len(plain)
 
 
 @pytest.mark.parametrize("update", [FusionUpdate(), SamplesOnly(), Union()])
