@@ -21,7 +21,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from functools import lru_cache
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -42,6 +41,7 @@ from mstfilter.smc.interfaces import (
     Trigger,
     Update,
 )
+from mstfilter.smc.once import identity, keep_memory, unused
 from mstfilter.smc.population import Population
 from mstfilter.smc.resampling import EssBelow, Systematic
 from mstfilter.smc.state import Info, State
@@ -66,30 +66,6 @@ _INTERFACES: dict[str, type] = {
     "rejuvenation": Rejuvenation,
     "size": Size,
 }
-
-
-@lru_cache(maxsize=1)
-def _keep_memory() -> None:
-    """Once a process: hand a large block back to the C library.
-
-    glibc learns from it to keep freed memory. Else it gives the arrays of every step back to the system and asks for
-    them again, which costs a filter of 10,000 particles a fifth of its time. Where it is another library: nothing.
-    """
-    np.empty(1 << 21, np.uint8)
-
-
-@lru_cache(maxsize=8)
-def _identity(n: int) -> np.ndarray:
-    """0 .. n-1, read-only and shared: the parents of particles that stayed in place."""
-    index = np.arange(n)
-    index.flags.writeable = False
-    return index
-
-
-@lru_cache(maxsize=1)
-def _unused() -> np.random.Generator:
-    """For components that draw nothing: making a stream for them would be for nothing too."""
-    return Key(0).child("unused").generator()
 
 
 @dataclass(frozen=True)
@@ -196,7 +172,7 @@ class ParticleFilter:
         parents = {name: index for name, index in chosen.parents.items() if name != "ancestor"}
         if before is not None and "previous" in parents:
             old = parents["previous"]
-            parents["previous"] = before if old is _identity(len(before)) else np.where(old >= 0, before[old], -1)
+            parents["previous"] = before if old is identity(len(before)) else np.where(old >= 0, before[old], -1)
         ess = fused.ess  # kept by the population: the trigger of the next step asks again
         population = chosen.labelled(parents)
         info = Info(
@@ -263,14 +239,14 @@ class ParticleFilter:
                 raise InputError(f"asked for {self.n} particles it returned {len(population)}")
             watch.leave(population)
             return population
-        identity = {"previous": _identity(len(past))}
-        population = past.realised().labelled(identity)
+        stayed = {"previous": identity(len(past))}
+        population = past.realised().labelled(stayed)
         if self.transition is None:
             return population
         watch.enter("transition")
         moved = self.transition.predict(streams.child("transition").generator(), population, observation)
         if "previous" not in moved.parents and len(moved) == len(population):
-            moved = moved.labelled({**moved.parents, **identity}, moved.notes)
+            moved = moved.labelled({**moved.parents, **stayed}, moved.notes)
         watch.leave(moved)
         return moved
 
@@ -285,7 +261,7 @@ class ParticleFilter:
             raise InputError("the first observation is missing and the filter starts from its proposal")
         n = self.n_proposed or self.n
         proposed = self.proposal.sample(streams.child("proposal").generator(), observation, n)
-        proposed = proposed.labelled({"proposed": _identity(len(proposed))}, proposed.notes)
+        proposed = proposed.labelled({"proposed": identity(len(proposed))}, proposed.notes)
         watch.leave(proposed)
         return proposed
 
@@ -303,7 +279,7 @@ class ParticleFilter:
             assert fused is not None
             return fused
         watch.enter("update")
-        rng = streams.child("update").generator() if self.update.draws else _unused()
+        rng = streams.child("update").generator() if self.update.draws else unused()
         fused = self.update.update(rng, predicted, proposed, observation)
         watch.leave(fused)
         return fused
@@ -321,7 +297,7 @@ class ParticleFilter:
                 n = self.size.choose(fused)
                 limit = n if after else limit
         if len(fused) <= limit and not (after and self.trigger.wants(fused, t)):
-            return fused, _identity(len(fused))
+            return fused, identity(len(fused))
         chosen = self.resampler.resample(streams.child("resampler").generator(), fused, n)
         watch.leave(chosen if chosen.notes is not fused.notes else None)
         return chosen, np.asarray(chosen.parents.get("ancestor", np.full(len(chosen), -1)))
@@ -342,7 +318,7 @@ class ParticleFilter:
             index = population.parents.get("previous")
             if index is None or (index < 0).any():
                 raise InputError("rejuvenation needs a parent for every particle, and some have none")
-            previous = past if index is _identity(len(past)) else past.take(index)
+            previous = past if index is identity(len(past)) else past.take(index)
         moved = rejuvenation.move(streams.child("rejuvenation").generator(), population, previous, observation)
         if len(moved) != len(population):
             raise InputError(f"a move returned {len(moved)} of {len(population)} particles, expected all in order")
@@ -403,7 +379,7 @@ class ParticleFilter:
         self, observations: Iterable[Any], state: State | int, checkpoint: str | Path | None, codec: Codec | None
     ) -> tuple[Iterable[Any], State, Checkpoint | None]:
         """What is left to observe, the state to go on from, and where to store it."""
-        _keep_memory()
+        keep_memory()
         current = state if isinstance(state, State) else self.start(state)
         if checkpoint is None:
             return observations, current, None
