@@ -113,7 +113,7 @@ def test_a_program_that_is_run_particle_by_particle():
         lambda p, guide: p.resample_move(40, steps=1),
     ):
         filter = make(Program(mild_one_by_one), per_particle(mild_guide))
-        mean, standard, _ = mean_ratio(filter, YS[:2], exact_mild, range(300))
+        mean, standard, _ = mean_ratio(filter, YS[:2], exact_mild, range(180))
         assert abs(mean - 1) < 4 * standard
         assert standard < 0.005
     state, _ = Program(ar1_one_by_one).bootstrap(5).run(YS, 0)
