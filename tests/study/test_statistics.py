@@ -62,6 +62,20 @@ def test_coverage_by_simulation():
     assert missed < plain  # what it is for: t intervals miss too often where values are skewed
 
 
+def test_the_bootstrap_interval_leans_with_the_skew():
+    """As written in the book, drawn anew: the long tail of the values is on the side where the interval is long."""
+    values = np.random.default_rng(7).exponential(1.0, 15)
+    rng, ratios = np.random.default_rng(1), []
+    for _ in range(4000):
+        drawn = rng.choice(values, 15)
+        ratios.append((drawn.mean() - values.mean()) / (drawn.std(ddof=1) / np.sqrt(15)))
+    error = values.std(ddof=1) / np.sqrt(15)
+    expected = values.mean() - np.quantile(ratios, 0.975) * error, values.mean() - np.quantile(ratios, 0.025) * error
+    low, high = studentised(values)
+    assert (low, high) == pytest.approx(expected, abs=0.7 * error)  # the outer quantile of heavy tails
+    assert high - values.mean() > values.mean() - low
+
+
 def test_sign_flips_keep_their_level():
     """400 samples without a difference: p <= .1 in at most 40 + 4 sd of them (false alarm below 1 in 10^4)."""
     rng = np.random.default_rng(5)
