@@ -21,8 +21,8 @@ from mstfilter.scene.quality import weighted_coverage
 __all__ = ["degrade"]
 
 _TRIES = 30
-_REACH = 60.0  # largest displacement in pixels of a 640 px wide image
-_SMOOTH = 5.0  # of the displacement, pixels of a 640 px wide image
+_REACH = 120.0  # largest displacement in pixels of a 640 px wide image
+_SMOOTH = 15.0  # of the displacement, pixels of a 640 px wide image
 
 
 def degrade(
