@@ -37,7 +37,7 @@ def main() -> None:
         (cache_folder() / "recordings").mkdir(parents=True, exist_ok=True)
         (cache / "recordings").symlink_to(cache_folder() / "recordings")
         for family in families:
-            for arm in ARMS:
+            for arm in ARMS[:1] if options.smoke else ARMS:
                 for sharing in ("none", "written", "found"):
                     scenes = [{"family": family, "seeds": 0, "set": small}]
                     data = {"name": "sharing", "scenes": scenes, "arms": [{"preset": arm}], "seeds": 0}

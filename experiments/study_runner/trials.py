@@ -31,8 +31,9 @@ HERE = Path(__file__).parent
 SCENE = {"width": 160, "height": 120, "n_actions": 1, "frames_per_clip": 8, "voxel_size": 0.02}
 
 
-def short_study(n_runs: int, n_scenes: int = 4):
+def short_study(n_runs: int):
     """Runs of about a second, as they are: each opens its recording, filters two pauses and measures them."""
+    n_scenes = min(4, n_runs // 2)
     seeds = list(range(n_runs // n_scenes))
     scenes = [{"family": "demo", "seeds": list(range(n_scenes)), "set": SCENE}]
     arms = [{"preset": "mst"}]
@@ -97,11 +98,11 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--out", type=Path, default=HERE)
     options = parser.parse_args()
-    n, rounds = (8, 1) if options.smoke else (200, options.rounds)
+    n, rounds = (4, 1) if options.smoke else (200, options.rounds)
     rows = []
     with tempfile.TemporaryDirectory() as name:
         folder, cache = Path(name) / "study", Path(name) / "cache"
-        for seed in range(4):
+        for seed in range(min(4, n // 2)):
             cached_recording("demo", seed, cache / "recordings", **SCENE)
         for round_ in range(rounds):
             for workers in (1, 2):

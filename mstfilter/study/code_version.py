@@ -16,7 +16,7 @@ from functools import lru_cache
 from importlib.util import find_spec
 from pathlib import Path
 
-__all__ = ["code_version", "reached"]
+__all__ = ["code_version", "files_version", "reached"]
 
 _PACKAGE = "mstfilter"
 
@@ -28,6 +28,15 @@ def code_version(modules: Iterable[str]) -> str:
         path = _path(module)
         assert path is not None
         digest.update(f"{module}:{_parsed(path, path.stat().st_mtime_ns)[0]}\n".encode())
+    return digest.hexdigest()[:16]
+
+
+def files_version(modules: Iterable[str]) -> str:
+    """A hash of the files of exactly these modules, byte by byte: quick, and stricter than `code_version`."""
+    digest = hashlib.sha256()
+    for module in sorted(modules):
+        path = _path(module)
+        digest.update(f"{module}:".encode() + (b"" if path is None else path.read_bytes()))
     return digest.hexdigest()[:16]
 
 

@@ -23,7 +23,7 @@ from typing import Any
 
 from mstfilter.errors import InputError
 from mstfilter.scene.recording import Recording
-from mstfilter.study.code_version import code_version, reached
+from mstfilter.study.code_version import files_version
 from mstfilter.study.executors import Job, Outcome
 from mstfilter.study.memory import peak_megabytes, reset_peak
 from mstfilter.study.results import RESULT, read_result
@@ -88,12 +88,12 @@ def _verify(job: Job) -> None:
     """
     if job["code"] in _verified:
         return
-    if code_version(job["modules"]) != job["code"]:
+    if files_version(job["modules"]) != job["code"]:
         raise InputError(
             "the code has changed since the study began",
             "the same command begins these runs with the code as it is now",
         )
-    for module in sorted(reached(job["modules"])):
+    for module in job["modules"]:
         importlib.import_module(module)
     _verified.add(job["code"])
 

@@ -12,10 +12,11 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from mstfilter.study.code_version import code_version
+from mstfilter.study.code_version import code_version, files_version, reached
 from mstfilter.study.executors import Job
 from mstfilter.study.plan import Plan, Run
 from mstfilter.study.results import StudyFolder, read_result
+from mstfilter.study.shared_work import kind_versions
 from mstfilter.study.space import check_space, recording_bytes, run_bytes
 
 __all__ = ["ToDo"]
@@ -50,8 +51,8 @@ class ToDo:
     @cached_property
     def _code(self) -> dict[str, Any]:
         """The code of all arms. A worker makes sure of it once, so that later changes of files meet no part of it."""
-        modules = sorted({module for arm in self.plan.arms for module in arm.modules})
-        return {"modules": modules, "code": code_version(modules)}
+        modules = sorted(reached(module for arm in self.plan.arms for module in arm.modules))
+        return {"modules": modules, "code": files_version(modules)}
 
     def runs(self) -> tuple[list[tuple[Run, Job]], set[str]]:
         """Runs to do with their jobs, and the folders of those that are done."""
@@ -107,7 +108,13 @@ class ToDo:
         """The folder of shared work; none for an arm with installed components of others, whose version we do not
         know."""
         gb = self.plan.config.cache_gb
-        return {"folder": str((self.cache / "work").absolute()), "gb": gb} if gb and run.arm.ours else None
+        if not gb or not run.arm.ours:
+            return None
+        return {"folder": str((self.cache / "work").absolute()), "gb": gb, "versions": self._kind_versions}
+
+    @cached_property
+    def _kind_versions(self) -> dict[str, str]:
+        return kind_versions()
 
     def check_space(self) -> None:
         """Raise InputError if what is left to do will not fit on the disk."""

@@ -11,7 +11,7 @@ import pytest
 from mstfilter.errors import InputError
 from mstfilter.study import code_version as version_module
 from mstfilter.study import jobs
-from mstfilter.study.code_version import code_version, reached
+from mstfilter.study.code_version import code_version, files_version, reached
 
 PACKAGE = "mstfilter_of_a_test"
 
@@ -66,4 +66,5 @@ def test_a_worker_with_other_code_refuses():
     job = {"code": "another", "modules": ["mstfilter.fusion.update"]}
     with pytest.raises(InputError, match="code has changed since the study began"):
         jobs._verify(job)
-    jobs._verify({**job, "code": code_version(job["modules"])})
+    jobs._verify({**job, "code": files_version(job["modules"])})
+    assert files_version(["mstfilter.fusion.update"]) != files_version(["mstfilter.fusion.crossover"])

@@ -94,10 +94,9 @@ def test_a_failure_that_could_not_be_written_down_is_written_later(folder, tmp_p
     assert "no space left" in table(tmp_path / "out", "failures.csv")[0]["error"]
 
 
-@pytest.mark.parametrize("how", ["die", "exit"])
-def test_a_run_whose_worker_died_is_begun_again(folder, tmp_path, how):
+def test_a_run_whose_worker_died_is_begun_again(folder, tmp_path):
     seen = []
-    wanted = study(folder, f"{how}@{tmp_path / 'once'}", seeds=[0])
+    wanted = study(folder, f"exit@{tmp_path / 'once'}", seeds=[0])
     result = run_study(
         wanted, tmp_path / "out", Local(1), cache=tmp_path, progress=lambda p: seen.append(p.event and p.event.kind)
     )

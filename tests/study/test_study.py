@@ -8,7 +8,7 @@ import json
 import numpy as np
 import pytest
 
-from mstfilter.study.config import load_study, study_of
+from mstfilter.study.config import SceneEntry, load_study, study_of
 from mstfilter.study.grid import split_grid
 from mstfilter.study.local import Local
 from mstfilter.study.plan import make_plan
@@ -98,7 +98,8 @@ def test_figures_that_are_defined_anew_are_measured_again(folder, tmp_path):
     study = load_study(folder / "base.toml", smoke=True)
     for keep in ("all", "tables"):
         out = tmp_path / keep
-        chosen = study.model_copy(update={"keep": keep, "arms": study.arms[:1]})
+        scenes = (SceneEntry(recordings=("slide-0",)),)
+        chosen = study.model_copy(update={"keep": keep, "scenes": scenes})
         run_study(chosen, out, Local(1), cache=tmp_path / "cache")
         assert all((path / "pauses").exists() == (keep == "all") for path in (out / "runs").iterdir())
         before, kept = table(out / "runs.csv", costs=True), {}
@@ -107,7 +108,6 @@ def test_figures_that_are_defined_anew_are_measured_again(folder, tmp_path):
             path.write_text(json.dumps({**found, "metrics": "earlier", "rows": [{"pause": 0, "quality": 0.0}] * 3}))
             kept[path] = found["costs"]
         run_study(chosen, out, Local(1), cache=tmp_path / "cache")
-        assert table(out / "runs.csv") == table(out / "runs.csv")
         after = table(out / "runs.csv", costs=True)
         assert [r["quality"] for r in after] == [r["quality"] for r in before]
         same = [json.loads(path.read_text())["costs"] == costs for path, costs in kept.items()]
