@@ -50,8 +50,8 @@ def measure(run: RunFolder, recording: Recording, t: int) -> dict[str, Any]:
     if truth is None:
         return {**row, "diversity": diversity(labels)}
     known = all(recording.instance(p) is not None for p in recording.pauses[: t + 1])
-    found = figures(labels, weights, truth, object_status(recording, t) if known else {})
-    return {**row, **found, "qualities": [weighted_coverage(one, truth) for one in labels]}
+    found, q = _figures(labels, weights, truth, object_status(recording, t) if known else {})
+    return {**row, **found, "qualities": q.tolist()}
 
 
 def figures(
@@ -69,8 +69,16 @@ def figures(
     status : mapping
         True label -> visible, hidden or unseen; empty where not known.
     """
+    return _figures(labels, weights, truth, status)[0]
+
+
+def _figures(
+    labels: Sequence[np.ndarray], weights: np.ndarray, truth: np.ndarray, status: Mapping[int, str]
+) -> tuple[dict[str, float], np.ndarray]:
+    """The figures, and the quality of every hypothesis (n,)."""
+    (truth, *labels), n_free = _cropped([truth, *labels])
     distinct, which = _distinct(labels)
-    tables = [overlap(one, truth) for one in distinct]
+    tables = [_with_free(overlap(one, truth), n_free) for one in distinct]
     share = np.bincount(which, minlength=len(distinct)) / len(labels)
 
     def mean(values: Sequence[float] | np.ndarray) -> float:
@@ -100,7 +108,29 @@ def figures(
     row["true_objects"] = float(np.count_nonzero(tables[0].labels_b))
     row["diversity"] = diversity(labels)
     row["brier"], row["disputed"] = pair_brier(labels, weights, truth)
-    return row
+    return row, q
+
+
+def _cropped(grids: Sequence[np.ndarray]) -> tuple[list[np.ndarray], int]:
+    """The grids cut to where any of them is occupied, and how many voxels were cut away, which are free in all.
+
+    A layer of free voxels stays wherever something is cut, so that free space is still a region of every grid.
+    """
+    occupied = np.any([grid > 0 for grid in grids], axis=0)
+    box = []
+    for axis in range(occupied.ndim):
+        hit = np.flatnonzero(occupied.any(axis=tuple(a for a in range(occupied.ndim) if a != axis)))
+        box.append(slice(max(hit[0] - 1, 0), hit[-1] + 2) if len(hit) else slice(0, 1))
+    cut = [np.ascontiguousarray(grid[tuple(box)]) for grid in grids]
+    return cut, occupied.size - cut[0].size
+
+
+def _with_free(table: Overlap, n_free: int) -> Overlap:
+    """The table of the whole grids."""
+    counts = table.counts.copy()
+    if n_free:
+        counts[0, 0] += n_free
+    return Overlap(table.labels_a, table.labels_b, counts)
 
 
 def _distinct(labels: Sequence[np.ndarray]) -> tuple[list[np.ndarray], np.ndarray]:

@@ -125,6 +125,21 @@ def test_figures_of_a_population():
     assert math.isnan(one["diversity"]) and math.isnan(one["brier"]) and math.isnan(one["quality_hidden"])
 
 
+@settings(max_examples=40, deadline=None, derandomize=True)
+@given(WORLDS, st.sampled_from([0, 1, 3]))
+def test_free_space_around_changes_no_more_than_it_should(world, margin):
+    """Figures of grids with room around are those of the whole grids, the paper's form included."""
+    small, true = world
+    labels, truth = [np.pad(one, margin) for one in small], np.pad(true, margin)
+    n = len(labels)
+    row = figures(labels, np.full(n, 1 / n), truth, dict.fromkeys(range(1, 4), "visible"))
+    for form, name in (("objects", "quality"), ("paper", "quality_paper"), ("authors", "quality_authors")):
+        assert row[name] == pytest.approx(np.mean([weighted_coverage(one, truth, form) for one in labels])), name
+    tight = figures(small, np.full(n, 1 / n), true, dict.fromkeys(range(1, 4), "visible"))
+    for name in set(row) - {"quality_paper"}:
+        assert row[name] == pytest.approx(tight[name], nan_ok=True), name
+
+
 def test_empty_worlds():
     nothing, some = np.zeros((2, 2, 2), int), np.ones((2, 2, 2), int)
     assert figures([nothing], np.ones(1), nothing, {})["quality"] == 1.0
