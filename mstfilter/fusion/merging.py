@@ -12,6 +12,7 @@ rule           probability                    source
 ``iou``        IoU                            a plain alternative
 ``match``      1 if IoU > 1/2, else 0         an object overlaps at most one other so much: the same thing
                                               seen twice
+``covered``    1 if I / n1 >= 3/4, else 0     what is left of the child would be a sliver
 ``always``     1                              a control
 ``never``      0                              a control
 =============  =============================  ========================================================
@@ -27,7 +28,7 @@ from mstfilter.errors import InputError
 
 __all__ = ["MERGE_RULES", "MergeRule", "merge_probability"]
 
-MergeRule = Literal["share", "printed", "iou", "match", "always", "never"]
+MergeRule = Literal["share", "printed", "iou", "match", "covered", "always", "never"]
 MERGE_RULES: tuple[MergeRule, ...] = get_args(MergeRule)
 
 
@@ -53,6 +54,8 @@ def merge_probability(
         return iou
     if rule == "match":
         return (iou > 0.5).astype(np.float64)
+    if rule == "covered":
+        return (common >= 0.75 * n1).astype(np.float64)
     if rule == "always":
         return np.ones_like(iou)
     if rule == "never":

@@ -18,17 +18,17 @@ and scored; what the first stage has used is divided out, so a drawn candidate's
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import ClassVar
 
 import numpy as np
 
 from mstfilter.errors import InputError
+from mstfilter.fusion.claims import Claims
 from mstfilter.fusion.crossover import Crossover
 from mstfilter.fusion.division import NoDivision, PartRule, take_apart
 from mstfilter.fusion.free_space import FreeSpace, Projection
 from mstfilter.scene.clip import Clip
 from mstfilter.scene.evidence import Division, Evidence
-from mstfilter.scene.frame_geometry import frame_geometry
 from mstfilter.scene.voxels import Hypothesis
 from mstfilter.smc.interfaces import Update
 from mstfilter.smc.population import Candidates, Population
@@ -38,7 +38,6 @@ from mstfilter.smc.updates import union
 
 __all__ = ["FusionUpdate"]
 
-_SURFACE_VOXELS = 1.5  # how far behind the reading a voxel still counts as surface, as in completion
 _SMALLEST_QUALITY = 1e-3  # a prediction that loses every voxel keeps a weight, lest all are zero
 
 
@@ -60,12 +59,8 @@ class FusionUpdate(Update):
         Objects of both sides that hold what has moved apart in the clip are parted first, and remembered as such.
     parts : PartRule
         When a part is worth an object.
-    surface : {"both", "sample"}
-        Whose objects may fill voxels at the surface that the last frame measures: those of both, or of the
-        sample alone, which has seen it. What a prediction has there is mostly a voxel or two of misplacement.
-    hidden : {"order", "prediction"}
-        Whose objects get voxels behind the measured surface that both claim: the one painted later, or the
-        prediction, which may have seen them; the sample's completion has not.
+    claims : Claims
+        Which voxels each parent may claim.
     evidence : tuple of Evidence
         Terms by which built candidates are scored; none: candidates are weighted by their pair alone.
     n_scored : int
@@ -78,8 +73,7 @@ class FusionUpdate(Update):
     quality_exponent: float = 3.0
     division: Division = NoDivision()  # noqa: RUF009 (frozen)
     parts: PartRule = PartRule()  # noqa: RUF009 (frozen)
-    surface: Literal["both", "sample"] = "both"
-    hidden: Literal["order", "prediction"] = "order"
+    claims: Claims = Claims()  # noqa: RUF009 (frozen)
     evidence: tuple[Evidence, ...] = ()
     n_scored: int = 0
 
@@ -105,6 +99,7 @@ class FusionUpdate(Update):
         if predicted is None:
             return union(None, proposed)
         refined, quality = self._refine(predicted, observation)
+        doubtful = [self.claims.doubtful(h, r) for h, r in zip(predicted.particles, refined, strict=True)]
         refined = self._parted(refined, observation, proposed=False)
         log_q = self.quality_exponent * np.log(np.maximum(quality, _SMALLEST_QUALITY))
         notes = {"quality": quality.tolist(), "eta": self.eta}
@@ -114,17 +109,14 @@ class FusionUpdate(Update):
         i, j = _pairs(child(rng, "order"), len(proposed), len(predicted), self.eta)
         key, crossover = key_of(rng), self.crossover
         samples = self._parted(tuple(proposed.particles), observation, proposed=True)
-
-        simple = self.surface == "both" and self.hidden == "order"
-        exposed = np.zeros(0, bool) if simple else self._exposed(observation)
+        claims, exposed = self.claims, self.claims.exposed(observation)
 
         def build(candidate: int) -> Hypothesis:
             stream = key.child("candidate", candidate).generator()
             sample, prediction = samples[i[candidate]], refined[j[candidate]]
-            if self.surface == "sample" and sample.n_objects:
-                unseen = exposed & (sample.labels == 0) & (prediction.labels != 0)
-                prediction = prediction.with_labels(np.where(unseen, 0, prediction.labels).astype(np.uint16))
-            return crossover.mix(stream, sample, prediction, ~exposed if self.hidden == "prediction" else None)
+            wrong = doubtful[j[candidate]]
+            prediction = claims.limited(sample, prediction, exposed, wrong)
+            return crossover.mix(stream, sample, prediction, claims.predicted_wins(exposed, wrong))
 
         none_j, none_i = np.full(len(predicted), -1), np.full(len(proposed), -1)
         parents = {
@@ -152,12 +144,6 @@ class FusionUpdate(Update):
         known = {id(h): h for h in hypotheses}
         parted = {name: take_apart(h, motions, clip, self.parts, proposed) for name, h in known.items()}
         return tuple(parted[id(h)] for h in hypotheses)
-
-    def _exposed(self, clip: Clip) -> np.ndarray:
-        """(X, Y, Z) bool: voxels at or before the measured surface, which nothing hides."""
-        grid, frame = clip.grid, clip.after
-        with np.errstate(invalid="ignore"):
-            return frame_geometry(frame, grid).signed < _SURFACE_VOXELS * grid.voxel_size
 
     def _refine(self, predicted: Population, clip: Clip) -> tuple[tuple[Hypothesis, ...], np.ndarray]:
         """Predicted hypotheses after free-space projection, and their qualities (n,)."""

@@ -1,0 +1,102 @@
+"""Who may claim what: the sample at the surface, no hidden voxels of a prediction that went wrong."""
+
+import numpy as np
+import pytest
+
+from mstfilter.errors import InputError
+from mstfilter.fusion.claims import Claims
+from mstfilter.fusion.crossover import Crossover
+from mstfilter.fusion.free_space import FreeSpace
+from mstfilter.fusion.mode_filter import ModeFilter
+from mstfilter.fusion.update import FusionUpdate
+from mstfilter.scene.clip import Clip
+from mstfilter.scene.frame import Frame
+from mstfilter.scene.voxels import Hypothesis
+from mstfilter.smc.population import Population
+from tests.scene.scenes import CAMERA, GRID, table_scene
+
+MST = Claims(surface="sample", max_cleared=0.03)
+
+
+@pytest.fixture(scope="module")
+def scene():
+    noise = np.random.default_rng(0)
+    rgb, depth, truth = table_scene(0, noise)
+    frame = Frame(rgb, depth, CAMERA)
+    return Clip((frame, frame), GRID, 1), truth
+
+
+def children(clip, sample, prediction, claims, seeds=range(4), **fields):
+    predicted = Population((Hypothesis.from_labels(prediction, GRID),), np.zeros(1), {"previous": np.zeros(1, int)})
+    proposed = Population((Hypothesis.from_labels(sample, GRID, 1),), np.zeros(1), {"proposed": np.zeros(1, int)})
+    update = FusionUpdate(eta=1, claims=claims, **fields)
+    return [update.update(np.random.default_rng(k), predicted, proposed, clip).particles[0].labels for k in seeds]
+
+
+def test_the_parents_are_limited_as_said(scene):
+    clip, truth = scene
+    empty = np.zeros_like(truth)
+    exposed = Claims(surface="sample").exposed(clip)
+    sample, prediction = Hypothesis.from_labels(truth, GRID), Hypothesis.from_labels((truth == 0) * 7, GRID)
+    left = MST.limited(sample, prediction, exposed, None).labels
+    assert not (left[exposed] > 0).any()  # nothing of the sample there, so nothing of the prediction either
+    np.testing.assert_array_equal(left[~exposed], prediction.labels[~exposed])
+    both = MST.limited(sample, prediction, exposed, np.ones(truth.shape, bool)).labels
+    assert not both.any()
+    nothing = Hypothesis.from_labels(empty, GRID)
+    assert MST.limited(nothing, prediction, exposed, None) is prediction
+    assert Claims().exposed(clip) is None
+
+
+def test_objects_that_free_space_cleared_too_much_of_are_doubtful(scene):
+    clip, truth = scene
+    lifted = np.roll(truth, 8, axis=2)  # into the air: free space clears it
+    right = Hypothesis.from_labels(truth, GRID)
+    wrong = Hypothesis.from_labels(np.where(lifted == 1, 1, np.where(truth == 2, 2, 0)), GRID)
+    for hypothesis, labels in ((right, set()), (wrong, {1})):
+        refined, _ = FreeSpace().project(hypothesis, clip.after)
+        doubtful = MST.doubtful(hypothesis, refined)
+        found = set() if doubtful is None else set(np.unique(refined.labels[doubtful]).tolist())
+        assert found == labels
+    assert Claims().doubtful(wrong, FreeSpace().project(wrong, clip.after)[0]) is None
+
+
+def test_a_perfect_prediction_and_measurement_leave_the_scene_as_it_is(scene):
+    """A book of 2 cm and a thin rod too, whatever is merged and whoever wins."""
+    clip, truth = scene
+    for claims in (MST, Claims("sample", "prediction", 0.0), Claims()):
+        for merge in ("covered", "never", "always", "share"):
+            crossover = Crossover(merge=merge, mode_filter=ModeFilter(scope="disputed"))
+            for labels in children(clip, truth, truth, claims, crossover=crossover):
+                assert ((labels > 0) == (truth > 0)).all()
+                for k in np.unique(truth)[1:]:
+                    assert len(np.unique(labels[truth == k])) == 1
+
+
+def test_hidden_voxels_of_the_prediction_win_where_asked(scene):
+    clip, truth = scene
+    hidden = ~Claims(surface="sample").exposed(clip) & (truth == 1)
+    assert hidden.sum() > 10
+    prediction = np.where(hidden, 9, 0)  # says that the hidden part is another thing
+    plain = Crossover(merge="never", mode_filter=ModeFilter(window=1))
+    asked = children(clip, truth, prediction, Claims(hidden="prediction"), range(8), crossover=plain)
+    inner = hidden & (children(clip, prediction * 0, prediction, Claims(), [0])[0] > 0)  # what free space leaves
+    assert inner.sum() > 10
+    for labels in asked:
+        own = labels[inner]
+        assert (own == np.bincount(own).argmax()).mean() > 0.9
+        visible = labels[(truth == 1) & ~hidden]
+        assert np.bincount(own).argmax() != np.bincount(visible).argmax()
+    order = children(clip, truth, prediction, Claims(), range(8), crossover=plain)
+    outcomes = {
+        bool(np.bincount(o[inner]).argmax() == np.bincount(o[(truth == 1) & ~hidden]).argmax()) for o in order
+    }
+    assert outcomes == {True, False}  # by chance either way
+
+
+@pytest.mark.parametrize(
+    "fields", [{"surface": "none"}, {"hidden": "sample"}, {"max_cleared": 1.5}, {"max_cleared": -1}]
+)
+def test_wrong_fields_are_named(fields):
+    with pytest.raises(InputError, match=next(iter(fields))):
+        Claims(**fields)
