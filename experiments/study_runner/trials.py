@@ -118,9 +118,9 @@ def main() -> None:
     for round_ in range(rounds):
         one, two = (r for r in rows if r["round"] == round_ and not r["killed_every_s"])
         print(f"round {round_}: {one['wall_s']} s with one worker, {two['wall_s']} s with two: ", end="")
-        print(
-            f"efficiency {one['wall_s'] / 2 / two['wall_s']:.2f}, others used {two['others_core_s']:.0f} core-seconds"
-        )
+        print(f"efficiency {one['wall_s'] / 2 / two['wall_s']:.2f} by the clock", end="")
+        runner = two["at_runs"] / one["at_runs"] * one["core_s"] / two["core_s"]
+        print(f", {runner:.2f} of the runner itself; others used {two['others_core_s']:.0f} core seconds")
     last = rows[-1]
     print(f"{last['killed']} workers killed: {last['done']} of {last['runs']} runs done, {last['failed']} failed")
 
