@@ -113,6 +113,7 @@ COMPONENTS: dict[str, dict[str, str]] = {
     },
     "crossover": {"conflict_graph": "mstfilter.fusion.crossover:Crossover"},
     "structure": {
+        "one_side_last": "mstfilter.fusion.structure:OneSideLast",
         "random_order": "mstfilter.fusion.structure:RandomOrder",
         "spanning_tree": "mstfilter.fusion.structure:SpanningTree",
     },
