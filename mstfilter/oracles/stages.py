@@ -17,8 +17,7 @@ STAGES: dict[str, tuple[str, ...]] = {
     "boundary": ('proposal.boundary={component="true_boundary", form="cleaned"}',),
     "masks": ("proposal=true_masks",),
     "completion": ("proposal.completer=true_completion",),
-    "motions": ("transition=true_motions", "transition.warp.method=pull"),
-    "warp": ("transition.warp.method=smooth",),
+    "motions": ("transition=true_motions",),
     "choice": ('update.evidence=["true_quality"]', "update.n_scored=100"),
     "fusion": ("update=true_fusion",),
     "free space": ("update.free_space=true_free_space",),
@@ -26,7 +25,7 @@ STAGES: dict[str, tuple[str, ...]] = {
 }
 
 #: The stages of a filter that is perfect throughout. True masks need no boundary, true fusion leaves no choice.
-ALL: tuple[str, ...] = ("masks", "completion", "motions", "warp", "fusion", "free space", "selection")
+ALL: tuple[str, ...] = ("masks", "completion", "motions", "fusion", "free space", "selection")
 
 
 def overrides_of(*stages: str) -> tuple[str, ...]:

@@ -90,7 +90,7 @@ class RigidMotions(Division):
 
     cell: int = 10
     moved: float = 0.008
-    misfit: float = 0.008
+    misfit: float = 0.015
     noisy: float = 0.006
     reach: float = 0.04
     min_points: int = 40

@@ -20,7 +20,6 @@ WHERE = {
     "masks": ["proposal"],
     "completion": ["proposal.completer"],
     "motions": ["transition"],
-    "warp": ["transition.warp.method"],
     "choice": ["update.evidence", "update.n_scored"],
     "fusion": ["update"],
     "free space": ["update.free_space"],

@@ -6,7 +6,7 @@
 What the images feed is replaced: tracking by the motion model, tree cuts by cuts of the segmentation that the
 sensor reports, free space by the cells in front of the depth reading, and what scores built candidates (where the
 preset has such terms) by the likelihood of the reading. What fuses and selects is the preset's own; only the mode
-filter is sized to the grid.
+filter is sized to the grid, and what needs a video (motions that part objects, measured surfaces) is left out.
 """
 
 from __future__ import annotations
@@ -19,6 +19,8 @@ from typing import Any, Literal
 import numpy as np
 
 from mstfilter.errors import InputError
+from mstfilter.fusion.claims import Claims
+from mstfilter.fusion.division import NoDivision
 from mstfilter.fusion.free_space import Projection
 from mstfilter.fusion.update import FusionUpdate
 from mstfilter.oracles.miniature.filters import Push
@@ -199,6 +201,8 @@ def shrink(
     update = replace(
         filter.update,
         free_space=SeenThrough(),
+        division=NoDivision(),
+        claims=Claims(),
         crossover=replace(crossover, mode_filter=small),
         evidence=evidence,
         n_scored=0,

@@ -1,0 +1,85 @@
+"""How often is what one parent alone claims right?
+
+    python experiments/fusion/claims.py [--smoke] [--out FOLDER]
+
+On tuning scenes (seeds 0, 1 of s1, s2, s3) every pair of a sample and a moved hypothesis is compared with the true
+volumes: the share of voxels that truly belong to the object which most of the claiming object is, by who claims them,
+by whether the last frame measures them, and by the share of the predicted object that free space has cleared.
+Writes results/claims.csv. These shares are what `Claims` of the preset `mst` stands on.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+from collections import defaultdict
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+import mstfilter
+from mstfilter.fusion.claims import Claims
+from mstfilter.scene.recording import Recording
+from mstfilter.simulation.cache import cached_recording
+
+CLEARED = (0.01, 0.03, 0.06, 1.0)
+SMALL = {"width": 160, "height": 120, "n_actions": 1, "frames_per_clip": 8, "voxel_size": 0.02}
+
+
+def count(found: dict[tuple[str, str, str], np.ndarray], clip, truth, sample, predicted, refined) -> None:
+    """Add the voxels of one pair of parents."""
+    near = Claims(surface="sample").exposed(clip)
+    n_true = int(truth.max()) + 1
+    before, after = predicted.volumes(), refined.volumes()
+    for own, other, side in ((sample, refined, "sample"), (refined, sample, "prediction")):
+        for label, volume in own.volumes().items():
+            mine = own.labels == label
+            if volume < 30:
+                continue
+            true = int(np.bincount(truth[mine], minlength=n_true)[1:].argmax()) + 1
+            cleared = ""
+            if side == "prediction":
+                share = 1 - after[label] / before[label]
+                cleared = f"<= {next(c for c in CLEARED if share <= c):g}"
+            for where, place in (("surface", near), ("hidden", ~near)):
+                for whose, rest in ((f"{side} alone", other.labels == 0), ("both", other.labels > 0)):
+                    voxels = mine & place & rest
+                    found[f"{side}: {whose}", where, cleared] += [voxels.sum(), (voxels & (truth == true)).sum()]
+
+
+def main(out: Path, smoke: bool) -> None:
+    """All scenes; one row a class."""
+    found: dict[tuple[str, str, str], np.ndarray] = defaultdict(lambda: np.zeros(2, np.int64))
+    # What the parents claim without limits, along the path of the preset.
+    mst = mstfilter.preset("mst")
+    for family in ("s1",) if smoke else ("s1", "s2", "s3"):
+        for seed in (0,) if smoke else (0, 1):
+            recording = Recording.open(cached_recording(family, seed, **(SMALL if smoke else {})))
+            state = mst.start(0)
+            for clip in recording.clips():
+                if clip.index:
+                    before = replace(state.population, parents={"previous": np.arange(len(state.population))})
+                    predicted = mst.transition.predict(np.random.default_rng(0), before, clip)
+                    samples = mst.proposal.sample(np.random.default_rng(1), clip, 3)
+                    truth = recording.truth(clip.index).astype(np.int64)
+                    for sample in samples.particles:
+                        for h in predicted.particles[:3]:
+                            refined, _ = mst.update.free_space.project(h, clip.after)
+                            count(found, clip, truth, sample, h, refined)
+                state, _ = mst.step(state, clip)
+    out.mkdir(parents=True, exist_ok=True)
+    with (out / "claims.csv").open("w", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(["claimed by", "where", "cleared", "voxels", "share right"])
+        for (who, where, cleared), (n, right) in sorted(found.items()):
+            writer.writerow([who, where, cleared, n, round(right / n, 3) if n else ""])
+            print(f"{who:32} {where:8} {cleared:8} {n:9d}  {right / max(n, 1):.3f}")
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--smoke", action="store_true")
+    parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results")
+    arguments = parser.parse_args()
+    main(arguments.out, arguments.smoke)
