@@ -50,7 +50,7 @@ class PartRule:
     """
 
     min_pixels: int = 40
-    min_share: float = 0.15
+    min_share: float = 0.25
     pure: float = 0.8
     min_voxels: int = 20
 
