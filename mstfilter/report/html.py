@@ -10,17 +10,15 @@ SVG, there is no script and no link. Times of the steps aside, the same run give
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from mstfilter.errors import InputError
 from mstfilter.report.cards import cards_of_pause, close_up, data_uri, truth_card
 from mstfilter.report.content import Numbers, different, numbers_of, seconds_text
 from mstfilter.report.figures import genealogy_figure, health_figure, quality_figure
 from mstfilter.report.identities import identity_colours
+from mstfilter.report.page import render, write_page
 from mstfilter.report.pictures import jpeg_bytes, viewpoint
 from mstfilter.report.tables import counts, flatten, note_rows, shown
 from mstfilter.study.run_folder import RunFolder
@@ -59,40 +57,21 @@ def write_report(run: RunFolder | str | Path, out: str | Path | None = None) -> 
     """
     run = RunFolder.open(run.path if isinstance(run, RunFolder) else run)
     path = run.path / "report.html" if out is None else Path(out)
-    text = _page(run)
-    partial = path.with_name(f".{path.name}.partial")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        partial.write_text(text, encoding="utf-8")
-        os.replace(partial, path)
-    except OSError as error:
-        raise InputError(f"cannot write report {path}: {error.strerror}", "choose another file") from error
-    return path
+    return write_page(path, _page(run))
 
 
 def _page(run: RunFolder) -> str:
-    from jinja2 import Environment, FunctionLoader, StrictUndefined
-
-    folder = files("mstfilter.report") / "templates"
-    environment = Environment(
-        loader=FunctionLoader(lambda name: (folder / name).read_text(encoding="utf-8")),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    environment.filters.update(
-        different=different, shown=shown, seconds=seconds_text, percent=lambda x: f"{100 * x:.3g} %"
-    )
+    filters = dict(different=different, shown=shown, seconds=seconds_text, percent=lambda x: f"{100 * x:.3g} %")
     numbers = numbers_of(run)
-    return environment.get_template("report.html").render(
+    return render(
+        "report.html",
+        filters,
         run=numbers,
         pauses=_pauses(run, numbers),
         figures=_figures(numbers),
         parts=[_part(numbers, slot) for slot in numbers.slots],
         config=_config(numbers.description.get("config") or {}),
         facts=_facts(numbers.description),
-        style=(folder / "style.css").read_text(encoding="utf-8"),
     )
 
 

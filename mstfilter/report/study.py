@@ -8,15 +8,13 @@ claim no more than the scenes show.
 
 from __future__ import annotations
 
-import os
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from mstfilter.errors import InputError
 from mstfilter.report.content import seconds_text
+from mstfilter.report.page import render, write_page
 from mstfilter.report.study_figures import differences_figure, time_figure
 from mstfilter.report.tables import flatten, shown
 from mstfilter.study.results import StudyFolder
@@ -66,32 +64,16 @@ def write_study_report(study: StudyFolder | str | Path, out: str | Path | None =
     """
     study = StudyFolder.open(study.path if isinstance(study, StudyFolder) else study)
     path = study.path / "report.html" if out is None else Path(out)
-    text = _page(study)
-    partial = path.with_name(f".{path.name}.partial")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        partial.write_text(text, encoding="utf-8")
-        os.replace(partial, path)
-    except OSError as error:
-        raise InputError(f"cannot write report {path}: {error.strerror}", "choose another file") from error
-    return path
+    return write_page(path, _page(study))
 
 
 def _page(study: StudyFolder) -> str:
-    from jinja2 import Environment, FunctionLoader, StrictUndefined
-
-    folder = files("mstfilter.report") / "templates"
-    environment = Environment(
-        loader=FunctionLoader(lambda name: (folder / name).read_text(encoding="utf-8")),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    environment.filters.update(seconds=seconds_text, number=_number, signed=lambda x: _number(x, "+"), range=_range)
+    filters = dict(seconds=seconds_text, number=_number, signed=lambda x: _number(x, "+"), range=_range)
     records, summary, failures = study.records(), study.summary(), study.failures()
     sources: list[dict[str, Any]] = [scene["source"] for scene in study.description["scenes"]]
-    return environment.get_template("study.html").render(
+    return render(
+        "study.html",
+        filters,
         study=study.description,
         n_done=len({(r["scene"], r["arm"], r["seed"]) for r in records}),
         summary=summary,
@@ -104,7 +86,6 @@ def _page(study: StudyFolder) -> str:
         costs=_costs(summary),
         arms=_arms(study.description),
         failures=failures,
-        style=(folder / "style.css").read_text(encoding="utf-8"),
     )
 
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import csv
 import json
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -131,10 +133,10 @@ def test_shared_work_changes_no_result(folder, tmp_path):
 
 
 def test_peak_memory():
-    from mstfilter.study.memory import peak_megabytes, reset_peak
-
-    reset_peak()
-    before = peak_megabytes()
-    held = np.ones(40 * 2**20 // 8)
-    assert peak_megabytes() >= before + 35
-    del held
+    # In a process of its own: what earlier tests left is given back at any time.
+    code = (
+        "import numpy as np; from mstfilter.study.memory import *; reset_peak(); before = peak_megabytes(); "
+        "held = np.ones(40 * 2**20 // 8); print(peak_megabytes() - before)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=True)
+    assert 35 <= float(done.stdout) < 100
