@@ -7,7 +7,6 @@ import json
 import subprocess
 import sys
 
-import numpy as np
 import pytest
 
 from mstfilter.study.config import SceneEntry, load_study, study_of
