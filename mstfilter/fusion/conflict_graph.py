@@ -9,14 +9,26 @@ The graph is bipartite: objects of one hypothesis never overlap.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import networkx as nx
 import numpy as np
 
-from mstfilter.scene.quality import overlap
+from mstfilter.errors import InputError
+from mstfilter.scene.voxels import MAX_LABEL, as_labels
 
-__all__ = ["PREDICTED", "PROPOSED", "ConflictGraph", "conflict_graph"]
+__all__ = [
+    "PREDICTED",
+    "PROPOSED",
+    "Claimed",
+    "ConflictGraph",
+    "claimed",
+    "conflict_graph",
+    "graph_of",
+    "overlapping",
+]
 
 PROPOSED, PREDICTED = 0, 1
 
@@ -76,40 +88,69 @@ class ConflictGraph:
         return [sorted(a) for a in adjacent]
 
 
-def conflict_graph(proposed: np.ndarray, predicted: np.ndarray) -> ConflictGraph:
-    """The conflict graph of two label grids (X, Y, Z) of the same shape.
+class Claimed(NamedTuple):
+    """The voxels that a proposed or a predicted hypothesis fills: a few percent of a grid, all that fusion looks at.
 
-    One pass over the voxels finds all sizes and overlaps.
+    at : (n,) flat indices; proposed, predicted : (n,) uint16 labels there, 0 free; shape : of the grid.
     """
-    table = overlap(proposed, predicted)
-    first = [_first_voxel(proposed, table.labels_a), _first_voxel(predicted, table.labels_b)]
+
+    at: np.ndarray
+    proposed: np.ndarray
+    predicted: np.ndarray
+    shape: tuple[int, ...]
+
+    def spread(self, values: np.ndarray) -> np.ndarray:
+        """A grid with these values (n,) in its claimed voxels and 0 elsewhere."""
+        grid = np.zeros(self.shape, values.dtype)
+        grid.reshape(-1)[self.at] = values
+        return grid
+
+
+def claimed(proposed: np.ndarray, predicted: np.ndarray) -> Claimed:
+    """The voxels (X, Y, Z) that either label grid fills."""
+    a, b = as_labels(proposed, "proposed label grid"), as_labels(predicted, "predicted label grid")
+    if a.shape != b.shape:
+        raise InputError(
+            f"proposed and predicted label grids have shapes {a.shape} and {b.shape}, expected the same shape",
+            "all hypotheses of a run share one workspace",
+        )
+    at = np.flatnonzero((a | b) != 0)
+    return Claimed(at, a.reshape(-1)[at], b.reshape(-1)[at], a.shape)
+
+
+def conflict_graph(proposed: np.ndarray, predicted: np.ndarray) -> ConflictGraph:
+    """The conflict graph of two label grids (X, Y, Z) of the same shape."""
+    return graph_of(claimed(proposed, predicted))
+
+
+def graph_of(voxels: Claimed) -> ConflictGraph:
+    """The conflict graph of two hypotheses, from the voxels that they claim."""
+    position = np.ravel_multi_index(np.unravel_index(voxels.at, voxels.shape), voxels.shape, order="F")
     side, label, size, begin = [], [], [], []
-    for which, (labels, sizes) in enumerate(((table.labels_a, table.sizes_a), (table.labels_b, table.sizes_b))):
-        real = labels > 0
-        label.append(labels[real])
-        size.append(sizes[real])
-        begin.append(first[which][real])
-        side.append(np.full(int(real.sum()), which))
-    n_proposed = len(label[0])
-    order = np.lexsort((np.concatenate(side), np.concatenate(begin)))
-    number = np.empty(len(order), np.int64)
-    number[order] = np.arange(len(order))
+    for which, labels in ((PROPOSED, voxels.proposed), (PREDICTED, voxels.predicted)):
+        sizes = np.bincount(labels, minlength=1)
+        first = np.full(len(sizes), math.prod(voxels.shape))
+        np.minimum.at(first, labels.astype(np.intp), position)
+        sizes[0] = 0
+        present = np.flatnonzero(sizes)
+        label.append(present)
+        size.append(sizes[present])
+        begin.append(first[present])
+        side.append(np.full(len(present), which))
+    sides, labels = np.concatenate(side), np.concatenate(label)
+    order = np.lexsort((sides, np.concatenate(begin)))
+    number = np.zeros((2, MAX_LABEL + 1), np.int64)
+    number[sides[order], labels[order]] = np.arange(len(order))
 
-    counts = table.counts[table.labels_a > 0][:, table.labels_b > 0]
-    a, b = np.nonzero(counts)
-    edges = np.stack([number[a], number[n_proposed + b]], axis=1) if len(a) else np.zeros((0, 2), np.int64)
-    return ConflictGraph(
-        np.concatenate(side)[order],
-        np.concatenate(label)[order],
-        np.concatenate(size)[order],
-        edges,
-        counts[a, b],
-    )
+    a, b, common = overlapping(voxels)
+    edges = np.stack([number[PROPOSED, a], number[PREDICTED, b]], axis=1)
+    return ConflictGraph(sides[order], labels[order], np.concatenate(size)[order], edges, common)
 
 
-def _first_voxel(labels: np.ndarray, present: np.ndarray) -> np.ndarray:
-    """Position of each label's first voxel in a scan with x fastest."""
-    flat = np.asarray(labels).ravel(order="F")
-    position = np.zeros(int(present[-1]) + 1 if len(present) else 1, np.int64)
-    position[flat[::-1]] = np.arange(len(flat) - 1, -1, -1)  # written last = met first
-    return position[present]
+def overlapping(voxels: Claimed) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Proposed label, predicted label and common voxels (m,) of each overlapping pair, labels ascending."""
+    both = (voxels.proposed != 0) & (voxels.predicted != 0)
+    pair = voxels.proposed[both].astype(np.int64) * (MAX_LABEL + 1) + voxels.predicted[both]
+    found, common = np.unique(pair, return_counts=True)
+    a, b = np.divmod(found, MAX_LABEL + 1)
+    return a, b, common

@@ -16,12 +16,12 @@ from typing import NamedTuple
 import numpy as np
 
 from mstfilter.errors import InputError
-from mstfilter.fusion.conflict_graph import PREDICTED, PROPOSED, ConflictGraph, conflict_graph
+from mstfilter.fusion.conflict_graph import PREDICTED, PROPOSED, Claimed, ConflictGraph, claimed, graph_of
 from mstfilter.fusion.division import part_like, remember_like
 from mstfilter.fusion.merging import MergeRule, merge_probability
 from mstfilter.fusion.mode_filter import ModeFilter
 from mstfilter.fusion.structure import SpanningTree, Structure
-from mstfilter.scene.voxels import Hypothesis, ObjectRecord
+from mstfilter.scene.voxels import MAX_LABEL, Hypothesis, ObjectRecord, as_labels
 
 __all__ = ["Crossover", "Draw"]
 
@@ -86,11 +86,20 @@ class Crossover:
         if not proposed.objects:
             return predicted
         proposed = part_like(proposed, predicted)
-        graph = conflict_graph(proposed.labels, predicted.labels)
+        voxels = claimed(proposed.labels, predicted.labels)
+        graph = graph_of(voxels)
         draw = self.draw(rng, graph, _strangers(graph, proposed, predicted))
-        labels, disputed = self.paint(graph, draw, proposed.labels, predicted.labels, from_predicted)
-        labels = self.mode_filter.apply(labels, disputed)
-        return _with_records(labels, graph, draw, proposed, predicted)
+        painted, disputed = _painted(graph, draw, voxels, from_predicted)
+        groups, numbers = _numbered(painted)
+        if len(groups) > MAX_LABEL:
+            raise InputError(
+                f"crossover of {len(proposed.objects)} proposed and {len(predicted.objects)} predicted objects gives "
+                f"{len(groups)}, at most {MAX_LABEL} can be told apart",
+                "objects of a voxel or two are noise: drop them before fusion",
+            )
+        labels = self.mode_filter.apply(voxels.spread(numbers.astype(np.uint16)), voxels.spread(disputed))
+        left, numbers = _numbered(labels.reshape(-1)[voxels.at])
+        return _with_records(voxels, numbers, groups[left - 1] - 1, graph, draw, proposed, predicted)
 
     def draw(self, rng: np.random.Generator, graph: ConflictGraph, strangers: Strangers | None = None) -> Draw:
         """Draw a resolution of all conflicts of a graph.
@@ -134,42 +143,59 @@ class Crossover:
         Disputed are the voxels on which the parents still disagree after merging and whose object is part of
         such a disagreement: objects that both parents see alike, or only one sees, are not.
         """
-        rank = np.empty(len(graph), np.int64)
-        rank[draw.order] = np.arange(len(draw.order))
-        group_of, rank_of = [], []
-        for side, labels in ((PROPOSED, proposed), (PREDICTED, predicted)):
-            mine = graph.side == side
-            table = np.zeros(int(labels.max()) + 1, np.int32)
-            ranks = np.full(int(labels.max()) + 1, -1, np.int32)
-            table[graph.label[mine]] = draw.group[mine] + 1
-            kept = mine & (draw.group >= 0)
-            ranks[graph.label[kept]] = rank[kept]
-            group_of.append(table[labels])
-            rank_of.append(ranks[labels])
-        later = rank_of[PREDICTED] > rank_of[PROPOSED]
-        if from_predicted is not None:
-            later |= from_predicted & (group_of[PREDICTED] > 0)
-        out = np.where(later, group_of[PREDICTED], group_of[PROPOSED])
-        differ = group_of[PROPOSED] != group_of[PREDICTED]
-        clash = differ & (group_of[PROPOSED] > 0) & (group_of[PREDICTED] > 0)
-        involved = np.zeros(len(graph) + 2, bool)
-        involved[group_of[PROPOSED][clash]] = True
-        involved[group_of[PREDICTED][clash]] = True
-        return out.astype(np.uint16), differ & involved[out]
+        voxels = claimed(proposed, predicted)
+        painted, disputed = _painted(graph, draw, voxels, from_predicted)
+        return as_labels(voxels.spread(painted), "painted label grid"), voxels.spread(disputed)
+
+
+def _painted(
+    graph: ConflictGraph, draw: Draw, voxels: Claimed, from_predicted: np.ndarray | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Group + 1 of each claimed voxel (n,), 0 where its object was dropped, and whether it stays disputed (n,)."""
+    rank = np.empty(len(graph), np.int64)
+    rank[draw.order] = np.arange(len(draw.order))
+    group_of, rank_of = [], []
+    for side, labels in ((PROPOSED, voxels.proposed), (PREDICTED, voxels.predicted)):
+        mine = graph.side == side
+        table = np.zeros(int(labels.max(initial=0)) + 1, np.int64)
+        ranks = np.full(len(table), -1)
+        table[graph.label[mine]] = draw.group[mine] + 1
+        kept = mine & (draw.group >= 0)
+        ranks[graph.label[kept]] = rank[kept]
+        group_of.append(table[labels])
+        rank_of.append(ranks[labels])
+    later = rank_of[PREDICTED] > rank_of[PROPOSED]
+    if from_predicted is not None:
+        later |= from_predicted.reshape(-1)[voxels.at] & (group_of[PREDICTED] > 0)
+    out = np.where(later, group_of[PREDICTED], group_of[PROPOSED])
+    differ = group_of[PROPOSED] != group_of[PREDICTED]
+    clash = differ & (group_of[PROPOSED] > 0) & (group_of[PREDICTED] > 0)
+    involved = np.zeros(len(graph) + 1, bool)
+    involved[group_of[PROPOSED][clash]] = True
+    involved[group_of[PREDICTED][clash]] = True
+    return out, differ & involved[out]
+
+
+def _numbered(labels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Labels that occur, ascending, 0 left out, and the array with their positions 1, 2, ... in their place."""
+    counts = np.bincount(labels, minlength=1)
+    counts[0] = 0
+    present = np.flatnonzero(counts)
+    table = np.zeros(len(counts), np.int64)
+    table[present] = np.arange(1, len(present) + 1)
+    return present, table[labels]
 
 
 def _strangers(graph: ConflictGraph, proposed: Hypothesis, predicted: Hypothesis) -> Strangers:
     """For each vertex, those of its own side that it came apart from."""
-    vertex: dict[tuple[int, int], int] = {}
-    records = []
-    for v in range(len(graph)):
-        side = int(graph.side[v])
-        record = (predicted if side == PREDICTED else proposed).record(int(graph.label[v]))
-        vertex[side, record.id] = v
-        records.append((side, record))
+    if not any(r.apart for h in (proposed, predicted) for r in h.objects):
+        return {}
+    record_of = {(side, r.label): r for side, h in ((PROPOSED, proposed), (PREDICTED, predicted)) for r in h.objects}
+    records = [record_of[key] for key in zip(graph.side.tolist(), graph.label.tolist(), strict=True)]
+    vertex = {(int(side), record.id): v for v, (side, record) in enumerate(zip(graph.side, records, strict=True))}
     return {
         v: {vertex[side, other] for other in record.apart if (side, other) in vertex}
-        for v, (side, record) in enumerate(records)
+        for v, (side, record) in enumerate(zip(graph.side.tolist(), records, strict=True))
         if record.apart
     }
 
@@ -180,51 +206,58 @@ def _unite(group: np.ndarray, merges: list[tuple[int, int]], order: list[int], s
     A merge that would bring strangers together is left out.
     """
     place = {v: k for k, v in enumerate(order)}
-    members = {v: {v} for v in order}
+    members = {v: {v} for v in order} if strangers else {}
 
     def find(v: int) -> int:
-        while group[v] != v:
-            v = int(group[v])
-        return v
+        root = v
+        while group[root] != root:
+            root = int(group[root])
+        while group[v] != root:  # the next search is short
+            group[v], v = root, int(group[v])
+        return root
 
     for child, parent in merges:
         a, b = find(child), find(parent)
         if a != b:
             low, high = sorted((a, b), key=place.__getitem__)
-            if any(strangers.get(v, _NONE) & members[high] for v in members[low]):
-                continue
+            if strangers:
+                if any(strangers.get(v, _NONE) & members[high] for v in members[low]):
+                    continue
+                members[high] |= members.pop(low)
             group[low] = high
-            members[high] |= members.pop(low)
     for v in order:
         group[v] = find(v)
 
 
 def _with_records(
-    labels: np.ndarray, graph: ConflictGraph, draw: Draw, proposed: Hypothesis, predicted: Hypothesis
+    voxels: Claimed,
+    numbers: np.ndarray,
+    groups: np.ndarray,
+    graph: ConflictGraph,
+    draw: Draw,
+    proposed: Hypothesis,
+    predicted: Hypothesis,
 ) -> Hypothesis:
-    """Number the painted objects 1, 2, ... and give them the records of what they are made of."""
-    sizes = np.bincount(labels.ravel())
-    present = [int(k) for k in np.flatnonzero(sizes) if k > 0]
-    compact = np.zeros(len(sizes), np.uint16)
-    compact[present] = np.arange(1, len(present) + 1)
-    parents, volumes = (proposed, predicted), (proposed.volumes(), predicted.volumes())
+    """The child, objects 1, 2, ... of `groups` (m,) at `numbers` (n,), with the records of what they are made of."""
+    # The largest predicted member gives the identity; where there is none, the largest proposed one.
+    order = np.lexsort((-np.arange(len(graph)), graph.size, graph.side, draw.group))
+    last = np.append(np.diff(draw.group[order]) != 0, True)
+    best_of = dict(zip(draw.group[order[last]].tolist(), order[last].tolist(), strict=True))
+    best = np.array([-1, *(best_of[g] for g in groups.tolist())], np.int64)  # of each number, 0 free
+    side, label = graph.side[best], graph.label[best]
+    own = np.where(side[numbers] == PREDICTED, voxels.predicted, voxels.proposed) == label[numbers]
+    sizes, kept = (np.bincount(n, minlength=len(best)) for n in (numbers, numbers[own]))
+    unchanged = (sizes == graph.size[best]) & (kept == sizes)
+    parents = (proposed, predicted)
+    record_of = [{r.label: r for r in parent.objects} for parent in parents]
     records: list[ObjectRecord] = []
-    number_of: dict[tuple[int, int], int] = {}  # side and label of a parent's object -> its number in the child
-    for number, painted in enumerate(present, start=1):
-        members = np.flatnonzero(draw.group == painted - 1)
-        # The largest predicted member gives the identity; where there is none, the largest proposed one.
-        best = max(members, key=lambda v: (graph.side[v], graph.size[v], -v))
-        side, label = int(graph.side[best]), int(graph.label[best])
-        parent = parents[side]
-        record = parent.record(label)
-        for v in members.tolist():
-            number_of[int(graph.side[v]), int(graph.label[v])] = number
-        whole = sizes[painted] == volumes[side][label]
-        unchanged = whole and bool((labels[parent.labels == label] == painted).all())
-        record = replace(record, label=number)
-        records.append(record if unchanged else record.changed())
-    child = Hypothesis(compact[labels], predicted.grid, tuple(replace(r, apart=frozenset()) for r in records))
-    for side, parent in enumerate(parents):
-        own = {label: number for (s, label), number in number_of.items() if s == side}
-        child = remember_like(child, parent, own)
+    for number in range(1, len(best)):
+        record = replace(record_of[side[number]][int(label[number])], label=number, apart=frozenset())
+        records.append(record if unchanged[number] else record.changed())
+    child = Hypothesis(voxels.spread(numbers.astype(np.uint16)), predicted.grid, tuple(records))
+    number_of = {g: number for number, g in enumerate(groups.tolist(), start=1)}
+    for which, parent in enumerate(parents):
+        mine = np.flatnonzero(graph.side == which)
+        heirs = zip(graph.label[mine].tolist(), draw.group[mine].tolist(), strict=True)
+        child = remember_like(child, parent, {k: number_of[g] for k, g in heirs if g in number_of})
     return child

@@ -15,10 +15,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial import cKDTree
 
+from mstfilter.fusion.conflict_graph import claimed, overlapping
 from mstfilter.scene.clip import Clip
 from mstfilter.scene.evidence import Division
 from mstfilter.scene.frame_geometry import frame_geometry
-from mstfilter.scene.quality import overlap
 from mstfilter.scene.rendering import project
 from mstfilter.scene.voxels import MAX_LABEL, Hypothesis, ObjectRecord
 
@@ -184,15 +184,14 @@ def part_like(proposed: Hypothesis, predicted: Hypothesis, rule: PartRule = Part
     """
     if not any(record.apart for record in predicted.objects):
         return proposed
-    table = overlap(proposed.labels, predicted.labels)
+    pairs = zip(*(a.tolist() for a in overlapping(claimed(proposed.labels, predicted.labels))), strict=True)
     inverse = {r.label: r for r in predicted.objects}
+    within: dict[int, list[ObjectRecord]] = {}
+    for label, k, common in pairs:
+        if common >= rule.min_voxels:
+            within.setdefault(label, []).append(inverse[k])
     labels, parents = proposed.labels, {}
-    for row, label in enumerate(table.labels_a.tolist()):
-        if label == 0:
-            continue
-        inside = [
-            inverse[k] for c, k in enumerate(table.labels_b.tolist()) if k and table.counts[row, c] >= rule.min_voxels
-        ]
+    for label, inside in within.items():
         ids = {r.id for r in inside}
         seeds = [r.label for r in inside if r.apart & ids]
         if len(seeds) < 2:

@@ -20,6 +20,8 @@ from mstfilter.scene.voxels import as_labels
 
 __all__ = ["ModeFilter"]
 
+_CHUNK = 2**19  # cells of windows that are looked at together: they fit in the cache
+
 
 @dataclass(frozen=True)
 class ModeFilter:
@@ -70,77 +72,131 @@ class ModeFilter:
             may_change = may_change & disputed if disputed is not None else np.zeros_like(may_change)
         if self.window == 1 or not may_change.any():
             return labels
-        # Work inside the box that sweeps can touch.
+        # Work inside the box that sweeps can touch, with a border of free cells so that every window is whole.
         half = self.window // 2
         where = np.nonzero(may_change)
         box = tuple(
             slice(max(int(w.min()) - half, 0), min(int(w.max()) + half + 1, n))
             for w, n in zip(where, labels.shape, strict=True)
         )
-        out = labels.copy()
-        part, allowed = out[box], may_change[box]
-        for _ in range(self.max_sweeps):
-            swept = self._sweep(part, allowed, labels.shape, box)
-            if np.array_equal(swept, part):
+        part = np.pad(np.ascontiguousarray(labels[box]), half)  # C order whatever comes in
+        at = np.ravel_multi_index([w - b.start + half for w, b in zip(where, box, strict=True)], part.shape)
+        votes = _Votes(self, part, at, _window_cells(where, labels.shape, half))
+        changed = votes.sweep(votes.unsettled())
+        for _ in range(self.max_sweeps - 1):
+            if not len(changed):
                 break
-            part = swept
-        out[box] = part
-        return out
-
-    def _sweep(
-        self,
-        labels: np.ndarray,
-        allowed: np.ndarray,
-        shape: tuple[int, ...],
-        box: tuple[slice, ...],
-    ) -> np.ndarray:
-        half = self.window // 2
-        best = np.zeros(labels.shape, np.int32)
-        winner = np.zeros(labels.shape, np.uint16)
-        own = np.zeros(labels.shape, np.int32)
-        occupied = _window_sum(labels != 0, half)
-        for label in np.flatnonzero(np.bincount(labels.ravel()))[::-1]:
-            if label == 0:
-                continue
-            mask = labels == label
-            reach = _reach(mask, half)
-            count = _window_sum(mask[reach], half)
-            better = count > best[reach]  # descending labels: a tie stays with the larger one
-            best[reach] = np.where(better, count, best[reach])
-            winner[reach] = np.where(better, label, winner[reach])
-            own[reach] = np.where(mask[reach], count, own[reach])
-        take = allowed & (labels != 0) & (winner != labels) & (best >= own + self.margin)
-        out = np.where(take, winner, labels)
-        free = _window_cells(labels.shape, half, shape, box) - occupied
-        out[allowed & (labels != 0) & (free > self.isolation)] = 0
+            changed = votes.sweep(votes.beside(changed))
+        out = labels.copy()
+        out[box] = part[(slice(half, -half),) * 3]
         return out
 
 
-def _reach(mask: np.ndarray, half: int) -> tuple[slice, ...]:
-    """The box of a mask, grown by half a window."""
-    box = []
+class _Votes:
+    """A label grid under the filter, swept in place.
+
+    A voxel in whose window nothing has changed since the last sweep votes as it did then: only the first sweep looks
+    at all voxels, and of these only at those whose window holds another object or much free space.
+
+    Parameters
+    ----------
+    filter : ModeFilter
+    labels : (X, Y, Z) uint16
+        With a border of half a window, in C order. Is written to.
+    at : (n,) int
+        Flat indices of the voxels that may change.
+    cells : (n,) int
+        Cells of each one's window that lie in the grid.
+    """
+
+    def __init__(self, filter: ModeFilter, labels: np.ndarray, at: np.ndarray, cells: np.ndarray) -> None:
+        self.filter, self.labels, self.flat, self.at, self.cells = filter, labels, labels.reshape(-1), at, cells
+        steps = np.indices((filter.window,) * 3).reshape(3, -1) - filter.window // 2
+        self.offsets = np.array(labels.strides) // labels.itemsize @ steps
+        self.count_type = np.min_scalar_type(len(self.offsets))
+        self.chunk = max(1, _CHUNK // len(self.offsets))
+
+    def unsettled(self) -> np.ndarray:
+        """Positions in `at` of voxels that a sweep might change."""
+        window, half = self.filter.window, self.filter.window // 2
+        inner = self.labels[(slice(half, -half),) * 3]
+        below = self.labels - np.uint16(1)  # free becomes the largest: the smallest label of a window is an object's
+        mixed = _over_window(np.maximum, self.labels, window) != inner
+        mixed |= _over_window(np.minimum, below, window) != below[(slice(half, -half),) * 3]
+        taken = _over_window(np.add, (self.labels != 0).astype(self.count_type), window)
+        inside = np.zeros(self.labels.shape, bool)
+        inside[(slice(half, -half),) * 3] = mixed
+        counts = np.zeros(self.labels.shape, self.count_type)
+        counts[(slice(half, -half),) * 3] = taken
+        free = self.cells - counts.reshape(-1)[self.at]
+        return np.flatnonzero(inside.reshape(-1)[self.at] | (free > self.filter.isolation))
+
+    def beside(self, changed: np.ndarray) -> np.ndarray:
+        """Positions in `at` of occupied voxels whose window holds one of the cells `changed` (flat indices)."""
+        touched = np.zeros(self.flat.shape, bool)
+        for k in range(0, len(changed), self.chunk):
+            touched[changed[k : k + self.chunk, None] + self.offsets] = True
+        return np.flatnonzero(touched[self.at] & (self.flat[self.at] != 0))
+
+    def sweep(self, positions: np.ndarray) -> np.ndarray:
+        """All voxels at these positions vote at once; flat indices of those that changed."""
+        at, cells = self.at[positions], self.cells[positions]
+        new = np.empty(len(at), np.uint16)
+        for k in range(0, len(at), self.chunk):
+            new[k : k + self.chunk] = self._elected(at[k : k + self.chunk], cells[k : k + self.chunk])
+        differ = new != self.flat[at]
+        self.flat[at[differ]] = new[differ]
+        return at[differ]
+
+    def _elected(self, at: np.ndarray, cells: np.ndarray) -> np.ndarray:
+        """Labels (m,) after the vote of voxels `at` (m,) with `cells` (m,) grid cells in their windows."""
+        windows = self.flat[at + self.offsets[:, None]]
+        own = self.flat[at]
+        is_own = windows == own
+        own_count = self._count(is_own)
+        taken = self._count(windows != 0)
+        out = own.copy()
+        # Only where the others together would win need they be told apart.
+        open_ = np.flatnonzero(taken - own_count >= own_count + self.filter.margin)
+        others = windows[:, open_] * ~is_own[:, open_]
+        left = (taken - own_count)[open_]
+        best, winner = np.zeros(len(own), np.int64), np.zeros(len(own), np.uint16)
+        while True:  # label by label, the largest first: a tie stays with it
+            going = left > best[open_]
+            open_, left, others = open_[going], left[going], others[:, going]
+            if not len(open_):
+                break
+            top = others.max(axis=0)
+            is_top = others == top
+            count = self._count(is_top)
+            ahead = count > best[open_]
+            best[open_[ahead]], winner[open_[ahead]] = count[ahead], top[ahead]
+            left = left - count
+            others *= ~is_top
+        wins = (best > own_count) | ((best == own_count) & (winner > own))
+        wins &= best >= own_count + self.filter.margin
+        out[wins] = winner[wins]
+        out[cells - taken > self.filter.isolation] = 0
+        return out
+
+    def _count(self, hit: np.ndarray) -> np.ndarray:
+        """(m,) how many of the window's cells are True in (cells, m)."""
+        return hit.sum(axis=0, dtype=self.count_type).astype(np.int64)
+
+
+def _over_window(function: np.ufunc, cells: np.ndarray, window: int) -> np.ndarray:
+    """`function` over the window of every cell that has a whole one: each axis is shorter by ``window - 1``."""
     for axis in range(3):
-        hit = np.flatnonzero(mask.any(axis=tuple(a for a in range(3) if a != axis)))
-        box.append(slice(max(int(hit[0]) - half, 0), min(int(hit[-1]) + half + 1, mask.shape[axis])))
-    return tuple(box)
+        n = cells.shape[axis] - window + 1
+        along = np.moveaxis(cells, axis, 0)
+        out = along[:n].copy()
+        for k in range(1, window):
+            function(out, along[k : k + n], out=out)
+        cells = np.moveaxis(out, 0, axis)
+    return cells
 
 
-def _window_sum(mask: np.ndarray, half: int) -> np.ndarray:
-    """Number of True cells in the window of every cell; cells outside count nothing."""
-    total = mask.astype(np.int32)
-    for axis in range(3):
-        n = total.shape[axis]
-        padded = np.concatenate([np.zeros_like(total.take([0], axis)), np.cumsum(total, axis=axis)], axis=axis)
-        high = np.minimum(np.arange(n) + half + 1, n)
-        low = np.maximum(np.arange(n) - half, 0)
-        total = padded.take(high, axis) - padded.take(low, axis)
-    return total
-
-
-def _window_cells(part: tuple[int, ...], half: int, shape: tuple[int, ...], box: tuple[slice, ...]) -> np.ndarray:
-    """Number of cells of the whole grid in the window of every cell of the box."""
-    sides = []
-    for n, size, where in zip(part, shape, box, strict=True):
-        index = np.arange(n) + where.start
-        sides.append(np.minimum(index + half + 1, size) - np.maximum(index - half, 0))
-    return sides[0][:, None, None] * sides[1][None, :, None] * sides[2][None, None, :]
+def _window_cells(at: tuple[np.ndarray, ...], shape: tuple[int, ...], half: int) -> np.ndarray:
+    """Number of grid cells in the window of every voxel `at`."""
+    sides = [np.minimum(w + half + 1, n) - np.maximum(w - half, 0) for w, n in zip(at, shape, strict=True)]
+    return np.asarray(sides[0] * sides[1] * sides[2])

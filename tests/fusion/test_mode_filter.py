@@ -46,6 +46,30 @@ def test_one_sweep_against_loops(labels, window, margin, isolation, where):
     np.testing.assert_array_equal(some.apply(labels, where > 0), expected)
 
 
+@pytest.mark.parametrize("seed", range(12))
+def test_sweep_after_sweep_against_loops(seed):
+    """Later sweeps look only at what lies beside a change; the plain one looks at everything every time."""
+    rng = np.random.default_rng(seed)
+    window, margin, isolation = int(rng.choice([3, 5])), int(rng.integers(-1, 4)), int(rng.integers(5, 125))
+    labels = rng.choice([0, 1, 2, 5], (4, 3, 3), p=[0.1, 0.3, 0.3, 0.3]).repeat(2, 0).repeat(2, 1).repeat(2, 2)
+    labels = np.where(rng.random(labels.shape) < 0.4, rng.choice([0, 1, 2, 5], labels.shape), labels).astype(
+        np.uint16
+    )
+    may_change, expected = (labels > 0) & (rng.random(labels.shape) < 0.8), labels
+    for sweeps in range(1, 7):
+        expected = by_loops(expected, window, margin, isolation, may_change)
+        filter = ModeFilter(window, margin, isolation, max_sweeps=sweeps, scope="disputed")
+        np.testing.assert_array_equal(filter.apply(labels, may_change), expected)
+
+
+def test_a_large_window():
+    """More cells than a byte counts; wider than the grid."""
+    labels = np.random.default_rng(0).choice([0, 1, 1, 2, 9], (7, 6, 5)).astype(np.uint16)
+    for window in (7, 11):
+        expected = by_loops(labels, window, 3, 120, labels > 0)
+        np.testing.assert_array_equal(ModeFilter(window, 3, 120, max_sweeps=1).apply(labels), expected)
+
+
 @settings(max_examples=30, deadline=None)
 @given(grids)
 def test_the_result_is_a_fixed_point_or_the_bound_is_met(labels):
