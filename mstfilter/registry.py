@@ -124,7 +124,9 @@ COMPONENTS: dict[str, dict[str, str]] = {
     "evidence": {
         "agreement": "mstfilter.fusion.similarity:Agreement",
         "boundaries": "mstfilter.segmentation.evidence:BoundaryAgreement",
+        "depth": "mstfilter.fusion.depth_evidence:DepthAgreement",
         "motions": "mstfilter.tracking.evidence:MotionAgreement",
+        "support": "mstfilter.fusion.support:Support",
     },
     "mode_filter": {"majority": "mstfilter.fusion.mode_filter:ModeFilter"},
     "format": {

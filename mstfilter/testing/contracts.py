@@ -9,6 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from mstfilter.errors import InputError
+from mstfilter.scene.evidence import Evidence
 from mstfilter.smc.interfaces import (
     Codec,
     Lookahead,
@@ -22,7 +23,7 @@ from mstfilter.smc.interfaces import (
 )
 from mstfilter.smc.population import Population
 from mstfilter.smc.similarity import Equivalence, Similarity
-from mstfilter.testing import choices, moves, optional, properties
+from mstfilter.testing import choices, moves, optional, properties, scenes, terms
 from mstfilter.testing.properties import Exact, Example, NotApplicable, Outcome, Property, Suite
 from mstfilter.testing.resampling_law import RESAMPLER
 
@@ -30,6 +31,7 @@ __all__ = [
     "CodecContract",
     "Contract",
     "EquivalenceContract",
+    "EvidenceContract",
     "LookaheadContract",
     "ProposalContract",
     "RejuvenationContract",
@@ -136,6 +138,14 @@ class EquivalenceContract(Contract, suite=choices.EQUIVALENCE):
     """What every `Equivalence` keeps."""
 
 
+class EvidenceContract(Contract, suite=terms.EVIDENCE):
+    """What every `Evidence` keeps. The default example is a scene."""
+
+    def example(self, rng: np.random.Generator, n: int) -> tuple[Population, Any]:
+        """`n` hypotheses and a clip."""
+        return scenes.example(rng, n)
+
+
 _SUITES: dict[type, Suite] = {
     Resampler: RESAMPLER,
     Transition: moves.TRANSITION,
@@ -148,6 +158,7 @@ _SUITES: dict[type, Suite] = {
     Codec: optional.CODEC,
     Similarity: choices.SIMILARITY,
     Equivalence: choices.EQUIVALENCE,
+    Evidence: terms.EVIDENCE,
 }
 
 
@@ -168,7 +179,7 @@ def verify(component: Any, example: Example | None = None, exact: Exact | None =
     component : component
         Of any kind that has a contract.
     example : callable, optional
-        ``(rng, n) -> (population, observation)`` that the component works on. Default: numbers.
+        ``(rng, n) -> (population, observation)`` that the component works on. Default: numbers (`Evidence`: a scene).
     exact : callable, optional
         For a `Rejuvenation`: ``(rng, n) -> (previous, population, observation)``, rows of x_{t-1} and exact draws of
         x_t given them and the observation. Default: the function ``exact`` in the module of its class, if any.
@@ -183,4 +194,5 @@ def verify(component: Any, example: Example | None = None, exact: Exact | None =
     if exact is None:
         found = getattr(sys.modules.get(type(component).__module__), "exact", None)
         exact = found if callable(found) else None
-    yield from suite.run(component, example or properties.example, exact)
+    default = scenes.example if suite is terms.EVIDENCE else properties.example
+    yield from suite.run(component, example or default, exact)

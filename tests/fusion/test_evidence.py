@@ -112,5 +112,10 @@ def test_terms_are_named_in_presets():
     _, infos = filter.run(clips, seed=0)
     assert infos[1].n_candidates == 12
     assert set(infos[1].notes["update"]["scores"]) == {"MotionAgreement", "BoundaryAgreement"}
+    filter = build_filter(load_config("mst", ['update.evidence=["agreement", "depth", "support"]']))
+    _, infos = filter.run(clips, seed=0)
+    scores = infos[1].notes["update"]["scores"]
+    assert list(scores) == ["Agreement", "DepthAgreement", "Support"]
+    assert max(scores["DepthAgreement"]) < 0 and len(scores["Support"]) == infos[1].n_candidates
     with pytest.raises(Exception, match="there is no evidence 'smell'"):
         load_config("mst", ['update.evidence=["smell"]'])

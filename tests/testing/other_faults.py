@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from mstfilter.scene.evidence import Evidence
 from mstfilter.smc.interfaces import Codec, Lookahead, Proposal, Rejuvenation, Size, Transition, Trigger, Update
 from mstfilter.smc.population import Population
 from mstfilter.smc.similarity import Equivalence, Similarity
@@ -264,6 +265,49 @@ class Lists(Codec):
         return arrays["x"]
 
 
+@dataclass(frozen=True)
+class RulesOutOdd(Evidence):
+    def log_score(self, hypotheses, clip):
+        with np.errstate(divide="ignore"):
+            return np.log([0.0 if k % 2 else 1.0 for k, _ in enumerate(hypotheses)])
+
+
+@dataclass(frozen=True)
+class FirstIsBest(Evidence):
+    def log_score(self, hypotheses, clip):
+        return -np.arange(float(len(hypotheses)))
+
+
+@dataclass(frozen=True)
+class OneScore(Evidence):
+    def log_score(self, hypotheses, clip):
+        return np.zeros(1)
+
+
+@dataclass(frozen=True)
+class HighNamesWin(Evidence):
+    def log_score(self, hypotheses, clip):
+        return np.array([float(h.labels.max()) for h in hypotheses])
+
+
+@dataclass(frozen=True)
+class ByIdentity(Evidence):
+    """Knows what it has seen before by its object and not by its content."""
+
+    def log_score(self, hypotheses, clip):
+        born = {id(h.objects): k for k, h in reversed(list(enumerate(hypotheses)))}
+        return np.array([float(born[id(h.objects)]) for h in hypotheses])
+
+
+@dataclass(frozen=True)
+class GrowsTired(Evidence):
+    asked: list = field(default_factory=list)
+
+    def log_score(self, hypotheses, clip):
+        self.asked.append(clip)
+        return np.full(len(hypotheses), -float(len(self.asked)))
+
+
 #: Fault, property that must be broken, words of its message.
 FAULTS = [
     (LooksAtWeights, "priority_ignores_scale_and_order", "changes the priorities"),
@@ -301,4 +345,10 @@ FAULTS = [
     (OneSided, "similarity_is_symmetric", "like"),
     (CountsFromOne, "classes_are_numbered", "classes are"),
     (AllDifferent, "copies_are_equal", "copy"),
+    (RulesOutOdd, "scores_are_finite", "-inf"),
+    (OneScore, "scores_are_finite", "shape (1,)"),
+    (FirstIsBest, "order_of_hypotheses_is_irrelevant", "another order"),
+    (ByIdentity, "copies_score_the_same", "its copy"),
+    (HighNamesWin, "names_of_labels_are_irrelevant", "other names"),
+    (GrowsTired, "evidence_has_no_memory", "asked again"),
 ]

@@ -19,6 +19,7 @@ from mstfilter.study.codec import HypothesisCodec
 from mstfilter.testing import (
     CodecContract,
     EquivalenceContract,
+    EvidenceContract,
     LookaheadContract,
     ProposalContract,
     RejuvenationContract,
@@ -163,7 +164,14 @@ class TestBins(EquivalenceContract):
         return registry.build("equivalence", "bins")
 
 
-@pytest.mark.parametrize("kind", ["trigger", "size", "similarity", "equivalence", "transition", "proposal", "update"])
+class TestSupport(EvidenceContract):
+    def make(self):
+        return registry.build("evidence", "support")
+
+
+@pytest.mark.parametrize(
+    "kind", ["trigger", "size", "similarity", "equivalence", "evidence", "transition", "proposal", "update"]
+)
 def test_our_own(kind):
     """All that work on their own; oracles want to be told a recording, baselines leave out a part of the filter."""
     for name, where in registry.COMPONENTS[kind].items():
