@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 _EXPORTS = {
+    "Belief": "mstfilter.fusion.belief",
     "Camera": "mstfilter.scene.camera",
     "Clip": "mstfilter.scene.clip",
     "Frame": "mstfilter.scene.frame",
@@ -35,6 +36,7 @@ __all__ = ["__version__", *_EXPORTS]
 
 if TYPE_CHECKING:
     from mstfilter.errors import InputError as InputError
+    from mstfilter.fusion.belief import Belief as Belief
     from mstfilter.presets import preset as preset
     from mstfilter.scene.camera import Camera as Camera
     from mstfilter.scene.clip import Clip as Clip
