@@ -42,6 +42,7 @@ COMPONENTS: dict[str, dict[str, str]] = {
     "update": {
         "fusion": "mstfilter.fusion.update:FusionUpdate",
         "object_fusion": "mstfilter.baselines.object_fusion:ObjectFusion",
+        "projection": "mstfilter.fusion.projection:ProjectionUpdate",
         "samples_only": "mstfilter.baselines.updates:SamplesOnly",
         "tracking_only": "mstfilter.baselines.updates:TrackingOnly",
         "union": "mstfilter.baselines.updates:Union",

@@ -120,7 +120,7 @@ class ObjectFusion(Update):
         known = old.n_objects
         # Records begin anew at every pause, so what the tracker has not moved has not moved in this clip.
         moved = {r.label for r in old.objects if not np.array_equal(r.motion.as_matrix(), np.eye(4))}
-        old = self.free_space.project(old, frame)[0]
+        old = self.free_space.refine((old,), clip)[0][0]
         match = self._match(old, sample, frame)
         volumes = {r.label: self._begin(old, r.label) for r in old.objects}
         taken = 0

@@ -16,7 +16,7 @@ import numpy as np
 
 from mstfilter.errors import InputError
 from mstfilter.fusion.division import take_apart
-from mstfilter.fusion.free_space import FreeSpace, Projection
+from mstfilter.fusion.free_space import SMALLEST_QUALITY, FreeSpace, Projection
 from mstfilter.fusion.update import FusionUpdate
 from mstfilter.scene.clip import Clip
 from mstfilter.scene.voxels import Hypothesis
@@ -25,8 +25,6 @@ from mstfilter.smc.population import Population
 from mstfilter.smc.updates import union
 
 __all__ = ["SamplesOnly", "TrackingOnly", "Union"]
-
-_SMALLEST_QUALITY = 1e-3  # as in fusion: a prediction that loses every voxel keeps a weight
 
 
 @dataclass(frozen=True)
@@ -72,7 +70,7 @@ class TrackingOnly(Update):
         """The refined predictions with their weights; the proposed samples at the first pause."""
         if predicted is None:
             return union(None, proposed)
-        refined, quality = _refine(self.free_space, predicted, observation)
+        refined, quality = self.free_space.refine(predicted.particles, observation)
         return Population(refined, predicted.log_weights, predicted.parents, {"quality": quality.tolist()})
 
 
@@ -108,10 +106,10 @@ class Union(Update):
         """All predicted and proposed hypotheses."""
         if predicted is None or proposed is None:
             return self.fusion.update(rng, predicted, proposed, observation)
-        refined, quality = _refine(self.fusion.free_space, predicted, observation)
+        refined, quality = self.fusion.free_space.refine(predicted.particles, observation)
         refined = self._parted(refined, observation, proposed=False)
         samples = self._parted(tuple(proposed.particles), observation, proposed=True)
-        log_q = self.fusion.quality_exponent * np.log(np.maximum(quality, _SMALLEST_QUALITY))
+        log_q = self.fusion.quality_exponent * np.log(np.maximum(quality, SMALLEST_QUALITY))
         weighed = predicted.log_weights - predicted.log_mean_weight + log_q
         both = union(
             Population(refined, weighed, predicted.parents),
@@ -128,9 +126,3 @@ class Union(Update):
         if motions is None:
             return hypotheses
         return tuple(take_apart(h, motions, clip, self.fusion.parts, proposed) for h in hypotheses)
-
-
-def _refine(free_space: Projection, predicted: Population, clip: Clip) -> tuple[tuple[Hypothesis, ...], np.ndarray]:
-    """Predicted hypotheses on what the latest image leaves possible, and their qualities (n,)."""
-    pairs = [free_space.project(hypothesis, clip.after) for hypothesis in predicted.particles]
-    return tuple(h for h, _ in pairs), np.array([q for _, q in pairs])

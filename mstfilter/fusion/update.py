@@ -26,7 +26,7 @@ from mstfilter.errors import InputError
 from mstfilter.fusion.claims import Claims
 from mstfilter.fusion.crossover import Crossover
 from mstfilter.fusion.division import NoDivision, PartRule, take_apart
-from mstfilter.fusion.free_space import FreeSpace, Projection
+from mstfilter.fusion.free_space import SMALLEST_QUALITY, FreeSpace, Projection
 from mstfilter.scene.clip import Clip
 from mstfilter.scene.evidence import Division, Evidence
 from mstfilter.scene.voxels import Hypothesis
@@ -38,8 +38,6 @@ from mstfilter.smc.updates import union
 
 __all__ = ["FusionUpdate"]
 
-_SMALLEST_QUALITY = 1e-3  # a prediction that loses every voxel keeps a weight, lest all are zero
-
 
 @dataclass(frozen=True)
 class FusionUpdate(Update):
@@ -48,7 +46,8 @@ class FusionUpdate(Update):
     Parameters
     ----------
     free_space : Projection
-        Projects the predicted hypotheses onto what the latest frame leaves possible.
+        Projects the predicted hypotheses onto what the latest frame (and, if it has a memory, earlier ones) leaves
+        possible.
     crossover : Crossover
         Makes one hypothesis of two.
     eta : int
@@ -98,10 +97,10 @@ class FusionUpdate(Update):
         """
         if predicted is None:
             return union(None, proposed)
-        refined, quality = self._refine(predicted, observation)
+        refined, quality = self.free_space.refine(predicted.particles, observation)
         doubtful = [self.claims.doubtful(h, r) for h, r in zip(predicted.particles, refined, strict=True)]
         refined = self._parted(refined, observation, proposed=False)
-        log_q = self.quality_exponent * np.log(np.maximum(quality, _SMALLEST_QUALITY))
+        log_q = self.quality_exponent * np.log(np.maximum(quality, SMALLEST_QUALITY))
         notes = {"quality": quality.tolist(), "eta": self.eta}
         if proposed is None:
             return Population(refined, predicted.log_weights + log_q, predicted.parents, notes)
@@ -144,11 +143,6 @@ class FusionUpdate(Update):
         known = {id(h): h for h in hypotheses}
         parted = {name: take_apart(h, motions, clip, self.parts, proposed) for name, h in known.items()}
         return tuple(parted[id(h)] for h in hypotheses)
-
-    def _refine(self, predicted: Population, clip: Clip) -> tuple[tuple[Hypothesis, ...], np.ndarray]:
-        """Predicted hypotheses after free-space projection, and their qualities (n,)."""
-        pairs = [self.free_space.project(hypothesis, clip.after) for hypothesis in predicted.particles]
-        return tuple(h for h, _ in pairs), np.array([q for _, q in pairs])
 
 
 def _pairs(rng: np.random.Generator, n_proposed: int, n_predicted: int, eta: int) -> tuple[np.ndarray, np.ndarray]:

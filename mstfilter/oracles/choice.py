@@ -150,7 +150,7 @@ class TrueFusion(UsesTruth, Update):
         """One candidate for each pair, unbuilt; one parent alone is fused with nothing."""
         if predicted is None:
             return union(None, proposed)
-        refined = tuple(self.free_space.project(h, observation.after)[0] for h in predicted.particles)
+        refined, _ = self.free_space.refine(predicted.particles, observation)
         if proposed is None:
             return Population(refined, predicted.log_weights, predicted.parents)
         labels, samples = self.truth.labels(observation.index), tuple(proposed.particles)

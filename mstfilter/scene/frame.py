@@ -2,6 +2,11 @@
 
 >>> frame = Frame(rgb, depth, camera)          # rgb (H, W, 3) uint8, depth (H, W) metres, NaN = no reading
 >>> frame.points                               # (H, W, 3) world points in metres
+
+Where several cameras look at the scene, one of them is segmented and tracked; what the others saw at the same instant
+comes along as `views`, and free space is known from all:
+
+>>> frame = Frame(rgb, depth, camera, views=(Frame(rgb_2, depth_2, camera_2),))
 """
 
 from __future__ import annotations
@@ -32,12 +37,16 @@ class Frame:
         Intrinsics and pose.
     robot_mask : (H, W) bool, optional
         Pixels that show the robot. They are unknown: never background, never free space.
+    views : tuple of Frame
+        What further cameras saw at the same instant; all cameras need a pose in the same world. They have no views
+        themselves.
     """
 
     rgb: np.ndarray
     depth: np.ndarray
     camera: Camera
     robot_mask: np.ndarray | None = None
+    views: tuple[Frame, ...] = ()
 
     def __post_init__(self) -> None:
         shape = (self.camera.height, self.camera.width)
@@ -64,12 +73,26 @@ class Frame:
             if robot.shape != shape:
                 raise InputError(f"robot mask has shape {robot.shape}, expected {shape}")
             object.__setattr__(self, "robot_mask", frozen(robot))
+        object.__setattr__(self, "views", tuple(self.views))
+        if any(view.views for view in self.views):
+            raise InputError("a further view has views of its own", "list all cameras as views of one frame")
+        if self.views and any(view.camera.T_world_camera is None for view in self.all_views):
+            raise InputError(
+                f"of {len(self.all_views)} cameras that see the same instant, at least one has no pose",
+                "give every camera its T_world_camera, calibrated to one world",
+            )
 
     @cached_property
     def key(self) -> bytes:
         """Name by content."""
         robot = b"" if self.robot_mask is None else self.robot_mask
-        return content_key("frame", self.rgb, self.depth, self.camera.key, robot)
+        own = content_key("frame", self.rgb, self.depth, self.camera.key, robot)
+        return content_key("views", own, *(view.key for view in self.views)) if self.views else own
+
+    @property
+    def all_views(self) -> tuple[Frame, ...]:
+        """This image and those of the further cameras."""
+        return (self, *self.views)
 
     @cached_property
     def valid(self) -> np.ndarray:

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mstfilter.scene.arrays import read_only
+from mstfilter.scene.camera import Camera
 from mstfilter.scene.frame import Frame
 from mstfilter.scene.memo import memo
 from mstfilter.scene.voxels import VoxelGrid
@@ -57,13 +58,21 @@ def frame_geometry(frame: Frame, grid: VoxelGrid) -> FrameGeometry:
 
 def _compute(frame: Frame, grid: VoxelGrid) -> FrameGeometry:
     camera = frame.camera
+    exact = camera.pose.as_matrix().tobytes()  # the camera's key is rounded
+    pixel, z, z64 = memo("voxels in image", (camera.key, exact, grid.key), lambda: _projected(camera, grid))
+    inside = pixel >= 0
+    measured = np.where(frame.valid, frame.depth, np.nan).ravel()
+    signed = np.full(grid.shape, np.nan, np.float32)
+    signed[inside] = z64[inside] - measured[pixel[inside]]
+    return FrameGeometry(pixel, z, read_only(signed))
+
+
+def _projected(camera: Camera, grid: VoxelGrid) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Pixel, and z-depth in single and in double precision, of every voxel centre: the same for all frames."""
     uv, z = camera.project(grid.centres())
     with np.errstate(invalid="ignore"):
         u, v = np.rint(uv[..., 0]), np.rint(uv[..., 1])
         inside = (z > 1e-6) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
     pixel = np.full(grid.shape, -1, np.int32)
     pixel[inside] = (v[inside] * camera.width + u[inside]).astype(np.int32)
-    measured = np.where(frame.valid, frame.depth, np.nan).ravel()
-    signed = np.full(grid.shape, np.nan, np.float32)
-    signed[inside] = z[inside] - measured[pixel[inside]]
-    return FrameGeometry(read_only(pixel), read_only(z.astype(np.float32)), read_only(signed))
+    return read_only(pixel), read_only(z.astype(np.float32)), read_only(z)

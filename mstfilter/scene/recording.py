@@ -218,12 +218,13 @@ class Recording:
         return len(self.frames)
 
     def clips(self) -> tuple[Clip, ...]:
-        """One clip a pause: the first pause alone, then from each pause to the next."""
-        clips = []
+        """One clip a pause: the first pause alone, then from each pause to the next. Each knows the one before it."""
+        clips: list[Clip] = []
         for t, end in enumerate(self.pauses):
             start = self.pauses[max(t - 1, 0)]
             frames = self.frames[start : end + 1]
-            clips.append(Clip(frames, self.grid, t, tuple(self.times[start : end + 1])))
+            previous = clips[-1] if clips else None
+            clips.append(Clip(frames, self.grid, t, tuple(self.times[start : end + 1]), previous))
         return tuple(clips)
 
     def truth(self, t: int) -> np.ndarray | None:

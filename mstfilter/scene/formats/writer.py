@@ -252,6 +252,12 @@ def save(
                     f"{recording.pauses[0]} has {home.K.tolist()}: a recording folder holds one",
                     "convert frames of one camera only",
                 )
+            if frame.views:
+                raise InputError(
+                    f"frame {index} of {recording.name} has images of {len(frame.all_views)} cameras: a recording "
+                    "folder holds those of one",
+                    "write one recording a camera, and join their frames by Frame(..., views=...)",
+                )
             moved = {} if frame.camera.key == home.key else {"T_world_camera": frame.camera.pose.as_matrix().tolist()}
             writer.add_frame(
                 frame.rgb,
