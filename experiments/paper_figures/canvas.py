@@ -1,0 +1,93 @@
+"""What the figures have in common: a page of panels on paper, tables, and files that stay small."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from mstfilter.report.cards import close_up
+from mstfilter.report.palette import Colour
+from mstfilter.report.pictures import voxel_picture
+from mstfilter.scene.camera import Camera
+from mstfilter.scene.voxels import VoxelGrid
+
+PAPER, INK, MUTED, LINE = "#fcfcfa", "#1d2126", "#646b74", "#d6d7d4"
+BLUE, ORANGE, FLOOR = "#336fb9", "#ee9138", "#b26a1c"
+
+#: Settings under which all figures are drawn.
+STYLE = {
+    "font.size": 10,
+    "axes.edgecolor": LINE,
+    "axes.labelcolor": MUTED,
+    "axes.titlesize": 10.5,
+    "axes.titlelocation": "left",
+    "axes.titlecolor": INK,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.axisbelow": True,
+    "xtick.color": LINE,
+    "ytick.color": LINE,
+    "xtick.labelcolor": MUTED,
+    "ytick.labelcolor": MUTED,
+    "grid.color": LINE,
+    "grid.linewidth": 0.7,
+    "legend.frameon": False,
+    "legend.labelcolor": MUTED,
+    "svg.hashsalt": "mstfilter",
+}
+
+
+def page(rows: int, columns: int, width: float, height: float, **layout: Any) -> tuple[Figure, np.ndarray]:
+    """A figure of so many inches and its axes (rows, columns)."""
+    figure = Figure((width, height), layout="constrained", facecolor=PAPER)
+    FigureCanvasAgg(figure)
+    axes = figure.subplots(rows, columns, squeeze=False, gridspec_kw=layout or None)
+    for a in axes.ravel():
+        a.set_facecolor(PAPER)
+    return figure, axes
+
+
+def show(axes: Axes, image: np.ndarray, title: str = "") -> None:
+    """A picture without axes."""
+    axes.imshow(image, interpolation="antialiased")
+    axes.set_axis_off()
+    axes.set_title(title)
+
+
+def voxels(labels: np.ndarray, grid: VoxelGrid, view: Camera, colours: Mapping[int, Colour]) -> np.ndarray:
+    """The voxels from a viewpoint, on paper, (h, w, 3) uint8."""
+    picture = voxel_picture(np.asarray(labels).astype(np.uint16), grid, view, colours)
+    alpha = picture[..., 3:] / 255
+    paper = np.array([int(PAPER[k : k + 2], 16) for k in (1, 3, 5)])
+    return np.rint(picture[..., :3] * alpha + paper * (1 - alpha)).astype(np.uint8)
+
+
+def save(figure: Figure, path: Path, dpi: int = 100) -> Path:
+    """Write the figure; the same values give the same bytes."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    metadata = {"Date": None, "Creator": None} if path.suffix == ".svg" else {"Software": None}
+    figure.savefig(path, dpi=dpi, metadata=metadata)
+    return path
+
+
+def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> Path:
+    """A table; numbers with three digits after the point."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("w", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(columns)
+        writer.writerows([f"{v:.3f}" if isinstance(v, float) else v for v in row] for row in rows)
+    return path
+
+
+def crop(labels: np.ndarray, grid: VoxelGrid, camera: Camera) -> tuple[slice, slice]:
+    """Rows and columns of the part of the image that shows all objects, in the image's proportions."""
+    x, y, width, height = close_up([(labels, grid)], camera)
+    return slice(round(y), round(y + height)), slice(round(x), round(x + width))

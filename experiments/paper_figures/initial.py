@@ -1,0 +1,44 @@
+"""Figure `initial`: the first pause of a scene of each family: the image, and the true objects over it and as voxels.
+
+Scenes are simulated by this program; seed 0 of each family, not chosen by its looks.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from canvas import crop, page, save, show, voxels
+
+from mstfilter.report.palette import colour
+from mstfilter.report.pictures import overlay, viewpoint
+from mstfilter.scene.object_status import MIN_PIXELS
+from mstfilter.simulation.families import scene_family
+from mstfilter.simulation.recorder import Scene
+
+FAMILIES = ("s1", "s2", "s3")
+SEED = 0
+
+
+def make(out: Path, smoke: bool) -> list[Path]:
+    """The figure."""
+    small = {"width": 160, "height": 120} if smoke else {}
+    figure, axes = page(3, len(FAMILIES), 12.0, 9.4)
+    for k, name in enumerate(FAMILIES):
+        family = replace(scene_family(name), **small)
+        scene = Scene(family, SEED)
+        shot = scene.see(0)
+        truth, grid, camera = scene.truth(), family.grid(), scene.camera
+        colours = {label: colour(label - 1) for label in range(1, int(truth.max()) + 1)}
+        pixels = np.bincount(shot["instance"].ravel(), minlength=256)
+        hidden = [k for k in colours if pixels[k] < max(1.0, MIN_PIXELS * camera.width * camera.height / 307200)]
+        title = f"{name.upper()}: {scene.world.n_objects} objects" + (
+            f", {len(hidden)} out of sight" if hidden else ""
+        )
+        box = crop(truth, grid, camera)
+        show(axes[0, k], shot["rgb"][box], title)
+        show(axes[1, k], overlay(shot["rgb"], shot["instance"], colours, fill=0.5)[box])
+        view = viewpoint([(truth, grid)], camera, *((160, 120) if smoke else (600, 450)))
+        show(axes[2, k], voxels(truth, grid, view, colours))
+    return [save(figure, out / "initial.png", 50 if smoke else 75)]

@@ -1,0 +1,54 @@
+"""All figures of the paper's kinds, drawn by this program.
+
+    python experiments/paper_figures/make.py                       # all, about a quarter of an hour
+    python experiments/paper_figures/make.py merging sampled_cuts  # some
+    python experiments/paper_figures/make.py quality_over_time --study studies/main
+    python experiments/paper_figures/make.py --smoke --out DIR     # all at small size, a minute
+
+`merging` and `fusion_step` need the authors' particles (r1.py) and are left out, with a word, where they are absent;
+`quality_over_time` needs the folder of a study.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+from pathlib import Path
+
+import matplotlib
+from canvas import STYLE
+
+FIGURES = (
+    "merging",
+    "fusion_step",
+    "teaser",
+    "initial",
+    "over_segmenting",
+    "sampled_cuts",
+    "quality_over_time",
+)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("figures", nargs="*", metavar="FIGURE", help=f"{', '.join(FIGURES)}; default: all")
+    parser.add_argument("--smoke", action="store_true", help="small and quick; shows only that all works")
+    parser.add_argument("--out", type=Path, default=Path(__file__).resolve().parent / "results")
+    parser.add_argument("--study", type=Path, help="folder of a study, for quality_over_time")
+    options = parser.parse_args()
+    unknown = [name for name in options.figures if name not in FIGURES]
+    if unknown:
+        parser.error(f"no figure is called {unknown[0]!r}; there are {', '.join(FIGURES)}")
+    with matplotlib.rc_context(STYLE):
+        for name in options.figures or FIGURES:
+            figure = importlib.import_module(name)
+            if name == "quality_over_time":
+                made = figure.make(options.out, options.study) if options.study else []
+                missing = "give a study with --study"
+            else:
+                made, missing = figure.make(options.out, options.smoke), "the authors' particles are absent"
+            print(f"{name}:", ", ".join(map(str, made)) or f"left out, {missing}", flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,255 @@
+"""Figure `merging`: how two real hypotheses become one, step by step; and how often each merge probability merges.
+
+Rows: a sample, a prediction and their conflict graph; then, twice, the same random order with other merges, what is
+painted, and what the mode filter leaves. The particles are the authors' (see r1.py), the fusion is that of `paper`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from canvas import INK, MUTED, page, save, show, voxels, write_csv
+from matplotlib.axes import Axes
+from r1 import NOTICE, Particles, folder
+
+from mstfilter.fusion.conflict_graph import PREDICTED, PROPOSED, ConflictGraph, conflict_graph
+from mstfilter.fusion.crossover import Crossover, Draw
+from mstfilter.fusion.merging import merge_probability
+from mstfilter.fusion.structure import OneSideLast, RandomOrder, SpanningTree, Structure
+from mstfilter.presets import load_config
+from mstfilter.registry import build
+from mstfilter.report.palette import Colour
+from mstfilter.report.pictures import viewpoint
+
+SAMPLE, PREDICTION = 2, 2  # the pair with the fewest conflicts of those that the authors' program kept
+SEED = 0
+COOL = ("#bfe3c0", "#2ca281", "#12305c", "#336fb9", "#a3d3eb")
+WARM = ("#f7d98b", "#ee9138", "#c9302c", "#5e0d2a", "#e8a0b0")
+Edges = list[tuple[int, int]]
+Chance = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
+
+
+@dataclass(frozen=True)
+class Replay(Structure):
+    """A structure that was drawn before: by a component's first vertex, its order and its edges."""
+
+    drawn: dict[int, tuple[list[int], Edges]]
+
+    def draw(
+        self, rng: np.random.Generator, component: Sequence[int], neighbours: Sequence[Sequence[int]]
+    ) -> tuple[list[int], Edges]:
+        """What was drawn."""
+        return self.drawn[component[0]]
+
+
+def make(out: Path, smoke: bool) -> list[Path]:
+    """The figure and the table; nothing where the data are absent."""
+    found = folder()
+    if found is None:
+        return []
+    particles = Particles(found)
+    return [picture(particles, out / "merging.png", smoke), table(particles, out / "merge_forms.csv", smoke)]
+
+
+def picture(particles: Particles, path: Path, smoke: bool) -> Path:
+    """The steps for one pair."""
+    sample, prediction = particles.samples[SAMPLE], particles.predictions[PREDICTION]
+    crossover: Crossover = build("crossover", load_config("paper")["update"]["crossover"])
+    graph = conflict_graph(sample.labels, prediction.labels)
+    rng = np.random.default_rng(SEED)
+    neighbours = graph.neighbours()
+    drawn = {c[0]: crossover.structure.draw(rng, c, neighbours) for c in graph.components()}
+    fixed = replace(crossover, structure=Replay(drawn))
+    first = second = fixed.draw(rng, graph)
+    while np.array_equal(first.group, second.group):  # many merges are certain or out of the question
+        second = fixed.draw(rng, graph)
+
+    colours, places = colours_of(graph), layout(graph)
+    size = (240, 180) if smoke else (600, 450)
+    view = viewpoint([sample, prediction], None, *size)
+    figure, axes = page(3, 3, 12.6, 9.9)
+    for k, (title, side, one) in enumerate(
+        (("A sample of the new image", PROPOSED, sample), ("A moved earlier hypothesis", PREDICTED, prediction))
+    ):
+        own = {int(graph.label[v]): colours[v] for v in range(len(graph)) if graph.side[v] == side}
+        show(axes[0, k], voxels(one.labels, one.grid, view, own), f"{title}: {one.n_objects} objects")
+    draw_graph(axes[0, 2], graph, places, colours)
+    axes[0, 2].set_title(f"Conflict graph: {len(graph.edges)} overlaps")
+    directed = [edge for _, edges in drawn.values() for edge in edges]
+    for row, draw in enumerate((first, second), start=1):
+        own = {v + 1: colours[v] for v in range(len(graph))}
+        labels, disputed = fixed.paint(graph, draw, sample.labels, prediction.labels)
+        smooth = fixed.mode_filter.apply(labels, disputed)
+        draw_graph(axes[row, 0], graph, places, [colours[g] for g in draw.group], directed, draw)
+        axes[row, 0].set_title(("A random order; bold: merged", "The same order, other merges")[row - 1])
+        show(axes[row, 1], voxels(labels, sample.grid, view, own), f"Painted: {count(labels)} objects")
+        title = f"After the mode filter: {count(smooth)} objects"
+        show(axes[row, 2], voxels(smooth, sample.grid, view, own), title)
+    figure.supxlabel(NOTICE, fontsize=8, color=MUTED)
+    return save(figure, path, 50 if smoke else 100)
+
+
+def count(labels: np.ndarray) -> int:
+    """Objects in a label grid."""
+    return int(np.count_nonzero(np.bincount(labels.ravel())[1:]))
+
+
+def colours_of(graph: ConflictGraph) -> list[Colour]:
+    """Cool colours for the sample's objects, warm ones for the prediction's; neighbours in number far apart."""
+    from matplotlib.colors import LinearSegmentedColormap
+
+    colours: list[Colour] = [(0, 0, 0)] * len(graph)
+    for side, ramp in ((PROPOSED, COOL), (PREDICTED, WARM)):
+        shade = LinearSegmentedColormap.from_list("ramp", ramp)
+        for k, v in enumerate(np.flatnonzero(graph.side == side).tolist()):
+            r, g, b = (int(x) for x in np.rint(255 * np.array(shade((0.15 + k * 0.618) % 1.0)[:3])))
+            colours[v] = (r, g, b)
+    return colours
+
+
+def layout(graph: ConflictGraph) -> np.ndarray:
+    """(n, 2) places: sample above, prediction below, components side by side, few crossings."""
+    places, left = np.zeros((len(graph), 2)), 0.0
+    neighbours = graph.neighbours()
+    for component in graph.components():
+        rows = {y: [v for v in component if graph.side[v] == side] for y, side in ((1.0, PROPOSED), (0.0, PREDICTED))}
+        width = max(len(row) for row in rows.values())
+        for turn in range(16):
+            y, row = list(rows.items())[turn % 2]
+            if turn:  # each vertex near the mean of its neighbours
+                row.sort(key=lambda v: float(np.mean(places[neighbours[v], 0])))
+            for k, v in enumerate(row):
+                places[v] = left + (k + 0.5) * width / len(row), y
+        left += width + 0.6
+    return places
+
+
+def draw_graph(
+    axes: Axes,
+    graph: ConflictGraph,
+    places: np.ndarray,
+    colours: Sequence[Colour],
+    directed: Edges = (),
+    draw: Draw | None = None,
+) -> None:
+    """The conflict graph; with a draw, arrows run from the one painted first, and merged conflicts are bold."""
+    conflicts = directed or [(a, b) for a, b in graph.edges.tolist()]
+    for a, b in conflicts:
+        merged = draw is not None and draw.group[a] == draw.group[b]
+        axes.annotate(
+            "",
+            places[b],
+            places[a],
+            arrowprops={
+                "arrowstyle": "-|>" if draw else "-",
+                "color": INK if merged else ("#a9aca8" if draw else MUTED),
+                "lw": 2.0 if merged else 0.8,
+                "shrinkA": 7,
+                "shrinkB": 7,
+                "mutation_scale": 9,
+            },
+        )
+    for side, mark in ((PROPOSED, "o"), (PREDICTED, "s")):
+        own = np.flatnonzero(graph.side == side)
+        fill = np.array([colours[v] for v in own]) / 255
+        axes.scatter(*places[own].T, s=150, c=fill, marker=mark, edgecolors=INK, linewidths=0.8, zorder=3)
+    if draw is not None:
+        for number, v in enumerate(draw.order, start=1):
+            bright = np.dot(colours[v], (0.3, 0.59, 0.11)) > 140
+            style = {"ha": "center", "va": "center", "fontsize": 7, "zorder": 4}
+            axes.text(*places[v], str(number), color=INK if bright else "white", **style)
+    else:
+        axes.text(places[:, 0].mean(), 1.2, "objects of the sample", ha="center", color=MUTED)
+        axes.text(places[:, 0].mean(), -0.24, "objects of the prediction", ha="center", color=MUTED)
+    axes.set(xlim=(places[:, 0].min() - 0.7, places[:, 0].max() + 0.7), ylim=(-0.4, 1.4))
+    axes.set_axis_off()
+
+
+#: Name, formula with child n1, parent n2 and I common voxels, and the probability itself.
+FORMS: tuple[tuple[str, str, Chance], ...] = (
+    ("paper as printed", "min(1, IoU n2 / n1^2)", lambda i, a, b: merge_probability("printed", i, a, b)),
+    ("authors' program", "min(1, I n2 / n1^2)", lambda i, a, b: merge_probability("share", i, a, b)),
+    (
+        "paper with its dimensions mended",
+        "min(1, IoU n2 / n1)",
+        lambda i, a, b: np.minimum(1, i / (a + b - i) * b / a),
+    ),
+    ("IoU", "IoU", lambda i, a, b: merge_probability("iou", i, a, b)),
+    ("containment", "I / n1", lambda i, a, b: i / a),
+    ("containment of the smaller", "I / min(n1, n2)", lambda i, a, b: i / np.minimum(a, b)),
+    ("mst: covered", "1 if I / n1 >= 3/4", lambda i, a, b: merge_probability("covered", i, a, b)),
+    ("match", "1 if IoU > 1/2", lambda i, a, b: merge_probability("match", i, a, b)),
+)
+STRUCTURES: tuple[tuple[str, Structure], ...] = (
+    ("random order", RandomOrder()),
+    ("spanning tree", SpanningTree()),
+    ("one side last", OneSideLast()),
+)
+
+
+def table(particles: Particles, path: Path, smoke: bool) -> Path:
+    """How often each form merges on the conflicts of all 25 pairs: both directions, and as structures draw them.
+
+    ``mean`` .. ``at 1`` count every conflict in both directions. For each structure: the share of the edges that it
+    draws along which a merge happens, and the mean number of objects after all merges.
+    """
+    graphs = [conflict_graph(s.labels, p.labels) for s in particles.samples for p in particles.predictions]
+    both = [np.concatenate([g.intersection] * 2) for g in graphs]
+    child = [np.concatenate([g.size[g.edges[:, 0]], g.size[g.edges[:, 1]]]) for g in graphs]
+    parent = [np.concatenate([g.size[g.edges[:, 1]], g.size[g.edges[:, 0]]]) for g in graphs]
+    chances = {
+        form: chance(*(np.concatenate(x).astype(float) for x in (both, child, parent))) for form, _, chance in FORMS
+    }
+    rounds = 2 if smoke else 100
+    drawn = {name: list(edges_of(structure, graphs, rounds)) for name, structure in STRUCTURES}
+    rows = []
+    for form, formula, chance in FORMS:
+        p = chances[form]
+        row = [
+            form,
+            formula,
+            len(p),
+            float(p.mean()),
+            float(np.median(p)),
+            float((p < 0.01).mean()),
+            float((p == 1).mean()),
+        ]
+        for name, _ in STRUCTURES:
+            row += merged(graphs, drawn[name], chance)
+        rows.append(row)
+    named = [f"{what}: {name}" for name, _ in STRUCTURES for what in ("merges", "objects")]
+    columns = ["form", "formula", "directed conflicts", "mean", "median", "below 1 %", "at 1", *named]
+    return write_csv(path, columns, rows)
+
+
+def edges_of(structure: Structure, graphs: Sequence[ConflictGraph], rounds: int) -> list[tuple[int, np.ndarray]]:
+    """Directed edges (m, 2) that a structure draws: graph by graph, so many times."""
+    rng, found = np.random.default_rng(SEED), []
+    for k, graph in enumerate(graphs):
+        neighbours = graph.neighbours()
+        for _ in range(rounds):
+            edges = [e for c in graph.components() for e in structure.draw(rng, c, neighbours)[1]]
+            found.append((k, np.array(edges).reshape(-1, 2)))
+    return found
+
+
+def merged(graphs: Sequence[ConflictGraph], drawn: Sequence[tuple[int, np.ndarray]], chance: Chance) -> list[float]:
+    """Share of drawn edges that merge, and mean number of objects afterwards."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    rng, total, n_edges, objects = np.random.default_rng(SEED + 1), 0, 0, []
+    for k, edges in drawn:
+        graph = graphs[k]
+        common = np.zeros((len(graph), len(graph)))
+        a, b = graph.edges.T
+        common[a, b] = common[b, a] = graph.intersection
+        child, parent = edges.T
+        yes = rng.random(len(edges)) < chance(common[child, parent], graph.size[child], graph.size[parent])
+        links = coo_matrix((np.ones(yes.sum()), edges[yes].T), shape=(len(graph), len(graph)))
+        objects.append(connected_components(links, directed=False)[0])
+        total, n_edges = total + int(yes.sum()), n_edges + len(edges)
+    return [total / n_edges, float(np.mean(objects))]

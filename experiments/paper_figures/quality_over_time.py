@@ -1,0 +1,45 @@
+"""Figure `quality_over_time`: quality of all hypotheses over pauses, methods by families, from a study's folder.
+
+The drawing is that of the study's report; here it stands alone, in the report's light colours.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+from mstfilter.report import study_figures
+from mstfilter.report.palette import colour, hexadecimal
+from mstfilter.report.svg import SERIES
+from mstfilter.study.results import StudyFolder
+
+PAGE = 'xmlns="http://www.w3.org/2000/svg" style="background:var(--paper);font-family:sans-serif"'
+
+
+def make(out: Path, study: Path) -> list[Path]:
+    """The figure of the runs that are done; arms that stand beside the comparisons are left out."""
+    folder = StudyFolder.open(study)
+    arms = [arm["name"] for arm in folder.description["arms"] if not arm.get("beside")]
+    values: dict[str, dict[str, dict[int, list[float]]]] = {}
+    for row in folder.records():
+        if row["arm"] in arms and row.get("qualities"):
+            by_pause = values.setdefault(row["family"], {}).setdefault(row["arm"], {})
+            by_pause.setdefault(row["pause"], []).extend(row["qualities"])
+    if not values:
+        return []
+    path = out / "quality_over_time.svg"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(standalone(study_figures.time_figure(values, arms)))
+    return [path]
+
+
+def standalone(svg: str) -> str:
+    """A report's figure as a file of its own: the report's style sheet says what its colours are."""
+    css = (Path(study_figures.__file__).parent / "templates" / "style.css").read_text()
+    light = css[: css.index("}")]
+    colours = {f"--s{k}": hexadecimal(colour(k)) for k in range(len(SERIES))}  # also those that the sheet lacks
+    colours |= dict(re.findall(r"(--[a-z0-9]+): (#[0-9a-f]{3,6})", light))
+    width, height = re.findall(r"[\d.]+", svg[svg.index("viewBox") :])[2:4]
+    svg = svg.replace("<svg ", f'<svg {PAGE} width="{width}pt" height="{height}pt" ', 1)
+    svg = svg.replace("currentColor", "var(--ink)")
+    return re.sub(r"var\((--[a-z0-9]+)\)", lambda found: colours[found[1]], svg)

@@ -1,0 +1,84 @@
+"""The authors' own real particles (experiment R1 of the paper), found by MSTFILTER_SHARED, else in ``../shared``.
+
+They are Copyright (c) 2020 The Autonomous Robotic Manipulation Lab, MIT licence (results/LICENSE-R1), and no part of
+this program.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from mstfilter.scene.quality import weighted_coverage
+from mstfilter.scene.voxels import Hypothesis, VoxelGrid
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+
+
+def folder() -> Path | None:
+    """Where the data are; None where they are not."""
+    named = os.environ.get("MSTFILTER_SHARED")
+    path = (Path(named) if named else REPOSITORY.parent / "shared") / "r1"
+    return path if (path / "measurement.npz").exists() else None
+
+
+@dataclass(frozen=True)
+class Particles:
+    """R1 at t = 1: what was sampled, what was predicted, and what the authors' program made of them.
+
+    Parameters
+    ----------
+    path : Path
+        The folder of the data.
+    """
+
+    path: Path
+
+    def _load(self, name: str, key: str) -> np.ndarray:
+        with np.load(self.path / f"{name}.npz", allow_pickle=False) as data:
+            return data[key]
+
+    @cached_property
+    def grid(self) -> VoxelGrid:
+        """Voxels of 1 cm."""
+        return VoxelGrid(self._load("measurement", "region_min"), 0.01, (61, 61, 41))
+
+    def _hypotheses(self, labels: np.ndarray, birth: int) -> tuple[Hypothesis, ...]:
+        return tuple(Hypothesis.from_labels(one, self.grid, birth) for one in labels)
+
+    @cached_property
+    def samples(self) -> tuple[Hypothesis, ...]:
+        """The five samples of t = 1 that the authors fused, of ten."""
+        return self._hypotheses(self._load("measurement", "labels")[1, :5], 1)
+
+    @cached_property
+    def predictions(self) -> tuple[Hypothesis, ...]:
+        """Five hypotheses of t = 0, moved to t = 1 and cleared by free space."""
+        return self._hypotheses(self._load("freespace_refined", "labels")[0], 0)
+
+    @cached_property
+    def estimates(self) -> tuple[Hypothesis, ...]:
+        """The five that the authors' program kept of 125 fused ones."""
+        return self._hypotheses(self._load("estimate", "labels")[0], 1)
+
+    @cached_property
+    def log_weights(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Log weights of samples and predictions (5,), and the predictions' share kept by free space (5,)."""
+        measured = self._load("measurement", "weight")
+        return measured[1, :5], measured[0, :5], self._load("freespace_refined", "weight")[0]
+
+    def partition(self, labels: np.ndarray) -> np.ndarray:
+        """A hypothesis' own voxels parted in can (2) and carton (1): the pseudo-truth of its segmentation."""
+        can = self._load("pseudo_truth", "can_footprint")[1].astype(bool)
+        return np.where(labels > 0, np.where(can[:, :, None], 2, 1), 0).astype(np.uint16)
+
+    def score(self, labels: np.ndarray) -> float:
+        """Objects quality against that partition: segmentation only, what is missing or invented costs nothing."""
+        return weighted_coverage(labels, self.partition(labels))
+
+
+NOTICE = "Particles: Copyright (c) 2020 The Autonomous Robotic Manipulation Lab, MIT licence."

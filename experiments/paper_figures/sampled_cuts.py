@@ -1,0 +1,166 @@
+"""Figure `sampled_cuts`: cuts of the segmentation tree of one simulated frame: on the tree, and over the image.
+
+The best cut, and the first two cuts drawn by the sampler of `mst` that show other objects. Height in the tree is the
+log odds that a merge joins different objects (where a merge above has less, that of the strongest inside it). Merges
+below `LEAST` are not drawn.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from canvas import INK, MUTED, crop, page, save, show
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+
+import mstfilter
+from mstfilter.report.palette import GREY, Colour, colour
+from mstfilter.report.pictures import overlay
+from mstfilter.scene.frame import Frame
+from mstfilter.segmentation.optimal import optimal_cut
+from mstfilter.segmentation.segments import Segments
+from mstfilter.segmentation.tree import Tree
+from mstfilter.simulation.families import scene_family
+from mstfilter.simulation.recorder import Scene
+
+FAMILY, SEED = "s2", 0
+LEAST = -6.0
+ABOVE = (176, 179, 175)
+
+
+def make(out: Path, smoke: bool) -> list[Path]:
+    """The figure."""
+    family = replace(scene_family(FAMILY), **({"width": 160, "height": 120} if smoke else {}))
+    scene = Scene(family, SEED)
+    shot = scene.see(0)
+    frame = Frame(shot["rgb"], shot["depth"], scene.camera)
+    proposal = mstfilter.preset("mst").proposal
+    tree, w = proposal.tree_of(frame)
+    found = proposal.objects.segments(tree, frame, family.grid())
+    drawn = proposal.sampler.sample(np.random.default_rng(0), tree, w, 50)
+    best = optimal_cut(tree, w)
+    shown, probability = [best], [0.0]
+    for cut, log_p in zip(drawn.cuts, drawn.log_p, strict=True):
+        if len(shown) < 3 and all(set(objects(found, cut)) != set(objects(found, other)) for other in shown):
+            shown.append(cut)
+            probability.append(float(log_p))
+
+    colours = colours_of(tree, found, shown)
+    part = Drawn.of(tree, shown)
+    box = crop(scene.truth(), family.grid(), scene.camera)
+    figure, axes = page(2, len(shown), 12.6, 7.2)
+    for k, (cut, log_p) in enumerate(zip(shown, probability, strict=True)):
+        own = {int(n): colours.get(int(n), GREY) for n in cut}
+        draw_tree(axes[0, k], part, own, ylabel=k == 0)
+        name = "The best cut" if k == 0 else f"Sampled, {np.exp(log_p):.2g} as probable"
+        axes[0, k].set_title(f"{name}: {len(objects(found, cut))} objects")
+        labels = np.where(found.own, np.where(found.is_object[cut], cut, 0)[tree.label_image(cut)], 0)
+        show(axes[1, k], overlay(shot["rgb"], labels, own, fill=0.55)[box])
+    return [save(figure, out / "sampled_cuts.png", 50 if smoke else 90)]
+
+
+def objects(found: Segments, cut: np.ndarray) -> list[int]:
+    """The nodes of a cut that count as objects."""
+    return [int(n) for n in cut if found.is_object[n]]
+
+
+def colours_of(tree: Tree, found: Segments, cuts: Sequence[np.ndarray]) -> dict[int, Colour]:
+    """A colour for every object; one that is mostly the same as one of an earlier cut has its colour."""
+    names: dict[int, int] = {}
+    for cut in cuts:
+        used: set[int] = set()
+        for node in sorted(objects(found, cut), key=lambda n: -int(found.points[n])):
+            mask = tree.mask(node)
+            like = [(jaccard(mask, tree.mask(other)), name) for other, name in names.items() if name not in used]
+            best = max(like, default=(0.0, -1))
+            names[node] = names.get(node, best[1] if best[0] > 0.5 else len(set(names.values())))
+            used.add(names[node])
+    return {node: colour(name) for node, name in names.items()}
+
+
+def jaccard(a: np.ndarray, b: np.ndarray) -> float:
+    """Intersection over union of two masks."""
+    return float((a & b).sum() / (a | b).sum())
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """The upper part of a tree, ready to be drawn.
+
+    Parameters
+    ----------
+    inside : dict
+        Node -> children that are drawn; none for a node whose inside is not.
+    x, y : dict
+        Place of each drawn node.
+    root : int
+    """
+
+    inside: dict[int, list[int]]
+    x: dict[int, float]
+    y: dict[int, float]
+    root: int
+
+    @classmethod
+    def of(cls, tree: Tree, cuts: Sequence[np.ndarray]) -> Drawn:
+        """Merges above `LEAST`, and whatever a cut takes apart."""
+        odds = np.where(np.arange(tree.n_nodes) < tree.n_leaves, -np.inf, tree.odds)
+        taken = np.zeros(tree.n_nodes, bool)  # holds a node of a cut strictly inside
+        for cut in cuts:
+            for node in cut.tolist():
+                while node != tree.root:
+                    node = int(tree.parent[node])
+                    taken[node] = True
+        for node in range(tree.n_nodes - 1):
+            odds[tree.parent[node]] = max(odds[tree.parent[node]], odds[node])
+        top = float(odds[:-1].max()) + 2  # the root joins the table and what never touched: for certain
+        inside: dict[int, list[int]] = {}
+        x: dict[int, float] = {}
+        y: dict[int, float] = {}
+        stack = [tree.root]
+        while stack:
+            node = stack.pop()
+            whole = node < tree.n_leaves or not (odds[node] > LEAST or taken[node])
+            inside[node] = [] if whole else tree.children(node).tolist()
+            y[node] = LEAST - 1 if whole else top if node == tree.root else max(float(odds[node]), LEAST - 0.5)
+            if whole:
+                x[node] = float(len(x))
+            stack.extend(inside[node])
+        for node in sorted(inside):  # children come before their parents
+            if inside[node]:
+                x[node] = float(np.mean([x[c] for c in inside[node]]))
+        return cls(inside, x, y, tree.root)
+
+
+def draw_tree(axes: Axes, part: Drawn, cut: dict[int, Colour], ylabel: bool) -> None:
+    """The tree: below the cut in the colours of its segments, above it grey; a disc on every node of the cut."""
+    lines, colours, widths = [], [], []
+    stack: list[tuple[int, Colour | None]] = [(part.root, None)]
+    while stack:
+        node, own = stack.pop()
+        own = cut.get(node, own)
+        for child in part.inside[node]:
+            x, y = part.x[child], part.y[node]
+            lines.append([(part.x[node], y), (x, y), (x, part.y[child])])
+            colours.append(tuple(np.array(ABOVE if own is None else own) / 255))
+            widths.append(0.9 if own is None or own == GREY else 1.6)
+            stack.append((child, own))
+    axes.add_collection(LineCollection(lines, colors=colours, lw=widths))
+    for node, own in cut.items():
+        size = 16 if own == GREY else 55
+        axes.scatter(
+            part.x[node], part.y[node], s=size, color=[np.array(own) / 255], edgecolors=INK, lw=0.7, zorder=3
+        )
+    axes.axhline(0, color=MUTED, lw=0.7, dashes=(3, 3), zorder=0)
+    axes.set(
+        xlim=(-1, max(part.x.values()) + 1),
+        ylim=(LEAST - 1.6, part.y[part.root] + 0.6),
+        xticks=[],
+        yticks=range(-5, 11, 5),
+    )
+    axes.spines["bottom"].set_visible(False)
+    if ylabel:
+        axes.set_ylabel("log odds: different objects")
