@@ -83,7 +83,7 @@ def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "speed.csv")
     parser.add_argument("--n", type=int, nargs="+", default=[5, 20, 100])
-    parser.add_argument("--repeat", type=int, default=3)
+    parser.add_argument("--repeat", type=int, default=1)
     arguments = parser.parse_args()
     rows: dict[str, dict[str, float]] = {}
     cases = [(n, rough) for rough in (False, True) for n in arguments.n]
