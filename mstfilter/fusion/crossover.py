@@ -76,9 +76,12 @@ class Crossover:
         predicted object in it, and its motion history where its voxels are exactly those predicted.
         """
         if proposed.grid != predicted.grid:
+            one, other = (
+                f"{g.shape} voxels of {g.voxel_size:g} m at {g.origin.tolist()}"
+                for g in (proposed.grid, predicted.grid)
+            )
             raise InputError(
-                f"hypotheses lie on different grids: {proposed.grid.shape} at {proposed.grid.origin.tolist()} and "
-                f"{predicted.grid.shape} at {predicted.grid.origin.tolist()}",
+                f"hypotheses lie on different grids: the proposed one has {one}, the predicted one {other}",
                 "all hypotheses of a run share one workspace",
             )
         if not predicted.objects:
@@ -166,6 +169,11 @@ def _painted(
         rank_of.append(ranks[labels])
     later = rank_of[PREDICTED] > rank_of[PROPOSED]
     if from_predicted is not None:
+        if from_predicted.shape != voxels.shape or from_predicted.dtype != bool:
+            raise InputError(
+                f"from_predicted is {from_predicted.dtype} of shape {from_predicted.shape}, expected bool of "
+                f"shape {voxels.shape}"
+            )
         later |= from_predicted.reshape(-1)[voxels.at] & (group_of[PREDICTED] > 0)
     out = np.where(later, group_of[PREDICTED], group_of[PROPOSED])
     differ = group_of[PROPOSED] != group_of[PREDICTED]

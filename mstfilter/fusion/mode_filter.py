@@ -49,6 +49,9 @@ class ModeFilter:
     scope: Literal["everywhere", "disputed"] = "everywhere"
 
     def __post_init__(self) -> None:
+        for name in ("window", "margin", "isolation", "max_sweeps"):
+            if not isinstance(getattr(self, name), (int, np.integer)):
+                raise InputError(f"mode filter {name} is {getattr(self, name)!r}, expected a whole number")
         if self.window < 1 or self.window % 2 == 0:
             raise InputError(f"mode filter window is {self.window}, expected an odd number of voxels")
         if self.max_sweeps < 1:
@@ -67,7 +70,13 @@ class ModeFilter:
             Used where `scope` is "disputed"; no other voxel changes then.
         """
         labels = as_labels(labels)
+        if labels.ndim != 3:
+            raise InputError(f"label grid has shape {labels.shape}, the mode filter expects three axes")
         may_change = labels != 0
+        if disputed is not None and (disputed.shape != labels.shape or disputed.dtype != bool):
+            raise InputError(
+                f"disputed is {disputed.dtype} of shape {disputed.shape}, expected bool of shape {labels.shape}"
+            )
         if self.scope == "disputed":
             may_change = may_change & disputed if disputed is not None else np.zeros_like(may_change)
         if self.window == 1 or not may_change.any():

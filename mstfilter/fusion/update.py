@@ -29,7 +29,7 @@ from mstfilter.fusion.division import NoDivision, PartRule, take_apart
 from mstfilter.fusion.free_space import SMALLEST_QUALITY, FreeSpace, Projection
 from mstfilter.scene.clip import Clip
 from mstfilter.scene.evidence import Division, Evidence
-from mstfilter.scene.voxels import Hypothesis
+from mstfilter.scene.voxels import Hypothesis, VoxelGrid
 from mstfilter.smc.interfaces import Update
 from mstfilter.smc.population import Candidates, Population
 from mstfilter.smc.resampling import Systematic
@@ -109,6 +109,7 @@ class FusionUpdate(Update):
         key, crossover = key_of(rng), self.crossover
         samples = self._parted(tuple(proposed.particles), observation, proposed=True)
         claims, exposed = self.claims, self.claims.exposed(observation)
+        _check_grids(refined, samples, refined[0].grid if exposed is None else observation.grid)
 
         def build(candidate: int) -> Hypothesis:
             stream = key.child("candidate", candidate).generator()
@@ -143,6 +144,20 @@ class FusionUpdate(Update):
         known = {id(h): h for h in hypotheses}
         parted = {name: take_apart(h, motions, clip, self.parts, proposed) for name, h in known.items()}
         return tuple(parted[id(h)] for h in hypotheses)
+
+
+def _check_grids(predicted: tuple[Hypothesis, ...], proposed: tuple[Hypothesis, ...], grid: VoxelGrid) -> None:
+    """All hypotheses lie on this grid: said now, not when a candidate of two that do not fit happens to be built."""
+    for name, hypotheses in (("predicted", predicted), ("proposed", proposed)):
+        for k, hypothesis in enumerate(hypotheses):
+            if hypothesis.grid != grid:
+                found, wanted = (
+                    f"{g.shape} voxels of {g.voxel_size:g} m at {g.origin.tolist()}" for g in (hypothesis.grid, grid)
+                )
+                raise InputError(
+                    f"grid of {name} hypothesis {k} is {found}, expected {wanted}",
+                    "all hypotheses of a run share the workspace of its clips",
+                )
 
 
 def _pairs(rng: np.random.Generator, n_proposed: int, n_predicted: int, eta: int) -> tuple[np.ndarray, np.ndarray]:

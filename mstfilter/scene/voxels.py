@@ -29,6 +29,7 @@ __all__ = ["MAX_LABEL", "Crop", "Hypothesis", "ObjectRecord", "VoxelGrid", "as_l
 
 MAX_LABEL = 65535
 MAX_VOXELS = 2**28
+_NO_MOTION = RigidTransform.identity()  # one for all: making it takes longer than all else in a record
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,14 +51,19 @@ class VoxelGrid:
     shape: tuple[int, int, int]
 
     def __post_init__(self) -> None:
-        origin = np.asarray(self.origin, dtype=np.float64)
+        origin, size, counts = (_numbers(v) for v in (self.origin, self.voxel_size, self.shape))
         if origin.shape != (3,) or not np.isfinite(origin).all():
             raise InputError(f"grid origin is {self.origin!r}, expected three finite numbers in metres")
-        if not (np.isfinite(self.voxel_size) and self.voxel_size > 0):
+        if size.shape != () or not (np.isfinite(size) and size > 0):
             raise InputError(f"voxel size is {self.voxel_size!r}, expected metres > 0")
+        if counts.shape != (3,) or not (
+            np.isfinite(counts).all() and (counts >= 1).all() and (counts % 1 == 0).all()
+        ):
+            raise InputError(
+                f"grid shape is {self.shape!r}, expected three counts of at least 1",
+                "a workspace without extent along an axis holds nothing",
+            )
         shape = tuple(int(n) for n in self.shape)
-        if len(shape) != 3 or min(shape) < 1:
-            raise InputError(f"grid shape is {self.shape!r}, expected three counts of at least 1")
         if shape[0] * shape[1] * shape[2] > MAX_VOXELS:
             raise InputError(
                 f"a grid of {shape[0]} x {shape[1]} x {shape[2]} voxels of {self.voxel_size:g} m is too large",
@@ -115,6 +121,14 @@ class VoxelGrid:
         """(...) bool: indices (..., 3) that lie in the grid."""
         index = np.asarray(index)
         return np.asarray(((index >= 0) & (index < np.array(self.shape))).all(axis=-1))
+
+
+def _numbers(value: object) -> np.ndarray:
+    """Numbers as float64; NaN for what is none."""
+    try:
+        return np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        return np.array(np.nan)
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,7 +196,7 @@ class ObjectRecord:
     id: int
     birth: int = 0
     source: Crop | None = None
-    motion: RigidTransform = field(default_factory=RigidTransform.identity)
+    motion: RigidTransform = field(default_factory=lambda: _NO_MOTION)
     completion_key: str | None = None
     apart: frozenset[int] = frozenset()
 
@@ -193,7 +207,7 @@ class ObjectRecord:
 
     def changed(self) -> ObjectRecord:
         """The record after something other than a rigid motion has changed the object's voxels."""
-        return replace(self, source=None, motion=RigidTransform.identity())
+        return replace(self, source=None, motion=_NO_MOTION)
 
 
 def as_labels(labels: np.ndarray, where: str = "label grid") -> np.ndarray:
@@ -211,6 +225,20 @@ def as_labels(labels: np.ndarray, where: str = "label grid") -> np.ndarray:
             "0 is free; renumber the objects",
         )
     return labels.astype(np.uint16)
+
+
+def _labels_on(grid: VoxelGrid, labels: np.ndarray) -> np.ndarray:
+    """Labels as uint16 of the grid's shape."""
+    labels = as_labels(labels)
+    if labels.shape != grid.shape:
+        raise InputError(f"label grid has shape {labels.shape}, the voxel grid is {grid.shape}")
+    return labels
+
+
+def _few(labels: set[int]) -> str:
+    """Labels to name in a message, not thousands of them."""
+    first = sorted(labels)[:5]
+    return f"{first} and {len(labels) - 5} more" if len(labels) > 5 else str(first)
 
 
 @dataclass(frozen=True, eq=False)
@@ -236,25 +264,21 @@ class Hypothesis:
     objects: tuple[ObjectRecord, ...] = ()
 
     def __post_init__(self) -> None:
-        labels = as_labels(self.labels)
-        if labels.shape != self.grid.shape:
-            raise InputError(f"label grid has shape {labels.shape}, the voxel grid is {self.grid.shape}")
-        object.__setattr__(self, "labels", frozen(labels))
+        object.__setattr__(self, "labels", frozen(_labels_on(self.grid, self.labels)))
         numbers = [o.label for o in self.objects]
         if any(b <= a for a, b in pairwise(numbers)):
             raise InputError(f"object records are not in ascending order of labels: {numbers}")
         if numbers != list(self.volumes()):
+            lone, idle = (_few(set(a) - set(b)) for a, b in ((self.volumes(), numbers), (numbers, self.volumes())))
             raise InputError(
-                f"labels in the grid {list(self.volumes())} and in the object records {numbers} differ",
+                f"labels in the grid and in the object records differ: no record for {lone}, no voxel for {idle}",
                 "use Hypothesis.from_labels, or with_labels to change a hypothesis",
             )
 
     @classmethod
     def from_labels(cls, labels: np.ndarray, grid: VoxelGrid, birth: int = 0) -> Hypothesis:
         """A hypothesis whose objects are all new."""
-        labels = as_labels(labels)
-        if labels.shape != grid.shape:
-            raise InputError(f"label grid has shape {labels.shape}, the voxel grid is {grid.shape}")
+        labels = _labels_on(grid, labels)
         present = np.flatnonzero(np.bincount(labels.ravel()))
         records = tuple(ObjectRecord.born(int(k), birth) for k in present if k > 0)
         return cls(labels, grid, records)
@@ -265,7 +289,7 @@ class Hypothesis:
         Objects that keep exactly their voxels keep source and motion; changed ones start anew; vanished
         ones lose their record. A label without a record is an error.
         """
-        labels = as_labels(labels)
+        labels = _labels_on(self.grid, labels)
         changed = set(np.unique(labels[labels != self.labels]).tolist())
         changed |= set(np.unique(self.labels[labels != self.labels]).tolist())
         present = np.bincount(labels.ravel(), minlength=MAX_LABEL + 1) > 0
