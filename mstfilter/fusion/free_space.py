@@ -111,6 +111,10 @@ class FreeSpace(Projection):
         """(X, Y, Z) bool: voxels that cannot be occupied, by this frame alone. Memoised by content."""
         return self._look(frame, grid).free
 
+    def hidden(self, frame: Frame, grid: VoxelGrid) -> np.ndarray:
+        """(X, Y, Z) bool: voxels of which this frame says nothing: well behind a surface, or without a reading."""
+        return self._look(frame, grid).hidden
+
     def known_free_after(self, clip: Clip) -> np.ndarray:
         """(X, Y, Z) bool on the clip's grid: voxels that cannot be occupied at its end, memory included."""
         return self.memory.free(self._look, self._key, clip)

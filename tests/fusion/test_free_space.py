@@ -12,8 +12,10 @@ from mstfilter.errors import InputError
 from mstfilter.fusion.free_space import FreeSpace, NoFreeSpace
 from mstfilter.scene.camera import Camera, look_at
 from mstfilter.scene.clip import Clip
+from mstfilter.scene.formats.writer import save
 from mstfilter.scene.frame import Frame
 from mstfilter.scene.quality import weighted_coverage
+from mstfilter.scene.recording import Recording
 from mstfilter.scene.rendering import render
 from mstfilter.scene.voxels import Hypothesis
 from mstfilter.smc.population import Population
@@ -184,7 +186,7 @@ def _depth(labels, camera):
     )
 
 
-def test_views_belong_to_the_content_of_a_frame_and_are_checked():
+def test_views_belong_to_the_content_of_a_frame_and_are_checked(tmp_path):
     plain = frame_of(np.ones((9, 12), np.float32), CAMERAS[0])
     other = frame_of(np.ones((9, 12), np.float32), CAMERAS[1])
     with_view = frame_of(plain.depth, CAMERAS[0], views=(other,))
@@ -193,6 +195,9 @@ def test_views_belong_to_the_content_of_a_frame_and_are_checked():
     assert with_view.all_views == (with_view, other)
     with pytest.raises(InputError, match="views of its own"):
         frame_of(plain.depth, CAMERAS[0], views=(with_view,))
+    with pytest.raises(InputError, match="images of 2 cameras"):
+        save(Recording((with_view,), SMALL, (0,), (0.0,)), tmp_path / "two")
+    assert not list(tmp_path.iterdir())
     lost = frame_of(np.ones((9, 12), np.float32), Camera(CAMERAS[0].K, 12, 9))
     with pytest.raises(InputError, match="no pose"):
         frame_of(plain.depth, CAMERAS[0], views=(lost,))
