@@ -25,3 +25,22 @@ def test_smoke(tmp_path):
     for line in kept.values():
         if line["target"]:
             assert float(line["median"]) <= float(line["target"].removeprefix("<= ")), line
+
+
+def test_fusion_smoke(tmp_path):
+    command = [sys.executable, str(REPOSITORY / "experiments/benchmarks/fusion.py"), "--smoke"]
+    refused = subprocess.run(command, capture_output=True, text=True)
+    assert refused.returncode == 2
+    assert "would overwrite the results" in refused.stderr
+    # It ends at once where both programs do not make the same labels of the same random decisions.
+    subprocess.run([*command, "--out", str(tmp_path)], check=True, capture_output=True)
+    lines, kept = [], []
+    for path, into in ((tmp_path, lines), (REPOSITORY / "experiments/benchmarks", kept)):
+        with (path / "fusion.csv").open(newline="") as file:
+            into.extend(csv.DictReader(file))
+    assert [(r["unit"], r["target"] != "") for r in lines] == [(r["unit"], r["target"] != "") for r in kept]
+    meets = {"<=": lambda found, bound: found <= bound, ">=": lambda found, bound: found >= bound}
+    targets = [(r, *r["target"].split()) for r in kept if r["target"]]
+    assert len(targets) == 4
+    for line, sign, bound in targets:
+        assert meets[sign](float(line["median"]), float(bound)), line["what"]

@@ -62,6 +62,7 @@ def test_grids_that_differ(grid, found):
         (((0, 0, 0), 0.01, (9.5, 8, 7)), r"shape is \(9.5, 8, 7\)"),
         (((0, 0, 0), 0.01, 9), "shape is 9"),
         (((0, 0, 0), "fine", (9, 8, 7)), "voxel size is 'fine'"),
+        (((0, 0, 0), [0.01, 0.02], (9, 8, 7)), "voxel size is .0.01, 0.02."),
         (((0, 0, "low"), 0.01, (9, 8, 7)), "origin is .*low"),
     ],
 )
