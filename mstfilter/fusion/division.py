@@ -24,6 +24,8 @@ from mstfilter.scene.voxels import MAX_LABEL, Hypothesis, ObjectRecord
 
 __all__ = ["NoDivision", "PartRule", "part_like", "remember_like", "take_apart"]
 
+_INSIDE = 0.5  # of a predicted object, for a proposed one to hold it
+
 
 @dataclass(frozen=True)
 class NoDivision(Division):
@@ -45,14 +47,11 @@ class PartRule:
         ... and the share of the object's pixels of known motion.
     pure : float
         Share of an object's pixels of known motion that must agree for it to count as having moved so.
-    min_voxels : int
-        Voxels that two objects which came apart must each have in a third one for it to be parted.
     """
 
     min_pixels: int = 40
     min_share: float = 0.25
     pure: float = 0.8
-    min_voxels: int = 20
 
 
 def take_apart(
@@ -177,18 +176,19 @@ def _remember(hypothesis: Hypothesis, went: dict[int, int]) -> Hypothesis:
     return Hypothesis(hypothesis.labels, hypothesis.grid, tuple(by_id[r.id] for r in records))
 
 
-def part_like(proposed: Hypothesis, predicted: Hypothesis, rule: PartRule = PartRule()) -> Hypothesis:
+def part_like(proposed: Hypothesis, predicted: Hypothesis) -> Hypothesis:
     """The proposal with every object parted that covers predicted objects which came apart before.
 
-    Its voxels go to the nearest of these.
+    Its voxels go to the nearest of these. What holds less than half of one of them is only its neighbour, seen or
+    moved a little wrong.
     """
     if not any(record.apart for record in predicted.objects):
         return proposed
     pairs = zip(*(a.tolist() for a in overlapping(claimed(proposed.labels, predicted.labels))), strict=True)
-    inverse = {r.label: r for r in predicted.objects}
+    inverse, volume = {r.label: r for r in predicted.objects}, predicted.volumes()
     within: dict[int, list[ObjectRecord]] = {}
     for label, k, common in pairs:
-        if common >= rule.min_voxels:
+        if common >= _INSIDE * volume[k]:
             within.setdefault(label, []).append(inverse[k])
     labels, parents = proposed.labels, {}
     for label, inside in within.items():

@@ -10,7 +10,7 @@ SVG, there is no script and no link. Times of the steps aside, the same run give
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -61,7 +61,9 @@ def write_report(run: RunFolder | str | Path, out: str | Path | None = None) -> 
 
 
 def _page(run: RunFolder) -> str:
-    filters = dict(different=different, shown=shown, seconds=seconds_text, percent=lambda x: f"{100 * x:.3g} %")
+    filters: dict[str, Callable[..., Any]] = dict(
+        different=different, shown=shown, seconds=seconds_text, percent=lambda x: f"{100 * x:.3g} %"
+    )
     numbers = numbers_of(run)
     return render(
         "report.html",

@@ -32,7 +32,7 @@ from mstfilter.simulation.sensor import ColourSensor, DepthSensor
 from mstfilter.simulation.truth import label_voxels
 from mstfilter.simulation.world import FINGER_ID, World
 
-__all__ = ["Progress", "Scene", "simulate"]
+__all__ = ["Progress", "Scene", "record", "simulate"]
 
 TOLERANCE = 0.0002
 """Metres by which what is recorded (pictures, poses and volumes alike) may lag behind trembling physics."""
@@ -140,7 +140,24 @@ def simulate(family: SceneFamily, seed: int, path: str | Path, progress: Progres
     InputError
         If the folder cannot be written, or the objects cannot be arranged or pushed.
     """
-    scene = Scene(family, seed)
+    return record(Scene(family, seed), path, progress)
+
+
+def record(scene: Scene, path: str | Path, progress: Progress | None = None) -> Recording:
+    """Act in a scene, record it and write the recording: `simulate` for a scene of one's own.
+
+    Parameters
+    ----------
+    scene : Scene
+        At its first pause. A subclass may arrange it and choose its pushes otherwise.
+    path, progress
+        See `simulate`.
+
+    Raises
+    ------
+    InputError
+        If the folder cannot be written, or the objects cannot be pushed.
+    """
     with RecordingWriter(path, scene.camera, scene.grid, **scene.describe()) as writer:
         _record(scene, writer, progress or (lambda done, total, what: None))
     return Recording.open(path)

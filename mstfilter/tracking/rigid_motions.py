@@ -17,6 +17,7 @@ from heapq import heappop, heappush
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.distance import cdist
 
 from mstfilter.scene.arrays import component_key, read_only
 from mstfilter.scene.clip import Clip
@@ -80,6 +81,10 @@ class RigidMotions(Division):
         the common motion, beyond what they do under their own.
     noisy : float
         A cell whose points do not follow any rigid motion within this (metres) is left out.
+    rival, rival_reach : float
+        A point tells nothing that another motion takes as near to where it went, to within `rival` (metres): so do
+        points near the axis about which their object turned. Such motions are rest, and those that are followed
+        within `rival_reach` (metres) of the point's cell; further away motions coincide by chance.
     reach : float
         Neighbouring cells further apart than this in space (metres) are not neighbours.
     min_points : int
@@ -92,6 +97,8 @@ class RigidMotions(Division):
     moved: float = 0.008
     misfit: float = 0.015
     noisy: float = 0.006
+    rival: float = 0.015
+    rival_reach: float = 0.15
     reach: float = 0.04
     min_points: int = 40
     flow: DenseFlow = field(default_factory=DenseFlow)
@@ -127,7 +134,11 @@ class RigidMotions(Division):
         group[~used] = -1
         group[(cells % 2 == 0) & ~near] = -2  # surely at rest
         motions, group = self._motions(sums, group)
-        number = _best(points, cell, pairs, group, motions, origin, 3 * self.misfit)
+        centre = sums[:, 4:7] / sums[:, :1]
+        rivals = [cdist(centre, centre[group == k]).min(axis=1, initial=np.inf) for k in range(len(motions))]
+        close = np.array(rivals) < self.rival_reach
+        close[0] = True
+        number = _best(points, cell, pairs, group, motions, origin, 3 * self.misfit, self.rival, close)
         out[points.row, points.column] = number
         return out
 
@@ -222,22 +233,30 @@ def _join(sums: Array, pairs: Ints, limit: float) -> Ints:
 
 
 def _best(
-    points: FollowedPoints, cell: Ints, pairs: Ints, number: Ints, motions: Array, origin: Array, limit: float
+    points: FollowedPoints,
+    cell: Ints,
+    pairs: Ints,
+    number: Ints,
+    motions: Array,
+    origin: Array,
+    limit: float,
+    rival: float,
+    rivals: NDArray[np.bool_],
 ) -> NDArray[np.int32]:
-    """Of the motions in its cell and those around it, the one that takes each point nearest to where it went."""
+    """Of the motions in its cell and those around it, the one that takes each point nearest to where it went.
+
+    -1 where that is further off than `limit`, or where another of the `rivals` (motions, cells) comes as near to within `rival`.
+    """
     p, q = points.p - origin, points.q - origin
-    best, least = np.full(len(p), -1, np.int32), np.full(len(p), limit)
-    n = len(number)
-    around: list[set[int]] = [{int(number[k])} for k in range(n)]
-    for a, b in pairs.tolist():
-        around[a].add(int(number[b]))
-        around[b].add(int(number[a]))
-    sure = np.array([len(s) == 1 and 0 in s for s in around])
-    best[sure[cell]] = 0
-    for k in range(len(motions)):
-        has = np.array([k in s for s in around]) & ~sure
-        here = np.flatnonzero(has[cell])
-        distance = np.linalg.norm(apply(motions[k], p[here]) - q[here], axis=1)
-        better = distance < least[here]
-        best[here[better]], least[here[better]] = k, distance[better]
-    return best
+    n, every = len(number), np.arange(len(p))
+    near = np.zeros((n, len(motions)), bool)
+    a, b = pairs.T
+    for here, there in ((np.arange(n), number), (a, number[b]), (b, number[a])):
+        near[here[there >= 0], there[there >= 0]] = True
+    distance = np.stack([np.linalg.norm(apply(T, p) - q, axis=1) for T in motions], axis=1)
+    best = np.where(near[cell], distance, np.inf).argmin(axis=1)
+    least = np.where(near[cell, best], distance[every, best], np.inf)
+    distance[every, best] = np.inf
+    distance[~rivals.T[cell]] = np.inf
+    rivalled = distance.min(axis=1) < least + rival
+    return np.where((least < limit) & ~rivalled, best, -1).astype(np.int32)

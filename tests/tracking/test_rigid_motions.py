@@ -6,8 +6,8 @@ import pytest
 from mstfilter.scene.clip import Clip
 from mstfilter.scene.rendering import project
 from mstfilter.scene.voxels import Hypothesis
-from mstfilter.tracking.rigid_motions import RigidMotions
-from tests.tracking.scenes import standard
+from mstfilter.tracking.rigid_motions import RigidMotions, followed_points
+from tests.tracking.scenes import Box, Scene, at, standard
 
 
 @pytest.fixture(scope="module")
@@ -48,3 +48,21 @@ def test_the_limit_of_misfit_decides(pushed):
     coarse = RigidMotions(misfit=1.0, reach=1.0).divide(clip)
     inside = (objects > 0) & (fine >= 0) & (coarse >= 0)
     assert len(np.unique(coarse[inside])) < len(np.unique(fine[inside]))
+
+
+def test_an_object_that_turned_is_not_broken():
+    """A long bar turns about its end: what lies near the axis went with it, and may as well have rested."""
+    length, turns = 0.24, np.linspace(0, 24, 5)
+    poses = []
+    for degrees in turns:
+        pose = at(-0.1, 0.0, 0.03, degrees)
+        pose[:3, 3] += pose[:3, 0] * length / 2
+        poses.append([pose])
+    clip = Scene([Box((length, 0.06, 0.06))], poses).clip(0)
+    points = followed_points(clip, RigidMotions().flow)
+    went = np.linalg.norm(points.q - points.p, axis=1)
+    bar = points.q[:, 2] > 0.02
+    careful, careless = (RigidMotions(rival=r).divide(clip)[points.row, points.column] for r in (0.015, 0.0))
+    assert ((careful[bar] > 0) & (went[bar] > 0.03)).sum() > 40
+    assert (careless[bar] == 0).sum() > 5
+    assert (careful[bar] == 0).sum() == 0
