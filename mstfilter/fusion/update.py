@@ -130,7 +130,10 @@ class FusionUpdate(Update):
     def _scored(self, rng: np.random.Generator, fused: Population, clip: Clip, n: int) -> Population:
         """Second stage: `n` candidates drawn by pair weight, weighted by their score."""
         drawn = Systematic().resample(rng, fused, n).realised()
-        scores = {type(term).__name__: term.log_score(tuple(drawn.particles), clip) for term in self.evidence}
+        scores: dict[str, np.ndarray] = {}
+        for k, term in enumerate(self.evidence):
+            name = type(term).__name__
+            scores[f"{name} {k}" if name in scores else name] = term.log_score(tuple(drawn.particles), clip)
         log_weights = drawn.log_weights + np.sum(list(scores.values()), axis=0)
         parents = {name: index for name, index in drawn.parents.items() if name != "ancestor"}
         notes = {**fused.notes, "scores": {name: score.round(3).tolist() for name, score in scores.items()}}

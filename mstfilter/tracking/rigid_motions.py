@@ -245,7 +245,8 @@ def _best(
 ) -> NDArray[np.int32]:
     """Of the motions in its cell and those around it, the one that takes each point nearest to where it went.
 
-    -1 where that is further off than `limit`, or where another of the `rivals` (motions, cells) comes as near to within `rival`.
+    -1 where that is further off than `limit`, or where another of the `rivals` (motions, cells) comes as near to
+    within `rival`.
     """
     p, q = points.p - origin, points.q - origin
     n, every = len(number), np.arange(len(p))

@@ -104,6 +104,12 @@ def test_two_stages_give_pair_weight_times_score():
     expected = 800 * np.outer([0.2, 0.8], [0.7, 0.3])
     assert stats.chi2.sf(((total - expected) ** 2 / expected).sum(), 3) > 1e-6
 
+    twice = FusionUpdate(NoFreeSpace(), eta=3, evidence=(Size(), Size()), n_scored=8)
+    fused = twice.update(np.random.default_rng(0), a, b, clip)
+    size = np.array([sum(h.volumes().values()) for h in fused.particles])
+    assert np.ptp(fused.log_weights - 2 * size / 10) < 1e-12  # two terms of a kind both count
+    assert len(fused.notes["scores"]) == 2
+
 
 def test_terms_are_named_in_presets():
     filter = build_filter(load_config("mst", ['update.evidence=["motions", "boundaries"]', "update.n_scored=12"]))

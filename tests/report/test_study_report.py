@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import json
 import re
+from importlib.resources import files
 
 import numpy as np
 import pytest
 
 from mstfilter.errors import InputError
 from mstfilter.report.study import write_study_report
+from mstfilter.report.svg import SERIES
 from mstfilter.study.results import RESULT, StudyFolder
 from tests.test_cli import call
 
@@ -113,3 +115,9 @@ def test_command(tmp_path, capsys):
     assert code == 2 and "only runs can be exported" in error
     with pytest.raises(InputError, match="not a study folder"):
         write_study_report(tmp_path)
+
+
+def test_every_arm_has_a_colour():
+    style = (files("mstfilter.report") / "templates" / "style.css").read_text()
+    for k in range(len(SERIES)):
+        assert f"--s{k}: #" in style and f".s{k} {{" in style
