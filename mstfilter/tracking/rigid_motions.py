@@ -97,7 +97,7 @@ class RigidMotions(Division):
     moved: float = 0.008
     misfit: float = 0.015
     noisy: float = 0.006
-    rival: float = 0.015
+    rival: float = 0.006
     rival_reach: float = 0.15
     reach: float = 0.04
     min_points: int = 40
