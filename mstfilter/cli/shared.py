@@ -79,14 +79,15 @@ def bar(what: str) -> Iterator[Callable[[int, int], None]]:
 
 
 def summary(run: Path) -> None:
-    """Two lines a pause: hypotheses with weights, objects and quality."""
+    """A line a pause: hypotheses, their objects, effective number of candidates, quality."""
     from mstfilter.study.run_folder import RunFolder
 
     folder = RunFolder.open(run)
     for t in range(folder.n_pauses):
         info, hypotheses = folder.info(t), folder.hypotheses(t)
         objects = " ".join(str(h.n_objects) for h in hypotheses)
-        line = f"pause {t}     {len(hypotheses)} hypotheses of {objects} objects, ESS {info['ess']:.1f}"
+        line = f"pause {t}     {len(hypotheses)} hypotheses of {objects} objects, "
+        line += f"ESS {info['ess']:.1f} of {info['n_candidates']} candidates"
         if info["quality"] is not None:
             q = info["quality"]["objects"]
             line += f", quality {sum(q) / len(q):.3f} (mean), {max(q):.3f} (best)"

@@ -135,7 +135,7 @@ def test_scipy_rows_and_vectors():
 
 
 def test_torch_distributions():
-    torch = pytest.importorskip("torch")
+    torch = pytest.importorskip("torch", reason="torch cannot be imported", exc_type=ImportError)
     d = as_distribution(torch.distributions.Normal(torch.tensor(1.0, dtype=torch.float64), 2.0))
     a = d.sample(np.random.default_rng(3), 3000)
     np.testing.assert_array_equal(a, d.sample(np.random.default_rng(3), 3000))

@@ -248,7 +248,7 @@ def test_distributions_of_other_libraries_in_programs():
 
     state, _ = Program(model).bootstrap(2000).run(YS, 1)
     assert state.log_evidence == pytest.approx(EXACT, abs=0.5)
-    torch = pytest.importorskip("torch")
+    torch = pytest.importorskip("torch", reason="torch cannot be imported", exc_type=ImportError)
 
     def in_torch(previous, y):
         before = torch.zeros(1) if previous is None else torch.from_numpy(np.array(previous["x"]))
