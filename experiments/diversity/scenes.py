@@ -25,7 +25,7 @@ from mstfilter.errors import InputError
 from mstfilter.scene.clip import Clip
 from mstfilter.scene.frame import Frame
 from mstfilter.scene.recording import Recording
-from mstfilter.simulation.actions import Push, choose_push, play
+from mstfilter.simulation.actions import Effect, Push, choose_push, play
 from mstfilter.simulation.cache import cache_folder
 from mstfilter.simulation.families import GENERATOR_VERSION, SceneFamily, scene_family
 from mstfilter.simulation.recorder import Scene, record
@@ -103,7 +103,7 @@ class TwinScene(Scene):
         if action < self.family.n_actions - 1:
             for _ in range(20):
                 push = choose_push(rng, self.world, self.family)
-                if self._effect(push)[pair].max() < 0.001:
+                if self._tried(push).displacement[pair].max() < 0.001:
                     return push
             raise InputError("no push leaves the twins alone")
         along = np.array([-self.normal[1], self.normal[0]])
@@ -118,22 +118,18 @@ class TwinScene(Scene):
                 push = Push(
                     (float(start[0]), float(start[1])), (float(end[0]), float(end[1])), self.family.action_seconds
                 )
-                shift = self._effect(push)
-                if shift[moved] > 0.06 and shift[stays] < 0.03 and self._kept(push):
+                result = self._tried(push)
+                far, near = result.displacement[moved], result.displacement[stays]
+                if far > 0.06 and near < 0.03 and result.kept and result.settled:
                     return push
         raise InputError("the twins cannot be parted")
 
-    def _effect(self, push: Push) -> np.ndarray:
+    def _tried(self, push: Push) -> Effect:
+        """What a push would do; the world is left as it was."""
         saved = self.world.save()
         result = play(self.world, push, self.family)
         self.world.restore(saved)
-        return result.displacement
-
-    def _kept(self, push: Push) -> bool:
-        saved = self.world.save()
-        result = play(self.world, push, self.family)
-        self.world.restore(saved)
-        return result.kept and result.settled
+        return result
 
 
 def as_one(labels: np.ndarray, truth: np.ndarray, pair: tuple[int, int]) -> bool | None:
@@ -165,10 +161,8 @@ def recorded(
     Kept beside other recordings, and so is the fact that there is none.
     """
     family = replace(TWINS, **overrides)
-    what = hashlib.sha256(json.dumps([GENERATOR_VERSION, asdict(family), ambiguous, N_CUTS]).encode()).hexdigest()[
-        :12
-    ]
-    target = cache_folder() / "recordings" / f"twins-{seed}-{what}"
+    recipe = json.dumps([GENERATOR_VERSION, asdict(family), ambiguous, N_CUTS])
+    target = cache_folder() / "recordings" / f"twins-{seed}-{hashlib.sha256(recipe.encode()).hexdigest()[:12]}"
     if not (target / "twins.json").is_file():
         target.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=target.parent) as work:

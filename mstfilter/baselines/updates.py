@@ -15,11 +15,9 @@ from typing import ClassVar
 import numpy as np
 
 from mstfilter.errors import InputError
-from mstfilter.fusion.division import take_apart
 from mstfilter.fusion.free_space import SMALLEST_QUALITY, FreeSpace, Projection
 from mstfilter.fusion.update import FusionUpdate
 from mstfilter.scene.clip import Clip
-from mstfilter.scene.voxels import Hypothesis
 from mstfilter.smc.interfaces import Update
 from mstfilter.smc.population import Population
 from mstfilter.smc.updates import union
@@ -107,22 +105,14 @@ class Union(Update):
         if predicted is None or proposed is None:
             return self.fusion.update(rng, predicted, proposed, observation)
         refined, quality = self.fusion.free_space.refine(predicted.particles, observation)
-        refined = self._parted(refined, observation, proposed=False)
-        samples = self._parted(tuple(proposed.particles), observation, proposed=True)
+        refined = self.fusion.parted(refined, observation, proposed=False)
+        samples = self.fusion.parted(tuple(proposed.particles), observation, proposed=True)
         log_q = self.fusion.quality_exponent * np.log(np.maximum(quality, SMALLEST_QUALITY))
         weighed = predicted.log_weights - predicted.log_mean_weight + log_q
         both = union(
             Population(refined, weighed, predicted.parents),
             Population(samples, proposed.log_weights - proposed.log_mean_weight, proposed.parents),
         )
-        scores = {type(term).__name__: term.log_score(both.particles, observation) for term in self.fusion.evidence}
-        log_weights = both.log_weights + np.sum(list(scores.values()), axis=0) if scores else both.log_weights
-        notes = {"quality": quality.tolist(), "scores": {k: v.round(3).tolist() for k, v in scores.items()}}
-        return Population(both.particles, log_weights, both.parents, notes)
-
-    def _parted(self, hypotheses: tuple[Hypothesis, ...], clip: Clip, proposed: bool) -> tuple[Hypothesis, ...]:
-        """Hypotheses whose objects fusion would take apart first, taken apart."""
-        motions = self.fusion.division.divide(clip)
-        if motions is None:
-            return hypotheses
-        return tuple(take_apart(h, motions, clip, self.fusion.parts, proposed) for h in hypotheses)
+        total, scores = self.fusion.scored(tuple(both.particles), observation)
+        notes = {"quality": quality.tolist(), "scores": scores}
+        return Population(both.particles, both.log_weights + total, both.parents, notes)

@@ -99,7 +99,7 @@ class FusionUpdate(Update):
             return union(None, proposed)
         refined, quality = self.free_space.refine(predicted.particles, observation)
         doubtful = [self.claims.doubtful(h, r) for h, r in zip(predicted.particles, refined, strict=True)]
-        refined = self._parted(refined, observation, proposed=False)
+        refined = self.parted(refined, observation, proposed=False)
         log_q = self.quality_exponent * np.log(np.maximum(quality, SMALLEST_QUALITY))
         notes = {"quality": quality.tolist(), "eta": self.eta}
         if proposed is None:
@@ -107,7 +107,7 @@ class FusionUpdate(Update):
 
         i, j = _pairs(child(rng, "order"), len(proposed), len(predicted), self.eta)
         key, crossover = key_of(rng), self.crossover
-        samples = self._parted(tuple(proposed.particles), observation, proposed=True)
+        samples = self.parted(tuple(proposed.particles), observation, proposed=True)
         claims, exposed = self.claims, self.claims.exposed(observation)
         _check_grids(refined, samples, refined[0].grid if exposed is None else observation.grid)
 
@@ -130,17 +130,23 @@ class FusionUpdate(Update):
     def _scored(self, rng: np.random.Generator, fused: Population, clip: Clip, n: int) -> Population:
         """Second stage: `n` candidates drawn by pair weight, weighted by their score."""
         drawn = Systematic().resample(rng, fused, n).realised()
-        scores: dict[str, np.ndarray] = {}
-        for k, term in enumerate(self.evidence):
-            name = type(term).__name__
-            scores[f"{name} {k}" if name in scores else name] = term.log_score(tuple(drawn.particles), clip)
-        log_weights = drawn.log_weights + np.sum(list(scores.values()), axis=0)
+        total, scores = self.scored(tuple(drawn.particles), clip)
+        log_weights = drawn.log_weights + total
         parents = {name: index for name, index in drawn.parents.items() if name != "ancestor"}
-        notes = {**fused.notes, "scores": {name: score.round(3).tolist() for name, score in scores.items()}}
+        notes = {**fused.notes, "scores": scores}
         return Population(drawn.particles, log_weights, parents, notes)
 
-    def _parted(self, hypotheses: tuple[Hypothesis, ...], clip: Clip, proposed: bool) -> tuple[Hypothesis, ...]:
-        """Taken apart by what has moved apart; the same hypothesis once."""
+    def scored(self, hypotheses: tuple[Hypothesis, ...], clip: Clip) -> tuple[np.ndarray, dict[str, list[float]]]:
+        """What all terms of evidence say together (n,), nats, and what each says, by name, for the notes."""
+        total, scores = np.zeros(len(hypotheses)), {}
+        for k, term in enumerate(self.evidence):
+            name, score = type(term).__name__, term.log_score(hypotheses, clip)
+            scores[f"{name} {k}" if name in scores else name] = score.round(3).tolist()
+            total += score
+        return total, scores
+
+    def parted(self, hypotheses: tuple[Hypothesis, ...], clip: Clip, proposed: bool) -> tuple[Hypothesis, ...]:
+        """Hypotheses about the end of a clip, taken apart by what has moved apart in it; the same one once."""
         motions = self.division.divide(clip)
         if motions is None:
             return hypotheses
