@@ -56,7 +56,8 @@ class ClusterStratified(Resampler):
 
     With fewer places than clusters, Fearnhead-Clifford chooses clusters and their weights. With more, cluster g
     gets max(1, W_g / c) places on average, sum max(1, W_g / c) = n, rounded systematically. The particles of a
-    cluster share its mass, so any such allocation is unbiased.
+    cluster share its mass, so any such allocation is unbiased. Clusters below `least_mass` have no claim to a place:
+    each gets W_g / c places on average, and where that is below one and it gets one, it stands for mass c.
 
     Parameters
     ----------
@@ -66,11 +67,14 @@ class ClusterStratified(Resampler):
         Similarity to the leader from which on a particle belongs to its cluster, in (0, 1].
     scheme : Resampler
         Draws inside a cluster; sees only weights.
+    least_mass : float
+        Share of all weight from which on a cluster is sure of a place, in [0, 1).
     """
 
     similarity: Similarity = Gaussian()  # noqa: RUF009 (frozen)
     at_least: float = 0.5
     scheme: Resampler = Systematic()  # noqa: RUF009 (frozen)
+    least_mass: float = 0.0
 
     exact_size: ClassVar[bool] = False
 
@@ -83,6 +87,7 @@ class ClusterStratified(Resampler):
         part("similarity", self.similarity, Similarity)
         part("scheme", self.scheme, Resampler)
         number("at_least", self.at_least, above=0, at_most=1, unit="similarity")
+        number("least_mass", self.least_mass, at_least=0, below=1, unit="share of the weight")
 
     def select(self, rng: np.random.Generator, log_weights: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
         """Not possible without the particles."""
@@ -112,31 +117,37 @@ class ClusterStratified(Resampler):
         notes = {**population.notes, "clusters": len(mass)}
         return replace(chosen, parents={**chosen.parents, "ancestor": chosen_ancestors}, notes=notes)
 
-    @staticmethod
-    def _allocate(rng: np.random.Generator, mass: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
+    def _allocate(self, rng: np.random.Generator, mass: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
         """Places of each cluster (0: none), and the mass that each one stands for."""
-        if n < len(mass):
+        sure = mass >= self.least_mass * mass.sum()
+        n_sure = int(sure.sum())
+        if n_sure > n or (n_sure == n and not sure.all()):
             places, masses = np.zeros(len(mass), np.int64), np.zeros(len(mass))
             kept, log_masses = FearnheadClifford().select(rng, np.log(mass), n)
             places[kept] = 1
             masses[kept] = np.exp(log_masses) * (len(mass) / len(kept))
             return places, masses
-        share = _at_least_one(mass, n)
+        share = _shares(mass, sure, n)
         whole = np.floor(share * (1 + 1e-13)).astype(np.int64)
         rest = n - int(whole.sum())
         if rest > 0:
             with np.errstate(divide="ignore"):
                 extra, _ = Systematic().select(rng, np.log(np.clip(share - whole, 0.0, None)), rest)
             whole += np.bincount(extra, minlength=len(mass))
-        return whole, mass
+        return whole, np.where(share < 1, mass / share, mass)
 
 
-def _at_least_one(mass: np.ndarray, n: int) -> np.ndarray:
-    """max(1, mass / c) with sum n, for n >= number of clusters."""
-    order = np.argsort(-mass, kind="stable")
-    heavy = np.cumsum(mass[order])
-    count = np.arange(1, len(mass) + 1)
-    # With the first A clusters above one place each, these share n - (G - A) places by mass.
-    c = heavy / (n - len(mass) + count)
-    above = np.flatnonzero(mass[order] >= c)
-    return np.maximum(1.0, mass / c[above[-1]]) if len(above) else np.ones(len(mass))
+def _shares(mass: np.ndarray, sure: np.ndarray, n: int) -> np.ndarray:
+    """max(1, mass / c) where `sure`, mass / c elsewhere, with sum n: at most n are sure, fewer if not all are."""
+    wanted = mass[sure]
+    heavy = np.append(0.0, np.cumsum(np.sort(wanted)[::-1])) + mass[~sure].sum()
+    count = np.arange(len(heavy))
+    # With the A heaviest of S sure ones above one place each, these and the others share n - (S - A) places by mass.
+    left = n - len(wanted) + count
+    with np.errstate(divide="ignore", invalid="ignore"):
+        c = np.where(left > 0, heavy / left, np.inf)
+    above = np.flatnonzero(np.append(np.inf, np.sort(wanted)[::-1]) >= c)
+    if not len(above):
+        return np.ones(len(mass))
+    share = mass / c[above[-1]]
+    return np.where(sure, np.maximum(1.0, share), share)

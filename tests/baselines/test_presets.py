@@ -54,6 +54,19 @@ def test_baselines_differ_from_mst_only_where_they_must():
     assert differences(described("mst", "update.crossover.merge=always"), MST) == ["update.crossover.merge"]
 
 
+@pytest.mark.parametrize("whose", ["paper", "authors"])
+def test_published_fusions_behind_the_front_end_of_mst(whose):
+    """Update and resampler of the one, all else of the other."""
+    both, theirs = described(f"{whose}_fusion"), described(whose)
+    assert both["update"] == theirs["update"]
+    assert both["resampler"] == theirs["resampler"]
+    assert sorted(differences(both, MST)) == sorted(["proposal.weight_rule", "resampler", *_in_update(both)])
+
+
+def _in_update(config):
+    return [f"update.{d}" for d in differences(config["update"], MST["update"])]
+
+
 @pytest.mark.parametrize(
     "overrides, where",
     [

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import csv
 
+import pytest
+
 from mstfilter.cli import main
 from mstfilter.simulation.families import FIRST_REPORTED_SEED
 from mstfilter.study.config import load_study
@@ -11,6 +13,7 @@ from mstfilter.study.plan import make_plan
 from tests.conftest import REPOSITORY
 
 CONFIG = REPOSITORY / "experiments/main/study.toml"
+FUSION = REPOSITORY / "experiments/fusion"
 
 
 def test_smoke(tmp_path, capsys, monkeypatch):
@@ -21,16 +24,25 @@ def test_smoke(tmp_path, capsys, monkeypatch):
             main(command)
         except SystemExit as end:
             assert not end.code
-    assert "17 of them before" in capsys.readouterr().out  # the second time nothing is run
+    arms = [arm.name for arm in make_plan(load_study(CONFIG)).arms]
+    assert f"{len(arms)} of them before" in capsys.readouterr().out  # the second time nothing is run
     with (tmp_path / "out" / "runs.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
-    arms = [arm.name for arm in make_plan(load_study(CONFIG)).arms]
     assert {row["arm"] for row in rows} == set(arms) and len(rows) == len(arms) * 2
 
 
-def test_seeds_are_of_the_right_side():
-    """The study reports seeds that nothing is tuned on; its small form never looks at one."""
-    reported = [scene.source["seed"] for scene in make_plan(load_study(CONFIG)).scenes]
-    assert set(reported) <= set(range(1000, 1100)) and min(reported) >= FIRST_REPORTED_SEED
-    small = [scene.source["seed"] for scene in make_plan(load_study(CONFIG, smoke=True)).scenes]
+@pytest.mark.parametrize("config, first", [(CONFIG, 1000), (FUSION / "reported.toml", 1100)])
+def test_seeds_are_of_the_right_side(config, first):
+    """The studies report seeds that nothing is tuned on; their small forms never look at one."""
+    reported = [scene.source["seed"] for scene in make_plan(load_study(config)).scenes]
+    assert set(reported) <= set(range(first, first + 100)) and min(reported) >= FIRST_REPORTED_SEED
+    small = [scene.source["seed"] for scene in make_plan(load_study(config, smoke=True)).scenes]
     assert max(small) < 100
+
+
+def test_what_is_reported_of_fusion_is_what_was_tuned():
+    """The same arms on other scenes."""
+    tuned, reported = (make_plan(load_study(FUSION / f"{name}.toml")) for name in ("study", "reported"))
+    assert [(arm.name, arm.key) for arm in tuned.arms] == [(arm.name, arm.key) for arm in reported.arms]
+    assert not {scene.name for scene in tuned.scenes} & {scene.name for scene in reported.scenes}
+    assert len(tuned.scenes) == len(reported.scenes) == 30

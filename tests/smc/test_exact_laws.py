@@ -150,10 +150,11 @@ def of(x, weights):
 GROUPS = of([0.0, 0.1, 5.0, 5.1, 9.0], [3.0, 1.0, 1.0, 1.0, 2.0])  # clusters of mass 4, 2 and 2: jumps at quarters
 
 
+@pytest.mark.parametrize("least_mass", [0.0, 0.3, 0.6])
 @pytest.mark.parametrize("n", [1, 2, 3, 4, 5, 8])
-def test_clusters(n):
-    """Fewer places than clusters, as many, and more: what a particle carries is its weight."""
-    scheme = ClusterStratified(Gaussian(1.0))
+def test_clusters(n, least_mass):
+    """Fewer places than clusters, as many, and more; all, one or none sure of a place: all carry their weight."""
+    scheme = ClusterStratified(Gaussian(1.0), least_mass=least_mass)
     found = carried(scheme, GROUPS, n, cells=4)
     np.testing.assert_allclose(found, np.exp(GROUPS.log_weights) / 5, atol=1e-12)
 

@@ -1,0 +1,121 @@
+"""The small tables of a study that are kept here, from the folder that `mstfilter study` wrote.
+
+    python experiments/main/tables.py STUDY experiments/main/results [--reference "true masks: mst"]
+
+Writes, named after the study, NAME.csv (a line a family and arm: means over scenes of pauses t >= 1) and NAME_differences.csv
+(reference minus arm in the primary endpoint; unadjusted t interval, studentised bootstrap, p by flipping signs, p after Holm
+over families and arms), and prints the latter as a table for the README.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+from pathlib import Path
+
+from mstfilter.study.results import StudyFolder
+from mstfilter.study.summary import ENDPOINT, Summary, summarise
+
+FIGURES = (
+    "quality",
+    "quality_weighted",
+    "quality_top",
+    "quality_best",
+    "quality_authors",
+    "quality_slope",
+    "quality_visible",
+    "quality_hidden",
+    "quality_unseen",
+    "quality_one_blob",
+    "quality_components",
+    "occupancy",
+    "object_f",
+    "split",
+    "merged",
+    "missed",
+    "invented",
+    "diversity",
+    "brier",
+    "core_seconds",
+    "peak_mb",
+)
+
+
+def write(path: Path, rows: list[dict[str, str]]) -> None:
+    """A CSV file of rows that have the same columns."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("w", newline="") as file:
+        writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def means(found: Summary) -> list[dict[str, str]]:
+    """A line a family and arm."""
+    by_name = {(f.family, f.arm, f.name): f for f in found.figures}
+    keys = dict.fromkeys((f.family, f.arm) for f in found.figures)
+    return [
+        {
+            "family": family,
+            "arm": arm,
+            "n": str(len(by_name[family, arm, ENDPOINT].by_scene)),
+            **{
+                name: f"{by_name[family, arm, name].mean:.4g}" if (family, arm, name) in by_name else ""
+                for name in FIGURES
+            },
+        }
+        for family, arm in keys
+    ]
+
+
+def differences(found: Summary) -> list[dict[str, str]]:
+    """A line a family and arm that is compared with the reference."""
+    lines = []
+    for c in found.differences:
+        d = c.difference
+        if c.figure == ENDPOINT and not c.beside:
+            row = {"family": c.family, "reference": c.first, "arm": c.second, "n": str(d.n), "mean": f"{d.mean:.4f}"}
+            row |= {name: f"{getattr(d, name):.4f}" for name in ("low", "high", "low_bootstrap", "high_bootstrap")}
+            lines.append(row | {"p": f"{d.p:.4g}", "p_holm": f"{d.p_holm:.4g}"})
+    return lines
+
+
+def markdown(rows: list[dict[str, str]]) -> str:
+    """Arms down, families across."""
+    families, arms = (list(dict.fromkeys(r[key] for r in rows)) for key in ("family", "arm"))
+    cell = {
+        (r["family"], r["arm"]): f"{float(r['mean']):+.3f} [{float(r['low']):+.3f}, {float(r['high']):+.3f}]"
+        for r in rows
+    }
+    head = ["| |", *(f" {f} |" for f in families), "\n|---|", *("---|" for _ in families), "\n"]
+    body = ["| " + " | ".join([arm, *(cell.get((f, arm), "") for f in families)]) + " |\n" for arm in arms]
+    return "".join(head + body)
+
+
+def main(study: Path, out: Path, reference: str) -> None:
+    """Read, write, print."""
+    folder = StudyFolder.open(study)
+    name = folder.description["name"]
+    if reference:
+        beside = [
+            arm["name"]
+            for arm in folder.description["arms"]
+            if arm["name"].startswith("true masks") != reference.startswith("true masks")
+        ]
+        found = summarise(folder.rows(), reference, beside=beside)
+        name += f"_{reference.split(':')[0].replace(' ', '_')}"
+    else:
+        found = folder.summary()
+        write(out / f"{name}.csv", means(found))
+    compared = differences(found)
+    write(out / f"{name}_differences.csv", compared)
+    print(markdown(compared))
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("study", type=Path)
+    parser.add_argument("out", type=Path)
+    parser.add_argument("--reference", default="", help="another arm than the study's own reference")
+    given = parser.parse_args()
+    main(given.study, given.out, given.reference)
