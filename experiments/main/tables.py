@@ -2,9 +2,10 @@
 
     python experiments/main/tables.py STUDY experiments/main/results [--reference "true masks: mst"]
 
-Writes, named after the study, NAME.csv (a line a family and arm: means over scenes of pauses t >= 1) and NAME_differences.csv
-(reference minus arm in the primary endpoint; unadjusted t interval, studentised bootstrap, p by flipping signs, p after Holm
-over families and arms), and prints the latter as a table for the README.
+Writes, named after the study, NAME.csv (a line a family and arm: means over scenes of pauses t >= 1), NAME_scenes.csv
+(the primary endpoint of each scene) and NAME_differences.csv (reference minus arm in the primary endpoint; unadjusted
+t interval, studentised bootstrap, p by flipping signs, p after Holm over families and arms), and prints the latter as
+a table for the README.
 """
 
 from __future__ import annotations
@@ -48,6 +49,16 @@ def write(path: Path, rows: list[dict[str, str]]) -> None:
         writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
         writer.writeheader()
         writer.writerows(rows)
+
+
+def by_scene(found: Summary) -> list[dict[str, str]]:
+    """The primary endpoint, a line a scene and arm."""
+    return [
+        {"family": f.family, "scene": scene, "arm": f.arm, ENDPOINT: f"{value:.4f}"}
+        for f in found.figures
+        if f.name == ENDPOINT
+        for scene, value in f.by_scene.items()
+    ]
 
 
 def means(found: Summary) -> list[dict[str, str]]:
@@ -107,6 +118,7 @@ def main(study: Path, out: Path, reference: str) -> None:
     else:
         found = folder.summary()
         write(out / f"{name}.csv", means(found))
+        write(out / f"{name}_scenes.csv", by_scene(found))
     compared = differences(found)
     write(out / f"{name}_differences.csv", compared)
     print(markdown(compared))

@@ -20,12 +20,12 @@ from mstfilter.oracles.miniature.calibration import DRAWS, rank, statistics, uni
 from mstfilter.oracles.miniature.exact import exact_filter
 from mstfilter.oracles.miniature.filters import bootstrap_filter, guided_filter
 from mstfilter.oracles.miniature.measures import MEASURES, class_weights, iid_population, measure
-from mstfilter.oracles.miniature.shrunk import ReadingEvidence, shrink
+from mstfilter.oracles.miniature.shrunk import shrink
 from mstfilter.oracles.miniature.weighting import ScoredFusion, balanced_filter
 from mstfilter.oracles.miniature.world import Miniature
 from mstfilter.smc.kept_weights import KeepWeights
 from mstfilter.smc.particle_filter import ParticleFilter
-from mstfilter.smc.resampling import Multinomial
+from mstfilter.smc.resampling import Multinomial, Systematic
 from mstfilter.smc.resampling_optimal import FearnheadClifford
 
 HERE = Path(__file__).resolve().parent
@@ -33,7 +33,7 @@ WORLDS = {"shelf": Miniature((3, 2)), "row": Miniature((6, 1))}
 PROPER = {"bootstrap": bootstrap_filter, "guided": guided_filter, "balanced": balanced_filter}
 PRESETS = {"paper": ("p", False), "authors": ("p", True), "mst": ("equal", False)}
 LADDER = ("+ score", "+ distinct", "+ predictive", "+ parents", "+ optimal", "+ cover")
-FAULTS = ("mst, p twice", "mst, weights kept", "mst, no Q", "mst, evidence")
+CHANGES = ("mst, p twice", "mst, weights kept", "mst, no Q", "mst, no score", "mst, systematic")
 UNIONS = {"union, optimal": "+ optimal", "union, cover": "+ cover"}  # the same without crossover
 T = 6
 
@@ -57,8 +57,10 @@ def arm(name: str, world: Miniature, n: int) -> ParticleFilter:
         return replace(mst, resampler=KeepWeights(Multinomial()))
     if name == "mst, no Q":
         return replace(mst, update=replace(mst.update, quality_exponent=0.0))
-    if name == "mst, evidence":  # the update's own two stages, with the best evidence that there can be
-        return replace(mst, update=replace(mst.update, evidence=(ReadingEvidence(world),)))
+    if name == "mst, no score":  # what is built is not judged
+        return replace(mst, update=replace(mst.update, evidence=()))
+    if name == "mst, systematic":
+        return replace(mst, resampler=Systematic())
     if name in UNIONS:
         filter = arm(UNIONS[name], world, n)
         return replace(filter, update=replace(filter.update, first=0))
@@ -183,7 +185,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=HERE / "results")
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
-    every = (*PROPER, *PRESETS, *FAULTS, *LADDER, *UNIONS)
+    every = (*PROPER, *PRESETS, *CHANGES, *LADDER, *UNIONS)
     if options.smoke:
         plan, ranked, n_worlds = [(every, 5, 2), (every, 20, 2)], {"exact": 0, "guided": 50, "mst": 5}, 20
     else:

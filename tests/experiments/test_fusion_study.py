@@ -17,6 +17,16 @@ def test_claims_smoke(tmp_path, monkeypatch):
         rows = list(csv.DictReader(file))
     assert {"sample: sample alone", "prediction: prediction alone"} <= {r["claimed by"] for r in rows}
     assert sum(int(r["voxels"]) for r in rows) > 100
+    with (tmp_path / "hidden.csv").open(newline="") as file:
+        hidden = list(csv.DictReader(file))
+    alone = sum(
+        int(r["voxels"])
+        for r in rows
+        if r["claimed by"] == "prediction: prediction alone"
+        and r["where"] == "hidden"
+        and r["cleared"] in ("<= 0.01", "<= 0.03")
+    )
+    assert sum(int(r["voxels"]) for r in hidden) == alone > 0
 
 
 def test_memory_smoke(tmp_path, monkeypatch):

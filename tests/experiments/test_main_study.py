@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import csv
+import subprocess
+import sys
 
 import pytest
 
@@ -14,6 +16,43 @@ from tests.conftest import REPOSITORY
 
 CONFIG = REPOSITORY / "experiments/main/study.toml"
 FUSION = REPOSITORY / "experiments/fusion"
+
+
+def study(tmp_path, config):
+    """The folder of a study in its small form."""
+    out = tmp_path / config.stem
+    try:
+        main(["study", str(config), "--smoke", "--out", str(out), "--workers", "2"])
+    except SystemExit as end:
+        assert not end.code
+    return out
+
+
+def tables(folder, out, *more):
+    """What the script of tables writes of a study, by the name of the file."""
+    script = REPOSITORY / "experiments/main/tables.py"
+    subprocess.run([sys.executable, str(script), str(folder), str(out), *more], check=True, capture_output=True)
+    return {path.stem: list(csv.DictReader(path.open(newline=""))) for path in out.iterdir()}
+
+
+@pytest.mark.parametrize(
+    "config", ["main/paper_best", "fusion/study", "fusion/reported", "ablations/study"], ids=lambda name: name
+)
+def test_other_studies_run_in_their_small_form(tmp_path, monkeypatch, config):
+    monkeypatch.setenv("MSTFILTER_CACHE", str(tmp_path / "cache"))
+    path = REPOSITORY / "experiments" / f"{config}.toml"
+    make_plan(load_study(path))  # the long form is one that can be run
+    folder = study(tmp_path, path)
+    arms = [arm.name for arm in make_plan(load_study(path, smoke=True)).arms]
+    name = load_study(path).name
+    found = tables(folder, tmp_path / "tables")
+    assert [row["arm"] for row in found[name]] == arms
+    assert all(0 < float(row["quality"]) <= 1 for row in found[name])
+    beside = [arm for arm in arms if arm.startswith("true masks")]
+    assert [row["arm"] for row in found[f"{name}_differences"]] == [a for a in arms[1:] if a not in beside]
+    if beside:
+        found = tables(folder, tmp_path / "tables", "--reference", "true masks: mst")
+        assert [row["arm"] for row in found[f"{name}_true_masks_differences"]] == beside[1:]
 
 
 def test_smoke(tmp_path, capsys, monkeypatch):
