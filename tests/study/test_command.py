@@ -54,6 +54,7 @@ def test_an_unknown_component_is_answered_before_heavy_imports(tmp_path):
 
 
 def test_ctrl_c_ends_workers_and_loses_nothing(config, tmp_path):
+    config.write_text(config.read_text().replace('"0-5"', '"0-299"'))  # more than end before the signal comes
     command = [sys.executable, "-m", "mstfilter", "study", str(config), "--workers", "1"]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
     deadline = time.monotonic() + 120
@@ -65,4 +66,4 @@ def test_ctrl_c_ends_workers_and_loses_nothing(config, tmp_path):
     assert "interrupted: the same command goes on from here" in error
     assert "Traceback" not in error
     assert not list(tmp_path.glob("studies/mine/runs/.*"))
-    assert 1 <= len(list(tmp_path.glob("studies/mine/runs/*/result.json"))) < 6
+    assert 1 <= len(list(tmp_path.glob("studies/mine/runs/*/result.json"))) < 300
