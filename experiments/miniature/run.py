@@ -1,6 +1,6 @@
 """How far the filters are from the exact posterior of the miniature world.
 
-python experiments/miniature/run.py [--smoke] [--out results]
+python experiments/miniature/run.py [--presets | --smoke] [--out results]
 """
 
 from __future__ import annotations
@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 import csv
 from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -72,26 +73,34 @@ def arm(name: str, world: Miniature, n: int) -> ParticleFilter:
     return replace(filter, proposal=replace(mst.proposal, prior_share=0.2)) if rung >= 5 else filter
 
 
-def distances(plan: list[tuple[tuple[str, ...], int, int]]) -> list[dict[str, object]]:
-    """One row a world, arm, size and step. `plan`: (arms, n, number of worlds)."""
-    rows = []
-    for shape, world in WORLDS.items():
-        for arms, n, n_worlds in plan:
-            for seed in range(n_worlds):
-                truth, glances = world.simulate(np.random.default_rng([seed, 11]), T)
-                exact = exact_filter(world, glances).posterior
-                answers: dict[str, list[np.ndarray]] = {
-                    "exact": list(exact),
-                    "n exact draws": [iid_population(np.random.default_rng([seed, 12]), p, n) for p in exact],
-                }
-                for name in arms:
-                    steps = arm(name, world, n).iterate(glances, seed)
-                    answers[name] = [class_weights(world, state.population) for state, _ in steps]
-                for name, laws in answers.items():
-                    for t, p in enumerate(laws):
-                        found = measure(world, p, exact[t], int(truth[t]))
-                        rows.append({"world": shape, "arm": name, "n": n, "seed": seed, "t": t, **found})
-            print(shape, n, n_worlds, "worlds", flush=True)
+Plan = list[tuple[tuple[str, ...], int, int]]  # arms, n, number of worlds
+
+
+def distances(plan: Plan) -> list[dict[str, object]]:
+    """One row a world, arm, size and step; a process for each shape of world."""
+    with ProcessPoolExecutor(len(WORLDS)) as pool:
+        return [row for rows in pool.map(of_shape, WORLDS, [plan] * len(WORLDS)) for row in rows]
+
+
+def of_shape(shape: str, plan: Plan) -> list[dict[str, object]]:
+    """The rows of one shape of world."""
+    rows, world = [], WORLDS[shape]
+    for arms, n, n_worlds in plan:
+        for seed in range(n_worlds):
+            truth, glances = world.simulate(np.random.default_rng([seed, 11]), T)
+            exact = exact_filter(world, glances).posterior
+            answers: dict[str, list[np.ndarray]] = {
+                "exact": list(exact),
+                "n exact draws": [iid_population(np.random.default_rng([seed, 12]), p, n) for p in exact],
+            }
+            for name in arms:
+                steps = arm(name, world, n).iterate(glances, seed)
+                answers[name] = [class_weights(world, state.population) for state, _ in steps]
+            for name, laws in answers.items():
+                for t, p in enumerate(laws):
+                    found = measure(world, p, exact[t], int(truth[t]))
+                    rows.append({"world": shape, "arm": name, "n": n, "seed": seed, "t": t, **found})
+        print(shape, n, n_worlds, "worlds", flush=True)
     return rows
 
 
@@ -182,10 +191,18 @@ def main() -> None:
     """Run what is asked for."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--smoke", action="store_true", help="two worlds, few particles: a minute")
+    parser.add_argument("--presets", action="store_true", help="the presets alone, distances alone: 10 minutes")
     parser.add_argument("--out", type=Path, default=HERE / "results")
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
     every = (*PROPER, *PRESETS, *CHANGES, *LADDER, *UNIONS)
+    if options.presets:
+        options.out = options.out / "presets"
+        options.out.mkdir(exist_ok=True)
+        summarise(
+            distances([(tuple(PRESETS), 5, 100), (tuple(PRESETS), 20, 100), (tuple(PRESETS), 100, 50)]), options.out
+        )
+        return
     if options.smoke:
         plan, ranked, n_worlds = [(every, 5, 2), (every, 20, 2)], {"exact": 0, "guided": 50, "mst": 5}, 20
     else:
