@@ -29,6 +29,7 @@ from mstfilter.scene.quality import weighted_coverage
 from mstfilter.scene.recording import Recording
 from mstfilter.simulation.cache import cached_recording
 from mstfilter.smc.particle_filter import State
+from mstfilter.study.results import write_table
 from mstfilter.study.statistics import interval
 
 SCENES = [(family, k) for family in ("s1", "s2") for k in range(6)]
@@ -116,16 +117,6 @@ def summary(rows: list[dict[str, str]]) -> Iterator[dict[str, object]]:
         }
 
 
-def write(path: Path, rows: list[dict]) -> None:
-    """A CSV that is there in full or not at all."""
-    partial = path.with_suffix(".partial")
-    with partial.open("w", newline="") as file:
-        writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
-    partial.replace(path)
-
-
 def main() -> None:
     """Run what is missing, then summarise."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -146,10 +137,10 @@ def main() -> None:
         here, there = (Recording.open(cached_recording(f, s, **change)) for f, s in (scene, other))
         row = run(scene, there, here)
         rows.append({name: str(value) for name, value in row.items()})
-        write(path, rows)
+        write_table(path, FIELDS, rows)
         print(k, row, flush=True)
     found = list(summary(rows))
-    write(options.out / "summary.csv", found)
+    write_table(options.out / "summary.csv", list(found[0]), found)
     print(*found, sep="\n")
 
 

@@ -11,10 +11,9 @@ a table for the README.
 from __future__ import annotations
 
 import argparse
-import csv
 from pathlib import Path
 
-from mstfilter.study.results import StudyFolder
+from mstfilter.study.results import StudyFolder, write_table
 from mstfilter.study.summary import ENDPOINT, Summary, summarise
 
 FIGURES = (
@@ -40,15 +39,6 @@ FIGURES = (
     "core_seconds",
     "peak_mb",
 )
-
-
-def write(path: Path, rows: list[dict[str, str]]) -> None:
-    """A CSV file of rows that have the same columns."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
 
 
 def by_scene(found: Summary) -> list[dict[str, str]]:
@@ -106,7 +96,7 @@ def markdown(rows: list[dict[str, str]]) -> str:
 def main(study: Path, out: Path, reference: str) -> None:
     """Read, write, print."""
     folder = StudyFolder.open(study)
-    name = folder.description["name"]
+    name, tables = folder.description["name"], {}
     if reference:
         beside = [
             arm["name"]
@@ -117,11 +107,12 @@ def main(study: Path, out: Path, reference: str) -> None:
         name += f"_{reference.split(':')[0].replace(' ', '_')}"
     else:
         found = folder.summary()
-        write(out / f"{name}.csv", means(found))
-        write(out / f"{name}_scenes.csv", by_scene(found))
-    compared = differences(found)
-    write(out / f"{name}_differences.csv", compared)
-    print(markdown(compared))
+        tables |= {name: means(found), f"{name}_scenes": by_scene(found)}
+    tables[f"{name}_differences"] = differences(found)
+    out.mkdir(parents=True, exist_ok=True)
+    for table, rows in tables.items():
+        write_table(out / f"{table}.csv", list(rows[0]), rows)
+    print(markdown(tables[f"{name}_differences"]))
 
 
 if __name__ == "__main__":

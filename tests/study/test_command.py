@@ -53,10 +53,21 @@ def test_an_unknown_component_is_answered_before_heavy_imports(tmp_path):
     assert done.stdout.strip() == "2 []"
 
 
+def heed_interrupts():
+    """Shells start background jobs deaf to Ctrl-C, and tests that such a job runs would inherit that."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
 def test_ctrl_c_ends_workers_and_loses_nothing(config, tmp_path):
-    config.write_text(config.read_text().replace('"0-5"', '"0-299"'))  # more than end before the signal comes
+    config.write_text(config.read_text().replace('"0-5"', '"0-59"'))  # more than end before the signal comes
     command = [sys.executable, "-m", "mstfilter", "study", str(config), "--workers", "1"]
-    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+    process = subprocess.Popen(
+        command,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+        preexec_fn=heed_interrupts,
+    )
     deadline = time.monotonic() + 120
     while not list(tmp_path.glob("studies/mine/runs/*/result.json")) and time.monotonic() < deadline:
         time.sleep(0.02)
@@ -66,4 +77,4 @@ def test_ctrl_c_ends_workers_and_loses_nothing(config, tmp_path):
     assert "interrupted: the same command goes on from here" in error
     assert "Traceback" not in error
     assert not list(tmp_path.glob("studies/mine/runs/.*"))
-    assert 1 <= len(list(tmp_path.glob("studies/mine/runs/*/result.json"))) < 300
+    assert 1 <= len(list(tmp_path.glob("studies/mine/runs/*/result.json"))) < 60
