@@ -55,9 +55,10 @@ def at_rest(recording: Recording, pause: int) -> int | None:
 
 def shuffled(clip: Clip, rng: np.random.Generator) -> Clip:
     """The clip with its inner frames in random order."""
-    inner = 1 + rng.permutation(len(clip) - 2) if len(clip) > 2 else np.zeros(0, int)
-    order = [0, *inner.tolist(), len(clip) - 1] if len(clip) > 1 else [0]
-    return replace(clip, frames=tuple(clip.frames[k] for k in order))
+    frames = list(clip.frames)
+    inner = frames[1:-1]
+    frames[1:-1] = [inner[k] for k in rng.permutation(len(inner))]
+    return replace(clip, frames=tuple(frames))
 
 
 def run(scene: tuple[str, int], stranger: Recording, recording: Recording) -> dict[str, object]:
@@ -69,9 +70,7 @@ def run(scene: tuple[str, int], stranger: Recording, recording: Recording) -> di
     for clip, other in zip(recording.clips(), stranger.clips(), strict=False):
         truth = recording.truth(clip.index)
         assert truth is not None
-        # The population of another scene at the pause before, in this one's clip.
-        lost, _ = mst.step(foreign, clip) if clip.index else (foreign, None)
-        foreign, _ = mst.step(foreign, other)
+        past, (foreign, _) = foreign, mst.step(foreign, other)
         state, _ = mst.step(state, clip)
         alone, _ = samples.step(alone, clip)
         mixed, _ = mst.step(mixed, shuffled(clip, rng))
@@ -81,6 +80,7 @@ def run(scene: tuple[str, int], stranger: Recording, recording: Recording) -> di
             ]
             found["start"].append(float(all(same)))
             continue
+        lost, _ = mst.step(past, clip)  # another scene's population at the pause before
         found["mst"].append(quality(state, truth))
         found["samples"].append(quality(alone, truth))
         found["shuffled"].append(quality(mixed, truth))

@@ -23,6 +23,7 @@ from scenes import as_one, recorded
 import mstfilter
 from mstfilter.scene.quality import weighted_coverage
 from mstfilter.scene.recording import Recording
+from mstfilter.study.results import write_table
 
 METHODS = ("mst", "samples_only", "tracking_only", "union", "paper", "authors")
 SMALL = {"width": 320, "height": 240, "frames_per_clip": 8, "voxel_size": 0.02}
@@ -97,23 +98,13 @@ def main(n_scenes: int, out: Path, smoke: bool) -> None:
                 continue
             new = pauses(method, recording, pair, seed)
             rows += [{"scene": str(seed), "method": method, **{k: str(v) for k, v in row.items()}} for row in new]
-            write(path, FIELDS, rows)
+            write_table(path, FIELDS, rows)
         table = summary(rows)
-        write(out / "summary.csv", list(table[0]), table)
+        write_table(out / "summary.csv", list(table[0]), table)
         print(
             f"scene {seed}: " + "; ".join(f"{r['method']} {r['share']} {r['share parted']}" for r in table),
             flush=True,
         )
-
-
-def write(path: Path, fields: list[str], rows: list) -> None:
-    """A table, written whole."""
-    partial = path.with_suffix(".partial")
-    with partial.open("w", newline="") as file:
-        writer = csv.DictWriter(file, fields, lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
-    partial.replace(path)
 
 
 if __name__ == "__main__":

@@ -28,7 +28,6 @@ from mstfilter.scene.recording import Recording
 from mstfilter.simulation.cache import cached_recording
 
 CLEARED = (0.01, 0.03, 0.06, 1.0)
-DOUBTFUL = 0.03
 VOTES = (0.4, 0.8, 1.0)
 SMALL = {"width": 160, "height": 120, "n_actions": 1, "frames_per_clip": 8, "voxel_size": 0.02}
 
@@ -55,15 +54,17 @@ def count(found: dict[tuple[str, str, str], np.ndarray], clip, truth, sample, pr
 
 
 def count_hidden(
-    found: dict[tuple[str, str, str], np.ndarray], family: str, clip, truth, sample, predicted, refined, votes
+    found: dict[tuple[str, str, str], np.ndarray], family: str, clip, truth, sample, refined, doubtful, votes
 ) -> None:
     """Add the hidden voxels of a prediction that a sample has free; `votes` (X, Y, Z) is a share of predictions."""
     hidden = ~Claims(surface="sample").exposed(clip) & (sample.labels == 0)
     n_true, n_sample = int(truth.max()) + 1, int(sample.labels.max()) + 1
-    sizes, before = np.bincount(sample.labels.ravel(), minlength=n_sample), predicted.volumes()
+    sizes = np.bincount(sample.labels.ravel(), minlength=n_sample)
+    if doubtful is not None:
+        hidden &= ~doubtful
     for label, volume in refined.volumes().items():
         mine = refined.labels == label
-        if volume < 30 or volume < (1 - DOUBTFUL) * before[label]:
+        if volume < 30:
             continue
         true = int(np.bincount(truth[mine], minlength=n_true)[1:].argmax()) + 1
         common = np.bincount(sample.labels[mine], minlength=n_sample)
@@ -106,7 +107,8 @@ def main(out: Path, smoke: bool) -> None:
                     for sample in samples.particles:
                         for h, r in list(zip(predicted.particles, refined, strict=True))[:3]:
                             count(found, clip, truth, sample, h, r)
-                            count_hidden(found_hidden, family, clip, truth, sample, h, r, votes)
+                            doubtful = mst.update.claims.doubtful(h, r)
+                            count_hidden(found_hidden, family, clip, truth, sample, r, doubtful, votes)
                 state, _ = mst.step(state, clip)
     out.mkdir(parents=True, exist_ok=True)
     write(out / "claims.csv", ["claimed by", "where", "cleared"], found)

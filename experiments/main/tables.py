@@ -11,6 +11,7 @@ a table for the README.
 from __future__ import annotations
 
 import argparse
+from itertools import product
 from pathlib import Path
 
 from mstfilter.study.results import StudyFolder, write_table
@@ -53,28 +54,21 @@ def by_scene(found: Summary) -> list[dict[str, str]]:
 
 def means(found: Summary) -> list[dict[str, str]]:
     """A line a family and arm."""
-    by_name = {(f.family, f.arm, f.name): f for f in found.figures}
-    keys = dict.fromkeys((f.family, f.arm) for f in found.figures)
-    return [
-        {
-            "family": family,
-            "arm": arm,
-            "n": str(len(by_name[family, arm, ENDPOINT].by_scene)),
-            **{
-                name: f"{by_name[family, arm, name].mean:.4g}" if (family, arm, name) in by_name else ""
-                for name in FIGURES
-            },
-        }
-        for family, arm in keys
-    ]
+    lines = []
+    for family, arm in product(found.families, found.arms):
+        if endpoint := found.figure(family, arm):
+            figures = {name: found.figure(family, arm, name) for name in FIGURES}
+            row = {"family": family, "arm": arm, "n": str(len(endpoint.by_scene))}
+            lines.append(row | {name: f"{f.mean:.4g}" if f else "" for name, f in figures.items()})
+    return lines
 
 
 def differences(found: Summary) -> list[dict[str, str]]:
     """A line a family and arm that is compared with the reference."""
     lines = []
-    for c in found.differences:
+    for c in found.compared():
         d = c.difference
-        if c.figure == ENDPOINT and not c.beside:
+        if not c.beside:
             row = {"family": c.family, "reference": c.first, "arm": c.second, "n": str(d.n), "mean": f"{d.mean:.4f}"}
             row |= {name: f"{getattr(d, name):.4f}" for name in ("low", "high", "low_bootstrap", "high_bootstrap")}
             lines.append(row | {"p": f"{d.p:.4g}", "p_holm": f"{d.p_holm:.4g}"})

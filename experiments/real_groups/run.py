@@ -30,6 +30,7 @@ from mstfilter.scene.quality import weighted_coverage
 from mstfilter.scene.recording import Recording
 from mstfilter.scene.rendering import project
 from mstfilter.smc.particle_filter import ParticleFilter, State
+from mstfilter.study.results import write_table
 from mstfilter.study.statistics import Difference, adjusted, compare
 
 HERE = Path(__file__).resolve().parent
@@ -201,21 +202,11 @@ def summarise(lines: Sequence[dict[str, str]], out: Path) -> None:
     found = adjusted([compare(means[m], means[own]) for m, own in OWN_SAMPLES.items()])
     past = [{"method": m, "minus": own, **columns(d)} for (m, own), d in zip(OWN_SAMPLES.items(), found, strict=True)]
     for name, rows in (("summary", summary), ("past", past)):
-        write(out / f"{name}.csv", list(rows[0]), rows)
+        write_table(out / f"{name}.csv", list(rows[0]), rows)
         print(
             *("  ".join(f"{v:>{21 if k in ('method', 'minus') else 9}}" for k, v in r.items()) for r in rows),
             sep="\n",
         )
-
-
-def write(path: Path, fields: Sequence[str], rows: Sequence[dict]) -> None:
-    """A CSV that is there in full or not at all."""
-    partial = path.with_suffix(".partial")
-    with partial.open("w", newline="") as file:
-        writer = csv.DictWriter(file, fields, lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
-    partial.replace(path)
 
 
 def main() -> None:
@@ -239,7 +230,7 @@ def main() -> None:
         began = time.process_time()
         lines += run(group, SEEDS[:1] if options.smoke else SEEDS, 4 if options.smoke else 1)
         lines.sort(key=lambda r: (int(r["frame"].removeprefix("learn")), list(METHODS).index(r["method"])))
-        write(target, FIELDS, lines)
+        write_table(target, FIELDS, lines)
         print(f"learn{group[0]}-{group[1]}  {time.process_time() - began:.0f} s of the processor", flush=True)
     summarise(lines, options.out)
     from figure import draw

@@ -183,16 +183,6 @@ def slopes(rows: list[dict[str, str]]) -> list[dict[str, str]]:
     return lines
 
 
-def write(path: Path, rows: list[dict[str, str]]) -> None:
-    """A CSV that is there in full or not at all."""
-    partial = path.with_suffix(".partial")
-    with partial.open("w", newline="") as file:
-        writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
-    partial.replace(path)
-
-
 def main() -> None:
     """Measure what is missing, fit, draw."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -213,6 +203,7 @@ def main() -> None:
             known = {r["case"]: r for r in csv.DictReader(file)}
     wanted = cases(options.smoke)
     from mstfilter.simulation.cache import cached_recording
+    from mstfilter.study.results import write_table
 
     for factor, chosen in wanted.items():
         for case in chosen:
@@ -226,10 +217,10 @@ def main() -> None:
             row = json.loads(done.stdout.splitlines()[-1])
             known[case.name] = {"case": case.name, **{k: str(v) for k, v in row.items()}}
             print(factor, *(f"{k} {v}" for k, v in row.items()), flush=True)
-            write(target, list(known.values()))
+            write_table(target, list(known[case.name]), known.values())
     rows = [{"factor": f, **known[c.name]} for f, chosen in wanted.items() for c in chosen if c.name in known]
     fitted = slopes(rows)
-    write(options.out / "slopes.csv", fitted)
+    write_table(options.out / "slopes.csv", list(fitted[0]), fitted)
     for line in fitted:
         print("  ".join(f"{v:>12}" for v in line.values()))
     from figure import draw

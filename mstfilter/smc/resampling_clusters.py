@@ -139,15 +139,11 @@ class ClusterStratified(Resampler):
 
 def _shares(mass: np.ndarray, sure: np.ndarray, n: int) -> np.ndarray:
     """max(1, mass / c) where `sure`, mass / c elsewhere, with sum n: at most n are sure, fewer if not all are."""
-    wanted = mass[sure]
-    heavy = np.append(0.0, np.cumsum(np.sort(wanted)[::-1])) + mass[~sure].sum()
-    count = np.arange(len(heavy))
+    ordered = np.sort(mass[sure])[::-1]
+    heavy = np.append(0.0, np.cumsum(ordered)) + mass[~sure].sum()
     # With the A heaviest of S sure ones above one place each, these and the others share n - (S - A) places by mass.
-    left = n - len(wanted) + count
+    left = n - len(ordered) + np.arange(len(heavy))
     with np.errstate(divide="ignore", invalid="ignore"):
         c = np.where(left > 0, heavy / left, np.inf)
-    above = np.flatnonzero(np.append(np.inf, np.sort(wanted)[::-1]) >= c)
-    if not len(above):
-        return np.ones(len(mass))
-    share = mass / c[above[-1]]
+    share = mass / c[np.flatnonzero(np.append(np.inf, ordered) >= c)[-1]]
     return np.where(sure, np.maximum(1.0, share), share)

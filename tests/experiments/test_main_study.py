@@ -57,15 +57,11 @@ def test_other_studies_run_in_their_small_form(tmp_path, monkeypatch, config):
 
 def test_smoke(tmp_path, capsys, monkeypatch):
     monkeypatch.setenv("MSTFILTER_CACHE", str(tmp_path / "cache"))
-    command = ["study", str(CONFIG), "--smoke", "--out", str(tmp_path / "out"), "--workers", "2"]
     for _ in range(2):
-        try:
-            main(command)
-        except SystemExit as end:
-            assert not end.code
+        folder = study(tmp_path, CONFIG)
     arms = [arm.name for arm in make_plan(load_study(CONFIG)).arms]
     assert f"{len(arms)} of them before" in capsys.readouterr().out  # the second time nothing is run
-    with (tmp_path / "out" / "runs.csv").open(newline="") as file:
+    with (folder / "runs.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert {row["arm"] for row in rows} == set(arms) and len(rows) == len(arms) * 2
 
