@@ -1,6 +1,7 @@
 """Time and memory of `mst` at full size: 640 x 480, 15 frames a clip, 100 x 100 x 50 voxels, 5 x 10 x 5 candidates.
 
     python experiments/full_size/run.py [--seed 1]
+    python experiments/full_size/run.py --smoke --out DIR    # a small recording: shows only that all works
 
 Filters a simulated recording of the scene `table` in a process of its own with one thread a library, prints seconds
 by part of every step and the peak memory, and writes results/full_size.csv (the peak is that of the whole run).
@@ -9,28 +10,32 @@ by part of every step and the peak memory, and writes results/full_size.csv (the
 from __future__ import annotations
 
 import argparse
-import csv
 import os
 import platform
 import resource
 import subprocess
 import sys
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 
 from mstfilter.simulation.families import scene_family
 from mstfilter.simulation.recorder import simulate
+from mstfilter.study.results import write_table
 from mstfilter.study.run_folder import RunFolder
 
-HERE = Path(__file__).parent
+HERE = Path(__file__).resolve().parent
+SIZE = ["n=5", "n_proposed=10", "update.eta=5"]
+SMALL = {"width": 160, "height": 120, "n_actions": 1, "frames_per_clip": 8, "voxel_size": 0.02}
 
 
-def main(seed: int) -> None:
+def main(seed: int, out: Path, smoke: bool) -> None:
     """Simulate, run, report."""
     with tempfile.TemporaryDirectory() as folder:
         recording, run = Path(folder) / "recording", Path(folder) / "run"
-        simulate(scene_family("table"), seed, recording)
-        command = [sys.executable, "-m", "mstfilter", "run", str(recording), "n=5", "n_proposed=10", "update.eta=5"]
+        family = replace(scene_family("demo"), **SMALL) if smoke else scene_family("table")
+        simulate(family, seed, recording)
+        command = [sys.executable, "-m", "mstfilter", "run", str(recording), *(["n=2"] if smoke else SIZE)]
         threads = {name: "1" for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")}
         subprocess.run(
             [*command, "--out", str(run), "--no-report"],
@@ -55,10 +60,8 @@ def main(seed: int) -> None:
                     "peak_GiB": round(peak, 2),
                 }
             )
-    with (HERE / "results" / "full_size.csv").open("w", newline="") as file:
-        writer = csv.DictWriter(file, rows[0], lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
+    out.mkdir(parents=True, exist_ok=True)
+    write_table(out / "full_size.csv", list(rows[0]), rows)
     print("  ".join(f"{name:>12}" for name in rows[0]))
     for row in rows:
         print("  ".join(f"{value:>12}" for value in row.values()))
@@ -73,4 +76,9 @@ SLOTS = ("transition", "proposal", "update", "resampler", "build")
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seed", type=int, default=1)
-    main(parser.parse_args().seed)
+    parser.add_argument("--smoke", action="store_true", help="small and quick; needs --out")
+    parser.add_argument("--out", type=Path, default=HERE / "results")
+    options = parser.parse_args()
+    if options.smoke and options.out == HERE / "results":
+        parser.error("--smoke would overwrite the results: name another folder with --out")
+    main(options.seed, options.out, options.smoke)

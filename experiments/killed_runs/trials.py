@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import csv
 import os
 import signal
 import subprocess
@@ -14,7 +13,11 @@ from pathlib import Path
 
 import numpy as np
 
-HERE = Path(__file__).parent
+from mstfilter.study.results import write_table
+
+HERE = Path(__file__).resolve().parent
+
+FIELDS = ("trial", "killed_after_s", "had_ended", "steps_stored_at_kill", "identical")
 
 
 def same(a: Path, b: Path) -> bool:
@@ -27,7 +30,9 @@ def main() -> None:
     """Run the trials."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--trials", type=int, default=100)
+    parser.add_argument("--out", type=Path, default=HERE)
     options = parser.parse_args()
+    options.out.mkdir(parents=True, exist_ok=True)
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     command = [sys.executable, str(HERE / "victim.py")]
     rng, rows = np.random.default_rng(0), []
@@ -49,13 +54,12 @@ def main() -> None:
                 with np.load(path) as data:
                     t = str(data["head"]).split('"t": ')[1].split(",")[0]
             subprocess.run([*command, str(path)], check=True, env=environment, stdout=subprocess.DEVNULL)
-            rows.append([trial, f"{delay:.4f}", int(ended), t, int(same(whole, path))])
-    with (HERE / "trials.csv").open("w", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(["trial", "killed_after_s", "had_ended", "steps_stored_at_kill", "identical"])
-        writer.writerows(rows)
-    killed = [r for r in rows if not r[2]]
-    print(f"{len(rows)} trials, {len(killed)} killed while running, {sum(r[4] for r in rows)} ended identically")
+            rows.append(
+                dict(zip(FIELDS, (trial, f"{delay:.4f}", int(ended), t, int(same(whole, path))), strict=True))
+            )
+    write_table(options.out / "trials.csv", FIELDS, rows)
+    killed, identical = sum(not r["had_ended"] for r in rows), sum(r["identical"] for r in rows)
+    print(f"{len(rows)} trials, {killed} killed while running, {identical} ended identically")
     print(f"{time.perf_counter() - start:.0f} s")
 
 

@@ -1,6 +1,7 @@
 """How far the filters are from the exact posterior of the miniature world.
 
-python experiments/miniature/run.py [--presets | --smoke] [--out results]
+python experiments/miniature/run.py [--presets]
+    python experiments/miniature/run.py --smoke --out DIR
 """
 
 from __future__ import annotations
@@ -190,10 +191,12 @@ def write(path: Path, rows: list[dict]) -> None:
 def main() -> None:
     """Run what is asked for."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--smoke", action="store_true", help="two worlds, few particles: a minute")
+    parser.add_argument("--smoke", action="store_true", help="two worlds, few particles: a minute; needs --out")
     parser.add_argument("--presets", action="store_true", help="the presets alone, distances alone: 10 minutes")
     parser.add_argument("--out", type=Path, default=HERE / "results")
     options = parser.parse_args()
+    if options.smoke and options.out == HERE / "results":
+        parser.error("--smoke would overwrite the results: name another folder with --out")
     options.out.mkdir(parents=True, exist_ok=True)
     every = (*PROPER, *PRESETS, *CHANGES, *LADDER, *UNIONS)
     if options.presets:

@@ -1,6 +1,7 @@
 """How well one image is segmented: optimal cut, sampled cuts and floors on 45 real frames, held out by set-up.
 
     python experiments/osd_frames/run.py
+    python experiments/osd_frames/run.py --smoke --out DIR    # two frames: shows only that all works
 
 Needs the frames in MSTFILTER_SHARED (default ../shared) under real/osd_learn. Writes results/*.csv beside this file.
 The learned tree was fitted on simulated scenes alone. SceneCut's constants (colour weight, centre and slope of the
@@ -9,11 +10,12 @@ calibration) are fitted on the frames of the other camera set-ups, and so is the
 
 from __future__ import annotations
 
+import argparse
 import csv
 import itertools
 import os
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -160,22 +162,22 @@ def components(case: Case, step: float = np.inf) -> np.ndarray:
     return np.unique(label, return_inverse=True)[1].reshape(label.shape)
 
 
-def write(name: str, header: list[str], rows: Iterable[Iterable]) -> None:
-    target = HERE / "results" / f"{name}.csv"
-    target.parent.mkdir(exist_ok=True)
+def write(target: Path, header: list[str], rows: Iterable[Iterable]) -> None:
     temporary = target.with_suffix(".partial")
     with temporary.open("w", newline="") as file:
         csv.writer(file, lineterminator="\n").writerows([header, *rows])
     temporary.replace(target)
 
 
-def main() -> None:
+def main(numbers: Sequence[int], out: Path) -> None:
+    """Score every arm on the frames of these numbers."""
     began = time.time()
-    cases = [load(number) for number in range(45)]
-    setup = np.array([next(g for g, (a, b) in enumerate(GROUPS) if a <= i <= b) for i in range(45)])
+    cases = [load(number) for number in numbers]
+    setup = np.array([next(g for g, (a, b) in enumerate(GROUPS) if a <= i <= b) for i in numbers])
+    groups = [(g, a, b) for g, (a, b) in enumerate(GROUPS) if g in setup]
     near = np.array([case.touching for case in cases])
     print(
-        f"{len(cases)} frames, {len(GROUPS)} set-ups, {near.sum()} with touching objects, {time.time() - began:.0f} s"
+        f"{len(cases)} frames, {len(groups)} set-ups, {near.sum()} with touching objects, {time.time() - began:.0f} s"
     )
 
     grid = list(itertools.product(COLOUR_WEIGHTS, CENTRES, SLOPES))
@@ -186,21 +188,21 @@ def main() -> None:
             tree = calibrated(tree, centre, slope)
             scores[k, i] = case.score_cut(tree, found, optimal_cut(tree, VALUE.values(tree, case.frame)))
 
-    chosen = {g: int(scores[:, setup != g].mean(axis=1).argmax()) for g in range(len(GROUPS))}
+    chosen = {g: int(scores[:, setup != g].mean(axis=1).argmax()) for g, _, _ in groups}
     judged = np.zeros((len(COLOUR_WEIGHTS), len(cases)))
     for k, weight in enumerate(COLOUR_WEIGHTS):
         for i, case in enumerate(cases):
             tree, found = case.learned[weight]
             judged[k, i] = case.score_cut(tree, found, optimal_cut(tree, ODDS.values(tree, case.frame)))
-    picked = {g: int(judged[:, setup != g].mean(axis=1).argmax()) for g in range(len(GROUPS))}
+    picked = {g: int(judged[:, setup != g].mean(axis=1).argmax()) for g, _, _ in groups}
     default = COLOUR_WEIGHTS.index(0.4)
     arms: dict[str, np.ndarray] = {
         "learned tree, optimal cut, colour weight held out": np.array(
-            [judged[picked[setup[i]], i] for i in range(45)]
+            [judged[picked[g], i] for i, g in enumerate(setup)]
         ),
         "learned tree, optimal cut, colour 0.4 (default)": judged[default],
         "learned tree, optimal cut, colour 0.6 (no labels used)": judged[COLOUR_WEIGHTS.index(NOTES_COLOUR)],
-        "scenecut, optimal cut, constants held out": np.array([scores[chosen[setup[i]], i] for i in range(45)]),
+        "scenecut, optimal cut, constants held out": np.array([scores[chosen[g], i] for i, g in enumerate(setup)]),
         "scenecut, optimal cut, constants of all frames": scores[scores.mean(axis=1).argmax()],
     }
     unlabelled, unlabelled_best = [], []
@@ -271,16 +273,17 @@ def main() -> None:
         print(f"{name:32s} {objects:5.2f} {distinct:5.2f}")
     print("\ncolour weight of the learned tree without each set-up:", [COLOUR_WEIGHTS[k] for k in picked.values()])
     print("\nconstants (colour weight, centre, slope) fitted without each set-up:")
-    for g, (a, b) in enumerate(GROUPS):
+    for g, a, b in groups:
         print(f"  learn{a}-{b}: {grid[chosen[g]]}")
     print(f"  on all frames: {grid[int(scores.mean(axis=1).argmax())]}")
     print(f"{time.time() - began:.0f} s")
 
-    write("summary", ["arm", "all", "touching", "apart"], summary)
-    write("samplers", ["sampler", "objects", "distinct_of_10"], sampled)
+    out.mkdir(parents=True, exist_ok=True)
+    write(out / "summary.csv", ["arm", "all", "touching", "apart"], summary)
+    write(out / "samplers.csv", ["sampler", "objects", "distinct_of_10"], sampled)
     names = list(arms)
     write(
-        "frames",
+        out / "frames.csv",
         ["frame", "set_up", "touching", "objects", *names],
         (
             [c.name, int(setup[i]), int(near[i]), int(c.truth.max()), *(f"{arms[n][i]:.3f}" for n in names)]
@@ -288,11 +291,17 @@ def main() -> None:
         ),
     )
     write(
-        "constants",
+        out / "constants.csv",
         ["set_up", "frames", "colour_weight", "centre", "slope", "colour_weight_learned"],
-        ([g, f"learn{a}-{b}", *grid[chosen[g]], COLOUR_WEIGHTS[picked[g]]] for g, (a, b) in enumerate(GROUPS)),
+        ([g, f"learn{a}-{b}", *grid[chosen[g]], COLOUR_WEIGHTS[picked[g]]] for g, a, b in groups),
     )
 
 
 if __name__ == "__main__":
-    main()
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--smoke", action="store_true", help="two frames of two set-ups; needs --out")
+    parser.add_argument("--out", type=Path, default=HERE / "results")
+    options = parser.parse_args()
+    if options.smoke and options.out == HERE / "results":
+        parser.error("--smoke would overwrite the results: name another folder with --out")
+    main((0, 2) if options.smoke else range(45), options.out)

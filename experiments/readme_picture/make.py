@@ -1,6 +1,7 @@
 """The picture of the README: pauses of a simulated recording, hypotheses over the image, voxels.
 
     python experiments/readme_picture/make.py [--seed 0] [--out docs/images/demo.png]
+    python experiments/readme_picture/make.py --smoke --out FILE    # a small scene: shows only that it works
 
 Rows are the first, second and last pause; columns the image, the heaviest hypothesis, the one that differs most from
 it, and the voxels of the heaviest.
@@ -10,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +28,8 @@ from mstfilter.study.run import execute
 from mstfilter.study.run_folder import RunFolder
 
 WIDTH, HEIGHT, GAP = 400, 300, 10
+SMALL = {"width": 160, "height": 120, "n_actions": 1, "frames_per_clip": 8, "voxel_size": 0.02}
+PICTURE = Path("docs/images/demo.png")
 PAPER = np.array([252, 252, 250], float)
 
 
@@ -58,10 +62,11 @@ def row(run: RunFolder, t: int, box: tuple[slice, slice], colours, view) -> np.n
     return np.hstack([part for cell in cells for part in (cell, gap)][:-1])
 
 
-def main(seed: int, out: Path) -> None:
+def main(seed: int, out: Path, smoke: bool) -> None:
     """Simulate, filter, and paste the pauses together."""
     with tempfile.TemporaryDirectory() as folder:
-        recording = simulate(scene_family("table"), seed, Path(folder) / "recording")
+        family = replace(scene_family("demo"), **SMALL) if smoke else scene_family("table")
+        recording = simulate(family, seed, Path(folder) / "recording")
         run = execute(recording, load_config("mst"), Path(folder) / "run", seed=0)
         colours, pauses = identity_colours(run), (0, 1, run.n_pauses - 1)
         everything = [h for t in pauses for h in run.hypotheses(t)]
@@ -78,6 +83,9 @@ def main(seed: int, out: Path) -> None:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--out", type=Path, default=Path("docs/images/demo.png"))
+    parser.add_argument("--out", type=Path, default=PICTURE)
+    parser.add_argument("--smoke", action="store_true", help="a small scene; needs --out")
     arguments = parser.parse_args()
-    main(arguments.seed, arguments.out)
+    if arguments.smoke and arguments.out == PICTURE:
+        parser.error("--smoke would overwrite the picture: name another file with --out")
+    main(arguments.seed, arguments.out, arguments.smoke)

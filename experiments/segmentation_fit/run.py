@@ -1,6 +1,7 @@
 """Fit the weights of `mstfilter.segmentation.join_weights` on simulated scenes; no real image is used.
 
     python experiments/segmentation_fit/run.py
+    python experiments/segmentation_fit/run.py --smoke --out FILE    # few scenes, one round: shows only that it works
 
 Regions of each scene merge best first under the present weights. A pair of different objects is noted and kept
 apart, a pair of one object is noted and merged, so the pairs are those that the tree meets. Three rounds; each fits a
@@ -9,7 +10,9 @@ logistic regression to the pairs of all rounds so far.
 
 from __future__ import annotations
 
+import argparse
 import time
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -26,15 +29,16 @@ from mstfilter.segmentation.regions import REGION, Regions
 ROUNDS = 3
 PURE = 0.8  # regions that mix objects teach nothing
 RIDGE = 1.0
+PACKAGED = Path(join_weights.__file__)
 
 Pairs = tuple[list[np.ndarray], list[bool], list[float]]
 
 
-def measured() -> list[tuple[Regions, np.ndarray, float]]:
+def measured(seeds: Iterable[int]) -> list[tuple[Regions, np.ndarray, float]]:
     """Regions of every scene, their pixels of each true object (R, K), and the image scale."""
     found = []
     for family in FITTED.values():
-        for seed in FITTED_SEEDS:
+        for seed in seeds:
             try:
                 pause = first_pause(family, seed)
             except RuntimeError as error:  # no room for that many objects
@@ -91,22 +95,22 @@ def logistic(pairs: Pairs) -> np.ndarray:
     return b
 
 
-def write(weights: np.ndarray) -> None:
-    """Put the table into the package."""
-    path = Path(join_weights.__file__)
-    head = path.read_text().split("JOIN_WEIGHTS", 1)[0]
+def write(weights: np.ndarray, path: Path) -> None:
+    """The module of weights with the new table."""
+    head = PACKAGED.read_text().split("JOIN_WEIGHTS", 1)[0]
     rows = "".join(f'    "{name}": {value:.4g},\n' for name, value in zip(FEATURES, weights, strict=True))
     path.write_text(f"{head}JOIN_WEIGHTS: dict[str, float] = {{\n{rows}}}\n")
 
 
-def main() -> None:
+def main(path: Path, smoke: bool) -> None:
+    """Fit, and write the module."""
     began = time.time()
-    scenes = measured()
+    scenes = measured(FITTED_SEEDS[:2] if smoke else FITTED_SEEDS)
     print(f"{len(scenes)} scenes measured, {time.time() - began:.0f} s")
     weights = np.zeros(len(FEATURES))
     weights[:2] = -6.0, 12.0  # to begin with: the strength of the border
     pairs: Pairs = ([], [], [])
-    for _ in range(ROUNDS):
+    for _ in range(1 if smoke else ROUNDS):
         before = len(pairs[0])
         for regions, pixels, scale in scenes:
             episode(regions, pixels, scale, weights, pairs)
@@ -117,8 +121,14 @@ def main() -> None:
             f"{len(X)} pairs, {different.mean():.3f} different, {wrong:.4f} judged wrongly, "
             f"{time.time() - began:.0f} s"
         )
-    write(weights)
+    write(weights, path)
 
 
 if __name__ == "__main__":
-    main()
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--smoke", action="store_true", help="a few scenes, one round; needs --out")
+    parser.add_argument("--out", type=Path, default=PACKAGED, help="the module to write")
+    options = parser.parse_args()
+    if options.smoke and options.out == PACKAGED:
+        parser.error("--smoke would overwrite the weights of the package: name another file with --out")
+    main(options.out, options.smoke)

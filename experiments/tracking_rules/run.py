@@ -1,14 +1,15 @@
 """Motion rules against volumetric truth: start from the true labels, predict one clip, compare.
 
 python experiments/tracking_rules/run.py demo 0 12 table 3 7
+python experiments/tracking_rules/run.py --smoke --out DIR    # one small scene: shows only that all works
 """
 
 from __future__ import annotations
 
-import csv
-import sys
+import argparse
 import tempfile
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,12 +18,16 @@ from mstfilter.scene.voxels import Hypothesis
 from mstfilter.simulation.families import scene_family
 from mstfilter.simulation.recorder import simulate
 from mstfilter.smc.population import Population
+from mstfilter.study.results import write_table
 from mstfilter.tracking.flow import DenseFlow
 from mstfilter.tracking.mst_rule import MstRule
 from mstfilter.tracking.rules import AuthorsRule, PaperRule
 from mstfilter.tracking.static import StaticTest
 from mstfilter.tracking.transition import IdentityTransition, TrackingTransition
 from mstfilter.tracking.warp import Warp
+
+HERE = Path(__file__).resolve().parent
+SMALL = {"width": 160, "height": 120, "n_actions": 1, "frames_per_clip": 8, "voxel_size": 0.02}
 
 PUBLISHED = {"static": StaticTest(enabled=False), "warp": Warp("splat", "label")}
 CENTROID = MstRule(use_flow=False, use_sift=False, n_refine=0, search_above=-1.0)
@@ -47,13 +52,13 @@ def iou(a: np.ndarray, b: np.ndarray) -> float:
     return float((a & b).sum() / max((a | b).sum(), 1))
 
 
-def main(families: list[tuple[str, int, int]], out: Path) -> None:
+def main(families: list[tuple[str, int, int]], out: Path, small: dict[str, float]) -> None:
     rows = []
     for name, first, last in families:
         scores: dict[str, dict[str, list[float]]] = {arm: {"moved": [], "rest": [], "s": []} for arm in ARMS}
         for seed in range(first, last):
             with tempfile.TemporaryDirectory() as folder:
-                recording = simulate(scene_family(name), seed=seed, path=Path(folder) / "recording")
+                recording = simulate(replace(scene_family(name), **small), seed=seed, path=Path(folder) / "recording")
                 for i, clip in enumerate(recording.clips()):
                     if i == 0:
                         continue
@@ -81,13 +86,22 @@ def main(families: list[tuple[str, int, int]], out: Path) -> None:
                     "iou_rest_worst": f"{min(s['rest']):.2f}",
                 }
             )
-    with out.open("w", newline="") as file:
-        writer = csv.DictWriter(file, list(rows[0]))
-        writer.writeheader()
-        writer.writerows(rows)
+    out.mkdir(parents=True, exist_ok=True)
+    write_table(out / "results.csv", list(rows[0]), rows)
 
 
 if __name__ == "__main__":
-    arguments = sys.argv[1:] or ["demo", "0", "12", "table", "3", "7"]
-    triples = [(arguments[i], int(arguments[i + 1]), int(arguments[i + 2])) for i in range(0, len(arguments), 3)]
-    main(triples, Path(__file__).with_name("results.csv"))
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument(
+        "scenes", nargs="*", default=["demo", "0", "12", "table", "3", "7"], help="family, first, end"
+    )
+    parser.add_argument("--smoke", action="store_true", help="one small scene; needs --out")
+    parser.add_argument("--out", type=Path, default=HERE)
+    options = parser.parse_args()
+    if len(options.scenes) % 3:
+        parser.error(f"scenes are triples of family, first seed and end, not {options.scenes}")
+    if options.smoke and options.out == HERE:
+        parser.error("--smoke would overwrite the results: name another folder with --out")
+    words = ["demo", "0", "1"] if options.smoke else options.scenes
+    triples = [(words[i], int(words[i + 1]), int(words[i + 2])) for i in range(0, len(words), 3)]
+    main(triples, options.out, SMALL if options.smoke else {})
