@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import csv
+import subprocess
+import sys
 
 import pytest
 
@@ -26,6 +28,14 @@ def test_smoke(tmp_path, monkeypatch, name, arms):
     else:
         best = [q for arm, q in quality.items() if "1.0" in arm]
         assert min(best) > max(q for arm, q in quality.items() if "0.7" in arm)
+        script = [sys.executable, str(config.with_name("mask_quality.py")), str(folder), str(tmp_path / "tables")]
+        subprocess.run(script, check=True, capture_output=True)
+        with (tmp_path / "tables/mask_quality.csv").open(newline="") as file:
+            lines = {(line["masks"], line["method"]): line for line in csv.DictReader(file)}
+        assert set(lines) == {(m, a) for m in ("0.7", "1") for a in ("mst", "samples_only")}
+        gain = float(lines["1", "mst"]["quality"]) - float(lines["1", "samples_only"]["quality"])
+        assert float(lines["1", "samples_only"]["mst_minus"]) == pytest.approx(gain, abs=2e-4)
+        assert (tmp_path / "tables/mask_quality.png").stat().st_size > 5000
 
 
 def main_ok(main, arguments):
