@@ -18,6 +18,8 @@ from pathlib import Path
 import matplotlib
 from canvas import STYLE
 
+from mstfilter.errors import InputError
+
 FIGURES = (
     "merging",
     "fusion_step",
@@ -35,15 +37,20 @@ def main() -> None:
     parser.add_argument("--smoke", action="store_true", help="small and quick; shows only that all works")
     parser.add_argument("--out", type=Path, default=Path(__file__).resolve().parent / "results")
     parser.add_argument("--study", type=Path, help="folder of a study, for quality_over_time")
+    parser.add_argument("--arms", default="", help="the arms of the study to draw, by comma; default: all compared")
     options = parser.parse_args()
     unknown = [name for name in options.figures if name not in FIGURES]
     if unknown:
         parser.error(f"no figure is called {unknown[0]!r}; there are {', '.join(FIGURES)}")
+    arms = [name.strip() for name in options.arms.split(",") if name.strip()]
     with matplotlib.rc_context(STYLE):
         for name in options.figures or FIGURES:
             figure = importlib.import_module(name)
             if name == "quality_over_time":
-                made = figure.make(options.out, options.study) if options.study else []
+                try:
+                    made = figure.make(options.out, options.study, arms) if options.study else []
+                except InputError as error:
+                    parser.error("; ".join((error.message, *error.hints)))
                 missing = "give a study with --study"
             else:
                 made, missing = figure.make(options.out, options.smoke), "the authors' particles are absent"

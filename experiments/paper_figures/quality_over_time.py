@@ -6,8 +6,10 @@ The drawing is that of the study's report; here it stands alone, in the report's
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from pathlib import Path
 
+from mstfilter.errors import InputError
 from mstfilter.report import study_figures
 from mstfilter.report.palette import colour, hexadecimal
 from mstfilter.report.svg import SERIES
@@ -16,10 +18,13 @@ from mstfilter.study.results import StudyFolder
 PAGE = 'xmlns="http://www.w3.org/2000/svg" style="background:var(--paper);font-family:sans-serif"'
 
 
-def make(out: Path, study: Path) -> list[Path]:
-    """The figure of the runs that are done; arms that stand beside the comparisons are left out."""
+def make(out: Path, study: Path, chosen: Sequence[str] = ()) -> list[Path]:
+    """The figure of the runs that are done, with the arms chosen, or else all but those beside the comparisons."""
     folder = StudyFolder.open(study)
-    arms = [arm["name"] for arm in folder.description["arms"] if not arm.get("beside")]
+    known = {arm["name"]: arm for arm in folder.description["arms"]}
+    if unknown := [name for name in chosen if name not in known]:
+        raise InputError(f"the study has no arm {unknown[0]!r}", f"it has {', '.join(known)}")
+    arms = list(chosen) or [name for name, arm in known.items() if not arm.get("beside")]
     values: dict[str, dict[str, dict[int, list[float]]]] = {}
     for row in folder.records():
         if row["arm"] in arms and row.get("qualities"):

@@ -89,6 +89,10 @@ def test_quality_over_time_stands_alone(tmp_path):
     ElementTree.fromstring(text)
     assert "var(" not in text and "currentColor" not in text
     assert "ours" in text and "&lt;theirs&gt;" in text and "a ceiling" not in text
+    (path,) = script("quality_over_time").make(tmp_path / "out", study, ["ours", "a ceiling"])
+    assert "a ceiling" in path.read_text() and "theirs" not in path.read_text()
+    wrong = make(tmp_path, "quality_over_time", "--study", str(study), "--arms", "ours,mine")
+    assert wrong.returncode == 2 and "the study has no arm 'mine'" in wrong.stderr
 
 
 def test_merge_forms_agree_with_each_other():
