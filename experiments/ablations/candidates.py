@@ -1,6 +1,6 @@
 """Do the terms know good candidates, and do the remains of objects spoil them?
 
-    python experiments/ablations/candidates.py [--smoke] [--kept FOLDER] [--out FOLDER]
+    python experiments/ablations/candidates.py [--kept FOLDER] [--smoke] [--out FOLDER]
 
 The scored candidates of `mst` (20 a pause) on tuning scenes that evidence.py does not use, with their true quality.
 
@@ -173,8 +173,10 @@ def main(out: Path, smoke: bool, kept: Path | None) -> None:
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--smoke", action="store_true")
+    parser.add_argument("--smoke", action="store_true", help="small and quick; needs --out")
     parser.add_argument("--kept", type=Path)
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results")
     arguments = parser.parse_args()
+    if arguments.smoke and arguments.out == parser.get_default("out"):
+        parser.error("--smoke would overwrite the results: name another folder with --out")
     main(arguments.out, arguments.smoke, arguments.kept)

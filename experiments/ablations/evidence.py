@@ -1,6 +1,6 @@
 """What does each term that scores built candidates bring to `mst`?
 
-    python experiments/ablations/evidence.py [--smoke] [--minutes 25] [--out FOLDER]
+    python experiments/ablations/evidence.py [--minutes 25] [--smoke] [--out FOLDER]
 
 Every arm is `mst` with other `update.evidence`; `remains` is `mst` with a step after the update that clears the
 pieces of objects that lie apart from the rest and that the last frame does not show. Tuning scenes, one filter seed,
@@ -159,8 +159,10 @@ def main(out: Path, smoke: bool, minutes: float) -> None:
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--smoke", action="store_true")
+    parser.add_argument("--smoke", action="store_true", help="small and quick; needs --out")
     parser.add_argument("--minutes", type=float, default=25.0)
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results")
     arguments = parser.parse_args()
+    if arguments.smoke and arguments.out == parser.get_default("out"):
+        parser.error("--smoke would overwrite the results: name another folder with --out")
     main(arguments.out, arguments.smoke, arguments.minutes)

@@ -120,9 +120,11 @@ def summary(rows: list[dict[str, str]]) -> Iterator[dict[str, object]]:
 def main() -> None:
     """Run what is missing, then summarise."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--smoke", action="store_true", help="two small scenes")
+    parser.add_argument("--smoke", action="store_true", help="two small scenes; needs --out")
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results")
     options = parser.parse_args()
+    if options.smoke and options.out == parser.get_default("out"):
+        parser.error("--smoke would overwrite the results: name another folder with --out")
     options.out.mkdir(parents=True, exist_ok=True)
     path = options.out / "scenes.csv"
     rows = list(csv.DictReader(path.open(newline=""))) if path.exists() else []

@@ -1,7 +1,7 @@
 """The families s1, s2, s3: what lies on the table, how stable it is, and how hard one frame of it is.
 
     python experiments/families/run.py            # an hour on one core; finished scenes are not run again
-    python experiments/families/run.py --smoke    # half a minute
+    python experiments/families/run.py --smoke --out DIR    # half a minute
 
 Writes counts.csv (a line a scene: physics and visibility), difficulty.csv (a line a first pause: quality of the
 single-frame baseline in the image and in space, and floors), summary.csv and pictures. Tuning seeds only.
@@ -204,12 +204,14 @@ def picture(folder: Path, small: dict[str, int]) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--smoke", action="store_true")
+    parser.add_argument("--smoke", action="store_true", help="small and quick; needs --out")
     parser.add_argument("--out", type=Path, default=Path(__file__).resolve().parent / "results")
     parser.add_argument("--scenes", type=int, default=20, help="seeds 0, 1, ... of each family")
     parser.add_argument("--families", default=",".join(FAMILIES), help="which, separated by commas")
     parser.add_argument("--only", choices=("counts", "difficulty", "pictures"))
     options = parser.parse_args()
+    if options.smoke and options.out == parser.get_default("out"):
+        parser.error("--smoke would overwrite the results: name another folder with --out")
     assert options.scenes <= FIRST_REPORTED_SEED // 10, "tuning seeds are 0 - 99"
     options.out.mkdir(parents=True, exist_ok=True)
     small = {"width": 160, "height": 120, "n_actions": 1} if options.smoke else {}

@@ -1,7 +1,7 @@
 """Seconds a frame of the renderer with and without keeping what cannot have changed; the pictures are compared.
 
     OMP_NUM_THREADS=1 python experiments/families/speed.py            # two minutes on one core
-    python experiments/families/speed.py --smoke                      # some seconds
+    python experiments/families/speed.py --smoke --out DIR            # some seconds
 
 Both renderers see the same states of the same scenes, in turns, so that other work on the machine disturbs both.
 Trust the ratio; the seconds are those of the machine. Writes speed.csv.
@@ -65,9 +65,11 @@ def measure(name: str, seed: int, actions: int, small: dict[str, int]) -> list[s
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--smoke", action="store_true")
+    parser.add_argument("--smoke", action="store_true", help="small and quick; needs --out")
     parser.add_argument("--out", type=Path, default=Path(__file__).resolve().parent / "results")
     options = parser.parse_args()
+    if options.smoke and options.out == parser.get_default("out"):
+        parser.error("--smoke would overwrite the results: name another folder with --out")
     options.out.mkdir(parents=True, exist_ok=True)
     small = {"width": 160, "height": 120} if options.smoke else {}
     jobs = [("s1", 0)] if options.smoke else [("s1", 0), ("s2", 0), ("s3", 0), ("s3", 3)]

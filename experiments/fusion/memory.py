@@ -51,6 +51,9 @@ def main(out: Path, smoke: bool) -> None:
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--smoke", action="store_true")
+    parser.add_argument("--smoke", action="store_true", help="small and quick; needs --out")
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results")
-    main(**vars(parser.parse_args()))
+    arguments = parser.parse_args()
+    if arguments.smoke and arguments.out == parser.get_default("out"):
+        parser.error("--smoke would overwrite the results: name another folder with --out")
+    main(**vars(arguments))

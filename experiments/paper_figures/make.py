@@ -34,11 +34,15 @@ FIGURES = (
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("figures", nargs="*", metavar="FIGURE", help=f"{', '.join(FIGURES)}; default: all")
-    parser.add_argument("--smoke", action="store_true", help="small and quick; shows only that all works")
+    parser.add_argument(
+        "--smoke", action="store_true", help="small and quick; shows only that all works; needs --out"
+    )
     parser.add_argument("--out", type=Path, default=Path(__file__).resolve().parent / "results")
     parser.add_argument("--study", type=Path, help="folder of a study, for quality_over_time")
     parser.add_argument("--arms", default="", help="the arms of the study to draw, by comma; default: all compared")
     options = parser.parse_args()
+    if options.smoke and options.out == parser.get_default("out"):
+        parser.error("--smoke would overwrite the results: name another folder with --out")
     unknown = [name for name in options.figures if name not in FIGURES]
     if unknown:
         parser.error(f"no figure is called {unknown[0]!r}; there are {', '.join(FIGURES)}")

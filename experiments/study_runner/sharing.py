@@ -1,6 +1,6 @@
 """What work that is shared on disk saves: core seconds a step without it, when it is written, when it is there.
 
-``python experiments/study_runner/sharing.py [--smoke]`` writes sharing.csv beside this file.
+``python experiments/study_runner/sharing.py [--smoke --out DIR]`` writes sharing.csv beside this file.
 
 Each row is a study of its own in a fresh worker, so nothing is found in memory.
 """
@@ -25,9 +25,11 @@ ARMS = ["mst", "paper"]
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--smoke", action="store_true")
+    parser.add_argument("--smoke", action="store_true", help="small and quick; needs --out")
     parser.add_argument("--out", type=Path, default=HERE)
     options = parser.parse_args()
+    if options.smoke and options.out == parser.get_default("out"):
+        parser.error("--smoke would overwrite the results: name another folder with --out")
     families = ["demo"] if options.smoke else ["s1", "s2", "s3"]
     small = {"width": 160, "height": 120, "n_actions": 1} if options.smoke else {}
     rows = []

@@ -1,6 +1,6 @@
 """The study runner under load: parallel efficiency, and workers that are killed.
 
-``python experiments/study_runner/trials.py [--smoke]`` writes results.csv beside this file.
+``python experiments/study_runner/trials.py [--smoke --out DIR]`` writes results.csv beside this file.
 
 Efficiency is that of a machine, so 1 and 2 workers run the same study of short runs in turn, several times. Where
 others use the machine too, two workers cannot have two cores; so what others used is recorded, and beside the
@@ -94,10 +94,12 @@ def killer(every: float, stop: threading.Event, killed: list[int]) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--smoke", action="store_true")
+    parser.add_argument("--smoke", action="store_true", help="small and quick; needs --out")
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--out", type=Path, default=HERE)
     options = parser.parse_args()
+    if options.smoke and options.out == parser.get_default("out"):
+        parser.error("--smoke would overwrite the results: name another folder with --out")
     n, rounds = (4, 1) if options.smoke else (200, options.rounds)
     rows = []
     with tempfile.TemporaryDirectory() as name:

@@ -31,15 +31,7 @@ def run(script, *arguments):
 
 @pytest.mark.parametrize(
     "script",
-    [
-        "full_size/run.py",
-        "miniature/run.py",
-        "osd_frames/run.py",
-        "readme_picture/make.py",
-        "segmentation_fit/check.py",
-        "segmentation_fit/run.py",
-        "tracking_rules/run.py",
-    ],
+    [str(p.relative_to(EXPERIMENTS)) for p in sorted(EXPERIMENTS.glob("*/*.py")) if '"--smoke"' in p.read_text()],
 )
 def test_small_form_never_overwrites_results(script):
     refused = subprocess.run([sys.executable, str(EXPERIMENTS / script), "--smoke"], capture_output=True, text=True)
