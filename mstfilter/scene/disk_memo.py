@@ -12,6 +12,7 @@ files are renamed into place whole, carry a checksum, and one that cannot be rea
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 import uuid
 import zipfile
@@ -52,8 +53,8 @@ class DiskMemo(Layer):
     ----------
     folder : Path
     limit_bytes : int
-        Beyond it, what was used longest ago is removed. Each process looks after a twentieth of the limit that it
-        has written itself, so the folder may exceed the limit by that much a process.
+        Beyond it, what was used longest ago is removed. Each object looks when it writes first and after every
+        twentieth of the limit that it has written, so the folder may exceed the limit by that much an object.
     kinds : mapping
         Name -> what its entries are. Other names are not kept.
     """
@@ -62,7 +63,7 @@ class DiskMemo(Layer):
     limit_bytes: int
     kinds: Mapping[str, Kind]
     hits: dict[str, int] = field(default_factory=dict, init=False)
-    _written: int = field(default=0, init=False)
+    _written: float = field(default=math.inf, init=False)  # since it looked; it has not yet
 
     def find(self, name: str, key: Hashable) -> Any:
         """The entry; None where there is none that can be read."""

@@ -214,6 +214,17 @@ class Recording:
             keys.append(frame.key)
         return content_key(self.grid.key, self.pauses, self.times, *keys)
 
+    @cached_property
+    def truth_key(self) -> bytes:
+        """Name by content of all that is known to be true: volumes, label images, poses. Looks at every frame."""
+        keys = []
+        for t in range(len(self.pauses)):
+            keys.append(content_key(self.truth(t)))
+        for index in range(len(self)):
+            poses = sorted((self.poses(index) or {}).items())
+            keys.append(content_key(self.instance(index), *(part for pair in poses for part in pair)))
+        return content_key(*keys)
+
     def __len__(self) -> int:
         return len(self.frames)
 

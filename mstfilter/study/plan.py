@@ -4,8 +4,8 @@
 >>> [run.name for run in plan.runs]
 
 A run's identity is a hash of its resolved configuration, what recording it reads (the recipe of a simulated one,
-the content of a folder), its seed, and the version of the code and the libraries that it reaches. Two studies
-that share a run share its identity; a run whose identity is unchanged is never repeated.
+the content of a folder, its truth included), its seed, and the version of the code and the libraries that it
+reaches. Two studies that share a run share its identity; a run whose identity is unchanged is never repeated.
 """
 
 from __future__ import annotations
@@ -14,14 +14,16 @@ import glob
 import hashlib
 import json
 import re
+from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from mstfilter import registry
 from mstfilter.errors import InputError
 from mstfilter.presets import build_filter, describe_filter
+from mstfilter.scene.arrays import content_key
 from mstfilter.study.code_version import code_version
 from mstfilter.study.config import SceneEntry, StudyConfig
 from mstfilter.study.grid import Asked, expand
@@ -140,7 +142,7 @@ def make_plan(study: StudyConfig, overrides: Sequence[str] = (), *, allow_files:
         if not found:
             raise InputError(f"study {study.name} has no {what}, so there is nothing to run")
     _all_different("arms", [(arm.name, arm.key) for arm in arms])
-    scenes = tuple(scene for entry in study.scenes for scene in _scenes(entry, study.folder, allow_files))
+    scenes = _told_apart([scene for entry in study.scenes for scene in _scenes(entry, study.folder, allow_files)])
     _all_different("scenes", [(scene.name, scene.key) for scene in scenes])
     if len(set(study.seeds)) < len(study.seeds):
         raise InputError(f"study {study.name} names a seed twice: {list(study.seeds)}")
@@ -188,7 +190,15 @@ def _scenes(entry: SceneEntry, folder: Path, allow_files: bool) -> Iterator[Scen
             source = {"path": str(Path(path).resolve()), "format": entry.format, "pauses": entry.pauses}
             source |= {"options": list(entry.options)}
             recording = open_source(Path(path), entry.format, entry.options, entry.pauses, allow_files=allow_files)
-            yield Scene(Path(path).name, entry.group or "recordings", source, recording.key.hex())
+            # The truth counts: figures depend on it, and all that oracles do.
+            key = content_key(recording.key, recording.truth_key).hex()
+            yield Scene(Path(path).name, entry.group or "recordings", source, key)
+
+
+def _told_apart(scenes: list[Scene]) -> tuple[Scene, ...]:
+    """Scenes of one name in several groups get their group's name in front."""
+    often = Counter(scene.name for scene in scenes)
+    return tuple(replace(s, name=f"{s.group}-{s.name}") if often[s.name] > 1 else s for s in scenes)
 
 
 def _all_different(what: str, named: list[tuple[str, str]]) -> None:
@@ -201,7 +211,8 @@ def _all_different(what: str, named: list[tuple[str, str]]) -> None:
             )
         if name in seen.values():
             raise InputError(
-                f"two {what} are called {name!r}", "give each a name" if what == "arms" else "give each a group"
+                f"two {what} are called {name!r}",
+                "give each a name" if what == "arms" else "give each a group of its own",
             )
         seen[key] = name
 

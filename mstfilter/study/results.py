@@ -84,16 +84,17 @@ class StudyFolder:
         """A run's folder."""
         return self.path / "runs" / folder
 
-    def is_done(self, folder: str, identity: str) -> bool:
-        """Whether a run is there, whole, and the one that is meant."""
-        result = read_result(self.run(folder))
-        return result.get("status") == "done" and result.get("identity") == identity
-
     def fail(self, run: Mapping[str, Any], outcome: Outcome) -> None:
-        """Write down why a run failed; the folder of an earlier failure is reused."""
+        """Write down why a run failed; the folder of an earlier failure is reused.
+
+        Of a run that could only not be measured again, what was known of it before is kept beside.
+        """
         folder = self.run(run["folder"])
         folder.mkdir(parents=True, exist_ok=True)
+        before = read_result(folder)
         record = {"identity": run["identity"], "status": "failed", "error": outcome.error, "hints": outcome.hints}
+        if before.get("identity") == run["identity"]:
+            record |= {k: before[k] for k in ("metrics", "rows", "costs") if k in before}
         write_json(folder / RESULT, {**record, "tries": outcome.tries, "trace": outcome.trace})
 
     def failures(self) -> list[dict[str, Any]]:

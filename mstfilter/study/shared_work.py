@@ -10,6 +10,7 @@ the seed that asks. Entries are named by the version of the code that makes them
 from __future__ import annotations
 
 import contextlib
+import functools
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -32,26 +33,32 @@ def shared_work(where: Mapping[str, Any] | None) -> Iterator[None]:
     where : mapping, optional
         ``folder``, ``gb``, the bound of its size, and ``versions`` as `kind_versions` gives them.
     """
-    from mstfilter.completion.completer import Completion
-    from mstfilter.scene.disk_memo import DiskMemo, Kind
     from mstfilter.scene.memo import beneath
-    from mstfilter.segmentation.tree import Tree
-    from mstfilter.tracking.features import Matches
-    from mstfilter.tracking.flow import ClipTracks
 
     if where is None:
         with beneath(None):
             yield
         return
+    with beneath(_layer(Path(where["folder"]), int(where["gb"] * 1e9), tuple(where["versions"].items()))):
+        yield
+
+
+@functools.lru_cache(maxsize=1)
+def _layer(folder: Path, limit_bytes: int, versions: tuple[tuple[str, str], ...]) -> Any:
+    """One for all runs of a worker, so that what they write together is what it counts."""
+    from mstfilter.completion.completer import Completion
+    from mstfilter.scene.disk_memo import DiskMemo, Kind
+    from mstfilter.segmentation.tree import Tree
+    from mstfilter.tracking.features import Matches
+    from mstfilter.tracking.flow import ClipTracks
+
     types = {
         "clip tracks": ClipTracks,
         "segmentation_tree": (Tree, np.ndarray),
         "completion": Completion,
         "sift matches": Matches,
     }
-    kinds = {name: Kind(types[name], version) for name, version in where["versions"].items()}
-    with beneath(DiskMemo(Path(where["folder"]), int(where["gb"] * 1e9), kinds)):
-        yield
+    return DiskMemo(folder, limit_bytes, {name: Kind(types[name], version) for name, version in versions})
 
 
 def kind_versions() -> dict[str, str]:

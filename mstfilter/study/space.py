@@ -1,6 +1,6 @@
 """How much disk a study will need, so that it is refused before it begins rather than after an hour.
 
->>> check_space(1.5e9, Path("studies/first"), "the study")
+>>> check_space({"the study": (Path("studies/first"), 1.5e9)})
 """
 
 from __future__ import annotations
@@ -43,17 +43,39 @@ def run_bytes(source: Mapping[str, Any], n: int, keep: str) -> float:
     return float(pauses * (pixels * _PER_PIXEL + n * voxels * _PER_VOXEL + _PER_PAUSE))
 
 
-def check_space(needed: float, folder: Path, what: str) -> None:
-    """Raise InputError if the disk of a folder, which need not exist yet, has less than `needed` bytes left."""
-    existing = folder.absolute()
-    while not existing.exists():
-        existing = existing.parent
-    free = shutil.disk_usage(existing).free
-    if needed > free:
-        raise InputError(
-            f"{what} needs about {needed / 1e9:.2g} GB in {folder}, where {free / 1e9:.2g} GB are free",
-            'make room, choose another folder, or keep = "tables" in the study',
-        )
+def check_space(needs: Mapping[str, tuple[Path, float]]) -> None:
+    """Raise InputError if a disk has less left than all that is to be written on it.
+
+    Parameters
+    ----------
+    needs : mapping
+        What is written -> its folder, which need not exist yet, and bytes.
+    """
+    disks: dict[int, list[str]] = {}
+    for what, (folder, _) in needs.items():
+        disks.setdefault(_device(folder), []).append(what)
+    for together in disks.values():
+        needed = sum(needs[what][1] for what in together)
+        free = shutil.disk_usage(_existing(needs[together[0]][0])).free
+        if needed > free:
+            each = (f"{what} needs about {needs[what][1] / 1e9:.2g} GB in {needs[what][0]}" for what in together)
+            raise InputError(
+                f"{' and '.join(each)}, where {free / 1e9:.2g} GB are free",
+                'make room, choose another folder, or keep = "tables" in the study',
+            )
+
+
+def _device(folder: Path) -> int:
+    """Names the disk of a folder."""
+    return _existing(folder).stat().st_dev
+
+
+def _existing(folder: Path) -> Path:
+    """The folder, or the one above it that exists."""
+    path = folder.absolute()
+    while not path.exists():
+        path = path.parent
+    return path
 
 
 def _family(source: Mapping[str, Any]) -> Any:

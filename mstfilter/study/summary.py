@@ -73,6 +73,11 @@ class Compared:
     beside: bool = False
 
     @property
+    def adjusted(self) -> bool:
+        """Whether `p_holm` of the difference is an adjusted one."""
+        return self.figure == ENDPOINT and not self.beside
+
+    @property
     def words(self) -> str:
         """A conclusion."""
         return said(self.difference, self.first, self.second, self.family)
@@ -125,9 +130,10 @@ class Summary:
         for one in self.differences:
             d = one.difference
             row = {"family": one.family, "first": one.first, "second": one.second, "figure": one.figure, "n": d.n}
-            row |= {"mean": d.mean, "low": d.low, "high": d.high, "p": d.p, "p_holm": d.p_holm}
+            row |= {"mean": d.mean, "low": d.low, "high": d.high, "p": d.p}
+            row["p_holm"] = d.p_holm if one.adjusted else None
             row |= {"low_bootstrap": d.low_bootstrap, "high_bootstrap": d.high_bootstrap}
-            rows.append({**row, "conclusion": "" if one.beside or one.figure != ENDPOINT else one.words})
+            rows.append({**row, "conclusion": one.words if one.adjusted else ""})
         return rows
 
 

@@ -7,6 +7,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -79,10 +80,12 @@ class ToDo:
                 path.rename(wanted)
 
     def _needed(self, run: Run, metrics: str) -> str | None:
+        """What is left to do of a run; None if nothing is. One that failed while it was measured again is whole."""
         path = self.folder.run(run.folder)
-        if not self.folder.is_done(run.folder, run.identity):
+        found = read_result(path)
+        if found.get("identity") != run.identity or "costs" not in found:
             return "run"
-        if read_result(path).get("metrics") == metrics:
+        if found.get("status") == "done" and found.get("metrics") == metrics:
             return None
         return "measure" if (path / "pauses").is_dir() else "run"
 
@@ -120,12 +123,13 @@ class ToDo:
         """Raise InputError if what is left to do will not fit on the disk."""
         waiting = [run for run, job in self.runs()[0] if job["kind"] == "run"]
         keep = self.plan.config.keep
-        runs = sum(run_bytes(run.scene.source, int(run.arm.config["n"]), keep) for run in waiting)
-        check_space(runs, self.folder.path, "the study")
+        sizes = Counter((run.scene.key, int(run.arm.config["n"])) for run in waiting)
+        sources = {run.scene.key: run.scene.source for run in waiting}
+        runs = sum(many * run_bytes(sources[key], n, keep) for (key, n), many in sizes.items())
         records = sum(recording_bytes(job["source"]) for job in self.records()[1])
-        work = self.plan.config.cache_gb * 1e9 if waiting else 0.0
+        work = min(self.plan.config.cache_gb * 1e9, _WORK_A_SCENE * len(sources))
         check_space(
-            records + min(work, 0.05e9 * len(self.plan.scenes)), self.cache, "the cache of recordings and work"
+            {"the study": (self.folder.path, runs), "the cache of recordings and work": (self.cache, records + work)}
         )
 
     def records(self) -> tuple[list[str], list[Job]]:

@@ -113,6 +113,26 @@ def test_the_bound_holds_and_the_oldest_goes(tmp_path):
     assert layer.find("array", 1) is None
 
 
+def test_the_bound_holds_over_many_short_lives(tmp_path):
+    """Processes that each write less than they would count still keep the folder bounded."""
+    for k in range(40):
+        DiskMemo(tmp_path, 50_000, KINDS).keep("array", k, np.zeros(1000))
+        assert sum(p.stat().st_size for p in tmp_path.rglob("*.npz")) <= 50_000
+    assert DiskMemo(tmp_path, 50_000, KINDS).find("array", 39) is not None
+
+
+def test_runs_of_a_process_share_one_layer(tmp_path):
+    from mstfilter.scene import memo as store
+    from mstfilter.study.shared_work import kind_versions, shared_work
+
+    where = {"folder": str(tmp_path), "gb": 0.5, "versions": kind_versions()}
+    seen = []
+    for _ in range(2):
+        with shared_work(where):
+            seen.append(store._layer)
+    assert seen[0] is seen[1] is not None
+
+
 def test_writers_at_the_same_time(tmp_path):
     """Eight threads write and read the same few entries under a bound that keeps removing them."""
     value, wrong = np.arange(2000.0), []

@@ -17,6 +17,7 @@ from mstfilter.errors import InputError
 from mstfilter.study.config import load_study, study_of
 from mstfilter.study.local import Local
 from mstfilter.study.results import StudyFolder
+from mstfilter.study.space import check_space
 from mstfilter.study.study import run_study
 from tests.study.scenes import slide
 
@@ -227,3 +228,16 @@ def test_folders_that_will_not_do(folder, tmp_path, monkeypatch):
     with pytest.raises(InputError, match=r"the study needs about .* GB in .*, where 1e-06 GB are free"):
         run_study(study(folder, "good"), tmp_path / "full", cache=tmp_path, progress=begun.append)
     assert begun == []
+
+
+def test_what_goes_on_one_disk_must_fit_on_it_together(tmp_path, monkeypatch):
+    monkeypatch.setattr("mstfilter.study.space.shutil.disk_usage", lambda path: SimpleNamespace(free=10e9))
+    needs = {"the study": (tmp_path / "study", 8e9), "the cache": (tmp_path / "deep" / "cache", 8e9)}
+    with pytest.raises(
+        InputError, match=r"study needs about 8 GB in .* and the cache needs .*, where 10 GB are free"
+    ):
+        check_space(needs)
+    check_space({"the study": needs["the study"]})
+    disks = {tmp_path: 1}  # another disk each
+    monkeypatch.setattr("mstfilter.study.space._device", lambda path: disks.setdefault(path, len(disks) + 1))
+    check_space(needs)

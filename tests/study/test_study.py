@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import csv
 import json
+import shutil
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 
+from mstfilter.errors import InputError
 from mstfilter.study.config import SceneEntry, load_study, study_of
 from mstfilter.study.grid import split_grid
 from mstfilter.study.local import Local
 from mstfilter.study.plan import make_plan
+from mstfilter.study.results import StudyFolder
 from mstfilter.study.study import run_study
 from tests.study.scenes import slide
 
@@ -86,6 +90,35 @@ def test_identity_is_of_what_matters(folder):
     assert json.loads(json.dumps(runs[0].arm.config)) == runs[0].arm.config
 
 
+def test_a_corrected_truth_is_another_recording(tmp_path):
+    """Quality and all that oracles do depend on it."""
+    found = set()
+    for label in (1, 2, 2):
+        path = slide(tmp_path / "slide", seed=0)
+        with np.load(path / "voxels.npz") as data:
+            volumes = {name: np.where(data[name] == 1, label, data[name]) for name in data.files}
+        np.savez(path / "voxels.npz", **volumes)
+        study = study_of(
+            {"name": "s", "folder": tmp_path, "scenes": [{"recordings": "slide"}], "arms": [{}], "seeds": [0]}
+        )
+        found.add(make_plan(study).runs[0].identity)
+        shutil.rmtree(path)
+    assert len(found) == 2
+
+
+def test_recordings_of_one_name_in_two_groups(tmp_path):
+    scenes = []
+    for k, group in enumerate("ab"):
+        slide(tmp_path / group / "000001", seed=k)
+        scenes.append({"recordings": f"{group}/000001", "group": group})
+    base = {"name": "s", "folder": tmp_path, "arms": [{}], "seeds": [0]}
+    assert [s.name for s in make_plan(study_of({**base, "scenes": scenes})).scenes] == ["a-000001", "b-000001"]
+    unnamed = [{"recordings": s["recordings"]} for s in scenes]
+    with pytest.raises(InputError, match="two scenes are called 'recordings-000001'") as caught:
+        make_plan(study_of({**base, "scenes": unnamed}))
+    assert caught.value.hints == ("give each a group of its own",)
+
+
 def test_a_study_that_grows_runs_what_is_new(folder, tmp_path):
     study = load_study(folder / "base.toml", smoke=True)
     assert run_study(study, tmp_path / "out", Local(1), cache=tmp_path / "cache").done == 4
@@ -113,6 +146,26 @@ def test_figures_that_are_defined_anew_are_measured_again(folder, tmp_path):
         assert [r["quality"] for r in after] == [r["quality"] for r in before]
         same = [json.loads(path.read_text())["costs"] == costs for path, costs in kept.items()]
         assert same == [keep == "all"] * len(same)
+
+
+def test_a_run_that_cannot_be_measured_again_is_not_lost(folder, tmp_path):
+    slide(tmp_path / "mine")
+    base = {"name": "s", "folder": tmp_path, "scenes": [{"recordings": "mine"}], "arms": [{}], "seeds": [0]}
+    study, out = study_of({**base, "keep": "all"}), tmp_path / "out"
+    run_study(study, out, Local(1), cache=tmp_path / "cache")
+    before = table(out / "runs.csv", costs=True)
+    (path,) = (out / "runs").glob("*/result.json")
+    path.write_text(json.dumps({**json.loads(path.read_text()), "metrics": "earlier"}))
+    kept = path.parent / "pauses" / "001" / "hypotheses.npz"
+    whole = kept.read_bytes()
+    kept.write_bytes(b"")
+    assert len(run_study(study, out, Local(1), cache=tmp_path / "cache").failed) == 1
+    assert len(StudyFolder.open(out).failures()) == 1 and StudyFolder.open(out).rows() == []
+    kept.write_bytes(whole)
+    made = kept.stat().st_mtime_ns
+    assert run_study(study, out, Local(1), cache=tmp_path / "cache").failed == ()
+    assert table(out / "runs.csv", costs=True) == before  # costs are those of the run itself
+    assert kept.stat().st_mtime_ns == made
 
 
 def test_shared_work_changes_no_result(folder, tmp_path):

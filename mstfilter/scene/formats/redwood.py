@@ -3,8 +3,9 @@
 >>> Redwood().open(Path("bedroom"))
 
 ``intrinsic.json`` (or ``camera_intrinsic.json``) is Open3D's: width, height, ``intrinsic_matrix`` column by column.
-A trajectory has five lines a frame: three numbers, then a 4x4 camera-to-world matrix. Images are paired in the order
-of their names. Depth is in millimetres unless said otherwise. Format: http://redwood-data.org/indoor/fileformat.html.
+A trajectory has five lines a frame: three numbers, then a 4x4 camera-to-world matrix. Images are paired by the
+first number in their names. Depth is in millimetres unless said otherwise.
+Format: http://redwood-data.org/indoor/fileformat.html.
 """
 
 from __future__ import annotations
@@ -83,6 +84,12 @@ class Redwood(Format):
                 f"{path}: there are {len(colour)} colour images and {len(depth)} depth images",
                 f"each frame needs both; {folder.name}/ ends with {colour[-1].name}, depth/ with {depth[-1].name}",
             )
+        for a, b in zip(colour, depth, strict=True):
+            if _number(a) != _number(b):
+                raise InputError(
+                    f"{path}: colour image {a.name} would be paired with depth image {b.name}",
+                    "an image is missing, or the two are numbered differently; rename one side to match",
+                )
 
         def read(index: int) -> Images:
             names = f"colour image {colour[index]}", f"depth image {depth[index]}"
@@ -116,11 +123,13 @@ def _numbered(folder: Path) -> list[Path]:
     if not files:
         raise InputError(f"{folder} holds no image", f"expected {', '.join(_SUFFIXES)}")
 
-    def key(file: Path) -> tuple[int, str]:
-        number = re.search(r"\d+", file.stem)
-        return (int(number.group()) if number else -1, file.name)
+    return sorted(files, key=lambda file: (_number(file), file.name))
 
-    return sorted(files, key=key)
+
+def _number(file: Path) -> int:
+    """The first number in the name; -1 without any."""
+    found = re.search(r"\d+", file.stem)
+    return int(found.group()) if found else -1
 
 
 def _intrinsics(path: Path) -> tuple[float, ...]:

@@ -250,6 +250,12 @@ FAULTS = {
         lambda p: first_file(p, "depth").unlink(),
         "17 colour .* 16",
     ),
+    "redwood, one of each missing": (
+        write_redwood,
+        Redwood(),
+        lambda p: (first_file(p, "depth").unlink(), sorted((p / "color").iterdir())[5].unlink()),
+        "would be paired with depth image",
+    ),
     "redwood, no intrinsics": (write_redwood, Redwood(), lambda p: (p / "intrinsic.json").unlink(), "intrinsics are"),
     "redwood, row by row": (
         write_redwood,
