@@ -20,9 +20,8 @@ def blocks(page):
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)
-def test_examples_run(page, tmp_path, capsys):
+def test_examples_run(page, tmp_path, capsys, monkeypatch):
     """One namespace a page, in order, as a reader would type them; the reader's own data are given."""
-    from mstfilter.scene.recording import Recording
     from mstfilter.scene.voxels import Hypothesis
 
     noise = np.random.default_rng(0)
@@ -31,10 +30,9 @@ def test_examples_run(page, tmp_path, capsys):
         "rgb": np.stack([s[0] for s in scenes]),
         "depth": np.stack([s[1] for s in scenes]),
         "K": CAMERA.K,
-        "tmp_path": tmp_path,
         "hypotheses": [Hypothesis.from_labels(s[2], GRID) for s in scenes],
     }
-    given["clips"] = Recording.from_arrays(given["rgb"], given["depth"], CAMERA.K).clips()
+    monkeypatch.chdir(tmp_path)
     for number, block in enumerate(blocks(page)):
         exec(compile(block, f"{page.name}, example {number + 1}", "exec"), given)
     assert "nan" not in capsys.readouterr().out
