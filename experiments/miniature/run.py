@@ -192,7 +192,9 @@ def main() -> None:
     """Run what is asked for."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--smoke", action="store_true", help="two worlds, few particles: a minute; needs --out")
-    parser.add_argument("--presets", action="store_true", help="the presets alone, distances alone: 4 minutes on two cores")
+    parser.add_argument(
+        "--presets", action="store_true", help="the presets alone, distances alone: 4 minutes on two cores"
+    )
     parser.add_argument("--out", type=Path, default=HERE / "results")
     options = parser.parse_args()
     if options.smoke and options.out == HERE / "results":

@@ -19,7 +19,10 @@ PAGE = 'xmlns="http://www.w3.org/2000/svg" style="background:var(--paper);font-f
 
 
 def make(out: Path, study: Path, chosen: Sequence[str] = ()) -> list[Path]:
-    """The figure of the runs that are done, with the arms chosen, or else all but those beside the comparisons."""
+    """The figure of the runs that are done, with the arms chosen, or else all but those beside the comparisons.
+
+    More than twelve arms make several figures.
+    """
     folder = StudyFolder.open(study)
     known = {arm["name"]: arm for arm in folder.description["arms"]}
     if unknown := [name for name in chosen if name not in known]:
@@ -32,10 +35,13 @@ def make(out: Path, study: Path, chosen: Sequence[str] = ()) -> list[Path]:
             by_pause.setdefault(row["pause"], []).extend(row["qualities"])
     if not values:
         return []
-    path = out / "quality_over_time.svg"
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(standalone(study_figures.time_figure(values, arms)))
-    return [path]
+    out.mkdir(parents=True, exist_ok=True)
+    paths = []
+    for k, group in enumerate(study_figures.in_groups(arms, folder.description["reference"])):
+        paths.append(out / f"quality_over_time{f'_{k + 1}' if k else ''}.svg")
+        drawn = {family: {a: v for a, v in of_arms.items() if a in group} for family, of_arms in values.items()}
+        paths[-1].write_text(standalone(study_figures.time_figure(drawn, group)))
+    return paths
 
 
 def standalone(svg: str) -> str:

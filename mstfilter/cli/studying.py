@@ -46,7 +46,7 @@ def study(
     if scheduler:
         from mstfilter.study.cluster import Cluster
 
-        executor = Cluster(scheduler)
+        executor = Cluster(scheduler, wanted.tries, wanted.timeout_s)
     with _shown() as progress:
         result = run_study(wanted, folder, executor, overrides or (), progress=progress)
     print(f"study       {folder}")

@@ -15,7 +15,7 @@ from typing import Any
 
 from mstfilter.report.content import seconds_text
 from mstfilter.report.page import render, write_page
-from mstfilter.report.study_figures import differences_figure, time_figure
+from mstfilter.report.study_figures import differences_figure, in_groups, time_figure
 from mstfilter.report.tables import flatten, shown
 from mstfilter.study.results import StudyFolder
 from mstfilter.study.statistics import CLAIM
@@ -115,13 +115,15 @@ def _drawn(records: Sequence[Mapping[str, Any]], summary: Summary, beside: Seque
     for row in records:
         if row.get("qualities"):
             values[row["family"]][row["arm"]][row["pause"]].extend(row["qualities"])
-    found = {}
+    found: dict[str, Any] = {}
     arms = [arm for arm in summary.arms if arm not in beside]
     if values:
-        found["time"] = Markup(time_figure(_of(values, arms), arms))
+        groups = in_groups(arms, summary.reference)
+        found["time"] = [Markup(time_figure(_of(values, group), group)) for group in groups]
     ends = [summary.reference, *(arm for arm in summary.arms if arm in beside)]
     if values and len(ends) > 1:
-        found["ends"] = Markup(time_figure(_of(values, ends), ends))
+        groups = in_groups(ends, summary.reference)
+        found["ends"] = [Markup(time_figure(_of(values, group), group)) for group in groups]
     compared = [one for one in summary.compared() if one.difference.n]
     if compared:
         found["differences"] = Markup(differences_figure(compared, summary.arms))

@@ -16,14 +16,23 @@ from mstfilter.study.summary import Compared
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-__all__ = ["colour_of", "differences_figure", "time_figure"]
+__all__ = ["colour_of", "differences_figure", "in_groups", "time_figure"]
 
-_MOST_BOXES = 12  # arms at a pause that are still told apart as boxes; more are lines
+_MOST, _GROUP = len(SERIES), 8  # arms that one figure can tell apart, and that each of several holds
 
 
 def colour_of(arms: Sequence[str]) -> dict[str, str]:
     """A colour for every arm; they repeat after twelve."""
     return {arm: SERIES[k % len(SERIES)] for k, arm in enumerate(arms)}
+
+
+def in_groups(arms: Sequence[str], reference: str) -> list[list[str]]:
+    """Arms for one figure each: all of them up to twelve, else the reference with seven others in each."""
+    if len(arms) <= _MOST:
+        return [list(arms)]
+    others, first = [arm for arm in arms if arm != reference], [reference] if reference in arms else []
+    size = _GROUP - len(first)
+    return [first + others[k : k + size] for k in range(0, len(others), size)]
 
 
 def time_figure(values: Mapping[str, Mapping[str, Mapping[int, Sequence[float]]]], arms: Sequence[str]) -> str:
@@ -34,7 +43,7 @@ def time_figure(values: Mapping[str, Mapping[str, Mapping[int, Sequence[float]]]
     values : mapping
         Family -> arm -> pause -> quality of every hypothesis of every scene and seed.
     arms : sequence of str
-        In the order in which they stand beside each other.
+        In the order in which they stand beside each other; see `in_groups` where there are many.
 
     Arms that the values lack are left out. Boxes hold the middle half of the hypotheses, the bar is their median,
     whiskers reach the 5th and 95th per cent; points are hypotheses, lines join the means.
@@ -50,8 +59,7 @@ def time_figure(values: Mapping[str, Mapping[str, Mapping[int, Sequence[float]]]
                 if arm not in of_arms:
                     continue
                 at = {t: t + (k - (len(shown) - 1) / 2) * width for t in of_arms[arm]}
-                if len(shown) <= _MOST_BOXES:
-                    _boxes(axes, at, of_arms[arm], width, colours[arm])
+                _boxes(axes, at, of_arms[arm], width, colours[arm])
                 means = [float(np.mean(of_arms[arm][t])) for t in at]
                 axes.plot(
                     list(at.values()), means, color=colours[arm], lw=1.3, marker="D", ms=3.6, label=arm, zorder=4

@@ -4,12 +4,16 @@
 
 The scheduler is somebody else's: it is neither started nor stopped here. All machines must see the study's folder and
 the cache under the same paths and have the same version of this package. A run whose worker dies goes to another one;
-after as many deaths as the scheduler allows (its ``allowed-failures``, 3) it is named and the rest goes on.
+after as many deaths as the scheduler allows (its ``allowed-failures``, 3) it is named and the rest goes on. A run
+that takes too long costs its worker its process, which the nanny of the worker begins anew.
 """
 
 from __future__ import annotations
 
 import contextlib
+import queue
+import time
+import uuid
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -18,6 +22,8 @@ from mstfilter.errors import InputError, MissingLibraryError
 from mstfilter.study.executors import Event, Executor, Job, Outcome, Tell
 
 __all__ = ["Cluster"]
+
+_LOOK_S = 0.5  # how often it is looked for runs that take too long
 
 
 @dataclass(frozen=True)
@@ -28,49 +34,26 @@ class Cluster(Executor):
     ----------
     address : str
         For example ``tcp://head:8786``.
+    tries : int
+        How often a run that takes too long is begun before it is named.
     timeout_s : float
+        Seconds that one try may take; 0: any.
+    connect_s : float
         How long the scheduler may take to answer at first.
     """
 
     address: str
-    timeout_s: float = 10.0
+    tries: int = 3
+    timeout_s: float = 0.0
+    connect_s: float = 10.0
 
     def run(self, jobs: Sequence[Job], tell: Tell) -> list[Outcome]:
         """Run all jobs; where those of one share run is the scheduler's choice."""
         if not jobs:
             return []
-        outcomes: dict[int, Outcome] = {}
         with self._client() as client:
-            from distributed import as_completed
-
             _check_workers(client)
-            futures = {}
-            for k, job in enumerate(jobs):
-                future = client.submit(_perform, dict(job), pure=False, key=f"mstfilter-{k}-{id(self)}", priority=-k)
-                futures[future] = k
-                tell(Event("begun", k))
-            with contextlib.ExitStack() as stack:
-                stack.callback(lambda: client.cancel([f for f in futures if not f.done()], force=True))
-                for future in as_completed(list(futures), loop=client.loop):
-                    k = futures[future]
-                    outcomes[k] = self._outcome(future)
-                    tell(Event("ended", k, outcome=outcomes[k]))
-        return [outcomes[k] for k in range(len(jobs))]
-
-    def _outcome(self, future: Any) -> Outcome:
-        """What became of a job whose future is done."""
-        from distributed import KilledWorker
-
-        error = future.exception()
-        if error is None:
-            result = future.result()
-            return Outcome(**{**result, "hints": tuple(result["hints"])})
-        if isinstance(error, KilledWorker):
-            n = error.allowed_failures + 1
-            return Outcome(
-                "failed", f"its worker died {n} times", ("if memory ran out: more memory a worker",), tries=n
-            )
-        return Outcome("failed", f"{type(error).__name__}: {error}", ("look at the logs of the cluster",))
+            return _Conversation(self, client, tell).run(jobs)
 
     @contextlib.contextmanager
     def _client(self) -> Iterator[Any]:
@@ -82,13 +65,93 @@ class Cluster(Executor):
                 "pip install 'mstfilter[dask]'",
             ) from error
         try:
-            client = Client(self.address, timeout=self.timeout_s, set_as_default=False)
+            client = Client(self.address, timeout=self.connect_s, set_as_default=False)
         except (OSError, TimeoutError, ValueError) as error:
             raise InputError(
                 f"no Dask scheduler answers at {self.address}: {error}", "start one: dask scheduler"
             ) from error
         with client:
             yield client
+
+
+class _Conversation:
+    """Jobs handed in, and what is heard of them."""
+
+    def __init__(self, settings: Cluster, client: Any, tell: Tell) -> None:
+        self._settings, self._client, self._tell = settings, client, tell
+        self._heard: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
+        self._outcomes: dict[int, Outcome] = {}
+        self._at: dict[int, tuple[str, float]] = {}  # worker and time of the try that is going on
+        self._tries: dict[int, int] = {}
+
+    def run(self, jobs: Sequence[Job]) -> list[Outcome]:
+        topic = f"mstfilter-{uuid.uuid4().hex}"
+        self._client.subscribe_topic(topic, lambda event: self._heard.put(event[1]))
+        futures = {}
+        try:
+            for k, job in enumerate(jobs):
+                key = f"{topic}-{k}"
+                futures[k] = self._client.submit(_perform, dict(job), k, topic, pure=False, key=key, priority=-k)
+                futures[k].add_done_callback(lambda future, k=k: self._heard.put({"job": k, "ended": True}))
+            while len(self._outcomes) < len(jobs):
+                with contextlib.suppress(queue.Empty):
+                    self._hear(self._heard.get(timeout=_LOOK_S), futures)
+                self._end_what_hangs(futures)
+        finally:
+            self._client.cancel([f for k, f in futures.items() if k not in self._outcomes], force=True)
+            self._client.unsubscribe_topic(topic)
+        return [self._outcomes[k] for k in range(len(jobs))]
+
+    def _hear(self, said: dict[str, Any], futures: dict[int, Any]) -> None:
+        k = said["job"]
+        if k in self._outcomes:
+            return
+        if "ended" in said:
+            self._end(k, _outcome(futures[k], self._tries.get(k, 1)))
+        elif "begun" in said:
+            if k not in self._tries:
+                self._tell(Event("begun", k))
+            self._tries[k] = self._tries.get(k, 0) + 1
+            self._at[k] = (said["begun"], time.monotonic())
+        else:
+            self._tell(Event("step", k, said["done"], said["total"]))
+
+    def _end(self, k: int, outcome: Outcome) -> None:
+        self._at.pop(k, None)
+        self._outcomes[k] = outcome
+        self._tell(Event("ended", k, outcome=outcome))
+
+    def _end_what_hangs(self, futures: dict[int, Any]) -> None:
+        limit = self._settings.timeout_s
+        late = [k for k, (_, began) in self._at.items() if limit and time.monotonic() - began > limit]
+        for k in late:
+            worker, _ = self._at.pop(k)
+            n = self._tries[k]
+            if n >= self._settings.tries:
+                self._client.cancel([futures[k]], force=True)
+                why = f"it took longer than {limit:g} s, {n} time{'s' if n > 1 else ''}"
+                self._end(k, Outcome("failed", why, ("raise timeout_s, or set it to 0",), tries=n))
+            # Its process goes, with whatever hangs there; if tries are left the scheduler begins it elsewhere.
+            with contextlib.suppress(Exception):  # a worker without nanny, or one that is gone already
+                self._client.restart_workers([worker], timeout=30, raise_for_error=False)
+
+
+def _outcome(future: Any, tries: int) -> Outcome:
+    """What became of a job whose future is done."""
+    from distributed import KilledWorker
+
+    if future.status in ("cancelled", "lost"):
+        return Outcome(
+            "failed", f"the scheduler has given it up: {future.status}", ("repeat the command",), tries=tries
+        )
+    error = future.exception()
+    if error is None:
+        result = future.result()
+        return Outcome(**{**result, "hints": tuple(result["hints"])})
+    if isinstance(error, KilledWorker):
+        n = error.allowed_failures + 1
+        return Outcome("failed", f"its worker died {n} times", ("if memory ran out: more memory a worker",), tries=n)
+    return Outcome("failed", f"{type(error).__name__}: {error}", ("look at the logs of the cluster",), tries=tries)
 
 
 def _check_workers(client: Any) -> None:
@@ -120,11 +183,18 @@ def _version() -> str:
     return __version__
 
 
-def _perform(job: Job) -> dict[str, Any]:
+def _perform(job: Job, k: int, topic: str) -> dict[str, Any]:
     """In a worker."""
     import cv2
+    from distributed import get_worker
 
     from mstfilter.study.jobs import perform
 
+    worker = get_worker()
+
+    def say(**what: Any) -> None:
+        worker.log_event(topic, {"job": k, **what})
+
     cv2.setNumThreads(1)
-    return asdict(perform(job))
+    say(begun=worker.address)
+    return asdict(perform(job, lambda done, total: say(done=done, total=total)))

@@ -8,9 +8,12 @@ from importlib.resources import files
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from mstfilter.errors import InputError
 from mstfilter.report.study import write_study_report
+from mstfilter.report.study_figures import in_groups
 from mstfilter.report.svg import SERIES
 from mstfilter.study.results import RESULT, StudyFolder
 from tests.test_cli import call
@@ -90,6 +93,29 @@ def test_the_same_study_gives_the_same_page(tmp_path):
 def test_few_and_many_arms(tmp_path, arms):
     text = write_study_report(make_study(tmp_path, n_scenes=2, arms=arms, groups=("s1",), fail=False)).read_text()
     assert ("Paired differences" in text) == (len(arms) > 1)
+
+
+def test_more_arms_than_colours_are_drawn_in_several_figures(tmp_path):
+    """Each with the reference, points and boxes; none is left out."""
+    arms = tuple(f"arm {k}" for k in range(15))
+    text = write_study_report(make_study(tmp_path, n_scenes=2, arms=arms, groups=("s1",), fail=False)).read_text()
+    drawn = re.findall(r'<svg class="figure".*?</svg>', text, flags=re.S)
+    times = [svg for svg in drawn if "over time" in svg]
+    assert len(times) == 2 and len(drawn) == 3
+    points = 2 * 2 * 3 * 5  # scenes, seeds, pauses, hypotheses
+    for svg, others in zip(times, (arms[1:8], arms[8:]), strict=True):
+        assert set(re.findall(r">(arm \d+)<", svg)) == {arms[0], *others}
+        assert svg.count("<use") >= points * (1 + len(others))
+    assert text.count("<figcaption>Every point") == 1
+
+
+@given(st.lists(st.integers(), unique=True, min_size=1, max_size=60), st.data())
+def test_groups_hold_every_arm_once_and_the_reference_always(numbers, data):
+    arms = [str(k) for k in numbers]
+    reference = data.draw(st.sampled_from(arms))
+    groups = in_groups(arms, reference)
+    assert all(reference in group and len(group) == len(set(group)) <= len(SERIES) for group in groups)
+    assert [a for group in groups for a in group if a != reference] == [a for a in arms if a != reference]
 
 
 def test_floors_stand_beside_and_are_not_spoken_of(tmp_path):

@@ -26,7 +26,19 @@ def test_a_cluster_gives_the_same_bytes(cluster, tmp_path):
     slide(tmp_path / "slide", pauses=2)
     wanted = study(tmp_path, "good", "raise", "die")
     here = run_study(wanted, tmp_path / "here", Local(1), cache=tmp_path / "cache-1")
-    there = run_study(wanted, tmp_path / "there", Cluster(cluster), cache=tmp_path / "cache-2")
+    seen = []
+    there = run_study(
+        wanted,
+        tmp_path / "there",
+        Cluster(cluster),
+        cache=tmp_path / "cache-2",
+        progress=lambda p: seen.append(p.event),
+    )
+    events = [(e.kind, e.job) for e in seen if e is not None]
+    for job in range(6):  # live: each begins once, and before it ends; steps are heard of
+        assert events.count(("begun", job)) == events.count(("ended", job)) == 1
+        assert events.index(("begun", job)) < events.index(("ended", job))
+    assert max(e.done for e in seen if e is not None and e.kind == "step") == 2
     assert figures(tmp_path / "there") == figures(tmp_path / "here")
     assert (tmp_path / "there" / "differences.csv").read_bytes() == (
         tmp_path / "here" / "differences.csv"
@@ -43,9 +55,26 @@ def test_a_cluster_gives_the_same_bytes(cluster, tmp_path):
     assert again.repeated == 2
 
 
+def test_a_run_that_takes_too_long_is_named(cluster, tmp_path):
+    """Its worker is there for others afterwards."""
+    from mstfilter.study.cluster import Cluster
+
+    slide(tmp_path / "slide", pauses=2)
+    settings = Cluster(cluster, tries=1, timeout_s=12)
+    result = run_study(study(tmp_path, "hang", "good", seeds=[0]), tmp_path / "out", settings, cache=tmp_path)
+    assert [(n, o.error, o.tries) for n, o in result.failed] == [
+        ("hang on slide, seed 0", "it took longer than 12 s, 1 time", 1)
+    ]
+    assert result.done == 1
+    again = run_study(study(tmp_path, "good", seeds=[0, 1, 2]), tmp_path / "out", settings, cache=tmp_path)
+    assert (again.done, again.repeated) == (3, 1)
+
+
 def test_no_scheduler_is_one_clear_error(tmp_path):
     from mstfilter.study.cluster import Cluster
 
     slide(tmp_path / "slide", pauses=2)
     with pytest.raises(InputError, match="no Dask scheduler answers at tcp://127.0.0.1:9"):
-        run_study(study(tmp_path, "good"), tmp_path / "out", Cluster("tcp://127.0.0.1:9", 1.0), cache=tmp_path)
+        run_study(
+            study(tmp_path, "good"), tmp_path / "out", Cluster("tcp://127.0.0.1:9", connect_s=1.0), cache=tmp_path
+        )
