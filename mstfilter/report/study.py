@@ -136,20 +136,22 @@ def _of(values: Mapping[str, Mapping[str, Any]], arms: Sequence[str]) -> dict[st
 
 
 def _costs(summary: Summary) -> dict[str, Any]:
-    """Seconds by stage and family, core seconds and memory, means over pauses."""
+    """Seconds and memory by stage and family, core seconds, means over pauses."""
     stages = [n.removeprefix("seconds_") for n in summary.names if n.startswith("seconds_")]
     rows: list[dict[str, Any]] = []
+    per = ("seconds_", "peak_mb")
     for family in summary.families:
         for arm in summary.arms:
             cells = {
                 name: figure.mean
-                for name in ("seconds", "core_seconds", "peak_mb", *(f"seconds_{s}" for s in stages))
+                for name in ("seconds", "core_seconds", *(n for n in summary.names if n.startswith(per)))
                 if (figure := summary.figure(family, arm, name)) is not None
             }
             if cells:
                 rows.append({"family": family, "arm": arm, **cells})
     most = max((sum(float(r.get(f"seconds_{s}", 0.0)) for s in stages) for r in rows), default=1.0)
-    return {"stages": stages, "rows": rows, "most": most or 1.0}
+    held = [s for s in stages if f"peak_mb_{s}" in summary.names]
+    return {"stages": stages, "rows": rows, "most": most or 1.0, "held": held}
 
 
 def _arms(description: Mapping[str, Any]) -> list[tuple[str, list[tuple[str, str]]]]:

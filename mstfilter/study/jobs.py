@@ -23,9 +23,10 @@ from typing import Any
 
 from mstfilter.errors import InputError
 from mstfilter.scene.recording import Recording
+from mstfilter.smc.watch import telling
 from mstfilter.study.code_version import files_version
 from mstfilter.study.executors import Job, Outcome
-from mstfilter.study.memory import peak_megabytes, reset_peak
+from mstfilter.study.memory import StagePeaks
 from mstfilter.study.results import RESULT, read_result
 from mstfilter.study.run_folder import RunFolder, write_json
 from mstfilter.study.shared_work import shared_work
@@ -105,22 +106,21 @@ def _run(job: Job, step: Step) -> None:
     final = Path(job["folder"])
     work = final.with_name(f".{final.name}.{uuid.uuid4().hex[:8]}.partial")
     costs: list[dict[str, float]] = []
-    began = time.process_time()
-    reset_peak()
+    began, peaks = time.process_time(), StagePeaks()
 
     def progress(p: Any) -> None:
         nonlocal began
         now = time.process_time()
         if p.done:
-            costs.append({"seconds": p.seconds, "core_seconds": now - began, "peak_mb": peak_megabytes()})
-            reset_peak()
+            costs.append({"seconds": p.seconds, "core_seconds": now - began, **peaks.figures()})
+            peaks.begin()
         began = time.process_time()
         step(p.done, p.total)
 
     try:
         recording = open_scene(job["source"], job["recordings"])
         began = time.process_time()
-        with shared_work(job["work"]):
+        with shared_work(job["work"]), telling(peaks):
             run = execute(
                 recording, job["config"], work, job["seed"], allow_files=job["allow_files"], progress=progress
             )

@@ -9,13 +9,15 @@ from __future__ import annotations
 import contextlib
 from pathlib import Path
 
-__all__ = ["peak_megabytes", "reset_peak"]
+__all__ = ["StagePeaks", "peak_megabytes", "reset_peak"]
 
 
-def reset_peak() -> None:
-    """Begin anew, where the system can (Linux); elsewhere the peak is that of the whole process."""
+def reset_peak() -> bool:
+    """Begin anew, where the system can (Linux); elsewhere the peak is that of the whole process. Whether it could."""
     with contextlib.suppress(OSError):
         Path("/proc/self/clear_refs").write_text("5")
+        return True
+    return False
 
 
 def peak_megabytes() -> float:
@@ -34,3 +36,34 @@ def peak_megabytes() -> float:
 
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak / (2**20 if sys.platform == "darwin" else 1024)
+
+
+class StagePeaks:
+    """Most memory of a step and of each of its stages; a listener for `mstfilter.smc.watch.telling`.
+
+    >>> peaks = StagePeaks()
+    >>> with telling(peaks):
+    ...     state, info = filter.step(state, clip)
+    >>> peaks.figures()["peak_mb"]
+    """
+
+    def __init__(self) -> None:
+        self.begin()
+
+    def begin(self) -> None:
+        """A step begins."""
+        self._whole, self._stages = 0.0, dict[str, float]()
+        self._apart = reset_peak()
+
+    def __call__(self, stage: str, begins: bool) -> None:
+        """A stage begins or ends."""
+        peak = peak_megabytes()
+        self._whole = max(self._whole, peak)
+        if not begins:
+            self._stages[stage] = max(peak, self._stages.get(stage, 0.0))
+        self._apart = reset_peak() and self._apart
+
+    def figures(self) -> dict[str, float]:
+        """``peak_mb`` of the step, ``peak_mb_STAGE`` where the system can tell stages apart."""
+        stages = {f"peak_mb_{stage}": peak for stage, peak in self._stages.items()} if self._apart else {}
+        return {"peak_mb": max(self._whole, peak_megabytes()), **stages}

@@ -143,7 +143,7 @@ class StudyFolder:
 
 def cost_columns(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     """Columns of time and memory: the only ones that may differ between two times of running the same study."""
-    return [c for c in _columns(rows) if c in ("core_seconds", "peak_mb") or c.startswith("seconds")]
+    return [c for c in _columns(rows) if c == "core_seconds" or c.startswith(("seconds", "peak_mb"))]
 
 
 def _columns(rows: Sequence[Mapping[str, Any]]) -> list[str]:

@@ -158,7 +158,8 @@ def summarise(
     measured = [name for name in named if name not in cost]
     values = _by_scene(rows, measured, lambda row: row["pause"] >= 1)
     spent = [k for k in named if k in cost]
-    values.update(_by_scene([{**dict.fromkeys(spent, 0.0), **row} for row in rows], spent, lambda row: True))
+    nothing = {k: 0.0 for k in spent if not k.startswith("peak_mb")}  # no time, but no less memory
+    values.update(_by_scene([{**nothing, **row} for row in rows], spent, lambda row: True))
     if ENDPOINT in measured:
         values.update(_slopes(rows))
         measured.insert(1 + measured.index(ENDPOINT), SLOPE)

@@ -47,7 +47,7 @@ def folder(tmp_path_factory):
 def table(path, costs=False):
     with path.open(newline="") as file:
         rows = list(csv.DictReader(file))
-    kept = [k for k in rows[0] if costs or not (k.startswith("seconds") or k in ("core_seconds", "peak_mb"))]
+    kept = [k for k in rows[0] if costs or not k.startswith(("seconds", "core_seconds", "peak_mb"))]
     return [{k: row[k] for k in kept} for row in rows]
 
 
@@ -62,6 +62,9 @@ def test_a_study_runs_resumes_and_repeats_nothing(folder, tmp_path):
         "mst transition=identity update.eta=2",
     }
     assert {(r["scene"], r["family"]) for r in rows} == {("slide-0", "slide"), ("slide-1", "slide")}
+    for r in table(tmp_path / "out" / "runs.csv", costs=True):
+        stages = [float(v) for k, v in r.items() if k.startswith("peak_mb_") and v]
+        assert len(stages) >= 3 and max(stages) <= float(r["peak_mb"])
     made = {p: p.stat().st_mtime_ns for p in (tmp_path / "out" / "runs").rglob("result.json")}
     before = (tmp_path / "out" / "runs.csv").read_bytes()
     again = run_study(study, tmp_path / "out", Local(1), cache=tmp_path / "cache")
@@ -182,6 +185,28 @@ def test_shared_work_changes_no_result(folder, tmp_path):
         assert (cache / "work").exists() == (case != "none")
     assert {p.name for p in (cache / "work").iterdir()} >= {"clip_tracks", "segmentation_tree", "completion"}
     assert found["none"] == found["written"] == found["found"] == found["broken"]
+
+
+def test_memory_by_stage():
+    """A stage that holds 60 MB for a moment is told from one that holds 20; the step has the most of all."""
+    code = """
+import numpy as np
+from mstfilter.smc.watch import Watch, telling
+from mstfilter.study.memory import StagePeaks
+peaks, watch = StagePeaks(), Watch()
+base = peaks.figures()["peak_mb"]
+with telling(peaks):
+    for stage, mb in (("transition", 20), ("update", 60), ("resampler", 0)):
+        watch.enter(stage)
+        np.ones(mb * 2**20 // 8)
+        watch.leave()
+watch.enter("build")  # nobody listens any more
+print(*(peaks.figures()[k] - base for k in ("peak_mb_transition", "peak_mb_update", "peak_mb_resampler", "peak_mb")))
+assert len(peaks.figures()) == 4
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=True)
+    transition, update, resampler, step = map(float, done.stdout.split())
+    assert 15 <= transition < 45 <= update < 90 and resampler < 15 and step == update
 
 
 def test_peak_memory():
