@@ -2,7 +2,7 @@
 
     python experiments/ablations/candidates.py [--kept FOLDER] [--smoke] [--out FOLDER]
 
-The scored candidates of `mst` (20 a pause) on tuning scenes that evidence.py does not use, with their true quality.
+The scored candidates of `mst` (20 a pause) on tuning scenes, with their true quality.
 
 - A term: the spread of its scores among the candidates of a pause, their correlation with quality, and the quality
   that is expected to be gained by weighting the candidates with it, alone and on top of agreement; by how much it

@@ -1,11 +1,11 @@
 """The small tables of a study that are kept here, from the folder that `mstfilter study` wrote.
 
-    python experiments/main/tables.py STUDY experiments/main/results [--reference "true masks: mst"]
+    python experiments/main/tables.py STUDY experiments/main/results [--reference "true masks: mst"] [--pooled]
 
 Writes, named after the study, NAME.csv (a line a family and arm: means over scenes of pauses t >= 1), NAME_scenes.csv
 (the primary endpoint of each scene) and NAME_differences.csv (reference minus arm in the primary endpoint; unadjusted
 t interval, studentised bootstrap, p by flipping signs, p after Holm over families and arms), and prints the latter as
-a table for the README.
+a table for the README. Pooled, differences are over the scenes of all families together: NAME_pooled_differences.csv.
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ def markdown(rows: list[dict[str, str]]) -> str:
     return "".join(head + body)
 
 
-def main(study: Path, out: Path, reference: str) -> None:
+def main(study: Path, out: Path, reference: str, pooled: bool) -> None:
     """Read, write, print."""
     folder = StudyFolder.open(study)
     name, tables = folder.description["name"], {}
@@ -99,6 +99,11 @@ def main(study: Path, out: Path, reference: str) -> None:
         ]
         found = summarise(folder.rows(), reference, beside=beside)
         name += f"_{reference.split(':')[0].replace(' ', '_')}"
+    elif pooled:
+        beside = [arm["name"] for arm in folder.description["arms"] if arm.get("beside")]
+        rows = [{**row, "family": "all"} for row in folder.rows()]
+        found = summarise(rows, folder.description["reference"], beside=beside)
+        name += "_pooled"
     else:
         found = folder.summary()
         tables |= {name: means(found), f"{name}_scenes": by_scene(found)}
@@ -114,5 +119,8 @@ if __name__ == "__main__":
     parser.add_argument("study", type=Path)
     parser.add_argument("out", type=Path)
     parser.add_argument("--reference", default="", help="another arm than the study's own reference")
+    parser.add_argument("--pooled", action="store_true", help="differences over the scenes of all families together")
     given = parser.parse_args()
-    main(given.study, given.out, given.reference)
+    if given.pooled and given.reference:
+        parser.error("--pooled and --reference do not go together")
+    main(given.study, given.out, given.reference, given.pooled)
