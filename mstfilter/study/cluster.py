@@ -125,15 +125,20 @@ class _Conversation:
         limit = self._settings.timeout_s
         late = [k for k, (_, began) in self._at.items() if limit and time.monotonic() - began > limit]
         for k in late:
-            worker, _ = self._at.pop(k)
-            n = self._tries[k]
-            if n >= self._settings.tries:
+            (worker, _), n = self._at.pop(k), self._tries[k]
+            last = n >= self._settings.tries
+            if last:  # before its worker goes, or the scheduler would begin it elsewhere
                 self._client.cancel([futures[k]], force=True)
-                why = f"it took longer than {limit:g} s, {n} time{'s' if n > 1 else ''}"
-                self._end(k, Outcome("failed", why, ("raise timeout_s, or set it to 0",), tries=n))
-            # Its process goes, with whatever hangs there; if tries are left the scheduler begins it elsewhere.
-            with contextlib.suppress(Exception):  # a worker without nanny, or one that is gone already
+            hints = ["raise timeout_s, or set it to 0"]
+            try:
                 self._client.restart_workers([worker], timeout=30, raise_for_error=False)
+            except Exception as error:  # no nanny: it hangs there for good
+                self._client.cancel([futures[k]], force=True)
+                hints.append(f"{worker} could not be restarted ({error}): start workers with their nanny")
+                last = True
+            if last:
+                why = f"it took longer than {limit:g} s, {n} time{'s' if n > 1 else ''}"
+                self._end(k, Outcome("failed", why, tuple(hints), tries=n))
 
 
 def _outcome(future: Any, tries: int) -> Outcome:
