@@ -29,17 +29,22 @@ def make(out: Path, study: Path, chosen: Sequence[str] = ()) -> list[Path]:
         raise InputError(f"the study has no arm {unknown[0]!r}", f"it has {', '.join(known)}")
     arms = list(chosen) or [name for name, arm in known.items() if not arm.get("beside")]
     values: dict[str, dict[str, dict[int, list[float]]]] = {}
+    scenes: dict[str, set[str]] = {}
     for row in folder.records():
         if row["arm"] in arms and row.get("qualities"):
             by_pause = values.setdefault(row["family"], {}).setdefault(row["arm"], {})
             by_pause.setdefault(row["pause"], []).extend(row["qualities"])
+            scenes.setdefault(row["family"], set()).add(row["scene"])
     if not values:
         return []
     out.mkdir(parents=True, exist_ok=True)
     paths = []
     for k, group in enumerate(study_figures.in_groups(arms, folder.description["reference"])):
         paths.append(out / f"quality_over_time{f'_{k + 1}' if k else ''}.svg")
-        drawn = {family: {a: v for a, v in of_arms.items() if a in group} for family, of_arms in values.items()}
+        drawn = {
+            f"{family}, n = {len(scenes[family])} scenes": {a: v for a, v in of_arms.items() if a in group}
+            for family, of_arms in values.items()
+        }
         paths[-1].write_text(standalone(study_figures.time_figure(drawn, group)))
     return paths
 

@@ -98,9 +98,19 @@ def svg_text(figure: Figure, title: str) -> str:
     text = head + text[text.index(">") + 1 :]
     text = re.sub(r"font(-family)?: ?[^;\"]*'[^;\"]*(;|(?=\"))", _font, text)
     text = text.replace("xlink:href", "href")
+    text = re.sub(r"(<g [^>]*)>\n((?:\s*<use [^>]*/>\n){2,})", _once, text)
     for mark, colour in _PAGE.items():
         text = text.replace(mark, colour)
     return text.strip()
+
+
+def _once(match: re.Match[str]) -> str:
+    """Marks of one group that look alike: their style once, their places to a tenth of a point."""
+    styles = set(re.findall(r'style="([^"]*)"', match[2]))
+    marks = re.sub(r'([xy]="-?\d+\.\d)\d+"', r'\1"', match[2])
+    if len(styles) > 1 or "style=" in match[1]:
+        return f"{match[1]}>\n{marks}"
+    return f'{match[1]} style="{styles.pop()}">\n' + re.sub(r' style="[^"]*"', "", marks)
 
 
 def _font(match: re.Match[str]) -> str:

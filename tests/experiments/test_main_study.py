@@ -12,10 +12,12 @@ from mstfilter.cli import main
 from mstfilter.simulation.families import FIRST_REPORTED_SEED
 from mstfilter.study.config import load_study
 from mstfilter.study.plan import make_plan
+from mstfilter.study.statistics import compare
 from tests.conftest import REPOSITORY
 
 CONFIG = REPOSITORY / "experiments/main/study.toml"
 FUSION = REPOSITORY / "experiments/fusion"
+NAMES = ("main_scenes", "main_differences", "paper_best_scenes", "paper_best_differences")
 
 
 def study(tmp_path, config):
@@ -81,3 +83,21 @@ def test_what_is_reported_of_fusion_is_what_was_tuned():
     assert [(arm.name, arm.key) for arm in tuned.arms] == [(arm.name, arm.key) for arm in reported.arms]
     assert not {scene.name for scene in tuned.scenes} & {scene.name for scene in reported.scenes}
     assert len(tuned.scenes) == len(reported.scenes) == 30
+
+
+def test_committed_tables_are_of_the_study_and_agree():
+    folder = CONFIG.parent / "results"
+    read = {name: list(csv.DictReader((folder / f"{name}.csv").open(newline=""))) for name in NAMES}
+    for config in (CONFIG, CONFIG.with_name("paper_best.toml")):
+        plan = make_plan(load_study(config))
+        quality = {}
+        for row in read[f"{plan.config.name}_scenes"]:
+            quality.setdefault((row["family"], row["arm"]), {})[row["scene"]] = float(row["quality"])
+        scenes = {f: {s.name for s in plan.scenes if s.group == f} for f in ("s1", "s2", "s3")}
+        assert set(quality) == {(family, arm.name) for family in scenes for arm in plan.arms}
+        assert all(set(of_arm) == scenes[family] for (family, _), of_arm in quality.items())
+        for row in read[f"{plan.config.name}_differences"]:
+            expected = compare(quality[row["family"], plan.reference], quality[row["family"], row["arm"]])
+            assert abs(expected.mean - float(row["mean"])) < 2e-4 and int(row["n"]) == expected.n
+    claims = [row for row in read["main_differences"] if float(row["p_holm"]) < 0.05]
+    assert not claims, "with five scenes nothing can be claimed"
