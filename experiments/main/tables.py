@@ -100,9 +100,8 @@ def main(study: Path, out: Path, reference: str, pooled: bool) -> None:
         found = summarise(folder.rows(), reference, beside=beside)
         name += f"_{reference.split(':')[0].replace(' ', '_')}"
     elif pooled:
-        beside = [arm["name"] for arm in folder.description["arms"] if arm.get("beside")]
         rows = [{**row, "family": "all"} for row in folder.rows()]
-        found = summarise(rows, folder.description["reference"], beside=beside)
+        found = summarise(rows, folder.description["reference"], beside=folder.beside)
         name += "_pooled"
     else:
         found = folder.summary()

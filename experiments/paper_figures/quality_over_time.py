@@ -24,10 +24,10 @@ def make(out: Path, study: Path, chosen: Sequence[str] = ()) -> list[Path]:
     More than twelve arms make several figures.
     """
     folder = StudyFolder.open(study)
-    known = {arm["name"]: arm for arm in folder.description["arms"]}
+    known = [arm["name"] for arm in folder.description["arms"]]
     if unknown := [name for name in chosen if name not in known]:
         raise InputError(f"the study has no arm {unknown[0]!r}", f"it has {', '.join(known)}")
-    arms = list(chosen) or [name for name, arm in known.items() if not arm.get("beside")]
+    arms = list(chosen) or [name for name in known if name not in folder.beside]
     values: dict[str, dict[str, dict[int, list[float]]]] = {}
     scenes: dict[str, set[str]] = {}
     for row in folder.records():
@@ -38,14 +38,11 @@ def make(out: Path, study: Path, chosen: Sequence[str] = ()) -> list[Path]:
     if not values:
         return []
     out.mkdir(parents=True, exist_ok=True)
+    titled = {f"{family}, n = {len(scenes[family])} scenes": of_arms for family, of_arms in values.items()}
     paths = []
     for k, group in enumerate(study_figures.in_groups(arms, folder.description["reference"])):
         paths.append(out / f"quality_over_time{f'_{k + 1}' if k else ''}.svg")
-        drawn = {
-            f"{family}, n = {len(scenes[family])} scenes": {a: v for a, v in of_arms.items() if a in group}
-            for family, of_arms in values.items()
-        }
-        paths[-1].write_text(standalone(study_figures.time_figure(drawn, group)))
+        paths[-1].write_text(standalone(study_figures.time_figure(titled, group)))
     return paths
 
 

@@ -82,7 +82,7 @@ def _page(study: StudyFolder) -> str:
         claim=CLAIM,
         compared=[one for one in summary.compared() if one.difference.n],
         columns=[(name, heading) for name, heading in _FIGURES if name in summary.names],
-        figures=_drawn(records, summary, [arm["name"] for arm in study.description["arms"] if arm.get("beside")]),
+        figures=_drawn(records, summary, study.beside),
         costs=_costs(summary),
         arms=_arms(study.description),
         failures=failures,
@@ -119,20 +119,15 @@ def _drawn(records: Sequence[Mapping[str, Any]], summary: Summary, beside: Seque
     arms = [arm for arm in summary.arms if arm not in beside]
     if values:
         groups = in_groups(arms, summary.reference)
-        found["time"] = [Markup(time_figure(_of(values, group), group)) for group in groups]
+        found["time"] = [Markup(time_figure(values, group)) for group in groups]
     ends = [summary.reference, *(arm for arm in summary.arms if arm in beside)]
     if values and len(ends) > 1:
         groups = in_groups(ends, summary.reference)
-        found["ends"] = [Markup(time_figure(_of(values, group), group)) for group in groups]
+        found["ends"] = [Markup(time_figure(values, group)) for group in groups]
     compared = [one for one in summary.compared() if one.difference.n]
     if compared:
         found["differences"] = Markup(differences_figure(compared, summary.arms))
     return found
-
-
-def _of(values: Mapping[str, Mapping[str, Any]], arms: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """Those of some arms."""
-    return {family: {arm: v for arm, v in of_arms.items() if arm in arms} for family, of_arms in values.items()}
 
 
 def _costs(summary: Summary) -> dict[str, Any]:

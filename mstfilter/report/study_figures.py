@@ -45,9 +45,11 @@ def time_figure(values: Mapping[str, Mapping[str, Mapping[int, Sequence[float]]]
     arms : sequence of str
         In the order in which they stand beside each other; see `in_groups` where there are many.
 
-    Arms that the values lack are left out. Boxes hold the middle half of the hypotheses, the bar is their median,
-    whiskers reach the 5th and 95th per cent; points are hypotheses, lines join the means.
+    Arms that the values lack are left out, and so are values of other arms. Boxes hold the middle half of the
+    hypotheses, the bar is their median, whiskers reach the 5th and 95th per cent; points are hypotheses, lines join
+    the means.
     """
+    values = {family: {a: v for a, v in of_arms.items() if a in arms} for family, of_arms in values.items()}
     colours, n = colour_of(arms), len(values)
     shown = [arm for arm in arms if any(arm in of_arms for of_arms in values.values())]
     with style("study over time"):

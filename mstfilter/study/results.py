@@ -80,6 +80,11 @@ class StudyFolder:
         except (OSError, ValueError) as error:
             raise InputError(f"{self.path / 'study.json'} cannot be read: {error}") from error
 
+    @property
+    def beside(self) -> list[str]:
+        """Names of the arms that are no part of the comparisons: floors and ceilings."""
+        return [arm["name"] for arm in self.description["arms"] if arm.get("beside")]
+
     def run(self, folder: str) -> Path:
         """A run's folder."""
         return self.path / "runs" / folder
@@ -125,8 +130,7 @@ class StudyFolder:
     def summary(self) -> Summary:
         """What the runs that are done say together."""
         rows = self.rows()
-        beside = [arm["name"] for arm in self.description["arms"] if arm.get("beside")]
-        return summarise(rows, self.description["reference"], cost_columns(rows), beside)
+        return summarise(rows, self.description["reference"], cost_columns(rows), self.beside)
 
     def write_tables(self) -> None:
         """Write all tables from the runs."""
