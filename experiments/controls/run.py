@@ -7,8 +7,11 @@ On tuning scenes, primary endpoint (objects quality against the true volumes, me
 - start: at t = 0 `mst` and samples of the latest image alone hold the same hypotheses;
 - still: after each pause a clip of two frames in which no object moves (new sensor noise, the arm perhaps in view)
   must not lower quality;
-- shuffled: with the inner frames of every clip in random order the gain over samples must shrink;
-- stranger: with the hypotheses of another scene as its past, a step must lose the gain.
+- stranger: with the hypotheses of another scene as its past, a step must lose the gain;
+- shuffled: with the inner frames of every clip in random order what comes of following them must be lost. Beside it
+  `ends`, clips of their first and last frame alone, and `frozen`, no object ever moved. The same for a filter that
+  has nothing but optical flow to find motions with (`flow`), and, segmentation set aside, for the objects that moved
+  when the TRUE labels of the pause before are tracked (columns `moved: ...`, mean IoU).
 
 Writes results/scenes.csv, a line a scene, and results/summary.csv. Resumable: a scene that is there is not run again.
 """
@@ -27,15 +30,30 @@ import mstfilter
 from mstfilter.scene.clip import Clip
 from mstfilter.scene.quality import weighted_coverage
 from mstfilter.scene.recording import Recording
+from mstfilter.scene.voxels import Hypothesis
 from mstfilter.simulation.cache import cached_recording
+from mstfilter.smc.interfaces import Transition
 from mstfilter.smc.particle_filter import State
+from mstfilter.smc.population import Population
 from mstfilter.study.results import write_table
 from mstfilter.study.statistics import interval
 
 SCENES = [(family, k) for family in ("s1", "s2") for k in range(6)]
 SMALL = {"width": 160, "height": 120, "n_actions": 1, "frames_per_clip": 8, "voxel_size": 0.02}
 STILL = 0.0005  # metres
-FIELDS = ["scene", "mst", "samples", "start", "still", "shuffled", "stranger"]
+MOVED = 0.9  # an object whose own IoU before and after lies below has moved
+FILTERS = {
+    "mst": (),
+    "flow": [f"transition.rule.{v}" for v in ("use_icp=false", "use_sift=false", "n_refine=0", "search_above=-1")],
+    "frozen": ["transition=identity"],
+}
+ORDERS = ("in order", "shuffled", "ends")
+CHAINS = [(name, order) for name in ("mst", "flow") for order in ORDERS] + [("frozen", "in order")]
+FIELDS = [
+    *("scene", "start", "still", "samples", "stranger"),
+    *(f"{name} {order}" for name, order in CHAINS),
+    *(f"moved: {name} {order}" for name, order in CHAINS),
+]
 
 
 def quality(state: State, truth: np.ndarray) -> float:
@@ -53,43 +71,67 @@ def at_rest(recording: Recording, pause: int) -> int | None:
     return None
 
 
-def shuffled(clip: Clip, rng: np.random.Generator) -> Clip:
-    """The clip with its inner frames in random order."""
+def in_orders(clip: Clip, rng: np.random.Generator) -> dict[str, Clip]:
+    """The clip as it is, with its inner frames in random order, and without them."""
     frames = list(clip.frames)
-    inner = frames[1:-1]
-    frames[1:-1] = [inner[k] for k in rng.permutation(len(inner))]
-    return replace(clip, frames=tuple(frames))
+    inner = [frames[1 + k] for k in rng.permutation(max(len(frames) - 2, 0))]
+    shuffled, ends = [frames[0], *inner, *frames[1:][-1:]], [frames[0], *frames[1:][-1:]]
+    return {
+        "in order": clip,
+        "shuffled": replace(clip, frames=tuple(shuffled), times=()),
+        "ends": replace(clip, frames=tuple(ends), times=()),
+    }
+
+
+def iou(a: np.ndarray, b: np.ndarray) -> float:
+    """Of two sets of voxels, one of them not empty."""
+    return float((a & b).sum() / (a | b).sum())
+
+
+def tracked(transition: Transition, labels: np.ndarray, truth: np.ndarray, clip: Clip) -> list[float]:
+    """IoU of the objects that moved, tracked from their true labels."""
+    start = Population((Hypothesis.from_labels(labels, clip.grid),), np.zeros(1))
+    end = transition.predict(np.random.default_rng(0), start, clip).particles[0].labels
+    return [
+        iou(end == k, truth == k)
+        for k in np.intersect1d(labels[labels > 0], truth)
+        if iou(labels == k, truth == k) < MOVED
+    ]
 
 
 def run(scene: tuple[str, int], stranger: Recording, recording: Recording) -> dict[str, object]:
     """Means over the pauses of a scene."""
-    mst, samples = mstfilter.preset("mst"), mstfilter.preset("samples_only")
+    filters = {name: mstfilter.preset("mst", *changes) for name, changes in FILTERS.items()}
+    mst, samples = filters["mst"], mstfilter.preset("samples_only")
     rng = np.random.default_rng(scene[1])
     found: dict[str, list[float]] = {name: [] for name in FIELDS[1:]}
-    state, alone, mixed, foreign = (f.start(0) for f in (mst, samples, mst, mst))
+    states = {chain: filters[chain[0]].start(0) for chain in CHAINS}
+    alone, foreign, before = samples.start(0), mst.start(0), None
     for clip, other in zip(recording.clips(), stranger.clips(), strict=False):
         truth = recording.truth(clip.index)
         assert truth is not None
+        clips = in_orders(clip, rng)
         past, (foreign, _) = foreign, mst.step(foreign, other)
-        state, _ = mst.step(state, clip)
         alone, _ = samples.step(alone, clip)
-        mixed, _ = mst.step(mixed, shuffled(clip, rng))
-        if clip.index == 0:
-            same = [
-                a.key == b.key for a, b in zip(state.population.particles, alone.population.particles, strict=True)
-            ]
-            found["start"].append(float(all(same)))
-            continue
-        lost, _ = mst.step(past, clip)  # another scene's population at the pause before
-        found["mst"].append(quality(state, truth))
-        found["samples"].append(quality(alone, truth))
-        found["shuffled"].append(quality(mixed, truth))
-        found["stranger"].append(quality(lost, truth))
-        beside = at_rest(recording, recording.pauses[clip.index])
-        if beside is not None:
-            frames = (clip.after, recording.frames[beside])
-            again, _ = mst.step(state, Clip(frames, clip.grid, clip.index + 1))
-            found["still"].append(quality(again, truth) - found["mst"][-1])
+        for name, order in CHAINS:
+            states[name, order], _ = filters[name].step(states[name, order], clips[order])
+        state = states["mst", "in order"]
+        if before is None:
+            pairs = zip(state.population.particles, alone.population.particles, strict=True)
+            found["start"].append(float(all(a.key == b.key for a, b in pairs)))
+        else:
+            found["samples"].append(quality(alone, truth))
+            lost, _ = mst.step(past, clip)  # another scene's population at the pause before
+            found["stranger"].append(quality(lost, truth))
+            for name, order in CHAINS:
+                found[f"{name} {order}"].append(quality(states[name, order], truth))
+                found[f"moved: {name} {order}"] += tracked(filters[name].transition, before, truth, clips[order])
+            beside = at_rest(recording, recording.pauses[clip.index])
+            if beside is not None:
+                frames = (clip.after, recording.frames[beside])
+                again, _ = mst.step(state, Clip(frames, clip.grid, clip.index + 1))
+                found["still"].append(quality(again, truth) - quality(state, truth))
+        before = truth
     means = {name: round(float(np.mean(v)), 4) if v else "" for name, v in found.items()}
     return {"scene": f"{scene[0]}-{scene[1]}", **means}
 
@@ -97,15 +139,27 @@ def run(scene: tuple[str, int], stranger: Recording, recording: Recording) -> di
 def summary(rows: list[dict[str, str]]) -> Iterator[dict[str, object]]:
     """Means over scenes with 95 % t intervals."""
     column = {name: np.array([float(r[name]) if r[name] != "" else np.nan for r in rows]) for name in FIELDS[1:]}
-    for what, values in {
-        "same hypotheses at the start": column["start"],
-        "mst - samples": column["mst"] - column["samples"],
-        "shuffled - samples": column["shuffled"] - column["samples"],
-        "mst - shuffled": column["mst"] - column["shuffled"],
-        "stranger - samples": column["stranger"] - column["samples"],
-        "mst - stranger": column["mst"] - column["stranger"],
-        "a still clip": column["still"],
-    }.items():
+
+    def minus(a: str, b: str) -> tuple[str, np.ndarray]:
+        return f"{a} - {b}", column[a] - column[b]
+
+    for what, values in (
+        ("same hypotheses at the start", column["start"]),
+        ("a still clip", column["still"]),
+        minus("mst in order", "samples"),
+        minus("stranger", "samples"),
+        minus("mst shuffled", "samples"),
+        minus("frozen in order", "samples"),
+        minus("flow in order", "samples"),
+        minus("flow shuffled", "samples"),
+        *(
+            minus(f"{m}{f} in order", f"{m}{f} {o}")
+            for m in ("", "moved: ")
+            for f in ("mst", "flow")
+            for o in ORDERS[1:]
+        ),
+        *((name, column[name]) for name in FIELDS if name.startswith("moved: ")),
+    ):
         values = values[np.isfinite(values)]
         low, high = interval(values)
         yield {

@@ -53,8 +53,13 @@ class Clip:
             raise InputError(f"clip {self.index} and the one before it have different grids")
 
     @cached_property
+    def frames_key(self) -> bytes:
+        """Name by content of all frames and the grid. Looks at every image once."""
+        return content_key("frames", self.grid.key, *(frame.key for frame in self.frames))
+
+    @cached_property
     def key(self) -> bytes:
-        """Name by content of all frames, the grid and everything before. Looks at every image once."""
+        """Name by content of this clip and everything before. Looks at every image once."""
         chain: list[Clip] = []
         clip: Clip | None = self
         while clip is not None and "key" not in clip.__dict__:
@@ -62,7 +67,7 @@ class Clip:
             clip = clip.previous
         key = b"" if clip is None else clip.key
         for clip in reversed(chain):  # not by recursion: a recording may have a thousand pauses
-            key = content_key("clip", clip.grid.key, key, *(frame.key for frame in clip.frames))
+            key = content_key("clip", key, clip.frames_key)
             clip.__dict__["key"] = key
         return key
 

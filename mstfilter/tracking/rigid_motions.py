@@ -63,7 +63,7 @@ def followed_points(clip: Clip, flow: DenseFlow) -> FollowedPoints:
         known &= clip.grid.contains(clip.grid.index_of(q))
         return FollowedPoints(p[known], q[known], end[known, 0], end[known, 1])
 
-    return memo("followed points", (clip.before.key, clip.after.key, len(clip), component_key(flow)), compute)
+    return memo("followed points", (clip.frames_key, component_key(flow)), compute)
 
 
 @dataclass(frozen=True)
@@ -107,8 +107,7 @@ class RigidMotions(Division):
         """(H, W) number of the motion of each pixel of the last frame; None for a single frame. Memoised."""
         if len(clip.frames) < 2:
             return None
-        key = (clip.before.key, clip.after.key, len(clip), component_key(self))
-        return memo("rigid motions", key, lambda: read_only(self._divide(clip)))
+        return memo("rigid motions", (clip.frames_key, component_key(self)), lambda: read_only(self._divide(clip)))
 
     def _divide(self, clip: Clip) -> NDArray[np.int32]:
         points = followed_points(clip, self.flow)

@@ -3,9 +3,11 @@
 import numpy as np
 import pytest
 
+from mstfilter.scene import memo
 from mstfilter.scene.clip import Clip
 from mstfilter.scene.rendering import project
-from mstfilter.scene.voxels import Hypothesis
+from mstfilter.scene.voxels import Hypothesis, VoxelGrid
+from mstfilter.tracking.flow import DenseFlow
 from mstfilter.tracking.rigid_motions import RigidMotions, followed_points
 from tests.tracking.scenes import Box, Scene, at, standard
 
@@ -39,6 +41,29 @@ def test_nothing_moved_or_a_single_frame(pushed):
     motions = RigidMotions().divide(still)
     assert motions.max() == 0
     assert RigidMotions().divide(Clip((clip.before,), clip.grid, 0)) is None
+
+
+@pytest.mark.parametrize("change", ["frames", "grid"])
+def test_what_is_remembered_belongs_to_one_clip(pushed, change):
+    """Clips of the same first and last frame are told apart by what lies between, and by the workspace."""
+    clip, _ = pushed
+    frames, grid = list(clip.frames), clip.grid
+    if change == "frames":
+        frames[1:-1] = [clip.after] * (len(frames) - 2)
+    else:
+        grid = VoxelGrid(grid.origin, grid.voxel_size, (grid.shape[0] // 2, *grid.shape[1:]))
+    other = Clip(frames, grid, clip.index)
+
+    def found(c):
+        return RigidMotions().divide(c), followed_points(c, DenseFlow()).p
+
+    memo.clear()
+    alone = found(other)
+    memo.clear()
+    first, second = found(clip), found(other)
+    np.testing.assert_array_equal(alone[0], second[0])
+    np.testing.assert_array_equal(alone[1], second[1])
+    assert len(first[1]) != len(second[1]) and (first[0] != second[0]).any()
 
 
 def test_the_limit_of_misfit_decides(pushed):
