@@ -11,7 +11,7 @@ import pytest
 from tests.conftest import REPOSITORY
 
 
-@pytest.mark.parametrize("name, arms", [("study", 3), ("mask_quality", 4)])
+@pytest.mark.parametrize("name, arms", [("study", 3), ("mask_quality", 6)])
 def test_smoke(tmp_path, monkeypatch, name, arms):
     from mstfilter.cli import main
 
@@ -26,15 +26,19 @@ def test_smoke(tmp_path, monkeypatch, name, arms):
     if name == "study":
         assert quality["all true"] >= 0.97 > quality["mst"]
     else:
-        best = [q for arm, q in quality.items() if "1.0" in arm]
-        assert min(best) > max(q for arm, q in quality.items() if "0.7" in arm)
+        best = [q for arm, q in quality.items() if "=1.0" in arm]
+        assert min(best) > max(q for arm, q in quality.items() if "=0.7" in arm)
         script = [sys.executable, str(config.with_name("mask_quality.py")), str(folder), str(tmp_path / "tables")]
         subprocess.run(script, check=True, capture_output=True)
         with (tmp_path / "tables/mask_quality.csv").open(newline="") as file:
-            lines = {(line["masks"], line["method"]): line for line in csv.DictReader(file)}
-        assert set(lines) == {(m, a) for m in ("0.7", "1") for a in ("mst", "samples_only")}
-        gain = float(lines["1", "mst"]["quality"]) - float(lines["1", "samples_only"]["quality"])
-        assert float(lines["1", "samples_only"]["mst_minus"]) == pytest.approx(gain, abs=2e-4)
+            lines = {(line["source"], line["masks"], line["method"]): line for line in csv.DictReader(file)}
+        own = next(masks for source, masks, _ in lines if source == "own")
+        sources = (("set", "0.7"), ("set", "1"), ("own", own))
+        assert set(lines) == {(*masks, method) for masks in sources for method in ("mst", "object_fusion")}
+        assert 0.5 < float(own) < 1
+        other = lines["set", "1", "object_fusion"]
+        gain = float(lines["set", "1", "mst"]["quality"]) - float(other["quality"])
+        assert float(other["mst_minus"]) == pytest.approx(gain, abs=2e-4)
         assert (tmp_path / "tables/mask_quality.png").stat().st_size > 5000
 
 
