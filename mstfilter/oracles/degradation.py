@@ -7,7 +7,10 @@ True
 The loss 1 - quality is spent in this order: splits by random lines until `over` of it is gone, merges of touching
 objects until `under` is, then a smooth random displacement of all borders, as strong as the rest asks for. Splits and
 displacements are found by bisection, so the quality is met whatever the image; merges cannot be dosed, and one that
-costs too much is not made.
+costs too much is not made. Pieces of one object are not joined again.
+
+Draws are named by the objects that they are about, and the displacement by its place in the image: the same stream
+makes similar errors in similar images, so errors can be made to last while a scene changes.
 """
 
 from __future__ import annotations
@@ -17,12 +20,15 @@ from collections.abc import Callable
 import numpy as np
 
 from mstfilter.scene.quality import weighted_coverage
+from mstfilter.smc.streams import child
 
 __all__ = ["degrade"]
 
 _TRIES = 30
 _REACH = 120.0  # largest displacement in pixels of a 640 px wide image
 _SMOOTH = 15.0  # of the displacement, pixels of a 640 px wide image
+
+_Names = dict[int, tuple[int, ...]]
 
 
 def degrade(
@@ -38,7 +44,7 @@ def degrade(
     Parameters
     ----------
     rng : Generator
-        For the draws.
+        Names the draws (`mstfilter.smc.streams.child`); not consumed.
     labels : (H, W) int
         True objects, 0 elsewhere.
     quality : float
@@ -60,62 +66,82 @@ def degrade(
     margin = 8
     box = tuple(slice(max(int(k.min()) - margin, 0), int(k.max()) + margin + 1) for k in inside)
     true = labels[box]
-    worse = _split(rng, true, true, 1 - over * (1 - quality), tolerance)
-    worse = _merge(rng, true, worse, 1 - (over + under) * (1 - quality), tolerance)
+    worse, names = _split(rng, true, 1 - over * (1 - quality), tolerance)
+    worse = _merge(rng, true, worse, names, 1 - (over + under) * (1 - quality), tolerance)
     if over + under < 1 or weighted_coverage(worse, true) > quality + tolerance:
-        worse = _displace(rng, true, worse, quality, tolerance, labels.shape[1] / 640)
+        worse = _displace(rng, true, worse, quality, tolerance, labels.shape, box)
     out = np.zeros_like(labels)
     out[box] = worse
     return out
 
 
-def _split(rng: np.random.Generator, true: np.ndarray, labels: np.ndarray, target: float, tol: float) -> np.ndarray:
-    """Cut objects in two until the quality is `target`; the last cut takes as little as is needed."""
+def _split(rng: np.random.Generator, true: np.ndarray, target: float, tol: float) -> tuple[np.ndarray, _Names]:
+    """Cut objects in two until the quality is `target`; the last cut takes as little as is needed.
+
+    Returns the labels and what each stands for: the true object, then which side of each cut.
+    """
+    labels = true
+    names: _Names = {int(k): (int(k),) for k in np.unique(true) if k > 0}
     for _ in range(_TRIES):
         if weighted_coverage(labels, true) <= target + tol / 2:
             break
         sizes = np.bincount(labels.ravel())
-        sizes[0] = 0
-        chosen = int(rng.choice(len(sizes), p=sizes / sizes.sum()))
+        # The first of exponential times at the rate of their sizes: a part is chosen in proportion to its size.
+        draws = {k: child(rng, "split", *name).random(2) for k, name in names.items()}
+        chosen = min(names, key=lambda k: -np.log1p(-draws[k][0]) / sizes[k])
         where = np.nonzero(labels == chosen)
-        angle = rng.uniform(0, np.pi)
+        angle = np.pi * draws[chosen][1]
         along = np.cos(angle) * where[1] + np.sin(angle) * where[0]
         rank = np.argsort(np.argsort(along, kind="stable"), kind="stable") / max(len(along), 1)
+        fresh = max(names) + 1
 
         def cut(
-            share: float, at: tuple[np.ndarray, ...] = where, rank: np.ndarray = rank, old: np.ndarray = labels
+            share: float,
+            at: tuple[np.ndarray, ...] = where,
+            rank: np.ndarray = rank,
+            old: np.ndarray = labels,
+            fresh: int = fresh,
         ) -> np.ndarray:
             new = old.copy()
-            new[at[0][rank < share], at[1][rank < share]] = old.max() + 1
+            new[at[0][rank < share], at[1][rank < share]] = fresh
             return new
-
-        half = cut(0.5)
-        if weighted_coverage(half, true) >= target - tol / 2:
-            labels = half
-            continue
 
         def left(share: float, cut: Callable[[float], np.ndarray] = cut) -> float:
             return weighted_coverage(cut(share), true)
 
-        labels = cut(_bisect(left, 0.0, 0.5, target, tol / 2))
-    return labels
+        share = 0.5
+        if left(share) < target - tol / 2:
+            share = _bisect(left, 0.0, 0.5, target, tol / 2)
+        labels = cut(share)
+        if (labels == fresh).any():
+            names[fresh], names[chosen] = (*names[chosen], 1), (*names[chosen], 0)
+        else:
+            break  # a cut that takes nothing: no smaller loss is possible
+    return labels, names
 
 
-def _merge(rng: np.random.Generator, true: np.ndarray, labels: np.ndarray, target: float, tol: float) -> np.ndarray:
+def _merge(
+    rng: np.random.Generator, true: np.ndarray, labels: np.ndarray, names: _Names, target: float, tol: float
+) -> np.ndarray:
     """Join touching objects while the quality stays at `target` or above."""
     refused: set[tuple[int, int]] = set()
+    roots = {k: {name[0]} for k, name in names.items()}
     for _ in range(_TRIES):
         if weighted_coverage(labels, true) <= target + tol / 2:
             break
-        pairs = sorted(_touching(labels) - refused)
+        # Joining what was one object would undo a split.
+        pairs = {(a, b) for a, b in _touching(labels) - refused if not roots[a] & roots[b]}
         if not pairs:
             break
-        a, b = pairs[int(rng.integers(len(pairs)))]
+        named = {pair: sorted(names[k] for k in pair) for pair in pairs}
+        draws = {pair: child(rng, "merge", len(x), *x, *y).random() for pair, (x, y) in named.items()}
+        a, b = min(pairs, key=lambda pair: (draws[pair], pair))
         new = np.where(labels == b, a, labels)
         if weighted_coverage(new, true) < target - tol / 2:
             refused.add((a, b))
         else:
             labels = new
+            roots[a] |= roots[b]
     return labels
 
 
@@ -131,12 +157,20 @@ def _touching(labels: np.ndarray, gap: int = 3) -> set[tuple[int, int]]:
 
 
 def _displace(
-    rng: np.random.Generator, true: np.ndarray, labels: np.ndarray, target: float, tol: float, resize: float
+    rng: np.random.Generator,
+    true: np.ndarray,
+    labels: np.ndarray,
+    target: float,
+    tol: float,
+    image: tuple[int, ...],
+    box: tuple[slice, ...],
 ) -> np.ndarray:
-    """Move every pixel's label along a smooth random field, as far as the quality asks for."""
+    """Move every pixel's label along a smooth random field over the image, as far as the quality asks for."""
     from scipy.ndimage import gaussian_filter
 
-    field = np.stack([gaussian_filter(rng.standard_normal(true.shape), max(1.0, _SMOOTH * resize)) for _ in range(2)])
+    resize = image[1] / 640
+    noise = child(rng, "displace").standard_normal((2, *image))
+    field = np.stack([gaussian_filter(one, max(1.0, _SMOOTH * resize))[box] for one in noise])
     field /= field.std()
     rows, columns = np.indices(true.shape)
     seen = true > 0

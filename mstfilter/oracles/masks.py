@@ -2,6 +2,7 @@
 
 >>> proposal = TrueMasks()                       # every sample is the true segmentation of the image
 >>> proposal = TrueMasks(quality=0.8)            # every sample is wrong in its own way, with quality 0.8
+>>> proposal = TrueMasks(quality=0.8, errors="lasting")    # all are wrong in the same way, at every pause
 >>> boundary = TrueBoundary()                    # or the boundary map alone, below an ordinary tree
 
 What objects look like is all that is replaced: masks are completed by an ordinary completer.
@@ -30,7 +31,7 @@ from mstfilter.segmentation.proposal import hypothesis_of
 from mstfilter.segmentation.segments import ObjectRule
 from mstfilter.smc.interfaces import Proposal
 from mstfilter.smc.population import Population
-from mstfilter.smc.streams import child
+from mstfilter.smc.streams import Key, child
 
 __all__ = ["TrueBoundary", "TrueMasks"]
 
@@ -43,8 +44,11 @@ class TrueMasks(UsesTruth, Proposal):
     ----------
     completer : Completer
     quality : float
-        2-D quality (form ``objects``) of each sample's masks against the true ones, 0.3 .. 1. Below 1 every sample
-        is degraded in its own way.
+        2-D quality (form ``objects``) of each sample's masks against the true ones, 0.3 .. 1.
+    errors : {"independent", "lasting"}
+        Below quality 1. *independent*: every sample of every pause is wrong in its own way, so that errors average
+        out over samples and pauses. *lasting*: all samples have the same masks, and an object is cut and joined
+        alike at every pause, as a front end does whose errors have a cause.
     over, under : float
         Shares of the lost quality that come from splitting and from merging objects, 0 .. 1 together at most. The
         rest comes from displaced borders, and what splitting and merging could not reach too.
@@ -60,6 +64,7 @@ class TrueMasks(UsesTruth, Proposal):
 
     completer: Completer = field(default_factory=Extrude)
     quality: float = 1.0
+    errors: Literal["independent", "lasting"] = "independent"
     over: float = 0.35
     under: float = 0.35
     tolerance: float = 0.01
@@ -73,6 +78,8 @@ class TrueMasks(UsesTruth, Proposal):
     def __post_init__(self) -> None:
         if not 0.3 <= self.quality <= 1:
             raise InputError(f"quality of masks is {self.quality}, expected 0.3 .. 1")
+        if self.errors not in ("independent", "lasting"):
+            raise InputError(f"errors of masks are {self.errors!r}", "there are: independent, lasting")
         if min(self.over, self.under) < 0 or self.over + self.under > 1:
             raise InputError(f"over is {self.over} and under {self.under}, expected shares that sum to at most 1")
         if not self.tolerance > 0:
@@ -87,19 +94,21 @@ class TrueMasks(UsesTruth, Proposal):
         return np.where(enough[image] & self.objects.own(frame, clip.grid), image, 0).astype(np.int32)
 
     def sample(self, rng: np.random.Generator, observation: Clip, n: int) -> Population:
-        """`n` hypotheses about the scene at the end of the clip; equal ones where quality is 1."""
+        """`n` hypotheses about the scene at the end of the clip; equal ones where their masks are."""
         frame, grid = observation.after, observation.grid
         true = self.masks(frame, observation)
+        lasting = Key(int.from_bytes(self.truth.key[:8], "big")).child("lasting masks")
+        alike = self.quality == 1 or self.errors == "lasting"
         particles: list[Hypothesis] = []
         reached: list[float] = []
         for i in range(n):
-            masks = true
-            if self.quality < 1:
-                masks = degrade(child(rng, "masks", i), true, self.quality, self.over, self.under, self.tolerance)
-            reached.append(round(weighted_coverage(masks, true), 4) if self.quality < 1 else 1.0)
-            if particles and self.quality == 1:
+            if alike and particles:
                 particles.append(particles[0])
+                reached.append(reached[0])
                 continue
+            stream = lasting.generator() if alike else child(rng, "masks", i)
+            masks = degrade(stream, true, self.quality, self.over, self.under, self.tolerance)
+            reached.append(round(weighted_coverage(masks, true), 4))
             numbers = [int(k) for k in np.unique(masks) if k > 0]
             completed = [
                 self.completer.complete(child(rng, "completion", i, k), frame, [masks == k], grid)[0] for k in numbers

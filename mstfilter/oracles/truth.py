@@ -8,13 +8,14 @@ run; `bind_truth` finds all of them in a filter, however deep they stand:
 >>> state, infos = filter.run(recording.clips(), seed=0)
 
 ``mstfilter run`` and studies do so by themselves. The truth is no hyperparameter: it is no field, so a component's
-description, its content key and its equality are those of the unbound one.
+description and its equality are those of the unbound one. What is kept by content (`component_key`) names it.
 """
 
 from __future__ import annotations
 
 import copy
 import dataclasses
+from functools import cached_property
 from typing import Any, ClassVar, Literal, TypeVar
 
 import numpy as np
@@ -45,6 +46,11 @@ class Truth:
         self._instance: dict[int, np.ndarray] = {}
         self._pauses: dict[bytes, int] | None = None
         self._objects: np.ndarray | None = None
+
+    @cached_property
+    def key(self) -> bytes:
+        """Name by content of all that is known to be true. Looks at every frame once."""
+        return self.recording.truth_key
 
     def check(self, needs: tuple[Need, ...], who: str) -> None:
         """One clear error if something that a component needs is missing at any pause."""
@@ -114,6 +120,12 @@ class UsesTruth:
         bound = copy.copy(self)
         object.__setattr__(bound, "_truth", truth)  # components are frozen
         return bound
+
+    @property
+    def bound_key(self) -> bytes:
+        """Name by content of the truth it was bound to; empty before."""
+        truth = self.__dict__.get("_truth")
+        return b"" if truth is None else truth.key
 
     @property
     def truth(self) -> Truth:

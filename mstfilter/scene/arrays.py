@@ -31,12 +31,15 @@ def frozen(array: np.ndarray) -> np.ndarray:
 
 
 def component_key(component: object) -> bytes:
-    """Name by content of a component: its class, its file where it has one, and its fields, arrays included."""
+    """Name by content of a component: its class, its file where it has one, and its fields, arrays included.
+
+    One that was bound to a recording's truth (`mstfilter.oracles.truth`) is named by that too.
+    """
     if dataclasses.is_dataclass(component) and not isinstance(component, type):
         cls = type(component)
         source = getattr(cls, "__mst_source__", "")
         fields = [component_key(getattr(component, f.name)) for f in dataclasses.fields(component)]
-        return content_key(cls.__module__, cls.__qualname__, source, *fields)
+        return content_key(cls.__module__, cls.__qualname__, source, getattr(component, "bound_key", b""), *fields)
     if isinstance(component, (tuple, list)):
         return content_key(type(component).__name__, *(component_key(part) for part in component))
     if isinstance(component, Mapping):

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mstfilter.errors import InputError
+from mstfilter.oracles import degradation
 from mstfilter.oracles.degradation import degrade
-from mstfilter.oracles.masks import TrueMasks
+from mstfilter.oracles.masks import TrueBoundary, TrueMasks
 from mstfilter.oracles.truth import bind_truth
+from mstfilter.scene.arrays import component_key
 from mstfilter.scene.quality import overlap, weighted_coverage
 from tests.baselines.scenes import slide
 
@@ -55,6 +59,33 @@ def test_each_means_does_what_it_says():
     assert (moved > 0).sum() < (true > 0).sum()
 
 
+@pytest.mark.parametrize("seed", range(5))
+def test_what_was_split_is_not_joined_again(seed):
+    """Merges after splits: each object stays in as many pieces as it was cut into."""
+    rng = np.random.default_rng(seed)
+    true = np.kron(np.arange(1, 7).reshape(2, 3), np.ones((40, 45), np.int32))  # all touch
+    split, names = degradation._split(rng, true, 0.8, 0.01)
+    both = degradation._merge(rng, true, split, names, 0.6, 0.01)
+    assert len(np.unique(split)) > 7 and len(np.unique(both)) < len(np.unique(split))
+    for k in range(1, 7):
+        assert len(np.unique(both[true == k])) == len(np.unique(split[true == k]))
+
+
+def test_similar_images_get_similar_errors():
+    """An object that went some pixels is cut where it was cut before."""
+    rng = np.random.default_rng(3)
+    true = picture(rng)
+    later = np.where(true == 2, 0, true)
+    rows, columns = np.nonzero(true == 2)
+    later[rows + 3, columns + 1] = 2
+    one, same, other = (
+        degrade(np.random.default_rng(s), image, 0.6, 0.5, 0.5) for s, image in ((1, true), (1, later), (2, later))
+    )
+    still = true == later
+    assert weighted_coverage(one * still, same * still) > 0.9
+    assert weighted_coverage(one * still, other * still) < 0.8
+
+
 def test_perfect_masks_and_empty_images_come_back_unchanged():
     true = picture(np.random.default_rng(0))
     assert (degrade(np.random.default_rng(0), true, 1.0) == true).all()
@@ -84,12 +115,32 @@ def test_samples_are_wrong_each_in_its_own_way_and_calibrated(tmp_path):
     assert found[0.9] > found[0.6] + 0.1
 
 
+def test_lasting_errors_are_those_of_all_samples_and_pauses(tmp_path):
+    recording = slide(tmp_path / "r")
+    one, two, *_ = recording.clips()
+    proposal = bind_truth(TrueMasks(quality=0.6, errors="lasting"), recording)
+    populations = [proposal.sample(np.random.default_rng(s), clip, 3) for s, clip in ((0, one), (1, one), (0, two))]
+    keys = [{h.key for h in p.particles} for p in populations]
+    assert len(keys[0]) == 1 and keys[0] == keys[1]
+    for population in populations:
+        np.testing.assert_allclose(population.notes["mask_quality"], 0.6, atol=0.011)
+
+
+def test_what_is_kept_by_content_names_the_truth(tmp_path):
+    first, second = slide(tmp_path / "a"), slide(tmp_path / "b")
+    second = replace(second, read_truth=lambda t: first.truth(t) * 2)
+    keys = {component_key(bind_truth(TrueBoundary(), r)) for r in (first, second)} | {component_key(TrueBoundary())}
+    assert len(keys) == 3
+    assert component_key(bind_truth(TrueBoundary(), first)) in keys
+
+
 @pytest.mark.parametrize(
     "fields, says",
     [
         ({"quality": 1.2}, "quality of masks is 1.2"),
         ({"over": 0.7, "under": 0.5}, "shares"),
         ({"tolerance": 0}, "> 0"),
+        ({"errors": "often"}, "errors of masks are 'often'"),
     ],
 )
 def test_useless_fields_are_one_clear_error(fields, says):
