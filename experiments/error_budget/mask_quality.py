@@ -2,9 +2,10 @@
 
     python experiments/error_budget/mask_quality.py STUDY experiments/error_budget/results
 
-Writes mask_quality.csv (a line a quality of the masks and method: primary endpoint over all scenes, and `mst` minus
-the method, paired by scene, unadjusted t interval) and mask_quality.png. Lines whose `source` is `own` have the masks
-of `mst` itself, at their quality in the image, which is measured here.
+Writes mask_quality.csv (a line a quality of the masks and method: primary endpoint over all scenes, unweighted and
+weighted over the hypotheses, and `mst` minus the method, paired by scene, unadjusted t interval) and
+mask_quality.png. `source` says where masks come from: true ones made worse, with errors that are `lasting` or
+`independent`, or `own`, the cuts that `mst` samples, at their quality in the image, which is measured here.
 """
 
 from __future__ import annotations
@@ -28,13 +29,20 @@ from mstfilter.study.results import StudyFolder, write_table
 from mstfilter.study.statistics import compare
 from mstfilter.study.summary import Summary
 
-COLUMNS = ("source", "masks", "method", "n", "quality", "mst_minus", "low", "high", "p")
+FIGURES = {"quality": "", "quality_weighted": "_weighted"}  # of a study, and what its columns end in
+COLUMNS = (
+    "source",
+    "masks",
+    "method",
+    "n",
+    *(f"{c}{e}" for e in FIGURES.values() for c in ("quality", "mst_minus", "low", "high")),
+)
 REFERENCE = "mst"
-OWN = "own masks "
+SOURCES = ("lasting", "independent", "own")
 
 
 class Masks(NamedTuple):
-    """Where masks come from (`set` or `own`) and how good they are in the image."""
+    """Where masks come from and how good they are in the image."""
 
     source: str
     quality: float
@@ -56,31 +64,33 @@ def own_quality(recording: Recording) -> float:
     return float(np.mean(found))
 
 
-def by_masks(found: Summary, own: float) -> dict[Masks, dict[str, dict[str, float]]]:
-    """Masks -> method -> scene -> primary endpoint."""
+def by_masks(found: Summary, name: str, own: float) -> dict[Masks, dict[str, dict[str, float]]]:
+    """Masks -> method -> scene -> a figure of the study."""
     scenes: dict[Masks, dict[str, dict[str, float]]] = {}
     for arm in found.arms:
-        method = re.split(r" proposal[.=]", arm.removeprefix(OWN))[0]
-        masks = Masks("own", own) if arm.startswith(OWN) else Masks("set", float(re.findall(r"y=([\d.]+)", arm)[0]))
+        source, method, _, quality = re.fullmatch(r"(\w+) (.+?)( proposal\.quality=([\d.]+))?", arm).groups()
+        masks = Masks(source, float(quality) if quality else own)
         for family in found.families:
-            if figure := found.figure(family, arm):
+            if figure := found.figure(family, arm, name):
                 scenes.setdefault(masks, {}).setdefault(method, {}).update(figure.by_scene)
     return scenes
 
 
-def table(scenes: dict[Masks, dict[str, dict[str, float]]]) -> list[dict[str, Any]]:
+def table(found: Summary, own: float) -> list[dict[str, Any]]:
     """A line a quality of the masks and method."""
-    lines: list[dict[str, Any]] = []
-    for (source, masks), methods in sorted(scenes.items(), key=lambda item: (item[0].source != "set", item[0])):
-        for method, by_scene in methods.items():
-            line: dict[str, Any] = {"source": source, "masks": round(masks, 3), "method": method, "n": len(by_scene)}
-            line["quality"] = f"{np.mean(list(by_scene.values())):.4f}"
-            if method != REFERENCE:
-                d = compare(methods[REFERENCE], by_scene)
-                line |= {"mst_minus": f"{d.mean:.4f}", "low": f"{d.low:.4f}", "high": f"{d.high:.4f}"}
-                line["p"] = f"{d.p:.4g}"
-            lines.append(line)
-    return lines
+    lines: dict[tuple[Masks, str], dict[str, Any]] = {}
+    for name, ending in FIGURES.items():
+        for masks, methods in by_masks(found, name, own).items():
+            for method, by_scene in methods.items():
+                new = {"source": masks.source, "masks": round(masks.quality, 3), "method": method, "n": len(by_scene)}
+                line = lines.setdefault((masks, method), new)
+                line[f"quality{ending}"] = f"{np.mean(list(by_scene.values())):.4f}"
+                if method != REFERENCE:
+                    d = compare(methods[REFERENCE], by_scene)
+                    differences = {"mst_minus": d.mean, "low": d.low, "high": d.high}
+                    line |= {f"{k}{ending}": f"{v:.4f}" for k, v in differences.items()}
+    order = sorted(lines, key=lambda key: (SOURCES.index(key[0].source), key[0].quality))
+    return [lines[key] for key in order]
 
 
 def draw(lines: list[dict[str, Any]], path: Path) -> None:
@@ -91,28 +101,36 @@ def draw(lines: list[dict[str, Any]], path: Path) -> None:
     import matplotlib.pyplot as plt
 
     methods = list(dict.fromkeys(line["method"] for line in lines))
-    figure, (left, right) = plt.subplots(1, 2, figsize=(10, 4), layout="constrained")
+    figure, axes = plt.subplots(1, 3, figsize=(13, 4), layout="constrained", width_ratios=(1, 1, 0.8))
+    axes[2].sharey(axes[1])
     for k, method in enumerate(methods):
         shade = np.array(colour(k)) / 255
         aside = 0.007 * (k - len(methods) / 2)  # so that bars do not hide one another
-        for source, style, face in (("set", "o-", shade), ("own", "D", "white")):
+        for source in SOURCES:
             mine = [line for line in lines if line["method"] == method and line["source"] == source]
-            x = np.array([line["masks"] for line in mine])
-            label = method if source == "set" else None
-            left.plot(x, [float(v["quality"]) for v in mine], style, color=shade, mfc=face, ms=4.5, label=label)
-            if method == REFERENCE:
+            if not mine:
                 continue
-            gain, low, high = (np.array([float(v[c]) for v in mine]) for c in ("mst_minus", "low", "high"))
-            bars = {"color": shade, "mfc": face, "ms": 4.5, "capsize": 2, "lw": 1.1}
-            right.errorbar(x + aside, gain, (gain - low, high - gain), fmt=style, **bars)
-    right.axhline(0, color="black", lw=0.8)
-    left.set(xlabel="quality of the masks in the image", ylabel="3-D quality, pauses t >= 1")
-    right.set(xlabel="quality of the masks in the image", ylabel="mst minus the method")
-    left.plot([], [], "D", color="grey", mfc="white", ms=4.5, label="masks of mst itself")
-    left.legend(frameon=False)
-    for axis in (left, right):
+            x = np.array([line["masks"] for line in mine])
+            style = {"color": shade, "mfc": "white" if source == "own" else shade, "ms": 4.5}
+            marker = "D" if source == "own" else "o-"
+            if source != "independent":
+                q = [float(line["quality"]) for line in mine]
+                axes[0].plot(x, q, marker, **style, label=method if source == "lasting" else None)
+            if method != REFERENCE:
+                gain, low, high = (np.array([float(line[c]) for line in mine]) for c in ("mst_minus", "low", "high"))
+                axis = axes[2 if source == "independent" else 1]
+                axis.errorbar(x + aside, gain, (gain - low, high - gain), fmt=marker, capsize=2, lw=1.1, **style)
+    axes[0].plot([], [], "D", color="grey", mfc="white", ms=4.5, label="masks of mst itself")
+    axes[0].legend(frameon=False)
+    axes[0].set(title="errors that last", ylabel="3-D quality, pauses t >= 1")
+    axes[1].set(title="errors that last", ylabel="mst minus the method")
+    axes[2].set(title="errors drawn anew for every sample", ylabel="mst minus the method")
+    for axis in axes:
+        axis.set_xlabel("quality of the masks in the image")
         axis.spines[["top", "right"]].set_visible(False)
         axis.grid(alpha=0.25)
+    for axis in axes[1:]:
+        axis.axhline(0, color="black", lw=0.8)
     figure.savefig(path, dpi=110)
     plt.close(figure)
 
@@ -122,7 +140,8 @@ def main(study: Path, out: Path) -> None:
     folder = StudyFolder.open(study)
     sources = [scene["source"] for scene in folder.description["scenes"]]
     own = [own_quality(Recording.open(cached_recording(s["family"], s["seed"], **s["set"]))) for s in sources]
-    lines = table(by_masks(folder.summary(), float(np.mean(own))))
+    lines = table(folder.summary(), float(np.mean(own)))
+    print("quality of the masks that mst samples, by scene:", *(f"{q:.3f}" for q in own))
     out.mkdir(parents=True, exist_ok=True)
     write_table(out / "mask_quality.csv", COLUMNS, lines)
     draw(lines, out / "mask_quality.png")

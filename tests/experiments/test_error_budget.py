@@ -11,7 +11,7 @@ import pytest
 from tests.conftest import REPOSITORY
 
 
-@pytest.mark.parametrize("name, arms", [("study", 3), ("mask_quality", 6)])
+@pytest.mark.parametrize("name, arms", [("study", 3), ("mask_quality", 10)])
 def test_smoke(tmp_path, monkeypatch, name, arms):
     from mstfilter.cli import main
 
@@ -33,12 +33,15 @@ def test_smoke(tmp_path, monkeypatch, name, arms):
         with (tmp_path / "tables/mask_quality.csv").open(newline="") as file:
             lines = {(line["source"], line["masks"], line["method"]): line for line in csv.DictReader(file)}
         own = next(masks for source, masks, _ in lines if source == "own")
-        sources = (("set", "0.7"), ("set", "1"), ("own", own))
-        assert set(lines) == {(*masks, method) for masks in sources for method in ("mst", "object_fusion")}
         assert 0.5 < float(own) < 1
-        other = lines["set", "1", "object_fusion"]
-        gain = float(lines["set", "1", "mst"]["quality"]) - float(other["quality"])
-        assert float(other["mst_minus"]) == pytest.approx(gain, abs=2e-4)
+        fused, sampled = ("mst", "object_fusion"), ("mst", "samples_only")
+        expected = {("own", own): fused, ("lasting", "0.7"): fused, ("lasting", "1"): fused}
+        expected |= {("independent", "0.7"): sampled, ("independent", "0.9"): sampled}
+        assert set(lines) == {(*masks, method) for masks, methods in expected.items() for method in methods}
+        mst, other = (lines["lasting", "1", method] for method in fused)
+        for ending in ("", "_weighted"):
+            gain = float(mst[f"quality{ending}"]) - float(other[f"quality{ending}"])
+            assert float(other[f"mst_minus{ending}"]) == pytest.approx(gain, abs=2e-4)
         assert (tmp_path / "tables/mask_quality.png").stat().st_size > 5000
 
 
