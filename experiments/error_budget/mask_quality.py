@@ -5,13 +5,15 @@
 Writes mask_quality.csv (a line a quality of the masks and method: primary endpoint over all scenes, unweighted and
 weighted over the hypotheses, and `mst` minus the method, paired by scene, unadjusted t interval) and
 mask_quality.png. `source` says where masks come from: true ones made worse, with errors that are `lasting` or
-`independent`, or `own`, the cuts that `mst` samples, at their quality in the image, which is measured here.
+`independent`, or `own`, the cuts that `mst` samples, at their quality in the image, which is measured here
+(own_masks.csv, with how far the samples of a pause agree).
 """
 
 from __future__ import annotations
 
 import argparse
 import re
+from itertools import permutations
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -48,20 +50,21 @@ class Masks(NamedTuple):
     quality: float
 
 
-def own_quality(recording: Recording) -> float:
-    """Quality in the image of the cuts that `mst` draws, mean over pauses t >= 1."""
+def own_quality(recording: Recording) -> tuple[float, float]:
+    """Quality in the image of the cuts that `mst` draws, and how far they agree, means over pauses t >= 1."""
     filter = mstfilter.preset("mst")
     proposal = filter.proposal
     assert isinstance(proposal, TreeCutProposal)
     true = bind_truth(TrueMasks(), recording)
     rng = np.random.default_rng(0)
-    found = []
+    found, agree = [], []
     for clip in recording.clips()[1:]:
         tree, values = proposal.tree_of(clip.after)
         drawn = proposal.sampler.sample(rng, tree, values, filter.n)
         images = [proposal.objects.label_image(tree, cut, clip.after, clip.grid) for cut in drawn.cuts]
         found.append(np.mean([weighted_coverage(image, true.masks(clip.after, clip)) for image in images]))
-    return float(np.mean(found))
+        agree.append(np.mean([weighted_coverage(a, b) for a, b in permutations(images, 2)]))
+    return float(np.mean(found)), float(np.mean(agree))
 
 
 def by_masks(found: Summary, name: str, own: float) -> dict[Masks, dict[str, dict[str, float]]]:
@@ -138,11 +141,14 @@ def draw(lines: list[dict[str, Any]], path: Path) -> None:
 def main(study: Path, out: Path) -> None:
     """Read, measure the own masks, write, print."""
     folder = StudyFolder.open(study)
-    sources = [scene["source"] for scene in folder.description["scenes"]]
-    own = [own_quality(Recording.open(cached_recording(s["family"], s["seed"], **s["set"]))) for s in sources]
-    lines = table(folder.summary(), float(np.mean(own)))
-    print("quality of the masks that mst samples, by scene:", *(f"{q:.3f}" for q in own))
+    own: list[dict[str, Any]] = []
+    for scene in folder.description["scenes"]:
+        made = scene["source"]
+        found = own_quality(Recording.open(cached_recording(made["family"], made["seed"], **made["set"])))
+        own.append({"scene": scene["name"], "quality": f"{found[0]:.4f}", "agreement": f"{found[1]:.4f}"})
+    lines = table(folder.summary(), float(np.mean([float(line["quality"]) for line in own])))
     out.mkdir(parents=True, exist_ok=True)
+    write_table(out / "own_masks.csv", list(own[0]), own)
     write_table(out / "mask_quality.csv", COLUMNS, lines)
     draw(lines, out / "mask_quality.png")
     for line in lines:
