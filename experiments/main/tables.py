@@ -5,17 +5,24 @@
 Writes, named after the study, NAME.csv (a line a family and arm: means over scenes of pauses t >= 1), NAME_scenes.csv
 (the primary endpoint of each scene) and NAME_differences.csv (reference minus arm in the primary endpoint; unadjusted
 t interval, studentised bootstrap, p by flipping signs, p after Holm over families and arms), and prints the latter as
-a table for the README. Pooled, differences are over the scenes of all families together: NAME_pooled_differences.csv.
+a table for the README. NAME_cases.csv has quality by what can be known of an object, a case being an object at a
+pause t >= 1 (mean over cases, not over scenes), and NAME_time.csv core seconds of a step t >= 1: of the first filter
+seed, in which an arm may be the first to see a recording, and of later ones, which find shared work on disk. Pooled,
+differences are over the scenes of all families together: NAME_pooled_differences.csv.
 """
 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Mapping, Sequence
 from itertools import product
 from pathlib import Path
+from typing import Any
 
 from mstfilter.study.results import StudyFolder, write_table
 from mstfilter.study.summary import ENDPOINT, Summary, summarise
+
+Row = Mapping[str, Any]
 
 FIGURES = (
     "quality",
@@ -75,6 +82,47 @@ def differences(found: Summary) -> list[dict[str, str]]:
     return lines
 
 
+def cases(rows: Sequence[Row]) -> list[dict[str, str]]:
+    """A line a family and arm: number and mean quality of the objects that are visible, hidden, never seen."""
+    lines = []
+    for (family, arm), mine in grouped(rows).items():
+        line = {"family": family, "arm": arm}
+        for kind in ("visible", "hidden", "unseen"):
+            pairs = [(row[f"n_{kind}"], row[f"quality_{kind}"]) for row in mine if row[f"n_{kind}"]]
+            seeds = len({row["seed"] for row in mine})
+            n = sum(count for count, _ in pairs)
+            line[kind] = f"{n / seeds:g}"
+            line[f"quality_{kind}"] = f"{sum(count * q for count, q in pairs) / n:.4f}" if n else ""
+        lines.append(line)
+    return lines
+
+
+def times(rows: Sequence[Row]) -> list[dict[str, str]]:
+    """A line a family and arm: core seconds of a step, mean and most, of the first filter seed and of later ones."""
+    lines = []
+    for (family, arm), mine in grouped(rows).items():
+        line = {"family": family, "arm": arm}
+        first = min(row["seed"] for row in mine)
+        for name, chosen in (
+            ("first", [r for r in mine if r["seed"] == first]),
+            ("later", [r for r in mine if r["seed"] != first]),
+        ):
+            seconds = [row["core_seconds"] for row in chosen]
+            line[f"{name}_mean"] = f"{sum(seconds) / len(seconds):.2f}" if seconds else ""
+            line[f"{name}_most"] = f"{max(seconds):.2f}" if seconds else ""
+        lines.append(line)
+    return lines
+
+
+def grouped(rows: Sequence[Row]) -> dict[tuple[str, str], list[Row]]:
+    """Rows of pauses t >= 1 by family and arm."""
+    found: dict[tuple[str, str], list[Row]] = {}
+    for row in rows:
+        if row["pause"] >= 1:
+            found.setdefault((row["family"], row["arm"]), []).append(row)
+    return found
+
+
 def markdown(rows: list[dict[str, str]]) -> str:
     """Arms down, families across."""
     families, arms = (list(dict.fromkeys(r[key] for r in rows)) for key in ("family", "arm"))
@@ -105,7 +153,9 @@ def main(study: Path, out: Path, reference: str, pooled: bool) -> None:
         name += "_pooled"
     else:
         found = folder.summary()
+        rows = folder.rows()
         tables |= {name: means(found), f"{name}_scenes": by_scene(found)}
+        tables |= {f"{name}_cases": cases(rows), f"{name}_time": times(rows)}
     tables[f"{name}_differences"] = differences(found)
     out.mkdir(parents=True, exist_ok=True)
     for table, rows in tables.items():

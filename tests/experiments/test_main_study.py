@@ -50,6 +50,9 @@ def test_other_studies_run_in_their_small_form(tmp_path, monkeypatch, config):
     found = tables(folder, tmp_path / "tables")
     assert [row["arm"] for row in found[name]] == arms
     assert all(0 < float(row["quality"]) <= 1 for row in found[name])
+    assert [row["arm"] for row in found[f"{name}_time"]] == [row["arm"] for row in found[f"{name}_cases"]] == arms
+    for row in found[f"{name}_cases"]:
+        assert float(row["visible"]) > 0 and 0 <= float(row["quality_visible"]) <= 1
     beside = [arm for arm in arms if arm.startswith("true masks")]
     assert [row["arm"] for row in found[f"{name}_differences"]] == [a for a in arms[1:] if a not in beside]
     if beside:
