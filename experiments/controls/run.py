@@ -30,7 +30,7 @@ import numpy as np
 
 import mstfilter
 from mstfilter.scene.clip import Clip
-from mstfilter.scene.quality import weighted_coverage
+from mstfilter.scene.quality import overlap, weighted_coverage
 from mstfilter.scene.recording import Recording
 from mstfilter.scene.voxels import Hypothesis
 from mstfilter.simulation.cache import cached_recording
@@ -45,7 +45,7 @@ SMALL = {"width": 160, "height": 120, "n_actions": 1, "frames_per_clip": 8, "vox
 STILL = 0.0005  # metres
 MOVED = 0.9  # an object whose own IoU before and after lies below has moved
 FILTERS = {
-    "mst": (),
+    "mst": [],
     "flow": [f"transition.rule.{v}" for v in ("use_icp=false", "use_sift=false", "n_refine=0", "search_above=-1")],
     "frozen": ["transition=identity", "update.division=none"],
 }
@@ -75,13 +75,14 @@ def at_rest(recording: Recording, pause: int) -> int | None:
 
 def in_orders(clip: Clip, rng: np.random.Generator) -> dict[str, Clip]:
     """The clip as it is, with its inner frames in random order, and without them."""
-    frames = list(clip.frames)
-    inner = [frames[1 + k] for k in rng.permutation(max(len(frames) - 2, 0))]
-    shuffled, ends = [frames[0], *inner, *frames[1:][-1:]], [frames[0], *frames[1:][-1:]]
+    if len(clip) == 1:
+        return dict.fromkeys(ORDERS, clip)
+    first, *inner, last = clip.frames
+    shuffled = (first, *(inner[k] for k in rng.permutation(len(inner))), last)
     return {
         "in order": clip,
-        "shuffled": replace(clip, frames=tuple(shuffled), times=()),
-        "ends": replace(clip, frames=tuple(ends), times=()),
+        "shuffled": replace(clip, frames=shuffled, times=()),
+        "ends": replace(clip, frames=(first, last), times=()),
     }
 
 
@@ -95,20 +96,19 @@ def again(filter: ParticleFilter, clip: Clip) -> State:
     return state
 
 
-def iou(a: np.ndarray, b: np.ndarray) -> float:
-    """Of two sets of voxels, one of them not empty."""
-    return float((a & b).sum() / (a | b).sum())
+def ious(a: np.ndarray, b: np.ndarray) -> dict[int, float]:
+    """IoU of each object with the one of its label, of those that both label images have."""
+    table = overlap(a, b)
+    labels, i, j = np.intersect1d(table.labels_a, table.labels_b, return_indices=True)
+    found = zip(labels.tolist(), table.jaccard()[i, j].tolist(), strict=True)
+    return {k: value for k, value in found if k > 0}
 
 
 def tracked(transition: Transition, labels: np.ndarray, truth: np.ndarray, clip: Clip) -> list[float]:
     """IoU of the objects that moved, tracked from their true labels."""
     start = Population((Hypothesis.from_labels(labels, clip.grid),), np.zeros(1))
-    end = transition.predict(np.random.default_rng(0), start, clip).particles[0].labels
-    return [
-        iou(end == k, truth == k)
-        for k in np.intersect1d(labels[labels > 0], truth)
-        if iou(labels == k, truth == k) < MOVED
-    ]
+    end = ious(transition.predict(np.random.default_rng(0), start, clip).particles[0].labels, truth)
+    return [end.get(k, 0.0) for k, own in ious(labels, truth).items() if own < MOVED]
 
 
 def run(scene: tuple[str, int], stranger: Recording, recording: Recording) -> dict[str, object]:

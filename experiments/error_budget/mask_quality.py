@@ -62,7 +62,8 @@ def own_quality(recording: Recording) -> tuple[float, float]:
         tree, values = proposal.tree_of(clip.after)
         drawn = proposal.sampler.sample(rng, tree, values, filter.n)
         images = [proposal.objects.label_image(tree, cut, clip.after, clip.grid) for cut in drawn.cuts]
-        found.append(np.mean([weighted_coverage(image, true.masks(clip.after, clip)) for image in images]))
+        masks = true.masks(clip.after, clip)
+        found.append(np.mean([weighted_coverage(image, masks) for image in images]))
         agree.append(np.mean([weighted_coverage(a, b) for a, b in permutations(images, 2)]))
     return float(np.mean(found)), float(np.mean(agree))
 

@@ -19,7 +19,7 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
-from mstfilter.study.results import StudyFolder, write_table
+from mstfilter.study.results import StudyFolder, cost_columns, write_table
 from mstfilter.study.summary import ENDPOINT, Summary, summarise
 
 Row = Mapping[str, Any]
@@ -87,9 +87,9 @@ def cases(rows: Sequence[Row]) -> list[dict[str, str]]:
     lines = []
     for (family, arm), mine in grouped(rows).items():
         line = {"family": family, "arm": arm}
+        seeds = len({row["seed"] for row in mine})
         for kind in ("visible", "hidden", "unseen"):
             pairs = [(row[f"n_{kind}"], row[f"quality_{kind}"]) for row in mine if row[f"n_{kind}"]]
-            seeds = len({row["seed"] for row in mine})
             n = sum(count for count, _ in pairs)
             line[kind] = f"{n / seeds:g}"
             line[f"quality_{kind}"] = f"{sum(count * q for count, q in pairs) / n:.4f}" if n else ""
@@ -103,11 +103,8 @@ def times(rows: Sequence[Row]) -> list[dict[str, str]]:
     for (family, arm), mine in grouped(rows).items():
         line = {"family": family, "arm": arm}
         first = min(row["seed"] for row in mine)
-        for name, chosen in (
-            ("first", [r for r in mine if r["seed"] == first]),
-            ("later", [r for r in mine if r["seed"] != first]),
-        ):
-            seconds = [row["core_seconds"] for row in chosen]
+        for name in ("first", "later"):
+            seconds = [row["core_seconds"] for row in mine if (row["seed"] == first) == (name == "first")]
             line[f"{name}_mean"] = f"{sum(seconds) / len(seconds):.2f}" if seconds else ""
             line[f"{name}_most"] = f"{max(seconds):.2f}" if seconds else ""
         lines.append(line)
@@ -138,28 +135,28 @@ def markdown(rows: list[dict[str, str]]) -> str:
 def main(study: Path, out: Path, reference: str, pooled: bool) -> None:
     """Read, write, print."""
     folder = StudyFolder.open(study)
-    name, tables = folder.description["name"], {}
+    name, rows, tables = folder.description["name"], folder.rows(), {}
     if reference:
         beside = [
             arm["name"]
             for arm in folder.description["arms"]
             if arm["name"].startswith("true masks") != reference.startswith("true masks")
         ]
-        found = summarise(folder.rows(), reference, beside=beside)
+        found = summarise(rows, reference, beside=beside)
         name += f"_{reference.split(':')[0].replace(' ', '_')}"
     elif pooled:
-        rows = [{**row, "family": "all"} for row in folder.rows()]
-        found = summarise(rows, folder.description["reference"], beside=folder.beside)
+        found = summarise(
+            [{**row, "family": "all"} for row in rows], folder.description["reference"], beside=folder.beside
+        )
         name += "_pooled"
     else:
-        found = folder.summary()
-        rows = folder.rows()
+        found = summarise(rows, folder.description["reference"], cost_columns(rows), folder.beside)
         tables |= {name: means(found), f"{name}_scenes": by_scene(found)}
         tables |= {f"{name}_cases": cases(rows), f"{name}_time": times(rows)}
     tables[f"{name}_differences"] = differences(found)
     out.mkdir(parents=True, exist_ok=True)
-    for table, rows in tables.items():
-        write_table(out / f"{table}.csv", list(rows[0]), rows)
+    for table, lines in tables.items():
+        write_table(out / f"{table}.csv", list(lines[0]), lines)
     print(markdown(tables[f"{name}_differences"]))
 
 

@@ -51,7 +51,7 @@ class TrueCompletion(UsesTruth, Completer):
         t = self.truth.pause_of(frame)
         voxels, pixel = memo(
             "true_pixels",
-            (frame.key, grid.key, content_key(self.truth.labels(t), self.truth.instance(t))),
+            (frame.key, grid.key, self.bound_key),
             lambda: self._pixels(frame, grid, t),
         )
         return [self._true(rng, frame, np.asarray(mask, bool), grid, voxels, pixel) for mask in masks]

@@ -16,6 +16,7 @@ makes similar errors in similar images, so errors can be made to last while a sc
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
 
 import numpy as np
 
@@ -80,14 +81,18 @@ def _split(rng: np.random.Generator, true: np.ndarray, target: float, tol: float
 
     Returns the labels and what each stands for: the true object, then which side of each cut.
     """
+
+    def draw(name: tuple[int, ...]) -> np.ndarray:
+        return child(rng, "split", *name).random(2)
+
     labels = true
     names: _Names = {int(k): (int(k),) for k in np.unique(true) if k > 0}
+    draws = {k: draw(name) for k, name in names.items()}
     for _ in range(_TRIES):
         if weighted_coverage(labels, true) <= target + tol / 2:
             break
         sizes = np.bincount(labels.ravel())
         # The first of exponential times at the rate of their sizes: a part is chosen in proportion to its size.
-        draws = {k: child(rng, "split", *name).random(2) for k, name in names.items()}
         chosen = min(names, key=lambda k: -np.log1p(-draws[k][0]) / sizes[k])
         where = np.nonzero(labels == chosen)
         angle = np.pi * draws[chosen][1]
@@ -115,6 +120,7 @@ def _split(rng: np.random.Generator, true: np.ndarray, target: float, tol: float
         labels = cut(share)
         if (labels == fresh).any():
             names[fresh], names[chosen] = (*names[chosen], 1), (*names[chosen], 0)
+            draws |= {k: draw(names[k]) for k in (fresh, chosen)}
         else:
             break  # a cut that takes nothing: no smaller loss is possible
     return labels, names
@@ -124,6 +130,13 @@ def _merge(
     rng: np.random.Generator, true: np.ndarray, labels: np.ndarray, names: _Names, target: float, tol: float
 ) -> np.ndarray:
     """Join touching objects while the quality stays at `target` or above."""
+
+    @cache
+    def turn(pair: tuple[int, int]) -> float:
+        """When a pair is tried."""
+        x, y = sorted(names[k] for k in pair)
+        return float(child(rng, "merge", len(x), *x, *y).random())
+
     refused: set[tuple[int, int]] = set()
     roots = {k: {name[0]} for k, name in names.items()}
     for _ in range(_TRIES):
@@ -133,9 +146,7 @@ def _merge(
         pairs = {(a, b) for a, b in _touching(labels) - refused if not roots[a] & roots[b]}
         if not pairs:
             break
-        named = {pair: sorted(names[k] for k in pair) for pair in pairs}
-        draws = {pair: child(rng, "merge", len(x), *x, *y).random() for pair, (x, y) in named.items()}
-        a, b = min(pairs, key=lambda pair: (draws[pair], pair))
+        a, b = min(pairs, key=lambda pair: (turn(pair), pair))
         new = np.where(labels == b, a, labels)
         if weighted_coverage(new, true) < target - tol / 2:
             refused.add((a, b))

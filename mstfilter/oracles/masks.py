@@ -97,7 +97,6 @@ class TrueMasks(UsesTruth, Proposal):
         """`n` hypotheses about the scene at the end of the clip; equal ones where their masks are."""
         frame, grid = observation.after, observation.grid
         true = self.masks(frame, observation)
-        lasting = Key(int.from_bytes(self.truth.key[:8], "big")).child("lasting masks")
         alike = self.quality == 1 or self.errors == "lasting"
         particles: list[Hypothesis] = []
         reached: list[float] = []
@@ -106,8 +105,7 @@ class TrueMasks(UsesTruth, Proposal):
                 particles.append(particles[0])
                 reached.append(reached[0])
                 continue
-            stream = lasting.generator() if alike else child(rng, "masks", i)
-            masks = degrade(stream, true, self.quality, self.over, self.under, self.tolerance)
+            masks = degrade(self._errors(rng, i), true, self.quality, self.over, self.under, self.tolerance)
             reached.append(round(weighted_coverage(masks, true), 4))
             numbers = [int(k) for k in np.unique(masks) if k > 0]
             completed = [
@@ -116,6 +114,12 @@ class TrueMasks(UsesTruth, Proposal):
             particles.append(hypothesis_of(completed, grid, observation.index, self.threshold))
         notes = {"mask_quality": reached, "objects": [h.n_objects for h in particles]}
         return Population(tuple(particles), notes=notes)
+
+    def _errors(self, rng: np.random.Generator, i: int) -> np.random.Generator:
+        """The stream that the errors of sample `i` are drawn from."""
+        if self.errors == "lasting":
+            return Key(int.from_bytes(self.bound_key[:8], "big")).child("lasting masks").generator()
+        return child(rng, "masks", i)
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import copy
 import dataclasses
-from functools import cached_property
 from typing import Any, ClassVar, Literal, TypeVar
 
 import numpy as np
@@ -46,11 +45,6 @@ class Truth:
         self._instance: dict[int, np.ndarray] = {}
         self._pauses: dict[bytes, int] | None = None
         self._objects: np.ndarray | None = None
-
-    @cached_property
-    def key(self) -> bytes:
-        """Name by content of all that is known to be true. Looks at every frame once."""
-        return self.recording.truth_key
 
     def check(self, needs: tuple[Need, ...], who: str) -> None:
         """One clear error if something that a component needs is missing at any pause."""
@@ -125,7 +119,7 @@ class UsesTruth:
     def bound_key(self) -> bytes:
         """Name by content of the truth it was bound to; empty before."""
         truth = self.__dict__.get("_truth")
-        return b"" if truth is None else truth.key
+        return b"" if truth is None else truth.recording.truth_key
 
     @property
     def truth(self) -> Truth:
