@@ -23,7 +23,7 @@ from mstfilter.errors import InputError
 from mstfilter.resources import find_preset
 
 if TYPE_CHECKING:
-    from mstfilter.smc.particle_filter import ParticleFilter
+    from mstfilter.smc import ParticleFilter
 
 __all__ = ["build_filter", "describe_filter", "load_config", "preset"]
 
@@ -79,7 +79,7 @@ def _read(name: str, above: tuple[str, ...] = ()) -> dict[str, Any]:
 
 def build_filter(config: Mapping[str, Any], *, allow_files: bool = False) -> ParticleFilter:
     """The filter of a configuration."""
-    from mstfilter.smc.particle_filter import ParticleFilter
+    from mstfilter.smc import ParticleFilter
 
     fields = {k: v for k, v in config.items() if k not in _META and v is not None}
     return registry.make(ParticleFilter, fields, "", allow_files)

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from mstfilter.cli import main
-from mstfilter.study.run_folder import RunFolder
+from mstfilter.study import RunFolder
 from tests.scene.test_recording import FAULTS, write
 
 HEAVY = ("torch", "open3d", "cv2", "scipy", "higra", "mujoco", "matplotlib")

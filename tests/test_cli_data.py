@@ -8,12 +8,10 @@ import shutil
 import numpy as np
 import pytest
 
-from mstfilter.scene.formats.folder import RecordingWriter
-from mstfilter.scene.recording import Recording
-from mstfilter.scene.voxels import VoxelGrid
-from tests.scene.formats import layouts
-from tests.scene.formats.bags import COLOUR, DEPTH, Messages, scene_messages
-from tests.scene.formats.bags import write as write_bag
+from mstfilter.formats import RecordingWriter
+from mstfilter.scene import Recording, VoxelGrid
+from tests.formats import layouts
+from tests.formats.bags import COLOUR, DEPTH, Messages, scene_messages, write as write_bag
 from tests.scene.scenes import CAMERA, table_scene
 from tests.scene.test_recording import write
 from tests.test_cli import call
@@ -154,7 +152,7 @@ def test_an_occupied_name_is_known_before_anything_is_read(tmp_path, capsys):
 )
 def test_what_stops_in_the_middle_leaves_nothing(tmp_path, capsys, monkeypatch, stop, expected):
     """An interruption, and a disk that is full at the fifth image."""
-    from mstfilter.scene.formats import writer
+    from mstfilter.formats import writer
 
     count, usual = [], writer.write_image
 

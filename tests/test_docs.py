@@ -22,7 +22,7 @@ def blocks(page):
 @pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)
 def test_examples_run(page, tmp_path, capsys, monkeypatch):
     """One namespace a page, in order, as a reader would type them; the reader's own data are given."""
-    from mstfilter.scene.voxels import Hypothesis
+    from mstfilter.scene import Hypothesis
 
     noise = np.random.default_rng(0)
     scenes = [table_scene(shift, noise) for shift in (0, 1, 2)]

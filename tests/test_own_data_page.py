@@ -10,11 +10,10 @@ import shutil
 import numpy as np
 import pytest
 
-from mstfilter.scene.images import read_depth, read_rgb, write_image
+from mstfilter.scene import read_depth, read_rgb, write_image
 from tests.conftest import REPOSITORY
-from tests.scene.formats import layouts
-from tests.scene.formats.bags import scene_messages
-from tests.scene.formats.bags import write as write_bag
+from tests.formats import layouts
+from tests.formats.bags import scene_messages, write as write_bag
 from tests.scene.test_recording import write
 from tests.test_cli import call
 

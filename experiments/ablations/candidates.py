@@ -29,17 +29,11 @@ import numpy as np
 from scipy.ndimage import find_objects, label
 
 import mstfilter
-from mstfilter.fusion.depth_evidence import DepthAgreement
-from mstfilter.fusion.similarity import Agreement
-from mstfilter.fusion.support import Support, stands
-from mstfilter.scene.clip import Clip
-from mstfilter.scene.evidence import Evidence
-from mstfilter.scene.frame_geometry import frame_geometry
-from mstfilter.scene.quality import weighted_coverage
-from mstfilter.scene.recording import Recording
-from mstfilter.scene.voxels import Hypothesis
-from mstfilter.simulation.cache import cached_recording
-from mstfilter.study.statistics import interval
+from mstfilter.fusion import Agreement, DepthAgreement, Support, stands
+from mstfilter.scene import Clip, Evidence, Hypothesis, Recording, frame_geometry
+from mstfilter.scoring import weighted_coverage
+from mstfilter.simulation import cached_recording
+from mstfilter.study import interval
 
 SCENES = ("s1-6", "s1-7", "s1-8", "s1-9", "s2-4", "s2-5", "s2-6")
 SMALL = {"width": 160, "height": 120, "n_actions": 1, "frames_per_clip": 8, "voxel_size": 0.02}

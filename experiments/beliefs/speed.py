@@ -9,11 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from mstfilter.fusion.belief import Belief
-from mstfilter.scene import memo
-from mstfilter.scene.camera import Camera, look_at
-from mstfilter.scene.voxels import Hypothesis, VoxelGrid
-from mstfilter.smc.population import Population
+from mstfilter.fusion import Belief
+from mstfilter.scene import Camera, Hypothesis, VoxelGrid, cache as memo, look_at
+from mstfilter.smc import Population
 
 GRID = VoxelGrid((-0.5, -0.5, 0.0), 0.01, (100, 100, 50))
 CAMERA = Camera.from_intrinsics(525, 525, 319.5, 239.5, 640, 480, look_at((0.0, -0.9, 0.8), (0, 0, 0.05)))

@@ -20,22 +20,10 @@ import numpy as np
 from fusion_parents import GRID, N_OBJECTS, parents, table, table_labels
 
 from mstfilter import preset
-from mstfilter.fusion.conflict_graph import conflict_graph
-from mstfilter.fusion.crossover import Crossover
-from mstfilter.fusion.division import NoDivision
-from mstfilter.fusion.free_space import NoFreeSpace
-from mstfilter.fusion.similarity import canonical
-from mstfilter.fusion.structure import RandomOrder
-from mstfilter.fusion.update import FusionUpdate
-from mstfilter.scene.camera import Camera, look_at
-from mstfilter.scene.clip import Clip
-from mstfilter.scene.frame import Frame
-from mstfilter.scene.memo import clear
-from mstfilter.scene.rendering import render
-from mstfilter.scene.voxels import Hypothesis
-from mstfilter.smc.population import Population
-from mstfilter.smc.resampling import Systematic
-from mstfilter.study.memory import peak_megabytes
+from mstfilter.fusion import Crossover, FusionUpdate, NoDivision, NoFreeSpace, RandomOrder, canonical, conflict_graph
+from mstfilter.scene import Camera, Clip, Frame, Hypothesis, clear, look_at, render
+from mstfilter.smc import Population, Systematic
+from mstfilter.study import peak_megabytes
 
 HERE = Path(__file__).parent
 CAMERA = Camera.from_intrinsics(525, 525, 319.5, 239.5, 640, 480, look_at((0.0, -0.9, 0.8), (0, 0, 0.05)))

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mstfilter.scene.voxels import Hypothesis, VoxelGrid
+from mstfilter.scene import Hypothesis, VoxelGrid
 
 GRID = VoxelGrid((-0.5, -0.5, 0.0), 0.01, (100, 100, 50))
 N_OBJECTS, N_WRONG = 20, 3  # of the objects, so many pairs are joined and as many objects split in each parent

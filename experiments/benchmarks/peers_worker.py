@@ -11,9 +11,7 @@ import time
 
 import numpy as np
 import particles
-from particles import distributions as dists
-from particles import resampling
-from particles import state_space_models as ssm
+from particles import distributions as dists, resampling, state_space_models as ssm
 
 model = json.loads(sys.argv[1])
 clock = time.process_time if model.get("clock") == "cpu" else time.perf_counter
@@ -22,13 +20,13 @@ clock = time.process_time if model.get("clock") == "cpu" else time.perf_counter
 class AR1(ssm.StateSpaceModel):
     """x_t = rho x_{t-1} + N(0, sigma^2), y_t = x_t + N(0, tau^2)."""
 
-    def PX0(self):  # noqa: D102
+    def PX0(self):
         return dists.Normal(scale=model["sigma"] / np.sqrt(1 - model["rho"] ** 2))
 
-    def PX(self, t, xp):  # noqa: D102
+    def PX(self, t, xp):
         return dists.Normal(loc=model["rho"] * xp, scale=model["sigma"])
 
-    def PY(self, t, xp, x):  # noqa: D102
+    def PY(self, t, xp, x):
         return dists.Normal(loc=x, scale=model["tau"])
 
 

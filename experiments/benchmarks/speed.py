@@ -15,15 +15,21 @@ from pathlib import Path
 import numpy as np
 from loop import bootstrap_loop
 
-from mstfilter.smc.distributions import Normal
-from mstfilter.smc.filters import bootstrap
-from mstfilter.smc.interfaces import Proposal, Transition
-from mstfilter.smc.particle_filter import ParticleFilter
-from mstfilter.smc.population import Population
-from mstfilter.smc.programs import Program, observe, sample
-from mstfilter.smc.resampling import Always, Systematic
-from mstfilter.smc.state_space import StateSpaceModel
-from mstfilter.smc.updates import Reweight
+from mstfilter.smc import (
+    Always,
+    Normal,
+    ParticleFilter,
+    Population,
+    Program,
+    Proposal,
+    Reweight,
+    StateSpaceModel,
+    Systematic,
+    Transition,
+    bootstrap,
+    observe,
+    sample,
+)
 
 RHO, SIGMA, TAU = 0.9, 0.6, 0.4
 SD0 = SIGMA / math.sqrt(1 - RHO**2)

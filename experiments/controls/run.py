@@ -29,16 +29,11 @@ from pathlib import Path
 import numpy as np
 
 import mstfilter
-from mstfilter.scene.clip import Clip
-from mstfilter.scene.quality import overlap, weighted_coverage
-from mstfilter.scene.recording import Recording
-from mstfilter.scene.voxels import Hypothesis
-from mstfilter.simulation.cache import cached_recording
-from mstfilter.smc.interfaces import Transition
-from mstfilter.smc.particle_filter import ParticleFilter, State
-from mstfilter.smc.population import Population
-from mstfilter.study.results import write_table
-from mstfilter.study.statistics import interval
+from mstfilter.scene import Clip, Hypothesis, Recording
+from mstfilter.scoring import overlap, weighted_coverage
+from mstfilter.simulation import cached_recording
+from mstfilter.smc import ParticleFilter, Population, State, Transition
+from mstfilter.study import interval, write_table
 
 SCENES = [(family, k) for family in ("s1", "s2") for k in range(6)]
 SMALL = {"width": 160, "height": 120, "n_actions": 1, "frames_per_clip": 8, "voxel_size": 0.02}

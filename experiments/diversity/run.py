@@ -21,9 +21,9 @@ import numpy as np
 from scenes import as_one, recorded
 
 import mstfilter
-from mstfilter.scene.quality import weighted_coverage
-from mstfilter.scene.recording import Recording
-from mstfilter.study.results import write_table
+from mstfilter.scene import Recording
+from mstfilter.scoring import weighted_coverage
+from mstfilter.study import write_table
 
 METHODS = ("mst", "samples_only", "tracking_only", "union", "paper", "authors")
 SMALL = {"width": 320, "height": 240, "frames_per_clip": 8, "voxel_size": 0.02}

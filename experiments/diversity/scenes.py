@@ -22,13 +22,19 @@ from scipy.spatial.transform import Rotation
 
 import mstfilter
 from mstfilter.errors import InputError
-from mstfilter.scene.clip import Clip
-from mstfilter.scene.frame import Frame
-from mstfilter.scene.recording import Recording
-from mstfilter.simulation.actions import Effect, Push, choose_push, play
-from mstfilter.simulation.cache import cache_folder
-from mstfilter.simulation.families import GENERATOR_VERSION, SceneFamily, scene_family
-from mstfilter.simulation.recorder import Scene, record
+from mstfilter.scene import Clip, Frame, Recording
+from mstfilter.simulation import (
+    GENERATOR_VERSION,
+    Effect,
+    Push,
+    Scene,
+    SceneFamily,
+    cache_folder,
+    choose_push,
+    play,
+    record,
+    scene_family,
+)
 
 AMBIGUOUS = (0.2, 0.8)
 N_CUTS = 60

@@ -20,16 +20,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import mstfilter
-from mstfilter.oracles.masks import TrueMasks
-from mstfilter.oracles.truth import bind_truth
-from mstfilter.report.palette import colour
-from mstfilter.scene.quality import weighted_coverage
-from mstfilter.scene.recording import Recording
-from mstfilter.segmentation.proposal import TreeCutProposal
-from mstfilter.simulation.cache import cached_recording
-from mstfilter.study.results import StudyFolder, write_table
-from mstfilter.study.statistics import compare
-from mstfilter.study.summary import Summary
+from mstfilter.oracles import TrueMasks, bind_truth
+from mstfilter.report import colour
+from mstfilter.scene import Recording
+from mstfilter.scoring import weighted_coverage
+from mstfilter.segmentation import TreeCutProposal
+from mstfilter.simulation import cached_recording
+from mstfilter.study import StudyFolder, Summary, compare, write_table
 
 FIGURES = {"quality": "", "quality_weighted": "_weighted"}  # of a study, and what its columns end in
 COLUMNS = (

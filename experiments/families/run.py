@@ -20,17 +20,11 @@ import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from mstfilter.completion.arbitration import arbitrate
-from mstfilter.completion.extrude import Extrude
-from mstfilter.scene.clip import Clip
-from mstfilter.scene.frame import Frame
-from mstfilter.scene.quality import weighted_coverage
-from mstfilter.segmentation.optimal import OptimalCut, optimal_cut
-from mstfilter.segmentation.proposal import TreeCutProposal
-from mstfilter.simulation.actions import play
-from mstfilter.simulation.families import FIRST_REPORTED_SEED, SceneFamily, scene_family
-from mstfilter.simulation.recorder import Scene
-from mstfilter.simulation.sensor import DepthSensor
+from mstfilter.completion import Extrude, arbitrate
+from mstfilter.scene import Clip, Frame
+from mstfilter.scoring import weighted_coverage
+from mstfilter.segmentation import OptimalCut, TreeCutProposal, optimal_cut
+from mstfilter.simulation import FIRST_REPORTED_SEED, DepthSensor, Scene, SceneFamily, play, scene_family
 
 FAMILIES = ("s1", "s2", "s3")
 SEEN = 150  # pixels at 640 x 480 from which an object counts as visible
@@ -186,7 +180,7 @@ def picture(folder: Path, small: dict[str, int]) -> None:
         for seed in (0, 1, 2):
             scene = Scene(replace(scene_family(name), **small), seed)
             shots.append(scene.see(0))
-        from mstfilter.simulation.actions import advance
+        from mstfilter.simulation import advance
 
         push = scene.choose(0)
         advance(scene.world, push, 0.0, 0.55 * push.seconds)

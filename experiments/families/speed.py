@@ -18,10 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mstfilter.simulation.actions import advance, finish
-from mstfilter.simulation.families import scene_family
-from mstfilter.simulation.recorder import TOLERANCE, Scene
-from mstfilter.simulation.renderer import Renderer
+from mstfilter.simulation import TOLERANCE, Renderer, Scene, advance, finish, scene_family
 
 HEADER = ("family", "seed", "frames", "kept_s", "full_s", "ratio", "sensor_s", "kept_cpu_s", "full_cpu_s")
 

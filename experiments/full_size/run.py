@@ -19,10 +19,8 @@ import tempfile
 from dataclasses import replace
 from pathlib import Path
 
-from mstfilter.simulation.families import scene_family
-from mstfilter.simulation.recorder import simulate
-from mstfilter.study.results import write_table
-from mstfilter.study.run_folder import RunFolder
+from mstfilter.simulation import scene_family, simulate
+from mstfilter.study import RunFolder, write_table
 
 HERE = Path(__file__).resolve().parent
 SIZE = ["n=5", "n_proposed=10", "update.eta=5"]

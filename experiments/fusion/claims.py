@@ -23,9 +23,9 @@ from pathlib import Path
 import numpy as np
 
 import mstfilter
-from mstfilter.fusion.claims import Claims
-from mstfilter.scene.recording import Recording
-from mstfilter.simulation.cache import cached_recording
+from mstfilter.fusion import Claims
+from mstfilter.scene import Recording
+from mstfilter.simulation import cached_recording
 
 CLEARED = (0.01, 0.03, 0.06, 1.0)
 VOTES = (0.4, 0.8, 1.0)

@@ -15,10 +15,9 @@ from pathlib import Path
 
 import numpy as np
 
-from mstfilter.fusion.free_space import FreeSpace
-from mstfilter.fusion.scene_memory import SceneMemory
-from mstfilter.scene.recording import Recording
-from mstfilter.simulation.cache import cached_recording
+from mstfilter.fusion import FreeSpace, SceneMemory
+from mstfilter.scene import Recording
+from mstfilter.simulation import cached_recording
 
 REACHES = (0.0, 0.03, 0.05, 0.1, 0.2)
 SMALL = {"width": 160, "height": 120, "n_actions": 1, "frames_per_clip": 8, "voxel_size": 0.02}

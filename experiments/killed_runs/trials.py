@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mstfilter.study.results import write_table
+from mstfilter.study import write_table
 
 HERE = Path(__file__).resolve().parent
 

@@ -6,9 +6,7 @@ import sys
 
 import numpy as np
 
-from mstfilter.smc.distributions import Normal
-from mstfilter.smc.filters import bootstrap
-from mstfilter.smc.state_space import StateSpaceModel
+from mstfilter.smc import Normal, StateSpaceModel, bootstrap
 
 MODEL = StateSpaceModel.of(Normal(0.0, 1.0), lambda x: Normal(0.9 * x, 0.6), lambda x: Normal(x, 0.4))
 

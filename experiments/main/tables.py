@@ -19,8 +19,7 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
-from mstfilter.study.results import StudyFolder, cost_columns, write_table
-from mstfilter.study.summary import ENDPOINT, Summary, summarise
+from mstfilter.study import ENDPOINT, StudyFolder, Summary, cost_columns, summarise, write_table
 
 Row = Mapping[str, Any]
 

@@ -18,17 +18,24 @@ import numpy as np
 from scipy import stats
 
 import mstfilter
-from mstfilter.oracles.miniature.calibration import DRAWS, rank, statistics, uniformity
-from mstfilter.oracles.miniature.exact import exact_filter
-from mstfilter.oracles.miniature.filters import bootstrap_filter, guided_filter
-from mstfilter.oracles.miniature.measures import MEASURES, class_weights, iid_population, measure
-from mstfilter.oracles.miniature.shrunk import shrink
-from mstfilter.oracles.miniature.weighting import ScoredFusion, balanced_filter
-from mstfilter.oracles.miniature.world import Miniature
-from mstfilter.smc.kept_weights import KeepWeights
-from mstfilter.smc.particle_filter import ParticleFilter
-from mstfilter.smc.resampling import Multinomial, Systematic
-from mstfilter.smc.resampling_optimal import FearnheadClifford
+from mstfilter.oracles import (
+    DRAWS,
+    MEASURES,
+    Miniature,
+    ScoredFusion,
+    balanced_filter,
+    bootstrap_filter,
+    class_weights,
+    exact_filter,
+    guided_filter,
+    iid_population,
+    measure,
+    rank,
+    shrink,
+    statistics,
+    uniformity,
+)
+from mstfilter.smc import FearnheadClifford, KeepWeights, Multinomial, ParticleFilter, Systematic
 
 HERE = Path(__file__).resolve().parent
 WORLDS = {"shelf": Miniature((3, 2)), "row": Miniature((6, 1))}

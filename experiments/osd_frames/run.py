@@ -24,19 +24,23 @@ import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from mstfilter.scene.camera import Camera
-from mstfilter.scene.frame import Frame
-from mstfilter.scene.quality import weighted_coverage
-from mstfilter.segmentation.boundary import ColourDepthBoundary
-from mstfilter.segmentation.gibbs import ExactCuts
-from mstfilter.segmentation.interfaces import CutSampler, TreeBuilder
-from mstfilter.segmentation.learned_tree import LearnedTree
-from mstfilter.segmentation.mh import MetropolisHastingsCuts
-from mstfilter.segmentation.optimal import optimal_cut
-from mstfilter.segmentation.segments import ObjectRule, Segments
-from mstfilter.segmentation.tree import Tree
-from mstfilter.segmentation.ucm import UcmTree
-from mstfilter.segmentation.value import MergeLogOdds, SceneCutObjectness
+from mstfilter.scene import Camera, Frame
+from mstfilter.scoring import weighted_coverage
+from mstfilter.segmentation import (
+    ColourDepthBoundary,
+    CutSampler,
+    ExactCuts,
+    LearnedTree,
+    MergeLogOdds,
+    MetropolisHastingsCuts,
+    ObjectRule,
+    SceneCutObjectness,
+    Segments,
+    Tree,
+    TreeBuilder,
+    UcmTree,
+    optimal_cut,
+)
 
 HERE = Path(__file__).resolve().parent
 SHARED = Path(os.environ.get("MSTFILTER_SHARED", HERE.parents[2] / "shared"))

@@ -12,11 +12,8 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from mstfilter.report.cards import close_up
-from mstfilter.report.palette import Colour
-from mstfilter.report.pictures import voxel_picture
-from mstfilter.scene.camera import Camera
-from mstfilter.scene.voxels import VoxelGrid
+from mstfilter.report import Colour, close_up, voxel_picture
+from mstfilter.scene import Camera, VoxelGrid
 
 PAPER, INK, MUTED, LINE = "#fcfcfa", "#1d2126", "#646b74", "#d6d7d4"
 BLUE, ORANGE, FLOOR = "#336fb9", "#ee9138", "#b26a1c"

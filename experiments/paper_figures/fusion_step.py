@@ -18,9 +18,8 @@ from r1 import NOTICE, Particles, folder
 
 from mstfilter.presets import load_config
 from mstfilter.registry import build
-from mstfilter.report.palette import colour
-from mstfilter.report.pictures import viewpoint
-from mstfilter.scene.floors import components, one_blob
+from mstfilter.report import colour, viewpoint
+from mstfilter.scoring import components, one_blob
 
 ETA = 5
 PRESETS = ("authors", "paper", "mst")

@@ -11,11 +11,9 @@ from pathlib import Path
 import numpy as np
 from canvas import crop, page, save, show, voxels
 
-from mstfilter.report.palette import colour
-from mstfilter.report.pictures import overlay, viewpoint
-from mstfilter.scene.object_status import MIN_PIXELS
-from mstfilter.simulation.families import scene_family
-from mstfilter.simulation.recorder import Scene
+from mstfilter.report import colour, overlay, viewpoint
+from mstfilter.scoring import MIN_PIXELS
+from mstfilter.simulation import Scene, scene_family
 
 FAMILIES = ("s1", "s2", "s3")
 SEED = 0

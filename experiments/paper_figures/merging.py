@@ -15,14 +15,22 @@ from canvas import INK, MUTED, page, save, show, voxels, write_csv
 from matplotlib.axes import Axes
 from r1 import NOTICE, Particles, folder
 
-from mstfilter.fusion.conflict_graph import PREDICTED, PROPOSED, ConflictGraph, conflict_graph
-from mstfilter.fusion.crossover import Crossover, Draw
-from mstfilter.fusion.merging import merge_probability
-from mstfilter.fusion.structure import OneSideLast, RandomOrder, SpanningTree, Structure
+from mstfilter.fusion import (
+    PREDICTED,
+    PROPOSED,
+    ConflictGraph,
+    Crossover,
+    Draw,
+    OneSideLast,
+    RandomOrder,
+    SpanningTree,
+    Structure,
+    conflict_graph,
+    merge_probability,
+)
 from mstfilter.presets import load_config
 from mstfilter.registry import build
-from mstfilter.report.palette import Colour
-from mstfilter.report.pictures import viewpoint
+from mstfilter.report import Colour, viewpoint
 
 SAMPLE, PREDICTION = 2, 2  # the pair with the fewest conflicts of those that the authors' program kept
 SEED = 0

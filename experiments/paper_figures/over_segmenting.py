@@ -19,13 +19,10 @@ from matplotlib.axes import Axes
 from scipy import stats
 
 import mstfilter
-from mstfilter.scene.frame import Frame
-from mstfilter.scene.quality import weighted_coverage
-from mstfilter.scene.recording import Recording
-from mstfilter.segmentation.interfaces import CutValue
-from mstfilter.segmentation.tree import Tree
-from mstfilter.segmentation.value import MergeLogOdds
-from mstfilter.simulation.cache import cached_recording
+from mstfilter.scene import Frame, Recording
+from mstfilter.scoring import weighted_coverage
+from mstfilter.segmentation import CutValue, MergeLogOdds, Tree
+from mstfilter.simulation import cached_recording
 
 SHIFT = 5.0
 FAMILY, SEEDS = "s1", range(8)

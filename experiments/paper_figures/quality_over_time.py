@@ -10,10 +10,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from mstfilter.errors import InputError
-from mstfilter.report import study_figures
-from mstfilter.report.palette import colour, hexadecimal
-from mstfilter.report.svg import SERIES
-from mstfilter.study.results import StudyFolder
+from mstfilter.report import SERIES, colour, hexadecimal, study_figures
+from mstfilter.study import StudyFolder
 
 PAGE = 'xmlns="http://www.w3.org/2000/svg" style="background:var(--paper);font-family:sans-serif"'
 

@@ -13,8 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from mstfilter.scene.quality import weighted_coverage
-from mstfilter.scene.voxels import Hypothesis, VoxelGrid
+from mstfilter.scene import Hypothesis, VoxelGrid
+from mstfilter.scoring import weighted_coverage
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 

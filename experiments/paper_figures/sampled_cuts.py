@@ -17,14 +17,10 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 
 import mstfilter
-from mstfilter.report.palette import GREY, Colour, colour
-from mstfilter.report.pictures import overlay
-from mstfilter.scene.frame import Frame
-from mstfilter.segmentation.optimal import optimal_cut
-from mstfilter.segmentation.segments import Segments
-from mstfilter.segmentation.tree import Tree
-from mstfilter.simulation.families import scene_family
-from mstfilter.simulation.recorder import Scene
+from mstfilter.report import GREY, Colour, colour, overlay
+from mstfilter.scene import Frame
+from mstfilter.segmentation import Segments, Tree, optimal_cut
+from mstfilter.simulation import Scene, scene_family
 
 FAMILY, SEED = "s2", 0
 LEAST = -6.0

@@ -18,15 +18,11 @@ from matplotlib.patches import Rectangle
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from mstfilter.presets import load_config
-from mstfilter.report.identities import TRUTH, Identities, by_weight, identity_colours
-from mstfilter.report.pictures import viewpoint
-from mstfilter.scene.camera import Camera
-from mstfilter.scene.object_status import object_status
-from mstfilter.scene.quality import overlap
-from mstfilter.scene.recording import Recording
-from mstfilter.simulation.cache import cached_recording
-from mstfilter.study.run import execute
-from mstfilter.study.run_folder import RunFolder
+from mstfilter.report import TRUTH, Identities, by_weight, identity_colours, viewpoint
+from mstfilter.scene import Camera, Recording
+from mstfilter.scoring import object_status, overlap
+from mstfilter.simulation import cached_recording
+from mstfilter.study import RunFolder, execute
 
 #: The scene of the figures `initial` and `sampled_cuts`.
 FAMILY, SEED = "s2", 0

@@ -17,15 +17,11 @@ from pathlib import Path
 import numpy as np
 
 from mstfilter.presets import load_config
-from mstfilter.report.identities import identity_colours
-from mstfilter.report.pictures import overlay, viewpoint, voxel_picture
-from mstfilter.scene.images import write_image
-from mstfilter.scene.quality import weighted_coverage
-from mstfilter.scene.rendering import project
-from mstfilter.simulation.families import scene_family
-from mstfilter.simulation.recorder import simulate
-from mstfilter.study.run import execute
-from mstfilter.study.run_folder import RunFolder
+from mstfilter.report import identity_colours, overlay, viewpoint, voxel_picture
+from mstfilter.scene import project, write_image
+from mstfilter.scoring import weighted_coverage
+from mstfilter.simulation import scene_family, simulate
+from mstfilter.study import RunFolder, execute
 
 WIDTH, HEIGHT, GAP = 400, 300, 10
 SMALL = {"width": 160, "height": 120, "n_actions": 1, "frames_per_clip": 8, "voxel_size": 0.02}

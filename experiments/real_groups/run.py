@@ -23,15 +23,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from mstfilter.formats import open_paired
 from mstfilter.presets import preset
-from mstfilter.scene.formats.paired_images import open_paired
-from mstfilter.scene.images import read_labels
-from mstfilter.scene.quality import weighted_coverage
-from mstfilter.scene.recording import Recording
-from mstfilter.scene.rendering import project
-from mstfilter.smc.particle_filter import ParticleFilter, State
-from mstfilter.study.results import write_table
-from mstfilter.study.statistics import Difference, adjusted, compare
+from mstfilter.scene import Recording, project, read_labels
+from mstfilter.scoring import weighted_coverage
+from mstfilter.smc import ParticleFilter, State
+from mstfilter.study import Difference, adjusted, compare, write_table
 
 HERE = Path(__file__).resolve().parent
 SHARED = Path(os.environ.get("MSTFILTER_SHARED", HERE.parents[2] / "shared"))

@@ -15,22 +15,15 @@ from worlds import World, branching
 
 import mstfilter
 from mstfilter.errors import InputError
-from mstfilter.fusion.free_space import NoFreeSpace
-from mstfilter.fusion.similarity import SameSegmentation, WeightedCoverage
+from mstfilter.fusion import NoFreeSpace, SameSegmentation, WeightedCoverage
 from mstfilter.presets import load_config
 from mstfilter.registry import build
-from mstfilter.scene.camera import Camera
-from mstfilter.scene.clip import Clip
-from mstfilter.scene.frame import Frame
-from mstfilter.scene.quality import weighted_coverage
-from mstfilter.scene.voxels import Hypothesis, VoxelGrid
-from mstfilter.segmentation.evidence import BoundaryAgreement
-from mstfilter.simulation.families import scene_family
-from mstfilter.simulation.recorder import simulate
-from mstfilter.smc.interfaces import Resampler
-from mstfilter.smc.population import Population
-from mstfilter.smc.resampling import Systematic
-from mstfilter.tracking.evidence import MotionAgreement
+from mstfilter.scene import Camera, Clip, Frame, Hypothesis, VoxelGrid
+from mstfilter.scoring import weighted_coverage
+from mstfilter.segmentation import BoundaryAgreement
+from mstfilter.simulation import scene_family, simulate
+from mstfilter.smc import Population, Resampler, Systematic
+from mstfilter.tracking import MotionAgreement
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,9 +20,7 @@ from scipy import stats
 from worlds import World, branching, plain, worlds
 
 from mstfilter.errors import InputError
-from mstfilter.smc.particle_filter import ParticleFilter
-from mstfilter.smc.population import Population
-from mstfilter.smc.similarity import Exact, Gaussian
+from mstfilter.smc import Exact, Gaussian, ParticleFilter, Population
 
 HERE = Path(__file__).resolve().parent
 Row = dict[str, object]

@@ -7,16 +7,26 @@ from typing import Any
 
 import numpy as np
 
-from mstfilter.smc.interfaces import Resampler
-from mstfilter.smc.kept_weights import KeepWeights
-from mstfilter.smc.resampling import Multinomial, Residual, Stratified, Systematic
-from mstfilter.smc.resampling_clusters import ClusterStratified
-from mstfilter.smc.resampling_dpp import KDpp
-from mstfilter.smc.resampling_greedy import GreedyDiverse
-from mstfilter.smc.resampling_optimal import FearnheadClifford
-from mstfilter.smc.resampling_rounding import Killing, ResidualSystematic, Ssp
-from mstfilter.smc.resampling_wrappers import Coalesced, Shuffled, Tempered
-from mstfilter.smc.similarity import Equivalence, Similarity
+from mstfilter.smc import (
+    ClusterStratified,
+    Coalesced,
+    Equivalence,
+    FearnheadClifford,
+    GreedyDiverse,
+    KDpp,
+    KeepWeights,
+    Killing,
+    Multinomial,
+    Resampler,
+    Residual,
+    ResidualSystematic,
+    Shuffled,
+    Similarity,
+    Ssp,
+    Stratified,
+    Systematic,
+    Tempered,
+)
 
 BASE = "systematic"  # what all others are compared with
 

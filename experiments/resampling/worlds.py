@@ -10,19 +10,24 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
-from mstfilter.fusion.similarity import SameSegmentation, WeightedCoverage
-from mstfilter.oracles.miniature.exact import exact_filter
-from mstfilter.oracles.miniature.filters import bootstrap_filter
-from mstfilter.oracles.miniature.measures import class_weights
-from mstfilter.oracles.miniature.world import Miniature
-from mstfilter.smc.branching import Branching
-from mstfilter.smc.distributions import Normal, Student
-from mstfilter.smc.interfaces import Resampler
-from mstfilter.smc.particle_filter import ParticleFilter
-from mstfilter.smc.population import Population
-from mstfilter.smc.resampling import EssBelow, Never
-from mstfilter.smc.similarity import Equivalence, Exact, Gaussian, Similarity
-from mstfilter.smc.state_space import StateSpaceModel, bootstrap
+from mstfilter.fusion import SameSegmentation, WeightedCoverage
+from mstfilter.oracles import Miniature, bootstrap_filter, class_weights, exact_filter
+from mstfilter.smc import (
+    Branching,
+    Equivalence,
+    EssBelow,
+    Exact,
+    Gaussian,
+    Never,
+    Normal,
+    ParticleFilter,
+    Population,
+    Resampler,
+    Similarity,
+    StateSpaceModel,
+    Student,
+    bootstrap,
+)
 
 BRANCHES = 4
 

@@ -103,11 +103,10 @@ def measure(case: Case) -> dict[str, Any]:
     import cv2
 
     import mstfilter
-    from mstfilter.scene.recording import Recording
-    from mstfilter.scene.voxels import VoxelGrid
-    from mstfilter.simulation.cache import cached_recording
+    from mstfilter.scene import Recording, VoxelGrid
+    from mstfilter.simulation import cached_recording
     from mstfilter.smc import watch
-    from mstfilter.study.memory import peak_megabytes, reset_peak
+    from mstfilter.study import peak_megabytes, reset_peak
 
     cv2.setNumThreads(1)
     watch.time = SimpleNamespace(perf_counter=time.process_time)  # the parts of a step in processor seconds
@@ -202,8 +201,8 @@ def main() -> None:
         with target.open(newline="") as file:
             known = {r["case"]: r for r in csv.DictReader(file)}
     wanted = cases(options.smoke)
-    from mstfilter.simulation.cache import cached_recording
-    from mstfilter.study.results import write_table
+    from mstfilter.simulation import cached_recording
+    from mstfilter.study import write_table
 
     for factor, chosen in wanted.items():
         for case in chosen:

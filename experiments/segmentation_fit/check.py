@@ -15,16 +15,20 @@ from pathlib import Path
 import numpy as np
 from scenes import CHECKED_SEEDS, first_pause
 
-from mstfilter.completion.extrude import Extrude
-from mstfilter.scene.clip import Clip
-from mstfilter.scene.quality import weighted_coverage
-from mstfilter.segmentation.learned_tree import LearnedTree
-from mstfilter.segmentation.mh import MetropolisHastingsCuts
-from mstfilter.segmentation.optimal import OptimalCut, optimal_cut
-from mstfilter.segmentation.proposal import TreeCutProposal
-from mstfilter.segmentation.ucm import UcmTree
-from mstfilter.segmentation.value import MergeLogOdds, SceneCutObjectness
-from mstfilter.simulation.families import SCENE_FAMILIES
+from mstfilter.completion import Extrude
+from mstfilter.scene import Clip
+from mstfilter.scoring import weighted_coverage
+from mstfilter.segmentation import (
+    LearnedTree,
+    MergeLogOdds,
+    MetropolisHastingsCuts,
+    OptimalCut,
+    SceneCutObjectness,
+    TreeCutProposal,
+    UcmTree,
+    optimal_cut,
+)
+from mstfilter.simulation import SCENE_FAMILIES
 
 OLD = {"tree": UcmTree(), "value": SceneCutObjectness()}
 NEW = {"tree": LearnedTree(), "value": MergeLogOdds()}
@@ -73,7 +77,7 @@ def main(out: Path, smoke: bool) -> None:
 
 
 def _true_masks(pause) -> tuple[float, ...]:
-    from mstfilter.completion.arbitration import arbitrate
+    from mstfilter.completion import arbitrate
 
     masks = [pause.image == k for k in range(1, int(pause.image.max()) + 1) if (pause.image == k).any()]
     completions = Extrude().complete(np.random.default_rng(0), pause.frame, masks, pause.grid)

@@ -19,12 +19,16 @@ import numpy as np
 from scenes import FITTED, FITTED_SEEDS, first_pause
 from scipy.optimize import minimize
 
-from mstfilter.segmentation import join_weights
-from mstfilter.segmentation.agglomerate import Agglomeration
-from mstfilter.segmentation.boundary import ColourDepthBoundary
-from mstfilter.segmentation.joins import FEATURES, features
-from mstfilter.segmentation.learned_tree import LearnedTree
-from mstfilter.segmentation.regions import REGION, Regions
+from mstfilter.segmentation import (
+    FEATURES,
+    REGION,
+    Agglomeration,
+    ColourDepthBoundary,
+    LearnedTree,
+    Regions,
+    features,
+    join_weights,
+)
 
 ROUNDS = 3
 PURE = 0.8  # regions that mix objects teach nothing

@@ -6,11 +6,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mstfilter.scene.camera import Camera
-from mstfilter.scene.frame import Frame
-from mstfilter.scene.voxels import VoxelGrid
-from mstfilter.simulation.families import SCENE_FAMILIES, SceneFamily
-from mstfilter.simulation.recorder import Scene
+from mstfilter.scene import Camera, Frame, VoxelGrid
+from mstfilter.simulation import SCENE_FAMILIES, Scene, SceneFamily
 
 _TABLE, _DEMO = SCENE_FAMILIES["table"], SCENE_FAMILIES["demo"]
 

@@ -13,11 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from mstfilter.simulation.cache import cache_folder
-from mstfilter.study.config import study_of
-from mstfilter.study.local import Local
-from mstfilter.study.results import write_table
-from mstfilter.study.study import run_study
+from mstfilter.simulation import cache_folder
+from mstfilter.study import Local, run_study, study_of, write_table
 
 HERE = Path(__file__).parent
 ARMS = ["mst", "paper"]

@@ -22,10 +22,8 @@ from pathlib import Path
 
 import psutil
 
-from mstfilter.simulation.cache import cached_recording
-from mstfilter.study.config import study_of
-from mstfilter.study.local import Local
-from mstfilter.study.study import run_study
+from mstfilter.simulation import cached_recording
+from mstfilter.study import Local, run_study, study_of
 
 HERE = Path(__file__).parent
 SCENE = {"width": 160, "height": 120, "n_actions": 1, "frames_per_clip": 8, "voxel_size": 0.02}

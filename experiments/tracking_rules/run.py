@@ -14,17 +14,20 @@ from pathlib import Path
 
 import numpy as np
 
-from mstfilter.scene.voxels import Hypothesis
-from mstfilter.simulation.families import scene_family
-from mstfilter.simulation.recorder import simulate
-from mstfilter.smc.population import Population
-from mstfilter.study.results import write_table
-from mstfilter.tracking.flow import DenseFlow
-from mstfilter.tracking.mst_rule import MstRule
-from mstfilter.tracking.rules import AuthorsRule, PaperRule
-from mstfilter.tracking.static import StaticTest
-from mstfilter.tracking.transition import IdentityTransition, TrackingTransition
-from mstfilter.tracking.warp import Warp
+from mstfilter.scene import Hypothesis
+from mstfilter.simulation import scene_family, simulate
+from mstfilter.smc import Population
+from mstfilter.study import write_table
+from mstfilter.tracking import (
+    AuthorsRule,
+    DenseFlow,
+    IdentityTransition,
+    MstRule,
+    PaperRule,
+    StaticTest,
+    TrackingTransition,
+    Warp,
+)
 
 HERE = Path(__file__).resolve().parent
 SMALL = {"width": 160, "height": 120, "n_actions": 1, "frames_per_clip": 8, "voxel_size": 0.02}

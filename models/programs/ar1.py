@@ -9,8 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from mstfilter.smc.distributions import Normal
-from mstfilter.smc.programs import Program, observe, sample
+from mstfilter.smc import Normal, Program, observe, sample
 
 R, S, Q = 0.9, 0.6, 0.4
 GAIN = S**2 / (S**2 + Q**2)

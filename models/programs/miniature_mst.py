@@ -11,11 +11,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from mstfilter.oracles.miniature.exact import exact_filter
-from mstfilter.oracles.miniature.measures import total_variation
-from mstfilter.oracles.miniature.world import Glance, Miniature
-from mstfilter.smc.distributions import Bernoulli, Categorical
-from mstfilter.smc.programs import Program, observe, sample
+from mstfilter.oracles import Glance, Miniature, exact_filter, total_variation
+from mstfilter.smc import Bernoulli, Categorical, Program, observe, sample
 
 WORLD = Miniature(shape=(3, 2))
 

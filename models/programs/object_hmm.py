@@ -11,8 +11,7 @@ from __future__ import annotations
 import numpy as np
 from scipy import stats
 
-from mstfilter.smc.distributions import Categorical
-from mstfilter.smc.programs import Program, observe, per_particle, sample
+from mstfilter.smc import Categorical, Program, observe, per_particle, sample
 
 COLOURS = ("red", "green", "blue")
 SEEN = 0.8

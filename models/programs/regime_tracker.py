@@ -10,8 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from mstfilter.smc.distributions import Normal, Uniform
-from mstfilter.smc.programs import Program, observe, sample, switch
+from mstfilter.smc import Normal, Program, Uniform, observe, sample, switch
 
 STEP, NOISE = 1.0, 0.5
 TO_MANOEUVRE = np.array([0.1, 0.6])  # from drifting, from manoeuvring

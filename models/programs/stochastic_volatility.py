@@ -9,8 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from mstfilter.smc.distributions import Normal, Student
-from mstfilter.smc.programs import Program, observe, sample
+from mstfilter.smc import Normal, Program, Student, observe, sample
 
 M, R, S, DF = -1.0, 0.97, 0.2, 8.0
 

@@ -24,21 +24,11 @@ import numpy as np
 
 from mstfilter.baselines.volumes import ObjectVolume
 from mstfilter.errors import InputError
-from mstfilter.fusion.free_space import FreeSpace, Projection
-from mstfilter.scene.clip import Clip
-from mstfilter.scene.depth_noise import depth_sigma
-from mstfilter.scene.frame import Frame
-from mstfilter.scene.quality import overlap
-from mstfilter.scene.rendering import project
-from mstfilter.scene.voxels import Hypothesis, ObjectRecord, VoxelGrid
-from mstfilter.smc.interfaces import Update
-from mstfilter.smc.population import Population
-from mstfilter.smc.updates import union
-from mstfilter.tracking.flow import DenseFlow
-from mstfilter.tracking.refine import refine
-from mstfilter.tracking.rigid import Array, apply
-from mstfilter.tracking.segments import Segment, segments_of
-from mstfilter.tracking.track import Track
+from mstfilter.fusion import FreeSpace, Projection
+from mstfilter.scene import Clip, Frame, Hypothesis, ObjectRecord, VoxelGrid, depth_sigma, project
+from mstfilter.scoring import overlap
+from mstfilter.smc import Population, Update, union
+from mstfilter.tracking import Array, DenseFlow, Segment, Track, apply, refine, segments_of
 
 __all__ = ["ObjectFusion"]
 

@@ -16,17 +16,11 @@ from typing import ClassVar
 
 import numpy as np
 
-from mstfilter.completion.completer import Completer
-from mstfilter.completion.extrude import Extrude
-from mstfilter.scene.clip import Clip
-from mstfilter.scene.floors import components, one_blob
-from mstfilter.scene.frame import Frame
-from mstfilter.scene.voxels import Hypothesis
-from mstfilter.segmentation.proposal import TreeCutProposal, hypothesis_of
-from mstfilter.segmentation.segments import ObjectRule
-from mstfilter.smc.interfaces import Proposal
-from mstfilter.smc.population import Population
-from mstfilter.smc.streams import child
+from mstfilter.completion import Completer, Extrude
+from mstfilter.scene import Clip, Frame, Hypothesis
+from mstfilter.scoring import components, one_blob
+from mstfilter.segmentation import ObjectRule, TreeCutProposal, hypothesis_of
+from mstfilter.smc import Population, Proposal, child
 
 __all__ = ["FirstPause", "ImageComponents", "OccupiedComponents", "OneBlob"]
 

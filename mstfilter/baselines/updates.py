@@ -15,12 +15,9 @@ from typing import ClassVar
 import numpy as np
 
 from mstfilter.errors import InputError
-from mstfilter.fusion.free_space import SMALLEST_QUALITY, FreeSpace, Projection
-from mstfilter.fusion.update import FusionUpdate
-from mstfilter.scene.clip import Clip
-from mstfilter.smc.interfaces import Update
-from mstfilter.smc.population import Population
-from mstfilter.smc.updates import union
+from mstfilter.fusion import SMALLEST_QUALITY, FreeSpace, FusionUpdate, Projection
+from mstfilter.scene import Clip
+from mstfilter.smc import Population, Update, union
 
 __all__ = ["SamplesOnly", "TrackingOnly", "Union"]
 

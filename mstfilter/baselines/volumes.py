@@ -14,9 +14,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mstfilter.scene.frame import Frame
-from mstfilter.scene.voxels import VoxelGrid
-from mstfilter.tracking.rigid import apply
+from mstfilter.scene import Frame, VoxelGrid
+from mstfilter.tracking import apply
 
 __all__ = ["ObjectVolume"]
 

@@ -41,9 +41,7 @@ def check(
     """Test whether a component keeps what its interface promises, and say in words what it does not."""
     from mstfilter import registry
     from mstfilter.presets import settings
-    from mstfilter.testing import verify
-    from mstfilter.testing.properties import FALSE_ALARM
-    from mstfilter.testing.starters import example_of
+    from mstfilter.testing import FALSE_ALARM, example_of, verify
 
     kind, _, name = ("", "", component) if ".py:" in component else component.partition(".")
     if ".py:" not in component and kind not in registry.COMPONENTS:
@@ -83,7 +81,7 @@ def new(
     path: Annotated[Path, typer.Argument(help="Python file to make, for example mine.py.")],
 ) -> None:
     """Write a commented component of your own that works, and its test."""
-    from mstfilter.testing.starters import write_starter
+    from mstfilter.testing import write_starter
 
     file, test = write_starter(kind, path)
     print(f"component   {file}")
@@ -103,7 +101,7 @@ def _lines(kind: str) -> Iterator[str]:
             yield f"{name:<20}{tomllib.loads(find_preset(name).read_text()).get('description', '')}"
         return
     if kind == "families":
-        from mstfilter.simulation.families import SCENE_FAMILIES
+        from mstfilter.simulation import SCENE_FAMILIES
 
         for name, f in SCENE_FAMILIES.items():
             objects = f"{f.n_objects_min}-{f.n_objects_max}" if f.n_objects_min < f.n_objects_max else f.n_objects_max

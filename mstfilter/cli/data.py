@@ -24,7 +24,7 @@ def convert(
     frames: Annotated[str, typer.Option(help="Frames of a folder of pairs, separated by commas.")] = "",
 ) -> None:
     """Write data of another format as a recording. Stopped or failed, it leaves nothing behind."""
-    from mstfilter.scene.formats.writer import check_writable, save
+    from mstfilter.formats import check_writable, save
 
     check_writable(out)
     recording = open_recording(source, format, option, pauses, frames)
@@ -52,7 +52,7 @@ def quality(
     """Score the hypotheses of a run against the truth, beside trivial baselines."""
     from statistics import fmean
 
-    from mstfilter.study.scoring import read_estimate, read_truth, score, write_csv
+    from mstfilter.study import read_estimate, read_truth, score, write_csv
 
     volumes = truth.is_file() and truth.suffix in (".npz", ".npy")
     known = truth if volumes else open_recording(truth, format, option, "")

@@ -53,7 +53,7 @@ def demo(
     import shutil
 
     from mstfilter.presets import load_config
-    from mstfilter.scene.recording import Recording
+    from mstfilter.scene import Recording
 
     if out.exists() and not out.is_dir():
         raise InputError(f"{out} is a file, expected a folder for the demo")
@@ -91,7 +91,7 @@ def report(
 ) -> None:
     """Write the report of a run or a study, finished or not."""
     if (run / "study.json").is_file():
-        from mstfilter.report.study import write_study_report
+        from mstfilter.report import write_study_report
 
         if export is not None:
             raise InputError(f"{run} is a study, only runs can be exported", f"export one of {run / 'runs'}")
@@ -99,16 +99,15 @@ def report(
         return
     _report(run, out)
     if export is not None:
-        from mstfilter.report.export import export_run
-        from mstfilter.study.run_folder import RunFolder
+        from mstfilter.report import export_run
+        from mstfilter.study import RunFolder
 
         export_run(RunFolder.open(run), export)
         print(f"hypotheses  {export}")
 
 
 def _simulate(family: str, out: Path, seed: int) -> None:
-    from mstfilter.simulation.families import scene_family
-    from mstfilter.simulation.recorder import simulate
+    from mstfilter.simulation import scene_family, simulate
 
     chosen = scene_family(family)
     with bar("simulate") as advance:
@@ -117,7 +116,7 @@ def _simulate(family: str, out: Path, seed: int) -> None:
 
 
 def _execute(recording: Any, config: dict[str, Any], folder: Path, seed: int) -> None:
-    from mstfilter.study.run import execute
+    from mstfilter.study import execute
 
     with bar("filter") as advance:
         execute(recording, config, folder, seed, allow_files=True, progress=lambda p: advance(p.done, p.total))
@@ -125,7 +124,7 @@ def _execute(recording: Any, config: dict[str, Any], folder: Path, seed: int) ->
 
 
 def _report(run: Path, out: Path | None) -> None:
-    from mstfilter.report.html import write_report
-    from mstfilter.study.run_folder import RunFolder
+    from mstfilter.report import write_report
+    from mstfilter.study import RunFolder
 
     print(f"report      {write_report(RunFolder.open(run), out)}")

@@ -32,19 +32,16 @@ def study(
     ] = False,
 ) -> None:
     """Compare filters on many scenes. A study that was stopped goes on; what is done is never repeated."""
-    from mstfilter.study.config import load_study
-    from mstfilter.study.grid import check_names
+    from mstfilter.study import check_names, load_study
 
     wanted = load_study(config, smoke=smoke)
     check_names(wanted, overrides or ())  # a slip is answered before anything heavy is imported
-    from mstfilter.study.executors import Executor
-    from mstfilter.study.local import Local
-    from mstfilter.study.study import run_study
+    from mstfilter.study import Executor, Local, run_study
 
     folder = out or Path("studies") / f"{wanted.name}{'-smoke' if smoke else ''}"
     executor: Executor = Local(workers, wanted.tries, wanted.timeout_s, folder / "logs")
     if scheduler:
-        from mstfilter.study.cluster import Cluster
+        from mstfilter.study import Cluster
 
         executor = Cluster(scheduler, wanted.tries, wanted.timeout_s)
     with _shown() as progress:

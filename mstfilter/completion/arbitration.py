@@ -16,7 +16,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from mstfilter.completion.completer import Completion
-from mstfilter.scene.voxels import VoxelGrid
+from mstfilter.scene import VoxelGrid
 
 __all__ = ["arbitrate"]
 

@@ -21,12 +21,7 @@ from typing import ClassVar
 import numpy as np
 
 from mstfilter.errors import InputError
-from mstfilter.scene.arrays import component_key, content_key, read_only
-from mstfilter.scene.depth_noise import depth_sigma
-from mstfilter.scene.frame import Frame
-from mstfilter.scene.frame_geometry import frame_geometry
-from mstfilter.scene.memo import memo
-from mstfilter.scene.voxels import VoxelGrid
+from mstfilter.scene import Frame, VoxelGrid, component_key, content_key, depth_sigma, frame_geometry, memo, read_only
 
 __all__ = ["Completer", "Completion", "Evidence", "evidence"]
 

@@ -42,11 +42,8 @@ from mstfilter.fusion.information import (
 )
 from mstfilter.fusion.places import box_of, camera_of, flat_of, pixels_of, region_of, single, voxel_of
 from mstfilter.fusion.refinement import Refinement, refine
-from mstfilter.scene.camera import Camera
-from mstfilter.scene.rendering import project, render_hypothesis
-from mstfilter.scene.voxels import Hypothesis, VoxelGrid
-from mstfilter.smc.population import Population
-from mstfilter.smc.similarity import first_seen
+from mstfilter.scene import Camera, Hypothesis, VoxelGrid, project, render_hypothesis
+from mstfilter.smc import Population, first_seen
 
 __all__ = ["Belief"]
 

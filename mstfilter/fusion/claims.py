@@ -15,9 +15,7 @@ from typing import Literal
 import numpy as np
 
 from mstfilter.errors import InputError
-from mstfilter.scene.clip import Clip
-from mstfilter.scene.frame_geometry import frame_geometry
-from mstfilter.scene.voxels import Hypothesis
+from mstfilter.scene import Clip, Hypothesis, frame_geometry
 
 __all__ = ["Claims"]
 

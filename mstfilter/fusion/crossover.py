@@ -16,12 +16,12 @@ from typing import NamedTuple
 import numpy as np
 
 from mstfilter.errors import InputError
-from mstfilter.fusion.conflict_graph import PREDICTED, PROPOSED, Claimed, ConflictGraph, claimed, graph_of
+from mstfilter.fusion.conflicts import PREDICTED, PROPOSED, Claimed, ConflictGraph, claimed, graph_of
 from mstfilter.fusion.division import part_like, remember_like
 from mstfilter.fusion.merging import MergeRule, merge_probability
 from mstfilter.fusion.mode_filter import ModeFilter
 from mstfilter.fusion.structure import SpanningTree, Structure
-from mstfilter.scene.voxels import MAX_LABEL, Hypothesis, ObjectRecord, as_labels
+from mstfilter.scene import MAX_LABEL, Hypothesis, ObjectRecord, as_labels
 
 __all__ = ["Crossover", "Draw"]
 

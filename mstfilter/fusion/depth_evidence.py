@@ -22,15 +22,18 @@ from typing import NamedTuple
 import numpy as np
 
 from mstfilter.errors import InputError
-from mstfilter.scene.arrays import component_key
-from mstfilter.scene.camera import Camera
-from mstfilter.scene.clip import Clip
-from mstfilter.scene.depth_noise import depth_sigma
-from mstfilter.scene.evidence import Evidence
-from mstfilter.scene.frame import Frame
-from mstfilter.scene.memo import memo
-from mstfilter.scene.rendering import render_hypothesis
-from mstfilter.scene.voxels import Hypothesis, VoxelGrid
+from mstfilter.scene import (
+    Camera,
+    Clip,
+    Evidence,
+    Frame,
+    Hypothesis,
+    VoxelGrid,
+    component_key,
+    depth_sigma,
+    memo,
+    render_hypothesis,
+)
 
 __all__ = ["DepthAgreement"]
 

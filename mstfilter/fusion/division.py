@@ -15,12 +15,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial import cKDTree
 
-from mstfilter.fusion.conflict_graph import claimed, overlapping
-from mstfilter.scene.clip import Clip
-from mstfilter.scene.evidence import Division
-from mstfilter.scene.frame_geometry import frame_geometry
-from mstfilter.scene.rendering import project
-from mstfilter.scene.voxels import MAX_LABEL, Hypothesis, ObjectRecord
+from mstfilter.fusion.conflicts import claimed, overlapping
+from mstfilter.scene import MAX_LABEL, Clip, Division, Hypothesis, ObjectRecord, frame_geometry, project
 
 __all__ = ["NoDivision", "PartRule", "part_like", "remember_like", "take_apart"]
 

@@ -18,13 +18,17 @@ import numpy as np
 
 from mstfilter.errors import InputError
 from mstfilter.fusion.scene_memory import SceneMemory, Seen
-from mstfilter.scene.arrays import content_key, read_only
-from mstfilter.scene.clip import Clip
-from mstfilter.scene.depth_noise import depth_sigma
-from mstfilter.scene.frame import Frame
-from mstfilter.scene.frame_geometry import frame_geometry
-from mstfilter.scene.memo import memo
-from mstfilter.scene.voxels import Hypothesis, VoxelGrid
+from mstfilter.scene import (
+    Clip,
+    Frame,
+    Hypothesis,
+    VoxelGrid,
+    content_key,
+    depth_sigma,
+    frame_geometry,
+    memo,
+    read_only,
+)
 
 __all__ = ["SMALLEST_QUALITY", "FreeSpace", "NoFreeSpace", "Projection", "Voxels"]
 

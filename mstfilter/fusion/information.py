@@ -34,7 +34,7 @@ from scipy.optimize import linear_sum_assignment
 
 from mstfilter.errors import InputError
 from mstfilter.fusion.similarity import canonical
-from mstfilter.smc.similarity import first_seen
+from mstfilter.smc import first_seen
 
 __all__ = [
     "binary_entropy",

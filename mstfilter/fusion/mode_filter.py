@@ -16,7 +16,7 @@ from typing import Literal
 import numpy as np
 
 from mstfilter.errors import InputError
-from mstfilter.scene.voxels import as_labels
+from mstfilter.scene import as_labels
 
 __all__ = ["ModeFilter"]
 

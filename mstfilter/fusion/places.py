@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 
 from mstfilter.errors import InputError
-from mstfilter.scene.camera import Camera
-from mstfilter.scene.voxels import VoxelGrid
+from mstfilter.scene import Camera, VoxelGrid
 
 __all__ = ["box_of", "camera_of", "flat_of", "pixels_of", "region_of", "single", "voxel_of"]
 

@@ -16,11 +16,8 @@ from typing import ClassVar
 import numpy as np
 
 from mstfilter.fusion.free_space import SMALLEST_QUALITY, FreeSpace, Projection
-from mstfilter.scene.clip import Clip
-from mstfilter.smc.fields import number, part
-from mstfilter.smc.interfaces import Update
-from mstfilter.smc.population import Population
-from mstfilter.smc.updates import union
+from mstfilter.scene import Clip
+from mstfilter.smc import Population, Update, number, part, union
 
 __all__ = ["ProjectionUpdate"]
 

@@ -25,11 +25,7 @@ import numpy as np
 from scipy import ndimage
 
 from mstfilter.errors import InputError
-from mstfilter.scene.arrays import read_only
-from mstfilter.scene.clip import Clip
-from mstfilter.scene.frame import Frame
-from mstfilter.scene.memo import memo
-from mstfilter.scene.voxels import VoxelGrid
+from mstfilter.scene import Clip, Frame, VoxelGrid, memo, read_only
 
 __all__ = ["SceneMemory", "Seen"]
 

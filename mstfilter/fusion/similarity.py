@@ -15,10 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from mstfilter.errors import InputError
-from mstfilter.scene.clip import Clip
-from mstfilter.scene.evidence import Evidence
-from mstfilter.scene.voxels import Hypothesis
-from mstfilter.smc.similarity import Equivalence, Similarity, first_seen
+from mstfilter.scene import Clip, Evidence, Hypothesis
+from mstfilter.smc import Equivalence, Similarity, first_seen
 
 __all__ = ["Agreement", "SameSegmentation", "WeightedCoverage", "canonical"]
 
@@ -52,7 +50,7 @@ class SameSegmentation(Equivalence):
 
 @dataclass(frozen=True)
 class WeightedCoverage(Similarity):
-    """Quality of one hypothesis against the other (form ``objects`` of `mstfilter.scene.quality`), for all pairs.
+    """Quality of one hypothesis against the other (form ``objects`` of `mstfilter.scoring.quality`), for all pairs.
 
     Parameters
     ----------

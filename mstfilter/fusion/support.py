@@ -26,9 +26,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mstfilter.errors import InputError
-from mstfilter.scene.clip import Clip
-from mstfilter.scene.evidence import Evidence
-from mstfilter.scene.voxels import Hypothesis
+from mstfilter.scene import Clip, Evidence, Hypothesis
 
 __all__ = ["Stand", "Support", "stands"]
 

@@ -27,14 +27,8 @@ from mstfilter.fusion.claims import Claims
 from mstfilter.fusion.crossover import Crossover
 from mstfilter.fusion.division import NoDivision, PartRule, take_apart
 from mstfilter.fusion.free_space import SMALLEST_QUALITY, FreeSpace, Projection
-from mstfilter.scene.clip import Clip
-from mstfilter.scene.evidence import Division, Evidence
-from mstfilter.scene.voxels import Hypothesis, VoxelGrid
-from mstfilter.smc.interfaces import Update
-from mstfilter.smc.population import Candidates, Population
-from mstfilter.smc.resampling import Systematic
-from mstfilter.smc.streams import child, key_of
-from mstfilter.smc.updates import union
+from mstfilter.scene import Clip, Division, Evidence, Hypothesis, VoxelGrid
+from mstfilter.smc import Candidates, Population, Systematic, Update, child, key_of, union
 
 __all__ = ["FusionUpdate"]
 

@@ -15,19 +15,11 @@ from typing import ClassVar
 import numpy as np
 
 from mstfilter.errors import InputError
-from mstfilter.fusion.free_space import FreeSpace, Projection
+from mstfilter.fusion import FreeSpace, Projection
 from mstfilter.oracles.truth import UsesTruth
-from mstfilter.scene.clip import Clip
-from mstfilter.scene.evidence import Evidence
-from mstfilter.scene.frame import Frame
-from mstfilter.scene.frame_geometry import frame_geometry
-from mstfilter.scene.quality import Form, overlap, weighted_coverage
-from mstfilter.scene.rendering import render
-from mstfilter.scene.voxels import Hypothesis, ObjectRecord
-from mstfilter.smc.interfaces import Resampler, Update
-from mstfilter.smc.population import Candidates, Population
-from mstfilter.smc.streams import Key, key_of
-from mstfilter.smc.updates import union
+from mstfilter.scene import Clip, Evidence, Frame, Hypothesis, ObjectRecord, frame_geometry, render
+from mstfilter.scoring import Form, overlap, weighted_coverage
+from mstfilter.smc import Candidates, Key, Population, Resampler, Update, key_of, union
 
 __all__ = ["TrueBest", "TrueFreeSpace", "TrueFusion", "TrueQuality"]
 

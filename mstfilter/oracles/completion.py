@@ -15,13 +15,10 @@ from typing import ClassVar
 
 import numpy as np
 
-from mstfilter.completion.completer import Completer, Completion, Evidence, evidence
+from mstfilter.completion import Completer, Completion, Evidence, evidence
 from mstfilter.oracles.truth import Need, UsesTruth
-from mstfilter.scene.arrays import content_key, read_only
-from mstfilter.scene.frame import Frame
-from mstfilter.scene.memo import memo
-from mstfilter.scene.voxels import VoxelGrid
-from mstfilter.segmentation.segments import ObjectRule
+from mstfilter.scene import Frame, VoxelGrid, content_key, memo, read_only
+from mstfilter.segmentation import ObjectRule
 
 __all__ = ["TrueCompletion"]
 

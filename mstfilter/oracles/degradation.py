@@ -20,8 +20,8 @@ from functools import cache
 
 import numpy as np
 
-from mstfilter.scene.quality import weighted_coverage
-from mstfilter.smc.streams import child
+from mstfilter.scoring import weighted_coverage
+from mstfilter.smc import child
 
 __all__ = ["degrade"]
 

@@ -15,23 +15,14 @@ from typing import ClassVar, Literal
 
 import numpy as np
 
-from mstfilter.completion.completer import Completer
-from mstfilter.completion.extrude import Extrude
+from mstfilter.completion import Completer, Extrude
 from mstfilter.errors import InputError
 from mstfilter.oracles.degradation import degrade
 from mstfilter.oracles.truth import Need, UsesTruth
-from mstfilter.scene.clip import Clip
-from mstfilter.scene.frame import Frame
-from mstfilter.scene.object_status import MIN_PIXELS
-from mstfilter.scene.quality import weighted_coverage
-from mstfilter.scene.voxels import Hypothesis
-from mstfilter.segmentation.boundary import ColourDepthBoundary
-from mstfilter.segmentation.interfaces import BoundaryModel
-from mstfilter.segmentation.proposal import hypothesis_of
-from mstfilter.segmentation.segments import ObjectRule
-from mstfilter.smc.interfaces import Proposal
-from mstfilter.smc.population import Population
-from mstfilter.smc.streams import Key, child
+from mstfilter.scene import Clip, Frame, Hypothesis
+from mstfilter.scoring import MIN_PIXELS, weighted_coverage
+from mstfilter.segmentation import BoundaryModel, ColourDepthBoundary, ObjectRule, hypothesis_of
+from mstfilter.smc import Key, Population, Proposal, child
 
 __all__ = ["TrueBoundary", "TrueMasks"]
 

@@ -14,13 +14,10 @@ from typing import ClassVar
 import numpy as np
 
 from mstfilter.oracles.truth import Need, UsesTruth
-from mstfilter.scene.clip import Clip
-from mstfilter.scene.quality import overlap
-from mstfilter.scene.voxels import Hypothesis
-from mstfilter.smc.interfaces import Transition
-from mstfilter.smc.population import Population
-from mstfilter.tracking.rigid import Array, apply
-from mstfilter.tracking.warp import Warp
+from mstfilter.scene import Clip, Hypothesis
+from mstfilter.scoring import overlap
+from mstfilter.smc import Population, Transition
+from mstfilter.tracking import Array, Warp, apply
 
 __all__ = ["TrueMotions"]
 

@@ -20,8 +20,7 @@ from typing import Any, ClassVar, Literal, TypeVar
 import numpy as np
 
 from mstfilter.errors import InputError
-from mstfilter.scene.frame import Frame
-from mstfilter.scene.recording import Recording
+from mstfilter.scene import Frame, Recording
 
 __all__ = ["Need", "Truth", "UsesTruth", "bind_truth", "uses_truth"]
 

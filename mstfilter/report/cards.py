@@ -15,10 +15,8 @@ import numpy as np
 from mstfilter.report.identities import TRUTH, Identities, by_weight
 from mstfilter.report.palette import colour, hexadecimal
 from mstfilter.report.pictures import layer, png_bytes, voxel_picture
-from mstfilter.scene.camera import Camera
-from mstfilter.scene.rendering import project
-from mstfilter.scene.voxels import Hypothesis, VoxelGrid
-from mstfilter.study.run_folder import RunFolder
+from mstfilter.scene import Camera, Hypothesis, VoxelGrid, project
+from mstfilter.study import RunFolder
 
 __all__ = ["Card", "Tag", "cards_of_pause", "close_up", "data_uri", "truth_card"]
 

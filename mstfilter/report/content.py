@@ -13,9 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from mstfilter.scene.floors import components, one_blob
-from mstfilter.scene.quality import weighted_coverage
-from mstfilter.study.run_folder import RunFolder
+from mstfilter.scoring import components, one_blob, weighted_coverage
+from mstfilter.study import RunFolder
 
 __all__ = ["Numbers", "Step", "different", "numbers_of", "seconds_text"]
 

@@ -23,10 +23,8 @@ import numpy as np
 from mstfilter.errors import InputError
 from mstfilter.report.identities import identity_colours
 from mstfilter.report.palette import GREY, Colour, colour, hexadecimal
-from mstfilter.scene.images import write_image
-from mstfilter.scene.rendering import project
-from mstfilter.scene.voxels import Hypothesis
-from mstfilter.study.run_folder import RunFolder
+from mstfilter.scene import Hypothesis, project, write_image
+from mstfilter.study import RunFolder
 
 __all__ = ["export_label_images", "export_ply", "export_run", "surface"]
 

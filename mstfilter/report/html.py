@@ -21,7 +21,7 @@ from mstfilter.report.identities import identity_colours
 from mstfilter.report.page import render, write_page
 from mstfilter.report.pictures import jpeg_bytes, viewpoint
 from mstfilter.report.tables import counts, flatten, note_rows, shown
-from mstfilter.study.run_folder import RunFolder
+from mstfilter.study import RunFolder
 
 __all__ = ["write_report"]
 

@@ -19,9 +19,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from mstfilter.report.palette import Colour, colour
-from mstfilter.scene.quality import overlap
-from mstfilter.scene.voxels import Hypothesis
-from mstfilter.study.run_folder import RunFolder
+from mstfilter.scene import Hypothesis
+from mstfilter.scoring import overlap
+from mstfilter.study import RunFolder
 
 __all__ = ["Identities", "by_weight", "identity_colours"]
 

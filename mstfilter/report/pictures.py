@@ -15,10 +15,7 @@ from collections.abc import Iterable, Mapping
 import numpy as np
 
 from mstfilter.report.palette import GREY, Colour
-from mstfilter.scene.camera import Camera, look_at
-from mstfilter.scene.memo import memo
-from mstfilter.scene.rendering import render
-from mstfilter.scene.voxels import Hypothesis, VoxelGrid
+from mstfilter.scene import Camera, Hypothesis, VoxelGrid, look_at, memo, render
 
 __all__ = ["layer", "overlay", "png_bytes", "viewpoint", "voxel_picture"]
 

@@ -17,9 +17,7 @@ from mstfilter.report.content import seconds_text
 from mstfilter.report.page import render, write_page
 from mstfilter.report.study_figures import differences_figure, in_groups, time_figure
 from mstfilter.report.tables import flatten, shown
-from mstfilter.study.results import StudyFolder
-from mstfilter.study.statistics import CLAIM
-from mstfilter.study.summary import ENDPOINT, SLOPE, Summary
+from mstfilter.study import CLAIM, ENDPOINT, SLOPE, StudyFolder, Summary
 
 __all__ = ["write_study_report"]
 

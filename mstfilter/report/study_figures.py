@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mstfilter.report.svg import INK, LINE, MUTED, SERIES, new_figure, style, svg_text
-from mstfilter.study.summary import Compared
+from mstfilter.study import Compared
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from mstfilter.scene.arrays import content_key
-from mstfilter.scene.memo import Layer
+from mstfilter.scene.cache import Layer
 
 __all__ = ["DiskMemo", "Kind"]
 

@@ -124,7 +124,7 @@ class Recording:
     @classmethod
     def open(cls, path: str | Path) -> Recording:
         """Read a recording folder; images are read when they are looked at (see `check`)."""
-        from mstfilter.scene.formats.folder import open_folder
+        from mstfilter.formats import open_folder
 
         return open_folder(Path(path))
 

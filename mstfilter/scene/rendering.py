@@ -19,8 +19,8 @@ import numpy as np
 
 from mstfilter.errors import InputError
 from mstfilter.scene.arrays import read_only
+from mstfilter.scene.cache import memo
 from mstfilter.scene.camera import Camera
-from mstfilter.scene.memo import memo
 from mstfilter.scene.voxels import Hypothesis, VoxelGrid, as_labels
 
 __all__ = ["Rendering", "project", "render"]

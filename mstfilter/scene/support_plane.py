@@ -18,9 +18,9 @@ from scipy.spatial.transform import RigidTransform
 
 from mstfilter.errors import InputError
 from mstfilter.scene.arrays import read_only
+from mstfilter.scene.cache import memo
 from mstfilter.scene.camera import Camera
 from mstfilter.scene.frame import Frame
-from mstfilter.scene.memo import memo
 from mstfilter.scene.voxels import VoxelGrid
 
 __all__ = ["BASELINE", "SupportPlane", "disparity", "fit_support_plane", "table_residual", "workspace"]

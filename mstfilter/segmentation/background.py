@@ -7,8 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from mstfilter.scene.frame import Frame
-from mstfilter.scene.support_plane import fit_support_plane, table_residual
+from mstfilter.scene import Frame, fit_support_plane, table_residual
 
 __all__ = ["SENSOR_FOCAL", "above_table"]
 

@@ -15,8 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mstfilter.errors import InputError
-from mstfilter.scene.frame import Frame
-from mstfilter.scene.support_plane import BASELINE
+from mstfilter.scene import BASELINE, Frame
 from mstfilter.segmentation.background import SENSOR_FOCAL, above_table
 from mstfilter.segmentation.interfaces import BoundaryModel
 

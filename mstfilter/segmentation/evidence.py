@@ -19,13 +19,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mstfilter.scene.arrays import component_key
-from mstfilter.scene.clip import Clip
-from mstfilter.scene.evidence import Evidence
-from mstfilter.scene.frame import Frame
-from mstfilter.scene.memo import memo
-from mstfilter.scene.rendering import project
-from mstfilter.scene.voxels import Hypothesis
+from mstfilter.scene import Clip, Evidence, Frame, Hypothesis, component_key, memo, project
 from mstfilter.segmentation.boundary import ColourDepthBoundary
 from mstfilter.segmentation.interfaces import BoundaryModel, TreeBuilder
 from mstfilter.segmentation.ucm import UcmTree

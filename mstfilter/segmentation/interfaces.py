@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from mstfilter.scene.frame import Frame
+from mstfilter.scene import Frame
 from mstfilter.segmentation.tree import Tree
 
 __all__ = ["BoundaryModel", "CutSample", "CutSampler", "CutValue", "TreeBuilder"]

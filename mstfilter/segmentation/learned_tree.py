@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from mstfilter.errors import InputError
-from mstfilter.scene.frame import Frame
+from mstfilter.scene import Frame
 from mstfilter.segmentation.agglomerate import Agglomeration
 from mstfilter.segmentation.interfaces import TreeBuilder
 from mstfilter.segmentation.join_weights import JOIN_WEIGHTS

@@ -16,15 +16,9 @@ from typing import ClassVar
 
 import numpy as np
 
-from mstfilter.completion.arbitration import arbitrate
-from mstfilter.completion.completer import Completer, Completion
-from mstfilter.completion.extrude import Extrude
+from mstfilter.completion import Completer, Completion, Extrude, arbitrate
 from mstfilter.errors import InputError
-from mstfilter.scene.arrays import component_key
-from mstfilter.scene.clip import Clip
-from mstfilter.scene.frame import Frame
-from mstfilter.scene.memo import memo
-from mstfilter.scene.voxels import Hypothesis, ObjectRecord, VoxelGrid
+from mstfilter.scene import Clip, Frame, Hypothesis, ObjectRecord, VoxelGrid, component_key, memo
 from mstfilter.segmentation.boundary import ColourDepthBoundary
 from mstfilter.segmentation.interfaces import BoundaryModel, CutSampler, CutValue, TreeBuilder
 from mstfilter.segmentation.learned_tree import LearnedTree
@@ -33,9 +27,7 @@ from mstfilter.segmentation.optimal import optimal_cut
 from mstfilter.segmentation.segments import ObjectRule, Segments
 from mstfilter.segmentation.tree import Tree
 from mstfilter.segmentation.value import MergeLogOdds
-from mstfilter.smc.interfaces import Proposal
-from mstfilter.smc.population import Population
-from mstfilter.smc.streams import child
+from mstfilter.smc import Population, Proposal, child
 
 __all__ = ["TreeCutProposal", "hypothesis_of"]
 

@@ -10,9 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mstfilter.scene.camera import Camera
-from mstfilter.scene.frame import Frame
-from mstfilter.scene.support_plane import BASELINE, fit_support_plane
+from mstfilter.scene import BASELINE, Camera, Frame, fit_support_plane
 from mstfilter.segmentation.background import SENSOR_FOCAL, above_table
 from mstfilter.segmentation.boundary import fill_from_nearest
 

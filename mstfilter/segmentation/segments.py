@@ -10,8 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mstfilter.scene.frame import Frame
-from mstfilter.scene.voxels import VoxelGrid
+from mstfilter.scene import Frame, VoxelGrid
 from mstfilter.segmentation.background import above_table
 from mstfilter.segmentation.tree import Tree
 

@@ -23,7 +23,7 @@ from itertools import pairwise
 import numpy as np
 
 from mstfilter.errors import InputError
-from mstfilter.scene.arrays import content_key, read_only
+from mstfilter.scene import content_key, read_only
 
 __all__ = ["Tree"]
 

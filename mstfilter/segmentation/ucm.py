@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mstfilter.errors import InputError
-from mstfilter.scene.frame import Frame
+from mstfilter.scene import Frame
 from mstfilter.segmentation.interfaces import TreeBuilder
 from mstfilter.segmentation.tree import Tree
 

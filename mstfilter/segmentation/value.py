@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mstfilter.errors import InputError
-from mstfilter.scene.frame import Frame
+from mstfilter.scene import Frame
 from mstfilter.segmentation.background import above_table
 from mstfilter.segmentation.interfaces import CutValue
 from mstfilter.segmentation.tree import Tree

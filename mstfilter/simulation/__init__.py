@@ -10,3 +10,7 @@ What is missing, so that nobody is misled: camera motion, glossy and transparent
 between objects, articulated and soft objects, a hand. Depth noise, the projector's shadow and losses at edges are
 calibrated to real frames; within surfaces noise is not correlated from pixel to pixel.
 """
+
+from mstfilter.lazy import attach
+
+__getattr__, __dir__, __all__ = attach(__name__, __file__)

@@ -12,7 +12,7 @@ from typing import Literal
 import numpy as np
 
 from mstfilter.errors import InputError
-from mstfilter.scene.camera import Camera
+from mstfilter.scene import Camera
 from mstfilter.simulation.families import SceneFamily
 from mstfilter.simulation.shapes import Shape, draw_shape
 from mstfilter.simulation.textures import Skin, draw_skin

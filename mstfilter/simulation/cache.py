@@ -1,6 +1,6 @@
 """Simulated recordings kept on disk: made once, found again by the content of their recipe.
 
->>> from mstfilter.scene.recording import Recording
+>>> from mstfilter.scene import Recording
 >>> from mstfilter.simulation.cache import cached_recording
 >>> recording = Recording.open(cached_recording("s2", seed=7))  # doctest: +SKIP
 >>> small = cached_recording("s2", 7, width=160, height=120, n_actions=1)  # doctest: +SKIP

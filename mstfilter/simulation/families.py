@@ -16,8 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mstfilter.errors import InputError
-from mstfilter.scene.camera import Camera, look_at
-from mstfilter.scene.voxels import VoxelGrid
+from mstfilter.scene import Camera, VoxelGrid, look_at
 from mstfilter.simulation.pools import ANY, REPORTED, TUNING, Pool
 from mstfilter.simulation.shapes import FAMILIES
 

@@ -21,8 +21,8 @@ from typing import Any
 import numpy as np
 
 from mstfilter.errors import InputError
-from mstfilter.scene.formats.folder import RecordingWriter
-from mstfilter.scene.recording import Recording
+from mstfilter.formats import RecordingWriter
+from mstfilter.scene import Recording
 from mstfilter.simulation.actions import Effect, Push, advance, choose_push, effect, finish
 from mstfilter.simulation.arrangement import Things, arrange, draw_things
 from mstfilter.simulation.families import GENERATOR_VERSION, SceneFamily

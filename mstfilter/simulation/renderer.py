@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mstfilter.scene.camera import Camera
+from mstfilter.scene import Camera
 from mstfilter.simulation.bounds import Bounds
 from mstfilter.simulation.layer import Layer
 from mstfilter.simulation.light import CASTERS, LightMap

@@ -22,7 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mstfilter.errors import InputError
-from mstfilter.scene.depth_noise import SIGMA_AT_ONE_METRE
+from mstfilter.scene import SIGMA_AT_ONE_METRE
 
 __all__ = ["ColourSensor", "DepthSensor"]
 

@@ -1,7 +1,7 @@
 """Volumetric truth: which voxels lie in which object, hidden ones included.
 
 >>> import numpy as np
->>> from mstfilter.scene.voxels import VoxelGrid
+>>> from mstfilter.scene import VoxelGrid
 >>> from mstfilter.simulation.shapes import draw_shape
 >>> from mstfilter.simulation.truth import label_voxels
 >>> ball = draw_shape(np.random.default_rng(0), "ball")
@@ -17,7 +17,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from mstfilter.scene.voxels import VoxelGrid
+from mstfilter.scene import VoxelGrid
 from mstfilter.simulation.shapes import Shape
 
 __all__ = ["label_voxels"]

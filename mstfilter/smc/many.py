@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from mstfilter.errors import InputError
-from mstfilter.smc.collect import Collector, History, collect, log_evidence
+from mstfilter.smc.collectors import Collector, History, collect, log_evidence
 from mstfilter.smc.particle_filter import ParticleFilter
 
 __all__ = ["run_many"]

@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from mstfilter.scene.storage import decode, encode
-from mstfilter.smc.interfaces import Codec
+from mstfilter.scene import decode, encode
+from mstfilter.smc import Codec
 
 __all__ = ["HypothesisCodec"]
 

@@ -22,8 +22,8 @@ from pathlib import Path
 from typing import Any
 
 from mstfilter.errors import InputError
-from mstfilter.scene.recording import Recording
-from mstfilter.smc.watch import telling
+from mstfilter.scene import Recording
+from mstfilter.smc import telling
 from mstfilter.study.code_version import files_version
 from mstfilter.study.executors import Job, Outcome
 from mstfilter.study.memory import StagePeaks
@@ -70,7 +70,7 @@ def open_scene(source: Mapping[str, Any], recordings: str) -> Recording:
     """The recording of a scene; a simulated one is made if it is missing."""
     if "path" in source:
         return open_source(Path(source["path"]), source["format"], source["options"], source["pauses"])
-    from mstfilter.simulation.cache import cached_recording
+    from mstfilter.simulation import cached_recording
 
     return Recording.open(cached_recording(source["family"], source["seed"], Path(recordings), **source["set"]))
 

@@ -6,7 +6,7 @@
 All are means over the hypotheses, each counting the same, unless they say otherwise; truth is volumetric.
 
 ``quality``: weighted coverage, form ``objects``: missing, invented, split and merged objects all cost;
-``quality_paper``, ``quality_authors``: its other forms (`mstfilter.scene.quality`).
+``quality_paper``, ``quality_authors``: its other forms (`mstfilter.scoring.quality`).
 ``quality_top``, ``quality_weighted``, ``quality_best``: of the heaviest hypothesis; mean by weight; of the best one
 (to be compared between equal n only).
 ``quality_visible``, ``_hidden``, ``_unseen``: coverage of the true objects of that status alone (`coverage_of`).
@@ -24,10 +24,18 @@ from typing import Any
 
 import numpy as np
 
-from mstfilter.scene.floors import components, one_blob
-from mstfilter.scene.object_status import STATUSES, object_status
-from mstfilter.scene.quality import FORMS, Overlap, overlap, quality_of, weighted_coverage
-from mstfilter.scene.recording import Recording
+from mstfilter.scene import Recording
+from mstfilter.scoring import (
+    FORMS,
+    STATUSES,
+    Overlap,
+    components,
+    object_status,
+    one_blob,
+    overlap,
+    quality_of,
+    weighted_coverage,
+)
 from mstfilter.study.run_folder import RunFolder
 
 __all__ = ["coverage_of", "diversity", "errors_of", "figures", "measure", "object_f", "occupancy_iou", "pair_brier"]

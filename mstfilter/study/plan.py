@@ -23,7 +23,7 @@ from typing import Any
 from mstfilter import registry
 from mstfilter.errors import InputError
 from mstfilter.presets import build_filter, describe_filter
-from mstfilter.scene.arrays import content_key
+from mstfilter.scene import content_key
 from mstfilter.study.code_version import code_version
 from mstfilter.study.config import SceneEntry, StudyConfig
 from mstfilter.study.grid import Asked, expand
@@ -171,8 +171,7 @@ def _arm(asked: Asked, allow_files: bool) -> Arm:
 
 def _scenes(entry: SceneEntry, folder: Path, allow_files: bool) -> Iterator[Scene]:
     if entry.family:
-        from mstfilter.simulation.cache import recipe_key
-        from mstfilter.simulation.families import scene_family
+        from mstfilter.simulation import recipe_key, scene_family
 
         family = scene_family(entry.family)
         family = registry.make(type(family), entry.set, f"scene family {entry.family!r}", base=family)

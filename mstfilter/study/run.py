@@ -19,9 +19,9 @@ from typing import Any
 
 import mstfilter
 from mstfilter.errors import InputError
-from mstfilter.oracles.truth import bind_truth
+from mstfilter.oracles import bind_truth
 from mstfilter.presets import build_filter, describe_filter
-from mstfilter.scene.recording import Recording
+from mstfilter.scene import Recording
 from mstfilter.study.run_folder import RunFolder, plain
 
 __all__ = ["Progress", "execute"]

@@ -30,15 +30,18 @@ from typing import Any
 import numpy as np
 
 from mstfilter.errors import InputError
-from mstfilter.scene.camera import Camera, rigid_from_matrix
-from mstfilter.scene.clip import Clip
-from mstfilter.scene.images import read_rgb, write_image
-from mstfilter.scene.quality import FORMS, weighted_coverage
-from mstfilter.scene.storage import load_hypotheses, save_hypotheses
-from mstfilter.scene.voxels import Hypothesis
-from mstfilter.smc.particle_filter import Info, State
-from mstfilter.smc.population import Population
-from mstfilter.smc.streams import Key
+from mstfilter.scene import (
+    Camera,
+    Clip,
+    Hypothesis,
+    load_hypotheses,
+    read_rgb,
+    rigid_from_matrix,
+    save_hypotheses,
+    write_image,
+)
+from mstfilter.scoring import FORMS, weighted_coverage
+from mstfilter.smc import Info, Key, Population, State
 
 __all__ = ["RunFolder", "plain", "write_json"]
 

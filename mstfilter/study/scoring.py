@@ -3,7 +3,7 @@
 >>> rows = score(read_estimate(Path("runs/mine")), read_truth(Path("recordings/mine")))
 >>> rows[0].form, rows[0].mean, rows[0].best, rows[0].one_blob
 
-One row a pause and form of weighted coverage (`mstfilter.scene.quality`): mean over the hypotheses, mean by weight,
+One row a pause and form of weighted coverage (`mstfilter.scoring.quality`): mean over the hypotheses, mean by weight,
 best, that of the heaviest one; beside them the floors of the same hypotheses: their occupied voxels as one blob and
 as connected components. Where the truth has instance images and no volumes, hypotheses are projected into the image
 and compared there (``where`` says image); pixels of the robot (255) do not count.
@@ -21,12 +21,8 @@ from pathlib import Path
 import numpy as np
 
 from mstfilter.errors import InputError
-from mstfilter.scene.camera import Camera
-from mstfilter.scene.floors import components, one_blob
-from mstfilter.scene.quality import FORMS, weighted_coverage
-from mstfilter.scene.recording import Recording
-from mstfilter.scene.rendering import render
-from mstfilter.scene.voxels import VoxelGrid, as_labels
+from mstfilter.scene import Camera, Recording, VoxelGrid, as_labels, render
+from mstfilter.scoring import FORMS, components, one_blob, weighted_coverage
 from mstfilter.study.run_folder import RunFolder
 
 __all__ = ["Estimate", "Row", "Truth", "read_estimate", "read_truth", "score", "write_csv"]

@@ -33,7 +33,7 @@ def shared_work(where: Mapping[str, Any] | None) -> Iterator[None]:
     where : mapping, optional
         ``folder``, ``gb``, the bound of its size, and ``versions`` as `kind_versions` gives them.
     """
-    from mstfilter.scene.memo import beneath
+    from mstfilter.scene import beneath
 
     if where is None:
         with beneath(None):
@@ -46,11 +46,10 @@ def shared_work(where: Mapping[str, Any] | None) -> Iterator[None]:
 @functools.lru_cache(maxsize=1)
 def _layer(folder: Path, limit_bytes: int, versions: tuple[tuple[str, str], ...]) -> Any:
     """One for all runs of a worker, so that what they write together is what it counts."""
-    from mstfilter.completion.completer import Completion
-    from mstfilter.scene.disk_memo import DiskMemo, Kind
-    from mstfilter.segmentation.tree import Tree
-    from mstfilter.tracking.features import Matches
-    from mstfilter.tracking.flow import ClipTracks
+    from mstfilter.completion import Completion
+    from mstfilter.scene import DiskMemo, Kind
+    from mstfilter.segmentation import Tree
+    from mstfilter.tracking import ClipTracks, Matches
 
     types = {
         "clip tracks": ClipTracks,

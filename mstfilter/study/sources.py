@@ -15,9 +15,9 @@ from typing import Any
 
 from mstfilter import registry
 from mstfilter.errors import InputError
+from mstfilter.formats import Format
 from mstfilter.presets import settings
-from mstfilter.scene.formats.interfaces import Format
-from mstfilter.scene.recording import Recording
+from mstfilter.scene import Recording
 
 __all__ = ["detect_format", "format_settings", "open_source"]
 
@@ -36,13 +36,13 @@ def open_source(
     options : sequence of str
         ``FIELD=VALUE`` of the format.
     pauses : str
-        Where a video is cut: see `mstfilter.scene.formats.pauses.pauses_from_text`. Empty: the format's default.
+        Where a video is cut: see `mstfilter.formats.pauses.pauses_from_text`. Empty: the format's default.
     allow_files : bool
         Whether ``./file.py:Class`` is loaded.
     """
     fields = format_settings(options)
     if pauses:
-        from mstfilter.scene.formats.pauses import pauses_from_text
+        from mstfilter.formats import pauses_from_text
 
         rule = pauses_from_text(pauses)
         more = fields.get("pauses")
@@ -60,7 +60,7 @@ def _reader(name: str, allow_files: bool = False) -> type[Format]:
     """The class of a format."""
     cls = registry.find_class("format", name, "format", allow_files)
     if not issubclass(cls, Format):
-        raise InputError(f"{name} is no reader of recordings", "subclass mstfilter.scene.formats.interfaces.Format")
+        raise InputError(f"{name} is no reader of recordings", "subclass mstfilter.formats.interfaces.Format")
     return cls
 
 

@@ -81,7 +81,7 @@ def _existing(folder: Path) -> Path:
 def _family(source: Mapping[str, Any]) -> Any:
     from dataclasses import replace
 
-    from mstfilter.simulation.families import scene_family
+    from mstfilter.simulation import scene_family
 
     return replace(scene_family(source["family"]), **source["set"])
 

@@ -105,7 +105,7 @@ def run_study(
     InputError
         For whatever is wrong with the study or the folder, before any run begins. Runs that fail raise nothing.
     """
-    from mstfilter.simulation.cache import cache_folder
+    from mstfilter.simulation import cache_folder
 
     plan = make_plan(study, overrides, allow_files=allow_files)
     cache = cache or cache_folder()

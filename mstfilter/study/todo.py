@@ -147,8 +147,7 @@ class ToDo:
 def _is_made(source: dict[str, Any], recordings: str) -> bool:
     from dataclasses import replace
 
-    from mstfilter.simulation.cache import recipe_key
-    from mstfilter.simulation.families import scene_family
+    from mstfilter.simulation import recipe_key, scene_family
 
     family = replace(scene_family(source["family"]), **source["set"])
     return (

@@ -12,42 +12,6 @@ Without pytest, ``mstfilter check ./mine.py:MyResampler`` runs the same properti
 not hold; `verify` does so from Python.
 """
 
-from mstfilter.testing.contracts import (
-    CodecContract,
-    Contract,
-    EquivalenceContract,
-    EvidenceContract,
-    LookaheadContract,
-    ProposalContract,
-    RejuvenationContract,
-    ResamplerContract,
-    SimilarityContract,
-    SizeContract,
-    TransitionContract,
-    TriggerContract,
-    UpdateContract,
-    verify,
-)
-from mstfilter.testing.properties import Broken, Outcome, Property, Suite, example
+from mstfilter.lazy import attach
 
-__all__ = [
-    "Broken",
-    "CodecContract",
-    "Contract",
-    "EquivalenceContract",
-    "EvidenceContract",
-    "LookaheadContract",
-    "Outcome",
-    "Property",
-    "ProposalContract",
-    "RejuvenationContract",
-    "ResamplerContract",
-    "SimilarityContract",
-    "SizeContract",
-    "Suite",
-    "TransitionContract",
-    "TriggerContract",
-    "UpdateContract",
-    "example",
-    "verify",
-]
+__getattr__, __dir__, __all__ = attach(__name__, __file__)

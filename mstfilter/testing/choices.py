@@ -6,9 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from mstfilter.smc.interfaces import Size, Trigger
-from mstfilter.smc.population import Population
-from mstfilter.smc.similarity import Equivalence, Similarity
+from mstfilter.smc import Equivalence, Population, Similarity, Size, Trigger
 from mstfilter.testing.properties import Broken, Example, Suite, Untouched, guarded
 
 __all__ = ["EQUIVALENCE", "SIMILARITY", "SIZE", "TRIGGER"]

@@ -9,20 +9,21 @@ from typing import Any, ClassVar
 import numpy as np
 
 from mstfilter.errors import InputError
-from mstfilter.scene.evidence import Evidence
-from mstfilter.smc.interfaces import (
+from mstfilter.scene import Evidence
+from mstfilter.smc import (
     Codec,
+    Equivalence,
     Lookahead,
+    Population,
     Proposal,
     Rejuvenation,
     Resampler,
+    Similarity,
     Size,
     Transition,
     Trigger,
     Update,
 )
-from mstfilter.smc.population import Population
-from mstfilter.smc.similarity import Equivalence, Similarity
 from mstfilter.testing import choices, moves, optional, properties, scenes, terms
 from mstfilter.testing.properties import Exact, Example, NotApplicable, Outcome, Property, Suite
 from mstfilter.testing.resampling_law import RESAMPLER
@@ -143,7 +144,7 @@ class EvidenceContract(Contract, suite=terms.EVIDENCE):
 
     def example(self, rng: np.random.Generator, n: int) -> tuple[Population, Any]:
         """`n` hypotheses and a clip."""
-        return scenes.example(rng, n)
+        return scenes.scene_example(rng, n)
 
 
 _SUITES: dict[type, Suite] = {
@@ -194,5 +195,5 @@ def verify(component: Any, example: Example | None = None, exact: Exact | None =
     if exact is None:
         found = getattr(sys.modules.get(type(component).__module__), "exact", None)
         exact = found if callable(found) else None
-    default = scenes.example if suite is terms.EVIDENCE else properties.example
+    default = scenes.scene_example if suite is terms.EVIDENCE else properties.example
     yield from suite.run(component, example or default, exact)

@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from mstfilter.smc.interfaces import Proposal, Transition, Update
-from mstfilter.smc.population import Population
+from mstfilter.smc import Population, Proposal, Transition, Update
 from mstfilter.testing.properties import (
     FALSE_ALARM,
     Broken,
@@ -98,7 +97,7 @@ def order_of_particles_is_irrelevant(component: Transition, example: Example) ->
     """Distribution-free comparison (Kolmogorov-Smirnov) of every particle's moves in two orders; arrays only."""
     from scipy.stats import ks_2samp
 
-    from mstfilter.smc.similarity import as_matrix
+    from mstfilter.smc import as_matrix
 
     population, observation = example(_rng(), _N)
     if not isinstance(population.particles, (np.ndarray, dict)):

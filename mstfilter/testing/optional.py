@@ -13,9 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from mstfilter.smc.interfaces import Codec, Lookahead, Rejuvenation
-from mstfilter.smc.population import Population
-from mstfilter.smc.similarity import as_matrix
+from mstfilter.smc import Codec, Lookahead, Population, Rejuvenation, as_matrix
 from mstfilter.testing.properties import (
     FALSE_ALARM,
     Broken,

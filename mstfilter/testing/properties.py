@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from mstfilter.errors import InputError
-from mstfilter.smc.population import Population
+from mstfilter.smc import Population
 
 __all__ = [
     "Broken",

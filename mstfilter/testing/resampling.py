@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from mstfilter.errors import InputError
-from mstfilter.smc.interfaces import Resampler
-from mstfilter.smc.population import Population
+from mstfilter.smc import Population, Resampler
 from mstfilter.testing.properties import (
     Broken,
     Example,

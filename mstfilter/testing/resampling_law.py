@@ -14,8 +14,7 @@ from functools import lru_cache
 import numpy as np
 
 from mstfilter.errors import InputError
-from mstfilter.smc.interfaces import Resampler
-from mstfilter.smc.population import Population, log_mean_exp
+from mstfilter.smc import Population, Resampler, log_mean_exp
 from mstfilter.testing.properties import (
     FALSE_ALARM,
     Broken,

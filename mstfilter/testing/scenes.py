@@ -1,6 +1,6 @@
 """Hypotheses and a clip, to test components that look at scenes: a small table with three boxes, one of them pushed.
 
->>> population, clip = example(np.random.default_rng(0), 4)
+>>> population, clip = scene_example(np.random.default_rng(0), 4)
 >>> len(population), clip.before.depth.shape
 (4, (96, 128))
 
@@ -13,14 +13,10 @@ from functools import lru_cache
 
 import numpy as np
 
-from mstfilter.scene.camera import Camera, look_at
-from mstfilter.scene.clip import Clip
-from mstfilter.scene.frame import Frame
-from mstfilter.scene.rendering import render
-from mstfilter.scene.voxels import Hypothesis, VoxelGrid
-from mstfilter.smc.population import Population
+from mstfilter.scene import Camera, Clip, Frame, Hypothesis, VoxelGrid, look_at, render
+from mstfilter.smc import Population
 
-__all__ = ["example"]
+__all__ = ["scene_example"]
 
 _GRID = VoxelGrid(np.array([-0.24, -0.24, 0.0]), 0.02, (24, 24, 8))
 _COLOURS = np.array([[160, 140, 110], [190, 60, 50], [60, 100, 180], [70, 160, 80]])
@@ -56,7 +52,7 @@ def _clip() -> Clip:
     return Clip(tuple(frames), _GRID, index=1, times=(0.0, 0.2, 0.4))
 
 
-def example(rng: np.random.Generator, n: int) -> tuple[Population, Clip]:
+def scene_example(rng: np.random.Generator, n: int) -> tuple[Population, Clip]:
     """`n` hypotheses before the push, unevenly weighted, and the clip of the push.
 
     Some are right; in others two boxes are one, a box is missing, or a box is two.

@@ -96,7 +96,7 @@ def example_of(cls: type) -> Example | None:
     if callable(found):
         return found
     if cls.__module__.startswith("mstfilter.") and not cls.__module__.startswith("mstfilter.smc."):
-        from mstfilter.testing.scenes import example
+        from mstfilter.testing.scenes import scene_example
 
-        return example
+        return scene_example
     return None

@@ -6,8 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from mstfilter.scene.evidence import Evidence
-from mstfilter.scene.voxels import Hypothesis
+from mstfilter.scene import Evidence, Hypothesis
 from mstfilter.testing.properties import Broken, Example, Suite, Untouched, guarded
 
 __all__ = ["EVIDENCE"]

@@ -17,3 +17,7 @@
 `warp`              voxels follow a motion
 ==================  ====================================================================
 """
+
+from mstfilter.lazy import attach
+
+__getattr__, __dir__, __all__ = attach(__name__, __file__)

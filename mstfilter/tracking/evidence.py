@@ -16,10 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mstfilter.scene.clip import Clip
-from mstfilter.scene.evidence import Evidence
-from mstfilter.scene.rendering import project
-from mstfilter.scene.voxels import Hypothesis
+from mstfilter.scene import Clip, Evidence, Hypothesis, project
 from mstfilter.tracking.flow import DenseFlow
 from mstfilter.tracking.rigid import Array, apply, kabsch
 from mstfilter.tracking.rigid_motions import followed_points

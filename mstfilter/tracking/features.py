@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mstfilter.errors import InputError
-from mstfilter.scene.frame import Frame
-from mstfilter.scene.memo import memo
+from mstfilter.scene import Frame, memo
 
 __all__ = ["Matches", "SiftMatching"]
 

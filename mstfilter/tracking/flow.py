@@ -26,9 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mstfilter.errors import InputError
-from mstfilter.scene.clip import Clip
-from mstfilter.scene.frame import Frame
-from mstfilter.scene.memo import memo
+from mstfilter.scene import Clip, Frame, memo
 from mstfilter.tracking.photometry import matched_colour, same_depth, smooth_colour
 
 __all__ = ["ClipTracks", "DenseFlow", "track_labels"]

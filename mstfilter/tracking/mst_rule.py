@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from mstfilter.errors import InputError
 from mstfilter.tracking import rigid
 from mstfilter.tracking.features import SiftMatching
-from mstfilter.tracking.refine import refine
+from mstfilter.tracking.refinement import refine
 from mstfilter.tracking.registration import centroid_shift, register
 from mstfilter.tracking.residual import Residual
 from mstfilter.tracking.rules import IDENTITY, Candidate, MotionRule, sift_motions

@@ -10,9 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from mstfilter.scene.depth_noise import depth_sigma
-from mstfilter.scene.frame import Frame
-from mstfilter.scene.memo import memo
+from mstfilter.scene import Frame, depth_sigma, memo
 
 __all__ = ["matched_colour", "same_depth"]
 

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mstfilter.scene.depth_noise import depth_sigma
+from mstfilter.scene import depth_sigma
 from mstfilter.tracking import rigid
 from mstfilter.tracking.track import Track
 

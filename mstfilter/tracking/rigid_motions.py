@@ -19,10 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
-from mstfilter.scene.arrays import component_key, read_only
-from mstfilter.scene.clip import Clip
-from mstfilter.scene.evidence import Division
-from mstfilter.scene.memo import memo
+from mstfilter.scene import Clip, Division, component_key, memo, read_only
 from mstfilter.tracking.flow import DenseFlow
 from mstfilter.tracking.rigid import Array, apply, fit_statistics, statistics
 

@@ -14,10 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mstfilter.scene.arrays import content_key
-from mstfilter.scene.frame import Frame
-from mstfilter.scene.rendering import render_hypothesis
-from mstfilter.scene.voxels import Hypothesis
+from mstfilter.scene import Frame, Hypothesis, content_key, render_hypothesis
 
 __all__ = ["Segment", "segments_of"]
 

@@ -11,7 +11,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from mstfilter.scene.clip import Clip
+from mstfilter.scene import Clip
 from mstfilter.tracking.features import SiftMatching
 from mstfilter.tracking.flow import ClipTracks
 from mstfilter.tracking.photometry import matched_colour, smooth_colour

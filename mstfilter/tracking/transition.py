@@ -17,11 +17,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from mstfilter.scene.clip import Clip
-from mstfilter.scene.voxels import Hypothesis
-from mstfilter.smc.interfaces import Transition
-from mstfilter.smc.population import Population
-from mstfilter.smc.streams import child
+from mstfilter.scene import Clip, Hypothesis
+from mstfilter.smc import Population, Transition, child
 from mstfilter.tracking.flow import ClipTracks, DenseFlow
 from mstfilter.tracking.mst_rule import MstRule
 from mstfilter.tracking.rules import IDENTITY, Candidate, MotionRule

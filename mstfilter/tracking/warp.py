@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
 from mstfilter.errors import InputError
-from mstfilter.scene.voxels import Crop, Hypothesis, ObjectRecord, VoxelGrid
+from mstfilter.scene import Crop, Hypothesis, ObjectRecord, VoxelGrid
 from mstfilter.tracking import rigid
 
 __all__ = ["Moved", "Warp"]

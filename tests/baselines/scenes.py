@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from mstfilter.scene.formats.folder import RecordingWriter
-from mstfilter.scene.recording import Recording
-from mstfilter.scene.rendering import render
+from mstfilter.formats import RecordingWriter
+from mstfilter.scene import Recording, render
 from tests.scene.scenes import CAMERA, GRID, table_scene
 
 

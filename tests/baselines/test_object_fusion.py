@@ -9,14 +9,10 @@ from mstfilter.baselines.object_fusion import ObjectFusion
 from mstfilter.baselines.volumes import ObjectVolume
 from mstfilter.errors import InputError
 from mstfilter.presets import build_filter, load_config
-from mstfilter.scene.clip import Clip
-from mstfilter.scene.frame import Frame
-from mstfilter.scene.quality import weighted_coverage
-from mstfilter.scene.rendering import render
-from mstfilter.scene.voxels import Hypothesis
-from mstfilter.smc.population import Population
-from mstfilter.testing import UpdateContract
-from mstfilter.testing.scenes import example
+from mstfilter.scene import Clip, Frame, Hypothesis, render
+from mstfilter.scoring import weighted_coverage
+from mstfilter.smc import Population
+from mstfilter.testing import UpdateContract, scene_example
 from tests.baselines.scenes import slide
 from tests.scene.scenes import CAMERA, GRID, table_scene
 
@@ -180,4 +176,4 @@ class TestObjectFusion(UpdateContract):
         return ObjectFusion()
 
     def example(self, rng, n):
-        return example(rng, n)
+        return scene_example(rng, n)

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from mstfilter.baselines.proposals import FirstPause, ImageComponents, OccupiedComponents, OneBlob
-from mstfilter.scene.camera import Camera
-from mstfilter.scene.frame import Frame
-from mstfilter.segmentation.proposal import TreeCutProposal
+from mstfilter.scene import Camera, Frame
+from mstfilter.segmentation import TreeCutProposal
 from tests.baselines.scenes import slide
 
 
@@ -68,7 +67,7 @@ def test_components_of_the_image_end_at_steps_of_depth():
 
 
 def test_nothing_on_the_table_is_nothing(tmp_path):
-    from mstfilter.scene.clip import Clip
+    from mstfilter.scene import Clip
     from tests.scene.scenes import CAMERA, GRID, table_scene
 
     rgb, depth, _ = table_scene(empty=True)

@@ -6,14 +6,11 @@ import numpy as np
 import pytest
 
 from mstfilter.baselines.updates import SamplesOnly, TrackingOnly, Union
-from mstfilter.fusion.free_space import FreeSpace, NoFreeSpace
-from mstfilter.fusion.update import FusionUpdate
+from mstfilter.fusion import FreeSpace, FusionUpdate, NoFreeSpace
 from mstfilter.presets import build_filter, load_config
-from mstfilter.scene.evidence import Division, Evidence
-from mstfilter.scene.voxels import Hypothesis
-from mstfilter.smc.population import Population
-from mstfilter.testing import UpdateContract
-from mstfilter.testing.scenes import example
+from mstfilter.scene import Division, Evidence, Hypothesis
+from mstfilter.smc import Population
+from mstfilter.testing import UpdateContract, scene_example
 from tests.baselines.scenes import slide
 
 
@@ -74,7 +71,7 @@ class _Watch:
 
 
 def test_the_single_frame_baseline_is_the_optimal_cut_and_knows_no_past(recording):
-    from mstfilter.scene.rendering import project
+    from mstfilter.scene import project
 
     populations = run("single_frame", recording)
     filter = build_filter(load_config("mst"))
@@ -99,7 +96,7 @@ def test_tracking_only_follows_the_objects_of_the_first_pause(recording):
 
 
 def two(rng=None):
-    population, clip = example(np.random.default_rng(0), 4)
+    population, clip = scene_example(np.random.default_rng(0), 4)
     predicted = Population(population.particles[:2], np.log([0.2, 0.6]), {"previous": np.arange(2)})
     proposed = Population(population.particles[1:], np.zeros(3), {"proposed": np.arange(3)})
     return predicted, proposed, clip
@@ -178,7 +175,7 @@ class TestTrackingOnly(UpdateContract):
         return TrackingOnly()
 
     def example(self, rng, n):
-        return example(rng, n)
+        return scene_example(rng, n)
 
 
 class TestUnion(UpdateContract):
@@ -186,7 +183,7 @@ class TestUnion(UpdateContract):
         return Union()
 
     def example(self, rng, n):
-        return example(rng, n)
+        return scene_example(rng, n)
 
 
 class TestSamplesOnly(UpdateContract):
@@ -194,4 +191,4 @@ class TestSamplesOnly(UpdateContract):
         return SamplesOnly()
 
     def example(self, rng, n):
-        return example(rng, n)
+        return scene_example(rng, n)

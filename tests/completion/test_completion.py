@@ -7,18 +7,13 @@ from typing import ClassVar
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from mstfilter.completion.arbitration import arbitrate
 from mstfilter.completion.completer import Completer, Completion, Evidence
 from mstfilter.completion.extrude import Extrude, SurfaceOnly
 from mstfilter.errors import InputError
-from mstfilter.scene import memo
-from mstfilter.scene.frame import Frame
-from mstfilter.scene.frame_geometry import frame_geometry
-from mstfilter.scene.rendering import render
-from mstfilter.scene.voxels import VoxelGrid
+from mstfilter.scene import Frame, VoxelGrid, cache as memo, frame_geometry, render
 from tests.segmentation.scenes import GRID, TWO, boxes, frame_of
 
 RNG = np.random.default_rng(0)

@@ -13,10 +13,8 @@ import sys
 import numpy as np
 import pytest
 
-from mstfilter.simulation.families import FIRST_REPORTED_SEED
-from mstfilter.study.config import load_study
-from mstfilter.study.plan import make_plan
-from mstfilter.study.statistics import compare
+from mstfilter.simulation import FIRST_REPORTED_SEED
+from mstfilter.study import compare, load_study, make_plan
 from tests.conftest import REPOSITORY
 
 FOLDER = REPOSITORY / "experiments/ablations"

@@ -11,11 +11,9 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
-from mstfilter.segmentation.optimal import optimal_cut
-from mstfilter.segmentation.value import MergeLogOdds
+from mstfilter.segmentation import MergeLogOdds, optimal_cut
 from tests.conftest import REPOSITORY
 from tests.report.test_study_report import make_study
 from tests.segmentation.trees import all_cuts, random_tree

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from scipy.stats import linregress
 
-from mstfilter.simulation.families import FIRST_REPORTED_SEED
+from mstfilter.simulation import FIRST_REPORTED_SEED
 from tests.conftest import REPOSITORY
 
 FOLDER = REPOSITORY / "experiments/scaling"

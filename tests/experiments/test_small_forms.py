@@ -10,7 +10,7 @@ import sys
 
 import pytest
 
-from mstfilter.scene.images import read_rgb
+from mstfilter.scene import read_rgb
 from tests.conftest import REPOSITORY, find_shared
 
 EXPERIMENTS = REPOSITORY / "experiments"

@@ -7,10 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from hypothesis import strategies as st
 
-from mstfilter.scene.camera import Camera, look_at
-from mstfilter.scene.frame import Frame
-from mstfilter.scene.rendering import render
-from mstfilter.scene.voxels import VoxelGrid
+from mstfilter.scene import Camera, Frame, VoxelGrid, look_at, render
 
 SMALL = VoxelGrid((-0.1, -0.12, -0.04), 0.04, (5, 6, 5))  # the lowest layer lies below the table
 SIGMA = 0.00185

@@ -6,16 +6,13 @@ import itertools
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 import mstfilter
 from mstfilter.fusion.belief import Belief
 from mstfilter.fusion.information import noisy_information
-from mstfilter.scene.camera import Camera, look_at
-from mstfilter.scene.rendering import render
-from mstfilter.scene.voxels import Hypothesis, VoxelGrid
-from mstfilter.smc.population import Population
+from mstfilter.scene import Camera, Hypothesis, VoxelGrid, look_at, render
+from mstfilter.smc import Population
 
 SHAPE = (4, 3, 2)
 GRID = VoxelGrid(np.array([-0.02, -0.015, 0.0]), 0.01, SHAPE)

@@ -11,8 +11,8 @@ from mstfilter.errors import InputError
 from mstfilter.fusion.belief import Belief
 from mstfilter.fusion.information import partition_distance
 from mstfilter.fusion.refinement import refine
-from mstfilter.scene.voxels import Hypothesis, VoxelGrid
-from mstfilter.smc.population import Population
+from mstfilter.scene import Hypothesis, VoxelGrid
+from mstfilter.smc import Population
 from tests.fusion.test_belief import CAMERA, GRID, SHAPE, belief_of, scenes, voxels_of
 
 

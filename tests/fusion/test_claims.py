@@ -9,10 +9,8 @@ from mstfilter.fusion.crossover import Crossover
 from mstfilter.fusion.free_space import FreeSpace
 from mstfilter.fusion.mode_filter import ModeFilter
 from mstfilter.fusion.update import FusionUpdate
-from mstfilter.scene.clip import Clip
-from mstfilter.scene.frame import Frame
-from mstfilter.scene.voxels import Hypothesis
-from mstfilter.smc.population import Population
+from mstfilter.scene import Clip, Frame, Hypothesis
+from mstfilter.smc import Population
 from tests.scene.scenes import CAMERA, GRID, table_scene
 
 MST = Claims(surface="sample", max_cleared=0.03)

@@ -7,13 +7,12 @@ from itertools import combinations, permutations, product
 import networkx as nx
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from hypothesis.extra import numpy as hnp
 from scipy import stats
 
 from mstfilter.errors import InputError
-from mstfilter.fusion.conflict_graph import ConflictGraph, conflict_graph
+from mstfilter.fusion.conflicts import ConflictGraph, conflict_graph
 from mstfilter.fusion.crossover import Crossover
 from mstfilter.fusion.merging import MERGE_RULES, merge_probability
 from mstfilter.fusion.structure import RandomOrder, SpanningTree, random_spanning_tree

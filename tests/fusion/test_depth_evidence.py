@@ -4,17 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from mstfilter.errors import InputError
 from mstfilter.fusion.depth_evidence import DepthAgreement, _every
-from mstfilter.scene.camera import Camera, look_at
-from mstfilter.scene.clip import Clip
-from mstfilter.scene.depth_noise import depth_sigma
-from mstfilter.scene.frame import Frame
-from mstfilter.scene.rendering import render
-from mstfilter.scene.voxels import Hypothesis, VoxelGrid
+from mstfilter.scene import Camera, Clip, Frame, Hypothesis, VoxelGrid, depth_sigma, look_at, render
 from tests.scene.scenes import CAMERA, GRID, table_scene
 
 ABOVE = look_at((0.0, 0.0, 0.8), (0, 0, 0), up=(0, 1, 0))

@@ -8,11 +8,10 @@ import pytest
 from mstfilter.fusion.crossover import Crossover
 from mstfilter.fusion.division import NoDivision, PartRule, part_like, take_apart
 from mstfilter.fusion.update import FusionUpdate
-from mstfilter.scene.quality import weighted_coverage
-from mstfilter.scene.storage import decode, encode
-from mstfilter.scene.voxels import Hypothesis, ObjectRecord, VoxelGrid
-from mstfilter.smc.population import Population
-from mstfilter.tracking.rigid_motions import RigidMotions
+from mstfilter.scene import Hypothesis, ObjectRecord, VoxelGrid, decode, encode
+from mstfilter.scoring import weighted_coverage
+from mstfilter.smc import Population
+from mstfilter.tracking import RigidMotions
 from tests.tracking.scenes import standard
 
 GRID = VoxelGrid(np.zeros(3), 0.01, (20, 10, 5))

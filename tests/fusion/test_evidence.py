@@ -11,13 +11,10 @@ from scipy import stats
 from mstfilter.fusion.free_space import NoFreeSpace
 from mstfilter.fusion.update import FusionUpdate
 from mstfilter.presets import build_filter, load_config
-from mstfilter.scene.clip import Clip
-from mstfilter.scene.evidence import Evidence
-from mstfilter.scene.frame import Frame
-from mstfilter.scene.voxels import Hypothesis, VoxelGrid
-from mstfilter.segmentation.evidence import BoundaryAgreement
-from mstfilter.smc.population import Population
-from mstfilter.tracking.evidence import MotionAgreement
+from mstfilter.scene import Clip, Evidence, Frame, Hypothesis, VoxelGrid
+from mstfilter.segmentation import BoundaryAgreement
+from mstfilter.smc import Population
+from mstfilter.tracking import MotionAgreement
 from tests.scene.scenes import CAMERA, GRID, table_scene
 from tests.tracking.scenes import standard
 

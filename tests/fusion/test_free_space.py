@@ -4,21 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 import mstfilter
 from mstfilter.errors import InputError
+from mstfilter.formats import save
 from mstfilter.fusion.free_space import FreeSpace, NoFreeSpace
-from mstfilter.scene.camera import Camera, look_at
-from mstfilter.scene.clip import Clip
-from mstfilter.scene.formats.writer import save
-from mstfilter.scene.frame import Frame
-from mstfilter.scene.quality import weighted_coverage
-from mstfilter.scene.recording import Recording
-from mstfilter.scene.rendering import render
-from mstfilter.scene.voxels import Hypothesis
-from mstfilter.smc.population import Population
+from mstfilter.scene import Camera, Clip, Frame, Hypothesis, Recording, look_at, render
+from mstfilter.scoring import weighted_coverage
+from mstfilter.smc import Population
 from tests.fusion.looks import CAMERAS, SMALL, frame_of, look, shelf, views
 from tests.scene.scenes import CAMERA, GRID, table_scene
 

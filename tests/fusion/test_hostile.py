@@ -9,17 +9,15 @@ import pytest
 
 from mstfilter.errors import InputError
 from mstfilter.fusion.claims import Claims
-from mstfilter.fusion.conflict_graph import conflict_graph
+from mstfilter.fusion.conflicts import conflict_graph
 from mstfilter.fusion.crossover import Crossover
 from mstfilter.fusion.free_space import FreeSpace
 from mstfilter.fusion.mode_filter import ModeFilter
 from mstfilter.fusion.similarity import Agreement
 from mstfilter.fusion.structure import OneSideLast, RandomOrder, SpanningTree
 from mstfilter.fusion.update import FusionUpdate
-from mstfilter.scene.clip import Clip
-from mstfilter.scene.frame import Frame
-from mstfilter.scene.voxels import MAX_LABEL, Hypothesis, VoxelGrid
-from mstfilter.smc.population import Population
+from mstfilter.scene import MAX_LABEL, Clip, Frame, Hypothesis, VoxelGrid
+from mstfilter.smc import Population
 from tests.scene.scenes import CAMERA, GRID, table_scene
 
 SMALL = VoxelGrid((0, 0, 0), 0.01, (9, 8, 7))

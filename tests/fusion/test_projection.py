@@ -12,13 +12,8 @@ from mstfilter.errors import InputError
 from mstfilter.fusion.free_space import FreeSpace, NoFreeSpace
 from mstfilter.fusion.projection import ProjectionUpdate
 from mstfilter.fusion.update import FusionUpdate
-from mstfilter.scene.clip import Clip
-from mstfilter.scene.frame import Frame
-from mstfilter.scene.voxels import Hypothesis, VoxelGrid
-from mstfilter.smc.interfaces import Proposal, Transition
-from mstfilter.smc.particle_filter import ParticleFilter
-from mstfilter.smc.population import Population
-from mstfilter.smc.vectors import ProjectOnto
+from mstfilter.scene import Clip, Frame, Hypothesis, VoxelGrid
+from mstfilter.smc import ParticleFilter, Population, ProjectOnto, Proposal, Transition
 from mstfilter.testing import UpdateContract, scenes
 from tests.scene.scenes import CAMERA, GRID, table_scene
 

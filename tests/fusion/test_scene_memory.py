@@ -6,23 +6,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
-from hypothesis import strategies as st
+from hypothesis import assume, given, settings, strategies as st
 
 from mstfilter.errors import InputError
 from mstfilter.fusion.free_space import FreeSpace
 from mstfilter.fusion.projection import ProjectionUpdate
 from mstfilter.fusion.scene_memory import SceneMemory
 from mstfilter.presets import preset
-from mstfilter.scene import memo
-from mstfilter.scene.clip import Clip
-from mstfilter.scene.frame import Frame
-from mstfilter.scene.recording import Recording
-from mstfilter.scene.voxels import Hypothesis, VoxelGrid
-from mstfilter.smc.interfaces import Proposal
-from mstfilter.smc.particle_filter import ParticleFilter
-from mstfilter.smc.population import Population
-from mstfilter.tracking.transition import IdentityTransition
+from mstfilter.scene import Clip, Frame, Hypothesis, Recording, VoxelGrid, cache as memo
+from mstfilter.smc import ParticleFilter, Population, Proposal
+from mstfilter.tracking import IdentityTransition
 from tests.fusion.looks import CAMERAS, SMALL, frame_of, look, views
 from tests.scene.scenes import CAMERA, GRID, table_scene
 

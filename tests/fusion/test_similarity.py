@@ -8,12 +8,10 @@ import pytest
 from mstfilter import registry
 from mstfilter.errors import InputError
 from mstfilter.fusion.similarity import SameSegmentation, WeightedCoverage, canonical
-from mstfilter.scene.quality import weighted_coverage
-from mstfilter.scene.voxels import Hypothesis, VoxelGrid
-from mstfilter.smc.population import Population
-from mstfilter.smc.resampling_dpp import KDpp
-from mstfilter.smc.resampling_wrappers import Coalesced
-from mstfilter.testing.scenes import example
+from mstfilter.scene import Hypothesis, VoxelGrid
+from mstfilter.scoring import weighted_coverage
+from mstfilter.smc import Coalesced, KDpp, Population
+from mstfilter.testing import scene_example
 
 GRID = VoxelGrid(np.zeros(3), 0.01, (6, 5, 4))
 
@@ -84,7 +82,7 @@ def test_diverse_resampling_from_configuration():
     scheme = registry.build("resampler", config)
     assert scheme == Coalesced(KDpp(WeightedCoverage(2)), SameSegmentation())
     assert registry.build("resampler", registry.describe(scheme)) == scheme
-    population, _ = example(np.random.default_rng(0), 40)
+    population, _ = scene_example(np.random.default_rng(0), 40)
     chosen = scheme.resample(np.random.default_rng(1), population, 3)
     assert chosen.notes["distinct"] == len(set(SameSegmentation().classes(population.particles).tolist()))
     assert len(set(SameSegmentation().classes(chosen.particles).tolist())) == 3

@@ -4,14 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from mstfilter.errors import InputError
 from mstfilter.fusion.support import Support, stands
-from mstfilter.scene.clip import Clip
-from mstfilter.scene.frame import Frame
-from mstfilter.scene.voxels import Hypothesis, VoxelGrid
+from mstfilter.scene import Clip, Frame, Hypothesis, VoxelGrid
 from tests.scene.scenes import CAMERA, GRID, table_scene
 
 CLIP = Clip((Frame(*table_scene()[:2], CAMERA),), GRID, 0)

@@ -6,8 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from hypothesis.extra import numpy as hnp
 from scipy.spatial.transform import RigidTransform
 
@@ -19,11 +18,9 @@ from mstfilter.fusion.structure import RandomOrder, SpanningTree
 from mstfilter.fusion.update import FusionUpdate
 from mstfilter.presets import load_config
 from mstfilter.registry import build
-from mstfilter.scene.clip import Clip
-from mstfilter.scene.frame import Frame
-from mstfilter.scene.quality import weighted_coverage
-from mstfilter.scene.voxels import Crop, Hypothesis, VoxelGrid
-from mstfilter.smc.population import Population
+from mstfilter.scene import Clip, Crop, Frame, Hypothesis, VoxelGrid
+from mstfilter.scoring import weighted_coverage
+from mstfilter.smc import Population
 from tests.fusion.test_mode_filter import book_and_rod
 from tests.scene.scenes import CAMERA, GRID, table_scene
 
@@ -64,7 +61,7 @@ def test_crossover_invariants(a, b, crossover, seed):
 
 
 def _graph_and_draw(crossover, a, b, seed):
-    from mstfilter.fusion.conflict_graph import conflict_graph
+    from mstfilter.fusion.conflicts import conflict_graph
 
     graph = conflict_graph(a, b)
     return graph, crossover.draw(np.random.default_rng(seed), graph)
@@ -233,7 +230,7 @@ def test_systematic_resampling_reaches_many_parents(n, n_proposed):
     n independent draws would reach n (1 - (1 - 1/n)^n) predictions on average; ours must reach as many, within 4
     standard errors of 60 runs (false alarm below 1e-4 a case), and all of them where there are as many samples.
     """
-    from mstfilter.smc.resampling import Systematic
+    from mstfilter.smc import Systematic
 
     hypothesis = Hypothesis.from_labels(np.ones(SMALL.shape, np.uint16), SMALL)
     predicted = Population((hypothesis,) * n, None, {"previous": np.arange(n)})

@@ -6,16 +6,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from mstfilter.errors import InputError
 from mstfilter.oracles import degradation
 from mstfilter.oracles.degradation import degrade
 from mstfilter.oracles.masks import TrueBoundary, TrueMasks
 from mstfilter.oracles.truth import bind_truth
-from mstfilter.scene.arrays import component_key
-from mstfilter.scene.quality import overlap, weighted_coverage
+from mstfilter.scene import component_key
+from mstfilter.scoring import overlap, weighted_coverage
 from tests.baselines.scenes import slide
 
 

@@ -19,10 +19,7 @@ from mstfilter.oracles.miniature.measures import class_weights, measure, total_v
 from mstfilter.oracles.miniature.shrunk import ReadingEvidence, SampledCuts, SeenThrough, cut_law, shrink
 from mstfilter.oracles.miniature.weighting import ScoredFusion, balanced_filter, predictive_law
 from mstfilter.oracles.miniature.world import Glance, Miniature
-from mstfilter.smc.population import Population
-from mstfilter.smc.resampling import Always
-from mstfilter.smc.resampling_optimal import FearnheadClifford
-from mstfilter.smc.updates import Reweight
+from mstfilter.smc import Always, FearnheadClifford, Population, Reweight
 from tests.oracles.test_miniature_world import FALSE_ALARM, chi_square, ids, state_of
 
 WORLD = Miniature((3, 2))

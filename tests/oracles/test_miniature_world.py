@@ -15,7 +15,7 @@ from mstfilter.errors import InputError
 from mstfilter.oracles.miniature.exact import exact_filter
 from mstfilter.oracles.miniature.states import all_states
 from mstfilter.oracles.miniature.world import Glance, Miniature
-from mstfilter.scene.voxels import Hypothesis
+from mstfilter.scene import Hypothesis
 
 FALSE_ALARM = 1e-4
 WORLDS = [Miniature((3, 2)), Miniature((6, 1))]

@@ -10,19 +10,18 @@ import pytest
 from scipy.ndimage import distance_transform_edt
 
 from mstfilter.errors import InputError
-from mstfilter.fusion.update import FusionUpdate
+from mstfilter.fusion import FusionUpdate
 from mstfilter.oracles.choice import TrueBest, TrueFreeSpace, TrueFusion, TrueQuality, best_of_both
 from mstfilter.oracles.completion import TrueCompletion
 from mstfilter.oracles.masks import TrueBoundary, TrueMasks
 from mstfilter.oracles.motion import TrueMotions
 from mstfilter.oracles.truth import Truth, UsesTruth, bind_truth, uses_truth
 from mstfilter.presets import build_filter, describe_filter, load_config
-from mstfilter.scene.quality import weighted_coverage
-from mstfilter.scene.voxels import Hypothesis
-from mstfilter.segmentation.boundary import ColourDepthBoundary
-from mstfilter.smc.population import Population
-from mstfilter.smc.streams import Key
-from mstfilter.study.run import execute
+from mstfilter.scene import Hypothesis
+from mstfilter.scoring import weighted_coverage
+from mstfilter.segmentation import ColourDepthBoundary
+from mstfilter.smc import Key, Population
+from mstfilter.study import execute
 from tests.baselines.scenes import slide
 
 ALL = (

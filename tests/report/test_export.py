@@ -6,15 +6,12 @@ import csv
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from mstfilter.errors import InputError
 from mstfilter.report.export import export_label_images, export_ply, export_run, surface
 from mstfilter.report.palette import PALETTE
-from mstfilter.scene.images import read_labels
-from mstfilter.scene.rendering import project
-from mstfilter.scene.voxels import Hypothesis, VoxelGrid
+from mstfilter.scene import Hypothesis, VoxelGrid, project, read_labels
 from tests.report.runs import make_run
 
 

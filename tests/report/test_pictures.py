@@ -12,8 +12,7 @@ from mstfilter.report.identities import TRUTH, identity_colours
 from mstfilter.report.palette import GREY, PALETTE, colour
 from mstfilter.report.pictures import layer, overlay, png_bytes, viewpoint, voxel_picture
 from mstfilter.report.tables import counts, flatten, note_rows, shown
-from mstfilter.scene.rendering import project, render
-from mstfilter.scene.voxels import Hypothesis
+from mstfilter.scene import Hypothesis, project, render
 from tests.report.runs import CAMERA, GRID, labels_of, make_run
 
 # Machado, Oliveira, Fernandes 2009, severity 1, on linear RGB.

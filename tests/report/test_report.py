@@ -14,8 +14,8 @@ import pytest
 from mstfilter.errors import InputError
 from mstfilter.report.content import numbers_of
 from mstfilter.report.html import write_report
-from mstfilter.scene.quality import weighted_coverage
-from mstfilter.study.run_folder import RunFolder
+from mstfilter.scoring import weighted_coverage
+from mstfilter.study import RunFolder
 from tests.report.runs import make_run
 
 
@@ -185,7 +185,7 @@ def test_many_particles_are_cut_to_the_heaviest(tmp_path):
     run = make_run(tmp_path / "run", pauses=1)
     from dataclasses import replace
 
-    from mstfilter.scene.storage import save_hypotheses
+    from mstfilter.scene import save_hypotheses
 
     first = run.hypotheses(0)[0]
     many = []

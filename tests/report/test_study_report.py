@@ -8,14 +8,13 @@ from importlib.resources import files
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from mstfilter.errors import InputError
 from mstfilter.report.study import write_study_report
 from mstfilter.report.study_figures import in_groups
 from mstfilter.report.svg import SERIES
-from mstfilter.study.results import RESULT, StudyFolder
+from mstfilter.study import RESULT, StudyFolder
 from tests.test_cli import call
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from mstfilter.scene import memo as module
+from mstfilter.scene import cache as module
 from mstfilter.scene.disk_memo import DiskMemo, Kind
 
 
@@ -122,8 +122,9 @@ def test_the_bound_holds_over_many_short_lives(tmp_path):
 
 
 def test_runs_of_a_process_share_one_layer(tmp_path):
-    from mstfilter.scene import memo as store
-    from mstfilter.study.shared_work import kind_versions, shared_work
+    from mstfilter.scene import cache as store
+    from mstfilter.study import kind_versions
+    from mstfilter.study.shared_work import shared_work
 
     where = {"folder": str(tmp_path), "gb": 0.5, "versions": kind_versions()}
     seen = []

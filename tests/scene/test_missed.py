@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from mstfilter.errors import InputWarning
-from mstfilter.scene.formats.folder import RecordingWriter, save
+from mstfilter.formats import RecordingWriter, save
 from mstfilter.scene.recording import Recording
 from mstfilter.scene.voxels import VoxelGrid
 from tests.scene.scenes import CAMERA, GRID, table_scene

@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 
 from mstfilter.errors import InputError
+from mstfilter.formats import RecordingWriter, open_paired, save
 from mstfilter.scene.camera import Camera, look_at
-from mstfilter.scene.formats.folder import RecordingWriter, save
-from mstfilter.scene.formats.paired_images import open_paired
 from mstfilter.scene.recording import Recording
 from mstfilter.scene.support_plane import fit_support_plane, table_residual, workspace
 from mstfilter.scene.voxels import VoxelGrid

@@ -4,11 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from mstfilter.scene.camera import Camera, look_at
-from mstfilter.scene.clip import Clip
-from mstfilter.scene.frame import Frame
-from mstfilter.scene.rendering import render
-from mstfilter.scene.voxels import VoxelGrid
+from mstfilter.scene import Camera, Clip, Frame, VoxelGrid, look_at, render
 
 GRID = VoxelGrid((-0.3, -0.3, 0.0), 0.01, (60, 60, 30))
 COLOURS = np.array([[200, 190, 170], [200, 40, 40], [40, 160, 60], [40, 60, 200]], np.uint8)

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from mstfilter.errors import InputError
-from mstfilter.scene.camera import Camera
-from mstfilter.scene.frame import Frame
+from mstfilter.scene import Camera, Frame
 from mstfilter.segmentation.agglomerate import Agglomeration
 from mstfilter.segmentation.boundary import ColourDepthBoundary
 from mstfilter.segmentation.join_weights import JOIN_WEIGHTS

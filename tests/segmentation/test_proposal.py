@@ -7,12 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mstfilter.completion.extrude import SurfaceOnly
+from mstfilter.completion import SurfaceOnly
 from mstfilter.errors import InputError
-from mstfilter.scene.camera import Camera
-from mstfilter.scene.frame import Frame
-from mstfilter.scene.quality import weighted_coverage
-from mstfilter.scene.rendering import render
+from mstfilter.scene import Camera, Frame, render
+from mstfilter.scoring import weighted_coverage
 from mstfilter.segmentation.boundary import ColourDepthBoundary
 from mstfilter.segmentation.learned_tree import LearnedTree
 from mstfilter.segmentation.mh import MetropolisHastingsCuts

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from mstfilter.scene.camera import Camera
-from mstfilter.scene.frame import Frame
-from mstfilter.scene.quality import weighted_coverage
+from mstfilter.scene import Camera, Frame
+from mstfilter.scoring import weighted_coverage
 from mstfilter.segmentation.proposal import TreeCutProposal
 
 

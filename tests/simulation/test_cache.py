@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 
 from mstfilter.errors import InputError
-from mstfilter.scene.recording import Recording
+from mstfilter.scene import Recording
 from mstfilter.simulation import cache
 from mstfilter.simulation.cache import cache_folder, cached_recording, recipe_key
 from mstfilter.simulation.families import scene_family

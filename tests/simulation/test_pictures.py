@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from mstfilter.errors import InputError
-from mstfilter.scene.camera import Camera, look_at
-from mstfilter.scene.depth_noise import depth_sigma
+from mstfilter.scene import Camera, depth_sigma, look_at
 from mstfilter.simulation.renderer import Renderer
 from mstfilter.simulation.room import draw_room
 from mstfilter.simulation.sensor import ColourSensor, DepthSensor

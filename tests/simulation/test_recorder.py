@@ -10,9 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from mstfilter.errors import InputError
-from mstfilter.scene.recording import Recording
-from mstfilter.scene.rendering import render
-from mstfilter.scene.voxels import VoxelGrid
+from mstfilter.scene import Recording, VoxelGrid, render
 from mstfilter.simulation.families import scene_family
 from mstfilter.simulation.recorder import Scene, simulate
 from mstfilter.simulation.shapes import FAMILIES, draw_shape

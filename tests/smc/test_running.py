@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 
 from mstfilter.errors import InputError, MissingLibraryError
-from mstfilter.smc import collect as collectors
+from mstfilter.smc import collectors as collectors
 from mstfilter.smc.checkpoint import load_state, save_state
 from mstfilter.smc.codecs import ArrayCodec
-from mstfilter.smc.collect import collect
+from mstfilter.smc.collectors import collect
 from mstfilter.smc.filters import bootstrap
 from mstfilter.smc.interfaces import Codec
 from mstfilter.smc.many import run_many

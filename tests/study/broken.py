@@ -9,7 +9,7 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from mstfilter.smc.interfaces import Transition
+from mstfilter.smc import Transition
 
 
 @dataclass(frozen=True)

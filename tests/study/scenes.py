@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from mstfilter.scene.formats.folder import RecordingWriter
+from mstfilter.formats import RecordingWriter
 from tests.scene.scenes import CAMERA, GRID, table_scene
 
 

@@ -9,8 +9,7 @@ import sys
 import pytest
 
 from mstfilter.errors import InputError
-from mstfilter.study import code_version as version_module
-from mstfilter.study import jobs
+from mstfilter.study import code_version as version_module, jobs
 from mstfilter.study.code_version import code_version, files_version, reached
 
 PACKAGE = "mstfilter_of_a_test"

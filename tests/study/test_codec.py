@@ -6,10 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mstfilter.scene.voxels import Hypothesis
-from mstfilter.smc.interfaces import Proposal, Transition
-from mstfilter.smc.particle_filter import ParticleFilter
-from mstfilter.smc.population import Population
+from mstfilter.scene import Hypothesis
+from mstfilter.smc import ParticleFilter, Population, Proposal, Transition
 from mstfilter.study.codec import HypothesisCodec
 from tests.scene.scenes import GRID, table_scene
 

@@ -7,11 +7,10 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from hypothesis.extra import numpy as hnp
 
-from mstfilter.scene.quality import overlap, weighted_coverage
+from mstfilter.scoring import overlap, weighted_coverage
 from mstfilter.study.metrics import coverage_of, diversity, errors_of, figures, object_f, occupancy_iou, pair_brier
 
 SMALL = hnp.arrays(np.uint16, (3, 3, 2), elements=st.integers(0, 3))

@@ -11,11 +11,11 @@ import pytest
 
 from mstfilter import registry
 from mstfilter.errors import InputError
+from mstfilter.formats import RecordingWriter
 from mstfilter.presets import build_filter, describe_filter, load_config
 from mstfilter.resources import preset_names
-from mstfilter.scene.formats.folder import RecordingWriter
-from mstfilter.scene.quality import weighted_coverage
-from mstfilter.scene.recording import Recording
+from mstfilter.scene import Recording
+from mstfilter.scoring import weighted_coverage
 from mstfilter.study.run import execute
 from mstfilter.study.run_folder import RunFolder
 from tests.scene.scenes import CAMERA, GRID, table_scene
@@ -63,7 +63,7 @@ def test_every_preset_runs_and_its_description_builds_it_again(recording, tmp_pa
 
 
 def test_the_same_seed_gives_the_same_bytes(recording, tmp_path):
-    from mstfilter.scene import memo
+    from mstfilter.scene import cache as memo
 
     execute(recording, load_config("mst"), tmp_path / "a", seed=7)
     memo.clear()

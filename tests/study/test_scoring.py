@@ -8,10 +8,8 @@ import numpy as np
 import pytest
 
 from mstfilter.errors import InputError
-from mstfilter.scene.formats.folder import RecordingWriter
-from mstfilter.scene.recording import Recording
-from mstfilter.scene.rendering import render
-from mstfilter.scene.voxels import VoxelGrid
+from mstfilter.formats import RecordingWriter
+from mstfilter.scene import Recording, VoxelGrid, render
 from mstfilter.study.scoring import Estimate, Truth, read_estimate, read_truth, score, write_csv
 from tests.scene.scenes import CAMERA, GRID, table_scene
 

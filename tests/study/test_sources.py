@@ -8,7 +8,7 @@ import pytest
 from mstfilter import registry
 from mstfilter.errors import InputError
 from mstfilter.study.sources import detect_format, format_settings, open_source
-from tests.scene.formats import layouts
+from tests.formats import layouts
 from tests.scene.test_recording import write
 
 WRITERS = {
@@ -85,7 +85,7 @@ def test_a_reader_of_ones_own(tmp_path):
     (tmp_path / "mine.py").write_text(
         "from dataclasses import dataclass\n"
         "import numpy as np\n"
-        "from mstfilter.scene.formats.interfaces import Format\n"
+        "from mstfilter.formats.interfaces import Format\n"
         "from mstfilter.scene.recording import Recording\n"
         "@dataclass(frozen=True)\n"
         "class Mine(Format):\n"

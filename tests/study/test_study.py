@@ -191,7 +191,7 @@ def test_memory_by_stage():
     """A stage that holds 60 MB for a moment is told from one that holds 20; the step has the most of all."""
     code = """
 import numpy as np
-from mstfilter.smc.watch import Watch, telling
+from mstfilter.smc import Watch, telling
 from mstfilter.study.memory import StagePeaks
 peaks, watch = StagePeaks(), Watch()
 base = peaks.figures()["peak_mb"]

@@ -6,8 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mstfilter.smc.interfaces import Resampler
-from mstfilter.smc.population import log_mean_exp, normalise
+from mstfilter.smc import Resampler, log_mean_exp, normalise
 
 
 def systematic(rng, weights, n):

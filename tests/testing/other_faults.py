@@ -6,10 +6,20 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from mstfilter.scene.evidence import Evidence
-from mstfilter.smc.interfaces import Codec, Lookahead, Proposal, Rejuvenation, Size, Transition, Trigger, Update
-from mstfilter.smc.population import Population
-from mstfilter.smc.similarity import Equivalence, Similarity
+from mstfilter.scene import Evidence
+from mstfilter.smc import (
+    Codec,
+    Equivalence,
+    Lookahead,
+    Population,
+    Proposal,
+    Rejuvenation,
+    Similarity,
+    Size,
+    Transition,
+    Trigger,
+    Update,
+)
 from tests.smc.models import optimal
 
 

@@ -7,15 +7,22 @@ import pytest
 
 from mstfilter import registry
 from mstfilter.errors import InputError
-from mstfilter.smc.codecs import ArrayCodec
-from mstfilter.smc.distributions import Normal
-from mstfilter.smc.filters import PriorityLookahead
-from mstfilter.smc.population import Population
-from mstfilter.smc.programs import ProgramLookahead, ProgramMove, observe, sample
-from mstfilter.smc.rejuvenation import RandomWalkMove
-from mstfilter.smc.state_space import Dynamics, Prior, linear_gaussian
-from mstfilter.smc.updates import Reweight
-from mstfilter.study.codec import HypothesisCodec
+from mstfilter.smc import (
+    ArrayCodec,
+    Dynamics,
+    Normal,
+    Population,
+    Prior,
+    PriorityLookahead,
+    ProgramLookahead,
+    ProgramMove,
+    RandomWalkMove,
+    Reweight,
+    linear_gaussian,
+    observe,
+    sample,
+)
+from mstfilter.study import HypothesisCodec
 from mstfilter.testing import (
     CodecContract,
     EquivalenceContract,

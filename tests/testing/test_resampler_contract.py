@@ -9,13 +9,17 @@ import numpy as np
 import pytest
 
 from mstfilter import registry
-from mstfilter.smc.population import Population
-from mstfilter.smc.resampling import Residual
-from mstfilter.smc.resampling_clusters import ClusterStratified
-from mstfilter.smc.resampling_dpp import KDpp
-from mstfilter.smc.resampling_optimal import FearnheadClifford
-from mstfilter.smc.resampling_wrappers import Coalesced, Shuffled, Tempered
-from mstfilter.smc.similarity import Gaussian
+from mstfilter.smc import (
+    ClusterStratified,
+    Coalesced,
+    FearnheadClifford,
+    Gaussian,
+    KDpp,
+    Population,
+    Residual,
+    Shuffled,
+    Tempered,
+)
 from mstfilter.testing import ResamplerContract, verify
 from tests.testing.faults import FAULTS, Correct, CorrectWeighted
 

@@ -11,10 +11,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from mstfilter.scene.camera import Camera, look_at
-from mstfilter.scene.clip import Clip
-from mstfilter.scene.frame import Frame
-from mstfilter.scene.voxels import Hypothesis, VoxelGrid
+from mstfilter.scene import Camera, Clip, Frame, Hypothesis, VoxelGrid, look_at
 
 GRID = VoxelGrid((-0.4, -0.3, 0.0), 0.01, (80, 60, 30))
 

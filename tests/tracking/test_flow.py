@@ -2,9 +2,7 @@ import numpy as np
 import pytest
 
 from mstfilter.errors import InputError
-from mstfilter.scene import memo
-from mstfilter.scene.clip import Clip
-from mstfilter.scene.frame import Frame
+from mstfilter.scene import Clip, Frame, cache as memo
 from mstfilter.tracking.flow import DenseFlow, track_labels
 from tests.tracking.scenes import Box, Scene, at, iou, slide
 

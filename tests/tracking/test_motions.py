@@ -3,11 +3,10 @@
 import numpy as np
 import pytest
 
-from mstfilter.scene.clip import Clip
-from mstfilter.scene.frame import Frame
+from mstfilter.scene import Clip, Frame
 from mstfilter.tracking.features import SiftMatching
 from mstfilter.tracking.flow import DenseFlow
-from mstfilter.tracking.refine import normals, refine
+from mstfilter.tracking.refinement import normals, refine
 from mstfilter.tracking.registration import assess, centroid_shift, prepare, register
 from mstfilter.tracking.residual import Residual
 from mstfilter.tracking.segments import segments_of

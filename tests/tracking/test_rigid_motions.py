@@ -3,10 +3,7 @@
 import numpy as np
 import pytest
 
-from mstfilter.scene import memo
-from mstfilter.scene.clip import Clip
-from mstfilter.scene.rendering import project
-from mstfilter.scene.voxels import Hypothesis, VoxelGrid
+from mstfilter.scene import Clip, Hypothesis, VoxelGrid, cache as memo, project
 from mstfilter.tracking.flow import DenseFlow
 from mstfilter.tracking.rigid_motions import RigidMotions, followed_points
 from tests.tracking.scenes import Box, Scene, at, standard

@@ -3,10 +3,8 @@ import json
 import numpy as np
 import pytest
 
-from mstfilter.scene.clip import Clip
-from mstfilter.scene.frame import Frame
-from mstfilter.scene.voxels import Hypothesis
-from mstfilter.smc.population import Population
+from mstfilter.scene import Clip, Frame, Hypothesis
+from mstfilter.smc import Population
 from mstfilter.tracking.mst_rule import MstRule
 from mstfilter.tracking.rules import AuthorsRule, PaperRule
 from mstfilter.tracking.static import StaticTest

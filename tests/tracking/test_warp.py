@@ -1,11 +1,10 @@
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from scipy.spatial.transform import Rotation
 
 from mstfilter.errors import InputError
-from mstfilter.scene.voxels import Hypothesis, VoxelGrid
+from mstfilter.scene import Hypothesis, VoxelGrid
 from mstfilter.tracking.warp import Warp
 from tests.tracking.scenes import at, iou
 

@@ -17,11 +17,17 @@ from typing import Any
 import numpy as np
 
 from mstfilter.oracles.miniature.world import Glance, Miniature, draw
-from mstfilter.smc.interfaces import DensityTransition, Proposal, Resampler, Trigger
-from mstfilter.smc.particle_filter import ParticleFilter
-from mstfilter.smc.population import Population
-from mstfilter.smc.resampling import EssBelow, Systematic
-from mstfilter.smc.updates import Reweight
+from mstfilter.smc import (
+    DensityTransition,
+    EssBelow,
+    ParticleFilter,
+    Population,
+    Proposal,
+    Resampler,
+    Reweight,
+    Systematic,
+    Trigger,
+)
 
 __all__ = ["GuidedPrior", "GuidedPush", "Prior", "Push", "bootstrap_filter", "guided_filter", "likelihood"]
 

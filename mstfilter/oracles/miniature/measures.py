@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from mstfilter.oracles.miniature.world import Miniature
-from mstfilter.smc.population import Population
+from mstfilter.smc import Population
 
 __all__ = ["MEASURES", "class_weights", "iid_population", "measure", "total_variation"]
 

@@ -19,17 +19,11 @@ from typing import Any, Literal
 import numpy as np
 
 from mstfilter.errors import InputError
-from mstfilter.fusion.claims import Claims
-from mstfilter.fusion.division import NoDivision
-from mstfilter.fusion.free_space import Projection
-from mstfilter.fusion.update import FusionUpdate
+from mstfilter.fusion import Claims, FusionUpdate, NoDivision, Projection
 from mstfilter.oracles.miniature.filters import Push
 from mstfilter.oracles.miniature.world import Glance, Miniature, draw
-from mstfilter.scene.evidence import Evidence
-from mstfilter.scene.voxels import Hypothesis
-from mstfilter.smc.interfaces import Proposal
-from mstfilter.smc.particle_filter import ParticleFilter
-from mstfilter.smc.population import Population
+from mstfilter.scene import Evidence, Hypothesis
+from mstfilter.smc import ParticleFilter, Population, Proposal
 
 __all__ = ["CutLaw", "ReadingEvidence", "SampledCuts", "SeenThrough", "cut_law", "shrink"]
 

@@ -21,8 +21,7 @@ from itertools import combinations
 import numpy as np
 
 from mstfilter.errors import InputError
-from mstfilter.scene.arrays import read_only
-from mstfilter.scene.voxels import Hypothesis, VoxelGrid
+from mstfilter.scene import Hypothesis, VoxelGrid, read_only
 
 __all__ = ["MAX_CELLS", "States", "all_states"]
 

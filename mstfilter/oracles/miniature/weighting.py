@@ -22,18 +22,25 @@ from typing import ClassVar
 import numpy as np
 
 from mstfilter.errors import InputError
-from mstfilter.fusion.update import FusionUpdate
+from mstfilter.fusion import FusionUpdate
 from mstfilter.oracles.miniature.filters import Prior, Push
 from mstfilter.oracles.miniature.shrunk import SampledCuts
 from mstfilter.oracles.miniature.world import Glance, Miniature
-from mstfilter.smc.interfaces import Resampler, Trigger, Update
-from mstfilter.smc.particle_filter import ParticleFilter
-from mstfilter.smc.population import Population, log_mean_exp
-from mstfilter.smc.resampling import EssBelow, Multinomial, Systematic
-from mstfilter.smc.resampling_wrappers import coalesce
-from mstfilter.smc.similarity import first_seen
-from mstfilter.smc.streams import child
-from mstfilter.smc.updates import union
+from mstfilter.smc import (
+    EssBelow,
+    Multinomial,
+    ParticleFilter,
+    Population,
+    Resampler,
+    Systematic,
+    Trigger,
+    Update,
+    child,
+    coalesce,
+    first_seen,
+    log_mean_exp,
+    union,
+)
 
 __all__ = ["BalancedUpdate", "ScoredFusion", "balanced_filter", "predictive_law"]
 

@@ -26,7 +26,7 @@ import numpy as np
 
 from mstfilter.errors import InputError
 from mstfilter.oracles.miniature.states import States, all_states
-from mstfilter.scene.arrays import read_only
+from mstfilter.scene import read_only
 
 __all__ = ["Glance", "Miniature"]
 

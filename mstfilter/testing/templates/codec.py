@@ -12,8 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from mstfilter.smc.interfaces import Codec
-from mstfilter.smc.population import Population
+from mstfilter.smc import Codec, Population
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from mstfilter.smc.interfaces import Lookahead
-from mstfilter.smc.population import Population
+from mstfilter.smc import Lookahead, Population
 
 
 @dataclass(frozen=True)

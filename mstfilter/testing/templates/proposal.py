@@ -11,8 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from mstfilter.smc.interfaces import Proposal
-from mstfilter.smc.population import Population
+from mstfilter.smc import Population, Proposal
 
 
 @dataclass(frozen=True)

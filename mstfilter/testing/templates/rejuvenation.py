@@ -11,8 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from mstfilter.smc.interfaces import Rejuvenation
-from mstfilter.smc.population import Population
+from mstfilter.smc import Population, Rejuvenation
 
 
 @dataclass(frozen=True)

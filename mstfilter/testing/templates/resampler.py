@@ -10,8 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mstfilter.smc.interfaces import Resampler
-from mstfilter.smc.population import normalise
+from mstfilter.smc import Resampler, normalise
 
 
 @dataclass(frozen=True)

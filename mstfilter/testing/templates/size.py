@@ -11,8 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mstfilter.errors import InputError
-from mstfilter.smc.interfaces import Size
-from mstfilter.smc.population import Population
+from mstfilter.smc import Population, Size
 
 
 @dataclass(frozen=True)

@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 
 from mstfilter.errors import InputError
-from mstfilter.smc.interfaces import Transition
-from mstfilter.smc.population import Population
+from mstfilter.smc import Population, Transition
 
 
 @dataclass(frozen=True)

@@ -9,8 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from mstfilter.errors import InputError
-from mstfilter.smc.interfaces import Trigger
-from mstfilter.smc.population import Population
+from mstfilter.smc import Population, Trigger
 
 
 @dataclass(frozen=True)

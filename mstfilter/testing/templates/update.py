@@ -11,9 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from mstfilter.smc.interfaces import Update
-from mstfilter.smc.population import Population
-from mstfilter.smc.updates import union
+from mstfilter.smc import Population, Update, union
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,151 @@
+"""Fingerprints: short hashes of everything that a change of structure must leave as it is.
+
+    python experiments/fingerprints/run.py before.json               # on the code as it is
+    python experiments/fingerprints/run.py after.json --against before.json
+
+For each preset and scene: the hypotheses (labels, weights, parents) after every pause. For each scene: the simulated
+images and the true volumes. For a few filters of `mstfilter.smc`: particles and log evidence. Hashes are comparable
+on one machine with one set of library versions only, so none is kept in the repository.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import sys
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import mstfilter
+from mstfilter import registry
+from mstfilter.smc import Population, Proposal, Transition, Update
+
+#: Scene families and seeds. Three small scenes: 5 objects, 9 objects, and the demo.
+SCENES = (("demo", 3), ("s1", 7), ("s2", 4))
+REPOSITORY = Path(__file__).resolve().parent.parent.parent
+SCHEMES = ("multinomial", "stratified", "systematic", "residual", "ssp", "killing", "fearnhead_clifford")
+SCHEMES += ("clusters", "kdpp", "greedy_diverse", "coalesced", "tempered", "shuffled")
+
+
+@dataclass(frozen=True)
+class Prior(Proposal):
+    """x_0 ~ N(0, 1)."""
+
+    def sample(self, rng: np.random.Generator, observation: Any, n: int) -> Population:
+        return Population(rng.standard_normal(n))
+
+
+@dataclass(frozen=True)
+class Walk(Transition):
+    """x_t ~ N(x_{t-1}, 1)."""
+
+    def predict(self, rng: np.random.Generator, population: Population, observation: Any) -> Population:
+        return population.moved(population.particles + rng.standard_normal(len(population)))
+
+
+@dataclass(frozen=True)
+class Noise(Update):
+    """y_t ~ N(x_t, 0.5)."""
+
+    def update(self, rng: np.random.Generator, predicted: Any, proposed: Any, observation: Any) -> Population:
+        return predicted.reweighted(-2.0 * (predicted.particles - observation) ** 2)
+
+
+def digest(*values: Any) -> str:
+    """Sixteen hexadecimal digits of the bytes, types and shapes of arrays and numbers."""
+    hasher = hashlib.sha256()
+    for value in values:
+        array = np.ascontiguousarray(value)
+        hasher.update(f"{array.dtype.str}{array.shape}".encode())
+        hasher.update(array.tobytes())
+    return hasher.hexdigest()[:16]
+
+
+def presets() -> list[str]:
+    """Names of all presets."""
+    return sorted(path.stem for path in (REPOSITORY / "models").glob("*.toml"))
+
+
+def of_recording(recording: Any) -> dict[str, str]:
+    """Fingerprints of images and true volumes."""
+    frames = [frame for clip in recording.clips() for frame in clip.frames]
+    return {
+        "images": digest(*(image for frame in frames for image in (frame.rgb, frame.depth))),
+        "truth": digest(*(recording.truth(t) for t in range(len(recording.pauses)))),
+    }
+
+
+def of_run(recording: Any, preset: str, *overrides: str) -> dict[str, str]:
+    """Fingerprints of the hypotheses after every pause."""
+    found = {}
+    for state, info in mstfilter.preset(preset, *overrides).iterate(recording.clips(), 0):
+        labels = [hypothesis.labels for hypothesis in state.population.particles]
+        parents = [np.asarray(info.parents[name]) for name in sorted(info.parents)]
+        found[f"pause {info.t}"] = digest(*labels, info.log_weights, *parents)
+    return found
+
+
+def of_smc() -> dict[str, str]:
+    """Fingerprints of particles and weights of a random walk observed with noise, for every resampling scheme."""
+    observations = np.random.default_rng(0).normal(size=20).cumsum()
+    walk, likelihood = Walk(), Noise()
+    found = {}
+    for name in SCHEMES:
+        for resample in ("before", "after"):
+            scheme = registry.build("resampler", name)
+            filter = mstfilter.ParticleFilter(
+                initial=Prior(), transition=walk, update=likelihood, resampler=scheme, n=30, resample=resample
+            )
+            values = []
+            for state, info in filter.iterate(observations, 5):
+                values += [state.population.particles, state.population.log_weights, info.ancestors, info.ess]
+            found[f"{name} {resample}"] = digest(*values)
+    return found
+
+
+def main() -> int:
+    """Write the fingerprints; compare them where another file is named."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("out", type=Path)
+    parser.add_argument("--against", type=Path, help="an earlier file; differences are listed and the exit code is 1")
+    parser.add_argument("--presets", nargs="*", default=None, help="only these")
+    parser.add_argument("--scenes", type=int, default=len(SCENES), help="only the first few scenes")
+    options = parser.parse_args()
+    found: dict[str, Any] = {"smc": of_smc()}
+    with tempfile.TemporaryDirectory() as folder:
+        for family, seed in SCENES[: options.scenes]:
+            from mstfilter.cli import main as command
+
+            path = Path(folder) / f"{family}-{seed}"
+            try:
+                command(["simulate", family, str(path), "--seed", str(seed)])
+            except SystemExit as end:
+                if end.code:
+                    return int(end.code)
+            recording = mstfilter.Recording.open(path)
+            found[f"{family}-{seed}"] = of_recording(recording)
+            for preset in options.presets or presets():
+                found[f"{family}-{seed} {preset}"] = of_run(recording, preset)
+                options.out.write_text(json.dumps(found, indent=1) + "\n")
+    options.out.write_text(json.dumps(found, indent=1) + "\n")
+    if options.against is None:
+        return 0
+    expected = json.loads(options.against.read_text())
+    changed = [
+        f"{group}, {key}: {value} instead of {expected[group][key]}"
+        for group in found
+        if group in expected
+        for key, value in found[group].items()
+        if expected[group].get(key) != value
+    ]
+    print("\n".join(changed) if changed else "all fingerprints agree")
+    return 1 if changed else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

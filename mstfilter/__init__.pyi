@@ -1,0 +1,16 @@
+from mstfilter.errors import InputError as InputError
+from mstfilter.fusion import Belief as Belief
+from mstfilter.presets import preset as preset
+from mstfilter.scene import (
+    Camera as Camera,
+    Clip as Clip,
+    Frame as Frame,
+    Hypothesis as Hypothesis,
+    ObjectRecord as ObjectRecord,
+    Recording as Recording,
+    VoxelGrid as VoxelGrid,
+)
+from mstfilter.scoring import weighted_coverage as weighted_coverage
+from mstfilter.smc import ParticleFilter as ParticleFilter, Population as Population
+
+__version__: str

@@ -1,0 +1,8 @@
+from mstfilter.baselines.object_fusion import ObjectFusion as ObjectFusion
+from mstfilter.baselines.proposals import (
+    FirstPause as FirstPause,
+    ImageComponents as ImageComponents,
+    OccupiedComponents as OccupiedComponents,
+    OneBlob as OneBlob,
+)
+from mstfilter.baselines.updates import SamplesOnly as SamplesOnly, TrackingOnly as TrackingOnly, Union as Union

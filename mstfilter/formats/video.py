@@ -1,0 +1,272 @@
+"""A video with depth, from whatever layout, as a recording: what all readers share.
+
+>>> video = Video("tum", times, read, camera, path, depth_scale=0.0002)
+>>> video.recording(pauses=Still(), world=World())
+
+Every frame is checked when it is read: sizes, that there is depth at all, that it can be metres. The pose comes from
+the support plane of the first pause unless it is given; where the layout knows how the camera moved, that motion is
+kept relative to the first pause, since the world of a trajectory seldom has its table at z = 0.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections import OrderedDict
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+from mstfilter.errors import InputError, InputWarning
+from mstfilter.formats.lens import Lens
+from mstfilter.formats.pauses import PauseRule
+from mstfilter.scene import (
+    Camera,
+    Frame,
+    LazyFrames,
+    Recording,
+    VoxelGrid,
+    check_range,
+    find_world,
+    rigid_from_matrix,
+)
+
+__all__ = ["Images", "Video", "World", "camera_of", "pair_stamps"]
+
+
+@dataclass(frozen=True, eq=False)
+class Images:
+    """Images of one instant.
+
+    Parameters
+    ----------
+    rgb : (H, W, 3) uint8
+        Colour.
+    depth : (H, W) float32
+        Metres, registered to the colour image; NaN = no reading.
+    rgb_name, depth_name : str
+        Where they are, for messages.
+    """
+
+    rgb: np.ndarray
+    depth: np.ndarray
+    rgb_name: str
+    depth_name: str
+
+
+@dataclass(frozen=True)
+class World:
+    """What a user knows of the place; whatever is empty is found from the first pause.
+
+    Parameters
+    ----------
+    T_world_camera : tuple of 16 float
+        Pose of the camera at the first pause, row by row: z up, table at z = 0, metres.
+    workspace : tuple of 6 float
+        x, y, z of the lower, then of the upper corner, metres.
+    voxel_size : float
+        Metres; used with `workspace`.
+    """
+
+    T_world_camera: tuple[float, ...] = ()
+    workspace: tuple[float, ...] = ()
+    voxel_size: float = 0.01
+
+    @cached_property
+    def pose(self) -> RigidTransform | None:
+        """The pose, None where it is not given."""
+        if not self.T_world_camera:
+            return None
+        if len(self.T_world_camera) != 16:
+            raise InputError(f"world.T_world_camera has {len(self.T_world_camera)} numbers, expected 16, row by row")
+        return rigid_from_matrix(np.reshape(self.T_world_camera, (4, 4)), "world.T_world_camera")
+
+    @cached_property
+    def grid(self) -> VoxelGrid | None:
+        """The workspace, None where it is not given."""
+        if not self.workspace:
+            return None
+        if len(self.workspace) != 6:
+            raise InputError(
+                f"world.workspace has {len(self.workspace)} numbers, expected 6: x y z lower, x y z upper"
+            )
+        return VoxelGrid.from_bounds(np.array(self.workspace[:3]), np.array(self.workspace[3:]), self.voxel_size)
+
+
+def camera_of(K: Sequence[float], width: int, height: int, where: str) -> Camera:
+    """A camera from fx, fy, cx, cy that fits its images."""
+    if len(K) != 4:
+        raise InputError(f"{where}: K has {len(K)} numbers, expected fx, fy, cx, cy in pixels")
+    fx, fy, cx, cy = (float(v) for v in K)
+    camera = Camera.from_intrinsics(fx, fy, cx, cy, width, height)
+    if not (0 < cx < width and 0 < cy < height):
+        raise InputError(
+            f"{where}: K has its principal point at ({cx:g}, {cy:g}), outside images of {width} x {height}",
+            "K is fx, fy, cx, cy in pixels of these images; were they resized or cropped?",
+        )
+    return camera
+
+
+@dataclass(frozen=True, eq=False)
+class Video:
+    """Frames on disk and what is known of them.
+
+    Parameters
+    ----------
+    name : str
+        For messages and reports.
+    times : tuple of float
+        Seconds, one a frame, ascending.
+    read : callable
+        Images of a frame index.
+    K : tuple of float
+        fx, fy, cx, cy in pixels.
+    path : Path
+        Where it is.
+    depth_scale : float
+        Metres a unit of the stored depth.
+    read_rgb : callable, optional
+        The colour image alone, where that is cheaper.
+    motion : sequence of RigidTransform, optional
+        T_any_camera, one a frame, in any world.
+    read_instance : callable, optional
+        True label image of a frame index.
+    distortion : tuple of float
+        OpenCV's k1, k2, p1, p2, k3, ... of both images; they are straightened.
+    """
+
+    name: str
+    times: tuple[float, ...]
+    read: Callable[[int], Images]
+    K: tuple[float, ...]
+    path: Path
+    depth_scale: float
+    read_rgb: Callable[[int], np.ndarray] | None = None
+    motion: Sequence[RigidTransform] | None = None
+    read_instance: Callable[[int], np.ndarray | None] = field(default=lambda index: None)
+    distortion: tuple[float, ...] = ()
+
+    def part(self, start_s: float, stop_s: float) -> Video:
+        """The frames from `start_s` to `stop_s` seconds after the first."""
+        kept = [k for k, t in enumerate(self.times) if start_s <= t - self.times[0] <= stop_s]
+        if len(kept) == len(self.times):
+            return self
+        if not kept:
+            raise InputError(
+                f"{self.path}: no frame lies between start_s={start_s:g} and stop_s={stop_s:g}; the video lasts "
+                f"{self.times[-1] - self.times[0]:.1f} s"
+            )
+        look = self.read_rgb
+        return replace(
+            self,
+            times=tuple(self.times[k] for k in kept),
+            read=lambda index: self.read(kept[index]),
+            read_rgb=None if look is None else lambda index: look(kept[index]),
+            motion=None if self.motion is None else [self.motion[k] for k in kept],
+            read_instance=lambda index: self.read_instance(kept[index]),
+        )
+
+    def recording(self, pauses: PauseRule, world: World) -> Recording:
+        """The recording; pose and workspace are found now, images are read when they are looked at."""
+        if not self.times:
+            raise InputError(f"{self.path} holds no pair of a colour and a depth image")
+        first = self.read(0)
+        height, width = first.rgb.shape[:2]
+        camera = camera_of(self.K, width, height, str(self.path))
+        lens = Lens.of(camera, self.distortion)
+        self._frame(0, camera, lens)  # what is wrong with the first frame is known before the pauses are looked for
+        look = self.read_rgb or (lambda index: self.read(index).rgb)
+        found = pauses.find(self.times, look)
+        home, grid = found[0], world.grid
+        camera, grid = find_world(
+            self._frame(home, camera if world.pose is None else camera.at(world.pose), lens), grid
+        )
+        cameras: dict[int, Camera] = {}
+
+        def camera_at(index: int) -> Camera:
+            if self.motion is None:
+                return camera
+            if index not in cameras:
+                cameras[index] = camera.at(camera.pose * (self.motion[home].inv() * self.motion[index]))
+            return cameras[index]
+
+        def instance(index: int) -> np.ndarray | None:
+            image = self.read_instance(index)
+            if image is not None and image.shape != (height, width):
+                raise InputError(f"instance image of frame {index} of {self.path} has shape {image.shape}")
+            return image if image is None else lens.nearest(image, 0)
+
+        return Recording(
+            LazyFrames(
+                lambda index: self._frame(index, camera_at(index), lens), range(len(self.times)), OrderedDict()
+            ),
+            grid,
+            found,
+            tuple(t - self.times[0] for t in self.times),
+            name=self.name,
+            path=self.path,
+            depth_scale=self.depth_scale,
+            read_instance=instance,
+        )
+
+    def _frame(self, index: int, camera: Camera, lens: Lens) -> Frame:
+        images = self.read(index)
+        (h, w), (dh, dw) = images.rgb.shape[:2], images.depth.shape[:2]
+        if (h, w) != (dh, dw):
+            raise InputError(
+                f"{images.depth_name} is {dw} x {dh}, the colour image {w} x {h}: depth is not registered to colour",
+                "align depth to colour when recording (each depth pixel must belong to the colour pixel above it)",
+            )
+        if (h, w) != (camera.height, camera.width):
+            raise InputError(f"{images.rgb_name} is {w} x {h}, the first is {camera.width} x {camera.height}")
+        readings = images.depth[np.isfinite(images.depth) & (images.depth > 0)]
+        if readings.size == 0:
+            raise InputError(
+                f"{images.depth_name} has no reading at all",
+                "leave the start out with start_s=1, or the end with stop_s",
+            )
+        check_range(readings, f"{images.depth_name} with {self.depth_scale:g} m a unit")
+        return Frame(lens.smooth(images.rgb), lens.nearest(images.depth, np.nan), camera)
+
+
+def pair_stamps(
+    colour: Sequence[float], depth: Sequence[float], tolerance_s: float, where: str
+) -> tuple[tuple[int, int], ...]:
+    """Pairs (colour index, depth index) in order of time: each the other's nearest, at most `tolerance_s` apart.
+
+    Warns where more than a tenth of the colour images find no partner; none at all is an error.
+    """
+    if len(colour) == 0 or len(depth) == 0:
+        raise InputError(f"{where}: there are {len(colour)} colour and {len(depth)} depth images")
+    a, b = np.asarray(colour, dtype=float), np.asarray(depth, dtype=float)
+    to_b, to_a = _nearest(a, b), _nearest(b, a)
+    pairs = [(i, int(j)) for i, j in enumerate(to_b) if to_a[j] == i and abs(a[i] - b[j]) <= tolerance_s]
+    pairs.sort(key=lambda pair: a[pair[0]])
+    kept = [pair for k, pair in enumerate(pairs) if k == 0 or a[pair[0]] > a[pairs[k - 1][0]]]
+    if not kept:
+        raise InputError(
+            f"{where}: no colour image has a depth image within {tolerance_s:g} s; the closest pair is "
+            f"{np.abs(a - b[to_b]).min():.3g} s apart",
+            "are both on one clock? a wider limit: tolerance_s=0.1",
+        )
+    if len(kept) < 0.9 * len(a):
+        warnings.warn(
+            InputWarning(
+                f"{where}: {len(a) - len(kept)} of {len(a)} colour images have no depth image of their own within "
+                f"{tolerance_s:g} s and are left out ({len(b)} depth images)",
+                "a wider limit: tolerance_s=0.1",
+            ),
+            stacklevel=2,
+        )
+    return tuple(kept)
+
+
+def _nearest(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Index in b of the nearest to each of a."""
+    order = np.argsort(b, kind="stable")
+    right = np.searchsorted(b[order], a).clip(0, len(b) - 1)
+    left = (right - 1).clip(0)
+    return order[np.where(np.abs(a - b[order][left]) <= np.abs(b[order][right] - a), left, right)]

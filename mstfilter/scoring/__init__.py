@@ -1,0 +1,5 @@
+"""Scores of hypotheses against the truth, and which objects were visible."""
+
+from mstfilter.lazy import attach
+
+__getattr__, __dir__, __all__ = attach(__name__, __file__)

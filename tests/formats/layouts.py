@@ -1,0 +1,97 @@
+"""A short video of a known scene, written in each layout by the test itself."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+
+from mstfilter.scene import write_image
+from tests.scene.scenes import CAMERA, table_scene
+
+K = (131.0, 131.0, 79.5, 59.5)
+SHIFTS = (*[0] * 6, 1, 2, 3, 4, *[5] * 7)
+FPS = 10.0
+PAUSES = (2, 13)
+"""Middle frames of the two intervals in which nothing moves."""
+
+
+def video(shifts=SHIFTS):
+    """Colour images, depth in whole millimetres, and true labels of the frames."""
+    scenes = {s: table_scene(s) for s in set(shifts)}
+    rgb = np.stack([scenes[s][0] for s in shifts])
+    depth = np.round(np.stack([scenes[s][1] for s in shifts]).astype(float), 3)
+    return rgb, depth, [scenes[s][2] for s in shifts]
+
+
+def units(depth, scale):
+    return np.rint(np.nan_to_num(depth) / scale).astype(np.uint16)
+
+
+def write_tum(path, shifts=SHIFTS, scale=0.0002, lag=0.004):
+    rgb, depth, _ = video(shifts)
+    for part in ("rgb", "depth"):
+        (path / part).mkdir(parents=True)
+    lists = {"rgb": ["# color images"], "depth": ["# depth maps"]}
+    for k in range(len(rgb)):
+        stamps = {"rgb": 1305031102.175 + k / FPS, "depth": 1305031102.175 + k / FPS + lag}
+        write_image(path / "rgb" / f"{stamps['rgb']:.6f}.png", rgb[k])
+        write_image(path / "depth" / f"{stamps['depth']:.6f}.png", units(depth[k], scale))
+        for part, stamp in stamps.items():
+            lists[part].append(f"{stamp:.6f} {part}/{stamp:.6f}.png")
+    for part, lines in lists.items():
+        (path / f"{part}.txt").write_text("\n".join(lines) + "\n")
+    return path
+
+
+def write_bop(path, shifts=(0, 3, 5), depth_scale=0.1):
+    rgb, depth, labels = video(shifts)
+    from mstfilter.scene import render
+    from tests.scene.scenes import GRID
+
+    for part in ("rgb", "depth", "mask_visib"):
+        (path / part).mkdir(parents=True)
+    cameras = {}
+    for k in range(len(rgb)):
+        number = 3 * k + 1
+        write_image(path / "rgb" / f"{number:06d}.png", rgb[k])
+        write_image(path / "depth" / f"{number:06d}.png", units(depth[k], depth_scale / 1000))
+        cameras[str(number)] = {"cam_K": CAMERA.K.ravel().tolist(), "depth_scale": depth_scale}
+        seen = render(labels[k], GRID, CAMERA).labels
+        for label in (1, 2):
+            write_image(
+                path / "mask_visib" / f"{number:06d}_{label - 1:06d}.png", (seen == label).astype(np.uint8) * 255
+            )
+    (path / "scene_camera.json").write_text(json.dumps(cameras))
+    return path
+
+
+def write_redwood(path, shifts=SHIFTS, scale=0.001):
+    rgb, depth, _ = video(shifts)
+    for part in ("color", "depth"):
+        (path / part).mkdir(parents=True)
+    for k in range(len(rgb)):
+        write_image(path / "color" / f"{k:05d}.png", rgb[k])
+        write_image(path / "depth" / f"{k:05d}.png", units(depth[k], scale))
+    matrix = CAMERA.K.T.ravel().tolist()
+    (path / "intrinsic.json").write_text(json.dumps({"width": 160, "height": 120, "intrinsic_matrix": matrix}))
+    return path
+
+
+def write_dsr(path, shifts=(0, 2, 4), sequence="7"):
+    """Two boxes in volumes of 64 x 48 x 24 voxels of 4 mm, (y, x, z) as the layout has them."""
+    import h5py
+
+    path.mkdir(parents=True, exist_ok=True)
+    for k, shift in enumerate(shifts):
+        mask = np.zeros((48, 64, 24), np.int64)
+        mask[10:20, 10 + shift : 20 + shift, :12] = 1
+        mask[25:40, 40:50, :6] = 2
+        tsdf = np.where(mask > 0, -0.5, 0.6).astype(np.float32)
+        colour = np.full((48, 64, 3), (150, 130, 110), np.uint8)
+        top = mask.max(axis=2)
+        colour[top == 1], colour[top == 2] = (190, 60, 50), (50, 90, 180)
+        with h5py.File(path / f"{sequence}_{k}.hdf5", "w") as file:
+            for key, value in {"tsdf": tsdf, "mask_3d": mask, "color_heightmap": colour}.items():
+                file.create_dataset(key, data=value, compression="gzip")
+    return path

@@ -1,0 +1,222 @@
+"""ROS 1 bags, ROS 2 bags and MCAP files give the frames that were written, or one clear error."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pytest
+
+from mstfilter.errors import InputError, InputWarning
+from mstfilter.formats.bag import Bag
+from mstfilter.formats.bag_images import colour_of, depth_of
+from mstfilter.formats.pauses import Ends
+from mstfilter.formats.writer import save
+from mstfilter.scene import Recording
+from tests.formats.bags import COLOUR, DEPTH, KINDS, Messages, scene_messages, topic_info, write
+from tests.formats.layouts import FPS, PAUSES, SHIFTS, K, video
+from tests.formats.test_layouts import WORLD, same_frames
+
+pytest.importorskip("rosbags", reason="rosbags absent: pip install -e '.[bags]'")
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_kind_of_bag(tmp_path, kind):
+    path = write(tmp_path / "session", kind, scene_messages(kind == "bag"))
+    assert Bag.detects(path)
+    recording = Bag(world=WORLD).open(path)
+    same_frames(recording, SHIFTS)
+    assert recording.pauses == PAUSES
+    np.testing.assert_allclose(recording.times, np.arange(len(SHIFTS)) / FPS, atol=1e-6)
+    assert Recording.open(save(recording, tmp_path / "out")).key == recording.key
+
+
+def test_a_bare_mcap_file(tmp_path):
+    """The .mcap itself, without the folder that ROS 2 puts around it."""
+    folder = write(tmp_path / "session", "mcap", scene_messages(False, (0, 1)))
+    file = next(folder.glob("*.mcap"))
+    assert Bag.detects(file)
+    same_frames(Bag(pauses=Ends(), world=WORLD).open(file), (0, 1))
+
+
+@pytest.mark.parametrize("depth", ["32FC1", "mono16", "compressed 16UC1", "compressed 32FC1"])
+@pytest.mark.parametrize("colour", ["bgr8", "compressed"])
+def test_encodings(tmp_path, depth, colour):
+    path = write(tmp_path / "s", "db3", scene_messages(False, (0, 3), depth=depth, colour=colour))
+    recording = Bag(pauses=Ends(), world=WORLD).open(path)
+    # 32FC1 is compressed in steps of 1 / 500 of the inverse depth: below z^2 / 1000 m.
+    atol = 2e-3 if depth == "compressed 32FC1" else 2e-7
+    same_frames(recording, (0, 3), atol)
+
+
+def test_pixels_of_other_encodings():
+    """Grey, four channels, packed YUV, big-endian depth; each against numbers made here."""
+    make = Messages(False)
+    rng = np.random.default_rng(0)
+    grey = rng.integers(0, 255, (4, 6), dtype=np.uint8)
+    np.testing.assert_array_equal(colour_of(make.image(0, grey, "mono8")[1], False, "m")[..., 1], grey)
+    four = rng.integers(0, 255, (4, 6, 4), dtype=np.uint8)
+    np.testing.assert_array_equal(colour_of(make.image(0, four, "bgra8")[1], False, "m"), four[..., 2::-1])
+    np.testing.assert_array_equal(colour_of(make.image(0, four, "rgba8")[1], False, "m"), four[..., :3])
+    # UYVY with neutral chroma is grey: Y 16..235 to 0..255.
+    packed = np.dstack([np.full((4, 6), 128, np.uint8), np.full((4, 6), 235, np.uint8)])
+    np.testing.assert_allclose(colour_of(make.image(0, packed, "yuv422")[1], False, "m"), 255, atol=1)
+    np.testing.assert_allclose(colour_of(make.image(0, packed[..., ::-1], "yuyv")[1], False, "m"), 255, atol=1)
+    millimetres = np.array([[0, 700], [1500, 65535]], np.uint16)
+    message = make.image(0, millimetres.byteswap(), "16UC1")[1]
+    message.is_bigendian = 1
+    np.testing.assert_allclose(depth_of(message, False, 0.001, "m"), [[np.nan, 0.7], [1.5, 65.535]], rtol=1e-6)
+    metres = np.array([[np.nan, 0.7], [np.inf, -1.0]], np.float32)
+    found = depth_of(make.image(0, metres, "32FC1")[1], False, 0.001, "m")
+    np.testing.assert_allclose(found, [[np.nan, 0.7], [np.nan, np.nan]], rtol=1e-6)
+    message.data = message.data[:5]
+    for wrong in (message, make.image(0, millimetres, "bayer_rggb8")[1]):
+        with pytest.raises(InputError, match="bytes|encoding"):
+            depth_of(wrong, False, 0.001, "m")
+
+
+def test_registered_depth_is_chosen_by_itself(tmp_path):
+    """Beside the aligned depth there is the raw one of another frame, and an infrared image: no question arises."""
+    make, messages = Messages(False), scene_messages(False, (0, 0))
+    for k in range(2):
+        t = 1700000000.0 + k / FPS
+        raw = np.full((100, 128), 900, np.uint16)
+        messages.append(
+            ("/camera/depth/image_rect_raw", t, make.image(t, raw, "16UC1", "camera_depth_optical_frame"))
+        )
+        messages.append(("/camera/infra1/image_raw", t, make.image(t, raw.astype(np.uint8), "mono8", "infra1")))
+    path = write(tmp_path / "s", "mcap", messages)
+    same_frames(Bag(pauses=Ends(), world=WORLD).open(path), (0, 0))
+    with pytest.raises(InputError, match="differ in size"):
+        Bag(depth="/camera/depth/image_rect_raw").open(path)
+
+
+def test_the_lens_of_the_camera_info_is_used(tmp_path):
+    """A raw image with distortion is straightened; a rectified one takes its matrix from P."""
+    make = Messages(True)
+    for topic, same in ((COLOUR, False), ("/camera/color/image_rect_color", True)):
+        messages = []
+        for name, t, message in scene_messages(True, (0, 0), info=False):
+            messages.append((topic if name == COLOUR else name, t, message))
+            messages.append((topic_info(topic), t, make.info(t, d=(0.3, 0.0, 0.0, 0.0, 0.0))))
+        path = write(tmp_path / f"s{same}", "bag", messages)
+        frame = Bag(pauses=Ends(), world=WORLD).open(path).frames[0]
+        assert np.array_equal(frame.rgb, video((0,))[0][0]) == same
+
+
+def with_messages(**change):
+    return lambda path: write(path, "db3", scene_messages(False, (0, 1), **change))
+
+
+def two_colours(path):
+    messages = scene_messages(False, (0, 1))
+    again = [("/left" + topic, t, message) for topic, t, message in messages if topic == COLOUR]
+    return write(path, "db3", messages + again)
+
+
+def other_matrix(path):
+    make, messages = Messages(False), scene_messages(False, (0, 1))
+    info = make.info(0.0, k=(100.0, 100.0, 80.0, 60.0))
+    return write(path, "db3", [*messages, (topic_info(DEPTH), 1700000000.0, info)])
+
+
+def other_model(path):
+    messages = [m for m in scene_messages(False, (0, 1)) if m[0] != topic_info(COLOUR)]
+    info = Messages(False).info(0.0, d=(0.1, 0.1, 0.1, 0.1), model="equidistant")
+    return write(path, "db3", [*messages, (topic_info(COLOUR), 1700000000.0, info)])
+
+
+def uncalibrated(path):
+    messages = [m for m in scene_messages(False, (0, 1)) if m[0] != topic_info(COLOUR)]
+    return write(
+        path, "db3", [*messages, (topic_info(COLOUR), 1700000000.0, Messages(False).info(0.0, k=(0, 0, 0, 0)))]
+    )
+
+
+def truncated(kind, share):
+    def make(path):
+        target = write(path, kind, scene_messages(kind == "bag"))
+        file = target if kind == "bag" else next(p for p in target.iterdir() if p.suffix == f".{kind}")
+        file.write_bytes(file.read_bytes()[: int(share * file.stat().st_size)])
+        return target
+
+    return make
+
+
+def small_depth(path):
+    make, messages = Messages(False), scene_messages(False, (0, 1), depth=None)
+    images = [(DEPTH, m[1], make.image(m[1], np.full((60, 80), 700, np.uint16), "16UC1")) for m in messages]
+    return write(path, "db3", messages + images)
+
+
+FAULTS = {
+    "no depth at all": (with_messages(depth=None), Bag(), "no depth topic"),
+    "no colour": (with_messages(colour=None), Bag(), "no colour topic"),
+    "no intrinsics": (with_messages(info=False), Bag(), "intrinsics are missing"),
+    "wrong topic": (with_messages(), Bag(colour="/camera/colour"), "no image topic '/camera/colour'"),
+    "depth for colour": (with_messages(), Bag(colour=DEPTH), "holds no colour images"),
+    "wrong info": (with_messages(), Bag(info="/info"), "no CameraInfo topic '/info'"),
+    "two colours": (two_colours, Bag(), "2 topics could be colour"),
+    "sizes differ": (small_depth, Bag(), "differ in size: depth is not registered"),
+    "other frame": (with_messages(frame="camera_depth_optical_frame"), Bag(), "not registered"),
+    "other matrix": (other_matrix, Bag(), "camera matrices .* differ"),
+    "fisheye": (other_model, Bag(), "'equidistant'"),
+    "not calibrated": (uncalibrated, Bag(), "not calibrated"),
+    "1 km away": (with_messages(), Bag(depth_scale=1.2), "median of"),
+    "1 mm away": (with_messages(), Bag(depth_scale=1e-6), "median of"),
+    "never together": (with_messages(lag=0.05), Bag(), "0.05 s apart"),
+    "truncated bag": (truncated("bag", 0.6), Bag(), "bag cannot be read"),
+    "truncated mcap": (truncated("mcap", 0.6), Bag(), "bag cannot be read"),
+    "truncated db3": (truncated("db3", 0.6), Bag(), "bag cannot be read"),
+    "empty file": (truncated("bag", 0.0), Bag(), "bag cannot be read"),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_what_is_wrong_is_one_clear_error(tmp_path, fault):
+    make, reader, message = FAULTS[fault]
+    path = make(tmp_path / "session")
+    with pytest.raises(InputError, match=message) as caught:
+        reader.open(path).check()
+    assert "\n" not in caught.value.message
+    assert caught.value.hints or "could be" not in caught.value.message
+
+
+def test_ambiguous_topics_are_listed(tmp_path):
+    """The error names every image topic with count, encoding, size and frame."""
+    path = two_colours(tmp_path / "session")
+    with pytest.raises(InputError) as caught:
+        Bag().open(path)
+    listed = "\n".join(caught.value.hints)
+    for topic in (COLOUR, "/left" + COLOUR, DEPTH):
+        assert re.search(rf"{topic} \(2 x \w+, 160 x 120, frame 'camera_color_optical_frame'\)", listed), listed
+    same_frames(Bag(colour="/left" + COLOUR, K=K, pauses=Ends(), world=WORLD).open(path), (0, 1))
+
+
+def test_registered_after_all(tmp_path):
+    path = with_messages(frame="camera_depth_optical_frame")(tmp_path / "session")
+    same_frames(Bag(registered=True, pauses=Ends(), world=WORLD).open(path), (0, 1))
+
+
+def test_stamps_of_the_header_count(tmp_path):
+    """Messages that were logged late, out of step, are paired by when they were taken; lost ones are told."""
+    rng = np.random.default_rng(1)
+    messages = [(topic, t + float(rng.uniform(0, 0.3)), m) for topic, t, m in scene_messages(False)]
+    messages.sort(key=lambda m: m[1])
+    path = write(tmp_path / "late", "mcap", messages)
+    same_frames(Bag(world=WORLD).open(path), SHIFTS)
+    lost = [m for k, m in enumerate(scene_messages(False)) if m[0] != DEPTH or k % 2]
+    with pytest.warns(InputWarning, match="left out"):
+        recording = Bag(pauses=Ends()).open(write(tmp_path / "lost", "mcap", lost))
+    assert len(recording) < len(SHIFTS)
+    recording.check()
+
+
+def test_without_rosbags(tmp_path, monkeypatch):
+    import sys
+
+    path = with_messages()(tmp_path / "session")
+    monkeypatch.setitem(sys.modules, "rosbags.highlevel", None)
+    with pytest.raises(InputError, match="need rosbags") as caught:
+        Bag().open(path)
+    assert "mstfilter[bags]" in caught.value.hints[0]

@@ -1,0 +1,417 @@
+"""Every layout gives the frames that were written into it, and one clear error for what is wrong."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import warnings
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from mstfilter.errors import InputError, InputWarning
+from mstfilter.formats.bop import Bop
+from mstfilter.formats.dsr import Dsr
+from mstfilter.formats.lens import Lens
+from mstfilter.formats.pauses import Ends, Every
+from mstfilter.formats.redwood import Redwood
+from mstfilter.formats.tum import Tum
+from mstfilter.formats.video import World, pair_stamps
+from mstfilter.formats.writer import save
+from mstfilter.scene import Recording, write_image
+from tests.formats.layouts import (
+    FPS,
+    PAUSES,
+    SHIFTS,
+    K,
+    units,
+    video,
+    write_bop,
+    write_dsr,
+    write_redwood,
+    write_tum,
+)
+from tests.scene.scenes import CAMERA
+
+WORLD = World(tuple(CAMERA.pose.as_matrix().ravel()))
+
+
+def same_frames(recording, shifts, atol=2e-7):
+    rgb, depth, _ = video(shifts)
+    assert len(recording) == len(shifts)
+    for index in range(len(shifts)):
+        np.testing.assert_array_equal(recording.frames[index].rgb, rgb[index])
+        np.testing.assert_allclose(recording.frames[index].depth, depth[index], atol=atol)
+        np.testing.assert_allclose(recording.frames[index].camera.K, CAMERA.K)
+
+
+def same_on_disk(recording, path):
+    """Converted, the recording is the same byte for byte."""
+    assert Recording.open(save(recording, path)).key == recording.key
+    assert not list(path.parent.glob(".*"))
+
+
+@pytest.mark.parametrize("scale", [0.0002, 0.001])
+def test_tum(tmp_path, scale):
+    path = write_tum(tmp_path / "tum", scale=scale)
+    assert Tum.detects(path)
+    recording = Tum(K=K, depth_scale=scale, world=WORLD).open(path)
+    same_frames(recording, SHIFTS)
+    assert recording.pauses == PAUSES
+    np.testing.assert_allclose(recording.times, np.arange(len(SHIFTS)) / FPS, atol=1e-5)
+    same_on_disk(recording, tmp_path / "out")
+
+
+def test_the_pose_is_found_and_the_workspace_can_be_given(tmp_path):
+    path = write_tum(tmp_path / "tum")
+    found = Tum(K=K).open(path).frames[0].camera
+    assert abs(found.position[2] - CAMERA.position[2]) < 3e-3
+    grid = Tum(K=K, world=World(workspace=(-0.3, -0.3, 0, 0.3, 0.3, 0.2), voxel_size=0.02)).open(path).grid
+    assert grid.shape == (30, 30, 10)
+    for wrong, message in ((World(workspace=(1.0, 2.0)), "6"), (World(T_world_camera=(1.0,)), "16")):
+        with pytest.raises(InputError, match=message):
+            Tum(K=K, world=wrong).open(path)
+
+
+def camera_to_world(k):
+    """The true pose at frame k of a moving camera, in a world of its own."""
+    return RigidTransform.from_components([1 + 0.01 * k, -2, 0.9], Rotation.from_rotvec([0.3, -0.2, 0.02 * k]))
+
+
+def check_motion(recording):
+    """Relative to the first pause the camera moves as the trajectory says."""
+    home = recording.pauses[0]
+    # At the first pause the pose is the one that the table gives, not the trajectory's.
+    assert abs(recording.frames[home].camera.position[2] - CAMERA.position[2]) < 5e-3
+    for k in (0, 5, len(recording) - 1):
+        expected = camera_to_world(home).inv() * camera_to_world(k)
+        found = recording.frames[home].camera.pose.inv() * recording.frames[k].camera.pose
+        np.testing.assert_allclose(found.as_matrix(), expected.as_matrix(), atol=1e-9)
+
+
+def test_tum_trajectory(tmp_path):
+    path = write_tum(tmp_path / "tum")
+    lines = ["# timestamp tx ty tz qx qy qz qw"]
+    for k in range(len(SHIFTS)):
+        pose = camera_to_world(k)
+        numbers = (1305031102.175 + k / FPS + 0.001, *pose.translation, *pose.rotation.as_quat())
+        lines.append(" ".join(f"{v:.12f}" for v in numbers))
+    (path / "groundtruth.txt").write_text("\n".join(lines))
+    check_motion(Tum(K=K).open(path))
+    still = Tum(K=K, moving=False).open(path)
+    assert still.frames[0].camera.key == still.frames[9].camera.key
+    same_on_disk(Tum(K=K, world=WORLD).open(path), tmp_path / "out")
+    (path / "groundtruth.txt").write_text("5.0 0 0 0 0 0 0 1\n")
+    with pytest.raises(InputError, match="nearest pose"):
+        Tum(K=K).open(path)
+
+
+def test_redwood(tmp_path):
+    path = write_redwood(tmp_path / "redwood")
+    assert Redwood.detects(path)
+    recording = Redwood(fps=FPS, world=WORLD).open(path)
+    same_frames(recording, SHIFTS)
+    assert recording.pauses == PAUSES
+    same_on_disk(recording, tmp_path / "out")
+
+
+def test_redwood_trajectory(tmp_path):
+    path = write_redwood(tmp_path / "redwood")
+    blocks = [
+        f"{k} {k} {k + 1}\n" + "\n".join(" ".join(map(repr, row)) for row in camera_to_world(k).as_matrix().tolist())
+        for k in range(len(SHIFTS))
+    ]
+    (path / "trajectory.log").write_text("\n".join(blocks) + "\n")
+    check_motion(Redwood(fps=FPS).open(path))
+    (path / "trajectory.log").write_text("\n".join(blocks[:-1]))
+    with pytest.raises(InputError, match="80 lines for 17 frames"):
+        Redwood(fps=FPS).open(path)
+
+
+def test_bop(tmp_path):
+    """Depth in tenths of millimetres, image numbers with gaps, masks as instances that follow the box."""
+    path = write_bop(tmp_path / "000048")
+    assert Bop.detects(path)
+    recording = Bop(world=WORLD).open(path)
+    same_frames(recording, (0, 3, 5), atol=1e-6)
+    assert recording.pauses == (0, 1, 2)
+    columns = [np.nonzero(recording.instance(k) == 1)[1].mean() for k in range(3)]
+    assert columns[0] + 3 < columns[1] < columns[2]
+    assert set(np.unique(recording.instance(0))) == {0, 1, 2}
+    same_on_disk(recording, tmp_path / "out")
+    np.testing.assert_array_equal(Recording.open(tmp_path / "out").instance(1), recording.instance(1))
+    few = Bop(images=(7, 1)).open(path)
+    np.testing.assert_array_equal(few.frames[0].rgb, video((5,))[0][0])
+    shutil.rmtree(path / "mask_visib")
+    assert Bop().open(path).instance(0) is None
+
+
+def test_bop_motion(tmp_path):
+    path = write_bop(tmp_path / "000048", shifts=SHIFTS[:12])
+    cameras = json.loads((path / "scene_camera.json").read_text())
+    for k, entry in enumerate(cameras.values()):
+        matrix = camera_to_world(k).inv().as_matrix()
+        entry["cam_R_w2c"] = matrix[:3, :3].ravel().tolist()
+        entry["cam_t_w2c"] = (matrix[:3, 3] * 1000).tolist()
+    (path / "scene_camera.json").write_text(json.dumps(cameras))
+    check_motion(Bop().open(path))
+
+
+def test_dsr(tmp_path):
+    """Volumes turn into x, y, z; what is drawn from above lies where the boxes are, in their colours."""
+    path = write_dsr(tmp_path / "dsr")
+    assert Dsr.detects(path)
+    recording = Dsr(origin=(0.1, -0.1, 0.0)).open(path)
+    assert recording.pauses == (0, 1, 2)
+    assert recording.grid.shape == (64, 48, 24)
+    truth = recording.truth(1)
+    assert truth[12:22, 10:20, :12].min() == truth[12:22, 10:20, :12].max() == 1
+    assert (truth == 1).sum() == 1200
+    frame = recording.frames[1]
+    red = (frame.rgb == (190, 60, 50)).all(axis=2)
+    heights = frame.points[red][:, 2]
+    # The box's 12 voxels are centred at 0, 4, ... 44 mm: its top is at 46 mm.
+    np.testing.assert_allclose(np.median(heights), 0.046, atol=1e-4)
+    inside = recording.grid.index_of(frame.points[red] - [0, 0, 1e-4])
+    on_box = heights > 0.04
+    assert (truth[tuple(inside[on_box].T)] == 1).all()
+    np.testing.assert_allclose(np.median(frame.points[..., 2]), 0.0, atol=1e-6)
+    again = Recording.open(save(recording, tmp_path / "out"))
+    np.testing.assert_allclose(again.frames[2].depth, recording.frames[2].depth, atol=5.1e-5)
+    np.testing.assert_array_equal(again.truth(2), recording.truth(2))
+
+
+def test_dsr_sequences(tmp_path):
+    path = write_dsr(write_dsr(tmp_path / "dsr"), sequence="12", shifts=(0, 1))
+    with pytest.raises(InputError, match="2 sequences: 7, 12"):
+        Dsr().open(path)
+    assert len(Dsr(sequence="12").open(path)) == 2
+    with pytest.raises(InputError, match="no sequence '9'"):
+        Dsr(sequence="9").open(path)
+    (path / "7_1.hdf5").unlink()
+    with pytest.raises(InputError, match=r"\[0, 2\]"):
+        Dsr(sequence="7").open(path)
+    (path / "12_1.hdf5").write_bytes((path / "12_0.hdf5").read_bytes()[:500])
+    with pytest.raises(InputError, match="does not hold"):
+        Dsr(sequence="12").open(path).check()
+
+
+def edit(file, change):
+    data = json.loads(file.read_text())
+    change(data)
+    file.write_text(json.dumps(data))
+
+
+def first_file(path, part):
+    return sorted((path / part).iterdir())[0]
+
+
+def cut(file):
+    file.write_bytes(file.read_bytes()[:-30])
+
+
+def other_size(file):
+    write_image(file, np.full((60, 80), 700, np.uint16))
+
+
+def blank(path):
+    for file in (path / "depth").iterdir():
+        write_image(file, np.zeros((120, 160), np.uint16))
+
+
+def drop_line(file):
+    lines = file.read_text().splitlines()
+    file.write_text("\n".join(lines[:2]) + "\n")
+
+
+def shift_stamps(file):
+    rows = [line.split() for line in file.read_text().splitlines()[1:]]
+    file.write_text("".join(f"{float(t) + 1000:.6f} {name}\n" for t, name in rows))
+
+
+FAULTS = {
+    "tum, no intrinsics": (write_tum, Tum(), lambda p: None, "intrinsics are missing"),
+    "tum, table 1 km away": (write_tum, Tum(K=K, depth_scale=0.25), lambda p: None, "median of"),
+    "tum, table 1 mm away": (write_tum, Tum(K=K, depth_scale=2e-7), lambda p: None, "median of"),
+    "tum, file missing": (write_tum, Tum(K=K), lambda p: first_file(p, "rgb").unlink(), "image is missing"),
+    "tum, truncated": (write_tum, Tum(K=K), lambda p: cut(first_file(p, "depth")), "truncated"),
+    "tum, other clock": (write_tum, Tum(K=K), lambda p: shift_stamps(p / "depth.txt"), "within 0.02 s"),
+    "tum, not a list": (write_tum, Tum(K=K), lambda p: (p / "rgb.txt").write_text("a b\n"), "line 1"),
+    "tum, empty list": (write_tum, Tum(K=K), lambda p: (p / "depth.txt").write_text("# none\n"), "0 depth images"),
+    "tum, sizes differ": (write_tum, Tum(K=K), lambda p: other_size(first_file(p, "depth")), "not registered"),
+    "tum, no depth": (write_tum, Tum(K=K), blank, "no reading at all"),
+    "tum, K of another size": (write_tum, Tum(K=(525, 525, 319.5, 239.5)), lambda p: None, "principal point"),
+    "tum, three numbers": (write_tum, Tum(K=(1.0, 2.0, 3.0)), lambda p: None, "3 numbers"),
+    "redwood, numbers differ": (
+        write_redwood,
+        Redwood(),
+        lambda p: first_file(p, "depth").unlink(),
+        "17 colour .* 16",
+    ),
+    "redwood, one of each missing": (
+        write_redwood,
+        Redwood(),
+        lambda p: (first_file(p, "depth").unlink(), sorted((p / "color").iterdir())[5].unlink()),
+        "would be paired with depth image",
+    ),
+    "redwood, no intrinsics": (write_redwood, Redwood(), lambda p: (p / "intrinsic.json").unlink(), "intrinsics are"),
+    "redwood, row by row": (
+        write_redwood,
+        Redwood(),
+        lambda p: edit(p / "intrinsic.json", lambda d: d.update(intrinsic_matrix=CAMERA.K.ravel().tolist())),
+        "column by column",
+    ),
+    "redwood, no depth folder": (write_redwood, Redwood(), lambda p: shutil.rmtree(p / "depth"), "depth is missing"),
+    "redwood, metres for mm": (write_redwood, Redwood(depth_scale=1.0), lambda p: None, "median of"),
+    "bop, no depth_scale": (
+        write_bop,
+        Bop(),
+        lambda p: edit(p / "scene_camera.json", lambda d: d["1"].pop("depth_scale")),
+        "depth_scale",
+    ),
+    "bop, no cam_K": (
+        write_bop,
+        Bop(),
+        lambda p: edit(p / "scene_camera.json", lambda d: d["4"].pop("cam_K")),
+        "cam_K",
+    ),
+    "bop, two cameras": (
+        write_bop,
+        Bop(),
+        lambda p: edit(p / "scene_camera.json", lambda d: d["4"]["cam_K"].__setitem__(0, 600.0)),
+        "image 4 differs",
+    ),
+    "bop, image missing": (write_bop, Bop(), lambda p: first_file(p, "depth").unlink(), "image is missing"),
+    "bop, no such image": (write_bop, Bop(images=(2,)), lambda p: None, "image 2 is not"),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_what_is_wrong_is_one_clear_error(tmp_path, fault):
+    write, reader, spoil, message = FAULTS[fault]
+    path = write(tmp_path / "data")
+    spoil(path)
+    with pytest.raises(InputError, match=message) as caught:
+        reader.open(path).check()
+    assert "\n" not in caught.value.message
+
+
+def test_pairs_of_stamps():
+    """Each image is used once; jitter, gaps and another rate are no matter; many left out are told."""
+    rng = np.random.default_rng(0)
+    colour = np.arange(60) / 30 + 100
+    depth = np.delete(colour + rng.uniform(-0.01, 0.01, 60), [7, 30])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        pairs = pair_stamps(colour, depth, 0.02, "bag")
+    assert [i for i, _ in pairs] == [i for i in range(60) if i not in (7, 30)]
+    assert len({j for _, j in pairs}) == 58
+    with pytest.warns(InputWarning, match="30 of 60"):
+        half = pair_stamps(colour, colour[::2] + 0.001, 0.02, "bag")
+    assert half == tuple((2 * k, k) for k in range(30))
+    with pytest.warns(InputWarning):  # no depth image is used twice, however wide the limit
+        assert pair_stamps(colour, colour[::2] + 0.001, 0.05, "bag") == half
+    assert pair_stamps([5.0], [5.01], 0.02, "bag") == ((0, 0),)
+    with pytest.raises(InputError, match="0.5 s apart"):
+        pair_stamps([5.0], [5.5], 0.02, "bag")
+
+
+def test_a_distorted_lens_is_straightened():
+    """A straight image, bent by the lens model, comes back; depth values are picked, never mixed."""
+    bend = (0.2, -0.5, 0.001, -0.002, 0.1)
+    lens = Lens.of(CAMERA, bend)
+    k1, k2, p1, p2, k3 = bend
+    x, y = CAMERA.rays()[..., 0], CAMERA.rays()[..., 1]
+    r2 = x**2 + y**2
+    radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
+    u = CAMERA.K[0, 0] * (x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x**2)) + CAMERA.K[0, 2]
+    v = CAMERA.K[1, 1] * (y * radial + p1 * (r2 + 2 * y**2) + 2 * p2 * x * y) + CAMERA.K[1, 2]
+    # The brown model: pixel (x, y) of the straight image is at (u, v) of the distorted one.
+    np.testing.assert_allclose(lens.source[..., 0], u, atol=1e-3)
+    np.testing.assert_allclose(lens.source[..., 1], v, atol=1e-3)
+    depth = np.where(np.arange(160) % 2, 1.0, 2.0)[None].repeat(120, axis=0).astype(np.float32)
+    assert set(np.unique(lens.nearest(depth, np.nan)[20:100, 30:130])) == {1.0, 2.0}
+    assert Lens.of(CAMERA, (1e-4, 0, 0, 0)).source is None
+    with pytest.raises(InputError, match="3 numbers"):
+        Lens.of(CAMERA, (0.1, 0.1, 0.1))
+
+
+def test_distorted_images_are_read_straight(tmp_path):
+    path = write_tum(tmp_path / "tum", shifts=(0, 0))
+    straight = Tum(K=K, distortion=(0.3, 0.0, 0.0, 0.0), pauses=Ends(), world=WORLD).open(path).frames[0]
+    bent = Tum(K=K, pauses=Ends(), world=WORLD).open(path).frames[0]
+    assert (straight.rgb != bent.rgb).mean() > 0.02
+    np.testing.assert_allclose(straight.rgb[50:70, 70:90].astype(int), bent.rgb[50:70, 70:90], atol=4)
+    u, v = np.moveaxis(np.rint(Lens.of(CAMERA, (0.3, 0.0, 0.0, 0.0)).source).astype(int), -1, 0)
+    inside = (u >= 0) & (u < 160) & (v >= 0) & (v < 120)
+    picked = bent.depth[v.clip(0, 119), u.clip(0, 159)]
+    assert (straight.depth[inside] == picked[inside]).mean() > 0.99  # halves of a pixel may round the other way
+    assert (straight.depth != bent.depth).mean() > 0.3
+    assert np.isnan(straight.depth[~inside]).all()
+
+
+def test_depth_beyond_the_file_is_no_reading(tmp_path):
+    """A recording that cannot hold a value says "no reading", not the largest number it has."""
+    from mstfilter.formats.writer import RecordingWriter
+
+    _, depth, _ = video((0,))
+    depth = depth[0].copy()
+    depth[:5] = 80.0
+    with RecordingWriter(tmp_path / "r", CAMERA) as writer:
+        writer.add_frame(video((0,))[0][0], depth, 0.0, "static")
+    assert np.isnan(Recording.open(tmp_path / "r").frames[0].depth[:5]).all()
+    assert units(depth, 0.002).max() == 40000
+
+
+def test_a_disk_that_is_full_at_the_end(tmp_path, monkeypatch):
+    """The last files do not fit: nothing is left of those before."""
+    from mstfilter.formats.writer import RecordingWriter
+
+    def full(self, described):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(RecordingWriter, "_finish", full)
+    rgb, depth, _ = video((0,))
+    with pytest.raises(InputError, match="No space left"), RecordingWriter(tmp_path / "r", CAMERA) as writer:
+        writer.add_frame(rgb[0], depth[0], 0.0, "static")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_two_camera_matrices_do_not_fit_into_one_folder(tmp_path):
+    from dataclasses import replace
+
+    rgb, depth, _ = video((0, 1))
+    recording = Recording.from_arrays(rgb, depth, CAMERA.K)
+    other = replace(recording.frames[1].camera, K=CAMERA.K * [[1.1], [1.1], [1.0]])
+    mixed = replace(recording, frames=[recording.frames[0], replace(recording.frames[1], camera=other)])
+    with pytest.raises(InputError, match="frame 1 .* camera matrix"):
+        save(mixed, tmp_path / "r")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_part_of_a_video(tmp_path):
+    """A sensor that shows nothing at first; the trajectory and the times go with the frames."""
+    path = write_redwood(tmp_path / "redwood")
+    lines = [
+        f"{k} {k} {k + 1}\n" + "\n".join(" ".join(map(repr, row)) for row in camera_to_world(k).as_matrix().tolist())
+        for k in range(len(SHIFTS))
+    ]
+    (path / "trajectory.log").write_text("\n".join(lines) + "\n")
+    write_image(first_file(path, "depth"), np.zeros((120, 160), np.uint16))
+    with pytest.raises(InputError, match="no reading at all") as caught:
+        Redwood(fps=FPS).open(path)
+    assert "start_s" in caught.value.hints[0]
+    recording = Redwood(fps=FPS, start_s=0.35, stop_s=1.45, pauses=Ends(), world=WORLD).open(path)
+    assert (len(recording), recording.pauses, recording.times[0]) == (11, (0, 10), 0.0)
+    np.testing.assert_array_equal(recording.frames[3].rgb, video((SHIFTS[7],))[0][0])
+    expected = camera_to_world(4).inv() * camera_to_world(9)
+    found = recording.frames[0].camera.pose.inv() * recording.frames[5].camera.pose
+    np.testing.assert_allclose(found.as_matrix(), expected.as_matrix(), atol=1e-9)
+    with pytest.raises(InputError, match=r"lasts 1\.6 s"):
+        Redwood(fps=FPS, start_s=9).open(path)
+
+
+def test_every_nth_image(tmp_path):
+    path = write_redwood(tmp_path / "redwood")
+    assert Redwood(pauses=Every(8)).open(path).pauses == (0, 8, 16)

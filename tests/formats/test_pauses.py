@@ -1,0 +1,155 @@
+"""Where a video is cut: given pauses, and pauses found by image motion on simulated recordings."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from mstfilter.errors import InputError
+from mstfilter.formats.pauses import At, Ends, Every, Listed, pauses_from_text
+from mstfilter.formats.still import Still, grey_blocks
+from tests.formats.layouts import PAUSES, video
+
+TIMES = tuple(10 + k / 10 for k in range(40))
+
+
+def none(index):
+    raise AssertionError("no image is needed")
+
+
+def test_given_pauses(tmp_path):
+    assert At(frames=(30, 0, -1)).find(TIMES, none) == (0, 30, 39)
+    assert At(seconds=(0.0, 1.52, 3.9)).find(TIMES, none) == (0, 15, 39)
+    assert Ends().find(TIMES, none) == (0, 39)
+    assert Ends().find(TIMES[:1], none) == (0,)
+    assert Every(15).find(TIMES, none) == (0, 15, 30)
+    file = tmp_path / "pauses.txt"
+    file.write_text("# first the empty table\n0\n12, 20  # seconds too\n3.5s\n")
+    assert Listed(str(file)).find(TIMES, none) == (0, 12, 20, 35)
+    for rule, message in (
+        (At(), "no pause"),
+        (At(frames=(40,)), "frame 40: the video has 40"),
+        (At(seconds=(9.0,)), "lasts from 0 to 3.9 s"),
+        (Listed(str(tmp_path / "none")), "cannot be read"),
+    ):
+        with pytest.raises(InputError, match=message):
+            rule.find(TIMES, none)
+    file.write_text("0 twelve\n")
+    with pytest.raises(InputError, match=r"pauses.txt: .*twelve"):
+        Listed(str(file)).find(TIMES, none)
+
+
+def test_pauses_as_text(tmp_path):
+    assert pauses_from_text("0,40,85") == {"component": "at", "frames": (0, 40, 85)}
+    assert pauses_from_text("0s, 4.2s,9") == {"component": "at", "seconds": (0.0, 4.2), "frames": (9,)}
+    assert pauses_from_text("-1") == {"component": "at", "frames": (-1,)}
+    assert pauses_from_text("still") == {"component": "still"}
+    file = tmp_path / "p.txt"
+    file.write_text("0")
+    assert pauses_from_text(str(file)) == {"component": "listed", "file": str(file)}
+    with pytest.raises(InputError, match="1.5"):
+        pauses_from_text("0,1.5")
+
+
+def times_of(images, fps=10.0):
+    return tuple(k / fps for k in range(len(images)))
+
+
+def test_still_intervals_of_an_exact_video():
+    rgb, _, _ = video()
+    assert Still().intervals(times_of(rgb), lambda k: rgb[k]) == ((0, 5), (10, 16))
+    assert Still().find(times_of(rgb), lambda k: rgb[k]) == PAUSES
+    assert Still(hold_s=0.6).find(times_of(rgb), lambda k: rgb[k]) == (13,)
+    with pytest.raises(InputError, match="no pause found: nowhere in 17 frames"):
+        Still(hold_s=0.7).find(times_of(rgb), lambda k: rgb[k])
+    assert Still().find((0.0,), lambda k: rgb[k]) == (0,)
+
+
+def test_what_all_pixels_share_is_no_motion():
+    """Exposure that drifts, flickers and steps, with noise, hides no pause."""
+    rng = np.random.default_rng(0)
+    rgb, _, _ = video()
+    steady = np.zeros(len(rgb))
+    steps = np.where(np.arange(len(rgb)) > 2, 20.0, 0.0)
+    flicker = rng.uniform(-6, 6, len(rgb)) + np.linspace(0, 12, len(rgb))
+    for levels, noise in ((steady, 4.0), (steps, 0.5), (flicker, 4.0)):
+        noisy = [
+            np.clip(image * 0.8 + level + rng.normal(size=image.shape) * noise, 0, 255).astype(np.uint8)
+            for image, level in zip(rgb, levels, strict=True)
+        ]
+        assert Still().intervals(times_of(noisy), lambda k, v=noisy: v[k]) == ((0, 5), (10, 16))
+
+
+def test_a_region_leaves_out_what_moves_elsewhere():
+    """Somebody walks behind the table through every frame."""
+    rgb, _, _ = video()
+    walking = rgb.copy()
+    for k, image in enumerate(walking):
+        image[:15, 5 * k : 5 * k + 12] = 0
+    assert Still().intervals(times_of(rgb), lambda k: walking[k]) == ()
+    table = Still(region=(0.0, 0.2, 1.0, 1.0))
+    assert table.intervals(times_of(rgb), lambda k: walking[k]) == ((0, 5), (10, 16))
+    for wrong in ((0.5, 0.2, 0.5, 1.0), (0.1, 0.2)):
+        with pytest.raises(InputError, match="region"):
+            Still(region=wrong).intervals(times_of(rgb), lambda k: rgb[k])
+
+
+def test_blocks_that_shimmer_have_a_noise_of_their_own():
+    """A shimmering edge, which is a percent of the image, is no motion; a box that moves beside it is."""
+    rng = np.random.default_rng(0)
+    rgb, _, _ = video()
+    shimmer = [image.astype(float) for image in rgb]
+    for image in shimmer:
+        image[100:102] += rng.normal(size=(1, 160, 1)) * 3
+    assert Still().intervals(times_of(rgb), lambda k: shimmer[k]) == ((0, 5), (10, 16))
+
+
+def test_slow_motion_adds_up():
+    """A twentieth of a pixel a frame changes no block by three levels, ten frames of it do."""
+    image = video((0,))[0][0].astype(float)
+    slow = [(1 - f) * image + f * np.roll(image, 1, axis=1) for f in np.arange(20) * 0.05]
+    changes = [np.abs(grey_blocks(b) - grey_blocks(a)).max() for a, b in pairwise(slow)]
+    assert max(changes) < 3
+    assert max(b - a for a, b in Still(hold_s=0.1).intervals(times_of(slow), lambda k: slow[k])) < 10
+    assert Still(hold_s=1.9, levels=100).intervals(times_of(slow), lambda k: slow[k]) == ((0, 19),)
+
+
+def test_blocks_are_means():
+    image = np.random.default_rng(0).integers(0, 255, (48, 163, 3), dtype=np.uint8)
+    blocks = grey_blocks(image)
+    assert blocks.shape == (24, 81)
+    np.testing.assert_allclose(blocks[3, 5], image[6:8, 10:12].mean(), rtol=1e-6)
+
+
+@pytest.mark.parametrize("seed", [3, 8])
+def test_still_intervals_of_a_simulated_recording(seed):
+    """Pushes with sensor noise, each pause held for a second: every pause is found, in order, and nothing else.
+
+    The truth is the simulator's: a frame belongs to a pause if it was drawn from the world at rest.
+    """
+    from mstfilter.simulation import Scene, advance, finish, scene_family
+
+    family = scene_family("demo")
+    scene = Scene(family, seed)
+    images, pause_of = [], []
+
+    def see(pause):
+        images.append(scene.see(len(images))["rgb"])
+        pause_of.append(pause)
+
+    fps = 6.0
+    for action in range(family.n_actions + 1):
+        for _ in range(7):
+            see(action)
+        if action == family.n_actions:
+            break
+        push = scene.choose(action)
+        for step in range(int(push.seconds * fps)):
+            advance(scene.world, push, step / fps, (step + 1) / fps)
+            see(None)
+        advance(scene.world, push, int(push.seconds * fps) / fps, push.seconds)
+        finish(scene.world)
+    found = Still(hold_s=0.8).find(times_of(images, fps), lambda k: images[k])
+    assert [pause_of[k] for k in found] == list(range(family.n_actions + 1))
