@@ -22,4 +22,5 @@ from mstfilter.testing.properties import (
     Suite as Suite,
     example as example,
 )
+from mstfilter.testing.scenes import scene_example as scene_example
 from mstfilter.testing.starters import example_of as example_of, write_starter as write_starter

@@ -35,11 +35,11 @@ class TestProjectionUpdate(UpdateContract):
         return ProjectionUpdate()
 
     def example(self, rng, n):
-        return scenes.example(rng, n)
+        return scenes.scene_example(rng, n)
 
 
 def test_it_is_fusion_without_a_proposal():
-    predicted, clip = scenes.example(np.random.default_rng(1), 6)
+    predicted, clip = scenes.scene_example(np.random.default_rng(1), 6)
     for exponent in (0.0, 3.0):
         mine = ProjectionUpdate(quality_exponent=exponent).update(None, predicted, None, clip)
         fused = FusionUpdate(quality_exponent=exponent).update(np.random.default_rng(0), predicted, None, clip)
@@ -50,7 +50,7 @@ def test_it_is_fusion_without_a_proposal():
 
 
 def test_the_manifold_update_for_vectors_takes_the_same_projection():
-    predicted, clip = scenes.example(np.random.default_rng(1), 6)
+    predicted, clip = scenes.scene_example(np.random.default_rng(1), 6)
     onto = ProjectOnto(lambda particles, y: FreeSpace().refine(particles, y)[0])
     found = onto.update(None, predicted, None, clip)
     mine = ProjectionUpdate(quality_exponent=0.0).update(None, predicted, None, clip)
@@ -88,8 +88,8 @@ def test_particles_of_ones_own_in_a_filter_without_a_proposal():
 
 
 def test_proposed_particles_join_and_are_projected():
-    predicted, clip = scenes.example(np.random.default_rng(0), 2)
-    proposed, _ = scenes.example(np.random.default_rng(1), 3)
+    predicted, clip = scenes.scene_example(np.random.default_rng(0), 2)
+    proposed, _ = scenes.scene_example(np.random.default_rng(1), 3)
     predicted = predicted.labelled({"previous": np.arange(2)})
     both = ProjectionUpdate().update(None, predicted, proposed.labelled({"proposed": np.arange(3)}), clip)
     assert both.parents["previous"].tolist() == [0, 1, -1, -1, -1]

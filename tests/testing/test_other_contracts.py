@@ -158,7 +158,7 @@ class TestHypotheses(CodecContract):
         return HypothesisCodec()
 
     def example(self, rng, n):
-        return scenes.example(rng, n)
+        return scenes.scene_example(rng, n)
 
 
 class TestGaussian(SimilarityContract):
