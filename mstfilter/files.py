@@ -1,0 +1,59 @@
+"""Writing files so that a reader never sees half of one.
+
+>>> with atomic_path(folder / "metrics.csv") as path:
+...     path.write_text(text)
+
+The file is written under a temporary name in the same folder and renamed when it is complete. If the block raises,
+the temporary file is removed and an earlier file is left as it was.
+"""
+
+from __future__ import annotations
+
+import csv
+import os
+import uuid
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+__all__ = ["atomic_path", "write_csv", "write_text"]
+
+
+@contextmanager
+def atomic_path(path: str | Path) -> Iterator[Path]:
+    """A temporary path beside `path`, renamed to it at the end of the block; missing folders are made."""
+    target = Path(path)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    partial = target.with_name(f".{target.name}.{uuid.uuid4().hex[:8]}.partial")
+    try:
+        yield partial
+        os.replace(partial, target)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def write_text(path: str | Path, text: str) -> None:
+    """Write a text file (UTF-8) in one step."""
+    with atomic_path(path) as partial:
+        partial.write_text(text, encoding="utf-8", newline="")
+
+
+def write_csv(path: str | Path, rows: Iterable[Mapping[str, Any]], columns: Iterable[str] | None = None) -> None:
+    """Write rows as CSV in one step.
+
+    Parameters
+    ----------
+    path : path
+        The file.
+    rows : iterable of mappings
+        Column name -> value; None is written as an empty cell.
+    columns : iterable of str, optional
+        Their order; by default every column in the order of first appearance.
+    """
+    rows = [dict(row) for row in rows]
+    names = list(columns) if columns is not None else list(dict.fromkeys(name for row in rows for name in row))
+    with atomic_path(path) as partial, partial.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.DictWriter(file, names, lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
