@@ -1,0 +1,44 @@
+"""The only place that imports open3d, which is large and needs system libraries.
+
+>>> from mstfilter.open3d_import import import_open3d
+>>> o3d = import_open3d()                            # doctest: +SKIP
+>>> o3d.geometry.PointCloud()                        # doctest: +SKIP
+
+Components that need open3d call this function when they are used. No default component does.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from types import ModuleType
+
+from mstfilter.errors import MissingLibraryError
+
+__all__ = ["import_open3d"]
+
+SYSTEM_PACKAGES = ("libusb-1.0-0", "libgl1", "libegl1", "libgomp1")
+
+
+def import_open3d() -> ModuleType:
+    """Import open3d, limited to one thread.
+
+    With several threads the order of a parallel sum varies, and results differ in their last digits.
+
+    Raises
+    ------
+    MissingLibraryError
+        If the package or a system library that it needs is missing.
+    """
+    try:
+        open3d = import_module("open3d")
+    except ModuleNotFoundError as error:
+        raise MissingLibraryError(
+            f"open3d cannot be imported: {error}", f"pip install {(error.name or 'open3d').partition('.')[0]}"
+        ) from error
+    except (ImportError, OSError) as error:  # a shared library does not load
+        raise MissingLibraryError(
+            f"open3d cannot be imported: {error}",
+            f"install its libraries: apt-get install {' '.join(SYSTEM_PACKAGES)}",
+        ) from error
+    open3d.utility.set_max_threads(1)
+    return open3d
