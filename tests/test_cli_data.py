@@ -8,8 +8,8 @@ import shutil
 import numpy as np
 import pytest
 
-from mstfilter.formats import RecordingWriter
-from mstfilter.scene import Recording, VoxelGrid
+from mstfilter.formats import RecordingWriter, open_recording
+from mstfilter.scene import VoxelGrid
 from tests.formats import layouts
 from tests.formats.bags import COLOUR, DEPTH, Messages, scene_messages, write as write_bag
 from tests.scene.scenes import CAMERA, table_scene
@@ -46,7 +46,7 @@ def test_convert(tmp_path, capsys, name):
     assert code == 0, err
     assert "error" not in err
     assert f"pauses      {len(pauses)} of" in out
-    recording = Recording.open(tmp_path / "out")
+    recording = open_recording(tmp_path / "out")
     recording.check()
     assert recording.pauses == pauses
     assert sorted(p.name for p in tmp_path.iterdir() if p.name.startswith(".")) == []
@@ -225,4 +225,4 @@ def test_a_workspace_that_misses_is_one_warning(tmp_path, capsys):
     assert "hypotheses of 0" in out
     shutil.rmtree(tmp_path / "run")
     with pytest.warns(UserWarning):
-        Recording.open(tmp_path / "r").check()
+        open_recording(tmp_path / "r").check()

@@ -29,8 +29,9 @@ import numpy as np
 from scipy.ndimage import find_objects, label
 
 import mstfilter
+from mstfilter.formats import open_recording
 from mstfilter.fusion import Agreement, DepthAgreement, Support, stands
-from mstfilter.scene import Clip, Evidence, Hypothesis, Recording, frame_geometry
+from mstfilter.scene import Clip, Evidence, Hypothesis, frame_geometry
 from mstfilter.scoring import weighted_coverage
 from mstfilter.simulation import cached_recording
 from mstfilter.study import interval
@@ -55,7 +56,7 @@ class Keep(Evidence):
 def candidates(scene: str, smoke: bool, kept: Path | None) -> Iterator[tuple[Clip, list[Hypothesis], np.ndarray]]:
     """Clip, scored candidates and true labels of every pause after the first."""
     family, _, seed = scene.partition("-")
-    recording = Recording.open(cached_recording(family, int(seed), **(SMALL if smoke else {})))
+    recording = open_recording(cached_recording(family, int(seed), **(SMALL if smoke else {})))
     clips, file = list(recording.clips()), kept / f"{scene}.npz" if kept else None
     if file and file.exists():
         found = dict(np.load(file))

@@ -29,6 +29,7 @@ from pathlib import Path
 import numpy as np
 
 import mstfilter
+from mstfilter.formats import open_recording
 from mstfilter.scene import Clip, Hypothesis, Recording
 from mstfilter.scoring import overlap, weighted_coverage
 from mstfilter.simulation import cached_recording
@@ -197,7 +198,7 @@ def main() -> None:
         family = [s for s in scenes if s[0] == scene[0]]
         other = family[(family.index(scene) + 1) % len(family)]
         change = SMALL if options.smoke else {}
-        here, there = (Recording.open(cached_recording(f, s, **change)) for f, s in (scene, other))
+        here, there = (open_recording(cached_recording(f, s, **change)) for f, s in (scene, other))
         row = run(scene, there, here)
         rows.append({name: str(value) for name, value in row.items()})
         write_table(path, FIELDS, rows)

@@ -22,6 +22,7 @@ from scipy.spatial.transform import Rotation
 
 import mstfilter
 from mstfilter.errors import InputError
+from mstfilter.formats import open_recording
 from mstfilter.scene import Clip, Frame, Recording
 from mstfilter.simulation import (
     GENERATOR_VERSION,
@@ -181,7 +182,7 @@ def recorded(
             shutil.rmtree(target, ignore_errors=True)
             made.rename(target)
     pair = json.loads((target / "twins.json").read_text())
-    return None if pair is None else (Recording.open(target), tuple(pair))
+    return None if pair is None else (open_recording(target), tuple(pair))
 
 
 def _record(seed: int, family: SceneFamily, ambiguous: tuple[float, float], path: Path) -> tuple[int, int] | None:

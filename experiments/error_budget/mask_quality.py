@@ -20,6 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import mstfilter
+from mstfilter.formats import open_recording
 from mstfilter.oracles import TrueMasks, bind_truth
 from mstfilter.report import colour
 from mstfilter.scene import Recording
@@ -142,7 +143,7 @@ def main(study: Path, out: Path) -> None:
     own: list[dict[str, Any]] = []
     for scene in folder.description["scenes"]:
         made = scene["source"]
-        found = own_quality(Recording.open(cached_recording(made["family"], made["seed"], **made["set"])))
+        found = own_quality(open_recording(cached_recording(made["family"], made["seed"], **made["set"])))
         own.append({"scene": scene["name"], "quality": f"{found[0]:.4f}", "agreement": f"{found[1]:.4f}"})
     lines = table(folder.summary(), float(np.mean([float(line["quality"]) for line in own])))
     out.mkdir(parents=True, exist_ok=True)

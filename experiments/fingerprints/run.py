@@ -127,7 +127,7 @@ def main() -> int:
             except SystemExit as end:
                 if end.code:
                     return int(end.code)
-            recording = mstfilter.Recording.open(path)
+            recording = mstfilter.open_recording(path)
             found[f"{family}-{seed}"] = of_recording(recording)
             for preset in options.presets or presets():
                 found[f"{family}-{seed} {preset}"] = of_run(recording, preset)

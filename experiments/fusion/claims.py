@@ -23,8 +23,8 @@ from pathlib import Path
 import numpy as np
 
 import mstfilter
+from mstfilter.formats import open_recording
 from mstfilter.fusion import Claims
-from mstfilter.scene import Recording
 from mstfilter.simulation import cached_recording
 
 CLEARED = (0.01, 0.03, 0.06, 1.0)
@@ -94,7 +94,7 @@ def main(out: Path, smoke: bool) -> None:
     mst = mstfilter.preset("mst")
     for family in ("s1",) if smoke else ("s1", "s2", "s3"):
         for seed in (0,) if smoke else (0, 1):
-            recording = Recording.open(cached_recording(family, seed, **(SMALL if smoke else {})))
+            recording = open_recording(cached_recording(family, seed, **(SMALL if smoke else {})))
             state = mst.start(0)
             for clip in recording.clips():
                 if clip.index:

@@ -15,8 +15,8 @@ from pathlib import Path
 
 import numpy as np
 
+from mstfilter.formats import open_recording
 from mstfilter.fusion import FreeSpace, SceneMemory
-from mstfilter.scene import Recording
 from mstfilter.simulation import cached_recording
 
 REACHES = (0.0, 0.03, 0.05, 0.1, 0.2)
@@ -28,7 +28,7 @@ def main(out: Path, smoke: bool) -> None:
     rows: dict[tuple[str, float], np.ndarray] = {}
     for family in ("s1",) if smoke else ("s1", "s2", "s3"):
         for seed in (0,) if smoke else (0, 1, 2):
-            recording = Recording.open(cached_recording(family, seed, **(SMALL if smoke else {})))
+            recording = open_recording(cached_recording(family, seed, **(SMALL if smoke else {})))
             for clip in recording.clips()[1:]:
                 occupied = recording.truth(clip.index) > 0
                 now = FreeSpace().known_free(clip.after, clip.grid)

@@ -19,7 +19,8 @@ from matplotlib.axes import Axes
 from scipy import stats
 
 import mstfilter
-from mstfilter.scene import Frame, Recording
+from mstfilter.formats import open_recording
+from mstfilter.scene import Frame
 from mstfilter.scoring import weighted_coverage
 from mstfilter.segmentation import CutValue, MergeLogOdds, Tree
 from mstfilter.simulation import cached_recording
@@ -67,7 +68,7 @@ def make(out: Path, smoke: bool) -> list[Path]:
 
 def scene(seed: int, smoke: bool) -> list[list[object]]:
     """A row an arm, value and pause: mean quality and number of objects of the hypotheses."""
-    recording = Recording.open(cached_recording(FAMILY, seed, **(SMALL if smoke else SIZE)))
+    recording = open_recording(cached_recording(FAMILY, seed, **(SMALL if smoke else SIZE)))
     rows: list[list[object]] = []
     for value in ("usual", "too fine"):
         for arm in ARMS:

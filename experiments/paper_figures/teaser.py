@@ -17,6 +17,7 @@ from matplotlib.axes import Axes
 from matplotlib.patches import Rectangle
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from mstfilter.formats import open_recording
 from mstfilter.presets import load_config
 from mstfilter.report import TRUTH, Identities, by_weight, identity_colours, viewpoint
 from mstfilter.scene import Camera, Recording
@@ -33,7 +34,7 @@ TURN = RigidTransform.from_rotation(Rotation.from_euler("z", 125, degrees=True))
 
 def make(out: Path, smoke: bool) -> list[Path]:
     """The figure."""
-    recording = Recording.open(cached_recording(FAMILY, SEED, **(SMALL if smoke else {})))
+    recording = open_recording(cached_recording(FAMILY, SEED, **(SMALL if smoke else {})))
     with tempfile.TemporaryDirectory() as folder:
         run = execute(recording, load_config("mst"), Path(folder) / "run", seed=0)
         return [picture(recording, run, out / "teaser.png", smoke), table(recording, run, out / "teaser.csv")]

@@ -103,14 +103,15 @@ def measure(case: Case) -> dict[str, Any]:
     import cv2
 
     import mstfilter
-    from mstfilter.scene import Recording, VoxelGrid
+    from mstfilter.formats import open_recording
+    from mstfilter.scene import VoxelGrid
     from mstfilter.simulation import cached_recording
     from mstfilter.smc import watch
     from mstfilter.study import peak_megabytes, reset_peak
 
     cv2.setNumThreads(1)
     watch.time = SimpleNamespace(perf_counter=time.process_time)  # the parts of a step in processor seconds
-    recording = Recording.open(cached_recording(case.family, case.seed, **case.set))
+    recording = open_recording(cached_recording(case.family, case.seed, **case.set))
     grid = VoxelGrid(recording.grid.origin, 1.0 / case.side, (case.side, case.side, case.side // 2))
     recording = replace(
         recording,

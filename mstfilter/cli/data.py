@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from mstfilter.cli.root import Format, Options, Pauses, app
-from mstfilter.cli.shared import bar, open_recording
+from mstfilter.cli.shared import bar, read_source
 
 __all__ = ["convert", "quality"]
 
@@ -27,7 +27,7 @@ def convert(
     from mstfilter.formats import check_writable, save
 
     check_writable(out)
-    recording = open_recording(source, format, option, pauses, frames)
+    recording = read_source(source, format, option, pauses, frames)
     generator = recording.manifest.get("generator") or f"converted from {source.name}"
     try:
         with bar("convert") as advance:
@@ -55,7 +55,7 @@ def quality(
     from mstfilter.study import read_estimate, read_truth, score, write_csv
 
     volumes = truth.is_file() and truth.suffix in (".npz", ".npy")
-    known = truth if volumes else open_recording(truth, format, option, "")
+    known = truth if volumes else read_source(truth, format, option, "")
     rows = score(read_estimate(run), read_truth(known))
     if csv is not None:
         write_csv(csv, rows)

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from mstfilter.cli.root import Format, Options, Overrides, Pauses, Seed, app
-from mstfilter.cli.shared import bar, open_recording, safe_name, summary
+from mstfilter.cli.shared import bar, read_source, safe_name, summary
 from mstfilter.errors import InputError
 
 __all__ = ["demo", "report", "run", "simulate"]
@@ -33,7 +33,7 @@ def run(
     from mstfilter.presets import load_config
 
     config = load_config(preset, overrides or ())
-    source = open_recording(recording, format, option, pauses, frames)
+    source = read_source(recording, format, option, pauses, frames)
     name = Path(preset).stem
     folder = out or Path("runs") / f"{safe_name(source.name)}-{safe_name(name)}-{seed}"
     _execute(source, config, folder, seed)
@@ -52,8 +52,8 @@ def demo(
     """Simulate a robot at a cluttered table, filter the recording, write a report."""
     import shutil
 
+    from mstfilter.formats import open_recording
     from mstfilter.presets import load_config
-    from mstfilter.scene import Recording
 
     if out.exists() and not out.is_dir():
         raise InputError(f"{out} is a file, expected a folder for the demo")
@@ -66,7 +66,7 @@ def demo(
             )
         shutil.rmtree(out)
     _simulate("demo", out / "recording", seed)
-    _execute(Recording.open(out / "recording"), load_config("mst"), out / "run", 0)
+    _execute(open_recording(out / "recording"), load_config("mst"), out / "run", 0)
     _report(out / "run", out / "report.html")
     summary(out / "run")
 

@@ -12,7 +12,7 @@ from typing import Any, TextIO
 
 from mstfilter.errors import InputWarning
 
-__all__ = ["bar", "open_recording", "safe_name", "summary", "warnings_as_lines"]
+__all__ = ["bar", "read_source", "safe_name", "summary", "warnings_as_lines"]
 
 
 def safe_name(name: str) -> str:
@@ -20,7 +20,7 @@ def safe_name(name: str) -> str:
     return re.sub(r"[^\w.-]+", "-", name).strip(".-") or "recording"
 
 
-def open_recording(path: Path, format: str, options: list[str] | None, pauses: str, frames: str = "") -> Any:
+def read_source(path: Path, format: str, options: list[str] | None, pauses: str, frames: str = "") -> Any:
     """A recording of any format that is read."""
     from mstfilter.study import open_source
 

@@ -1,7 +1,7 @@
 from mstfilter.formats.bag import Bag as Bag
 from mstfilter.formats.bop import Bop as Bop
 from mstfilter.formats.dsr import Dsr as Dsr
-from mstfilter.formats.folder import RecordingFolder as RecordingFolder, open_folder as open_folder
+from mstfilter.formats.folder import RecordingFolder as RecordingFolder, open_recording as open_recording
 from mstfilter.formats.interfaces import Format as Format
 from mstfilter.formats.paired_images import PairedImages as PairedImages, open_paired as open_paired
 from mstfilter.formats.pauses import (

@@ -1,6 +1,6 @@
 """Our own recording folder: reading, with one clear error for whatever is wrong.
 
->>> recording = open_folder(Path("recordings/mine"))
+>>> recording = open_recording("recordings/mine")
 
 The layout stands in `mstfilter.scene.recording`; `mstfilter.formats.writer` writes it.
 """
@@ -38,7 +38,7 @@ from mstfilter.scene import (
     truth_reader,
 )
 
-__all__ = ["RecordingFolder", "RecordingWriter", "open_folder", "save"]
+__all__ = ["RecordingFolder", "RecordingWriter", "open_recording", "save"]
 
 
 class _Workspace(BaseModel):
@@ -108,11 +108,16 @@ class RecordingFolder(Format):
 
     def open(self, path: Path) -> Recording:
         """See `Format`."""
-        return open_folder(path)
+        return open_recording(path)
 
 
-def open_folder(path: Path) -> Recording:
-    """Read a recording folder. Images are read later; everything else is checked now."""
+def open_recording(path: str | Path) -> Recording:
+    """Read a recording folder.
+
+    Everything but the images is checked now. Images are read when they are first used; `Recording.check` reads them
+    all.
+    """
+    path = Path(path)
     if not path.is_dir():
         raise InputError(f"recording folder does not exist: {path}")
     if not any(path.iterdir()):

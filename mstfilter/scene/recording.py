@@ -1,6 +1,6 @@
 """Recordings: an RGB-D video with pauses, on disk or in memory.
 
->>> recording = Recording.open("recordings/table-7")
+>>> recording = mstfilter.open_recording("recordings/table-7")
 >>> for clip in recording.clips():
 ...     clip.before, clip.after                 # Frames, read when they are looked at
 >>> Recording.from_arrays(rgb, depth, K)         # a user's own arrays; depth in metres
@@ -120,13 +120,6 @@ class Recording:
         ):
             raise InputError(f"times of recording {self.name} are not {n} ascending numbers")
         object.__setattr__(self, "pauses", pauses)
-
-    @classmethod
-    def open(cls, path: str | Path) -> Recording:
-        """Read a recording folder; images are read when they are looked at (see `check`)."""
-        from mstfilter.formats import open_folder
-
-        return open_folder(Path(path))
 
     @classmethod
     def from_arrays(

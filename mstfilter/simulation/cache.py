@@ -1,8 +1,9 @@
 """Simulated recordings kept on disk: made once, found again by the content of their recipe.
 
+>>> from mstfilter.formats import open_recording
 >>> from mstfilter.scene import Recording
 >>> from mstfilter.simulation.cache import cached_recording
->>> recording = Recording.open(cached_recording("s2", seed=7))  # doctest: +SKIP
+>>> recording = open_recording(cached_recording("s2", seed=7))  # doctest: +SKIP
 >>> small = cached_recording("s2", 7, width=160, height=120, n_actions=1)  # doctest: +SKIP
 
 The name of a recording's folder holds a hash of everything that decides its bytes: every field of the family, the

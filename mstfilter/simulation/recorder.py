@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from mstfilter.errors import InputError
-from mstfilter.formats import RecordingWriter
+from mstfilter.formats import RecordingWriter, open_recording
 from mstfilter.scene import Recording
 from mstfilter.simulation.actions import Effect, Push, advance, choose_push, effect, finish
 from mstfilter.simulation.arrangement import Things, arrange, draw_things
@@ -160,7 +160,7 @@ def record(scene: Scene, path: str | Path, progress: Progress | None = None) -> 
     """
     with RecordingWriter(path, scene.camera, scene.grid, **scene.describe()) as writer:
         _record(scene, writer, progress or (lambda done, total, what: None))
-    return Recording.open(path)
+    return open_recording(path)
 
 
 def _record(scene: Scene, writer: RecordingWriter, progress: Progress) -> None:

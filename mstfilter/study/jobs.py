@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from mstfilter.errors import InputError
+from mstfilter.formats import open_recording
 from mstfilter.scene import Recording
 from mstfilter.smc import telling
 from mstfilter.study.code_version import files_version
@@ -72,7 +73,7 @@ def open_scene(source: Mapping[str, Any], recordings: str) -> Recording:
         return open_source(Path(source["path"]), source["format"], source["options"], source["pauses"])
     from mstfilter.simulation import cached_recording
 
-    return Recording.open(cached_recording(source["family"], source["seed"], Path(recordings), **source["set"]))
+    return open_recording(cached_recording(source["family"], source["seed"], Path(recordings), **source["set"]))
 
 
 def _record(job: Job, step: Step) -> None:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from mstfilter.formats import RecordingWriter
-from mstfilter.scene import Recording, render
+from mstfilter.formats import RecordingWriter, open_recording
+from mstfilter.scene import render
 from tests.scene.scenes import CAMERA, GRID, table_scene
 
 
@@ -27,4 +27,4 @@ def slide(path, shifts=(0, 1, 2, 3, 4), noise=True):
             )
             if index % 2 == 0:
                 writer.add_voxels(labels)
-    return Recording.open(path)
+    return open_recording(path)

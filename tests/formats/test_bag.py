@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from mstfilter.errors import InputError, InputWarning
+from mstfilter.formats import open_recording
 from mstfilter.formats.bag import Bag
 from mstfilter.formats.bag_images import colour_of, depth_of
 from mstfilter.formats.pauses import Ends
 from mstfilter.formats.writer import save
-from mstfilter.scene import Recording
 from tests.formats.bags import COLOUR, DEPTH, KINDS, Messages, scene_messages, topic_info, write
 from tests.formats.layouts import FPS, PAUSES, SHIFTS, K, video
 from tests.formats.test_layouts import WORLD, same_frames
@@ -28,7 +28,7 @@ def test_every_kind_of_bag(tmp_path, kind):
     same_frames(recording, SHIFTS)
     assert recording.pauses == PAUSES
     np.testing.assert_allclose(recording.times, np.arange(len(SHIFTS)) / FPS, atol=1e-6)
-    assert Recording.open(save(recording, tmp_path / "out")).key == recording.key
+    assert open_recording(save(recording, tmp_path / "out")).key == recording.key
 
 
 def test_a_bare_mcap_file(tmp_path):

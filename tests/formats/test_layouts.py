@@ -11,6 +11,7 @@ import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from mstfilter.errors import InputError, InputWarning
+from mstfilter.formats import open_recording
 from mstfilter.formats.bop import Bop
 from mstfilter.formats.dsr import Dsr
 from mstfilter.formats.lens import Lens
@@ -48,7 +49,7 @@ def same_frames(recording, shifts, atol=2e-7):
 
 def same_on_disk(recording, path):
     """Converted, the recording is the same byte for byte."""
-    assert Recording.open(save(recording, path)).key == recording.key
+    assert open_recording(save(recording, path)).key == recording.key
     assert not list(path.parent.glob(".*"))
 
 
@@ -140,7 +141,7 @@ def test_bop(tmp_path):
     assert columns[0] + 3 < columns[1] < columns[2]
     assert set(np.unique(recording.instance(0))) == {0, 1, 2}
     same_on_disk(recording, tmp_path / "out")
-    np.testing.assert_array_equal(Recording.open(tmp_path / "out").instance(1), recording.instance(1))
+    np.testing.assert_array_equal(open_recording(tmp_path / "out").instance(1), recording.instance(1))
     few = Bop(images=(7, 1)).open(path)
     np.testing.assert_array_equal(few.frames[0].rgb, video((5,))[0][0])
     shutil.rmtree(path / "mask_visib")
@@ -177,7 +178,7 @@ def test_dsr(tmp_path):
     on_box = heights > 0.04
     assert (truth[tuple(inside[on_box].T)] == 1).all()
     np.testing.assert_allclose(np.median(frame.points[..., 2]), 0.0, atol=1e-6)
-    again = Recording.open(save(recording, tmp_path / "out"))
+    again = open_recording(save(recording, tmp_path / "out"))
     np.testing.assert_allclose(again.frames[2].depth, recording.frames[2].depth, atol=5.1e-5)
     np.testing.assert_array_equal(again.truth(2), recording.truth(2))
 
@@ -360,7 +361,7 @@ def test_depth_beyond_the_file_is_no_reading(tmp_path):
     depth[:5] = 80.0
     with RecordingWriter(tmp_path / "r", CAMERA) as writer:
         writer.add_frame(video((0,))[0][0], depth, 0.0, "static")
-    assert np.isnan(Recording.open(tmp_path / "r").frames[0].depth[:5]).all()
+    assert np.isnan(open_recording(tmp_path / "r").frames[0].depth[:5]).all()
     assert units(depth, 0.002).max() == 40000
 
 

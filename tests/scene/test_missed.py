@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from mstfilter.errors import InputWarning
-from mstfilter.formats import RecordingWriter, save
+from mstfilter.formats import RecordingWriter, open_recording, save
 from mstfilter.scene.recording import Recording
 from mstfilter.scene.voxels import VoxelGrid
 from tests.scene.scenes import CAMERA, GRID, table_scene
@@ -49,4 +49,4 @@ def test_good_grids_are_not_told(tmp_path):
             for k, empty in enumerate((True, False)):
                 rgb, depth, _ = table_scene(empty=empty)
                 writer.add_frame(rgb, depth, float(k), "static")
-        Recording.open(tmp_path / "r").check()
+        open_recording(tmp_path / "r").check()

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 
 from mstfilter.errors import InputError
-from mstfilter.scene import Recording
+from mstfilter.formats import open_recording
 from mstfilter.simulation import cache
 from mstfilter.simulation.cache import cache_folder, cached_recording, recipe_key
 from mstfilter.simulation.families import scene_family
@@ -15,7 +15,7 @@ TINY = {"width": 80, "height": 60, "n_actions": 1, "frames_per_clip": 3, "fps": 
 
 def test_made_once_and_found_again(tmp_path, monkeypatch):
     first = cached_recording("s1", 3, tmp_path, **TINY)
-    assert first.parent == tmp_path and len(Recording.open(first)) == 3
+    assert first.parent == tmp_path and len(open_recording(first)) == 3
     assert sorted(p.name for p in tmp_path.iterdir()) == [".gitignore", first.name]
     monkeypatch.setattr(cache, "_make", lambda *_: pytest.fail("made again"))
     assert cached_recording("s1", 3, tmp_path, **TINY) == first

@@ -10,7 +10,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from mstfilter.errors import InputError
-from mstfilter.scene import Recording, VoxelGrid, render
+from mstfilter.formats import open_recording
+from mstfilter.scene import VoxelGrid, render
 from mstfilter.simulation.families import scene_family
 from mstfilter.simulation.recorder import Scene, simulate
 from mstfilter.simulation.shapes import FAMILIES, draw_shape
@@ -167,7 +168,7 @@ def test_camera_of_families():
 
 
 def test_reopened(recording):
-    again = Recording.open(recording.path)
+    again = open_recording(recording.path)
     np.testing.assert_array_equal(again.truth(2), recording.truth(2))
 
 
@@ -179,7 +180,7 @@ def test_objects_that_left_the_workspace_are_named_and_the_truth_keeps_its_exten
     scene.world.forward()
     with recorder.RecordingWriter(tmp_path / "away", scene.camera, scene.grid, **scene.describe()) as writer:
         recorder._pause(scene, writer, 0, 0.0)
-    away = Recording.open(tmp_path / "away")
+    away = open_recording(tmp_path / "away")
     assert away.manifest["frames"][0]["left_workspace"] == [2]
     assert away.truth(0).shape == SMALL.grid().shape
     assert set(np.unique(away.truth(0))) == {0, 1, 3, 4, 5}

@@ -11,10 +11,9 @@ import pytest
 
 from mstfilter import registry
 from mstfilter.errors import InputError
-from mstfilter.formats import RecordingWriter
+from mstfilter.formats import RecordingWriter, open_recording
 from mstfilter.presets import build_filter, describe_filter, load_config
 from mstfilter.resources import preset_names
-from mstfilter.scene import Recording
 from mstfilter.scoring import weighted_coverage
 from mstfilter.study.run import execute
 from mstfilter.study.run_folder import RunFolder
@@ -32,7 +31,7 @@ def recording(tmp_path_factory):
             writer.add_frame(rgb, depth, index / 5, "action" if index % 2 else "static")
             if index % 2 == 0:
                 writer.add_voxels(labels)
-    return Recording.open(path)
+    return open_recording(path)
 
 
 def content(folder):
@@ -67,7 +66,7 @@ def test_the_same_seed_gives_the_same_bytes(recording, tmp_path):
 
     execute(recording, load_config("mst"), tmp_path / "a", seed=7)
     memo.clear()
-    execute(Recording.open(recording.path), load_config("mst"), tmp_path / "b", seed=7)
+    execute(open_recording(recording.path), load_config("mst"), tmp_path / "b", seed=7)
     a, b = content(tmp_path / "a"), content(tmp_path / "b")
     assert a.keys() == b.keys()
     assert [k for k in a if a[k] != b[k]] == []
@@ -119,7 +118,7 @@ def test_broken_input_makes_no_folder(recording, tmp_path):
     image = broken / "depth" / "000004.png"
     image.write_bytes(image.read_bytes()[:-50])
     with pytest.raises(InputError, match="truncated"):
-        execute(Recording.open(broken), load_config("mst"), tmp_path / "run")
+        execute(open_recording(broken), load_config("mst"), tmp_path / "run")
     with pytest.raises(InputError, match="n is 0"):
         execute(recording, load_config("mst", ["n=0"]), tmp_path / "run")
     assert not (tmp_path / "run").exists()
@@ -241,7 +240,7 @@ def test_what_a_run_was_made_of_is_remembered(recording, tmp_path):
     changed = tmp_path / "changed"
     shutil.copytree(recording.path, changed)
     shutil.copy(changed / "rgb" / "000000.png", changed / "rgb" / "000001.png")
-    assert Recording.open(changed).key != recording.key
+    assert open_recording(changed).key != recording.key
 
 
 @pytest.mark.parametrize("override", ["update.eta=0", "n_proposed=-1", "update.quality_exponent=nan", "trigger.k=0"])

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from mstfilter.errors import InputError
-from mstfilter.formats import RecordingWriter
-from mstfilter.scene import Recording, VoxelGrid, render
+from mstfilter.formats import RecordingWriter, open_recording
+from mstfilter.scene import VoxelGrid, render
 from mstfilter.study.scoring import Estimate, Truth, read_estimate, read_truth, score, write_csv
 from tests.scene.scenes import CAMERA, GRID, table_scene
 
@@ -62,7 +62,7 @@ def write_recording(path, volumes=True, instance=True, grid=GRID):
 def test_volumes_against_a_recording(tmp_path):
     """Pauses are matched by frame, whatever the order and however many there are."""
     path = write_recording(tmp_path / "r")
-    truth = read_truth(Recording.open(path))
+    truth = read_truth(open_recording(path))
     whole = read_estimate(path / "voxels.npz")
     assert [row.mean for row in score(whole, truth)] == [1.0] * 6
     labels = np.stack([table_scene(4)[2], np.zeros(GRID.shape, np.uint16)])
@@ -75,7 +75,7 @@ def test_volumes_against_a_recording(tmp_path):
 
 def test_instance_images_score_what_is_seen(tmp_path):
     """Without volumes the truth is the image: right volumes are perfect there, wrong hidden voxels cost nothing."""
-    recording = Recording.open(write_recording(tmp_path / "r", volumes=False))
+    recording = open_recording(write_recording(tmp_path / "r", volumes=False))
     truth = read_truth(recording)
     assert truth[0].camera is not None
     right = table_scene(0)[2].copy()
@@ -95,7 +95,7 @@ def test_a_run_scores_as_its_own_metrics_say(tmp_path):
     from mstfilter.presets import load_config
     from mstfilter.study.run import execute
 
-    recording = Recording.open(write_recording(tmp_path / "r"))
+    recording = open_recording(write_recording(tmp_path / "r"))
     run = execute(recording, load_config("mst", ["n=3"]), tmp_path / "run", 0)
     rows = score(read_estimate(run.path), read_truth(recording))
     written = list(csv.DictReader((run.path / "metrics.csv").open()))
@@ -114,7 +114,7 @@ def test_a_run_scores_as_its_own_metrics_say(tmp_path):
 
 def test_what_does_not_fit(tmp_path):
     path = write_recording(tmp_path / "r")
-    truth = read_truth(Recording.open(path))
+    truth = read_truth(open_recording(path))
     other = VoxelGrid((1, 1, 0), 0.01, GRID.shape)
     labels = table_scene(0)[2]
     for estimate, message in (
@@ -125,7 +125,7 @@ def test_what_does_not_fit(tmp_path):
         with pytest.raises(InputError, match=message):
             score(estimate, truth)
     with pytest.raises(InputError, match="holds no truth"):
-        read_truth(Recording.open(write_recording(tmp_path / "bare", volumes=False, instance=False)))
+        read_truth(open_recording(write_recording(tmp_path / "bare", volumes=False, instance=False)))
     (tmp_path / "bad.npz").write_bytes(b"PK")
     np.save(tmp_path / "flat.npy", np.zeros((3, 3), int))
     np.save(tmp_path / "real.npy", np.zeros((3, 3, 3)))
