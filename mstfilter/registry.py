@@ -120,15 +120,9 @@ COMPONENTS: dict[str, dict[str, str]] = {
     },
     "division": {
         "none": "mstfilter.fusion:NoDivision",
-        "rigid_motions": "mstfilter.tracking:RigidMotions",
+        "rigid_motions": "mstfilter.fusion:RigidMotions",
     },
-    "evidence": {
-        "agreement": "mstfilter.fusion:Agreement",
-        "boundaries": "mstfilter.segmentation:BoundaryAgreement",
-        "depth": "mstfilter.fusion:DepthAgreement",
-        "motions": "mstfilter.tracking:MotionAgreement",
-        "support": "mstfilter.fusion:Support",
-    },
+    "evidence": {"agreement": "mstfilter.fusion:Agreement"},
     "mode_filter": {"majority": "mstfilter.fusion:ModeFilter"},
     "format": {
         "recording": "mstfilter.formats:RecordingFolder",

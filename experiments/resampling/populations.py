@@ -15,15 +15,13 @@ from worlds import World, branching
 
 import mstfilter
 from mstfilter.errors import InputError
-from mstfilter.fusion import NoFreeSpace, SameSegmentation, WeightedCoverage
+from mstfilter.fusion import Agreement, NoFreeSpace, SameSegmentation, WeightedCoverage
 from mstfilter.presets import load_config
 from mstfilter.registry import build
 from mstfilter.scene import Camera, Clip, Frame, Hypothesis, VoxelGrid
 from mstfilter.scoring import weighted_coverage
-from mstfilter.segmentation import BoundaryAgreement
 from mstfilter.simulation import scene_family, simulate
 from mstfilter.smc import Population, Resampler, Systematic
-from mstfilter.tracking import MotionAgreement
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,7 +99,7 @@ def real(eta: int = 5) -> Candidates | None:
     return Candidates.of(fused, WeightedCoverage(), SameSegmentation(), quality)
 
 
-#: Filters whose candidates of simulated scenes are kept. `scored` is `mst` with evidence for built candidates.
+#: Filters whose candidates of simulated scenes are kept. `scored` is `mst` with more scored candidates.
 SIMULATED = ("mst", "scored", "paper")
 
 
@@ -122,8 +120,8 @@ def simulated(seed: int, small: bool = False) -> dict[str, Candidates]:
         for name in SIMULATED:
             filter = mstfilter.preset("mst" if name == "scored" else name, *(["update.eta=1"] if small else []))
             if name == "scored":
-                terms = (BoundaryAgreement(), MotionAgreement())
-                filter = replace(filter, update=replace(filter.update, evidence=terms, n_scored=12 if small else 60))
+                n_scored = 12 if small else 60
+                filter = replace(filter, update=replace(filter.update, evidence=(Agreement(),), n_scored=n_scored))
             catch = Catch()
             replace(filter, resampler=catch).run(clips, 0)
             out[name] = Candidates.of(

@@ -7,18 +7,17 @@ from mstfilter.fusion.conflicts import (
     conflict_graph as conflict_graph,
 )
 from mstfilter.fusion.crossover import Crossover as Crossover, Draw as Draw
-from mstfilter.fusion.depth_evidence import DepthAgreement as DepthAgreement
-from mstfilter.fusion.division import NoDivision as NoDivision
+from mstfilter.fusion.division import NoDivision as NoDivision, RigidMotions as RigidMotions
 from mstfilter.fusion.free_space import (
     SMALLEST_QUALITY as SMALLEST_QUALITY,
     FreeSpace as FreeSpace,
     NoFreeSpace as NoFreeSpace,
     Projection as Projection,
 )
+from mstfilter.fusion.interfaces import Division as Division, Evidence as Evidence
 from mstfilter.fusion.merging import merge_probability as merge_probability
 from mstfilter.fusion.mode_filter import ModeFilter as ModeFilter
 from mstfilter.fusion.projection import ProjectionUpdate as ProjectionUpdate
-from mstfilter.fusion.scene_memory import SceneMemory as SceneMemory
 from mstfilter.fusion.similarity import (
     Agreement as Agreement,
     SameSegmentation as SameSegmentation,
@@ -31,5 +30,4 @@ from mstfilter.fusion.structure import (
     SpanningTree as SpanningTree,
     Structure as Structure,
 )
-from mstfilter.fusion.support import Support as Support, stands as stands
 from mstfilter.fusion.update import FusionUpdate as FusionUpdate

@@ -10,25 +10,44 @@ remembers from whom it came apart (`ObjectRecord.apart`), and fusion never makes
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from mstfilter.fusion.conflicts import claimed, overlapping
-from mstfilter.scene import MAX_LABEL, Clip, Division, Hypothesis, ObjectRecord, frame_geometry, project
+from mstfilter.fusion.interfaces import Division
+from mstfilter.scene import MAX_LABEL, Clip, Hypothesis, ObjectRecord, frame_geometry, project
+from mstfilter.tracking import MotionSegmentation
 
-__all__ = ["NoDivision", "PartRule", "part_like", "remember_like", "take_apart"]
+__all__ = ["NoDivision", "PartRule", "RigidMotions", "part_like", "remember_like", "take_apart"]
 
 _INSIDE = 0.5  # of a predicted object, for a proposed one to hold it
 
 
 @dataclass(frozen=True)
 class NoDivision(Division):
-    """Says nothing."""
+    """Divides no object."""
 
     def divide(self, clip: Clip) -> None:
-        """None."""
+        """Return None."""
+
+
+@dataclass(frozen=True)
+class RigidMotions(Division):
+    """Pixels that followed different rigid motions in the clip belong to different objects.
+
+    Parameters
+    ----------
+    motions : MotionSegmentation
+        Groups the pixels of the last frame by rigid motion.
+    """
+
+    motions: MotionSegmentation = field(default_factory=MotionSegmentation)
+
+    def divide(self, clip: Clip) -> np.ndarray | None:
+        """Number of the motion of each pixel: 0 at rest, 1, 2, ... moving, -1 unknown; None for a single frame."""
+        return self.motions.labels(clip)
 
 
 @dataclass(frozen=True)
@@ -60,7 +79,7 @@ def take_apart(
     hypothesis : Hypothesis
         About the end of the clip.
     motions : (H, W) int
-        Number of the motion of each pixel of the last frame, -1 unknown (`mstfilter.scene.evidence.Division`).
+        Number of the motion of each pixel of the last frame, -1 unknown (`Division.divide`).
     clip : Clip
     rule : PartRule
     proposed : bool

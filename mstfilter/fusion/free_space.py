@@ -1,7 +1,7 @@
 """What the sensor looked through cannot be occupied: projection of a hypothesis onto known free space.
 
 >>> refined, quality = FreeSpace().project(hypothesis, frame)           # one frame, all its cameras
->>> refined, quality = FreeSpace().refine(hypotheses, clip)             # many, at the end of a clip, with memory
+>>> refined, quality = FreeSpace().refine(hypotheses, clip)             # many, at the end of a clip
 
 The share of voxels that a hypothesis keeps is its quality Q (paper, section IV-D): a prediction that has put
 objects where there is nothing loses voxels and weight. `mstfilter.fusion.projection` makes an update of it.
@@ -17,7 +17,6 @@ from typing import Any, Protocol, TypeVar
 import numpy as np
 
 from mstfilter.errors import InputError
-from mstfilter.fusion.scene_memory import SceneMemory, Seen
 from mstfilter.scene import (
     Clip,
     Frame,
@@ -94,14 +93,11 @@ class FreeSpace(Projection):
         Margin for the noise, in standard deviations of a depth reading at that range.
     table_height : float
         Voxels whose centre is below it (metres above the table) are cleared as well.
-    memory : SceneMemory
-        What was seen to be free at earlier pauses and is hidden now; by default nothing is remembered.
     """
 
     margin_voxels: float = 0.5
     margin_sigmas: float = 3.0
     table_height: float = 0.0
-    memory: SceneMemory = SceneMemory()  # noqa: RUF009 (frozen)
 
     def __post_init__(self) -> None:
         margins = (self.margin_voxels, self.margin_sigmas)
@@ -112,27 +108,12 @@ class FreeSpace(Projection):
             )
 
     def known_free(self, frame: Frame, grid: VoxelGrid) -> np.ndarray:
-        """(X, Y, Z) bool: voxels that cannot be occupied, by this frame alone. Memoised by content."""
-        return self._look(frame, grid).free
+        """Voxels (X, Y, Z) bool that a frame observes as free. Memoised by content."""
+        key = content_key("free space", self.margin_voxels, self.margin_sigmas, self.table_height)
+        return memo("known_free", (frame.key, grid.key, key), lambda: read_only(self._known_free(frame, grid)))
 
-    def hidden(self, frame: Frame, grid: VoxelGrid) -> np.ndarray:
-        """(X, Y, Z) bool: voxels of which this frame says nothing: well behind a surface, or without a reading."""
-        return self._look(frame, grid).hidden
-
-    def known_free_after(self, clip: Clip) -> np.ndarray:
-        """(X, Y, Z) bool on the clip's grid: voxels that cannot be occupied at its end, memory included."""
-        return self.memory.free(self._look, self._key, clip)
-
-    @property
-    def _key(self) -> bytes:
-        """Names how a frame is looked at; memory plays no part in it."""
-        return content_key("free space", self.margin_voxels, self.margin_sigmas, self.table_height)
-
-    def _look(self, frame: Frame, grid: VoxelGrid) -> Seen:
-        return memo("seen", (frame.key, grid.key, self._key), lambda: self._seen(frame, grid))
-
-    def _seen(self, frame: Frame, grid: VoxelGrid) -> Seen:
-        free, hit, hidden = np.zeros(grid.shape, bool), np.zeros(grid.shape, bool), np.ones(grid.shape, bool)
+    def _known_free(self, frame: Frame, grid: VoxelGrid) -> np.ndarray:
+        free, hit = np.zeros(grid.shape, bool), np.zeros(grid.shape, bool)
         for view in frame.all_views:
             geometry = frame_geometry(view, grid)
             # The noise belongs to the reading, so its range is that of the measured surface.
@@ -140,27 +121,16 @@ class FreeSpace(Projection):
             margin = self.margin_voxels * grid.voxel_size + self.margin_sigmas * noise
             with np.errstate(invalid="ignore"):
                 free |= geometry.signed < -margin
-                hidden &= ~(geometry.signed <= margin)  # no reading, or well behind one
             points = grid.index_of(view.points[view.valid])
             hit[tuple(points[grid.contains(points)].T)] = True
         free &= ~hit
         below = grid.origin[2] + (np.arange(grid.shape[2]) + 0.5) * grid.voxel_size < self.table_height
-        free[:, :, below], hit[:, :, below] = True, False
-        return Seen(read_only(free), read_only(hit), read_only(hidden & ~hit & ~free))
+        free[:, :, below] = True
+        return free
 
     def project(self, hypothesis: P, frame: Frame) -> tuple[P, float]:
-        """Clear what this frame shows to be free; the quality of a hypothesis without voxels is 1."""
+        """Clear voxels that the frame observes as free. A hypothesis without voxels has quality 1."""
         return _cleared(hypothesis, self.known_free(frame, hypothesis.grid))
-
-    def refine(self, hypotheses: Sequence[P], clip: Clip) -> tuple[tuple[P, ...], np.ndarray]:
-        """Clear what is known to be free at the end of a clip."""
-        if not self.memory.pauses:
-            return super().refine(hypotheses, clip)
-        if any(hypothesis.grid != clip.grid for hypothesis in hypotheses):
-            raise InputError(f"clip {clip.index} and a hypothesis about it have different grids")
-        free = self.known_free_after(clip)
-        pairs = [_cleared(hypothesis, free) for hypothesis in hypotheses]
-        return tuple(h for h, _ in pairs), np.array([q for _, q in pairs])
 
 
 def _cleared(particle: P, free: np.ndarray) -> tuple[P, float]:

@@ -15,7 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from mstfilter.errors import InputError
-from mstfilter.scene import Clip, Evidence, Hypothesis
+from mstfilter.fusion.interfaces import Evidence
+from mstfilter.scene import Clip, Hypothesis
 from mstfilter.smc import Equivalence, Similarity, first_seen
 
 __all__ = ["Agreement", "SameSegmentation", "WeightedCoverage", "canonical"]

@@ -27,7 +27,8 @@ from mstfilter.fusion.claims import Claims
 from mstfilter.fusion.crossover import Crossover
 from mstfilter.fusion.division import NoDivision, PartRule, take_apart
 from mstfilter.fusion.free_space import SMALLEST_QUALITY, FreeSpace, Projection
-from mstfilter.scene import Clip, Division, Evidence, Hypothesis, VoxelGrid
+from mstfilter.fusion.interfaces import Division, Evidence
+from mstfilter.scene import Clip, Hypothesis, VoxelGrid
 from mstfilter.smc import Candidates, Population, Systematic, Update, child, key_of, union
 
 __all__ = ["FusionUpdate"]

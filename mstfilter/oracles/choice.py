@@ -15,9 +15,9 @@ from typing import ClassVar
 import numpy as np
 
 from mstfilter.errors import InputError
-from mstfilter.fusion import FreeSpace, Projection
+from mstfilter.fusion import Evidence, FreeSpace, Projection
 from mstfilter.oracles.truth import UsesTruth
-from mstfilter.scene import Clip, Evidence, Frame, Hypothesis, ObjectRecord, frame_geometry, render
+from mstfilter.scene import Clip, Frame, Hypothesis, ObjectRecord, frame_geometry, render
 from mstfilter.scoring import Form, overlap, weighted_coverage
 from mstfilter.smc import Candidates, Key, Population, Resampler, Update, key_of, union
 

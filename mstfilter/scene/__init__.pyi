@@ -4,7 +4,6 @@ from mstfilter.scene.camera import Camera as Camera, look_at as look_at, rigid_f
 from mstfilter.scene.clip import Clip as Clip
 from mstfilter.scene.depth_noise import SIGMA_AT_ONE_METRE as SIGMA_AT_ONE_METRE, depth_sigma as depth_sigma
 from mstfilter.scene.disk_memo import DiskMemo as DiskMemo, Kind as Kind
-from mstfilter.scene.evidence import Division as Division, Evidence as Evidence
 from mstfilter.scene.frame import Frame as Frame
 from mstfilter.scene.geometry import frame_geometry as frame_geometry
 from mstfilter.scene.images import (

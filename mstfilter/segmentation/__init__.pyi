@@ -1,6 +1,5 @@
 from mstfilter.segmentation.agglomerate import Agglomeration as Agglomeration
 from mstfilter.segmentation.boundary import ColourDepthBoundary as ColourDepthBoundary
-from mstfilter.segmentation.evidence import BoundaryAgreement as BoundaryAgreement
 from mstfilter.segmentation.gibbs import ExactCuts as ExactCuts
 from mstfilter.segmentation.interfaces import (
     BoundaryModel as BoundaryModel,

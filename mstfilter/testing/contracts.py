@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from mstfilter.errors import InputError
-from mstfilter.scene import Evidence
+from mstfilter.fusion import Evidence
 from mstfilter.smc import (
     Codec,
     Equivalence,

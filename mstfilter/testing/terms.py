@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from mstfilter.scene import Evidence, Hypothesis
+from mstfilter.fusion import Evidence
+from mstfilter.scene import Hypothesis
 from mstfilter.testing.properties import Broken, Example, Suite, Untouched, guarded
 
 __all__ = ["EVIDENCE"]

@@ -1,6 +1,6 @@
-"""What moved apart: the pixels of a clip's last frame, grouped by rigid motion.
+"""Motion segmentation: the pixels of a clip's last frame, grouped by rigid motion.
 
->>> RigidMotions().divide(clip)        # (H, W) int32: 0 at rest, 1, 2, ... what moved together, -1 unknown
+>>> MotionSegmentation().labels(clip)        # (H, W) int32: 0 at rest, 1, 2, ... what moved together, -1 unknown
 
 Points that the optical flow followed through the clip are binned into small cells of the last image, and
 neighbouring cells are joined while one rigid motion explains them both, the pair with the smallest misfit first
@@ -19,11 +19,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
-from mstfilter.scene import Clip, Division, component_key, memo, read_only
+from mstfilter.scene import Clip, component_key, memo, read_only
 from mstfilter.tracking.flow import DenseFlow
 from mstfilter.tracking.rigid import Array, apply, fit_statistics, statistics
 
-__all__ = ["FollowedPoints", "RigidMotions", "followed_points"]
+__all__ = ["FollowedPoints", "MotionSegmentation", "followed_points"]
 
 Ints = NDArray[np.int64]
 
@@ -64,7 +64,7 @@ def followed_points(clip: Clip, flow: DenseFlow) -> FollowedPoints:
 
 
 @dataclass(frozen=True)
-class RigidMotions(Division):
+class MotionSegmentation:
     """Cells of the image joined while one rigid motion explains them.
 
     Parameters
@@ -100,13 +100,13 @@ class RigidMotions(Division):
     min_points: int = 40
     flow: DenseFlow = field(default_factory=DenseFlow)
 
-    def divide(self, clip: Clip) -> NDArray[np.int32] | None:
+    def labels(self, clip: Clip) -> NDArray[np.int32] | None:
         """(H, W) number of the motion of each pixel of the last frame; None for a single frame. Memoised."""
         if len(clip.frames) < 2:
             return None
-        return memo("rigid motions", (clip.frames_key, component_key(self)), lambda: read_only(self._divide(clip)))
+        return memo("rigid motions", (clip.frames_key, component_key(self)), lambda: read_only(self._labels(clip)))
 
-    def _divide(self, clip: Clip) -> NDArray[np.int32]:
+    def _labels(self, clip: Clip) -> NDArray[np.int32]:
         points = followed_points(clip, self.flow)
         height, width = clip.after.depth.shape
         out = np.full((height, width), -1, np.int32)

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from mstfilter.baselines.updates import SamplesOnly, TrackingOnly, Union
-from mstfilter.fusion import FreeSpace, FusionUpdate, NoFreeSpace
+from mstfilter.fusion import Division, Evidence, FreeSpace, FusionUpdate, NoFreeSpace
 from mstfilter.presets import build_filter, load_config
-from mstfilter.scene import Division, Evidence, Hypothesis
+from mstfilter.scene import Hypothesis
 from mstfilter.smc import Population
 from mstfilter.testing import UpdateContract, scene_example
 from tests.baselines.scenes import slide

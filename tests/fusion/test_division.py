@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 
 from mstfilter.fusion.crossover import Crossover
-from mstfilter.fusion.division import NoDivision, PartRule, part_like, take_apart
+from mstfilter.fusion.division import NoDivision, PartRule, RigidMotions, part_like, take_apart
 from mstfilter.fusion.update import FusionUpdate
 from mstfilter.scene import Hypothesis, ObjectRecord, VoxelGrid, decode, encode
 from mstfilter.scoring import weighted_coverage
 from mstfilter.smc import Population
-from mstfilter.tracking import RigidMotions
 from tests.tracking.scenes import standard
 
 GRID = VoxelGrid(np.zeros(3), 0.01, (20, 10, 5))

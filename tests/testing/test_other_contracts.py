@@ -171,9 +171,9 @@ class TestBins(EquivalenceContract):
         return registry.build("equivalence", "bins")
 
 
-class TestSupport(EvidenceContract):
+class TestAgreement(EvidenceContract):
     def make(self):
-        return registry.build("evidence", "support")
+        return registry.build("evidence", "agreement")
 
 
 @pytest.mark.parametrize(

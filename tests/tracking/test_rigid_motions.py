@@ -5,7 +5,7 @@ import pytest
 
 from mstfilter.scene import Clip, Hypothesis, VoxelGrid, cache as memo, project
 from mstfilter.tracking.flow import DenseFlow
-from mstfilter.tracking.rigid_motions import RigidMotions, followed_points
+from mstfilter.tracking.rigid_motions import MotionSegmentation, followed_points
 from tests.tracking.scenes import Box, Scene, at, standard
 
 
@@ -20,7 +20,7 @@ def pushed():
 
 def test_every_motion_has_a_number_of_its_own(pushed):
     clip, objects = pushed
-    motions = RigidMotions().divide(clip)
+    motions = MotionSegmentation().labels(clip)
     main = {}
     for k in range(1, 7):
         seen = motions[(objects == k) & (motions >= 0)]
@@ -35,9 +35,9 @@ def test_every_motion_has_a_number_of_its_own(pushed):
 def test_nothing_moved_or_a_single_frame(pushed):
     clip, _ = pushed
     still = Clip((clip.before,) * 3, clip.grid, 1)
-    motions = RigidMotions().divide(still)
+    motions = MotionSegmentation().labels(still)
     assert motions.max() == 0
-    assert RigidMotions().divide(Clip((clip.before,), clip.grid, 0)) is None
+    assert MotionSegmentation().labels(Clip((clip.before,), clip.grid, 0)) is None
 
 
 @pytest.mark.parametrize("change", ["frames", "grid"])
@@ -52,7 +52,7 @@ def test_what_is_remembered_belongs_to_one_clip(pushed, change):
     other = Clip(frames, grid, clip.index)
 
     def found(c):
-        return RigidMotions().divide(c), followed_points(c, DenseFlow()).p
+        return MotionSegmentation().labels(c), followed_points(c, DenseFlow()).p
 
     memo.clear()
     alone = found(other)
@@ -66,8 +66,8 @@ def test_what_is_remembered_belongs_to_one_clip(pushed, change):
 def test_the_limit_of_misfit_decides(pushed):
     """A limit larger than any motion joins everything that touches."""
     clip, objects = pushed
-    fine = RigidMotions().divide(clip)
-    coarse = RigidMotions(misfit=1.0, reach=1.0).divide(clip)
+    fine = MotionSegmentation().labels(clip)
+    coarse = MotionSegmentation(misfit=1.0, reach=1.0).labels(clip)
     inside = (objects > 0) & (fine >= 0) & (coarse >= 0)
     assert len(np.unique(coarse[inside])) < len(np.unique(fine[inside]))
 
@@ -81,10 +81,10 @@ def test_an_object_that_turned_is_not_broken():
         pose[:3, 3] += pose[:3, 0] * length / 2
         poses.append([pose])
     clip = Scene([Box((length, 0.06, 0.06))], poses).clip(0)
-    points = followed_points(clip, RigidMotions().flow)
+    points = followed_points(clip, MotionSegmentation().flow)
     went = np.linalg.norm(points.q - points.p, axis=1)
     bar = points.q[:, 2] > 0.02
-    careful, careless = (RigidMotions(rival=r).divide(clip)[points.row, points.column] for r in (0.006, 0.0))
+    careful, careless = (MotionSegmentation(rival=r).labels(clip)[points.row, points.column] for r in (0.006, 0.0))
     assert ((careful[bar] > 0) & (went[bar] > 0.03)).sum() > 40
     assert (careless[bar] == 0).sum() > 5
     assert (careful[bar] == 0).sum() < 0.2 * (careless[bar] == 0).sum()  # a few readings are off

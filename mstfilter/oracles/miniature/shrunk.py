@@ -19,10 +19,10 @@ from typing import Any, Literal
 import numpy as np
 
 from mstfilter.errors import InputError
-from mstfilter.fusion import Claims, FusionUpdate, NoDivision, Projection
+from mstfilter.fusion import Claims, Evidence, FusionUpdate, NoDivision, Projection
 from mstfilter.oracles.miniature.filters import Push
 from mstfilter.oracles.miniature.world import Glance, Miniature, draw
-from mstfilter.scene import Evidence, Hypothesis
+from mstfilter.scene import Hypothesis
 from mstfilter.smc import ParticleFilter, Population, Proposal
 
 __all__ = ["CutLaw", "ReadingEvidence", "SampledCuts", "SeenThrough", "cut_law", "shrink"]
