@@ -9,8 +9,9 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
+import mstfilter.report
 from mstfilter.errors import InputError
-from mstfilter.report import SERIES, colour, hexadecimal, study_figures
+from mstfilter.report import SERIES, colour, hexadecimal, in_groups, time_figure
 from mstfilter.study import StudyFolder
 
 PAGE = 'xmlns="http://www.w3.org/2000/svg" style="background:var(--paper);font-family:sans-serif"'
@@ -38,15 +39,15 @@ def make(out: Path, study: Path, chosen: Sequence[str] = ()) -> list[Path]:
     out.mkdir(parents=True, exist_ok=True)
     titled = {f"{family}, n = {len(scenes[family])} scenes": of_arms for family, of_arms in values.items()}
     paths = []
-    for k, group in enumerate(study_figures.in_groups(arms, folder.description["reference"])):
+    for k, group in enumerate(in_groups(arms, folder.description["reference"])):
         paths.append(out / f"quality_over_time{f'_{k + 1}' if k else ''}.svg")
-        paths[-1].write_text(standalone(study_figures.time_figure(titled, group)))
+        paths[-1].write_text(standalone(time_figure(titled, group)))
     return paths
 
 
 def standalone(svg: str) -> str:
     """A report's figure as a file of its own: the report's style sheet says what its colours are."""
-    css = (Path(study_figures.__file__).parent / "templates" / "style.css").read_text()
+    css = (Path(mstfilter.report.__file__).parent / "templates" / "style.css").read_text()
     light = css[: css.index("}")]
     colours = {f"--s{k}": hexadecimal(colour(k)) for k in range(len(SERIES))}  # also those that the sheet lacks
     colours |= dict(re.findall(r"(--[a-z0-9]+): (#[0-9a-f]{3,6})", light))

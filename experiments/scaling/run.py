@@ -3,7 +3,7 @@
     python experiments/scaling/run.py                     # what is in results/measured.csv is not measured again
     python experiments/scaling/run.py --smoke --out DIR   # two values a factor at small size, seconds
 
-Simulated recordings, made once and kept (`mstfilter.simulation.cache`). Every measurement is a process of its own,
+Simulated recordings, made once and kept (`mstfilter.simulation.recorder`). Every measurement is a process of its own,
 one thread a library: processor seconds by part of the first step that has a past (objects: mean of two), and
 the peak of resident memory. Writes measured.csv, slopes.csv and figure.png.
 """

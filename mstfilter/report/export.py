@@ -22,7 +22,7 @@ import numpy as np
 
 from mstfilter.errors import InputError
 from mstfilter.report.identities import identity_colours
-from mstfilter.report.palette import GREY, Colour, colour, hexadecimal
+from mstfilter.report.pictures import GREY, Colour, colour, hexadecimal
 from mstfilter.scene import Hypothesis, project, write_image
 from mstfilter.study import RunFolder
 

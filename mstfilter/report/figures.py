@@ -1,24 +1,158 @@
-"""Figures over time as inline SVG: quality, effective sample size and ancestors, genealogy.
+"""Figures as inline SVG that takes its colours and fonts from the page it stands in, so that it follows its theme.
+
+>>> with style("quality"):
+...     figure, (axes,) = new_figure(6.6, 3.3)
+...     axes.plot([0, 1], [0.5, 0.7], color=ACCENT)
+...     text = svg_text(figure, "Quality over time")
+
+The same values give the same text.
+
+
+Figures over time as inline SVG: quality, effective sample size and ancestors, genealogy.
 
 >>> svg = quality_figure(times, qualities, weights, {"one blob": [...], "connected components": [...]})
 
 Every function returns the text of an ``<svg>`` element that takes its colours and fonts from the page it stands
 in, so that it follows a light or a dark theme. The same values give the same text.
+
+
+Figures of a study as inline SVG: quality over time by family and method, paired differences.
+
+>>> svg = time_figure({"s1": {"mst": {0: [0.5, 0.6], 1: [0.7]}}}, arms=["mst"])
 """
 
 from __future__ import annotations
 
+import io
+import re
 from collections.abc import Mapping, Sequence
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mstfilter.report.svg import ACCENT, FLOOR, INK, LINE, MUTED, new_figure, style, svg_text
+from mstfilter.study import Compared
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
+    from collections.abc import Iterator
 
-__all__ = ["genealogy_figure", "health_figure", "quality_figure"]
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+__all__ = [
+    "ACCENT",
+    "FLOOR",
+    "INK",
+    "LINE",
+    "MUTED",
+    "SERIES",
+    "colour_of",
+    "differences_figure",
+    "genealogy_figure",
+    "health_figure",
+    "in_groups",
+    "new_figure",
+    "quality_figure",
+    "style",
+    "svg_text",
+    "time_figure",
+]
+
+# Stand-ins that are replaced by the page's own colours.
+INK, MUTED, LINE, ACCENT, FLOOR = "#010203", "#020304", "#030405", "#040506", "#050607"
+#: Colours of things that are compared.
+SERIES = tuple(f"#06{k:02x}08" for k in range(12))
+_PAGE = {
+    INK: "currentColor",
+    MUTED: "var(--muted)",
+    LINE: "var(--line)",
+    ACCENT: "var(--accent)",
+    FLOOR: "var(--floor)",
+    **{mark: f"var(--s{k})" for k, mark in enumerate(SERIES)},
+}
+
+
+@contextmanager
+def style(name: str) -> Iterator[None]:
+    """Settings of figures; `name` keeps their element names apart in one page."""
+    import matplotlib
+
+    settings = {
+        "svg.fonttype": "none",
+        "svg.hashsalt": f"mstfilter {name}",
+        "font.size": 9.5,
+        "axes.edgecolor": LINE,
+        "axes.labelcolor": MUTED,
+        "axes.titlecolor": INK,
+        "axes.titlesize": 10,
+        "axes.titlelocation": "left",
+        "axes.spines.top": False,
+        "axes.spines.right": False,
+        "axes.spines.left": False,
+        "axes.axisbelow": True,
+        "text.color": INK,
+        "xtick.color": LINE,
+        "ytick.color": LINE,
+        "xtick.labelcolor": MUTED,
+        "ytick.labelcolor": MUTED,
+        "ytick.left": False,
+        "grid.color": LINE,
+        "grid.linewidth": 0.7,
+        "legend.frameon": False,
+        "legend.labelcolor": MUTED,
+    }
+    with matplotlib.rc_context(settings):
+        yield
+
+
+def new_figure(width: float, height: float, n: int = 1, *, below: bool = False) -> tuple[Figure, list[Axes]]:
+    """A figure of so many inches with `n` axes side by side, or one below the other."""
+    from matplotlib.backends.backend_svg import FigureCanvasSVG
+    from matplotlib.figure import Figure
+
+    figure = Figure((width, height), layout="constrained")
+    FigureCanvasSVG(figure)
+    figure.patch.set_alpha(0)
+    axes = [figure.add_subplot(*((n, 1) if below else (1, n)), k + 1) for k in range(n)]
+    for a in axes:
+        a.patch.set_alpha(0)
+        a.grid(axis="y")
+    return figure, axes
+
+
+def svg_text(figure: Figure, title: str) -> str:
+    """The figure as an element to stand in a page, without prolog, links, size or fonts of its own."""
+    buffer = io.StringIO()
+    figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
+    text = buffer.getvalue()
+    text = text[text.index("<svg") :]
+    text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.S)
+    view = re.search(r'viewBox="([^"]*)"', text)
+    assert view is not None
+    head = f'<svg class="figure" viewBox="{view[1]}" role="img" aria-label="{title}">'
+    text = head + text[text.index(">") + 1 :]
+    text = re.sub(r"font(-family)?: ?[^;\"]*'[^;\"]*(;|(?=\"))", _font, text)
+    text = text.replace("xlink:href", "href")
+    text = re.sub(r"(<g [^>]*)>\n((?:\s*<use [^>]*/>\n){2,})", _once, text)
+    for mark, colour in _PAGE.items():
+        text = text.replace(mark, colour)
+    return text.strip()
+
+
+def _once(match: re.Match[str]) -> str:
+    """Marks of one group that look alike: their style once, their places to a tenth of a point."""
+    styles = set(re.findall(r'style="([^"]*)"', match[2]))
+    marks = re.sub(r'([xy]="-?\d+\.\d)\d+"', r'\1"', match[2])
+    if len(styles) > 1 or "style=" in match[1]:
+        return f"{match[1]}>\n{marks}"
+    return f'{match[1]} style="{styles.pop()}">\n' + re.sub(r' style="[^"]*"', "", marks)
+
+
+def _font(match: re.Match[str]) -> str:
+    """Keep the size of a ``font`` shorthand, drop the family."""
+    size = re.search(r"([\d.]+)px", match[0])
+    return "" if size is None else f"font-size: {size[1]}px;"
+
 
 _MOST_NAMED = 24  # particles of a pause that are still named in a genealogy
 
@@ -172,3 +306,133 @@ def _bend(x0: float, y0: float, x1: float, y1: float) -> tuple[np.ndarray, np.nd
     """A smooth line between two points that leaves and arrives level."""
     s = np.linspace(0, 1, 24)
     return x0 + (x1 - x0) * s, y0 + (y1 - y0) * (3 * s**2 - 2 * s**3)
+
+
+_MOST, _GROUP = len(SERIES), 8  # arms that one figure can tell apart, and that each of several holds
+
+
+def colour_of(arms: Sequence[str]) -> dict[str, str]:
+    """A colour for every arm; they repeat after twelve."""
+    return {arm: SERIES[k % len(SERIES)] for k, arm in enumerate(arms)}
+
+
+def in_groups(arms: Sequence[str], reference: str) -> list[list[str]]:
+    """Arms for one figure each: all of them up to twelve, else the reference with seven others in each."""
+    if len(arms) <= _MOST:
+        return [list(arms)]
+    others, first = [arm for arm in arms if arm != reference], [reference] if reference in arms else []
+    size = _GROUP - len(first)
+    return [first + others[k : k + size] for k in range(0, len(others), size)]
+
+
+def time_figure(values: Mapping[str, Mapping[str, Mapping[int, Sequence[float]]]], arms: Sequence[str]) -> str:
+    """Quality of all hypotheses over time, one panel a family.
+
+    Parameters
+    ----------
+    values : mapping
+        Family -> arm -> pause -> quality of every hypothesis of every scene and seed.
+    arms : sequence of str
+        In the order in which they stand beside each other; see `in_groups` where there are many.
+
+    Arms that the values lack are left out, and so are values of other arms. Boxes hold the middle half of the
+    hypotheses, the bar is their median, whiskers reach the 5th and 95th per cent; points are hypotheses, lines join
+    the means.
+    """
+    values = {family: {a: v for a, v in of_arms.items() if a in arms} for family, of_arms in values.items()}
+    colours, n = colour_of(arms), len(values)
+    shown = [arm for arm in arms if any(arm in of_arms for of_arms in values.values())]
+    with style("study over time"):
+        figure, panels = new_figure(max(6.6, 1.1 + 0.42 * _slots(values, len(shown))), 3.4 * n, n, below=True)
+        for axes, (family, of_arms) in zip(panels, values.items(), strict=True):
+            pauses = sorted({t for by_pause in of_arms.values() for t in by_pause})
+            width = 0.84 / max(len(shown), 1)
+            for k, arm in enumerate(shown):
+                if arm not in of_arms:
+                    continue
+                at = {t: t + (k - (len(shown) - 1) / 2) * width for t in of_arms[arm]}
+                _boxes(axes, at, of_arms[arm], width, colours[arm])
+                means = [float(np.mean(of_arms[arm][t])) for t in at]
+                axes.plot(
+                    list(at.values()), means, color=colours[arm], lw=1.3, marker="D", ms=3.6, label=arm, zorder=4
+                )
+            for t in pauses[1:]:
+                axes.axvline(t - 0.5, color=LINE, lw=0.7)
+            axes.set_xlim(min(pauses) - 0.5, max(pauses) + 0.5)
+            axes.set_xticks(pauses)
+            drawn = np.concatenate([np.asarray(q) for by_pause in of_arms.values() for q in by_pause.values()])
+            axes.set_ylim(max(-0.02, drawn.min() - 0.05), min(1.02, drawn.max() + 0.05))
+            axes.set_title(family)
+            axes.set_ylabel("quality")
+        panels[-1].set_xlabel("pause")
+        handles = {line.get_label(): line for axes in panels for line in axes.get_lines() if line.get_label() in arms}
+        figure.legend(
+            [handles[arm] for arm in arms if arm in handles],
+            [arm for arm in arms if arm in handles],
+            loc="outside lower center",
+            ncols=min(4, len(shown)),
+            fontsize=8.5,
+        )
+        return svg_text(figure, "Quality of the hypotheses over time by family and method")
+
+
+def _slots(values: Mapping[str, Mapping[str, Mapping[int, Sequence[float]]]], n_arms: int) -> int:
+    """Boxes side by side in the widest panel."""
+    return max(len({t for by_pause in of_arms.values() for t in by_pause}) for of_arms in values.values()) * n_arms
+
+
+def _boxes(
+    axes: Axes, at: Mapping[int, float], by_pause: Mapping[int, Sequence[float]], width: float, colour: str
+) -> None:
+    """A box and the points of every pause."""
+    for t, x in at.items():
+        q = np.sort(np.asarray(by_pause[t]))
+        # Points beside one another, in an order that does not depend on their height.
+        place = (np.arange(len(q)) * 0.618) % 1.0 - 0.5
+        axes.scatter(x + 0.6 * width * place, q, s=5, color=colour, alpha=0.35, lw=0, zorder=2)
+        axes.boxplot(
+            [q],
+            positions=[x],
+            widths=0.78 * width,
+            whis=(5, 95),
+            showfliers=False,
+            manage_ticks=False,
+            boxprops={"color": colour, "lw": 1.0},
+            medianprops={"color": colour, "lw": 2.0},
+            whiskerprops={"color": colour, "lw": 1.0},
+            capprops={"color": colour, "lw": 0},
+            zorder=3,
+        )
+
+
+def differences_figure(compared: Sequence[Compared], arms: Sequence[str]) -> str:
+    """Paired differences with their t intervals, by family; right of zero the reference is better."""
+    known = [one for one in compared if one.difference.n]
+    colours = colour_of(arms)
+    with style("study differences"):
+        figure, (axes,) = new_figure(6.6, 0.9 + 0.26 * len(known) + 0.3 * len({one.family for one in known}))
+        axes.grid(axis="y", visible=False)
+        axes.grid(axis="x")
+        axes.axvline(0, color=MUTED, lw=1.0)
+        y, ticks, family = 0.0, [], None
+        for one in known:
+            if one.family != family:
+                y += 0.0 if family is None else 0.9
+                where: dict[str, Any] = {
+                    "xycoords": ("axes fraction", "data"),
+                    "textcoords": "offset points",
+                    "va": "center",
+                }
+                axes.annotate(one.family, (0, y), (4, 0), fontsize=9, color=INK, fontweight="bold", **where)
+                family, y = one.family, y + 0.9
+            d = one.difference
+            if np.isfinite(d.low):
+                axes.plot([d.low, d.high], [y, y], color=colours[one.second], lw=2.2, solid_capstyle="butt")
+            axes.plot([d.mean], [y], marker="o", ms=6, color=colours[one.second])
+            ticks.append((y, one.second))
+            y += 1.0
+        axes.set_yticks([at for at, _ in ticks], [name for _, name in ticks])
+        axes.set_ylim(y - 0.3, -0.7)
+        reference = known[0].first if known else ""
+        axes.set_xlabel(f"quality of {reference} minus quality of the method")
+        return svg_text(figure, "Paired differences of quality with 95 % intervals")

@@ -1,16 +1,3 @@
-from mstfilter.simulation.actions import (
-    Effect as Effect,
-    Push as Push,
-    advance as advance,
-    choose_push as choose_push,
-    finish as finish,
-    play as play,
-)
-from mstfilter.simulation.cache import (
-    cache_folder as cache_folder,
-    cached_recording as cached_recording,
-    recipe_key as recipe_key,
-)
 from mstfilter.simulation.families import (
     FIRST_REPORTED_SEED as FIRST_REPORTED_SEED,
     GENERATOR_VERSION as GENERATOR_VERSION,
@@ -21,8 +8,19 @@ from mstfilter.simulation.families import (
 from mstfilter.simulation.recorder import (
     TOLERANCE as TOLERANCE,
     Scene as Scene,
+    cache_folder as cache_folder,
+    cached_recording as cached_recording,
+    recipe_key as recipe_key,
     record as record,
     simulate as simulate,
 )
 from mstfilter.simulation.renderer import Renderer as Renderer
 from mstfilter.simulation.sensor import DepthSensor as DepthSensor
+from mstfilter.simulation.world import (
+    Effect as Effect,
+    Push as Push,
+    advance as advance,
+    choose_push as choose_push,
+    finish as finish,
+    play as play,
+)

@@ -17,8 +17,7 @@ import numpy as np
 
 from mstfilter.errors import InputError
 from mstfilter.scene import Camera, VoxelGrid, look_at
-from mstfilter.simulation.pools import ANY, REPORTED, TUNING, Pool
-from mstfilter.simulation.shapes import FAMILIES
+from mstfilter.simulation.shapes import ANY, FAMILIES, REPORTED, TUNING, Pool
 
 __all__ = ["SCENE_FAMILIES", "SceneFamily", "scene_family"]
 

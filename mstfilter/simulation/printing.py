@@ -16,7 +16,7 @@ import colorsys
 
 import numpy as np
 
-from mstfilter.simulation.pools import ANY, Pool
+from mstfilter.simulation.shapes import ANY, Pool
 
 __all__ = ["DOT", "carton_face", "cloth", "glaze", "label_side", "lid", "noise", "peel", "speckle", "wood"]
 

@@ -13,12 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from mstfilter.scene import Camera
-from mstfilter.simulation.bounds import Bounds
-from mstfilter.simulation.layer import Layer
-from mstfilter.simulation.light import CASTERS, LightMap
-from mstfilter.simulation.room import Room
-from mstfilter.simulation.stage import Stage
-from mstfilter.simulation.textures import Atlas, Skin
+from mstfilter.simulation.layers import CASTERS, Layer, LightMap, Stage
+from mstfilter.simulation.solids import Bounds
+from mstfilter.simulation.textures import Atlas, Room, Skin
 from mstfilter.simulation.world import FINGER_GROUP, OBJECT_GROUP, ROOM_GROUP, TABLE, World
 
 __all__ = ["Renderer", "View", "seen_texel"]

@@ -1,4 +1,15 @@
-"""Families of household objects, made of convex pieces.
+"""What scenes for tuning and scenes for reporting draw from: disjoint sizes, hues and printed names.
+
+Both pools cover the same range in alternate bands, so that one is not harder than the other.
+
+>>> import numpy as np
+>>> from mstfilter.simulation.shapes import REPORTED, TUNING
+>>> sizes = [[pool.factor(np.random.default_rng(k)) for k in range(99)] for pool in (TUNING, REPORTED)]
+>>> len({int(s / 0.025) for s in sizes[0]} & {int(s / 0.025) for s in sizes[1]})
+0
+
+
+Families of household objects, made of convex pieces.
 
 `draw_shape(rng, family)` gives a `Shape`: pieces in the frame of the body (origin at the middle of the
 bounding box, z up in its main pose), the poses in which it rests, its mass and how print lies on it.
@@ -15,11 +26,24 @@ Sizes and masses follow objects of the YCB set (B. Calli, A. Walsman, A. Singh, 
 banana, ball. Crisps are cut to 0.20 m (the set's can has 0.25 m). Tea, biscuits, bricks, bottle, soap and angle are
 of our own making, of like size. Each measure is scaled by up to 10 %. Walls of bowl and mug are 1 cm, thicker than
 the real ones: a thinner wall falls between the centres of 1 cm voxels and would be missing from the truth.
+
+
+Volumetric truth: which voxels lie in which object, hidden ones included.
+
+>>> import numpy as np
+>>> from mstfilter.scene import VoxelGrid
+>>> from mstfilter.simulation.shapes import draw_shape
+>>> from mstfilter.simulation.shapes import label_voxels
+>>> ball = draw_shape(np.random.default_rng(0), "ball")
+>>> grid = VoxelGrid((-0.2, -0.2, -0.2), 0.01, (40, 40, 40))
+>>> labels = label_voxels([ball], np.eye(4)[None], grid)
+>>> bool(abs(labels.sum() * 1e-6 / ball.pieces[0].volume - 1) < 0.1)
+True
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
@@ -27,10 +51,58 @@ from itertools import pairwise
 import numpy as np
 
 from mstfilter.errors import InputError
-from mstfilter.simulation.pools import ANY, Pool
+from mstfilter.scene import VoxelGrid
 from mstfilter.simulation.solids import Piece, box, capsule, cylinder, ellipsoid, frustum, hull, ring
 
-__all__ = ["FAMILIES", "Shape", "draw_shape"]
+__all__ = ["ANY", "FAMILIES", "Pool", "REPORTED", "Shape", "TUNING", "draw_shape", "label_voxels"]
+
+_SMALLEST, _BAND = 0.90, 0.025
+# Bands of sizes from 0.9 to 1.1 of each pool; both have mean 1.
+_SIZE_BANDS = ((0, 3, 4, 7), (1, 2, 5, 6))
+_N_HUES = 12
+_MARGIN = 0.04  # of a band is left free at either side
+
+
+@dataclass(frozen=True)
+class Pool:
+    """A part of all sizes, hues and names.
+
+    Parameters
+    ----------
+    half : {0, 1, None}
+        Which of the two disjoint parts; None for everything.
+    """
+
+    half: int | None = None
+
+    def factor(self, rng: np.random.Generator) -> float:
+        """By what a measure is scaled, 0.9 .. 1.1."""
+        u = float(rng.uniform())
+        if self.half is None:
+            return _SMALLEST + 8 * _BAND * u
+        bands = _SIZE_BANDS[self.half]
+        k = int(u * len(bands))
+        return _SMALLEST + _BAND * (bands[k] + _within(u * len(bands) - k))
+
+    def hue(self, rng: np.random.Generator) -> float:
+        """A hue, 0 .. 1."""
+        u = float(rng.uniform())
+        if self.half is None:
+            return u
+        k = int(u * _N_HUES / 2)
+        return (2 * k + self.half + _within(u * _N_HUES / 2 - k)) / _N_HUES
+
+    def name(self, rng: np.random.Generator, names: Sequence[str]) -> str:
+        """One of the pool's names."""
+        own = names if self.half is None else names[self.half :: 2]
+        return own[int(rng.integers(len(own)))]
+
+
+def _within(share: float) -> float:
+    return _MARGIN + (1 - 2 * _MARGIN) * share
+
+
+ANY, TUNING, REPORTED = Pool(), Pool(0), Pool(1)
 
 WALL = 0.010
 
@@ -278,3 +350,34 @@ def draw_shape(rng: np.random.Generator, family: str, pool: Pool = ANY) -> Shape
     if family not in _MAKERS:
         raise InputError(f"no family of shapes is called {family!r}", f"there are {', '.join(FAMILIES)}")
     return _MAKERS[family](rng, lambda: pool.factor(rng))
+
+
+def label_voxels(shapes: Sequence[Shape], poses: np.ndarray, grid: VoxelGrid) -> np.ndarray:
+    """Labels (X, Y, Z) uint16: k + 1 where the voxel's centre lies in shape k, 0 where it lies in none.
+
+    Parameters
+    ----------
+    shapes : sequence of Shape
+        The objects.
+    poses : (n, 4, 4)
+        T_world_object of each.
+    grid : VoxelGrid
+        Workspace.
+
+    Notes
+    -----
+    Objects at rest overlap by less than a millimetre; a centre that lies in two goes to the first.
+    """
+    labels = np.zeros(grid.shape, np.uint16)
+    for k, (shape, pose) in enumerate(zip(shapes, poses, strict=True)):
+        reach = np.abs(pose[:3, :3]) @ shape.half + grid.voxel_size
+        low = np.maximum(grid.index_of(pose[:3, 3] - reach), 0)
+        high = np.minimum(grid.index_of(pose[:3, 3] + reach) + 1, grid.shape)
+        if (high <= low).any():
+            continue
+        box = tuple(slice(int(a), int(b)) for a, b in zip(low, high, strict=True))
+        index = np.stack(np.meshgrid(*(np.arange(a, b) for a, b in zip(low, high, strict=True)), indexing="ij"), -1)
+        local = (grid.centre_of(index) - pose[:3, 3]) @ pose[:3, :3]
+        free = labels[box] == 0
+        labels[box][free & shape.inside(local)] = k + 1
+    return labels

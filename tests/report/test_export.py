@@ -10,7 +10,7 @@ from hypothesis import given, settings, strategies as st
 
 from mstfilter.errors import InputError
 from mstfilter.report.export import export_label_images, export_ply, export_run, surface
-from mstfilter.report.palette import PALETTE
+from mstfilter.report.pictures import PALETTE
 from mstfilter.scene import Hypothesis, VoxelGrid, project, read_labels
 from tests.report.runs import make_run
 

@@ -7,11 +7,9 @@ import itertools
 import numpy as np
 import pytest
 
-from mstfilter.report.cards import close_up
-from mstfilter.report.identities import TRUTH, identity_colours
-from mstfilter.report.palette import GREY, PALETTE, colour
-from mstfilter.report.pictures import layer, overlay, png_bytes, viewpoint, voxel_picture
-from mstfilter.report.tables import counts, flatten, note_rows, shown
+from mstfilter.report.identities import TRUTH, close_up, identity_colours
+from mstfilter.report.page import counts, flatten, note_rows, shown
+from mstfilter.report.pictures import GREY, PALETTE, colour, layer, overlay, png_bytes, viewpoint, voxel_picture
 from mstfilter.scene import Hypothesis, project, render
 from tests.report.runs import CAMERA, GRID, labels_of, make_run
 

@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 
 from mstfilter.errors import InputError
-from mstfilter.report.content import numbers_of
-from mstfilter.report.html import write_report
+from mstfilter.report.run_report import numbers_of, write_report
 from mstfilter.scoring import weighted_coverage
 from mstfilter.study import RunFolder
 from tests.report.runs import make_run

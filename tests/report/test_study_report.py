@@ -11,9 +11,8 @@ import pytest
 from hypothesis import given, strategies as st
 
 from mstfilter.errors import InputError
-from mstfilter.report.study import write_study_report
-from mstfilter.report.study_figures import in_groups
-from mstfilter.report.svg import SERIES
+from mstfilter.report.figures import SERIES, in_groups
+from mstfilter.report.study_report import write_study_report
 from mstfilter.study import RESULT, StudyFolder
 from tests.test_cli import call
 

@@ -6,9 +6,9 @@ import pytest
 
 from mstfilter.errors import InputError
 from mstfilter.formats import open_recording
-from mstfilter.simulation import cache
-from mstfilter.simulation.cache import cache_folder, cached_recording, recipe_key
+from mstfilter.simulation import recorder
 from mstfilter.simulation.families import scene_family
+from mstfilter.simulation.recorder import cache_folder, cached_recording, recipe_key
 
 TINY = {"width": 80, "height": 60, "n_actions": 1, "frames_per_clip": 3, "fps": 1.0, "supersample": False}
 
@@ -17,7 +17,7 @@ def test_made_once_and_found_again(tmp_path, monkeypatch):
     first = cached_recording("s1", 3, tmp_path, **TINY)
     assert first.parent == tmp_path and len(open_recording(first)) == 3
     assert sorted(p.name for p in tmp_path.iterdir()) == [".gitignore", first.name]
-    monkeypatch.setattr(cache, "_make", lambda *_: pytest.fail("made again"))
+    monkeypatch.setattr(recorder, "_make", lambda *_: pytest.fail("made again"))
     assert cached_recording("s1", 3, tmp_path, **TINY) == first
     assert cached_recording(replace(scene_family("s1"), **TINY), 3, tmp_path) == first
 
@@ -31,13 +31,11 @@ def test_key_is_that_of_the_whole_recipe(monkeypatch):
         recipe_key(scene_family("s2"), 3),
     }
     assert len(keys) == 4 and recipe_key(s1, 3) in keys
-    monkeypatch.setattr(cache, "GENERATOR_VERSION", -1)
+    monkeypatch.setattr(recorder, "GENERATOR_VERSION", -1)
     assert recipe_key(s1, 3) not in keys
 
 
 def test_a_quicker_process_wins_and_nothing_else_is_left(tmp_path, monkeypatch):
-    from mstfilter.simulation import recorder
-
     simulate = recorder.simulate
     expected = cached_recording("s1", 3, tmp_path / "other", **TINY).name
 
@@ -54,8 +52,6 @@ def test_a_quicker_process_wins_and_nothing_else_is_left(tmp_path, monkeypatch):
 
 
 def test_failure_leaves_nothing(tmp_path, monkeypatch):
-    from mstfilter.simulation import recorder
-
     def broken(family, seed, path, progress=None):
         (path.parent / "half").write_text("")
         raise InputError("no")

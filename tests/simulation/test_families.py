@@ -7,7 +7,7 @@ import pytest
 
 from mstfilter.errors import InputError
 from mstfilter.simulation.families import SCENE_FAMILIES, SceneFamily, scene_family
-from mstfilter.simulation.pools import ANY, REPORTED, TUNING
+from mstfilter.simulation.shapes import ANY, REPORTED, TUNING
 
 
 def test_named_families():

@@ -6,11 +6,10 @@ import pytest
 from mstfilter.errors import InputError
 from mstfilter.scene import Camera, depth_sigma, look_at
 from mstfilter.simulation.renderer import Renderer
-from mstfilter.simulation.room import draw_room
 from mstfilter.simulation.sensor import ColourSensor, DepthSensor
 from mstfilter.simulation.shapes import Shape, draw_shape
 from mstfilter.simulation.solids import box, ellipsoid
-from mstfilter.simulation.textures import Atlas, Skin, draw_skin, locate
+from mstfilter.simulation.textures import Atlas, Skin, draw_room, draw_skin, locate
 from mstfilter.simulation.world import FLOOR, World
 
 ROOM = draw_room(np.random.default_rng(0), 0.008)

@@ -9,7 +9,7 @@ import pytest
 from mstfilter.simulation import printing
 from mstfilter.simulation.arrangement import draw_things
 from mstfilter.simulation.families import scene_family
-from mstfilter.simulation.pools import ANY, REPORTED, TUNING
+from mstfilter.simulation.shapes import ANY, REPORTED, TUNING
 
 POOLS = (TUNING, REPORTED)
 

@@ -14,8 +14,7 @@ from mstfilter.formats import open_recording
 from mstfilter.scene import VoxelGrid, render
 from mstfilter.simulation.families import scene_family
 from mstfilter.simulation.recorder import Scene, simulate
-from mstfilter.simulation.shapes import FAMILIES, draw_shape
-from mstfilter.simulation.truth import label_voxels
+from mstfilter.simulation.shapes import FAMILIES, draw_shape, label_voxels
 from mstfilter.simulation.world import FINGER_ID
 
 SMALL = replace(scene_family("demo"), width=160, height=120, frames_per_clip=6, fps=3.0)

@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mstfilter.simulation.actions import advance
-from mstfilter.simulation.bounds import Bounds
 from mstfilter.simulation.families import scene_family
+from mstfilter.simulation.layers import Stage
 from mstfilter.simulation.recorder import TOLERANCE, Scene
 from mstfilter.simulation.renderer import Renderer
-from mstfilter.simulation.stage import Stage
+from mstfilter.simulation.solids import Bounds
+from mstfilter.simulation.world import advance
 
 SMALL = replace(scene_family("s1"), width=160, height=120, frames_per_clip=6, fps=3.0)
 

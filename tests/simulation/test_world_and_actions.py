@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 
 from mstfilter.errors import InputError
-from mstfilter.simulation.actions import Push, choose_push, play
 from mstfilter.simulation.arrangement import arrange, draw_things
 from mstfilter.simulation.families import scene_family
 from mstfilter.simulation.recorder import Scene
 from mstfilter.simulation.shapes import FAMILIES, draw_shape
-from mstfilter.simulation.world import FINGER_ID, World
+from mstfilter.simulation.world import FINGER_ID, Push, World, choose_push, play
 
 DEMO = scene_family("demo")
 

@@ -13,10 +13,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from mstfilter.report.content import seconds_text
-from mstfilter.report.page import render, write_page
-from mstfilter.report.study_figures import differences_figure, in_groups, time_figure
-from mstfilter.report.tables import flatten, shown
+from mstfilter.report.figures import differences_figure, in_groups, time_figure
+from mstfilter.report.page import flatten, render, shown, write_page
+from mstfilter.report.run_report import seconds_text
 from mstfilter.study import CLAIM, ENDPOINT, SLOPE, StudyFolder, Summary
 
 __all__ = ["write_study_report"]
