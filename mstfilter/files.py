@@ -17,7 +17,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-__all__ = ["atomic_path", "write_csv", "write_text"]
+__all__ = ["atomic_path", "read_csv", "write_csv", "write_text"]
 
 
 @contextmanager
@@ -57,3 +57,9 @@ def write_csv(path: str | Path, rows: Iterable[Mapping[str, Any]], columns: Iter
         writer = csv.DictWriter(file, names, lineterminator="\n")
         writer.writeheader()
         writer.writerows(rows)
+
+
+def read_csv(path: str | Path) -> list[dict[str, str]]:
+    """Rows of a CSV file with a header: column name -> text."""
+    with Path(path).open(encoding="utf-8", newline="") as file:
+        return list(csv.DictReader(file))

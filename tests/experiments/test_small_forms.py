@@ -1,46 +1,108 @@
-"""Small forms of experiments that have no test file of their own: they run to the end, and spare the results."""
+"""The scripts of experiments/ run in their small form (`--smoke`) and do not overwrite committed results."""
 
 from __future__ import annotations
 
-import csv
 import math
 import runpy
-import subprocess
-import sys
 
 import pytest
 
+from mstfilter.files import read_csv
+from mstfilter.registry import COMPONENTS
 from mstfilter.scene import read_rgb
 from tests.conftest import REPOSITORY, find_shared
+from tests.experiments.scripts import EXPERIMENTS, run_script
 
-EXPERIMENTS = REPOSITORY / "experiments"
-
-
-def lines(path):
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
+SCRIPTS = [
+    str(p.relative_to(EXPERIMENTS)) for p in sorted(EXPERIMENTS.glob("*/*.py")) if '"--smoke"' in p.read_text()
+]
 
 
-def run(script, *arguments):
-    done = subprocess.run(
-        [sys.executable, str(EXPERIMENTS / script), *map(str, arguments)], capture_output=True, text=True
-    )
-    assert done.returncode == 0, done.stderr
-    return done.stdout
+@pytest.fixture
+def cache(tmp_path):
+    """A folder for simulated recordings of this test alone."""
+    return tmp_path / "cache"
 
 
-@pytest.mark.parametrize(
-    "script",
-    [str(p.relative_to(EXPERIMENTS)) for p in sorted(EXPERIMENTS.glob("*/*.py")) if '"--smoke"' in p.read_text()],
-)
+@pytest.mark.parametrize("script", SCRIPTS)
 def test_small_form_never_overwrites_results(script):
-    refused = subprocess.run([sys.executable, str(EXPERIMENTS / script), "--smoke"], capture_output=True, text=True)
-    assert refused.returncode == 2 and "would overwrite the" in refused.stderr
+    assert "would overwrite the" in run_script(script, "--smoke", expected_exit=2)
+
+
+def test_beliefs(tmp_path):
+    run_script("beliefs/speed.py", "--n", 2, "--repeat", 1, "--out", tmp_path / "speed.csv")
+    rows = read_csv(tmp_path / "speed.csv")
+    assert list(rows[0]) == ["seconds of processor time", "n=2", "n=2 rough"]
+    assert all(float(row["n=2"]) >= 0 for row in rows)
+
+
+def test_benchmark_of_the_filter(tmp_path):
+    run_script("benchmarks/speed.py", "--smoke", "--clock", "cpu", "--out", tmp_path)
+    rows = {r["what"]: r for r in read_csv(tmp_path / "speed.csv")}
+    assert rows["array components / particles 0.4"]["median"] == "not measured"
+    assert all(float(r["median"]) > 0 for r in rows.values() if r["unit"] == "ms" or "peers" in r["what"])
+
+
+def test_benchmark_of_fusion(tmp_path):
+    """The script stops with an error if both programs make different labels of the same random decisions."""
+    run_script("benchmarks/fusion.py", "--smoke", "--out", tmp_path)
+    rows = read_csv(tmp_path / "fusion.csv")
+    assert [r["unit"] for r in rows if r["target"]] == ["pairs", "ratio", "ratio", "MiB"]
+    assert float(rows[0]["median"]) == 1
+
+
+def test_controls(tmp_path, cache):
+    arguments = ("controls/run.py", "--smoke", "--out", tmp_path / "out")
+    assert "s1-0" in run_script(*arguments, MSTFILTER_CACHE=cache)
+    rows = {row["what"]: row for row in read_csv(tmp_path / "out/summary.csv")}
+    assert float(rows["same hypotheses at the start"]["mean"]) == 1.0
+    assert int(rows["a still clip"]["n"]) >= 1
+    assert int(rows["stranger - samples"]["n"]) == int(rows["again - samples"]["n"]) == 2
+    # An object moved, and following it is better than leaving it.
+    assert float(rows["moved: mst in order"]["mean"]) > float(rows["moved: frozen in order"]["mean"])
+    assert "'scene'" not in run_script(*arguments, MSTFILTER_CACHE=cache), "finished scenes are not run again"
+
+
+def test_families(tmp_path):
+    arguments = ("families/run.py", "--smoke", "--out", tmp_path)
+    run_script(*arguments)
+    difficulty, counts = read_csv(tmp_path / "difficulty.csv"), read_csv(tmp_path / "counts.csv")
+    assert [row["seed"] for row in difficulty] == [row["seed"] for row in counts] == ["0", "1"]
+    assert all(row["restless"] == row["left_workspace"] == row["without_voxels"] == "0" for row in counts)
+    assert all(float(row["single_frame_image"]) > float(row["one_blob_image"]) for row in difficulty)
+    assert {row["measure"] for row in read_csv(tmp_path / "summary.csv")} >= {"single_frame_image", "hidden"}
+    # A finished scene is not run again: a row that was changed by hand stays.
+    text = (tmp_path / "counts.csv").read_text()
+    (tmp_path / "counts.csv").write_text(text.replace(counts[0]["median_pixels"], "1.5"))
+    run_script(*arguments)
+    assert read_csv(tmp_path / "counts.csv")[0]["median_pixels"] == "1.5"
+
+
+def test_speed_of_the_renderer(tmp_path):
+    """The script stops with an error if the images of both forms of the renderer differ."""
+    run_script("families/speed.py", "--smoke", "--out", tmp_path)
+    (row,) = read_csv(tmp_path / "speed.csv")
+    assert row["family"] == "s1" and int(row["frames"]) == 15
+
+
+def test_claims_of_fusion(tmp_path, cache):
+    run_script("fusion/claims.py", "--smoke", "--out", tmp_path, MSTFILTER_CACHE=cache)
+    rows, hidden = read_csv(tmp_path / "claims.csv"), read_csv(tmp_path / "hidden.csv")
+    assert {"sample: sample alone", "prediction: prediction alone"} <= {r["claimed by"] for r in rows}
+    assert sum(int(r["voxels"]) for r in rows) > 100
+    alone = sum(
+        int(r["voxels"])
+        for r in rows
+        if r["claimed by"] == "prediction: prediction alone"
+        and r["where"] == "hidden"
+        and r["cleared"] in ("<= 0.01", "<= 0.03")
+    )
+    assert sum(int(r["voxels"]) for r in hidden) == alone > 0
 
 
 def test_full_size(tmp_path):
-    assert "peak memory" in run("full_size/run.py", "--smoke", "--out", tmp_path)
-    rows = lines(tmp_path / "full_size.csv")
+    assert "peak memory" in run_script("full_size/run.py", "--smoke", "--out", tmp_path)
+    rows = read_csv(tmp_path / "full_size.csv")
     assert [r["pause"] for r in rows] == ["0", "1"]
     for r in rows:
         assert 0 <= float(r["quality_mean"]) <= 1 and float(r["peak_GiB"]) > 0.05
@@ -49,55 +111,75 @@ def test_full_size(tmp_path):
 
 
 def test_readme_picture(tmp_path):
-    run("readme_picture/make.py", "--smoke", "--out", tmp_path / "picture.png")
+    run_script("readme_picture/make.py", "--smoke", "--out", tmp_path / "picture.png")
     picture = read_rgb(tmp_path / "picture.png")
     assert picture.shape == (3 * 300 + 2 * 10, 4 * 400 + 3 * 10, 3) and picture.std() > 10
 
 
 def test_segmentation_fit(tmp_path):
-    assert "judged wrongly" in run("segmentation_fit/run.py", "--smoke", "--out", tmp_path / "weights.py")
+    assert "judged wrongly" in run_script("segmentation_fit/run.py", "--smoke", "--out", tmp_path / "weights.py")
     made = runpy.run_path(str(tmp_path / "weights.py"))["JOIN_WEIGHTS"]
     present = runpy.run_path(str(REPOSITORY / "mstfilter/segmentation/join_weights.py"))["JOIN_WEIGHTS"]
     assert list(made) == list(present) and all(math.isfinite(w) for w in made.values())
     assert made != present
 
-    run("segmentation_fit/check.py", "--smoke", "--out", tmp_path)
-    rows = {r["arm"]: r for r in lines(tmp_path / "quality.csv")}
+    run_script("segmentation_fit/check.py", "--smoke", "--out", tmp_path)
+    rows = {r["arm"]: r for r in read_csv(tmp_path / "quality.csv")}
     assert len(rows) == 7 and float(rows["true masks"]["image"]) == 1.0
     for r in rows.values():
         assert 0 < float(r["space_mean"]) <= float(r["space_best"]) <= 1
 
 
 def test_tracking_rules(tmp_path):
-    run("tracking_rules/run.py", "--smoke", "--out", tmp_path)
-    rows = {r["arm"]: r for r in lines(tmp_path / "results.csv")}
+    run_script("tracking_rules/run.py", "--smoke", "--out", tmp_path)
+    rows = {r["arm"]: r for r in read_csv(tmp_path / "results.csv")}
     assert len(rows) == 13 and len({(r["n_moved"], r["n_rest"]) for r in rows.values()}) == 1
     assert int(rows["mst"]["n_moved"]) >= 1
-    # Nothing that moved has an own IoU of .9, which is what standing still scores.
+    # An object counts as moved if its IoU before/after is below .9, which is the score of the arm that moves nothing.
     assert float(rows["identity"]["iou_moved"]) < 0.9
 
 
 def test_killed_runs(tmp_path):
-    assert "2 ended identically" in run("killed_runs/trials.py", "--trials", 2, "--out", tmp_path)
-    assert [r["identical"] for r in lines(tmp_path / "trials.csv")] == ["1", "1"]
+    assert "2 ended identically" in run_script("killed_runs/trials.py", "--trials", 2, "--out", tmp_path)
+    assert [r["identical"] for r in read_csv(tmp_path / "trials.csv")] == ["1", "1"]
 
 
 def test_miniature(tmp_path):
-    run("miniature/run.py", "--smoke", "--out", tmp_path)
-    rows = {(r["world"], r["n"], r["arm"]): float(r["tv"]) for r in lines(tmp_path / "distances.csv")}
+    run_script("miniature/run.py", "--smoke", "--out", tmp_path)
+    rows = {(r["world"], r["n"], r["arm"]): float(r["tv"]) for r in read_csv(tmp_path / "distances.csv")}
     assert {key[0] for key in rows} == {"shelf", "row"}
     for (_, _, arm), tv in rows.items():
         assert tv == 0 if arm == "exact" else 0 < tv <= 1
-    ranks = [int(v) for r in lines(tmp_path / "calibration.csv") for k, v in r.items() if k.startswith("rank_")]
-    assert sum(ranks) == 20 * len(lines(tmp_path / "calibration.csv"))
+    tests = read_csv(tmp_path / "calibration.csv")
+    ranks = [int(v) for r in tests for k, v in r.items() if k.startswith("rank_")]
+    assert sum(ranks) == 20 * len(tests)
 
 
 def test_osd_frames(tmp_path):
     find_shared("real/osd_learn/learn0_rgb.png")
-    run("osd_frames/run.py", "--smoke", "--out", tmp_path)
-    rows = lines(tmp_path / "frames.csv")
+    run_script("osd_frames/run.py", "--smoke", "--out", tmp_path)
+    rows = read_csv(tmp_path / "frames.csv")
     assert [r["frame"] for r in rows] == ["learn0", "learn2"]
-    committed = {r["frame"]: r for r in lines(EXPERIMENTS / "osd_frames/results/frames.csv")}
-    floor = "floor: plane + components"  # asks nothing of the other frames
+    committed = {r["frame"]: r for r in read_csv(EXPERIMENTS / "osd_frames/results/frames.csv")}
+    floor = "floor: plane + components"  # does not depend on the other frames
     for r in rows:
         assert r[floor] == committed[r["frame"]][floor]
+
+
+def test_resampling(tmp_path):
+    arguments = ("resampling/run.py", "--smoke", "--out", tmp_path)
+    run_script(*arguments)
+    rows = read_csv(tmp_path / "summary.csv")
+    assert {r["scheme"] for r in rows} == set(COMPONENTS["resampler"])
+    assert not [r for r in rows if r["measure"].startswith("log_evidence") and r["scheme"] == "keep_weights"]
+    assert " s\n" not in run_script(*arguments), "finished parts are not run again"
+
+
+@pytest.mark.parametrize(("script", "table"), [("trials", "results"), ("sharing", "sharing")])
+def test_study_runner(tmp_path, cache, script, table):
+    run_script(f"study_runner/{script}.py", "--smoke", "--out", tmp_path, MSTFILTER_CACHE=cache)
+    rows = read_csv(tmp_path / f"{table}.csv")
+    assert len(rows) == 3
+    if script == "trials":
+        assert all(row["done"] == row["runs"] for row in rows)
+        assert [row["killed"] for row in rows] == ["0", "0", "1"]

@@ -1,0 +1,117 @@
+"""The studies (main, fusion, ablations, error budget) run in their small form; reported seeds are no tuning seeds."""
+
+from __future__ import annotations
+
+import pytest
+
+from mstfilter.cli import main
+from mstfilter.files import read_csv
+from mstfilter.simulation import FIRST_REPORTED_SEED
+from mstfilter.study import load_study, make_plan
+from tests.experiments.scripts import EXPERIMENTS, run_script
+
+MAIN = EXPERIMENTS / "main/study.toml"
+FUSION = EXPERIMENTS / "fusion"
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path, monkeypatch):
+    """Recordings and shared work are kept in a folder of the test."""
+    monkeypatch.setenv("MSTFILTER_CACHE", str(tmp_path / "cache"))
+
+
+def run_small(tmp_path, config, workers=2):
+    """The folder of a study in its small form."""
+    out = tmp_path / config.stem
+    try:
+        main(["study", str(config), "--smoke", "--out", str(out), "--workers", str(workers)])
+    except SystemExit as end:
+        assert not end.code
+    return out
+
+
+def write_tables(folder, out, *more):
+    """The tables that the script writes of a study, by the name of the file."""
+    run_script("main/tables.py", folder, out, *more)
+    return {path.stem: read_csv(path) for path in out.iterdir()}
+
+
+@pytest.mark.parametrize("name", ["main/paper_best", "fusion/study", "fusion/reported", "ablations/study"])
+def test_studies_run_in_their_small_form(tmp_path, name):
+    path = EXPERIMENTS / f"{name}.toml"
+    make_plan(load_study(path))  # the long form can be planned
+    folder = run_small(tmp_path, path)
+    arms = [arm.name for arm in make_plan(load_study(path, smoke=True)).arms]
+    name = load_study(path).name
+    found = write_tables(folder, tmp_path / "tables")
+    assert [row["arm"] for row in found[name]] == arms
+    assert all(0 < float(row["quality"]) <= 1 for row in found[name])
+    assert [row["arm"] for row in found[f"{name}_time"]] == [row["arm"] for row in found[f"{name}_cases"]] == arms
+    for row in found[f"{name}_cases"]:
+        assert float(row["visible"]) > 0 and 0 <= float(row["quality_visible"]) <= 1
+    beside = [arm for arm in arms if arm.startswith("true masks")]
+    assert [row["arm"] for row in found[f"{name}_differences"]] == [a for a in arms[1:] if a not in beside]
+    if beside:
+        found = write_tables(folder, tmp_path / "tables", "--reference", "true masks: mst")
+        assert [row["arm"] for row in found[f"{name}_true_masks_differences"]] == beside[1:]
+
+
+def test_main_study_runs_and_resumes(tmp_path, capsys):
+    for _ in range(2):
+        folder = run_small(tmp_path, MAIN)
+    arms = [arm.name for arm in make_plan(load_study(MAIN)).arms]
+    assert f"{len(arms)} of them before" in capsys.readouterr().out  # the second time no run is left to do
+    rows = read_csv(folder / "runs.csv")
+    assert {row["arm"] for row in rows} == set(arms) and len(rows) == len(arms) * 2
+
+
+@pytest.mark.parametrize("config, first", [(MAIN, 1000), (FUSION / "reported.toml", 1100)])
+def test_reported_seeds_are_no_tuning_seeds(config, first):
+    """The long form uses seeds that no rule was tuned on; the small form uses tuning seeds only."""
+    reported = [scene.source["seed"] for scene in make_plan(load_study(config)).scenes]
+    assert set(reported) <= set(range(first, first + 100)) and min(reported) >= FIRST_REPORTED_SEED
+    small = [scene.source["seed"] for scene in make_plan(load_study(config, smoke=True)).scenes]
+    assert max(small) < 100
+
+
+@pytest.mark.parametrize("name", ["ablations/study", "main/paper_best", "fusion/study", "error_budget/study"])
+def test_tuning_studies_use_tuning_seeds(name):
+    plan = make_plan(load_study(EXPERIMENTS / f"{name}.toml"))
+    assert all(scene.source["seed"] < 100 for scene in plan.scenes)
+
+
+def test_fusion_study_reports_the_arms_that_were_tuned():
+    tuned, reported = (make_plan(load_study(FUSION / f"{name}.toml")) for name in ("study", "reported"))
+    assert [(arm.name, arm.key) for arm in tuned.arms] == [(arm.name, arm.key) for arm in reported.arms]
+    assert not {scene.name for scene in tuned.scenes} & {scene.name for scene in reported.scenes}
+    assert len(tuned.scenes) == len(reported.scenes) == 30
+
+
+def test_error_budget(tmp_path):
+    folder = run_small(tmp_path, EXPERIMENTS / "error_budget/study.toml", workers=1)
+    quality = {row["arm"]: float(row["quality"]) for row in read_csv(folder / "runs.csv")}
+    assert len(quality) == 3
+    assert quality["all true"] >= 0.97 > quality["mst"]
+
+
+def test_mask_quality(tmp_path):
+    folder = run_small(tmp_path, EXPERIMENTS / "error_budget/mask_quality.toml", workers=1)
+    quality = {row["arm"]: float(row["quality"]) for row in read_csv(folder / "runs.csv")}
+    assert len(quality) == 10
+    best = [q for arm, q in quality.items() if "=1.0" in arm]
+    assert min(best) > max(q for arm, q in quality.items() if "=0.7" in arm)
+
+    run_script("error_budget/mask_quality.py", folder, tmp_path / "tables")
+    rows = read_csv(tmp_path / "tables/mask_quality.csv")
+    lines = {(row["source"], row["masks"], row["method"]): row for row in rows}
+    own = next(masks for source, masks, _ in lines if source == "own")
+    assert 0.5 < float(own) < 1
+    fused, sampled = ("mst", "object_fusion"), ("mst", "samples_only")
+    expected = {("own", own): fused, ("lasting", "0.7"): fused, ("lasting", "1"): fused}
+    expected |= {("independent", "0.7"): sampled, ("independent", "0.9"): sampled}
+    assert set(lines) == {(*masks, method) for masks, methods in expected.items() for method in methods}
+    mst, other = (lines["lasting", "1", method] for method in fused)
+    for ending in ("", "_weighted"):
+        gain = float(mst[f"quality{ending}"]) - float(other[f"quality{ending}"])
+        assert float(other[f"mst_minus{ending}"]) == pytest.approx(gain, abs=2e-4)
+    assert (tmp_path / "tables/mask_quality.png").stat().st_size > 5000
