@@ -16,16 +16,18 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Iterable, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from mstfilter import registry
+from mstfilter import baselines, completion, formats, fusion, oracles, segmentation, smc, tracking
 from mstfilter.errors import InputError
+from mstfilter.registry import Registry
 from mstfilter.resources import find_preset
+from mstfilter.smc import ParticleFilter
 
-if TYPE_CHECKING:
-    from mstfilter.smc import ParticleFilter
+__all__ = ["REGISTRY", "build_filter", "describe_filter", "load_config", "preset"]
 
-__all__ = ["build_filter", "describe_filter", "load_config", "preset"]
+#: All components that presets and overrides can name.
+REGISTRY = Registry(smc, segmentation, completion, tracking, fusion, formats, baselines, oracles)
 
 _META = ("description", "source")
 _PLAIN = ("n", "n_proposed", "resample")
@@ -45,7 +47,7 @@ def load_config(name: str, overrides: Iterable[str] = (), *, allow_files: bool =
     unknown = set(config) - {*_META, *_PLAIN, *_SLOTS}
     if unknown:
         raise InputError(f"a filter has no field {sorted(unknown)[0]!r}", f"fields: {', '.join((*_PLAIN, *_SLOTS))}")
-    registry.check_names(config, allow_files)
+    REGISTRY.check_names(ParticleFilter, config, allow_files)
     return config
 
 
@@ -79,15 +81,13 @@ def _read(name: str, above: tuple[str, ...] = ()) -> dict[str, Any]:
 
 def build_filter(config: Mapping[str, Any], *, allow_files: bool = False) -> ParticleFilter:
     """The filter of a configuration."""
-    from mstfilter.smc import ParticleFilter
-
     fields = {k: v for k, v in config.items() if k not in _META and v is not None}
-    return registry.make(ParticleFilter, fields, "", allow_files)
+    return REGISTRY.make(ParticleFilter, fields, allow_files=allow_files)
 
 
 def describe_filter(filter: ParticleFilter) -> dict[str, Any]:
     """The full configuration that builds a filter again, defaults included."""
-    config = registry.describe(filter)
+    config = REGISTRY.describe(filter)
     config.pop("component")
     return config
 

@@ -1,12 +1,25 @@
 """Components by name, and components from configuration.
 
->>> build("resampler", "systematic")
-Systematic()
->>> build("update", {"component": "fusion", "eta": 3, "free_space": "none"})
+A package declares its components in its ``__init__.py``: ``__interfaces__`` maps a kind to the class that components
+of this kind inherit, ``__components__`` maps the names of a kind to classes::
 
-A configuration is a nested mapping: a component is its name, or a mapping with ``component`` and fields. Names
-are known without importing what they name. A user's own class is found as ``./file.py:Class`` (where files are
-allowed) or by an entry point ``kind.name`` of the group ``mstfilter.components``.
+    __interfaces__ = {"resampler": "Resampler"}
+    __components__ = {"resampler": {"systematic": "Systematic", "residual": "Residual"}}
+
+A `Registry` joins the declarations of several packages. `mstfilter.presets.REGISTRY` joins all packages:
+
+>>> from mstfilter.presets import REGISTRY
+>>> REGISTRY.build("resampler", "systematic")
+Systematic()
+>>> REGISTRY.build("update", {"component": "fusion", "eta": 3, "free_space": "none"})
+
+A configuration is a nested mapping. A component is its name, or a mapping with ``component`` and fields. The kind of
+a field follows from its annotation: a field of type ``Resampler`` or ``Resampler | None`` holds a resampler, one of
+type ``tuple[Evidence, ...]`` a list of evidence.
+
+A component is imported when it is first built; looking up a name imports nothing. A class of the user is named as
+``./file.py:Class`` (only where files are allowed), or added by an entry point ``kind.name`` of the group
+``mstfilter.components``.
 """
 
 from __future__ import annotations
@@ -21,205 +34,231 @@ import typing
 from collections.abc import Mapping
 from importlib.metadata import entry_points
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 from mstfilter.errors import InputError
 
-__all__ = ["COMPONENTS", "ORACLES", "build", "check_names", "describe", "find_class", "known"]
+__all__ = ["Registry", "default_of"]
 
-COMPONENTS: dict[str, dict[str, str]] = {
-    "transition": {
-        "tracking": "mstfilter.tracking:TrackingTransition",
-        "identity": "mstfilter.tracking:IdentityTransition",
-    },
-    "proposal": {
-        "tree_cuts": "mstfilter.segmentation:TreeCutProposal",
-        "first_pause": "mstfilter.baselines:FirstPause",
-        "image_components": "mstfilter.baselines:ImageComponents",
-        "occupied_components": "mstfilter.baselines:OccupiedComponents",
-        "one_blob": "mstfilter.baselines:OneBlob",
-    },
-    "update": {
-        "fusion": "mstfilter.fusion:FusionUpdate",
-        "object_fusion": "mstfilter.baselines:ObjectFusion",
-        "projection": "mstfilter.fusion:ProjectionUpdate",
-        "samples_only": "mstfilter.baselines:SamplesOnly",
-        "tracking_only": "mstfilter.baselines:TrackingOnly",
-        "union": "mstfilter.baselines:Union",
-    },
-    "resampler": {
-        "multinomial": "mstfilter.smc:Multinomial",
-        "residual": "mstfilter.smc:Residual",
-        "stratified": "mstfilter.smc:Stratified",
-        "systematic": "mstfilter.smc:Systematic",
-        "residual_systematic": "mstfilter.smc:ResidualSystematic",
-        "ssp": "mstfilter.smc:Ssp",
-        "killing": "mstfilter.smc:Killing",
-        "fearnhead_clifford": "mstfilter.smc:FearnheadClifford",
-        "clusters": "mstfilter.smc:ClusterStratified",
-        "kdpp": "mstfilter.smc:KDpp",
-        "greedy_diverse": "mstfilter.smc:GreedyDiverse",
-        "coalesced": "mstfilter.smc:Coalesced",
-        "tempered": "mstfilter.smc:Tempered",
-        "shuffled": "mstfilter.smc:Shuffled",
-        "keep_weights": "mstfilter.smc:KeepWeights",
-    },
-    "trigger": {
-        "always": "mstfilter.smc:Always",
-        "ess": "mstfilter.smc:EssBelow",
-        "every": "mstfilter.smc:Every",
-        "never": "mstfilter.smc:Never",
-    },
-    "size": {
-        "fixed": "mstfilter.smc:Fixed",
-        "kld": "mstfilter.smc:Kld",
-    },
-    "similarity": {
-        "gaussian": "mstfilter.smc:Gaussian",
-        "weighted_coverage": "mstfilter.fusion:WeightedCoverage",
-    },
-    "equivalence": {
-        "bins": "mstfilter.smc:Bins",
-        "exact": "mstfilter.smc:Exact",
-        "same_segmentation": "mstfilter.fusion:SameSegmentation",
-    },
-    "boundary": {
-        "colour_depth": "mstfilter.segmentation:ColourDepthBoundary",
-    },
-    "tree": {
-        "learned": "mstfilter.segmentation:LearnedTree",
-        "ucm": "mstfilter.segmentation:UcmTree",
-    },
-    "value": {
-        "scenecut": "mstfilter.segmentation:SceneCutObjectness",
-        "merge_log_odds": "mstfilter.segmentation:MergeLogOdds",
-    },
-    "sampler": {
-        "mh": "mstfilter.segmentation:MetropolisHastingsCuts",
-        "exact": "mstfilter.segmentation:ExactCuts",
-        "optimal": "mstfilter.segmentation:OptimalCut",
-    },
-    "completer": {
-        "extrude": "mstfilter.completion:Extrude",
-        "surface": "mstfilter.completion:SurfaceOnly",
-    },
-    "rule": {
-        "authors": "mstfilter.tracking:AuthorsRule",
-        "mst": "mstfilter.tracking:MstRule",
-        "paper": "mstfilter.tracking:PaperRule",
-    },
-    "free_space": {
-        "projective": "mstfilter.fusion:FreeSpace",
-        "none": "mstfilter.fusion:NoFreeSpace",
-    },
-    "crossover": {"conflict_graph": "mstfilter.fusion:Crossover"},
-    "structure": {
-        "one_side_last": "mstfilter.fusion:OneSideLast",
-        "random_order": "mstfilter.fusion:RandomOrder",
-        "spanning_tree": "mstfilter.fusion:SpanningTree",
-    },
-    "division": {
-        "none": "mstfilter.fusion:NoDivision",
-        "rigid_motions": "mstfilter.fusion:RigidMotions",
-    },
-    "evidence": {"agreement": "mstfilter.fusion:Agreement"},
-    "mode_filter": {"majority": "mstfilter.fusion:ModeFilter"},
-    "format": {
-        "recording": "mstfilter.formats:RecordingFolder",
-        "pairs": "mstfilter.formats:PairedImages",
-        "tum": "mstfilter.formats:Tum",
-        "bop": "mstfilter.formats:Bop",
-        "redwood": "mstfilter.formats:Redwood",
-        "dsr": "mstfilter.formats:Dsr",
-        "bag": "mstfilter.formats:Bag",
-    },
-    "pauses": {
-        "still": "mstfilter.formats:Still",
-        "at": "mstfilter.formats:At",
-        "listed": "mstfilter.formats:Listed",
-        "ends": "mstfilter.formats:Ends",
-        "every": "mstfilter.formats:Every",
-    },
-}
-#: Stages replaced by the truth of a recording (`mstfilter.oracles`): found by name as the others are, but of no use
-#: without a recording that knows.
-ORACLES: dict[str, dict[str, str]] = {
-    "transition": {"true_motions": "mstfilter.oracles:TrueMotions"},
-    "proposal": {"true_masks": "mstfilter.oracles:TrueMasks"},
-    "update": {"true_fusion": "mstfilter.oracles:TrueFusion"},
-    "resampler": {"true_best": "mstfilter.oracles:TrueBest"},
-    "boundary": {"true_boundary": "mstfilter.oracles:TrueBoundary"},
-    "completer": {"true_completion": "mstfilter.oracles:TrueCompletion"},
-    "free_space": {"true_free_space": "mstfilter.oracles:TrueFreeSpace"},
-    "evidence": {"true_quality": "mstfilter.oracles:TrueQuality"},
-}
-_SAME = {"initial": "proposal", "scheme": "resampler", "fusion": "update"}
-_GROUP = "mstfilter.components"
+_ENTRY_POINTS = "mstfilter.components"
 
 
-def known(kind: str) -> dict[str, str]:
-    """Names of a kind and where their classes are, entry points included."""
-    names = {**COMPONENTS.get(kind, {}), **ORACLES.get(kind, {})}
-    for entry in entry_points(group=_GROUP):
-        slot, _, name = entry.name.partition(".")
-        if slot == kind:
-            names.setdefault(name, entry.value)
-    return names
+class Registry:
+    """The components that packages declare.
 
+    Parameters
+    ----------
+    *packages : module
+        Packages with ``__components__``, ``__interfaces__`` or both.
+    """
 
-def kind_of(field: str) -> str | None:
-    """The kind of component that a field of this name holds; None for plain values."""
-    kind = _SAME.get(field, field)
-    return kind if kind in COMPONENTS else None
+    def __init__(self, *packages: ModuleType) -> None:
+        self._interfaces: dict[str, str] = {}  # location of the class -> kind
+        self._components: dict[str, dict[str, str]] = {}  # kind -> name -> location
+        for package in packages:
+            for kind, cls in getattr(package, "__interfaces__", {}).items():
+                self._interfaces[_location(package.__name__, cls)] = kind
+                self._components.setdefault(kind, {})
+        for package in packages:
+            for kind, names in getattr(package, "__components__", {}).items():
+                for name, cls in names.items():
+                    self._components[kind][name] = _location(package.__name__, cls)
 
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """All kinds of component."""
+        return tuple(self._components)
 
-def check_names(config: Mapping[str, Any], allow_files: bool = False, where: str = "") -> None:
-    """Find unknown component names in a configuration, without importing any component."""
-    for field, value in config.items():
-        kind = kind_of(field)
-        path = f"{where}{field}"
-        if kind is not None:
+    def known(self, kind: str) -> dict[str, str]:
+        """Names of a kind -> locations ``package:Class``, entry points included."""
+        names = dict(self._components[kind])
+        for entry in entry_points(group=_ENTRY_POINTS):
+            entry_kind, _, name = entry.name.partition(".")
+            if entry_kind == kind:
+                names.setdefault(name, entry.value)
+        return names
+
+    def interface(self, kind: str) -> type:
+        """The class that components of a kind inherit; imports it."""
+        return _import(next(where for where, other in self._interfaces.items() if other == kind))
+
+    def kind_of(self, annotation: Any) -> str | None:
+        """The kind of component that a field with this annotation holds; None if it holds a plain value."""
+        for part in typing.get_args(annotation) or (annotation,):
+            for base in getattr(part, "__mro__", ()):
+                kind = self._interfaces.get(_location_of(base))
+                if kind is not None:
+                    return kind
+        return None
+
+    def check_names(self, cls: type, config: Mapping[str, Any], allow_files: bool = False) -> None:
+        """Raise InputError if a field of `cls` names an unknown component; imports no component.
+
+        Names deeper in the configuration are checked by `make`, which imports what it builds.
+        """
+        hints = typing.get_type_hints(cls)
+        for field, value in config.items():
+            kind = self.kind_of(hints.get(field))
             name = value.get("component") if isinstance(value, Mapping) else value
-            for item in value if isinstance(value, list) else [name]:
-                inner = item.get("component") if isinstance(item, Mapping) else item
-                if isinstance(inner, str):
-                    _locate(kind, inner, path, allow_files)
-        if isinstance(value, Mapping):
-            check_names(value, allow_files, f"{path}.")
+            if kind is not None and isinstance(name, str):
+                self._locate(kind, name, field, allow_files)
 
+    def find_class(self, kind: str, name: str, where: str | None = None, allow_files: bool = False) -> type:
+        """The class of a component name; imports it."""
+        location = self._locate(kind, name, where or kind, allow_files)
+        path, _, attribute = location.partition(":")
+        if path.endswith(".py"):
+            return _from_file(Path(path), attribute)
+        try:
+            return _import(location)
+        except ImportError as error:
+            raise InputError(f"{where or kind}: component {name!r} cannot be imported: {error}") from error
 
-def find_class(kind: str, name: str, where: str | None = None, allow_files: bool = False) -> type:
-    """The class of a component name; imports it."""
-    location = _locate(kind, name, where or kind, allow_files)
-    module, _, attribute = location.partition(":")
-    if module.endswith(".py"):
-        return _from_file(Path(module), attribute)
-    try:
-        found = getattr(importlib.import_module(module), attribute)
-    except ImportError as error:
-        raise InputError(f"{where or kind}: component {name!r} cannot be imported: {error}") from error
-    return found
-
-
-def _locate(kind: str, name: str, where: str, allow_files: bool) -> str:
-    if ".py:" in name:
-        if not allow_files:
+    def _locate(self, kind: str, name: str, where: str, allow_files: bool) -> str:
+        if ".py:" in name:
+            if not allow_files:
+                raise InputError(
+                    f"{where}: {name!r} names a file, which is not loaded here",
+                    "only run, study and check load files",
+                )
+            path = name.partition(":")[0]
+            if not Path(path).is_file():
+                raise InputError(f"{where}: file does not exist: {path}")
+            return name
+        names = self.known(kind)
+        if name not in names:
             raise InputError(
-                f"{where}: {name!r} names a file, which is not loaded here", "only run, study and check load files"
+                f"{where}: there is no {kind} {name!r}",
+                *_suggestion(name, names),
+                f"there are: {', '.join(sorted(names))}; or ./file.py:Class",
             )
-        if not Path(name.partition(":")[0]).is_file():
-            raise InputError(f"{where}: file does not exist: {name.partition(':')[0]}")
-        return name
-    names = known(kind)
-    if name not in names:
-        close = difflib.get_close_matches(name, names, n=1)
-        hints = [f"did you mean {close[0]}?"] if close else []
-        raise InputError(
-            f"{where}: there is no {kind} {name!r}",
-            *hints,
-            f"there are: {', '.join(sorted(names))}; or ./file.py:Class",
-        )
-    return names[name]
+        return names[name]
+
+    def build(
+        self, kind: str, spec: Any, where: str | None = None, allow_files: bool = False, default: Any = None
+    ) -> Any:
+        """A component from its name, or from a mapping with ``component`` and fields.
+
+        Parameters
+        ----------
+        kind : str
+            One of `kinds`.
+        spec : str or mapping
+            What to build. A mapping without ``component`` changes fields of `default`.
+        where : str, optional
+            Path in the configuration, for messages.
+        allow_files : bool
+            Whether ``./file.py:Class`` is loaded.
+        default : component, optional
+            The component that a mapping without ``component`` changes.
+        """
+        where = where or kind
+        if isinstance(spec, str):
+            spec = {"component": spec}
+        if not isinstance(spec, Mapping):
+            raise InputError(f"{where} is {spec!r}, expected the name of a {kind} or a table")
+        fields = dict(spec)
+        name = fields.pop("component", None)
+        if name is not None:
+            return self.make(self.find_class(kind, name, where, allow_files), fields, where, allow_files)
+        if default is None:
+            names = ", ".join(sorted(self.known(kind)))
+            raise InputError(f"{where} names no component", f"add component = one of {names}")
+        return self.make(type(default), fields, where, allow_files, default)
+
+    def make(
+        self, cls: type, fields: Mapping[str, Any], where: str = "", allow_files: bool = False, base: Any = None
+    ) -> Any:
+        """A dataclass from plain values, nested components included; fields that are not given are those of `base`.
+
+        Raises
+        ------
+        InputError
+            If a field or a component is unknown, or a value does not fit its field.
+        """
+        if not dataclasses.is_dataclass(cls):
+            raise InputError(f"{where}: {cls.__name__} is not a dataclass, so its fields cannot be configured")
+        known = {field.name: field for field in dataclasses.fields(cls) if field.init}
+        hints = typing.get_type_hints(cls)
+        values = {}
+        for name, value in fields.items():
+            path = f"{where}.{name}" if where else name
+            if name not in known:
+                raise InputError(
+                    f"{path}: {cls.__name__} has no field {name!r}",
+                    *_suggestion(name, known),
+                    f"fields: {', '.join(known) or 'none'}",
+                )
+            current = default_of(known[name]) if base is None else getattr(base, name)
+            values[name] = self._value(hints[name], value, current, path, allow_files)
+        try:
+            return cls(**values) if base is None else dataclasses.replace(base, **values)
+        except InputError as error:
+            raise InputError(f"{where}: {error.message}" if where else error.message, *error.hints) from error
+        except TypeError as error:
+            raise InputError(f"{where}: {error}") from error
+
+    def _value(self, hint: Any, value: Any, current: Any, path: str, allow_files: bool) -> Any:
+        """The value of a field with annotation `hint`, which holds `current` if nothing is given."""
+        kind = self.kind_of(hint)
+        default = current if dataclasses.is_dataclass(current) else None
+        if kind is not None and isinstance(value, list):
+            return tuple(self.build(kind, item, f"{path}[{k}]", allow_files) for k, item in enumerate(value))
+        if kind is not None and value is None and type(None) in typing.get_args(hint):
+            return None
+        if kind is not None:
+            return self.build(kind, value, path, allow_files, default)
+        if default is not None and isinstance(value, Mapping):
+            # A settings object: it has fields, but no other class can replace it.
+            inner = {k: v for k, v in value.items() if k != "component"}
+            return self.make(type(default), inner, path, allow_files, default)
+        return _plain(hint, value, path)
+
+    def describe(self, component: Any) -> dict[str, Any]:
+        """The configuration that builds a component again."""
+        out: dict[str, Any] = {"component": self.name_of(type(component))}
+        for field in dataclasses.fields(component):
+            value = getattr(component, field.name)
+            if dataclasses.is_dataclass(value) and not isinstance(value, type):
+                value = self.describe(value)
+            elif isinstance(value, tuple):
+                value = [self.describe(v) if dataclasses.is_dataclass(v) else v for v in value]
+            out[field.name] = value
+        return out
+
+    def name_of(self, cls: type) -> str:
+        """The registered name of a class, its file, or its import path."""
+        file = cls.__dict__.get("__mst_file__")
+        if file is not None:
+            return str(file)
+        location = _location_of(cls)
+        for names in self._components.values():
+            for name, where in names.items():
+                if where == location:
+                    return name
+        return f"{cls.__module__}:{cls.__qualname__}"
+
+
+def default_of(field: dataclasses.Field[Any]) -> Any:
+    """The default of a dataclass field, made if it has a factory; MISSING if it has none."""
+    return field.default if field.default_factory is dataclasses.MISSING else field.default_factory()
+
+
+def _location(package: str, cls: str) -> str:
+    return cls if ":" in cls else f"{package}:{cls}"
+
+
+def _location_of(cls: type) -> str:
+    """``package:Class``, where classes of mstfilter count as classes of their top package."""
+    package = ".".join(cls.__module__.split(".")[:2])
+    return f"{package}:{cls.__qualname__}"
+
+
+def _import(location: str) -> type:
+    module, _, attribute = location.partition(":")
+    found: type = getattr(importlib.import_module(module), attribute)
+    return found
 
 
 def _from_file(path: Path, attribute: str) -> type:
@@ -240,80 +279,6 @@ def _from_file(path: Path, attribute: str) -> type:
     return found
 
 
-def build(kind: str, spec: Any, where: str | None = None, allow_files: bool = False, default: Any = None) -> Any:
-    """A component from its name, or from a mapping with ``component`` and fields.
-
-    Parameters
-    ----------
-    kind : str
-        Key of `COMPONENTS`.
-    spec : str or mapping
-        What to build. A mapping without ``component`` changes fields of `default`.
-    where : str, optional
-        Path in the configuration, for messages.
-    allow_files : bool
-        Whether ``./file.py:Class`` is loaded.
-    default : component, optional
-        What a mapping that names no component changes.
-    """
-    where = where or kind
-    if isinstance(spec, str):
-        spec = {"component": spec}
-    if not isinstance(spec, Mapping):
-        raise InputError(f"{where} is {spec!r}, expected the name of a {kind} or a table")
-    fields = dict(spec)
-    name = fields.pop("component", None)
-    if name is None:
-        if default is None:
-            raise InputError(
-                f"{where} names no component", f"add component = one of {', '.join(sorted(known(kind)))}"
-            )
-        return make(type(default), fields, where, allow_files, default)
-    return make(find_class(kind, name, where, allow_files), fields, where, allow_files)
-
-
-def make(cls: type, fields: Mapping[str, Any], where: str, allow_files: bool = False, base: Any = None) -> Any:
-    """An instance of a dataclass from plain values, nested components included; other fields are those of `base`."""
-    if not dataclasses.is_dataclass(cls):
-        raise InputError(f"{where}: {cls.__name__} is not a dataclass, so its fields cannot be configured")
-    own = {f.name: f for f in dataclasses.fields(cls) if f.init}
-    hints = typing.get_type_hints(cls)
-    values = {}
-    for name, value in fields.items():
-        path = f"{where}.{name}" if where else name
-        if name not in own:
-            close = difflib.get_close_matches(name, own, n=1)
-            raise InputError(
-                f"{path}: {cls.__name__} has no field {name!r}",
-                *([f"did you mean {close[0]}?"] if close else []),
-                f"fields: {', '.join(own) or 'none'}",
-            )
-        kind = kind_of(name)
-        current = default_of(own[name]) if base is None else getattr(base, name)
-        part = current if dataclasses.is_dataclass(current) else None
-        if kind is not None and isinstance(value, list):
-            values[name] = tuple(build(kind, item, f"{path}[{k}]", allow_files) for k, item in enumerate(value))
-        elif kind is not None and value is not None:
-            values[name] = build(kind, value, path, allow_files, part)
-        elif part is not None and isinstance(value, Mapping):
-            # Part of a component that is no component itself: it has fields, but nothing can replace it.
-            inner = {k: v for k, v in value.items() if k != "component"}
-            values[name] = make(type(part), inner, path, allow_files, part)
-        else:
-            values[name] = _plain(hints[name], value, path)
-    try:
-        return cls(**values) if base is None else dataclasses.replace(base, **values)
-    except InputError as error:
-        raise InputError(f"{where}: {error.message}" if where else error.message, *error.hints) from error
-    except TypeError as error:
-        raise InputError(f"{where}: {error}") from error
-
-
-def default_of(field: dataclasses.Field[Any]) -> Any:
-    """The default of a dataclass field, made if it has a factory; MISSING where there is none."""
-    return field.default if field.default_factory is dataclasses.MISSING else field.default_factory()
-
-
 def _plain(hint: Any, value: Any, where: str) -> Any:
     """A plain value checked against a field's annotation."""
     from pydantic import TypeAdapter, ValidationError
@@ -324,29 +289,5 @@ def _plain(hint: Any, value: Any, where: str) -> Any:
         raise InputError(f"{where} is {value!r}: {error.errors()[0]['msg'].lower()}") from error
 
 
-def describe(component: Any) -> dict[str, Any]:
-    """The configuration that builds a component again."""
-    cls = type(component)
-    out: dict[str, Any] = {"component": name_of(cls)}
-    for field in dataclasses.fields(component):
-        value = getattr(component, field.name)
-        if dataclasses.is_dataclass(value) and not isinstance(value, type):
-            value = describe(value)
-        elif isinstance(value, tuple):
-            value = [describe(v) if dataclasses.is_dataclass(v) else v for v in value]
-        out[field.name] = value
-    return out
-
-
-def name_of(cls: type) -> str:
-    """The registered name of a class, its file, or its import path."""
-    file = cls.__dict__.get("__mst_file__")
-    if file is not None:
-        return str(file)
-    package = ".".join(cls.__module__.split(".")[:2])
-    location = f"{package}:{cls.__qualname__}"
-    for names in (*COMPONENTS.values(), *ORACLES.values()):
-        for name, where in names.items():
-            if where == location:
-                return name
-    return f"{cls.__module__}:{cls.__qualname__}"
+def _suggestion(name: str, names: Mapping[str, Any]) -> list[str]:
+    return [f"did you mean {close}?" for close in difflib.get_close_matches(name, names, n=1)]

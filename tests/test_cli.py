@@ -65,6 +65,7 @@ def test_bad_recordings_are_one_clear_error(recording, tmp_path, capsys, fault):
     [
         (("run", "nowhere"), "does not exist"),
         (("run", "nowhere", "resampler=sistematic"), "there is no resampler 'sistematic'"),
+        (("run", "nowhere", "transition.rule=mzt"), "there is no rule 'mzt'"),
         (("run", "nowhere", "--preset", "best"), "there is no preset 'best'"),
         (("simulate", "kitchen", "out"), "kitchen"),
         (("report", "nowhere"), "not a run folder"),

@@ -79,7 +79,7 @@ def test_commands_run(here, command, capsys):
 
 def test_every_format_has_a_command():
     """Data of each registered format is converted or run by a command of the page."""
-    from mstfilter import registry
+    from mstfilter import formats
 
     data = {
         "recording": "table-7",
@@ -90,5 +90,5 @@ def test_every_format_has_a_command():
         "dsr": "real_test_data",
         "bag": "session.bag",
     }
-    assert set(data) == set(registry.COMPONENTS["format"])
+    assert set(data) == set(formats.__components__["format"])
     assert all(any(name in command.split() for command in COMMANDS) for name in data.values())

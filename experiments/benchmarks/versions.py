@@ -28,7 +28,6 @@ from typing import Any
 import numpy as np
 
 import mstfilter
-from mstfilter import registry
 from mstfilter.smc.interfaces import Proposal, Transition, Update
 from mstfilter.smc.population import Population
 
@@ -71,7 +70,7 @@ def tasks(recordings: Path) -> dict[str, Callable[[], Any]]:
         return lambda: [None for _ in filter.iterate(walk[:steps], 1)]
 
     def resample(name: str) -> Callable[[], Any]:
-        scheme, rng = registry.build("resampler", name), np.random.default_rng(2)
+        scheme, rng = mstfilter.preset("mst", f"resampler={name}").resampler, np.random.default_rng(2)
         return lambda: scheme.select(rng, log_weights, len(log_weights))
 
     def mst(scene: str) -> Callable[[], Any]:

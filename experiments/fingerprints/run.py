@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 import mstfilter
-from mstfilter import registry
+from mstfilter.presets import REGISTRY
 from mstfilter.smc import Population, Proposal, Transition, Update
 
 #: Scene families and seeds. Three small scenes: 5 objects, 9 objects, and the demo.
@@ -97,7 +97,7 @@ def of_smc() -> dict[str, str]:
     found = {}
     for name in SCHEMES:
         for resample in ("before", "after"):
-            scheme = registry.build("resampler", name)
+            scheme = REGISTRY.build("resampler", name)
             filter = mstfilter.ParticleFilter(
                 initial=Prior(), transition=walk, update=likelihood, resampler=scheme, n=30, resample=resample
             )

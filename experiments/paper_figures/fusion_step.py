@@ -16,8 +16,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from r1 import NOTICE, Particles, folder
 
-from mstfilter.presets import load_config
-from mstfilter.registry import build
+from mstfilter.presets import REGISTRY, load_config
 from mstfilter.report import colour, viewpoint
 from mstfilter.scoring import components, one_blob
 
@@ -56,7 +55,7 @@ def score(particles: Particles, labels: np.ndarray, of: np.ndarray) -> float:
 
 def fused(particles: Particles, preset: str, eta: int) -> Iterator[np.ndarray]:
     """Labels of every pair's candidates. There is no image: a preset's claims, division and evidence play no part."""
-    crossover = build("crossover", load_config(preset)["update"]["crossover"])
+    crossover = REGISTRY.build("crossover", load_config(preset)["update"]["crossover"])
     rng = np.random.default_rng(0)
     for sample in particles.samples:
         for prediction in particles.predictions:

@@ -28,8 +28,7 @@ from mstfilter.fusion import (
     conflict_graph,
     merge_probability,
 )
-from mstfilter.presets import load_config
-from mstfilter.registry import build
+from mstfilter.presets import REGISTRY, load_config
 from mstfilter.report import Colour, viewpoint
 
 SAMPLE, PREDICTION = 2, 2  # the pair with the fewest conflicts of those that the authors' program kept
@@ -65,7 +64,7 @@ def make(out: Path, smoke: bool) -> list[Path]:
 def picture(particles: Particles, path: Path, smoke: bool) -> Path:
     """The steps for one pair."""
     sample, prediction = particles.samples[SAMPLE], particles.predictions[PREDICTION]
-    crossover: Crossover = build("crossover", load_config("paper")["update"]["crossover"])
+    crossover: Crossover = REGISTRY.build("crossover", load_config("paper")["update"]["crossover"])
     graph = conflict_graph(sample.labels, prediction.labels)
     rng = np.random.default_rng(SEED)
     neighbours = graph.neighbours()

@@ -16,8 +16,7 @@ from worlds import World, branching
 import mstfilter
 from mstfilter.errors import InputError
 from mstfilter.fusion import Agreement, NoFreeSpace, SameSegmentation, WeightedCoverage
-from mstfilter.presets import load_config
-from mstfilter.registry import build
+from mstfilter.presets import REGISTRY, load_config
 from mstfilter.scene import Camera, Clip, Frame, Hypothesis, VoxelGrid
 from mstfilter.scoring import weighted_coverage
 from mstfilter.simulation import scene_family, simulate
@@ -83,7 +82,9 @@ def real(eta: int = 5) -> Candidates | None:
     predictions = tuple(Hypothesis.from_labels(m, grid) for m in refined["labels"][0])
     proposed = Population(samples, measured["weight"][1, :5], {"proposed": np.arange(5)})
     # There is no depth image. The quality Q of the projection came with the data and enters as log Q^3, by hand.
-    update = build("update", load_config("authors", ["update.free_space=none", f"update.eta={eta}"])["update"])
+    update = REGISTRY.build(
+        "update", load_config("authors", ["update.free_space=none", f"update.eta={eta}"])["update"]
+    )
     update = replace(update, free_space=NoFreeSpace())
     log_weights = measured["weight"][0, :5] + update.quality_exponent * np.log(refined["weight"][0])
     predicted = Population(predictions, log_weights, {"previous": np.arange(5)})

@@ -19,10 +19,10 @@ def list_(
     kind: Annotated[str, typer.Argument(help="One kind only: resampler, rule, ..., presets or families.")] = "",
 ) -> None:
     """List presets, scene families and components with their fields."""
-    from mstfilter import registry
+    from mstfilter.presets import REGISTRY
 
-    kinds = ["presets", "families", *registry.COMPONENTS]
-    wanted = kind.removesuffix("s") if kind.removesuffix("s") in registry.COMPONENTS else kind
+    kinds = ["presets", "families", *REGISTRY.kinds]
+    wanted = kind.removesuffix("s") if kind.removesuffix("s") in REGISTRY.kinds else kind
     if wanted and wanted not in kinds:
         raise InputError(f"there is no kind of component {kind!r}", f"there are: {', '.join(kinds)}")
     for name in [wanted] if wanted else kinds:
@@ -39,17 +39,16 @@ def check(
     ] = None,
 ) -> None:
     """Test whether a component keeps what its interface promises, and say in words what it does not."""
-    from mstfilter import registry
-    from mstfilter.presets import settings
+    from mstfilter.presets import REGISTRY, settings
     from mstfilter.testing import FALSE_ALARM, example_of, verify
 
     kind, _, name = ("", "", component) if ".py:" in component else component.partition(".")
-    if ".py:" not in component and kind not in registry.COMPONENTS:
+    if ".py:" not in component and kind not in REGISTRY.kinds:
         raise InputError(
             f"{component!r} is no component", "give ./file.py:Class, or KIND.NAME as `mstfilter list` shows"
         )
-    cls = registry.find_class(kind, name, component, allow_files=True)
-    made = registry.make(cls, settings(overrides or ()), "", allow_files=True)
+    cls = REGISTRY.find_class(kind, name, component, allow_files=True)
+    made = REGISTRY.make(cls, settings(overrides or ()), allow_files=True)
     failed = statistical = 0
     for outcome in verify(made, example_of(cls)):
         state = "broken" if outcome.broken else "skipped" if outcome.skipped else "holds"
@@ -93,7 +92,8 @@ def _lines(kind: str) -> Iterator[str]:
     """One line a preset, family or component."""
     import tomllib
 
-    from mstfilter import registry
+    from mstfilter.oracles import UsesTruth
+    from mstfilter.presets import REGISTRY
     from mstfilter.resources import find_preset, preset_names
 
     if kind == "presets":
@@ -110,9 +110,10 @@ def _lines(kind: str) -> Iterator[str]:
                 f"{f.width} x {f.height}, voxels {' x '.join(map(str, f.grid().shape))}"
             )
         return
-    for name in registry.known(kind):
-        cls = registry.find_class(kind, name)
-        yield f"{name:<20}{_first_line(cls)}  [{_fields(cls)}]"
+    for name in REGISTRY.known(kind):
+        cls = REGISTRY.find_class(kind, name)
+        truth = " (uses the ground truth)" if issubclass(cls, UsesTruth) else ""
+        yield f"{name:<20}{_first_line(cls)}{truth}  [{_fields(cls)}]"
 
 
 def _first_line(cls: type) -> str:
@@ -123,7 +124,8 @@ def _fields(cls: type) -> str:
     """Fields of a component with their defaults."""
     import dataclasses
 
-    from mstfilter.registry import default_of, name_of
+    from mstfilter.presets import REGISTRY
+    from mstfilter.registry import default_of
 
     parts = []
     for field in dataclasses.fields(cls):
@@ -131,7 +133,7 @@ def _fields(cls: type) -> str:
         if value is dataclasses.MISSING:
             parts.append(field.name)
         elif dataclasses.is_dataclass(value):
-            parts.append(f"{field.name}={name_of(type(value))}")
+            parts.append(f"{field.name}={REGISTRY.name_of(type(value))}")
         else:
             parts.append(f"{field.name}={value}")
     return ", ".join(parts)

@@ -30,9 +30,10 @@ def run(
     report: Annotated[bool, typer.Option(help="Write report.html into the run folder.")] = True,
 ) -> None:
     """Filter a recording into a run folder. A run that was stopped goes on."""
-    from mstfilter.presets import load_config
+    from mstfilter.presets import build_filter, load_config
 
     config = load_config(preset, overrides or ())
+    build_filter(config, allow_files=True)  # a wrong setting is reported before the recording is read
     source = read_source(recording, format, option, pauses, frames)
     name = Path(preset).stem
     folder = out or Path("runs") / f"{safe_name(source.name)}-{safe_name(name)}-{seed}"

@@ -3,3 +3,6 @@
 from mstfilter.lazy import attach
 
 __getattr__, __dir__, __all__ = attach(__name__, __file__)
+
+__interfaces__ = {"completer": "Completer"}
+__components__ = {"completer": {"extrude": "Extrude", "surface": "SurfaceOnly"}}

@@ -7,3 +7,17 @@ A reader is a `Format`: a frozen dataclass with ``detects(path)`` and ``open(pat
 from mstfilter.lazy import attach
 
 __getattr__, __dir__, __all__ = attach(__name__, __file__)
+
+__interfaces__ = {"format": "Format", "pauses": "PauseRule"}
+__components__ = {
+    "format": {
+        "recording": "RecordingFolder",
+        "pairs": "PairedImages",
+        "tum": "Tum",
+        "bop": "Bop",
+        "redwood": "Redwood",
+        "dsr": "Dsr",
+        "bag": "Bag",
+    },
+    "pauses": {"still": "Still", "at": "At", "listed": "Listed", "ends": "Ends", "every": "Every"},
+}

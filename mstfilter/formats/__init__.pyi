@@ -9,6 +9,7 @@ from mstfilter.formats.pauses import (
     Ends as Ends,
     Every as Every,
     Listed as Listed,
+    PauseRule as PauseRule,
     pauses_from_text as pauses_from_text,
 )
 from mstfilter.formats.redwood import Redwood as Redwood

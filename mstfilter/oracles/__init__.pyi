@@ -26,4 +26,4 @@ from mstfilter.oracles.miniature.shrunk import shrink as shrink
 from mstfilter.oracles.miniature.weighting import ScoredFusion as ScoredFusion, balanced_filter as balanced_filter
 from mstfilter.oracles.miniature.world import Glance as Glance, Miniature as Miniature
 from mstfilter.oracles.motion import TrueMotions as TrueMotions
-from mstfilter.oracles.truth import bind_truth as bind_truth
+from mstfilter.oracles.truth import UsesTruth as UsesTruth, bind_truth as bind_truth, uses_truth as uses_truth

@@ -20,9 +20,8 @@ from dataclasses import dataclass, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from mstfilter import registry
 from mstfilter.errors import InputError
-from mstfilter.presets import build_filter, describe_filter
+from mstfilter.presets import REGISTRY, build_filter, describe_filter
 from mstfilter.scene import content_key
 from mstfilter.study.code_version import code_version
 from mstfilter.study.config import SceneEntry, StudyConfig
@@ -174,7 +173,7 @@ def _scenes(entry: SceneEntry, folder: Path, allow_files: bool) -> Iterator[Scen
         from mstfilter.simulation import recipe_key, scene_family
 
         family = scene_family(entry.family)
-        family = registry.make(type(family), entry.set, f"scene family {entry.family!r}", base=family)
+        family = REGISTRY.make(type(family), entry.set, f"scene family {entry.family!r}", base=family)
         changed = {name: getattr(family, name) for name in entry.set}
         group = entry.group or entry.family
         for seed in entry.seeds:

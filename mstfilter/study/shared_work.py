@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from mstfilter.registry import COMPONENTS, ORACLES
+from mstfilter.presets import REGISTRY
 from mstfilter.study.code_version import code_version
 from mstfilter.study.run import versions
 
@@ -66,7 +66,7 @@ def kind_versions() -> dict[str, str]:
 
     def version(*slots: str, module: str) -> str:
         """Of a module and of all components that may stand in these slots."""
-        named = [where for slot in slots for names in (COMPONENTS, ORACLES) for where in names.get(slot, {}).values()]
+        named = [where for slot in slots for where in REGISTRY.known(slot).values()]
         return code_version([module, *(where.partition(":")[0] for where in named)]) + libraries
 
     return {

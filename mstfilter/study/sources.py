@@ -13,10 +13,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from mstfilter import registry
 from mstfilter.errors import InputError
 from mstfilter.formats import Format
-from mstfilter.presets import settings
+from mstfilter.presets import REGISTRY, settings
 from mstfilter.scene import Recording
 
 __all__ = ["detect_format", "format_settings", "open_source"]
@@ -51,14 +50,14 @@ def open_source(
     cls = _reader(name, allow_files)
     if not path.exists():
         raise InputError(f"recording does not exist: {path}")
-    reader = registry.make(cls, fields, "", allow_files)
+    reader = REGISTRY.make(cls, fields, "", allow_files)
     opened: Recording = reader.open(path)
     return opened
 
 
 def _reader(name: str, allow_files: bool = False) -> type[Format]:
     """The class of a format."""
-    cls = registry.find_class("format", name, "format", allow_files)
+    cls = REGISTRY.find_class("format", name, "format", allow_files)
     if not issubclass(cls, Format):
         raise InputError(f"{name} is no reader of recordings", "subclass mstfilter.formats.interfaces.Format")
     return cls
@@ -68,7 +67,7 @@ def detect_format(path: Path) -> str:
     """The one format that a file or folder looks like."""
     if not path.exists():
         raise InputError(f"recording folder or file does not exist: {path}")
-    names = registry.known("format")
+    names = REGISTRY.known("format")
     found = [name for name in names if _reader(name).detects(path)]
     if len(found) == 1:
         return found[0]

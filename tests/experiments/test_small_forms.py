@@ -7,8 +7,8 @@ import runpy
 
 import pytest
 
+from mstfilter import smc
 from mstfilter.files import read_csv
-from mstfilter.registry import COMPONENTS
 from mstfilter.scene import read_rgb
 from tests.conftest import REPOSITORY, find_shared
 from tests.experiments.scripts import EXPERIMENTS, run_script
@@ -170,7 +170,7 @@ def test_resampling(tmp_path):
     arguments = ("resampling/run.py", "--smoke", "--out", tmp_path)
     run_script(*arguments)
     rows = read_csv(tmp_path / "summary.csv")
-    assert {r["scheme"] for r in rows} == set(COMPONENTS["resampler"])
+    assert {r["scheme"] for r in rows} == set(smc.__components__["resampler"])
     assert not [r for r in rows if r["measure"].startswith("log_evidence") and r["scheme"] == "keep_weights"]
     assert " s\n" not in run_script(*arguments), "finished parts are not run again"
 

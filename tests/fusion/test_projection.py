@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from mstfilter import registry
 from mstfilter.errors import InputError
 from mstfilter.fusion.free_space import FreeSpace, NoFreeSpace
 from mstfilter.fusion.projection import ProjectionUpdate
 from mstfilter.fusion.update import FusionUpdate
+from mstfilter.presets import REGISTRY
 from mstfilter.scene import Clip, Frame, Hypothesis, VoxelGrid
 from mstfilter.smc import ParticleFilter, Population, ProjectOnto, Proposal, Transition
 from mstfilter.testing import UpdateContract, scenes
@@ -108,7 +108,7 @@ def test_a_particle_that_loses_all_keeps_a_weight():
 
 
 def test_it_is_found_by_name_and_says_what_is_wrong():
-    built = registry.build("update", {"component": "projection", "free_space": "none", "quality_exponent": 1.0})
+    built = REGISTRY.build("update", {"component": "projection", "free_space": "none", "quality_exponent": 1.0})
     assert built == ProjectionUpdate(NoFreeSpace(), 1.0)
     with pytest.raises(InputError, match="quality_exponent"):
         ProjectionUpdate(quality_exponent=-1.0)

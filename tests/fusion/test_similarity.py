@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mstfilter import registry
 from mstfilter.errors import InputError
 from mstfilter.fusion.similarity import SameSegmentation, WeightedCoverage, canonical
+from mstfilter.presets import REGISTRY
 from mstfilter.scene import Hypothesis, VoxelGrid
 from mstfilter.scoring import weighted_coverage
 from mstfilter.smc import Coalesced, KDpp, Population
@@ -79,9 +79,9 @@ def test_diverse_resampling_from_configuration():
         "equivalence": "same_segmentation",
         "scheme": {"component": "kdpp", "similarity": {"component": "weighted_coverage", "stride": 2}},
     }
-    scheme = registry.build("resampler", config)
+    scheme = REGISTRY.build("resampler", config)
     assert scheme == Coalesced(KDpp(WeightedCoverage(2)), SameSegmentation())
-    assert registry.build("resampler", registry.describe(scheme)) == scheme
+    assert REGISTRY.build("resampler", REGISTRY.describe(scheme)) == scheme
     population, _ = scene_example(np.random.default_rng(0), 40)
     chosen = scheme.resample(np.random.default_rng(1), population, 3)
     assert chosen.notes["distinct"] == len(set(SameSegmentation().classes(population.particles).tolist()))

@@ -16,8 +16,7 @@ from mstfilter.fusion.free_space import NoFreeSpace, Projection
 from mstfilter.fusion.mode_filter import ModeFilter
 from mstfilter.fusion.structure import RandomOrder, SpanningTree
 from mstfilter.fusion.update import FusionUpdate
-from mstfilter.presets import load_config
-from mstfilter.registry import build
+from mstfilter.presets import REGISTRY, load_config
 from mstfilter.scene import Clip, Crop, Frame, Hypothesis, VoxelGrid
 from mstfilter.scoring import weighted_coverage
 from mstfilter.smc import Population
@@ -189,7 +188,7 @@ def test_the_authors_real_particles(shared_data):
     proposed = Population(samples, measured["weight"][1, :5], {"proposed": np.arange(5)})
 
     config = load_config("authors", ["update.free_space=none"])
-    update = build("update", config["update"])
+    update = REGISTRY.build("update", config["update"])
     assert isinstance(update.free_space, NoFreeSpace)
     # There is no depth: the projection is off and hands out the Q that came with the data.
     update = replace(update, free_space=ShippedQuality({h.key: q for h, q in zip(predictions, quality, strict=True)}))
@@ -214,7 +213,7 @@ def test_the_authors_real_particles(shared_data):
         assert (ours.labels[~union] == 0).all()
         assert ((ours.labels > 0) == union).mean() > 0.9999
 
-    resampler = build("resampler", config["resampler"])
+    resampler = REGISTRY.build("resampler", config["resampler"])
     kept = resampler.resample(np.random.default_rng(1), fused, 5).realised()
     assert len(kept) == 5
     assert all(isinstance(h, Hypothesis) and h.objects for h in kept.particles)

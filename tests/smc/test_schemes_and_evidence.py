@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from mstfilter.registry import COMPONENTS, build
+from mstfilter import smc
+from mstfilter.presets import REGISTRY
 from mstfilter.smc.branching import Branching
 from mstfilter.smc.distributions import Normal
 from mstfilter.smc.filters import bootstrap
@@ -26,7 +27,7 @@ from mstfilter.smc.state_space import StateSpaceModel
 from tests.smc.models import AR1, RHO, SD0, SIGMA, SYMBOLS, ar1_observations, forward, hmm, kalman_ar1, mean_ratio
 
 YS = ar1_observations(8)
-SCHEMES = sorted(COMPONENTS["resampler"])
+SCHEMES = sorted(smc.__components__["resampler"])
 # Schemes that see the particles, or do not duplicate: few particles, in worlds where few are enough.
 SEEING = {
     "clusters": ClusterStratified(Gaussian(0.5)),
@@ -44,7 +45,7 @@ def proper(name):
     scheme = {"residual, stratified": Residual("stratified"), "residual, systematic": Residual("systematic")}.get(
         name
     )
-    scheme = scheme or build("resampler", name)
+    scheme = scheme or REGISTRY.build("resampler", name)
     if not scheme.properly_weighted:
         pytest.skip("says that it is not properly weighted")
     return scheme

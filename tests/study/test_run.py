@@ -5,16 +5,21 @@ from __future__ import annotations
 import json
 import shutil
 from dataclasses import dataclass
+from typing import get_type_hints
 
 import numpy as np
 import pytest
 
-from mstfilter import registry
+import mstfilter.registry
+from mstfilter.completion import Completer
 from mstfilter.errors import InputError
 from mstfilter.formats import RecordingWriter, open_recording
-from mstfilter.presets import build_filter, describe_filter, load_config
+from mstfilter.fusion import Agreement, Evidence, FusionUpdate
+from mstfilter.presets import REGISTRY, build_filter, describe_filter, load_config
 from mstfilter.resources import preset_names
 from mstfilter.scoring import weighted_coverage
+from mstfilter.segmentation import ObjectRule
+from mstfilter.smc import Resampler, Ssp
 from mstfilter.study.run import execute
 from mstfilter.study.run_folder import RunFolder
 from tests.scene.scenes import CAMERA, GRID, table_scene
@@ -190,13 +195,40 @@ def test_overrides_change_what_they_name():
         load_config("best")
 
 
-@pytest.mark.parametrize("kind", registry.COMPONENTS)
+@pytest.mark.parametrize("kind", REGISTRY.kinds)
 def test_every_registered_component_can_be_built_and_described(kind):
-    for name in registry.COMPONENTS[kind]:
-        component = registry.build(kind, name)
-        described = json.loads(json.dumps(registry.describe(component)))
+    for name in REGISTRY.known(kind):
+        component = REGISTRY.build(kind, name)
+        described = json.loads(json.dumps(REGISTRY.describe(component)))
         assert described["component"] == name
-        assert registry.build(kind, described) == component
+        assert REGISTRY.build(kind, described) == component
+        assert isinstance(component, REGISTRY.interface(kind))
+
+
+@dataclass(frozen=True)
+class Holder:
+    one: Resampler
+    subclass: FusionUpdate
+    optional: Completer | None = None
+    several: tuple[Evidence, ...] = ()
+    plain: float = 1.0
+    settings: ObjectRule = ObjectRule()  # noqa: RUF009 (frozen)
+
+
+def test_the_kind_of_a_field_follows_from_its_annotation():
+    hints = get_type_hints(Holder)
+    kinds = {name: REGISTRY.kind_of(hint) for name, hint in hints.items()}
+    assert kinds == {
+        "one": "resampler",
+        "subclass": "update",
+        "optional": "completer",
+        "several": "evidence",
+        "plain": None,
+        "settings": None,
+    }
+    fields = {"one": "ssp", "subclass": {"component": "fusion", "eta": 2}, "optional": None, "several": ["agreement"]}
+    made = REGISTRY.make(Holder, fields)
+    assert made == Holder(Ssp(), FusionUpdate(eta=2), None, (Agreement(),))
 
 
 def test_entry_points_add_components(monkeypatch):
@@ -206,10 +238,12 @@ def test_entry_points_add_components(monkeypatch):
         value: str
 
     monkeypatch.setattr(
-        registry, "entry_points", lambda group: [Entry("resampler.mine", "mstfilter.smc.resampling:Residual")]
+        mstfilter.registry,
+        "entry_points",
+        lambda group: [Entry("resampler.mine", "mstfilter.smc.resampling:Residual")],
     )
-    assert type(registry.build("resampler", "mine")).__name__ == "Residual"
-    assert "mine" not in registry.known("trigger")
+    assert type(REGISTRY.build("resampler", "mine")).__name__ == "Residual"
+    assert "mine" not in REGISTRY.known("trigger")
 
 
 def test_presets_are_complete():

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mstfilter import registry
 from mstfilter.errors import InputError
+from mstfilter.presets import REGISTRY
 from mstfilter.study.sources import detect_format, format_settings, open_source
 from tests.formats import layouts
 from tests.scene.test_recording import write
@@ -25,7 +25,7 @@ def test_formats_are_detected(tmp_path, name):
     """Each by exactly one reader; every registered format has a test here or among the bags and pairs."""
     path = WRITERS[name](tmp_path / "data")
     assert detect_format(path) == name
-    assert set(registry.known("format")) == {*WRITERS, "bag", "pairs"}
+    assert set(REGISTRY.known("format")) == {*WRITERS, "bag", "pairs"}
 
 
 def test_unknown_and_ambiguous(tmp_path):

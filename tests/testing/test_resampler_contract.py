@@ -8,7 +8,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mstfilter import registry
+from mstfilter import smc
+from mstfilter.presets import REGISTRY
 from mstfilter.smc import (
     ClusterStratified,
     Coalesced,
@@ -51,7 +52,7 @@ def test_the_global_generators_are_put_back():
 
 
 OURS = {
-    **{name: registry.build("resampler", name) for name in registry.COMPONENTS["resampler"]},
+    **{name: REGISTRY.build("resampler", name) for name in smc.__components__["resampler"]},
     "residual, stratified": Residual("stratified"),
     "residual, systematic": Residual("systematic"),
     "kdpp, wide": KDpp(Gaussian(5.0)),
