@@ -17,7 +17,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 
 import mstfilter
-from mstfilter.report import GREY, Colour, colour, overlay
+from mstfilter.report import UNASSIGNED_COLOUR, Colour, colour, overlay
 from mstfilter.scene import Frame
 from mstfilter.segmentation import Segments, Tree, optimal_cut
 from mstfilter.simulation import Scene, scene_family
@@ -49,7 +49,7 @@ def make(out: Path, smoke: bool) -> list[Path]:
     box = crop(scene.truth(), family.grid(), scene.camera)
     figure, axes = page(2, len(shown), 12.6, 7.2)
     for k, (cut, log_p) in enumerate(zip(shown, probability, strict=True)):
-        own = {int(n): colours.get(int(n), GREY) for n in cut}
+        own = {int(n): colours.get(int(n), UNASSIGNED_COLOUR) for n in cut}
         draw_tree(axes[0, k], part, own, ylabel=k == 0)
         name = "The best cut" if k == 0 else f"Sampled, {np.exp(log_p):.2g} as probable"
         axes[0, k].set_title(f"{name}: {len(objects(found, cut))} objects")
@@ -142,11 +142,11 @@ def draw_tree(axes: Axes, part: Drawn, cut: dict[int, Colour], ylabel: bool) -> 
             x, y = part.x[child], part.y[node]
             lines.append([(part.x[node], y), (x, y), (x, part.y[child])])
             colours.append(tuple(np.array(ABOVE if own is None else own) / 255))
-            widths.append(0.9 if own is None or own == GREY else 1.6)
+            widths.append(0.9 if own is None or own == UNASSIGNED_COLOUR else 1.6)
             stack.append((child, own))
     axes.add_collection(LineCollection(lines, colors=colours, lw=widths))
     for node, own in cut.items():
-        size = 16 if own == GREY else 55
+        size = 16 if own == UNASSIGNED_COLOUR else 55
         axes.scatter(
             part.x[node], part.y[node], s=size, color=[np.array(own) / 255], edgecolors=INK, lw=0.7, zorder=3
         )

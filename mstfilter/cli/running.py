@@ -86,9 +86,9 @@ def simulate(
 def report(
     run: Annotated[Path, typer.Argument(help="Run folder, or study folder.")],
     out: Annotated[Path | None, typer.Option(help="HTML file. Default: report.html in the folder.")] = None,
-    export: Annotated[
-        Path | None, typer.Option(help="Also write PLY meshes and label images into this folder.")
-    ] = None,
+    export: Annotated[Path | None, typer.Option(help="Also write meshes and label images into this folder.")] = None,
+    mesh_format: Annotated[str, typer.Option(help="Format of exported meshes: ply, obj or glb.")] = "ply",
+    mesh_style: Annotated[str, typer.Option(help="Style of exported meshes: blocky or smooth.")] = "blocky",
 ) -> None:
     """Write the report of a run or a study, finished or not."""
     if (run / "study.json").is_file():
@@ -103,7 +103,7 @@ def report(
         from mstfilter.report import export_run
         from mstfilter.study import RunFolder
 
-        export_run(RunFolder.open(run), export)
+        export_run(RunFolder.open(run), export, mesh_format, mesh_style)
         print(f"hypotheses  {export}")
 
 

@@ -1,4 +1,4 @@
-from mstfilter.report.export import export_run as export_run
+from mstfilter.report.export import export_mesh as export_mesh, export_run as export_run
 from mstfilter.report.figures import SERIES as SERIES, in_groups as in_groups, time_figure as time_figure
 from mstfilter.report.identities import (
     TRUTH as TRUTH,
@@ -8,7 +8,7 @@ from mstfilter.report.identities import (
     identity_colours as identity_colours,
 )
 from mstfilter.report.pictures import (
-    GREY as GREY,
+    UNASSIGNED_COLOUR as UNASSIGNED_COLOUR,
     Colour as Colour,
     colour as colour,
     hexadecimal as hexadecimal,

@@ -1,161 +1,214 @@
-"""Hypotheses for other programs: PLY meshes and 16-bit label images.
+"""Export of hypotheses for other programs: meshes, label images and a table of objects. open3d writes the meshes.
 
->>> export_ply(hypothesis, "scene.ply")                      # closed meshes, one an object, coloured
->>> export_label_images(run, "out")                          # what the camera would see of each hypothesis
->>> export_run(run, "out")                                   # both, and a table of objects
+>>> export_run("runs/demo", "out")                                        # blocky PLY meshes
+>>> export_run("runs/demo", "out", mesh_format="glb", mesh_style="smooth")
+>>> export_mesh(hypothesis, "scene.obj")                                  # one hypothesis
 
 Layout of an exported run::
 
     objects.csv                          pause, hypothesis, weight, label, id, birth, voxels, colour
-    pause_000/hypothesis_000.ply         faces between an object and anything else; world metres
-    pause_000/hypothesis_000.png         label of the object that each pixel shows, 0 none
+    pause_000/hypothesis_000.ply         meshes of all objects; world metres
+    pause_000/hypothesis_000.png         label of the object at each pixel, 0 for none
+
+Vertices have the colour of their object in the report. Objects share no vertices. A hypothesis without objects has
+no mesh file. In PLY and OBJ the z axis points up as in the recording; in GLB the y axis does, as glTF requires.
 """
 
 from __future__ import annotations
 
-import csv
 import os
 from collections.abc import Mapping
 from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
 
 from mstfilter.errors import InputError
+from mstfilter.files import atomic_path, write_csv
+from mstfilter.open3d_import import import_open3d
 from mstfilter.report.identities import identity_colours
-from mstfilter.report.pictures import GREY, Colour, colour, hexadecimal
-from mstfilter.scene import Hypothesis, project, write_image
+from mstfilter.report.pictures import UNASSIGNED_COLOUR, Colour, colour, hexadecimal
+from mstfilter.scene import Hypothesis, VoxelGrid, project, write_image
 from mstfilter.study import RunFolder
 
-__all__ = ["export_label_images", "export_ply", "export_run", "surface"]
+__all__ = ["MESH_FORMATS", "MESH_STYLES", "export_mesh", "export_run", "hypothesis_mesh", "voxel_faces"]
 
-_VERTEX = np.dtype([("xyz", "<f4", 3), ("rgb", "u1", 3)])
-_FACE = np.dtype([("n", "u1"), ("index", "<i4", 3)])
+MESH_FORMATS = ("ply", "obj", "glb")
+MESH_STYLES = ("blocky", "smooth")
 
-# Corners of the face of a unit voxel towards +axis, counter-clockwise seen from outside; towards -axis reversed.
+# Corners of the face of a unit voxel towards +axis, counter-clockwise seen from outside; reversed towards -axis.
 _CORNERS = {
     0: np.array([[1, 0, 0], [1, 1, 0], [1, 1, 1], [1, 0, 1]]),
     1: np.array([[0, 1, 0], [0, 1, 1], [1, 1, 1], [1, 1, 0]]),
     2: np.array([[0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1]]),
 }
+_TAUBIN_ITERATIONS = 10
 
 
-def surface(hypothesis: Hypothesis) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Triangles of all voxel faces where an object meets free space or another object.
+def voxel_faces(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Triangles of the faces between the voxels of a mask and all other voxels.
 
-    Every object's surface is closed on its own and turned outwards: where two objects touch, each has its face.
+    Parameters
+    ----------
+    mask : (X, Y, Z) bool
+        Not empty.
 
     Returns
     -------
-    vertices : (v, 3) float64
-        World metres; a corner is shared by the faces of one object only.
-    triangles : (f, 3) int64
+    vertices : (v, 3) int
+        Corners in voxels from the lower corner of the grid.
+    triangles : (f, 3) int
         Counter-clockwise seen from outside.
-    labels : (v,) int64
-        Object of each vertex.
     """
-    padded = np.pad(hypothesis.labels, 1).astype(np.int64)
-    corners, owners = [], []
-    inner = padded[1:-1, 1:-1, 1:-1]
+    padded = np.pad(mask, 1)
+    quads = []
     for axis, face in _CORNERS.items():
         for sign in (1, -1):
-            neighbour = np.roll(padded, -sign, axis=axis)[1:-1, 1:-1, 1:-1]
-            voxel = np.argwhere((inner > 0) & (neighbour != inner))
-            quad = face
+            neighbour = np.roll(padded, -sign, axis=axis)
+            corners = face
             if sign < 0:
-                quad = face[::-1].copy()
-                quad[:, axis] = 0
-            corners.append(voxel[:, None, :] + quad)
-            owners.append(inner[tuple(voxel.T)])
-    quads = np.concatenate(corners)
-    owner = np.concatenate(owners)
-    size = np.array(hypothesis.labels.shape, np.int64) + 1
-    flat = (quads[..., 0] * size[1] + quads[..., 1]) * size[2] + quads[..., 2]
-    named = flat + owner[:, None] * size.prod()
-    names, index = np.unique(named, return_inverse=True)
-    index = index.reshape(-1, 4)
-    labels, cell = np.divmod(names, size.prod())
-    lattice = np.stack(np.unravel_index(cell, tuple(size)), axis=-1)
-    vertices = hypothesis.grid.origin + lattice * hypothesis.grid.voxel_size
-    triangles = index[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3)
-    return vertices, triangles, labels
+                corners = face[::-1].copy()
+                corners[:, axis] = 0
+            quads.append(np.argwhere(padded & ~neighbour)[:, None, :] - 1 + corners)
+    vertices, index = np.unique(np.concatenate(quads).reshape(-1, 3), axis=0, return_inverse=True)
+    return vertices, index.reshape(-1, 4)[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3)
 
 
-def export_ply(hypothesis: Hypothesis, path: str | Path, colours: Mapping[int, Colour] | None = None) -> Path:
-    """Write a hypothesis as a binary little-endian PLY mesh with a colour a vertex.
+def hypothesis_mesh(
+    hypothesis: Hypothesis, colours: Mapping[int, Colour] | None = None, style: str = "blocky"
+) -> Any:
+    """Meshes of all objects of a hypothesis as one ``open3d.geometry.TriangleMesh``, in world metres.
 
     Parameters
     ----------
     hypothesis : Hypothesis
-        See `surface` for the mesh.
-    path : path
-        The file.
+        Its objects.
     colours : mapping, optional
         ``{label: (r, g, b)}``. Default: the palette in order of labels.
+    style : {"blocky", "smooth"}
+        "blocky": the faces of the voxels, which enclose exactly the volume of the voxels. "smooth": the isosurface
+        of the occupancy at 0.5 (open3d's dual contouring), smoothed by Taubin's filter, which shrinks it little
+        (G. Taubin, "Curve and surface smoothing without shrinkage", ICCV 1995).
+
+    Raises
+    ------
+    MissingLibraryError
+        If open3d cannot be imported.
     """
+    o3d = import_open3d()
     if colours is None:
         colours = {record.label: colour(k) for k, record in enumerate(hypothesis.objects)}
-    vertices, triangles, labels = surface(hypothesis)
-    points = np.zeros(len(vertices), _VERTEX)
-    points["xyz"] = vertices
-    for label in np.unique(labels).tolist():
-        points["rgb"][labels == label] = colours.get(label, GREY)
-    faces = np.zeros(len(triangles), _FACE)
-    faces["n"], faces["index"] = 3, triangles
-    header = [
-        "ply",
-        "format binary_little_endian 1.0",
-        "comment world metres, z up",
-        *(f"comment object label={r.label} id={r.id} birth={r.birth}" for r in hypothesis.objects),
-        f"element vertex {len(points)}",
-        *(f"property float {axis}" for axis in "xyz"),
-        *(f"property uchar {channel}" for channel in ("red", "green", "blue")),
-        f"element face {len(faces)}",
-        "property list uchar int vertex_indices",
-        "end_header",
-    ]
-    path = Path(path)
-    partial = path.with_name(f".{path.name}.partial")
-    partial.write_bytes(("\n".join(header) + "\n").encode() + points.tobytes() + faces.tobytes())
-    os.replace(partial, path)
+    build = _smooth_mesh if style == "smooth" else _blocky_mesh
+    mesh = o3d.geometry.TriangleMesh()
+    for record in hypothesis.objects:
+        part = build(o3d, hypothesis.labels == record.label, hypothesis.grid)
+        part.paint_uniform_color(np.array(colours.get(record.label, UNASSIGNED_COLOUR)) / 255)
+        mesh += part
+    return mesh
+
+
+def _blocky_mesh(o3d: Any, mask: np.ndarray, grid: VoxelGrid) -> Any:
+    corners, triangles = voxel_faces(mask)
+    vertices = o3d.utility.Vector3dVector(grid.origin + corners * grid.voxel_size)
+    return o3d.geometry.TriangleMesh(vertices, o3d.utility.Vector3iVector(triangles))
+
+
+def _smooth_mesh(o3d: Any, mask: np.ndarray, grid: VoxelGrid) -> Any:
+    # open3d's axes are (z, y, x); vertex 0 is the centre of the first voxel, which is one voxel of padding here.
+    occupancy = np.ascontiguousarray(np.pad(mask, 1).T, np.float32)
+    mesh = o3d.t.geometry.TriangleMesh.create_isosurfaces(occupancy, [0.5]).to_legacy()
+    mesh.vertex_normals = o3d.utility.Vector3dVector()
+    mesh.scale(grid.voxel_size, np.zeros(3))
+    mesh.translate(grid.origin - 0.5 * grid.voxel_size)
+    return mesh.filter_smooth_taubin(_TAUBIN_ITERATIONS)
+
+
+def export_mesh(
+    hypothesis: Hypothesis, path: str | Path, colours: Mapping[int, Colour] | None = None, style: str = "blocky"
+) -> Path:
+    """Write the mesh of a hypothesis that has objects; the ending of `path` (ply, obj, glb) chooses the format.
+
+    `colours` and `style` are those of `hypothesis_mesh`.
+    """
+    path, o3d = Path(path), import_open3d()
+    mesh = hypothesis_mesh(hypothesis, colours, style)
+    with atomic_path(path) as partial, TemporaryDirectory(dir=partial.parent) as folder:
+        work = str(Path(folder) / path.name)  # open3d writes the name into OBJ files
+        if path.suffix == ".glb":
+            # z up -> y up: (x, y, z) -> (x, z, -y). Only the tensor interface writes binary buffers.
+            mesh.rotate(np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]), np.zeros(3))
+            written = o3d.t.io.write_triangle_mesh(work, o3d.t.geometry.TriangleMesh.from_legacy(mesh))
+        else:
+            written = o3d.io.write_triangle_mesh(work, mesh)
+        if not written:
+            raise InputError(f"open3d cannot write the mesh {path}", "choose another folder")
+        os.replace(work, partial)
     return path
 
 
-def export_label_images(run: RunFolder | str | Path, out: str | Path) -> list[Path]:
-    """Write what the pause's camera would see of every hypothesis, as 16-bit PNG label images."""
-    run = run if isinstance(run, RunFolder) else RunFolder.open(run)
-    paths = []
-    for t in range(run.n_pauses):
-        folder, camera = _folder(out, t), run.camera(t)
-        for k, hypothesis in enumerate(run.hypotheses(t)):
-            paths.append(folder / f"hypothesis_{k:03d}.png")
-            write_image(paths[-1], project(hypothesis, camera))
-    return paths
+def export_run(
+    run: RunFolder | str | Path, out: str | Path, mesh_format: str = "ply", mesh_style: str = "blocky"
+) -> list[Path]:
+    """Write meshes and label images of all hypotheses of all pauses, and a table of all objects.
 
+    Parameters
+    ----------
+    run : RunFolder or path
+        The run.
+    out : path
+        The folder; see the layout above.
+    mesh_format : {"ply", "obj", "glb"}
+        Format of the meshes.
+    mesh_style : {"blocky", "smooth"}
+        See `hypothesis_mesh`.
 
-def export_run(run: RunFolder | str | Path, out: str | Path) -> list[Path]:
-    """Write meshes and label images of all pauses, and a table of all objects; the files written."""
+    Returns
+    -------
+    list of Path
+        The files that were written.
+
+    Raises
+    ------
+    InputError
+        If an option is unknown, the folder cannot be written, or open3d cannot be imported.
+    """
+    for option, value, known in (("format", mesh_format, MESH_FORMATS), ("style", mesh_style, MESH_STYLES)):
+        if value not in known:
+            raise InputError(f"unknown mesh {option} {value!r}", f"known: {', '.join(known)}")
+    import_open3d()  # a missing library is reported before anything is written
     run = run if isinstance(run, RunFolder) else RunFolder.open(run)
-    paths = export_label_images(run, out)
     identities = identity_colours(run)
-    rows: list[list[object]] = []
+    paths: list[Path] = []
+    rows: list[dict[str, object]] = []
     for t in range(run.n_pauses):
-        weights = run.info(t)["weights"]
+        folder, camera, weights = _pause_folder(out, t), run.camera(t), run.info(t)["weights"]
         for k, hypothesis in enumerate(run.hypotheses(t)):
             colours, volumes = identities.colours(t, k), hypothesis.volumes()
-            paths.append(export_ply(hypothesis, _folder(out, t) / f"hypothesis_{k:03d}.ply", colours))
-            for r in hypothesis.objects:
-                shown = hexadecimal(colours[r.label])
-                rows.append([t, k, f"{weights[k]:.6g}", r.label, r.id, r.birth, volumes[r.label], shown])
-    table = Path(out) / "objects.csv"
-    table.parent.mkdir(parents=True, exist_ok=True)
-    with table.open("w", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(["pause", "hypothesis", "weight", "label", "id", "birth", "voxels", "colour"])
-        writer.writerows(rows)
-    return [*paths, table]
+            image = folder / f"hypothesis_{k:03d}.png"
+            write_image(image, project(hypothesis, camera))
+            paths.append(image)
+            if hypothesis.objects:
+                paths.append(export_mesh(hypothesis, image.with_suffix(f".{mesh_format}"), colours, mesh_style))
+            for record in hypothesis.objects:
+                rows.append(
+                    {
+                        "pause": t,
+                        "hypothesis": k,
+                        "weight": f"{weights[k]:.6g}",
+                        "label": record.label,
+                        "id": record.id,
+                        "birth": record.birth,
+                        "voxels": volumes[record.label],
+                        "colour": hexadecimal(colours[record.label]),
+                    }
+                )
+    columns = ("pause", "hypothesis", "weight", "label", "id", "birth", "voxels", "colour")
+    write_csv(Path(out) / "objects.csv", rows, columns)
+    return [*paths, Path(out) / "objects.csv"]
 
 
-def _folder(out: str | Path, t: int) -> Path:
+def _pause_folder(out: str | Path, t: int) -> Path:
     folder = Path(out) / f"pause_{t:03d}"
     try:
         folder.mkdir(parents=True, exist_ok=True)

@@ -26,7 +26,17 @@ import numpy as np
 
 from mstfilter.scene import Camera, Hypothesis, VoxelGrid, look_at, memo, render
 
-__all__ = ["GREY", "PALETTE", "colour", "hexadecimal", "layer", "overlay", "png_bytes", "viewpoint", "voxel_picture"]
+__all__ = [
+    "PALETTE",
+    "UNASSIGNED_COLOUR",
+    "colour",
+    "hexadecimal",
+    "layer",
+    "overlay",
+    "png_bytes",
+    "viewpoint",
+    "voxel_picture",
+]
 
 Colour = tuple[int, int, int]
 
@@ -39,12 +49,12 @@ _HEX = (
 PALETTE: tuple[Colour, ...] = tuple((int(h[:2], 16), int(h[2:4], 16), int(h[4:], 16)) for h in _HEX.split())
 
 #: For what has no identity.
-GREY: Colour = (140, 143, 148)
+UNASSIGNED_COLOUR: Colour = (140, 143, 148)
 
 
 def colour(identity: int) -> Colour:
     """Colour of an identity 0, 1, 2, ...; they repeat after twenty. Grey for negative ones."""
-    return GREY if identity < 0 else PALETTE[identity % len(PALETTE)]
+    return UNASSIGNED_COLOUR if identity < 0 else PALETTE[identity % len(PALETTE)]
 
 
 def hexadecimal(rgb: Colour) -> str:
@@ -73,7 +83,7 @@ def jpeg_bytes(image: np.ndarray, quality: int = 92) -> bytes:
 
 def _painted(labels: np.ndarray, colours: Mapping[int, Colour]) -> np.ndarray:
     """(..., 3) float colour of each label; grey where none is named."""
-    table = np.tile(np.array(GREY, float), (int(labels.max(initial=0)) + 1, 1))
+    table = np.tile(np.array(UNASSIGNED_COLOUR, float), (int(labels.max(initial=0)) + 1, 1))
     for label, rgb in colours.items():
         if 0 <= label < len(table):
             table[label] = rgb

@@ -1,84 +1,120 @@
-"""Exports: closed meshes turned outwards, read back by a parser of our own; label images equal to Project."""
+"""Exports: closed meshes that are read back by open3d, and label images that equal the projection."""
 
 from __future__ import annotations
 
 import csv
+import sys
 
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
-from mstfilter.errors import InputError
-from mstfilter.report.export import export_label_images, export_ply, export_run, surface
+from mstfilter.errors import InputError, MissingLibraryError
+from mstfilter.open3d_import import import_open3d
+from mstfilter.report import write_report
+from mstfilter.report.export import MESH_FORMATS, export_mesh, export_run, voxel_faces
 from mstfilter.report.pictures import PALETTE
 from mstfilter.scene import Hypothesis, VoxelGrid, project, read_labels
 from tests.report.runs import make_run
+from tests.test_cli import call
 
 
-def read_ply(path):
-    """Vertices, colours and triangles of a binary PLY, by its own header."""
-    data = path.read_bytes()
-    head, _, body = data.partition(b"end_header\n")
-    lines = head.decode().splitlines()
-    assert lines[:2] == ["ply", "format binary_little_endian 1.0"]
-    counts = {line.split()[1]: int(line.split()[2]) for line in lines if line.startswith("element")}
-    vertex = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1")])
-    points = np.frombuffer(body, vertex, counts["vertex"])
-    face = np.dtype([("n", "u1"), ("i", "<i4", 3)])
-    faces = np.frombuffer(body, face, counts["face"], offset=points.nbytes)
-    assert len(body) == points.nbytes + faces.nbytes
-    assert (faces["n"] == 3).all()
-    xyz = np.stack([points[a] for a in "xyz"], axis=-1).astype(float)
-    return xyz, np.stack([points[c] for c in ("red", "green", "blue")], axis=-1), faces["i"]
+@pytest.fixture
+def o3d():
+    try:
+        return import_open3d()
+    except MissingLibraryError as error:
+        pytest.skip(error.message)
 
 
-def volume(vertices, triangles):
+def two_boxes():
+    """Labels 4 (8 voxels) and 9 (12 voxels), which touch."""
+    labels = np.zeros((6, 5, 4), np.uint16)
+    labels[1:3, 1:3, :2] = 4
+    labels[3:5, 1:3, :3] = 9
+    return Hypothesis.from_labels(labels, VoxelGrid((0, 0, 0), 0.01, labels.shape))
+
+
+def ball(radius=6):
+    index = np.indices((16, 16, 16)) - 7.5
+    labels = ((index**2).sum(axis=0) <= radius**2).astype(np.uint16)
+    return Hypothesis.from_labels(labels, VoxelGrid((-0.1, 0.2, 0.0), 0.01, labels.shape))
+
+
+def signed_volume(vertices, triangles):
+    """Volume inside a closed mesh, positive if its triangles are counter-clockwise seen from outside."""
     a, b, c = (vertices[triangles[:, k]] for k in range(3))
     return float(np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6)
 
 
+def objects_of(o3d, path):
+    """Colour -> mesh of each object in a file."""
+    mesh = o3d.io.read_triangle_mesh(str(path))
+    if path.suffix == ".glb":  # y up -> z up
+        mesh.rotate(np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]), np.zeros(3))
+    colours = np.rint(255 * np.asarray(mesh.vertex_colors)).astype(int)
+    found = {}
+    for colour in np.unique(colours, axis=0):
+        part = mesh.select_by_index(np.flatnonzero((colours == colour).all(axis=1)))
+        found[tuple(colour.tolist())] = part
+    assert sum(len(part.triangles) for part in found.values()) == len(mesh.triangles)
+    return found
+
+
 @settings(max_examples=40, deadline=None)
-@given(st.integers(0, 2**32 - 1), st.integers(1, 4), st.integers(1, 5))
-def test_each_surface_is_closed_turned_outwards_and_holds_its_volume(seed, n_labels, size):
-    labels = np.random.default_rng(seed).integers(0, n_labels + 1, (size, size + 1, size + 2)).astype(np.uint16)
-    grid = VoxelGrid((0.3, -1.0, 0.05), 0.02, labels.shape)
-    hypothesis = Hypothesis.from_labels(labels, grid)
-    vertices, triangles, owner = surface(hypothesis)
-    assert (owner[triangles] == owner[triangles[:, :1]]).all()
-    for label, voxels in hypothesis.volumes().items():
-        own = triangles[owner[triangles[:, 0]] == label]
-        assert volume(vertices, own) == pytest.approx(voxels * 0.02**3, rel=1e-9)
-        # Every directed edge is met by its reverse as often: no hole, no flipped face.
-        edges = np.concatenate([own[:, [0, 1]], own[:, [1, 2]], own[:, [2, 0]]])
-        names, counts = np.unique(edges, axis=0, return_counts=True)
-        table = {tuple(e): c for e, c in zip(names.tolist(), counts.tolist(), strict=True)}
-        assert all(table.get((b, a)) == c for (a, b), c in table.items())
+@given(st.integers(0, 2**32 - 1), st.integers(1, 5))
+def test_voxel_faces_are_closed_turned_outwards_and_hold_the_volume(seed, size):
+    mask = np.random.default_rng(seed).random((size, size + 1, size + 2)) < 0.4
+    mask[0, 0, 0] = True
+    vertices, triangles = voxel_faces(mask)
+    assert signed_volume(vertices, triangles) == pytest.approx(mask.sum(), rel=1e-9)
+    # Every directed edge is met by its reverse as often: no hole, no flipped face.
+    edges = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
+    names, counts = np.unique(edges, axis=0, return_counts=True)
+    table = {tuple(e): c for e, c in zip(names.tolist(), counts.tolist(), strict=True)}
+    assert all(table.get((b, a)) == c for (a, b), c in table.items())
 
 
-def test_ply_reads_back(tmp_path):
-    labels = np.zeros((6, 5, 4), np.uint16)
-    labels[1:3, 1:3, :2] = 4
-    labels[3:5, 1:3, :3] = 9
-    hypothesis = Hypothesis.from_labels(labels, VoxelGrid((0, 0, 0), 0.01, labels.shape))
-    xyz, rgb, triangles = read_ply(export_ply(hypothesis, tmp_path / "a.ply"))
-    assert volume(xyz, triangles) == pytest.approx(20 * 0.01**3, rel=1e-4)
-    assert {tuple(c) for c in rgb.tolist()} == {PALETTE[0], PALETTE[1]}
-    assert xyz.min(axis=0) == pytest.approx([0.01, 0.01, 0]) and xyz.max(axis=0) == pytest.approx([0.05, 0.03, 0.03])
-    # 8 voxels in a cube of 24 faces, 12 in a block of 32: 56 quads.
-    assert len(triangles) == 112
-    first = (tmp_path / "a.ply").read_bytes()
-    assert export_ply(hypothesis, tmp_path / "a.ply").read_bytes() == first
+@pytest.mark.parametrize("ending", MESH_FORMATS)
+def test_blocky_meshes_read_back_are_watertight_and_hold_the_volume_of_the_voxels(o3d, tmp_path, ending):
+    path = export_mesh(two_boxes(), tmp_path / f"a.{ending}")
+    assert list(tmp_path.iterdir()) == [path]
+    objects = objects_of(o3d, path)
+    assert set(objects) == {PALETTE[0], PALETTE[1]}
+    for mesh, voxels in zip((objects[PALETTE[0]], objects[PALETTE[1]]), (8, 12), strict=True):
+        assert mesh.is_watertight()
+        assert mesh.get_volume() == pytest.approx(voxels * 0.01**3, rel=1e-4)
+        assert signed_volume(np.asarray(mesh.vertices), np.asarray(mesh.triangles)) > 0
+    # 8 voxels in a cube of 24 faces, 12 in a block of 32: two triangles each.
+    assert [len(objects[c].triangles) for c in PALETTE[:2]] == [48, 64]
+    corners = np.concatenate([np.asarray(mesh.vertices) for mesh in objects.values()])
+    assert corners.min(axis=0) == pytest.approx([0.01, 0.01, 0], abs=1e-7)
+    assert corners.max(axis=0) == pytest.approx([0.05, 0.03, 0.03], abs=1e-7)
 
 
-def test_a_hypothesis_without_objects_is_an_empty_mesh(tmp_path):
-    grid = VoxelGrid((0, 0, 0), 0.01, (3, 3, 3))
-    xyz, _, triangles = read_ply(
-        export_ply(Hypothesis.from_labels(np.zeros((3, 3, 3), int), grid), tmp_path / "e.ply")
-    )
-    assert len(xyz) == len(triangles) == 0
+@pytest.mark.parametrize("ending", MESH_FORMATS)
+def test_the_same_hypothesis_gives_the_same_file(o3d, tmp_path, ending):
+    first = export_mesh(two_boxes(), tmp_path / f"a.{ending}").read_bytes()
+    assert export_mesh(two_boxes(), tmp_path / f"a.{ending}").read_bytes() == first
 
 
-def test_export_of_a_run(tmp_path):
+@pytest.mark.parametrize("ending", MESH_FORMATS)
+def test_a_smooth_ball_is_rounder_than_a_blocky_one(o3d, tmp_path, ending):
+    deviation = {}
+    for style in ("blocky", "smooth"):
+        path = export_mesh(ball(), tmp_path / f"{style}.{ending}", style=style)
+        (mesh,) = objects_of(o3d, path).values()
+        assert mesh.is_watertight()
+        centre = np.array([-0.1, 0.2, 0.0]) + 8 * 0.01
+        radius = np.linalg.norm(np.asarray(mesh.vertices) - centre, axis=1)
+        assert radius.mean() == pytest.approx(0.06, rel=0.06)
+        assert mesh.get_volume() == pytest.approx((ball().labels > 0).sum() * 0.01**3, rel=0.1)
+        assert signed_volume(np.asarray(mesh.vertices), np.asarray(mesh.triangles)) > 0
+        deviation[style] = radius.std()
+    assert deviation["smooth"] < 0.6 * deviation["blocky"]
+
+
+def test_export_of_a_run(o3d, tmp_path):
     run = make_run(tmp_path / "run")
     files = export_run(run, tmp_path / "out")
     assert len(files) == 3 * 3 * 2 + 1 and all(f.is_file() for f in files)
@@ -88,16 +124,44 @@ def test_export_of_a_run(tmp_path):
             image = read_labels(stem.with_suffix(".png"))
             assert image.dtype == np.uint16
             np.testing.assert_array_equal(image, project(hypothesis, run.camera(t)))
-            xyz, _, triangles = read_ply(stem.with_suffix(".ply"))
-            voxels = sum(hypothesis.volumes().values())
-            assert volume(xyz, triangles) == pytest.approx(voxels * hypothesis.grid.voxel_size**3, rel=1e-4)
+            volumes = [mesh.get_volume() for mesh in objects_of(o3d, stem.with_suffix(".ply")).values()]
+            voxels = sorted(hypothesis.volumes().values())
+            assert sorted(volumes) == pytest.approx([v * hypothesis.grid.voxel_size**3 for v in voxels], rel=1e-4)
     with (tmp_path / "out" / "objects.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == sum(h.n_objects for t in range(3) for h in run.hypotheses(t))
 
 
-def test_export_takes_a_path_and_says_where_it_cannot_write(tmp_path):
+def test_a_hypothesis_without_objects_has_a_label_image_and_no_mesh(o3d, tmp_path):
+    run = make_run(tmp_path / "run", pauses=1, empty=True)
+    names = {path.name for path in export_run(run, tmp_path / "out")}
+    assert names == {"objects.csv", *(f"hypothesis_{k:03d}.png" for k in range(3))}
+
+
+def test_errors(o3d, tmp_path):
     make_run(tmp_path / "run", pauses=1)
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match="cannot write exports"):
-        export_label_images(tmp_path / "run", tmp_path / "file")
+        export_run(tmp_path / "run", tmp_path / "file")
+    with pytest.raises(InputError, match="unknown mesh format 'stl'"):
+        export_run(tmp_path / "run", tmp_path / "out", mesh_format="stl")
+    with pytest.raises(InputError, match="unknown mesh style 'round'"):
+        export_run(tmp_path / "run", tmp_path / "out", mesh_style="round")
+    assert not (tmp_path / "out").exists()
+
+
+def test_command(o3d, tmp_path, capsys):
+    run = make_run(tmp_path / "run", pauses=1)
+    options = ("--export", tmp_path / "out", "--mesh-format", "glb", "--mesh-style", "smooth")
+    code, out, _ = call("report", run.path, *options, capsys=capsys)
+    assert code == 0 and str(tmp_path / "out") in out
+    assert len(list((tmp_path / "out").rglob("*.glb"))) == 3
+
+
+def test_without_open3d_the_report_is_written_and_an_export_is_one_clear_error(tmp_path, monkeypatch):
+    run = make_run(tmp_path / "run", pauses=1)
+    monkeypatch.setitem(sys.modules, "open3d", None)
+    assert write_report(run).is_file()
+    with pytest.raises(MissingLibraryError, match="open3d cannot be imported"):
+        export_run(run, tmp_path / "out")
+    assert not (tmp_path / "out").exists()

@@ -9,7 +9,16 @@ import pytest
 
 from mstfilter.report.identities import TRUTH, close_up, identity_colours
 from mstfilter.report.page import counts, flatten, note_rows, shown
-from mstfilter.report.pictures import GREY, PALETTE, colour, layer, overlay, png_bytes, viewpoint, voxel_picture
+from mstfilter.report.pictures import (
+    PALETTE,
+    UNASSIGNED_COLOUR,
+    colour,
+    layer,
+    overlay,
+    png_bytes,
+    viewpoint,
+    voxel_picture,
+)
 from mstfilter.scene import Hypothesis, project, render
 from tests.report.runs import CAMERA, GRID, labels_of, make_run
 
@@ -38,7 +47,7 @@ def test_palette_is_distinct_for_every_eye(view):
     distance = [float(np.linalg.norm(a - b)) for a, b in itertools.combinations(lab, 2)]
     assert len(PALETTE) == 20 and min(distance) > 0.06  # about three just noticeable differences
     assert min(float(np.linalg.norm(a - b)) for a, b in itertools.combinations(lab[:6], 2)) > 0.09
-    assert colour(21) == PALETTE[1] and colour(-1) == GREY
+    assert colour(21) == PALETTE[1] and colour(-1) == UNASSIGNED_COLOUR
 
 
 def test_identities_follow_objects_through_relabelling_and_time(tmp_path):
