@@ -92,7 +92,7 @@ def judge(family: SceneFamily, seed: int) -> dict[str, float]:
     proposal = TreeCutProposal(sampler=OptimalCut())
     tree, values = proposal.tree_of(frame)
     labels = proposal.objects.label_image(tree, optimal_cut(tree, values), frame, scene.grid)
-    own = proposal.objects.segments(tree, frame, scene.grid).own
+    own = proposal.objects.segments(tree, frame, scene.grid).object_pixels
     population = proposal.sample(np.random.default_rng(seed), Clip((frame,), scene.grid, 0), 1)
 
     def score(found: np.ndarray) -> float:

@@ -95,7 +95,7 @@ class Case:
     def score_cut(self, tree: Tree, found: Segments, cut: np.ndarray) -> float:
         """Quality of a cut, its background taken away."""
         numbers = np.where(found.is_object[cut], np.arange(1, len(cut) + 1), 0)
-        return self.score(np.where(found.own, numbers[tree.label_image(cut)], 0))
+        return self.score(np.where(found.object_pixels, numbers[tree.label_image(cut)], 0))
 
 
 @dataclass(frozen=True)
@@ -150,7 +150,7 @@ def without_labels(tree: Tree) -> Tree:
 
 def components(case: Case, step: float = np.inf) -> np.ndarray:
     """Floor: what stands above the table, 4-connected; neighbours whose depth differs by `step` m are not joined."""
-    own = case.trees[COLOUR_WEIGHTS[0]][1].own
+    own = case.trees[COLOUR_WEIGHTS[0]][1].object_pixels
     index = np.arange(own.size).reshape(own.shape)
     depth = np.where(own, case.frame.depth, 0)
     links = []
@@ -218,10 +218,10 @@ def main(numbers: Sequence[int], out: Path) -> None:
             sink.append(case.score_cut(tree, found, optimal_cut(tree, VALUE.values(tree, case.frame))))
         for name, trees in (("learned", case.learned), ("contour", case.trees)):
             tree, found = trees[0.4]
-            pixels = tree.accumulate_pixels(found.own & ~case.ignored)
+            pixels = tree.accumulate_pixels(found.object_pixels & ~case.ignored)
             recall = []
             for k in range(1, case.truth.max() + 1):
-                inside = tree.accumulate_pixels((case.truth == k) & found.own)
+                inside = tree.accumulate_pixels((case.truth == k) & found.object_pixels)
                 recall.append((inside / (pixels + (case.truth == k).sum() - inside)).max())
             best_node[name].append(float(np.mean(recall)))
     arms["scenecut, optimal cut, no labels used (colour 0.6)"] = np.array(unlabelled)

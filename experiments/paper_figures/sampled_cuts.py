@@ -53,7 +53,7 @@ def make(out: Path, smoke: bool) -> list[Path]:
         draw_tree(axes[0, k], part, own, ylabel=k == 0)
         name = "The best cut" if k == 0 else f"Sampled, {np.exp(log_p):.2g} as probable"
         axes[0, k].set_title(f"{name}: {len(objects(found, cut))} objects")
-        labels = np.where(found.own, np.where(found.is_object[cut], cut, 0)[tree.label_image(cut)], 0)
+        labels = np.where(found.object_pixels, np.where(found.is_object[cut], cut, 0)[tree.label_image(cut)], 0)
         show(axes[1, k], overlay(shot["rgb"], labels, own, fill=0.55)[box])
     return [save(figure, out / "sampled_cuts.png", 50 if smoke else 90)]
 
@@ -120,7 +120,7 @@ class Drawn:
         while stack:
             node = stack.pop()
             whole = node < tree.n_leaves or not (odds[node] > LEAST or taken[node])
-            inside[node] = [] if whole else tree.children(node).tolist()
+            inside[node] = [] if whole else list(tree.children[node])
             y[node] = LEAST - 1 if whole else top if node == tree.root else max(float(odds[node]), LEAST - 0.5)
             if whole:
                 x[node] = float(len(x))

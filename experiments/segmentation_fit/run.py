@@ -20,14 +20,14 @@ from scenes import FITTED, FITTED_SEEDS, first_pause
 from scipy.optimize import minimize
 
 from mstfilter.segmentation import (
-    FEATURES,
+    PAIR_FEATURES,
     REGION,
     Agglomeration,
     ColourDepthBoundary,
     LearnedTree,
     Regions,
-    features,
     join_weights,
+    pair_features,
 )
 
 ROUNDS = 3
@@ -60,13 +60,13 @@ def measured(seeds: Iterable[int]) -> list[tuple[Regions, np.ndarray, float]]:
 
 def episode(regions: Regions, pixels: np.ndarray, scale: float, weights: np.ndarray, pairs: Pairs) -> None:
     """Merge the regions of one scene with the truth at hand, and note what is met."""
-    growing = Agglomeration(regions, lambda *pair: features(*pair, scale) @ weights)
+    growing = Agglomeration(regions, lambda *pair: pair_features(*pair, scale) @ weights)
     true = np.zeros((2 * len(pixels), pixels.shape[1]))
     true[: len(pixels)] = pixels
     while (pair := growing.pop()) is not None:
         odds, i, j = pair
         rows = growing.sums[[i]], growing.sums[[j]], growing.borders[i][j][None]
-        x = features(*rows, growing.table[i][None], growing.table[j][None], scale)[0]
+        x = pair_features(*rows, growing.table[i][None], growing.table[j][None], scale)[0]
         first, second = (int(true[r].argmax()) for r in (i, j))
         if all(true[r].max() >= PURE * true[r].sum() for r in (i, j)):
             size = growing.sums[[i, j], REGION["pixels"].start].min() / scale**2
@@ -75,7 +75,7 @@ def episode(regions: Regions, pixels: np.ndarray, scale: float, weights: np.ndar
             for sink, value in zip(pairs, (x, first != second, weight), strict=True):
                 sink.append(value)
         if first != second:
-            growing.forget(i, j)
+            growing.remove_border(i, j)
         else:
             new = growing.merge(i, j, odds)
             true[new] = true[i] + true[j]
@@ -102,7 +102,7 @@ def logistic(pairs: Pairs) -> np.ndarray:
 def write(weights: np.ndarray, path: Path) -> None:
     """The module of weights with the new table."""
     head = PACKAGED.read_text().split("JOIN_WEIGHTS", 1)[0]
-    rows = "".join(f'    "{name}": {value:.4g},\n' for name, value in zip(FEATURES, weights, strict=True))
+    rows = "".join(f'    "{name}": {value:.4g},\n' for name, value in zip(PAIR_FEATURES, weights, strict=True))
     path.write_text(f"{head}JOIN_WEIGHTS: dict[str, float] = {{\n{rows}}}\n")
 
 
@@ -111,7 +111,7 @@ def main(path: Path, smoke: bool) -> None:
     began = time.time()
     scenes = measured(FITTED_SEEDS[:2] if smoke else FITTED_SEEDS)
     print(f"{len(scenes)} scenes measured, {time.time() - began:.0f} s")
-    weights = np.zeros(len(FEATURES))
+    weights = np.zeros(len(PAIR_FEATURES))
     weights[:2] = -6.0, 12.0  # to begin with: the strength of the border
     pairs: Pairs = ([], [], [])
     for _ in range(1 if smoke else ROUNDS):

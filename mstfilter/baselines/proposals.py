@@ -124,7 +124,7 @@ class ImageComponents(Proposal):
     def sample(self, rng: np.random.Generator, observation: Clip, n: int) -> Population:
         """The same hypothesis, `n` times."""
         frame, grid = observation.after, observation.grid
-        labels = self.label_image(frame, self.objects.own(frame, grid))
+        labels = self.label_image(frame, self.objects.object_pixels(frame, grid))
         completed = [
             self.completer.complete(child(rng, "completion", k), frame, [labels == k], grid)[0]
             for k in range(1, int(labels.max(initial=0)) + 1)
@@ -155,6 +155,6 @@ class ImageComponents(Proposal):
 
 def _occupied(rule: OneBlob | OccupiedComponents, rng: np.random.Generator, clip: Clip) -> np.ndarray:
     """(X, Y, Z) labels: 1 where the completed surface above the table is."""
-    own = rule.objects.own(clip.after, clip.grid)
+    own = rule.objects.object_pixels(clip.after, clip.grid)
     completed = rule.completer.complete(child(rng, "completion"), clip.after, [own], clip.grid)
     return hypothesis_of(completed, clip.grid, clip.index, rule.threshold).labels

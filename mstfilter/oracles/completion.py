@@ -83,7 +83,7 @@ class TrueCompletion(UsesTruth, Completer):
         from scipy.spatial import cKDTree
 
         labels, image = self.truth.labels(t), self.truth.instance(t)
-        own = self.objects.own(frame, grid)
+        own = self.objects.object_pixels(frame, grid)
         found, pixels = [np.zeros((0, 3), np.int64)], [np.zeros(0, np.int64)]
         for k in np.unique(labels):
             shown = image == k

@@ -82,7 +82,7 @@ class TrueMasks(UsesTruth, Proposal):
         counts = np.bincount(image.ravel())
         enough = counts >= max(1.0, self.min_pixels * image.size / 307200)
         enough[0] = False
-        return np.where(enough[image] & self.objects.own(frame, clip.grid), image, 0).astype(np.int32)
+        return np.where(enough[image] & self.objects.object_pixels(frame, clip.grid), image, 0).astype(np.int32)
 
     def sample(self, rng: np.random.Generator, observation: Clip, n: int) -> Population:
         """`n` hypotheses about the scene at the end of the clip; equal ones where their masks are."""

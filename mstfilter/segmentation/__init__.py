@@ -1,4 +1,23 @@
-"""Segmentation: image -> boundaries -> tree -> cuts -> hypotheses (paper IV-B)."""
+"""Segmentation of one image into hypotheses: boundaries -> tree -> cuts -> hypotheses (paper IV-B).
+
+>>> from mstfilter.segmentation import ColourDepthBoundary, LearnedTree, MergeLogOdds, MetropolisHastingsCuts
+>>> boundary = ColourDepthBoundary().boundary(frame)                                  # doctest: +SKIP
+>>> tree = LearnedTree().build(boundary, frame)                                       # doctest: +SKIP
+>>> w = MergeLogOdds().values(tree, frame)                                            # doctest: +SKIP
+>>> cuts = MetropolisHastingsCuts(temperature=1).sample(rng, tree, w, 10).cuts        # doctest: +SKIP
+
+`TreeCutProposal` does all of this and completes the segments to 3-D.
+
+================  ====================================================================
+`boundary`        boundary maps from colour and depth
+`tree`            the tree and its helpers; the ultrametric contour map
+`regions`         measurements of regions and features of pairs of regions
+`learned_tree`    a tree from learned log odds; `join_weights`: the fitted weights
+`cuts`            node values, the optimal cut, exact samples
+`mh`              Metropolis-Hastings samples
+`proposal`        which regions are objects; the proposal of the filter
+================  ====================================================================
+"""
 
 from mstfilter.lazy import attach
 

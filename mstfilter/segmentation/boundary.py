@@ -1,46 +1,67 @@
-"""Where objects end, without learned weights: colour gradients and concave depth edges.
-
-Objects are mostly convex, so where two of them meet, or one meets the table, depth has a *concave* crease or a
-step; the convex creases of a box lie inside one object. Disparity D = 8 f b / z is affine on every plane and its
-noise is the same at every range, so the largest eigenvalue of its Hessian shows creases and steps and nothing
-else. Colour adds borders that depth does not show, at reduced strength because print on a box is not a border.
+"""Boundary maps from colour gradients and concave depth edges, without learned weights.
 
 >>> boundary = ColourDepthBoundary().boundary(frame)       # (H, W) float32 in 0 .. 1
+>>> height = above_table(frame)                            # (H, W), > 0 above the table, NaN without reading
+
+Objects are mostly convex, so depth has a concave crease or a step where two objects meet and where an object meets
+the table. The convex creases of a box lie inside one object. Disparity D = 8 f b / z is affine on every plane and its
+noise does not depend on the range, so the largest eigenvalue of its Hessian responds to creases and steps only.
+Colour adds boundaries that depth does not show. Its weight is lower because print on a box is not a boundary.
 """
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
 import numpy as np
 
 from mstfilter.errors import InputError
-from mstfilter.scene import BASELINE, Frame
-from mstfilter.segmentation.background import SENSOR_FOCAL, above_table
-from mstfilter.segmentation.interfaces import BoundaryModel
+from mstfilter.scene import BASELINE, Frame, fit_support_plane, table_residual
 
-__all__ = ["ColourDepthBoundary"]
+__all__ = ["BoundaryModel", "ColourDepthBoundary", "above_table", "fill_from_nearest"]
+
+#: Focal length in pixels that defines the sensor's disparity unit: 1/8 pixel of a 640 x 480 Kinect, whatever the
+#: size of the image. The noise (0.58 units) and all thresholds then stay the same when an image is resized.
+SENSOR_FOCAL = 525.0
+
+
+def above_table(frame: Frame) -> np.ndarray:
+    """Disparity above the table, (H, W) float32 in sensor units (1/8 px at f = 525 px); NaN without reading.
+
+    One unit is 3.2 mm of depth at 1 m. The table is z = 0 if the camera has a pose, else the plane that contains the
+    most readings.
+    """
+    return fit_support_plane(frame).residual if frame.camera.T_world_camera is None else table_residual(frame)
+
+
+class BoundaryModel(ABC):
+    """Estimates where one object ends and another begins."""
+
+    @abstractmethod
+    def boundary(self, frame: Frame) -> np.ndarray:
+        """(H, W) float32 in 0 .. 1: boundary strength of each pixel."""
 
 
 @dataclass(frozen=True)
 class ColourDepthBoundary(BoundaryModel):
-    """``max(colour_weight * colour, concave)``: colour structure tensor and concave disparity Hessian.
+    """The maximum of weighted colour edges (structure tensor) and concave depth edges (disparity Hessian).
 
     Parameters
     ----------
     colour_weight : float
-        Weight of the colour edges; 0 switches them off.
+        Weight of the colour edges; 0 disables them.
     depth_weight : float
-        Weight of the depth edges; 0 switches them off.
+        Weight of the depth edges; 0 disables them.
     depth_scale : float
-        Blur before the Hessian in pixels of a 640 px wide image; scales with the width.
+        Standard deviation of the blur before the Hessian, in pixels of a 640 px wide image.
     depth_half : float
-        Hessian response that counts 0.5, in sensor disparity units (1/8 px at f = 525 px).
+        Hessian response that maps to strength 0.5, in sensor disparity units (1/8 px at f = 525 px).
     lightness_unit, chroma_unit : float
-        Lab differences that count as one unit of colour strength.
+        Differences of L and of a, b (CIE Lab) that equal one unit of colour strength.
     quiet_table : float
-        Nothing but table within this many pixels (of a 640 px wide image): no boundary there. Keeps print,
-        grain and shadows on the table out of the tree. Negative: off.
+        Pixels (of a 640 px wide image). The boundary is 0 where everything within this distance is table, so that
+        print, grain and shadows on the table do not enter the tree. Negative values disable the rule.
     table_tolerance : float
         Readings up to this much above the table are table, in sensor disparity units.
     """
@@ -60,7 +81,7 @@ class ColourDepthBoundary(BoundaryModel):
                 raise InputError(f"boundary field {name} is {getattr(self, name)!r}, expected a number > 0")
 
     def boundary(self, frame: Frame) -> np.ndarray:
-        """Boundary strength; robot pixels are 0 inside and 1 at their rim, so nothing merges through them."""
+        """Boundary strength (H, W). Robot pixels are 1 at their rim and 0 inside, so that they separate regions."""
         import cv2
 
         resize = frame.camera.width / 640
@@ -72,7 +93,7 @@ class ColourDepthBoundary(BoundaryModel):
         if self.quiet_table >= 0 and frame.valid.any():
             with np.errstate(invalid="ignore"):
                 object_like = (above_table(frame) > self.table_tolerance).astype(np.uint8)
-            # A lone pixel above the table is noise; three by three are not.
+            # Single pixels above the table are noise; blocks of 3 x 3 are not.
             object_like = cv2.morphologyEx(object_like, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
             reach = 2 * max(1, round(self.quiet_table * resize)) + 1
             near = cv2.dilate(object_like, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (reach, reach)))
@@ -94,7 +115,7 @@ class ColourDepthBoundary(BoundaryModel):
         for scale in (1.0, 2.0, 4.0):
             s = max(0.7, scale * resize)
             smooth = cv2.GaussianBlur(lab, (0, 0), s)
-            # Sobel sums to 8 times a derivative a pixel; times s makes scales comparable.
+            # A Sobel filter gives 8 times the derivative per pixel; the factor s makes scales comparable.
             gx = cv2.Sobel(smooth, cv2.CV_32F, 1, 0) * (s / 8)
             gy = cv2.Sobel(smooth, cv2.CV_32F, 0, 1) * (s / 8)
             xx += (gx * gx).sum(axis=2) / 3
@@ -104,7 +125,7 @@ class ColourDepthBoundary(BoundaryModel):
         return strength / (1 + strength)
 
     def _concave(self, frame: Frame, resize: float) -> np.ndarray:
-        """x / (x + depth_half) with x the largest positive curvature of disparity; weak where depth is filled."""
+        """x / (x + depth_half) with x the largest positive curvature of disparity, reduced at filled-in depth."""
         import cv2
 
         holes = ~frame.valid
@@ -122,11 +143,12 @@ class ColourDepthBoundary(BoundaryModel):
 
 
 def _largest_eigenvalue(xx: np.ndarray, yy: np.ndarray, xy: np.ndarray) -> np.ndarray:
+    """Largest eigenvalue of the symmetric matrices [[xx, xy], [xy, yy]]."""
     return (xx + yy) / 2 + np.sqrt(((xx - yy) / 2) ** 2 + xy * xy)
 
 
 def fill_from_nearest(depth: np.ndarray, holes: np.ndarray) -> np.ndarray:
-    """Depth with holes filled from the nearest reading."""
+    """Depth (H, W) with the pixels of `holes` set to the nearest reading."""
     if not holes.any():
         return depth
     from scipy.ndimage import distance_transform_edt

@@ -1,10 +1,6 @@
-"""Weights of `joins.FEATURES`: log odds that two regions are different objects.
+"""Weights of `PAIR_FEATURES`: log odds that two regions are different objects.
 
-Fitted on simulated scenes by
-
-    python experiments/segmentation_fit/run.py
-
-which writes this table; no real image was used.
+The table is written by ``python experiments/segmentation_fit/run.py``, which fits it on simulated scenes.
 """
 
 JOIN_WEIGHTS: dict[str, float] = {

@@ -1,8 +1,8 @@
-"""A hierarchy of regions whose merges are judged one by one: same object or not.
+"""A segmentation tree whose merges are decided by learned log odds: same object or not.
 
-The watershed regions of a boundary map merge best first. How likely two regions are different objects is a logistic
-function of what is measured along their border and of how they would fit together (`joins.FEATURES`), measured anew
-whenever one of them grows. The weights were fitted on simulated scenes alone.
+Watershed regions of a boundary map are merged best first. The log odds that two regions are different objects are
+linear in features of their border and of their union (`PAIR_FEATURES`), which are recomputed when a region grows. The
+weights were fitted on simulated scenes only.
 
 >>> tree = LearnedTree().build(boundary, frame)
 >>> w = MergeLogOdds().values(tree, frame)
@@ -10,40 +10,112 @@ whenever one of them grows. The weights were fitted on simulated scenes alone.
 
 from __future__ import annotations
 
+import heapq
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from mstfilter.errors import InputError
 from mstfilter.scene import Frame
-from mstfilter.segmentation.agglomerate import Agglomeration
-from mstfilter.segmentation.interfaces import TreeBuilder
 from mstfilter.segmentation.join_weights import JOIN_WEIGHTS
-from mstfilter.segmentation.joins import FEATURES, features
-from mstfilter.segmentation.regions import Regions, measure_regions
-from mstfilter.segmentation.tree import Tree
-from mstfilter.segmentation.ucm import UcmTree
+from mstfilter.segmentation.regions import BORDER, PAIR_FEATURES, REGION, Regions, measure_regions, pair_features
+from mstfilter.segmentation.tree import Tree, TreeBuilder, UcmTree
 
-__all__ = ["LearnedTree", "tree_of_merges"]
+__all__ = ["Agglomeration", "LearnedTree", "tree_of_merges"]
 
-#: Log odds of the root, which joins the table and what never touched.
-_CERTAIN = 30.0
+#: Log odds (k,) that the regions of k pairs belong to different objects:
+#: (rows of a, rows of b, borders, table borders of a, of b).
+PairLogOdds = Callable[[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray], np.ndarray]
+
+_NO_BORDER = np.zeros(len(BORDER))
+_ROOT_ODDS = 30.0  # the root joins the table and regions that never touched
+
+
+class Agglomeration:
+    """Best-first merging of regions.
+
+    Parameters
+    ----------
+    regions : Regions
+        Region 0, the table, is never merged.
+    log_odds : callable
+        Log odds that pairs belong to different objects.
+    """
+
+    def __init__(self, regions: Regions, log_odds: PairLogOdds) -> None:
+        n = len(regions.sums)
+        self.log_odds = log_odds
+        self.n_regions = n
+        self.sums = np.zeros((2 * n, regions.sums.shape[1]))
+        self.sums[:n] = regions.sums
+        self.borders: list[dict[int, np.ndarray]] = [dict(near) for near in regions.borders]
+        self.table = [near.pop(0, _NO_BORDER) for near in self.borders]
+        self.alive = set(range(1, n))
+        self.merges: list[tuple[int, int, float]] = []
+        self.heap: list[tuple[float, int, int]] = []
+        for i in range(1, n):
+            self._push(i, [j for j in self.borders[i] if j > i])
+
+    def _push(self, i: int, others: list[int]) -> None:
+        if not others:
+            return
+        borders = np.array([self.borders[i][j] for j in others])
+        table = np.array([self.table[j] for j in others])
+        mine = np.broadcast_to(self.sums[i], (len(others), self.sums.shape[1]))
+        odds = self.log_odds(mine, self.sums[others], borders, np.broadcast_to(self.table[i], table.shape), table)
+        for j, value in zip(others, odds.tolist(), strict=True):
+            heapq.heappush(self.heap, (value, min(i, j), max(i, j)))
+
+    def pop(self) -> tuple[float, int, int] | None:
+        """Remove the pair with the lowest log odds, (log odds, i, j); None if no pair is left."""
+        while self.heap:
+            odds, i, j = heapq.heappop(self.heap)
+            if i in self.alive and j in self.alive and j in self.borders[i]:
+                return odds, i, j
+        return None
+
+    def remove_border(self, i: int, j: int) -> None:
+        """Remove the border of a pair, for the two regions and for those that they are merged into."""
+        del self.borders[i][j], self.borders[j][i]
+
+    def merge(self, i: int, j: int, odds: float) -> int:
+        """Merge two regions and return the number of the new one."""
+        new = self.n_regions + len(self.merges)
+        self.merges.append((i, j, odds))
+        self.sums[new] = self.sums[i] + self.sums[j]
+        common = self.borders[i].pop(j, _NO_BORDER)
+        self.borders[j].pop(i, None)
+        self.sums[new, REGION["perimeter"].start] -= 2 * common[0]
+        near = {k: row for k, row in self.borders[i].items() if k in self.alive}
+        for k, row in self.borders[j].items():
+            if k in self.alive:
+                near[k] = near[k] + row if k in near else row
+        self.borders.append(near)
+        self.table.append(self.table[i] + self.table[j])
+        self.alive -= {i, j}
+        self.alive.add(new)
+        for k in near:
+            back = self.borders[k].pop(i, _NO_BORDER) + self.borders[k].pop(j, _NO_BORDER)
+            self.borders[k][new] = back
+        self._push(new, list(near))
+        return new
 
 
 @dataclass(frozen=True)
 class LearnedTree(TreeBuilder):
     """Best-first merging of watershed regions by learned log odds.
 
-    All regions of the table are one leaf, and only the root joins it to anything.
+    The table is one leaf. Only the root merges it with other regions.
 
     Parameters
     ----------
     leaves : TreeBuilder
-        Gives the regions to begin with: the leaves of its tree.
+        The leaves of its tree are the initial regions.
     table_tolerance : float
         Readings up to this much above the table are table, in sensor disparity units.
     clear_step : float
-        Step of disparity that counts as clear, in sensor disparity units.
+        Smallest clear step of disparity, in sensor disparity units.
     """
 
     leaves: TreeBuilder = field(default_factory=UcmTree)
@@ -51,18 +123,18 @@ class LearnedTree(TreeBuilder):
     clear_step: float = 4.0
 
     def regions(self, boundary: np.ndarray, frame: Frame) -> tuple[Tree, Regions]:
-        """The first tree, and its leaves measured."""
+        """The initial tree and its measured leaves."""
         tree = self.leaves.build(boundary, frame)
         return tree, measure_regions(tree.leaves, frame, boundary, self.table_tolerance, self.clear_step)
 
     def build(self, boundary: np.ndarray, frame: Frame | None = None) -> Tree:
-        """The tree of a frame. Its `odds` are those of each merge; `start` is their running maximum as P."""
+        """Build the tree. `odds` are the log odds of each merge, `start` the maximum of their probabilities below."""
         if frame is None:
-            raise InputError("LearnedTree needs the frame beside its boundary map", "tree.build(boundary, frame)")
+            raise InputError("LearnedTree needs the frame of the boundary map", "tree.build(boundary, frame)")
         tree, regions = self.regions(boundary, frame)
         scale = frame.camera.width / 640
-        weights = np.array([JOIN_WEIGHTS[name] for name in FEATURES])
-        growing = Agglomeration(regions, lambda a, b, ab, at, bt: features(a, b, ab, at, bt, scale) @ weights)
+        weights = np.array([JOIN_WEIGHTS[name] for name in PAIR_FEATURES])
+        growing = Agglomeration(regions, lambda a, b, ab, at, bt: pair_features(a, b, ab, at, bt, scale) @ weights)
         while (pair := growing.pop()) is not None:
             odds, i, j = pair
             growing.merge(i, j, odds)
@@ -70,15 +142,16 @@ class LearnedTree(TreeBuilder):
 
 
 def tree_of_merges(image: np.ndarray, n_regions: int, merges: list[tuple[int, int, float]]) -> Tree:
-    """The tree of merges (a, b, log odds), the k-th of which makes node n_regions + k; a root joins the rest.
+    """The tree of a list of merges. Merge k creates node n_regions + k; a root joins the remaining regions.
 
     Parameters
     ----------
     image : (H, W) int
         Region of every pixel.
     n_regions : int
-        Region 0 is the table.
+        Number of regions. Region 0 is the table.
     merges : list of (int, int, float)
+        The two nodes and the log odds of each merge.
     """
     if n_regions == 1:
         return Tree(np.zeros(1, np.int64), image, np.zeros(1), np.zeros(1))
@@ -86,7 +159,7 @@ def tree_of_merges(image: np.ndarray, n_regions: int, merges: list[tuple[int, in
     parent = np.full(root + 1, root)
     odds = np.zeros(root + 1)
     start = np.zeros(root + 1)
-    odds[root], start[root] = _CERTAIN, 1.0
+    odds[root], start[root] = _ROOT_ODDS, 1.0
     for node, (a, b, value) in enumerate(merges, start=n_regions):
         parent[[a, b]] = node
         odds[node] = value

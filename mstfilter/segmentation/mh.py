@@ -1,8 +1,8 @@
 """Segmentations drawn from a tree by Metropolis-Hastings (paper IV-B, Algorithm 1).
 
-The chain starts at the optimal cut c* and aims at ``p(c) = exp(-(v(c*) - v(c))^2 / s2)`` with
-``s2 = sigma2 v(c*)^2``. Values that are log odds (`MergeLogOdds`) have natural units and need no such scale: with a
-`temperature` the chain aims at ``p(c) = exp((v(c) - v(c*)) / temperature)``, at 1 the law that the odds stand for.
+The chain starts at the optimal cut c*. Its target is ``p(c) = exp(-(v(c*) - v(c))^2 / s2)`` with
+``s2 = sigma2 v(c*)^2``, or, with a `temperature`, ``p(c) = exp((v(c) - v(c*)) / temperature)``. The second form is
+for values that are log odds (`MergeLogOdds`), which need no scale.
 
 - ``mst``: ``MetropolisHastingsCuts(temperature=1)``: one chain, MoveNode mixed with subtree redraws.
 - ``paper``: ``MetropolisHastingsCuts(0.25, burn_in=0, thinning=20, redraw_share=0)``.
@@ -11,33 +11,247 @@ The chain starts at the optimal cut c* and aims at ``p(c) = exp(-(v(c*) - v(c))^
 
 >>> sample = MetropolisHastingsCuts().sample(np.random.default_rng(0), tree, w, 5)
 >>> sample.diagnostics["acceptance"], sample.diagnostics["autocorrelation_steps"]
+
+A `MoveRule` proposes the next cut. MoveNode goes *up* or *down* at a node of the cut: up replaces the node and all
+its siblings, which must be in the cut, by their parent; down replaces the node by its children. Any of the m siblings
+can propose the same move up, so with a node drawn uniformly from n and a fair coin for the direction the proposal
+probability is ``g(up) = m / (2 n)``, and ``1 / (2 n')`` for the reverse move. A rule draws a choice, which determines
+the move:
+
+>>> state = CutState(tree, cut)
+>>> rule = NodeMoves()
+>>> move = rule.outcome(state, rule.choose(random, state))     # None: the chain stays
+>>> move.removed, move.added, move.log_ratio                   # log_ratio = log g(back) - log g(forward)
 """
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from math import exp, inf
-from typing import Any
+from math import exp, inf, log
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from mstfilter.errors import InputError
-from mstfilter.segmentation.gibbs import best_envelope, gibbs
-from mstfilter.segmentation.interfaces import CutSample, CutSampler
-from mstfilter.segmentation.moves import (
-    AuthorsMoves,
-    CutState,
-    FeasibleMoves,
-    MoveRule,
-    NodeMoves,
-    SubtreeRedraw,
+from mstfilter.segmentation.cuts import (
+    CutSample,
+    CutSampler,
+    Gibbs,
+    best_envelope,
+    check_target_law,
+    check_values,
+    gibbs,
+    optimal_cut,
 )
-from mstfilter.segmentation.optimal import check_values, optimal_cut
 from mstfilter.segmentation.tree import Tree
 
-__all__ = ["CutChain", "MetropolisHastingsCuts"]
+__all__ = ["AuthorsMoves", "CutChain", "CutState", "MetropolisHastingsCuts", "Move", "MoveRule", "NodeMoves"]
 
-RULES: dict[str, type[MoveRule]] = {"node": NodeMoves, "feasible": FeasibleMoves, "authors": AuthorsMoves}
+
+class Move(NamedTuple):
+    """Nodes that leave and enter the cut, and log g(back) - log g(forward) of the proposal."""
+
+    removed: tuple[int, ...] | list[int]
+    added: tuple[int, ...] | list[int]
+    log_ratio: float
+
+
+class CutState:
+    """A mutable cut with insertion, removal and uniform draws in constant time."""
+
+    def __init__(self, tree: Tree, cut: list[int]) -> None:
+        self.children = tree.children
+        self.parent = tree.parent.tolist()
+        self.root = tree.root
+        self.nodes: list[int] = []
+        self.position = [-1] * tree.n_nodes  # index of the node in `nodes`
+        self.inside = [0] * tree.n_nodes  # number of children that are in the cut
+        self.splittable = 0  # number of nodes of the cut that have children
+        for node in cut:
+            self._insert(node)
+
+    def _insert(self, node: int) -> None:
+        self.position[node] = len(self.nodes)
+        self.nodes.append(node)
+        if node != self.root:
+            self.inside[self.parent[node]] += 1
+        self.splittable += bool(self.children[node])
+
+    def _remove(self, node: int) -> None:
+        position, last = self.position[node], self.nodes.pop()
+        if last != node:
+            self.nodes[position] = last
+            self.position[last] = position
+        self.position[node] = -1
+        if node != self.root:
+            self.inside[self.parent[node]] -= 1
+        self.splittable -= bool(self.children[node])
+
+    def apply(self, move: Move) -> None:
+        """Replace the removed nodes of a move by the added ones."""
+        for node in move.removed:
+            self._remove(node)
+        for node in move.added:
+            self._insert(node)
+
+    def up(self, node: int) -> int:
+        """The parent if the node and all its siblings are in the cut, else -1."""
+        if node == self.root:
+            return -1
+        parent = self.parent[node]
+        return parent if self.inside[parent] == len(self.children[parent]) else -1
+
+    def below(self, node: int) -> list[int]:
+        """Nodes of the cut inside the subtree of `node`; empty if an ancestor of `node` is in the cut."""
+        found, stack = [], [node]
+        while stack:
+            top = stack.pop()
+            if self.position[top] >= 0:
+                found.append(top)
+            else:
+                stack.extend(self.children[top])
+        return found
+
+    def covered_from_above(self, node: int) -> bool:
+        """Whether a proper ancestor of the node is in the cut."""
+        while node != self.root:
+            node = self.parent[node]
+            if self.position[node] >= 0:
+                return True
+        return False
+
+
+class MoveRule(ABC):
+    """Proposes the next cut of a chain."""
+
+    @abstractmethod
+    def choose(self, random: Callable[[], float], state: CutState) -> Any:
+        """Draw a choice; `random` returns uniform numbers in [0, 1)."""
+
+    @abstractmethod
+    def outcome(self, state: CutState, choice: Any) -> Move | None:
+        """The move that a choice results in; None if the chain stays."""
+
+
+@dataclass(frozen=True)
+class NodeMoves(MoveRule):
+    """MoveNode of the paper: a uniform node of the cut, then up or down by a fair coin; impossible moves stay."""
+
+    def choose(self, random: Callable[[], float], state: CutState) -> tuple[int, bool]:
+        """A node of the cut, and True for up."""
+        draw = random() * 2 * len(state.nodes)
+        return state.nodes[int(draw) >> 1], bool(int(draw) & 1)
+
+    def outcome(self, state: CutState, choice: tuple[int, bool]) -> Move | None:
+        """The move with its exact ratio."""
+        node, upward = choice
+        n = len(state.nodes)
+        if upward:
+            parent = state.up(node)
+            if parent < 0:
+                return None
+            children = state.children[parent]
+            m = len(children)
+            return Move(children, (parent,), log(n / (m * (n - m + 1))))
+        children = state.children[node]
+        if not children:
+            return None
+        m = len(children)
+        return Move((node,), children, log(m * n / (n + m - 1)))
+
+
+@dataclass(frozen=True)
+class AuthorsMoves(MoveRule):
+    """The moves of the authors' program, including its error: the target law is not stationary.
+
+    Uniform over (node, direction). Up is allowed for every node but the root and removes all nodes of the cut below
+    the parent. The forward probability of a move up is taken as 1 / M although each sibling in the cut proposes the
+    same move, so merges are accepted too often.
+    """
+
+    def choose(self, random: Callable[[], float], state: CutState) -> tuple[int, bool] | None:
+        """A node of the cut, and True for up; None if no move is possible."""
+        moves = self.possible(state)
+        return moves[int(random() * len(moves))] if moves else None
+
+    @staticmethod
+    def possible(state: CutState) -> list[tuple[int, bool]]:
+        """All moves (node, True for up)."""
+        moves = []
+        for node in state.nodes:
+            if node != state.root:
+                moves.append((node, True))
+            if state.children[node]:
+                moves.append((node, False))
+        return moves
+
+    def outcome(self, state: CutState, choice: tuple[int, bool] | None) -> Move | None:
+        """The move with the authors' ratio."""
+        if choice is None:
+            return None
+        node, upward = choice
+        at_root = state.position[state.root] >= 0
+        here = self._count(len(state.nodes), state.splittable, at_root)
+        if upward:
+            parent = state.parent[node]
+            removed = state.below(parent)
+            if len(removed) > state.inside[parent]:
+                # A child of the parent was split: no single move leads back.
+                return Move(removed, (parent,), -inf)
+            splittable = state.splittable - sum(1 for x in removed if state.children[x]) + 1
+            there = self._count(len(state.nodes) - len(removed) + 1, splittable, parent == state.root)
+            return Move(removed, (parent,), log(here / there))
+        children = state.children[node]
+        splittable = state.splittable - 1 + sum(1 for x in children if state.children[x])
+        there = self._count(len(state.nodes) - 1 + len(children), splittable, False)
+        return Move((node,), children, log(here / there))
+
+    @staticmethod
+    def _count(n: int, splittable: int, at_root: bool) -> int:
+        """Number of possible moves: up for every node but the root, down for every inner node."""
+        return (0 if at_root else n) + splittable
+
+
+@dataclass(frozen=True, eq=False)
+class SubtreeRedraw(MoveRule):
+    """Redraw the part of the cut inside a random subtree from a Gibbs law.
+
+    The subtree's node is uniform over the inner nodes, for any state; if an ancestor of it is in the cut, the chain
+    stays. A choice is (inner node, new nodes).
+
+    Parameters
+    ----------
+    law : Gibbs
+        Law that the new nodes are drawn from.
+    """
+
+    law: Gibbs
+
+    def choose(self, random: Callable[[], float], state: CutState) -> tuple[int, list[int]]:
+        """An inner node, and the new nodes of the cut below it."""
+        tree = self.law.tree
+        inner = tree.n_nodes - tree.n_leaves
+        if inner == 0:
+            return tree.root, [tree.root]
+        node = tree.n_leaves + int(random() * inner)
+        if state.covered_from_above(node):
+            return node, []
+        return node, self.law.draw(random, node)
+
+    def outcome(self, state: CutState, choice: tuple[int, list[int]]) -> Move | None:
+        """The move; its ratio is exp(b v(old)) / exp(b v(new)) of the Gibbs law."""
+        node, added = choice
+        if not added or state.covered_from_above(node):
+            return None
+        removed = state.below(node)
+        w = self.law.w
+        old, new = sum(w[x] for x in removed), sum(w[x] for x in added)
+        return Move(removed, added, self.law.b * (old - new))
+
+
+LOCAL_MOVES: dict[str, type[MoveRule]] = {"node": NodeMoves, "authors": AuthorsMoves}
 
 
 class CutChain:
@@ -53,9 +267,9 @@ class CutChain:
     s2 : float
         Scale of the target law, in squared units of value.
     cut : array of int
-        Where it starts.
+        Initial cut.
     temperature : float
-        If > 0, the target is the Gibbs law at this temperature, in units of value, and s2 plays no part.
+        If > 0, the target is the Gibbs law at this temperature, in units of value, and s2 is not used.
     """
 
     def __init__(
@@ -73,8 +287,8 @@ class CutChain:
             return (value - self.best) / self.temperature
         return -((self.best - value) ** 2) / self.s2
 
-    def judge(self, rule: MoveRule, choice: Any) -> tuple[Any, float, float]:
-        """Move (None: stay), value after it and log of the acceptance ratio of a choice."""
+    def judge(self, rule: MoveRule, choice: Any) -> tuple[Move | None, float, float]:
+        """Move of a choice (None: stay), value after it, and log of its acceptance ratio."""
         move = rule.outcome(self.state, choice)
         if move is None or move.log_ratio == -inf:
             return None, self.value, -inf
@@ -85,7 +299,7 @@ class CutChain:
             value += self.w[x]
         return move, value, self.log_target(value) - self.log_target(self.value) + move.log_ratio
 
-    def step(self, random: Any, rule: MoveRule) -> None:
+    def step(self, random: Callable[[], float], rule: MoveRule) -> None:
         """One step under a rule."""
         move, value, log_ratio = self.judge(rule, rule.choose(random, self.state))
         self.steps += 1
@@ -101,29 +315,28 @@ class CutChain:
 
 @dataclass(frozen=True)
 class MetropolisHastingsCuts(CutSampler):
-    """Cuts from a Metropolis-Hastings chain started at the optimal cut.
+    """Cuts from a Metropolis-Hastings chain that starts at the optimal cut.
 
     Parameters
     ----------
     sigma2 : float
-        s2 relative to the squared value of the optimal cut. No unit. Unused with a temperature.
+        s2 relative to the squared value of the optimal cut. No unit. Not used with a temperature.
     burn_in : int
-        Steps before the first sample (on top of `thinning`), once a chain.
+        Steps before the first sample, in addition to `thinning`, per chain.
     thinning : int
         Steps from one sample to the next.
-    moves : {"node", "feasible", "authors"}
-        Local moves: uniform node then direction (the paper; exact), uniform over possible moves (exact), or
-        the authors' program, whose forward probability is faulty.
+    moves : {"node", "authors"}
+        Local moves: the paper's (exact), or the authors' program's, whose forward probability is wrong.
     redraw_share : float
-        Share of the steps that redraw a random subtree instead of a local move.
+        Share of the steps that redraw a random subtree instead of making a local move.
     restart : bool
-        Start at the optimal cut again for each sample.
+        Start a new chain at the optimal cut for each sample.
     include_optimal : bool
         The first sample is the optimal cut itself.
     redraw_repeated : bool
-        A cut that was drawn before is drawn once more, then kept whatever it is.
+        If a cut was drawn before, draw once more and keep the second cut in any case.
     temperature : float
-        0: the law of the paper. Above: the Gibbs law exp(v / temperature), in units of value.
+        0: the law of the paper. > 0: the Gibbs law exp(v / temperature), in units of value.
     """
 
     sigma2: float = 1e-3
@@ -137,29 +350,25 @@ class MetropolisHastingsCuts(CutSampler):
     temperature: float = 0.0
 
     def __post_init__(self) -> None:
-        if self.moves not in RULES:
-            raise InputError(f"move rule {self.moves!r} is not known", f"there are: {', '.join(RULES)}")
-        if not self.sigma2 > 0:
-            raise InputError(f"sigma2 is {self.sigma2!r}, expected a number > 0")
-        if self.temperature < 0:
-            raise InputError(f"temperature is {self.temperature!r}, expected a number >= 0")
+        if self.moves not in LOCAL_MOVES:
+            raise InputError(f"move rule {self.moves!r} is not known", f"known rules: {', '.join(LOCAL_MOVES)}")
+        check_target_law(self.sigma2, self.temperature)
         if self.burn_in < 0 or self.thinning < 1:
             raise InputError(f"burn_in {self.burn_in!r} must be >= 0 and thinning {self.thinning!r} >= 1")
         if not 0 <= self.redraw_share <= 1:
             raise InputError(f"redraw_share is {self.redraw_share!r}, expected a share 0 .. 1")
 
     def sample(self, rng: np.random.Generator, tree: Tree, w: np.ndarray, n: int) -> CutSample:
-        """`n` cuts from the chain."""
+        """Draw `n` cuts from the chain."""
         w = check_values(tree, w)
         optimal = optimal_cut(tree, w)
         best = float(w[optimal].sum())
         s2 = max(self.sigma2 * best**2, 1e-300)
-        local = RULES[self.moves]()
+        local = LOCAL_MOVES[self.moves]()
         redraw = None
         if self.redraw_share > 0:
             warm = self.temperature > 0
-            law = gibbs(tree, w, 1 / self.temperature) if warm else best_envelope(tree, w, best, s2)
-            redraw = SubtreeRedraw(law)
+            redraw = SubtreeRedraw(gibbs(tree, w, 1 / self.temperature) if warm else best_envelope(tree, w, best, s2))
         random = _uniforms(rng)
 
         chain = CutChain(tree, w, best, s2, optimal, self.temperature)
@@ -206,10 +415,10 @@ class MetropolisHastingsCuts(CutSampler):
         return CutSample(tuple(cuts), v, np.array([chain.log_target(float(x)) for x in v]), diagnostics)
 
 
-def _uniforms(rng: np.random.Generator, block: int = 1024) -> Any:
-    """A function that gives uniform numbers one by one, drawn in blocks: ten times faster than single draws."""
+def _uniforms(rng: np.random.Generator, block: int = 1024) -> Callable[[], float]:
+    """A function that returns uniform numbers, drawn in blocks: ten times faster than single draws."""
 
-    def numbers() -> Any:
+    def numbers() -> Iterator[float]:
         while True:
             yield from rng.random(block).tolist()
 
@@ -217,9 +426,9 @@ def _uniforms(rng: np.random.Generator, block: int = 1024) -> Any:
 
 
 def _autocorrelation(trace: np.ndarray) -> float | None:
-    """Integrated autocorrelation time of a trace in steps; None where it is too short or constant.
+    """Integrated autocorrelation time of a trace in steps; None if it is shorter than 100 steps or constant.
 
-    A chain shorter than about 50 such times underestimates it: the figure is a warning, not a certificate.
+    A chain shorter than about 50 such times underestimates it, so a low value does not prove convergence.
     """
     if len(trace) < 100 or np.ptp(trace) == 0:
         return None

@@ -1,11 +1,15 @@
-"""New hypotheses from one image: tree cuts, completed to 3-D (paper IV-B).
-
-One boundary map and one tree a frame; each distinct segment of the sampled cuts is completed once; voxels that
-several objects of a hypothesis claim are settled hypothesis by hypothesis.
+"""Hypotheses from one image: tree cuts, completed to 3-D (paper IV-B).
 
 >>> proposal = TreeCutProposal()
 >>> population = proposal.sample(np.random.default_rng(0), clip, 10)
 >>> population.particles[0].n_objects, population.notes["distinct_segments"]
+
+There is one boundary map and one tree per frame. Each distinct segment of the sampled cuts is completed once. Voxels
+that several objects of a hypothesis claim are assigned per hypothesis.
+
+`ObjectRule` decides which regions of a cut are objects:
+
+>>> labels = ObjectRule().label_image(tree, cut, frame)      # (H, W): 0 background, k + 1 for node k of the cut
 """
 
 from __future__ import annotations
@@ -19,19 +23,119 @@ import numpy as np
 from mstfilter.completion import Completer, Completion, Extrude, arbitrate
 from mstfilter.errors import InputError
 from mstfilter.scene import Clip, Frame, Hypothesis, ObjectRecord, VoxelGrid, component_key, memo
-from mstfilter.segmentation.boundary import ColourDepthBoundary
-from mstfilter.segmentation.interfaces import BoundaryModel, CutSampler, CutValue, TreeBuilder
+from mstfilter.segmentation.boundary import BoundaryModel, ColourDepthBoundary, above_table
+from mstfilter.segmentation.cuts import CutSampler, CutValue, MergeLogOdds, optimal_cut
 from mstfilter.segmentation.learned_tree import LearnedTree
 from mstfilter.segmentation.mh import MetropolisHastingsCuts
-from mstfilter.segmentation.optimal import optimal_cut
-from mstfilter.segmentation.segments import ObjectRule, Segments
-from mstfilter.segmentation.tree import Tree
-from mstfilter.segmentation.value import MergeLogOdds
+from mstfilter.segmentation.tree import Tree, TreeBuilder
 from mstfilter.smc import Population, Proposal, child
 
-__all__ = ["TreeCutProposal", "hypothesis_of"]
+__all__ = ["ObjectRule", "Segments", "TreeCutProposal", "hypothesis_of"]
 
 WEIGHT_RULES = ("equal", "p")
+
+
+@dataclass(frozen=True, eq=False)
+class Segments:
+    """Object pixels of an image, and which nodes of its tree are objects.
+
+    Parameters
+    ----------
+    object_pixels : (H, W) bool
+        Pixels that can belong to an object: a depth reading above the table and in the workspace, not the robot.
+    points : (N,) int
+        Number of these pixels in each node.
+    is_object : (N,) bool
+        Whether the node is an object if it is part of a cut.
+    """
+
+    object_pixels: np.ndarray
+    points: np.ndarray
+    is_object: np.ndarray
+
+
+@dataclass(frozen=True)
+class ObjectRule:
+    """Decides which regions are objects.
+
+    A region is background if most of its readings are on the table, behind it or outside the workspace, or if too few
+    readings remain.
+
+    Parameters
+    ----------
+    table_tolerance : float
+        Readings up to this much above the table are table, in sensor disparity units (1/8 px at f = 525 px;
+        one is 3.2 mm of depth at 1 m).
+    object_share : float
+        Smallest share of a region's readings that must lie above the table and in the workspace.
+    min_points : int
+        Smallest number of such readings, in pixels of a 640 x 480 image; scales with the image's area.
+    min_core : int
+        Smallest number of pixels that remain after an erosion by `core_radius`, in pixels of a 640 x 480 image.
+        Removes slivers along the borders of objects (the authors erode by 5 x 5 and require more than 25 points).
+    core_radius : int
+        Radius of that erosion in pixels of a 640 px wide image.
+    min_readings : float
+        Smallest share of a region's pixels with a depth reading (the authors' 0.004).
+    """
+
+    table_tolerance: float = 2.0
+    object_share: float = 0.5
+    min_points: int = 60
+    min_core: int = 25
+    core_radius: int = 2
+    min_readings: float = 0.004
+
+    def object_pixels(self, frame: Frame, grid: VoxelGrid | None = None) -> np.ndarray:
+        """Pixels that can belong to an object, (H, W) bool, as `Segments.object_pixels`."""
+        with np.errstate(invalid="ignore"):
+            found = frame.valid & (above_table(frame) > self.table_tolerance)
+        if grid is not None:
+            found &= grid.contains(grid.index_of(frame.points))
+        return found
+
+    def segments(self, tree: Tree, frame: Frame, grid: VoxelGrid | None = None) -> Segments:
+        """Test every node of a tree. Without a grid the workspace is everything above the table."""
+        own = self.object_pixels(frame, grid)
+        readings = tree.accumulate_pixels(frame.valid)
+        points = tree.accumulate_pixels(own)
+        core = _core(tree, own, max(1, round(self.core_radius * frame.camera.width / 640)))
+        resize = own.size / 307200
+        is_object = (
+            (points >= max(1.0, self.min_points * resize))
+            & (core >= self.min_core * resize)
+            & (points >= self.object_share * readings)
+            & (readings >= self.min_readings * tree.area)
+        )
+        return Segments(own, points, is_object)
+
+    def label_image(self, tree: Tree, cut: np.ndarray, frame: Frame, grid: VoxelGrid | None = None) -> np.ndarray:
+        """(H, W) int32 segments of a cut: 0 is background, k + 1 the k-th node of the cut."""
+        found = self.segments(tree, frame, grid)
+        cut = np.asarray(cut)
+        numbers = np.where(found.is_object[cut], np.arange(1, len(cut) + 1), 0)
+        return np.where(found.object_pixels, numbers[tree.label_image(cut)], 0).astype(np.int32)
+
+
+def _core(tree: Tree, own: np.ndarray, radius: int) -> np.ndarray:
+    """Number of pixels (N,) of each node whose square neighbourhood lies in the node and in `own`.
+
+    A neighbourhood lies in the lowest node that contains all of it and in the ancestors of that node, so one pass
+    over the pixels is sufficient. The lowest node is the one that contains the first and the last leaf of the
+    neighbourhood in depth-first order.
+    """
+    import cv2
+
+    square = np.ones((2 * radius + 1, 2 * radius + 1), np.uint8)
+    # Single missing readings inside an object are closed first.
+    closed = cv2.morphologyEx(own.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
+    inside = (cv2.erode(closed, square, borderValue=0) > 0) & own
+    position = tree.leaf_position[tree.leaves].astype(np.float32)
+    first = cv2.erode(position, square)[inside].astype(np.int64)
+    last = cv2.dilate(position, square)[inside].astype(np.int64)
+    pairs, counts = np.unique(first * tree.n_leaves + last, return_counts=True)
+    lowest = tree.lowest_common(pairs // tree.n_leaves, pairs % tree.n_leaves)
+    return tree.accumulate_nodes(np.bincount(lowest, weights=counts, minlength=tree.n_nodes).astype(np.int64))
 
 
 @dataclass(frozen=True)
@@ -44,17 +148,17 @@ class TreeCutProposal(Proposal):
     tree : TreeBuilder
     value : CutValue
     sampler : CutSampler
-        Its width must suit the value: a `temperature` for log odds, `sigma2` for `SceneCutObjectness`.
+        Must match the value: a `temperature` for log odds, `sigma2` for `SceneCutObjectness`.
     objects : ObjectRule
-        What of a cut is background.
+        Decides which regions of a cut are objects.
     completer : Completer
     weight_rule : {"equal", "p"}
-        "equal": draws from p carry p already. "p": log weight ``log p(c) - log p(c*)``, as the paper and the
-        authors have it; the samples then count p twice.
+        "equal": equal weights, correct for draws from p. "p": log weight ``log p(c) - log p(c*)`` as in the paper and
+        the authors' program, which applies p twice.
     include_optimal : bool
-        Put the optimal cut in place of the first sample.
+        Replace the first sample by the optimal cut.
     threshold : float
-        Probability from which a completed voxel is occupied.
+        Smallest probability of an occupied voxel.
     """
 
     boundary: BoundaryModel = field(default_factory=ColourDepthBoundary)
@@ -72,11 +176,11 @@ class TreeCutProposal(Proposal):
     def __post_init__(self) -> None:
         if self.weight_rule not in WEIGHT_RULES:
             raise InputError(
-                f"weight rule {self.weight_rule!r} is not known", f"there are: {', '.join(WEIGHT_RULES)}"
+                f"weight rule {self.weight_rule!r} is not known", f"known rules: {', '.join(WEIGHT_RULES)}"
             )
 
     def tree_of(self, frame: Frame) -> tuple[Tree, np.ndarray]:
-        """The tree of a frame and its node values (N,); computed once a frame."""
+        """The tree of a frame and its node values (N,). Cached by content."""
 
         def compute() -> tuple[Tree, np.ndarray]:
             tree = self.tree.build(self.boundary.boundary(frame), frame)
@@ -90,7 +194,7 @@ class TreeCutProposal(Proposal):
         return self.objects.label_image(tree, optimal_cut(tree, w) if cut is None else cut, frame)
 
     def sample(self, rng: np.random.Generator, observation: Clip, n: int) -> Population:
-        """Draw `n` hypotheses about the scene at the end of the clip."""
+        """Draw `n` hypotheses of the scene at the end of the clip."""
         frame, grid = observation.after, observation.grid
         tree, w = self.tree_of(frame)
         drawn = self.sampler.sample(rng, tree, w, n)
@@ -130,12 +234,12 @@ class TreeCutProposal(Proposal):
         grid: VoxelGrid,
         kept: list[np.ndarray],
     ) -> dict[int, Completion]:
-        """Completions of all nodes that occur, by node."""
+        """Completion of every distinct node of the cuts."""
         nodes = np.unique(np.concatenate([np.zeros(0, np.int64), *kept])).tolist()
         completed = {}
         for node in nodes:
-            mask = tree.mask(node) & found.own
-            # A stream of its own for each segment: which others were sampled changes nothing.
+            mask = tree.mask(node) & found.object_pixels
+            # One stream per segment, so the result does not depend on the other segments.
             stream = child(rng, "completion", node)
             completed[node] = self.completer.complete(stream, frame, [mask], grid)[0]
         return completed
@@ -144,17 +248,17 @@ class TreeCutProposal(Proposal):
 def hypothesis_of(
     completions: Sequence[Completion], grid: VoxelGrid, birth: int = 0, threshold: float = 0.5
 ) -> Hypothesis:
-    """Completed segments as one hypothesis: objects numbered 1 .. in order; those that fill no voxel get no record.
+    """One hypothesis from completed segments. Labels are 1, 2, ... in order; segments without voxels get no record.
 
     Parameters
     ----------
     completions : sequence of Completion
-        Of one frame; what several claim is settled by `mstfilter.completion.arbitration`.
+        Of one frame. `mstfilter.completion.arbitrate` assigns voxels that several claim.
     grid : VoxelGrid
     birth : int
         Index of the pause.
     threshold : float
-        Probability from which a completed voxel is occupied.
+        Smallest probability of an occupied voxel.
     """
     labels = arbitrate(completions, grid, threshold)
     present = np.bincount(labels.ravel(), minlength=len(completions) + 1)

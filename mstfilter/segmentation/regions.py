@@ -1,7 +1,13 @@
-"""What regions and their common borders look like, as sums over pixels, so that merging two adds their rows.
+"""Measurements of image regions and of their common borders, and features of pairs of regions.
 
->>> regions = measure_regions(leaves, frame, boundary)
->>> regions.of_leaf[leaf], regions.sums.shape, regions.borders[0]     # region 0 is the table
+Regions and borders are measured as sums over pixels, so the row of a merged region is the sum of two rows.
+
+>>> regions = measure_regions(leaves, frame, boundary, table_tolerance=2.0, clear_step=4.0)
+>>> regions.of_leaf[leaf], regions.sums.shape, regions.borders[0]              # region 0 is the table
+>>> x = pair_features(sums[a], sums[b], border, table_a, table_b, scale)       # (k, len(PAIR_FEATURES))
+
+The features are inputs of the log odds that two regions are different objects. Sizes are in pixels of a 640 px wide
+image, disparity in sensor units, lengths in metres. "Front" is the region that is nearer to the camera at the border.
 """
 
 from __future__ import annotations
@@ -11,16 +17,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from mstfilter.scene import BASELINE, Camera, Frame, fit_support_plane
-from mstfilter.segmentation.background import SENSOR_FOCAL, above_table
-from mstfilter.segmentation.boundary import fill_from_nearest
+from mstfilter.segmentation.boundary import SENSOR_FOCAL, above_table, fill_from_nearest
 
-__all__ = ["BORDER", "HEIGHT_BIN", "REGION", "Regions", "measure_regions"]
+__all__ = ["BORDER", "PAIR_FEATURES", "REGION", "Regions", "measure_regions", "pair_features", "quadric_residual"]
 
-#: Metres of height a bin of the height histogram; the last bin holds everything above.
-HEIGHT_BIN = 0.01
+#: Bin width of the height histogram in metres; the last bin has no upper limit.
+_HEIGHT_BIN = 0.01
 _BINS = 32
 _QUADRIC = 6
-#: Share of a leaf's pixels above the table from which it is object matter.
+#: Smallest share of pixels above the table of a leaf that is part of an object.
 _MIXED = 0.1
 
 _WIDTHS = {
@@ -45,19 +50,19 @@ def _columns(widths: dict[str, int]) -> dict[str, slice]:
 
 #: Columns of `Regions.sums`. All but the perimeter are sums over the region's readings above the table: their number,
 #: Lab colour and its squares, normal equations and squares of the quadric fit of disparity, ground coordinates (m)
-#: and their squares, signed curvature of disparity (> 0 where the surface is hollow), histogram of heights. The
-#: perimeter counts the pairs of neighbouring pixels of which one is outside.
+#: and their squares, signed curvature of disparity (> 0 where the surface is concave), histogram of heights. The
+#: perimeter is the number of pairs of neighbouring pixels of which one is outside the region.
 REGION = _columns(_WIDTHS)
 
-#: Columns of a border: neighbouring pixel pairs, and their sums of boundary strength, hollow and convex curvature,
-#: step of disparity (first region minus second), its magnitude, and the number of pairs with a clear step.
+#: Columns of a border: number of neighbouring pixel pairs, sums over them of boundary strength, concave ("hollow")
+#: and convex curvature, step of disparity (first region minus second) and its magnitude, number of clear steps.
 BORDER = {name: k for k, name in enumerate(("length", "strength", "hollow", "convex", "step", "size", "clear"))}
 _SIGN = np.array([1, 1, 1, 1, -1, 1, 1], dtype=np.float64)
 
 
 @dataclass(frozen=True, eq=False)
 class Regions:
-    """The leaves of a tree, those of the table taken together.
+    """Measured leaves of a tree. All leaves of the table form one region.
 
     Parameters
     ----------
@@ -66,7 +71,8 @@ class Regions:
     sums : (R, C) float64
         Columns `REGION`.
     borders : list of dict
-        For each region its neighbours, and the row (columns `BORDER`) of the common border seen from it.
+        For each region a mapping from neighbour to the row (columns `BORDER`) of the common border, with the region
+        as the first of the two.
     """
 
     of_leaf: np.ndarray
@@ -86,8 +92,8 @@ def measure_regions(
     boundary : (H, W) float
         Boundary strength.
     table_tolerance : float
-        Readings up to this much above the table are table, in sensor disparity units. A leaf most of whose pixels
-        are not above it belongs to the table.
+        Readings up to this much above the table are table, in sensor disparity units. A leaf belongs to the table if
+        most of its pixels are.
     clear_step : float
         Step that counts as clear, in sensor disparity units.
     """
@@ -98,7 +104,8 @@ def measure_regions(
     with np.errstate(invalid="ignore"):
         own = frame.valid & (above > table_tolerance)
     areas = np.bincount(flat, minlength=n_leaves)
-    # Leaves that mix object and table keep their object; rays above the table's horizon need a clear majority.
+    # A leaf that contains object and table pixels is an object. Rays above the horizon of the table (infinite
+    # disparity above it) make a leaf an object only if they are the majority.
     meets = own & (above < np.inf)
     some, most = (
         _raised(flat, above, mask, areas, table_tolerance, share) for mask, share in ((meets, _MIXED), (own, 0.5))
@@ -126,7 +133,7 @@ def measure_regions(
     put("lab2", *(lab.T**2))
     u, v = (at[1] - width / 2) / (width / 4), (at[0] - height / 2) / (width / 4)
     terms = np.stack([np.ones(len(u)), u, v, u * u, u * v, v * v])
-    # Relative to the table: smaller numbers, and the table is affine, so the quadrics are the same.
+    # Relative to the table the numbers are smaller; the table is affine, so the residuals are the same.
     d = np.minimum(above[at], 1e3)
     gram = {}
     for i in range(_QUADRIC):
@@ -142,7 +149,7 @@ def measure_regions(
     put("ground", points[:, 0], points[:, 1])
     put("spread", points[:, 0] ** 2 + points[:, 1] ** 2)
     put("bend", (hollow - convex)[at])
-    bins = np.clip(points[:, 2] / HEIGHT_BIN, 0, _BINS - 1).astype(np.int64)
+    bins = np.clip(points[:, 2] / _HEIGHT_BIN, 0, _BINS - 1).astype(np.int64)
     sums[:, REGION["heights"]] = np.bincount(which * _BINS + bins, minlength=n * _BINS).reshape(n, _BINS)
 
     borders = _borders(region, n, boundary, hollow, convex, disparity, clear_step)
@@ -153,7 +160,7 @@ def measure_regions(
 def _raised(
     flat: np.ndarray, above: np.ndarray, mask: np.ndarray, areas: np.ndarray, tolerance: float, share: float
 ) -> np.ndarray:
-    """Leaves of which more than `share` is in the mask, and rises there clearly above the tolerance on average."""
+    """Leaves with more than `share` of their pixels in the mask, and a mean height there above 1.75 tolerances."""
     inside = np.bincount(flat[mask.ravel()], minlength=len(areas))
     rise = np.bincount(flat[mask.ravel()], weights=np.minimum(above[mask], 1e3), minlength=len(areas))
     raised: np.ndarray = (inside > share * areas) & (rise > 1.75 * tolerance * inside)
@@ -161,13 +168,13 @@ def _raised(
 
 
 def _camera(frame: Frame) -> Camera:
-    """The frame's camera, posed by the support plane where it has no pose of its own."""
+    """The camera of the frame; its pose is estimated from the support plane if it has none."""
     camera = frame.camera
     return camera if camera.T_world_camera is not None else camera.at(fit_support_plane(frame).T_world_camera)
 
 
 def _curvature(frame: Frame) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Smoothed disparity in sensor units, and x / (x + 2) of its positive and negative curvature; (H, W) each."""
+    """Smoothed disparity in sensor units, and x / (x + 2) of its concave and convex curvature; (H, W) each."""
     import cv2
 
     resize = frame.camera.width / 640
@@ -192,27 +199,20 @@ def _borders(
     disparity: np.ndarray,
     clear_step: float,
 ) -> list[dict[int, np.ndarray]]:
-    """Neighbours of every region with sums over the pairs of neighbouring pixels."""
+    """For every region its neighbours and the border rows (columns `BORDER`)."""
     reach = max(1, round(3 * region.shape[1] / 640))
     first, second, rows = [], [], []
     for axis in (0, 1):
         size = region.shape[axis]
-        a, b = np.arange(size - 1), np.arange(1, size)
-        pair_a, pair_b = np.take(region, a, axis), np.take(region, b, axis)
+        pair_a, pair_b = np.take(region, np.arange(size - 1), axis), np.take(region, np.arange(1, size), axis)
         at = np.nonzero(pair_a != pair_b)
         i, j = pair_a[at], pair_b[at]
-        # A little away from the border on both sides; what the slopes there account for is no step.
-        along = at[axis]
-
-        def value(
-            shift: int, along: np.ndarray = along, at: tuple = at, axis: int = axis, size: int = size
-        ) -> np.ndarray:
-            index = list(at)
-            index[axis] = np.clip(along + shift, 0, size - 1)
-            return disparity[tuple(index)]
-
-        near_a, near_b = value(-reach), value(1 + reach)
-        slopes = (near_a - value(-2 * reach)) + (value(1 + 2 * reach) - near_b)
+        # Step of disparity, measured `reach` pixels away from the border on both sides, minus the change that the
+        # slopes on both sides predict over that distance.
+        far_a, near_a, near_b, far_b = (
+            _shifted(disparity, at, axis, shift) for shift in (-2 * reach, -reach, 1 + reach, 1 + 2 * reach)
+        )
+        slopes = (near_a - far_a) + (far_b - near_b)
         raw = near_a - near_b
         step = raw + slopes * ((2 * reach + 1) / (2 * reach))
         step = np.where(np.sign(step) == np.sign(raw), np.sign(raw) * np.minimum(np.abs(step), np.abs(raw)), 0)
@@ -248,3 +248,180 @@ def _borders(
         borders[i][j] = table[k]
         borders[j][i] = table[k] * _SIGN
     return borders
+
+
+def _shifted(image: np.ndarray, at: tuple[np.ndarray, ...], axis: int, shift: int) -> np.ndarray:
+    """Values of an image (H, W) at pixels moved along an axis; pixels outside take the value at the edge."""
+    index = list(at)
+    index[axis] = np.clip(at[axis] + shift, 0, image.shape[axis] - 1)
+    return image[tuple(index)]
+
+
+PAIR_FEATURES = (
+    "bias",
+    "strength",
+    "strength^2",
+    "hollow",
+    "convex",
+    "step",
+    "clear step share",
+    "lightness",
+    "chroma",
+    "texture",
+    "misfit",
+    "residual",
+    "border share",
+    "free border share",
+    "log pixels",
+    "log ratio",
+    "front higher",
+    "back higher",
+    "front bottom",
+    "back bottom",
+    "front bend",
+    "back bend",
+    "ground distance",
+    "front on table",
+    "back on table",
+    "front drop",
+    "back drop",
+    "rim",
+    "rim * back bend",
+    "rim * step",
+    "rim * inside",
+    "step * misfit",
+    "hollow * misfit",
+    "strength * log pixels",
+    "hollow * log pixels",
+    "convex * strength",
+)
+
+
+def quadric_residual(sums: np.ndarray) -> np.ndarray:
+    """Squared residual (k,) of the least-squares quadric of disparity of each region (k, C), sensor units squared."""
+    gram = sums[:, REGION["gram"]].reshape(-1, 6, 6)
+    moment = sums[:, REGION["moment"]]
+    n = sums[:, REGION["pixels"].start]
+    ridge = (1e-9 * n + 1e-9)[:, None, None] * np.eye(6)
+    fit = np.linalg.solve(gram + ridge, moment[..., None])[..., 0]
+    return np.maximum(sums[:, REGION["square"].start] - (moment * fit).sum(axis=1), 0)
+
+
+def pair_features(
+    a: np.ndarray, b: np.ndarray, border: np.ndarray, table_a: np.ndarray, table_b: np.ndarray, scale: float
+) -> np.ndarray:
+    """Features of k pairs of regions.
+
+    Parameters
+    ----------
+    a, b : (k, C) float64
+        Rows of `Regions.sums`.
+    border : (k, B) float64
+        Their common borders, seen from `a`.
+    table_a, table_b : (k, B) float64
+        Their borders with the table; zeros if there is none.
+    scale : float
+        Image width / 640.
+    """
+    flip = border[:, BORDER["step"]] < 0
+    front, back = np.where(flip[:, None], b, a), np.where(flip[:, None], a, b)
+    table_front = np.where(flip[:, None], table_b, table_a)
+    table_back = np.where(flip[:, None], table_a, table_b)
+    length = np.maximum(border[:, BORDER["length"]], 1)
+    mean = border / length[:, None]
+    n_front, n_back = _get(front, "pixels"), _get(back, "pixels")
+    small = np.minimum(n_front, n_back)
+
+    lab = front[:, REGION["lab"]] / n_front[:, None] - back[:, REGION["lab"]] / n_back[:, None]
+    joint = quadric_residual(front + back)
+    excess = np.maximum(joint - quadric_residual(front) - quadric_residual(back), 0) / small
+    misfit = np.log1p(excess)
+    free = np.minimum(_get(front, "perimeter") - table_front[:, 0], _get(back, "perimeter") - table_back[:, 0])
+    bottom_front, top_front = _range(front)
+    bottom_back, top_back = _range(back)
+    higher = np.clip((top_front - top_back) * 10, -1, 1)
+    rim = np.exp(-(((top_front - top_back) / 0.015) ** 2))
+    bend_front, bend_back = _get(front, "bend") / n_front, _get(back, "bend") / n_back
+    strength = mean[:, BORDER["strength"]]
+    step = np.log1p(np.abs(mean[:, BORDER["step"]]))
+    gap = front[:, REGION["ground"]] / n_front[:, None] - back[:, REGION["ground"]] / n_back[:, None]
+    extent = np.sqrt(_variance(front, n_front)) + np.sqrt(_variance(back, n_back)) + 1e-3
+    distance = np.minimum(np.hypot(gap[:, 0], gap[:, 1]) / extent, 4)
+    hollow, convex = mean[:, BORDER["hollow"]], mean[:, BORDER["convex"]]
+    log_small = np.log(small / scale**2)
+    on_front, drop_front = _table(table_front, front)
+    on_back, drop_back = _table(table_back, back)
+    columns = [
+        np.ones(len(small)),
+        strength,
+        strength**2,
+        hollow,
+        convex,
+        step,
+        mean[:, BORDER["clear"]],
+        np.minimum(np.abs(lab[:, 0]) / 20, 3),
+        np.minimum(np.hypot(lab[:, 1], lab[:, 2]) / 10, 4),
+        _texture(front, back, n_front, n_back),
+        misfit,
+        np.log1p(joint / (n_front + n_back)),
+        np.minimum(length / np.minimum(_get(front, "perimeter"), _get(back, "perimeter")), 1),
+        np.minimum(length / np.maximum(free, 1), 1),
+        log_small,
+        np.abs(np.log(n_front / n_back)),
+        np.maximum(higher, 0),
+        np.maximum(-higher, 0),
+        np.minimum(bottom_front * 10, 2),
+        np.minimum(bottom_back * 10, 2),
+        bend_front,
+        bend_back,
+        distance,
+        on_front,
+        on_back,
+        drop_front,
+        drop_back,
+        rim,
+        rim * bend_back,
+        rim * step,
+        rim * np.exp(-(distance**2)) * step,
+        step * misfit,
+        hollow * misfit,
+        strength * log_small,
+        hollow * log_small,
+        convex * strength,
+    ]
+    return np.stack(columns, axis=1)
+
+
+def _texture(a: np.ndarray, b: np.ndarray, n_a: np.ndarray, n_b: np.ndarray) -> np.ndarray:
+    """Bhattacharyya distance of normal distributions of Lab colour, summed over the channels, at most 4."""
+    mean_a, mean_b = a[:, REGION["lab"]] / n_a[:, None], b[:, REGION["lab"]] / n_b[:, None]
+    var_a = np.maximum(a[:, REGION["lab2"]] / n_a[:, None] - mean_a**2, 0) + 4
+    var_b = np.maximum(b[:, REGION["lab2"]] / n_b[:, None] - mean_b**2, 0) + 4
+    total = var_a + var_b
+    distance = (mean_a - mean_b) ** 2 / (4 * total) + 0.5 * np.log(total / (2 * np.sqrt(var_a * var_b)))
+    return np.minimum(distance.sum(axis=1), 4)
+
+
+def _get(sums: np.ndarray, name: str) -> np.ndarray:
+    """A column of region sums; at least 1 if it is a divisor."""
+    column: np.ndarray = sums[:, REGION[name].start]
+    return np.maximum(column, 1) if name in ("pixels", "perimeter") else column
+
+
+def _variance(sums: np.ndarray, n: np.ndarray) -> np.ndarray:
+    """Variance of the ground coordinates, square metres."""
+    mean = sums[:, REGION["ground"]] / n[:, None]
+    return np.maximum(_get(sums, "spread") / n - (mean**2).sum(axis=1), 0)
+
+
+def _range(sums: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """3rd and 97th percentile of the heights of a region, metres."""
+    share = np.cumsum(sums[:, REGION["heights"]], axis=1) / _get(sums, "pixels")[:, None]
+    return (share < 0.03).sum(axis=1) * _HEIGHT_BIN, ((share < 0.97).sum(axis=1) + 1) * _HEIGHT_BIN
+
+
+def _table(border: np.ndarray, sums: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Shares of the outline that touch the table, and that border on it with a clear step."""
+    clear = border[:, BORDER["clear"]]
+    outline = _get(sums, "perimeter")
+    return (border[:, 0] - clear) / outline, clear / outline

@@ -1,31 +1,35 @@
-"""The segmentation tree: a hierarchy of image regions, and the cuts through it.
+"""The segmentation tree: a hierarchy of image regions, and its construction from a boundary map.
 
-A tree is a plain parent array. Leaves come first (0 .. n_leaves - 1), every parent has a larger index than its
-children, the root is last; so a loop over ascending indices goes bottom-up and nothing recurses. A *cut* is an
-ascending array of nodes that covers every leaf exactly once: one segmentation of the image.
+A tree is a parent array. Leaves come first (0 .. n_leaves - 1), every parent has a larger index than its children,
+and the root is last, so a loop over ascending indices visits children before parents. A *cut* is an ascending array
+of nodes that covers every leaf exactly once: one segmentation of the image.
 
 >>> import numpy as np
->>> from mstfilter.segmentation.tree import Tree
+>>> from mstfilter.segmentation import Tree
 >>> tree = Tree(parent=[3, 3, 4, 4, 4], leaves=[[0, 0], [1, 2]], start=[0, 0, 0, 0.2, 0.9])
->>> tree.children(4).tolist(), tree.area.tolist()
-([2, 3], [2, 1, 1, 3, 4])
->>> tree.label_image(np.array([2, 3]))        # number of the cut's node, pixel by pixel
+>>> tree.children[4], tree.area.tolist()
+((2, 3), [2, 1, 1, 3, 4])
+>>> tree.label_image(np.array([2, 3]))        # index into the cut, for every pixel
 array([[1, 1],
        [1, 0]])
+
+`UcmTree` builds the ultrametric contour map (Arbelaez et al. 2011): watershed regions of the boundary map are merged
+in order of the mean strength of their common border. A logistic curve maps merge heights to P(boundary): a region
+inside one object starts near 0, a region bordered by other objects ends near 1.
 """
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import pairwise
 
 import numpy as np
 
 from mstfilter.errors import InputError
-from mstfilter.scene import content_key, read_only
+from mstfilter.scene import Frame, content_key, read_only
 
-__all__ = ["Tree"]
+__all__ = ["Tree", "TreeBuilder", "UcmTree", "merge_tree", "prune"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,13 +41,12 @@ class Tree:
     parent : (N,) int
         Parent of every node; the root (last) is its own parent. ``parent[i] > i`` elsewhere.
     leaves : (H, W) int
-        Which leaf every pixel belongs to.
+        Leaf of every pixel.
     start : (N,) float
-        Strength of the weakest boundary at which the region forms, 0 .. 1: P(boundary) of the merge that makes
-        it. Leaves 0. Non-decreasing towards the root.
+        P(boundary) of the merge that creates the node, 0 .. 1. Zero for leaves, non-decreasing towards the root.
     odds : (N,) float, optional
-        Log odds that the merge that makes the node joins different objects, where the builder judges every merge
-        by itself; they need not grow towards the root. Leaves 0.
+        Log odds that the merge that creates the node joins different objects, if the builder estimates them.
+        Zero for leaves; not necessarily monotone.
     """
 
     parent: np.ndarray
@@ -81,73 +84,64 @@ class Tree:
 
     @property
     def n_nodes(self) -> int:
-        """Number of nodes."""
         return len(self.parent)
 
     @cached_property
     def n_leaves(self) -> int:
-        """Number of leaves."""
         return self.n_nodes - len(np.unique(self.parent[:-1]))
 
     @property
     def root(self) -> int:
-        """Index of the root."""
         return self.n_nodes - 1
 
     @cached_property
     def key(self) -> bytes:
-        """Name by content."""
+        """Hash of the content."""
         odds = () if self.odds is None else (self.odds,)
         return content_key("tree", self.parent, self.leaves, self.start, *odds)
 
     @cached_property
     def end(self) -> np.ndarray:
-        """(N,) strength at which the region is merged away: its parent's `start`; the root's is 1."""
+        """(N,) `start` of the parent: P(boundary) of the merge that absorbs the node. 1 for the root."""
         end = self.start[self.parent]
         end[self.root] = 1.0
         return read_only(end)
 
     @cached_property
-    def child_offsets(self) -> np.ndarray:
-        """(N + 1,) CSR offsets: the children of i are ``child_list[child_offsets[i]:child_offsets[i + 1]]``."""
-        counts = np.bincount(self.parent[:-1], minlength=self.n_nodes)
-        return read_only(np.concatenate([[0], np.cumsum(counts)]))
-
-    @cached_property
-    def child_list(self) -> np.ndarray:
-        """(N - 1,) children of all nodes, ascending within a node."""
-        return read_only(np.argsort(self.parent[:-1], kind="stable"))
-
-    @cached_property
-    def child_tuples(self) -> tuple[tuple[int, ...], ...]:
-        """Children of every node as Python integers: for loops, which numpy scalars slow down."""
-        offsets, flat = self.child_offsets.tolist(), self.child_list.tolist()
-        return tuple(tuple(flat[a:b]) for a, b in pairwise(offsets))
-
-    def children(self, node: int) -> np.ndarray:
-        """Children of a node, ascending; empty for a leaf."""
-        return self.child_list[self.child_offsets[node] : self.child_offsets[node + 1]]
+    def children(self) -> tuple[tuple[int, ...], ...]:
+        """Children of every node, ascending; empty for leaves. Python integers, which are fast in loops."""
+        found: list[list[int]] = [[] for _ in range(self.n_nodes)]
+        for node, parent in enumerate(self.parent[:-1].tolist()):
+            found[parent].append(node)
+        return tuple(map(tuple, found))
 
     def accumulate(self, leaf_values: np.ndarray) -> np.ndarray:
-        """Sums (N, ...) over each node's leaves of values (n_leaves, ...)."""
+        """Sum of leaf values (n_leaves, ...) over the leaves of every node, (N, ...)."""
         leaf_values = np.asarray(leaf_values)
         order, first, last = self._leaf_ranges
         sums = np.zeros((self.n_leaves + 1, *leaf_values.shape[1:]), dtype=np.result_type(leaf_values, np.int64))
         np.cumsum(leaf_values[order], axis=0, out=sums[1:])
         return sums[last] - sums[first]
 
+    def accumulate_nodes(self, values: np.ndarray) -> np.ndarray:
+        """Sum of node values (N,) over every node and its descendants, (N,)."""
+        total, parent = values.tolist(), self.parent.tolist()
+        for node in range(self.n_nodes - 1):
+            total[parent[node]] += total[node]
+        return np.array(total)
+
     def accumulate_pixels(self, mask: np.ndarray) -> np.ndarray:
-        """(N,) number of pixels of a boolean image (H, W) in each node."""
+        """Number of true pixels of a boolean image (H, W) in every node, (N,)."""
         return self.accumulate(np.bincount(self.leaves[mask], minlength=self.n_leaves))
 
     @cached_property
     def area(self) -> np.ndarray:
-        """(N,) pixels of every node."""
+        """(N,) number of pixels of every node."""
         return read_only(self.accumulate(np.bincount(self.leaves.ravel(), minlength=self.n_leaves)))
 
     @cached_property
     def _leaf_ranges(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Leaves in depth-first order, and the range of them that each node covers."""
+        """Leaves in depth-first order, and for every node the first and the end of its range in that order."""
         n, parent = self.n_nodes, self.parent.tolist()
         count = [1] * self.n_leaves + [0] * (n - self.n_leaves)
         for i in range(n - 1):
@@ -162,12 +156,12 @@ class Tree:
         return order, first, first + np.array(count)
 
     @cached_property
-    def leaf_place(self) -> np.ndarray:
-        """(n_leaves,) place of every leaf in depth-first order, in which the leaves of a node are neighbours."""
+    def leaf_position(self) -> np.ndarray:
+        """(n_leaves,) position of every leaf in depth-first order; the leaves of a node are consecutive."""
         return read_only(self._leaf_ranges[1][: self.n_leaves].copy())
 
     def lowest_common(self, first: np.ndarray, last: np.ndarray) -> np.ndarray:
-        """The lowest nodes (k,) that hold the leaves at places `first` (k,) to `last` (k,), first <= last."""
+        """Lowest nodes (k,) that contain the leaves at positions `first` (k,) to `last` (k,), first <= last."""
         order, _, end = self._leaf_ranges
         node = order[np.asarray(first)]
         last = np.asarray(last)
@@ -178,33 +172,129 @@ class Tree:
             node = np.where(short, self.parent[node], node)
 
     def leaves_of(self, node: int) -> np.ndarray:
-        """The leaves under a node."""
+        """The leaves below a node."""
         order, first, last = self._leaf_ranges
         return order[first[node] : last[node]]
 
-    def is_cut(self, cut: np.ndarray) -> bool:
-        """Whether a set of nodes covers every leaf exactly once."""
-        cut = np.asarray(cut, dtype=np.int64)
-        if cut.size == 0 or cut.min() < 0 or cut.max() >= self.n_nodes:
-            return False
-        covered = np.zeros(self.n_leaves, dtype=np.int64)
-        for node in cut.tolist():
-            covered[self.leaves_of(node)] += 1
-        return bool((covered == 1).all())
-
-    def label_leaves(self, cut: np.ndarray) -> np.ndarray:
-        """(n_leaves,) position in `cut` of the node that covers each leaf; -1 where none does."""
+    def label_image(self, cut: np.ndarray) -> np.ndarray:
+        """(H, W) index into `cut` of the node that covers each pixel; -1 for pixels that no node covers."""
         labels = np.full(self.n_leaves, -1, dtype=np.int64)
         for k, node in enumerate(np.asarray(cut).tolist()):
             labels[self.leaves_of(node)] = k
-        return labels
-
-    def label_image(self, cut: np.ndarray) -> np.ndarray:
-        """(H, W) position in `cut` of the node that covers each pixel; -1 where none does."""
-        return self.label_leaves(cut)[self.leaves]
+        return labels[self.leaves]
 
     def mask(self, node: int) -> np.ndarray:
-        """(H, W) bool: the pixels of a node."""
+        """The pixels of a node, (H, W) bool."""
         inside = np.zeros(self.n_leaves, dtype=bool)
         inside[self.leaves_of(node)] = True
         return inside[self.leaves]
+
+
+class TreeBuilder(ABC):
+    """Builds a hierarchy of regions from a boundary map."""
+
+    @abstractmethod
+    def build(self, boundary: np.ndarray, frame: Frame | None = None) -> Tree:
+        """The tree of a boundary map (H, W). Some builders also need the frame."""
+
+
+@dataclass(frozen=True)
+class UcmTree(TreeBuilder):
+    """Watershed, average linkage by mean boundary strength, pruned to the strongest merges.
+
+    The logistic curve and the colour weight of `ColourDepthBoundary` were fitted together on the 45 `learn` frames of
+    mOSD. experiments/osd_frames reports results on other camera set-ups.
+
+    Parameters
+    ----------
+    max_leaves : int
+        Largest number of leaves. The tree has fewer than twice as many nodes.
+    centre : float
+        Merge height (mean boundary strength 0 .. 1) at which P(boundary) = 0.5.
+    slope : float
+        Slope of the log odds, per unit of height.
+    calibrate : bool
+        If False, `start` is the merge height.
+    """
+
+    max_leaves: int = 501
+    centre: float = 0.55
+    slope: float = 12.0
+    calibrate: bool = True
+
+    def __post_init__(self) -> None:
+        if self.max_leaves < 1:
+            raise InputError(f"max_leaves is {self.max_leaves!r}, expected at least 1")
+
+    def build(self, boundary: np.ndarray, frame: Frame | None = None) -> Tree:
+        """Build the tree of a boundary map (H, W) with values 0 .. 1; the frame is not used."""
+        boundary = np.asarray(boundary)
+        if boundary.ndim != 2 or boundary.size == 0:
+            raise InputError(f"boundary map has shape {boundary.shape}, expected (H, W)")
+        if not np.isfinite(boundary).all():
+            raise InputError("boundary map contains a value that is not finite")
+        parent, altitude, leaves = merge_tree(boundary)
+        parent, altitude, leaves = prune(parent, altitude, leaves, self.max_leaves)
+        n_leaves = int(leaves.max()) + 1
+        start = np.zeros(len(parent))
+        heights = altitude[n_leaves:]
+        start[n_leaves:] = self.probability(heights) if self.calibrate else heights
+        return Tree(parent, leaves, start)
+
+    def probability(self, height: np.ndarray) -> np.ndarray:
+        """P(boundary) of merge heights."""
+        return 1 / (1 + np.exp(-self.slope * (np.asarray(height) - self.centre)))
+
+
+def merge_tree(boundary: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The complete hierarchy: parents (N,), merge heights (N,) with 0 for leaves, leaf image (H, W)."""
+    import higra as hg
+
+    shape = boundary.shape
+    if boundary.size == 1:
+        return np.array([0]), np.zeros(1), np.zeros(shape, np.int64)
+    graph = hg.get_4_adjacency_graph(shape)
+    weights = hg.weight_graph(graph, boundary.astype(np.float64), hg.WeightFunction.mean)
+    # No edge orientations: the library's convention would weaken axis-parallel borders.
+    rag, strengths = hg.oriented_watershed(graph, weights, shape)
+    leaves = np.asarray(hg.CptRegionAdjacencyGraph.construct(rag)["vertex_map"]).reshape(shape)
+    if rag.num_vertices() == 1:
+        return np.array([0]), np.zeros(1), np.zeros(shape, np.int64)
+    lengths = hg.rag_accumulate_on_edges(rag, hg.Accumulators.sum, np.ones(graph.num_edges()))
+    tree, altitude = hg.binary_partition_tree_average_linkage(rag, strengths, lengths)
+    # By rounding, the mean of a parent can be lower than that of its child; heights must not decrease upwards.
+    altitude = hg.accumulate_and_max_sequential(tree, altitude, np.zeros(tree.num_leaves()), hg.Accumulators.max)
+    return np.array(tree.parents(), dtype=np.int64), np.array(altitude, dtype=np.float64), leaves
+
+
+def prune(
+    parent: np.ndarray, altitude: np.ndarray, leaves: np.ndarray, max_leaves: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Keep the `max_leaves - 1` highest merges of a binary tree. The nodes that they merge become the leaves.
+
+    Heights do not decrease upwards and parents come after children, so the kept merges contain the root and are
+    connected.
+    """
+    n = len(parent)
+    n_leaves = (n + 1) // 2
+    if n_leaves <= max_leaves:
+        return parent, altitude, leaves
+    inner = np.arange(n_leaves, n)
+    order = np.lexsort((inner, altitude[inner]))
+    kept = np.zeros(n, dtype=bool)
+    if max_leaves == 1:
+        return np.array([0]), np.zeros(1), np.zeros_like(leaves)
+    kept[inner[order[-(max_leaves - 1) :]]] = True
+    cut = ~kept & kept[parent]
+    new = np.full(n, -1, dtype=np.int64)
+    new[cut] = np.arange(int(cut.sum()))
+    new[kept] = int(cut.sum()) + np.arange(int(kept.sum()))
+    # Nodes below a new leaf take its number; parents come before children.
+    below = new.copy()
+    for node in range(n - 2, -1, -1):
+        if below[node] < 0:
+            below[node] = below[parent[node]]
+    survivors = np.concatenate([np.flatnonzero(cut), np.flatnonzero(kept)])
+    height = altitude[survivors].copy()
+    height[: int(cut.sum())] = 0.0
+    return new[parent[survivors]], height, below[leaves]

@@ -1,0 +1,373 @@
+"""Cuts of a segmentation tree: node values, the optimal cut, and exact samples.
+
+A `CutValue` gives every node a value w; the value of a cut is the sum over its nodes, v(c) = sum w. `optimal_cut`
+maximises it, a `CutSampler` draws cuts at random.
+
+>>> w = MergeLogOdds().values(tree, frame)                     # (N,), higher is better
+>>> best = optimal_cut(tree, w)                                # ascending nodes
+>>> sample = ExactCuts().sample(np.random.default_rng(0), tree, w, 10)
+
+Under a Gibbs law a cut has probability proportional to exp(b v(c)). One pass up the tree gives the probability
+``stop[n]`` that a cut which reaches node n contains n itself. A walk down from the root with these probabilities
+draws a cut exactly.
+
+The law of the paper, exp(-(v* - v)^2 / s2), is bounded by a scaled Gibbs law for any b: with d = v* - v,
+``exp(-d^2 / s2) <= exp(-b d + b^2 s2 / 4)``. Gibbs draws that are accepted with probability
+``exp(-(d - b s2 / 2)^2 / s2)`` are therefore exact and independent draws from it (`ExactCuts`). The acceptance rate
+is highest for the b that solves ``b = 2 E_b[d] / s2``.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from math import exp, log1p
+from typing import Any
+
+import numpy as np
+
+from mstfilter.errors import InputError
+from mstfilter.scene import Frame
+from mstfilter.segmentation.boundary import above_table
+from mstfilter.segmentation.tree import Tree
+
+__all__ = [
+    "CutSample",
+    "CutSampler",
+    "CutValue",
+    "ExactCuts",
+    "Gibbs",
+    "MergeLogOdds",
+    "OptimalCut",
+    "SceneCutObjectness",
+    "best_envelope",
+    "check_target_law",
+    "check_values",
+    "gibbs",
+    "optimal_cut",
+]
+
+
+class CutValue(ABC):
+    """Rates how well a region fits one object."""
+
+    @abstractmethod
+    def values(self, tree: Tree, frame: Frame) -> np.ndarray:
+        """(N,) value w of every node."""
+
+
+@dataclass(frozen=True)
+class SceneCutObjectness(CutValue):
+    """SceneCut's objectness: regions that form early and end late (Pham et al. 2018, eq. 4-5).
+
+    ``s = 0.5 exp(-(start / start_scale)^2) exp(-((1 - end) / end_scale)^2)``, ``w = ln(s) area^power``; a region
+    outside the area limits gets ``s = floor``. SceneCut's second term, a model of planes the size of furniture, is
+    omitted: on a tabletop the support plane is found directly and removed as background.
+
+    Parameters
+    ----------
+    start_scale : float
+        Tolerance for boundaries inside the region, in P(boundary).
+    end_scale : float
+        Tolerance for a weak outer boundary, in P(boundary).
+    power : float
+        Exponent of the area; below 1 favours larger regions.
+    floor : float
+        Objectness of a region outside the area limits.
+    min_area, max_area : float
+        Area limits as shares of the image. SceneCut's 1000 and 150,000 px at 640 x 480.
+    background_weight : float
+        Area of a pixel that is not above the table; 1 in SceneCut. With 1 the table contributes most of v*. The width
+        of the sampled law is relative to v*, so a larger table gives more random samples. With 0 cuts of the
+        table have no cost, and chains spend their steps on them.
+    table_tolerance : float
+        Readings up to this much above the table are table, in sensor disparity units.
+    """
+
+    start_scale: float = 0.3
+    end_scale: float = 0.7
+    power: float = 0.95
+    floor: float = 1e-3
+    min_area: float = 1000 / 307200
+    max_area: float = 150000 / 307200
+    background_weight: float = 0.003
+    table_tolerance: float = 2.0
+
+    def __post_init__(self) -> None:
+        for name in ("start_scale", "end_scale", "power", "floor"):
+            if not getattr(self, name) > 0:
+                raise InputError(f"objectness {name} is {getattr(self, name)!r}, expected a number > 0")
+
+    def values(self, tree: Tree, frame: Frame) -> np.ndarray:
+        """``ln(s) area^power`` of every node."""
+        area = tree.area.astype(np.float64)
+        if self.background_weight < 1:
+            with np.errstate(invalid="ignore"):
+                above = frame.valid & (above_table(frame) > self.table_tolerance)
+            foreground = tree.accumulate_pixels(above).astype(np.float64)
+            background = self.background_weight * (area - foreground)
+            limited = foreground > background
+            area = foreground + background
+        else:
+            limited = np.ones(len(area), dtype=bool)
+        share = area / tree.leaves.size
+        log_s = np.log(0.5) - (tree.start / self.start_scale) ** 2 - ((1 - tree.end) / self.end_scale) ** 2
+        outside = limited & ((share < self.min_area) | (share > self.max_area))
+        return np.where(outside, np.log(self.floor), log_s) * area**self.power
+
+
+@dataclass(frozen=True)
+class MergeLogOdds(CutValue):
+    """Log likelihood of independent merge decisions.
+
+    ``w(n) = -sum of logit P(boundary) over the merges inside n``: exp(v(c)) is, up to a constant, the
+    probability that exactly the merges above the cut join different objects. The values are log probabilities, so
+    cuts are sampled at a temperature, without a scale sigma. The odds of the tree are used if it has any
+    (`LearnedTree`); else `start` is the probability.
+
+    Parameters
+    ----------
+    clip : float
+        Probabilities are clipped to clip .. 1 - clip.
+    """
+
+    clip: float = 1e-3
+
+    def values(self, tree: Tree, frame: Frame) -> np.ndarray:
+        """Minus the log odds of all merges inside each node, summed."""
+        if tree.odds is None:
+            p = np.clip(tree.start, self.clip, 1 - self.clip)
+            merge = -(np.log(p) - np.log1p(-p))
+        else:
+            bound = np.log1p(-self.clip) - np.log(self.clip)
+            merge = -np.clip(tree.odds, -bound, bound)
+        merge[: tree.n_leaves] = 0.0
+        return tree.accumulate_nodes(merge)
+
+
+@dataclass(frozen=True, eq=False)
+class CutSample:
+    """Cuts drawn from a tree.
+
+    Parameters
+    ----------
+    cuts : tuple of int arrays
+        Ascending nodes of each cut.
+    values : (n,) float
+        v(c) of each cut.
+    log_p : (n,) float
+        Log of the sampler's target law relative to the optimal cut.
+    diagnostics : dict
+        Statistics of the draw; JSON types only.
+    """
+
+    cuts: tuple[np.ndarray, ...]
+    values: np.ndarray
+    log_p: np.ndarray
+    diagnostics: dict[str, Any] = field(default_factory=dict)
+
+
+class CutSampler(ABC):
+    """Draws segmentations from a tree with node values."""
+
+    @abstractmethod
+    def sample(self, rng: np.random.Generator, tree: Tree, w: np.ndarray, n: int) -> CutSample:
+        """Draw `n` cuts of the tree under node values `w` (N,)."""
+
+
+def check_values(tree: Tree, w: np.ndarray) -> np.ndarray:
+    """Node values as float64 (N,); raises InputError if the shape is wrong or a value is not finite."""
+    w = np.asarray(w, dtype=np.float64)
+    if w.shape != (tree.n_nodes,):
+        raise InputError(f"node values have shape {w.shape}, the tree has {tree.n_nodes} nodes")
+    if not np.isfinite(w).all():
+        raise InputError(f"value of tree node {int(np.flatnonzero(~np.isfinite(w))[0])} is not finite")
+    return w
+
+
+def check_target_law(sigma2: float, temperature: float) -> None:
+    """Raise InputError unless sigma2 > 0 and temperature >= 0."""
+    if not sigma2 > 0:
+        raise InputError(f"sigma2 is {sigma2!r}, expected a number > 0")
+    if temperature < 0:
+        raise InputError(f"temperature is {temperature!r}, expected a number >= 0")
+
+
+def optimal_cut(tree: Tree, w: np.ndarray) -> np.ndarray:
+    """The cut of largest value, by one pass up the tree. If parent and children tie, the parent is kept.
+
+    Parameters
+    ----------
+    tree : Tree
+    w : (N,) array
+        Node values.
+
+    Returns
+    -------
+    (n,) int array
+        Ascending nodes of the cut.
+    """
+    best = check_values(tree, w).tolist()
+    keep = [True] * tree.n_nodes
+    for node in range(tree.n_leaves, tree.n_nodes):
+        split = sum(best[child] for child in tree.children[node])
+        # The tolerance is larger than the rounding error of the sum.
+        if split > best[node] + 1e-12 * abs(split):
+            best[node], keep[node] = split, False
+    cut, stack = [], [tree.root]
+    while stack:
+        node = stack.pop()
+        if keep[node]:
+            cut.append(node)
+        else:
+            stack.extend(tree.children[node])
+    return np.sort(np.array(cut, dtype=np.int64))
+
+
+@dataclass(frozen=True)
+class OptimalCut(CutSampler):
+    """The optimal cut, `n` times, without randomness. The single-frame baseline (SceneCut)."""
+
+    def sample(self, rng: np.random.Generator, tree: Tree, w: np.ndarray, n: int) -> CutSample:
+        """The optimal cut, `n` times."""
+        cut = optimal_cut(tree, w)
+        value = float(np.asarray(w, dtype=np.float64)[cut].sum())
+        return CutSample((cut,) * n, np.full(n, value), np.zeros(n), {"size_of_best": len(cut)})
+
+
+@dataclass(frozen=True, eq=False)
+class Gibbs:
+    """A Gibbs law over the cuts of a tree and of its subtrees.
+
+    Parameters
+    ----------
+    tree : Tree
+    b : float
+        Inverse temperature, per unit of value.
+    w : list of float
+        Node values.
+    log_z : list of float
+        Log normaliser of every subtree.
+    stop : list of float
+        Probability that a cut which reaches the node contains the node itself.
+    mean : list of float
+        Expected value of the part of a cut inside the subtree.
+    """
+
+    tree: Tree
+    b: float
+    w: list[float]
+    log_z: list[float]
+    stop: list[float]
+    mean: list[float]
+
+    def draw(self, random: Callable[[], float], node: int) -> list[int]:
+        """Draw a cut of the subtree of `node`, unordered; `random` returns uniform numbers in [0, 1)."""
+        children, stop = self.tree.children, self.stop
+        cut, stack = [], [node]
+        while stack:
+            node = stack.pop()
+            if random() < stop[node]:
+                cut.append(node)
+            else:
+                stack.extend(children[node])
+        return cut
+
+    def log_prob(self, cut: list[int], node: int) -> float:
+        """Log probability of a cut of the subtree of `node`."""
+        return self.b * sum(self.w[x] for x in cut) - self.log_z[node]
+
+
+def gibbs(tree: Tree, w: np.ndarray, b: float) -> Gibbs:
+    """The Gibbs law with inverse temperature `b` under node values `w` (N,)."""
+    values = check_values(tree, w).tolist()
+    n = tree.n_nodes
+    log_z, stop, mean = [0.0] * n, [1.0] * n, [0.0] * n
+    for node, children in enumerate(tree.children):
+        own = b * values[node]
+        if not children:
+            log_z[node], mean[node] = own, values[node]
+            continue
+        split = inner = 0.0
+        for child in children:
+            split += log_z[child]
+            inner += mean[child]
+        # log Z = log(exp(own) + exp(split)), stable for either order of magnitude.
+        if own >= split:
+            log_z[node] = own + log1p(exp(split - own))
+        else:
+            log_z[node] = split + log1p(exp(own - split))
+        stop[node] = p = exp(own - log_z[node])
+        mean[node] = p * values[node] + (1 - p) * inner
+    return Gibbs(tree, b, values, log_z, stop, mean)
+
+
+def best_envelope(tree: Tree, w: np.ndarray, best: float, s2: float) -> Gibbs:
+    """The Gibbs law with the highest acceptance rate: b = 2 E_b[best - v] / s2, by bisection in log b."""
+    low = 0.0
+    high = 2 * (best - gibbs(tree, w, 0.0).mean[-1]) / s2
+    law = gibbs(tree, w, high)
+    for _ in range(60):
+        middle = (low * high) ** 0.5 if low > 0 else high / 64
+        law = gibbs(tree, w, middle)
+        if middle * s2 > 2 * (best - law.mean[-1]):
+            high = middle
+        else:
+            low = middle
+        # The sampler is exact for any b; a tolerance of 1 % does not change the acceptance rate.
+        if high <= 0 or (low > 0 and high / low < 1.01):
+            break
+    return law
+
+
+@dataclass(frozen=True)
+class ExactCuts(CutSampler):
+    """Independent exact draws from exp(-(v* - v)^2 / s2), or from exp(v / temperature).
+
+    Parameters
+    ----------
+    sigma2 : float
+        s2 relative to the squared value of the optimal cut: ``s2 = sigma2 v*^2``. No unit.
+    max_tries : int
+        Largest number of Gibbs draws per cut.
+    temperature : float
+        0: the law of the paper. > 0: the Gibbs law at this temperature, in units of value; no draw is rejected and
+        sigma2 is not used.
+    """
+
+    sigma2: float = 1e-3
+    max_tries: int = 100000
+    temperature: float = 0.0
+
+    def __post_init__(self) -> None:
+        check_target_law(self.sigma2, self.temperature)
+
+    def sample(self, rng: np.random.Generator, tree: Tree, w: np.ndarray, n: int) -> CutSample:
+        """Draw `n` independent cuts."""
+        best = float(check_values(tree, w)[optimal_cut(tree, w)].sum())
+        s2 = max(self.sigma2 * best**2, 1e-300)
+        warm = self.temperature > 0
+        law = gibbs(tree, w, 1 / self.temperature) if warm else best_envelope(tree, w, best, s2)
+        cuts: list[np.ndarray] = []
+        values: list[float] = []
+        tries = 0
+        while len(cuts) < n:
+            tries += 1
+            if tries > self.max_tries * n:
+                raise InputError(
+                    f"exact cut sampler accepted {len(cuts)} of {tries - 1} draws, {n} are needed",
+                    "use the `mh` sampler for this tree, or raise max_tries",
+                )
+            cut = law.draw(rng.random, tree.root)
+            d = best - sum(law.w[x] for x in cut)
+            if warm or rng.random() < exp(-((d - law.b * s2 / 2) ** 2) / s2):
+                cuts.append(np.sort(np.array(cut, dtype=np.int64)))
+                values.append(best - d)
+        v = np.array(values)
+        diagnostics = {
+            "acceptance": n / tries if tries else 1.0,
+            "distinct": len({c.tobytes() for c in cuts}) / max(n, 1),
+        }
+        log_p = (v - best) / self.temperature if warm else -((best - v) ** 2) / s2
+        return CutSample(tuple(cuts), v, log_p, diagnostics)
