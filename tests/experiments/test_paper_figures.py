@@ -112,7 +112,7 @@ def test_drawn_tree_holds_every_node_of_the_cuts():
         assert {n for cut in cuts for n in cut.tolist()} <= set(part.x)
         for node, inside in part.inside.items():
             if inside:
-                assert sorted(inside) == tree.children(node).tolist()
+                assert sorted(inside) == list(tree.children[node])
                 assert min(part.x[c] for c in inside) < part.x[node] < max(part.x[c] for c in inside)
                 assert part.y[node] >= max(part.y[c] for c in inside)
         ends = [part.x[n] for n, inside in part.inside.items() if not inside]

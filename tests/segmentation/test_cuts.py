@@ -8,13 +8,12 @@ from hypothesis import given, settings, strategies as st
 from scipy import stats
 
 from mstfilter.errors import InputError
-from mstfilter.segmentation.gibbs import ExactCuts, best_envelope, gibbs
-from mstfilter.segmentation.mh import MetropolisHastingsCuts
-from mstfilter.segmentation.moves import AuthorsMoves, FeasibleMoves, NodeMoves, SubtreeRedraw
-from mstfilter.segmentation.optimal import OptimalCut, optimal_cut
+from mstfilter.segmentation.cuts import ExactCuts, OptimalCut, best_envelope, gibbs, optimal_cut
+from mstfilter.segmentation.mh import AuthorsMoves, MetropolisHastingsCuts, NodeMoves, SubtreeRedraw
 from mstfilter.segmentation.tree import Tree
 from tests.segmentation.trees import (
     all_cuts,
+    is_cut,
     random_tree,
     random_values,
     stationary,
@@ -34,7 +33,6 @@ def case(leaves: int, most: int, seed: int = 3):
 def rules(tree, w, best, s2):
     return {
         "node": NodeMoves(),
-        "feasible": FeasibleMoves(),
         "redraw, fitted surrogate": SubtreeRedraw(best_envelope(tree, w, best, s2)),
         "redraw, poor surrogate": SubtreeRedraw(gibbs(tree, w * 0.8 - 0.1, 0.3)),
     }
@@ -46,7 +44,7 @@ def test_optimal_cut_is_the_best_of_all(seed, leaves, most):
     tree = random_tree(rng, leaves, most)
     w = random_values(rng, tree)
     cut = optimal_cut(tree, w)
-    assert tree.is_cut(cut)
+    assert is_cut(tree, cut)
     assert w[cut].sum() == pytest.approx(max(w[list(c)].sum() for c in all_cuts(tree)))
 
 
@@ -86,7 +84,7 @@ def test_the_samplers_chain_follows_the_matrix():
     """Frequencies of the default sampler's chain against the target; false alarm 1e-4."""
     tree, w = case(5, 2)
     cuts, p, _, _ = target(tree, w, 0.05)
-    for rule, redraw in [("node", 0.3), ("node", 0.0), ("feasible", 0.0)]:
+    for rule, redraw in [("node", 0.3), ("node", 0.0)]:
         sampler = MetropolisHastingsCuts(0.05, burn_in=100, thinning=40, moves=rule, redraw_share=redraw)
         sample = sampler.sample(np.random.default_rng(1), tree, w, 3000)
         found = _counts(sample.cuts, cuts)
@@ -105,7 +103,7 @@ def _chi_square(found, p):
     k = int(np.searchsorted(np.cumsum(expected), 5.0)) + 1  # the least likely cuts are one cell
     f = np.append(found[order][:k].sum(), found[order][k:])
     e = np.append(expected[:k].sum(), expected[k:])
-    assert len(f) > 1, "the target law is concentrated on one cut: the test says nothing"
+    assert len(f) > 1, "the target law is concentrated on one cut: the test has no power"
     return stats.chisquare(f, e).pvalue
 
 
@@ -132,7 +130,6 @@ def test_gibbs_law(leaves, most):
     p /= p.sum()
     assert np.allclose([np.exp(law.log_prob(list(c), tree.root)) for c in cuts], p, atol=1e-12)
     assert law.mean[-1] == pytest.approx(p @ v)
-    assert law.expected_size() == pytest.approx(p @ [len(c) for c in cuts])
 
 
 def test_best_envelope_solves_its_equation():
@@ -152,7 +149,6 @@ def test_every_sample_is_a_cut(seed, leaves, most, sigma2):
         MetropolisHastingsCuts(sigma2, burn_in=10, thinning=7),
         MetropolisHastingsCuts(sigma2, 0, 20, redraw_share=0.0),
         MetropolisHastingsCuts(sigma2, 0, 20, "authors", 0.0, True, True, True),
-        MetropolisHastingsCuts(sigma2, 0, 5, "feasible", 0.0),
         ExactCuts(sigma2),
         OptimalCut(),
     ]
@@ -160,7 +156,7 @@ def test_every_sample_is_a_cut(seed, leaves, most, sigma2):
         sample = sampler.sample(np.random.default_rng(seed), tree, w, 6)
         again = sampler.sample(np.random.default_rng(seed), tree, w, 6)
         assert len(sample.cuts) == 6
-        assert all(tree.is_cut(c) for c in sample.cuts)
+        assert all(is_cut(tree, c) for c in sample.cuts)
         assert np.allclose(sample.values, [w[c].sum() for c in sample.cuts])
         assert all((a == b).all() for a, b in zip(sample.cuts, again.cuts, strict=True))
 

@@ -7,13 +7,18 @@ import pytest
 
 from mstfilter.errors import InputError
 from mstfilter.scene import Camera, Frame
-from mstfilter.segmentation.agglomerate import Agglomeration
 from mstfilter.segmentation.boundary import ColourDepthBoundary
+from mstfilter.segmentation.cuts import MergeLogOdds
 from mstfilter.segmentation.join_weights import JOIN_WEIGHTS
-from mstfilter.segmentation.joins import FEATURES, features, quadric_residual
-from mstfilter.segmentation.learned_tree import LearnedTree, tree_of_merges
-from mstfilter.segmentation.regions import BORDER, REGION, measure_regions
-from mstfilter.segmentation.value import MergeLogOdds
+from mstfilter.segmentation.learned_tree import Agglomeration, LearnedTree, tree_of_merges
+from mstfilter.segmentation.regions import (
+    BORDER,
+    PAIR_FEATURES,
+    REGION,
+    measure_regions,
+    pair_features,
+    quadric_residual,
+)
 from tests.segmentation.scenes import GRID, TOUCHING, TWO, frame_of
 
 
@@ -56,9 +61,9 @@ def test_features_do_not_depend_on_which_region_comes_first():
     a, b = next((i, j) for i in range(1, len(regions.sums)) for j in regions.borders[i] if j > i)
     empty = np.zeros((1, len(BORDER)))
     table = [regions.borders[r].get(0, empty[0])[None] for r in (a, b)]
-    one = features(regions.sums[[a]], regions.sums[[b]], regions.borders[a][b][None], *table, 0.5)
-    other = features(regions.sums[[b]], regions.sums[[a]], regions.borders[b][a][None], *table[::-1], 0.5)
-    assert one.shape == (1, len(FEATURES))
+    one = pair_features(regions.sums[[a]], regions.sums[[b]], regions.borders[a][b][None], *table, 0.5)
+    other = pair_features(regions.sums[[b]], regions.sums[[a]], regions.borders[b][a][None], *table[::-1], 0.5)
+    assert one.shape == (1, len(PAIR_FEATURES))
     assert np.isfinite(one).all()
     assert np.allclose(one, other)
 
@@ -79,8 +84,8 @@ def test_the_residual_of_a_quadric_matches_least_squares():
 
 
 def test_every_feature_has_a_weight():
-    assert set(JOIN_WEIGHTS) == set(FEATURES)
-    assert len(FEATURES) == len(set(FEATURES))
+    assert set(JOIN_WEIGHTS) == set(PAIR_FEATURES)
+    assert len(PAIR_FEATURES) == len(set(PAIR_FEATURES))
 
 
 @pytest.mark.parametrize("width", [160, 320, 640])
@@ -94,7 +99,7 @@ def test_the_table_is_one_leaf_and_objects_are_nodes(width):
     w = MergeLogOdds().values(tree, frame)
     for node in range(tree.n_leaves, tree.n_nodes):
         assert w[node] == pytest.approx(
-            w[tree.children(node)].sum() - np.clip(tree.odds[node], -6.91, 6.91), abs=0.01
+            w[list(tree.children[node])].sum() - np.clip(tree.odds[node], -6.91, 6.91), abs=0.01
         )
 
 

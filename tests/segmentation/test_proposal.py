@@ -12,13 +12,11 @@ from mstfilter.errors import InputError
 from mstfilter.scene import Camera, Frame, render
 from mstfilter.scoring import weighted_coverage
 from mstfilter.segmentation.boundary import ColourDepthBoundary
+from mstfilter.segmentation.cuts import MergeLogOdds, OptimalCut, SceneCutObjectness, optimal_cut
 from mstfilter.segmentation.learned_tree import LearnedTree
 from mstfilter.segmentation.mh import MetropolisHastingsCuts
-from mstfilter.segmentation.optimal import OptimalCut, optimal_cut
-from mstfilter.segmentation.proposal import TreeCutProposal
-from mstfilter.segmentation.segments import ObjectRule, _core
-from mstfilter.segmentation.ucm import UcmTree
-from mstfilter.segmentation.value import MergeLogOdds, SceneCutObjectness
+from mstfilter.segmentation.proposal import ObjectRule, TreeCutProposal, _core
+from mstfilter.segmentation.tree import UcmTree
 from tests.segmentation.scenes import GRID, TOUCHING, TWO, clip_of, frame_of
 from tests.segmentation.trees import random_tree
 

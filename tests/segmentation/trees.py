@@ -6,8 +6,7 @@ from math import exp
 
 import numpy as np
 
-from mstfilter.segmentation.mh import CutChain
-from mstfilter.segmentation.moves import cuts_below
+from mstfilter.segmentation.mh import AuthorsMoves, CutChain, CutState, MoveRule, NodeMoves, SubtreeRedraw
 from mstfilter.segmentation.tree import Tree
 
 
@@ -33,6 +32,45 @@ def random_values(rng: np.random.Generator, tree: Tree) -> np.ndarray:
     return -tree.area * rng.uniform(0.85, 1.15, tree.n_nodes)
 
 
+def is_cut(tree: Tree, cut: np.ndarray) -> bool:
+    """Whether a set of nodes covers every leaf exactly once."""
+    covered = np.zeros(tree.n_leaves, dtype=np.int64)
+    for node in np.asarray(cut).tolist():
+        covered[tree.leaves_of(node)] += 1
+    return bool((covered == 1).all())
+
+
+def cuts_below(tree: Tree, node: int) -> list[list[int]]:
+    """All cuts of the subtree of a node."""
+    table: list[list[list[int]]] = []
+    for i, children in enumerate(tree.children[: node + 1]):
+        products: list[list[int]] = [[]]
+        for child in children:
+            products = [a + b for a in products for b in table[child]]
+        table.append([[i], *(products if children else [])])
+    return table[node]
+
+
+def choices(rule: MoveRule, state: CutState) -> list[tuple[float, object]]:
+    """All choices of a rule with their probabilities."""
+    if isinstance(rule, NodeMoves):
+        share = 0.5 / len(state.nodes)
+        return [(share, (node, upward)) for node in state.nodes for upward in (False, True)]
+    if isinstance(rule, AuthorsMoves):
+        moves = rule.possible(state)
+        return [(1 / len(moves), move) for move in moves] or [(1.0, None)]
+    assert isinstance(rule, SubtreeRedraw)
+    tree = rule.law.tree
+    inner = range(tree.n_leaves, tree.n_nodes)
+    if len(inner) == 0:
+        return [(1.0, (tree.root, []))]
+    return [
+        (exp(rule.law.log_prob(cut, node)) / len(inner), (node, cut))
+        for node in inner
+        for cut in cuts_below(tree, node)
+    ]
+
+
 def all_cuts(tree: Tree) -> list[tuple[int, ...]]:
     """Every cut, as ascending tuples."""
     return [tuple(sorted(c)) for c in cuts_below(tree, tree.root)]
@@ -54,7 +92,7 @@ def transition_matrix(tree: Tree, w: np.ndarray, best: float, s2: float, rule) -
     T = np.zeros((len(cuts), len(cuts)))
     for i, cut in enumerate(cuts):
         chain = CutChain(tree, w, best, s2, np.array(cut))
-        for probability, choice in rule.choices(chain.state):
+        for probability, choice in choices(rule, chain.state):
             move, _, log_ratio = chain.judge(rule, choice)
             accept = 0.0 if move is None else exp(min(0.0, log_ratio))
             T[i, i] += probability * (1 - accept)
@@ -71,4 +109,4 @@ def stationary(T: np.ndarray) -> np.ndarray:
     return np.linalg.lstsq(A, np.concatenate([np.zeros(n), [1.0]]), rcond=None)[0]
 
 
-__all__ = ["all_cuts", "random_tree", "random_values", "stationary", "target", "transition_matrix"]
+__all__ = ["all_cuts", "is_cut", "random_tree", "random_values", "stationary", "target", "transition_matrix"]
