@@ -18,7 +18,7 @@ from r1 import NOTICE, Particles, folder
 
 from mstfilter.presets import REGISTRY, load_config
 from mstfilter.report import colour, viewpoint
-from mstfilter.scoring import components, one_blob
+from mstfilter.scoring import connected_components, one_blob
 
 ETA = 5
 PRESETS = ("authors", "paper", "mst")
@@ -38,7 +38,10 @@ def make(out: Path, smoke: bool) -> list[Path]:
     }
     scores = {name: np.array([particles.score(x) for x in labels]) for name, labels in groups.items()}
     floors = {
-        name: [float(np.mean([score(particles, floor(x), x) for x in labels])) for floor in (one_blob, components)]
+        name: [
+            float(np.mean([score(particles, floor(x), x) for x in labels]))
+            for floor in (one_blob, connected_components)
+        ]
         for name, labels in groups.items()
     }
     return [

@@ -23,7 +23,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from mstfilter.formats import open_paired
+from mstfilter.formats import PairedImages
 from mstfilter.presets import preset
 from mstfilter.scene import Recording, project, read_labels
 from mstfilter.scoring import weighted_coverage
@@ -93,7 +93,7 @@ def assemble(method: str, constants: dict[str, str]) -> ParticleFilter:
 def load(group: tuple[int, int], step: int = 1) -> tuple[Recording, list[np.ndarray]]:
     """A group as a recording in which every frame is a pause, and its label images; every `step`-th pixel."""
     folder, names = SHARED / "real" / "osd_learn", [f"learn{i}" for i in range(group[0], group[1] + 1)]
-    recording = open_paired(folder, names)
+    recording = PairedImages(tuple(names)).open(folder)
     labels = [read_labels(folder / f"{name}_label.png").astype(np.int64)[::step, ::step] for name in names]
     if step > 1:
         frames, K = recording.frames, recording.frames[0].camera.K.copy()

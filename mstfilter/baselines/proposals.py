@@ -18,7 +18,7 @@ import numpy as np
 
 from mstfilter.completion import Completer, Extrude
 from mstfilter.scene import Clip, Frame, Hypothesis
-from mstfilter.scoring import components, one_blob
+from mstfilter.scoring import connected_components, one_blob
 from mstfilter.segmentation import ObjectRule, TreeCutProposal, hypothesis_of
 from mstfilter.smc import Population, Proposal, child
 
@@ -93,7 +93,7 @@ class OccupiedComponents(Proposal):
 
     def sample(self, rng: np.random.Generator, observation: Clip, n: int) -> Population:
         """The same hypothesis, `n` times."""
-        labels = components(_occupied(self, rng, observation))
+        labels = connected_components(_occupied(self, rng, observation))
         kept = np.bincount(labels.ravel()) >= self.min_voxels
         kept[0] = False
         numbers = np.where(kept, np.cumsum(kept), 0)

@@ -24,14 +24,14 @@ def convert(
     frames: Annotated[str, typer.Option(help="Frames of a folder of pairs, separated by commas.")] = "",
 ) -> None:
     """Write data of another format as a recording. Stopped or failed, it leaves nothing behind."""
-    from mstfilter.formats import check_writable, save
+    from mstfilter.formats import check_writable, save_recording
 
     check_writable(out)
     recording = read_source(source, format, option, pauses, frames)
     generator = recording.manifest.get("generator") or f"converted from {source.name}"
     try:
         with bar("convert") as advance:
-            save(recording, out, progress=advance, generator=generator)
+            save_recording(recording, out, progress=advance, generator=generator)
     except KeyboardInterrupt:
         print("interrupted: nothing was written", file=sys.stderr)
         raise typer.Exit(130) from None

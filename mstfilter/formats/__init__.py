@@ -1,14 +1,19 @@
-"""Recordings on disk: our own folder, and one reader for each other layout.
+"""Readers and writers of recordings: the recording folder of mstfilter, and a reader for each other layout.
 
-A reader is a `Format`: a frozen dataclass with ``detects(path)`` and ``open(path)``. What they share stands in
-`mstfilter.formats.video`, how a long video is cut at its pauses in `mstfilter.formats.pauses`.
+>>> from mstfilter.formats import Tum, open_recording, save_recording
+>>> recording = Tum(K=(525, 525, 319.5, 239.5)).open(path)  # doctest: +SKIP
+>>> save_recording(recording, "recordings/mine")  # doctest: +SKIP
+>>> recording = open_recording("recordings/mine")  # doctest: +SKIP
+
+A reader is a `RecordingFormat`, a frozen dataclass with ``detects(path)`` and ``open(path)``. A `PauseRule` divides a
+long video into clips.
 """
 
 from mstfilter.lazy import attach
 
 __getattr__, __dir__, __all__ = attach(__name__, __file__)
 
-__interfaces__ = {"format": "Format", "pauses": "PauseRule"}
+__interfaces__ = {"format": "RecordingFormat", "pauses": "PauseRule"}
 __components__ = {
     "format": {
         "recording": "RecordingFolder",
@@ -19,5 +24,5 @@ __components__ = {
         "dsr": "Dsr",
         "bag": "Bag",
     },
-    "pauses": {"still": "Still", "at": "At", "listed": "Listed", "ends": "Ends", "every": "Every"},
+    "pauses": {"still": "Still", "at": "At", "listed": "Listed", "ends": "Ends", "every": "EveryNth"},
 }

@@ -1,32 +1,244 @@
-"""ROS 1 and ROS 2 bags and MCAP files: colour, depth and CameraInfo topics.
+"""ROS 1 bags, ROS 2 bags and MCAP files: colour, depth and CameraInfo topics.
 
 >>> Bag(colour="/camera/color/image_raw", depth="/camera/aligned_depth_to_color/image_raw").open(Path("session.bag"))
 
-Topics need to be named only where several would do. The camera matrix comes from the ``camera_info`` beside the
-colour topic (of a rectified image, from its P). A colour and a depth image are one frame where each is the other's
-nearest by the time stamp of the header, at most `tolerance_s` apart. Depth has to be registered to colour: same size
-and same ``frame_id``. Transforms (tf) are not read: the camera stands still, its pose is found from the table.
+A topic must be named only if several topics fit. The camera matrix is read from the ``camera_info`` topic beside the
+colour topic (for rectified images, its P). A colour and a depth image form a frame if each is the nearest of the
+other by the time stamp of the header and they are at most `tolerance_s` apart. Depth must be registered to colour:
+same size and same ``frame_id``. Transforms (tf) are not read: the camera is assumed to stand still, and its pose is
+found from the table.
+
+Depth encodings: 16UC1 and mono16 are units of the depth scale (millimetres by convention, REP 118), 32FC1 is metres.
+Compressed depth is a PNG, or the ``compressedDepth`` transport: 12 bytes of header (quantisation A, B of 32FC1), then
+a PNG. The files are read with rosbags (extra ``bags``), without ROS.
 """
 
 from __future__ import annotations
 
+import contextlib
 import math
+import struct
+import weakref
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from mstfilter.errors import InputError
-from mstfilter.formats.bag_file import BagFile, Topic
-from mstfilter.formats.bag_images import DEPTH, GREY, colour_of, depth_of, encoding_of
-from mstfilter.formats.interfaces import Format
-from mstfilter.formats.pauses import PauseRule
-from mstfilter.formats.still import Still
-from mstfilter.formats.video import Images, Video, World, pair_stamps
+from mstfilter.errors import InputError, MissingLibraryError
+from mstfilter.formats.pauses import PauseRule, Still
+from mstfilter.formats.video import KnownWorld, RecordingFormat, RgbdImages, Video, pair_stamps
 from mstfilter.scene import Recording
 
-__all__ = ["Bag"]
+__all__ = [
+    "Bag",
+    "BagFile",
+    "_COLOUR",
+    "_DEPTH",
+    "Entry",
+    "_GREY",
+    "Topic",
+    "colour_image",
+    "depth_image",
+    "image_encoding",
+]
+
+
+@dataclass(frozen=True)
+class Topic:
+    """A topic: its name, message type and number of messages."""
+
+    name: str
+    kind: str
+    count: int
+
+    @property
+    def compressed(self) -> bool:
+        """Whether its images are compressed."""
+        return self.kind.endswith("/CompressedImage")
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A message: stamp of its header (s), when it was logged (ns), which of those logged then."""
+
+    stamp: float
+    logged: int
+    ordinal: int
+
+
+class BagFile:
+    """An open bag. It is closed when nothing refers to it.
+
+    Parameters
+    ----------
+    path : Path
+        A .bag, .mcap or .db3 file, or the folder of a ROS 2 bag.
+    """
+
+    def __init__(self, path: Path) -> None:
+        try:
+            from rosbags.highlevel import AnyReader
+            from rosbags.typesys import Stores, get_typestore
+        except ImportError as error:
+            raise MissingLibraryError(
+                "bags and MCAP need rosbags, which is not installed", "pip install 'mstfilter[bags]'"
+            ) from error
+        self.path = path
+        if not path.exists():
+            raise InputError(f"bag does not exist: {path}")
+        with self._reading():
+            self._reader = AnyReader([path], default_typestore=get_typestore(Stores.LATEST))
+            self._reader.open()
+        weakref.finalize(self, _close, self._reader)
+        self.is_ros2: bool = self._reader.is2
+        self.topics: dict[str, Topic] = {
+            c.topic: Topic(
+                c.topic, str(c.msgtype), sum(x.msgcount for x in self._reader.connections if x.topic == c.topic)
+            )
+            for c in self._reader.connections
+        }
+
+    @contextlib.contextmanager
+    def _reading(self) -> Iterator[None]:
+        try:
+            yield
+        except InputError:
+            raise
+        except Exception as error:  # rosbags lets errors of storage and compression libraries through
+            said = " ".join(str(error).split())[:160]  # one line
+            raise InputError(
+                f"bag cannot be read: {self.path} ({type(error).__name__}: {said})",
+                "was it closed properly? copy it again, or mend it: rosbag reindex, ros2 bag reindex, mcap recover",
+            ) from error
+
+    def _messages(self, topic: str, start: int | None = None, stop: int | None = None) -> Iterator[tuple[int, Any]]:
+        connections = [c for c in self._reader.connections if c.topic == topic]
+        with self._reading():
+            for connection, logged, raw in self._reader.messages(connections, start=start, stop=stop):
+                yield logged, self._reader.deserialize(raw, connection.msgtype)
+
+    def first(self, topic: str) -> Any:
+        """The first message of a topic."""
+        for _, message in self._messages(topic):
+            return message
+        raise InputError(f"bag {self.path} says it holds messages of {topic}, and there are none", "is it damaged?")
+
+    def index(self, topic: str) -> list[Entry]:
+        """Every message of a topic with a header, in the order of the file. Reads all of them once."""
+        entries: list[Entry] = []
+        for logged, message in self._messages(topic):
+            stamp = message.header.stamp
+            seconds = stamp.sec + stamp.nanosec * 1e-9
+            ordinal = entries[-1].ordinal + 1 if entries and entries[-1].logged == logged else 0
+            entries.append(Entry(seconds if seconds > 0 else logged * 1e-9, logged, ordinal))
+        return entries
+
+    def message(self, topic: str, entry: Entry) -> Any:
+        """A message of a topic again."""
+        for k, (_, message) in enumerate(self._messages(topic, entry.logged, entry.logged + 1)):
+            if k == entry.ordinal:
+                return message
+        raise InputError(f"bag {self.path} changed while it was read: a message of {topic} is gone")
+
+
+def _close(reader: Any) -> None:
+    with contextlib.suppress(Exception):
+        reader.close()
+
+
+_COLOUR = ("rgb8", "bgr8", "rgba8", "bgra8", "mono8", "8UC1", "8UC3", "8UC4", "yuv422", "yuv422_yuy2", "uyvy", "yuyv")
+"""Encodings of colour images that are read."""
+_GREY = ("mono8", "8UC1")
+"""Those of them without colour."""
+_DEPTH = ("16UC1", "mono16", "32FC1")
+"""Encodings of depth images that are read."""
+_PNG = b"\x89PNG\r\n\x1a\n"
+
+
+def image_encoding(message: Any, compressed: bool) -> str:
+    """The encoding of an image message; of a compressed one ``16UC1``, ``32FC1`` or ``compressed colour``."""
+    if not compressed:
+        return str(message.encoding)
+    named = str(message.format)
+    return next((e for e in _DEPTH if named.startswith(e) or ("compressedDepth" in named and e in named)), "") or (
+        "16UC1" if "compressedDepth" in named else "compressed colour"
+    )
+
+
+def colour_image(message: Any, compressed: bool, where: str) -> np.ndarray:
+    """Colour image (H, W, 3) uint8, RGB."""
+    import cv2
+
+    if compressed:
+        image = cv2.imdecode(np.frombuffer(bytes(message.data), np.uint8), cv2.IMREAD_COLOR)
+        if image is None:
+            raise InputError(f"{where} cannot be decoded: {message.format!r}, {len(message.data)} bytes")
+        return np.ascontiguousarray(image[..., ::-1])
+    encoding = str(message.encoding)
+    if encoding not in _COLOUR:
+        raise InputError(
+            f"{where} has encoding {encoding!r}, which is not read as colour", f"read are: {', '.join(_COLOUR)}"
+        )
+    if encoding in _GREY:
+        return np.repeat(_pixels(message, np.dtype(np.uint8), 1, where), 3, axis=2)
+    if encoding in ("yuv422", "uyvy", "yuv422_yuy2", "yuyv"):
+        code = cv2.COLOR_YUV2RGB_UYVY if encoding in ("yuv422", "uyvy") else cv2.COLOR_YUV2RGB_YUY2
+        return np.asarray(cv2.cvtColor(np.ascontiguousarray(_pixels(message, np.dtype(np.uint8), 2, where)), code))
+    channels = 4 if encoding in ("rgba8", "bgra8", "8UC4") else 3
+    image = _pixels(message, np.dtype(np.uint8), channels, where)[..., :3]
+    return np.ascontiguousarray(image if encoding.startswith("rgb") else image[..., ::-1])
+
+
+def depth_image(message: Any, compressed: bool, depth_scale: float, where: str) -> np.ndarray:
+    """Depth image (H, W) float32 in metres, NaN where there is no reading."""
+    encoding = image_encoding(message, compressed)
+    if encoding not in _DEPTH:
+        raise InputError(f"{where} has encoding {encoding!r}, which is no depth", f"depth is: {', '.join(_DEPTH)}")
+    if compressed:
+        metres = _compressed_depth(bytes(message.data), encoding, depth_scale, where)
+    elif encoding == "32FC1":
+        metres = _pixels(message, np.dtype(np.float32), 1, where)[..., 0].astype(np.float32)
+    else:
+        metres = _pixels(message, np.dtype(np.uint16), 1, where)[..., 0] * np.float32(depth_scale)
+    with np.errstate(invalid="ignore"):
+        return np.where(np.isfinite(metres) & (metres > 0), metres, np.float32(np.nan)).astype(np.float32)
+
+
+def _pixels(message: Any, kind: np.dtype[Any], channels: int, where: str) -> np.ndarray:
+    """Pixels (H, W, channels) of an uncompressed image; rows may be padded."""
+    height, width, step = int(message.height), int(message.width), int(message.step)
+    data = np.asarray(message.data, dtype=np.uint8)
+    if min(height, width) < 1 or step < width * channels * kind.itemsize or data.size < height * step:
+        raise InputError(
+            f"{where} says {width} x {height} of {message.encoding} in rows of {step} bytes, holds {data.size} bytes"
+        )
+    rows = data[: height * step].reshape(height, step)[:, : width * channels * kind.itemsize]
+    order = kind.newbyteorder(">" if message.is_bigendian else "<")
+    return np.ascontiguousarray(rows).view(order).reshape(height, width, channels).astype(kind)
+
+
+def _compressed_depth(data: bytes, encoding: str, depth_scale: float, where: str) -> np.ndarray:
+    import cv2
+
+    start = data.find(_PNG, 0, 64)
+    image = None
+    if start >= 0:
+        image = cv2.imdecode(np.frombuffer(data[start:], np.uint8), cv2.IMREAD_UNCHANGED)
+    if image is None or image.ndim != 2 or image.dtype != np.uint16:
+        raise InputError(
+            f"{where} is not a 16-bit PNG ({len(data)} bytes)",
+            "compressed depth is read as PNG only, not RVL or JPEG",
+        )
+    if encoding != "32FC1":
+        return image * np.float32(depth_scale)
+    if start != 12:
+        raise InputError(f"{where} is compressed 32FC1 without its header of 12 bytes")
+    a, b = struct.unpack("<ff", data[4:12])
+    with np.errstate(divide="ignore"):
+        return np.where(image > 0, a / (image.astype(np.float64) - b), np.nan).astype(np.float32)
+
 
 _IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 _INFO = "sensor_msgs/msg/CameraInfo"
@@ -49,7 +261,7 @@ class _Stream:
 
 
 @dataclass(frozen=True)
-class Bag(Format):
+class Bag(RecordingFormat):
     """ROS 1 bag, ROS 2 bag or MCAP: image, compressed image, depth and CameraInfo topics.
 
     Parameters
@@ -72,7 +284,7 @@ class Bag(Format):
         Part of the video that is used, in seconds after its first frame.
     pauses : PauseRule
         Where the video is cut.
-    world : World
+    world : KnownWorld
         Pose and workspace, where known.
     """
 
@@ -86,21 +298,21 @@ class Bag(Format):
     start_s: float = 0.0
     stop_s: float = math.inf
     pauses: PauseRule = field(default_factory=Still)
-    world: World = field(default_factory=World)
+    world: KnownWorld = field(default_factory=KnownWorld)
 
     @classmethod
     def detects(cls, path: Path) -> bool:
-        """See `Format`."""
+        """See `RecordingFormat`."""
         if path.is_file():
             return path.suffix in (".bag", ".mcap", ".db3")
         return (path / "metadata.yaml").is_file()
 
     def open(self, path: Path) -> Recording:
-        """See `Format`."""
+        """See `RecordingFormat`."""
         bag = BagFile(path)
         streams = [_stream(bag, t) for t in bag.topics.values() if t.kind in _IMAGES and t.count]
-        pictures = [s for s in streams if s.encoding not in DEPTH]
-        pictures = [s for s in pictures if s.encoding not in GREY] or pictures  # infrared beside a colour camera
+        pictures = [s for s in streams if s.encoding not in _DEPTH]
+        pictures = [s for s in pictures if s.encoding not in _GREY] or pictures  # infrared beside a colour camera
         colour = _choose(path, "colour", self.colour, pictures, streams)
         depth = self._depth(path, colour, streams)
         K, distortion = self._intrinsics(bag, colour, depth)
@@ -110,13 +322,17 @@ class Bag(Format):
 
         def read_rgb(index: int) -> np.ndarray:
             k, topic = pairs[index][0], colour.topic
-            return colour_of(bag.message(topic.name, entries[0][k]), topic.compressed, f"message {k} of {topic.name}")
+            return colour_image(
+                bag.message(topic.name, entries[0][k]), topic.compressed, f"message {k} of {topic.name}"
+            )
 
-        def read(index: int) -> Images:
+        def read(index: int) -> RgbdImages:
             k, topic = pairs[index][1], depth.topic
             where = f"depth message {k} of {topic.name} in {path.name}"
-            metres = depth_of(bag.message(topic.name, entries[1][k]), topic.compressed, self.depth_scale, where)
-            return Images(read_rgb(index), metres, f"colour message {pairs[index][0]} of {colour.topic.name}", where)
+            metres = depth_image(bag.message(topic.name, entries[1][k]), topic.compressed, self.depth_scale, where)
+            return RgbdImages(
+                read_rgb(index), metres, f"colour message {pairs[index][0]} of {colour.topic.name}", where
+            )
 
         return (
             Video(
@@ -134,7 +350,7 @@ class Bag(Format):
         )
 
     def _depth(self, path: Path, colour: _Stream, streams: list[_Stream]) -> _Stream:
-        found = [s for s in streams if s.encoding in DEPTH]
+        found = [s for s in streams if s.encoding in _DEPTH]
         fitting = [s for s in found if s.size == colour.size and (self.registered or s.frame_id == colour.frame_id)]
         depth = _choose(path, "depth", self.depth, fitting if fitting and not self.depth else found, streams)
         if depth.size != colour.size:
@@ -188,12 +404,12 @@ class Bag(Format):
 
 def _stream(bag: BagFile, topic: Topic) -> _Stream:
     message = bag.first(topic.name)
-    encoding = encoding_of(message, topic.compressed)
+    encoding = image_encoding(message, topic.compressed)
     where = f"first message of {topic.name} in {bag.path.name}"
     if not topic.compressed:
         size = int(message.width), int(message.height)
     else:
-        read = depth_of(message, True, 1.0, where) if encoding in DEPTH else colour_of(message, True, where)
+        read = depth_image(message, True, 1.0, where) if encoding in _DEPTH else colour_image(message, True, where)
         size = read.shape[1], read.shape[0]
     return _Stream(topic, encoding, str(message.header.frame_id).lstrip("/"), size)
 
@@ -205,7 +421,7 @@ def _choose(path: Path, what: str, name: str, candidates: list[_Stream], streams
         chosen = next((s for s in streams if s.topic.name == name), None)
         if chosen is None:
             raise InputError(f"{path}: no image topic {name!r} for {what}", "image topics are:", *listed)
-        if (chosen.encoding in DEPTH) != (what == "depth"):
+        if (chosen.encoding in _DEPTH) != (what == "depth"):
             raise InputError(f"{path}: {chosen} holds no {what} images", "image topics are:", *listed)
         return chosen
     if not candidates:

@@ -1,27 +1,44 @@
-"""Our own recording folder: reading, with one clear error for whatever is wrong.
+"""The recording folder of mstfilter: reader and writer.
 
+>>> with RecordingWriter("recordings/mine", camera, grid) as writer:
+...     writer.add_frame(rgb, depth, time_s=0.0, role="static")
 >>> recording = open_recording("recordings/mine")
+>>> save_recording(recording, "recordings/copy")
 
-The layout stands in `mstfilter.scene.recording`; `mstfilter.formats.writer` writes it.
+The layout::
+
+    manifest.json        version, generator, seed, frames: [{index, time_s, role: static | action}]
+    camera.json          K, width, height, depth_scale (metres per unit, mandatory), T_world_camera, workspace
+    rgb/000000.png       8-bit RGB         depth/000000.png     16-bit, 0 = no reading
+    instance/000000.png  optional: object number of each pixel      robot/000000.png   optional: robot mask
+    voxels.npz           optional ground truth: labels (S, X, Y, Z), frame (S,), origin, voxel_size
+    poses.json           optional ground truth: per frame, per object a 4x4 T_world_object
+
+Frames with role ``static`` are the pauses. If camera.json holds no pose, the world is found from the support plane of
+the first pause; without a workspace, a grid is placed around the objects on the table. A recording is written under
+a temporary name and renamed when it is complete: if writing fails, no file remains.
 """
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
+import shutil
 import zipfile
 from collections import OrderedDict
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from types import TracebackType
 from typing import Any, Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from mstfilter.errors import InputError
-from mstfilter.formats.interfaces import Format
-from mstfilter.formats.writer import VERSION, RecordingWriter, save
+from mstfilter.formats.video import RecordingFormat
 from mstfilter.scene import (
     Camera,
     Frame,
@@ -29,16 +46,269 @@ from mstfilter.scene import (
     Recording,
     VoxelGrid,
     as_labels,
-    check_range,
+    check_depth_range,
     find_world,
     read_depth,
     read_labels,
     read_rgb,
     rigid_from_matrix,
     truth_reader,
+    warn_if_workspace_is_empty,
+    write_image,
 )
 
-__all__ = ["RecordingFolder", "RecordingWriter", "open_recording", "save"]
+__all__ = ["RecordingFolder", "RecordingWriter", "VERSION", "check_writable", "open_recording", "save_recording"]
+
+
+VERSION = 1
+"""Version of the layout."""
+
+
+def check_writable(path: Path) -> None:
+    """Whether a new recording may be called so: nothing is there, or an empty folder."""
+    if path.exists() and (not path.is_dir() or any(path.iterdir())):
+        raise InputError(
+            f"cannot write a recording to {path}: it exists and is not an empty folder",
+            "choose another name, or remove it",
+        )
+
+
+class RecordingWriter:
+    """Writes a recording folder, frame by frame.
+
+    Parameters
+    ----------
+    path : path
+        The folder to make. It must not exist, or be empty.
+    camera : Camera
+        Intrinsics, and the pose if it is known.
+    grid : VoxelGrid, optional
+        Workspace.
+    depth_scale : float
+        Metres a unit of the 16-bit depth images.
+    **manifest
+        What else manifest.json should say: generator, seed, ...
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        camera: Camera,
+        grid: VoxelGrid | None = None,
+        *,
+        depth_scale: float = 0.001,
+        **manifest: Any,
+    ) -> None:
+        self.path = Path(path)
+        check_writable(self.path)
+        self._camera, self._grid, self._scale = camera, grid, depth_scale
+        self._manifest = {"version": VERSION, **manifest}
+        self._frames: list[dict[str, Any]] = []
+        self._poses: list[dict[str, Any]] = []
+        self._voxels: list[np.ndarray] = []
+        self._voxel_frames: list[int] = []
+        self._folder = self.path.with_name(f".{self.path.name}.partial")
+        try:
+            if self._folder.exists():
+                shutil.rmtree(self._folder)
+            self._folder.mkdir(parents=True)
+        except OSError as error:
+            raise InputError(f"cannot write recording {self.path}: {error.strerror}") from error
+
+    def add_frame(
+        self,
+        rgb: np.ndarray,
+        depth: np.ndarray,
+        time_s: float,
+        role: Literal["static", "action"],
+        *,
+        instance: np.ndarray | None = None,
+        robot_mask: np.ndarray | None = None,
+        poses: Mapping[Any, Any] | None = None,
+        **entry: Any,
+    ) -> int:
+        """Add a frame; its index.
+
+        Parameters
+        ----------
+        rgb : (H, W, 3) uint8
+            Colour.
+        depth : (H, W) float
+            Metres, NaN = no reading.
+        time_s : float
+            Seconds.
+        role : {"static", "action"}
+            At a pause, or between.
+        instance : (H, W) uint8 or uint16, optional
+            True object of each pixel.
+        robot_mask : (H, W) bool, optional
+            Pixels of the robot.
+        poses : dict, optional
+            True 4x4 T_world_object by object number.
+        **entry
+            What else the manifest should say of the frame.
+        """
+        index = len(self._frames)
+        units = np.rint(np.nan_to_num(np.asarray(depth, dtype=np.float64) / self._scale, nan=0.0, posinf=0.0))
+        units[(units < 0) | (units > 65535)] = 0  # out of the file's range: no reading, not its largest number
+        images: dict[str, np.ndarray | None] = {
+            "rgb": rgb,
+            "depth": units.astype(np.uint16),
+            "instance": instance,
+            "robot": None if robot_mask is None else robot_mask.astype(np.uint8) * 255,
+        }
+        for part, image in images.items():
+            if image is None:
+                continue
+            if image.shape[:2] != (self._camera.height, self._camera.width):
+                raise InputError(
+                    f"{part} image of frame {index} has shape {image.shape}, "
+                    f"the camera is {self._camera.width} x {self._camera.height}"
+                )
+            with self._writing():
+                (self._folder / part).mkdir(exist_ok=True)
+                write_image(self._folder / part / f"{index:06d}.png", image)
+        self._frames.append({"index": index, "time_s": float(time_s), "role": role, **entry})
+        if poses is not None:
+            objects = {str(k): np.asarray(T, dtype=float).tolist() for k, T in poses.items()}
+            self._poses.append({"frame": index, "T_world_object": objects})
+        return index
+
+    def add_voxels(self, labels: np.ndarray) -> None:
+        """True labels (X, Y, Z) at the frame added last."""
+        if self._grid is None or labels.shape != self._grid.shape:
+            raise InputError(
+                f"true labels have shape {labels.shape}, the workspace is {self._grid and self._grid.shape}"
+            )
+        self._voxels.append(as_labels(labels))
+        self._voxel_frames.append(len(self._frames) - 1)
+
+    def close(self) -> Path:
+        """Write what is left and give the folder its name."""
+        camera = self._camera
+        described: dict[str, Any] = {
+            "K": camera.K.tolist(),
+            "width": camera.width,
+            "height": camera.height,
+            "depth_scale": self._scale,
+            "T_world_camera": None if camera.T_world_camera is None else camera.T_world_camera.as_matrix().tolist(),
+            "workspace": None,
+        }
+        if self._grid is not None:
+            described["workspace"] = {
+                "min": self._grid.origin.tolist(),
+                "max": self._grid.upper.tolist(),
+                "voxel": self._grid.voxel_size,
+            }
+        with self._writing():
+            self._finish(described)
+        return self.path
+
+    def _finish(self, described: dict[str, Any]) -> None:
+        (self._folder / "camera.json").write_text(json.dumps(described, indent=1))
+        (self._folder / "manifest.json").write_text(json.dumps({**self._manifest, "frames": self._frames}, indent=1))
+        if self._poses:
+            (self._folder / "poses.json").write_text(json.dumps(self._poses))
+        if self._voxels:
+            assert self._grid is not None
+            np.savez_compressed(
+                self._folder / "voxels.npz",
+                labels=np.stack(self._voxels),
+                frame=np.array(self._voxel_frames),
+                origin=self._grid.origin,
+                voxel_size=self._grid.voxel_size,
+            )
+        if self.path.exists():
+            self.path.rmdir()
+        self._folder.rename(self.path)
+
+    @contextlib.contextmanager
+    def _writing(self) -> Iterator[None]:
+        """A disk that is full or not writable is the user's to mend."""
+        try:
+            yield
+        except OSError as error:
+            raise InputError(
+                f"cannot write recording {self.path}: {error.strerror}", "nothing of it is left behind"
+            ) from error
+
+    def discard(self) -> None:
+        """Leave nothing behind."""
+        shutil.rmtree(self._folder, ignore_errors=True)
+
+    def __enter__(self) -> RecordingWriter:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if kind is not None:
+            self.discard()
+            return
+        try:
+            self.close()
+        except BaseException:
+            self.discard()
+            raise
+
+
+def save_recording(
+    recording: Recording,
+    path: str | Path,
+    *,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+    **manifest: Any,
+) -> Path:
+    """Write any recording as a folder of our own; a camera that moves keeps its pose in every frame.
+
+    Parameters
+    ----------
+    recording : Recording
+        What to write. Its depth is stored in units of its `depth_scale`.
+    path : path
+        The folder to make. It must not exist, or be empty.
+    progress : callable
+        Called with (frames done, frames in all).
+    **manifest
+        What else manifest.json should say: generator, ...
+    """
+    home, total = recording.frames[recording.pauses[0]].camera, len(recording)
+    manifest = {"name": recording.name, "depth_scale": recording.depth_scale, **manifest}
+    with RecordingWriter(path, home, recording.grid, **manifest) as writer:
+        for index in range(total):
+            frame = recording.frames[index]
+            pause = index in recording.pauses
+            if not np.array_equal(frame.camera.K, home.K):
+                raise InputError(
+                    f"frame {index} of {recording.name} has camera matrix {frame.camera.K.tolist()}, frame "
+                    f"{recording.pauses[0]} has {home.K.tolist()}: a recording folder holds one",
+                    "convert frames of one camera only",
+                )
+            if frame.views:
+                raise InputError(
+                    f"frame {index} of {recording.name} has images of {len(frame.all_views)} cameras: a recording "
+                    "folder holds those of one",
+                    "write one recording a camera, and join their frames by Frame(..., views=...)",
+                )
+            moved = {} if frame.camera.key == home.key else {"T_world_camera": frame.camera.pose.as_matrix().tolist()}
+            writer.add_frame(
+                frame.rgb,
+                frame.depth,
+                recording.times[index],
+                "static" if pause else "action",
+                instance=recording.instance(index),
+                robot_mask=frame.robot_mask,
+                poses=recording.poses(index),
+                **moved,
+            )
+            truth = recording.truth(recording.pauses.index(index)) if pause else None
+            if truth is not None:
+                writer.add_voxels(truth)
+            progress(index + 1, total)
+    warn_if_workspace_is_empty(
+        (recording.frames[p] for p in recording.pauses), recording.grid, f"recording {recording.name}"
+    )
+    return writer.path
 
 
 class _Workspace(BaseModel):
@@ -98,16 +368,16 @@ def _load(path: Path, model: type[BaseModel]) -> Any:
 
 
 @dataclass(frozen=True)
-class RecordingFolder(Format):
+class RecordingFolder(RecordingFormat):
     """Our own recording folder: manifest.json, camera.json, rgb/, depth/."""
 
     @classmethod
     def detects(cls, path: Path) -> bool:
-        """See `Format`."""
+        """See `RecordingFormat`."""
         return (path / "manifest.json").is_file()
 
     def open(self, path: Path) -> Recording:
-        """See `Format`."""
+        """See `RecordingFormat`."""
         return open_recording(path)
 
 
@@ -168,7 +438,7 @@ def open_recording(path: str | Path) -> Recording:
         readings = depth[np.isfinite(depth)]
         if readings.size == 0:
             raise InputError(f"depth image {path / 'depth' / name} has no reading at all: every pixel is 0")
-        check_range(readings, f"depth image {path / 'depth' / name} with depth_scale {described.depth_scale:g}")
+        check_depth_range(readings, f"depth image {path / 'depth' / name} with depth_scale {described.depth_scale:g}")
         robot_path = path / "robot" / name
         robot = read_labels(robot_path) > 0 if robot_path.exists() else None
         return Frame(rgb, depth, view, robot)

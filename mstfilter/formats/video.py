@@ -1,27 +1,38 @@
-"""A video with depth, from whatever layout, as a recording: what all readers share.
+"""Videos with depth: the interface of all readers, and what they share.
 
->>> video = Video("tum", times, read, camera, path, depth_scale=0.0002)
->>> video.recording(pauses=Still(), world=World())
+A reader is a subclass of `RecordingFormat`:
 
-Every frame is checked when it is read: sizes, that there is depth at all, that it can be metres. The pose comes from
-the support plane of the first pause unless it is given; where the layout knows how the camera moved, that motion is
-kept relative to the first pause, since the world of a trajectory seldom has its table at z = 0.
+>>> reader = Tum(K=(525, 525, 319.5, 239.5))
+>>> if reader.detects(path):
+...     recording = reader.open(path)
+
+To read another layout, define a subclass in a file: ``mstfilter convert IN OUT --format ./mine.py:Mine``. Its fields
+are options of the command line. It is best built with `Video`, which checks every frame when it is read; for arrays
+in memory use `Recording.from_arrays`.
+
+>>> video = Video("tum", times, read, K, path, depth_scale=0.0002)
+>>> video.recording(pauses=Still(), world=KnownWorld())
+
+The camera pose is found from the support plane of the first pause unless it is given. If the layout stores the motion
+of the camera, only the motion relative to the first pause is used, because the world of a trajectory seldom has its
+table at z = 0. Cameras have no distortion: distorted images are undistorted when they are read (`Lens`).
 """
 
 from __future__ import annotations
 
 import warnings
+from abc import ABC, abstractmethod
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from mstfilter.errors import InputError, InputWarning
-from mstfilter.formats.lens import Lens
 from mstfilter.formats.pauses import PauseRule
 from mstfilter.scene import (
     Camera,
@@ -29,16 +40,86 @@ from mstfilter.scene import (
     LazyFrames,
     Recording,
     VoxelGrid,
-    check_range,
+    check_depth_range,
     find_world,
     rigid_from_matrix,
 )
 
-__all__ = ["Images", "Video", "World", "camera_of", "pair_stamps"]
+__all__ = ["RecordingFormat", "RgbdImages", "Lens", "Video", "KnownWorld", "pair_stamps"]
+
+
+class RecordingFormat(ABC):
+    """A layout of RGB-D data on disk. Subclasses are frozen dataclasses; their fields say what the files do not."""
+
+    @classmethod
+    @abstractmethod
+    def detects(cls, path: Path) -> bool:
+        """Whether a file or folder looks like this layout; looks at names only, raises nothing."""
+
+    @abstractmethod
+    def open(self, path: Path) -> Recording:
+        """The recording. Images may be read when they are looked at; what is wrong raises one `InputError`."""
+
+
+_NEGLIGIBLE = 0.5  # pixels
 
 
 @dataclass(frozen=True, eq=False)
-class Images:
+class Lens:
+    """Where each pixel of a straight image comes from.
+
+    Parameters
+    ----------
+    source : (H, W, 2) float32, optional
+        Column and row in the distorted image; None where the lens is straight.
+    """
+
+    source: np.ndarray | None = None
+
+    @classmethod
+    def of(cls, camera: Camera, distortion: tuple[float, ...]) -> Lens:
+        """The lens of OpenCV's coefficients k1, k2, p1, p2, k3, ...; less than half a pixel anywhere is straight."""
+        if not any(distortion):
+            return cls()
+        if len(distortion) not in (4, 5, 8, 12, 14) or not np.isfinite(distortion).all():
+            raise InputError(
+                f"distortion has {len(distortion)} numbers {tuple(distortion)}, expected 4, 5, 8, 12 or 14",
+                "k1, k2, p1, p2, k3, ... as OpenCV orders them",
+            )
+        import cv2
+
+        size = (camera.width, camera.height)
+        x, y = cv2.initUndistortRectifyMap(
+            camera.K, np.array(distortion, dtype=float), None, camera.K, size, cv2.CV_32FC1
+        )
+        source = np.stack([x, y], axis=-1)
+        v, u = np.mgrid[: camera.height, : camera.width]
+        return cls() if np.abs(source - np.stack([u, v], axis=-1)).max() < _NEGLIGIBLE else cls(source)
+
+    def smooth(self, image: np.ndarray) -> np.ndarray:
+        """A straight colour image."""
+        import cv2
+
+        return image if self.source is None else self._remap(image, cv2.INTER_LINEAR, 0)
+
+    def nearest(self, image: np.ndarray, outside: float) -> np.ndarray:
+        """A straight image of depth or labels: values are picked, never mixed."""
+        import cv2
+
+        return image if self.source is None else self._remap(image, cv2.INTER_NEAREST, outside)
+
+    def _remap(self, image: np.ndarray, how: int, outside: float) -> np.ndarray:
+        import cv2
+
+        fill: Any = outside
+        remapped: np.ndarray = cv2.remap(
+            image, self.source, None, how, borderMode=cv2.BORDER_CONSTANT, borderValue=fill
+        )
+        return remapped
+
+
+@dataclass(frozen=True, eq=False)
+class RgbdImages:
     """Images of one instant.
 
     Parameters
@@ -58,7 +139,7 @@ class Images:
 
 
 @dataclass(frozen=True)
-class World:
+class KnownWorld:
     """What a user knows of the place; whatever is empty is found from the first pause.
 
     Parameters
@@ -96,7 +177,7 @@ class World:
         return VoxelGrid.from_bounds(np.array(self.workspace[:3]), np.array(self.workspace[3:]), self.voxel_size)
 
 
-def camera_of(K: Sequence[float], width: int, height: int, where: str) -> Camera:
+def _camera_from(K: Sequence[float], width: int, height: int, where: str) -> Camera:
     """A camera from fx, fy, cx, cy that fits its images."""
     if len(K) != 4:
         raise InputError(f"{where}: K has {len(K)} numbers, expected fx, fy, cx, cy in pixels")
@@ -140,7 +221,7 @@ class Video:
 
     name: str
     times: tuple[float, ...]
-    read: Callable[[int], Images]
+    read: Callable[[int], RgbdImages]
     K: tuple[float, ...]
     path: Path
     depth_scale: float
@@ -169,13 +250,13 @@ class Video:
             read_instance=lambda index: self.read_instance(kept[index]),
         )
 
-    def recording(self, pauses: PauseRule, world: World) -> Recording:
+    def recording(self, pauses: PauseRule, world: KnownWorld) -> Recording:
         """The recording; pose and workspace are found now, images are read when they are looked at."""
         if not self.times:
             raise InputError(f"{self.path} holds no pair of a colour and a depth image")
         first = self.read(0)
         height, width = first.rgb.shape[:2]
-        camera = camera_of(self.K, width, height, str(self.path))
+        camera = _camera_from(self.K, width, height, str(self.path))
         lens = Lens.of(camera, self.distortion)
         self._frame(0, camera, lens)  # what is wrong with the first frame is known before the pauses are looked for
         look = self.read_rgb or (lambda index: self.read(index).rgb)
@@ -228,7 +309,7 @@ class Video:
                 f"{images.depth_name} has no reading at all",
                 "leave the start out with start_s=1, or the end with stop_s",
             )
-        check_range(readings, f"{images.depth_name} with {self.depth_scale:g} m a unit")
+        check_depth_range(readings, f"{images.depth_name} with {self.depth_scale:g} m a unit")
         return Frame(lens.smooth(images.rgb), lens.nearest(images.depth, np.nan), camera)
 
 

@@ -28,7 +28,7 @@ from mstfilter.report.figures import genealogy_figure, health_figure, quality_fi
 from mstfilter.report.identities import cards_of_pause, close_up, data_uri, identity_colours, truth_card
 from mstfilter.report.page import counts, flatten, note_rows, render, shown, write_page
 from mstfilter.report.pictures import jpeg_bytes, viewpoint
-from mstfilter.scoring import components, one_blob, weighted_coverage
+from mstfilter.scoring import connected_components, one_blob, weighted_coverage
 from mstfilter.study import RunFolder
 
 __all__ = ["Numbers", "Step", "different", "numbers_of", "seconds_text", "write_report"]
@@ -251,7 +251,7 @@ def numbers_of(run: RunFolder) -> Numbers:
             known: dict[bytes, tuple[float, float]] = {}
             for h, w in zip(hypotheses, info["weights"], strict=True):
                 if h.key not in known:
-                    both = (one_blob(h.labels), components(h.labels))
+                    both = (one_blob(h.labels), connected_components(h.labels))
                     known[h.key] = tuple(weighted_coverage(b, truth) for b in both)  # type: ignore[assignment]
                 for name, value in zip(floors, known[h.key], strict=True):
                     floors[name] += w * value

@@ -1,4 +1,14 @@
-"""RGB-D geometry: cameras, frames, clips, voxel grids, hypotheses, recordings. Knows nothing of filters."""
+"""RGB-D scenes: cameras, frames, clips, voxel grids, hypotheses, recordings.
+
+>>> from mstfilter.scene import Hypothesis, Recording, project
+>>> recording = Recording.from_arrays(rgb, depth, K)  # doctest: +SKIP
+>>> clip = recording.clips()[-1]                      # the frames from one pause to the next  # doctest: +SKIP
+>>> hypothesis = Hypothesis.from_labels(labels, clip.grid)  # doctest: +SKIP
+>>> project(hypothesis, clip.after.camera)            # label image of the hypothesis  # doctest: +SKIP
+
+Units are metres, radians and seconds; rigid motions are scipy `RigidTransform` objects named ``T_to_from``. The
+package knows nothing of filters, components or file formats.
+"""
 
 from mstfilter.lazy import attach
 

@@ -1,37 +1,32 @@
 from mstfilter.scene.arrays import component_key as component_key, content_key as content_key, read_only as read_only
 from mstfilter.scene.cache import beneath as beneath, clear as clear, memo as memo
 from mstfilter.scene.camera import Camera as Camera, look_at as look_at, rigid_from_matrix as rigid_from_matrix
-from mstfilter.scene.clip import Clip as Clip
-from mstfilter.scene.depth_noise import SIGMA_AT_ONE_METRE as SIGMA_AT_ONE_METRE, depth_sigma as depth_sigma
 from mstfilter.scene.disk_memo import DiskMemo as DiskMemo, Kind as Kind
-from mstfilter.scene.frame import Frame as Frame
-from mstfilter.scene.geometry import frame_geometry as frame_geometry
-from mstfilter.scene.images import (
+from mstfilter.scene.frame import (
+    SIGMA_AT_ONE_METRE as SIGMA_AT_ONE_METRE,
+    Clip as Clip,
+    Frame as Frame,
+    depth_sigma as depth_sigma,
     read_depth as read_depth,
     read_labels as read_labels,
     read_rgb as read_rgb,
     write_image as write_image,
 )
-from mstfilter.scene.missed import warn_if_missed as warn_if_missed
+from mstfilter.scene.geometry import (
+    BASELINE as BASELINE,
+    fit_support_plane as fit_support_plane,
+    frame_geometry as frame_geometry,
+    table_residual as table_residual,
+    warn_if_workspace_is_empty as warn_if_workspace_is_empty,
+)
 from mstfilter.scene.recording import (
     LazyFrames as LazyFrames,
     Recording as Recording,
-    check_range as check_range,
+    check_depth_range as check_depth_range,
     find_world as find_world,
     truth_reader as truth_reader,
 )
 from mstfilter.scene.rendering import project as project, render as render, render_hypothesis as render_hypothesis
-from mstfilter.scene.storage import (
-    decode as decode,
-    encode as encode,
-    load_hypotheses as load_hypotheses,
-    save_hypotheses as save_hypotheses,
-)
-from mstfilter.scene.support_plane import (
-    BASELINE as BASELINE,
-    fit_support_plane as fit_support_plane,
-    table_residual as table_residual,
-)
 from mstfilter.scene.voxels import (
     MAX_LABEL as MAX_LABEL,
     Crop as Crop,
@@ -39,4 +34,8 @@ from mstfilter.scene.voxels import (
     ObjectRecord as ObjectRecord,
     VoxelGrid as VoxelGrid,
     as_labels as as_labels,
+    decode_hypotheses as decode_hypotheses,
+    encode_hypotheses as encode_hypotheses,
+    load_hypotheses as load_hypotheses,
+    save_hypotheses as save_hypotheses,
 )

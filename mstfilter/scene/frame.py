@@ -1,26 +1,121 @@
-"""One RGB-D image.
+"""RGB-D images: frames, clips, image files, depth noise.
 
 >>> frame = Frame(rgb, depth, camera)          # rgb (H, W, 3) uint8, depth (H, W) metres, NaN = no reading
 >>> frame.points                               # (H, W, 3) world points in metres
+>>> clip = Clip([frame, frame_2], grid)        # the frames from one pause to the next
+>>> clip.before, clip.after                    # its first and its last frame
 
-Where several cameras look at the scene, one of them is segmented and tracked; what the others saw at the same instant
-comes along as `views`, and free space is known from all:
+If several cameras observe the scene, one of them is segmented and tracked. The frames of the others at the same
+instant are its `views`; free space is computed from all of them:
 
 >>> frame = Frame(rgb, depth, camera, views=(Frame(rgb_2, depth_2, camera_2),))
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from mstfilter.errors import InputError
 from mstfilter.scene.arrays import content_key, frozen, read_only
 from mstfilter.scene.camera import Camera
+from mstfilter.scene.voxels import VoxelGrid
 
-__all__ = ["Frame"]
+__all__ = [
+    "Clip",
+    "Frame",
+    "SIGMA_AT_ONE_METRE",
+    "depth_sigma",
+    "read_depth",
+    "read_labels",
+    "read_rgb",
+    "write_image",
+]
+
+
+SIGMA_AT_ONE_METRE = 0.00185
+
+
+def depth_sigma(z: ArrayLike, at_one_metre: float = SIGMA_AT_ONE_METRE) -> np.ndarray:
+    """Standard deviation (m) of a depth reading at z-depth `z` (m); same shape as `z`.
+
+    Examples
+    --------
+    >>> float(depth_sigma(1.0))
+    0.00185
+    """
+    z = np.asarray(z)
+    return at_one_metre * z * z
+
+
+_PNG_START = b"\x89PNG\r\n\x1a\n"
+_PNG_END = b"\x00\x00\x00\x00IEND\xaeB\x60\x82"
+
+
+def _decode(path: Path, flags: int) -> np.ndarray:
+    import cv2
+
+    try:
+        data = path.read_bytes()
+    except FileNotFoundError:
+        raise InputError(
+            f"image is missing: {path}", "record the frame again, or take it out of manifest.json"
+        ) from None
+    except OSError as error:
+        raise InputError(f"image cannot be read: {path} ({error.strerror})") from error
+    if data.startswith(_PNG_START) and not data.endswith(_PNG_END):
+        # The decoder would fill the lost rows with zeros and say nothing.
+        raise InputError(f"image is truncated: {path} ({len(data)} bytes, no end of PNG)", "copy the file again")
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data else None
+    if image is None:
+        raise InputError(f"image cannot be decoded: {path} ({len(data)} bytes)", "expected a PNG or JPEG file")
+    return image
+
+
+def read_rgb(path: Path) -> np.ndarray:
+    """Colour image (H, W, 3) uint8, RGB."""
+    import cv2
+
+    image = _decode(path, cv2.IMREAD_COLOR)
+    return np.ascontiguousarray(image[..., ::-1])
+
+
+def read_depth(path: Path, scale: float) -> np.ndarray:
+    """Depth image (H, W) float32 in metres, NaN where the file holds 0; `scale` is metres a unit."""
+    import cv2
+
+    image = _decode(path, cv2.IMREAD_UNCHANGED)
+    if image.ndim != 2 or image.dtype != np.uint16:
+        raise InputError(
+            f"depth image {path} has shape {image.shape} and type {image.dtype}, expected one channel of 16 bits"
+        )
+    return np.where(image > 0, image * np.float32(scale), np.float32(np.nan)).astype(np.float32)
+
+
+def read_labels(path: Path) -> np.ndarray:
+    """Label image (H, W) uint8 or uint16."""
+    import cv2
+
+    image = _decode(path, cv2.IMREAD_UNCHANGED)
+    if image.ndim != 2 or image.dtype not in (np.uint8, np.uint16):
+        raise InputError(f"label image {path} has shape {image.shape} and type {image.dtype}, expected one channel")
+    return image
+
+
+def write_image(path: Path, image: np.ndarray) -> None:
+    """Write a PNG: (H, W, 3) uint8 RGB, or (H, W) uint8 / uint16."""
+    import cv2
+
+    data = image[..., ::-1] if image.ndim == 3 else image
+    done, encoded = cv2.imencode(".png", np.ascontiguousarray(data), [cv2.IMWRITE_PNG_COMPRESSION, 3])
+    if not done:
+        raise InputError(f"image cannot be written: {path}, shape {image.shape}, type {image.dtype}")
+    path.write_bytes(encoded.tobytes())
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,3 +201,68 @@ class Frame:
     def points(self) -> np.ndarray:
         """(H, W, 3) float64 world points in metres, NaN where there is no reading."""
         return read_only(self.camera.unproject(self.depth))
+
+
+@dataclass(frozen=True, eq=False)
+class Clip:
+    """Frames from one pause to the next, and the workspace in which they are understood.
+
+    Parameters
+    ----------
+    frames : sequence of Frame
+        In time order, first and last at rest. A lazy sequence is kept as it is.
+    grid : VoxelGrid
+        The workspace.
+    index : int
+        Number of the pause that the clip ends at; 0 is the first.
+    times : tuple of float, optional
+        Seconds, one a frame.
+    previous : Clip, optional
+        The clip that ended at the previous pause; None at the first, or where the past is not known.
+    """
+
+    frames: Sequence[Frame]
+    grid: VoxelGrid
+    index: int = 0
+    times: tuple[float, ...] = ()
+    previous: Clip | None = None
+
+    def __post_init__(self) -> None:
+        if len(self.frames) == 0:
+            raise InputError(f"clip {self.index} has no frames")
+        if self.times and len(self.times) != len(self.frames):
+            raise InputError(f"clip {self.index} has {len(self.frames)} frames and {len(self.times)} times")
+        if self.previous is not None and self.previous.grid != self.grid:
+            raise InputError(f"clip {self.index} and the one before it have different grids")
+
+    @cached_property
+    def frames_key(self) -> bytes:
+        """Name by content of all frames and the grid. Looks at every image once."""
+        return content_key("frames", self.grid.key, *(frame.key for frame in self.frames))
+
+    @cached_property
+    def key(self) -> bytes:
+        """Name by content of this clip and everything before. Looks at every image once."""
+        chain: list[Clip] = []
+        clip: Clip | None = self
+        while clip is not None and "key" not in clip.__dict__:
+            chain.append(clip)
+            clip = clip.previous
+        key = b"" if clip is None else clip.key
+        for clip in reversed(chain):  # not by recursion: a recording may have a thousand pauses
+            key = content_key("clip", key, clip.frames_key)
+            clip.__dict__["key"] = key
+        return key
+
+    @property
+    def before(self) -> Frame:
+        """The frame at the previous pause."""
+        return self.frames[0]
+
+    @property
+    def after(self) -> Frame:
+        """The frame at this pause."""
+        return self.frames[-1]
+
+    def __len__(self) -> int:
+        return len(self.frames)

@@ -1,24 +1,43 @@
-"""Where every voxel of a grid lies in a depth image.
+"""Geometry of a depth image: voxels in the image, the support plane, the workspace.
 
->>> geometry = frame_geometry(frame, grid)
->>> geometry.known_free(0.005)        # voxels that the sensor looked through
+>>> frame_geometry(frame, grid).known_free(0.005)         # voxels observed as free
+>>> plane = fit_support_plane(frame)                      # if the camera pose is not known
+>>> camera = frame.camera.at(plane.T_world_camera)        # z up, table at z = 0
+>>> grid = workspace(frame_with_that_camera)              # voxels around the objects on the table
+>>> warn_if_workspace_is_empty(frames, grid, "recording table-7")
 
-Computed once a frame and shared by completion, free space and scoring.
+Disparity D = 8 f b / z is affine in pixel coordinates on a plane, and its noise is the same everywhere. The support
+plane is therefore a least-squares fit of D = a u + b v + c. Disparity is given in the units of a Kinect (f = 525
+pixels, b = 0.075 m, 1/8 pixel) for every image size, so that thresholds correspond to the same noise.
 """
 
 from __future__ import annotations
 
+import warnings
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.transform import RigidTransform
 
+from mstfilter.errors import InputError, InputWarning
 from mstfilter.scene.arrays import read_only
 from mstfilter.scene.cache import memo
 from mstfilter.scene.camera import Camera
 from mstfilter.scene.frame import Frame
 from mstfilter.scene.voxels import VoxelGrid
 
-__all__ = ["FrameGeometry", "frame_geometry"]
+__all__ = [
+    "BASELINE",
+    "FrameGeometry",
+    "SupportPlane",
+    "disparity",
+    "fit_support_plane",
+    "frame_geometry",
+    "table_residual",
+    "warn_if_workspace_is_empty",
+    "workspace",
+]
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,3 +95,209 @@ def _projected(camera: Camera, grid: VoxelGrid) -> tuple[np.ndarray, np.ndarray,
     pixel = np.full(grid.shape, -1, np.int32)
     pixel[inside] = (v[inside] * camera.width + u[inside]).astype(np.int32)
     return read_only(pixel), read_only(z.astype(np.float32)), read_only(z)
+
+
+BASELINE = 0.075  # metres between projector and camera of a Kinect v1; only sets the unit of disparity
+FOCAL = 525.0  # its focal length in pixels, likewise
+
+
+@dataclass(frozen=True, eq=False)
+class SupportPlane:
+    """A plane that carries the scene.
+
+    Parameters
+    ----------
+    T_world_camera : RigidTransform
+        Camera pose in the plane's world: z is the plane's normal, z = 0 the plane, the origin under the middle of
+        what is seen of it, y away from the camera.
+    coefficients : (3,)
+        a, b, c of D = a u + b v + c.
+    on_or_behind : (H, W) bool
+        Readings on the plane or behind it.
+    residual : (H, W) float32
+        Measured minus plane disparity, in 1/8 pixels; positive is in front of the plane (above it), NaN unknown.
+    inlier_share : float
+        Share of the readings that lie on the plane.
+    """
+
+    T_world_camera: RigidTransform
+    coefficients: np.ndarray
+    on_or_behind: np.ndarray
+    residual: np.ndarray
+    inlier_share: float
+
+
+def disparity(depth: np.ndarray) -> np.ndarray:
+    """Disparity (H, W) float64 in 1/8 pixel of a Kinect from depth in metres; NaN stays NaN."""
+    return 8.0 * FOCAL * BASELINE / np.asarray(depth, dtype=np.float64)
+
+
+def fit_support_plane(
+    frame: Frame, inlier: float = 1.5, tolerance: float = 2.0, n_trials: int = 400, min_share: float = 0.1
+) -> SupportPlane:
+    """Find the plane that most readings lie on.
+
+    Parameters
+    ----------
+    frame : Frame
+        Its pose, if it has one, is not used.
+    inlier : float
+        Largest residual of an inlier, in 1/8 pixels.
+    tolerance : float
+        Readings up to this much in front of the plane count as on it, in 1/8 pixels.
+    n_trials : int
+        Minimal sets drawn; the draw is seeded by a constant, so the same frame gives the same plane.
+    min_share : float
+        Fewer inliers than this share of the readings is an error.
+    """
+    key = (frame.key, inlier, tolerance, n_trials, min_share)
+    return memo("support_plane", key, lambda: _fit(frame, inlier, tolerance, n_trials, min_share))
+
+
+def _fit(frame: Frame, inlier: float, tolerance: float, n_trials: int, min_share: float) -> SupportPlane:
+    D = disparity(np.where(frame.valid, frame.depth, np.nan))
+    v, u = np.nonzero(np.isfinite(D))
+    if len(v) < 100:
+        raise InputError(
+            f"no support plane: the depth image has {len(v)} readings of {D.size} pixels",
+            "give a camera pose (T_world_camera), or check the depth image and its scale",
+        )
+    d = D[v, u]
+    design = np.stack([u, v, np.ones(len(u))], axis=1).astype(np.float64)
+
+    rng = np.random.default_rng(20210927)
+    few = rng.choice(len(d), size=min(len(d), 4000), replace=False)
+    triples = rng.integers(0, len(few), size=(n_trials, 3))
+    A = design[few][triples]
+    sound = np.abs(np.linalg.det(A)) > 3e-3 * D.size  # twice the area of the triangle in pixels
+    planes = np.linalg.solve(A[sound], d[few][triples[sound]][..., None])[..., 0]
+    if len(planes) == 0:
+        raise InputError("no support plane: all readings lie on one line of the image")
+    counts = (np.abs(design[few] @ planes.T - d[few][:, None]) < inlier).sum(axis=0)
+    plane = planes[counts.argmax()]
+    for _ in range(3):
+        close = np.abs(design @ plane - d) < inlier
+        plane = np.linalg.lstsq(design[close], d[close], rcond=None)[0]
+    close = np.abs(design @ plane - d) < inlier
+    share = float(close.mean())
+    if share < min_share:
+        raise InputError(
+            f"no support plane: the best plane holds {100 * share:.1f} % of the readings",
+            "give a camera pose (T_world_camera) if the table is not visible",
+        )
+    rows, columns = np.mgrid[: D.shape[0], : D.shape[1]]
+    residual = (D - (plane[0] * columns + plane[1] * rows + plane[2])).astype(np.float32)
+    with np.errstate(invalid="ignore"):
+        on_or_behind = residual < tolerance
+    pose = _pose(frame.camera, plane, np.stack([u, v], axis=1)[close])
+    return SupportPlane(pose, read_only(plane), read_only(on_or_behind), read_only(residual), share)
+
+
+def _pose(camera: Camera, plane: np.ndarray, pixels: np.ndarray) -> RigidTransform:
+    """World frame of a plane given by its disparity: camera pose with z up and the plane at z = 0."""
+    scale = 8.0 * FOCAL * BASELINE
+    # D = p . (u, v, 1) and (u, v, 1) = K X / z  =>  scale = p K X: the plane in camera axes.
+    normal = plane @ camera.K
+    offset = scale / np.linalg.norm(normal)
+    normal = normal / np.linalg.norm(normal)  # p K X > 0 in front: the normal points away from the camera
+    up = -normal
+    middle = np.linalg.inv(camera.K) @ np.append(np.median(pixels, axis=0), 1.0)
+    middle = middle * (offset / (normal @ middle))
+    away = np.array([0.0, 0.0, 1.0]) - up * up[2]
+    if np.linalg.norm(away) < 1e-6:  # looking straight down: the top of the image is "away"
+        away = np.array([0.0, -1.0, 0.0])
+    away /= np.linalg.norm(away)
+    R = np.stack([np.cross(away, up), away, up])
+    matrix = np.eye(4)
+    matrix[:3, :3] = R
+    matrix[:3, 3] = -R @ middle
+    return RigidTransform.from_matrix(matrix)
+
+
+def table_residual(frame: Frame) -> np.ndarray:
+    """(H, W) float32 measured minus table disparity in 1/8 pixels, for a camera whose world has the table at z = 0.
+
+    Positive is above the table; NaN without reading, or where the pixel's ray does not meet the table (there
+    nothing can lie on it, and the reading counts as above: +inf).
+    """
+
+    def compute() -> np.ndarray:
+        camera = frame.camera
+        direction = camera.rays() @ camera.pose.as_matrix()[2, :3]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            depth = -camera.position[2] / direction
+            table = np.where((direction < 0) & (depth > 0), disparity(depth), -np.inf)
+        residual = disparity(np.where(frame.valid, frame.depth, np.nan)) - table
+        return read_only(residual.astype(np.float32))
+
+    return memo("table_residual", frame.key, compute)
+
+
+def workspace(
+    frame: Frame, voxel_size: float = 0.01, shape: tuple[int, int, int] = (100, 100, 50), above: float = 0.01
+) -> VoxelGrid:
+    """A grid around what stands on the table.
+
+    Parameters
+    ----------
+    frame : Frame
+        With a pose whose world has the table at z = 0.
+    voxel_size : float
+        Metres.
+    shape : (3,) int
+        Voxels; the grid is centred on the readings that lie more than `above` metres above the table, or on the
+        table itself where there are none.
+    """
+    points = frame.points[frame.valid]
+    raised = points[(points[:, 2] > max(above, 4 * 0.00185)) & (points[:, 2] < shape[2] * voxel_size)]
+    chosen = raised if len(raised) >= 200 else points[np.abs(points[:, 2]) < above]
+    if len(chosen) == 0:
+        raise InputError(
+            "no workspace: no depth reading lies on or above the table",
+            "give the grid: VoxelGrid(origin, voxel_size, shape)",
+        )
+    low, high = np.percentile(chosen[:, :2], (2, 98), axis=0)
+    corner = np.round((low + high) / 2 / voxel_size) * voxel_size - np.array(shape[:2]) * voxel_size / 2
+    return VoxelGrid(np.append(corner, 0.0), voxel_size, shape)
+
+
+ABOVE = 0.01
+"""Metres above the table from which a reading may show an object."""
+FEW = 30
+"""Fewer readings than this show none: single ones occur by noise."""
+
+
+def warn_if_workspace_is_empty(frames: Iterable[Frame], grid: VoxelGrid, where: str) -> None:
+    """Warn where no frame has readings inside the grid and above the table.
+
+    Parameters
+    ----------
+    frames : iterable of Frame
+        With poses, at the pauses. Looked at until one has such readings.
+    grid : VoxelGrid
+        Workspace.
+    where : str
+        For the message.
+    """
+    spans = []
+    for frame in frames:
+        points = frame.points[frame.valid]
+        inside = points[grid.contains(grid.index_of(points))]
+        if (inside[:, 2] > ABOVE).sum() >= FEW:
+            return
+        if len(points):
+            spans.append(np.percentile(points, (2, 98), axis=0))
+    if not spans:
+        return
+    low, high = np.min(spans, axis=0)[0], np.max(spans, axis=0)[1]
+    seen = ", ".join(f"{axis} {a:.2f} to {b:.2f}" for axis, a, b in zip("xyz", low, high, strict=True))
+    held = ", ".join(f"{axis} {a:.2f} to {b:.2f}" for axis, a, b in zip("xyz", grid.origin, grid.upper, strict=True))
+    warnings.warn(
+        InputWarning(
+            f"the workspace of {where} holds nothing above the table, so no object can be found: it spans {held} m, "
+            f"depth readings span {seen} m",
+            "give a workspace around the objects, or none: it is then laid around what stands on the table",
+            "the world's z is up and the table at z = 0: is the pose right?",
+        ),
+        stacklevel=3,
+    )

@@ -33,13 +33,11 @@ from scipy.spatial.transform import RigidTransform
 from mstfilter.errors import InputError
 from mstfilter.scene.arrays import content_key
 from mstfilter.scene.camera import Camera, rigid_from_matrix
-from mstfilter.scene.clip import Clip
-from mstfilter.scene.frame import Frame
-from mstfilter.scene.missed import warn_if_missed
-from mstfilter.scene.support_plane import fit_support_plane, workspace
+from mstfilter.scene.frame import Clip, Frame
+from mstfilter.scene.geometry import fit_support_plane, warn_if_workspace_is_empty, workspace
 from mstfilter.scene.voxels import VoxelGrid, as_labels
 
-__all__ = ["LazyFrames", "Recording", "check_range", "find_world"]
+__all__ = ["LazyFrames", "Recording", "check_depth_range", "find_world"]
 
 _KEPT_FRAMES = 40
 
@@ -193,7 +191,7 @@ class Recording:
         frames = [Frame(rgb[i], depth[i], camera, masks[i]) for i in range(n)]
         stamps = tuple(float(t) for t in (times if times is not None else range(n)))
         if given:
-            warn_if_missed((frames[p] for p in chosen), grid, f"recording {name}")
+            warn_if_workspace_is_empty((frames[p] for p in chosen), grid, f"recording {name}")
         return cls(frames, grid, chosen, stamps, name)
 
     @cached_property
@@ -246,7 +244,7 @@ class Recording:
     def check(self) -> None:
         """Look at every image once, so that a broken one is known before a run begins; warn of a misplaced grid."""
         _ = self.key
-        warn_if_missed((self.frames[p] for p in self.pauses), self.grid, f"recording {self.name}")
+        warn_if_workspace_is_empty((self.frames[p] for p in self.pauses), self.grid, f"recording {self.name}")
 
 
 def _check_depth(depth: np.ndarray, name: str) -> None:
@@ -259,10 +257,10 @@ def _check_depth(depth: np.ndarray, name: str) -> None:
                 f"depth image of frame {index} of {name} has no reading at all",
                 "0 and NaN mean no reading; values are metres",
             )
-        check_range(image[good], f"depth image of frame {index} of {name}")
+        check_depth_range(image[good], f"depth image of frame {index} of {name}")
 
 
-def check_range(metres: np.ndarray, where: str) -> None:
+def check_depth_range(metres: np.ndarray, where: str) -> None:
     """Readings (n,) whose median cannot be metres of a table seen by a camera."""
     median = float(np.median(metres))
     if not 0.05 < median < 30:

@@ -1,7 +1,7 @@
-"""Quality of a segmentation: weighted coverage of regions by regions.
+"""Quality of a segmentation, trivial baselines, and the visibility of objects.
 
-For every region of one segmentation take the region of the other that overlaps it best (Jaccard index J),
-and average by size:
+Weighted coverage: for every region of one segmentation take the region of the other that overlaps it best (Jaccard
+index J), and average by size:
 
     side(A -> B) = sum_{a in A} size(a) max_{b in B} J(a, b)
 
@@ -9,18 +9,29 @@ Three forms, by name:
 
 ``objects`` (default)
     Objects only (label 0 is no region); ``q = (side(A->B) / V_A + side(B->A) / V_B) / 2`` with V the volume of
-    all objects of that segmentation. Symmetric; missing, invented, split and merged objects all cost.
+    all objects of that segmentation. Symmetric; missing, invented, split and merged objects all reduce it.
 ``paper``
     The published text taken literally (Price et al. 2021, section V): every label is a region, free space
-    too, and both sides are divided by the size of the grid. Nearly 1 for anything, as free space dominates.
+    too, and both sides are divided by the size of the grid. Nearly 1 for any input, because free space dominates.
 ``authors``
     The authors' program: objects only, but both sides are divided by the volume of the FIRST argument. Not
-    symmetric; it flatters a first argument that is too small.
+    symmetric; it is too high if the first argument is too small.
 
 >>> import numpy as np
 >>> a = np.array([1, 1, 2, 2, 0]); b = np.array([1, 1, 1, 1, 0])
 >>> weighted_coverage(a, b)
 0.5
+
+`one_blob` and `connected_components` are trivial baselines that are shown beside every quality. Both keep the
+occupied voxels of a hypothesis and change only which object they belong to. A filter that is not better than these
+has found occupied space, but not objects.
+
+>>> object_status(recording, 2)  # doctest: +SKIP
+{1: 'visible', 2: 'hidden', 3: 'unseen'}
+>>> split_truth(recording, 2)["hidden"]  # doctest: +SKIP
+
+Figures of quality are split by the status of objects: no method can know an object that it never saw, and hidden
+objects show what tracking contributes.
 """
 
 from __future__ import annotations
@@ -31,9 +42,24 @@ from typing import Literal, get_args
 import numpy as np
 
 from mstfilter.errors import InputError
-from mstfilter.scene import as_labels
+from mstfilter.scene import Recording, as_labels
 
-__all__ = ["FORMS", "Form", "Overlap", "overlap", "quality_of", "weighted_coverage"]
+__all__ = [
+    "FORMS",
+    "Form",
+    "MIN_PIXELS",
+    "Overlap",
+    "STATUSES",
+    "Status",
+    "connected_components",
+    "object_status",
+    "one_blob",
+    "overlap",
+    "quality_of",
+    "split_truth",
+    "weighted_coverage",
+]
+
 
 Form = Literal["objects", "paper", "authors"]
 FORMS: tuple[Form, ...] = get_args(Form)
@@ -128,3 +154,77 @@ def quality_of(table: Overlap, form: Form = "objects") -> float:
     if form == "authors":
         return float((side_a + side_b) / (2 * volume_a))
     return float((side_a / volume_a + side_b / volume_b) / 2)
+
+
+def one_blob(labels: np.ndarray) -> np.ndarray:
+    """All occupied voxels as one object, (X, Y, Z) uint16."""
+    return (labels > 0).astype(np.uint16)
+
+
+def connected_components(labels: np.ndarray) -> np.ndarray:
+    """Connected components of the occupied voxels (sharing a face), (X, Y, Z) int32."""
+    from scipy.ndimage import label
+
+    return label(labels > 0)[0]
+
+
+Status = Literal["visible", "hidden", "unseen"]
+STATUSES: tuple[Status, ...] = get_args(Status)
+
+MIN_PIXELS = 100  # of a 640 x 480 image: 2.3 cm^2 at 0.8 m
+
+
+def object_status(recording: Recording, t: int, min_pixels: float = MIN_PIXELS) -> dict[int, Status]:
+    """Status of every object that has true voxels at pause `t`, by its label, ascending.
+
+    *visible*: the instance image of the pause shows it; *hidden*: that of an earlier pause did; *unseen*: none
+    did. Frames between pauses do not count: hypotheses are made at pauses.
+
+    Parameters
+    ----------
+    recording : Recording
+        With true voxels and instance images at the pauses.
+    t : int
+        Number of the pause.
+    min_pixels : float
+        An object is shown by an image if so many pixels show it; of a 640 x 480 image, scales with its area.
+
+    Raises
+    ------
+    InputError
+        If the recording has no true voxels at pause `t`, or no instance image at a pause up to it.
+    """
+    if not 0 <= t < len(recording.pauses):
+        raise InputError(f"recording {recording.name} has no pause {t}, it has {len(recording.pauses)}")
+    labels = recording.truth(t)
+    if labels is None:
+        raise InputError(f"recording {recording.name} has no true voxels at pause {t}")
+    present = [int(k) for k in np.unique(labels) if k > 0]
+    visible = _shown(recording, t, min_pixels)
+    left = set(present) - visible
+    seen: set[int] = set()
+    for earlier in range(t - 1, -1, -1):
+        if not left - seen:
+            break
+        seen |= _shown(recording, earlier, min_pixels)
+    return {k: "visible" if k in visible else "hidden" if k in seen else "unseen" for k in present}
+
+
+def split_truth(recording: Recording, t: int, min_pixels: float = MIN_PIXELS) -> dict[Status, np.ndarray]:
+    """True labels (X, Y, Z) uint16 at pause `t` of the objects of each status alone; parameters as above."""
+    status = object_status(recording, t, min_pixels)
+    labels = recording.truth(t)
+    assert labels is not None
+    return {
+        wanted: np.where(np.isin(labels, [k for k, s in status.items() if s == wanted]), labels, 0).astype(np.uint16)
+        for wanted in STATUSES
+    }
+
+
+def _shown(recording: Recording, t: int, min_pixels: float) -> set[int]:
+    """Labels that the instance image of a pause shows in enough pixels."""
+    image = recording.instance(recording.pauses[t])
+    if image is None:
+        raise InputError(f"recording {recording.name} has no instance image at pause {t}")
+    counts = np.bincount(image.ravel())
+    return set(np.flatnonzero(counts >= max(1.0, min_pixels * image.size / 307200)).tolist())

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from mstfilter.scene import decode, encode
+from mstfilter.scene import decode_hypotheses, encode_hypotheses
 from mstfilter.smc import Codec
 
 __all__ = ["HypothesisCodec"]
@@ -23,8 +23,8 @@ class HypothesisCodec(Codec):
 
     def encode(self, particles: Any) -> Mapping[str, np.ndarray]:
         """Named arrays of a sequence of hypotheses."""
-        return encode(particles)
+        return encode_hypotheses(particles)
 
     def decode(self, arrays: Mapping[str, np.ndarray]) -> Any:
         """The hypotheses."""
-        return decode(dict(arrays))
+        return decode_hypotheses(dict(arrays))

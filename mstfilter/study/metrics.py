@@ -29,7 +29,7 @@ from mstfilter.scoring import (
     FORMS,
     STATUSES,
     Overlap,
-    components,
+    connected_components,
     object_status,
     one_blob,
     overlap,
@@ -107,7 +107,7 @@ def _figures(
         row[f"quality_{one}"] = mean([coverage_of(table, chosen) for table in tables])
         row[f"n_{one}"] = float(len(chosen)) if status else np.nan
     row["quality_one_blob"] = mean([weighted_coverage(one_blob(one), truth) for one in distinct])
-    row["quality_components"] = mean([weighted_coverage(components(one), truth) for one in distinct])
+    row["quality_components"] = mean([weighted_coverage(connected_components(one), truth) for one in distinct])
     row["occupancy"] = mean([occupancy_iou(table) for table in tables])
     row["object_f"] = mean([object_f(table) for table in tables])
     errors = [errors_of(table) for table in tables]

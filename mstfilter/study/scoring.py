@@ -22,7 +22,7 @@ import numpy as np
 
 from mstfilter.errors import InputError
 from mstfilter.scene import Camera, Recording, VoxelGrid, as_labels, render
-from mstfilter.scoring import FORMS, components, one_blob, weighted_coverage
+from mstfilter.scoring import FORMS, connected_components, one_blob, weighted_coverage
 from mstfilter.study.run_folder import RunFolder
 
 __all__ = ["Estimate", "Row", "Truth", "read_estimate", "read_truth", "score", "write_csv"]
@@ -202,7 +202,8 @@ def _score_pause(pause: int, estimate: Estimate, truth: Truth) -> list[Row]:
 
     found = [seen(labels) for labels in estimate.labels]
     floors = [
-        [seen(floor(labels).astype(np.uint16)) for labels in estimate.labels] for floor in (one_blob, components)
+        [seen(floor(labels).astype(np.uint16)) for labels in estimate.labels]
+        for floor in (one_blob, connected_components)
     ]
     w = np.asarray(estimate.weights, dtype=float)
     rows = []

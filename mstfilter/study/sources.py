@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from mstfilter.errors import InputError
-from mstfilter.formats import Format
+from mstfilter.formats import RecordingFormat
 from mstfilter.presets import REGISTRY, settings
 from mstfilter.scene import Recording
 
@@ -55,11 +55,11 @@ def open_source(
     return opened
 
 
-def _reader(name: str, allow_files: bool = False) -> type[Format]:
+def _reader(name: str, allow_files: bool = False) -> type[RecordingFormat]:
     """The class of a format."""
     cls = REGISTRY.find_class("format", name, "format", allow_files)
-    if not issubclass(cls, Format):
-        raise InputError(f"{name} is no reader of recordings", "subclass mstfilter.formats.interfaces.Format")
+    if not issubclass(cls, RecordingFormat):
+        raise InputError(f"{name} is no reader of recordings", "subclass mstfilter.formats.RecordingFormat")
     return cls
 
 

@@ -12,14 +12,11 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from mstfilter.errors import InputError, InputWarning
 from mstfilter.formats import open_recording
-from mstfilter.formats.bop import Bop
-from mstfilter.formats.dsr import Dsr
-from mstfilter.formats.lens import Lens
-from mstfilter.formats.pauses import Ends, Every
-from mstfilter.formats.redwood import Redwood
-from mstfilter.formats.tum import Tum
-from mstfilter.formats.video import World, pair_stamps
-from mstfilter.formats.writer import save
+from mstfilter.formats.datasets import Bop, Dsr
+from mstfilter.formats.folder import save_recording
+from mstfilter.formats.image_folders import Redwood, Tum
+from mstfilter.formats.pauses import Ends, EveryNth
+from mstfilter.formats.video import KnownWorld, Lens, pair_stamps
 from mstfilter.scene import Recording, write_image
 from tests.formats.layouts import (
     FPS,
@@ -35,7 +32,7 @@ from tests.formats.layouts import (
 )
 from tests.scene.scenes import CAMERA
 
-WORLD = World(tuple(CAMERA.pose.as_matrix().ravel()))
+WORLD = KnownWorld(tuple(CAMERA.pose.as_matrix().ravel()))
 
 
 def same_frames(recording, shifts, atol=2e-7):
@@ -49,7 +46,7 @@ def same_frames(recording, shifts, atol=2e-7):
 
 def same_on_disk(recording, path):
     """Converted, the recording is the same byte for byte."""
-    assert open_recording(save(recording, path)).key == recording.key
+    assert open_recording(save_recording(recording, path)).key == recording.key
     assert not list(path.parent.glob(".*"))
 
 
@@ -68,9 +65,9 @@ def test_the_pose_is_found_and_the_workspace_can_be_given(tmp_path):
     path = write_tum(tmp_path / "tum")
     found = Tum(K=K).open(path).frames[0].camera
     assert abs(found.position[2] - CAMERA.position[2]) < 3e-3
-    grid = Tum(K=K, world=World(workspace=(-0.3, -0.3, 0, 0.3, 0.3, 0.2), voxel_size=0.02)).open(path).grid
+    grid = Tum(K=K, world=KnownWorld(workspace=(-0.3, -0.3, 0, 0.3, 0.3, 0.2), voxel_size=0.02)).open(path).grid
     assert grid.shape == (30, 30, 10)
-    for wrong, message in ((World(workspace=(1.0, 2.0)), "6"), (World(T_world_camera=(1.0,)), "16")):
+    for wrong, message in ((KnownWorld(workspace=(1.0, 2.0)), "6"), (KnownWorld(T_world_camera=(1.0,)), "16")):
         with pytest.raises(InputError, match=message):
             Tum(K=K, world=wrong).open(path)
 
@@ -178,7 +175,7 @@ def test_dsr(tmp_path):
     on_box = heights > 0.04
     assert (truth[tuple(inside[on_box].T)] == 1).all()
     np.testing.assert_allclose(np.median(frame.points[..., 2]), 0.0, atol=1e-6)
-    again = open_recording(save(recording, tmp_path / "out"))
+    again = open_recording(save_recording(recording, tmp_path / "out"))
     np.testing.assert_allclose(again.frames[2].depth, recording.frames[2].depth, atol=5.1e-5)
     np.testing.assert_array_equal(again.truth(2), recording.truth(2))
 
@@ -354,7 +351,7 @@ def test_distorted_images_are_read_straight(tmp_path):
 
 def test_depth_beyond_the_file_is_no_reading(tmp_path):
     """A recording that cannot hold a value says "no reading", not the largest number it has."""
-    from mstfilter.formats.writer import RecordingWriter
+    from mstfilter.formats.folder import RecordingWriter
 
     _, depth, _ = video((0,))
     depth = depth[0].copy()
@@ -367,7 +364,7 @@ def test_depth_beyond_the_file_is_no_reading(tmp_path):
 
 def test_a_disk_that_is_full_at_the_end(tmp_path, monkeypatch):
     """The last files do not fit: nothing is left of those before."""
-    from mstfilter.formats.writer import RecordingWriter
+    from mstfilter.formats.folder import RecordingWriter
 
     def full(self, described):
         raise OSError(28, "No space left on device")
@@ -387,7 +384,7 @@ def test_two_camera_matrices_do_not_fit_into_one_folder(tmp_path):
     other = replace(recording.frames[1].camera, K=CAMERA.K * [[1.1], [1.1], [1.0]])
     mixed = replace(recording, frames=[recording.frames[0], replace(recording.frames[1], camera=other)])
     with pytest.raises(InputError, match="frame 1 .* camera matrix"):
-        save(mixed, tmp_path / "r")
+        save_recording(mixed, tmp_path / "r")
     assert list(tmp_path.iterdir()) == []
 
 
@@ -415,4 +412,4 @@ def test_a_part_of_a_video(tmp_path):
 
 def test_every_nth_image(tmp_path):
     path = write_redwood(tmp_path / "redwood")
-    assert Redwood(pauses=Every(8)).open(path).pauses == (0, 8, 16)
+    assert Redwood(pauses=EveryNth(8)).open(path).pauses == (0, 8, 16)

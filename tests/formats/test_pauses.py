@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from mstfilter.errors import InputError
-from mstfilter.formats.pauses import At, Ends, Every, Listed, pauses_from_text
-from mstfilter.formats.still import Still, grey_blocks
+from mstfilter.formats.pauses import At, Ends, EveryNth, Listed, Still, grey_blocks, pauses_from_text
 from tests.formats.layouts import PAUSES, video
 
 TIMES = tuple(10 + k / 10 for k in range(40))
@@ -24,7 +23,7 @@ def test_given_pauses(tmp_path):
     assert At(seconds=(0.0, 1.52, 3.9)).find(TIMES, none) == (0, 15, 39)
     assert Ends().find(TIMES, none) == (0, 39)
     assert Ends().find(TIMES[:1], none) == (0,)
-    assert Every(15).find(TIMES, none) == (0, 15, 30)
+    assert EveryNth(15).find(TIMES, none) == (0, 15, 30)
     file = tmp_path / "pauses.txt"
     file.write_text("# first the empty table\n0\n12, 20  # seconds too\n3.5s\n")
     assert Listed(str(file)).find(TIMES, none) == (0, 12, 20, 35)

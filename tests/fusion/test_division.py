@@ -8,7 +8,7 @@ import pytest
 from mstfilter.fusion.crossover import Crossover
 from mstfilter.fusion.division import NoDivision, PartRule, RigidMotions, part_like, take_apart
 from mstfilter.fusion.update import FusionUpdate
-from mstfilter.scene import Hypothesis, ObjectRecord, VoxelGrid, decode, encode
+from mstfilter.scene import Hypothesis, ObjectRecord, VoxelGrid, decode_hypotheses, encode_hypotheses
 from mstfilter.scoring import weighted_coverage
 from mstfilter.smc import Population
 from tests.tracking.scenes import standard
@@ -121,7 +121,7 @@ def test_without_memory_always_merging_does_make_one():
 
 def test_memory_survives_files():
     h = strangers(bars(1, 2, 3, 4), (1, 2), (1, 4))
-    (back,) = decode(encode([h]))
+    (back,) = decode_hypotheses(encode_hypotheses([h]))
     assert [r.apart for r in back.objects] == [r.apart for r in h.objects]
     assert ObjectRecord.born(1, 0).apart == frozenset()
 

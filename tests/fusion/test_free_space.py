@@ -8,7 +8,7 @@ from hypothesis import given, settings, strategies as st
 
 import mstfilter
 from mstfilter.errors import InputError
-from mstfilter.formats import save
+from mstfilter.formats import save_recording
 from mstfilter.fusion.free_space import FreeSpace, NoFreeSpace
 from mstfilter.scene import Camera, Clip, Frame, Hypothesis, Recording, look_at, render
 from mstfilter.scoring import weighted_coverage
@@ -190,7 +190,7 @@ def test_views_belong_to_the_content_of_a_frame_and_are_checked(tmp_path):
     with pytest.raises(InputError, match="views of its own"):
         frame_of(plain.depth, CAMERAS[0], views=(with_view,))
     with pytest.raises(InputError, match="images of 2 cameras"):
-        save(Recording((with_view,), SMALL, (0,), (0.0,)), tmp_path / "two")
+        save_recording(Recording((with_view,), SMALL, (0,), (0.0,)), tmp_path / "two")
     assert not list(tmp_path.iterdir())
     lost = frame_of(np.ones((9, 12), np.float32), Camera(CAMERAS[0].K, 12, 9))
     with pytest.raises(InputError, match="no pose"):

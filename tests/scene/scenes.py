@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from mstfilter.scene.camera import Camera, look_at
-from mstfilter.scene.depth_noise import depth_sigma
+from mstfilter.scene.frame import depth_sigma
 from mstfilter.scene.rendering import render
 from mstfilter.scene.voxels import VoxelGrid
 

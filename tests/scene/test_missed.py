@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from mstfilter.errors import InputWarning
-from mstfilter.formats import RecordingWriter, open_recording, save
+from mstfilter.formats import RecordingWriter, open_recording, save_recording
 from mstfilter.scene.recording import Recording
 from mstfilter.scene.voxels import VoxelGrid
 from tests.scene.scenes import CAMERA, GRID, table_scene
@@ -28,7 +28,7 @@ def test_a_misplaced_grid(grid, tmp_path):
         recording = arrays(grid)
     assert len(told) == 1
     assert "is the pose right" in told[0].message.hints[1]
-    for look in (recording.check, lambda: save(recording, tmp_path / "r")):
+    for look in (recording.check, lambda: save_recording(recording, tmp_path / "r")):
         with pytest.warns(InputWarning, match=r"spans x .* depth readings span x -"):
             look()
 

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from mstfilter.errors import InputError
-from mstfilter.formats import RecordingWriter, open_paired, open_recording, save
+from mstfilter.formats import PairedImages, RecordingWriter, open_recording, save_recording
 from mstfilter.scene.camera import Camera, look_at
+from mstfilter.scene.geometry import fit_support_plane, table_residual, workspace
 from mstfilter.scene.recording import Recording
-from mstfilter.scene.support_plane import fit_support_plane, table_residual, workspace
 from mstfilter.scene.voxels import VoxelGrid
 from tests.scene.scenes import CAMERA, GRID, table_scene
 
@@ -47,7 +47,7 @@ def test_round_trip(folder):
     assert (clip.index, clip.times) == (2, (0.4, 0.6, 0.8))
     assert clip.before.key == recording.clips()[1].after.key
     assert not list(folder.parent.glob(".*"))
-    again = save(recording, folder.parent / "again", generator="copy")
+    again = save_recording(recording, folder.parent / "again", generator="copy")
     assert open_recording(again).key == recording.key
 
 
@@ -60,7 +60,7 @@ def test_true_poses_come_back_and_broken_ones_are_one_clear_error(tmp_path):
             writer.add_frame(rgb, depth, index / 5, "static", poses={"3": pose} if index else None)
     for recording in (
         open_recording(tmp_path / "r"),
-        open_recording(save(open_recording(tmp_path / "r"), tmp_path / "s")),
+        open_recording(save_recording(open_recording(tmp_path / "r"), tmp_path / "s")),
     ):
         assert recording.poses(0) is None
         assert list(recording.poses(1)) == [3]
@@ -230,11 +230,11 @@ def test_paired_images(tmp_path, folder):
     K = CAMERA.K
     info = {"K": [K[0, 0], K[1, 1], K[0, 2], K[1, 2]], "depth_scale_m": 0.001}
     (tmp_path / "info.json").write_text(json.dumps(info))
-    pairs = open_paired(tmp_path, ["f2", "f0"])
+    pairs = PairedImages(("f2", "f0")).open(tmp_path)
     assert pairs.pauses == (0, 1)
     np.testing.assert_array_equal(pairs.frames[1].rgb, recording.frames[0].rgb)
     with pytest.raises(InputError, match="no frame 'f9'"):
-        open_paired(tmp_path, ["f9"])
+        PairedImages(("f9",)).open(tmp_path)
 
 
 def test_real_frames_find_their_table(shared_data):
@@ -244,7 +244,7 @@ def test_real_frames_find_their_table(shared_data):
     path = shared_data("real/osd_learn")
     scores = []
     for name in ("learn0", "learn9", "learn17", "learn25", "learn33", "learn41"):
-        recording = open_paired(path, [name])
+        recording = PairedImages((name,)).open(path)
         label = cv2.imread(str(path / f"{name}_label.png"), cv2.IMREAD_UNCHANGED)
         table = fit_support_plane(recording.frames[0]).on_or_behind & (label > 0)
         scores.append((table & (label == 1)).sum() / (table | (label == 1)).sum())
@@ -255,7 +255,7 @@ def test_grids_of_any_kind_are_kept(tmp_path):
     rgb, depth, _ = table_scene()
     grid = VoxelGrid((-0.2, -0.25, -0.01), 0.015, (30, 31, 17))
     recording = Recording.from_arrays(rgb, depth, CAMERA.K, T_world_camera=CAMERA.pose, grid=grid)
-    assert open_recording(save(recording, tmp_path / "r")).grid == grid
+    assert open_recording(save_recording(recording, tmp_path / "r")).grid == grid
 
 
 def test_a_moving_camera_keeps_its_poses(tmp_path):
@@ -277,7 +277,7 @@ def test_a_moving_camera_keeps_its_poses(tmp_path):
         - CAMERA.position,
         atol=1e-9,
     )
-    again = open_recording(save(recording, tmp_path / "again"))
+    again = open_recording(save_recording(recording, tmp_path / "again"))
     np.testing.assert_allclose([again.frames[k].camera.position for k in range(3)], positions, atol=1e-12)
 
 

@@ -11,8 +11,7 @@ from hypothesis.extra import numpy as hnp
 from scipy.spatial.transform import RigidTransform
 
 from mstfilter.errors import InputError
-from mstfilter.scene.storage import load_hypotheses, save_hypotheses
-from mstfilter.scene.voxels import Crop, Hypothesis, ObjectRecord, VoxelGrid
+from mstfilter.scene.voxels import Crop, Hypothesis, ObjectRecord, VoxelGrid, load_hypotheses, save_hypotheses
 
 GRID = VoxelGrid((-0.3, -0.3, -0.05), 0.01, (6, 5, 4))
 

@@ -9,7 +9,7 @@ import pytest
 
 from mstfilter.errors import InputError
 from mstfilter.scene import Recording
-from mstfilter.scoring.status import STATUSES, object_status, split_truth
+from mstfilter.scoring.quality import STATUSES, object_status, split_truth
 from tests.scene.scenes import CAMERA, GRID, table_scene
 
 SHAPE = (120, 160)  # 1/16 of 640 x 480: 100 pixels there are 6.25 here

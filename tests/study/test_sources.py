@@ -85,10 +85,10 @@ def test_a_reader_of_ones_own(tmp_path):
     (tmp_path / "mine.py").write_text(
         "from dataclasses import dataclass\n"
         "import numpy as np\n"
-        "from mstfilter.formats.interfaces import Format\n"
+        "from mstfilter.formats import RecordingFormat\n"
         "from mstfilter.scene.recording import Recording\n"
         "@dataclass(frozen=True)\n"
-        "class Mine(Format):\n"
+        "class Mine(RecordingFormat):\n"
         "    '''Arrays in one file.'''\n"
         "    f: float = 1.0\n"
         "    @classmethod\n"

@@ -1,0 +1,328 @@
+"""Folders of colour and depth images: pairs of images, Redwood / Open3D, TUM RGB-D.
+
+>>> PairedImages(frames=("learn2", "learn3", "learn4")).open(Path("frames"))
+>>> Redwood().open(Path("bedroom"))
+>>> Tum(K=(525.0, 525.0, 319.5, 239.5)).open(Path("rgbd_dataset"))
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from mstfilter.errors import InputError
+from mstfilter.formats.pauses import PauseRule, Still
+from mstfilter.formats.video import KnownWorld, RecordingFormat, RgbdImages, Video, pair_stamps
+from mstfilter.scene import Recording, read_depth, read_rgb, rigid_from_matrix
+
+__all__ = ["PairedImages", "Redwood", "Tum"]
+
+
+@dataclass(frozen=True)
+class PairedImages(RecordingFormat):
+    """A folder of pairs NAME_rgb.png, NAME_depth.png with an info.json; every frame is a pause.
+
+    Parameters
+    ----------
+    frames : tuple of str or int
+        Names of frames in order. Default: all, sorted by name.
+    """
+
+    frames: tuple[str | int, ...] = ()
+
+    @classmethod
+    def detects(cls, path: Path) -> bool:
+        """See `RecordingFormat`."""
+        return (path / "info.json").is_file() and any(path.glob("*_rgb.png"))
+
+    def open(self, path: Path) -> Recording:
+        """See `RecordingFormat`."""
+        try:
+            info = json.loads((path / "info.json").read_text())
+            K = np.asarray(info["K"], dtype=float)
+            scale = float(info["depth_scale_m"])
+        except FileNotFoundError:
+            raise InputError(f"{path / 'info.json'} is missing", "it holds K and depth_scale_m") from None
+        except (json.JSONDecodeError, KeyError, TypeError, ValueError) as error:
+            raise InputError(f"{path / 'info.json'} does not give K and depth_scale_m: {error!r}") from error
+        if K.shape == (4,):
+            K = np.array([[K[0], 0, K[2]], [0, K[1], K[3]], [0, 0, 1]])
+        present = sorted(p.name.removesuffix("_rgb.png") for p in path.glob("*_rgb.png"))
+        chosen = [str(name) for name in self.frames] or present
+        missing = [name for name in chosen if name not in present]
+        if missing:
+            raise InputError(
+                f"no frame {missing[0]!r} in {path}", f"there are {len(present)}: {', '.join(present[:8])}, ..."
+            )
+        rgb = [read_rgb(path / f"{name}_rgb.png") for name in chosen]
+        depth = [read_depth(path / f"{name}_depth.png", scale) for name in chosen]
+        for name, image in zip(chosen, rgb, strict=True):
+            if image.shape != rgb[0].shape:
+                raise InputError(f"frame {name} of {path} has shape {image.shape}, the first has {rgb[0].shape}")
+        label = chosen[0] if len(chosen) == 1 else f"{chosen[0]}-{chosen[-1]}"
+        return Recording.from_arrays(np.stack(rgb), np.stack(depth), K, pauses=range(len(chosen)), name=label)
+
+
+_COLOUR, _SUFFIXES = ("color", "image", "rgb", "colour"), (".png", ".jpg", ".jpeg")
+_INTRINSICS = ("intrinsic.json", "camera_intrinsic.json", "intrinsics.json")
+
+
+@dataclass(frozen=True)
+class Redwood(RecordingFormat):
+    """Redwood / Open3D: color/, depth/, intrinsic.json, and a trajectory .log where the camera moves.
+
+    Parameters
+    ----------
+    K : tuple of 4 float
+        fx, fy, cx, cy in pixels. Default: from intrinsic.json.
+    distortion : tuple of float
+        OpenCV's k1, k2, p1, p2, k3.
+    depth_scale : float
+        Metres a unit.
+    fps : float
+        The layout has no times: frame k is at k / fps seconds.
+    moving : bool
+        Use the trajectory where there is one.
+    start_s, stop_s : float
+        Part of the video that is used, in seconds after its first frame.
+    pauses : PauseRule
+        Where the video is cut.
+    world : KnownWorld
+        Pose and workspace, where known.
+    """
+
+    K: tuple[float, ...] = ()
+    distortion: tuple[float, ...] = ()
+    depth_scale: float = 0.001
+    fps: float = 30.0
+    moving: bool = True
+    start_s: float = 0.0
+    stop_s: float = math.inf
+    pauses: PauseRule = field(default_factory=Still)
+    world: KnownWorld = field(default_factory=KnownWorld)
+
+    @classmethod
+    def detects(cls, path: Path) -> bool:
+        """See `RecordingFormat`."""
+        known = any((path / name).is_file() for name in _INTRINSICS) or any(path.glob("*.log"))
+        folders = _COLOUR if known else _COLOUR[:2]  # rgb/ and depth/ alone may be anything
+        return (path / "depth").is_dir() and any((path / name).is_dir() for name in folders)
+
+    def open(self, path: Path) -> Recording:
+        """See `RecordingFormat`."""
+        folder = next((path / name for name in _COLOUR if (path / name).is_dir()), path / _COLOUR[0])
+        colour, depth = _numbered(folder), _numbered(path / "depth")
+        if len(colour) != len(depth):
+            raise InputError(
+                f"{path}: there are {len(colour)} colour images and {len(depth)} depth images",
+                f"each frame needs both; {folder.name}/ ends with {colour[-1].name}, depth/ with {depth[-1].name}",
+            )
+        for a, b in zip(colour, depth, strict=True):
+            if _number(a) != _number(b):
+                raise InputError(
+                    f"{path}: colour image {a.name} would be paired with depth image {b.name}",
+                    "an image is missing, or the two are numbered differently; rename one side to match",
+                )
+
+        def read(index: int) -> RgbdImages:
+            names = f"colour image {colour[index]}", f"depth image {depth[index]}"
+            return RgbdImages(read_rgb(colour[index]), read_depth(depth[index], self.depth_scale), *names)
+
+        logs = sorted(path.glob("*.log")) if self.moving else []
+        if len(logs) > 1:
+            raise InputError(f"{path} holds {len(logs)} trajectories: {', '.join(p.name for p in logs)}", "keep one")
+        return (
+            Video(
+                path.resolve().name,
+                tuple(k / self.fps for k in range(len(colour))),
+                read,
+                self.K or _intrinsics(path),
+                path,
+                self.depth_scale,
+                read_rgb=lambda index: read_rgb(colour[index]),
+                motion=_trajectory(logs[0], len(colour)) if logs else None,
+                distortion=self.distortion,
+            )
+            .part(self.start_s, self.stop_s)
+            .recording(self.pauses, self.world)
+        )
+
+
+def _numbered(folder: Path) -> list[Path]:
+    """Images of a folder in the order of the first number in their names."""
+    if not folder.is_dir():
+        raise InputError(f"not a Redwood folder: {folder} is missing", "it holds color/ and depth/")
+    files = [p for p in folder.iterdir() if p.suffix.lower() in _SUFFIXES and not p.name.startswith(".")]
+    if not files:
+        raise InputError(f"{folder} holds no image", f"expected {', '.join(_SUFFIXES)}")
+
+    return sorted(files, key=lambda file: (_number(file), file.name))
+
+
+def _number(file: Path) -> int:
+    """The first number in the name; -1 without any."""
+    found = re.search(r"\d+", file.stem)
+    return int(found.group()) if found else -1
+
+
+def _intrinsics(path: Path) -> tuple[float, ...]:
+    """fx, fy, cx, cy from Open3D's file."""
+    file = next((path / name for name in _INTRINSICS if (path / name).is_file()), None)
+    if file is None:
+        raise InputError(
+            f"{path}: intrinsics are missing, there is no {_INTRINSICS[0]}",
+            "give them: K=fx,fy,cx,cy (Redwood's own default is 525,525,319.5,239.5)",
+        )
+    try:
+        matrix = np.reshape(np.asarray(json.loads(file.read_text())["intrinsic_matrix"], dtype=float), (3, 3)).T
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError(f"{file} does not hold Open3D's intrinsic_matrix: {error!r}") from error
+    if not np.allclose(matrix[2], (0, 0, 1)):
+        raise InputError(
+            f"{file}: intrinsic_matrix is {matrix.T.ravel().tolist()}, expected 9 numbers column by column",
+            "fx 0 0 0 fy 0 cx cy 1",
+        )
+    return float(matrix[0, 0]), float(matrix[1, 1]), float(matrix[0, 2]), float(matrix[1, 2])
+
+
+def _trajectory(path: Path, n: int) -> list[RigidTransform]:
+    """Camera-to-world poses of a .log file, one a frame."""
+    try:
+        rows = [[float(v) for v in line.split()] for line in path.read_text().splitlines() if line.strip()]
+    except (OSError, ValueError) as error:
+        raise InputError(f"trajectory cannot be read: {path} ({error})", "or leave it out: moving=false") from error
+    if len(rows) != 5 * n or any(len(row) != (3 if k % 5 == 0 else 4) for k, row in enumerate(rows)):
+        raise InputError(
+            f"trajectory {path} has {len(rows)} lines for {n} frames, expected five a frame: 3 numbers, then 4 x 4",
+            "or leave it out: moving=false",
+        )
+    return [rigid_from_matrix(np.array(rows[5 * k + 1 : 5 * k + 5]), f"{path}: pose of frame {k}") for k in range(n)]
+
+
+@dataclass(frozen=True)
+class Tum(RecordingFormat):
+    """TUM RGB-D: rgb.txt, depth.txt, groundtruth.txt where the camera moves; K has to be given.
+
+    Parameters
+    ----------
+    K : tuple of 4 float
+        fx, fy, cx, cy in pixels.
+    distortion : tuple of float
+        OpenCV's k1, k2, p1, p2, k3.
+    depth_scale : float
+        Metres a unit.
+    tolerance_s : float
+        A colour and a depth image at most this far apart are one frame.
+    moving : bool
+        Use groundtruth.txt where it is present.
+    start_s, stop_s : float
+        Part of the video that is used, in seconds after its first frame.
+    pauses : PauseRule
+        Where the video is cut.
+    world : KnownWorld
+        Pose and workspace, where known.
+    """
+
+    K: tuple[float, ...] = ()
+    distortion: tuple[float, ...] = ()
+    depth_scale: float = 0.0002
+    tolerance_s: float = 0.02
+    moving: bool = True
+    start_s: float = 0.0
+    stop_s: float = math.inf
+    pauses: PauseRule = field(default_factory=Still)
+    world: KnownWorld = field(default_factory=KnownWorld)
+
+    @classmethod
+    def detects(cls, path: Path) -> bool:
+        """See `RecordingFormat`."""
+        return (path / "rgb.txt").is_file() and (path / "depth.txt").is_file()
+
+    def open(self, path: Path) -> Recording:
+        """See `RecordingFormat`."""
+        colour, depth = (_table(path / name, 2) for name in ("rgb.txt", "depth.txt"))
+        if not self.K:
+            raise InputError(
+                f"{path}: intrinsics are missing, TUM folders hold none",
+                "give them: K=fx,fy,cx,cy (TUM's own default is 525,525,319.5,239.5)",
+            )
+        stamps = [[float(row[0]) for row in table] for table in (colour, depth)]
+        pairs = pair_stamps(stamps[0], stamps[1], self.tolerance_s, str(path))
+
+        def read(index: int) -> RgbdImages:
+            names = [path / table[k][1] for table, k in zip((colour, depth), pairs[index], strict=True)]
+            return RgbdImages(
+                read_rgb(names[0]),
+                read_depth(names[1], self.depth_scale),
+                f"colour image {names[0]}",
+                f"depth image {names[1]}",
+            )
+
+        times = tuple(stamps[0][i] for i, _ in pairs)
+        truth = path / "groundtruth.txt"
+        return (
+            Video(
+                path.resolve().name,
+                times,
+                read,
+                self.K,
+                path,
+                self.depth_scale,
+                read_rgb=lambda index: read_rgb(path / colour[pairs[index][0]][1]),
+                motion=_motion(truth, times) if self.moving and truth.is_file() else None,
+                distortion=self.distortion,
+            )
+            .part(self.start_s, self.stop_s)
+            .recording(self.pauses, self.world)
+        )
+
+
+def _table(path: Path, columns: int) -> list[list[str]]:
+    """Rows of a text file, comments left out."""
+    try:
+        lines = path.read_text().splitlines()
+    except FileNotFoundError:
+        raise InputError(f"not a TUM folder: {path} is missing", "it holds rgb.txt and depth.txt") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path} cannot be read: {error}") from error
+    rows = []
+    for number, line in enumerate(lines, 1):
+        words = line.partition("#")[0].replace(",", " ").split()
+        if not words:
+            continue
+        try:
+            float(words[0])
+        except ValueError:
+            words = []
+        if len(words) < columns:
+            raise InputError(
+                f"{path}, line {number}: found {line[:60]!r}, expected {columns} columns, time stamp first"
+            )
+        rows.append(words)
+    return rows
+
+
+def _motion(path: Path, times: tuple[float, ...]) -> list[RigidTransform]:
+    """Camera poses at given times, from the nearest line."""
+    try:
+        rows = np.array([[float(v) for v in row[:8]] for row in _table(path, 8)])
+        if not np.isfinite(rows).all():
+            raise ValueError("a value is not finite")
+        stamps = rows[:, 0]
+        poses = RigidTransform.from_components(rows[:, 1:4], Rotation.from_quat(rows[:, 4:8]))
+    except (ValueError, IndexError) as error:
+        raise InputError(f"{path} does not hold poses: {error}", "or leave it out: moving=false") from error
+    nearest = [int(np.abs(stamps - t).argmin()) for t in times]
+    apart = max(abs(stamps[k] - t) for k, t in zip(nearest, times, strict=True))
+    if apart > 0.1:
+        raise InputError(
+            f"{path}: the nearest pose is {apart:.2f} s from an image, expected at most 0.1 s",
+            "is it of another recording? leave it out: moving=false",
+        )
+    return [poses[k] for k in nearest]
