@@ -60,9 +60,9 @@ class Recorded(RandomOrder):
 
     seen: list = field(default_factory=list)
 
-    def draw(self, rng, component, neighbours):
+    def draw(self, rng, graph, component):
         """Draw."""
-        self.seen.append(super().draw(rng, component, neighbours))
+        self.seen.append(super().draw(rng, graph, component))
         return self.seen[-1]
 
 

@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import networkx as nx
 import numpy as np
 from canvas import INK, MUTED, page, save, show, voxels, write_csv
 from matplotlib.axes import Axes
@@ -19,8 +20,8 @@ from mstfilter.fusion import (
     PREDICTED,
     PROPOSED,
     ConflictGraph,
+    ConflictResolution,
     Crossover,
-    Draw,
     OneSideLast,
     RandomOrder,
     SpanningTree,
@@ -45,9 +46,7 @@ class Replay(Structure):
 
     drawn: dict[int, tuple[list[int], Edges]]
 
-    def draw(
-        self, rng: np.random.Generator, component: Sequence[int], neighbours: Sequence[Sequence[int]]
-    ) -> tuple[list[int], Edges]:
+    def draw(self, rng: np.random.Generator, graph: nx.Graph, component: Sequence[int]) -> tuple[list[int], Edges]:
         """What was drawn."""
         return self.drawn[component[0]]
 
@@ -67,12 +66,12 @@ def picture(particles: Particles, path: Path, smoke: bool) -> Path:
     crossover: Crossover = REGISTRY.build("crossover", load_config("paper")["update"]["crossover"])
     graph = conflict_graph(sample.labels, prediction.labels)
     rng = np.random.default_rng(SEED)
-    neighbours = graph.neighbours()
-    drawn = {c[0]: crossover.structure.draw(rng, c, neighbours) for c in graph.components()}
+    links = graph.networkx()
+    drawn = {c[0]: crossover.structure.draw(rng, links, c) for c in graph.components()}
     fixed = replace(crossover, structure=Replay(drawn))
-    first = second = fixed.draw(rng, graph)
+    first = second = fixed.resolve(rng, graph)
     while np.array_equal(first.group, second.group):  # many merges are certain or out of the question
-        second = fixed.draw(rng, graph)
+        second = fixed.resolve(rng, graph)
 
     colours, places = colours_of(graph), layout(graph)
     size = (240, 180) if smoke else (600, 450)
@@ -120,14 +119,14 @@ def colours_of(graph: ConflictGraph) -> list[Colour]:
 def layout(graph: ConflictGraph) -> np.ndarray:
     """(n, 2) places: sample above, prediction below, components side by side, few crossings."""
     places, left = np.zeros((len(graph), 2)), 0.0
-    neighbours = graph.neighbours()
+    neighbours = graph.networkx().adj
     for component in graph.components():
         rows = {y: [v for v in component if graph.side[v] == side] for y, side in ((1.0, PROPOSED), (0.0, PREDICTED))}
         width = max(len(row) for row in rows.values())
         for turn in range(16):
             y, row = list(rows.items())[turn % 2]
             if turn:  # each vertex near the mean of its neighbours
-                row.sort(key=lambda v: float(np.mean(places[neighbours[v], 0])))
+                row.sort(key=lambda v: float(np.mean(places[list(neighbours[v]), 0])))
             for k, v in enumerate(row):
                 places[v] = left + (k + 0.5) * width / len(row), y
         left += width + 0.6
@@ -140,7 +139,7 @@ def draw_graph(
     places: np.ndarray,
     colours: Sequence[Colour],
     directed: Edges = (),
-    draw: Draw | None = None,
+    draw: ConflictResolution | None = None,
 ) -> None:
     """The conflict graph; with a draw, arrows run from the one painted first, and merged conflicts are bold."""
     conflicts = directed or [(a, b) for a, b in graph.edges.tolist()]
@@ -236,9 +235,9 @@ def edges_of(structure: Structure, graphs: Sequence[ConflictGraph], rounds: int)
     """Directed edges (m, 2) that a structure draws: graph by graph, so many times."""
     rng, found = np.random.default_rng(SEED), []
     for k, graph in enumerate(graphs):
-        neighbours = graph.neighbours()
+        links = graph.networkx()
         for _ in range(rounds):
-            edges = [e for c in graph.components() for e in structure.draw(rng, c, neighbours)[1]]
+            edges = [e for c in graph.components() for e in structure.draw(rng, links, c)[1]]
             found.append((k, np.array(edges).reshape(-1, 2)))
     return found
 

@@ -15,7 +15,7 @@ from typing import ClassVar
 import numpy as np
 
 from mstfilter.errors import InputError
-from mstfilter.fusion import SMALLEST_QUALITY, FreeSpace, FusionUpdate, Projection
+from mstfilter.fusion import FreeSpace, FusionUpdate, Projection, log_quality
 from mstfilter.scene import Clip
 from mstfilter.smc import Population, Update, union
 
@@ -102,9 +102,9 @@ class Union(Update):
         if predicted is None or proposed is None:
             return self.fusion.update(rng, predicted, proposed, observation)
         refined, quality = self.fusion.free_space.refine(predicted.particles, observation)
-        refined = self.fusion.parted(refined, observation, proposed=False)
-        samples = self.fusion.parted(tuple(proposed.particles), observation, proposed=True)
-        log_q = self.fusion.quality_exponent * np.log(np.maximum(quality, SMALLEST_QUALITY))
+        refined = self.fusion.divided(refined, observation, proposed=False)
+        samples = self.fusion.divided(tuple(proposed.particles), observation, proposed=True)
+        log_q = self.fusion.quality_exponent * log_quality(quality)
         weighed = predicted.log_weights - predicted.log_mean_weight + log_q
         both = union(
             Population(refined, weighed, predicted.parents),

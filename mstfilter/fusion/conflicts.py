@@ -1,36 +1,68 @@
-"""Which objects of two hypotheses claim the same voxels (paper, section IV-D, figure 5).
+"""The conflict graph of two hypotheses, and the random choices that resolve it (paper, section IV-D, figure 5).
 
 >>> graph = conflict_graph(proposed.labels, predicted.labels)
 >>> graph.edges, graph.components()
+>>> networkx.draw(graph.networkx(), with_labels=True)
 
-A vertex is an object of one of the two hypotheses, an edge says that a proposed and a predicted object overlap.
-The graph is bipartite: objects of one hypothesis never overlap.
+A vertex is an object of one of the two hypotheses; an edge joins a proposed and a predicted object that overlap. The
+graph is bipartite, because objects of one hypothesis never overlap.
+
+For each connected component a `Structure` draws a painting order and directed edges child -> parent.
+`merge_probability` is the probability that a child with n1 voxels is merged into its parent with n2 voxels, if they
+have I voxels in common:
+
+=============  =============================  ========================================================
+rule           probability                    source
+=============  =============================  ========================================================
+``share``      min(1, I n2 / n1^2)            the authors' program: (covered share of the child) x (size
+                                              ratio); about even odds on real conflicts
+``printed``    min(1, IoU n2 / n1^2)          the formula as printed (paper, section IV-D); its dimension
+                                              is 1 / voxels, so it practically never merges
+``iou``        IoU                            a plain alternative
+``match``      1 if IoU > 1/2, else 0         an object has at most one such overlap: both hypotheses
+                                              contain the same object
+``covered``    1 if I / n1 >= 3/4, else 0     the rest of the child would be a sliver
+``always``     1                              a control
+``never``      0                              a control
+=============  =============================  ========================================================
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Literal, NamedTuple, get_args
 
 import networkx as nx
 import numpy as np
 
 from mstfilter.errors import InputError
+from mstfilter.fusion.interfaces import Structure
 from mstfilter.scene import MAX_LABEL, as_labels
 
 __all__ = [
+    "MERGE_RULES",
     "PREDICTED",
     "PROPOSED",
-    "Claimed",
+    "ClaimedVoxels",
     "ConflictGraph",
-    "claimed",
+    "MergeRule",
+    "OneSideLast",
+    "RandomOrder",
+    "SpanningTree",
+    "claimed_voxels",
+    "components_in_conflict",
     "conflict_graph",
     "graph_of",
-    "overlapping",
+    "merge_probability",
+    "overlapping_pairs",
+    "random_spanning_tree",
 ]
 
 PROPOSED, PREDICTED = 0, 1
+MergeRule = Literal["share", "printed", "iou", "match", "covered", "always", "never"]
+MERGE_RULES: tuple[MergeRule, ...] = get_args(MergeRule)
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,15 +76,15 @@ class ConflictGraph:
     label : (n,) int
         Label of the object in its hypothesis.
     size : (n,) int
-        Its voxels.
+        Voxels of the object.
     edges : (m, 2) int
         Vertex numbers of overlapping pairs.
     intersection : (m,) int
-        Voxels that both claim.
+        Voxels that both objects claim.
 
     Notes
     -----
-    Vertices are numbered at their first voxel in a scan with x fastest, the proposed object first where both
+    Vertices are numbered by their first voxel in a scan with x fastest, the proposed object first if two objects
     begin at the same voxel: the authors' numbering.
     """
 
@@ -65,31 +97,35 @@ class ConflictGraph:
     def __len__(self) -> int:
         return len(self.label)
 
-    def components(self) -> list[list[int]]:
-        """Connected components with at least one edge, as ascending vertex numbers."""
-        conflicted = [sorted(c) for c in nx.connected_components(self.networkx()) if len(c) > 1]
-        return sorted(conflicted)
-
     def networkx(self) -> nx.Graph:
-        """The graph in networkx: vertices carry side, label and size, edges the intersection in voxels."""
+        """The graph in networkx.
+
+        Vertices carry ``side``, ``label`` and ``size``, edges carry ``intersection``, in voxels. Neighbours ascend.
+        """
         graph = nx.Graph()
-        for v in range(len(self)):
-            graph.add_node(v, side=int(self.side[v]), label=int(self.label[v]), size=int(self.size[v]))
-        for (a, b), count in zip(self.edges.tolist(), self.intersection.tolist(), strict=True):
-            graph.add_edge(a, b, intersection=count)
+        for v, (side, label, size) in enumerate(
+            zip(self.side.tolist(), self.label.tolist(), self.size.tolist(), strict=True)
+        ):
+            graph.add_node(v, side=side, label=label, size=size)
+        for (a, b), common in sorted(zip(map(tuple, self.edges.tolist()), self.intersection.tolist(), strict=True)):
+            graph.add_edge(a, b, intersection=common)
         return graph
 
-    def neighbours(self) -> list[list[int]]:
-        """Adjacent vertices of each vertex, ascending."""
-        adjacent: list[list[int]] = [[] for _ in range(len(self))]
-        for a, b in self.edges.tolist():
-            adjacent[a].append(b)
-            adjacent[b].append(a)
-        return [sorted(a) for a in adjacent]
+    def components(self) -> list[list[int]]:
+        """Connected components with at least one edge, as ascending vertex numbers."""
+        return components_in_conflict(self.networkx())
 
 
-class Claimed(NamedTuple):
-    """The voxels that a proposed or a predicted hypothesis fills: a few percent of a grid, all that fusion looks at.
+def components_in_conflict(graph: nx.Graph) -> list[list[int]]:
+    """Connected components of a graph with at least one edge, as ascending vertices."""
+    return sorted(sorted(c) for c in nx.connected_components(graph) if len(c) > 1)
+
+
+# The graph of two label grids ---------------------------------------------------------------------------------------
+
+
+class ClaimedVoxels(NamedTuple):
+    """The occupied voxels of a proposed or a predicted hypothesis: a few percent of a grid.
 
     at : (n,) flat indices; proposed, predicted : (n,) uint16 labels there, 0 free; shape : of the grid.
     """
@@ -100,14 +136,14 @@ class Claimed(NamedTuple):
     shape: tuple[int, ...]
 
     def spread(self, values: np.ndarray) -> np.ndarray:
-        """A grid with these values (n,) in its claimed voxels and 0 elsewhere."""
-        grid = np.zeros(self.shape, values.dtype)
-        grid.reshape(-1)[self.at] = values
-        return grid
+        """Values (n,) in the shape of the grid, 0 elsewhere."""
+        out = np.zeros(self.shape, values.dtype)
+        out.reshape(-1)[self.at] = values
+        return out
 
 
-def claimed(proposed: np.ndarray, predicted: np.ndarray) -> Claimed:
-    """The voxels (X, Y, Z) that either label grid fills."""
+def claimed_voxels(proposed: np.ndarray, predicted: np.ndarray) -> ClaimedVoxels:
+    """The voxels that either of two label grids (X, Y, Z) occupies."""
     a, b = as_labels(proposed, "proposed label grid"), as_labels(predicted, "predicted label grid")
     if a.shape != b.shape:
         raise InputError(
@@ -115,15 +151,15 @@ def claimed(proposed: np.ndarray, predicted: np.ndarray) -> Claimed:
             "all hypotheses of a run share one workspace",
         )
     at = np.flatnonzero((a | b) != 0)
-    return Claimed(at, a.reshape(-1)[at], b.reshape(-1)[at], a.shape)
+    return ClaimedVoxels(at, a.reshape(-1)[at], b.reshape(-1)[at], a.shape)
 
 
 def conflict_graph(proposed: np.ndarray, predicted: np.ndarray) -> ConflictGraph:
     """The conflict graph of two label grids (X, Y, Z) of the same shape."""
-    return graph_of(claimed(proposed, predicted))
+    return graph_of(claimed_voxels(proposed, predicted))
 
 
-def graph_of(voxels: Claimed) -> ConflictGraph:
+def graph_of(voxels: ClaimedVoxels) -> ConflictGraph:
     """The conflict graph of two hypotheses, from the voxels that they claim."""
     position = np.ravel_multi_index(np.unravel_index(voxels.at, voxels.shape), voxels.shape, order="F")
     side, label, size, begin = [], [], [], []
@@ -142,15 +178,133 @@ def graph_of(voxels: Claimed) -> ConflictGraph:
     number = np.zeros((2, MAX_LABEL + 1), np.int64)
     number[sides[order], labels[order]] = np.arange(len(order))
 
-    a, b, common = overlapping(voxels)
+    a, b, common = overlapping_pairs(voxels)
     edges = np.stack([number[PROPOSED, a], number[PREDICTED, b]], axis=1)
     return ConflictGraph(sides[order], labels[order], np.concatenate(size)[order], edges, common)
 
 
-def overlapping(voxels: Claimed) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def overlapping_pairs(voxels: ClaimedVoxels) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Proposed label, predicted label and common voxels (m,) of each overlapping pair, labels ascending."""
     both = (voxels.proposed != 0) & (voxels.predicted != 0)
     pair = voxels.proposed[both].astype(np.int64) * (MAX_LABEL + 1) + voxels.predicted[both]
     found, common = np.unique(pair, return_counts=True)
     a, b = np.divmod(found, MAX_LABEL + 1)
     return a, b, common
+
+
+# Painting orders and merges -----------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class RandomOrder(Structure):
+    """The paper's text: edges get a random acyclic orientation, vertices a topological order of it.
+
+    A uniformly random order of the vertices gives both. Every conflict may end in a merge.
+    """
+
+    def draw(
+        self, rng: np.random.Generator, graph: nx.Graph, component: Sequence[int]
+    ) -> tuple[list[int], list[tuple[int, int]]]:
+        order = [component[k] for k in rng.permutation(len(component))]
+        place = {v: k for k, v in enumerate(order)}
+        return order, [(v, w) for v in order for w in graph[v] if place[v] < place[w]]
+
+
+@dataclass(frozen=True)
+class OneSideLast(Structure):
+    """Paints all objects of one hypothesis over those of the other; a fair coin for each component decides which.
+
+    In a random order of all vertices the hypothesis with more objects wins more often: if one parent has an object
+    in one piece and the other has it in k pieces, the object in one piece is painted last in 1 of k + 1 cases only,
+    and an object that was cut stays cut. Every conflict may end in a merge.
+    """
+
+    def draw(
+        self, rng: np.random.Generator, graph: nx.Graph, component: Sequence[int]
+    ) -> tuple[list[int], list[tuple[int, int]]]:
+        side = {v: graph.nodes[v]["side"] for v in component}
+        first_is_last = bool(rng.random() < 0.5)
+        last = {v: (side[v] == side[component[0]]) == first_is_last for v in component}
+        shuffled = [component[k] for k in rng.permutation(len(component))]
+        order = [v for v in shuffled if not last[v]] + [v for v in shuffled if last[v]]
+        return order, [(v, w) for v in order if not last[v] for w in graph[v]]
+
+
+@dataclass(frozen=True)
+class SpanningTree(Structure):
+    """The authors' program: a uniform random spanning tree from a uniform random root.
+
+    Only edges of the tree may end in a merge. Children are painted before their parent, the root last.
+    """
+
+    def draw(
+        self, rng: np.random.Generator, graph: nx.Graph, component: Sequence[int]
+    ) -> tuple[list[int], list[tuple[int, int]]]:
+        root, parent = random_spanning_tree(rng, graph, component)
+        tree = nx.DiGraph((parent[v], v) for v in component if v != root)
+        tree.add_node(root)
+        order = list(nx.dfs_postorder_nodes(tree, root))
+        return order, [(v, parent[v]) for v in order if v != root]
+
+
+def random_spanning_tree(
+    rng: np.random.Generator, graph: nx.Graph, component: Sequence[int]
+) -> tuple[int, dict[int, int]]:
+    """Draw a uniformly random spanning tree of a connected component by Wilson's algorithm (1996).
+
+    Loop-erased random walks run from each vertex to the tree so far. `networkx.random_spanning_tree` has the same
+    law, but computes a determinant for every edge.
+
+    Returns
+    -------
+    root : int
+        Uniformly random.
+    parent : dict
+        Parent of every other vertex.
+    """
+    root = component[int(rng.integers(len(component)))]
+    inside = {root}
+    parent: dict[int, int] = {}
+    for start in component:
+        v = start
+        while v not in inside:
+            neighbours = list(graph[v])
+            parent[v] = neighbours[int(rng.integers(len(neighbours)))]  # the last exit from v erases its loops
+            v = parent[v]
+        v = start
+        while v not in inside:
+            inside.add(v)
+            v = parent[v]
+    return root, parent
+
+
+def merge_probability(
+    rule: MergeRule, intersection: np.ndarray | int, child: np.ndarray | int, parent: np.ndarray | int
+) -> np.ndarray:
+    """Probability that a child object is merged into its parent, elementwise.
+
+    Parameters
+    ----------
+    rule : str
+        One of `MERGE_RULES`; the table of the module has the formulas.
+    intersection, child, parent : int or arrays of the same shape
+        Voxels in common, of the child, of the parent.
+    """
+    common, n1, n2 = (np.asarray(a, dtype=np.float64) for a in (intersection, child, parent))
+    iou = common / (n1 + n2 - common)
+    match rule:
+        case "share":
+            return np.minimum(1.0, common * n2 / n1**2)
+        case "printed":
+            return np.minimum(1.0, iou * n2 / n1**2)
+        case "iou":
+            return iou
+        case "match":
+            return (iou > 0.5).astype(np.float64)
+        case "covered":
+            return (common >= 0.75 * n1).astype(np.float64)
+        case "always":
+            return np.ones_like(iou)
+        case "never":
+            return np.zeros_like(iou)
+    raise InputError(f"there is no merge rule {rule!r}", f"there are: {', '.join(MERGE_RULES)}")

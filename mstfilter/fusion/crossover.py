@@ -1,43 +1,136 @@
-"""Two hypotheses into one: conflict-graph crossover (paper, section IV-D, figure 5).
+"""Crossover of two hypotheses by their conflict graph (paper, section IV-D, figure 5).
 
 >>> child = Crossover().mix(rng, proposed, predicted)
 
-Objects of the two hypotheses that overlap are in conflict. In each component of the conflict graph a random
-structure says along which conflicts objects may be merged, and in which order the rest is painted, later over
-earlier. Whatever has no conflict is inserted as it is. Then a mode filter takes the speckle away.
+1. `graph_of` builds the conflict graph: objects of the two hypotheses that overlap are in conflict.
+2. `Crossover.resolve` draws, for each connected component, the conflicts along which objects are merged, and the
+   order in which the merged objects are painted, later over earlier.
+3. `Crossover.paint` writes the labels. Objects without conflict are copied.
+4. `ModeFilter` removes the speckle that painting leaves.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
 from mstfilter.errors import InputError
-from mstfilter.fusion.conflicts import PREDICTED, PROPOSED, Claimed, ConflictGraph, claimed, graph_of
-from mstfilter.fusion.division import part_like, remember_like
-from mstfilter.fusion.merging import MergeRule, merge_probability
-from mstfilter.fusion.mode_filter import ModeFilter
-from mstfilter.fusion.structure import SpanningTree, Structure
+from mstfilter.fusion.conflicts import (
+    PREDICTED,
+    PROPOSED,
+    ClaimedVoxels,
+    ConflictGraph,
+    MergeRule,
+    SpanningTree,
+    claimed_voxels,
+    components_in_conflict,
+    graph_of,
+    merge_probability,
+)
+from mstfilter.fusion.division import inherit_apart, split_like
+from mstfilter.fusion.interfaces import Structure
 from mstfilter.scene import MAX_LABEL, Hypothesis, ObjectRecord, as_labels
 
-__all__ = ["Crossover", "Draw"]
+__all__ = ["ConflictResolution", "Crossover", "ModeFilter"]
 
-Strangers = Mapping[int, set[int]]
-_NONE: set[int] = set()
+_CHUNK = 2**19  # cells of windows that are read together: they fit in the cache
 
 
-class Draw(NamedTuple):
-    """One resolution of all conflicts.
+class ConflictResolution(NamedTuple):
+    """One resolution of all conflicts of a conflict graph.
 
-    order : vertices in painting order, first to last; group : representative vertex of each vertex's merge group
-    (-1: the object is dropped).
+    order : vertices in painting order, first to last; group : representative vertex of the merge group of each
+    vertex, the one that is painted last (-1: the object is dropped).
     """
 
     order: list[int]
     group: np.ndarray
+
+
+@dataclass(frozen=True)
+class ModeFilter:
+    """Majority filter over label grids.
+
+    For an occupied voxel, the most frequent other label of the window replaces the label of the voxel if it occurs
+    at least `margin` times more often; ties between other labels go to the larger label. Free space never replaces
+    a label in this vote, but an occupied voxel with more than `isolation` free cells in its window becomes free.
+    All voxels change at the same time, sweep after sweep, until no voxel changes.
+
+    Parameters
+    ----------
+    window : int
+        Edge of the cubic window in voxels, odd. 1 switches the filter off.
+    margin : int
+        Cells by which another label must win.
+    isolation : int
+        More free cells than this in the window set a voxel free. A value of at least ``window**3`` never does.
+    max_sweeps : int
+        Largest number of sweeps.
+    scope : {"everywhere", "disputed"}
+        Voxels that may change: all, or only those that fusion marks as disputed between the two parents. The filter
+        everywhere erases objects that are thinner than half a window: a 2 cm book or a rod.
+    """
+
+    window: int = 5
+    margin: int = 3
+    isolation: int = 120
+    max_sweeps: int = 100
+    scope: Literal["everywhere", "disputed"] = "everywhere"
+
+    def __post_init__(self) -> None:
+        for name in ("window", "margin", "isolation", "max_sweeps"):
+            if not isinstance(getattr(self, name), (int, np.integer)):
+                raise InputError(f"mode filter {name} is {getattr(self, name)!r}, expected a whole number")
+        if self.window < 1 or self.window % 2 == 0:
+            raise InputError(f"mode filter window is {self.window}, expected an odd number of voxels")
+        if self.max_sweeps < 1:
+            raise InputError(f"mode filter has max_sweeps {self.max_sweeps}, expected at least 1")
+        if self.scope not in ("everywhere", "disputed"):
+            raise InputError(f'mode filter scope is {self.scope!r}, expected "everywhere" or "disputed"')
+
+    def apply(self, labels: np.ndarray, disputed: np.ndarray | None = None) -> np.ndarray:
+        """Filtered labels (X, Y, Z) uint16.
+
+        Parameters
+        ----------
+        labels : (X, Y, Z) integer
+            0 is free.
+        disputed : (X, Y, Z) bool, optional
+            The voxels that may change if `scope` is "disputed".
+        """
+        labels = as_labels(labels)
+        if labels.ndim != 3:
+            raise InputError(f"label grid has shape {labels.shape}, the mode filter expects three axes")
+        may_change = labels != 0
+        if disputed is not None and (disputed.shape != labels.shape or disputed.dtype != bool):
+            raise InputError(
+                f"disputed is {disputed.dtype} of shape {disputed.shape}, expected bool of shape {labels.shape}"
+            )
+        if self.scope == "disputed":
+            may_change = may_change & disputed if disputed is not None else np.zeros_like(may_change)
+        if self.window == 1 or not may_change.any():
+            return labels
+        # Work inside the box that sweeps can reach, with a border of free cells so that every window is complete.
+        half = self.window // 2
+        where = np.nonzero(may_change)
+        box = tuple(
+            slice(max(int(w.min()) - half, 0), min(int(w.max()) + half + 1, n))
+            for w, n in zip(where, labels.shape, strict=True)
+        )
+        part = np.pad(np.ascontiguousarray(labels[box]), half)
+        at = np.ravel_multi_index([w - b.start + half for w, b in zip(where, box, strict=True)], part.shape)
+        votes = _Votes(self, part, at, _window_cells(where, labels.shape, half))
+        changed = votes.sweep(votes.unsettled())
+        for _ in range(self.max_sweeps - 1):
+            if not len(changed):
+                break
+            changed = votes.sweep(votes.near(changed))
+        out = labels.copy()
+        out[box] = part[(slice(half, -half),) * 3]
+        return out
 
 
 @dataclass(frozen=True)
@@ -48,32 +141,25 @@ class Crossover:
     ----------
     structure : Structure
         Painting order and candidate merges.
-    merge : {"share", "printed", "iou", "always", "never"}
-        Probability of a merge along a directed edge (`mstfilter.fusion.merging`).
+    merge : {"share", "printed", "iou", "match", "covered", "always", "never"}
+        Probability of a merge along a directed edge (`mstfilter.fusion.conflicts`).
     mode_filter : ModeFilter
-        What is left is smoothed by it.
+        Smooths the painted labels.
     drop_rule : bool
-        A fault of the authors' program, on request: a conflict-free object is lost if its vertex number exceeds
-        that of every conflicting vertex.
+        Reproduces a fault of the authors' program: an object without conflict is lost if its vertex number exceeds
+        that of every vertex in conflict.
     """
 
     structure: Structure = SpanningTree()  # noqa: RUF009 (frozen)
     merge: MergeRule = "share"
-    mode_filter: ModeFilter = ModeFilter(scope="disputed")  # noqa: RUF009 (frozen)
+    mode_filter: ModeFilter = ModeFilter(scope="disputed")
     drop_rule: bool = False
 
-    def mix(
-        self,
-        rng: np.random.Generator,
-        proposed: Hypothesis,
-        predicted: Hypothesis,
-        from_predicted: np.ndarray | None = None,
-    ) -> Hypothesis:
-        """A hypothesis made of both parents.
+    def mix(self, rng: np.random.Generator, proposed: Hypothesis, predicted: Hypothesis) -> Hypothesis:
+        """A hypothesis made of the objects of both parents.
 
-        In the voxels `from_predicted` (X, Y, Z) bool, predicted objects are painted last, whatever the order.
-        A parent without objects leaves the other one unchanged. An object keeps the identity of the largest
-        predicted object in it, and its motion history where its voxels are exactly those predicted.
+        If one parent has no objects, the result is the other one. An object keeps the identity of the largest
+        predicted object in it, and its motion history if its voxels are exactly those predicted.
         """
         if proposed.grid != predicted.grid:
             one, other = (
@@ -88,11 +174,11 @@ class Crossover:
             return proposed
         if not proposed.objects:
             return predicted
-        proposed = part_like(proposed, predicted)
-        voxels = claimed(proposed.labels, predicted.labels)
+        proposed = split_like(proposed, predicted)
+        voxels = claimed_voxels(proposed.labels, predicted.labels)
         graph = graph_of(voxels)
-        draw = self.draw(rng, graph, _strangers(graph, proposed, predicted))
-        painted, disputed = _painted(graph, draw, voxels, from_predicted)
+        resolution = self.resolve(rng, graph, _vertices_apart(graph, proposed, predicted))
+        painted, disputed = _painted(graph, resolution, voxels)
         groups, numbers = _numbered(painted)
         if len(groups) > MAX_LABEL:
             raise InputError(
@@ -102,79 +188,71 @@ class Crossover:
             )
         labels = self.mode_filter.apply(voxels.spread(numbers.astype(np.uint16)), voxels.spread(disputed))
         left, numbers = _numbered(labels.reshape(-1)[voxels.at])
-        return _with_records(voxels, numbers, groups[left - 1] - 1, graph, draw, proposed, predicted)
+        return _with_records(voxels, numbers, groups[left - 1] - 1, graph, resolution, proposed, predicted)
 
-    def draw(self, rng: np.random.Generator, graph: ConflictGraph, strangers: Strangers | None = None) -> Draw:
+    def resolve(
+        self, rng: np.random.Generator, graph: ConflictGraph, apart: Mapping[int, set[int]] | None = None
+    ) -> ConflictResolution:
         """Draw a resolution of all conflicts of a graph.
 
-        `strangers` names the vertices of each vertex' own side that it must not be merged with.
+        Parameters
+        ----------
+        rng : Generator
+        graph : ConflictGraph
+        apart : mapping, optional
+            Vertices with which each vertex must not be merged.
         """
-        components = graph.components()
+        links = graph.networkx()
+        components = components_in_conflict(links)
         conflicted = {v for component in components for v in component}
         group = np.arange(len(graph))
-        loose = [v for v in range(len(graph)) if v not in conflicted]
+        order = [v for v in range(len(graph)) if v not in conflicted]
         if self.drop_rule:
             last = max(conflicted, default=-1)
-            group[[v for v in loose if v > last]] = -1
-            loose = [v for v in loose if v <= last]
-        order, neighbours = list(loose), graph.neighbours()
-        intersection = {}
-        for (a, b), count in zip(graph.edges.tolist(), graph.intersection.tolist(), strict=True):
-            intersection[a, b] = intersection[b, a] = count
+            group[[v for v in order if v > last]] = -1
+            order = [v for v in order if v <= last]
         for component in components:
-            painted, edges = self.structure.draw(rng, component, neighbours)
+            painted, edges = self.structure.draw(rng, links, component)
             order.extend(painted)
             if not edges:
                 continue
             child, parent = np.array(edges).T
-            common = np.array([intersection[edge] for edge in edges])
+            common = np.array([links.edges[edge]["intersection"] for edge in edges])
             chance = merge_probability(self.merge, common, graph.size[child], graph.size[parent])
             merged = rng.random(len(edges)) < chance
-            _unite(group, [e for e, yes in zip(edges, merged, strict=True) if yes], painted, strangers or {})
-        return Draw(order, group)
+            _unite(group, [e for e, yes in zip(edges, merged, strict=True) if yes], painted, apart or {})
+        return ConflictResolution(order, group)
 
     def paint(
-        self,
-        graph: ConflictGraph,
-        draw: Draw,
-        proposed: np.ndarray,
-        predicted: np.ndarray,
-        from_predicted: np.ndarray | None = None,
+        self, graph: ConflictGraph, resolution: ConflictResolution, proposed: np.ndarray, predicted: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Labels (X, Y, Z) uint16, group k painted as k + 1, and the voxels that stay disputed.
+        """Labels (X, Y, Z) uint16, group k painted as k + 1, and the voxels (X, Y, Z) bool that stay disputed.
 
-        Disputed are the voxels on which the parents still disagree after merging and whose object is part of
-        such a disagreement: objects that both parents see alike, or only one sees, are not.
+        A voxel is disputed if the parents still disagree on it after merging, and its object overlaps one of the
+        other parent. Objects that both parents see alike, or that only one parent sees, are not disputed.
         """
-        voxels = claimed(proposed, predicted)
-        painted, disputed = _painted(graph, draw, voxels, from_predicted)
+        voxels = claimed_voxels(proposed, predicted)
+        painted, disputed = _painted(graph, resolution, voxels)
         return as_labels(voxels.spread(painted), "painted label grid"), voxels.spread(disputed)
 
 
 def _painted(
-    graph: ConflictGraph, draw: Draw, voxels: Claimed, from_predicted: np.ndarray | None
+    graph: ConflictGraph, resolution: ConflictResolution, voxels: ClaimedVoxels
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Group + 1 of each claimed voxel (n,), 0 where its object was dropped, and whether it stays disputed (n,)."""
+    """Group + 1 of each claimed voxel (n,), 0 if its object was dropped, and whether it stays disputed (n,)."""
     rank = np.empty(len(graph), np.int64)
-    rank[draw.order] = np.arange(len(draw.order))
+    rank[resolution.order] = np.arange(len(resolution.order))
     group_of, rank_of = [], []
     for side, labels in ((PROPOSED, voxels.proposed), (PREDICTED, voxels.predicted)):
         mine = graph.side == side
         table = np.zeros(int(labels.max(initial=0)) + 1, np.int64)
         ranks = np.full(len(table), -1)
-        table[graph.label[mine]] = draw.group[mine] + 1
-        kept = mine & (draw.group >= 0)
+        table[graph.label[mine]] = resolution.group[mine] + 1
+        kept = mine & (resolution.group >= 0)
         ranks[graph.label[kept]] = rank[kept]
         group_of.append(table[labels])
         rank_of.append(ranks[labels])
     later = rank_of[PREDICTED] > rank_of[PROPOSED]
-    if from_predicted is not None:
-        if from_predicted.shape != voxels.shape or from_predicted.dtype != bool:
-            raise InputError(
-                f"from_predicted is {from_predicted.dtype} of shape {from_predicted.shape}, expected bool of "
-                f"shape {voxels.shape}"
-            )
-        later |= from_predicted.reshape(-1)[voxels.at] & (group_of[PREDICTED] > 0)
     out = np.where(later, group_of[PREDICTED], group_of[PROPOSED])
     differ = group_of[PROPOSED] != group_of[PREDICTED]
     clash = differ & (group_of[PROPOSED] > 0) & (group_of[PREDICTED] > 0)
@@ -185,7 +263,7 @@ def _painted(
 
 
 def _numbered(labels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Labels that occur, ascending, 0 left out, and the array with their positions 1, 2, ... in their place."""
+    """Labels > 0 that occur, ascending, and the array with each label replaced by its position 1, 2, ..."""
     counts = np.bincount(labels, minlength=1)
     counts[0] = 0
     present = np.flatnonzero(counts)
@@ -194,63 +272,50 @@ def _numbered(labels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return present, table[labels]
 
 
-def _strangers(graph: ConflictGraph, proposed: Hypothesis, predicted: Hypothesis) -> Strangers:
-    """For each vertex, those of its own side that it came apart from."""
+def _vertices_apart(graph: ConflictGraph, proposed: Hypothesis, predicted: Hypothesis) -> dict[int, set[int]]:
+    """For each vertex, the vertices of its side that were seen to move apart from it (`ObjectRecord.apart`)."""
     if not any(r.apart for h in (proposed, predicted) for r in h.objects):
         return {}
     record_of = {(side, r.label): r for side, h in ((PROPOSED, proposed), (PREDICTED, predicted)) for r in h.objects}
-    records = [record_of[key] for key in zip(graph.side.tolist(), graph.label.tolist(), strict=True)]
-    vertex = {(int(side), record.id): v for v, (side, record) in enumerate(zip(graph.side, records, strict=True))}
+    sides = graph.side.tolist()
+    records = [record_of[key] for key in zip(sides, graph.label.tolist(), strict=True)]
+    vertex = {(side, record.id): v for v, (side, record) in enumerate(zip(sides, records, strict=True))}
     return {
         v: {vertex[side, other] for other in record.apart if (side, other) in vertex}
-        for v, (side, record) in enumerate(zip(graph.side.tolist(), records, strict=True))
+        for v, (side, record) in enumerate(zip(sides, records, strict=True))
         if record.apart
     }
 
 
-def _unite(group: np.ndarray, merges: list[tuple[int, int]], order: list[int], strangers: Strangers) -> None:
-    """Merge groups along child -> parent edges; the vertex painted last represents its group.
+def _unite(group: np.ndarray, merges: list[tuple[int, int]], order: list[int], apart: Mapping[int, set[int]]) -> None:
+    """Merge groups along child -> parent edges, in place. The vertex painted last represents its group.
 
-    A merge that would bring strangers together is left out.
+    A merge that would join two vertices that moved apart is left out.
     """
     place = {v: k for k, v in enumerate(order)}
-    members = {v: {v} for v in order} if strangers else {}
-
-    def find(v: int) -> int:
-        root = v
-        while group[root] != root:
-            root = int(group[root])
-        while group[v] != root:  # the next search is short
-            group[v], v = root, int(group[v])
-        return root
-
-    for child, parent in merges:
-        a, b = find(child), find(parent)
-        if a != b:
-            low, high = sorted((a, b), key=place.__getitem__)
-            if strangers:
-                if any(strangers.get(v, _NONE) & members[high] for v in members[low]):
-                    continue
-                members[high] |= members.pop(low)
-            group[low] = high
-    for v in order:
-        group[v] = find(v)
+    members = {v: {v} for v in order}
+    for edge in merges:
+        low, high = sorted((int(group[v]) for v in edge), key=place.__getitem__)
+        if low == high or any(apart.get(v, set()) & members[high] for v in members[low]):
+            continue
+        group[list(members[low])] = high
+        members[high] |= members.pop(low)
 
 
 def _with_records(
-    voxels: Claimed,
+    voxels: ClaimedVoxels,
     numbers: np.ndarray,
     groups: np.ndarray,
     graph: ConflictGraph,
-    draw: Draw,
+    resolution: ConflictResolution,
     proposed: Hypothesis,
     predicted: Hypothesis,
 ) -> Hypothesis:
-    """The child, objects 1, 2, ... of `groups` (m,) at `numbers` (n,), with the records of what they are made of."""
-    # The largest predicted member gives the identity; where there is none, the largest proposed one.
-    order = np.lexsort((-np.arange(len(graph)), graph.size, graph.side, draw.group))
-    last = np.append(np.diff(draw.group[order]) != 0, True)
-    best_of = dict(zip(draw.group[order[last]].tolist(), order[last].tolist(), strict=True))
+    """The child hypothesis: object k = 1, 2, ... is group ``groups[k - 1]`` and has the voxels ``numbers == k``."""
+    # The largest predicted member of a group gives the record; without one, the largest proposed member.
+    order = np.lexsort((-np.arange(len(graph)), graph.size, graph.side, resolution.group))
+    last = np.append(np.diff(resolution.group[order]) != 0, True)
+    best_of = dict(zip(resolution.group[order[last]].tolist(), order[last].tolist(), strict=True))
     best = np.array([-1, *(best_of[g] for g in groups.tolist())], np.int64)  # of each number, 0 free
     side, label = graph.side[best], graph.label[best]
     own = np.where(side[numbers] == PREDICTED, voxels.predicted, voxels.proposed) == label[numbers]
@@ -266,6 +331,119 @@ def _with_records(
     number_of = {g: number for number, g in enumerate(groups.tolist(), start=1)}
     for which, parent in enumerate(parents):
         mine = np.flatnonzero(graph.side == which)
-        heirs = zip(graph.label[mine].tolist(), draw.group[mine].tolist(), strict=True)
-        child = remember_like(child, parent, {k: number_of[g] for k, g in heirs if g in number_of})
+        heirs = zip(graph.label[mine].tolist(), resolution.group[mine].tolist(), strict=True)
+        child = inherit_apart(child, parent, {k: number_of[g] for k, g in heirs if g in number_of})
     return child
+
+
+# The sweeps of the mode filter --------------------------------------------------------------------------------------
+
+
+class _Votes:
+    """A label grid under the filter, swept in place.
+
+    If no cell in the window of a voxel has changed since the last sweep, its vote is the same. So only the first
+    sweep reads all voxels, and of these only those whose window holds another object or much free space.
+
+    Parameters
+    ----------
+    filter : ModeFilter
+    labels : (X, Y, Z) uint16
+        With a border of half a window, in C order. Written in place.
+    at : (n,) int
+        Flat indices of the voxels that may change.
+    cells : (n,) int
+        Cells in the window of each voxel that lie in the grid.
+    """
+
+    def __init__(self, filter: ModeFilter, labels: np.ndarray, at: np.ndarray, cells: np.ndarray) -> None:
+        self.filter, self.labels, self.flat, self.at, self.cells = filter, labels, labels.reshape(-1), at, cells
+        steps = np.indices((filter.window,) * 3).reshape(3, -1) - filter.window // 2
+        self.offsets = np.array(labels.strides) // labels.itemsize @ steps
+        self.count_type = np.min_scalar_type(len(self.offsets))
+        self.chunk = max(1, _CHUNK // len(self.offsets))
+
+    def unsettled(self) -> np.ndarray:
+        """Positions in `at` of voxels that a sweep may change."""
+        window, half = self.filter.window, self.filter.window // 2
+        inner = self.labels[(slice(half, -half),) * 3]
+        below = self.labels - np.uint16(1)  # free becomes the largest: the smallest label of a window is an object's
+        mixed = _over_window(np.maximum, self.labels, window) != inner
+        mixed |= _over_window(np.minimum, below, window) != below[(slice(half, -half),) * 3]
+        taken = _over_window(np.add, (self.labels != 0).astype(self.count_type), window)
+        inside = np.zeros(self.labels.shape, bool)
+        inside[(slice(half, -half),) * 3] = mixed
+        counts = np.zeros(self.labels.shape, self.count_type)
+        counts[(slice(half, -half),) * 3] = taken
+        free = self.cells - counts.reshape(-1)[self.at]
+        return np.flatnonzero(inside.reshape(-1)[self.at] | (free > self.filter.isolation))
+
+    def near(self, changed: np.ndarray) -> np.ndarray:
+        """Positions in `at` of occupied voxels whose window holds one of the cells `changed` (flat indices)."""
+        touched = np.zeros(self.flat.shape, bool)
+        for k in range(0, len(changed), self.chunk):
+            touched[changed[k : k + self.chunk, None] + self.offsets] = True
+        return np.flatnonzero(touched[self.at] & (self.flat[self.at] != 0))
+
+    def sweep(self, positions: np.ndarray) -> np.ndarray:
+        """All voxels at these positions vote at once; flat indices of those that changed."""
+        at, cells = self.at[positions], self.cells[positions]
+        new = np.empty(len(at), np.uint16)
+        for k in range(0, len(at), self.chunk):
+            new[k : k + self.chunk] = self._elected(at[k : k + self.chunk], cells[k : k + self.chunk])
+        differ = new != self.flat[at]
+        self.flat[at[differ]] = new[differ]
+        return at[differ]
+
+    def _elected(self, at: np.ndarray, cells: np.ndarray) -> np.ndarray:
+        """Labels (m,) after the vote of voxels `at` (m,) with `cells` (m,) grid cells in their windows."""
+        windows = self.flat[at + self.offsets[:, None]]
+        own = self.flat[at]
+        is_own = windows == own
+        own_count = self._count(is_own)
+        taken = self._count(windows != 0)
+        out = own.copy()
+        # Only where the others together would win need they be told apart.
+        open_ = np.flatnonzero(taken - own_count >= own_count + self.filter.margin)
+        others = windows[:, open_] * ~is_own[:, open_]
+        left = (taken - own_count)[open_]
+        best, winner = np.zeros(len(own), np.int64), np.zeros(len(own), np.uint16)
+        while True:  # label by label, the largest first: a tie stays with it
+            going = left > best[open_]
+            open_, left, others = open_[going], left[going], others[:, going]
+            if not len(open_):
+                break
+            top = others.max(axis=0)
+            is_top = others == top
+            count = self._count(is_top)
+            ahead = count > best[open_]
+            best[open_[ahead]], winner[open_[ahead]] = count[ahead], top[ahead]
+            left = left - count
+            others *= ~is_top
+        wins = (best > own_count) | ((best == own_count) & (winner > own))
+        wins &= best >= own_count + self.filter.margin
+        out[wins] = winner[wins]
+        out[cells - taken > self.filter.isolation] = 0
+        return out
+
+    def _count(self, hit: np.ndarray) -> np.ndarray:
+        """(m,) how many of the window's cells are True in (cells, m)."""
+        return hit.sum(axis=0, dtype=self.count_type).astype(np.int64)
+
+
+def _over_window(function: np.ufunc, cells: np.ndarray, window: int) -> np.ndarray:
+    """`function` over the window of every cell that has a whole one: each axis is shorter by ``window - 1``."""
+    for axis in range(3):
+        n = cells.shape[axis] - window + 1
+        along = np.moveaxis(cells, axis, 0)
+        out = along[:n].copy()
+        for k in range(1, window):
+            function(out, along[k : k + n], out=out)
+        cells = np.moveaxis(out, 0, axis)
+    return cells
+
+
+def _window_cells(at: tuple[np.ndarray, ...], shape: tuple[int, ...], half: int) -> np.ndarray:
+    """Number of grid cells in the window of every voxel `at`."""
+    sides = [np.minimum(w + half + 1, n) - np.maximum(w - half, 0) for w, n in zip(at, shape, strict=True)]
+    return np.asarray(sides[0] * sides[1] * sides[2])

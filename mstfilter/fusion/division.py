@@ -1,10 +1,10 @@
-"""Objects that hold two things which were seen to move apart, taken apart; and the memory that they did.
+"""Split objects of which a clip shows that their parts move apart, and remember the split.
 
->>> hypothesis = take_apart(hypothesis, motions, clip)              # by what this clip has shown
->>> proposed = part_like(proposed, predicted)                       # by what earlier ones have shown
+>>> hypothesis = split_by_motion(hypothesis, motions, clip)         # by the motions of this clip
+>>> proposed = split_like(proposed, predicted)                      # by the motions of earlier clips
 
-Once two touching objects have been pulled apart, a later image may well show them as one again. Each object
-remembers from whom it came apart (`ObjectRecord.apart`), and fusion never makes one of the two again.
+After two touching objects have moved apart, a later image may show them as one object again. `ObjectRecord.apart`
+has the ids of the objects from which an object has moved apart, and crossover never merges such objects.
 """
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy.spatial import cKDTree
 
-from mstfilter.fusion.conflicts import claimed, overlapping
+from mstfilter.fusion.conflicts import claimed_voxels, overlapping_pairs
 from mstfilter.fusion.interfaces import Division
 from mstfilter.scene import MAX_LABEL, Clip, Hypothesis, ObjectRecord, frame_geometry, project
 from mstfilter.tracking import MotionSegmentation
 
-__all__ = ["NoDivision", "PartRule", "RigidMotions", "part_like", "remember_like", "take_apart"]
+__all__ = ["NoDivision", "PartRule", "RigidMotions", "inherit_apart", "split_by_motion", "split_like"]
 
-_INSIDE = 0.5  # of a predicted object, for a proposed one to hold it
+_INSIDE = 0.5  # share of a predicted object that must lie in a proposed object to count as inside
 
 
 @dataclass(frozen=True)
@@ -52,16 +52,16 @@ class RigidMotions(Division):
 
 @dataclass(frozen=True)
 class PartRule:
-    """When a part of an object is worth an object of its own.
+    """When a part of an object becomes a separate object.
 
     Parameters
     ----------
     min_pixels : int
-        Visible pixels of known motion that a part needs.
+        Least number of visible pixels of known motion of a part.
     min_share : float
-        ... and the share of the object's pixels of known motion.
+        Least share of the object's pixels of known motion.
     pure : float
-        Share of an object's pixels of known motion that must agree for it to count as having moved so.
+        Share of an object's pixels of known motion that must have the same motion for the object to have it.
     """
 
     min_pixels: int = 40
@@ -69,10 +69,10 @@ class PartRule:
     pure: float = 0.8
 
 
-def take_apart(
+def split_by_motion(
     hypothesis: Hypothesis, motions: np.ndarray, clip: Clip, rule: PartRule = PartRule(), proposed: bool = True
 ) -> Hypothesis:
-    """The hypothesis with objects parted by motion, and with the memory of what moved apart.
+    """Split objects by motion, and record which objects moved apart.
 
     Parameters
     ----------
@@ -83,7 +83,8 @@ def take_apart(
     clip : Clip
     rule : PartRule
     proposed : bool
-        Whether the hypothesis comes from the proposal: keeps the ids of new parts of both sides different.
+        Whether the hypothesis comes from the proposal. New parts of proposed and predicted hypotheses get
+        different ids.
     """
     image = project(hypothesis, clip.after.camera)
     known = (image > 0) & (motions >= 0)
@@ -96,9 +97,7 @@ def take_apart(
     parts = (count >= rule.min_pixels) & (count >= rule.min_share * total)
     labels, origin = hypothesis.labels, {}
     for label in np.flatnonzero(parts.sum(axis=1) >= 2).tolist():
-        labels, made = _parted_by_pixels(
-            hypothesis, labels, label, np.flatnonzero(parts[label]), image, motions, clip
-        )
+        labels, made = _split_by_pixels(hypothesis, labels, label, np.flatnonzero(parts[label]), image, motions, clip)
         origin.update(made)
     went = {
         k: int(count[k].argmax())
@@ -108,10 +107,10 @@ def take_apart(
     for label, (_, motion) in origin.items():
         went[label] = motion
     divided = _with_parts(hypothesis, labels, {k: parent for k, (parent, _) in origin.items()}, clip.index, proposed)
-    return _remember(divided, went)
+    return _record_apart(divided, went)
 
 
-def _parted_by_pixels(
+def _split_by_pixels(
     hypothesis: Hypothesis,
     labels: np.ndarray,
     label: int,
@@ -120,7 +119,7 @@ def _parted_by_pixels(
     motions: np.ndarray,
     clip: Clip,
 ) -> tuple[np.ndarray, dict[int, tuple[int, int]]]:
-    """Each voxel goes to the motion of the nearest visible one. Returns labels, new label -> (parent, motion)."""
+    """Give each voxel the motion of the nearest visible voxel. Returns labels and new label -> (parent, motion)."""
     geometry = frame_geometry(clip.after, hypothesis.grid)
     at = np.nonzero(hypothesis.labels == label)
     pixel = geometry.pixel[at]
@@ -141,7 +140,7 @@ def _parted_by_pixels(
 def _split(
     labels: np.ndarray, at: tuple[np.ndarray, ...], part: np.ndarray, label: int
 ) -> tuple[np.ndarray, dict[int, tuple[int, int]]]:
-    """New labels for all parts but the largest; new label -> (parent label, part)."""
+    """Give all parts but the largest new labels. Returns labels and label -> (parent label, part)."""
     present, counts = np.unique(part, return_counts=True)
     largest = int(present[counts.argmax()])
     free = int(labels.max()) + 1
@@ -159,7 +158,7 @@ def _split(
 def _with_parts(
     hypothesis: Hypothesis, labels: np.ndarray, parents: dict[int, int], birth: int, proposed: bool
 ) -> Hypothesis:
-    """Records of a hypothesis whose objects were parted: the largest part goes on, the others are new."""
+    """The hypothesis after a split: the largest part keeps the record of its parent, the others get new records."""
     if labels is hypothesis.labels:
         return hypothesis
     records = []
@@ -173,15 +172,14 @@ def _with_parts(
     return Hypothesis(labels, hypothesis.grid, tuple(sorted(records, key=lambda r: r.label)))
 
 
-def _remember(hypothesis: Hypothesis, went: dict[int, int]) -> Hypothesis:
-    """Objects whose motions differ know each other as apart."""
+def _record_apart(hypothesis: Hypothesis, went: dict[int, int]) -> Hypothesis:
+    """Record objects with different motions as apart, on both sides. `went` maps labels to motions."""
     movers = [(r.id, went[r.label]) for r in hypothesis.objects if r.label in went]
     records = []
     for record in hypothesis.objects:
         apart = record.apart
         if record.label in went:
             apart = apart | {other for other, motion in movers if motion != went[record.label]}
-        # What knew the parent as apart knows its parts so, too.
         records.append(replace(record, apart=apart))
     by_id = {r.id: r for r in records}
     for record in records:
@@ -191,20 +189,20 @@ def _remember(hypothesis: Hypothesis, went: dict[int, int]) -> Hypothesis:
     return Hypothesis(hypothesis.labels, hypothesis.grid, tuple(by_id[r.id] for r in records))
 
 
-def part_like(proposed: Hypothesis, predicted: Hypothesis) -> Hypothesis:
-    """The proposal with every object parted that covers predicted objects which came apart before.
+def split_like(proposed: Hypothesis, predicted: Hypothesis) -> Hypothesis:
+    """Split every proposed object that contains predicted objects which moved apart earlier.
 
-    Its voxels go to the nearest of these. What holds less than half of one of them is only its neighbour, seen or
-    moved a little wrong.
+    Each voxel goes to the nearest of these objects. A proposed object contains a predicted one if it has at least
+    half of its voxels; a smaller overlap is an error of position at the border.
     """
     if not any(record.apart for record in predicted.objects):
         return proposed
-    pairs = zip(*(a.tolist() for a in overlapping(claimed(proposed.labels, predicted.labels))), strict=True)
-    inverse, volume = {r.label: r for r in predicted.objects}, predicted.volumes()
+    pairs = overlapping_pairs(claimed_voxels(proposed.labels, predicted.labels))
+    record_of, volume = {r.label: r for r in predicted.objects}, predicted.volumes()
     within: dict[int, list[ObjectRecord]] = {}
-    for label, k, common in pairs:
+    for label, k, common in zip(*(column.tolist() for column in pairs), strict=True):
         if common >= _INSIDE * volume[k]:
-            within.setdefault(label, []).append(inverse[k])
+            within.setdefault(label, []).append(record_of[k])
     labels, parents = proposed.labels, {}
     for label, inside in within.items():
         ids = {r.id for r in inside}
@@ -222,11 +220,11 @@ def part_like(proposed: Hypothesis, predicted: Hypothesis) -> Hypothesis:
     return _with_parts(proposed, labels, parents, birth, True)
 
 
-def remember_like(child: Hypothesis, parent: Hypothesis, own: Mapping[int, int]) -> Hypothesis:
-    """The child with what a parent remembers of objects that came apart.
+def inherit_apart(child: Hypothesis, parent: Hypothesis, own: Mapping[int, int]) -> Hypothesis:
+    """Copy the record of objects that moved apart from a parent of a crossover to its child.
 
-    The heirs of a parent's object are the child's object `own` [label] that it is part of, and the one that has most
-    of its voxels now: an object that was painted over lives on in what covers it.
+    The heirs of a parent's object are the object ``own[label]`` of the child that it was merged into, and the object
+    that has most of its voxels. So the record is kept if the object is painted over.
     """
     if not any(record.apart for record in parent.objects):
         return child

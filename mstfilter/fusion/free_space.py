@@ -1,22 +1,28 @@
-"""What the sensor looked through cannot be occupied: projection of a hypothesis onto known free space.
+"""Clears voxels that the depth image observes as free (paper, section IV-D).
 
->>> refined, quality = FreeSpace().project(hypothesis, frame)           # one frame, all its cameras
->>> refined, quality = FreeSpace().refine(hypotheses, clip)             # many, at the end of a clip
+>>> refined, quality = FreeSpace().project(hypothesis, frame)           # one hypothesis, one frame
+>>> refined, quality = FreeSpace().refine(hypotheses, clip)             # several, at the end of a clip
 
-The share of voxels that a hypothesis keeps is its quality Q (paper, section IV-D): a prediction that has put
-objects where there is nothing loses voxels and weight. `mstfilter.fusion.projection` makes an update of it.
+The quality Q of a hypothesis is the share of its voxels that it keeps. A prediction with objects in free space loses
+voxels and weight.
+
+`ProjectionUpdate` is an update that consists of this projection alone. If an observation rules out all but a thin set
+of states, hardly any draw of the dynamics lies in the set; a projection moves every particle there (Koval, Pollard,
+Srinivasa 2015; for vectors `mstfilter.smc.ProjectOnto`). Here the set has all scenes without voxels in observed free
+space.
+
+>>> filter = ParticleFilter(proposal=None, initial=..., transition=..., update=ProjectionUpdate(), ...)
 """
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from collections.abc import Sequence
 from dataclasses import dataclass, is_dataclass, replace
-from typing import Any, Protocol, TypeVar
+from typing import Any, ClassVar, Protocol, TypeVar
 
 import numpy as np
 
 from mstfilter.errors import InputError
+from mstfilter.fusion.interfaces import Projection
 from mstfilter.scene import (
     Clip,
     Frame,
@@ -28,62 +34,46 @@ from mstfilter.scene import (
     memo,
     read_only,
 )
+from mstfilter.smc import Population, Update, number, part, union
 
-__all__ = ["SMALLEST_QUALITY", "FreeSpace", "NoFreeSpace", "Projection", "Voxels"]
+__all__ = ["FreeSpace", "LabelledVoxels", "NoFreeSpace", "ProjectionUpdate", "log_quality"]
 
-SMALLEST_QUALITY = 1e-3
-"""What Q counts as in a weight at least: if all predictions lost every voxel, all weights would be zero."""
+_SMALLEST_QUALITY = 1e-3
 
 
-class Voxels(Protocol):
-    """What a particle needs to be projected: labels on a grid. A `Hypothesis`, or any dataclass with these fields."""
+class LabelledVoxels(Protocol):
+    """A particle that can be projected: a `Hypothesis`, or any frozen dataclass with these fields."""
 
     @property
     def labels(self) -> np.ndarray:
-        """(X, Y, Z): 0 is free."""
+        """Labels (X, Y, Z), 0 is free."""
 
     @property
     def grid(self) -> VoxelGrid:
-        """Where the voxels are."""
+        """Grid of the labels."""
 
 
-P = TypeVar("P", bound=Voxels)
-
-
-class Projection(ABC):
-    """Moves a hypothesis onto the set of those that agree with what was seen."""
-
-    @abstractmethod
-    def project(self, hypothesis: Any, frame: Frame) -> tuple[Any, float]:
-        """The nearest hypothesis that agrees with a frame, and the share of voxels that it keeps, in [0, 1]."""
-
-    def refine(self, hypotheses: Sequence[Any], clip: Clip) -> tuple[tuple[Any, ...], np.ndarray]:
-        """Hypotheses about the end of a clip, projected, and their qualities (n,).
-
-        By default onto the last frame alone; one that looks at more overrides this.
-        """
-        pairs = [self.project(hypothesis, clip.after) for hypothesis in hypotheses]
-        return tuple(h for h, _ in pairs), np.array([q for _, q in pairs])
+P = TypeVar("P", bound=LabelledVoxels)
 
 
 @dataclass(frozen=True)
 class NoFreeSpace(Projection):
-    """Every hypothesis is kept as it is, with quality 1."""
+    """Leaves every hypothesis unchanged, with quality 1."""
 
     def project(self, hypothesis: Any, frame: Frame) -> tuple[Any, float]:
-        """The hypothesis itself."""
         return hypothesis, 1.0
 
 
 @dataclass(frozen=True)
 class FreeSpace(Projection):
-    """Clears voxels that the depth image sees through.
+    """Clears voxels that the depth image observes as free.
 
-    A voxel is known to be free where its centre lies in front of the measured surface by more than a margin for
-    its own extent and for the sensor's noise at that range. What was not measured (no reading, the robot,
-    outside the image, behind a surface) is unknown and stays. A voxel with a measured point inside it stays.
+    A voxel is free if its centre lies in front of the measured surface by more than a margin for the extent of the
+    voxel and for the noise of the sensor at that range. Voxels without a measurement (no reading, the robot, outside
+    the image, behind a surface) are unknown and stay. A voxel with a measured point inside stays.
 
-    Several cameras (`Frame.views`) clear what any of them sees through; a measured point of any protects a voxel.
+    With several cameras (`Frame.views`) a voxel is free if one of them observes it as free and none has a measured
+    point in it.
 
     Parameters
     ----------
@@ -92,7 +82,7 @@ class FreeSpace(Projection):
     margin_sigmas : float
         Margin for the noise, in standard deviations of a depth reading at that range.
     table_height : float
-        Voxels whose centre is below it (metres above the table) are cleared as well.
+        Voxels with centres below this height (metres above the table) are cleared as well.
     """
 
     margin_voxels: float = 0.5
@@ -134,7 +124,7 @@ class FreeSpace(Projection):
 
 
 def _cleared(particle: P, free: np.ndarray) -> tuple[P, float]:
-    """The particle without free voxels, and the share that it keeps."""
+    """The particle without the voxels `free`, and the share of voxels that it keeps."""
     occupied = particle.labels != 0
     hit = occupied & free
     n_hit = int(hit.sum())
@@ -142,15 +132,55 @@ def _cleared(particle: P, free: np.ndarray) -> tuple[P, float]:
         return particle, 1.0
     labels = np.where(hit, 0, particle.labels).astype(particle.labels.dtype)
     quality = 1.0 - n_hit / int(occupied.sum())
-    cleared: Any = particle.with_labels(labels) if isinstance(particle, Hypothesis) else _with(particle, labels)
-    return cleared, quality
-
-
-def _with(particle: Any, labels: np.ndarray) -> Any:
-    """The same particle with other labels."""
-    if not is_dataclass(particle):
+    cleared: Any
+    if isinstance(particle, Hypothesis):
+        cleared = particle.with_labels(labels)
+    elif is_dataclass(particle):
+        cleared = replace(particle, labels=labels)
+    else:
         raise InputError(
             f"a particle is a {type(particle).__name__}, and free space cannot clear it",
             "it takes a Hypothesis, or a dataclass with fields labels and grid",
         )
-    return replace(particle, labels=labels)  # type: ignore[type-var]
+    return cleared, quality
+
+
+def log_quality(quality: np.ndarray) -> np.ndarray:
+    """log Q (n,) of qualities (n,) of at least 1e-3: if all predictions lose all voxels, weights stay positive."""
+    return np.log(np.maximum(quality, _SMALLEST_QUALITY))
+
+
+@dataclass(frozen=True)
+class ProjectionUpdate(Update):
+    """Projects every particle, and adds lambda log Q to its log weight.
+
+    Proposed particles join the predicted ones.
+
+    Parameters
+    ----------
+    free_space : Projection
+    quality_exponent : float
+        lambda: power of Q, the share of voxels that a particle keeps, in the weight.
+    """
+
+    free_space: Projection = FreeSpace()
+    quality_exponent: float = 3.0
+
+    properly_weighted: ClassVar[bool] = False
+    draws: ClassVar[bool] = False
+
+    def __post_init__(self) -> None:
+        part("free_space", self.free_space, Projection)
+        number("quality_exponent", self.quality_exponent, at_least=0)
+
+    def update(
+        self,
+        rng: np.random.Generator,
+        predicted: Population | None,
+        proposed: Population | None,
+        observation: Clip,
+    ) -> Population:
+        population = union(predicted, proposed)
+        refined, quality = self.free_space.refine(population.particles, observation)
+        log_weights = population.log_weights + self.quality_exponent * log_quality(quality)
+        return Population(refined, log_weights, population.parents, {"quality": quality.tolist()})

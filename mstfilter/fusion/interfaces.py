@@ -1,7 +1,13 @@
 """Interfaces of the parts of fusion that a user can replace.
 
-- `Evidence` scores built candidates against one part of the data.
-- `Division` groups the pixels of a frame by what a clip has shown to be different objects.
+==============  =====================================================================  ===========================
+interface       task                                                                   field of a preset
+==============  =====================================================================  ===========================
+`Projection`    clears what a frame observes as free from predicted hypotheses         ``update.free_space``
+`Division`      groups the pixels of a frame by what a clip shows to be different      ``update.division``
+`Structure`     orders the objects of a component of the conflict graph                ``update.crossover.structure``
+`Evidence`      scores built candidates against one part of the data                   ``update.evidence``
+==============  =====================================================================  ===========================
 
 >>> log_score = evidence.log_score(hypotheses, clip)       # (n,) nats, larger is better
 """
@@ -10,23 +16,33 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from typing import Any
 
+import networkx as nx
 import numpy as np
 
-from mstfilter.scene import Clip, Hypothesis
+from mstfilter.scene import Clip, Frame, Hypothesis
 
-__all__ = ["Division", "Evidence"]
+__all__ = ["Division", "Evidence", "Projection", "Structure"]
 
 
-class Evidence(ABC):
-    """One term of the score of a candidate.
-
-    The documentation of a term states which data it uses, so that users see which data are counted twice.
-    """
+class Projection(ABC):
+    """Projects a hypothesis onto the set of hypotheses that agree with a frame."""
 
     @abstractmethod
-    def log_score(self, hypotheses: Sequence[Hypothesis], clip: Clip) -> np.ndarray:
-        """Log score (n,) of hypotheses about the end of a clip, in nats, up to a common constant."""
+    def project(self, hypothesis: Any, frame: Frame) -> tuple[Any, float]:
+        """The nearest hypothesis that agrees with a frame, and the share of voxels that it keeps, in [0, 1]."""
+
+    def refine(self, hypotheses: Sequence[Any], clip: Clip) -> tuple[tuple[Any, ...], np.ndarray]:
+        """Project hypotheses about the end of a clip onto its last frame.
+
+        Returns
+        -------
+        tuple of hypotheses, (n,) float
+            Projected hypotheses and the share of voxels that each keeps.
+        """
+        pairs = [self.project(hypothesis, clip.after) for hypothesis in hypotheses]
+        return tuple(h for h, _ in pairs), np.array([q for _, q in pairs])
 
 
 class Division(ABC):
@@ -42,3 +58,41 @@ class Division(ABC):
             Pixels with different numbers >= 0 belong to different objects; -1 is unknown. None if the clip
             shows nothing, for example a single frame.
         """
+
+
+class Structure(ABC):
+    """Draws the order in which objects in conflict are painted, and the conflicts that may end in a merge."""
+
+    @abstractmethod
+    def draw(
+        self, rng: np.random.Generator, graph: nx.Graph, component: Sequence[int]
+    ) -> tuple[list[int], list[tuple[int, int]]]:
+        """Draw an order and directed edges for one component of the conflict graph.
+
+        Parameters
+        ----------
+        rng : Generator
+        graph : networkx.Graph
+            The conflict graph (`ConflictGraph.networkx`). The neighbours of a vertex, ``graph[v]``, ascend.
+        component : sequence of int
+            Vertices of one connected component, ascending.
+
+        Returns
+        -------
+        order : list of int
+            All vertices of the component, first to last painted; later ones paint over earlier ones.
+        edges : list of (child, parent)
+            Edges of the graph along which the child may be merged into the parent. A parent is painted after its
+            child.
+        """
+
+
+class Evidence(ABC):
+    """One term of the score of a candidate.
+
+    The documentation of a term states which data it uses, so that users see which data are counted twice.
+    """
+
+    @abstractmethod
+    def log_score(self, hypotheses: Sequence[Hypothesis], clip: Clip) -> np.ndarray:
+        """Log score (n,) of hypotheses about the end of a clip, in nats, up to a common constant."""

@@ -1,37 +1,93 @@
-"""The measurement update of MST: predicted x proposed -> fused candidates (paper, section IV-D, Alg. 1).
+"""The measurement update of MST: predicted and proposed hypotheses in, weighted candidates out (paper, section IV-D).
 
->>> update = FusionUpdate(eta=5)
->>> fused = update.update(rng, predicted, proposed, clip)      # |proposed| x |predicted| x eta candidates
+>>> fused = FusionUpdate().update(rng, predicted, proposed, clip)
 
-Predicted hypotheses are projected onto the free space of the latest frame, which gives each a quality Q. Every
-pair of a proposed sample i and a predicted hypothesis j is crossed `eta` times. The weight of a candidate is
+1. Every predicted hypothesis j is projected onto the observed free space and keeps a share Q_j of its voxels.
+2. Every pair of a proposed sample i and a predicted hypothesis j is crossed `eta` times. The weight of a candidate,
 
-    log w = log w_j + log w_i + lambda log Q_j
+       log w = log w_j + log w_i + lambda log Q_j,
 
-and depends only on its pair, so candidates are drawn first and built afterwards: those that resampling does not
-choose are never built.
-
-With `evidence` the built candidates themselves are judged, in two stages: some are drawn by the weight above, built
-and scored; what the first stage has used is divided out, so a drawn candidate's weight is its score.
+   depends on its pair only. So candidates are resampled first, and only those that are chosen are built.
+3. With `evidence`, some candidates are drawn by this weight, built and scored. The weight of the first stage is
+   divided out, so the weight of a drawn candidate is its score.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 import numpy as np
 
 from mstfilter.errors import InputError
-from mstfilter.fusion.claims import Claims
 from mstfilter.fusion.crossover import Crossover
-from mstfilter.fusion.division import NoDivision, PartRule, take_apart
-from mstfilter.fusion.free_space import SMALLEST_QUALITY, FreeSpace, Projection
-from mstfilter.fusion.interfaces import Division, Evidence
-from mstfilter.scene import Clip, Hypothesis, VoxelGrid
+from mstfilter.fusion.division import NoDivision, PartRule, split_by_motion
+from mstfilter.fusion.free_space import FreeSpace, log_quality
+from mstfilter.fusion.interfaces import Division, Evidence, Projection
+from mstfilter.scene import Clip, Hypothesis, VoxelGrid, frame_geometry
 from mstfilter.smc import Candidates, Population, Systematic, Update, child, key_of, union
 
-__all__ = ["FusionUpdate"]
+__all__ = ["Claims", "FusionUpdate"]
+
+_SURFACE_VOXELS = 1.5  # a voxel up to this far behind the reading counts as surface, as in completion
+
+
+@dataclass(frozen=True)
+class Claims:
+    """Voxels that the predicted parent of a candidate may add to the sample.
+
+    The sample has seen the surface that the frame measures; the prediction may have seen the space behind it. If free
+    space had to clear much of a predicted object, its motion was wrong, and so are its hidden voxels.
+
+    Parameters
+    ----------
+    surface : {"both", "sample"}
+        Whose objects may fill voxels at the surface that the last frame measures: those of both parents, or of the
+        sample alone. Voxels that only a prediction has there are mostly one or two voxels of misplacement.
+    max_cleared : float
+        A predicted object that lost more than this share of its voxels to free space adds no voxels to those of the
+        sample. 1 sets no limit.
+    """
+
+    surface: Literal["both", "sample"] = "both"
+    max_cleared: float = 1.0
+
+    def __post_init__(self) -> None:
+        if self.surface not in ("both", "sample"):
+            raise InputError(f'surface is {self.surface!r}, expected "both" or "sample"')
+        if not 0 <= self.max_cleared <= 1:
+            raise InputError(f"max_cleared is {self.max_cleared}, expected a share from 0 to 1")
+
+    def exposed(self, clip: Clip) -> np.ndarray | None:
+        """Voxels (X, Y, Z) bool at or in front of the measured surface; None if `surface` is "both"."""
+        if self.surface == "both":
+            return None
+        with np.errstate(invalid="ignore"):
+            signed = frame_geometry(clip.after, clip.grid).signed
+            return np.asarray(signed < _SURFACE_VOXELS * clip.grid.voxel_size)
+
+    def doubtful(self, predicted: Hypothesis, refined: Hypothesis) -> np.ndarray | None:
+        """Voxels (X, Y, Z) bool of objects of which free space cleared too much; None if there are none."""
+        if self.max_cleared >= 1:
+            return None
+        left = refined.volumes()
+        lost = [k for k, n in predicted.volumes().items() if left.get(k, 0) < (1 - self.max_cleared) * n]
+        return np.isin(refined.labels, lost) if any(k in left for k in lost) else None
+
+    def limited(
+        self, sample: Hypothesis, prediction: Hypothesis, exposed: np.ndarray | None, doubtful: np.ndarray | None
+    ) -> Hypothesis:
+        """The prediction without the voxels that it must not add to a sample. An empty sample limits nothing."""
+        if not sample.n_objects:
+            return prediction
+        barred = np.zeros(prediction.labels.shape, bool)
+        for voxels in (exposed, doubtful):
+            if voxels is not None:
+                barred |= voxels
+        barred &= (sample.labels == 0) & (prediction.labels != 0)
+        if not barred.any():
+            return prediction
+        return prediction.with_labels(np.where(barred, 0, prediction.labels).astype(np.uint16))
 
 
 @dataclass(frozen=True)
@@ -41,8 +97,7 @@ class FusionUpdate(Update):
     Parameters
     ----------
     free_space : Projection
-        Projects the predicted hypotheses onto what the latest frame (and, if it has a memory, earlier ones) leaves
-        possible.
+        Projects the predicted hypotheses onto those that agree with the latest frame.
     crossover : Crossover
         Makes one hypothesis of two.
     eta : int
@@ -50,15 +105,15 @@ class FusionUpdate(Update):
     quality_exponent : float
         lambda: power of Q in the weight.
     division : Division
-        Objects of both sides that hold what has moved apart in the clip are parted first, and remembered as such.
+        Objects of both sides whose parts move apart in the clip are split first.
     parts : PartRule
-        When a part is worth an object.
+        When a part of an object becomes a separate object.
     claims : Claims
-        Which voxels each parent may claim.
+        Voxels that a prediction may add to a sample.
     evidence : tuple of Evidence
-        Terms by which built candidates are scored; none: candidates are weighted by their pair alone.
+        Terms that score built candidates; if empty, the weight of a candidate is that of its pair.
     n_scored : int
-        Candidates that are built and scored; 0 is four for each predicted hypothesis.
+        Candidates that are built and scored; 0 means four for each predicted hypothesis.
     """
 
     free_space: Projection = FreeSpace()  # noqa: RUF009 (frozen)
@@ -67,7 +122,7 @@ class FusionUpdate(Update):
     quality_exponent: float = 3.0
     division: Division = NoDivision()  # noqa: RUF009 (frozen)
     parts: PartRule = PartRule()  # noqa: RUF009 (frozen)
-    claims: Claims = Claims()  # noqa: RUF009 (frozen)
+    claims: Claims = Claims()
     evidence: tuple[Evidence, ...] = ()
     n_scored: int = 0
 
@@ -86,7 +141,7 @@ class FusionUpdate(Update):
         proposed: Population | None,
         observation: Clip,
     ) -> Population:
-        """Candidates of all pairs, unbuilt.
+        """Candidates of all pairs, not built.
 
         Without a prediction the proposed samples pass unchanged; without a proposal the refined predictions do.
         """
@@ -94,24 +149,23 @@ class FusionUpdate(Update):
             return union(None, proposed)
         refined, quality = self.free_space.refine(predicted.particles, observation)
         doubtful = [self.claims.doubtful(h, r) for h, r in zip(predicted.particles, refined, strict=True)]
-        refined = self.parted(refined, observation, proposed=False)
-        log_q = self.quality_exponent * np.log(np.maximum(quality, SMALLEST_QUALITY))
+        refined = self.divided(refined, observation, proposed=False)
+        log_q = self.quality_exponent * log_quality(quality)
         notes = {"quality": quality.tolist(), "eta": self.eta}
         if proposed is None:
             return Population(refined, predicted.log_weights + log_q, predicted.parents, notes)
 
         i, j = _pairs(child(rng, "order"), len(proposed), len(predicted), self.eta)
         key, crossover = key_of(rng), self.crossover
-        samples = self.parted(tuple(proposed.particles), observation, proposed=True)
+        samples = self.divided(tuple(proposed.particles), observation, proposed=True)
         claims, exposed = self.claims, self.claims.exposed(observation)
         _check_grids(refined, samples, refined[0].grid if exposed is None else observation.grid)
 
         def build(candidate: int) -> Hypothesis:
             stream = key.child("candidate", candidate).generator()
             sample, prediction = samples[i[candidate]], refined[j[candidate]]
-            wrong = doubtful[j[candidate]]
-            prediction = claims.limited(sample, prediction, exposed, wrong)
-            return crossover.mix(stream, sample, prediction, claims.predicted_wins(exposed, wrong))
+            prediction = claims.limited(sample, prediction, exposed, doubtful[j[candidate]])
+            return crossover.mix(stream, sample, prediction)
 
         none_j, none_i = np.full(len(predicted), -1), np.full(len(proposed), -1)
         parents = {
@@ -120,19 +174,20 @@ class FusionUpdate(Update):
         }
         log_weights = proposed.log_weights[i] + (predicted.log_weights + log_q)[j]
         fused = Population(Candidates(build, len(i)), log_weights, parents, notes)
-        return self._scored(rng, fused, observation, self.n_scored or 4 * len(predicted)) if self.evidence else fused
+        if not self.evidence:
+            return fused
+        return self._resampled(rng, fused, observation, self.n_scored or 4 * len(predicted))
 
-    def _scored(self, rng: np.random.Generator, fused: Population, clip: Clip, n: int) -> Population:
+    def _resampled(self, rng: np.random.Generator, fused: Population, clip: Clip, n: int) -> Population:
         """Second stage: `n` candidates drawn by pair weight, weighted by their score."""
         drawn = Systematic().resample(rng, fused, n).realised()
         total, scores = self.scored(tuple(drawn.particles), clip)
         log_weights = drawn.log_weights + total
         parents = {name: index for name, index in drawn.parents.items() if name != "ancestor"}
-        notes = {**fused.notes, "scores": scores}
-        return Population(drawn.particles, log_weights, parents, notes)
+        return Population(drawn.particles, log_weights, parents, {**fused.notes, "scores": scores})
 
     def scored(self, hypotheses: tuple[Hypothesis, ...], clip: Clip) -> tuple[np.ndarray, dict[str, list[float]]]:
-        """What all terms of evidence say together (n,), nats, and what each says, by name, for the notes."""
+        """The sum (n,) of all terms of evidence in nats, and the score of each term by name."""
         total, scores = np.zeros(len(hypotheses)), {}
         for k, term in enumerate(self.evidence):
             name, score = type(term).__name__, term.log_score(hypotheses, clip)
@@ -140,18 +195,18 @@ class FusionUpdate(Update):
             total += score
         return total, scores
 
-    def parted(self, hypotheses: tuple[Hypothesis, ...], clip: Clip, proposed: bool) -> tuple[Hypothesis, ...]:
-        """Hypotheses about the end of a clip, taken apart by what has moved apart in it; the same one once."""
+    def divided(self, hypotheses: tuple[Hypothesis, ...], clip: Clip, proposed: bool) -> tuple[Hypothesis, ...]:
+        """Hypotheses about the end of a clip with objects split by motion. A repeated hypothesis is split once."""
         motions = self.division.divide(clip)
         if motions is None:
             return hypotheses
-        known = {id(h): h for h in hypotheses}
-        parted = {name: take_apart(h, motions, clip, self.parts, proposed) for name, h in known.items()}
-        return tuple(parted[id(h)] for h in hypotheses)
+        distinct = {id(h): h for h in hypotheses}
+        split = {name: split_by_motion(h, motions, clip, self.parts, proposed) for name, h in distinct.items()}
+        return tuple(split[id(h)] for h in hypotheses)
 
 
 def _check_grids(predicted: tuple[Hypothesis, ...], proposed: tuple[Hypothesis, ...], grid: VoxelGrid) -> None:
-    """All hypotheses lie on this grid: said now, not when a candidate of two that do not fit happens to be built."""
+    """Raise InputError if a hypothesis lies on another grid, before any candidate is built."""
     for name, hypotheses in (("predicted", predicted), ("proposed", proposed)):
         for k, hypothesis in enumerate(hypotheses):
             if hypothesis.grid != grid:
@@ -167,9 +222,9 @@ def _check_grids(predicted: tuple[Hypothesis, ...], proposed: tuple[Hypothesis, 
 def _pairs(rng: np.random.Generator, n_proposed: int, n_predicted: int, eta: int) -> tuple[np.ndarray, np.ndarray]:
     """Sample i and prediction j of each candidate, every pair `eta` times in a row.
 
-    Each sample meets the predictions in cyclic order from one of its own, which the samples draw without replacement
-    as long as there are any. In one fixed order, equal strides through nearly equal weights, as systematic
-    resampling makes them, would meet one and the same prediction again and again.
+    Each sample is paired with the predictions in cyclic order. The first prediction of each sample is drawn without
+    replacement. With the same first prediction for all samples, systematic resampling, which takes equal strides
+    through nearly equal weights, would choose the same prediction again and again.
     """
     rounds = -(-n_proposed // n_predicted)
     first = np.concatenate([rng.permutation(n_predicted) for _ in range(rounds)])[:n_proposed]

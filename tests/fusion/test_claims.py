@@ -4,11 +4,9 @@ import numpy as np
 import pytest
 
 from mstfilter.errors import InputError
-from mstfilter.fusion.claims import Claims
-from mstfilter.fusion.crossover import Crossover
+from mstfilter.fusion.crossover import Crossover, ModeFilter
 from mstfilter.fusion.free_space import FreeSpace
-from mstfilter.fusion.mode_filter import ModeFilter
-from mstfilter.fusion.update import FusionUpdate
+from mstfilter.fusion.update import Claims, FusionUpdate
 from mstfilter.scene import Clip, Frame, Hypothesis
 from mstfilter.smc import Population
 from tests.scene.scenes import CAMERA, GRID, table_scene
@@ -62,7 +60,7 @@ def test_objects_that_free_space_cleared_too_much_of_are_doubtful(scene):
 def test_a_perfect_prediction_and_measurement_leave_the_scene_as_it_is(scene):
     """A book of 2 cm and a thin rod too, whatever is merged and whoever wins."""
     clip, truth = scene
-    for claims in (MST, Claims("sample", "prediction", 0.0), Claims()):
+    for claims in (MST, Claims("sample", 0.0), Claims()):
         for merge in ("covered", "never", "always", "share"):
             crossover = Crossover(merge=merge, mode_filter=ModeFilter(scope="disputed"))
             for labels in children(clip, truth, truth, claims, crossover=crossover):
@@ -71,30 +69,7 @@ def test_a_perfect_prediction_and_measurement_leave_the_scene_as_it_is(scene):
                     assert len(np.unique(labels[truth == k])) == 1
 
 
-def test_hidden_voxels_of_the_prediction_win_where_asked(scene):
-    clip, truth = scene
-    hidden = ~Claims(surface="sample").exposed(clip) & (truth == 1)
-    assert hidden.sum() > 10
-    prediction = np.where(hidden, 9, 0)  # says that the hidden part is another thing
-    plain = Crossover(merge="never", mode_filter=ModeFilter(window=1))
-    asked = children(clip, truth, prediction, Claims(hidden="prediction"), range(8), crossover=plain)
-    inner = hidden & (children(clip, prediction * 0, prediction, Claims(), [0])[0] > 0)  # what free space leaves
-    assert inner.sum() > 10
-    for labels in asked:
-        own = labels[inner]
-        assert (own == np.bincount(own).argmax()).mean() > 0.9
-        visible = labels[(truth == 1) & ~hidden]
-        assert np.bincount(own).argmax() != np.bincount(visible).argmax()
-    order = children(clip, truth, prediction, Claims(), range(8), crossover=plain)
-    outcomes = {
-        bool(np.bincount(o[inner]).argmax() == np.bincount(o[(truth == 1) & ~hidden]).argmax()) for o in order
-    }
-    assert outcomes == {True, False}  # by chance either way
-
-
-@pytest.mark.parametrize(
-    "fields", [{"surface": "none"}, {"hidden": "sample"}, {"max_cleared": 1.5}, {"max_cleared": -1}]
-)
+@pytest.mark.parametrize("fields", [{"surface": "none"}, {"max_cleared": 1.5}, {"max_cleared": -1}])
 def test_wrong_fields_are_named(fields):
     with pytest.raises(InputError, match=next(iter(fields))):
         Claims(**fields)

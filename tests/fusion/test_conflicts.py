@@ -12,10 +12,16 @@ from hypothesis.extra import numpy as hnp
 from scipy import stats
 
 from mstfilter.errors import InputError
-from mstfilter.fusion.conflicts import ConflictGraph, conflict_graph
+from mstfilter.fusion.conflicts import (
+    MERGE_RULES,
+    ConflictGraph,
+    RandomOrder,
+    SpanningTree,
+    conflict_graph,
+    merge_probability,
+    random_spanning_tree,
+)
 from mstfilter.fusion.crossover import Crossover
-from mstfilter.fusion.merging import MERGE_RULES, merge_probability
-from mstfilter.fusion.structure import RandomOrder, SpanningTree, random_spanning_tree
 
 labels = hnp.arrays(np.uint16, (4, 3, 5), elements=st.sampled_from([0, 0, 1, 2, 3, 9]))
 
@@ -40,6 +46,32 @@ def test_graph_against_plain_code(a, b):
             if common:
                 want[i, j] = common
     assert dict(zip(map(tuple, graph.edges.tolist()), graph.intersection.tolist(), strict=True)) == want
+
+
+def test_the_conflict_graph_of_a_crossover_is_a_networkx_graph(monkeypatch):
+    """Components come from networkx, structures draw on its graph, and users can inspect it."""
+    a, b = np.zeros((2, 6, 1, 1), np.uint16)
+    a[[0, 1, 3, 5], 0, 0] = 7, 7, 8, 9
+    b[[1, 2, 3, 4], 0, 0] = 3, 3, 4, 4
+    graph = conflict_graph(a, b)
+    links = graph.networkx()
+    assert isinstance(links, nx.Graph) and nx.is_bipartite(links)
+    assert links.nodes[0] == {"side": 0, "label": 7, "size": 2}
+    assert links.edges[0, 1] == {"intersection": 1}
+    assert [list(links[v]) for v in links] == [[1], [0], [3], [2], []]
+    components, given = [], []
+    found = nx.connected_components
+    monkeypatch.setattr(nx, "connected_components", lambda g: components.append(g) or found(g))
+
+    class Recorded(RandomOrder):
+        def draw(self, rng, graph, component):
+            given.append((graph, component))
+            return super().draw(rng, graph, component)
+
+    Crossover(structure=Recorded()).resolve(np.random.default_rng(0), graph)
+    assert len(components) == 1 and nx.utils.graphs_equal(components[0], links)
+    assert all(g is components[0] for g, _ in given)
+    assert [c for _, c in given] == [[0, 1], [2, 3]] == graph.components()
 
 
 def path_graph(n, edges, sizes=None, common=None):
@@ -67,11 +99,10 @@ def test_spanning_trees_are_uniform(n, edges):
     graph = nx.Graph(list(edges))
     laplacian = nx.laplacian_matrix(graph, nodelist=range(n)).toarray()
     n_trees = round(np.linalg.det(laplacian[1:, 1:]))
-    neighbours = [sorted(graph[v]) for v in range(n)]
     rng = np.random.default_rng(n + len(edges))
     draws, counts = max(4000, 12 * n * n_trees), {}
     for _ in range(draws):
-        root, parent = random_spanning_tree(rng, list(range(n)), neighbours)
+        root, parent = random_spanning_tree(rng, graph, list(range(n)))
         tree = (root, frozenset(frozenset(e) for e in parent.items()))
         counts[tree] = counts.get(tree, 0) + 1
     assert len(counts) <= n * n_trees
@@ -86,7 +117,7 @@ def test_parents_are_painted_after_their_children(structure):
     rng = np.random.default_rng(0)
     graph = path_graph(6, [(0, 3), (0, 4), (1, 4), (1, 5), (2, 5), (2, 3)])
     for _ in range(200):
-        order, edges = structure.draw(rng, list(range(6)), graph.neighbours())
+        order, edges = structure.draw(rng, graph.networkx(), list(range(6)))
         place = {v: k for k, v in enumerate(order)}
         assert sorted(order) == list(range(6))
         assert all(place[child] < place[parent] for child, parent in edges)
@@ -100,7 +131,7 @@ def outcome(group, order):
 
 def exact_law(graph, structure, rule):
     """All draws with their probabilities, by enumeration."""
-    n, neighbours = len(graph), graph.neighbours()
+    n = len(graph)
     common = {}
     for (a, b), c in zip(graph.edges.tolist(), graph.intersection.tolist(), strict=True):
         common[a, b] = common[b, a] = c
@@ -146,7 +177,6 @@ def exact_law(graph, structure, rule):
             key = outcome(group, order)
             law[key] = law.get(key, 0.0) + q
     assert sum(law.values()) == pytest.approx(1.0)
-    assert neighbours
     return law
 
 
@@ -162,7 +192,7 @@ def test_outcomes_follow_the_enumerated_law(structure, n, edges):
     crossover = Crossover(structure=structure, merge="share")
     draws, counts = 6000, dict.fromkeys(law, 0)
     for _ in range(draws):
-        draw = crossover.draw(rng, graph)
+        draw = crossover.resolve(rng, graph)
         counts[outcome(draw.group, draw.order)] += 1  # KeyError: an outcome that cannot be
     expected = np.array([draws * p for p in law.values()])
     observed = np.array([counts[k] for k in law])

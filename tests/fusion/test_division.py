@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mstfilter.fusion.crossover import Crossover
-from mstfilter.fusion.division import NoDivision, PartRule, RigidMotions, part_like, take_apart
+from mstfilter.fusion.division import NoDivision, PartRule, RigidMotions, split_by_motion, split_like
 from mstfilter.fusion.update import FusionUpdate
 from mstfilter.scene import Hypothesis, ObjectRecord, VoxelGrid, decode_hypotheses, encode_hypotheses
 from mstfilter.scoring import weighted_coverage
@@ -37,7 +37,7 @@ def test_what_moved_apart_is_taken_apart_and_remembered(pushed):
     clip, truth = pushed
     motions = RigidMotions().divide(clip)
     one = Hypothesis.from_labels(merged(truth, (4, 5)), clip.grid)
-    two = take_apart(one, motions, clip)
+    two = split_by_motion(one, motions, clip)
     assert two.n_objects == one.n_objects + 1
     assert weighted_coverage(two.labels, truth) > 0.97 > weighted_coverage(one.labels, truth)
     a, b = record_at(two, truth == 4), record_at(two, truth == 5)
@@ -51,18 +51,18 @@ def test_what_moved_apart_is_taken_apart_and_remembered(pushed):
 def test_what_moved_as_one_stays_as_it_is(pushed):
     clip, truth = pushed
     motions = RigidMotions().divide(clip)
-    right = take_apart(Hypothesis.from_labels(truth, clip.grid), motions, clip)
+    right = split_by_motion(Hypothesis.from_labels(truth, clip.grid), motions, clip)
     np.testing.assert_array_equal(right.labels, truth)
     resting = Hypothesis.from_labels(merged(truth, (3, 4)), clip.grid)
-    np.testing.assert_array_equal(take_apart(resting, motions, clip).labels, resting.labels)
+    np.testing.assert_array_equal(split_by_motion(resting, motions, clip).labels, resting.labels)
     nothing = Hypothesis.from_labels(np.zeros_like(truth), clip.grid)
-    assert take_apart(nothing, motions, clip) is nothing
+    assert split_by_motion(nothing, motions, clip) is nothing
 
 
 def test_small_parts_are_left(pushed):
     clip, truth = pushed
     one = Hypothesis.from_labels(merged(truth, (4, 5)), clip.grid)
-    kept = take_apart(one, RigidMotions().divide(clip), clip, PartRule(min_pixels=10**6))
+    kept = split_by_motion(one, RigidMotions().divide(clip), clip, PartRule(min_pixels=10**6))
     np.testing.assert_array_equal(kept.labels, one.labels)
 
 
@@ -87,11 +87,11 @@ def strangers(labels, *pairs):
 
 def test_a_sample_that_has_them_as_one_is_parted():
     sample = Hypothesis.from_labels(bars(1, 1, 2, 2), GRID, birth=1)
-    parted = part_like(sample, strangers(bars(1, 2, 3, 4), (1, 2)))
+    parted = split_like(sample, strangers(bars(1, 2, 3, 4), (1, 2)))
     assert parted.n_objects == 3
     assert weighted_coverage(parted.labels, bars(1, 2, 3, 3)) == 1.0
-    assert part_like(sample, strangers(bars(1, 2, 3, 4))) is sample
-    three = part_like(Hypothesis.from_labels(bars(1, 1, 1, 1), GRID, 1), strangers(bars(1, 2, 3, 0), (1, 2), (2, 3)))
+    assert split_like(sample, strangers(bars(1, 2, 3, 4))) is sample
+    three = split_like(Hypothesis.from_labels(bars(1, 1, 1, 1), GRID, 1), strangers(bars(1, 2, 3, 0), (1, 2), (2, 3)))
     assert weighted_coverage(three.labels, bars(1, 2, 3, 3)) == 1.0  # the rest goes to the nearest
 
 

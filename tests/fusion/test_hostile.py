@@ -8,14 +8,11 @@ import numpy as np
 import pytest
 
 from mstfilter.errors import InputError
-from mstfilter.fusion.claims import Claims
-from mstfilter.fusion.conflicts import conflict_graph
-from mstfilter.fusion.crossover import Crossover
+from mstfilter.fusion.conflicts import OneSideLast, RandomOrder, SpanningTree, conflict_graph
+from mstfilter.fusion.crossover import Crossover, ModeFilter
 from mstfilter.fusion.free_space import FreeSpace
-from mstfilter.fusion.mode_filter import ModeFilter
 from mstfilter.fusion.similarity import Agreement
-from mstfilter.fusion.structure import OneSideLast, RandomOrder, SpanningTree
-from mstfilter.fusion.update import FusionUpdate
+from mstfilter.fusion.update import Claims, FusionUpdate
 from mstfilter.scene import MAX_LABEL, Clip, Frame, Hypothesis, VoxelGrid
 from mstfilter.smc import Population
 from tests.scene.scenes import CAMERA, GRID, table_scene
@@ -104,7 +101,6 @@ def test_shapes_that_differ():
         lambda: conflict_graph(A, few),
         lambda: ModeFilter().apply(A[0]),
         lambda: ModeFilter(scope="disputed").apply(A, few > 0),
-        lambda: Crossover().mix(np.random.default_rng(0), on(A), on(B), few > 0),
     ):
         with pytest.raises(InputError, match="shape") as caught:
             call()
@@ -116,8 +112,6 @@ def test_shapes_that_differ():
 def test_masks_that_are_none():
     with pytest.raises(InputError, match="disputed is float64"):
         ModeFilter(scope="disputed").apply(A, np.ones(A.shape))
-    with pytest.raises(InputError, match="from_predicted is uint16"):
-        Crossover().mix(np.random.default_rng(0), on(A), on(B), B)
 
 
 def test_labels_without_a_record():
@@ -143,7 +137,7 @@ def test_parents_without_objects(structure):
     for n in (0, 3):
         free = np.zeros((n, 4, 5), np.uint16)
         graph = conflict_graph(free, free)
-        assert (len(graph), graph.edges.shape, graph.components(), graph.neighbours()) == (0, (0, 2), [], [])
+        assert (len(graph), graph.edges.shape, graph.components()) == (0, (0, 2), [])
         assert ModeFilter().apply(free).shape == free.shape
 
 
@@ -253,7 +247,7 @@ def test_free_space_of_odd_hypotheses():
     assert project(nothing, frame) == (nothing, 1.0)
 
 
-@pytest.mark.parametrize("claims", [Claims(), Claims("sample", "prediction", 0.03)])
+@pytest.mark.parametrize("claims", [Claims(), Claims("sample", 0.03)])
 @pytest.mark.parametrize("evidence", [(), (Agreement(),)])
 def test_an_update_of_parents_without_objects(claims, evidence):
     """Whichever side is empty, all candidates can be built, weighted and scored."""
@@ -269,7 +263,7 @@ def test_an_update_of_parents_without_objects(claims, evidence):
             np.testing.assert_array_equal(child.labels, wanted.labels)
 
 
-SURFACE = Claims("sample", "prediction", 0.03)  # asks the frame about voxels of the clip's grid
+SURFACE = Claims("sample", 0.03)  # asks the frame about voxels of the clip's grid
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ from hypothesis import given, settings, strategies as st
 from hypothesis.extra import numpy as hnp
 
 from mstfilter.errors import InputError
-from mstfilter.fusion.mode_filter import ModeFilter
+from mstfilter.fusion.crossover import ModeFilter
 
 
 def by_loops(labels, window, margin, isolation, may_change):

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from mstfilter.errors import InputError
-from mstfilter.fusion.free_space import FreeSpace, NoFreeSpace
-from mstfilter.fusion.projection import ProjectionUpdate
+from mstfilter.fusion.free_space import FreeSpace, NoFreeSpace, ProjectionUpdate
 from mstfilter.fusion.update import FusionUpdate
 from mstfilter.presets import REGISTRY
 from mstfilter.scene import Clip, Frame, Hypothesis, VoxelGrid

@@ -11,10 +11,10 @@ from hypothesis.extra import numpy as hnp
 from scipy.spatial.transform import RigidTransform
 
 from mstfilter.errors import InputError
-from mstfilter.fusion.crossover import Crossover
-from mstfilter.fusion.free_space import NoFreeSpace, Projection
-from mstfilter.fusion.mode_filter import ModeFilter
-from mstfilter.fusion.structure import RandomOrder, SpanningTree
+from mstfilter.fusion.conflicts import RandomOrder, SpanningTree
+from mstfilter.fusion.crossover import Crossover, ModeFilter
+from mstfilter.fusion.free_space import NoFreeSpace
+from mstfilter.fusion.interfaces import Projection
 from mstfilter.fusion.update import FusionUpdate
 from mstfilter.presets import REGISTRY, load_config
 from mstfilter.scene import Clip, Crop, Frame, Hypothesis, VoxelGrid
@@ -63,7 +63,7 @@ def _graph_and_draw(crossover, a, b, seed):
     from mstfilter.fusion.conflicts import conflict_graph
 
     graph = conflict_graph(a, b)
-    return graph, crossover.draw(np.random.default_rng(seed), graph)
+    return graph, crossover.resolve(np.random.default_rng(seed), graph)
 
 
 @settings(max_examples=60, deadline=None)
