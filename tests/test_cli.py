@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from mstfilter.cli import main
-from mstfilter.study import RunFolder
+from mstfilter.runs import RunFolder
 from tests.scene.test_recording import FAULTS, write
 
 HEAVY = ("torch", "open3d", "cv2", "scipy", "higra", "mujoco", "matplotlib")
@@ -149,7 +149,7 @@ def test_a_kill_at_any_moment_leaves_a_run_that_resumes(recording, tmp_path):
     """The process is killed mid-run; the same command ends with the same bytes as an undisturbed run."""
     import time
 
-    from tests.study.test_run import content
+    from tests.runs.test_run import content
 
     command = [sys.executable, "-m", "mstfilter", "run", str(recording), "--no-report"]
     subprocess.run([*command, "--out", tmp_path / "whole"], check=True, capture_output=True, timeout=300)

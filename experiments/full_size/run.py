@@ -19,8 +19,9 @@ import tempfile
 from dataclasses import replace
 from pathlib import Path
 
+from mstfilter.runs import RunFolder
 from mstfilter.simulation import scene_family, simulate
-from mstfilter.study import RunFolder, write_table
+from mstfilter.study import write_table
 
 HERE = Path(__file__).resolve().parent
 SIZE = ["n=5", "n_proposed=10", "update.eta=5"]

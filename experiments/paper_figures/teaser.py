@@ -20,10 +20,10 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from mstfilter.formats import open_recording
 from mstfilter.presets import load_config
 from mstfilter.report import TRUTH, Identities, by_weight, identity_colours, viewpoint
+from mstfilter.runs import RunFolder, filter_recording
 from mstfilter.scene import Camera, Recording
 from mstfilter.scoring import object_status, overlap
 from mstfilter.simulation import cached_recording
-from mstfilter.study import RunFolder, execute
 
 #: The scene of the figures `initial` and `sampled_cuts`.
 FAMILY, SEED = "s2", 0
@@ -36,7 +36,7 @@ def make(out: Path, smoke: bool) -> list[Path]:
     """The figure."""
     recording = open_recording(cached_recording(FAMILY, SEED, **(SMALL if smoke else {})))
     with tempfile.TemporaryDirectory() as folder:
-        run = execute(recording, load_config("mst"), Path(folder) / "run", seed=0)
+        run = filter_recording(recording, load_config("mst"), Path(folder) / "run", seed=0)
         return [picture(recording, run, out / "teaser.png", smoke), table(recording, run, out / "teaser.csv")]
 
 

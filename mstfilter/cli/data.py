@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from mstfilter.cli.root import Format, Options, Pauses, app
+from mstfilter.cli.root import FormatOption, Options, Pauses, app
 from mstfilter.cli.shared import bar, read_source
 
 __all__ = ["convert", "quality"]
@@ -18,7 +18,7 @@ __all__ = ["convert", "quality"]
 def convert(
     source: Annotated[Path, typer.Argument(help="Folder or file of a format that `mstfilter list format` shows.")],
     out: Annotated[Path, typer.Argument(help="Recording folder to make.")],
-    format: Format = "",
+    format: FormatOption = "",
     option: Options = None,
     pauses: Pauses = "",
     frames: Annotated[str, typer.Option(help="Frames of a folder of pairs, separated by commas.")] = "",
@@ -46,19 +46,19 @@ def quality(
     run: Annotated[Path, typer.Argument(help="Run folder, or label volumes (.npz or .npy).")],
     truth: Annotated[Path, typer.Argument(help="Recording that holds the truth, or its voxels.npz.")],
     csv: Annotated[Path | None, typer.Option(help="Also write the table into this file.")] = None,
-    format: Format = "",
+    format: FormatOption = "",
     option: Options = None,
 ) -> None:
     """Score the hypotheses of a run against the truth, beside trivial baselines."""
     from statistics import fmean
 
-    from mstfilter.study import read_estimate, read_truth, score, write_csv
+    from mstfilter.runs import read_estimate, read_truth, score_pauses, write_scores
 
     volumes = truth.is_file() and truth.suffix in (".npz", ".npy")
     known = truth if volumes else read_source(truth, format, option, "")
-    rows = score(read_estimate(run), read_truth(known))
+    rows = score_pauses(read_estimate(run), read_truth(known))
     if csv is not None:
-        write_csv(csv, rows)
+        write_scores(csv, rows)
     names = ("mean", "weighted", "best", "top", "one_blob", "components")
     print(f"{'pause':<7}{'form':<9}{'n':>4}" + "".join(f"{name:>12}" for name in names))
     for row in rows:

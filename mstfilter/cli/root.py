@@ -8,7 +8,7 @@ import typer
 
 from mstfilter import __version__
 
-__all__ = ["Format", "Options", "Overrides", "Pauses", "Seed", "app"]
+__all__ = ["FormatOption", "Options", "Overrides", "Pauses", "Seed", "app"]
 
 app = typer.Typer(
     add_completion=False,
@@ -24,7 +24,7 @@ Overrides = Annotated[
         metavar="[PATH=VALUE]...", help="Changes to the preset: n=10 resampler=multinomial transition.rule=paper"
     ),
 ]
-Format = Annotated[
+FormatOption = Annotated[
     str, typer.Option(metavar="NAME", help="Format, or ./file.py:Class. Default: detected; `mstfilter list format`.")
 ]
 Options = Annotated[

@@ -7,11 +7,11 @@ from typing import Annotated, Any
 
 import typer
 
-from mstfilter.cli.root import Format, Options, Overrides, Pauses, Seed, app
+from mstfilter.cli.root import FormatOption, Options, Overrides, Pauses, Seed, app
 from mstfilter.cli.shared import bar, read_source, safe_name, summary
 from mstfilter.errors import InputError
 
-__all__ = ["demo", "report", "run", "simulate"]
+__all__ = ["demo", "report", "run", "simulate_"]
 
 
 @app.command()
@@ -23,7 +23,7 @@ def run(
     preset: Annotated[str, typer.Option(help="mst, paper, authors, or the path of a .toml file.")] = "mst",
     out: Annotated[Path | None, typer.Option(help="Run folder. Default: runs/RECORDING-PRESET-SEED.")] = None,
     seed: Seed = 0,
-    format: Format = "",
+    format: FormatOption = "",
     option: Options = None,
     pauses: Pauses = "",
     frames: Annotated[str, typer.Option(help="Frames of a folder of pairs, separated by commas.")] = "",
@@ -72,8 +72,8 @@ def demo(
     summary(out / "run")
 
 
-@app.command()
-def simulate(
+@app.command("simulate")
+def simulate_(
     family: Annotated[str, typer.Argument(help="Kind of scene; `mstfilter list families` shows them.")],
     out: Annotated[Path, typer.Argument(help="Recording folder to make.")],
     seed: Seed = 0,
@@ -101,7 +101,7 @@ def report(
     _report(run, out)
     if export is not None:
         from mstfilter.report import export_run
-        from mstfilter.study import RunFolder
+        from mstfilter.runs import RunFolder
 
         export_run(RunFolder.open(run), export, mesh_format, mesh_style)
         print(f"hypotheses  {export}")
@@ -117,15 +117,17 @@ def _simulate(family: str, out: Path, seed: int) -> None:
 
 
 def _execute(recording: Any, config: dict[str, Any], folder: Path, seed: int) -> None:
-    from mstfilter.study import execute
+    from mstfilter.runs import filter_recording
 
     with bar("filter") as advance:
-        execute(recording, config, folder, seed, allow_files=True, progress=lambda p: advance(p.done, p.total))
+        filter_recording(
+            recording, config, folder, seed, allow_files=True, progress=lambda p: advance(p.done, p.total)
+        )
     print(f"run         {folder}")
 
 
 def _report(run: Path, out: Path | None) -> None:
     from mstfilter.report import write_report
-    from mstfilter.study import RunFolder
+    from mstfilter.runs import RunFolder
 
     print(f"report      {write_report(RunFolder.open(run), out)}")

@@ -22,7 +22,7 @@ def safe_name(name: str) -> str:
 
 def read_source(path: Path, format: str, options: list[str] | None, pauses: str, frames: str = "") -> Any:
     """A recording of any format that is read."""
-    from mstfilter.study import open_source
+    from mstfilter.runs import open_source
 
     names = ",".join(name.strip() for name in frames.split(",") if name.strip())
     chosen = [*(options or []), *([f"frames={names},"] if names else [])]
@@ -80,7 +80,7 @@ def bar(what: str) -> Iterator[Callable[[int, int], None]]:
 
 def summary(run: Path) -> None:
     """A line a pause: hypotheses, their objects, effective number of candidates, quality."""
-    from mstfilter.study import RunFolder
+    from mstfilter.runs import RunFolder
 
     folder = RunFolder.open(run)
     for t in range(folder.n_pauses):

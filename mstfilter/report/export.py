@@ -29,8 +29,8 @@ from mstfilter.files import atomic_path, write_csv
 from mstfilter.open3d_import import import_open3d
 from mstfilter.report.identities import identity_colours
 from mstfilter.report.pictures import UNASSIGNED_COLOUR, Colour, colour, hexadecimal
+from mstfilter.runs import RunFolder
 from mstfilter.scene import Hypothesis, VoxelGrid, project, write_image
-from mstfilter.study import RunFolder
 
 __all__ = ["MESH_FORMATS", "MESH_STYLES", "export_mesh", "export_run", "hypothesis_mesh", "voxel_faces"]
 

@@ -26,9 +26,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from mstfilter.report.pictures import Colour, colour, hexadecimal, layer, png_bytes, voxel_picture
+from mstfilter.runs import RunFolder
 from mstfilter.scene import Camera, Hypothesis, VoxelGrid, project
 from mstfilter.scoring import overlap
-from mstfilter.study import RunFolder
 
 __all__ = [
     "Card",

@@ -28,8 +28,8 @@ from mstfilter.report.figures import genealogy_figure, health_figure, quality_fi
 from mstfilter.report.identities import cards_of_pause, close_up, data_uri, identity_colours, truth_card
 from mstfilter.report.page import counts, flatten, note_rows, render, shown, write_page
 from mstfilter.report.pictures import jpeg_bytes, viewpoint
+from mstfilter.runs import RunFolder
 from mstfilter.scoring import connected_components, one_blob, weighted_coverage
-from mstfilter.study import RunFolder
 
 __all__ = ["Numbers", "Step", "different", "numbers_of", "seconds_text", "write_report"]
 

@@ -1,5 +1,4 @@
 from mstfilter.study.cluster import Cluster as Cluster
-from mstfilter.study.codec import HypothesisCodec as HypothesisCodec
 from mstfilter.study.config import load_study as load_study, study_of as study_of
 from mstfilter.study.executors import Executor as Executor
 from mstfilter.study.grid import check_names as check_names
@@ -12,16 +11,7 @@ from mstfilter.study.results import (
     cost_columns as cost_columns,
     write_table as write_table,
 )
-from mstfilter.study.run import execute as execute
-from mstfilter.study.run_folder import RunFolder as RunFolder
-from mstfilter.study.scoring import (
-    read_estimate as read_estimate,
-    read_truth as read_truth,
-    score as score,
-    write_csv as write_csv,
-)
 from mstfilter.study.shared_work import kind_versions as kind_versions
-from mstfilter.study.sources import open_source as open_source
 from mstfilter.study.statistics import (
     CLAIM as CLAIM,
     Difference as Difference,

@@ -19,7 +19,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from mstfilter.errors import InputError, MissingLibraryError
-from mstfilter.study.executors import Event, Executor, Job, Outcome, Tell
+from mstfilter.study.executors import Event, Executor, Job, JobOutcome, Tell
 
 __all__ = ["Cluster"]
 
@@ -47,7 +47,7 @@ class Cluster(Executor):
     timeout_s: float = 0.0
     connect_s: float = 10.0
 
-    def run(self, jobs: Sequence[Job], tell: Tell) -> list[Outcome]:
+    def run(self, jobs: Sequence[Job], tell: Tell) -> list[JobOutcome]:
         """Run all jobs; where those of one share run is the scheduler's choice."""
         if not jobs:
             return []
@@ -80,11 +80,11 @@ class _Conversation:
     def __init__(self, settings: Cluster, client: Any, tell: Tell) -> None:
         self._settings, self._client, self._tell = settings, client, tell
         self._heard: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
-        self._outcomes: dict[int, Outcome] = {}
+        self._outcomes: dict[int, JobOutcome] = {}
         self._at: dict[int, tuple[str, float]] = {}  # worker and time of the try that is going on
         self._tries: dict[int, int] = {}
 
-    def run(self, jobs: Sequence[Job]) -> list[Outcome]:
+    def run(self, jobs: Sequence[Job]) -> list[JobOutcome]:
         topic = f"mstfilter-{uuid.uuid4().hex}"
         self._client.subscribe_topic(topic, lambda event: self._heard.put(event[1]))
         futures = {}
@@ -116,7 +116,7 @@ class _Conversation:
         else:
             self._tell(Event("step", k, said["done"], said["total"]))
 
-    def _end(self, k: int, outcome: Outcome) -> None:
+    def _end(self, k: int, outcome: JobOutcome) -> None:
         self._at.pop(k, None)
         self._outcomes[k] = outcome
         self._tell(Event("ended", k, outcome=outcome))
@@ -138,25 +138,27 @@ class _Conversation:
                 last = True
             if last:
                 why = f"it took longer than {limit:g} s, {n} time{'s' if n > 1 else ''}"
-                self._end(k, Outcome("failed", why, tuple(hints), tries=n))
+                self._end(k, JobOutcome("failed", why, tuple(hints), tries=n))
 
 
-def _outcome(future: Any, tries: int) -> Outcome:
+def _outcome(future: Any, tries: int) -> JobOutcome:
     """What became of a job whose future is done."""
     from distributed import KilledWorker
 
     if future.status in ("cancelled", "lost"):
-        return Outcome(
+        return JobOutcome(
             "failed", f"the scheduler has given it up: {future.status}", ("repeat the command",), tries=tries
         )
     error = future.exception()
     if error is None:
         result = future.result()
-        return Outcome(**{**result, "hints": tuple(result["hints"])})
+        return JobOutcome(**{**result, "hints": tuple(result["hints"])})
     if isinstance(error, KilledWorker):
         n = error.allowed_failures + 1
-        return Outcome("failed", f"its worker died {n} times", ("if memory ran out: more memory a worker",), tries=n)
-    return Outcome("failed", f"{type(error).__name__}: {error}", ("look at the logs of the cluster",), tries=tries)
+        return JobOutcome(
+            "failed", f"its worker died {n} times", ("if memory ran out: more memory a worker",), tries=n
+        )
+    return JobOutcome("failed", f"{type(error).__name__}: {error}", ("look at the logs of the cluster",), tries=tries)
 
 
 def _check_workers(client: Any) -> None:

@@ -1,7 +1,7 @@
 """What runs the jobs of a study: processes of this machine (`local`), or a cluster (`cluster`).
 
 An executor is given jobs as plain dictionaries (see `jobs.perform`) and tells what happens. It never fails because
-a job does: a job ends with an `Outcome`, whatever becomes of it.
+a job does: a job ends with a `JobOutcome`, whatever becomes of it.
 
 >>> outcomes = Local(workers=2).run(jobs, tell=print)
 """
@@ -13,14 +13,14 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-__all__ = ["Event", "Executor", "Job", "Outcome", "Tell"]
+__all__ = ["Event", "Executor", "Job", "JobOutcome", "Tell"]
 
 Job = Mapping[str, Any]
 """Plain values: ``kind`` (record, run, measure), ``name``, ``share`` (jobs of one share use the same work), ..."""
 
 
 @dataclass(frozen=True)
-class Outcome:
+class JobOutcome:
     """How a job ended.
 
     Parameters
@@ -55,7 +55,7 @@ class Event:
         Its place in the list.
     done, total : int
         Steps of the job, where known.
-    outcome : Outcome, optional
+    outcome : JobOutcome, optional
         Of a job that has ended.
     """
 
@@ -63,7 +63,7 @@ class Event:
     job: int
     done: int = 0
     total: int = 0
-    outcome: Outcome | None = None
+    outcome: JobOutcome | None = None
 
 
 Tell = Callable[[Event], None]
@@ -73,7 +73,7 @@ class Executor(ABC):
     """Runs jobs."""
 
     @abstractmethod
-    def run(self, jobs: Sequence[Job], tell: Tell) -> list[Outcome]:
+    def run(self, jobs: Sequence[Job], tell: Tell) -> list[JobOutcome]:
         """Run all jobs; their outcomes in the order given.
 
         Parameters

@@ -1,7 +1,7 @@
 """What a worker does: make a recording, run a filter on one, or measure a run again.
 
 >>> perform({"kind": "run", "name": "mst on demo-0", ...}, step=lambda done, total: None)
-Outcome(status='done')
+JobOutcome(status='done')
 
 A job is plain values and needs nothing else, so that a process on another machine can do it. A run is written
 under a name of its own and renamed when it is whole: two workers with the same run do not disturb each other,
@@ -23,22 +23,22 @@ from typing import Any
 
 from mstfilter.errors import InputError
 from mstfilter.formats import open_recording
+from mstfilter.runs.run_folder import RunFolder, write_json
+from mstfilter.runs.sources import open_source
 from mstfilter.scene import Recording
 from mstfilter.smc import telling
 from mstfilter.study.code_version import files_version
-from mstfilter.study.executors import Job, Outcome
+from mstfilter.study.executors import Job, JobOutcome
 from mstfilter.study.memory import StagePeaks
 from mstfilter.study.results import RESULT, read_result
-from mstfilter.study.run_folder import RunFolder, write_json
 from mstfilter.study.shared_work import shared_work
-from mstfilter.study.sources import open_source
 
 __all__ = ["failed", "open_scene", "perform"]
 
-Step = Callable[[int, int], None]
+_Step = Callable[[int, int], None]
 
 
-def perform(job: Job, step: Step = lambda done, total: None) -> Outcome:
+def perform(job: Job, step: _Step = lambda done, total: None) -> JobOutcome:
     """Do a job; whatever goes wrong in it becomes its outcome.
 
     Parameters
@@ -52,19 +52,23 @@ def perform(job: Job, step: Step = lambda done, total: None) -> Outcome:
         {"record": _record, "run": _run, "measure": _measure}[job["kind"]](job, step)
     except Exception as error:
         return failed(error)
-    return Outcome("done")
+    return JobOutcome("done")
 
 
-def failed(error: Exception) -> Outcome:
+def failed(error: Exception) -> JobOutcome:
     """What an exception says to a user."""
     trace = "".join(traceback.format_exception(error))
     if isinstance(error, InputError):
-        return Outcome("failed", error.message, error.hints, trace)
+        return JobOutcome("failed", error.message, error.hints, trace)
     if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
-        return Outcome("failed", f"no space left: {error}", ("make room; the same command repeats this run",), trace)
+        return JobOutcome(
+            "failed", f"no space left: {error}", ("make room; the same command repeats this run",), trace
+        )
     if isinstance(error, MemoryError):
-        return Outcome("failed", "out of memory", ("use fewer workers",), trace)
-    return Outcome("failed", f"{type(error).__name__}: {error}", ("a fault of the program or of a component",), trace)
+        return JobOutcome("failed", "out of memory", ("use fewer workers",), trace)
+    return JobOutcome(
+        "failed", f"{type(error).__name__}: {error}", ("a fault of the program or of a component",), trace
+    )
 
 
 def open_scene(source: Mapping[str, Any], recordings: str) -> Recording:
@@ -76,7 +80,7 @@ def open_scene(source: Mapping[str, Any], recordings: str) -> Recording:
     return open_recording(cached_recording(source["family"], source["seed"], Path(recordings), **source["set"]))
 
 
-def _record(job: Job, step: Step) -> None:
+def _record(job: Job, step: _Step) -> None:
     open_scene(job["source"], job["recordings"])
 
 
@@ -100,8 +104,8 @@ def _verify(job: Job) -> None:
     _verified.add(job["code"])
 
 
-def _run(job: Job, step: Step) -> None:
-    from mstfilter.study.run import execute
+def _run(job: Job, step: _Step) -> None:
+    from mstfilter.runs.run import filter_recording
 
     _verify(job)
     final = Path(job["folder"])
@@ -122,7 +126,7 @@ def _run(job: Job, step: Step) -> None:
         recording = open_scene(job["source"], job["recordings"])
         began = time.process_time()
         with shared_work(job["work"]), telling(peaks):
-            run = execute(
+            run = filter_recording(
                 recording, job["config"], work, job["seed"], allow_files=job["allow_files"], progress=progress
             )
         stages = [{f"seconds_{k}": v for k, v in run.seconds(t).items()} for t in range(run.n_pauses)]
@@ -136,7 +140,7 @@ def _run(job: Job, step: Step) -> None:
         shutil.rmtree(work, ignore_errors=True)
 
 
-def _measure(job: Job, step: Step) -> None:
+def _measure(job: Job, step: _Step) -> None:
     """Figures of a run that is done already, by what they mean now."""
     folder = Path(job["folder"])
     recording = open_scene(job["source"], job["recordings"])
@@ -144,8 +148,8 @@ def _measure(job: Job, step: Step) -> None:
 
 
 def _write(run: RunFolder, recording: Recording, job: Job, costs: list[dict[str, float]]) -> None:
-    from mstfilter.study.metrics import measure
+    from mstfilter.runs.metrics import measure_pause
 
-    rows = [measure(run, recording, t) for t in range(run.n_pauses)]
+    rows = [measure_pause(run, recording, t) for t in range(run.n_pauses)]
     result = {"identity": job["identity"], "metrics": job["metrics"], "status": "done", "rows": rows, "costs": costs}
     write_json(run.path / RESULT, result)

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from mstfilter.errors import InputError
-from mstfilter.study.executors import Event, Executor, Job, Outcome, Queue, Tell
+from mstfilter.study.executors import Event, Executor, Job, JobOutcome, Queue, Tell
 
 __all__ = ["Local"]
 
@@ -59,14 +59,14 @@ class Local(Executor):
         if self.workers < 0 or self.tries < 1 or self.timeout_s < 0:
             raise InputError(f"workers is {self.workers}, tries {self.tries} and timeout {self.timeout_s} s")
 
-    def run(self, jobs: Sequence[Job], tell: Tell) -> list[Outcome]:
+    def run(self, jobs: Sequence[Job], tell: Tell) -> list[JobOutcome]:
         """Run all jobs."""
         if not jobs:
             return []
         n = min(self.workers or _cores(), len(jobs))
         crew = _Crew(self, jobs)
         threads = [threading.Thread(target=crew.serve, args=(w,), daemon=True) for w in range(n)]
-        outcomes: dict[int, Outcome] = {}
+        outcomes: dict[int, JobOutcome] = {}
         for thread in threads:
             thread.start()
         try:
@@ -120,7 +120,7 @@ class _Crew:
         finally:
             self._end(worker)
 
-    def _see_through(self, worker: int, k: int) -> Outcome | None:
+    def _see_through(self, worker: int, k: int) -> JobOutcome | None:
         """A job with all its tries; None if everything is being stopped."""
         why = ""
         for attempt in range(1, self.settings.tries + 1):
@@ -137,9 +137,9 @@ class _Crew:
             "if memory ran out: fewer workers, or a smaller scene",
             *([f"log: {self._log(worker)}"] if self._log(worker) else []),
         )
-        return Outcome("failed", f"its worker died {n} time{'s' if n > 1 else ''}{why}", hints, tries=n)
+        return JobOutcome("failed", f"its worker died {n} time{'s' if n > 1 else ''}{why}", hints, tries=n)
 
-    def _once(self, worker: int, k: int) -> tuple[Outcome | None, str]:
+    def _once(self, worker: int, k: int) -> tuple[JobOutcome | None, str]:
         """One try; no outcome, and why, if the worker died."""
         process = self._process(worker)
         if process is None:
@@ -216,5 +216,5 @@ class _Crew:
         process.wait()
 
 
-def _outcome(data: Mapping[str, Any]) -> Outcome:
-    return Outcome(**{**data, "hints": tuple(data["hints"])})
+def _outcome(data: Mapping[str, Any]) -> JobOutcome:
+    return JobOutcome(**{**data, "hints": tuple(data["hints"])})

@@ -22,18 +22,18 @@ from typing import Any
 
 from mstfilter.errors import InputError
 from mstfilter.presets import REGISTRY, build_filter, describe_filter
+from mstfilter.runs.run import files_of, versions
+from mstfilter.runs.run_folder import plain
+from mstfilter.runs.sources import open_source
 from mstfilter.scene import content_key
 from mstfilter.study.code_version import code_version
 from mstfilter.study.config import SceneEntry, StudyConfig
 from mstfilter.study.grid import Asked, expand
-from mstfilter.study.run import files_of, versions
-from mstfilter.study.run_folder import plain
-from mstfilter.study.sources import open_source
 
-__all__ = ["Arm", "Plan", "Run", "Scene", "make_plan"]
+__all__ = ["Arm", "Plan", "StudyRun", "StudyScene", "make_plan"]
 
 # What every run goes through besides its components.
-_ALWAYS = ("mstfilter.smc.particle_filter", "mstfilter.scene.recording", "mstfilter.study.codec")
+_ALWAYS = ("mstfilter.smc.particle_filter", "mstfilter.scene.recording", "mstfilter.runs.run_folder")
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ class Arm:
 
 
 @dataclass(frozen=True)
-class Scene:
+class StudyScene:
     """A recording to filter.
 
     Parameters
@@ -85,11 +85,11 @@ class Scene:
 
 
 @dataclass(frozen=True)
-class Run:
+class StudyRun:
     """An arm on a scene with a seed of the filter."""
 
     arm: Arm
-    scene: Scene
+    scene: StudyScene
     seed: int
     identity: str
 
@@ -111,8 +111,8 @@ class Plan:
 
     config: StudyConfig
     arms: tuple[Arm, ...]
-    scenes: tuple[Scene, ...]
-    runs: tuple[Run, ...]
+    scenes: tuple[StudyScene, ...]
+    runs: tuple[StudyRun, ...]
 
     @property
     def reference(self) -> str:
@@ -150,7 +150,7 @@ def make_plan(study: StudyConfig, overrides: Sequence[str] = (), *, allow_files:
             f"reference is {study.reference!r}, which is no arm", f"there are: {', '.join(a.name for a in arms)}"
         )
     runs = tuple(
-        Run(arm, scene, seed, _hash([arm.key, scene.key, seed]))
+        StudyRun(arm, scene, seed, _hash([arm.key, scene.key, seed]))
         for scene in scenes
         for seed in study.seeds
         for arm in arms
@@ -168,7 +168,7 @@ def _arm(asked: Asked, allow_files: bool) -> Arm:
     return Arm(asked.name, config, key, ours, modules, asked.beside)
 
 
-def _scenes(entry: SceneEntry, folder: Path, allow_files: bool) -> Iterator[Scene]:
+def _scenes(entry: SceneEntry, folder: Path, allow_files: bool) -> Iterator[StudyScene]:
     if entry.family:
         from mstfilter.simulation import recipe_key, scene_family
 
@@ -178,7 +178,7 @@ def _scenes(entry: SceneEntry, folder: Path, allow_files: bool) -> Iterator[Scen
         group = entry.group or entry.family
         for seed in entry.seeds:
             source = {"family": entry.family, "seed": seed, "set": changed}
-            yield Scene(f"{group}-{seed}", group, source, recipe_key(family, seed))
+            yield StudyScene(f"{group}-{seed}", group, source, recipe_key(family, seed))
         return
     for pattern in entry.recordings:
         paths = sorted(glob.glob(str(folder / pattern)))
@@ -190,10 +190,10 @@ def _scenes(entry: SceneEntry, folder: Path, allow_files: bool) -> Iterator[Scen
             recording = open_source(Path(path), entry.format, entry.options, entry.pauses, allow_files=allow_files)
             # The truth counts: figures depend on it, and all that oracles do.
             key = content_key(recording.key, recording.truth_key).hex()
-            yield Scene(Path(path).name, entry.group or "recordings", source, key)
+            yield StudyScene(Path(path).name, entry.group or "recordings", source, key)
 
 
-def _told_apart(scenes: list[Scene]) -> tuple[Scene, ...]:
+def _told_apart(scenes: list[StudyScene]) -> tuple[StudyScene, ...]:
     """Scenes of one name in several groups get their group's name in front."""
     often = Counter(scene.name for scene in scenes)
     return tuple(replace(s, name=f"{s.group}-{s.name}") if often[s.name] > 1 else s for s in scenes)

@@ -6,7 +6,7 @@
 Layout::
 
     study.json       what was asked: description, arms with their configuration, scenes, seeds, every run's folder
-    runs/NAME/       one folder a run (see `run_folder`); result.json holds its figures, or why it failed
+    runs/NAME/       one `RunFolder` a run; result.json holds its figures, or why it failed
     runs.csv         one row a pause and run: figures first, time and memory last
     summary.csv      one row a family, arm and figure: mean over scenes and its interval
     differences.csv  the reference against every other arm: paired differences, intervals, p values, conclusions
@@ -26,13 +26,13 @@ from pathlib import Path
 from typing import Any
 
 from mstfilter.errors import InputError
-from mstfilter.study.executors import Outcome
-from mstfilter.study.run_folder import plain, write_json
+from mstfilter.runs.run_folder import plain, write_json
+from mstfilter.study.executors import JobOutcome
 from mstfilter.study.summary import Summary, summarise
 
 __all__ = ["RESULT", "StudyFolder", "cost_columns", "read_result", "write_table"]
 
-FORMAT = 1
+STUDY_FORMAT = 1
 RESULT = "result.json"  # in a run's folder
 _FIGURES = ("family", "arm", "figure", "n", "mean", "low", "high")
 _DIFFERENCES = (
@@ -64,8 +64,8 @@ class StudyFolder:
     def open(cls, path: str | Path) -> StudyFolder:
         """An existing study folder."""
         folder = cls(Path(path))
-        if folder.description.get("format") != FORMAT:
-            raise InputError(f"{path}: study has format {folder.description.get('format')}, expected {FORMAT}")
+        if folder.description.get("format") != STUDY_FORMAT:
+            raise InputError(f"{path}: study has format {folder.description.get('format')}, expected {STUDY_FORMAT}")
         return folder
 
     @cached_property
@@ -89,7 +89,7 @@ class StudyFolder:
         """A run's folder."""
         return self.path / "runs" / folder
 
-    def fail(self, run: Mapping[str, Any], outcome: Outcome) -> None:
+    def fail(self, run: Mapping[str, Any], outcome: JobOutcome) -> None:
         """Write down why a run failed; the folder of an earlier failure is reused.
 
         Of a run that could only not be measured again, what was known of it before is kept beside.

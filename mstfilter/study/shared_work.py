@@ -1,7 +1,7 @@
 """Which work the runs of a study share on disk: what is dear to compute and cheap to read.
 
 >>> with shared_work({"folder": "cache/work", "gb": 4.0, "versions": kind_versions()}):
-...     execute(recording, config, path)
+...     filter_recording(recording, config, path)
 
 Flow through a clip, segmentation trees, completions and features depend on the recording alone, not on the arm or
 the seed that asks. Entries are named by the version of the code that makes them.
@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 
 from mstfilter.presets import REGISTRY
+from mstfilter.runs.run import versions
 from mstfilter.study.code_version import code_version
-from mstfilter.study.run import versions
 
 __all__ = ["kind_versions", "shared_work"]
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from mstfilter.errors import InputError
-from mstfilter.study.sources import open_source
+from mstfilter.runs.sources import open_source
 
 __all__ = ["check_space", "recording_bytes", "run_bytes"]
 

@@ -17,19 +17,19 @@ from pathlib import Path
 from typing import Any
 
 from mstfilter.errors import InputError
+from mstfilter.runs.run_folder import write_json
 from mstfilter.study.config import StudyConfig
-from mstfilter.study.executors import Event, Executor, Outcome
+from mstfilter.study.executors import Event, Executor, JobOutcome
 from mstfilter.study.local import Local
-from mstfilter.study.plan import Plan, Run, make_plan
-from mstfilter.study.results import FORMAT, StudyFolder
-from mstfilter.study.run_folder import write_json
+from mstfilter.study.plan import Plan, StudyRun, make_plan
+from mstfilter.study.results import STUDY_FORMAT, StudyFolder
 from mstfilter.study.todo import ToDo
 
-__all__ = ["Progress", "StudyResult", "run_study"]
+__all__ = ["StudyProgress", "StudyResult", "run_study"]
 
 
 @dataclass(frozen=True)
-class Progress:
+class StudyProgress:
     """What is reported while a study is going on.
 
     Parameters
@@ -62,14 +62,14 @@ class StudyResult:
         Runs that are done, earlier ones included.
     repeated : int
         Runs that were done before.
-    failed : tuple of (str, Outcome)
+    failed : tuple of (str, JobOutcome)
         Names of the runs that failed, and why.
     """
 
     folder: StudyFolder
     done: int
     repeated: int
-    failed: tuple[tuple[str, Outcome], ...]
+    failed: tuple[tuple[str, JobOutcome], ...]
 
 
 def run_study(
@@ -80,7 +80,7 @@ def run_study(
     *,
     allow_files: bool = True,
     cache: Path | None = None,
-    progress: Callable[[Progress], None] = lambda progress: None,
+    progress: Callable[[StudyProgress], None] = lambda progress: None,
 ) -> StudyResult:
     """Run a study into a folder.
 
@@ -192,7 +192,7 @@ def _visible(path: Path) -> Iterator[Path]:
 def _described(plan: Plan) -> dict[str, Any]:
     study = plan.config
     return {
-        "format": FORMAT,
+        "format": STUDY_FORMAT,
         "name": study.name,
         "description": study.description,
         "reference": plan.reference,
@@ -214,13 +214,13 @@ def _described(plan: Plan) -> dict[str, Any]:
     }
 
 
-def _note(folder: StudyFolder, run: Run, outcome: Outcome) -> None:
+def _note(folder: StudyFolder, run: StudyRun, outcome: JobOutcome) -> None:
     """Write a failure down; where not even that is possible it is told at the end all the same."""
     with contextlib.suppress(OSError):
         folder.fail({"folder": run.folder, "identity": run.identity}, outcome)
 
 
-def _recordings(todo: ToDo, executor: Executor, progress: Callable[[Progress], None]) -> dict[str, Outcome]:
+def _recordings(todo: ToDo, executor: Executor, progress: Callable[[StudyProgress], None]) -> dict[str, JobOutcome]:
     """Make what is missing; why it could not be made, by the scene's key."""
     keys, records = todo.records()
     if not records:
@@ -234,15 +234,21 @@ class _Counted:
     """Events as progress."""
 
     def __init__(
-        self, progress: Callable[[Progress], None], what: str, names: list[str], done: int, total: int, failed: int
+        self,
+        progress: Callable[[StudyProgress], None],
+        what: str,
+        names: list[str],
+        done: int,
+        total: int,
+        failed: int,
     ) -> None:
         self._progress, self._what, self._names, self._total = progress, what, names, total
         self._done, self._failed = done, failed
-        progress(Progress(what, None, "", done, failed, total))
+        progress(StudyProgress(what, None, "", done, failed, total))
 
     def __call__(self, event: Event) -> None:
         if event.outcome is not None:
             good = event.outcome.status == "done"
             self._done, self._failed = self._done + good, self._failed + (not good)
         name = self._names[event.job]
-        self._progress(Progress(self._what, event, name, self._done, self._failed, self._total))
+        self._progress(StudyProgress(self._what, event, name, self._done, self._failed, self._total))

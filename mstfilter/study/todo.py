@@ -15,7 +15,7 @@ from typing import Any
 
 from mstfilter.study.code_version import code_version, files_version, reached
 from mstfilter.study.executors import Job
-from mstfilter.study.plan import Plan, Run
+from mstfilter.study.plan import Plan, StudyRun
 from mstfilter.study.results import StudyFolder, read_result
 from mstfilter.study.shared_work import kind_versions
 from mstfilter.study.space import check_space, recording_bytes, run_bytes
@@ -55,10 +55,10 @@ class ToDo:
         modules = sorted(reached(module for arm in self.plan.arms for module in arm.modules))
         return {"modules": modules, "code": files_version(modules)}
 
-    def runs(self) -> tuple[list[tuple[Run, Job]], set[str]]:
+    def runs(self) -> tuple[list[tuple[StudyRun, Job]], set[str]]:
         """Runs to do with their jobs, and the folders of those that are done."""
         self._adopt()
-        metrics = code_version(["mstfilter.study.metrics"])
+        metrics = code_version(["mstfilter.runs.metrics"])
         waiting, done = [], set()
         for run in self.plan.runs:
             kind = self._needed(run, metrics)
@@ -79,7 +79,7 @@ class ToDo:
             if wanted is not None and found.get("status") == "done" and not wanted.exists():
                 path.rename(wanted)
 
-    def _needed(self, run: Run, metrics: str) -> str | None:
+    def _needed(self, run: StudyRun, metrics: str) -> str | None:
         """What is left to do of a run; None if nothing is. One that failed while it was measured again is whole."""
         path = self.folder.run(run.folder)
         found = read_result(path)
@@ -89,7 +89,7 @@ class ToDo:
             return None
         return "measure" if (path / "pauses").is_dir() else "run"
 
-    def _job(self, run: Run, kind: str, metrics: str) -> Job:
+    def _job(self, run: StudyRun, kind: str, metrics: str) -> Job:
         return {
             "kind": kind,
             "name": run.name,
@@ -107,7 +107,7 @@ class ToDo:
             "work": self._work(run),
         }
 
-    def _work(self, run: Run) -> dict[str, Any] | None:
+    def _work(self, run: StudyRun) -> dict[str, Any] | None:
         """The folder of shared work; none for an arm with installed components of others, whose version we do not
         know."""
         gb = self.plan.config.cache_gb

@@ -17,11 +17,11 @@ from mstfilter.oracles.masks import TrueBoundary, TrueMasks
 from mstfilter.oracles.motion import TrueMotions
 from mstfilter.oracles.truth import Truth, UsesTruth, bind_truth, uses_truth
 from mstfilter.presets import build_filter, describe_filter, load_config
+from mstfilter.runs import filter_recording
 from mstfilter.scene import Hypothesis
 from mstfilter.scoring import weighted_coverage
 from mstfilter.segmentation import ColourDepthBoundary
 from mstfilter.smc import Key, Population
-from mstfilter.study import execute
 from tests.baselines.scenes import slide
 
 ALL = (
@@ -79,7 +79,7 @@ def test_a_recording_without_truth_is_one_clear_error_before_anything_is_written
 ):
     blind = replace(recording, **{lacking: lambda index: None})
     with pytest.raises(InputError, match=says):
-        execute(blind, load_config("mst", [override]), tmp_path / "run")
+        filter_recording(blind, load_config("mst", [override]), tmp_path / "run")
     assert not (tmp_path / "run").exists()
 
 
@@ -91,15 +91,15 @@ def test_the_truth_of_one_recording_says_nothing_of_another(recording, tmp_path)
 
 def test_a_run_by_the_truth_goes_on_after_a_stop(recording, tmp_path):
     config = load_config("mst", ALL)
-    execute(recording, config, tmp_path / "a", seed=1)
+    filter_recording(recording, config, tmp_path / "a", seed=1)
 
     def stop(progress):
         if progress.done == 2:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        execute(recording, config, tmp_path / "b", seed=1, progress=stop)
-    execute(recording, config, tmp_path / "b", seed=1)
+        filter_recording(recording, config, tmp_path / "b", seed=1, progress=stop)
+    filter_recording(recording, config, tmp_path / "b", seed=1)
     for t in range(3):
         name = f"pauses/{t:03d}/hypotheses.npz"
         assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()

@@ -9,9 +9,9 @@ from typing import ClassVar
 
 import numpy as np
 
+from mstfilter.runs import RunFolder
 from mstfilter.scene import Camera, Hypothesis, Recording, VoxelGrid, look_at, render
 from mstfilter.smc import Always, ParticleFilter, Population, Proposal, Transition, Update
-from mstfilter.study import RunFolder
 
 GRID = VoxelGrid((-0.2, -0.2, 0.0), 0.02, (20, 20, 10))
 CAMERA = Camera.from_intrinsics(90, 90, 47.5, 35.5, 96, 72, look_at((0.0, -0.6, 0.5), (0, 0, 0.03)))

@@ -13,8 +13,8 @@ import pytest
 
 from mstfilter.errors import InputError
 from mstfilter.report.run_report import numbers_of, write_report
+from mstfilter.runs import RunFolder
 from mstfilter.scoring import weighted_coverage
-from mstfilter.study import RunFolder
 from tests.report.runs import make_run
 
 

@@ -7,6 +7,7 @@ import pytest
 
 from mstfilter.errors import InputError
 from mstfilter.presets import REGISTRY
+from mstfilter.runs import HypothesisCodec
 from mstfilter.smc import (
     ArrayCodec,
     Dynamics,
@@ -22,7 +23,6 @@ from mstfilter.smc import (
     observe,
     sample,
 )
-from mstfilter.study import HypothesisCodec
 from mstfilter.testing import (
     CodecContract,
     EquivalenceContract,

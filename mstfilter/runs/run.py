@@ -1,6 +1,6 @@
 """Run a filter over a recording into a run folder.
 
->>> folder = execute(recording, load_config("mst"), Path("runs/mine"), seed=0)
+>>> folder = filter_recording(recording, load_config("mst"), Path("runs/mine"), seed=0)
 
 Everything that can be wrong with the input is found before the folder is made. A run that was stopped goes on
 where it was, to the same result, when it is started again with the same configuration, seed and recording.
@@ -21,16 +21,16 @@ import mstfilter
 from mstfilter.errors import InputError
 from mstfilter.oracles import bind_truth
 from mstfilter.presets import build_filter, describe_filter
+from mstfilter.runs.run_folder import RunFolder, plain
 from mstfilter.scene import Recording
-from mstfilter.study.run_folder import RunFolder, plain
 
-__all__ = ["Progress", "execute"]
+__all__ = ["RunProgress", "filter_recording"]
 
 _LIBRARIES = ("numpy", "scipy", "networkx", "opencv-python-headless", "higra", "small_gicp")
 
 
 @dataclass(frozen=True)
-class Progress:
+class RunProgress:
     """What is reported while a run is going on: pauses done, pauses in all, wall seconds of the last step."""
 
     done: int
@@ -38,14 +38,14 @@ class Progress:
     seconds: float = 0.0
 
 
-def execute(
+def filter_recording(
     recording: Recording,
     config: Mapping[str, Any],
     path: Path,
     seed: int = 0,
     *,
     allow_files: bool = False,
-    progress: Callable[[Progress], None] = lambda progress: None,
+    progress: Callable[[RunProgress], None] = lambda progress: None,
 ) -> RunFolder:
     """Filter a recording; the run folder.
 
@@ -87,14 +87,14 @@ def execute(
     clips = recording.clips()
     done = 0 if folder is None else folder.n_pauses
     state = folder.state(done - 1) if folder is not None and done else running.start(int(seed))
-    progress(Progress(done, len(clips)))
+    progress(RunProgress(done, len(clips)))
     try:
         for clip in clips[done:]:
             state, info = running.step(state, clip)
             if folder is None:  # what fails at the first step leaves nothing behind
                 folder = RunFolder.create(path, wanted)
             folder.write_pause(clip, state, info, recording.truth(clip.index))
-            progress(Progress(clip.index + 1, len(clips), sum(info.seconds.values())))
+            progress(RunProgress(clip.index + 1, len(clips), sum(info.seconds.values())))
     except KeyboardInterrupt:
         if folder is not None:
             folder.set_status("interrupted")

@@ -1,6 +1,6 @@
 """Figures of a run at a pause: what the protocol of the studies asks for.
 
->>> row = measure(run, recording, t=2)
+>>> row = measure_pause(run, recording, t=2)
 >>> row["quality"], row["quality_hidden"], row["split"], row["brier"]
 
 All are means over the hypotheses, each counting the same, unless they say otherwise; truth is volumetric.
@@ -24,6 +24,7 @@ from typing import Any
 
 import numpy as np
 
+from mstfilter.runs.run_folder import RunFolder
 from mstfilter.scene import Recording
 from mstfilter.scoring import (
     FORMS,
@@ -36,16 +37,24 @@ from mstfilter.scoring import (
     quality_of,
     weighted_coverage,
 )
-from mstfilter.study.run_folder import RunFolder
 
-__all__ = ["coverage_of", "diversity", "errors_of", "figures", "measure", "object_f", "occupancy_iou", "pair_brier"]
+__all__ = [
+    "coverage_of",
+    "diversity",
+    "errors_of",
+    "figures",
+    "measure_pause",
+    "object_f",
+    "occupancy_iou",
+    "pair_brier",
+]
 
 MOST = 0.5
 FRAGMENT = 0.1
 _PAIRS_AT_ONCE = 2**22
 
 
-def measure(run: RunFolder, recording: Recording, t: int) -> dict[str, Any]:
+def measure_pause(run: RunFolder, recording: Recording, t: int) -> dict[str, Any]:
     """One row: the figures of the hypotheses of a run at pause `t`; without true volumes only what needs none.
 
     The list ``qualities``, one a hypothesis, is for figures; tables leave it out.

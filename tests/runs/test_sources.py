@@ -7,7 +7,7 @@ import pytest
 
 from mstfilter.errors import InputError
 from mstfilter.presets import REGISTRY
-from mstfilter.study.sources import detect_format, format_settings, open_source
+from mstfilter.runs.sources import detect_format, format_settings, open_source
 from tests.formats import layouts
 from tests.scene.test_recording import write
 

@@ -1,6 +1,6 @@
 """Quality of a run, or of any label volumes, against the truth.
 
->>> rows = score(read_estimate(Path("runs/mine")), read_truth(Path("recordings/mine")))
+>>> rows = score_pauses(read_estimate(Path("runs/mine")), read_truth(Path("recordings/mine")))
 >>> rows[0].form, rows[0].mean, rows[0].best, rows[0].one_blob
 
 One row a pause and form of weighted coverage (`mstfilter.scoring.quality`): mean over the hypotheses, mean by weight,
@@ -21,17 +21,17 @@ from pathlib import Path
 import numpy as np
 
 from mstfilter.errors import InputError
+from mstfilter.runs.run_folder import RunFolder
 from mstfilter.scene import Camera, Recording, VoxelGrid, as_labels, render
 from mstfilter.scoring import FORMS, connected_components, one_blob, weighted_coverage
-from mstfilter.study.run_folder import RunFolder
 
-__all__ = ["Estimate", "Row", "Truth", "read_estimate", "read_truth", "score", "write_csv"]
+__all__ = ["PauseEstimate", "PauseScore", "PauseTruth", "read_estimate", "read_truth", "score_pauses", "write_scores"]
 
 _ROBOT = 255
 
 
 @dataclass(frozen=True, eq=False)
-class Estimate:
+class PauseEstimate:
     """Hypotheses at one pause.
 
     Parameters
@@ -53,7 +53,7 @@ class Estimate:
 
 
 @dataclass(frozen=True, eq=False)
-class Truth:
+class PauseTruth:
     """True labels at one pause: volumes, or an image with its camera.
 
     Parameters
@@ -75,7 +75,7 @@ class Truth:
 
 
 @dataclass(frozen=True)
-class Row:
+class PauseScore:
     """Quality at one pause in one form."""
 
     pause: int
@@ -90,11 +90,11 @@ class Row:
     components: float
 
 
-def read_estimate(path: Path) -> list[Estimate]:
+def read_estimate(path: Path) -> list[PauseEstimate]:
     """Hypotheses of a run folder, or label volumes: .npz with ``labels`` as voxels.npz has them, or .npy."""
     if not path.is_dir():
         volumes, frames, grid = _read_volumes(path, "label volumes")
-        return [Estimate([one], np.ones(1), frame, grid) for one, frame in zip(volumes, frames, strict=True)]
+        return [PauseEstimate([one], np.ones(1), frame, grid) for one, frame in zip(volumes, frames, strict=True)]
     run = RunFolder.open(path)
     if run.n_pauses == 0:
         raise InputError(f"{path}: the run has no complete pause yet")
@@ -102,22 +102,22 @@ def read_estimate(path: Path) -> list[Estimate]:
     found = []
     for t in range(run.n_pauses):
         hypotheses, weights = run.hypotheses(t), np.asarray(run.info(t)["weights"], dtype=float)
-        found.append(Estimate([h.labels for h in hypotheses], weights, frames[t], hypotheses[0].grid))
+        found.append(PauseEstimate([h.labels for h in hypotheses], weights, frames[t], hypotheses[0].grid))
     return found
 
 
-def read_truth(source: Path | Recording) -> list[Truth]:
+def read_truth(source: Path | Recording) -> list[PauseTruth]:
     """Truth of a recording (its volumes, else its instance images), or of a .npz or .npy file of volumes."""
     if isinstance(source, Path):
         volumes, frames, grid = _read_volumes(source, "true volumes")
-        return [Truth(one, frame, grid) for one, frame in zip(volumes, frames, strict=True)]
+        return [PauseTruth(one, frame, grid) for one, frame in zip(volumes, frames, strict=True)]
     found = []
     for t, index in enumerate(source.pauses):
         volume, image = source.truth(t), source.instance(index)
         if volume is not None:
-            found.append(Truth(volume, index, source.grid))
+            found.append(PauseTruth(volume, index, source.grid))
         elif image is not None:
-            found.append(Truth(image, index, None, source.frames[index].camera))
+            found.append(PauseTruth(image, index, None, source.frames[index].camera))
     if not found:
         raise InputError(
             f"recording {source.name} holds no truth: neither volumes (voxels.npz) nor instance images",
@@ -155,7 +155,7 @@ def _read_volumes(path: Path, what: str) -> tuple[np.ndarray, list[int | None], 
     return labels, frames, grid
 
 
-def score(estimates: Sequence[Estimate], truths: Sequence[Truth]) -> list[Row]:
+def score_pauses(estimates: Sequence[PauseEstimate], truths: Sequence[PauseTruth]) -> list[PauseScore]:
     """Rows of quality of each pause that both know; pauses are matched by frame where both tell it, else in order."""
     by_frame = {t.frame: t for t in truths}
     named = None not in by_frame and all(e.frame is not None for e in estimates)
@@ -177,7 +177,7 @@ def score(estimates: Sequence[Estimate], truths: Sequence[Truth]) -> list[Row]:
     return rows
 
 
-def _score_pause(pause: int, estimate: Estimate, truth: Truth) -> list[Row]:
+def _score_pause(pause: int, estimate: PauseEstimate, truth: PauseTruth) -> list[PauseScore]:
     true = truth.labels
     if truth.camera is not None:
         if estimate.grid is None:
@@ -212,7 +212,7 @@ def _score_pause(pause: int, estimate: Estimate, truth: Truth) -> list[Row]:
         low = [float(w @ [weighted_coverage(labels, true, form) for labels in floor]) for floor in floors]
         where = "volume" if truth.camera is None else "image"
         figures = float(q.mean()), float(w @ q), float(q.max()), float(q[w.argmax()])
-        rows.append(Row(pause, where, form, len(q), *figures, *low))
+        rows.append(PauseScore(pause, where, form, len(q), *figures, *low))
     return rows
 
 
@@ -226,12 +226,12 @@ def _words(grid: VoxelGrid) -> str:
     return f"{' x '.join(map(str, grid.shape))} at {np.round(grid.origin, 4).tolist()} of {grid.voxel_size:g} m"
 
 
-def write_csv(path: Path, rows: Sequence[Row]) -> None:
+def write_scores(path: Path, rows: Sequence[PauseScore]) -> None:
     """Rows as a table, written under a temporary name and renamed."""
     partial = path.with_name(f".{path.name}.partial")
     try:
         with partial.open("w", newline="") as file:
-            writer = csv.DictWriter(file, [f.name for f in fields(Row)])
+            writer = csv.DictWriter(file, [f.name for f in fields(PauseScore)])
             writer.writeheader()
             for row in rows:
                 writer.writerow({k: f"{v:.6f}" if isinstance(v, float) else v for k, v in asdict(row).items()})

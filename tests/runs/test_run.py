@@ -17,11 +17,11 @@ from mstfilter.formats import RecordingWriter, open_recording
 from mstfilter.fusion import Agreement, Evidence, FusionUpdate
 from mstfilter.presets import REGISTRY, build_filter, describe_filter, load_config
 from mstfilter.resources import preset_names
+from mstfilter.runs.run import filter_recording
+from mstfilter.runs.run_folder import RunFolder
 from mstfilter.scoring import weighted_coverage
 from mstfilter.segmentation import ObjectRule
 from mstfilter.smc import Resampler, Ssp
-from mstfilter.study.run import execute
-from mstfilter.study.run_folder import RunFolder
 from tests.scene.scenes import CAMERA, GRID, table_scene
 
 
@@ -47,7 +47,7 @@ def content(folder):
 
 @pytest.mark.parametrize("name", ["mst", "paper", "authors"])
 def test_every_preset_runs_and_its_description_builds_it_again(recording, tmp_path, name):
-    run = execute(recording, load_config(name), tmp_path / "run", seed=1)
+    run = filter_recording(recording, load_config(name), tmp_path / "run", seed=1)
     assert run.n_pauses == 3
     assert run.description["status"] == "done" or RunFolder.open(run.path).description["status"] == "done"
     config = RunFolder.open(run.path).description["config"]
@@ -69,20 +69,20 @@ def test_every_preset_runs_and_its_description_builds_it_again(recording, tmp_pa
 def test_the_same_seed_gives_the_same_bytes(recording, tmp_path):
     from mstfilter.scene import cache as memo
 
-    execute(recording, load_config("mst"), tmp_path / "a", seed=7)
+    filter_recording(recording, load_config("mst"), tmp_path / "a", seed=7)
     memo.clear()
-    execute(open_recording(recording.path), load_config("mst"), tmp_path / "b", seed=7)
+    filter_recording(open_recording(recording.path), load_config("mst"), tmp_path / "b", seed=7)
     a, b = content(tmp_path / "a"), content(tmp_path / "b")
     assert a.keys() == b.keys()
     assert [k for k in a if a[k] != b[k]] == []
-    execute(recording, load_config("mst"), tmp_path / "c", seed=8)
+    filter_recording(recording, load_config("mst"), tmp_path / "c", seed=8)
     c = content(tmp_path / "c")
     assert any(a[k] != c[k] for k in a if k.endswith("hypotheses.npz"))
 
 
 @pytest.mark.parametrize("stop", [0, 1, 2])
 def test_an_interrupted_run_goes_on_to_the_same_result(recording, tmp_path, stop):
-    execute(recording, load_config("mst"), tmp_path / "whole", seed=2)
+    filter_recording(recording, load_config("mst"), tmp_path / "whole", seed=2)
 
     def interrupt(progress):
         if progress.done == stop and not (tmp_path / "stopped").exists():
@@ -90,31 +90,31 @@ def test_an_interrupted_run_goes_on_to_the_same_result(recording, tmp_path, stop
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        execute(recording, load_config("mst"), tmp_path / "part", seed=2, progress=interrupt)
+        filter_recording(recording, load_config("mst"), tmp_path / "part", seed=2, progress=interrupt)
     if stop == 0:
         assert not (tmp_path / "part").exists()  # nothing was done: nothing is there
     else:
         assert RunFolder.open(tmp_path / "part").n_pauses == stop
         assert RunFolder.open(tmp_path / "part").description["status"] == "interrupted"
         (tmp_path / "part" / "pauses" / f".{stop:03d}.partial").mkdir(exist_ok=True)  # what a kill leaves behind
-    execute(recording, load_config("mst"), tmp_path / "part", seed=2)
+    filter_recording(recording, load_config("mst"), tmp_path / "part", seed=2)
     whole, part = content(tmp_path / "whole"), content(tmp_path / "part")
     assert whole.keys() == part.keys()
     assert [k for k in whole if whole[k] != part[k]] == []
 
 
 def test_a_folder_of_another_run_is_refused(recording, tmp_path):
-    execute(recording, load_config("mst"), tmp_path / "run", seed=2)
+    filter_recording(recording, load_config("mst"), tmp_path / "run", seed=2)
     before = content(tmp_path / "run")
     with pytest.raises(InputError, match=r"its seed differs \(2 there, 3 now\)"):
-        execute(recording, load_config("mst"), tmp_path / "run", seed=3)
+        filter_recording(recording, load_config("mst"), tmp_path / "run", seed=3)
     with pytest.raises(InputError, match=r"its config differs \(n: 5 there, 4 now\)"):
-        execute(recording, load_config("mst", ["n=4"]), tmp_path / "run", seed=2)
+        filter_recording(recording, load_config("mst", ["n=4"]), tmp_path / "run", seed=2)
     assert content(tmp_path / "run") == before
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "precious.txt").write_text("x")
     with pytest.raises(InputError, match="not an empty folder"):
-        execute(recording, load_config("mst"), tmp_path / "other", seed=3)
+        filter_recording(recording, load_config("mst"), tmp_path / "other", seed=3)
 
 
 def test_broken_input_makes_no_folder(recording, tmp_path):
@@ -123,9 +123,9 @@ def test_broken_input_makes_no_folder(recording, tmp_path):
     image = broken / "depth" / "000004.png"
     image.write_bytes(image.read_bytes()[:-50])
     with pytest.raises(InputError, match="truncated"):
-        execute(open_recording(broken), load_config("mst"), tmp_path / "run")
+        filter_recording(open_recording(broken), load_config("mst"), tmp_path / "run")
     with pytest.raises(InputError, match="n is 0"):
-        execute(recording, load_config("mst", ["n=0"]), tmp_path / "run")
+        filter_recording(recording, load_config("mst", ["n=0"]), tmp_path / "run")
     assert not (tmp_path / "run").exists()
 
 
@@ -145,7 +145,7 @@ def test_a_failing_component_leaves_whole_pauses(recording, tmp_path):
     )
     config = load_config("mst", [f"transition={source}:Breaks"])
     with pytest.raises(RuntimeError, match="broke"):
-        execute(recording, config, tmp_path / "run", allow_files=True)
+        filter_recording(recording, config, tmp_path / "run", allow_files=True)
     run = RunFolder.open(tmp_path / "run")
     assert run.n_pauses == 2
     assert run.description["status"] == "failed"
@@ -266,11 +266,11 @@ def test_what_a_run_was_made_of_is_remembered(recording, tmp_path):
     )
     source.write_text(text)
     config = load_config("mst", [f"resampler={source}:Mine"])
-    execute(recording, config, tmp_path / "run", allow_files=True)
-    execute(recording, config, tmp_path / "run", allow_files=True)  # the same: nothing to do
+    filter_recording(recording, config, tmp_path / "run", allow_files=True)
+    filter_recording(recording, config, tmp_path / "run", allow_files=True)  # the same: nothing to do
     source.write_text(text + "# another\n")
     with pytest.raises(InputError, match="its files differs"):
-        execute(recording, config, tmp_path / "run", allow_files=True)
+        filter_recording(recording, config, tmp_path / "run", allow_files=True)
     changed = tmp_path / "changed"
     shutil.copytree(recording.path, changed)
     shutil.copy(changed / "rgb" / "000000.png", changed / "rgb" / "000001.png")
@@ -280,5 +280,5 @@ def test_what_a_run_was_made_of_is_remembered(recording, tmp_path):
 @pytest.mark.parametrize("override", ["update.eta=0", "n_proposed=-1", "update.quality_exponent=nan", "trigger.k=0"])
 def test_useless_settings_make_no_folder(recording, tmp_path, override):
     with pytest.raises(InputError):
-        execute(recording, load_config("mst", ["trigger=every", override]), tmp_path / "run")
+        filter_recording(recording, load_config("mst", ["trigger=every", override]), tmp_path / "run")
     assert not (tmp_path / "run").exists()

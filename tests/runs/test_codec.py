@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from mstfilter.runs.run_folder import HypothesisCodec
 from mstfilter.scene import Hypothesis
 from mstfilter.smc import ParticleFilter, Population, Proposal, Transition
-from mstfilter.study.codec import HypothesisCodec
 from tests.scene.scenes import GRID, table_scene
 
 

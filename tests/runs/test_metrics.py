@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given, settings, strategies as st
 from hypothesis.extra import numpy as hnp
 
+from mstfilter.runs.metrics import coverage_of, diversity, errors_of, figures, object_f, occupancy_iou, pair_brier
 from mstfilter.scoring import overlap, weighted_coverage
-from mstfilter.study.metrics import coverage_of, diversity, errors_of, figures, object_f, occupancy_iou, pair_brier
 
 SMALL = hnp.arrays(np.uint16, (3, 3, 2), elements=st.integers(0, 3))
 WORLDS = st.tuples(st.lists(SMALL, min_size=1, max_size=4), SMALL)
@@ -89,7 +89,7 @@ def test_brier_in_blocks_is_the_same(monkeypatch):
     rng = np.random.default_rng(0)
     labels, truth = [rng.integers(0, 4, (6, 6, 4)) for _ in range(4)], rng.integers(0, 3, (6, 6, 4))
     whole = pair_brier(labels, np.full(4, 0.25), truth)
-    monkeypatch.setattr("mstfilter.study.metrics._PAIRS_AT_ONCE", 1000)
+    monkeypatch.setattr("mstfilter.runs.metrics._PAIRS_AT_ONCE", 1000)
     assert pair_brier(labels, np.full(4, 0.25), truth) == pytest.approx(whole)
     assert whole == pytest.approx(plain_brier(labels, np.full(4, 0.25), truth), rel=1e-5)
 

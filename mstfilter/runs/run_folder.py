@@ -34,6 +34,8 @@ from mstfilter.scene import (
     Camera,
     Clip,
     Hypothesis,
+    decode_hypotheses,
+    encode_hypotheses,
     load_hypotheses,
     read_rgb,
     rigid_from_matrix,
@@ -41,11 +43,11 @@ from mstfilter.scene import (
     write_image,
 )
 from mstfilter.scoring import FORMS, weighted_coverage
-from mstfilter.smc import Info, Key, Population, State
+from mstfilter.smc import Codec, Info, Key, Population, State
 
-__all__ = ["RunFolder", "plain", "write_json"]
+__all__ = ["HypothesisCodec", "RunFolder", "plain", "write_json"]
 
-FORMAT = 1
+_FORMAT = 1
 
 
 def plain(value: Any) -> Any:
@@ -97,8 +99,8 @@ class RunFolder:
     def open(cls, path: str | Path) -> RunFolder:
         """An existing run folder."""
         folder = cls(Path(path))
-        if folder.description.get("format") != FORMAT:
-            raise InputError(f"{path}: run folder has format {folder.description.get('format')}, expected {FORMAT}")
+        if folder.description.get("format") != _FORMAT:
+            raise InputError(f"{path}: run folder has format {folder.description.get('format')}, expected {_FORMAT}")
         return folder
 
     @classmethod
@@ -108,7 +110,7 @@ class RunFolder:
             path.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise InputError(f"cannot write run folder {path}: {error.strerror}") from error
-        write_json(path / "run.json", {"format": FORMAT, "status": "running", **description})
+        write_json(path / "run.json", {"format": _FORMAT, "status": "running", **description})
         return cls(path)
 
     @cached_property
@@ -233,3 +235,16 @@ class RunFolder:
 def qualities(hypotheses: tuple[Hypothesis, ...], truth: np.ndarray) -> dict[str, list[float]]:
     """Quality of each hypothesis against the truth, in all forms."""
     return {form: [weighted_coverage(h.labels, truth, form) for h in hypotheses] for form in FORMS}
+
+
+@dataclass(frozen=True)
+class HypothesisCodec(Codec):
+    """Hypotheses on one grid as arrays, bit for bit."""
+
+    def encode(self, particles: Any) -> Mapping[str, np.ndarray]:
+        """Named arrays of a sequence of hypotheses."""
+        return encode_hypotheses(particles)
+
+    def decode(self, arrays: Mapping[str, np.ndarray]) -> Any:
+        """The hypotheses."""
+        return decode_hypotheses(dict(arrays))

@@ -9,8 +9,8 @@ import pytest
 
 from mstfilter.errors import InputError
 from mstfilter.formats import RecordingWriter, open_recording
+from mstfilter.runs.scoring import PauseEstimate, PauseTruth, read_estimate, read_truth, score_pauses, write_scores
 from mstfilter.scene import VoxelGrid, render
-from mstfilter.study.scoring import Estimate, Truth, read_estimate, read_truth, score, write_csv
 from tests.scene.scenes import CAMERA, GRID, table_scene
 
 SMALL = VoxelGrid((0, 0, 0), 0.01, (6, 1, 1))
@@ -21,7 +21,7 @@ def line(text):
 
 
 def rows_of(hypotheses, weights, truth):
-    rows = score([Estimate([line(h) for h in hypotheses], np.array(weights))], [Truth(line(truth))])
+    rows = score_pauses([PauseEstimate([line(h) for h in hypotheses], np.array(weights))], [PauseTruth(line(truth))])
     return {row.form: row for row in rows}
 
 
@@ -64,13 +64,13 @@ def test_volumes_against_a_recording(tmp_path):
     path = write_recording(tmp_path / "r")
     truth = read_truth(open_recording(path))
     whole = read_estimate(path / "voxels.npz")
-    assert [row.mean for row in score(whole, truth)] == [1.0] * 6
+    assert [row.mean for row in score_pauses(whole, truth)] == [1.0] * 6
     labels = np.stack([table_scene(4)[2], np.zeros(GRID.shape, np.uint16)])
     np.savez(tmp_path / "e.npz", labels=labels, frame=[2, 1], origin=GRID.origin, voxel_size=GRID.voxel_size)
-    rows = score(read_estimate(tmp_path / "e.npz"), truth)
+    rows = score_pauses(read_estimate(tmp_path / "e.npz"), truth)
     assert [(row.pause, row.form, row.mean) for row in rows] == [(0, f, 1.0) for f in ("objects", "paper", "authors")]
     np.save(tmp_path / "e.npy", labels)
-    assert score(read_estimate(tmp_path / "e.npy"), read_truth(path / "voxels.npz"))[3].mean == 0.0
+    assert score_pauses(read_estimate(tmp_path / "e.npy"), read_truth(path / "voxels.npz"))[3].mean == 0.0
 
 
 def test_instance_images_score_what_is_seen(tmp_path):
@@ -79,37 +79,37 @@ def test_instance_images_score_what_is_seen(tmp_path):
     truth = read_truth(recording)
     assert truth[0].camera is not None
     right = table_scene(0)[2].copy()
-    row = score([Estimate([right], np.ones(1), 0, GRID)], truth)[0]
+    row = score_pauses([PauseEstimate([right], np.ones(1), 0, GRID)], truth)[0]
     assert (row.where, row.mean) == ("image", 1.0)
     hidden = right.copy()
     hidden[16:24, 26:34, 1:11] = 0  # inside of a box
-    assert score([Estimate([hidden], np.ones(1), 0, GRID)], truth)[0].mean == 1.0
+    assert score_pauses([PauseEstimate([hidden], np.ones(1), 0, GRID)], truth)[0].mean == 1.0
     swapped = np.where(right == 2, 1, right).astype(np.uint16)
-    assert 0.3 < score([Estimate([swapped], np.ones(1), 0, GRID)], truth)[0].mean < 0.9
+    assert 0.3 < score_pauses([PauseEstimate([swapped], np.ones(1), 0, GRID)], truth)[0].mean < 0.9
     with pytest.raises(InputError, match="without a grid"):
-        score([Estimate([right], np.ones(1), 0)], truth)
+        score_pauses([PauseEstimate([right], np.ones(1), 0)], truth)
 
 
 def test_a_run_scores_as_its_own_metrics_say(tmp_path):
     """Rows equal what the run wrote while it was running."""
     from mstfilter.presets import load_config
-    from mstfilter.study.run import execute
+    from mstfilter.runs.run import filter_recording
 
     recording = open_recording(write_recording(tmp_path / "r"))
-    run = execute(recording, load_config("mst", ["n=3"]), tmp_path / "run", 0)
-    rows = score(read_estimate(run.path), read_truth(recording))
+    run = filter_recording(recording, load_config("mst", ["n=3"]), tmp_path / "run", 0)
+    rows = score_pauses(read_estimate(run.path), read_truth(recording))
     written = list(csv.DictReader((run.path / "metrics.csv").open()))
     for row in rows:
         q = np.array([float(m[f"quality_{row.form}"]) for m in written if int(m["pause"]) == row.pause])
         w = np.array([float(m["weight"]) for m in written if int(m["pause"]) == row.pause])
         np.testing.assert_allclose([row.mean, row.weighted, row.best], [q.mean(), w @ q, q.max()], atol=2e-6)
-    write_csv(tmp_path / "q.csv", rows)
+    write_scores(tmp_path / "q.csv", rows)
     table = list(csv.DictReader((tmp_path / "q.csv").open()))
     assert len(table) == 6
     assert float(table[0]["best"]) == pytest.approx(rows[0].best, abs=1e-6)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["q.csv", "r", "run"]
     with pytest.raises(InputError, match="cannot write"):
-        write_csv(tmp_path / "none" / "q.csv", rows)
+        write_scores(tmp_path / "none" / "q.csv", rows)
 
 
 def test_what_does_not_fit(tmp_path):
@@ -118,12 +118,12 @@ def test_what_does_not_fit(tmp_path):
     other = VoxelGrid((1, 1, 0), 0.01, GRID.shape)
     labels = table_scene(0)[2]
     for estimate, message in (
-        ([Estimate([labels], np.ones(1), 0, other)], "on a grid 60 x 60 x 30 at .* truth on"),
-        ([Estimate([labels], np.ones(1), 7, GRID)], "no pause has both"),
-        ([Estimate([labels], np.ones(1))], "1 pauses with hypotheses and 2 with truth"),
+        ([PauseEstimate([labels], np.ones(1), 0, other)], "on a grid 60 x 60 x 30 at .* truth on"),
+        ([PauseEstimate([labels], np.ones(1), 7, GRID)], "no pause has both"),
+        ([PauseEstimate([labels], np.ones(1))], "1 pauses with hypotheses and 2 with truth"),
     ):
         with pytest.raises(InputError, match=message):
-            score(estimate, truth)
+            score_pauses(estimate, truth)
     with pytest.raises(InputError, match="holds no truth"):
         read_truth(open_recording(write_recording(tmp_path / "bare", volumes=False, instance=False)))
     (tmp_path / "bad.npz").write_bytes(b"PK")

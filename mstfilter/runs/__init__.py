@@ -1,0 +1,16 @@
+"""One run: a recording is opened, filtered, kept in a folder and scored.
+
+>>> from mstfilter.presets import load_config
+>>> from mstfilter.runs import filter_recording, open_source, read_estimate, read_truth, score_pauses
+>>> recording = open_source(Path("recordings/mine"))                              # any format
+>>> run = filter_recording(recording, load_config("mst"), Path("runs/mine"), seed=0)
+>>> run.n_pauses, run.hypotheses(0), run.info(0)["ess"]
+>>> rows = score_pauses(read_estimate(run.path), read_truth(recording))
+
+The same call resumes a run that was stopped: its folder holds complete pauses, and the rest is computed to the same
+result.
+"""
+
+from mstfilter.lazy import attach
+
+__getattr__, __dir__, __all__ = attach(__name__, __file__)

@@ -1,0 +1,13 @@
+from mstfilter.runs.metrics import measure_pause as measure_pause
+from mstfilter.runs.run import RunProgress as RunProgress, filter_recording as filter_recording
+from mstfilter.runs.run_folder import HypothesisCodec as HypothesisCodec, RunFolder as RunFolder
+from mstfilter.runs.scoring import (
+    PauseEstimate as PauseEstimate,
+    PauseScore as PauseScore,
+    PauseTruth as PauseTruth,
+    read_estimate as read_estimate,
+    read_truth as read_truth,
+    score_pauses as score_pauses,
+    write_scores as write_scores,
+)
+from mstfilter.runs.sources import open_source as open_source
