@@ -19,21 +19,21 @@ from scipy import stats
 
 import mstfilter
 from mstfilter.oracles import (
-    DRAWS,
-    MEASURES,
+    N_RANK_DRAWS,
+    POSTERIOR_ERRORS,
     Miniature,
     ScoredFusion,
+    adapt_to_miniature,
     balanced_filter,
     bootstrap_filter,
-    class_weights,
     exact_filter,
     guided_filter,
-    iid_population,
-    measure,
-    rank,
-    shrink,
-    statistics,
-    uniformity,
+    iid_weights,
+    posterior_errors,
+    rank_of_truth,
+    rank_uniformity,
+    state_statistics,
+    state_weights,
 )
 from mstfilter.smc import FearnheadClifford, KeepWeights, Multinomial, ParticleFilter, Systematic
 
@@ -58,8 +58,8 @@ def arm(name: str, world: Miniature, n: int) -> ParticleFilter:
     if name in PROPER:
         return PROPER[name](world, n)
     if name in PRESETS:
-        return shrink(preset(name), world, n, *PRESETS[name])
-    mst = shrink(preset("mst"), world, n, *PRESETS["mst"])
+        return adapt_to_miniature(preset(name), world, n, *PRESETS[name])
+    mst = adapt_to_miniature(preset("mst"), world, n, *PRESETS["mst"])
     if name == "mst, p twice":
         return replace(mst, proposal=replace(mst.proposal, weight_rule="p"))
     if name == "mst, weights kept":
@@ -72,9 +72,9 @@ def arm(name: str, world: Miniature, n: int) -> ParticleFilter:
         return replace(mst, resampler=Systematic())
     if name in UNIONS:
         filter = arm(UNIONS[name], world, n)
-        return replace(filter, update=replace(filter.update, first=0))
+        return replace(filter, update=replace(filter.update, built_per_particle=0))
     rung = LADDER.index(name)  # each rung keeps what those below it brought
-    rule = ScoredFusion(world, mst.update, distinct=rung >= 1, predictive=rung >= 2, parents=rung >= 3)
+    rule = ScoredFusion(world, mst.update, distinct=rung >= 1, predictive=rung >= 2, include_parents=rung >= 3)
     filter = replace(mst, update=rule)
     if rung >= 4:
         filter = replace(filter, resampler=FearnheadClifford())
@@ -95,18 +95,18 @@ def of_shape(shape: str, plan: Plan) -> list[dict[str, object]]:
     rows, world = [], WORLDS[shape]
     for arms, n, n_worlds in plan:
         for seed in range(n_worlds):
-            truth, glances = world.simulate(np.random.default_rng([seed, 11]), T)
-            exact = exact_filter(world, glances).posterior
+            truth, observations = world.simulate(np.random.default_rng([seed, 11]), T)
+            exact = exact_filter(world, observations).posterior
             answers: dict[str, list[np.ndarray]] = {
                 "exact": list(exact),
-                "n exact draws": [iid_population(np.random.default_rng([seed, 12]), p, n) for p in exact],
+                "n exact draws": [iid_weights(np.random.default_rng([seed, 12]), p, n) for p in exact],
             }
             for name in arms:
-                steps = arm(name, world, n).iterate(glances, seed)
-                answers[name] = [class_weights(world, state.population) for state, _ in steps]
+                steps = arm(name, world, n).iterate(observations, seed)
+                answers[name] = [state_weights(world, state.population) for state, _ in steps]
             for name, laws in answers.items():
                 for t, p in enumerate(laws):
-                    found = measure(world, p, exact[t], int(truth[t]))
+                    found = posterior_errors(world, p, exact[t], int(truth[t]))
                     rows.append({"world": shape, "arm": name, "n": n, "seed": seed, "t": t, **found})
         print(shape, n, n_worlds, "worlds", flush=True)
     return rows
@@ -130,7 +130,7 @@ def by_world(rows: list[dict], key: Callable[[dict], tuple], measure: str) -> di
 def summarise(rows: list[dict], out: Path) -> None:
     """distances.csv (over all steps), over_time.csv (tv by step), paired.csv (differences by world)."""
     table = {}
-    for m in MEASURES:
+    for m in POSTERIOR_ERRORS:
         for key, values in by_world(rows, lambda r: (r["world"], r["n"], r["arm"]), m).items():
             mean, half = interval(values)
             entry = table.setdefault(key, {"world": key[0], "n": key[1], "arm": key[2], "worlds": len(values)})
@@ -162,25 +162,25 @@ def summarise(rows: list[dict], out: Path) -> None:
 def calibrate(arms: dict[str, int], n_worlds: int, steps: int, out: Path) -> None:
     """Ranks of true scalars in the answers after `steps` observations of the shelf."""
     world = WORLDS["shelf"]
-    scalars, rows = statistics(world), []
+    scalars, rows = state_statistics(world), []
     for name, n in arms.items():
         ranks: dict[str, list[int]] = {s: [] for s in scalars}
         for seed in range(n_worlds):
-            truth, glances = world.simulate(np.random.default_rng([seed, 13]), steps)
+            truth, observations = world.simulate(np.random.default_rng([seed, 13]), steps)
             if name == "exact":
-                p = exact_filter(world, glances).posterior[-1]
+                p = exact_filter(world, observations).posterior[-1]
             else:
-                p = class_weights(world, arm(name, world, n).run(glances, seed)[0].population)
+                p = state_weights(world, arm(name, world, n).run(observations, seed)[0].population)
             for s, scalar in scalars.items():
-                ranks[s].append(rank(np.random.default_rng([seed, 14]), scalar, p, int(truth[-1])))
+                ranks[s].append(rank_of_truth(np.random.default_rng([seed, 14]), scalar, p, int(truth[-1])))
         for s, found in ranks.items():
-            counts = np.bincount(found, minlength=DRAWS + 1).tolist()
+            counts = np.bincount(found, minlength=N_RANK_DRAWS + 1).tolist()
             row = {
                 "arm": name,
                 "n": n,
                 "statistic": s,
                 "worlds": n_worlds,
-                "p_value": f"{uniformity(np.array(found)):.2g}",
+                "p_value": f"{rank_uniformity(np.array(found)):.2g}",
             }
             rows.append(row | {f"rank_{k}": c for k, c in enumerate(counts)})
         print("calibration", name, flush=True)
@@ -206,7 +206,7 @@ def main() -> None:
     options = parser.parse_args()
     if options.smoke and options.out == HERE / "results":
         parser.error("--smoke would overwrite the results: name another folder with --out")
-    options.out.mkdir(parents=True, exist_ok=True)
+    options.out.mkdir(include_parents=True, exist_ok=True)
     every = (*PROPER, *PRESETS, *CHANGES, *LADDER, *UNIONS)
     if options.presets:
         options.out = options.out / "presets"

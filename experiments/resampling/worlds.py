@@ -11,7 +11,7 @@ import numpy as np
 from scipy import stats
 
 from mstfilter.fusion import SameSegmentation, WeightedCoverage
-from mstfilter.oracles import Miniature, bootstrap_filter, class_weights, exact_filter
+from mstfilter.oracles import Miniature, bootstrap_filter, exact_filter, state_weights
 from mstfilter.smc import (
     Branching,
     Equivalence,
@@ -207,10 +207,10 @@ TABLE = Miniature((3, 2))
 
 @cache
 def table_data(seed: int) -> Data:
-    """Six glances at a table; all configurations are enumerated."""
-    _, glances = TABLE.simulate(np.random.default_rng([seed, 24]), 6)
-    exact = exact_filter(TABLE, glances)
-    return Data(glances, float(exact.log_evidence[-1]), exact.posterior)
+    """Six observations at a table; all configurations are enumerated."""
+    _, observations = TABLE.simulate(np.random.default_rng([seed, 24]), 6)
+    exact = exact_filter(TABLE, observations)
+    return Data(observations, float(exact.log_evidence[-1]), exact.posterior)
 
 
 def worlds(reference: int) -> dict[str, World]:
@@ -224,7 +224,7 @@ def worlds(reference: int) -> dict[str, World]:
         "miniature_mst": World(
             lambda n: bootstrap_filter(TABLE, n),
             table_data,
-            lambda population: class_weights(TABLE, population),
+            lambda population: state_weights(TABLE, population),
             WeightedCoverage(),
             SameSegmentation(),
             (200, 20),

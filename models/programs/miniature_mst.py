@@ -11,13 +11,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from mstfilter.oracles import Glance, Miniature, exact_filter, total_variation
+from mstfilter.oracles import Miniature, MiniatureObservation, exact_filter, total_variation
 from mstfilter.smc import Bernoulli, Categorical, Program, observe, sample
 
 WORLD = Miniature(shape=(3, 2))
 
 
-def model(previous, y: Glance):
+def model(previous, y: MiniatureObservation):
     """One step for all particles; `previous` is None at the first."""
     fresh = sample("fresh", Categorical(WORLD.prior))
     if previous is None:
@@ -27,15 +27,15 @@ def model(previous, y: Glance):
         anew = sample("anew", Bernoulli(np.full(n, WORLD.rearranged)))
         slips = sample("slips", Bernoulli(np.full(n, WORLD.slip)))
         state = np.where(anew, fresh, np.where(slips, old, WORLD.pushed[y.action, old]))
-    surface, alike = WORLD.surface[state], WORLD.alike[state].astype(int)
+    surface, same_surface = WORLD.surface[state], WORLD.same_surface[state].astype(int)
     for pixel, reading in enumerate(y.depth):
-        observe(f"depth {pixel}", Categorical(WORLD.depth_law[surface[:, pixel]]), reading)
-    observe("segmentation", Bernoulli(WORLD.join_law[alike]), y.joined)
+        observe(f"depth {pixel}", Categorical(WORLD.depth_probability[surface[:, pixel]]), reading)
+    observe("segmentation", Bernoulli(WORLD.join_probability[same_surface]), y.joined)
     return {"state": state}
 
 
-def guide(previous, y: Glance):
-    """Draws the first scene near what is seen (half the log likelihood, since later glances may say otherwise)."""
+def guide(previous, y: MiniatureObservation):
+    """Draws the first scene near what is seen (half the log likelihood: later observations can correct it)."""
     first = previous is None
     fresh = sample(
         "fresh", Categorical(WORLD.prior * np.exp(0.5 * WORLD.log_likelihood(y)) if first else WORLD.prior)
@@ -45,7 +45,7 @@ def guide(previous, y: Glance):
         sample("slips", Bernoulli(np.full(len(fresh), WORLD.slip)))
 
 
-def simulate(T: int, seed: int = 0) -> tuple[np.ndarray, list[Glance]]:
+def simulate(T: int, seed: int = 0) -> tuple[np.ndarray, list[MiniatureObservation]]:
     """True configurations and observations."""
     return WORLD.simulate(np.random.default_rng(seed), T)
 
@@ -57,12 +57,12 @@ def filters(n: int) -> dict:
 
 
 if __name__ == "__main__":
-    truth, glances = simulate(6)
-    exact = exact_filter(WORLD, glances)
+    truth, observations = simulate(6)
+    exact = exact_filter(WORLD, observations)
     print("                           log evidence   total variation   p(truth)")
     for n in (100, 1000, 10_000, 100_000):
         for name, filter in filters(n).items():
-            state, _ = filter.run(glances, seed=0)
+            state, _ = filter.run(observations, seed=0)
             law = np.bincount(state.population.particles["state"], state.population.weights, len(WORLD.states))
             distance = total_variation(law, exact.posterior[-1])
             print(f"{name:16s} {n:7d}   {state.log_evidence:12.3f}   {distance:15.3f}   {law[truth[-1]]:8.3f}")

@@ -1,16 +1,271 @@
-"""The stages of `mst` and the changes that replace each by the truth: arms of an error budget.
+"""Tracking, free space, fusion and selection replaced by the truth, and the arms of an error budget.
 
->>> mstfilter.preset("mst", *STAGES["motions"])
->>> list(budget_arms())[:3]
-['mst', 'true boundary', 'true masks']
+>>> transition = TrueMotions()                                     # the rigid motion of each object
+>>> FusionUpdate(free_space=TrueFreeSpace())                       # exactly the free space that is visible
+>>> FusionUpdate(evidence=(TrueQuality(),), n_scored=100)          # the best of fusion's own candidates
+>>> TrueFusion()                                                   # the best that both parents allow
+>>> ParticleFilter(..., resampler=TrueBest())                      # the n best candidates
+>>> filter = mstfilter.preset("mst", *STAGES["motions"])
 
-One stage at a time says what a perfect one would bring to today's filter; all but one says what a stage costs a
-filter that is perfect elsewhere. The two differ because stages mend one another's faults.
+Replacing one stage shows what a perfect one would add to the present filter. Replacing all but one shows what that
+stage costs a filter that is perfect elsewhere. The two differ because stages correct errors of each other.
 """
 
 from __future__ import annotations
 
-__all__ = ["ALL", "STAGES", "budget_arms", "overrides_of"]
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import ClassVar
+
+import numpy as np
+
+from mstfilter.errors import InputError
+from mstfilter.fusion import Evidence, FreeSpace, Projection
+from mstfilter.oracles.truth import Need, UsesTruth
+from mstfilter.scene import Clip, Frame, Hypothesis, ObjectRecord, frame_geometry, render
+from mstfilter.scoring import Form, overlap, weighted_coverage
+from mstfilter.smc import Candidates, Key, Population, Resampler, Transition, Update, key_of, union
+from mstfilter.tracking import Array, Warp, apply
+
+__all__ = [
+    "PERFECT_STAGES",
+    "STAGES",
+    "TrueBest",
+    "TrueFreeSpace",
+    "TrueFusion",
+    "TrueMotions",
+    "TrueQuality",
+    "budget_arms",
+    "overrides_of",
+]
+
+
+@dataclass(frozen=True)
+class TrueMotions(UsesTruth, Transition):
+    """Move the objects of hypotheses by true motions.
+
+    Parameters
+    ----------
+    warp : Warp
+        Moves the voxels.
+    rest : float
+        Objects none of whose voxels moves farther than this (metres) stay exactly: simulated objects settle a
+        little.
+    """
+
+    warp: Warp = field(default_factory=lambda: Warp("smooth"))
+    rest: float = 0.0005
+
+    properly_weighted: ClassVar[bool] = False
+    needs: ClassVar[tuple[Need, ...]] = ("voxels", "poses")
+
+    def predict(self, rng: np.random.Generator, population: Population, observation: Clip | None) -> Population:
+        """Move all hypotheses; weights stay. Objects that meet no true object stay."""
+        parents = {"previous": np.arange(len(population))}
+        particles: tuple[Hypothesis, ...] = tuple(population.particles)
+        counts = {"true": 0, "rest": 0, "no object": 0}
+        if observation is not None and len(observation) > 1:
+            t = observation.index
+            motions, labels = self.truth.motions(t), self.truth.labels(t - 1)
+            particles = tuple(self._move(h, labels, motions, counts) for h in particles)
+        return Population(particles, population.log_weights, parents, {"motions": counts})
+
+    def _move(
+        self, hypothesis: Hypothesis, labels: np.ndarray, motions: dict[int, Array], counts: dict[str, int]
+    ) -> Hypothesis:
+        table = overlap(hypothesis.labels, labels)
+        shared = np.where(table.labels_b > 0, table.counts, 0)
+        chosen = {}
+        for row, label in enumerate(table.labels_a.tolist()):
+            if label == 0:
+                continue
+            fate = "no object"
+            if shared[row].any():
+                T = motions.get(int(table.labels_b[shared[row].argmax()]), np.eye(4))
+                centres = hypothesis.grid.centre_of(np.argwhere(hypothesis.mask(label)))
+                went = np.linalg.norm(apply(T, centres) - centres, axis=1).max()
+                fate = "true" if went > self.rest else "rest"
+                if fate == "true":
+                    chosen[label] = T
+            counts[fate] += 1
+        return self.warp.move(hypothesis, chosen).hypothesis
+
+
+@dataclass(frozen=True)
+class TrueFreeSpace(UsesTruth, Projection):
+    """Clears voxels that are free in truth.
+
+    Parameters
+    ----------
+    hidden : bool
+        Also those that the camera does not see: more than any sensor could tell.
+    """
+
+    hidden: bool = False
+
+    def project(self, hypothesis: Hypothesis, frame: Frame) -> tuple[Hypothesis, float]:
+        """The hypothesis without these voxels, and the share that it keeps."""
+        labels = self.truth.labels(self.truth.pause_of(frame))
+        free = labels == 0
+        if not self.hidden:
+            geometry = frame_geometry(frame, hypothesis.grid)
+            seen = render(labels, hypothesis.grid, frame.camera).depth
+            surface = np.where(np.isnan(seen), np.inf, seen).ravel()[np.maximum(geometry.pixel, 0)]
+            free = free & (geometry.pixel >= 0) & (geometry.z < surface)
+        occupied = hypothesis.labels != 0
+        hit = occupied & free
+        if not hit.any():
+            return hypothesis, 1.0
+        kept = hypothesis.with_labels(np.where(hit, 0, hypothesis.labels).astype(np.uint16))
+        return kept, 1.0 - int(hit.sum()) / int(occupied.sum())
+
+
+@dataclass(frozen=True)
+class TrueQuality(UsesTruth, Evidence):
+    """Scores hypotheses by their true quality.
+
+    Parameters
+    ----------
+    strength : float
+        Nats for a quality of 1. The default leaves the best of all candidates alone with weight.
+    form : {"objects", "paper", "authors"}
+        Of quality.
+    """
+
+    strength: float = 1e4
+    form: Form = "objects"
+
+    def log_score(self, hypotheses: Sequence[Hypothesis], clip: Clip) -> np.ndarray:
+        """(n,) strength x quality."""
+        labels = self.truth.labels(clip.index)
+        return self.strength * np.array([weighted_coverage(h.labels, labels, self.form) for h in hypotheses])
+
+
+@dataclass(frozen=True)
+class TrueBest(UsesTruth, Resampler):
+    """Keeps the n candidates of best true quality; draws nothing. All candidates are built.
+
+    Parameters
+    ----------
+    form : {"objects", "paper", "authors"}
+        Of quality.
+    """
+
+    form: Form = "objects"
+
+    properly_weighted: ClassVar[bool] = False
+
+    def select(
+        self, rng: np.random.Generator, log_weights: np.ndarray, n: int
+    ) -> tuple[np.ndarray, np.ndarray | None]:
+        """The n largest weights (in turn, where there are fewer): weights alone say nothing of the truth."""
+        order = np.argsort(-np.asarray(log_weights), kind="stable")
+        return order[np.arange(n) % len(order)], None
+
+    def resample(self, rng: np.random.Generator, population: Population, n: int) -> Population:
+        """Select by quality at the pause of the filter's step."""
+        labels = self.truth.labels(step_of(rng))
+        population = population.realised()
+        quality = np.array([weighted_coverage(h.labels, labels, self.form) for h in population.particles])
+        ancestors, _ = self.select(rng, quality, n)
+        chosen = population.take(ancestors, np.full(n, population.log_mean_weight))
+        return chosen.labelled({**chosen.parents, "ancestor": ancestors.astype(np.int64)}, chosen.notes)
+
+
+def step_of(rng: np.random.Generator) -> int:
+    """The step of the filter that a generator's stream belongs to: a resampler is told it by nothing else."""
+    path, word = key_of(rng).path, Key(0).child("step").path[0]
+    for k in range(len(path) - 2, -1, -1):
+        if path[k] == word:
+            return path[k + 1]
+    raise InputError("this generator belongs to no step of a filter, so the pause to judge by is unknown")
+
+
+@dataclass(frozen=True)
+class TrueFusion(UsesTruth, Update):
+    """The best hypothesis that the objects of two parents allow: fusion without its chances.
+
+    For every true object, the best object of either parent (by Jaccard index) and what improves it when merged
+    with it; better ones are painted over worse ones, all others are dropped. Each pair makes one candidate.
+
+    Parameters
+    ----------
+    free_space : Projection
+        Projects the predicted hypotheses first.
+    """
+
+    free_space: Projection = FreeSpace()  # noqa: RUF009 (frozen)
+
+    properly_weighted: ClassVar[bool] = False
+    draws: ClassVar[bool] = False
+
+    def update(
+        self,
+        rng: np.random.Generator,
+        predicted: Population | None,
+        proposed: Population | None,
+        observation: Clip,
+    ) -> Population:
+        """One candidate for each pair, unbuilt; one parent alone is fused with nothing."""
+        if predicted is None:
+            return union(None, proposed)
+        refined, _ = self.free_space.refine(predicted.particles, observation)
+        if proposed is None:
+            return Population(refined, predicted.log_weights, predicted.parents)
+        labels, samples = self.truth.labels(observation.index), tuple(proposed.particles)
+        i, j = np.divmod(np.arange(len(proposed) * len(predicted)), len(predicted))
+        none_j, none_i = np.full(len(predicted), -1), np.full(len(proposed), -1)
+        parents = {
+            "previous": predicted.parents.get("previous", none_j)[j],
+            "proposed": proposed.parents.get("proposed", none_i)[i],
+        }
+        candidates = Candidates(lambda c: best_of_both(samples[i[c]], refined[j[c]], labels), len(i))
+        return Population(candidates, proposed.log_weights[i] + predicted.log_weights[j], parents)
+
+
+def best_of_both(proposed: Hypothesis, predicted: Hypothesis, true: np.ndarray) -> Hypothesis:
+    """What `TrueFusion` makes of two hypotheses."""
+    masks: list[np.ndarray] = []
+    records: list[ObjectRecord] = []
+    claims: list[dict[int, float]] = []  # Jaccard index with each true object that an object meets
+    for parent in (predicted, proposed):
+        table = overlap(parent.labels, true)
+        jaccard = table.jaccard()
+        for record in parent.objects:
+            row = int(np.searchsorted(table.labels_a, record.label))
+            masks.append(parent.mask(record.label))
+            records.append(record)
+            met = np.flatnonzero((table.counts[row] > 0) & (table.labels_b > 0))
+            claims.append({int(table.labels_b[c]): float(jaccard[row, c]) for c in met})
+    n_predicted = predicted.n_objects
+    chosen: list[tuple[float, int, np.ndarray, bool]] = []
+    for k in sorted({k for claim in claims for k in claim}):
+        able = [m for m in range(len(masks)) if claims[m] and max(claims[m], key=lambda o: (claims[m][o], -o)) == k]
+        able.sort(key=lambda m: -claims[m][k])
+        if not able:
+            continue
+        target, mask, best, merged = true == k, masks[able[0]], claims[able[0]][k], False
+        for m in able[1:]:
+            joined = mask | masks[m]
+            jaccard_joined = float((joined & target).sum() / (joined | target).sum())
+            if jaccard_joined > best + 1e-9:
+                mask, best, merged = joined, jaccard_joined, True
+        known = [m for m in able if m < n_predicted]
+        if known:  # an object that was there before keeps its name
+            old = records[known[0]]
+            records[able[0]] = replace(records[able[0]], id=old.id, birth=old.birth)
+        chosen.append((best, able[0], mask, merged))
+    labels, kept = np.zeros(true.shape, np.uint16), {}
+    for number, (_, m, mask, merged) in enumerate(sorted(chosen, key=lambda c: (c[0], -c[1])), start=1):
+        labels[mask] = number
+        kept[number] = (records[m], mask, merged)
+    out = []
+    for number in [int(k) for k in np.unique(labels) if k > 0]:
+        record, mask, merged = kept[number]
+        record = replace(record, label=number)
+        out.append(record if not merged and np.array_equal(labels == number, mask) else record.changed())
+    return Hypothesis(labels, predicted.grid, tuple(out))
+
 
 #: Changes to the preset ``mst`` by stage. Fields that are named beside a component keep those of ``mst``.
 STAGES: dict[str, tuple[str, ...]] = {
@@ -25,7 +280,7 @@ STAGES: dict[str, tuple[str, ...]] = {
 }
 
 #: The stages of a filter that is perfect throughout. True masks need no boundary, true fusion leaves no choice.
-ALL: tuple[str, ...] = ("masks", "completion", "motions", "fusion", "free space", "selection")
+PERFECT_STAGES: tuple[str, ...] = ("masks", "completion", "motions", "fusion", "free space", "selection")
 
 
 def overrides_of(*stages: str) -> tuple[str, ...]:
@@ -37,6 +292,6 @@ def budget_arms() -> dict[str, tuple[str, ...]]:
     """Arms of the error budget by name: ``mst``, one stage true, all true, all true but one."""
     arms: dict[str, tuple[str, ...]] = {"mst": ()}
     arms |= {f"true {stage}": overrides_of(stage) for stage in STAGES}
-    arms["all true"] = overrides_of(*ALL)
-    arms |= {f"all but {left}": overrides_of(*(s for s in ALL if s != left)) for left in ALL}
+    arms["all true"] = overrides_of(*PERFECT_STAGES)
+    arms |= {f"all but {left}": overrides_of(*(s for s in PERFECT_STAGES if s != left)) for left in PERFECT_STAGES}
     return arms

@@ -22,7 +22,7 @@ import numpy as np
 from mstfilter.errors import InputError
 from mstfilter.scene import Frame, Recording
 
-__all__ = ["Need", "Truth", "UsesTruth", "bind_truth", "uses_truth"]
+__all__ = ["Need", "RecordingTruth", "UsesTruth", "bind_truth", "uses_truth"]
 
 Need = Literal["voxels", "instance", "poses"]
 _WORDS: dict[Need, str] = {"voxels": "true voxels", "instance": "instance image", "poses": "true poses"}
@@ -30,7 +30,7 @@ _WORDS: dict[Need, str] = {"voxels": "true voxels", "instance": "instance image"
 T = TypeVar("T")
 
 
-class Truth:
+class RecordingTruth:
     """What is true at the pauses of a recording.
 
     Parameters
@@ -108,7 +108,7 @@ class UsesTruth:
     #: What it asks a recording for.
     needs: ClassVar[tuple[Need, ...]] = ("voxels",)
 
-    def bind(self: T, truth: Truth) -> T:
+    def bind(self: T, truth: RecordingTruth) -> T:
         """The same component, knowing this truth."""
         bound = copy.copy(self)
         object.__setattr__(bound, "_truth", truth)  # components are frozen
@@ -121,7 +121,7 @@ class UsesTruth:
         return b"" if truth is None else truth.recording.truth_key
 
     @property
-    def truth(self) -> Truth:
+    def truth(self) -> RecordingTruth:
         """The truth it was bound to."""
         truth = self.__dict__.get("_truth")
         if truth is None:
@@ -149,10 +149,10 @@ def bind_truth(component: T, recording: Recording) -> T:
     InputError
         If the recording lacks what a part needs, at any pause.
     """
-    return _bind(component, Truth(recording)) if uses_truth(component) else component
+    return _bind(component, RecordingTruth(recording)) if uses_truth(component) else component
 
 
-def _bind(component: Any, truth: Truth) -> Any:
+def _bind(component: Any, truth: RecordingTruth) -> Any:
     changed = {}
     for name, part in _parts(component).items():
         new = tuple(_bind(inner, truth) for inner in part) if isinstance(part, tuple) else _bind(part, truth)

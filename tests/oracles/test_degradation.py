@@ -9,10 +9,7 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 from mstfilter.errors import InputError
-from mstfilter.oracles import degradation
-from mstfilter.oracles.degradation import degrade
-from mstfilter.oracles.masks import TrueBoundary, TrueMasks
-from mstfilter.oracles.truth import bind_truth
+from mstfilter.oracles import TrueBoundary, TrueMasks, bind_truth, degradation, degrade
 from mstfilter.scene import component_key
 from mstfilter.scoring import overlap, weighted_coverage
 from tests.baselines.scenes import slide

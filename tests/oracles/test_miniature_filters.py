@@ -12,13 +12,31 @@ import pytest
 
 import mstfilter
 from mstfilter.errors import InputError
-from mstfilter.oracles.miniature.calibration import DRAWS, rank, statistics, uniformity
-from mstfilter.oracles.miniature.exact import exact_filter
-from mstfilter.oracles.miniature.filters import GuidedPush, Push, bootstrap_filter, guided_filter
-from mstfilter.oracles.miniature.measures import class_weights, measure, total_variation
-from mstfilter.oracles.miniature.shrunk import ReadingEvidence, SampledCuts, SeenThrough, cut_law, shrink
-from mstfilter.oracles.miniature.weighting import ScoredFusion, balanced_filter, predictive_law
-from mstfilter.oracles.miniature.world import Glance, Miniature
+from mstfilter.oracles import (
+    N_RANK_DRAWS,
+    Miniature,
+    MiniatureObservation,
+    ScoredFusion,
+    adapt_to_miniature,
+    balanced_filter,
+    bootstrap_filter,
+    exact_filter,
+    guided_filter,
+    posterior_errors,
+    rank_of_truth,
+    rank_uniformity,
+    state_statistics,
+    state_weights,
+    total_variation,
+)
+from mstfilter.oracles.miniature_filters import GuidedMiniatureMotion, MiniatureMotion
+from mstfilter.oracles.miniature_mst import (
+    LikelihoodEvidence,
+    MiniatureCuts,
+    MiniatureFreeSpace,
+    cut_distribution,
+    predictive_distribution,
+)
 from mstfilter.smc import Always, FearnheadClifford, Population, Reweight
 from tests.oracles.test_miniature_world import FALSE_ALARM, chi_square, ids, state_of
 
@@ -28,7 +46,7 @@ RULES = {"paper": ("p", False), "authors": ("p", True), "mst": ("equal", False)}
 
 
 def preset(name, world, n):
-    return shrink(mstfilter.preset(name), world, n, *RULES[name])
+    return adapt_to_miniature(mstfilter.preset(name), world, n, *RULES[name])
 
 
 @pytest.mark.parametrize("name", RULES)
@@ -39,10 +57,10 @@ def test_the_rules_are_those_of_the_presets(name):
 
 @ids
 def test_one_step_of_the_guided_filter_has_the_exact_evidence(world):
-    _, glances = world.simulate(np.random.default_rng(0), 1)
-    exact = exact_filter(world, glances)
+    _, observations = world.simulate(np.random.default_rng(0), 1)
+    exact = exact_filter(world, observations)
     for n in (1, 7):
-        state, _ = guided_filter(world, n).run(glances, 1)
+        state, _ = guided_filter(world, n).run(observations, 1)
         assert state.log_evidence == pytest.approx(exact.log_evidence[0], abs=1e-10)
 
 
@@ -50,12 +68,12 @@ def test_one_step_of_the_guided_filter_has_the_exact_evidence(world):
 @ids
 def test_the_evidence_is_unbiased(name, world):
     """On data whose estimates are not skewed (spread below a half), so that few runs show their mean."""
-    _, glances = world.simulate(np.random.default_rng(4), 4)
-    exact = exact_filter(world, glances).log_evidence[-1]
+    _, observations = world.simulate(np.random.default_rng(4), 4)
+    exact = exact_filter(world, observations).log_evidence[-1]
     n = {"bootstrap": 2000, "guided": 60, "balanced": 300}[name]
     for extra in ({}, {"resampler": FearnheadClifford(), "trigger": Always()}):
         filter = PROPER[name](world, n, **extra)
-        ratio = np.exp([filter.run(glances, seed)[0].log_evidence - exact for seed in range(80)])
+        ratio = np.exp([filter.run(observations, seed)[0].log_evidence - exact for seed in range(80)])
         assert ratio.std() < 0.5
         assert abs(ratio.mean() - 1) < 4 * ratio.std(ddof=1) / np.sqrt(len(ratio))
 
@@ -68,10 +86,10 @@ def test_proper_filters_converge(name, world):
     for n in sizes:
         tv = []
         for seed in range(8):
-            _, glances = world.simulate(np.random.default_rng(seed), 3)
-            state, _ = PROPER[name](world, n).run(glances, seed)
-            exact = exact_filter(world, glances).posterior[-1]
-            tv.append(total_variation(class_weights(world, state.population), exact))
+            _, observations = world.simulate(np.random.default_rng(seed), 3)
+            state, _ = PROPER[name](world, n).run(observations, seed)
+            exact = exact_filter(world, observations).posterior[-1]
+            tv.append(total_variation(state_weights(world, state.population), exact))
         distances.append(np.mean(tv))
     assert distances[1] < 0.4 * distances[0]
     assert distances[1] < 0.15
@@ -79,49 +97,51 @@ def test_proper_filters_converge(name, world):
 
 def test_a_guided_move_is_an_importance_draw_of_the_motion_model():
     """log q sums to one; f / q is the weight that `predict` adds, up to the likelihood."""
-    _, glances = WORLD.simulate(np.random.default_rng(4), 2)
-    y, S = glances[1], len(WORLD.states)
+    _, observations = WORLD.simulate(np.random.default_rng(4), 2)
+    y, S = observations[1], len(WORLD.states)
     hypotheses = WORLD.states.hypotheses
     old = (hypotheses[321],) * S
-    log_q = GuidedPush(WORLD).log_prob(old, hypotheses, y)
+    log_q = GuidedMiniatureMotion(WORLD).log_prob(old, hypotheses, y)
     assert np.exp(log_q).sum() == pytest.approx(1)
-    moved = GuidedPush(WORLD).predict(np.random.default_rng(0), Population(old), y)
+    moved = GuidedMiniatureMotion(WORLD).predict(np.random.default_rng(0), Population(old), y)
     x = WORLD.states.index(moved.particles)
-    gain = Push(WORLD).log_prob(old, moved.particles, y) - log_q[x]
+    gain = MiniatureMotion(WORLD).log_prob(old, moved.particles, y) - log_q[x]
     np.testing.assert_allclose(moved.log_weights, gain, atol=1e-10)
     assert chi_square(x, np.exp(log_q)) > FALSE_ALARM
 
 
 def test_a_missing_observation_moves_the_particles_only():
-    _, glances = WORLD.simulate(np.random.default_rng(5), 3)
-    glances = [glances[0], None, glances[2]]
-    exact = exact_filter(WORLD, glances)
+    _, observations = WORLD.simulate(np.random.default_rng(5), 3)
+    observations = [observations[0], None, observations[2]]
+    exact = exact_filter(WORLD, observations)
     for make in (bootstrap_filter, guided_filter):
-        ratio = np.exp([make(WORLD, 500).run(glances, s)[0].log_evidence - exact.log_evidence[-1] for s in range(60)])
+        ratio = np.exp(
+            [make(WORLD, 500).run(observations, s)[0].log_evidence - exact.log_evidence[-1] for s in range(60)]
+        )
         assert abs(ratio.mean() - 1) < 4 * ratio.std(ddof=1) / np.sqrt(60)
 
 
 # --- MST on the same world ----------------------------------------------------------------------------------------
 @ids
-def test_cuts_follow_their_law(world):
-    _, glances = world.simulate(np.random.default_rng(8), 1)
-    law = cut_law(world, glances[0], 0.4)
+def test_cuts_follow_their_distribution(world):
+    _, observations = world.simulate(np.random.default_rng(8), 1)
+    law = cut_distribution(world, observations[0], 0.4)
     assert law.probability.sum() == pytest.approx(1)
     assert law.log_cut.max() == 0
-    proposal = SampledCuts(world, prior_share=0.2)
-    drawn = proposal.sample(np.random.default_rng(0), glances[0], 4000)
-    assert proposal.law(glances[0]).sum() == pytest.approx(1)
-    assert chi_square(world.states.index(drawn.particles), proposal.law(glances[0])) > FALSE_ALARM
+    proposal = MiniatureCuts(world, prior_share=0.2)
+    drawn = proposal.sample(np.random.default_rng(0), observations[0], 4000)
+    assert proposal.state_probability(observations[0]).sum() == pytest.approx(1)
+    assert chi_square(world.states.index(drawn.particles), proposal.state_probability(observations[0])) > FALSE_ALARM
 
 
 def test_cuts_on_a_picture():
     """Two pixels with a surface, sensed as joined: one object or two, in the proportion of the error rates."""
     world = Miniature((3, 2), split=0.2, merge=0.1)
-    law = cut_law(world, Glance(np.array([1, 1, 2]), np.array([True, False])), 0.4)
+    law = cut_distribution(world, MiniatureObservation(np.array([1, 1, 2]), np.array([True, False])), 0.4)
     assert dict(zip(law.states.tolist(), law.probability.tolist(), strict=True)) == pytest.approx(
         {state_of(world, ["01", "01", "00"]): 8 / 9, state_of(world, ["01", "02", "00"]): 1 / 9}
     )
-    deep = cut_law(world, Glance(np.array([0, 2, 2]), np.array([True, True])), 0.4)
+    deep = cut_distribution(world, MiniatureObservation(np.array([0, 2, 2]), np.array([True, True])), 0.4)
     assert dict(zip(deep.states.tolist(), deep.probability.tolist(), strict=True)) == pytest.approx(
         {state_of(world, ["10", "00", "00"]): 0.6, state_of(world, ["11", "00", "00"]): 0.4}
     )
@@ -129,51 +149,53 @@ def test_cuts_on_a_picture():
 
 def test_what_is_seen_through_is_cleared():
     hypothesis = WORLD.states.hypotheses[state_of(WORLD, ["11", "02", "30"])]
-    refined, quality = SeenThrough().project(hypothesis, Glance(np.array([1, 0, 2]), np.array([False, False])))
+    refined, quality = MiniatureFreeSpace().project(
+        hypothesis, MiniatureObservation(np.array([1, 0, 2]), np.array([False, False]))
+    )
     assert WORLD.states.index([refined])[0] == state_of(WORLD, ["01", "02", "00"])
     assert quality == pytest.approx(2 / 4)
 
 
 @pytest.mark.parametrize("name", RULES)
 def test_presets_run_and_report_no_evidence(name):
-    _, glances = WORLD.simulate(np.random.default_rng(0), 3)
+    _, observations = WORLD.simulate(np.random.default_rng(0), 3)
     filter = preset(name, WORLD, 5)
-    a, _ = filter.run(glances, 3)
-    b, _ = filter.run(glances, 3)
+    a, _ = filter.run(observations, 3)
+    b, _ = filter.run(observations, 3)
     assert len(a.population) == 5 and a.log_evidence is None
     np.testing.assert_array_equal(a.population.log_weights, b.population.log_weights)
     np.testing.assert_array_equal(
         [h.labels for h in a.population.particles], [h.labels for h in b.population.particles]
     )
-    assert class_weights(WORLD, a.population).sum() == pytest.approx(1)
+    assert state_weights(WORLD, a.population).sum() == pytest.approx(1)
 
 
 def test_scoring_terms_become_the_likelihood_of_the_reading():
     mst = mstfilter.preset("mst")
-    scored = replace(mst, update=replace(mst.update, evidence=(ReadingEvidence(Miniature((2, 2))),), n_scored=99))
-    filter = shrink(scored, WORLD, 10)
-    _, glances = WORLD.simulate(np.random.default_rng(1), 2)
-    _, info = filter.step(filter.run(glances[:1], 0)[0], glances[1])
+    scored = replace(mst, update=replace(mst.update, evidence=(LikelihoodEvidence(Miniature((2, 2))),), n_scored=99))
+    filter = adapt_to_miniature(scored, WORLD, 10)
+    _, observations = WORLD.simulate(np.random.default_rng(1), 2)
+    _, info = filter.step(filter.run(observations[:1], 0)[0], observations[1])
     assert info.n_candidates == 40
-    assert len(info.notes["update"]["scores"]["ReadingEvidence"]) == 40
-    score = ReadingEvidence(WORLD).log_score(WORLD.states.hypotheses, glances[1])
-    np.testing.assert_array_equal(score, WORLD.log_likelihood(glances[1]))
+    assert len(info.notes["update"]["scores"]["LikelihoodEvidence"]) == 40
+    score = LikelihoodEvidence(WORLD).log_score(WORLD.states.hypotheses, observations[1])
+    np.testing.assert_array_equal(score, WORLD.log_likelihood(observations[1]))
 
 
 def test_other_updates_cannot_be_shrunk():
     filter = replace(mstfilter.preset("mst"), update=Reweight(lambda p, y: np.zeros(len(p))))
     with pytest.raises(InputError, match="expected a FusionUpdate"):
-        shrink(filter, WORLD, 5)
+        adapt_to_miniature(filter, WORLD, 5)
 
 
 def test_scored_candidates_count_once_and_carry_prediction_times_likelihood():
-    _, glances = WORLD.simulate(np.random.default_rng(1), 2)
-    rng, y = np.random.default_rng(2), glances[1]
-    proposed = SampledCuts(WORLD).sample(rng, y, 10)
+    _, observations = WORLD.simulate(np.random.default_rng(1), 2)
+    rng, y = np.random.default_rng(2), observations[1]
+    proposed = MiniatureCuts(WORLD).sample(rng, y, 10)
     predicted = Population(WORLD.states.take(WORLD.draw_prior(rng, 10)), np.log(np.arange(1.0, 11.0)))
-    law = predictive_law(WORLD, predicted)
+    law = predictive_distribution(WORLD, predicted)
     assert law.sum() == pytest.approx(1)
-    rule = ScoredFusion(WORLD, preset("mst", WORLD, 10).update, distinct=True, predictive=True, parents=True)
+    rule = ScoredFusion(WORLD, preset("mst", WORLD, 10).update, distinct=True, predictive=True, include_parents=True)
     fused = rule.update(np.random.default_rng(0), predicted, proposed, y)
     states = WORLD.states.index(fused.particles)
     assert len(set(states.tolist())) == len(states)
@@ -183,28 +205,28 @@ def test_scored_candidates_count_once_and_carry_prediction_times_likelihood():
 
 
 def test_scoring_without_crossover_keeps_to_the_parents():
-    _, glances = WORLD.simulate(np.random.default_rng(1), 2)
-    proposed = SampledCuts(WORLD).sample(np.random.default_rng(2), glances[1], 6)
+    _, observations = WORLD.simulate(np.random.default_rng(1), 2)
+    proposed = MiniatureCuts(WORLD).sample(np.random.default_rng(2), observations[1], 6)
     predicted = Population(WORLD.states.take(WORLD.draw_prior(np.random.default_rng(3), 6)))
     fusion = preset("mst", WORLD, 6).update
-    fused = ScoredFusion(WORLD, fusion, first=0, parents=True).update(
-        np.random.default_rng(0), predicted, proposed, glances[1]
+    fused = ScoredFusion(WORLD, fusion, built_per_particle=0, include_parents=True).update(
+        np.random.default_rng(0), predicted, proposed, observations[1]
     )
     np.testing.assert_array_equal(
         WORLD.states.index(fused.particles), WORLD.states.index([*predicted.particles, *proposed.particles])
     )
     with pytest.raises(InputError, match="no candidates"):
-        ScoredFusion(WORLD, fusion, first=0)
+        ScoredFusion(WORLD, fusion, built_per_particle=0)
 
 
-def test_measures_of_the_exact_law_are_zero_and_of_a_wrong_one_known():
-    truth, glances = WORLD.simulate(np.random.default_rng(1), 1)
-    p = exact_filter(WORLD, glances).posterior[0]
-    found = measure(WORLD, p, p, truth[0])
+def test_errors_of_the_exact_posterior_are_zero():
+    truth, observations = WORLD.simulate(np.random.default_rng(1), 1)
+    p = exact_filter(WORLD, observations).posterior[0]
+    found = posterior_errors(WORLD, p, p, truth[0])
     assert found["tv"] == found["same_object_error"] == found["occupancy_error"] == 0
     assert found["p_truth"] == p[truth[0]]
     sure = np.eye(len(p))[truth[0]]
-    found = measure(WORLD, sure, p, truth[0])
+    found = posterior_errors(WORLD, sure, p, truth[0])
     assert found["tv"] == pytest.approx(1 - p[truth[0]])
     assert found["same_object_brier"] == found["occupancy_brier"] == 0
 
@@ -212,12 +234,12 @@ def test_measures_of_the_exact_law_are_zero_and_of_a_wrong_one_known():
 # --- calibration ---------------------------------------------------------------------------------------------------
 def ranks_of(filter, world, n_worlds):
     """{statistic: ranks}; one simulated world each."""
-    scalars, out = statistics(world), {}
+    scalars, out = state_statistics(world), {}
     for seed in range(n_worlds):
-        truth, glances = world.simulate(np.random.default_rng([seed, 77]), 3)
-        p = filter(glances, seed)
+        truth, observations = world.simulate(np.random.default_rng([seed, 77]), 3)
+        p = filter(observations, seed)
         for name, scalar in scalars.items():
-            out.setdefault(name, []).append(rank(np.random.default_rng([seed, 78]), scalar, p, truth[-1]))
+            out.setdefault(name, []).append(rank_of_truth(np.random.default_rng([seed, 78]), scalar, p, truth[-1]))
     return {name: np.array(r) for name, r in out.items()}
 
 
@@ -225,20 +247,20 @@ def ranks_of(filter, world, n_worlds):
 def test_ranks_of_a_proper_filter_are_uniform(name):
     """Four statistics: together they reject a right filter with probability 4 FALSE_ALARM."""
 
-    def answer(glances, seed):
+    def answer(observations, seed):
         if name == "exact":
-            return exact_filter(WORLD, glances).posterior[-1]
-        state, _ = PROPER[name](WORLD, 400).run(glances, seed)
-        return class_weights(WORLD, state.population)
+            return exact_filter(WORLD, observations).posterior[-1]
+        state, _ = PROPER[name](WORLD, 400).run(observations, seed)
+        return state_weights(WORLD, state.population)
 
     for ranks in ranks_of(answer, WORLD, 400).values():
-        assert ranks.min() >= 0 and ranks.max() <= DRAWS
-        assert uniformity(ranks) > FALSE_ALARM
+        assert ranks.min() >= 0 and ranks.max() <= N_RANK_DRAWS
+        assert rank_uniformity(ranks) > FALSE_ALARM
 
 
 def test_ranks_find_a_filter_that_counts_its_evidence_twice():
-    def twice(glances, seed):
-        p = exact_filter(WORLD, glances).posterior[-1] ** 3
+    def twice(observations, seed):
+        p = exact_filter(WORLD, observations).posterior[-1] ** 3
         return p / p.sum()
 
-    assert min(uniformity(r) for r in ranks_of(twice, WORLD, 400).values()) < FALSE_ALARM
+    assert min(rank_uniformity(r) for r in ranks_of(twice, WORLD, 400).values()) < FALSE_ALARM

@@ -12,9 +12,8 @@ import pytest
 from scipy import stats
 
 from mstfilter.errors import InputError
-from mstfilter.oracles.miniature.exact import exact_filter
-from mstfilter.oracles.miniature.states import all_states
-from mstfilter.oracles.miniature.world import Glance, Miniature
+from mstfilter.oracles import Miniature, MiniatureObservation, exact_filter
+from mstfilter.oracles.miniature import miniature_states
 from mstfilter.scene import Hypothesis
 
 FALSE_ALARM = 1e-4
@@ -31,19 +30,19 @@ def glances_of(world):
     X, Y = world.shape
     for depth in product(range(Y + 1), repeat=X):
         for joined in product((False, True), repeat=X - 1):
-            yield Glance(np.array(depth), np.array(joined, dtype=bool))
+            yield MiniatureObservation(np.array(depth), np.array(joined, dtype=bool))
 
 
 @pytest.mark.parametrize(("shape", "bell"), [((1, 1), 2), ((2, 2), 52), ((5, 1), 203), ((3, 2), 877), ((7, 1), 4140)])
 def test_states_are_the_partitions_of_the_cells_and_free_space(shape, bell):
-    states = all_states(shape)
+    states = miniature_states(shape)
     assert len(states) == bell
     assert len({row.tobytes() for row in states.labels}) == bell
 
 
 def test_names_of_objects_do_not_matter():
     rng = np.random.default_rng(0)
-    states = all_states((3, 2))
+    states = miniature_states((3, 2))
     for s in rng.integers(len(states), size=50):
         renamed = np.concatenate([[0], 1 + rng.permutation(60)])[states.labels[s]].astype(np.uint16)
         assert states.index([Hypothesis.from_labels(renamed.reshape(3, 2, 1), states.grid)])[0] == s
@@ -52,7 +51,7 @@ def test_names_of_objects_do_not_matter():
 
 def test_too_many_cells_are_one_clear_error():
     with pytest.raises(InputError, match="3 x 3 cells, expected 1 to 7"):
-        all_states((3, 3))
+        miniature_states((3, 3))
     with pytest.raises(InputError, match=r"slip is 1\.5"):
         Miniature(slip=1.5)
 
@@ -95,9 +94,9 @@ def test_hidden_cells_are_not_seen():
     world = Miniature((3, 2))
     a, b = state_of(world, ["10", "02", "00"]), state_of(world, ["13", "02", "00"])
     assert world.surface[a].tolist() == world.surface[b].tolist() == [0, 1, 2]
-    assert world.alike[a].tolist() == [False, False]
+    assert world.same_surface[a].tolist() == [False, False]
     one = state_of(world, ["10", "11", "00"])
-    assert world.alike[one].tolist() == [True, False]
+    assert world.same_surface[one].tolist() == [True, False]
     for g in list(glances_of(world))[::7]:
         assert world.log_likelihood(g)[a] == world.log_likelihood(g)[b]
 
@@ -106,10 +105,10 @@ def test_sensor_and_motion_follow_their_probabilities():
     world = Miniature((3, 2))
     rng = np.random.default_rng(2)
     state, n = state_of(world, ["10", "11", "02"]), 4000
-    glances = list(glances_of(world))
-    number = {(tuple(g.depth), tuple(g.joined)): k for k, g in enumerate(glances)}
-    p = np.exp([world.log_likelihood(g)[state] for g in glances])
-    drawn = [world.look(rng, state) for _ in range(n)]
+    observations = list(glances_of(world))
+    number = {(tuple(g.depth), tuple(g.joined)): k for k, g in enumerate(observations)}
+    p = np.exp([world.log_likelihood(g)[state] for g in observations])
+    drawn = [world.observe(rng, state) for _ in range(n)]
     assert chi_square([number[tuple(g.depth), tuple(g.joined)] for g in drawn], p) > FALSE_ALARM
     for action in (4, None):
         f = world.predict(np.eye(len(world.states))[state], action)
@@ -138,13 +137,13 @@ def naive_seen(grid):
     return out
 
 
-def naive_likelihood(world, grid, glance):
+def naive_likelihood(world, grid, observation):
     p, Y, seen = 1.0, world.shape[1], naive_seen(grid)
-    for (d, _), r in zip(seen, glance.depth, strict=True):
+    for (d, _), r in zip(seen, observation.depth, strict=True):
         near = world.false_alarm if d > 0 else 0.0
         far = world.miss if d < Y else 0.0
         p *= 1 - near - far if r == d else near / d if r < d else far / (Y - d)
-    for (_, a), (_, b), joined in zip(seen[:-1], seen[1:], glance.joined, strict=True):
+    for (_, a), (_, b), joined in zip(seen[:-1], seen[1:], observation.joined, strict=True):
         q = 1 - world.split if a == b else world.merge
         p *= q if joined else 1 - q
     return p
@@ -175,9 +174,9 @@ def test_the_exact_filter_is_the_sum_over_all_paths():
     grids = [row.reshape(2, 2).tolist() for row in world.states.labels]
     number = {naive_name(g): s for s, g in enumerate(grids)}
     prior, S = world.prior, len(grids)
-    _, glances = world.simulate(np.random.default_rng(5), 3)
-    joint = prior * [naive_likelihood(world, g, glances[0]) for g in grids]
-    for y in glances[1:]:
+    _, observations = world.simulate(np.random.default_rng(5), 3)
+    joint = prior * [naive_likelihood(world, g, observations[0]) for g in grids]
+    for y in observations[1:]:
         cell, step = world.actions[y.action]
         f = np.tile(world.rearranged * prior, (S, 1))
         for s, grid in enumerate(grids):
@@ -185,7 +184,7 @@ def test_the_exact_filter_is_the_sum_over_all_paths():
             f[s, number[naive_name(naive_push(grid, cell, step))]] += (1 - world.rearranged) * (1 - world.slip)
         g = np.array([naive_likelihood(world, grid, y) for grid in grids])
         joint = joint[..., :, None] * f * g  # one axis a step: every path has its entry
-    exact = exact_filter(world, glances)
+    exact = exact_filter(world, observations)
     assert joint.shape == (S, S, S)
     assert exact.log_evidence[-1] == pytest.approx(np.log(joint.sum()), abs=1e-12)
     np.testing.assert_allclose(exact.posterior[-1], joint.sum(axis=(0, 1)) / joint.sum(), atol=1e-14)
@@ -194,11 +193,11 @@ def test_the_exact_filter_is_the_sum_over_all_paths():
 def test_a_missing_observation_is_summed_out():
     """Its push, too: the mean over all pushes."""
     world = SMALL
-    _, glances = world.simulate(np.random.default_rng(6), 3)
+    _, observations = world.simulate(np.random.default_rng(6), 3)
     total = 0.0
     for y in glances_of(world):
         for action in range(len(world.actions)):
-            whole = [glances[0], Glance(y.depth, y.joined, action), glances[2]]
+            whole = [observations[0], MiniatureObservation(y.depth, y.joined, action), observations[2]]
             total += np.exp(exact_filter(world, whole).log_evidence[-1]) / len(world.actions)
-    exact = exact_filter(world, [glances[0], None, glances[2]])
+    exact = exact_filter(world, [observations[0], None, observations[2]])
     assert np.exp(exact.log_evidence[-1]) == pytest.approx(total, rel=1e-10)

@@ -7,8 +7,8 @@ import tomllib
 import pytest
 
 from mstfilter import oracles
-from mstfilter.oracles.stages import ALL, STAGES, budget_arms, overrides_of
-from mstfilter.oracles.truth import uses_truth
+from mstfilter.oracles import uses_truth
+from mstfilter.oracles.stages import PERFECT_STAGES, STAGES, budget_arms, overrides_of
 from mstfilter.presets import REGISTRY, build_filter, describe_filter, load_config
 from tests.baselines.test_presets import differences
 from tests.conftest import REPOSITORY
@@ -46,7 +46,7 @@ def test_a_stage_changes_itself_alone(stage):
 
 
 def test_with_all_stages_true_nothing_is_estimated():
-    filter = build_filter(load_config("mst", overrides_of(*ALL)))
+    filter = build_filter(load_config("mst", overrides_of(*PERFECT_STAGES)))
     assert set(uses_truth(filter)) == {
         "TrueMotions",
         "TrueMasks",
@@ -56,8 +56,8 @@ def test_with_all_stages_true_nothing_is_estimated():
         "TrueBest",
     }
     assert filter.transition.warp.method == "smooth"
-    for left in ALL:
-        fewer = described(*overrides_of(*(s for s in ALL if s != left)))
+    for left in PERFECT_STAGES:
+        fewer = described(*overrides_of(*(s for s in PERFECT_STAGES if s != left)))
         assert differences(fewer, describe_filter(filter)), left
 
 

@@ -11,11 +11,21 @@ from scipy.ndimage import distance_transform_edt
 
 from mstfilter.errors import InputError
 from mstfilter.fusion import FusionUpdate
-from mstfilter.oracles.choice import TrueBest, TrueFreeSpace, TrueFusion, TrueQuality, best_of_both
-from mstfilter.oracles.completion import TrueCompletion
-from mstfilter.oracles.masks import TrueBoundary, TrueMasks
-from mstfilter.oracles.motion import TrueMotions
-from mstfilter.oracles.truth import Truth, UsesTruth, bind_truth, uses_truth
+from mstfilter.oracles import (
+    TrueBest,
+    TrueBoundary,
+    TrueCompletion,
+    TrueFreeSpace,
+    TrueFusion,
+    TrueMasks,
+    TrueMotions,
+    TrueQuality,
+    UsesTruth,
+    bind_truth,
+    uses_truth,
+)
+from mstfilter.oracles.stages import best_of_both
+from mstfilter.oracles.truth import RecordingTruth
 from mstfilter.presets import build_filter, describe_filter, load_config
 from mstfilter.runs import filter_recording
 from mstfilter.scene import Hypothesis
@@ -213,7 +223,7 @@ def test_the_robot_is_no_object(recording):
         image[:20] = 255
         return image
 
-    truth = Truth(replace(recording, read_instance=with_robot))
+    truth = RecordingTruth(replace(recording, read_instance=with_robot))
     assert set(np.unique(truth.instance(0))) == {0, 1, 2}
 
 

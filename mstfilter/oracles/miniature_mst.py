@@ -1,0 +1,384 @@
+"""MST on the miniature world: its presets, other rules for its weights, and a properly weighted version.
+
+>>> filter = adapt_to_miniature(mstfilter.preset("paper"), world, n=5, weight_rule="p")
+>>> filter = replace(filter, update=ScoredFusion(world, filter.update, distinct=True, predictive=True))
+>>> filter = balanced_filter(world, n=500)              # exact: no crossover, weights f g / q
+>>> state, infos = filter.run(observations, seed=0)
+
+The parts that need images are replaced: tracking by the motion model, tree cuts by cuts of the reported
+segmentation, free space by the cells in front of the depth reading, and evidence (if the preset has any) by the
+likelihood of the observation. Crossover, weights and resampler are those of the preset; the mode filter is sized to
+the grid, and what needs a video (division by motion, measured surfaces) is left out.
+
+The weights of MST depend on the parents of a candidate, not on the candidate. `ScoredFusion` weights the built
+candidate x by the likelihood g(y | x), in three steps that can be switched on one by one:
+
+1. the pair's weight omits Q, which is computed from the same observation, and the candidate gets g(y | x);
+2. `distinct`: equal candidates count once, since how often crossover makes a candidate is no evidence for it;
+3. `predictive`: the candidate is also weighted by p(x | past), a mixture of the moved particles and the prior.
+
+With all three, and candidates that cover the probable states, the weights are those of the exact filter.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import reduce
+from itertools import product
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+
+from mstfilter.errors import InputError
+from mstfilter.fusion import Claims, Evidence, FusionUpdate, NoDivision, Projection
+from mstfilter.oracles.miniature import Miniature, MiniatureObservation, draw_states
+from mstfilter.oracles.miniature_filters import MiniatureMotion, MiniaturePrior, state_weights
+from mstfilter.scene import Hypothesis
+from mstfilter.smc import (
+    Multinomial,
+    ParticleFilter,
+    Population,
+    Proposal,
+    Update,
+    child,
+    coalesce,
+    first_seen,
+    log_mean_exp,
+    union,
+)
+
+__all__ = [
+    "BalancedUpdate",
+    "CutDistribution",
+    "LikelihoodEvidence",
+    "MiniatureCuts",
+    "MiniatureFreeSpace",
+    "ScoredFusion",
+    "adapt_to_miniature",
+    "balanced_filter",
+    "cut_distribution",
+    "predictive_distribution",
+]
+
+
+@dataclass(frozen=True)
+class MiniatureFreeSpace(Projection):
+    """Clears the cells in front of the depth reading; Q is the fraction of cells that remain."""
+
+    def project(self, hypothesis: Hypothesis, frame: Any) -> tuple[Hypothesis, float]:
+        """`frame` is a `MiniatureObservation`; a hypothesis without cells has quality 1."""
+        free = np.arange(hypothesis.labels.shape[1])[None, :, None] < frame.depth[:, None, None]
+        occupied = hypothesis.labels != 0
+        hit = occupied & free
+        if not hit.any():
+            return hypothesis, 1.0
+        cleared = hypothesis.with_labels(np.where(hit, 0, hypothesis.labels).astype(np.uint16))
+        return cleared, float(1.0 - hit.sum() / occupied.sum())
+
+
+@dataclass(frozen=True)
+class LikelihoodEvidence(Evidence):
+    """Scores a candidate by the exact log likelihood of depth and segmentation.
+
+    Parameters
+    ----------
+    world : Miniature
+    """
+
+    world: Miniature
+
+    def log_score(self, hypotheses: Sequence[Hypothesis], clip: Any) -> np.ndarray:
+        """(n,) log p(y | x); `clip` is a `MiniatureObservation`."""
+        return self.world.log_likelihood(clip)[self.world.states.index(hypotheses)]
+
+
+@dataclass(frozen=True, eq=False)
+class CutDistribution:
+    """The distribution that `MiniatureCuts` draws from.
+
+    Parameters
+    ----------
+    states : (m,) int
+        Outcomes; a state may occur more than once.
+    probability : (m,)
+        Probability of each outcome; sums to one.
+    log_cut : (m,)
+        Log probability of the cut without completion, relative to the best cut.
+    """
+
+    states: np.ndarray
+    probability: np.ndarray
+    log_cut: np.ndarray
+
+
+def cut_distribution(world: Miniature, observation: MiniatureObservation, completion: float) -> CutDistribution:
+    """The distribution of cuts of the reported segmentation, with the cells behind the surface completed.
+
+    Pixels with a surface are placed at the measured depth. Two neighbouring ones are one object with the posterior
+    probability that the error rates of the sensor give, for even prior odds. From the surface backwards, each next
+    cell is filled with probability `completion` until one is left free.
+    """
+    X, Y = world.shape
+    joins, splits = world.join_probability[1], world.join_probability[0]
+    same_surface = np.where(observation.joined, joins / (joins + splits), (1 - joins) / (2 - joins - splits))
+    hit = observation.depth < Y
+    edges = np.flatnonzero(hit[1:] & hit[:-1])
+    columns = np.flatnonzero(hit)
+    depths = [range(Y - int(observation.depth[x])) for x in columns]  # how many cells behind are filled
+    states, probability, cut = [], [], []
+    for keep in product((False, True), repeat=len(edges)):
+        p_cut = float(
+            np.prod([same_surface[e] if k else 1 - same_surface[e] for e, k in zip(edges, keep, strict=True)])
+        )
+        kept = set(edges[list(keep)].tolist()) if len(edges) else set()
+        label, pixel = 0, np.zeros(X, np.int64)
+        for x in columns.tolist():
+            label += x - 1 not in kept
+            pixel[x] = label
+        for fill in product(*depths):
+            labels, p = np.zeros((X, Y), np.uint16), p_cut
+            for x, behind in zip(columns.tolist(), fill, strict=True):
+                d = int(observation.depth[x])
+                labels[x, d : d + behind + 1] = pixel[x]
+                p *= completion**behind * (1 - completion if d + behind + 1 < Y else 1.0)
+            states.append(world.states.index_of_labels(labels))
+            probability.append(p)
+            cut.append(p_cut)
+    log_cut = np.log(cut)
+    return CutDistribution(np.array(states), np.array(probability), log_cut - log_cut.max())
+
+
+@dataclass(frozen=True)
+class MiniatureCuts(Proposal):
+    """Hypotheses from the observation alone: cuts of the sensed segmentation.
+
+    Parameters
+    ----------
+    world : Miniature
+    weight_rule : {"equal", "p"}
+        "equal": draws from p carry p already. "p": log weight ``log p(c) - log p(c*)``; p then counts twice.
+    include_optimal : bool
+        Replace the first sample's cut by the best cut.
+    completion : float
+        Probability that an object fills the next cell behind its surface.
+    prior_share : float
+        Fraction of samples that are drawn from the prior instead. Above 0 every state can be proposed.
+    """
+
+    world: Miniature
+    weight_rule: Literal["equal", "p"] = "equal"
+    include_optimal: bool = False
+    completion: float = 0.4
+    prior_share: float = 0.0
+
+    properly_weighted: ClassVar[bool] = False
+
+    def sample(self, rng: np.random.Generator, observation: MiniatureObservation, n: int) -> Population:
+        """Draw `n` hypotheses."""
+        cuts = cut_distribution(self.world, observation, self.completion)
+        k = draw_states(rng, cuts.probability, n)
+        if self.include_optimal:
+            k[0] = int(np.argmax(np.where(cuts.log_cut == 0, cuts.probability, -1.0)))
+        states = cuts.states[k]
+        if self.prior_share > 0:
+            prior = self.world.draw_prior(rng, n)
+            states = np.where(rng.random(n) < self.prior_share, prior, states)
+        weights = cuts.log_cut[k] if self.weight_rule == "p" else np.zeros(n)
+        return Population(self.world.states.take(states), weights)
+
+    def state_probability(self, observation: MiniatureObservation) -> np.ndarray:
+        """(S,) probability of each state in a sample that is not replaced by the best cut."""
+        cuts = cut_distribution(self.world, observation, self.completion)
+        q = np.bincount(cuts.states, cuts.probability, len(self.world.states))
+        return (1 - self.prior_share) * q + self.prior_share * self.world.prior
+
+
+def adapt_to_miniature(
+    filter: ParticleFilter,
+    world: Miniature,
+    n: int,
+    weight_rule: Literal["equal", "p"] = "equal",
+    include_optimal: bool = False,
+) -> ParticleFilter:
+    """A filter of MST on the miniature world, with `n` particles and `n` samples per step.
+
+    Parameters
+    ----------
+    filter : ParticleFilter
+        A preset; its update is a `FusionUpdate`.
+    world : Miniature
+    n : int
+    weight_rule, include_optimal : str, bool
+        Fields of `MiniatureCuts`, which the preset's proposal defines.
+
+    Raises
+    ------
+    InputError
+        If the update is not a `FusionUpdate`.
+    """
+    if not isinstance(filter.update, FusionUpdate):
+        raise InputError(
+            f"the update is a {type(filter.update).__name__}, expected a FusionUpdate", "give a preset of MST"
+        )
+    crossover = filter.update.crossover
+    small = replace(crossover.mode_filter, window=3, isolation=27)  # the window holds 27 cells: none is isolated
+    evidence = (LikelihoodEvidence(world),) if filter.update.evidence else ()
+    update = replace(
+        filter.update,
+        free_space=MiniatureFreeSpace(),
+        division=NoDivision(),
+        claims=Claims(),
+        crossover=replace(crossover, mode_filter=small),
+        evidence=evidence,
+        n_scored=0,
+    )
+    return replace(
+        filter,
+        transition=MiniatureMotion(world, rearranged=False),
+        proposal=MiniatureCuts(world, weight_rule, include_optimal),
+        update=update,
+        n=n,
+        n_proposed=n,
+    )
+
+
+def predictive_distribution(world: Miniature, predicted: Population | None) -> np.ndarray:
+    """(S,) p(x_t | past): a mixture of the weighted, moved particles and the prior."""
+    if predicted is None:
+        return world.prior
+    return (1 - world.rearranged) * state_weights(world, predicted) + world.rearranged * world.prior
+
+
+@dataclass(frozen=True)
+class ScoredFusion(Update):
+    """Draws some candidates by the weights of their pairs, builds them, and weights them by their likelihood.
+
+    Parameters
+    ----------
+    world : Miniature
+    fusion : FusionUpdate
+        Makes the candidates.
+    built_per_particle : int
+        Number of candidates that are built per predicted particle. 0: no crossover (needs `include_parents`).
+    distinct : bool
+        Whether equal candidates count once.
+    predictive : bool
+        Whether candidates are also weighted by p(x | past).
+    include_parents : bool
+        Whether the moved hypotheses and the samples are candidates too.
+    """
+
+    world: Miniature
+    fusion: FusionUpdate
+    built_per_particle: int = 4
+    distinct: bool = False
+    predictive: bool = False
+    include_parents: bool = False
+
+    properly_weighted: ClassVar[bool] = False
+
+    def __post_init__(self) -> None:
+        if self.built_per_particle < 0 or (self.built_per_particle == 0 and not self.include_parents):
+            raise InputError(
+                f"built_per_particle is {self.built_per_particle} and include_parents is False: no candidates"
+            )
+
+    def update(
+        self,
+        rng: np.random.Generator,
+        predicted: Population | None,
+        proposed: Population | None,
+        observation: MiniatureObservation,
+    ) -> Population:
+        """Weighted candidates."""
+        world = self.world
+        if predicted is None or proposed is None:
+            built = union(predicted, proposed)
+        else:
+            populations = []
+            if self.built_per_particle > 0:
+                # The score uses the same observation as Q, so Q is omitted from the pair weights.
+                fusion = replace(self.fusion, quality_exponent=0.0, evidence=())
+                candidates = fusion.update(rng, predicted, proposed, observation)  # type: ignore[arg-type]
+                m = self.built_per_particle * len(predicted)
+                chosen, _ = Multinomial().select(child(rng, "first stage"), candidates.log_weights, m)
+                populations.append(candidates.take(chosen, np.zeros(m)).realised())
+            if self.include_parents:
+                populations += [replace(p, log_weights=np.zeros(len(p))) for p in (predicted, proposed)]
+            built = reduce(union, populations)
+        states = world.states.index(built.particles)
+        score = world.log_likelihood(observation)[states]
+        if self.predictive:
+            score = score + np.log(predictive_distribution(world, predicted))[states]
+        if not self.distinct:
+            return replace(built, log_weights=score)
+        representatives, _ = coalesce(np.zeros(len(states)), first_seen(states.tolist()))
+        return built.take(representatives, score[representatives])
+
+
+@dataclass(frozen=True)
+class BalancedUpdate(Update):
+    """The union of moved hypotheses and samples of the new image, weighted so that the filter is exact.
+
+    Together they are draws from the mixture q = share q_samples + (1 - share) q_moved, so each is weighted by
+    p(x | past) g(y | x) / q(x): the marginal particle filter of Klaas, de Freitas and Doucet (2005) with the balance
+    heuristic. The transition does not rearrange the table; the samples account for that.
+
+    Parameters
+    ----------
+    world : Miniature
+    samples : MiniatureCuts
+        Draws one sample per moved hypothesis if the filter has no proposal. Needs `prior_share` > 0, so that every
+        state can be drawn. A filter with a `proposal` does not count as properly weighted, since the filter cannot
+        know that the update divides by its density.
+    share : float
+        Weight of the samples in the mixture.
+    """
+
+    world: Miniature
+    samples: MiniatureCuts
+    share: float = 0.5
+
+    def update(
+        self,
+        rng: np.random.Generator,
+        predicted: Population | None,
+        proposed: Population | None,
+        observation: MiniatureObservation,
+    ) -> Population:
+        """The weighted union. The log mean of its weights is the log evidence."""
+        world = self.world
+        if predicted is None:
+            raise InputError("the balanced update needs predicted hypotheses, and there are none")
+        if proposed is None:
+            proposed = self.samples.sample(child(rng, "samples"), observation, len(predicted))
+        log_g = world.log_likelihood(observation)
+        if observation.action < 0:  # the first step: the particles are draws from the prior
+            past = moved = world.prior
+        else:
+            moved = state_weights(world, predicted)
+            past = predictive_distribution(world, predicted)
+        q = (1 - self.share) * moved + self.share * self.samples.state_probability(observation)
+        both = union(predicted, proposed)
+        states = world.states.index(both.particles)
+        n_new, w_old = len(proposed), predicted.weights
+        with np.errstate(divide="ignore"):
+            base = np.concatenate([np.log((1 - self.share) * w_old), np.full(n_new, np.log(self.share / n_new))])
+            ratio = np.log(past) + log_g - np.log(q)
+        level = log_mean_exp(predicted.log_weights) + np.log(len(both))
+        return replace(both, log_weights=level + base + ratio[states])
+
+
+def balanced_filter(world: Miniature, n: int, **changes: Any) -> ParticleFilter:
+    """MST without crossover, properly weighted: `n` moved hypotheses and `n` samples per step.
+
+    No observation may be missing.
+    """
+    return ParticleFilter(
+        initial=MiniaturePrior(world),
+        transition=MiniatureMotion(world, rearranged=False),
+        update=BalancedUpdate(world, MiniatureCuts(world, prior_share=0.1)),
+        n=n,
+        **changes,
+    )
