@@ -21,7 +21,7 @@ from fusion_parents import GRID, N_OBJECTS, parents, table, table_labels
 
 from mstfilter import preset
 from mstfilter.fusion import Crossover, FusionUpdate, NoDivision, NoFreeSpace, RandomOrder, canonical, conflict_graph
-from mstfilter.scene import Camera, Clip, Frame, Hypothesis, clear, look_at, render
+from mstfilter.scene import Camera, Clip, Frame, Hypothesis, look_at, render, scene_cache
 from mstfilter.smc import Population, Systematic
 from mstfilter.study import peak_megabytes
 
@@ -134,7 +134,7 @@ def one_round(seed: int, n: int, order: np.random.Generator) -> dict[str, float]
             term.log_score(drawn.particles, clip)
 
     def projected() -> None:
-        clear()  # a new frame at every step
+        scene_cache.clear()  # a new frame at every step
         for hypothesis in predicted.particles:
             paper.free_space.project(hypothesis, clip.after)
 

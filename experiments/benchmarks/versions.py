@@ -92,10 +92,12 @@ def clear_cache() -> None:
     """Drop shared work, so that every round does all of it."""
     from mstfilter import scene
 
-    clear = getattr(scene, "clear", None)
-    if clear is None:
+    if hasattr(scene, "scene_cache"):
+        scene.scene_cache.clear()
+    else:  # version 0.1
         from mstfilter.scene.memo import clear
-    clear()
+
+        clear()
 
 
 def worker(recordings: Path) -> None:

@@ -151,7 +151,7 @@ class Completer(ABC):
                 p[seen.own] = 1
             return Completion(read_only(offset), read_only(p), read_only(seen.points), name.hex()[:16])
 
-        return compute() if self.stochastic else memo("completion", name, compute)
+        return compute() if self.stochastic else memo("completion", name, compute, Completion)
 
     def _key(self) -> bytes:
         return component_key(self)

@@ -1,7 +1,7 @@
 from mstfilter.scene.arrays import component_key as component_key, content_key as content_key, read_only as read_only
-from mstfilter.scene.cache import beneath as beneath, clear as clear, memo as memo
+from mstfilter.scene.cache import Cache as Cache, memo as memo, scene_cache as scene_cache
 from mstfilter.scene.camera import Camera as Camera, look_at as look_at, rigid_from_matrix as rigid_from_matrix
-from mstfilter.scene.disk_memo import DiskMemo as DiskMemo, Kind as Kind
+from mstfilter.scene.disk_cache import DiskCache as DiskCache
 from mstfilter.scene.frame import (
     SIGMA_AT_ONE_METRE as SIGMA_AT_ONE_METRE,
     Clip as Clip,

@@ -1,108 +1,141 @@
-"""Work that several parts of a step need, computed once and kept by content.
+"""Results that several parts of a step need, computed once and kept under the content of their input.
 
-The boundary map of a frame, the flow between two frames or the place of every voxel in an image depend on
-the data alone, not on the hypothesis that asks. They are kept here under the content of what they were made
-from, so hypotheses share them, and a repeated run on the same data in one process finds them again.
+The boundary map of a frame, the flow between two frames or the pixel of every voxel depend on the data alone, not on
+the hypothesis that needs them. `memo` keeps such results, so that all hypotheses of a step share them and a repeated
+run on the same data in one process finds them again.
 
->>> from mstfilter.scene.cache import memo
+>>> from mstfilter.scene import memo, scene_cache
 >>> memo("square", (3,), lambda: 9)
 9
+>>> memo("square", (3,), lambda: 10)    # found by name and key, not computed again
+9
+>>> scene_cache.clear()
 
-The store is bounded (`LIMIT_BYTES`); what was used longest ago is dropped first. Values must be treated as
-read-only. `beneath` puts a further layer below it, such as a `DiskMemo`.
+`scene_cache` is the only global state of the package. It changes how long a run takes, never its results.
 """
 
 from __future__ import annotations
 
 import contextlib
 import threading
-from abc import ABC, abstractmethod
-from collections import OrderedDict
+from collections import Counter, OrderedDict
 from collections.abc import Callable, Hashable, Iterator
 from dataclasses import fields, is_dataclass
-from typing import Any, TypeVar
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
-__all__ = ["LIMIT_BYTES", "Layer", "beneath", "clear", "memo"]
+if TYPE_CHECKING:
+    from mstfilter.scene.disk_cache import DiskCache
 
-LIMIT_BYTES = 768 * 2**20
+__all__ = ["Cache", "memo", "scene_cache"]
 
-T = TypeVar("T")
-
-_lock = threading.RLock()
-_store: OrderedDict[tuple[str, Hashable], tuple[Any, int]] = OrderedDict()
-_used = 0
+_Value = TypeVar("_Value")
 
 
-class Layer(ABC):
-    """Where values are looked for that the store has not, and kept when they are computed."""
-
-    @abstractmethod
-    def find(self, name: str, key: Hashable) -> Any:
-        """The value; None where it is not known."""
-
-    @abstractmethod
-    def keep(self, name: str, key: Hashable, value: Any) -> None:
-        """A value that was computed; what a layer does not want it leaves."""
-
-
-_layer: Layer | None = None
-
-
-@contextlib.contextmanager
-def beneath(layer: Layer | None) -> Iterator[None]:
-    """Use a layer below the store, for all threads of this process, in place of the one there was."""
-    global _layer
-    before, _layer = _layer, layer
-    try:
-        yield
-    finally:
-        _layer = before
-
-
-def memo(name: str, key: Hashable, compute: Callable[[], T]) -> T:
-    """The value of ``compute()``, from the store where it was computed before.
+class Cache:
+    """Values in memory, found by name and key; safe to use from several threads.
 
     Parameters
     ----------
-    name : str
-        What is computed; together with `key` it must determine the value completely.
-    key : hashable
-        Content keys (`Frame.key`, `Camera.key`, `VoxelGrid.key`) and every parameter that matters.
-    compute : callable
-        Computes the value. Deterministic: a value that depends on a generator does not belong here.
+    limit_bytes : int
+        Largest total size. Beyond it, the least recently used values are dropped.
+
+    Attributes
+    ----------
+    hits : Counter
+        How often values of each name were found, in memory or on disk.
     """
-    global _used
-    full = (name, key)
-    with _lock:
-        if full in _store:
-            _store.move_to_end(full)
-            return _store[full][0]
-    layer = _layer
-    found = None if layer is None else layer.find(name, key)
-    value = compute() if found is None else found
-    if layer is not None and found is None:
-        layer.keep(name, key, value)
-    size = _size_of(value)
-    if size > LIMIT_BYTES:
+
+    def __init__(self, limit_bytes: int = 768 * 2**20) -> None:
+        self.limit_bytes = limit_bytes
+        self.hits: Counter[str] = Counter()
+        self._entries: OrderedDict[tuple[str, Hashable], tuple[Any, int]] = OrderedDict()
+        self._n_bytes = 0
+        self._lock = threading.RLock()
+        self._disk: DiskCache | None = None
+
+    def get(self, name: str, key: Hashable, compute: Callable[[], _Value], stored_as: Any = None) -> _Value:
+        """The value of ``compute()``, computed if it is not in the cache.
+
+        Parameters
+        ----------
+        name : str
+            What is computed; together with `key` it must determine the value completely.
+        key : hashable
+            Content keys (`Frame.key`, `Camera.key`, `VoxelGrid.key`) and every parameter that matters.
+        compute : callable
+            Computes the value, without random numbers. The value must not be changed afterwards.
+        stored_as : type or tuple of types, optional
+            Type of the value if it is also stored on disk (see `on_disk`): an array, a dataclass whose fields are
+            arrays, strings or None, or a tuple of these. Only for values that take much longer to compute than to
+            read.
+        """
+        entry = (name, key)
+        with self._lock:
+            if entry in self._entries:
+                self._entries.move_to_end(entry)
+                self.hits[name] += 1
+                return self._entries[entry][0]
+        disk = self._disk if stored_as is not None else None
+        value = None if disk is None else disk.find(name, key, stored_as)
+        if value is not None:
+            self.hits[name] += 1
+        else:
+            value = compute()
+            if disk is not None:
+                disk.store(name, key, value)
+        self._keep(entry, value)
         return value
-    with _lock:
-        if full not in _store:
-            _store[full] = (value, size)
-            _used += size
-        while _used > LIMIT_BYTES:
-            _, (_, dropped) = _store.popitem(last=False)
-            _used -= dropped
-    return value
+
+    def _keep(self, entry: tuple[str, Hashable], value: Any) -> None:
+        size = _size_of(value)
+        if size > self.limit_bytes:
+            return
+        with self._lock:
+            if entry not in self._entries:
+                self._entries[entry] = (value, size)
+                self._n_bytes += size
+            while self._n_bytes > self.limit_bytes:
+                _, (_, dropped) = self._entries.popitem(last=False)
+                self._n_bytes -= dropped
+
+    def clear(self) -> None:
+        """Drop all values in memory and the counts of hits."""
+        with self._lock:
+            self._entries.clear()
+            self.hits.clear()
+            self._n_bytes = 0
+
+    @contextlib.contextmanager
+    def on_disk(self, folder: str | Path, limit_bytes: int, version: str) -> Iterator[DiskCache]:
+        """Also store values with `stored_as` in a folder that several processes share.
+
+        Parameters
+        ----------
+        folder : path
+            See `DiskCache`.
+        limit_bytes : int
+            Largest size of the folder.
+        version : str
+            Version of the code that computes the values. Values of other versions are not found.
+        """
+        from mstfilter.scene.disk_cache import DiskCache
+
+        before, self._disk = self._disk, DiskCache(folder, limit_bytes, version)
+        try:
+            yield self._disk
+        finally:
+            self._disk.close()
+            self._disk = before
 
 
-def clear() -> None:
-    """Forget everything (tests and benchmarks)."""
-    global _used
-    with _lock:
-        _store.clear()
-        _used = 0
+scene_cache = Cache()
+"""The cache of this process."""
+
+memo = scene_cache.get
+"""`Cache.get` of `scene_cache`."""
 
 
 def _size_of(value: Any) -> int:

@@ -186,7 +186,8 @@ class TreeCutProposal(Proposal):
             tree = self.tree.build(self.boundary.boundary(frame), frame)
             return tree, self.value.values(tree, frame)
 
-        return memo("segmentation_tree", (frame.key, component_key((self.boundary, self.tree, self.value))), compute)
+        key = (frame.key, component_key((self.boundary, self.tree, self.value)))
+        return memo("segmentation_tree", key, compute, stored_as=(Tree, np.ndarray))
 
     def label_image(self, frame: Frame, cut: np.ndarray | None = None) -> np.ndarray:
         """(H, W) int32 segments of a cut, 0 background, k + 1 its k-th node; the optimal cut by default."""

@@ -11,7 +11,6 @@ from mstfilter.study.results import (
     cost_columns as cost_columns,
     write_table as write_table,
 )
-from mstfilter.study.shared_work import kind_versions as kind_versions
 from mstfilter.study.statistics import (
     CLAIM as CLAIM,
     Difference as Difference,

@@ -16,7 +16,7 @@ from functools import lru_cache
 from importlib.util import find_spec
 from pathlib import Path
 
-__all__ = ["code_version", "files_version", "reached"]
+__all__ = ["code_version", "files_version", "package_version", "reached"]
 
 _PACKAGE = "mstfilter"
 
@@ -37,6 +37,17 @@ def files_version(modules: Iterable[str]) -> str:
     for module in sorted(modules):
         path = _path(module)
         digest.update(f"{module}:".encode() + (b"" if path is None else path.read_bytes()))
+    return digest.hexdigest()[:16]
+
+
+def package_version() -> str:
+    """A hash of all files of the package."""
+    import mstfilter
+
+    root = Path(mstfilter.__file__).parent
+    digest = hashlib.sha256()
+    for path in sorted(root.rglob("*.py")):
+        digest.update(f"{path.relative_to(root)}:".encode() + path.read_bytes())
     return digest.hexdigest()[:16]
 
 

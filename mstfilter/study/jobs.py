@@ -18,6 +18,7 @@ import time
 import traceback
 import uuid
 from collections.abc import Callable, Mapping
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -25,13 +26,12 @@ from mstfilter.errors import InputError
 from mstfilter.formats import open_recording
 from mstfilter.runs.run_folder import RunFolder, write_json
 from mstfilter.runs.sources import open_source
-from mstfilter.scene import Recording
+from mstfilter.scene import Recording, scene_cache
 from mstfilter.smc import telling
 from mstfilter.study.code_version import files_version
 from mstfilter.study.executors import Job, JobOutcome
 from mstfilter.study.memory import StagePeaks
 from mstfilter.study.results import RESULT, read_result
-from mstfilter.study.shared_work import shared_work
 
 __all__ = ["failed", "open_scene", "perform"]
 
@@ -125,7 +125,7 @@ def _run(job: Job, step: _Step) -> None:
     try:
         recording = open_scene(job["source"], job["recordings"])
         began = time.process_time()
-        with shared_work(job["work"]), telling(peaks):
+        with scene_cache.on_disk(**job["work"]) if job["work"] else nullcontext(), telling(peaks):
             run = filter_recording(
                 recording, job["config"], work, job["seed"], allow_files=job["allow_files"], progress=progress
             )

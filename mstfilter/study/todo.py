@@ -13,11 +13,11 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from mstfilter.study.code_version import code_version, files_version, reached
+from mstfilter.runs.run import versions
+from mstfilter.study.code_version import code_version, files_version, package_version, reached
 from mstfilter.study.executors import Job
 from mstfilter.study.plan import Plan, StudyRun
 from mstfilter.study.results import StudyFolder, read_result
-from mstfilter.study.shared_work import kind_versions
 from mstfilter.study.space import check_space, recording_bytes, run_bytes
 
 __all__ = ["ToDo"]
@@ -113,11 +113,16 @@ class ToDo:
         gb = self.plan.config.cache_gb
         if not gb or not run.arm.ours:
             return None
-        return {"folder": str((self.cache / "work").absolute()), "gb": gb, "versions": self._kind_versions}
+        return {
+            "folder": str((self.cache / "work").absolute()),
+            "limit_bytes": int(gb * 1e9),
+            "version": self._version,
+        }
 
     @cached_property
-    def _kind_versions(self) -> dict[str, str]:
-        return kind_versions()
+    def _version(self) -> str:
+        """The code of the package and its libraries: what computes shared work."""
+        return "".join([package_version(), *(f" {name}={version}" for name, version in versions().items())])
 
     def check_space(self) -> None:
         """Raise InputError if what is left to do will not fit on the disk."""

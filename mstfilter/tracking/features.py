@@ -79,7 +79,8 @@ class SiftMatching:
 
     def match(self, before: Frame, after: Frame) -> Matches:
         """Pairs between two frames. Memoised by content."""
-        return memo("sift matches", (before.key, after.key, astuple(self)), lambda: _match(before, after, self))
+        key = (before.key, after.key, astuple(self))
+        return memo("sift matches", key, lambda: _match(before, after, self), stored_as=Matches)
 
 
 def _features(frame: Frame) -> tuple[NDArray[np.int32], NDArray[np.float32]]:

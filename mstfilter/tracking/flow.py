@@ -119,7 +119,7 @@ class DenseFlow:
         chosen = list(range(0, len(clip.frames) - 1, self.frame_step)) + [len(clip.frames) - 1]
         frames = [clip.frames[i] for i in chosen]
         key = (tuple(f.key for f in frames), astuple(self))
-        return memo("clip tracks", key, lambda: _track(_thinned(frames, self.motion_share), self))
+        return memo("clip tracks", key, lambda: _track(_thinned(frames, self.motion_share), self), ClipTracks)
 
 
 def track_labels(labels: NDArray[np.integer], clip: Clip, flow: DenseFlow | None = None) -> NDArray[np.integer]:

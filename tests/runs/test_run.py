@@ -67,10 +67,10 @@ def test_every_preset_runs_and_its_description_builds_it_again(recording, tmp_pa
 
 
 def test_the_same_seed_gives_the_same_bytes(recording, tmp_path):
-    from mstfilter.scene import cache as memo
+    from mstfilter.scene import scene_cache
 
     filter_recording(recording, load_config("mst"), tmp_path / "a", seed=7)
-    memo.clear()
+    scene_cache.clear()
     filter_recording(open_recording(recording.path), load_config("mst"), tmp_path / "b", seed=7)
     a, b = content(tmp_path / "a"), content(tmp_path / "b")
     assert a.keys() == b.keys()

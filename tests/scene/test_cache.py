@@ -1,46 +1,71 @@
-"""The store of shared work."""
+"""The cache in memory and on disk: same values, bounded size, unreadable entries count as missing, no pickle."""
 
 from __future__ import annotations
 
+import io
+import multiprocessing
+import os
+import pickle
+import threading
+from dataclasses import dataclass
+
+import diskcache
 import numpy as np
 import pytest
 
-from mstfilter.scene import cache as module
+from mstfilter.scene import Cache, DiskCache
 from mstfilter.scene.arrays import content_key
 
 
-@pytest.fixture(autouse=True)
-def _clean():
-    module.clear()
-    yield
-    module.clear()
+@dataclass(frozen=True)
+class Thing:
+    array: np.ndarray
+    text: str = ""
+    maybe: np.ndarray | None = None
 
 
-def test_computed_once_a_key():
-    calls = []
+TYPES = {"thing": Thing, "pair": (Thing, np.ndarray), "array": np.ndarray}
+
+
+def get(folder, name, key, compute, limit_bytes=10**6, version="1"):
+    """The value of a new cache in memory above the folder, as another process would get it."""
+    cache = Cache()
+    with cache.on_disk(folder, limit_bytes, version):
+        return cache.get(name, key, compute, stored_as=TYPES.get(name))
+
+
+def fail():
+    raise AssertionError("computed again")
+
+
+def test_a_value_is_computed_once_per_key():
+    cache, calls = Cache(), []
     for key in (1, 1, 2, 1):
-        module.memo("x", key, lambda key=key: calls.append(key))
+        cache.get("x", key, lambda key=key: calls.append(key))
     assert calls == [1, 2]
-    module.memo("y", 1, lambda: calls.append("y"))
+    assert cache.hits == {"x": 2}
+    cache.get("y", 1, lambda: calls.append("y"))
     assert calls[-1] == "y"
+    cache.clear()
+    cache.get("x", 1, lambda: calls.append("cleared"))
+    assert calls[-1] == "cleared"
 
 
-def test_the_store_is_bounded_and_drops_the_oldest(monkeypatch):
-    monkeypatch.setattr(module, "LIMIT_BYTES", 10_000)
-    calls = []
+def test_memory_is_bounded_and_drops_the_least_recently_used():
+    cache, calls = Cache(limit_bytes=10_000), []
 
     def make(key):
         return lambda: calls.append(key) or np.zeros(500)
 
     for key in (1, 2, 1, 3, 1, 2):
-        module.memo("x", key, make(key))
-    assert calls == [1, 2, 3, 2]  # 2 was used longest ago when 3 came
-    module.memo("x", "huge", lambda: np.zeros(10_000))
-    module.memo("x", 2, make(2))
+        cache.get("x", key, make(key))
+    assert calls == [1, 2, 3, 2]  # 3 displaced 2, which was used before 1
+    cache.get("x", "huge", lambda: np.zeros(10_000))
+    cache.get("x", 2, make(2))
     assert calls == [1, 2, 3, 2]
 
 
-def test_keys_tell_content_apart():
+def test_content_keys_differ_if_content_differs():
     a = np.arange(6)
     assert content_key(a) == content_key(a.copy())
     different = {content_key(a), content_key(a.reshape(2, 3)), content_key(a.astype(np.int32)), content_key(a, 1)}
@@ -52,3 +77,162 @@ def test_keys_tell_content_apart():
         content_key(12),
     }
     assert len(different) == 9
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("thing", Thing(np.arange(6, dtype=np.int16).reshape(2, 3), "word", np.zeros(0, bool))),
+        ("thing", Thing(np.array([np.nan, -0.0], np.float32))),
+        ("pair", (Thing(np.ones((0, 3, 2)), "x"), np.array([1.5]))),
+        ("array", np.asfortranarray(np.arange(6.0).reshape(2, 3))),
+        ("array", np.random.default_rng(0).random(20_000)),  # large enough for a file
+    ],
+)
+def test_values_on_disk_are_found_bit_for_bit(tmp_path, name, value):
+    key = (b"key", 1, 2.5, ("a", None))
+    get(tmp_path, name, key, lambda: value)
+    found = get(tmp_path, name, key, fail)
+    parts = [(value, found)] if name != "pair" else list(zip(value, found, strict=True))
+    for a, b in parts:
+        for x, y in [(a, b)] if isinstance(a, np.ndarray) else [(a.array, b.array), (a.maybe, b.maybe)]:
+            if x is None:
+                assert y is None
+                continue
+            assert x.dtype == y.dtype and x.shape == y.shape and x.tobytes() == y.tobytes()
+            assert not y.flags.writeable
+        if isinstance(a, Thing):
+            assert a.text == b.text
+
+
+def test_hits_are_counted_on_disk_and_in_memory(tmp_path):
+    get(tmp_path, "array", 1, lambda: np.zeros(1))
+    cache = Cache()
+    with cache.on_disk(tmp_path, 10**6, "1"):
+        for _ in range(3):
+            cache.get("array", 1, fail, stored_as=np.ndarray)
+    assert cache.hits == {"array": 3}
+
+
+def test_key_version_and_type_separate_entries(tmp_path):
+    get(tmp_path, "array", (1,), lambda: np.zeros(1))
+    assert get(tmp_path, "array", (2,), lambda: np.ones(1))[0] == 1
+    assert get(tmp_path, "array", (1,), lambda: np.full(1, 5.0), version="2")[0] == 5
+    assert get(tmp_path, "array", (1,), fail)[0] == 0
+    get(tmp_path, "something else", (1,), lambda: 3)  # without `stored_as`: not written
+    with pytest.raises(AssertionError, match="again"):
+        get(tmp_path, "something else", (1,), fail)
+
+
+@pytest.mark.parametrize("damage", ["truncated", "flipped", "empty", "other"])
+def test_an_unreadable_entry_counts_as_missing(tmp_path, damage):
+    get(tmp_path, "array", 1, lambda: np.arange(10_000.0))
+    (path,) = tmp_path.rglob("*.val")
+    data = bytearray(path.read_bytes())
+    if damage == "truncated":
+        data = data[: len(data) // 2]
+    elif damage == "flipped":
+        data[len(data) // 2] ^= 1
+    elif damage == "empty":
+        data = bytearray()
+    else:
+        buffer = io.BytesIO()
+        np.savez(buffer, unexpected=np.zeros(1))
+        data = bytearray(buffer.getvalue())
+    path.write_bytes(data)
+    assert get(tmp_path, "array", 1, lambda: np.full(3, 7.0)).tolist() == [7, 7, 7]
+    assert get(tmp_path, "array", 1, fail).tolist() == [7, 7, 7]
+
+
+def test_a_damaged_database_counts_as_empty(tmp_path):
+    get(tmp_path, "array", 1, lambda: np.zeros(1))
+    (tmp_path / "cache.db").write_bytes(b"not a database" * 1000)
+    assert get(tmp_path, "array", 1, lambda: np.ones(1)).tolist() == [1]
+
+
+class Executed:
+    """Makes a folder when it is unpickled."""
+
+    def __init__(self, path):
+        self.path = path
+
+    def __reduce__(self):
+        return os.mkdir, (str(self.path),)
+
+
+@pytest.mark.parametrize("where", ["entry", "object array"])
+def test_a_pickle_in_the_folder_is_not_executed(tmp_path, where):
+    folder, mark = tmp_path / "work", tmp_path / "executed"
+    key = DiskCache(folder, 10**6, "1")._key("array", 1)
+    with diskcache.Cache(str(folder)) as foreign:
+        if where == "entry":
+            foreign.set(key, Executed(mark))  # diskcache pickles it
+        else:
+            buffer = io.BytesIO()
+            np.savez(buffer, value=np.array([Executed(mark)], dtype=object))
+            foreign.set(key, buffer.getvalue())
+        assert len(foreign) == 1
+    assert get(folder, "array", 1, lambda: np.ones(2)).tolist() == [1, 1]
+    assert not mark.exists()
+    assert get(folder, "array", 1, fail).tolist() == [1, 1]
+    pickle.loads(pickle.dumps(Executed(mark)))  # the pickle does what the test assumes
+    assert mark.exists()
+
+
+def test_the_folder_is_bounded_and_the_least_recently_used_entry_goes(tmp_path):
+    limit, size = 600_000, 50_000
+    disk = DiskCache(tmp_path, limit, "1")
+    for k in range(30):
+        disk.store("array", k, np.zeros(size // 8))
+        assert disk.find("array", 0, np.ndarray) is not None
+        files = sum(path.stat().st_size for path in tmp_path.rglob("*") if path.is_file())
+        assert files <= limit + 2 * size
+    assert disk.find("array", 29, np.ndarray) is not None
+    assert disk.find("array", 1, np.ndarray) is None
+    disk.store("array", "huge", np.zeros(limit // 8))
+    assert disk.find("array", "huge", np.ndarray) is None
+    assert disk.find("array", 29, np.ndarray) is not None  # a value above the limit displaces no other
+
+
+def read_and_write(folder, seed):
+    """Number of wrong values among the entries of a small folder that other workers use at the same time."""
+    disk, value, rng = DiskCache(folder, 150_000, "1"), np.arange(4000.0), np.random.default_rng(seed)
+    wrong = 0
+    for _ in range(40):
+        k = int(rng.integers(6))
+        found = disk.find("array", k, np.ndarray)
+        if found is None:
+            disk.store("array", k, value + k)
+        else:
+            wrong += not np.array_equal(found, value + k)
+    return wrong
+
+
+def test_threads_and_processes_use_one_folder(tmp_path):
+    with multiprocessing.get_context("spawn").Pool(2) as pool:
+        wrong = pool.starmap_async(read_and_write, [(tmp_path, 10), (tmp_path, 11)])
+        found = []
+        threads = [threading.Thread(target=lambda s=s: found.append(read_and_write(tmp_path, s))) for s in range(4)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        assert wrong.get() + found == [0] * 6
+    disk = DiskCache(tmp_path, 150_000, "1")
+    assert any(disk.find("array", k, np.ndarray) is not None for k in range(6))
+
+
+def test_a_folder_that_cannot_be_written_stores_nothing(tmp_path):
+    (tmp_path / "file").write_text("")
+    folder = tmp_path / "file" / "below"
+    assert get(folder, "array", 1, lambda: np.ones(2)).tolist() == [1, 1]
+
+
+def test_a_full_disk_stores_nothing(tmp_path, monkeypatch):
+    def full(*args, **options):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(diskcache.Cache, "set", full)
+    assert get(tmp_path, "array", 1, lambda: np.ones(2)).tolist() == [1, 1]
+    monkeypatch.undo()
+    assert get(tmp_path, "array", 1, lambda: np.zeros(2)).tolist() == [0, 0]

@@ -1,0 +1,149 @@
+"""Cached values on disk, for other processes and later runs.
+
+>>> with scene_cache.on_disk(folder, limit_bytes=10**9, version="1"):  # doctest: +SKIP
+...     run()                                    # values with `stored_as` are stored, and found again
+
+diskcache keeps the entries and removes the least recently used ones beyond the limit. An entry holds the bytes of an
+.npz file. Nothing is pickled, and nothing that the folder holds is unpickled.
+"""
+
+from __future__ import annotations
+
+import io
+import sqlite3
+import zipfile
+from collections.abc import Hashable, Mapping
+from dataclasses import fields, is_dataclass
+from pathlib import Path
+from typing import Any
+
+import diskcache
+import numpy as np
+
+from mstfilter.scene.arrays import content_key
+
+__all__ = ["DiskCache"]
+
+_UNREADABLE = (OSError, ValueError, TypeError, KeyError, EOFError, zipfile.BadZipFile, sqlite3.Error)
+
+
+class _BytesDisk(diskcache.Disk):
+    """Storage of bytes under bytes. diskcache's own class unpickles what it finds."""
+
+    def put(self, key: bytes) -> tuple[Any, bool]:
+        return sqlite3.Binary(key), True
+
+    def get(self, key: Any, raw: bool) -> bytes:
+        return bytes(key)
+
+    def fetch(self, mode: int, filename: Any, value: Any, read: bool) -> Any:
+        if mode not in (diskcache.core.MODE_RAW, diskcache.core.MODE_BINARY):
+            raise ValueError(f"entry has mode {mode}, expected bytes")
+        return super().fetch(mode, filename, value, read)
+
+
+class DiskCache:
+    """Values in a folder.
+
+    Several processes may use the folder at the same time. An entry that cannot be read counts as missing. If the
+    folder cannot be written or the disk is full, nothing is stored and no error is raised.
+
+    Parameters
+    ----------
+    folder : path
+        Made if it does not exist.
+    limit_bytes : int
+        Largest total size of the entries.
+    version : str
+        Version of the code that computes the values; part of the key of every entry.
+    """
+
+    def __init__(self, folder: str | Path, limit_bytes: int, version: str) -> None:
+        self.version, self.limit_bytes = version, limit_bytes
+        self._entries: diskcache.Cache | None
+        try:
+            self._entries = diskcache.Cache(
+                str(folder),
+                timeout=10,
+                disk=_BytesDisk,
+                size_limit=limit_bytes,
+                cull_limit=10,
+                eviction_policy="least-recently-used",
+                # A folder may be on a network file system, which has no memory shared between machines.
+                sqlite_journal_mode="delete",
+                sqlite_mmap_size=0,
+            )
+        except (OSError, sqlite3.Error, diskcache.Timeout):
+            self._entries = None
+
+    def find(self, name: str, key: Hashable, stored_as: Any) -> Any:
+        """The value of an entry, its arrays read-only; None if there is none that can be read."""
+        if self._entries is None:
+            return None
+        try:
+            data = self._entries.get(self._key(name, key))
+            if data is None:
+                return None
+            with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
+                return _unpack(stored_as, {k: arrays[k] for k in arrays.files}, "")
+        except (*_UNREADABLE, diskcache.Timeout):
+            return None
+
+    def store(self, name: str, key: Hashable, value: Any) -> None:
+        """Write an entry, if that is possible."""
+        if self._entries is None:
+            return
+        data = io.BytesIO()
+        arrays: dict[str, Any] = _pack(value, "")
+        np.savez(data, **arrays)
+        if data.tell() <= self.limit_bytes:
+            try:
+                self._entries.set(self._key(name, key), data.getvalue())
+            except (OSError, sqlite3.Error, diskcache.Timeout):
+                return
+
+    def close(self) -> None:
+        """Close the files of this thread."""
+        if self._entries is not None:
+            self._entries.close()
+
+    def _key(self, name: str, key: Hashable) -> bytes:
+        return content_key(name, self.version, key)
+
+
+def _pack(value: Any, path: str) -> dict[str, np.ndarray]:
+    """Arrays of a value by their path in it: ``0.labels`` is field `labels` of the first item of a tuple."""
+    if value is None:
+        return {}
+    if isinstance(value, np.ndarray):
+        return {path or "value": value}
+    if isinstance(value, str):
+        return {path: np.array(value, np.str_)}
+    if isinstance(value, tuple):
+        parts = {str(k): part for k, part in enumerate(value)}
+    else:
+        parts = {f.name: getattr(value, f.name) for f in fields(value)}
+    return {k: v for name, part in parts.items() for k, v in _pack(part, _joined(path, name)).items()}
+
+
+def _unpack(of: Any, arrays: Mapping[str, np.ndarray], path: str) -> Any:
+    """The value of type `of` from the arrays of `_pack`."""
+    if isinstance(of, tuple):
+        return tuple(_unpack(part, arrays, _joined(path, str(k))) for k, part in enumerate(of))
+    if is_dataclass(of):
+        assert isinstance(of, type)
+        return of(**{f.name: _leaf(arrays.get(_joined(path, f.name))) for f in fields(of)})
+    return _leaf(arrays[path or "value"])
+
+
+def _leaf(array: np.ndarray | None) -> np.ndarray | str | None:
+    if array is None:
+        return None
+    if array.dtype.kind == "U":
+        return str(array)
+    array.flags.writeable = False
+    return array
+
+
+def _joined(path: str, name: str) -> str:
+    return f"{path}.{name}" if path else name
