@@ -47,7 +47,7 @@ def main() -> None:
                         raise SystemExit(f"failed: {result.failed[0][0]}: {result.failed[0][1].trace}")
                     found = result.folder.rows()
                     later = [row for row in found if row["pause"]]
-                    work = sum(p.stat().st_size for p in (cache / "work").rglob("*.npz")) / 1e6
+                    work = sum(p.stat().st_size for p in (cache / "work").rglob("*") if p.is_file()) / 1e6
                     rows.append(
                         {
                             "family": family,

@@ -98,7 +98,7 @@ class DiskCache:
         np.savez(data, **arrays)
         if data.tell() <= self.limit_bytes:
             try:
-                self._entries.set(self._key(name, key), data.getvalue())
+                self._entries.set(self._key(name, key), data.getvalue(), tag=name)
             except (OSError, sqlite3.Error, diskcache.Timeout):
                 return
 

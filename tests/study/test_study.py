@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import json
 import shutil
+import sqlite3
 import subprocess
 import sys
 
@@ -177,13 +179,17 @@ def test_shared_work_changes_no_result(folder, tmp_path):
     found, cache = {}, tmp_path / "cache"
     for case in ("none", "written", "found", "broken"):
         if case == "broken":
-            for path in cache.rglob("*.npz"):
+            files = list((cache / "work").rglob("*.val"))
+            assert files
+            for path in files:
                 path.write_bytes(path.read_bytes()[:-40])
         study = study_of({**data, "cache_gb": 0 if case == "none" else 1})
         run_study(study, tmp_path / case, Local(1), cache=cache)
         found[case] = (tmp_path / case / "runs.csv").read_text() and table(tmp_path / case / "runs.csv")
         assert (cache / "work").exists() == (case != "none")
-    assert {p.name for p in (cache / "work").iterdir()} >= {"clip_tracks", "segmentation_tree", "completion"}
+    with contextlib.closing(sqlite3.connect(cache / "work" / "cache.db")) as database:
+        stored = {name for (name,) in database.execute("SELECT DISTINCT tag FROM Cache")}
+    assert stored >= {"clip tracks", "segmentation_tree", "completion"}
     assert found["none"] == found["written"] == found["found"] == found["broken"]
 
 
