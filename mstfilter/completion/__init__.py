@@ -1,4 +1,8 @@
-"""Completion: from the visible part of an object to the space it fills (paper IV-B)."""
+"""Completion: from the visible part of an object to the space that it fills (paper, section IV-B).
+
+>>> completions = Extrude().complete(rng, frame, masks, grid)      # one for each mask
+>>> labels = arbitrate(completions, grid)                          # (X, Y, Z) uint16
+"""
 
 from mstfilter.lazy import attach
 

@@ -1,8 +1,8 @@
-from mstfilter.completion.arbitration import arbitrate as arbitrate
 from mstfilter.completion.completer import (
     Completer as Completer,
     Completion as Completion,
-    Evidence as Evidence,
-    evidence as evidence,
+    ObservedBox as ObservedBox,
+    arbitrate as arbitrate,
+    observed_box as observed_box,
 )
 from mstfilter.completion.extrude import Extrude as Extrude, SurfaceOnly as SurfaceOnly

@@ -1,14 +1,23 @@
-"""From the visible part of an object to the space that it fills.
+"""Completion: from the visible part of an object to the space that it fills (paper, section IV-B).
 
-A segment of a depth image is a shell. A `Completer` guesses the rest, mask by mask: its answer depends on the
-frame and on the mask alone, never on how the rest of the image is segmented, so hypotheses that share a segment
-share the work. Masks that claim the same voxel are settled later, by `arbitration.arbitrate`.
+A segment of a depth image is a shell. A `Completer` estimates the hidden part of the object, mask by mask. The result
+depends on the frame and on the mask alone, not on the rest of the segmentation, so hypotheses that share a segment
+share the work.
 
 >>> completions = Extrude().complete(rng, frame, [mask_a, mask_b], grid)
 >>> labels = arbitrate(completions, grid)            # (X, Y, Z), 1 for mask_a, 2 for mask_b
 
-To make your own, subclass `Completer` and override `fill`: the seen evidence in a small box comes in,
-probabilities go out, and the veto by free space and the visible surface are seen to for you.
+For a new method, subclass `Completer` and override `fill`: the argument is an `ObservedBox`, a small box of the grid,
+and the result is the probability of each voxel. `complete` clears voxels that are observed as free and keeps the
+visible surface.
+
+`arbitrate` makes the label grid. If several completions claim a voxel:
+
+1. A voxel with readings belongs to the object with most readings in it.
+2. Otherwise it belongs to the object with the largest probability, if that reaches the threshold.
+3. Ties go to the object with the nearest visible surface.
+
+The result does not depend on the order of the objects: renumbered completions give renumbered labels.
 """
 
 from __future__ import annotations
@@ -19,27 +28,28 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from mstfilter.errors import InputError
 from mstfilter.scene import Frame, VoxelGrid, component_key, content_key, depth_sigma, frame_geometry, memo, read_only
 
-__all__ = ["Completer", "Completion", "Evidence", "evidence"]
+__all__ = ["Completer", "Completion", "ObservedBox", "arbitrate", "observed_box"]
 
 
 @dataclass(frozen=True, eq=False)
 class Completion:
-    """Where one segment's object is, in a box of the grid.
+    """The completed object of one segment, in a box of the grid.
 
     Parameters
     ----------
     offset : (3,) int
         Index of the box's first voxel in the grid.
     probability : (a, b, c) float32
-        Probability of being occupied by the object; empty where the mask has no reading in the grid.
+        Probability of being occupied by the object; empty if the mask has no reading in the grid.
     points : (a, b, c) int32
         Depth readings of the mask in each voxel: the visible surface.
     key : str
-        Name by content of frame, mask, grid and completer.
+        Key of the contents of frame, mask, grid and completer.
     """
 
     offset: np.ndarray
@@ -55,22 +65,22 @@ class Completion:
 
 
 @dataclass(frozen=True, eq=False)
-class Evidence:
-    """What a frame says about a box of the grid, seen from one mask.
+class ObservedBox:
+    """What a frame shows of a box of the grid around one mask.
 
     Parameters
     ----------
     points : (a, b, c) int32
         Readings of the mask in each voxel.
     own : (a, b, c) bool
-        Visible surface of the mask: the centre's pixel is in the mask, and the centre is at the measured surface
-        or just behind it. A mask so small that no centre falls into it has the voxel with most readings.
+        Visible surface of the mask: the pixel of the voxel's centre is in the mask, and the centre is at the measured
+        surface or just behind it. If no centre falls into a small mask, the voxel with most readings.
     other : (a, b, c) bool
-        Visible surface of anything else, likewise.
+        Visible surface outside the mask, by the same rule.
     free : (a, b, c) bool
-        Seen through: surely not the object.
+        Observed as free.
     behind : (a, b, c) bool
-        The centre's pixel is in the mask and the centre is behind the measured surface.
+        The pixel of the centre is in the mask and the centre is behind the measured surface.
     height : (c,) float
         Height of the voxel centres above the table in metres.
     """
@@ -85,17 +95,17 @@ class Evidence:
 
 @dataclass(frozen=True)
 class Completer(ABC):
-    """Guesses the hidden part of objects.
+    """Estimates the hidden part of objects.
 
     Parameters
     ----------
     in_front, depth : float
         A voxel is visible surface if its centre is at most `in_front` voxels in front of the measured surface and
-        less than `depth` voxels behind it, along the optical axis. Asking for the centre rather than for any
-        reading keeps objects from growing by half a voxel all round (rendered boxes: volume 1.13 of the truth
+        less than `depth` voxels behind it, along the optical axis. A test of the centre, and not of any reading in
+        the voxel, keeps objects from growing by half a voxel on all sides (rendered boxes: volume 1.13 of the truth
         instead of 1.41, quality .82 instead of .71; the two values were chosen on these).
     free_margin : float
-        A voxel is seen through if its centre is this far in front of the measured surface, in voxels.
+        A voxel is free if its centre is this far in front of the measured surface, in voxels ...
     free_sigmas : float
         ... and also this far, in standard deviations of the depth reading.
     """
@@ -107,12 +117,12 @@ class Completer(ABC):
 
     #: Voxels around the visible part that `fill` may use, besides all those below it.
     padding: ClassVar[int] = 0
-    #: Whether `fill` draws from its generator; what is drawn is not kept for the next hypothesis.
+    #: Whether `fill` draws random numbers. The result is then not reused for the next hypothesis.
     stochastic: ClassVar[bool] = False
 
     @abstractmethod
-    def fill(self, rng: np.random.Generator, seen: Evidence) -> np.ndarray:
-        """(a, b, c) probability of being occupied."""
+    def fill(self, rng: np.random.Generator, seen: ObservedBox) -> np.ndarray:
+        """Probability (a, b, c) of being occupied."""
 
     def complete(
         self, rng: np.random.Generator, frame: Frame, masks: Sequence[np.ndarray], grid: VoxelGrid
@@ -128,23 +138,23 @@ class Completer(ABC):
         masks : sequence of (H, W) bool
             Each one segment. Pixels without a reading, of the robot, or outside the grid are ignored.
         grid : VoxelGrid
-            The lattice of the answer.
+            The grid of the result.
 
         Returns
         -------
         list of Completion
-            One a mask. What was seen as free has probability 0. A mask with any reading in the grid has at least
-            one voxel of probability 1, so every visible object exists.
+            One for each mask. Voxels observed as free have probability 0. A mask with a reading in the grid has at
+            least one voxel of probability 1, so every visible object exists.
         """
         return [self._one(rng, frame, np.asarray(mask, dtype=bool), grid) for mask in masks]
 
     def _one(self, rng: np.random.Generator, frame: Frame, mask: np.ndarray, grid: VoxelGrid) -> Completion:
         if mask.shape != frame.depth.shape:
             raise InputError(f"mask has shape {mask.shape}, the frame is {frame.depth.shape}")
-        name = content_key("mask", np.packbits(mask), frame.key, grid.key, self._key())
+        name = content_key("mask", np.packbits(mask), frame.key, grid.key, component_key(self))
 
         def compute() -> Completion:
-            offset, seen = evidence(frame, mask, grid, self)
+            offset, seen = observed_box(frame, mask, grid, self)
             p = np.array(self.fill(rng, seen), dtype=np.float32)
             p[seen.free] = 0
             if p.size and not (p == 1).any():
@@ -153,42 +163,19 @@ class Completer(ABC):
 
         return compute() if self.stochastic else memo("completion", name, compute, Completion)
 
-    def _key(self) -> bytes:
-        return component_key(self)
 
+def observed_box(frame: Frame, mask: np.ndarray, grid: VoxelGrid, rule: Completer) -> tuple[np.ndarray, ObservedBox]:
+    """The box of a mask: its offset (3,) in the grid, and what the frame shows of it.
 
-def _frame_points(frame: Frame, grid: VoxelGrid) -> tuple[np.ndarray, np.ndarray]:
-    """Flat pixels with a reading inside the grid (k,), and their voxels (k, 3)."""
-
-    def compute() -> tuple[np.ndarray, np.ndarray]:
-        index = grid.index_of(frame.points)
-        pixels = np.flatnonzero(frame.valid & grid.contains(index))
-        return read_only(pixels), read_only(index.reshape(-1, 3)[pixels].astype(np.int32))
-
-    return memo("frame_points", (frame.key, grid.key), compute)
-
-
-def _free(frame: Frame, grid: VoxelGrid, margin: float, sigmas: float) -> np.ndarray:
-    def compute() -> np.ndarray:
-        geometry = frame_geometry(frame, grid)
-        distance = np.maximum(margin * grid.voxel_size, sigmas * depth_sigma(geometry.z - geometry.signed))
-        return read_only(geometry.known_free(distance))
-
-    return memo("seen_free", (frame.key, grid.key, margin, sigmas), compute)
-
-
-def evidence(frame: Frame, mask: np.ndarray, grid: VoxelGrid, rule: Completer) -> tuple[np.ndarray, Evidence]:
-    """What a frame says about the box of a mask: offset (3,) and the evidence in it.
-
-    The box holds the mask's readings, everything below them, and the margin that `rule` asks for; `rule` also
-    says what counts as visible surface and as free.
+    The box holds the readings of the mask, the space below them, and a margin. `rule` has the parameters of the
+    margin, the visible surface and the free space.
     """
     pixels, voxels = _frame_points(frame, grid)
     mine = voxels[mask.ravel()[pixels]]
     if len(mine) == 0:
         empty = np.zeros((0, 0, 0))
         no = empty.astype(bool)
-        return np.zeros(3, np.int64), Evidence(empty.astype(np.int32), no, no, no, no, np.zeros(0))
+        return np.zeros(3, np.int64), ObservedBox(empty.astype(np.int32), no, no, no, no, np.zeros(0))
     # The surface may reach `depth` voxels behind the readings.
     margin = max(rule.padding, int(np.ceil(rule.depth)))
     low = np.maximum(mine.min(axis=0) - margin, 0).astype(np.int64)
@@ -211,4 +198,99 @@ def evidence(frame: Frame, mask: np.ndarray, grid: VoxelGrid, rule: Completer) -
         own[np.unravel_index(points.argmax(), shape)] = True
         free = free & ~own
     height = grid.origin[2] + (np.arange(shape[2]) + 0.5) * grid.voxel_size
-    return low, Evidence(points, own, surface & ~inside & ~own, free, behind, height)
+    return low, ObservedBox(points, own, surface & ~inside & ~own, free, behind, height)
+
+
+def _frame_points(frame: Frame, grid: VoxelGrid) -> tuple[np.ndarray, np.ndarray]:
+    """Flat pixels with a reading inside the grid (k,), and their voxels (k, 3)."""
+
+    def compute() -> tuple[np.ndarray, np.ndarray]:
+        index = grid.index_of(frame.points)
+        pixels = np.flatnonzero(frame.valid & grid.contains(index))
+        return read_only(pixels), read_only(index.reshape(-1, 3)[pixels].astype(np.int32))
+
+    return memo("frame_points", (frame.key, grid.key), compute)
+
+
+def _free(frame: Frame, grid: VoxelGrid, margin: float, sigmas: float) -> np.ndarray:
+    """Voxels (X, Y, Z) bool in front of the measured surface by `margin` voxels and by `sigmas` of its noise."""
+
+    def compute() -> np.ndarray:
+        geometry = frame_geometry(frame, grid)
+        distance = np.maximum(margin * grid.voxel_size, sigmas * depth_sigma(geometry.z - geometry.signed))
+        return read_only(geometry.known_free(distance))
+
+    return memo("seen_free", (frame.key, grid.key, margin, sigmas), compute)
+
+
+def arbitrate(completions: Sequence[Completion], grid: VoxelGrid, threshold: float = 0.5) -> np.ndarray:
+    """Label grid of several completions.
+
+    Parameters
+    ----------
+    completions : sequence of Completion
+        The completions of one hypothesis, with disjoint masks.
+    grid : VoxelGrid
+        The grid of the completions.
+    threshold : float
+        Least probability of an occupied voxel.
+
+    Returns
+    -------
+    (X, Y, Z) uint16
+        0 free, k + 1 the k-th completion.
+    """
+    labels = np.zeros(grid.shape, dtype=np.uint16)
+    most = np.zeros(grid.shape, dtype=np.int32)
+    best = np.zeros(grid.shape, dtype=np.float32)
+    tied = np.zeros(grid.shape, dtype=bool)
+    for k, one in enumerate(completions):
+        box = one.box
+        p = np.where(one.probability >= threshold, one.probability, 0).astype(np.float32)
+        claims = p > 0
+        points = np.where(claims, one.points, 0)
+        more = (points > most[box]) | ((points == most[box]) & (p > best[box]))
+        equal = claims & (points == most[box]) & (p == best[box])
+        tied[box] = (tied[box] | equal) & ~more
+        labels[box][more] = k + 1
+        most[box][more] = points[more]
+        best[box][more] = p[more]
+    if tied.any():
+        _break_ties(labels, tied, most, best, completions, threshold)
+    return labels
+
+
+def _break_ties(
+    labels: np.ndarray,
+    tied: np.ndarray,
+    most: np.ndarray,
+    best: np.ndarray,
+    completions: Sequence[Completion],
+    threshold: float,
+) -> None:
+    """Give tied voxels to the object with the nearest visible surface; at equal distance, to the smaller key."""
+    voxels = np.argwhere(tied)
+    at = tuple(voxels.T)
+    nearest = np.full(len(voxels), np.inf)
+    taken = np.zeros(len(voxels), dtype=bool)
+    for k in sorted(range(len(completions)), key=lambda k: completions[k].key):
+        one = completions[k]
+        local = voxels - one.offset
+        inside = ((local >= 0) & (local < one.probability.shape)).all(axis=1)
+        here = np.flatnonzero(inside)
+        if len(here) == 0:
+            continue
+        place = tuple(local[here].T)
+        p = one.probability[place]
+        points = np.where(p >= threshold, one.points[place], 0)
+        contends = (p >= threshold) & (p == best[at][here]) & (points == most[at][here])
+        here = here[contends]
+        if len(here) == 0:
+            continue
+        distance = np.full(len(here), np.inf)
+        if (one.points > 0).any():
+            distance, _ = cKDTree(np.argwhere(one.points > 0) + one.offset).query(voxels[here])
+        nearer = ~taken[here] | (distance < nearest[here] - 1e-9)
+        nearest[here[nearer]] = distance[nearer]
+        taken[here[nearer]] = True
+        labels[tuple(voxels[here[nearer]].T)] = k + 1

@@ -1,6 +1,4 @@
-"""Completion without weights: the visible surface, extruded down to what carries it.
-
-Most things on a table stand on it: below a visible top or side there is more of the object.
+"""Completion without learned weights: the visible surface, extruded down to the table.
 
 >>> completions = Extrude().complete(rng, frame, masks, grid)
 """
@@ -11,41 +9,42 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mstfilter.completion.completer import Completer, Evidence
+from mstfilter.completion.completer import Completer, ObservedBox
 
 __all__ = ["Extrude", "SurfaceOnly"]
 
 
 @dataclass(frozen=True)
 class SurfaceOnly(Completer):
-    """No completion: the visible surface (the floor of any comparison)."""
+    """No completion: the visible surface alone."""
 
-    def fill(self, rng: np.random.Generator, seen: Evidence) -> np.ndarray:
-        """1 on the visible surface."""
+    def fill(self, rng: np.random.Generator, seen: ObservedBox) -> np.ndarray:
         return seen.own.astype(np.float32)
 
 
 @dataclass(frozen=True)
 class Extrude(Completer):
-    """The visible surface and all below it, down to the table or another object's surface.
+    """The visible surface, extruded down to the table or to the surface of another object.
+
+    Most objects on a table stand on it, so the space below a visible top or side belongs to the object.
 
     Parameters
     ----------
     below : float
         Probability of a hidden voxel under the surface (precision measured on procedural scenes: .8).
     floor : float
-        Nothing below this height in metres.
+        Voxels below this height in metres are free.
     """
 
     below: float = 0.8
     floor: float = 0.0
 
-    def fill(self, rng: np.random.Generator, seen: Evidence) -> np.ndarray:
-        """1 on the visible surface, `below` under it until another surface is met; gaps seen as free stay free."""
+    def fill(self, rng: np.random.Generator, seen: ObservedBox) -> np.ndarray:
+        """Probability 1 on the visible surface and `below` under it."""
         state = np.zeros(seen.own.shape[:2], dtype=bool)
         p = np.zeros(seen.own.shape, dtype=np.float32)
         for k in range(seen.own.shape[2] - 1, -1, -1):
-            # Another surface ends the column; own surface (re)starts it.
+            # From the top down: the surface of another object ends a column, the own surface starts it (again).
             state = (state & ~seen.other[:, :, k]) | seen.own[:, :, k]
             p[:, :, k] = np.where(seen.own[:, :, k], 1.0, np.where(state, self.below, 0.0))
         p[:, :, seen.height < self.floor] = 0

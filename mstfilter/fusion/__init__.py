@@ -1,4 +1,21 @@
-"""Predicted x proposed -> fused hypotheses: the measurement update of MST (paper, section IV-D)."""
+"""Fusion: the measurement update of MST (paper, section IV-D), and queries of the fused population.
+
+>>> update = FusionUpdate(eta=5, crossover=Crossover(merge="covered"))
+>>> fused = update.update(rng, predicted, proposed, clip)     # candidates of all pairs, with weights
+>>> belief = Belief(resampler.resample(rng, fused, 5))
+>>> belief.occupancy()                                        # (X, Y, Z) probability
+
+===============  =======================================================================================
+`update`         `FusionUpdate`: the steps below in their order, and the weights of the candidates
+`free_space`     clears predicted voxels that the depth image observes as free
+`division`       splits objects whose parts move apart in a clip
+`conflicts`      the conflict graph of two hypotheses (networkx), painting orders, merge probabilities
+`crossover`      makes one hypothesis of two, and smooths the result by a mode filter
+`similarity`     similarity of hypotheses, for diverse resampling and for evidence
+`belief`         probabilities and expected information, for planners; `information` has the formulas
+`interfaces`     `Projection`, `Division`, `Structure`, `Evidence`: what a user can replace
+===============  =======================================================================================
+"""
 
 from mstfilter.lazy import attach
 

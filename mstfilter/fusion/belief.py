@@ -1,23 +1,23 @@
-"""What a weighted population of hypotheses believes about the scene: queries for planners.
+"""Queries of a weighted population of hypotheses, for planners: probabilities, entropies, expected information.
 
 >>> belief = Belief(state.population)
->>> belief.occupancy()[tuple(belief.voxel([0.1, 0.0, 0.02]))]     # probability that something is there
->>> belief.same_object_at_pixels(camera, (310, 200), (340, 210))  # one object or two?
+>>> belief.occupancy()[tuple(belief.voxel([0.1, 0.0, 0.02]))]     # probability that the voxel is occupied
+>>> belief.same_object_at_pixels(camera, (310, 200), (340, 210))  # probability that two pixels show one object
 >>> belief.object_count()                                         # probability of 0, 1, 2, ... objects
->>> max(cameras, key=belief.view_information)                     # where to look from
->>> belief.push_map(tolerance=50)                                 # where a push tells hypotheses apart
+>>> max(cameras, key=belief.view_information)                     # the most informative camera
+>>> belief.push_map(tolerance=50)                                 # information of a push at each voxel
 
-Below, hypothesis i has labels L_i and the weight w_i, normalised. A label is a name within its hypothesis only, so
-nothing here compares labels of different hypotheses, and nothing changes with the names. Voxels are indices (x, y, z)
-as integers; `Belief.voxel` and `Belief.box` turn metres into them. Pixels are (column, row). A region is a bool array
-of the grid's shape, or voxels (..., 3). Entropy and information are in nats (divide by log 2 for bits).
+Hypothesis i has labels L_i and the normalised weight w_i. Labels of different hypotheses are unrelated, so no query
+compares them, and renaming them changes no result. Voxels are integer indices (x, y, z); `Belief.voxel` and
+`Belief.box` convert metres. Pixels are (column, row). A region is a bool array of the grid's shape, or voxels
+(..., 3). Entropy and information are in nats (divide by log 2 for bits).
 
-**Information.** Every action (looking at a region, from a camera, pushing) has one outcome under each hypothesis, and
-what it is expected to teach is the mutual information of hypothesis and outcome. Without noise this is exactly the
-entropy of the weights summed over equal outcomes, at most `partition_entropy()`, itself at most log n. It is about
-what the hypotheses disagree on: what all of them have wrong, no number here shows. Outcomes that differ in one voxel
-are two; with `tolerance` (in voxels or pixels) outcomes count as different as far as they differ by more than that
-(formula in `mstfilter.fusion.information`).
+**Information.** Every action (look at a region, look from a camera, push) has one outcome under each hypothesis. Its
+expected information is the mutual information of hypothesis and outcome. Without noise this is the entropy of the
+weights summed over equal outcomes, at most `partition_entropy()`, which is at most log n. It measures only what the
+hypotheses disagree on; errors that all of them share do not appear. Outcomes that differ in one voxel are different.
+With `tolerance` (in voxels or pixels), outcomes that differ by much less than it count as equal (formula in
+`mstfilter.fusion.information`).
 """
 
 from __future__ import annotations
@@ -31,39 +31,39 @@ import numpy as np
 
 from mstfilter.errors import InputError
 from mstfilter.fusion.information import (
+    CommonRefinement,
     binary_entropy,
     canonical_rows,
+    check_tolerance,
+    common_refinement,
     entropy,
-    foreseen,
     hamming,
     noisy_information,
+    outcome_information,
     partition_distance,
-    tolerated,
 )
-from mstfilter.fusion.places import box_of, camera_of, flat_of, pixels_of, region_of, single, voxel_of
-from mstfilter.fusion.refinement import Refinement, refine
 from mstfilter.scene import Camera, Hypothesis, VoxelGrid, project, render_hypothesis
 from mstfilter.smc import Population, first_seen
 
 __all__ = ["Belief"]
 
-DEPTH_STEP = 0.01  # of a voxel: depths closer than this are equal but for rounding
+_DEPTH_STEP = 0.01  # voxels: depths are rounded to this step before they are compared
 
 
 @dataclass(frozen=True, eq=False)
 class Belief:
-    """A posterior over scenes, as far as its hypotheses reach.
+    """A posterior over scenes, represented by weighted hypotheses.
 
     Parameters
     ----------
     population : Population
         Hypotheses on one grid with unnormalised log weights, such as ``state.population``. Equal hypotheses are
-        looked at once; those of weight 0 not at all.
+        merged, and hypotheses of weight 0 are ignored.
 
     Raises
     ------
     InputError
-        The population is empty or does not hold hypotheses, or their grids differ.
+        If the population is empty or does not hold hypotheses, or if their grids differ.
     """
 
     population: Population
@@ -71,12 +71,12 @@ class Belief:
     def __post_init__(self) -> None:
         if not isinstance(self.population, Population):
             raise InputError(
-                f"a belief is made of a Population, not of {type(self.population).__name__}",
+                f"Belief takes a Population, not a {type(self.population).__name__}",
                 "Belief(state.population), or Belief(Population(hypotheses, log_weights))",
             )
         particles = self.population.particles
         if isinstance(particles, Mapping | np.ndarray) or not all(isinstance(h, Hypothesis) for h in particles):
-            raise InputError("a belief is about particles that are hypotheses, not vectors or other objects")
+            raise InputError("the particles of a belief must be hypotheses, not vectors or other objects")
         for k, h in enumerate(particles):
             if h.grid != self.grid:
                 raise InputError(
@@ -106,7 +106,7 @@ class Belief:
 
     @cached_property
     def _merged(self) -> tuple[tuple[Hypothesis, ...], np.ndarray]:
-        """Different hypotheses of positive weight, and their weights."""
+        """Distinct hypotheses of positive weight, and their weights."""
         which = first_seen(h.key for h in self.hypotheses)
         mass = np.bincount(which, self.weights)
         example = np.unique(which, return_index=True)[1]
@@ -118,40 +118,61 @@ class Belief:
         return self._merged[1]
 
     @cached_property
-    def _refined(self) -> Refinement:
-        return refine([h.labels for h in self._merged[0]])
+    def _refined(self) -> CommonRefinement:
+        return common_refinement([h.labels for h in self._merged[0]])
 
-    # Places ---------------------------------------------------------------------------------------------------
+    # Voxels and regions ---------------------------------------------------------------------------------------
 
     def voxel(self, points: Any) -> np.ndarray:
-        """Voxels (..., 3) that hold world points (..., 3) in metres; a point outside the grid is an InputError."""
-        return voxel_of(self.grid, points)
+        """Voxels (..., 3) that hold world points (..., 3) in metres. Raises InputError if a point is outside."""
+        points = np.asarray(points, dtype=np.float64)
+        if points.shape[-1:] != (3,):
+            raise InputError(f"points have shape {points.shape}, expected (..., 3) in metres")
+        index = self.grid.index_of(points)
+        outside = ~self.grid.contains(index)
+        if outside.any():
+            raise InputError(
+                f"point {points[outside][0].tolist()} m lies outside the grid "
+                f"(so do {outside.sum()} of {outside.size} points)",
+                _extent(self.grid),
+            )
+        return index
 
     def box(self, lower: Any, upper: Any) -> np.ndarray:
-        """Region (X, Y, Z) bool: voxels whose centres lie in the box between two corners in metres."""
-        return box_of(self.grid, lower, upper)
+        """Voxels (X, Y, Z) bool with centres in the box between two corners (3,) in metres."""
+        lower, upper = np.asarray(lower, dtype=np.float64), np.asarray(upper, dtype=np.float64)
+        if lower.shape != (3,) or upper.shape != (3,):
+            raise InputError(f"corners of a box have shapes {lower.shape} and {upper.shape}, expected (3,) in metres")
+        centres = self.grid.centres()
+        inside = ((centres >= lower) & (centres <= upper)).all(axis=-1)
+        if not inside.any():
+            raise InputError(
+                f"the box from {lower.tolist()} to {upper.tolist()} m holds the centre of no voxel",
+                _extent(self.grid),
+            )
+        return inside
 
     def _cells(self, voxels: Any) -> np.ndarray:
-        """(...) cells of voxels (..., 3)."""
-        return self._refined.cells.ravel()[flat_of(self.grid, voxels)]
+        """Cells (...) of voxels (..., 3)."""
+        return self._refined.cells.ravel()[_flat_voxels(self.grid, voxels)]
 
     def _region(self, region: Any) -> tuple[np.ndarray, np.ndarray]:
-        """Cells that a region meets, and how many of its voxels lie in each; None is the whole grid."""
+        """Cells with voxels in a region, and the number of these voxels; None is the whole grid."""
         counts = self._refined.sizes
         if region is not None:
-            inside = self._refined.cells.ravel()[region_of(self.grid, region)]
+            inside = self._refined.cells.ravel()[_flat_region(self.grid, region)]
             counts = np.bincount(inside, minlength=len(counts))
         met = np.flatnonzero(counts)
         return met, counts[met]
 
-    # What is there --------------------------------------------------------------------------------------------
+    # Probabilities --------------------------------------------------------------------------------------------
 
     def occupancy(self) -> np.ndarray:
-        """(X, Y, Z) probability that a voxel belongs to any object: ``p(v) = sum_i w_i [L_i(v) > 0]``."""
+        """Probability (X, Y, Z) that a voxel is occupied: ``p(v) = sum_i w_i [L_i(v) > 0]``."""
         return (self._mass @ (self._refined.objects > 0))[self._refined.cells]
 
     def occupancy_entropy(self) -> np.ndarray:
-        """(X, Y, Z) entropy of "occupied or free": ``-p log p - (1 - p) log(1 - p)``, p the `occupancy`."""
+        """Entropy (X, Y, Z) of "occupied or free": ``-p log p - (1 - p) log(1 - p)``, p the `occupancy`."""
         return binary_entropy(self._mass @ (self._refined.objects > 0))[self._refined.cells]
 
     def same_object(self, a: Any, b: Any) -> np.ndarray:
@@ -160,7 +181,7 @@ class Belief:
         Parameters
         ----------
         a, b : (..., 3) int
-            Voxels; they are broadcast against each other. For a = b it is the occupancy.
+            Voxels, broadcast against each other. For a = b the result is the occupancy.
 
         Returns
         -------
@@ -170,8 +191,8 @@ class Belief:
         return np.tensordot(self._mass, (one == other) & (one > 0), axes=1)
 
     def object_at(self, voxel: Any) -> np.ndarray:
-        """(X, Y, Z) where the object at a voxel (3,) reaches: ``same_object(voxel, v)`` for every voxel v."""
-        own = self._refined.objects[:, self._cells(single(voxel, 3))]
+        """Extent (X, Y, Z) of the object at a voxel (3,): ``same_object(voxel, v)`` for every voxel v."""
+        own = self._refined.objects[:, self._cells(_one_index(voxel, 3))]
         same = (self._refined.objects == own[:, None]) & (own > 0)[:, None]
         return (self._mass @ same)[self._refined.cells]
 
@@ -182,39 +203,39 @@ class Belief:
         ----------
         camera : Camera
         a, b : (..., 2) int
-            Pixels (column, row); they are broadcast against each other.
+            Pixels (column, row), broadcast against each other.
 
         Returns
         -------
         (...) float
         """
         images = self._images(camera)
-        a, b = pixels_of(camera, a), pixels_of(camera, b)
+        a, b = _rows_and_columns(camera, a), _rows_and_columns(camera, b)
         same = [(image[a] == image[b]) & (image[a] > 0) for image in images]
         return np.tensordot(self._mass, np.stack(same), axes=1)
 
     def object_at_pixel(self, camera: Camera, pixel: Any) -> np.ndarray:
-        """(H, W) probability that each pixel shows the same object as `pixel`, (column, row)."""
+        """Probability (H, W) that each pixel shows the same object as `pixel`, (column, row)."""
         images = self._images(camera)
-        row, column = pixels_of(camera, single(pixel, 2))
+        row, column = _rows_and_columns(camera, _one_index(pixel, 2))
         return sum(
             w * ((r == r[row, column]) & (r[row, column] > 0)) for w, r in zip(self._mass, images, strict=True)
         )
 
     def object_count(self, region: Any = None) -> np.ndarray:
-        """(K + 1,) probability of k objects, k = 0 .. K: ``sum_i w_i [hypothesis i has k objects]``.
+        """Probability (K + 1,) of k = 0 .. K objects: ``sum_i w_i [hypothesis i has k objects]``.
 
-        With a region only objects are counted that have a voxel in it.
+        With a region, only objects with a voxel in it count.
         """
-        named = np.cumsum(self._refined.named(self._region(region)[0]))
-        return np.bincount(np.diff(named[self._refined.first]), self._mass)
+        count = np.cumsum(self._refined.objects_in(self._region(region)[0]))
+        return np.bincount(np.diff(count[self._refined.first]), self._mass)
 
     def mean_object_count(self, region: Any = None) -> float:
         """Expected number of objects: ``sum_k k p(k)``, p as in `object_count`."""
         p = self.object_count(region)
         return float(np.arange(len(p)) @ p)
 
-    # How sure it is -------------------------------------------------------------------------------------------
+    # Boundaries and entropy -----------------------------------------------------------------------------------
 
     def _faces(self, axis: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Faces between different cells: (X, Y, Z) bool of the lower voxel, P(both occupied), P(same object)."""
@@ -230,10 +251,10 @@ class Belief:
         return where, both, same
 
     def boundary(self) -> np.ndarray:
-        """(3, X, Y, Z) probability that two objects meet at a face.
+        """Probability (3, X, Y, Z) that two objects meet at a face.
 
-        ``[a, v] = sum_i w_i [L_i(v) > 0, L_i(v') > 0, L_i(v) != L_i(v')]``, v' the next voxel along axis a; 0 where
-        the grid ends.
+        ``[a, v] = sum_i w_i [L_i(v) > 0, L_i(v') > 0, L_i(v) != L_i(v')]``, v' the next voxel along axis a; 0 at
+        the end of the grid.
         """
         found = np.zeros((3, *self.grid.shape))
         for axis in range(3):
@@ -242,11 +263,11 @@ class Belief:
         return found
 
     def boundary_entropy(self) -> np.ndarray:
-        """(X, Y, Z) how unsure the segmentation is at a voxel: the most uncertain of its six faces, at most log 2.
+        """Entropy (X, Y, Z) of the segmentation at a voxel: the largest of its six faces, at most log 2.
 
-        A face between v and v' has ``H(S | B) = P(B) h(P(S | B))`` with B: both are occupied, S: by the same object,
-        ``h(p) = -p log p - (1 - p) log(1 - p)``. So doubt about occupancy alone, which `occupancy_entropy` shows,
-        counts nothing here: H(B, S) = H(B) + H(S | B).
+        A face between v and v' has ``H(S | B) = P(B) h(P(S | B))`` with B: both voxels are occupied, S: by the same
+        object, ``h(p) = -p log p - (1 - p) log(1 - p)``. The entropy of occupancy, H(B), is not included
+        (`occupancy_entropy`): H(B, S) = H(B) + H(S | B).
         """
         found = np.zeros(self.grid.shape)
         for axis in range(3):
@@ -259,27 +280,27 @@ class Belief:
         return found
 
     def partition_entropy(self, region: Any = None, tolerance: float = 0.0) -> float:
-        """Entropy of the segmentation of a region (default: the whole grid): which voxels are free, which together.
+        """Entropy of the segmentation of a region (default: the whole grid).
 
-        ``-sum_s P(s) log P(s)``, P(s) the weight of the hypotheses that divide the region in the way s. It is also
-        the information of learning the true segmentation there. Without region and tolerance it bounds every
-        information. The distance for the tolerance is the number of voxels that must change hands.
+        ``-sum_s P(s) log P(s)``, P(s) the weight of the hypotheses with segmentation s of the region. This is also
+        the information of the true segmentation of the region. Without region and tolerance it is an upper bound of
+        every information. The distance for the tolerance is `information.partition_distance`.
         """
-        tolerance = tolerated(tolerance)
+        tolerance = check_tolerance(tolerance)
         cells, sizes = self._region(region)
         rows = canonical_rows(self._refined.objects[:, cells])
-        return foreseen(self._mass, rows, partition_distance, sizes, tolerance)
+        return outcome_information(self._mass, rows, partition_distance, sizes, tolerance)
 
-    # What an action would teach -------------------------------------------------------------------------------
+    # Expected information of actions --------------------------------------------------------------------------
 
     def look_information(self, region: Any, tolerance: float = 0.0) -> float:
-        """Information of learning which voxels of a region are occupied (occluded or not).
+        """Information of the occupancy of a region, occluded voxels included.
 
-        Outcome: ``{v in region: L_i(v) > 0}``. For one voxel this is its `occupancy_entropy`.
+        Outcome: ``{v in region: L_i(v) > 0}``. For one voxel this is `occupancy_entropy`.
         """
-        tolerance = tolerated(tolerance)
+        tolerance = check_tolerance(tolerance)
         cells, sizes = self._region(region)
-        return foreseen(self._mass, self._refined.objects[:, cells] > 0, hamming, sizes, tolerance)
+        return outcome_information(self._mass, self._refined.objects[:, cells] > 0, hamming, sizes, tolerance)
 
     def view_information(
         self, camera: Camera, tolerance: float = 0.0, sees: Literal["depth", "objects"] = "depth"
@@ -289,39 +310,39 @@ class Belief:
         Parameters
         ----------
         camera : Camera
-            Real or imagined; ``camera.scaled(0.25)`` is cheaper.
+            Any camera; ``camera.scaled(0.25)`` is faster.
         tolerance : float
             Pixels.
         sees : {"depth", "objects"}
-            Outcome: the depth image of the objects (to a hundredth of a voxel; no table behind them), or which pixels
-            show the same object, as if the image were segmented without fault.
+            Outcome: the depth image of the objects (rounded to a hundredth of a voxel, without the table), or the
+            true segmentation of the image.
         """
-        tolerance = tolerated(tolerance)
+        tolerance = check_tolerance(tolerance)
         if sees == "objects":
-            image = refine(self._images(camera))
+            image = common_refinement(self._images(camera))
             rows = canonical_rows(image.objects)
-            return foreseen(self._mass, rows, partition_distance, image.sizes, tolerance)
+            return outcome_information(self._mass, rows, partition_distance, image.sizes, tolerance)
         if sees != "depth":
-            raise InputError(f'a camera sees {sees!r}, expected "depth" or "objects"')
-        step = DEPTH_STEP * self.grid.voxel_size
-        depths = (render_hypothesis(h, camera_of(camera)).depth.ravel() for h in self._merged[0])
+            raise InputError(f'sees is {sees!r}, expected "depth" or "objects"')
+        step = _DEPTH_STEP * self.grid.voxel_size
+        depths = (render_hypothesis(h, _check_camera(camera)).depth.ravel() for h in self._merged[0])
         pixels = np.stack([np.nan_to_num(np.round(d / step), nan=-1).astype(np.int32) for d in depths])
         pixels = pixels[:, (pixels != pixels[0]).any(axis=0)]
-        return foreseen(self._mass, pixels, hamming, np.ones(pixels.shape[1]), tolerance)
+        return outcome_information(self._mass, pixels, hamming, np.ones(pixels.shape[1]), tolerance)
 
     def push_information(self, region: Any, tolerance: float = 0.0) -> float:
-        """Information of pushing at a voxel or a region and seeing which voxels move along.
+        """Information of a push at a voxel or a region, if the moved voxels are observed.
 
-        Outcome: ``{v: L_i(v) = L_i(u) > 0 for a u in region}``, all voxels of all objects that have one in the region
-        (nothing where it is free). What they push in turn is left out.
+        Outcome: ``{v: L_i(v) = L_i(u) > 0 for a u in region}``, all voxels of all objects with a voxel in the region.
+        Further objects that these objects push are left out.
         """
-        tolerance = tolerated(tolerance)
-        moved = self._refined.named(self._region(region)[0])[self._refined.objects]
-        return foreseen(self._mass, moved, hamming, self._refined.sizes, tolerance)
+        tolerance = check_tolerance(tolerance)
+        moved = self._refined.objects_in(self._region(region)[0])[self._refined.objects]
+        return outcome_information(self._mass, moved, hamming, self._refined.sizes, tolerance)
 
     def push_map(self, tolerance: float = 0.0) -> np.ndarray:
-        """(X, Y, Z) `push_information` of each single voxel."""
-        tolerance = tolerated(tolerance)
+        """`push_information` (X, Y, Z) of each voxel."""
+        tolerance = check_tolerance(tolerance)
         refined, mass = self._refined, self._mass
         overlap = refined.overlaps()
         volume = overlap.diagonal()
@@ -333,27 +354,28 @@ class Belief:
             information -= w * np.log(alike)
         return np.maximum(information, 0.0)[refined.cells]
 
-    # Anything else --------------------------------------------------------------------------------------------
+    # Functions of the user ------------------------------------------------------------------------------------
 
     def expect(self, function: Callable[[Hypothesis], Any]) -> Any:
-        """``sum_i w_i f(h_i)`` of numbers or arrays, such as the probability that a path is free."""
+        """Expectation ``sum_i w_i f(h_i)`` of numbers or arrays, such as the probability that a path is free."""
         pairs = zip(self.weights, self.hypotheses, strict=True)
         return sum(w * np.asarray(function(h), dtype=np.float64) for w, h in pairs if w > 0)
 
     def information(self, outcome: Callable[[Hypothesis], Hashable]) -> float:
-        """Information of an action of your own whose outcome follows from the hypothesis.
+        """Information of an action with an outcome that the hypothesis determines.
 
-        ``H(O)``, ``P(O = o) = sum_i w_i [outcome(h_i) = o]``. The outcome must not contain labels: they are names.
+        ``H(O)``, ``P(O = o) = sum_i w_i [outcome(h_i) = o]``. The outcome must not contain labels, which differ
+        between hypotheses without a meaning.
         """
         outcomes = [(outcome(h), w) for w, h in zip(self.weights, self.hypotheses, strict=True) if w > 0]
         try:
             which = first_seen(o for o, _ in outcomes)
         except TypeError as error:
-            raise InputError(f"an outcome cannot be compared ({error})", "for arrays: array.tobytes()") from error
+            raise InputError(f"outcomes cannot be compared ({error})", "for arrays: array.tobytes()") from error
         return entropy(np.bincount(which, [w for _, w in outcomes]))
 
     def noisy_information(self, probabilities: Callable[[Hypothesis], Any]) -> float:
-        """Information of an action whose outcome is uncertain even if the hypothesis is known.
+        """Information of an action with a noisy outcome.
 
         ``H(O) - sum_i w_i H(O | i)``, exact; ``probabilities(h_i)`` gives (k,) ``P(O = o | i)`` for k outcomes.
         """
@@ -361,20 +383,79 @@ class Belief:
         try:
             channel = np.array([p for _, p in pairs], dtype=np.float64)
         except (TypeError, ValueError) as error:
-            raise InputError(f"probabilities of outcomes are not one list of k numbers ({error})") from error
+            raise InputError(f"probabilities of outcomes are not k numbers for each hypothesis ({error})") from error
         if channel.ndim != 2 or not (channel >= 0).all() or not np.allclose(channel.sum(axis=1), 1):
             raise InputError("probabilities of outcomes are negative or do not sum to 1 for a hypothesis")
         return noisy_information(np.array([w for w, _ in pairs]), channel)
 
     def reweighted(self, log_likelihood: Callable[[Hypothesis], float]) -> Belief:
-        """The belief after an observation: log weights plus ``log p(observation | h_i)``; -inf rules out."""
+        """The belief after an observation: adds ``log p(observation | h_i)`` to the log weights; -inf rules out."""
         return Belief(self.population.reweighted(np.array([float(log_likelihood(h)) for h in self.hypotheses])))
 
     def sample(self, rng: np.random.Generator, n: int = 1) -> tuple[Hypothesis, ...]:
         """n independent draws, each ``h_i`` with probability ``w_i``."""
         if n < 1:
-            raise InputError(f"{n} samples were asked for, expected at least 1")
+            raise InputError(f"the number of samples is {n}, expected at least 1")
         return tuple(self.hypotheses[int(k)] for k in rng.choice(len(self), size=n, p=self.weights))
 
     def _images(self, camera: Camera) -> list[np.ndarray]:
-        return [project(h, camera_of(camera)) for h in self._merged[0]]
+        return [project(h, _check_camera(camera)) for h in self._merged[0]]
+
+
+def _check_camera(camera: Any) -> Camera:
+    if not isinstance(camera, Camera):
+        raise InputError(f"a view takes a Camera, not a {type(camera).__name__}")
+    return camera
+
+
+def _one_index(index: Any, k: int) -> np.ndarray:
+    """The index of one voxel (3,) or pixel (2,)."""
+    index = np.asarray(index)
+    if index.shape != (k,):
+        raise InputError(f"expected one {'voxel' if k == 3 else 'pixel'}, {k} integers, not shape {index.shape}")
+    return index
+
+
+def _flat_voxels(grid: VoxelGrid, voxels: Any) -> np.ndarray:
+    """Flat indices (...) of voxels (..., 3)."""
+    index = np.asarray(voxels)
+    if index.shape[-1:] != (3,) or not np.issubdtype(index.dtype, np.integer):
+        raise InputError(
+            f"voxels have type {index.dtype} and shape {index.shape}, expected integers (..., 3)",
+            "belief.voxel(points) finds the voxels of points in metres",
+        )
+    outside = ~grid.contains(index)
+    if outside.any():
+        raise InputError(f"voxel {index[outside][0].tolist()} lies outside the grid of {grid.shape} voxels")
+    return np.ravel_multi_index(tuple(np.moveaxis(index, -1, 0)), grid.shape)
+
+
+def _flat_region(grid: VoxelGrid, region: Any) -> np.ndarray:
+    """Distinct flat indices (m,) of a region: a bool array of the grid's shape, or voxels (..., 3)."""
+    where = np.asarray(region)
+    if where.dtype != bool:
+        return np.unique(_flat_voxels(grid, where))
+    if where.shape != grid.shape:
+        raise InputError(f"region has shape {where.shape}, the grid is {grid.shape}")
+    return np.flatnonzero(where)
+
+
+def _rows_and_columns(camera: Camera, pixels: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Rows (...) and columns (...) of pixels (..., 2), which are (column, row)."""
+    index = np.asarray(pixels)
+    if index.shape[-1:] != (2,) or not np.issubdtype(index.dtype, np.integer):
+        raise InputError(
+            f"pixels have type {index.dtype} and shape {index.shape}, expected integers (..., 2)",
+            "a pixel is (column, row)",
+        )
+    outside = ((index < 0) | (index >= (camera.width, camera.height))).any(axis=-1)
+    if outside.any():
+        raise InputError(
+            f"pixel {index[outside][0].tolist()} lies outside the image of {camera.width} x {camera.height}",
+            "a pixel is (column, row)",
+        )
+    return index[..., 1], index[..., 0]
+
+
+def _extent(grid: VoxelGrid) -> str:
+    return f"the grid extends from {grid.origin.tolist()} to {grid.upper.tolist()} m"

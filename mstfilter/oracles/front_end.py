@@ -19,7 +19,7 @@ from typing import ClassVar, Literal
 
 import numpy as np
 
-from mstfilter.completion import Completer, Completion, Evidence, Extrude, evidence
+from mstfilter.completion import Completer, Completion, Extrude, ObservedBox, observed_box
 from mstfilter.errors import InputError
 from mstfilter.oracles.degradation import degrade
 from mstfilter.oracles.truth import Need, UsesTruth
@@ -176,7 +176,7 @@ class TrueCompletion(UsesTruth, Completer):
 
     needs: ClassVar[tuple[Need, ...]] = ("voxels", "instance")
 
-    def fill(self, rng: np.random.Generator, seen: Evidence) -> np.ndarray:
+    def fill(self, rng: np.random.Generator, seen: ObservedBox) -> np.ndarray:
         """1 on the visible surface: what is left to do where the mask shows no true object."""
         return seen.own.astype(np.float32)
 
@@ -204,7 +204,7 @@ class TrueCompletion(UsesTruth, Completer):
         mine = voxels[mask.ravel()[pixel]]
         if not len(mine):
             return super().complete(rng, frame, [mask], grid)[0]
-        offset, seen = evidence(frame, mask, grid, self)
+        offset, seen = observed_box(frame, mask, grid, self)
         low, high = mine.min(axis=0), mine.max(axis=0) + 1
         if seen.points.size:
             low, high = np.minimum(low, offset), np.maximum(high, offset + seen.points.shape)

@@ -9,9 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
-from mstfilter.completion.arbitration import arbitrate
-from mstfilter.completion.completer import Completer, Completion, Evidence
-from mstfilter.completion.extrude import Extrude, SurfaceOnly
+from mstfilter.completion import Completer, Completion, Extrude, ObservedBox, SurfaceOnly, arbitrate
 from mstfilter.errors import InputError
 from mstfilter.scene import Frame, VoxelGrid, cache as memo, frame_geometry, render
 from tests.segmentation.scenes import GRID, TWO, boxes, frame_of
@@ -25,7 +23,7 @@ class Greedy(Completer):
 
     padding: ClassVar[int] = 3
 
-    def fill(self, rng: np.random.Generator, seen: Evidence) -> np.ndarray:
+    def fill(self, rng: np.random.Generator, seen: ObservedBox) -> np.ndarray:
         return np.ones(seen.points.shape)
 
 
@@ -110,8 +108,8 @@ def test_extrusion_turns_with_its_evidence(turns):
     fields = [points, points > 1, (rng.random(points.shape) < 0.1) & (points < 2), points < -1, points < -1]
     height = np.arange(5) * 0.01 + 0.005
     for completer in (Extrude(), SurfaceOnly()):
-        straight = completer.fill(rng, Evidence(*fields, height))
-        turned = completer.fill(rng, Evidence(*(np.rot90(f, turns) for f in fields), height))
+        straight = completer.fill(rng, ObservedBox(*fields, height))
+        turned = completer.fill(rng, ObservedBox(*(np.rot90(f, turns) for f in fields), height))
         assert np.array_equal(np.rot90(straight, turns), turned)
 
 

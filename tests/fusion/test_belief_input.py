@@ -1,4 +1,4 @@
-"""What belief queries stand on: the common refinement, partitions, places; every wrong input is one clear error."""
+"""Common refinement, distance of partitions, voxels in metres, and the errors of wrong input to a belief."""
 
 from __future__ import annotations
 
@@ -9,8 +9,7 @@ import pytest
 
 from mstfilter.errors import InputError
 from mstfilter.fusion.belief import Belief
-from mstfilter.fusion.information import partition_distance
-from mstfilter.fusion.refinement import refine
+from mstfilter.fusion.information import common_refinement, partition_distance
 from mstfilter.scene import Hypothesis, VoxelGrid
 from mstfilter.smc import Population
 from tests.fusion.test_belief import CAMERA, GRID, SHAPE, belief_of, scenes, voxels_of
@@ -19,7 +18,7 @@ from tests.fusion.test_belief import CAMERA, GRID, SHAPE, belief_of, scenes, vox
 def test_refinement():
     """Two places share a cell exactly when all segmentations agree about both."""
     grids = scenes(3)[0]
-    found = refine(grids)
+    found = common_refinement(grids)
     columns = np.stack([g.ravel() for g in grids])
     cells = found.cells.ravel()
     for a, b in itertools.combinations(range(columns.shape[1]), 2):
@@ -32,7 +31,7 @@ def test_refinement():
     assert {frozenset(np.flatnonzero(m.any(axis=0))) for m in members} == own
     want = [[(a.any(axis=0) & b.any(axis=0)).sum() for b in members] for a in members]
     np.testing.assert_array_equal(found.overlaps()[1:, 1:], want)
-    sparse = refine([np.array([0, 65535, 9]), np.array([0, 65535, 65534])])
+    sparse = common_refinement([np.array([0, 65535, 9]), np.array([0, 65535, 65534])])
     np.testing.assert_array_equal(sparse.cells, [0, 2, 1])
 
 
