@@ -200,7 +200,7 @@ class CommonRefinement:
         return present
 
     def overlaps(self) -> np.ndarray:
-        """Number of positions that two objects share, (n_objects + 1, n_objects + 1); row and column 0 (free) are 0."""
+        """Positions (n_objects + 1, n_objects + 1) that two objects share; row and column 0 (free) are 0."""
         total = self.n_objects + 1
         found = np.zeros((total, total))
         sizes = np.broadcast_to(self.sizes, self.objects.shape).ravel()

@@ -11,7 +11,7 @@ from hypothesis import given, settings, strategies as st
 
 from mstfilter.completion import Completer, Completion, Extrude, ObservedBox, SurfaceOnly, arbitrate
 from mstfilter.errors import InputError
-from mstfilter.scene import Frame, VoxelGrid, cache as memo, frame_geometry, render
+from mstfilter.scene import Frame, VoxelGrid, frame_geometry, render, scene_cache
 from tests.segmentation.scenes import GRID, TWO, boxes, frame_of
 
 RNG = np.random.default_rng(0)
@@ -93,7 +93,7 @@ def test_the_answer_depends_on_frame_and_mask_alone():
     a, b = masks_of(TWO, frame)
     for completer in COMPLETERS:
         together = completer.complete(RNG, frame, [a, b], GRID)
-        memo.clear()
+        scene_cache.clear()
         alone = completer.complete(RNG, frame, [b], GRID) + completer.complete(RNG, frame, [a], GRID)
         for x, y in zip(together, alone[::-1], strict=True):
             assert np.array_equal(x.probability, y.probability)
