@@ -5,11 +5,24 @@
 Traceback (most recent call last):
 ...
 mstfilter.errors.InputError: depth image 000003.png is empty
+
+`check_number`, `check_integer` and `check_component` check the fields of components with one wording.
 """
 
 from __future__ import annotations
 
-__all__ = ["InputError", "InputWarning", "MissingLibraryError"]
+import math
+from numbers import Integral, Real
+from typing import Any
+
+__all__ = [
+    "InputError",
+    "InputWarning",
+    "MissingLibraryError",
+    "check_component",
+    "check_integer",
+    "check_number",
+]
 
 
 class InputError(ValueError):
@@ -48,3 +61,48 @@ class InputWarning(UserWarning):
         super().__init__(message)
         self.message = message
         self.hints = hints
+
+
+def check_number(
+    name: str,
+    value: Any,
+    *hints: str,
+    above: float = -math.inf,
+    at_least: float = -math.inf,
+    at_most: float = math.inf,
+    below: float = math.inf,
+    unit: str = "number",
+) -> None:
+    """Raise InputError unless `value` is finite, ``above < value < below`` and ``at_least <= value <= at_most``."""
+    numeric = isinstance(value, Real) and not isinstance(value, bool)
+    if numeric and math.isfinite(value) and above < value < below and at_least <= value <= at_most:
+        return
+    bounds = (
+        f"above {above:g}" if above > -math.inf else "",
+        f"of at least {at_least:g}" if at_least > -math.inf else "",
+        f"of at most {at_most:g}" if at_most < math.inf else "",
+        f"below {below:g}" if below < math.inf else "",
+    )
+    expected = " and ".join(bound for bound in bounds if bound)
+    raise InputError(f"{name} is {value!r}, expected a finite {unit} {expected}".rstrip(), *hints)
+
+
+def check_integer(name: str, value: Any, *hints: str, at_least: int = 1) -> None:
+    """Raise InputError unless `value` is an integer of at least `at_least`."""
+    if isinstance(value, Integral) and not isinstance(value, bool) and value >= at_least:
+        return
+    raise InputError(f"{name} is {value!r}, expected an integer of at least {at_least}", *hints)
+
+
+def check_component(name: str, value: Any, interface: type, optional: bool = False) -> None:
+    """Raise InputError unless `value` is an instance of `interface`, or None where it is optional."""
+    if isinstance(value, interface) or (optional and value is None):
+        return
+    hints = []
+    if isinstance(value, type) and issubclass(value, interface):
+        hints = [f"pass an instance: {name}={value.__name__}(...)"]
+    elif isinstance(value, str):
+        hints = ["names are for presets and the command line; in Python pass a component"]
+    article = "an" if interface.__name__[0] in "AEIOU" else "a"
+    found = f"the class {value.__name__}" if isinstance(value, type) else repr(value)
+    raise InputError(f"{name} is {found}, expected {article} {interface.__name__}", *hints)

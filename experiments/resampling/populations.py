@@ -20,7 +20,7 @@ from mstfilter.presets import REGISTRY, load_config
 from mstfilter.scene import Camera, Clip, Frame, Hypothesis, VoxelGrid
 from mstfilter.scoring import weighted_coverage
 from mstfilter.simulation import scene_family, simulate
-from mstfilter.smc import Population, Resampler, Systematic
+from mstfilter.smc import Population, Resampler, Systematic, WeightResampler
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +45,7 @@ class Candidates:
         return schemes(Table(self.similarity), Names(self.classes))
 
 
-class Catch(Resampler):
+class Catch(WeightResampler):
     """Systematic, and keeps the candidates that it saw last."""
 
     def __init__(self) -> None:

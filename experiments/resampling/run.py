@@ -20,7 +20,7 @@ from scipy import stats
 from worlds import World, branching, plain, worlds
 
 from mstfilter.errors import InputError
-from mstfilter.smc import Exact, Gaussian, ParticleFilter, Population
+from mstfilter.smc import ExactEquality, Gaussian, ParticleFilter, Population
 
 HERE = Path(__file__).resolve().parent
 Row = dict[str, object]
@@ -108,7 +108,7 @@ def timed(size: dict[str, int]) -> Iterator[Row]:
     for m, n in ((100, 20), (1000, 250)):
         rng = np.random.default_rng(m)
         population = Population(rng.normal(size=m), rng.normal(size=m))
-        arms = schemes(Gaussian(0.1), Exact())
+        arms = schemes(Gaussian(0.1), ExactEquality())
         for unit in range(size["rounds"]):
             seconds = {}
             for scheme, resampler in arms.items():

@@ -19,7 +19,6 @@ from mstfilter.smc import (
     Multinomial,
     Resampler,
     Residual,
-    ResidualSystematic,
     Shuffled,
     Similarity,
     Ssp,
@@ -35,7 +34,6 @@ def schemes(similarity: Similarity, equivalence: Equivalence) -> dict[str, Resam
     """By registered name; wrappers around the scheme that they have by default."""
     return {
         BASE: Systematic(),
-        "residual_systematic": ResidualSystematic(),
         "ssp": Ssp(),
         "shuffled": Shuffled(),
         "residual": Residual(),

@@ -16,7 +16,7 @@ from mstfilter.smc import (
     Branching,
     Equivalence,
     EssBelow,
-    Exact,
+    ExactEquality,
     Gaussian,
     Never,
     Normal,
@@ -216,11 +216,11 @@ def table_data(seed: int) -> Data:
 def worlds(reference: int) -> dict[str, World]:
     """By name."""
     return {
-        "linear_gaussian": World(lambda n: bootstrap(AR1, n), kalman, mean, Gaussian(0.3), Exact()),
+        "linear_gaussian": World(lambda n: bootstrap(AR1, n), kalman, mean, Gaussian(0.3), ExactEquality()),
         "stochastic_volatility": World(
-            lambda n: bootstrap(VOLATILITY, n), volatility_data(reference), mean, Gaussian(0.3), Exact()
+            lambda n: bootstrap(VOLATILITY, n), volatility_data(reference), mean, Gaussian(0.3), ExactEquality()
         ),
-        "object_hmm": World(lambda n: bootstrap(SHELF, n), shelf_data, n_boxes, SameBoxes(), Exact()),
+        "object_hmm": World(lambda n: bootstrap(SHELF, n), shelf_data, n_boxes, SameBoxes(), ExactEquality()),
         "miniature_mst": World(
             lambda n: bootstrap_filter(TABLE, n),
             table_data,

@@ -21,7 +21,7 @@ from typing import Any, ClassVar, Protocol, TypeVar
 
 import numpy as np
 
-from mstfilter.errors import InputError
+from mstfilter.errors import InputError, check_component, check_number
 from mstfilter.fusion.interfaces import Projection
 from mstfilter.scene import (
     Clip,
@@ -34,7 +34,7 @@ from mstfilter.scene import (
     memo,
     read_only,
 )
-from mstfilter.smc import Population, Update, number, part, union
+from mstfilter.smc import Population, Update, union
 
 __all__ = ["FreeSpace", "LabelledVoxels", "NoFreeSpace", "ProjectionUpdate", "log_quality"]
 
@@ -170,8 +170,8 @@ class ProjectionUpdate(Update):
     draws: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
-        part("free_space", self.free_space, Projection)
-        number("quality_exponent", self.quality_exponent, at_least=0)
+        check_component("free_space", self.free_space, Projection)
+        check_number("quality_exponent", self.quality_exponent, at_least=0)
 
     def update(
         self,

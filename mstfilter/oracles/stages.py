@@ -155,21 +155,14 @@ class TrueBest(UsesTruth, Resampler):
 
     properly_weighted: ClassVar[bool] = False
 
-    def select(
-        self, rng: np.random.Generator, log_weights: np.ndarray, n: int
-    ) -> tuple[np.ndarray, np.ndarray | None]:
-        """The n largest weights (in turn, where there are fewer): weights alone say nothing of the truth."""
-        order = np.argsort(-np.asarray(log_weights), kind="stable")
-        return order[np.arange(n) % len(order)], None
-
     def resample(self, rng: np.random.Generator, population: Population, n: int) -> Population:
         """Select by quality at the pause of the filter's step."""
         labels = self.truth.labels(step_of(rng))
         population = population.realised()
         quality = np.array([weighted_coverage(h.labels, labels, self.form) for h in population.particles])
-        ancestors, _ = self.select(rng, quality, n)
-        chosen = population.take(ancestors, np.full(n, population.log_mean_weight))
-        return chosen.labelled({**chosen.parents, "ancestor": ancestors.astype(np.int64)}, chosen.notes)
+        best_first = np.argsort(-quality, kind="stable")
+        ancestors = best_first[np.arange(n) % len(best_first)]
+        return population.select(ancestors, np.full(n, population.log_mean_weight))
 
 
 def step_of(rng: np.random.Generator) -> int:

@@ -23,6 +23,7 @@ from mstfilter.oracles import bind_truth
 from mstfilter.presets import build_filter, describe_filter
 from mstfilter.runs.run_folder import RunFolder, plain
 from mstfilter.scene import Recording
+from mstfilter.smc import Observer
 
 __all__ = ["RunProgress", "filter_recording"]
 
@@ -46,6 +47,7 @@ def filter_recording(
     *,
     allow_files: bool = False,
     progress: Callable[[RunProgress], None] = lambda progress: None,
+    observer: Observer | None = None,
 ) -> RunFolder:
     """Filter a recording; the run folder.
 
@@ -63,6 +65,8 @@ def filter_recording(
         Whether components may come from ``./file.py:Class``.
     progress : callable
         Called before the first step and after every step.
+    observer : callable, optional
+        ``observer(slot, begins)``, called when a component of the filter begins and ends its work.
     """
     filter = build_filter(config, allow_files=allow_files)
     recording.check()
@@ -90,7 +94,7 @@ def filter_recording(
     progress(RunProgress(done, len(clips)))
     try:
         for clip in clips[done:]:
-            state, info = running.step(state, clip)
+            state, info = running.step(state, clip, observer)
             if folder is None:  # what fails at the first step leaves nothing behind
                 folder = RunFolder.create(path, wanted)
             folder.write_pause(clip, state, info, recording.truth(clip.index))

@@ -20,7 +20,6 @@ __components__ = {
         "residual": "Residual",
         "stratified": "Stratified",
         "systematic": "Systematic",
-        "residual_systematic": "ResidualSystematic",
         "ssp": "Ssp",
         "killing": "Killing",
         "fearnhead_clifford": "FearnheadClifford",
@@ -32,8 +31,8 @@ __components__ = {
         "shuffled": "Shuffled",
         "keep_weights": "KeepWeights",
     },
-    "trigger": {"always": "Always", "ess": "EssBelow", "every": "Every", "never": "Never"},
+    "trigger": {"always": "Always", "ess": "EssBelow", "every": "EveryKth", "never": "Never"},
     "size": {"fixed": "Fixed", "kld": "Kld"},
     "similarity": {"gaussian": "Gaussian"},
-    "equivalence": {"bins": "Bins", "exact": "Exact"},
+    "equivalence": {"bins": "Bins", "exact": "ExactEquality"},
 }

@@ -1,102 +1,132 @@
-from mstfilter.smc.branching import Branching as Branching
-from mstfilter.smc.codecs import ArrayCodec as ArrayCodec
-from mstfilter.smc.collectors import (
+from mstfilter.smc.adapters import as_distribution as as_distribution
+from mstfilter.smc.checkpoint import ArrayCodec as ArrayCodec
+from mstfilter.smc.components import (
+    Branching as Branching,
+    CrossVectors as CrossVectors,
+    ProjectOnto as ProjectOnto,
+    Reweight as Reweight,
+)
+from mstfilter.smc.diagnostics import (
+    History as History,
     collect as collect,
     ess as ess,
     log_evidence as log_evidence,
     mean as mean,
+    n_particles as n_particles,
+    resampled as resampled,
+    run_many as run_many,
     unique_ancestors as unique_ancestors,
     weight_entropy as weight_entropy,
 )
-from mstfilter.smc.continuous import Normal as Normal, Student as Student, Uniform as Uniform
-from mstfilter.smc.discrete import Bernoulli as Bernoulli, Categorical as Categorical, Poisson as Poisson
-from mstfilter.smc.fields import number as number, part as part
-from mstfilter.smc.filters import (
-    PriorityLookahead as PriorityLookahead,
-    auxiliary as auxiliary,
-    guided as guided,
-    resample_move as resample_move,
+from mstfilter.smc.distributions import (
+    Bernoulli as Bernoulli,
+    Categorical as Categorical,
+    Distribution as Distribution,
+    Gamma as Gamma,
+    MultivariateNormal as MultivariateNormal,
+    Normal as Normal,
+    Poisson as Poisson,
+    Student as Student,
+    Uniform as Uniform,
 )
+from mstfilter.smc.diverse_resampling import (
+    ClusterStratified as ClusterStratified,
+    GreedyDiverse as GreedyDiverse,
+    KDpp as KDpp,
+)
+from mstfilter.smc.filter import ParticleFilter as ParticleFilter
 from mstfilter.smc.interfaces import (
     Codec as Codec,
+    Component as Component,
     DensityTransition as DensityTransition,
+    Info as Info,
     Lookahead as Lookahead,
+    Observer as Observer,
     Proposal as Proposal,
     Rejuvenation as Rejuvenation,
     Resampler as Resampler,
     Size as Size,
+    State as State,
     Transition as Transition,
     Trigger as Trigger,
     Update as Update,
+    WeightResampler as WeightResampler,
 )
-from mstfilter.smc.kept_weights import KeepWeights as KeepWeights
-from mstfilter.smc.many import run_many as run_many
-from mstfilter.smc.particle_filter import ParticleFilter as ParticleFilter
+from mstfilter.smc.kalman import (
+    ConditionallyLinear as ConditionallyLinear,
+    Linear as Linear,
+    linear_gaussian as linear_gaussian,
+    rao_blackwellised as rao_blackwellised,
+)
 from mstfilter.smc.population import (
     Candidates as Candidates,
     Population as Population,
     log_mean_exp as log_mean_exp,
     normalise as normalise,
+    union as union,
 )
-from mstfilter.smc.program_runs import per_particle as per_particle
-from mstfilter.smc.program_sites import observe as observe, sample as sample, switch as switch
-from mstfilter.smc.programs import (
+from mstfilter.smc.programs.filters import (
     Program as Program,
     ProgramLookahead as ProgramLookahead,
     ProgramMove as ProgramMove,
 )
-from mstfilter.smc.rao_blackwell import (
-    ConditionallyLinear as ConditionallyLinear,
-    Linear as Linear,
-    rao_blackwellised as rao_blackwellised,
+from mstfilter.smc.programs.sites import (
+    Trace as Trace,
+    observe as observe,
+    per_particle as per_particle,
+    sample as sample,
+    switch as switch,
 )
-from mstfilter.smc.rejuvenation import RandomWalkMove as RandomWalkMove
 from mstfilter.smc.resampling import (
-    Always as Always,
-    EssBelow as EssBelow,
-    Every as Every,
+    Coalesced as Coalesced,
+    FearnheadClifford as FearnheadClifford,
+    KeepWeights as KeepWeights,
+    Killing as Killing,
     Multinomial as Multinomial,
-    Never as Never,
+    ResamplerWrapper as ResamplerWrapper,
     Residual as Residual,
+    Shuffled as Shuffled,
+    Ssp as Ssp,
     Stratified as Stratified,
     Systematic as Systematic,
-)
-from mstfilter.smc.resampling_clusters import ClusterStratified as ClusterStratified
-from mstfilter.smc.resampling_dpp import KDpp as KDpp
-from mstfilter.smc.resampling_greedy import GreedyDiverse as GreedyDiverse
-from mstfilter.smc.resampling_optimal import FearnheadClifford as FearnheadClifford
-from mstfilter.smc.resampling_rounding import Killing as Killing, ResidualSystematic as ResidualSystematic, Ssp as Ssp
-from mstfilter.smc.resampling_wrappers import (
-    Coalesced as Coalesced,
-    Shuffled as Shuffled,
     Tempered as Tempered,
     coalesce as coalesce,
 )
 from mstfilter.smc.similarity import (
     Bins as Bins,
     Equivalence as Equivalence,
-    Exact as Exact,
+    ExactEquality as ExactEquality,
     Gaussian as Gaussian,
     Similarity as Similarity,
     as_matrix as as_matrix,
     first_seen as first_seen,
 )
-from mstfilter.smc.sizes import Fixed as Fixed, Kld as Kld
 from mstfilter.smc.smoothing import (
+    Record as Record,
     backward_paths as backward_paths,
     fixed_lag as fixed_lag,
     genealogy as genealogy,
     keep as keep,
 )
-from mstfilter.smc.state import Info as Info, State as State
 from mstfilter.smc.state_space import (
     Dynamics as Dynamics,
+    GuidedInitial as GuidedInitial,
+    GuidedTransition as GuidedTransition,
     Prior as Prior,
+    PriorityLookahead as PriorityLookahead,
+    RandomWalkMove as RandomWalkMove,
     StateSpaceModel as StateSpaceModel,
+    auxiliary as auxiliary,
     bootstrap as bootstrap,
-    linear_gaussian as linear_gaussian,
+    guided as guided,
+    resample_move as resample_move,
 )
 from mstfilter.smc.streams import Key as Key, child as child, key_of as key_of
-from mstfilter.smc.updates import Reweight as Reweight, union as union
-from mstfilter.smc.vectors import CrossVectors as CrossVectors, ProjectOnto as ProjectOnto
-from mstfilter.smc.watch import Watch as Watch, telling as telling
+from mstfilter.smc.triggers import (
+    Always as Always,
+    EssBelow as EssBelow,
+    EveryKth as EveryKth,
+    Fixed as Fixed,
+    Kld as Kld,
+    Never as Never,
+)

@@ -4,9 +4,9 @@
 >>> as_distribution(stats.norm(0.0, 2.0)).sample(np.random.default_rng(0), 3).shape
 (3,)
 
-Neither library is imported here: an object is known by the module of its class. torch draws with a generator of its
-own, global one; so torch distributions are drawn through the inverse of their distribution function, at uniforms
-from ours. Categorical and Bernoulli ones, which have no inverse, are drawn from their probabilities.
+Neither library is imported here: an object is recognised by the module of its class. torch draws from a global
+generator, so torch distributions are drawn by their inverse distribution function at uniforms of our generator, and
+categorical and Bernoulli ones, which have no inverse, from their probabilities.
 """
 
 from __future__ import annotations
@@ -18,19 +18,18 @@ from typing import Any
 import numpy as np
 
 from mstfilter.errors import InputError
-from mstfilter.smc.distribution import sum_rows
-from mstfilter.smc.distributions import Bernoulli, Categorical, Distribution, Poisson
+from mstfilter.smc.distributions import Bernoulli, Categorical, Distribution, Poisson, sum_rows
 
 __all__ = ["FromScipy", "FromTorch", "as_distribution"]
 
 
 def as_distribution(value: Any) -> Distribution:
-    """A distribution of this package from one of ours, of scipy.stats (frozen or new style) or of torch.
+    """Convert a distribution of this package, of scipy.stats (frozen or new style) or of torch.
 
     Raises
     ------
     InputError
-        Where `value` is no distribution, or one of torch that cannot be drawn with our generator.
+        If `value` is not a distribution.
     """
     if isinstance(value, Distribution):
         return value
@@ -41,8 +40,8 @@ def as_distribution(value: Any) -> Distribution:
         return _from_torch(value)
     raise InputError(
         f"expected a distribution, found a {type(value).__module__}.{type(value).__qualname__}",
-        "use mstfilter.smc.distributions, a frozen scipy.stats distribution, or one of torch.distributions",
-        "or subclass mstfilter.smc.distributions.Distribution",
+        "use one of mstfilter.smc, a frozen one of scipy.stats, or one of torch.distributions",
+        "or subclass mstfilter.smc.Distribution",
     )
 
 
@@ -53,19 +52,18 @@ class FromScipy(Distribution):
     Parameters
     ----------
     wrapped : object
-        The distribution; array parameters have one row a particle.
+        The distribution; array parameters have one row per particle.
     """
 
     wrapped: Any
 
     @cached_property
-    def discrete(self) -> bool:  # type: ignore[override]
+    def discrete(self) -> bool:
         """Whether it has probabilities instead of a density."""
         return "pmf" in dir(self.wrapped) and "discrete" in type(self.wrapped).__name__
 
     @cached_property
-    def _vectors(self) -> bool:
-        """Whether a draw is a vector."""
+    def _is_multivariate(self) -> bool:
         return type(self.wrapped).__module__.endswith("_multivariate")
 
     @cached_property
@@ -73,36 +71,32 @@ class FromScipy(Distribution):
         return not type(self.wrapped).__module__.endswith(("_multivariate", "_distn_infrastructure"))
 
     def sample(self, rng: np.random.Generator, size: int) -> np.ndarray:
-        """Draw."""
         wrapped = self.wrapped
-        if self._vectors:
+        if self._is_multivariate:
             return np.reshape(wrapped.rvs(size=size, random_state=rng), (size, -1))
         inner = np.shape(wrapped.mean())
         _check_rows(inner, size)
-        if self._new_style:  # its shape comes on top of that of the parameters
-            own = bool(inner) and inner[0] == size
-            drawn = np.asarray(wrapped.sample(() if own else (size,), rng=rng))
-            return drawn if own or not inner else drawn[:, 0]
+        if self._new_style:  # its shape is added to that of the parameters
+            has_rows = bool(inner) and inner[0] == size
+            drawn = np.asarray(wrapped.sample(() if has_rows else (size,), rng=rng))
+            return drawn if has_rows or not inner else drawn[:, 0]
         return np.asarray(wrapped.rvs(size=(size, *inner[1:]), random_state=rng))
 
     def log_prob(self, value: Any) -> np.ndarray:
-        """Log density or probability."""
         wrapped = self.wrapped
-        if self._vectors:
+        if self._is_multivariate:
             return np.asarray(wrapped.logpdf(value))
         return sum_rows(wrapped.logpmf(value) if self.discrete else wrapped.logpdf(value))
 
     @property
     def mean(self) -> np.ndarray:
-        """Mean."""
         mean = self.wrapped.mean
         return np.asarray(mean() if callable(mean) else mean)
 
     @property
     def sd(self) -> np.ndarray:
-        """Standard deviation."""
         wrapped = self.wrapped
-        if self._vectors:
+        if self._is_multivariate:
             return np.sqrt(np.diagonal(wrapped.cov))
         return np.asarray(wrapped.standard_deviation() if self._new_style else wrapped.std())
 
@@ -135,13 +129,12 @@ class FromTorch(Distribution):
     Parameters
     ----------
     wrapped : torch.distributions.Distribution
-        Parameters have one row a particle, or none.
+        Parameters have one row per particle, or no rows.
     """
 
     wrapped: Any
 
     def sample(self, rng: np.random.Generator, size: int) -> np.ndarray:
-        """Draw."""
         import torch
 
         inner = tuple(self.wrapped.batch_shape)
@@ -153,11 +146,10 @@ class FromTorch(Distribution):
         except NotImplementedError:
             raise InputError(
                 f"torch's {type(self.wrapped).__name__} has no icdf, so it cannot be drawn reproducibly",
-                "use the one of mstfilter.smc.distributions or of scipy.stats",
+                "use the one of mstfilter.smc or of scipy.stats",
             ) from None
 
     def log_prob(self, value: Any) -> np.ndarray:
-        """Log density."""
         import torch
 
         found = self.wrapped.log_prob(torch.as_tensor(np.ascontiguousarray(value)))
@@ -165,10 +157,8 @@ class FromTorch(Distribution):
 
     @property
     def mean(self) -> np.ndarray:
-        """Mean."""
         return np.asarray(self.wrapped.mean)
 
     @property
     def sd(self) -> np.ndarray:
-        """Standard deviation."""
         return np.asarray(self.wrapped.stddev)

@@ -1,10 +1,14 @@
-"""The state of a run on disk: written after every step, taken up in a new process to the identical result.
+"""Storing the state of a run, so that a new process continues it to the identical result.
 
->>> state, infos = filter.run(observations, seed=0, checkpoint="run.npz")     # killed? run it again
+>>> state, infos = filter.run(observations, seed=0, checkpoint="run.npz")     # run it again after an interruption
 
-The file is an .npz of plain arrays (`allow_pickle=False`). It is written under a temporary name and renamed, so a
-process that is killed at any moment leaves the state of one whole step or of the one before. What is drawn depends on
-the seed and the step alone, so the rest of the run is that of a run that was never stopped.
+The file is an .npz of plain arrays, read and written without pickle. It is written under a temporary name and
+renamed, so that a process that is killed leaves the state of a complete step. All draws depend on the seed and the
+step only, so a continued run equals an uninterrupted one.
+
+`ArrayCodec` stores particles that are arrays, mappings of arrays, and sequences of dataclasses or traces whose fields
+are arrays, numbers, strings or None. A dataclass is found by its name among the loaded modules; stored data never
+import code. Particles of another kind need your own `Codec`.
 """
 
 from __future__ import annotations
@@ -12,25 +16,24 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
+import sys
 import zipfile
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from mstfilter.errors import InputError
-from mstfilter.smc.codecs import ArrayCodec
-from mstfilter.smc.interfaces import Codec
+from mstfilter.files import atomic_path
+from mstfilter.smc.interfaces import Codec, State
 from mstfilter.smc.population import Population
-from mstfilter.smc.state import State
+from mstfilter.smc.programs.sites import Trace
 from mstfilter.smc.streams import Key
 
-if TYPE_CHECKING:
-    from mstfilter.smc.particle_filter import ParticleFilter
+__all__ = ["ArrayCodec", "Checkpoint", "load_state", "save_state"]
 
-__all__ = ["Checkpoint", "load_state", "save_state"]
-
-FORMAT = 1
+_FORMAT = 1
 
 
 def save_state(path: Path, state: State, codec: Codec | None = None, **description: Any) -> None:
@@ -56,7 +59,7 @@ def save_state(path: Path, state: State, codec: Codec | None = None, **descripti
     if population is None:
         raise InputError("a state without particles cannot be stored", "store it after a step")
     head = {
-        "format": FORMAT,
+        "format": _FORMAT,
         "t": state.t,
         "seed": state.key.seed,
         "path": list(state.key.path),
@@ -69,13 +72,11 @@ def save_state(path: Path, state: State, codec: Codec | None = None, **descripti
         **{f"parents/{name}": index for name, index in population.parents.items()},
         **{f"particles/{name}": a for name, a in (codec or ArrayCodec()).encode(population.particles).items()},
     }
-    partial = path.with_name(f".{path.name}.partial")
     try:
-        with partial.open("wb") as file:
+        with atomic_path(path) as partial, partial.open("wb") as file:
             np.savez(file, allow_pickle=False, **arrays)
             file.flush()
             os.fsync(file.fileno())
-        os.replace(partial, path)
     except OSError as error:
         raise InputError(f"cannot write checkpoint {path}: {error.strerror}") from error
 
@@ -90,8 +91,8 @@ def load_state(path: Path, codec: Codec | None = None) -> tuple[State, dict[str,
         raise InputError(f"checkpoint is missing: {path}") from None
     except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile) as error:
         raise InputError(f"checkpoint cannot be read: {path} ({error})", "remove it to start anew") from error
-    if head.get("format") != FORMAT:
-        raise InputError(f"checkpoint {path} has format {head.get('format')}, expected {FORMAT}")
+    if head.get("format") != _FORMAT:
+        raise InputError(f"checkpoint {path} has format {head.get('format')}, expected {_FORMAT}")
     particles = (codec or ArrayCodec()).decode(_below(arrays, "particles/"))
     population = Population(particles, arrays["log_weights"], _below(arrays, "parents/"))
     key = Key(head["seed"], tuple(head["path"]))
@@ -117,11 +118,11 @@ class Checkpoint:
     path: Path
     codec: Codec | None = None
 
-    def save(self, filter: ParticleFilter, state: State) -> None:
+    def save(self, filter: Any, state: State) -> None:
         """Write the state of a run of `filter`."""
         save_state(self.path, state, self.codec, filter=_outline(filter))
 
-    def load(self, filter: ParticleFilter, start: State) -> State | None:
+    def load(self, filter: Any, start: State) -> State | None:
         """The state to go on from; None where nothing is stored.
 
         Raises
@@ -148,7 +149,7 @@ class Checkpoint:
         return state
 
 
-def _outline(filter: ParticleFilter) -> dict[str, Any]:
+def _outline(filter: Any) -> dict[str, Any]:
     """What can be said of a filter without knowing its models: its components with their plain fields, its sizes."""
     return {
         field.name: _plain(value)
@@ -180,3 +181,141 @@ def _difference(what: str, found: Any, wanted: Any) -> tuple[str, Any, Any] | No
                 return first
         return None
     return None if found == wanted else (what, found, wanted)
+
+
+_FORM = "form"
+
+
+@dataclasses.dataclass(frozen=True)
+class ArrayCodec(Codec):
+    """Arrays, mappings of arrays, and sequences of dataclasses or traces of arrays.
+
+    Parameters
+    ----------
+    particle : type, optional
+        The dataclass of the particles, where it cannot be found by name (it is defined inside a function).
+    """
+
+    particle: type | None = None
+
+    def encode(self, particles: Any) -> dict[str, np.ndarray]:
+        """Named arrays; ``form`` says in JSON what they were."""
+        if isinstance(particles, np.ndarray):
+            return {_FORM: _json({"kind": "array"}), "x": _storable(particles, "the particles")}
+        if isinstance(particles, Mapping):
+            arrays = {f"x/{name}": _storable(np.asarray(a), f"{name!r}") for name, a in particles.items()}
+            return {_FORM: _json({"kind": "mapping", "names": list(particles)}), **arrays}
+        return self._encode_objects(particles)
+
+    def _encode_objects(self, particles: Sequence[Any]) -> dict[str, np.ndarray]:
+        kind = type(particles[0])
+        if any(type(p) is not kind for p in particles):
+            names = sorted({type(p).__qualname__ for p in particles})
+            raise InputError(f"particles of several types cannot be stored: {', '.join(names)}", _HINT)
+        if kind is Trace:
+            rows, form = [dict(p) for p in particles], {"kind": "traces"}
+        elif dataclasses.is_dataclass(kind):
+            rows = [{f.name: getattr(p, f.name) for f in dataclasses.fields(kind)} for p in particles]
+            form = {"kind": "dataclass", "type": f"{kind.__module__}:{kind.__qualname__}"}
+            if self.particle is not kind:
+                _find(form["type"], kind)
+        else:
+            raise InputError(f"particles of type {kind.__qualname__} cannot be stored", _HINT)
+        # Shared objects are stored once: resampled particles are references.
+        first: dict[int, int] = {}
+        index: list[int] = []
+        described: list[dict[str, Any]] = []
+        arrays: dict[str, np.ndarray] = {}
+        for particle, row in zip(particles, rows, strict=True):
+            k = first.setdefault(id(particle), len(first))
+            index.append(k)
+            if k < len(described):
+                continue
+            fields = {}
+            for name, value in row.items():
+                what = f"field {name!r} of {kind.__qualname__}"
+                fields[name] = _describe(value, what)
+                if isinstance(value, (np.ndarray, np.generic)):
+                    arrays[f"x/{k}/{name}"] = _storable(np.asarray(value), what)
+            described.append(fields)
+        arrays["index"] = np.array(index, np.int64)
+        return {_FORM: _json({**form, "rows": described}), **arrays}
+
+    def decode(self, arrays: Mapping[str, np.ndarray]) -> Any:
+        """The particles."""
+        form = json.loads(str(arrays[_FORM]))
+        if form["kind"] == "array":
+            return arrays["x"]
+        if form["kind"] == "mapping":
+            return {name: arrays[f"x/{name}"] for name in form["names"]}
+        make: Any = Trace
+        if form["kind"] == "dataclass":
+            cls = self.particle or _find(form["type"])
+
+            def make(row: dict[str, Any]) -> Any:
+                return cls(**row)
+
+        made = []
+        for k, fields in enumerate(form["rows"]):
+            row = {name: _restore(how, arrays.get(f"x/{k}/{name}")) for name, how in fields.items()}
+            made.append(make(row))
+        return tuple(made[k] for k in arrays["index"].tolist())
+
+
+_HINT = "pass codec= a mstfilter.smc.interfaces.Codec that stores them as arrays"
+
+
+def _describe(value: Any, what: str) -> Any:
+    """A value as JSON: arrays by kind, tuples and dicts marked, the rest as it is (JSON keeps floats exactly)."""
+    if isinstance(value, np.ndarray):
+        return {"is": "array"}
+    if isinstance(value, np.generic):
+        return {"is": "number"}
+    if isinstance(value, tuple):
+        return {"is": "tuple", "of": [_describe(v, what) for v in value if not _is_array(v, what)]}
+    if value is None or isinstance(value, (str, bool, int, float)):
+        return value
+    raise InputError(f"{what} is of type {type(value).__qualname__}, which cannot be stored", _HINT)
+
+
+def _is_array(value: Any, what: str) -> bool:
+    if isinstance(value, (np.ndarray, np.generic)):
+        raise InputError(f"{what} is a tuple that holds arrays, which cannot be stored", _HINT)
+    return False
+
+
+def _restore(described: Any, array: np.ndarray | None) -> Any:
+    if not isinstance(described, dict):
+        return described
+    if described["is"] == "tuple":
+        return tuple(_restore(v, None) for v in described["of"])
+    assert array is not None
+    if described["is"] == "number":
+        return array[()]
+    array.flags.writeable = False
+    return array
+
+
+def _storable(array: np.ndarray, what: str) -> np.ndarray:
+    if array.dtype.hasobject:
+        raise InputError(f"{what} is an array of Python objects, which cannot be stored", _HINT)
+    return array
+
+
+def _json(value: Any) -> np.ndarray:
+    return np.array(json.dumps(value))
+
+
+def _find(location: str, expected: type | None = None) -> type:
+    """A dataclass by name among the modules that are loaded already."""
+    module, _, path = location.partition(":")
+    found: Any = sys.modules.get(module)
+    for part in path.split("."):
+        found = getattr(found, part, None)
+    usable = isinstance(found, type) and dataclasses.is_dataclass(found)
+    if not usable or (expected is not None and found is not expected):
+        raise InputError(
+            f"dataclass {location} cannot be found by its name",
+            "define it at the top of a module that is imported before, or pass codec=ArrayCodec(TheClass)",
+        )
+    return found

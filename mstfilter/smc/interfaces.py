@@ -1,13 +1,12 @@
-"""What a particle filter is made of. Subclass these to make it yours.
+"""Interfaces of the components of a particle filter, and its `State` and `Info`.
 
-A component is a frozen dataclass: its fields are hyperparameters, its behaviour is one method. The generator
-is the first argument of whatever draws. All work on whole populations, so a component can share work over
+A component is a frozen dataclass: its fields are hyperparameters, its behaviour is one method. Methods that draw
+take the generator as first argument. All methods work on whole populations, so a component can share work between
 particles.
 
 >>> from dataclasses import dataclass
 >>> import numpy as np
->>> from mstfilter.smc.interfaces import Transition
->>> from mstfilter.smc.population import Population
+>>> from mstfilter.smc import Population, Transition
 >>> @dataclass(frozen=True)
 ... class RandomWalk(Transition):
 ...     scale: float = 1.0
@@ -16,56 +15,75 @@ particles.
 ...         step = self.scale * rng.standard_normal(population.particles.shape)
 ...         return Population(population.particles + step, population.log_weights)
 
-A guided move, which draws from q(x_t | x_{t-1}, y_t) instead of the model's f(x_t | x_{t-1}), is a Transition
-too: it sees the observation, and it adds log f - log q to the log weights
-(`mstfilter.smc.state_space.GuidedTransition` does so for any model and proposal with densities).
+A guided transition draws from q(x_t | x_{t-1}, y_t) instead of the model's f(x_t | x_{t-1}), and adds log f - log q
+to the log weights (`mstfilter.smc.GuidedTransition` does so for any model with densities).
 
-Needed by every filter: Proposal (or an initial one), Transition, Update, Resampler, Trigger. Optional: `Size`
-(how many particles to keep), `Lookahead` (auxiliary filter), `Rejuvenation` (resample-move), `Codec` (how
-particles of your own are stored). A further ability is a further interface: `DensityTransition`.
+Every filter needs a `Proposal` for its first particles, a `Resampler` and a `Trigger`; most have a `Transition` and
+an `Update`. Optional are `Size` (number of particles), `Lookahead` (auxiliary filter), `Rejuvenation`
+(resample-move) and `Codec` (checkpoints of your own particle type). An interface for an additional ability extends
+another one: `DensityTransition`, `WeightResampler`.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
-from typing import Any, ClassVar
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
 from mstfilter.smc.population import Population
+from mstfilter.smc.streams import Key
 
 __all__ = [
     "Codec",
     "Component",
     "DensityTransition",
+    "Info",
     "Lookahead",
+    "Observer",
     "Proposal",
     "Rejuvenation",
     "Resampler",
     "Size",
+    "State",
     "Transition",
     "Trigger",
     "Update",
+    "WeightResampler",
 ]
+
+#: ``observer(slot, begins)`` is called when the component in a slot of a filter begins and ends its work.
+Observer = Callable[[str, bool], None]
 
 
 class Component(ABC):
-    """Anything that takes part in a step."""
+    """A component that takes part in a step.
 
-    #: Whether the weights that it leaves behind are those of an exact filter (in expectation). The log evidence
-    #: is reported only where all components say so.
-    properly_weighted: ClassVar[bool] = True
-    #: Whether it draws at all. One that says False is given a generator of fixed seed, which it must not use.
-    draws: ClassVar[bool] = True
+    The two properties can be overridden by class attributes: ``properly_weighted = False``.
+    """
+
+    @property
+    def properly_weighted(self) -> bool:
+        """Whether the weights after it are those of an exact filter, in expectation.
+
+        The log evidence is reported only if this holds for all components.
+        """
+        return True
+
+    @property
+    def draws(self) -> bool:
+        """Whether it uses the generator. If False, it gets a generator that it must not use."""
+        return True
 
 
 class Proposal(Component):
-    """New particles from the observation alone."""
+    """Draws particles from the observation alone."""
 
     @abstractmethod
     def sample(self, rng: np.random.Generator, observation: Any, n: int) -> Population:
-        """Draw `n` particles; a proposal that has fewer distinct ones repeats them."""
+        """Draw `n` particles, repeating some if there are fewer distinct ones."""
 
 
 class Transition(Component):
@@ -73,11 +91,11 @@ class Transition(Component):
 
     @abstractmethod
     def predict(self, rng: np.random.Generator, population: Population, observation: Any) -> Population:
-        """Move all particles. `observation` is None where it is missing."""
+        """Move all particles. `observation` is None if it is missing."""
 
 
 class DensityTransition(Transition):
-    """A transition whose density is known, for moves, smoothing and importance weights."""
+    """A transition with a known density, for moves, smoothing and importance weights."""
 
     @abstractmethod
     def log_prob(self, previous: Any, new: Any, observation: Any) -> np.ndarray:
@@ -86,19 +104,19 @@ class DensityTransition(Transition):
         Parameters
         ----------
         previous, new : n particles each
-            Paired rows: row i of `new` was reached from row i of `previous`.
+            Row i of `new` was reached from row i of `previous`.
         observation : Any
-            The observation that `predict` was given with the move; None where it is missing.
+            The observation given to `predict`; None if it is missing.
 
         Returns
         -------
         (n,) float64
-            log f(new_i | previous_i); -inf where the move is impossible.
+            log f(new_i | previous_i); -inf if the move is impossible.
         """
 
 
 class Update(Component):
-    """Brings in the observation: weights particles, projects them, or makes new ones out of two."""
+    """Uses the observation: weights particles, projects them, or makes new ones from pairs."""
 
     @abstractmethod
     def update(
@@ -108,29 +126,37 @@ class Update(Component):
         proposed: Population | None,
         observation: Any,
     ) -> Population:
-        """Particles after the observation; any number of them.
+        """Any number of particles, from the predicted and the proposed ones.
 
         Parameters
         ----------
         rng : Generator
-            For whatever is drawn.
         predicted : Population or None
             The moved particles; None at the first step of a filter that starts from its proposal.
         proposed : Population or None
-            New particles; None where the filter has no proposal. At least one of the two is there.
+            New particles; None if the filter has no proposal. At least one of the two is given.
         observation : Any
-            The observation.
         """
 
 
 class Resampler(Component):
-    """Selects particles by weight. Three lines make one: override `select`.
+    """Selects particles by weight.
 
-    Override `resample` instead where the scheme looks at the particles.
+    A scheme that needs only the weights is a `WeightResampler`.
     """
 
-    #: Whether `n` particles come out in any case. A scheme without duplicates returns fewer where fewer have weight.
-    exact_size: ClassVar[bool] = True
+    @property
+    def exact_size(self) -> bool:
+        """Whether the result always has `n` particles. Schemes without duplicates may return fewer."""
+        return True
+
+    @abstractmethod
+    def resample(self, rng: np.random.Generator, population: Population, n: int) -> Population:
+        """Select `n` particles; ``parents["ancestor"]`` of the result are their (n,) indices in `population`."""
+
+
+class WeightResampler(Resampler):
+    """A resampler that needs only the weights of the particles."""
 
     @abstractmethod
     def select(
@@ -141,54 +167,49 @@ class Resampler(Component):
         Parameters
         ----------
         rng : Generator
-            For whatever is drawn.
         log_weights : (m,) float64
             Unnormalised; finite or -inf, at least one finite.
         n : int
-            How many to choose.
+            Number of ancestors.
 
         Returns
         -------
         ancestors : (n,) int
             Indices into the m particles.
         log_weights : (n,) float or None
-            Log weights after selection. None says equal weights: each gets the log mean of the old ones, which
-            keeps the evidence.
+            Log weights of the selected particles. None: equal weights, the log mean of the old ones, which keeps
+            the evidence.
         """
 
     def resample(self, rng: np.random.Generator, population: Population, n: int) -> Population:
-        """Select from a population; `parents["ancestor"]` (n,) says which particle each one was."""
+        """Select particles by `select`."""
         ancestors, log_weights = self.select(rng, population.log_weights, n)
         if log_weights is None:
             log_weights = np.full(len(ancestors), population.log_mean_weight)
-        chosen = population.take(ancestors, log_weights)
-        return chosen.labelled({**chosen.parents, "ancestor": np.asarray(ancestors, dtype=np.int64)}, chosen.notes)
+        return population.select(ancestors, log_weights)
 
 
 class Trigger(ABC):
-    """Decides whether to resample at a step."""
+    """Decides whether a step resamples."""
 
     @abstractmethod
     def wants(self, population: Population, t: int) -> bool:
-        """True to resample."""
+        """True to resample at step `t`."""
 
 
 class Size(ABC):
-    """Decides how many particles a resampling makes."""
+    """Chooses the number of particles of a resampling. The filter then only starts with `n` particles."""
 
     @abstractmethod
     def choose(self, population: Population) -> int:
-        """Number of particles (at least 1), from the weighted particles that are about to be resampled.
-
-        The filter's `n` is then only the number that it starts with.
-        """
+        """Number of particles (at least 1), from the weighted particles that are about to be resampled."""
 
 
 class Lookahead(Component):
-    """A glance at the next observation before particles are selected: the auxiliary filter.
+    """Evaluates the next observation before particles are selected (auxiliary filter).
 
-    The driver selects by log weight + priority and takes the priority off the selected weights again, so any
-    priority leaves the filter exact; a good one is close to log p(y_t | x_{t-1}).
+    The filter selects by log weight + priority and subtracts the priority from the selected log weights, so the
+    filter is exact for any priority; a good one is close to log p(y_t | x_{t-1}).
     """
 
     @abstractmethod
@@ -197,7 +218,7 @@ class Lookahead(Component):
 
 
 class Rejuvenation(Component):
-    """Moves particles at the end of a step that resampled, by a kernel that keeps their law: resample-move."""
+    """Moves particles at the end of a step that resampled, by a kernel that keeps their law (resample-move)."""
 
     @abstractmethod
     def move(
@@ -207,34 +228,108 @@ class Rejuvenation(Component):
         previous: Population | None,
         observation: Any,
     ) -> Population:
-        """Move x_t without changing what it is distributed as.
+        """Move x_t without changing its distribution.
 
         Parameters
         ----------
         rng : Generator
-            For whatever is drawn.
         population : Population
             Weighted particles x_t after the observation.
         previous : Population or None
             Their x_{t-1}, row by row; None at the first step.
         observation : Any
-            y_t; None where it is missing.
+            y_t; None if it is missing.
 
         Returns
         -------
         Population
-            As many particles in the same order, moved by a kernel that leaves p(x_t | x_{t-1}, y_t) invariant;
-            log weights unchanged.
+            As many particles in the same order, moved by a kernel that leaves p(x_t | x_{t-1}, y_t) invariant; log
+            weights unchanged.
         """
 
 
 class Codec(ABC):
-    """Stores particles as named arrays and makes them again, bit for bit. No pickle."""
+    """Converts particles to named arrays and back, bit for bit, without pickle."""
 
     @abstractmethod
     def encode(self, particles: Any) -> Mapping[str, np.ndarray]:
-        """Named arrays (no object arrays) of a population's particles."""
+        """Named arrays (no object arrays) of the particles of a population."""
 
     @abstractmethod
     def decode(self, arrays: Mapping[str, np.ndarray]) -> Any:
         """The particles of `encode`."""
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """Everything that a filter needs to continue.
+
+    Parameters
+    ----------
+    t : int
+        Number of observations so far.
+    population : Population or None
+        The particles after the last observation; None before the first.
+    key : Key
+        Names the random streams of the run.
+    properly_weighted : bool
+        Whether the weights are those of an exact filter.
+    """
+
+    t: int
+    population: Population | None
+    key: Key
+    properly_weighted: bool = True
+
+    @property
+    def log_evidence(self) -> float | None:
+        """Log of the unbiased estimate of p(y_1 .. y_t); None if a component is not properly weighted."""
+        if not self.properly_weighted:
+            return None
+        return 0.0 if self.population is None else self.population.log_mean_weight
+
+
+@dataclass(frozen=True, eq=False)
+class Info:
+    """Record of a step.
+
+    Parameters
+    ----------
+    t : int
+        Index of the observation, from 0.
+    n : int
+        Particles after the step.
+    n_candidates : int
+        Particles after the update, before the resampling that follows it.
+    ess : float
+        Effective sample size after the update, before the resampling that follows it.
+    resampled : bool
+        Whether the step resampled.
+    ancestors : (n,) int
+        Index among the candidates of each particle, if the step resampled after the update; else 0 .. n-1.
+    parents : mapping
+        ``"previous"`` and ``"proposed"`` parents of the particles after the step, if known.
+    log_weights : (n,) float
+        After the step.
+    notes : mapping
+        Notes of the components, by slot.
+    seconds : mapping
+        Wall time by slot. Not reproducible.
+    """
+
+    t: int
+    n: int
+    n_candidates: int
+    ess: float
+    resampled: bool
+    ancestors: np.ndarray
+    parents: Mapping[str, np.ndarray]
+    log_weights: np.ndarray
+    notes: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    seconds: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def unique_ancestors(self) -> int:
+        """Number of particles of the previous population that have descendants."""
+        previous = self.parents.get("previous")
+        return 0 if previous is None else len(np.unique(previous[previous >= 0]))

@@ -1,20 +1,18 @@
 """Weighted particles.
 
 >>> import numpy as np
->>> from mstfilter.smc.population import Population
+>>> from mstfilter.smc import Population
 >>> population = Population(np.array([0.0, 1.0, 2.0]), np.log([1.0, 1.0, 2.0]))
 >>> population.weights
 array([0.25, 0.25, 0.5 ])
 >>> round(population.ess, 3)
 2.667
 
-Particles are an array (n, ...), a mapping of arrays (n, ...), a tuple of frozen objects, or `Candidates` that
-are built only when someone looks at them. `take` selects from any of them: rows of arrays are copied, objects are
-shared, so a duplicate costs a reference.
+Particles are an array (n, ...), a mapping of arrays (n, ...), a tuple of frozen objects, or `Candidates`, which are
+built when they are accessed. `take` selects from any of these: rows of arrays are copied, objects are shared.
 
-Nobody can write to a population, but it does not copy what it is made of: its arrays are read-only views. Who keeps
-an array, makes a population of it, and writes to that array afterwards changes the population too. Components make
-new arrays at every step; hand in ``array.copy()`` where you go on writing to yours.
+A population is immutable, but it does not copy the arrays that it is given: it holds read-only views of them. Do not
+write to an array after a population was made from it; pass ``array.copy()`` if you need to.
 """
 
 from __future__ import annotations
@@ -22,20 +20,33 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from typing import Any, Generic, TypeVar
 
 import numpy as np
 
 from mstfilter.errors import InputError
 
-__all__ = ["Candidates", "Population", "effective_sample_size", "log_mean_exp", "normalise"]
+__all__ = [
+    "Candidates",
+    "Particles",
+    "Population",
+    "count_particles",
+    "identity",
+    "log_mean_exp",
+    "normalise",
+    "take",
+    "union",
+]
 
-T = TypeVar("T")
-U = TypeVar("U")
+_T = TypeVar("_T")
+_U = TypeVar("_U")
+
+Particles = Any  # ndarray (n, ...) | mapping name -> ndarray (n, ...) | sequence of objects
 
 
 def log_mean_exp(log_weights: np.ndarray) -> float:
-    """``log(mean(exp(log_weights)))`` without overflow; -inf where all are."""
+    """``log(mean(exp(log_weights)))`` without overflow; -inf if all are -inf."""
     top = np.max(log_weights)
     if top == -np.inf:
         return -np.inf
@@ -44,41 +55,40 @@ def log_mean_exp(log_weights: np.ndarray) -> float:
 
 
 def normalise(log_weights: np.ndarray) -> np.ndarray:
-    """Weights (n,) that sum to one from unnormalised log weights (n,)."""
+    """Weights (n,) that sum to one, from unnormalised log weights (n,)."""
     lw = np.asarray(log_weights, dtype=np.float64)
     weights = np.exp(lw - lw.max())
     return weights / weights.sum()
 
 
-def effective_sample_size(log_weights: np.ndarray) -> float:
-    """``(sum w)^2 / sum w^2``, between 1 and n."""
-    lw = np.asarray(log_weights, dtype=np.float64)
-    weights = lw - lw.max()
-    np.exp(weights, out=weights)
-    return float(weights.sum() ** 2 / (weights @ weights))
+@lru_cache(maxsize=8)
+def identity(n: int) -> np.ndarray:
+    """0 .. n-1, read-only and shared: the parents of particles that kept their positions."""
+    index = np.arange(n)
+    index.flags.writeable = False
+    return index
 
 
-class Candidates(Sequence[T], Generic[T]):
-    """Particles that are built when they are looked at.
+class Candidates(Sequence[_T], Generic[_T]):
+    """Particles that are built when they are accessed.
 
-    In MST a candidate's weight depends only on the pair it is made from, so the candidates need not exist to be
-    resampled. `build(i)` makes candidate i from stored keys alone: building twice gives the same thing, and
-    what was built is kept.
+    In MST the weight of a candidate depends only on the pair that it is made from, so candidates can be resampled
+    before they are built. What was built is kept.
 
     Parameters
     ----------
     build : callable
-        ``build(index) -> particle`` for the indices below.
-    indices : (n,) int array
-        Which candidates, in order; the same one may occur more than once.
+        ``build(index) -> particle``. It must return the same particle at every call with the same index.
+    indices : (n,) int array, or int
+        The candidates, in order; an index may occur more than once. An integer n stands for 0 .. n-1.
     """
 
     def __init__(
-        self, build: Callable[[int], T], indices: np.ndarray | int, _built: dict[int, T] | None = None
+        self, build: Callable[[int], _T], indices: np.ndarray | int, _built: dict[int, _T] | None = None
     ) -> None:
         self._build = build
         self._indices = np.arange(indices) if isinstance(indices, (int, np.integer)) else np.asarray(indices)
-        self._built: dict[int, T] = {} if _built is None else _built
+        self._built: dict[int, _T] = {} if _built is None else _built
 
     def __len__(self) -> int:
         return len(self._indices)
@@ -91,36 +101,25 @@ class Candidates(Sequence[T], Generic[T]):
             self._built[index] = self._build(index)
         return self._built[index]
 
-    def __iter__(self) -> Iterator[T]:
+    def __iter__(self) -> Iterator[_T]:
         return (self[i] for i in range(len(self)))
 
     @property
     def n_built(self) -> int:
-        """How many distinct candidates have been built so far (shared by all selections)."""
+        """Number of distinct candidates built so far, shared by all selections."""
         return len(self._built)
 
-    def take(self, positions: np.ndarray) -> Candidates[T]:
-        """Some of them, still unbuilt; what is built already is shared."""
+    def take(self, positions: np.ndarray) -> Candidates[_T]:
+        """Select candidates without building them."""
         return Candidates(self._build, self._indices[np.asarray(positions)], self._built)
 
-    def map(self, function: Callable[[T], U]) -> Candidates[U]:
-        """Candidates of ``function(candidate)``, still unbuilt."""
-        own = Candidates(self._build, len(self._indices), self._built)
-        parent = self._indices
-
-        def build(position: int) -> U:
-            index = int(parent[position])
-            if index not in own._built:
-                own._built[index] = own._build(index)
-            return function(own._built[index])
-
-        return Candidates(build, len(parent))
+    def map(self, function: Callable[[_T], _U]) -> Candidates[_U]:
+        """Candidates of ``function(candidate)``, not built."""
+        return Candidates(lambda position: function(self[position]), len(self))
 
 
-Particles = Any  # ndarray (n, ...) | mapping name -> ndarray (n, ...) | sequence of objects
-
-
-def _count(particles: Particles) -> int:
+def count_particles(particles: Particles) -> int:
+    """Number of particles; raises InputError if arrays of a mapping have different lengths."""
     if isinstance(particles, Mapping):
         sizes = {name: len(a) for name, a in particles.items()}
         if len(set(sizes.values())) != 1:
@@ -129,7 +128,19 @@ def _count(particles: Particles) -> int:
     return len(particles)
 
 
+def take(particles: Particles, indices: np.ndarray) -> Particles:
+    """Select particles by index; objects are shared, not copied."""
+    if isinstance(particles, np.ndarray):
+        return particles[indices]
+    if isinstance(particles, Mapping):
+        return {name: a[indices] for name, a in particles.items()}
+    if isinstance(particles, Candidates):
+        return particles.take(indices)
+    return tuple(particles[int(i)] for i in indices)
+
+
 def _freeze(particles: Particles) -> Particles:
+    """Read-only views of arrays, a tuple of objects."""
     if isinstance(particles, np.ndarray):
         view = particles.view()
         view.flags.writeable = False
@@ -141,22 +152,10 @@ def _freeze(particles: Particles) -> Particles:
     return tuple(particles)
 
 
-def take(particles: Particles, indices: np.ndarray) -> Particles:
-    """Select particles by index from any of the three kinds; objects are shared, not copied."""
-    if isinstance(particles, np.ndarray):
-        return particles[indices]
-    if isinstance(particles, Mapping):
-        return {name: a[indices] for name, a in particles.items()}
-    if isinstance(particles, Candidates):
-        return particles.take(indices)
-    return tuple(particles[int(i)] for i in indices)
-
-
 def _check_log_weights(lw: np.ndarray, n: int) -> None:
     if lw.shape != (n,):
         raise InputError(f"log weights have shape {lw.shape}, expected ({n},) as there are {n} particles")
-    # One pass finds all three faults: NaN poisons the maximum.
-    top = lw.max()
+    top = lw.max()  # NaN if any is NaN, so one pass finds all three errors
     if not top < np.inf:
         wrong = np.flatnonzero(~(lw < np.inf))
         raise InputError(
@@ -172,7 +171,7 @@ def _check_log_weights(lw: np.ndarray, n: int) -> None:
 
 @dataclass(frozen=True, eq=False)
 class Population:
-    """Weighted particles and where they come from.
+    """Weighted particles and their parents.
 
     Parameters
     ----------
@@ -182,9 +181,9 @@ class Population:
         Natural log, unnormalised. -inf is a weight of 0; NaN and +inf are errors. None: all 0.
     parents : mapping
         ``"previous"`` and ``"proposed"``: (n,) index of the parent in the previous population or among the
-        proposed particles, -1 for none. A resampler adds ``"ancestor"``: which particle each one was before.
+        proposed particles, -1 for none. A resampler adds ``"ancestor"``: the index before the resampling.
     notes : mapping
-        What a component wants recorded: plain numbers, strings and lists.
+        Values that a component records: plain numbers, strings and lists.
     """
 
     particles: Particles
@@ -194,7 +193,7 @@ class Population:
 
     def __post_init__(self) -> None:
         particles = _freeze(self.particles)
-        n = _count(particles)
+        n = count_particles(particles)
         if n == 0:
             raise InputError("a population has no particles", "a proposal must return at least one")
         lw = np.zeros(n) if self.log_weights is None else np.asarray(self.log_weights, dtype=np.float64).view()
@@ -221,7 +220,7 @@ class Population:
 
     @property
     def ess(self) -> float:
-        """Effective sample size."""
+        """Effective sample size ``(sum w)^2 / sum w^2``, between 1 and n."""
         return self._summary()[0]
 
     @property
@@ -230,7 +229,7 @@ class Population:
         return self._summary()[1]
 
     def _summary(self) -> tuple[float, float]:
-        """Effective sample size and log mean weight, from one pass; asked for by several parts of a step."""
+        """Effective sample size and log mean weight from one pass, kept because several parts of a step need them."""
         if "_both" not in self.__dict__:
             top = self.log_weights.max()
             weights = self.log_weights - top
@@ -242,14 +241,14 @@ class Population:
 
     @property
     def best(self) -> Any:
-        """The particle of the largest weight (the first of equals)."""
+        """The particle of largest weight, the first if several have it."""
         index = int(np.argmax(self.log_weights))
         if isinstance(self.particles, Mapping):
             return {name: a[index] for name, a in self.particles.items()}
         return self.particles[index]
 
     def take(self, indices: np.ndarray, log_weights: np.ndarray | None = None) -> Population:
-        """Select particles, with their parents; log weights come along unless new ones are given."""
+        """Select particles with their parents, and with their log weights unless new ones are given."""
         indices = np.asarray(indices, dtype=np.int64)
         return Population(
             take(self.particles, indices),
@@ -258,17 +257,40 @@ class Population:
             self.notes,
         )
 
+    def select(self, ancestors: np.ndarray, log_weights: np.ndarray, **notes: Any) -> Population:
+        """The result of a resampling: `take`, with ``parents["ancestor"]`` and further notes."""
+        return self.take(ancestors, log_weights).with_ancestors(ancestors, **notes)
+
+    def with_ancestors(self, ancestors: np.ndarray, **notes: Any) -> Population:
+        """The same particles with ``parents["ancestor"]`` set and further notes."""
+        parents = {**self.parents, "ancestor": np.asarray(ancestors, dtype=np.int64)}
+        return self.labelled(parents, {**self.notes, **notes} if notes else self.notes)
+
     def labelled(self, parents: Mapping[str, np.ndarray], notes: Mapping[str, Any] | None = None) -> Population:
         """The same particles and weights with other parents ((n,) int64 arrays) and notes (none by default)."""
-        new = object.__new__(Population)  # nothing that was checked has changed
+        new = object.__new__(Population)  # checked already
         new.__dict__.update(self.__dict__, parents=parents, notes=notes or {})
         return new
 
+    def traced_through(self, resampled: Population | None) -> Population:
+        """The same particles with parents among the particles that `resampled` was selected from.
+
+        ``parents["previous"]`` are indices into `resampled`; they become ``ancestor[previous]`` if `resampled` has
+        ancestors. ``parents["ancestor"]`` and the notes are dropped.
+        """
+        parents = {name: index for name, index in self.parents.items() if name != "ancestor"}
+        ancestors = None if resampled is None else resampled.parents.get("ancestor")
+        if ancestors is not None and "previous" in parents:
+            previous = parents["previous"]
+            stayed = previous is identity(len(ancestors))
+            parents["previous"] = ancestors if stayed else np.where(previous >= 0, ancestors[previous], -1)
+        return self.labelled(parents)
+
     def moved(self, particles: Particles) -> Population:
-        """Other particles, as many, with the same weights and parents; notes are dropped."""
+        """As many other particles with the same weights and parents; notes are dropped."""
         particles = _freeze(particles)
-        if _count(particles) != len(self):
-            raise InputError(f"{len(self)} particles became {_count(particles)}, expected as many")
+        if count_particles(particles) != len(self):
+            raise InputError(f"{len(self)} particles became {count_particles(particles)}, expected as many")
         new = self.labelled(self.parents)
         new.__dict__["particles"] = particles
         return new
@@ -280,7 +302,7 @@ class Population:
         return self
 
     def reweighted(self, log_factors: np.ndarray) -> Population:
-        """The same particles, log weights plus `log_factors`."""
+        """The same particles with `log_factors` added to the log weights."""
         lw = np.asarray(self.log_weights + log_factors, dtype=np.float64)
         _check_log_weights(lw, len(self))
         lw.flags.writeable = False
@@ -288,3 +310,26 @@ class Population:
         new.__dict__["log_weights"] = lw
         new.__dict__.pop("_both", None)
         return new
+
+
+def union(predicted: Population | None, proposed: Population | None) -> Population:
+    """Predicted and proposed particles in one population, with their weights and parents; either may be None."""
+    if predicted is None or proposed is None:
+        population = predicted if predicted is not None else proposed
+        if population is None:
+            raise InputError("an update got neither predicted nor proposed particles")
+        return population
+    a, b = predicted.particles, proposed.particles
+    particles: Any
+    if isinstance(a, np.ndarray) and isinstance(b, np.ndarray):
+        particles = np.concatenate([a, b])
+    elif isinstance(a, Mapping) and isinstance(b, Mapping):
+        particles = {name: np.concatenate([a[name], b[name]]) for name in a}
+    else:
+        particles = (*a, *b)
+    none_a, none_b = np.full(len(predicted), -1), np.full(len(proposed), -1)
+    parents = {
+        name: np.concatenate([predicted.parents.get(name, none_a), proposed.parents.get(name, none_b)])
+        for name in ("previous", "proposed")
+    }
+    return Population(particles, np.concatenate([predicted.log_weights, proposed.log_weights]), parents)

@@ -1,73 +1,85 @@
-"""Classical resampling schemes, and triggers.
+"""Resampling by weight: the classical schemes, and wrappers around a scheme.
 
-All are unbiased: particle i gets on average n W_i copies, W its normalised weight. They differ in how far the
-number of copies N_i strays from that. Notation: f = frac(n W_i).
+All schemes are unbiased: particle i gets n W_i copies on average, W its normalised weight. They differ in the
+variance of the number of copies N_i. Notation: f = frac(n W_i).
 
-============  =============================================  ========================================
-scheme        N_i                                            variance of N_i
-============  =============================================  ========================================
-multinomial   n independent draws                            n W_i (1 - W_i)
-residual      floor(n W_i), the rest by another scheme       r_i (1 - r_i / R), r_i = f, R = sum of r
-stratified    one draw in each of n equal strata of [0, 1)   sum over strata of p (1 - p)
-systematic    one draw, shifted to each stratum              f (1 - f)
-============  =============================================  ========================================
+==================  =================================================  ====================================
+scheme              N_i                                                variance of N_i
+==================  =================================================  ====================================
+Multinomial         n independent draws                                n W_i (1 - W_i)
+Residual            floor(n W_i), the rest by another scheme           r_i (1 - r_i / R), r_i = f, R = sum r
+Stratified          one draw in each of n equal strata of [0, 1)       sum over strata of p (1 - p)
+Systematic          one draw, shifted to each stratum                  f (1 - f)
+Ssp                 floor or ceil, fractions decided pair by pair      f (1 - f)
+Killing             survive with w_i / max w, else multinomial         see `Killing`
+FearnheadClifford   at most 1, with unequal weights                    least expected squared error
+==================  =================================================  ====================================
 
 >>> import numpy as np
 >>> rng = np.random.default_rng(0)
 >>> Systematic().select(rng, np.log([0.5, 0.25, 0.25]), 4)[0]
 array([0, 0, 1, 2])
 
-(The variance of residual is that of its default, the multinomial remainder.) Weights may be unnormalised, of any
-float type, and hold zeros (log weight -inf) anywhere; n may differ from their number. A particle of weight zero
-is never chosen; NaN, +inf or nothing but zeros is an `InputError`.
+(The variance of `Residual` is that of its default, the multinomial remainder.) Weights may be unnormalised, of any
+float type, and zero (log weight -inf); n may differ from their number. A particle of weight zero is never selected.
+NaN, +inf, or only zeros raise an `InputError`.
 
-More schemes: `mstfilter.smc.resampling_rounding` (SSP, residual-systematic, killing),
-`mstfilter.smc.resampling_optimal` (Fearnhead-Clifford: no duplicates), `mstfilter.smc.resampling_clusters`,
-`mstfilter.smc.resampling_dpp` and `mstfilter.smc.resampling_greedy` (diverse selections, which see the particles),
-`mstfilter.smc.resampling_wrappers` (coalescing, tempering, shuffling).
+`Coalesced`, `Tempered`, `Shuffled` and `KeepWeights` wrap another resampler:
 
-References: Douc, Cappe, Moulines (2005), "Comparison of resampling schemes for particle filtering"; Kitagawa
-(1996); Liu and Chen (1998).
+>>> doubled = Population(np.array([1.0, 2.0, 1.0, 3.0]), np.log([1.0, 1.0, 2.0, 4.0]))
+>>> Coalesced(FearnheadClifford()).resample(rng, doubled, 3).particles
+array([2., 1., 3.])
+
+Residual-systematic resampling (Bolic, Djuric, Hong 2004) has no class: in exact arithmetic it selects the same
+particles as `Systematic` from the same uniform, and as ``Residual("systematic")``.
+
+References: Douc, Cappe, Moulines (2005), "Comparison of resampling schemes for particle filtering"; Kitagawa (1996);
+Liu and Chen (1998).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import dataclass, replace
+from typing import ClassVar, Literal
 
 import numpy as np
 
-from mstfilter.errors import InputError
-from mstfilter.smc.fields import number, whole
-from mstfilter.smc.interfaces import Resampler, Trigger
+from mstfilter.errors import InputError, check_component, check_number
+from mstfilter.smc.interfaces import Resampler, WeightResampler
 from mstfilter.smc.population import Population
+from mstfilter.smc.similarity import Equivalence, ExactEquality
 
 __all__ = [
-    "Always",
-    "EssBelow",
-    "Every",
+    "Coalesced",
+    "FearnheadClifford",
+    "KeepWeights",
+    "Killing",
     "Multinomial",
-    "Never",
     "Residual",
+    "ResamplerWrapper",
+    "Shuffled",
+    "Ssp",
     "Stratified",
     "Systematic",
+    "Tempered",
     "checked_weights",
+    "coalesce",
 ]
 
 
 def checked_weights(log_weights: np.ndarray, n: int) -> np.ndarray:
-    """(m,) float64 weights whose largest is 1, from log weights of any float type.
+    """(m,) float64 weights with maximum 1, from log weights of any float type.
 
     Raises
     ------
     InputError
-        Not one number a particle, a NaN, +inf, nothing but -inf, or n < 1.
+        If the log weights are not one-dimensional, hold NaN or +inf, or are all -inf, or if n < 1.
     """
     lw = np.asarray(log_weights, dtype=np.float64)
     if lw.ndim != 1 or len(lw) == 0:
         raise InputError(f"log weights have shape {lw.shape}, expected one number a particle")
     if not isinstance(n, (int, np.integer)) or n < 1:
-        raise InputError(f"resampling to {n} particles, expected a whole number of at least 1")
+        raise InputError(f"resampling to {n} particles, expected an integer of at least 1")
     top = lw.max()
     if not -np.inf < top < np.inf:
         at = int(np.flatnonzero(~np.isfinite(lw) & ~np.isneginf(lw))[0]) if not np.isneginf(top) else 0
@@ -77,16 +89,15 @@ def checked_weights(log_weights: np.ndarray, n: int) -> np.ndarray:
 
 
 def _cumulative(log_weights: np.ndarray, n: int) -> np.ndarray:
-    """(m,) cumulative weights in float64, last entry exactly the total; checks the input."""
+    """(m,) cumulative sums of the checked weights."""
     weights = checked_weights(log_weights, n)
     return np.cumsum(weights, out=weights)
 
 
-def whole_copies(weights: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray, int]:
-    """floor(n W_i) as (m,) int64, the fractions left (m,), and how many copies these are to make."""
+def _certain_copies(weights: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray, int]:
+    """floor(n W_i) as (m,) int64, the fractions that remain (m,), and their sum, the number of copies to draw."""
     expected = weights * (n / weights.sum())
-    # What is a whole number but for rounding counts as whole: else its copy would be left to chance.
-    copies = np.floor(expected * (1 + 1e-13))
+    copies = np.floor(expected * (1 + 1e-13))  # an integer up to rounding counts as that integer
     return copies.astype(np.int64), np.clip(expected - copies, 0.0, None), n - int(copies.sum())
 
 
@@ -97,145 +108,351 @@ def ordered_uniforms(rng: np.random.Generator, n: int) -> np.ndarray:
 
 
 def _from_points(cumulative: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Index whose interval of the cumulative weights holds each point of [0, total)."""
+    """Index of the interval of the cumulative weights that holds each point of [0, total)."""
     index = np.searchsorted(cumulative, points, side="right")  # "right" skips weights of zero
-    # A point rounded up to the total belongs to the last particle that has any weight.
+    # A point rounded up to the total belongs to the last particle of positive weight.
     last = int(np.searchsorted(cumulative, cumulative[-1], side="left"))
     return np.minimum(index, last)
 
 
-def _from_shifts(cumulative: np.ndarray, n: int, shift: float) -> np.ndarray:
+def systematic_ancestors(cumulative: np.ndarray, n: int, shift: float) -> np.ndarray:
     """Systematic selection: ancestors at the points (k + shift) / n, in O(m + n) without a search."""
     total = cumulative[-1]
-    # Number of points below each cumulative weight; at the total it is n by definition, whatever rounding says.
+    # Number of points below each cumulative weight; n at the total, whatever the rounding.
     points = cumulative * (n / total)
     points -= shift
-    np.ceil(points, out=points)  # above -1 before, so not negative now
+    np.ceil(points, out=points)  # greater than -1 before, so not negative now
     np.minimum(points, n, out=points)
     points[cumulative.searchsorted(total, side="left") :] = n
-    # Place k has the particle before which k points lie: counting is quicker than repeating at random numbers.
+    # The ancestor of position k is the number of particles that end at or before point k.
     ends = points[:-1].astype(np.int64)
     return np.bincount(ends, minlength=n)[:n].cumsum()
 
 
+def _repeated(copies: np.ndarray) -> np.ndarray:
+    return np.repeat(np.arange(len(copies)), copies)
+
+
 @dataclass(frozen=True)
-class Multinomial(Resampler):
-    """Independent draws by weight (Gordon, Salmond, Smith 1993). The noisiest scheme; an oracle for the others."""
+class Multinomial(WeightResampler):
+    """Independent draws by weight (Gordon, Salmond, Smith 1993). The largest variance; a reference for the others."""
 
     def select(self, rng: np.random.Generator, log_weights: np.ndarray, n: int) -> tuple[np.ndarray, None]:
-        """Choose by n uniforms that are made in sorted order: O(m + n)."""
         cumulative = _cumulative(log_weights, n)
         return _from_points(cumulative, ordered_uniforms(rng, n) * cumulative[-1]), None
 
 
 @dataclass(frozen=True)
-class Stratified(Resampler):
+class Stratified(WeightResampler):
     """One uniform in each of n equal strata (Kitagawa 1996)."""
 
     def select(self, rng: np.random.Generator, log_weights: np.ndarray, n: int) -> tuple[np.ndarray, None]:
-        """Choose."""
         cumulative = _cumulative(log_weights, n)
         points = (np.arange(n) + rng.random(n)) * (cumulative[-1] / n)
         return _from_points(cumulative, points), None
 
 
 @dataclass(frozen=True)
-class Systematic(Resampler):
+class Systematic(WeightResampler):
     """One uniform for all strata (Carpenter, Clifford, Fearnhead 1999); N_i is floor or ceil of n W_i."""
 
     def select(self, rng: np.random.Generator, log_weights: np.ndarray, n: int) -> tuple[np.ndarray, None]:
-        """Choose."""
         cumulative = _cumulative(log_weights, n)
-        return _from_shifts(cumulative, n, rng.random()), None
+        return systematic_ancestors(cumulative, n, rng.random()), None
 
 
 @dataclass(frozen=True)
-class Residual(Resampler):
+class Residual(WeightResampler):
     """floor(n W_i) copies for certain, the rest by another scheme (Liu and Chen 1998).
 
     Parameters
     ----------
     remainder : {"multinomial", "stratified", "systematic"}
-        How the fractions frac(n W_i) make the remaining copies. Systematic has the least variance, f (1 - f).
+        Scheme for the fractions frac(n W_i). Systematic has the least variance, f (1 - f).
     """
 
     remainder: Literal["multinomial", "stratified", "systematic"] = "multinomial"
 
     def __post_init__(self) -> None:
         if self.remainder not in ("multinomial", "stratified", "systematic"):
-            raise InputError(
-                f"remainder is {self.remainder!r}", "there are: multinomial, stratified and systematic remainders"
-            )
+            raise InputError(f"remainder is {self.remainder!r}, expected multinomial, stratified or systematic")
 
     def select(self, rng: np.random.Generator, log_weights: np.ndarray, n: int) -> tuple[np.ndarray, None]:
-        """Choose."""
-        copies, fractions, rest = whole_copies(checked_weights(log_weights, n), n)
+        copies, fractions, rest = _certain_copies(checked_weights(log_weights, n), n)
         if rest > 0:
             cumulative = np.cumsum(fractions)
             if self.remainder == "systematic":
-                drawn = _from_shifts(cumulative, rest, rng.random())
+                drawn = systematic_ancestors(cumulative, rest, rng.random())
             elif self.remainder == "stratified":
                 drawn = _from_points(cumulative, (np.arange(rest) + rng.random(rest)) * (cumulative[-1] / rest))
             else:
                 drawn = _from_points(cumulative, ordered_uniforms(rng, rest) * cumulative[-1])
             copies += np.bincount(drawn, minlength=len(copies))
-        return np.repeat(np.arange(len(copies)), copies), None
+        return _repeated(copies), None
+
+
+_SETTLED = 1e-12  # a fraction this close to 0 or 1 is 0 or 1 up to rounding
 
 
 @dataclass(frozen=True)
-class EssBelow(Trigger):
-    """Resample where the effective sample size falls below a share of the particles.
+class Ssp(WeightResampler):
+    """Srinivasan sampling process: N_i is floor or ceil of n W_i, for any order of the particles.
+
+    Two fractions a and b are paired: with probability down / (up + down), up = min(1-a, b), down = min(a, 1-b), a
+    takes `up` from b, else b takes `down` from a. One of them is then 0 or 1 and settled; the other is paired again.
+    Here all pairs of a round are decided together: log2(n) rounds instead of n steps (Gerber, Chopin, Whiteley 2019,
+    "Negative association, ordering and convergence of resampling methods").
+    """
+
+    def select(self, rng: np.random.Generator, log_weights: np.ndarray, n: int) -> tuple[np.ndarray, None]:
+        weights = checked_weights(log_weights, n)
+        copies, fractions, rest = _certain_copies(weights, n)
+        index = np.flatnonzero(fractions > _SETTLED)
+        value = fractions[index]
+        while len(index) > 1:
+            pairs = len(index) // 2
+            a, b = value[: 2 * pairs : 2], value[1 : 2 * pairs : 2]
+            up, down = np.minimum(1 - a, b), np.minimum(a, 1 - b)
+            lift = rng.random(pairs) * (up + down) < down
+            value[: 2 * pairs : 2] = np.where(lift, a + up, a - down)
+            value[1 : 2 * pairs : 2] = np.where(lift, b - up, b + down)
+            full = value >= 1 - _SETTLED
+            copies[index[full]] += 1
+            rest -= int(full.sum())
+            alive = ~full & (value > _SETTLED)
+            index, value = index[alive], value[alive]
+        if rest > 0 and len(index):  # the fractions sum to an integer, so the last one is 0 or 1 up to rounding
+            copies[index[0]] += 1
+            rest -= 1
+        if rest > 0:  # a copy lost by rounding, probability of order 1e-12
+            copies[np.argmax(weights)] += rest
+        return _repeated(copies), None
+
+
+@dataclass(frozen=True)
+class Killing(WeightResampler):
+    """A particle keeps its position with probability w_i / max w; the others are replaced by draws by weight.
+
+    Most particles keep their positions if the weights are nearly equal. Del Moral (2004), "Feynman-Kac formulae",
+    section 5.6, for n = m. For n != m each of n positions belongs to one particle: floor(n / m) positions each, and
+    one more for a random subset. Each position then survives or is replaced. E[N_i] = n W_i for any n. For n = m,
+    with p = w / max w, var N_i = p_i (1 - p_i) (1 - 2 W_i) + W_i^2 sum p (1 - p) + (m - sum p) W_i (1 - W_i).
+    """
+
+    def select(self, rng: np.random.Generator, log_weights: np.ndarray, n: int) -> tuple[np.ndarray, None]:
+        weights = checked_weights(log_weights, n)
+        m = len(weights)
+        ancestors = np.tile(np.arange(m), n // m)
+        if n % m:
+            ancestors = np.concatenate([ancestors, np.sort(rng.choice(m, n % m, replace=False, shuffle=False))])
+        killed = np.flatnonzero(rng.random(n) >= weights[ancestors])
+        cumulative = np.cumsum(weights)
+        if len(killed):
+            ancestors[killed] = _from_points(cumulative, ordered_uniforms(rng, len(killed)) * cumulative[-1])
+        return ancestors, None
+
+
+@dataclass(frozen=True)
+class FearnheadClifford(WeightResampler):
+    """Optimal resampling: particles with w_i >= c for certain, the others with probability w_i / c and weight c.
+
+    c solves sum min(1, w_i / c) = n. The light particles are selected systematically, so there are no duplicates. The
+    total weight is kept exactly. Of all unbiased random weights with at most n positive ones, these have the least
+    expected squared error. If n or fewer particles have positive weight, these are kept, so fewer than n may be
+    returned: a filter that selects n of n particles degenerates; use more candidates than particles (`Branching`).
+
+    >>> log_weights = np.log([4.0, 3.0, 1.0, 1.0, 1.0])
+    >>> ancestors, log_weights = FearnheadClifford().select(np.random.default_rng(1), log_weights, 4)
+    >>> ancestors
+    array([0, 1, 2, 4])
+
+    Reference: Fearnhead and Clifford (2003), "On-line inference for hidden Markov models via particle filters",
+    Journal of the Royal Statistical Society B 65.
+    """
+
+    exact_size: ClassVar[bool] = False
+
+    def select(self, rng: np.random.Generator, log_weights: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
+        weights = checked_weights(log_weights, n)
+        lw = np.asarray(log_weights, dtype=np.float64)
+        positive = np.flatnonzero(weights > 0)
+        if len(positive) <= n:
+            return positive, lw[positive] + np.log(len(positive) / len(lw))
+        w = weights[positive]
+        c, heavy = optimal_threshold(w, n)
+        light = np.flatnonzero(~heavy)
+        log_out = np.where(heavy, lw[positive], lw.max() + np.log(c))
+        chosen = heavy
+        scaled = w[light] / w[light].max()  # avoids underflow
+        chosen[light[systematic_ancestors(np.cumsum(scaled), n - int(heavy.sum()), rng.random())]] = True
+        # Adding log(n / m) keeps the log mean of the weights.
+        return positive[chosen], log_out[chosen] + np.log(n / len(lw))
+
+
+def optimal_threshold(weights: np.ndarray, n: int) -> tuple[float, np.ndarray]:
+    """c with sum min(1, w_i / c) = n, and the (m,) bool mask of the fewer than n weights with w_i >= c.
 
     Parameters
     ----------
-    share : float
-        Of the number of particles, in (0, 1].
+    weights : (m,) float64
+        Positive, m > n.
+    n : int
+        Number of particles to select.
     """
-
-    share: float = 0.5
-
-    def __post_init__(self) -> None:
-        hint = "a share of the particles, not their number: 0.5 resamples below half of them"
-        number("share", self.share, f"{hint}; the triggers Always and Never do one or the other", above=0, at_most=1)
-
-    def wants(self, population: Population, t: int) -> bool:
-        """True where ESS < share * n."""
-        return population.ess < self.share * len(population)
-
-
-@dataclass(frozen=True)
-class Always(Trigger):
-    """Resample at every step."""
-
-    def wants(self, population: Population, t: int) -> bool:
-        """True."""
-        return True
+    heavy, kept, c = np.zeros(len(weights), bool), 0, float(weights.sum()) / n
+    while True:  # c decreases and more weights become heavy, until all light ones are below c: a few rounds
+        # Light means lighter than c by more than rounding, so that no light interval can hold two points.
+        heavy |= weights >= c * (1 - 1e-9)
+        if int(heavy.sum()) == kept:
+            return c, heavy
+        kept = int(heavy.sum())
+        if kept >= n:  # only by rounding: the light weights together are negligible beside the n-th heaviest
+            heavy = np.zeros(len(weights), bool)
+            heavy[np.argsort(-weights, kind="stable")[: n - 1]] = True
+            return float(weights[~heavy].sum()), heavy
+        c = float(weights[~heavy].sum()) / (n - kept)
 
 
 @dataclass(frozen=True)
-class Never(Trigger):
-    """Resample only where there are more particles than the filter keeps."""
-
-    def wants(self, population: Population, t: int) -> bool:
-        """False."""
-        return False
-
-
-@dataclass(frozen=True)
-class Every(Trigger):
-    """Resample at every k-th step.
+class ResamplerWrapper(Resampler):
+    """Base of resamplers that change what another resampler is given or returns; as proper as that one.
 
     Parameters
     ----------
-    k : int
-        Steps from one resampling to the next.
+    scheme : Resampler
+        The wrapped resampler.
     """
 
-    k: int = 2
+    scheme: Resampler = Systematic()
 
     def __post_init__(self) -> None:
-        whole("resampling at every k-th step: k", self.k)
+        check_component("scheme", self.scheme, Resampler)
 
-    def wants(self, population: Population, t: int) -> bool:
-        """True where t is a multiple of k."""
-        return t % self.k == 0
+    @property
+    def properly_weighted(self) -> bool:
+        """As the wrapped resampler."""
+        return self.scheme.properly_weighted
+
+    @property
+    def exact_size(self) -> bool:
+        """As the wrapped resampler."""
+        return self.scheme.exact_size
+
+
+@dataclass(frozen=True)
+class Coalesced(ResamplerWrapper):
+    """Merges equal particles before the selection, which loses nothing.
+
+    The population shrinks by the merged particles; only a transition or update that makes more candidates lets it
+    grow again. ``notes["distinct"]`` is the number of different particles of positive weight.
+
+    Parameters
+    ----------
+    scheme : Resampler
+        Selects among the merged particles.
+    equivalence : Equivalence
+        Decides which particles are equal. The heaviest of a class is kept.
+    """
+
+    scheme: Resampler = FearnheadClifford()
+    equivalence: Equivalence = ExactEquality()  # noqa: RUF009 (frozen)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_component("equivalence", self.equivalence, Equivalence)
+
+    def resample(self, rng: np.random.Generator, population: Population, n: int) -> Population:
+        population = population.realised()
+        classes = self.equivalence.classes(population.particles)
+        representatives, log_weights = coalesce(population.log_weights, classes)
+        chosen = self.scheme.resample(rng, population.take(representatives, log_weights), n)
+        ancestors = representatives[chosen.parents["ancestor"]]
+        return chosen.with_ancestors(ancestors, distinct=len(representatives))
+
+
+def coalesce(log_weights: np.ndarray, classes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """One particle for each class: the heaviest, with the weight of the class.
+
+    Returns
+    -------
+    representatives : (k,) int
+        The heaviest particle of each class (the first of equals), ascending. Classes without weight are left out.
+    log_weights : (k,) float64
+        Log of the summed weights times k / m, which keeps the log mean of the weights.
+    """
+    lw = np.asarray(log_weights, dtype=np.float64)
+    classes = np.asarray(classes)
+    mass = np.bincount(classes, np.exp(lw - lw.max()))
+    heaviest = np.lexsort((np.arange(len(lw)), -lw, classes))
+    first = np.concatenate([[True], np.diff(classes[heaviest]) > 0])
+    representatives = heaviest[first]
+    representatives = np.sort(representatives[mass[classes[representatives]] > 0])
+    total = np.log(mass[classes[representatives]]) + lw.max()
+    return representatives, total + np.log(len(representatives) / len(lw))
+
+
+@dataclass(frozen=True)
+class Tempered(ResamplerWrapper):
+    """Selects by w^power and multiplies the selected weights by w^(1 - power): light particles survive longer.
+
+    Parameters
+    ----------
+    scheme : Resampler
+        Selects.
+    power : float
+        In [0, 1]. 1 is the wrapped scheme, 0 ignores positive weights.
+    """
+
+    power: float = 0.5
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_number("power", self.power, at_least=0, at_most=1)
+
+    def resample(self, rng: np.random.Generator, population: Population, n: int) -> Population:
+        lw = population.log_weights
+        positive = checked_weights(lw, n) > 0
+        tempered = np.full(len(lw), -np.inf)
+        tempered[positive] = self.power * lw[positive]
+        rest = np.zeros(len(lw))
+        rest[positive] = (1 - self.power) * lw[positive]
+        chosen = self.scheme.resample(rng, replace(population, log_weights=tempered), n)
+        return chosen.reweighted(rest[chosen.parents["ancestor"]])
+
+
+@dataclass(frozen=True)
+class Shuffled(ResamplerWrapper):
+    """Permutes the particles at random before the selection, so that systematic and stratified schemes do not depend
+    on their order.
+
+    Parameters
+    ----------
+    scheme : Resampler
+        Selects.
+    """
+
+    def resample(self, rng: np.random.Generator, population: Population, n: int) -> Population:
+        order = rng.permutation(len(population))
+        chosen = self.scheme.resample(rng, population.take(order), n)
+        return chosen.with_ancestors(order[chosen.parents["ancestor"]])
+
+
+@dataclass(frozen=True)
+class KeepWeights(ResamplerWrapper):
+    """Selected particles keep their weights, as in the program of the MST authors.
+
+    Selecting by weight and keeping the weight counts the same evidence twice, so this is not properly weighted.
+
+    Parameters
+    ----------
+    scheme : Resampler
+        Chooses the ancestors.
+    """
+
+    scheme: Resampler = Multinomial()
+
+    properly_weighted: ClassVar[bool] = False
+
+    def resample(self, rng: np.random.Generator, population: Population, n: int) -> Population:
+        chosen = self.scheme.resample(rng, population, n)
+        return replace(chosen, log_weights=population.log_weights[chosen.parents["ancestor"]])

@@ -1,4 +1,4 @@
-"""Which particles are alike: similarities in [0, 1], and classes of particles that count as equal.
+"""Similarities of particles in [0, 1], and classes of particles that count as equal.
 
 >>> import numpy as np
 >>> Gaussian(scale=1.0).matrix(np.array([0.0, 0.0, 3.0])).round(3)
@@ -8,8 +8,8 @@ array([[1.   , 1.   , 0.011],
 >>> Bins(width=0.5).classes(np.array([0.1, 0.4, 0.6, -0.1]))
 array([0, 0, 1, 2])
 
-Diversity-preserving resamplers take a `Similarity`, coalescing and the KLD size an `Equivalence`. Subclass either
-for your own particles; `mstfilter.fusion.similarity` has those of label grids.
+Diverse resamplers take a `Similarity`; `Coalesced` and `Kld` take an `Equivalence`. Subclass either for your own
+particles; `mstfilter.fusion` has those of label grids.
 """
 
 from __future__ import annotations
@@ -21,14 +21,13 @@ from typing import Any
 
 import numpy as np
 
-from mstfilter.errors import InputError
-from mstfilter.smc.fields import number
+from mstfilter.errors import InputError, check_number
 
-__all__ = ["Bins", "Equivalence", "Exact", "Gaussian", "Similarity", "as_matrix", "first_seen"]
+__all__ = ["Bins", "Equivalence", "ExactEquality", "Gaussian", "Similarity", "as_matrix", "first_seen"]
 
 
 class Similarity(ABC):
-    """How alike particles are."""
+    """Similarity of particles."""
 
     @abstractmethod
     def matrix(self, particles: Any) -> np.ndarray:
@@ -36,21 +35,21 @@ class Similarity(ABC):
 
 
 class Equivalence(ABC):
-    """Which particles count as the same."""
+    """Classes of particles that count as equal."""
 
     @abstractmethod
     def classes(self, particles: Any) -> np.ndarray:
-        """(n,) int: the class of each particle, numbered from 0 in the order in which they first occur."""
+        """(n,) int: the class of each particle, numbered from 0 in the order of first occurrence."""
 
 
 def first_seen(keys: Iterable[Hashable]) -> np.ndarray:
-    """(n,) int: equal keys get equal numbers, counted from 0 in the order in which they first occur."""
+    """(n,) int: equal keys get equal numbers, counted from 0 in the order of first occurrence."""
     numbers: dict[Hashable, int] = {}
     return np.array([numbers.setdefault(key, len(numbers)) for key in keys], dtype=np.int64)
 
 
 def as_matrix(particles: Any) -> np.ndarray:
-    """(n, d) float64 rows of particles that are an array or a mapping of arrays; an error for objects."""
+    """(n, d) float64 rows of particles that are an array or a mapping of arrays; InputError for objects."""
     if isinstance(particles, np.ndarray) and particles.dtype != object:
         return np.asarray(particles, dtype=np.float64).reshape(len(particles), -1)
     if isinstance(particles, Mapping):
@@ -63,30 +62,28 @@ def as_matrix(particles: Any) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Gaussian(Similarity):
-    """exp(-d^2 / (2 scale^2)) of the Euclidean distance d of array particles; positive semidefinite.
+    """exp(-d^2 / (2 scale^2)) with the Euclidean distance d of array particles; positive semidefinite.
 
     Parameters
     ----------
     scale : float
-        Distance at which particles begin to differ, in the units of the particles.
+        Standard deviation of the kernel, in the units of the particles.
     """
 
     scale: float = 1.0
 
     def __post_init__(self) -> None:
-        number("scale", self.scale, above=0, unit="distance")
+        check_number("scale", self.scale, above=0, unit="distance")
 
     def matrix(self, particles: Any) -> np.ndarray:
-        """(n, n)."""
         x = as_matrix(particles) / self.scale
-        squares = (
-            ((x[:, None, :] - x[None, :, :]) ** 2).sum(axis=2) if len(x) ** 2 * x.shape[1] < 1e7 else _distances(x)
-        )
+        small = len(x) ** 2 * x.shape[1] < 1e7
+        squares = ((x[:, None, :] - x[None, :, :]) ** 2).sum(axis=2) if small else _squared_distances(x)
         return np.exp(-0.5 * squares)
 
 
-def _distances(x: np.ndarray) -> np.ndarray:
-    """(n, n) squared distances without an (n, n, d) array; centred, so that rounding stays small."""
+def _squared_distances(x: np.ndarray) -> np.ndarray:
+    """(n, n) |x_i|^2 + |x_j|^2 - 2 x_i x_j, without an (n, n, d) array; centred to keep rounding errors small."""
     x = x - x.mean(axis=0)
     norms = (x * x).sum(axis=1)
     squares = np.maximum(norms[:, None] + norms[None, :] - 2 * (x @ x.T), 0.0)
@@ -95,11 +92,10 @@ def _distances(x: np.ndarray) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class Exact(Equivalence):
-    """Equal values: rows of arrays bit for bit, objects by their own ``==`` and hash."""
+class ExactEquality(Equivalence):
+    """Equal values: rows of arrays bit for bit, objects by their ``==`` and hash."""
 
     def classes(self, particles: Any) -> np.ndarray:
-        """(n,)."""
         if isinstance(particles, np.ndarray) and particles.dtype != object:
             return first_seen(np.ascontiguousarray(row).tobytes() for row in particles)
         if isinstance(particles, Mapping):
@@ -121,10 +117,9 @@ class Bins(Equivalence):
     width: float = 1.0
 
     def __post_init__(self) -> None:
-        number("width", self.width, above=0, unit="side of a cell")
+        check_number("width", self.width, above=0, unit="side of a cell")
 
     def classes(self, particles: Any) -> np.ndarray:
-        """(n,)."""
         cells = np.floor(as_matrix(particles) / self.width)
         _, first, inverse = np.unique(cells, axis=0, return_index=True, return_inverse=True)
         rank = np.empty(len(first), np.int64)

@@ -25,12 +25,10 @@ from typing import Any
 
 import numpy as np
 
-from mstfilter.errors import InputError
-from mstfilter.smc.fields import part, whole
-from mstfilter.smc.interfaces import DensityTransition
-from mstfilter.smc.particle_filter import ParticleFilter
+from mstfilter.errors import InputError, check_component, check_integer
+from mstfilter.smc.filter import ParticleFilter
+from mstfilter.smc.interfaces import DensityTransition, State
 from mstfilter.smc.population import Population, take
-from mstfilter.smc.state import State
 
 __all__ = ["Record", "backward_paths", "fixed_lag", "genealogy", "keep"]
 
@@ -94,7 +92,7 @@ def fixed_lag(record: Record, lag: int) -> tuple[Population, ...]:
     lag : int
         Steps; 0 is the filter itself.
     """
-    whole("lag", lag, at_least=0)
+    check_integer("lag", lag, at_least=0)
     last = len(record) - 1
     return tuple(_traced(record, min(t + lag, last), t)[0] for t in range(len(record)))
 
@@ -128,8 +126,8 @@ def backward_paths(
     n : int
         Paths.
     """
-    part("transition", transition, DensityTransition)
-    whole("n", n)
+    check_component("transition", transition, DensityTransition)
+    check_integer("n", n)
     last = record.populations[-1].realised()
     index = _drawn(rng, np.broadcast_to(last.log_weights, (n, len(last))))
     path = [Population(take(last.particles, index))]

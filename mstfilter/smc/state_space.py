@@ -1,46 +1,50 @@
-"""State-space models written as samplers and densities, and the components made from them.
+"""State-space models, the components made from them, and the textbook filters.
 
 >>> model = StateSpaceModel.of(
 ...     initial=Normal(0.0, 1.0),
 ...     transition=lambda x: Normal(0.9 * x, 0.5),
 ...     observation=lambda x: Normal(x, 1.0),
 ... )
->>> state, infos = bootstrap(model, n=1000).run(observations, seed=0)
+>>> state, infos = bootstrap(model, n=1000).run(observations, seed=0)           # Gordon, Salmond, Smith 1993
+>>> guided(model, lambda x, y: Normal(0.5 * (0.9 * x + y), 0.4), n=100)         # Doucet, Godsill, Andrieu 2000
+>>> auxiliary(model, log_priority, n=100)                                       # Pitt and Shephard 1999
+>>> resample_move(model, RandomWalkMove(model, 0.5), n=100)                     # Gilks and Berzuini 2001
 
-The first observation updates the initial state before any prediction. A guided proposal q(x_t | x_{t-1}, y_t) is a
-function of x_{t-1} and y_t that returns a distribution; `GuidedTransition` makes a transition of it, which draws from
-q and adds log f - log q to the log weights:
-
->>> filter = guided(model, lambda x, y: Normal(0.5 * (0.9 * x + y), 0.4), n=100)
-
-`guided` and the other filters (`auxiliary`, `resample_move`) are in `mstfilter.smc.filters`, all the same driver with
-other parts.
+Each filter is a `ParticleFilter`, so any component can be replaced: ``replace(bootstrap(model, 100),
+resampler=...)``. The first observation updates the initial state before any prediction.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from mstfilter.errors import InputError
+from mstfilter.errors import InputError, check_component, check_integer
 from mstfilter.smc.adapters import as_distribution
-from mstfilter.smc.interfaces import DensityTransition, Proposal, Resampler, Trigger
-from mstfilter.smc.particle_filter import ParticleFilter
-from mstfilter.smc.population import Population
-from mstfilter.smc.resampling import EssBelow, Systematic
-from mstfilter.smc.updates import Reweight, n_of
+from mstfilter.smc.components import Reweight
+from mstfilter.smc.filter import ParticleFilter
+from mstfilter.smc.interfaces import DensityTransition, Lookahead, Proposal, Rejuvenation, Resampler, Trigger
+from mstfilter.smc.population import Particles, Population, count_particles
+from mstfilter.smc.resampling import Systematic
+from mstfilter.smc.triggers import EssBelow
 
 __all__ = [
     "Dynamics",
     "GuidedInitial",
     "GuidedTransition",
     "Prior",
+    "PriorityLookahead",
+    "RandomWalkMove",
     "StateSpaceModel",
+    "accept_moves",
+    "auxiliary",
     "bootstrap",
-    "linear_gaussian",
+    "choose_rows",
+    "guided",
+    "resample_move",
 ]
 
 
@@ -89,7 +93,7 @@ class StateSpaceModel:
                 )
         return cls(
             first.sample,
-            lambda rng, x: as_distribution(transition(x)).sample(rng, n_of(x)),
+            lambda rng, x: as_distribution(transition(x)).sample(rng, count_particles(x)),
             lambda x, y: as_distribution(observation(x)).log_prob(y),
             first.log_prob,
             lambda previous, new: as_distribution(transition(previous)).log_prob(new),
@@ -192,6 +196,94 @@ class GuidedTransition(DensityTransition):
         return as_distribution(self.proposal(previous, observation)).log_prob(new)
 
 
+@dataclass(frozen=True)
+class PriorityLookahead(Lookahead):
+    """Priority by a function.
+
+    Parameters
+    ----------
+    function : callable
+        ``(particles, y) -> (n,)`` log priority of x_{t-1} given y_t.
+    """
+
+    function: Callable[[Any, Any], np.ndarray]
+
+    def log_priority(self, population: Population, observation: Any) -> np.ndarray:
+        """(n,) log priority."""
+        return self.function(population.particles, observation)
+
+
+@dataclass(frozen=True)
+class RandomWalkMove(Rejuvenation):
+    """Metropolis steps with Gaussian increments on an array of particles.
+
+    Parameters
+    ----------
+    model : StateSpaceModel
+        With its log densities. Particles are floating-point arrays (n,) or (n, d), or mappings of such.
+    scale : float or array_like
+        Standard deviation of a step, in the units of the state. Fixed, so that the evidence stays unbiased.
+    steps : int
+        Metropolis steps a move.
+    """
+
+    model: StateSpaceModel
+    scale: Any = 1.0
+    steps: int = 1
+
+    def __post_init__(self) -> None:
+        check_component("model", self.model, StateSpaceModel)
+        check_integer("steps", self.steps)
+        scale = np.asarray(self.scale, dtype=np.float64)
+        if not (np.isfinite(scale).all() and (scale > 0).all()):
+            raise InputError(f"scale is {self.scale!r}, expected positive finite numbers")
+
+    def move(
+        self,
+        rng: np.random.Generator,
+        population: Population,
+        previous: Population | None,
+        observation: Any,
+    ) -> Population:
+        """Move; `notes` hold the share of accepted steps."""
+
+        def log_target(x: Any) -> np.ndarray:
+            if previous is None:
+                prior = self.model.density("log_initial")(x)
+            else:
+                prior = self.model.density("log_transition")(previous.particles, x)
+            return prior if observation is None else prior + self.model.log_likelihood(x, observation)
+
+        x, taken = population.particles, 0
+        current = log_target(x)
+        for _ in range(self.steps):
+            new = self._step(rng, x)
+            proposed = log_target(new)
+            with np.errstate(invalid="ignore"):
+                yes = accept_moves(rng, proposed - current)
+            x, current = choose_rows(yes, new, x), np.where(yes, proposed, current)
+            taken += int(yes.sum())
+        share = taken / (self.steps * len(population))
+        return Population(x, population.log_weights, population.parents, {"accepted": share})
+
+    def _step(self, rng: np.random.Generator, x: Particles) -> Particles:
+        if isinstance(x, np.ndarray):
+            return x + self.scale * rng.standard_normal(x.shape)
+        return {name: self._step(rng, a) for name, a in x.items()}
+
+
+def accept_moves(rng: np.random.Generator, log_ratio: np.ndarray) -> np.ndarray:
+    """(n,) bool: Metropolis-Hastings decisions; a ratio that is NaN (impossible to impossible) is refused."""
+    return np.log1p(-rng.random(len(log_ratio))) < log_ratio
+
+
+def choose_rows(accepted: np.ndarray, new: Particles, old: Particles) -> Particles:
+    """Row by row `new` where accepted, else `old`."""
+    if isinstance(old, np.ndarray):
+        return np.where(accepted.reshape(-1, *(1,) * (old.ndim - 1)), new, old)
+    return {name: choose_rows(accepted, new[name], a) for name, a in old.items()}
+
+
 def bootstrap(
     model: StateSpaceModel,
     n: int,
@@ -210,42 +302,76 @@ def bootstrap(
     )
 
 
-def linear_gaussian(F: Any, Q: Any, H: Any, R: Any, m0: Any, P0: Any) -> StateSpaceModel:
-    """x_0 ~ N(m0, P0), x_t = F x_{t-1} + N(0, Q), y_t = H x_t + N(0, R); particles are (n, d)."""
-    F, Q, H, R, m0, P0 = (np.asarray(a, dtype=np.float64) for a in (F, Q, H, R, m0, P0))
-    if m0.ndim != 1:
-        raise InputError(f"m0 has shape {m0.shape}, expected one number an entry of the state: (d,)")
-    d, k = m0.shape, H.shape[:1]
-    shapes = {"F": (F, d * 2), "Q": (Q, d * 2), "H": (H, k + d), "R": (R, k * 2), "m0": (m0, d), "P0": (P0, d * 2)}
-    for name, (array, shape) in shapes.items():
-        if array.shape != shape:
-            raise InputError(f"{name} has shape {array.shape}, expected {shape} as m0 has {d[0]} entries")
-    for name, cov in (("Q", Q), ("R", R), ("P0", P0)):
-        if not np.allclose(cov, cov.T) or not (np.linalg.eigvalsh(cov) > 0).all():
-            raise InputError(f"{name} is {cov.tolist()}, expected a covariance: symmetric and positive definite")
-    root_Q, root_P = np.linalg.cholesky(Q), np.linalg.cholesky(P0)
+def guided(
+    model: StateSpaceModel,
+    proposal: Callable[[Any, Any], Any],
+    n: int,
+    initial: Callable[[Any], Any] | None = None,
+    resampler: Resampler | None = None,
+    trigger: Trigger | None = None,
+) -> ParticleFilter:
+    """The guided filter: moves by q(x_t | x_{t-1}, y_t), weights by f g / q.
 
-    def log_normal(cov: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
-        whiten = np.linalg.inv(np.linalg.cholesky(cov))
-        constant = np.log(np.diag(whiten)).sum() - 0.5 * len(cov) * np.log(2 * np.pi)
-
-        def of(residual: np.ndarray) -> np.ndarray:
-            z = residual @ whiten.T
-            return constant - 0.5 * np.einsum("ij,ij->i", z, z)
-
-        return of
-
-    def initial(rng: np.random.Generator, n: int) -> np.ndarray:
-        return m0 + rng.standard_normal((n, len(m0))) @ root_P.T
-
-    def transition(rng: np.random.Generator, x: np.ndarray) -> np.ndarray:
-        return x @ F.T + rng.standard_normal(x.shape) @ root_Q.T
-
-    of_R, of_P, of_Q = log_normal(R), log_normal(P0), log_normal(Q)
-    return StateSpaceModel(
-        initial,
-        transition,
-        lambda x, y: of_R(np.atleast_1d(y) - x @ H.T),
-        lambda x: of_P(x - m0),
-        lambda old, new: of_Q(new - old @ F.T),
+    Parameters
+    ----------
+    model : StateSpaceModel
+        With its log densities.
+    proposal : callable
+        ``(particles, y) -> distribution`` of x_t.
+    n : int
+        Particles.
+    initial : callable, optional
+        ``(y) -> distribution`` of x_0; the model's prior where left out.
+    resampler, trigger : Resampler, Trigger, optional
+        Systematic at an effective sample size below half where left out.
+    """
+    return replace(
+        bootstrap(model, n, resampler, trigger),
+        initial=Prior(model) if initial is None else GuidedInitial(model, initial),
+        transition=GuidedTransition(model, proposal),
     )
+
+
+def auxiliary(
+    model: StateSpaceModel,
+    log_priority: Callable[[Any, Any], np.ndarray],
+    n: int,
+    proposal: Callable[[Any, Any], Any] | None = None,
+    initial: Callable[[Any], Any] | None = None,
+    resampler: Resampler | None = None,
+    trigger: Trigger | None = None,
+) -> ParticleFilter:
+    """The auxiliary filter (Pitt and Shephard 1999): selects by weight times priority, then takes that off again.
+
+    Parameters
+    ----------
+    model : StateSpaceModel
+        With its log densities where there is a proposal.
+    log_priority : callable
+        ``(particles, y) -> (n,)``, close to log p(y_t | x_{t-1}); any finite one is exact.
+    n : int
+        Particles.
+    proposal, initial : callable, optional
+        As in `guided`. With p(y_t | x_{t-1}) as priority and p(x_t | x_{t-1}, y_t) as proposal the filter is fully
+        adapted.
+    resampler, trigger : Resampler, Trigger, optional
+        Systematic at an effective sample size (of the weights times the priorities) below half where left out.
+    """
+    if proposal is None:
+        filter = bootstrap(model, n, resampler, trigger)
+        if initial is not None:
+            filter = replace(filter, initial=GuidedInitial(model, initial))
+    else:
+        filter = guided(model, proposal, n, initial, resampler, trigger)
+    return replace(filter, lookahead=PriorityLookahead(log_priority))
+
+
+def resample_move(
+    model: StateSpaceModel,
+    move: Rejuvenation,
+    n: int,
+    resampler: Resampler | None = None,
+    trigger: Trigger | None = None,
+) -> ParticleFilter:
+    """The bootstrap filter with a move at the end of each step that resampled (Gilks and Berzuini 2001)."""
+    return replace(bootstrap(model, n, resampler, trigger), rejuvenation=move)

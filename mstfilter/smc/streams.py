@@ -21,6 +21,7 @@ from __future__ import annotations
 import zlib
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 
@@ -36,7 +37,7 @@ class _KeyedSequence(np.random.SeedSequence):
 
     key: Key
 
-    def spawn(self, n_children: int) -> list[np.random.SeedSequence]:  # type: ignore[override]
+    def spawn(self, n_children: int) -> list[Any]:
         """As the sequence that it stands for."""
         numbers = [c.spawn_key[-1] for c in super().spawn(n_children)]
         path = (_PREFIX, *self.key.path)

@@ -27,7 +27,6 @@ from mstfilter.formats import open_recording
 from mstfilter.runs.run_folder import RunFolder, write_json
 from mstfilter.runs.sources import open_source
 from mstfilter.scene import Recording, scene_cache
-from mstfilter.smc import telling
 from mstfilter.study.code_version import files_version
 from mstfilter.study.executors import Job, JobOutcome
 from mstfilter.study.memory import StagePeaks
@@ -125,9 +124,15 @@ def _run(job: Job, step: _Step) -> None:
     try:
         recording = open_scene(job["source"], job["recordings"])
         began = time.process_time()
-        with scene_cache.on_disk(**job["work"]) if job["work"] else nullcontext(), telling(peaks):
+        with scene_cache.on_disk(**job["work"]) if job["work"] else nullcontext():
             run = filter_recording(
-                recording, job["config"], work, job["seed"], allow_files=job["allow_files"], progress=progress
+                recording,
+                job["config"],
+                work,
+                job["seed"],
+                allow_files=job["allow_files"],
+                progress=progress,
+                observer=peaks,
             )
         stages = [{f"seconds_{k}": v for k, v in run.seconds(t).items()} for t in range(run.n_pauses)]
         _write(run, recording, job, [{**cost, **stage} for cost, stage in zip(costs, stages, strict=True)])

@@ -39,11 +39,10 @@ def peak_megabytes() -> float:
 
 
 class StagePeaks:
-    """Most memory of a step and of each of its stages; a listener for `mstfilter.smc.watch.telling`.
+    """Peak memory of a step and of each of its stages; an observer of `ParticleFilter.step`.
 
     >>> peaks = StagePeaks()
-    >>> with telling(peaks):
-    ...     state, info = filter.step(state, clip)
+    >>> state, info = filter.step(state, clip, observer=peaks)
     >>> peaks.figures()["peak_mb"]
     """
 

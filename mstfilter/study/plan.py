@@ -33,7 +33,7 @@ from mstfilter.study.grid import Asked, expand
 __all__ = ["Arm", "Plan", "StudyRun", "StudyScene", "make_plan"]
 
 # What every run goes through besides its components.
-_ALWAYS = ("mstfilter.smc.particle_filter", "mstfilter.scene.recording", "mstfilter.runs.run_folder")
+_ALWAYS = ("mstfilter.smc.filter", "mstfilter.scene.recording", "mstfilter.runs.run_folder")
 
 
 @dataclass(frozen=True)

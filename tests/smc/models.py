@@ -9,8 +9,7 @@ import numpy as np
 from filterpy.kalman import KalmanFilter
 from scipy import stats
 
-from mstfilter.smc.distributions import Normal
-from mstfilter.smc.state_space import StateSpaceModel
+from mstfilter.smc import Normal, StateSpaceModel
 
 # --- scalar AR(1) observed in noise -------------------------------------------------------------------------------
 RHO, SIGMA, TAU = 0.9, 0.6, 0.4

@@ -8,12 +8,7 @@ import numpy as np
 import pytest
 
 from mstfilter.errors import InputError
-from mstfilter.smc.branching import Branching
-from mstfilter.smc.filters import bootstrap
-from mstfilter.smc.resampling import Always, Never, Systematic
-from mstfilter.smc.resampling_optimal import FearnheadClifford
-from mstfilter.smc.resampling_wrappers import Coalesced
-from mstfilter.smc.state_space import Dynamics
+from mstfilter.smc import Always, Branching, Coalesced, Dynamics, FearnheadClifford, Never, Systematic, bootstrap
 from mstfilter.testing import TransitionContract
 from tests.smc.models import AR1, ar1_observations, hmm, kalman_ar1, mean_ratio
 

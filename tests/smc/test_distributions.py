@@ -7,8 +7,7 @@ import pytest
 from scipy import stats
 
 from mstfilter.errors import InputError
-from mstfilter.smc.adapters import as_distribution
-from mstfilter.smc.distributions import (
+from mstfilter.smc import (
     Bernoulli,
     Categorical,
     Gamma,
@@ -17,6 +16,7 @@ from mstfilter.smc.distributions import (
     Poisson,
     Student,
     Uniform,
+    as_distribution,
 )
 
 COV = np.array([[2.0, 0.6], [0.6, 0.5]])

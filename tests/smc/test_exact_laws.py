@@ -10,15 +10,24 @@ from itertools import combinations, product
 import numpy as np
 import pytest
 
-from mstfilter.smc import resampling, resampling_dpp, resampling_rounding
-from mstfilter.smc.population import Population
-from mstfilter.smc.resampling import Multinomial, Residual, Stratified, Systematic
-from mstfilter.smc.resampling_clusters import ClusterStratified
-from mstfilter.smc.resampling_dpp import KDpp
-from mstfilter.smc.resampling_optimal import FearnheadClifford
-from mstfilter.smc.resampling_rounding import Killing, ResidualSystematic, Ssp
-from mstfilter.smc.resampling_wrappers import Coalesced, Shuffled, Tempered
-from mstfilter.smc.similarity import Gaussian
+from mstfilter.smc import (
+    ClusterStratified,
+    Coalesced,
+    FearnheadClifford,
+    Gaussian,
+    KDpp,
+    Killing,
+    Multinomial,
+    Population,
+    Residual,
+    Shuffled,
+    Ssp,
+    Stratified,
+    Systematic,
+    Tempered,
+    diverse_resampling,
+    resampling,
+)
 from tests.smc.enumeration import outcomes
 
 
@@ -77,8 +86,7 @@ def enumerated_uniforms(monkeypatch):
         def draw(rng, k):
             return np.sort([middle[rng.digit(W)] for _ in range(k)])
 
-        for module in (resampling, resampling_rounding):
-            monkeypatch.setattr(module, "ordered_uniforms", draw)
+        monkeypatch.setattr(resampling, "ordered_uniforms", draw)
 
     return ordered
 
@@ -115,8 +123,8 @@ def test_multinomial_and_residual(weights, n, enumerated_uniforms):
 @pytest.mark.parametrize(("weights", "n"), CASES)
 @pytest.mark.parametrize(
     "scheme",
-    [Systematic(), ResidualSystematic(), Residual("systematic"), Stratified(), Residual("stratified")],
-    ids=["systematic", "rsr", "residual-systematic", "stratified", "residual-stratified"],
+    [Systematic(), Residual("systematic"), Stratified(), Residual("stratified")],
+    ids=["systematic", "residual-systematic", "stratified", "residual-stratified"],
 )
 def test_schemes_of_uniforms(scheme, weights, n):
     """One uniform, or one a stratum; jumps at multiples of one over the total weight."""
@@ -192,7 +200,7 @@ def test_kdpp(k, monkeypatch):
     total, found = 0.0, np.zeros(5)
     for chosen_set in combinations(range(5), k):
         determinant = np.linalg.det(L[np.ix_(chosen_set, chosen_set)])
-        monkeypatch.setattr(resampling_dpp, "sample_kdpp", lambda *_, s=chosen_set: np.array(s))
+        monkeypatch.setattr(diverse_resampling, "sample_kdpp", lambda *_, s=chosen_set: np.array(s))
         chosen = scheme.resample(rng, population, k)
         assert chosen.notes["kdpp"] == f"rank 5 of {k}"
         found[list(chosen_set)] += determinant * np.exp(chosen.log_weights + 700) / k

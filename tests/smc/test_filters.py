@@ -9,13 +9,24 @@ import pytest
 from scipy import stats
 
 from mstfilter.errors import InputError
-from mstfilter.smc.distributions import Normal
-from mstfilter.smc.filters import PriorityLookahead, auxiliary, bootstrap, guided, resample_move
-from mstfilter.smc.interfaces import Resampler, Size
-from mstfilter.smc.population import Population, log_mean_exp
-from mstfilter.smc.rejuvenation import RandomWalkMove
-from mstfilter.smc.resampling import Always, EssBelow
-from mstfilter.smc.state_space import Dynamics, GuidedTransition, StateSpaceModel
+from mstfilter.smc import (
+    Always,
+    Dynamics,
+    EssBelow,
+    GuidedTransition,
+    Normal,
+    Population,
+    PriorityLookahead,
+    RandomWalkMove,
+    WeightResampler,
+    Size,
+    StateSpaceModel,
+    auxiliary,
+    bootstrap,
+    guided,
+    log_mean_exp,
+    resample_move,
+)
 from tests.smc.models import (
     AR1,
     RHO,
@@ -231,7 +242,7 @@ def test_a_size_that_changes_keeps_the_evidence(resample):
 
 def test_evidence_of_improper_parts_is_not_reported():
     @dataclass(frozen=True)
-    class Top(Resampler):
+    class Top(WeightResampler):
         properly_weighted = False
 
         def select(self, rng, log_weights, n):
@@ -256,5 +267,5 @@ def test_wrong_parts_are_named_with_step_and_slot():
     nan = replace(bootstrap(AR1, 5), update=replace(bootstrap(AR1, 5).update, log_likelihood=lambda x, y: x * np.nan))
     with pytest.raises(InputError, match="step 0, update: log weight of particle 0 is nan"):
         nan.run(YS)
-    with pytest.raises(InputError, match="sees the next observation"):
+    with pytest.raises(InputError, match="needs the next observation"):
         replace(auxiliary(AR1, predictive, 5), resample="after")

@@ -10,12 +10,23 @@ from filterpy.kalman import KalmanFilter
 from scipy import stats
 
 from mstfilter.errors import InputError
-from mstfilter.smc.interfaces import Proposal, Transition, Update
-from mstfilter.smc.particle_filter import ParticleFilter
-from mstfilter.smc.population import Population
-from mstfilter.smc.resampling import Always, EssBelow, Multinomial, Never, Residual, Stratified, Systematic
-from mstfilter.smc.state_space import bootstrap, linear_gaussian
-from mstfilter.smc.updates import Chain, Reweight
+from mstfilter.smc import (
+    Always,
+    EssBelow,
+    Multinomial,
+    Never,
+    ParticleFilter,
+    Population,
+    Proposal,
+    Residual,
+    Reweight,
+    Stratified,
+    Systematic,
+    Transition,
+    Update,
+    bootstrap,
+    linear_gaussian,
+)
 
 F, Q = np.array([[1.0, 0.5], [0.0, 0.9]]), np.array([[0.2, 0.05], [0.05, 0.3]])
 H, R = np.array([[1.0, 0.0]]), np.array([[0.7]])
@@ -116,7 +127,7 @@ def test_particles_of_every_kind_give_the_same_numbers():
     def box(array):
         return tuple(Boxed(tuple(row)) for row in array)
 
-    from mstfilter.smc.state_space import StateSpaceModel
+    from mstfilter.smc import StateSpaceModel
 
     objects = StateSpaceModel(
         lambda rng, n: box(MODEL.sample_initial(rng, n)),
@@ -236,7 +247,7 @@ def test_a_separate_initial_is_updated_before_any_prediction():
             seen.append(observation)
             return population
 
-    filter = ParticleFilter(initial=Numbers(), transition=Watch(), update=Chain(()), n=2)
+    filter = ParticleFilter(initial=Numbers(), transition=Watch(), update=None, n=2)
     filter.run([1, 2, 3])
     assert seen == [2, 3]
 

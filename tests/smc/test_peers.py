@@ -6,9 +6,7 @@ import csv
 
 import numpy as np
 
-from mstfilter.smc.distributions import Normal
-from mstfilter.smc.filters import bootstrap
-from mstfilter.smc.state_space import StateSpaceModel
+from mstfilter.smc import Normal, StateSpaceModel, bootstrap
 from tests.conftest import REPOSITORY
 
 RHO, SIGMA, TAU = 0.9, 0.6, 0.4

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from mstfilter.errors import InputError
-from mstfilter.smc.population import Candidates, Population, effective_sample_size, log_mean_exp
-from mstfilter.smc.streams import Key, child, key_of
+from mstfilter.smc import Candidates, Key, Population, child, key_of, log_mean_exp
 
 
 @pytest.mark.parametrize(
@@ -85,7 +84,7 @@ def test_weights_survive_extreme_offsets():
         lw = np.log([1.0, 2.0, 5.0]) + offset
         np.testing.assert_allclose(Population(np.zeros(3), lw).weights, [0.125, 0.25, 0.625])
         assert log_mean_exp(lw) == pytest.approx(np.log(8 / 3) + offset)
-        assert effective_sample_size(lw) == pytest.approx(64 / 30)
+        assert Population(np.zeros(3), lw).ess == pytest.approx(64 / 30)
 
 
 def test_candidates_are_built_once_and_only_when_looked_at():

@@ -9,11 +9,22 @@ import pytest
 from scipy import stats
 
 from mstfilter.errors import InputError
-from mstfilter.smc.distributions import Bernoulli, Categorical, Normal, Poisson
-from mstfilter.smc.filters import bootstrap, guided
-from mstfilter.smc.population import log_mean_exp
-from mstfilter.smc.programs import Program, observe, per_particle, sample, switch
-from mstfilter.smc.resampling import Always, EssBelow
+from mstfilter.smc import (
+    Always,
+    Bernoulli,
+    Categorical,
+    EssBelow,
+    Normal,
+    Poisson,
+    Program,
+    bootstrap,
+    guided,
+    log_mean_exp,
+    observe,
+    per_particle,
+    sample,
+    switch,
+)
 from tests.smc.models import (
     AR1,
     EMIT,

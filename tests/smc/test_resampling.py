@@ -10,10 +10,21 @@ from hypothesis import given, settings, strategies as st
 from scipy import stats
 
 from mstfilter.errors import InputError
-from mstfilter.smc.kept_weights import KeepWeights
-from mstfilter.smc.population import Population, log_mean_exp
-from mstfilter.smc.resampling import Always, EssBelow, Every, Multinomial, Never, Residual, Stratified, Systematic
-from mstfilter.smc.resampling_rounding import Killing, ResidualSystematic, Ssp
+from mstfilter.smc import (
+    Always,
+    EssBelow,
+    EveryKth,
+    KeepWeights,
+    Killing,
+    Multinomial,
+    Never,
+    Population,
+    Residual,
+    Ssp,
+    Stratified,
+    Systematic,
+    log_mean_exp,
+)
 
 SCHEMES = [
     Multinomial(),
@@ -22,7 +33,6 @@ SCHEMES = [
     Residual(),
     Residual("stratified"),
     Residual("systematic"),
-    ResidualSystematic(),
     Ssp(),
     Killing(),
 ]
@@ -33,11 +43,10 @@ NAMES = [
     "residual",
     "residual-stratified",
     "residual-systematic",
-    "rsr",
     "ssp",
     "killing",
 ]
-ROUNDING = (Systematic(), Residual("systematic"), ResidualSystematic(), Ssp())
+ROUNDING = (Systematic(), Residual("systematic"), Ssp())
 each_scheme = pytest.mark.parametrize("scheme", SCHEMES, ids=NAMES)
 
 
@@ -54,7 +63,7 @@ def theory(name, W, n):
     fraction = expected - np.floor(expected + 1e-12)
     if name == "multinomial":
         return expected * (1 - W)
-    if name in ("systematic", "residual-systematic", "rsr", "ssp"):
+    if name in ("systematic", "residual-systematic", "ssp"):
         return fraction * (1 - fraction)
     if name == "residual":
         rest = fraction.sum()
@@ -86,7 +95,7 @@ def test_mean_and_variance_of_copies(scheme, name, n):
     if want is None:  # no formula: at least the mean, by its own spread
         assert (np.abs(N.mean(axis=0) - n * W) <= 5 * N.std(axis=0) / np.sqrt(repeats) + 1e-9).all()
         return
-    if name in ("systematic", "residual-systematic", "rsr", "ssp"):
+    if name in ("systematic", "residual-systematic", "ssp"):
         assert ((np.floor(n * W + 1e-9) <= N) & (np.ceil(n * W - 1e-9) >= N)).all()
     spread = np.sqrt(np.maximum(want, 1e-12) / repeats)
     assert (np.abs(N.mean(axis=0) - n * W) <= 5 * spread + 1e-9).all()
@@ -98,7 +107,7 @@ def test_mean_and_variance_of_copies(scheme, name, n):
 
 def test_systematic_by_exact_quadrature():
     """Integrating the copies over the one uniform gives n W exactly."""
-    from mstfilter.smc.resampling import _cumulative, _from_shifts
+    from mstfilter.smc.resampling import _cumulative, systematic_ancestors
 
     W = np.array([0.12, 0.0, 0.43, 0.05, 0.4])
     for n in (1, 2, 5, 7):
@@ -106,7 +115,7 @@ def test_systematic_by_exact_quadrature():
         edges = np.unique(np.concatenate([[0, 1], np.mod(n * np.cumsum(W), 1.0)]))
         mean = np.zeros(len(W))
         for a, b in pairwise(edges):
-            copies = np.bincount(_from_shifts(cumulative, n, (a + b) / 2), minlength=len(W))
+            copies = np.bincount(systematic_ancestors(cumulative, n, (a + b) / 2), minlength=len(W))
             assert ((copies == np.floor(n * W + 1e-9)) | (copies == np.ceil(n * W - 1e-9))).all()
             mean += (b - a) * copies
         np.testing.assert_allclose(mean, n * W, atol=1e-9)
@@ -147,7 +156,7 @@ def test_any_weights_give_valid_ancestors(scheme, lw, n, offset, single, seed):
     assert ((ancestors >= 0) & (ancestors < len(lw))).all()
     W = np.exp(lw.astype(float) - lw.astype(float).max())
     assert (W[ancestors] > 0).all(), "a particle without weight was chosen"
-    if isinstance(scheme, (Systematic, Residual, ResidualSystematic, Ssp)):
+    if isinstance(scheme, (Systematic, Residual, Ssp)):
         floor = np.floor(n * W / W.sum() - 1e-6)
         assert (np.bincount(ancestors, minlength=len(lw)) >= floor).all()
     if scheme in ROUNDING:
@@ -206,7 +215,7 @@ def test_three_ways_to_the_same_counts(weights, n, u):
         loop.append(int(np.floor(n * w - carried)) + 1)
         carried += loop[-1] - n * w
     loop[-1] += n - sum(loop)  # its last count is decided by rounding alone
-    for scheme in (Systematic(), ResidualSystematic(), Residual("systematic")):
+    for scheme in (Systematic(), Residual("systematic")):
         found = np.bincount(scheme.select(Edge(u), np.log(weights), n)[0], minlength=len(W))
         np.testing.assert_array_equal(found, loop)
 
@@ -214,7 +223,7 @@ def test_three_ways_to_the_same_counts(weights, n, u):
 def test_residual_with_nearly_whole_copies_makes_exactly_n():
     """999 999 particles a millionth short of one copy each, and one that makes up for it."""
     weights = np.append(np.full(999_999, 1 - 1e-6), 1 + 0.999999)
-    for scheme in (Residual(), ResidualSystematic(), Ssp()):
+    for scheme in (Residual(), Ssp()):
         assert len(scheme.select(np.random.default_rng(0), np.log(weights), 1_000_000)[0]) == 1_000_000
 
 
@@ -260,4 +269,4 @@ def test_triggers():
     assert EssBelow(0.5).wants(peaked, 0)
     assert Always().wants(even, 0)
     assert not Never().wants(peaked, 0)
-    assert [Every(3).wants(even, t) for t in range(4)] == [True, False, False, True]
+    assert [EveryKth(3).wants(even, t) for t in range(4)] == [True, False, False, True]

@@ -13,20 +13,26 @@ import numpy as np
 import pytest
 
 from mstfilter.errors import InputError, MissingLibraryError
-from mstfilter.smc import collectors as collectors
+from mstfilter.smc import (
+    ArrayCodec,
+    Codec,
+    EssBelow,
+    Key,
+    Multinomial,
+    Population,
+    Program,
+    State,
+    Tempered,
+    Trace,
+    bootstrap,
+    collect,
+    observe,
+    per_particle,
+    run_many,
+    sample,
+)
+from mstfilter.smc import diagnostics
 from mstfilter.smc.checkpoint import load_state, save_state
-from mstfilter.smc.codecs import ArrayCodec
-from mstfilter.smc.collectors import collect
-from mstfilter.smc.filters import bootstrap
-from mstfilter.smc.interfaces import Codec
-from mstfilter.smc.many import run_many
-from mstfilter.smc.population import Population
-from mstfilter.smc.programs import Program, observe, per_particle, sample
-from mstfilter.smc.resampling import EssBelow, Multinomial
-from mstfilter.smc.resampling_wrappers import Tempered
-from mstfilter.smc.state import State
-from mstfilter.smc.streams import Key
-from mstfilter.smc.trace import Trace
 from tests.conftest import REPOSITORY
 from tests.smc.models import AR1, SYMBOLS, Box, ar1_observations, hmm
 
@@ -37,11 +43,11 @@ YS = ar1_observations(10)
 def test_collectors():
     history = collect(
         bootstrap(AR1, 64).iterate(YS, 3),
-        ess=collectors.ess,
-        unique=collectors.unique_ancestors,
-        entropy=collectors.weight_entropy,
-        evidence=collectors.log_evidence,
-        mean=collectors.mean,
+        ess=diagnostics.ess,
+        unique=diagnostics.unique_ancestors,
+        entropy=diagnostics.weight_entropy,
+        evidence=diagnostics.log_evidence,
+        mean=diagnostics.mean,
         own=lambda state, info: [info.t, 2 * info.t],
     )
     state, infos = bootstrap(AR1, 64).run(YS, 3)
@@ -60,9 +66,9 @@ def test_collectors():
 
 
 def test_to_xarray(monkeypatch):
-    history = collect(bootstrap(AR1, 8).iterate(YS, 3), ess=collectors.ess)
+    history = collect(bootstrap(AR1, 8).iterate(YS, 3), ess=diagnostics.ess)
     xarray = pytest.importorskip("xarray")
-    runs = run_many({"a": bootstrap(AR1, 8)}, YS, [1, 2], ess=collectors.ess, two=lambda s, i: np.zeros(2))
+    runs = run_many({"a": bootstrap(AR1, 8)}, YS, [1, 2], ess=diagnostics.ess, two=lambda s, i: np.zeros(2))
     table = runs.to_xarray()
     assert isinstance(table, xarray.Dataset)
     assert table["ess"].dims == ("arm", "seed", "time")
@@ -75,7 +81,7 @@ def test_to_xarray(monkeypatch):
 # --- many runs ----------------------------------------------------------------------------------------------------
 def test_results_do_not_depend_on_workers_or_on_other_arms():
     arms = {"systematic": bootstrap(AR1, 50), "multinomial": bootstrap(AR1, 50, Multinomial())}
-    kept = {"log_evidence": collectors.log_evidence, "mean": collectors.mean}
+    kept = {"log_evidence": diagnostics.log_evidence, "mean": diagnostics.mean}
     one = run_many(arms, YS, range(6), **kept)
     four = run_many(arms, YS, range(6), workers=4, **kept)
     alone = run_many({"multinomial": arms["multinomial"]}, YS, [4], workers=2, **kept)
@@ -197,7 +203,7 @@ def test_what_cannot_be_stored_is_one_clear_error(tmp_path):
 # --- checkpoints of runs ------------------------------------------------------------------------------------------
 @per_particle
 def walk(previous, y):
-    from mstfilter.smc.distributions import Normal
+    from mstfilter.smc import Normal
 
     x = sample("x", Normal(0.0 if previous is None else previous["x"], 1.0))
     observe("y", Normal(x, 1.0), y)

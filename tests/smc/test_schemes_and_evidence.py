@@ -14,16 +14,23 @@ from scipy import stats
 
 from mstfilter import smc
 from mstfilter.presets import REGISTRY
-from mstfilter.smc.branching import Branching
-from mstfilter.smc.distributions import Normal
-from mstfilter.smc.filters import bootstrap
-from mstfilter.smc.resampling import Always, EssBelow, Never, Residual
-from mstfilter.smc.resampling_clusters import ClusterStratified
-from mstfilter.smc.resampling_dpp import KDpp
-from mstfilter.smc.resampling_optimal import FearnheadClifford
-from mstfilter.smc.resampling_wrappers import Coalesced, Tempered
-from mstfilter.smc.similarity import Gaussian, Similarity
-from mstfilter.smc.state_space import StateSpaceModel
+from mstfilter.smc import (
+    Always,
+    Branching,
+    ClusterStratified,
+    Coalesced,
+    EssBelow,
+    FearnheadClifford,
+    Gaussian,
+    KDpp,
+    Never,
+    Normal,
+    Residual,
+    Similarity,
+    StateSpaceModel,
+    Tempered,
+    bootstrap,
+)
 from tests.smc.models import AR1, RHO, SD0, SIGMA, SYMBOLS, ar1_observations, forward, hmm, kalman_ar1, mean_ratio
 
 YS = ar1_observations(8)

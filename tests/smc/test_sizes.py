@@ -9,11 +9,18 @@ import pytest
 from scipy import stats
 
 from mstfilter.errors import InputError
-from mstfilter.smc.population import Population
-from mstfilter.smc.resampling import Always, Systematic
-from mstfilter.smc.similarity import Bins, Exact, Gaussian
-from mstfilter.smc.sizes import Fixed, Kld
-from mstfilter.smc.state_space import bootstrap, linear_gaussian
+from mstfilter.smc import (
+    Always,
+    Bins,
+    ExactEquality,
+    Fixed,
+    Gaussian,
+    Kld,
+    Population,
+    Systematic,
+    bootstrap,
+    linear_gaussian,
+)
 
 
 def sequential(rng, mass, epsilon, delta):
@@ -94,10 +101,10 @@ def test_fixed():
 
 
 def test_classes():
-    np.testing.assert_array_equal(Exact().classes(np.array([2.0, 1.0, 2.0])), [0, 1, 0])
-    np.testing.assert_array_equal(Exact().classes(np.array([[1, 2], [2, 1], [1, 2]])), [0, 1, 0])
-    np.testing.assert_array_equal(Exact().classes(("a", "b", "a")), [0, 1, 0])
-    np.testing.assert_array_equal(Exact().classes({"x": np.array([1, 1, 1]), "y": np.array([3, 4, 3])}), [0, 1, 0])
+    np.testing.assert_array_equal(ExactEquality().classes(np.array([2.0, 1.0, 2.0])), [0, 1, 0])
+    np.testing.assert_array_equal(ExactEquality().classes(np.array([[1, 2], [2, 1], [1, 2]])), [0, 1, 0])
+    np.testing.assert_array_equal(ExactEquality().classes(("a", "b", "a")), [0, 1, 0])
+    np.testing.assert_array_equal(ExactEquality().classes({"x": np.array([1, 1, 1]), "y": np.array([3, 4, 3])}), [0, 1, 0])
     np.testing.assert_array_equal(Bins(1.0).classes(np.array([[0.5, -0.5], [0.1, -0.1], [0.5, 0.5]])), [0, 0, 1])
 
 

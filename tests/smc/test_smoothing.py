@@ -13,13 +13,22 @@ import pytest
 from filterpy.kalman import KalmanFilter
 
 from mstfilter.errors import InputError
-from mstfilter.smc.filters import auxiliary, bootstrap, guided, resample_move
-from mstfilter.smc.interfaces import Proposal
-from mstfilter.smc.population import Population
-from mstfilter.smc.rejuvenation import RandomWalkMove
-from mstfilter.smc.resampling import Always
-from mstfilter.smc.smoothing import backward_paths, fixed_lag, genealogy, keep
-from mstfilter.smc.state_space import Dynamics, GuidedTransition
+from mstfilter.smc import (
+    Always,
+    Dynamics,
+    GuidedTransition,
+    Population,
+    Proposal,
+    RandomWalkMove,
+    auxiliary,
+    backward_paths,
+    bootstrap,
+    fixed_lag,
+    genealogy,
+    guided,
+    keep,
+    resample_move,
+)
 from tests.smc.models import (
     AR1,
     EMIT,

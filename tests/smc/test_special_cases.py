@@ -10,13 +10,19 @@ import pytest
 from scipy import stats
 
 from mstfilter.errors import InputError
-from mstfilter.smc.filters import bootstrap
-from mstfilter.smc.interfaces import Proposal
-from mstfilter.smc.population import Population
-from mstfilter.smc.rao_blackwell import ConditionallyLinear, Linear, rao_blackwellised
-from mstfilter.smc.resampling import Always, EssBelow
-from mstfilter.smc.state_space import linear_gaussian
-from mstfilter.smc.vectors import CrossVectors, ProjectOnto
+from mstfilter.smc import (
+    Always,
+    ConditionallyLinear,
+    CrossVectors,
+    EssBelow,
+    Linear,
+    Population,
+    ProjectOnto,
+    Proposal,
+    bootstrap,
+    linear_gaussian,
+    rao_blackwellised,
+)
 from tests.smc.test_particle_filter import M0, P0, F, H, Q, R, kalman, observations
 
 YS = observations(6)

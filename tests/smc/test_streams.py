@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from mstfilter.errors import InputError
-from mstfilter.smc.population import Population
-from mstfilter.smc.streams import _PREFIX, Key, child, key_of
+from mstfilter.smc import Key, Population, child, key_of
+from mstfilter.smc.streams import _PREFIX
 
 
 @pytest.mark.parametrize("seed", [0, 3, 2**31, 2**32, 2**40 + 5, 2**130 + 7])

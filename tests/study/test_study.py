@@ -197,18 +197,30 @@ def test_memory_by_stage():
     """A stage that holds 60 MB for a moment is told from one that holds 20; the step has the most of all."""
     code = """
 import numpy as np
-from mstfilter.smc import Watch, telling
+from mstfilter.smc import ParticleFilter, Population, Proposal, Reweight, Transition
 from mstfilter.study.memory import StagePeaks
-peaks, watch = StagePeaks(), Watch()
+
+class Zeros(Proposal):
+    def sample(self, rng, observation, n):
+        return Population(np.zeros(n))
+
+class Holds20(Transition):
+    def predict(self, rng, population, observation):
+        np.ones(20 * 2**20 // 8)
+        return population
+
+def holds_60(particles, observation):
+    np.ones(60 * 2**20 // 8)
+    return np.zeros(len(particles))
+
+filter = ParticleFilter(initial=Zeros(), transition=Holds20(), update=Reweight(lambda x, y: np.zeros(len(x))), n=2)
+state, _ = filter.step(filter.start(0), 1)
+filter = ParticleFilter(initial=Zeros(), transition=Holds20(), update=Reweight(holds_60), n=2)
+peaks = StagePeaks()
 base = peaks.figures()["peak_mb"]
-with telling(peaks):
-    for stage, mb in (("transition", 20), ("update", 60), ("resampler", 0)):
-        watch.enter(stage)
-        np.ones(mb * 2**20 // 8)
-        watch.leave()
-watch.enter("build")  # nobody listens any more
+filter.step(state, 1, observer=peaks)
 print(*(peaks.figures()[k] - base for k in ("peak_mb_transition", "peak_mb_update", "peak_mb_resampler", "peak_mb")))
-assert len(peaks.figures()) == 4
+assert len(peaks.figures()) == 5
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=True)
     transition, update, resampler, step = map(float, done.stdout.split())

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mstfilter.smc import Resampler, log_mean_exp, normalise
+from mstfilter.smc import WeightResampler, log_mean_exp, normalise
 
 
 def systematic(rng, weights, n):
@@ -18,13 +18,13 @@ def systematic(rng, weights, n):
 
 
 @dataclass(frozen=True)
-class Correct(Resampler):
+class Correct(WeightResampler):
     def select(self, rng, log_weights, n):
         return systematic(rng, normalise(log_weights), n), None
 
 
 @dataclass(frozen=True)
-class CorrectWeighted(Resampler):
+class CorrectWeighted(WeightResampler):
     """Select evenly among the positive ones and keep the weights: proper, with unequal output weights."""
 
     def select(self, rng, log_weights, n):
@@ -34,7 +34,7 @@ class CorrectWeighted(Resampler):
 
 
 @dataclass(frozen=True)
-class BiasedResidual(Resampler):
+class BiasedResidual(WeightResampler):
     """The remainder is drawn from W - copies instead of n W - copies: light particles hardly survive."""
 
     def select(self, rng, log_weights, n):
@@ -46,13 +46,13 @@ class BiasedResidual(Resampler):
 
 
 @dataclass(frozen=True)
-class IgnoresN(Resampler):
+class IgnoresN(WeightResampler):
     def select(self, rng, log_weights, n):
         return systematic(rng, normalise(log_weights), len(log_weights)), None
 
 
 @dataclass(frozen=True)
-class PicksZeroWeights(Resampler):
+class PicksZeroWeights(WeightResampler):
     """Gives what rounding leaves over to the last particle, whatever it weighs."""
 
     def select(self, rng, log_weights, n):
@@ -63,7 +63,7 @@ class PicksZeroWeights(Resampler):
 
 
 @dataclass(frozen=True)
-class ZeroAtTheEdge(Resampler):
+class ZeroAtTheEdge(WeightResampler):
     """Picks a leading weight of zero where the uniform is exactly 0."""
 
     def select(self, rng, log_weights, n):
@@ -72,7 +72,7 @@ class ZeroAtTheEdge(Resampler):
 
 
 @dataclass(frozen=True)
-class RemainderFromWeights(Resampler):
+class RemainderFromWeights(WeightResampler):
     """Residual as one library has it: W - copies, negative numbers and all."""
 
     def select(self, rng, log_weights, n):
@@ -87,7 +87,7 @@ class RemainderFromWeights(Resampler):
 
 
 @dataclass(frozen=True)
-class FirstAlwaysStays(Resampler):
+class FirstAlwaysStays(WeightResampler):
     """Elitism by place."""
 
     def select(self, rng, log_weights, n):
@@ -96,20 +96,20 @@ class FirstAlwaysStays(Resampler):
 
 
 @dataclass(frozen=True)
-class GreedyCalledProper(Resampler):
+class GreedyCalledProper(WeightResampler):
     def select(self, rng, log_weights, n):
         best = np.argsort(-log_weights)[: np.isfinite(log_weights).sum()]
         return best[np.arange(n) % len(best)], None
 
 
 @dataclass(frozen=True)
-class GlobalGenerator(Resampler):
+class GlobalGenerator(WeightResampler):
     def select(self, rng, log_weights, n):
         return systematic(np.random, normalise(log_weights), n), None
 
 
 @dataclass(frozen=True)
-class OldWeightsKept(Resampler):
+class OldWeightsKept(WeightResampler):
     """Chosen by weight, and the weight kept: the same evidence twice."""
 
     def select(self, rng, log_weights, n):
@@ -118,7 +118,7 @@ class OldWeightsKept(Resampler):
 
 
 @dataclass(frozen=True)
-class WeightsForgotten(Resampler):
+class WeightsForgotten(WeightResampler):
     """Equal weights, but not those that keep the evidence."""
 
     def select(self, rng, log_weights, n):
@@ -126,7 +126,7 @@ class WeightsForgotten(Resampler):
 
 
 @dataclass(frozen=True)
-class OffByOne(Resampler):
+class OffByOne(WeightResampler):
     """Counts particles from 1."""
 
     def select(self, rng, log_weights, n):
@@ -134,7 +134,7 @@ class OffByOne(Resampler):
 
 
 @dataclass(frozen=True)
-class OffByOneClipped(Resampler):
+class OffByOneClipped(WeightResampler):
     """The neighbour of the particle that was meant, inside the range."""
 
     def select(self, rng, log_weights, n):
@@ -142,7 +142,7 @@ class OffByOneClipped(Resampler):
 
 
 @dataclass(frozen=True)
-class OrderMatters(Resampler):
+class OrderMatters(WeightResampler):
     """Sorts by weight and forgets to sort back."""
 
     def select(self, rng, log_weights, n):
@@ -150,14 +150,14 @@ class OrderMatters(Resampler):
 
 
 @dataclass(frozen=True)
-class ChangesInput(Resampler):
+class ChangesInput(WeightResampler):
     def select(self, rng, log_weights, n):
         log_weights -= log_mean_exp(log_weights)
         return systematic(rng, np.exp(log_weights), n), None
 
 
 @dataclass(frozen=True)
-class SinglePrecisionOverflow(Resampler):
+class SinglePrecisionOverflow(WeightResampler):
     """exp in single precision overflows at 88."""
 
     def select(self, rng, log_weights, n):
@@ -166,7 +166,7 @@ class SinglePrecisionOverflow(Resampler):
 
 
 @dataclass(frozen=True)
-class SinglePrecisionSum(Resampler):
+class SinglePrecisionSum(WeightResampler):
     """Cumulated in single precision: light particles vanish behind a heavy one."""
 
     def select(self, rng, log_weights, n):
@@ -174,13 +174,13 @@ class SinglePrecisionSum(Resampler):
 
 
 @dataclass(frozen=True)
-class SeedIgnored(Resampler):
+class SeedIgnored(WeightResampler):
     def select(self, rng, log_weights, n):
         return systematic(np.random.default_rng(0), normalise(log_weights), n), None
 
 
 @dataclass(frozen=True)
-class OwnGenerator(Resampler):
+class OwnGenerator(WeightResampler):
     """A new generator of unknown seed at each call."""
 
     def select(self, rng, log_weights, n):

@@ -10,11 +10,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mstfilter.smc import Resampler, normalise
+from mstfilter.smc import WeightResampler, normalise
 
 
 @dataclass(frozen=True)
-class MyResampler(Resampler):
+class MyResampler(WeightResampler):
     """Independent draws by weight. Fields, with annotation and default, are settings: add yours here."""
 
     # Say False where the weights afterwards are not those of an exact filter (for example: keep the n best).

@@ -1,16 +1,18 @@
-"""The Rao-Blackwellised filter: part of the state is drawn, the rest is integrated exactly by a Kalman filter.
+"""Linear-Gaussian models, and the Rao-Blackwellised filter, which integrates part of the state by Kalman filters.
 
+>>> filter = bootstrap(linear_gaussian(F, Q, H, R, m0, P0), n=1000)
 >>> filter = rao_blackwellised(model, n=100)
 >>> state, infos = filter.run(observations, seed=0)
 >>> state.population.particles["mean"].shape           # (n, d)
 
-Given the drawn part u_0 .. u_t (a regime, a contact, an association) the state is linear and Gaussian:
+In a Rao-Blackwellised filter part of the state, u_t (a regime, a contact, an association), is drawn. Given u_0 .. u_t
+the rest is linear and Gaussian:
 
     z_t = F(u_t) z_{t-1} + b(u_t) + N(0, Q(u_t)),    y_t = H(u_t) z_t + N(0, R(u_t))
 
-A particle is u with the mean and covariance of z given u_0 .. u_t and y_0 .. y_t: a population that is a mapping of
-arrays, moved by a Transition (draw u, predict) and an Update (weigh by p(y_t | u_0 .. u_t, y_0 .. y_{t-1}), correct).
-Reference: Doucet, de Freitas, Murphy, Russell (2000).
+A particle holds u with the mean and covariance of z given u_0 .. u_t and y_0 .. y_t. The population is a mapping of
+arrays, moved by a Transition (draw u, predict z) and an Update (weight by p(y_t | u_0 .. u_t, y_0 .. y_{t-1}),
+correct z). Reference: Doucet, de Freitas, Murphy, Russell (2000).
 """
 
 from __future__ import annotations
@@ -21,12 +23,54 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
+from mstfilter.errors import InputError
+from mstfilter.smc.filter import ParticleFilter
 from mstfilter.smc.interfaces import Proposal, Transition, Update
-from mstfilter.smc.particle_filter import ParticleFilter
-from mstfilter.smc.population import Population
-from mstfilter.smc.updates import union
+from mstfilter.smc.population import Population, union
+from mstfilter.smc.state_space import StateSpaceModel
 
-__all__ = ["ConditionallyLinear", "Linear", "rao_blackwellised"]
+__all__ = ["ConditionallyLinear", "Linear", "linear_gaussian", "rao_blackwellised"]
+
+
+def linear_gaussian(F: Any, Q: Any, H: Any, R: Any, m0: Any, P0: Any) -> StateSpaceModel:
+    """x_0 ~ N(m0, P0), x_t = F x_{t-1} + N(0, Q), y_t = H x_t + N(0, R); particles are (n, d)."""
+    F, Q, H, R, m0, P0 = (np.asarray(a, dtype=np.float64) for a in (F, Q, H, R, m0, P0))
+    if m0.ndim != 1:
+        raise InputError(f"m0 has shape {m0.shape}, expected one number an entry of the state: (d,)")
+    d, k = m0.shape, H.shape[:1]
+    shapes = {"F": (F, d * 2), "Q": (Q, d * 2), "H": (H, k + d), "R": (R, k * 2), "m0": (m0, d), "P0": (P0, d * 2)}
+    for name, (array, shape) in shapes.items():
+        if array.shape != shape:
+            raise InputError(f"{name} has shape {array.shape}, expected {shape} as m0 has {d[0]} entries")
+    for name, cov in (("Q", Q), ("R", R), ("P0", P0)):
+        if not np.allclose(cov, cov.T) or not (np.linalg.eigvalsh(cov) > 0).all():
+            raise InputError(f"{name} is {cov.tolist()}, expected a covariance: symmetric and positive definite")
+    root_Q, root_P = np.linalg.cholesky(Q), np.linalg.cholesky(P0)
+
+    def log_normal(cov: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
+        whiten = np.linalg.inv(np.linalg.cholesky(cov))
+        constant = np.log(np.diag(whiten)).sum() - 0.5 * len(cov) * np.log(2 * np.pi)
+
+        def of(residual: np.ndarray) -> np.ndarray:
+            z = residual @ whiten.T
+            return constant - 0.5 * np.einsum("ij,ij->i", z, z)
+
+        return of
+
+    def initial(rng: np.random.Generator, n: int) -> np.ndarray:
+        return m0 + rng.standard_normal((n, len(m0))) @ root_P.T
+
+    def transition(rng: np.random.Generator, x: np.ndarray) -> np.ndarray:
+        return x @ F.T + rng.standard_normal(x.shape) @ root_Q.T
+
+    of_R, of_P, of_Q = log_normal(R), log_normal(P0), log_normal(Q)
+    return StateSpaceModel(
+        initial,
+        transition,
+        lambda x, y: of_R(np.atleast_1d(y) - x @ H.T),
+        lambda x: of_P(x - m0),
+        lambda old, new: of_Q(new - old @ F.T),
+    )
 
 
 class Linear(NamedTuple):
@@ -72,7 +116,7 @@ class ConditionallyLinear:
 
 
 @dataclass(frozen=True)
-class _First(Proposal):
+class _Initial(Proposal):
     model: ConditionallyLinear
 
     def sample(self, rng: np.random.Generator, observation: Any, n: int) -> Population:
@@ -146,4 +190,4 @@ def rao_blackwellised(model: ConditionallyLinear, n: int, **parts: Any) -> Parti
     **parts
         Further fields of `ParticleFilter`, such as ``resampler``.
     """
-    return ParticleFilter(initial=_First(model), transition=_Predict(model), update=_Correct(model), n=n, **parts)
+    return ParticleFilter(initial=_Initial(model), transition=_Predict(model), update=_Correct(model), n=n, **parts)

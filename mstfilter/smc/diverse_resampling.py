@@ -1,0 +1,368 @@
+"""Resampling that keeps different particles: by clusters, by a k-determinantal point process, greedily.
+
+These schemes compare the particles by a `Similarity`. They need more candidates than particles to select.
+
+>>> import numpy as np
+>>> from mstfilter.smc import ClusterStratified, Gaussian, GreedyDiverse, KDpp, Population
+>>> rng = np.random.default_rng(0)
+>>> population = Population(np.array([0.0, 0.1, 0.2, 9.0]), np.log([3.0, 3.0, 3.0, 1.0]))
+
+`ClusterStratified` gives every group of similar particles a share of the selection by its weight, at least one
+particle if possible, and selects inside each group. A light group that differs from all others keeps a particle where
+weight- based schemes lose it most of the time. Exact in expectation.
+
+>>> chosen = ClusterStratified(Gaussian(1.0)).resample(rng, population, 2)
+>>> float(chosen.particles[1]), chosen.weights
+(9.0, array([0.9, 0.1]))
+
+`KDpp` draws a set A of n particles with probability proportional to det L_A, L_ij = sqrt(w_i w_j) S_ij, S the
+similarity: heavy particles that differ from each other. Equal particles are never selected together. A selected
+particle gets the weight w_i / pi_i, pi_i its probability of being selected, which makes the selection unbiased.
+
+>>> twins = Population(np.array([0.0, 0.01, 5.0]), np.log([4.0, 4.0, 1.0]))
+>>> KDpp(similarity=Gaussian(1.0)).resample(rng, twins, 2).particles
+array([0., 5.])
+
+`GreedyDiverse` maximises det L_A greedily and draws nothing. It is not properly weighted: the weight of a particle
+that is not selected moves to the most similar selected one.
+
+References: Kulesza and Taskar (2011), "k-DPPs: fixed-size determinantal point processes"; (2012), "Determinantal
+point processes for machine learning", sections 2.4 and 5.2; Chen, Zhang, Zhou (2018), "Fast greedy MAP inference for
+determinantal point process".
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from mstfilter.errors import InputError, check_component, check_number
+from mstfilter.smc.interfaces import Resampler
+from mstfilter.smc.population import Population, log_mean_exp
+from mstfilter.smc.resampling import FearnheadClifford, Systematic, checked_weights
+from mstfilter.smc.similarity import Gaussian, Similarity
+
+__all__ = ["ClusterStratified", "GreedyDiverse", "KDpp"]
+
+#: Similarities of more particles than this are not computed: the matrix alone would take gigabytes.
+MAX_PARTICLES = 10_000
+
+
+def checked_similarity(similarity: Similarity, population: Population) -> np.ndarray:
+    """(m, m) float64 symmetric similarities of the particles; raises InputError if the matrix is not valid."""
+    m = len(population)
+    if m > MAX_PARTICLES:
+        raise InputError(
+            f"similarities of {m} particles take a matrix of {m} x {m}, at most {MAX_PARTICLES} are compared",
+            "select fewer first, for example by fearnhead_clifford",
+        )
+    matrix = np.asarray(similarity.matrix(population.realised().particles), dtype=np.float64)
+    if matrix.shape != (m, m):
+        raise InputError(f"similarities of {m} particles have shape {matrix.shape}, expected ({m}, {m})")
+    if not np.isfinite(matrix).all():
+        raise InputError(f"{int((~np.isfinite(matrix)).sum())} similarities are not finite")
+    return (matrix + matrix.T) / 2
+
+
+@dataclass(frozen=True)
+class ClusterStratified(Resampler):
+    """Particles are allocated to clusters by weight, at least one to each if n allows it; inside, drawn by weight.
+
+    With n below the number of clusters, Fearnhead-Clifford selects clusters and their weights. Otherwise cluster g
+    gets max(1, W_g / c) particles on average, with sum max(1, W_g / c) = n, rounded systematically. The particles of
+    a cluster share its weight, so any such allocation is unbiased. Clusters below `least_mass` are not sure of a
+    particle: each gets W_g / c on average, and if that is below 1 and it gets one, that particle has weight c.
+    ``notes["clusters"]`` is the number of clusters.
+
+    Parameters
+    ----------
+    similarity : Similarity
+        Compares particles.
+    at_least : float
+        Similarity to the leader from which a particle belongs to its cluster, in (0, 1].
+    scheme : Resampler
+        Selects inside a cluster.
+    least_mass : float
+        Share of the total weight from which a cluster is sure of a particle, in [0, 1).
+    """
+
+    similarity: Similarity = Gaussian()  # noqa: RUF009 (frozen)
+    at_least: float = 0.5
+    scheme: Resampler = Systematic()  # noqa: RUF009 (frozen)
+    least_mass: float = 0.0
+
+    exact_size: ClassVar[bool] = False
+
+    def __post_init__(self) -> None:
+        check_component("similarity", self.similarity, Similarity)
+        check_component("scheme", self.scheme, Resampler)
+        check_number("at_least", self.at_least, above=0, at_most=1, unit="similarity")
+        check_number("least_mass", self.least_mass, at_least=0, below=1, unit="share of the weight")
+
+    @property
+    def properly_weighted(self) -> bool:
+        """As the scheme inside."""
+        return self.scheme.properly_weighted
+
+    def resample(self, rng: np.random.Generator, population: Population, n: int) -> Population:
+        weights = checked_weights(population.log_weights, n)
+        population = population.realised()
+        cluster = leader_clusters(weights, checked_similarity(self.similarity, population), self.at_least)
+        mass = np.bincount(cluster[cluster >= 0], weights[cluster >= 0])
+        counts, masses = self._allocate(rng, mass, n)
+        ancestors, log_weights = [], []
+        for g in np.flatnonzero(counts):
+            members = np.flatnonzero(cluster == g)
+            inner = self.scheme.resample(rng, population.take(members, np.log(weights[members])), int(counts[g]))
+            # The scheme keeps the mean of the weights; here their sum is needed, scaled to the mass of the cluster.
+            scale = np.log(len(members) / len(inner)) + np.log(masses[g] / mass[g])
+            ancestors.append(members[inner.parents["ancestor"]])
+            log_weights.append(inner.log_weights + scale)
+        selected = np.concatenate(ancestors)
+        out = np.concatenate(log_weights) + population.log_weights.max()
+        out += np.log(len(selected) / len(weights))
+        return population.select(selected, out, clusters=len(mass))
+
+    def _allocate(self, rng: np.random.Generator, mass: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
+        """Number of particles of each cluster, and the weight that they share."""
+        sure = mass >= self.least_mass * mass.sum()
+        n_sure = int(sure.sum())
+        if n_sure > n or (n_sure == n and not sure.all()):
+            counts, masses = np.zeros(len(mass), np.int64), np.zeros(len(mass))
+            kept, log_masses = FearnheadClifford().select(rng, np.log(mass), n)
+            counts[kept] = 1
+            masses[kept] = np.exp(log_masses) * (len(mass) / len(kept))
+            return counts, masses
+        share = _shares(mass, sure, n)
+        counts = np.floor(share * (1 + 1e-13)).astype(np.int64)
+        rest = n - int(counts.sum())
+        if rest > 0:
+            with np.errstate(divide="ignore"):
+                extra, _ = Systematic().select(rng, np.log(np.clip(share - counts, 0.0, None)), rest)
+            counts += np.bincount(extra, minlength=len(mass))
+        return counts, np.where(share < 1, mass / share, mass)
+
+
+def leader_clusters(weights: np.ndarray, similarity: np.ndarray, at_least: float) -> np.ndarray:
+    """(m,) cluster of each particle; -1 if it has no weight.
+
+    The heaviest particle without a cluster leads a new one of all such particles similar enough to it; and so on.
+    """
+    cluster = np.full(len(weights), -1, np.int64)
+    number = 0
+    for i in np.argsort(-weights, kind="stable"):
+        if weights[i] <= 0:
+            break
+        if cluster[i] >= 0:
+            continue
+        members = (cluster < 0) & (weights > 0) & (similarity[i] >= at_least)
+        members[i] = True
+        cluster[members] = number
+        number += 1
+    return cluster
+
+
+def _shares(mass: np.ndarray, sure: np.ndarray, n: int) -> np.ndarray:
+    """max(1, mass / c) for `sure` clusters, mass / c for others, with sum n; at most n are sure, fewer if not all."""
+    ordered = np.sort(mass[sure])[::-1]
+    heavy = np.append(0.0, np.cumsum(ordered)) + mass[~sure].sum()
+    # If the A heaviest of S sure clusters exceed 1, they and the unsure ones share n - (S - A) particles by mass.
+    left = n - len(ordered) + np.arange(len(heavy))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        c = np.where(left > 0, heavy / left, np.inf)
+    share = mass / c[np.flatnonzero(np.append(np.inf, ordered) >= c)[-1]]
+    return np.where(sure, np.maximum(1.0, share), share)
+
+
+@dataclass(frozen=True)
+class KDpp(Resampler):
+    """n heavy particles that differ from each other, with weights w_i / pi_i.
+
+    ``notes["kdpp"]`` holds the rank of L, and ``"fallback"`` if `scheme` was used.
+
+    Parameters
+    ----------
+    similarity : Similarity
+        Compares particles. It is made positive semidefinite by dropping negative eigenvalues.
+    scheme : Resampler
+        Selects instead if fewer than n particles differ from each other (rank of L below n).
+    """
+
+    similarity: Similarity = Gaussian()  # noqa: RUF009 (frozen)
+    scheme: Resampler = FearnheadClifford()  # noqa: RUF009 (frozen)
+
+    exact_size: ClassVar[bool] = False
+
+    def __post_init__(self) -> None:
+        check_component("similarity", self.similarity, Similarity)
+        check_component("scheme", self.scheme, Resampler)
+
+    @property
+    def properly_weighted(self) -> bool:
+        """As the fallback."""
+        return self.scheme.properly_weighted
+
+    def likelihood(self, population: Population) -> np.ndarray:
+        """(p, p) L of the particles with positive weight, in units of the largest weight."""
+        weights = checked_weights(population.log_weights, 1)
+        positive = weights > 0
+        root = np.sqrt(weights[positive])
+        S = checked_similarity(self.similarity, population)[np.ix_(positive, positive)]
+        values, vectors = np.linalg.eigh(S)
+        if values[0] < 0:
+            S = (vectors * np.maximum(values, 0.0)) @ vectors.T
+        return root[:, None] * S * root[None, :]
+
+    def resample(self, rng: np.random.Generator, population: Population, n: int) -> Population:
+        positive = np.flatnonzero(checked_weights(population.log_weights, n) > 0)
+        population = population.realised()
+        spectrum = Spectrum.of(self.likelihood(population), min(n, len(positive)))
+        if spectrum.rank < n:
+            chosen = self.scheme.resample(rng, population, n)
+            return chosen.labelled(chosen.parents, {**chosen.notes, "kdpp": f"rank {spectrum.rank} of {n}: fallback"})
+        items = sample_kdpp(rng, spectrum, n)
+        ancestors = positive[items]
+        log_weights = population.log_weights[ancestors] - np.log(inclusion(spectrum, n)[items])
+        log_weights += np.log(n / len(population))
+        change = log_mean_exp(log_weights) - log_mean_exp(population.log_weights)
+        return population.select(
+            ancestors, log_weights, kdpp=f"rank {spectrum.rank} of {n}", log_mean_weight_change=change
+        )
+
+
+@dataclass(frozen=True)
+class Spectrum:
+    """Eigenvalues and eigenvectors of a likelihood matrix L, and its elementary symmetric polynomials.
+
+    Parameters
+    ----------
+    values : (r,) float64
+        Positive eigenvalues, scaled to maximum 1.
+    vectors : (m, r) float64
+        Orthonormal columns.
+    log_e : (r + 1, k + 1) float64
+        Row j, column l: log e_l of the first j values.
+    """
+
+    values: np.ndarray
+    vectors: np.ndarray
+    log_e: np.ndarray
+
+    @classmethod
+    def of(cls, L: np.ndarray, k: int) -> Spectrum:
+        """Decompose a symmetric matrix; eigenvalues that are negative, or zero up to rounding, are dropped."""
+        values, vectors = np.linalg.eigh(L)
+        keep = values > values[-1] * len(values) * np.finfo(np.float64).eps
+        values, vectors = values[keep] / values[-1], vectors[:, keep]
+        return cls(values, vectors, _log_polynomials(values, k))
+
+    @property
+    def rank(self) -> int:
+        """Number of eigenvalues."""
+        return len(self.values)
+
+
+def _log_polynomials(values: np.ndarray, k: int) -> np.ndarray:
+    """Row j, column l: log of the l-th elementary symmetric polynomial of the first j values.
+
+    e_l(v_1 .. v_{j+1}) = e_l(v_1 .. v_j) + v_{j+1} e_{l-1}(v_1 .. v_j).
+    """
+    table = np.full((len(values) + 1, k + 1), -np.inf)
+    table[:, 0] = 0.0
+    for j, log_value in enumerate(np.log(values)):
+        table[j + 1, 1:] = np.logaddexp(table[j, 1:], log_value + table[j, :-1])
+    return table
+
+
+def inclusion(spectrum: Spectrum, k: int) -> np.ndarray:
+    """(m,) probability of each item to be in a set of k.
+
+    pi_i = sum_j v_ij^2 P(eigenvector j is used), P = value_j e_{k-1}(all values but j) / e_k. The polynomial without
+    value j is the convolution of those of the values before j and after j, a sum of positive terms.
+    """
+    before = spectrum.log_e[:-1, :k]
+    after = _log_polynomials(spectrum.values[::-1], k)[::-1][1:, :k]
+    terms = before + after[:, ::-1]
+    top = terms.max(axis=1)
+    finite = np.where(np.isneginf(top), 0.0, top)
+    log_without = finite + np.log(np.maximum(np.exp(terms - finite[:, None]).sum(axis=1), np.finfo(np.float64).tiny))
+    log_without[np.isneginf(top)] = -np.inf  # fewer than k - 1 other values: the polynomial is zero
+    used = np.exp(np.log(spectrum.values) + log_without - spectrum.log_e[-1, k])
+    return np.minimum(spectrum.vectors**2 @ used, 1.0)
+
+
+def sample_kdpp(rng: np.random.Generator, spectrum: Spectrum, k: int) -> np.ndarray:
+    """(k,) ascending items: k eigenvectors drawn by the polynomials, then items one by one by projection."""
+    log_values, left, used = np.log(spectrum.values), k, []
+    uniforms = rng.random(spectrum.rank)
+    for j in range(spectrum.rank, 0, -1):
+        if left == 0:
+            break
+        log_take = log_values[j - 1] + spectrum.log_e[j - 1, left - 1] - spectrum.log_e[j, left]
+        if left == j or uniforms[j - 1] < np.exp(log_take):
+            used.append(j - 1)
+            left -= 1
+    V = spectrum.vectors[:, used]
+    norms = (V * V).sum(axis=1)
+    rows, items = np.zeros((len(V), k)), np.empty(k, np.int64)
+    for step in range(k):
+        cumulative = np.cumsum(norms)
+        i = int(np.searchsorted(cumulative, rng.random() * cumulative[-1], side="right"))
+        i = min(i, int(np.searchsorted(cumulative, cumulative[-1], side="left")))
+        items[step] = i
+        # Gram-Schmidt: subtract from all items their component along item i.
+        rows[:, step] = (V @ V[i] - rows[:, :step] @ rows[i, :step]) / np.sqrt(norms[i])
+        norms = np.maximum(norms - rows[:, step] ** 2, 0.0)
+        norms[items[: step + 1]] = 0.0
+    return np.sort(items)
+
+
+@dataclass(frozen=True)
+class GreedyDiverse(Resampler):
+    """Adds one by one the particle that increases det L of the selected set most; draws nothing.
+
+    The first is the heaviest; each next one maximises w_i times the squared norm of its component orthogonal to the
+    selected ones. If no different particle is left, the heaviest of the others follow. The weight of a particle that
+    is not selected moves to the most similar selected one, so the total stays.
+
+    Parameters
+    ----------
+    similarity : Similarity
+        Compares particles.
+    """
+
+    similarity: Similarity = Gaussian()  # noqa: RUF009 (frozen)
+
+    properly_weighted: ClassVar[bool] = False
+    exact_size: ClassVar[bool] = False
+
+    def __post_init__(self) -> None:
+        check_component("similarity", self.similarity, Similarity)
+
+    def resample(self, rng: np.random.Generator, population: Population, n: int) -> Population:
+        weights = checked_weights(population.log_weights, n)
+        population = population.realised()
+        S = checked_similarity(self.similarity, population)
+        n = min(n, int((weights > 0).sum()))
+        gain = weights * np.diag(S)
+        rows, items = np.zeros((len(weights), n)), np.empty(n, np.int64)
+        for step in range(n):
+            i = int(np.argmax(gain))
+            if gain[i] <= 1e-12 * weights.max():  # all others resemble the selected ones
+                rest = weights.copy()
+                rest[items[:step]] = 0.0
+                items[step:] = np.argsort(-rest, kind="stable")[: n - step]
+                break
+            items[step] = i
+            root = np.sqrt(weights[i] * weights)
+            rows[:, step] = (root * S[i] - rows[:, :step] @ rows[i, :step]) / np.sqrt(gain[i])
+            gain = np.maximum(gain - rows[:, step] ** 2, 0.0)
+            gain[items[: step + 1]] = 0.0
+        items = np.sort(items)
+        nearest = np.argmax(S[:, items], axis=1)
+        nearest[items] = np.arange(n)
+        mass = np.bincount(nearest, weights, minlength=n)
+        log_weights = np.log(mass) + population.log_weights.max() + np.log(n / len(weights))
+        return population.select(items, log_weights)

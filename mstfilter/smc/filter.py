@@ -1,0 +1,455 @@
+"""The particle filter: a short loop over components.
+
+>>> filter = ParticleFilter(initial=prior, transition=move, update=Reweight(likelihood), n=1000)
+>>> state, infos = filter.run(observations, seed=0)
+>>> state.population.weights, state.log_evidence
+
+A step selects particles, moves them, proposes new ones, fuses the two with the observation, and selects again:
+
+    past      = resampler.resample(previous, n)          resample="before", the textbook order
+    predicted = transition.predict(past, y)
+    proposed  = proposal.sample(y, n_proposed)
+    fused     = update.update(predicted, proposed, y)
+    next      = resampler.resample(fused, n)             resample="after", the order of MST
+
+Textbook filters have no `proposal`; MST (Price, Huang, Berenson 2021, Alg. 1) has all four components. Guided filters
+have a transition that weights its moves, auxiliary filters a `lookahead`, resample-move filters a `rejuvenation`.
+`step` is a pure function of a `State`, so a run can be stopped, stored and resumed at any step.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from itertools import islice
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from mstfilter.errors import InputError, check_component, check_integer
+from mstfilter.smc.interfaces import (
+    Codec,
+    Component,
+    Info,
+    Lookahead,
+    Observer,
+    Proposal,
+    Rejuvenation,
+    Resampler,
+    Size,
+    State,
+    Transition,
+    Trigger,
+    Update,
+)
+from mstfilter.smc.population import Population, identity
+from mstfilter.smc.resampling import Systematic
+from mstfilter.smc.streams import Key
+from mstfilter.smc.triggers import EssBelow
+
+__all__ = ["ParticleFilter"]
+
+_INTERFACES: dict[str, type] = {
+    "initial": Proposal,
+    "transition": Transition,
+    "proposal": Proposal,
+    "update": Update,
+    "resampler": Resampler,
+    "trigger": Trigger,
+    "lookahead": Lookahead,
+    "rejuvenation": Rejuvenation,
+    "size": Size,
+}
+
+
+@dataclass(frozen=True)
+class ParticleFilter:
+    """A particle filter made of components.
+
+    Parameters
+    ----------
+    initial : Proposal
+        Draws the particles of the first step; the first observation updates them before any prediction. If it is left
+        out or equal to `proposal`, the first step has no predicted particles, only proposed ones, as in MST.
+    transition : Transition
+        Prediction.
+    proposal : Proposal, optional
+        New particles at every step.
+    update : Update
+        Uses the observation. Not needed if the transition weights the particles (probabilistic programs).
+    resampler : Resampler
+        Selection.
+    trigger : Trigger
+        When to resample. More than `n` particles are always resampled.
+    lookahead : Lookahead, optional
+        Auxiliary filter: selects by weight times priority. Needs ``resample="before"``.
+    rejuvenation : Rejuvenation, optional
+        Resample-move: moves the particles at the end of a step that resampled.
+    size : Size, optional
+        Number of particles of a resampling; default `n`.
+    n : int
+        Particles to start with, and to keep.
+    n_proposed : int
+        Particles of the proposal at each step; 0 stands for `n`.
+    resample : {"after", "before"}
+        After the update (MST), or before the next prediction (textbook: estimates at time t then use all weights).
+    """
+
+    initial: Proposal | None = None
+    transition: Transition | None = None
+    proposal: Proposal | None = None
+    update: Update | None = None
+    resampler: Resampler = Systematic()  # noqa: RUF009 (frozen)
+    trigger: Trigger = EssBelow()  # noqa: RUF009 (frozen)
+    lookahead: Lookahead | None = None
+    rejuvenation: Rejuvenation | None = None
+    size: Size | None = None
+    n: int = 100
+    n_proposed: int = 0
+    resample: Literal["after", "before"] = "before"
+
+    def __post_init__(self) -> None:
+        check_integer("n", self.n)
+        check_integer("n_proposed", self.n_proposed, at_least=0)
+        for name, interface in _INTERFACES.items():
+            check_component(name, getattr(self, name), interface, optional=name not in ("resampler", "trigger"))
+        if self.initial is None and self.proposal is None:
+            raise InputError("the filter has neither `initial` nor `proposal`: no particles to start from")
+        if self.resample not in ("after", "before"):
+            raise InputError(f'resample is {self.resample!r}, expected "after" or "before"')
+        if self.lookahead is not None and self.resample == "after":
+            raise InputError(
+                'a lookahead needs the next observation, which is not known yet if resample="after"',
+                'use resample="before"',
+            )
+
+    @property
+    def properly_weighted(self) -> bool:
+        """Whether every component is, and no proposal adds particles to weights that carry the evidence so far."""
+        if self.proposal is not None:
+            return False
+        components = (getattr(self, slot) for slot in _INTERFACES)
+        return all(c.properly_weighted for c in components if isinstance(c, Component))
+
+    def start(self, seed: int | Key = 0) -> State:
+        """The state before the first observation."""
+        return State(0, None, seed if isinstance(seed, Key) else Key(seed), self.properly_weighted)
+
+    def step(self, state: State, observation: Any, observer: Observer | None = None) -> tuple[State, Info]:
+        """Assimilate one observation. None is a missing observation: the particles are only moved.
+
+        Raises
+        ------
+        InputError
+            From a component; the message starts with the step and the slot of the component.
+        """
+        step = _Step(self, state, observation, observer)
+        past, resampled_before = step.select_before()
+        predicted = step.predict(past)
+        proposed = step.propose(predicted)
+        fused = step.fuse(predicted, proposed)
+        chosen, resampled_after = step.select_after(fused, past)
+        resampled = resampled_before or resampled_after
+        if resampled:
+            chosen = step.rejuvenate(chosen, past)
+        return step.finish(past, fused, chosen, resampled)
+
+    def iterate(
+        self,
+        observations: Iterable[Any],
+        state: State | int = 0,
+        *,
+        checkpoint: str | Path | None = None,
+        codec: Codec | None = None,
+        observer: Observer | None = None,
+    ) -> Iterator[tuple[State, Info]]:
+        """Yield the state and the info of every step.
+
+        Parameters
+        ----------
+        observations : iterable
+            One for each step; None if it is missing.
+        state : State or int
+            The state to continue from, or a seed.
+        checkpoint : path, optional
+            A file that holds the state after every step. If it exists, the run continues from it: the observations
+            that it has used are skipped, and the result is that of an uninterrupted run.
+        codec : Codec, optional
+            For particles other than arrays, mappings of arrays and dataclasses of arrays.
+        observer : callable, optional
+            ``observer(slot, begins)``, called when a component begins and ends its work.
+        """
+        yield from self._steps(*self._begin(observations, state, checkpoint, codec), observer)
+
+    def run(
+        self,
+        observations: Iterable[Any],
+        seed: int | State = 0,
+        *,
+        checkpoint: str | Path | None = None,
+        codec: Codec | None = None,
+        observer: Observer | None = None,
+    ) -> tuple[State, list[Info]]:
+        """The last state and the infos of all steps; parameters as in `iterate`.
+
+        A run that continues from a checkpoint returns the infos of the steps after it.
+        """
+        observations, state, store = self._begin(observations, seed, checkpoint, codec)
+        infos = []
+        for current, info in self._steps(observations, state, store, observer):
+            state = current
+            infos.append(info)
+        return state, infos
+
+    def _begin(
+        self, observations: Iterable[Any], state: State | int, checkpoint: str | Path | None, codec: Codec | None
+    ) -> tuple[Iterable[Any], State, Any]:
+        """Observations that remain, the state to continue from, and the `Checkpoint` if there is one."""
+        _keep_freed_memory()
+        current = state if isinstance(state, State) else self.start(state)
+        if checkpoint is None:
+            return observations, current, None
+        from mstfilter.smc.checkpoint import Checkpoint
+
+        store = Checkpoint(Path(checkpoint), codec)
+        stored = store.load(self, current)
+        if stored is None:
+            return observations, current, store
+        return islice(observations, stored.t - current.t, None), stored, store
+
+    def _steps(
+        self, observations: Iterable[Any], state: State, store: Any, observer: Observer | None
+    ) -> Iterator[tuple[State, Info]]:
+        for observation in observations:
+            state, info = self.step(state, observation, observer)
+            if store is not None:
+                store.save(self, state)
+            yield state, info
+
+
+class _Step:
+    """The stages of one step. Each component call is wrapped by ``with self.slot(name)``."""
+
+    def __init__(
+        self, filter: ParticleFilter, state: State, observation: Any, observer: Observer | None = None
+    ) -> None:
+        self.filter, self.state, self.observation = filter, state, observation
+        self.streams = state.key.child("step", state.t)
+        self.slot = _Slot(state.t, observer)
+
+    def rng(self, slot: str) -> np.random.Generator:
+        """The random stream of a component in this step."""
+        return self.streams.child(slot).generator()
+
+    def select_before(self) -> tuple[Population | None, bool]:
+        """The particles x_{t-1} to move, and whether they were resampled."""
+        if self.state.population is None:
+            return None, False
+        unchanged, priority = self.state.population.labelled({}), None
+        if self.filter.resample == "after":
+            return unchanged, False
+        population = unchanged
+        if self.filter.lookahead is not None and self.observation is not None:
+            with self.slot("lookahead"):
+                priority = _priority(self.filter.lookahead, population, self.observation)
+                population = population.reweighted(priority)
+        with self.slot("resampler"):
+            if not self.filter.trigger.wants(population, self.state.t):
+                return unchanged, False
+            n = self.filter.n if self.filter.size is None else self.filter.size.choose(population)
+            selected = self._resample(population, n)
+            if priority is not None:
+                ancestors = selected.parents["ancestor"]
+                if (ancestors < 0).any():
+                    raise InputError("a lookahead needs a resampler that reports ancestors")
+                selected = selected.reweighted(-priority[ancestors])
+            self.slot.record(selected.notes)
+        return selected, True
+
+    def _resample(self, population: Population, n: int) -> Population:
+        """Resampled particles; their ancestors are -1 if the resampler does not report them."""
+        selected = self.filter.resampler.resample(self.rng("resampler"), population, n)
+        if "ancestor" in selected.parents:
+            return selected
+        return selected.with_ancestors(np.full(len(selected), -1))
+
+    def predict(self, past: Population | None) -> Population | None:
+        """Predicted particles; None at the first step of a filter that starts from its proposal."""
+        if past is None:
+            return self._first()
+        stayed = {"previous": identity(len(past))}
+        population = past.realised().labelled(stayed)
+        if self.filter.transition is None:
+            return population
+        with self.slot("transition"):
+            moved = self.filter.transition.predict(self.rng("transition"), population, self.observation)
+            if "previous" not in moved.parents and len(moved) == len(population):
+                moved = moved.labelled({**moved.parents, **stayed}, moved.notes)
+            self.slot.record(moved.notes)
+        return moved
+
+    def _first(self) -> Population | None:
+        initial, n = self.filter.initial, self.filter.n
+        if initial is None or initial == self.filter.proposal:
+            return None
+        with self.slot("initial"):
+            population = initial.sample(self.rng("initial"), self.observation, n)
+            if len(population) != n:
+                raise InputError(f"asked for {n} particles it returned {len(population)}")
+            self.slot.record(population.notes)
+        return population
+
+    def propose(self, predicted: Population | None) -> Population | None:
+        """Particles from the observation; None without a proposal or an observation."""
+        proposal = self.filter.proposal
+        if proposal is None or (self.observation is None and predicted is not None):
+            return None
+        with self.slot("proposal"):
+            if self.observation is None:
+                raise InputError("the first observation is missing and the filter starts from its proposal")
+            n = self.filter.n_proposed or self.filter.n
+            proposed = proposal.sample(self.rng("proposal"), self.observation, n)
+            self.slot.record(proposed.notes)
+        return proposed.labelled({"proposed": identity(len(proposed))}, proposed.notes)
+
+    def fuse(self, predicted: Population | None, proposed: Population | None) -> Population:
+        """The particles after the update."""
+        update = self.filter.update
+        if self.observation is None or update is None:
+            fused = predicted if predicted is not None else proposed
+            assert fused is not None
+            return fused
+        with self.slot("update"):
+            rng = self.rng("update") if update.draws else _unused_generator()
+            fused = update.update(rng, predicted, proposed, self.observation)
+            self.slot.record(fused.notes)
+        return fused
+
+    def select_after(self, fused: Population, past: Population | None) -> tuple[Population, bool]:
+        """The particles to keep, and whether they were resampled."""
+        size, after = self.filter.size, self.filter.resample == "after"
+        n = limit = self.filter.n
+        with self.slot("resampler"):
+            if size is not None:
+                # With resample="before" the size was chosen before the prediction: only excess particles go.
+                limit = max(n, 0 if past is None else len(past))
+                if after or len(fused) > limit:
+                    n = size.choose(fused)
+                    limit = n if after else limit
+            if len(fused) > limit or (after and self.filter.trigger.wants(fused, self.state.t)):
+                selected = self._resample(fused, n)
+                if selected.notes is not fused.notes:
+                    self.slot.record(selected.notes)
+                return selected, True
+        return fused.with_ancestors(identity(len(fused))), False
+
+    def rejuvenate(self, chosen: Population, past: Population | None) -> Population:
+        """Particles after the move, with the parents that they had."""
+        rejuvenation = self.filter.rejuvenation
+        if rejuvenation is None:
+            return chosen
+        with self.slot("rejuvenation"):
+            population, previous = chosen.realised(), None
+            if past is not None:
+                index = population.parents.get("previous")
+                if index is None or (index < 0).any():
+                    raise InputError("rejuvenation needs a parent for every particle, and some have none")
+                previous = past if index is identity(len(past)) else past.take(index)
+            moved = rejuvenation.move(self.rng("rejuvenation"), population, previous, self.observation)
+            if len(moved) != len(population):
+                raise InputError(
+                    f"a move returned {len(moved)} of {len(population)} particles, expected all in order"
+                )
+            if moved.notes is not population.notes:
+                self.slot.record(moved.notes)
+        return moved.labelled(population.parents, moved.notes)
+
+    def finish(
+        self, past: Population | None, fused: Population, chosen: Population, resampled: bool
+    ) -> tuple[State, Info]:
+        """The next state and the record of the step."""
+        with self.slot("build"):
+            chosen = chosen.realised()
+        population = chosen.traced_through(past)
+        info = Info(
+            t=self.state.t,
+            n=len(population),
+            n_candidates=len(fused),
+            ess=fused.ess,
+            resampled=resampled,
+            ancestors=chosen.parents["ancestor"],
+            parents=population.parents,
+            log_weights=population.log_weights,
+            notes=self.slot.notes,
+            seconds=self.slot.seconds,
+        )
+        return State(self.state.t + 1, population, self.state.key, self.state.properly_weighted), info
+
+
+class _Slot:
+    """Wraps the calls of components: measures wall time, and adds step and slot to the messages of errors.
+
+    >>> with slot("transition"):
+    ...     moved = transition.predict(rng, population, observation)
+    ...     slot.record(moved.notes)
+    """
+
+    def __init__(self, t: int, observer: Observer | None) -> None:
+        self.t, self.observer = t, observer
+        self.name, self._began = "", 0.0
+        self.seconds: dict[str, float] = {}
+        self.notes: dict[str, Mapping[str, Any]] = {}
+
+    def __call__(self, name: str) -> _Slot:
+        self.name = name
+        return self
+
+    def __enter__(self) -> None:
+        if self.observer is not None:
+            self.observer(self.name, True)
+        self._began = time.perf_counter()
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: Any) -> None:
+        self.seconds[self.name] = self.seconds.get(self.name, 0.0) + time.perf_counter() - self._began
+        if self.observer is not None:
+            self.observer(self.name, False)
+        if isinstance(error, InputError):
+            raise type(error)(f"step {self.t}, {self.name}: {error.message}", *error.hints) from error
+
+    def record(self, notes: Mapping[str, Any]) -> None:
+        """Keep the notes of the component, if there are any."""
+        if notes:
+            self.notes[self.name] = notes
+
+
+def _priority(lookahead: Lookahead, population: Population, observation: Any) -> np.ndarray:
+    priority = np.asarray(lookahead.log_priority(population, observation), dtype=np.float64)
+    if priority.shape != (len(population),):
+        raise InputError(f"log priorities have shape {priority.shape}, expected ({len(population)},)")
+    wrong = np.flatnonzero(~np.isfinite(priority))
+    if len(wrong):
+        raise InputError(
+            f"log priority of particle {wrong[0]} is {priority[wrong[0]]} ({len(wrong)} of {len(priority)} are "
+            "not finite)",
+            "a particle that is never selected would bias the filter: bound the priority from below",
+        )
+    return priority
+
+
+@lru_cache(maxsize=1)
+def _keep_freed_memory() -> None:
+    """Free one large block, once per process.
+
+    glibc then keeps freed memory instead of returning the arrays of every step to the system, which takes a filter of
+    10,000 particles a fifth of its time. Other C libraries are unaffected.
+    """
+    np.empty(1 << 21, np.uint8)
+
+
+@lru_cache(maxsize=1)
+def _unused_generator() -> np.random.Generator:
+    """For components that draw nothing; saves the time to make a stream."""
+    return Key(0).child("unused").generator()

@@ -1,0 +1,439 @@
+"""Filters from a program: bootstrap, guided, auxiliary and resample-move."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from mstfilter.errors import InputError, check_integer, check_number
+from mstfilter.smc.distributions import Normal
+from mstfilter.smc.filter import ParticleFilter
+from mstfilter.smc.interfaces import Lookahead, Proposal, Rejuvenation, Resampler, Transition, Trigger
+from mstfilter.smc.population import Particles, Population
+from mstfilter.smc.programs.sites import (
+    CentreHandler,
+    GuideHandler,
+    PerParticle,
+    ProgramRun,
+    ReplayHandler,
+    SampleHandler,
+    ScoreHandler,
+    Site,
+    SiteHandler,
+    Trace,
+    active_run,
+)
+from mstfilter.smc.resampling import Systematic
+from mstfilter.smc.state_space import accept_moves, choose_rows
+from mstfilter.smc.streams import child
+from mstfilter.smc.triggers import EssBelow
+
+__all__ = ["Program", "ProgramInitial", "ProgramLookahead", "ProgramMove", "ProgramTransition", "run_program"]
+
+Model = Callable[[Any, Any], Any]
+
+
+@dataclass(frozen=True)
+class Program:
+    """A model as a function, and the filters that come from it.
+
+    Parameters
+    ----------
+    model : callable
+        ``model(previous, observation)`` with calls of `sample` and `observe`; returns None, or a mapping of further
+        values to keep.
+    """
+
+    model: Model
+
+    def __post_init__(self) -> None:
+        if not callable(self.model):
+            raise InputError(
+                f"model is {self.model!r}, expected a function of the previous state and the observation"
+            )
+
+    def bootstrap(self, n: int, resampler: Resampler | None = None, trigger: Trigger | None = None) -> ParticleFilter:
+        """Bootstrap filter: draws from the model, weighs by what is observed."""
+        return self._filter(None, n, resampler, trigger)
+
+    def guided(
+        self, guide: Model, n: int, resampler: Resampler | None = None, trigger: Trigger | None = None
+    ) -> ParticleFilter:
+        """Guided filter.
+
+        Parameters
+        ----------
+        guide : callable
+            Program that draws every site of the model, by its name, knowing the observation. Where the observation
+            is missing the model draws itself.
+        n : int
+            Particles.
+        resampler, trigger : Resampler, Trigger, optional
+            Systematic at an effective sample size below half where left out.
+        """
+        return self._filter(guide, n, resampler, trigger)
+
+    def auxiliary(
+        self,
+        n: int,
+        guide: Model | None = None,
+        resampler: Resampler | None = None,
+        trigger: Trigger | None = None,
+        power: float = 1.0,
+    ) -> ParticleFilter:
+        """Auxiliary filter with the automatic lookahead: exact for every model.
+
+        Parameters
+        ----------
+        n : int
+            Particles.
+        guide : callable, optional
+            As in `guided`.
+        resampler, trigger : Resampler, Trigger, optional
+            Systematic at an effective sample size below half where left out.
+        power : float
+            Priority to this power: below 1 where the mean of a site says too much.
+        """
+        return replace(self._filter(guide, n, resampler, trigger), lookahead=ProgramLookahead(self.model, power))
+
+    def resample_move(
+        self,
+        n: int,
+        steps: int = 1,
+        scale: float = 0.5,
+        guide: Model | None = None,
+        resampler: Resampler | None = None,
+        trigger: Trigger | None = None,
+    ) -> ParticleFilter:
+        """Resample-move filter: `steps` Metropolis steps on all sites at the end of a step that resampled.
+
+        `scale` is the step in standard deviations of each site's distribution.
+        """
+        return replace(self._filter(guide, n, resampler, trigger), rejuvenation=ProgramMove(self.model, scale, steps))
+
+    def _filter(
+        self, guide: Model | None, n: int, resampler: Resampler | None, trigger: Trigger | None
+    ) -> ParticleFilter:
+        return ParticleFilter(
+            initial=ProgramInitial(self.model, guide),
+            transition=ProgramTransition(self.model, guide),
+            resampler=resampler if resampler is not None else Systematic(),
+            trigger=trigger if trigger is not None else EssBelow(0.5),
+            n=n,
+        )
+
+
+def _advance(
+    rng: np.random.Generator, model: Model, guide: Model | None, previous: Any, observation: Any, n: int
+) -> tuple[Any, np.ndarray]:
+    """Particles after a step and what their log weights gain."""
+    if guide is None or observation is None:
+        return run_program(model, SampleHandler(rng), previous, observation, n)
+    if isinstance(guide, PerParticle) != isinstance(model, PerParticle):
+        raise InputError("model and guide must both be per_particle, or neither")
+    proposed = GuideHandler(rng, n)
+    run_program(guide, proposed, previous, observation, n)
+    return run_program(model, ReplayHandler(proposed), previous, observation, n)
+
+
+@dataclass(frozen=True)
+class ProgramInitial(Proposal):
+    """First step of a program: draws and weighs.
+
+    Parameters
+    ----------
+    model : callable
+        The program.
+    guide : callable, optional
+        Draws in its place.
+    """
+
+    model: Model
+    guide: Model | None = None
+
+    def sample(self, rng: np.random.Generator, observation: Any, n: int) -> Population:
+        return Population(*_advance(rng, self.model, self.guide, None, observation, n))
+
+
+@dataclass(frozen=True)
+class ProgramTransition(Transition):
+    """A step of a program: draws and weighs.
+
+    Parameters
+    ----------
+    model : callable
+        The program.
+    guide : callable, optional
+        Draws in its place.
+    """
+
+    model: Model
+    guide: Model | None = None
+
+    def predict(self, rng: np.random.Generator, population: Population, observation: Any) -> Population:
+        n = len(population)
+        particles, gain = _advance(rng, self.model, self.guide, population.particles, observation, n)
+        return Population(particles, population.log_weights + gain, population.parents)
+
+
+@dataclass(frozen=True)
+class ProgramLookahead(Lookahead):
+    """Priority from a run in which the mean (mode of a discrete site) stands in place of each draw.
+
+    Parameters
+    ----------
+    model : callable
+        The program.
+    power : float
+        Power of the priority.
+    """
+
+    model: Model
+    power: float = 1.0
+
+    def __post_init__(self) -> None:
+        check_number("power", self.power, at_least=0)
+
+    def log_priority(self, population: Population, observation: Any) -> np.ndarray:
+        """(n,) log of what would be observed; bounded so that no particle is ruled out."""
+        _, priority = run_program(self.model, CentreHandler(), population.particles, observation, len(population))
+        # What a mean rules out a draw may allow: the priority is kept within 50 of the best (e^-50).
+        top = priority.max()
+        if not np.isfinite(top):
+            return np.zeros(len(priority))
+        return self.power * np.maximum(np.nan_to_num(priority, nan=-np.inf), top - 50.0)
+
+
+@dataclass(frozen=True)
+class ProgramMove(Rejuvenation):
+    """Metropolis-Hastings on all sites of a step at once.
+
+    Continuous sites take a Gaussian step, `scale` standard deviations of the site's distribution long; discrete sites
+    are drawn anew from theirs. Both distributions depend on earlier sites, so the way back is weighed by a second run
+    at the proposed values. Sites of branches keep to the branch that was drawn.
+
+    Parameters
+    ----------
+    model : callable
+        The program.
+    scale : float
+        Length of a step.
+    steps : int
+        Steps a move.
+    """
+
+    model: Model
+    scale: float = 0.5
+    steps: int = 1
+
+    def __post_init__(self) -> None:
+        check_number("scale", self.scale, above=0)
+        check_integer("steps", self.steps)
+
+    def move(
+        self,
+        rng: np.random.Generator,
+        population: Population,
+        previous: Population | None,
+        observation: Any,
+    ) -> Population:
+        """Move; `notes` hold the share of accepted steps."""
+        before = None if previous is None else previous.particles
+        particles, accepted = _metropolis(
+            rng, self.model, population.particles, before, observation, len(population), self.scale, self.steps
+        )
+        return Population(particles, population.log_weights, population.parents, {"accepted": accepted})
+
+
+def _metropolis(
+    rng: np.random.Generator,
+    model: Callable[[Any, Any], Any],
+    particles: Particles,
+    previous: Particles | None,
+    observation: Any,
+    n: int,
+    scale: float,
+    steps: int,
+) -> tuple[Particles, float]:
+    """Particles after `steps` Metropolis-Hastings steps on all sites, and the share that was accepted."""
+    if not isinstance(model, PerParticle):
+        return _move_rows(rng, model, particles, previous, observation, n, scale, steps, False)
+    moved, shares = [], []
+    for i, particle in enumerate(particles):
+        past = None if previous is None else previous[i]
+        own = child(rng, "particle", i)
+        new, share = _move_rows(own, model.function, particle, past, observation, 1, scale, steps, True)
+        moved.append(Trace(new))
+        shares.append(share)
+    return tuple(moved), float(np.mean(shares))
+
+
+def _move_rows(
+    rng: np.random.Generator,
+    model: Callable[[Any, Any], Any],
+    particles: Mapping[str, Any],
+    previous: Any,
+    observation: Any,
+    n: int,
+    scale: float,
+    steps: int,
+    single: bool,
+) -> tuple[Mapping[str, Any], float]:
+    """Steps of all particles at once, or of a single one."""
+
+    def score(values: Mapping[str, Any], bare: bool = False) -> tuple[ProgramRun, list[Site]]:
+        handler = ScoreHandler(values, bare)
+        return _run_once(model, handler, previous, observation, n, single), handler.sites
+
+    now, sites = score(particles, single)
+    taken = 0
+    for _ in range(steps):
+        values, forward = _propose(rng, now.values, sites, scale, n)
+        try:
+            new, new_sites = score(values)
+        except InputError:
+            if not single:
+                raise
+            continue  # a particle of another structure, for which there are no values: refused both ways
+        if [s.name for s in new_sites] != [s.name for s in sites]:
+            continue
+        backward = _log_density(values, now.values, new_sites, scale, n)
+        with np.errstate(invalid="ignore"):
+            yes = accept_moves(rng, new.gain - now.gain + backward - forward)
+        taken += int(yes.sum())
+        if yes.all():
+            now, sites = new, new_sites
+        elif yes.any():
+            now, sites = score(choose_rows(yes, new.values, now.values))
+    return _values_of(now), taken / (steps * n)
+
+
+def _propose(
+    rng: np.random.Generator, x: Mapping[str, np.ndarray], sites: list[Site], scale: float, n: int
+) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    """New values of all sites, and the log density (n,) of proposing them."""
+    values = {name: np.array(a) for name, a in x.items()}
+    for site in sites:
+        if site.branch:
+            continue
+        old = x[site.name][site.index]
+        if site.distribution.discrete:
+            values[site.name][site.index] = site.distribution.sample(rng, len(old))
+        else:
+            values[site.name][site.index] = old + scale * site.distribution.sd * rng.standard_normal(old.shape)
+    return values, _log_density(x, values, sites, scale, n)
+
+
+def _log_density(
+    old: Mapping[str, np.ndarray], new: Mapping[str, np.ndarray], sites: list[Site], scale: float, n: int
+) -> np.ndarray:
+    """(n,) log density of proposing `new` at `old`, where the program meets `sites`."""
+    total = np.zeros(n)
+    for site in sites:
+        if site.branch:
+            continue
+        to = new[site.name][site.index]
+        if site.distribution.discrete:
+            total[site.index] += site.distribution.log_prob(to)
+        else:
+            total[site.index] += Normal(old[site.name][site.index], scale * site.distribution.sd).log_prob(to)
+    return total
+
+
+def run_program(
+    model: Callable[[Any, Any], Any],
+    handler: SiteHandler,
+    previous: Particles | None,
+    observation: Any,
+    n: int,
+) -> tuple[Particles, np.ndarray]:
+    """Run a program over n particles.
+
+    Parameters
+    ----------
+    model : callable
+        The program, or its guide.
+    handler : SiteHandler
+        Decides the values of sites.
+    previous : particles or None
+        x_{t-1}.
+    observation : Any
+        y_t.
+    n : int
+        Particles.
+
+    Returns
+    -------
+    particles : mapping of arrays (n, ...), or tuple of n `Trace`
+        Values of the sites, and what the program returned.
+    gain : (n,) float64
+        What the log weights gain.
+    """
+    if not isinstance(model, PerParticle):
+        run = _run_once(model, handler, previous, observation, n, False)
+        return _values_of(run), run.gain
+    runs = [
+        _run_once(model.function, handler.row(i), None if previous is None else previous[i], observation, 1, True)
+        for i in range(n)
+    ]
+    return tuple(Trace(_values_of(r)) for r in runs), np.concatenate([r.gain for r in runs])
+
+
+def _run_once(
+    function: Callable[[Any, Any], Any], handler: SiteHandler, previous: Any, observation: Any, n: int, single: bool
+) -> ProgramRun:
+    """One pass of a function, `single` without the particle axis."""
+    run = ProgramRun(handler, n, single)
+    token = active_run.set(run)
+    try:
+        returned = function(previous, observation)
+    except ValueError as error:
+        if single or "truth value of an array" not in str(error):
+            raise
+        raise InputError(
+            "the program decides by an array that holds all particles (if, and, or, while)",
+            "use switch(name, probs, branches), numpy.where, or mark the program with @per_particle",
+        ) from error
+    finally:
+        active_run.reset(token)
+    if isinstance(handler, GuideHandler):
+        handler.values = dict(run.values)
+    if isinstance(handler, ReplayHandler):
+        unused = sorted(set(handler.guide.values) - set(run.values))
+        if unused:
+            raise InputError(
+                f"the model has no site {unused[0]!r}, which the guide samples", f"it has {sorted(run.values)}"
+            )
+    run.returned = _returned(returned, n, single)
+    return run
+
+
+def _returned(returned: Any, n: int, single: bool) -> dict[str, Any]:
+    """What a program returns: one row a particle, or a single particle's values as they are."""
+    if returned is None:
+        return {}
+    if not isinstance(returned, Mapping):
+        raise InputError(
+            f"a program returned a {type(returned).__qualname__}, expected None or a mapping of values to keep"
+        )
+    if single:
+        return {str(name): value for name, value in returned.items()}
+    out = {}
+    for name, value in returned.items():
+        array = np.asarray(value)
+        if array.ndim == 0 or len(array) != n:
+            raise InputError(f"a program returned {name!r} of shape {array.shape}, expected one row a particle ({n})")
+        out[str(name)] = array
+    return out
+
+
+def _values_of(run: ProgramRun) -> dict[str, Any]:
+    """What a particle (or all of them) is after a run: values of the sites, and what was returned."""
+    values = {name: a[0] for name, a in run.values.items()} if run.single else run.values
+    particles = {**values, **run.returned}
+    if not particles:
+        raise InputError("the program sampled nothing and returned nothing: a particle would be empty")
+    return particles
