@@ -89,7 +89,7 @@ def check_number(
 
 def check_integer(name: str, value: Any, *hints: str, at_least: int = 1) -> None:
     """Raise InputError unless `value` is an integer of at least `at_least`."""
-    if isinstance(value, Integral) and not isinstance(value, bool) and value >= at_least:
+    if isinstance(value, Integral) and not isinstance(value, bool) and int(value) >= at_least:
         return
     raise InputError(f"{name} is {value!r}, expected an integer of at least {at_least}", *hints)
 

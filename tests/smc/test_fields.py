@@ -27,7 +27,6 @@ from mstfilter.smc import (
     ProgramLookahead,
     ProgramMove,
     RandomWalkMove,
-    Reweight,
     Shuffled,
     StateSpaceModel,
     Student,

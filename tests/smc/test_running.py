@@ -26,12 +26,12 @@ from mstfilter.smc import (
     Trace,
     bootstrap,
     collect,
+    diagnostics,
     observe,
     per_particle,
     run_many,
     sample,
 )
-from mstfilter.smc import diagnostics
 from mstfilter.smc.checkpoint import load_state, save_state
 from tests.conftest import REPOSITORY
 from tests.smc.models import AR1, SYMBOLS, Box, ar1_observations, hmm

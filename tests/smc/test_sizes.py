@@ -104,7 +104,9 @@ def test_classes():
     np.testing.assert_array_equal(ExactEquality().classes(np.array([2.0, 1.0, 2.0])), [0, 1, 0])
     np.testing.assert_array_equal(ExactEquality().classes(np.array([[1, 2], [2, 1], [1, 2]])), [0, 1, 0])
     np.testing.assert_array_equal(ExactEquality().classes(("a", "b", "a")), [0, 1, 0])
-    np.testing.assert_array_equal(ExactEquality().classes({"x": np.array([1, 1, 1]), "y": np.array([3, 4, 3])}), [0, 1, 0])
+    np.testing.assert_array_equal(
+        ExactEquality().classes({"x": np.array([1, 1, 1]), "y": np.array([3, 4, 3])}), [0, 1, 0]
+    )
     np.testing.assert_array_equal(Bins(1.0).classes(np.array([[0.5, -0.5], [0.1, -0.1], [0.5, 0.5]])), [0, 0, 1])
 
 
