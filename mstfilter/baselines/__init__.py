@@ -1,4 +1,10 @@
-"""What MST is compared with: filters of the same parts that leave out what MST adds, and floors."""
+"""Baselines: filters that MST is compared with.
+
+>>> mstfilter.preset("tracking_only").run(recording.clips(), seed=0)
+
+`updates` has fusion without crossover (samples alone, tracking alone, their union), `proposals` the floors, and
+`object_fusion` a map of volumes in the manner of MID-Fusion. ``docs/baselines.md`` lists the presets.
+"""
 
 from mstfilter.lazy import attach
 

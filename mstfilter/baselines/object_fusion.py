@@ -1,18 +1,22 @@
-"""MID-Fusion-style: one map of objects, each a volume of signed distances that is tracked and averaged over time.
+"""A baseline in the manner of MID-Fusion: one map of objects, each a tracked volume of signed distances.
 
 >>> mstfilter.preset("object_fusion")
 
-A re-implementation of the idea of Xu et al. 2019 ("MID-Fusion: Octree-based Object-Level Multi-Instance Dynamic
-SLAM") within this package's interfaces, not of their program. At every pause
+This is a re-implementation of the idea of Xu et al. 2019 ("MID-Fusion: Octree-based Object-Level Multi-Instance
+Dynamic SLAM") within the interfaces of this package, not of their program. At every pause
 
-1. the map's objects follow the clip by the same tracker as in all other filters (the filter's transition);
+1. the objects of the map follow the clip by the tracker that all filters share (the transition of the filter);
 2. the masks of the single-frame segmentation are matched with the rendered map by their overlap;
-3. every object's volume takes in the images of the clip, each from the pose that registration of depth and colour,
-   frame by frame, gives; surfaces count within the object's mask, free space counts wherever it is seen;
-4. masks that match nothing, and are not covered by what does, become objects: completed as everywhere else.
+3. the volume of every object is averaged with the images of the clip, each from the pose that frame-by-frame
+   registration of depth and colour gives. Surface counts within the mask of the object, free space everywhere;
+4. masks without a match that do not show known objects become new objects, with the usual completion.
 
-There is one hypothesis: a wrong mask is never reconsidered, two objects never become one. Between pauses the map is
-kept as every hypothesis is, as voxels; a volume begins anew with their signed distance at `prior_weight`.
+There is one hypothesis: wrong masks are never revised, and two objects are never merged. Between pauses the map is
+stored as voxels, like every hypothesis; a volume starts with the signed distance of its voxels at `prior_weight`.
+
+>>> volume = ObjectVolume.of(hypothesis.mask(3), grid, truncation=0.03, weight=2.0)
+>>> volume = volume.integrate(frame, grid, np.eye(4), mine, others)
+>>> volume.occupied                     # (a, b, c) bool, at volume.box of the grid
 """
 
 from __future__ import annotations
@@ -20,21 +24,22 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import ClassVar, NamedTuple
 
+import cv2
 import numpy as np
+from scipy.ndimage import distance_transform_edt
 
-from mstfilter.baselines.volumes import ObjectVolume
 from mstfilter.errors import InputError
 from mstfilter.fusion import FreeSpace, Projection
-from mstfilter.scene import Clip, Frame, Hypothesis, ObjectRecord, VoxelGrid, depth_sigma, project
+from mstfilter.scene import Camera, Clip, Frame, Hypothesis, ObjectRecord, VoxelGrid, depth_sigma, project
 from mstfilter.scoring import overlap
 from mstfilter.smc import Population, Update, union
 from mstfilter.tracking import Array, DenseFlow, Segment, Track, apply, refine, segments_of
 
-__all__ = ["ObjectFusion"]
+__all__ = ["ObjectFusion", "ObjectVolume"]
 
 
 class _Match(NamedTuple):
-    """Masks (H, W) bool by the label of the object that they show, and labels of samples that are new objects."""
+    """Masks (H, W) bool by the label of the object that they show, and labels of the sample that are new objects."""
 
     masks: dict[int, np.ndarray]
     new: list[int]
@@ -42,30 +47,30 @@ class _Match(NamedTuple):
 
 @dataclass(frozen=True)
 class ObjectFusion(Update):
-    """Object-level volumetric fusion, MID-Fusion-style.
+    """Object-level volumetric fusion in the manner of MID-Fusion.
 
     Parameters
     ----------
     free_space : Projection
-        Clears the tracked map first, as in the other filters.
+        Clears the tracked map first.
     truncation : float
-        Of the signed distances, metres. Twice a voxel is better than three times: .01-.02 of quality on scenes for
-        tuning.
+        Truncation of the signed distances in metres. Two voxels are better than three by .01 to .02 of quality on
+        tuning scenes.
     prior_weight : float
-        Images that what the map held before counts for.
+        Weight of the map before the clip, in images.
     match_iou : float
-        Smallest overlap (intersection over union of pixels) of a mask with the rendered object that it shows.
+        Least intersection over union, in pixels, of a mask and the rendered object that it shows.
     new_share : float
-        A mask without a match is a new object where less than this share of it shows objects that are known.
+        A mask without a match is a new object if less than this share of it shows known objects.
     min_pixels : int
-        Smallest mask of a new object, in pixels of a 640 x 480 image; scales with the image's area.
+        Smallest mask of a new object, in pixels of a 640 x 480 image; scales with the area of the image.
     min_agreement : float
-        Share of an object's visible points that must lie on the measured surface (3 sigma + 5 mm) if an image between
-        pauses is to be taken in; the first that fails ends the way back of what moves.
+        Least share of an object's visible points that lie on the measured surface (3 sigma + 5 mm) in an image
+        between pauses that is integrated. The first image that fails ends the integration of a moving object.
     min_voxels : int
-        Objects with fewer voxels left are forgotten.
+        Objects with fewer voxels are removed.
     between : bool
-        Take in the images between the pauses.
+        Whether the images between the pauses are integrated.
     """
 
     free_space: Projection = field(default_factory=FreeSpace)
@@ -94,7 +99,7 @@ class ObjectFusion(Update):
         proposed: Population | None,
         observation: Clip,
     ) -> Population:
-        """The map after the clip; at the first pause the proposed segmentation, completed."""
+        """The map after the clip; at the first pause the proposed segmentation."""
         if predicted is None:
             return union(None, proposed)
         maps, notes = [], []
@@ -108,14 +113,14 @@ class ObjectFusion(Update):
     def _fuse(self, old: Hypothesis, sample: Hypothesis | None, clip: Clip) -> tuple[Hypothesis, dict[str, int]]:
         frame, grid = clip.after, clip.grid
         known = old.n_objects
-        # Records begin anew at every pause, so what the tracker has not moved has not moved in this clip.
+        # Records are reset at every pause, so an object with identity motion has not moved in this clip.
         moved = {r.label for r in old.objects if not np.array_equal(r.motion.as_matrix(), np.eye(4))}
         old = self.free_space.refine((old,), clip)[0][0]
         match = self._match(old, sample, frame)
         volumes = {r.label: self._begin(old, r.label) for r in old.objects}
         taken = 0
         if self.between and len(clip) > 2 and old.objects:
-            volumes, taken = self._take_between(volumes, old, moved, clip)
+            volumes, taken = self._integrate_between(volumes, old, moved, clip)
         everything = np.zeros(frame.depth.shape, np.int32)
         for label, mask in match.masks.items():
             everything[mask] = label
@@ -136,7 +141,7 @@ class ObjectFusion(Update):
         return ObjectVolume.of(old.mask(label), old.grid, self.truncation, self.prior_weight)
 
     def _match(self, old: Hypothesis, sample: Hypothesis | None, frame: Frame) -> _Match:
-        """Which mask shows which object. New ones get numbers beyond the map's."""
+        """Match masks with objects of the map. New objects get the next labels."""
         rendered = project(old, frame.camera) if old.objects else np.zeros(frame.depth.shape, np.uint16)
         if sample is None or not sample.objects:
             return _Match({int(k): rendered == k for k in np.unique(rendered) if k > 0}, [])
@@ -161,14 +166,14 @@ class ObjectFusion(Update):
                 masks[free + len(new)] = seen == k
         return _Match(masks, new)
 
-    def _take_between(
+    def _integrate_between(
         self, volumes: dict[int, ObjectVolume], old: Hypothesis, moved: set[int], clip: Clip
     ) -> tuple[dict[int, ObjectVolume], int]:
-        """Go back through the clip from its end, frame by frame, and take in what agrees.
+        """Integrate the frames of the clip from last to first, as long as they agree with the object.
 
-        Labels not in `moved` rested throughout.
+        Objects with labels not in `moved` rested in the whole clip.
         """
-        tracks = DenseFlow().track(clip)  # shared with the tracker; registration does not look at it
+        tracks = DenseFlow().track(clip)  # shared with the tracker; registration does not use it
         segments = segments_of(old, clip.after)
         poses: dict[int, Array] = {label: np.eye(4) for label in volumes if label in segments}
         rested = {label for label in poses if label not in moved}
@@ -193,22 +198,20 @@ class ObjectFusion(Update):
     def _agrees(self, track: Track, T: Array, frame: Frame) -> bool:
         """Whether a moved object's visible points lie on the surface that a frame measures."""
         points = track.points[:: max(1, len(track.points) // 400)]
-        uv, z = frame.camera.project(apply(T, points))
-        pixel = np.rint(np.where(np.isfinite(uv), uv, -1))
-        inside = (pixel >= 0).all(axis=1) & (pixel < [frame.camera.width, frame.camera.height]).all(axis=1)
-        u, v = pixel[inside].astype(np.int64).T
+        u, v, z, inside = _project(frame.camera, apply(T, points))
+        u, v, z = u[inside], v[inside], z[inside]
         known = frame.valid[v, u]
-        behind = (z[inside] - frame.depth[v, u])[known]
-        visible = behind < 0.015  # what is hidden says nothing
+        behind = (z - frame.depth[v, u])[known]
+        visible = behind < 0.015  # points further behind the measured surface are occluded
         if visible.sum() < max(12, 0.3 * len(points)):
             return False
-        near = np.abs(behind[visible]) <= 0.005 + 3 * depth_sigma(z[inside][known][visible])
+        near = np.abs(behind[visible]) <= 0.005 + 3 * depth_sigma(z[known][visible])
         return bool(near.mean() >= self.min_agreement)
 
     def _assemble(
         self, volumes: dict[int, ObjectVolume], records: dict[int, ObjectRecord], grid: VoxelGrid
     ) -> Hypothesis:
-        """One label grid: a voxel goes to the object in whose masks it was seen most, then to the deepest."""
+        """One label grid: a voxel goes to the object with the largest share of masks, then to the deepest."""
         labels = np.zeros(grid.shape, np.uint16)
         share, depth = np.zeros(grid.shape), np.zeros(grid.shape)
         for label, volume in volumes.items():
@@ -227,13 +230,102 @@ class ObjectFusion(Update):
 
 
 def _shown(segment: Segment, after: Frame, T: Array, frame: Frame) -> np.ndarray:
-    """(H, W) bool: where a segment of the last frame is seen in an earlier one."""
-    import cv2
-
-    uv, _ = frame.camera.project(apply(T, after.points.reshape(-1, 3)[segment.support]))
-    pixel = np.rint(np.where(np.isfinite(uv), uv, -1))
-    inside = (pixel >= 0).all(axis=1) & (pixel < [frame.camera.width, frame.camera.height]).all(axis=1)
-    u, v = pixel[inside].astype(np.int64).T
+    """Pixels (H, W) bool of an earlier frame that show a segment of the last frame."""
+    u, v, _, inside = _project(frame.camera, apply(T, after.points.reshape(-1, 3)[segment.support]))
     image = np.zeros(frame.depth.shape, np.uint8)
-    image[v, u] = 1
+    image[v[inside], u[inside]] = 1
     return cv2.morphologyEx(image, cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8)) > 0
+
+
+def _project(camera: Camera, points: Array) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Column and row (n,) of the pixel of each point, its depth z, and whether it lies in the image (else 0, 0)."""
+    uv, z = camera.project(points)
+    pixel = np.rint(np.where(np.isfinite(uv), uv, -1))
+    inside = np.all((pixel >= 0) & (pixel < [camera.width, camera.height]), axis=1)
+    u, v = np.where(inside[:, None], pixel, 0).astype(np.int64).T
+    return u, v, z, inside
+
+
+@dataclass(frozen=True, eq=False)
+class ObjectVolume:
+    """Truncated signed distances of one object in a box of the grid (Curless and Levoy 1996).
+
+    Parameters
+    ----------
+    offset : (3,) int
+        Index of the box's first voxel in the grid.
+    distance : (a, b, c) float
+        Metres to the surface, negative inside, clipped to +-`truncation`.
+    weight : (a, b, c) float
+        Number of images averaged in each distance.
+    own, other : (a, b, c) float
+        Number of images with the voxel at the surface and in the mask of the object, or of another object.
+    truncation : float
+        Metres.
+    """
+
+    offset: np.ndarray
+    distance: np.ndarray
+    weight: np.ndarray
+    own: np.ndarray
+    other: np.ndarray
+    truncation: float
+
+    @classmethod
+    def of(cls, mask: np.ndarray, grid: VoxelGrid, truncation: float, weight: float) -> ObjectVolume:
+        """The volume of voxels (X, Y, Z) bool, not empty, with a margin of `truncation` on all sides."""
+        margin = int(np.ceil(truncation / grid.voxel_size)) + 1
+        where = np.nonzero(mask)
+        low = np.array([max(int(w.min()) - margin, 0) for w in where])
+        high = np.array([min(int(w.max()) + 1 + margin, n) for w, n in zip(where, grid.shape, strict=True)])
+        inside = mask[tuple(slice(a, b) for a, b in zip(low, high, strict=True))]
+        # The surface lies half a voxel from the last centre inside and the first centre outside.
+        depth_inside = distance_transform_edt(np.pad(inside, 1))[1:-1, 1:-1, 1:-1]
+        signed = np.where(inside, 0.5 - depth_inside, distance_transform_edt(~inside) - 0.5)
+        distance = np.clip(signed * grid.voxel_size, -truncation, truncation)
+        full = np.full(inside.shape, float(weight))
+        return cls(low, distance, full, full, np.zeros(inside.shape), truncation)
+
+    @property
+    def box(self) -> tuple[slice, slice, slice]:
+        """Slices of the box in the grid."""
+        a, b, c = (slice(int(o), int(o) + n) for o, n in zip(self.offset, self.distance.shape, strict=True))
+        return a, b, c
+
+    @property
+    def occupied(self) -> np.ndarray:
+        """Voxels (a, b, c) bool inside the surface that more masks of this object than of others have shown."""
+        return (self.distance < 0) & (self.own > self.other)
+
+    def integrate(
+        self, frame: Frame, grid: VoxelGrid, T: np.ndarray, mine: np.ndarray, others: np.ndarray
+    ) -> ObjectVolume:
+        """The volume averaged with another image.
+
+        Parameters
+        ----------
+        frame : Frame
+        grid : VoxelGrid
+        T : (4, 4) array
+            Motion in world metres from the pose of the volume to the pose in the frame.
+        mine, others : (H, W) bool
+            Pixels that show this object, and another object. Surface is integrated in `mine` only, free space
+            everywhere.
+        """
+        index = np.stack(np.meshgrid(*(np.arange(n) for n in self.distance.shape), indexing="ij"), axis=-1)
+        u, v, z, inside = _project(frame.camera, apply(T, grid.centre_of(index.reshape(-1, 3) + self.offset)))
+        inside &= (z > 1e-6) & frame.valid[v, u]
+        sdf = np.where(inside, frame.depth[v, u] - z, -np.inf)
+        near = np.abs(sdf) <= self.truncation
+        taken = (sdf > self.truncation) | (near & mine[v, u])
+        shape = self.distance.shape
+        w = taken.reshape(shape).astype(float)
+        step = np.where(taken, np.clip(sdf, -self.truncation, self.truncation), 0).reshape(shape)
+        weight = self.weight + w
+        return replace(
+            self,
+            distance=(self.distance * self.weight + step * w) / weight,
+            weight=weight,
+            own=self.own + (near & mine[v, u]).reshape(shape),
+            other=self.other + (near & others[v, u]).reshape(shape),
+        )

@@ -1,12 +1,12 @@
-"""Floors, and a proposal that proposes once.
+"""Proposals of the baselines: three floors, and a proposal for the first pause only.
 
->>> FirstPause(TreeCutProposal())      # objects of the first pause; afterwards nothing new
->>> OneBlob()                          # all that stands on the table is one object
->>> OccupiedComponents()               # connected parts of the occupied space
->>> ImageComponents()                  # connected parts of the image above the table
+>>> FirstPause(TreeCutProposal())      # samples at the first pause, no objects afterwards
+>>> OneBlob()                          # everything above the table is one object
+>>> OccupiedComponents()               # connected components of the occupied space
+>>> ImageComponents()                  # connected components of the image above the table
 
-The floors use the pixels above the table and the completer, and no segmentation: what scores no better than they
-do has not understood the scene.
+The floors use the pixels above the table and the completer, but no segmentation. A method must score better than
+they do.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ __all__ = ["FirstPause", "ImageComponents", "OccupiedComponents", "OneBlob"]
 
 @dataclass(frozen=True)
 class FirstPause(Proposal):
-    """Another proposal's samples at the first pause; afterwards hypotheses without objects, at no cost.
+    """The samples of another proposal at the first pause; afterwards hypotheses without objects.
 
     Parameters
     ----------
     proposal : Proposal
-        Asked at the first pause, with the same random stream as if it stood here itself.
+        Used at the first pause, with the random stream that it would have without this wrapper.
     """
 
     proposal: Proposal = field(default_factory=TreeCutProposal)
@@ -40,7 +40,6 @@ class FirstPause(Proposal):
     properly_weighted: ClassVar[bool] = False
 
     def sample(self, rng: np.random.Generator, observation: Clip, n: int) -> Population:
-        """Draw `n` hypotheses."""
         if observation.index == 0:
             return self.proposal.sample(rng, observation, n)
         empty = Hypothesis(np.zeros(observation.grid.shape, np.uint16), observation.grid)
@@ -55,9 +54,9 @@ class OneBlob(Proposal):
     ----------
     completer : Completer
     objects : ObjectRule
-        Which pixels are above the table (its `own`).
+        Selects the pixels above the table.
     threshold : float
-        Probability from which a completed voxel is occupied.
+        Least probability of an occupied voxel.
     """
 
     completer: Completer = field(default_factory=Extrude)
@@ -67,21 +66,20 @@ class OneBlob(Proposal):
     properly_weighted: ClassVar[bool] = False
 
     def sample(self, rng: np.random.Generator, observation: Clip, n: int) -> Population:
-        """The same hypothesis, `n` times."""
         labels = one_blob(_occupied(self, rng, observation))
         return Population((Hypothesis.from_labels(labels, observation.grid, observation.index),) * n)
 
 
 @dataclass(frozen=True)
 class OccupiedComponents(Proposal):
-    """Connected components of the occupied space: what stands apart is an object.
+    """Connected components of the occupied space.
 
     Parameters
     ----------
     completer, objects, threshold
         As in `OneBlob`.
     min_voxels : int
-        Smaller components are noise.
+        Smaller components are dropped.
     """
 
     completer: Completer = field(default_factory=Extrude)
@@ -92,7 +90,6 @@ class OccupiedComponents(Proposal):
     properly_weighted: ClassVar[bool] = False
 
     def sample(self, rng: np.random.Generator, observation: Clip, n: int) -> Population:
-        """The same hypothesis, `n` times."""
         labels = connected_components(_occupied(self, rng, observation))
         kept = np.bincount(labels.ravel()) >= self.min_voxels
         kept[0] = False
@@ -104,14 +101,14 @@ class OccupiedComponents(Proposal):
 
 @dataclass(frozen=True)
 class ImageComponents(Proposal):
-    """Support plane and connected components of what the image shows above it, each completed.
+    """Connected components of the image above the support plane, each completed.
 
     Parameters
     ----------
     completer, objects, threshold
-        As in `OneBlob`; `objects` also says how small a component may be (`min_points`).
+        As in `OneBlob`; ``objects.min_points`` is the size of the smallest component.
     max_step : float
-        Metres; neighbouring pixels whose depths differ by more are not connected.
+        Neighbouring pixels with depths that differ by more (metres) are not connected.
     """
 
     completer: Completer = field(default_factory=Extrude)
@@ -122,7 +119,6 @@ class ImageComponents(Proposal):
     properly_weighted: ClassVar[bool] = False
 
     def sample(self, rng: np.random.Generator, observation: Clip, n: int) -> Population:
-        """The same hypothesis, `n` times."""
         frame, grid = observation.after, observation.grid
         labels = self.label_image(frame, self.objects.object_pixels(frame, grid))
         completed = [
@@ -132,14 +128,13 @@ class ImageComponents(Proposal):
         return Population((hypothesis_of(completed, grid, observation.index, self.threshold),) * n)
 
     def label_image(self, frame: Frame, own: np.ndarray) -> np.ndarray:
-        """(H, W) int32 components 1 .. of the pixels `own` (H, W); 0 elsewhere."""
+        """Components (H, W) int32, numbered from 1, of the pixels `own` (H, W) bool; 0 elsewhere."""
         from scipy.sparse import coo_array
         from scipy.sparse.csgraph import connected_components
 
         pixel = np.arange(own.size).reshape(own.shape)
         first, second = [], []
-        for a, b in (((slice(None), slice(None, -1)), (slice(None), slice(1, None))),
-                     ((slice(None, -1),), (slice(1, None),))):  # fmt: skip
+        for a, b in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
             with np.errstate(invalid="ignore"):
                 joined = own[a] & own[b] & (np.abs(frame.depth[a] - frame.depth[b]) <= self.max_step)
             first.append(pixel[a][joined])
@@ -154,7 +149,7 @@ class ImageComponents(Proposal):
 
 
 def _occupied(rule: OneBlob | OccupiedComponents, rng: np.random.Generator, clip: Clip) -> np.ndarray:
-    """(X, Y, Z) labels: 1 where the completed surface above the table is."""
+    """Labels (X, Y, Z), 1 in the completed space above the table."""
     own = rule.objects.object_pixels(clip.after, clip.grid)
     completed = rule.completer.complete(child(rng, "completion"), clip.after, [own], clip.grid)
     return hypothesis_of(completed, clip.grid, clip.index, rule.threshold).labels

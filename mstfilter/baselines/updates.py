@@ -1,10 +1,10 @@
-"""Updates without crossover: samples alone, predictions alone, both side by side.
+"""Updates without crossover: samples alone, predictions alone, or the union of both.
 
-They stand where `FusionUpdate` stands in MST and leave everything else, random streams included, as it is:
+They replace `FusionUpdate` and leave all other parts of the filter, with their random streams, unchanged:
 
 >>> mstfilter.preset("samples_only"), mstfilter.preset("tracking_only"), mstfilter.preset("union")
 
-At the first pause there is no prediction, and all of them, like fusion, return the proposed samples.
+At the first pause there is no prediction, and all of them return the proposed samples, as fusion does.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ __all__ = ["SamplesOnly", "TrackingOnly", "Union"]
 
 @dataclass(frozen=True)
 class SamplesOnly(Update):
-    """The proposed samples, as if there were no past."""
+    """The proposed samples alone."""
 
     properly_weighted: ClassVar[bool] = False
     draws: ClassVar[bool] = False
@@ -36,18 +36,18 @@ class SamplesOnly(Update):
         proposed: Population | None,
         observation: Clip,
     ) -> Population:
-        """The proposed population itself; where nothing was proposed, the last one stays."""
+        """The proposed population; without a proposal, the predicted one."""
         return union(predicted if proposed is None else None, proposed)
 
 
 @dataclass(frozen=True)
 class TrackingOnly(Update):
-    """The predicted hypotheses: objects of the first pause tracked on.
+    """The predicted hypotheses alone.
 
     Parameters
     ----------
     free_space : Projection
-        Clears what the latest image shows to be free; ``none`` leaves predictions as they are.
+        Clears voxels that the latest image observes as free; ``none`` leaves predictions unchanged.
     """
 
     free_space: Projection = field(default_factory=FreeSpace)
@@ -62,7 +62,7 @@ class TrackingOnly(Update):
         proposed: Population | None,
         observation: Clip,
     ) -> Population:
-        """The refined predictions with their weights; the proposed samples at the first pause."""
+        """The projected predictions with their weights; the proposed samples at the first pause."""
         if predicted is None:
             return union(None, proposed)
         refined, quality = self.free_space.refine(predicted.particles, observation)
@@ -71,15 +71,15 @@ class TrackingOnly(Update):
 
 @dataclass(frozen=True)
 class Union(Update):
-    """Predicted and proposed hypotheses side by side, weighted as fusion weighs, none crossed.
+    """Predicted and proposed hypotheses together, with the weights of fusion but without crossover.
 
-    A prediction has log weight ``log w + lambda log Q``, a sample ``log w``; both populations have mean weight 1
-    before. Evidence, where fusion has some, scores all of them.
+    A prediction has log weight ``log w + lambda log Q``, a sample ``log w``; both populations are first scaled to
+    mean weight 1. The evidence of the fusion scores all hypotheses.
 
     Parameters
     ----------
     fusion : FusionUpdate
-        Its free space, division, weights and evidence are used, its crossover is not.
+        The fusion whose free space, division, weights and evidence are used.
     """
 
     fusion: FusionUpdate = field(default_factory=FusionUpdate)
@@ -89,7 +89,7 @@ class Union(Update):
 
     def __post_init__(self) -> None:
         if not isinstance(self.fusion, FusionUpdate):
-            raise InputError(f"union weighs as a fusion does, and {type(self.fusion).__name__} is none")
+            raise InputError(f"union.fusion is a {type(self.fusion).__name__}, expected a FusionUpdate")
 
     def update(
         self,
@@ -98,7 +98,6 @@ class Union(Update):
         proposed: Population | None,
         observation: Clip,
     ) -> Population:
-        """All predicted and proposed hypotheses."""
         if predicted is None or proposed is None:
             return self.fusion.update(rng, predicted, proposed, observation)
         refined, quality = self.fusion.free_space.refine(predicted.particles, observation)

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mstfilter.baselines.object_fusion import ObjectFusion
-from mstfilter.baselines.volumes import ObjectVolume
+from mstfilter.baselines.object_fusion import ObjectFusion, ObjectVolume
 from mstfilter.errors import InputError
 from mstfilter.presets import build_filter, load_config
 from mstfilter.scene import Clip, Frame, Hypothesis, render

@@ -106,7 +106,10 @@ def test_changes_to_mst_reach_the_baselines(tmp_path, monkeypatch):
         ('base = "mst"\nwrap = ["updates.fusion=union"]', "of a slot that is set"),
         ('base = "mst"\noverrides = ["n"]', "not of the form path=value"),
         ('base = "mst"\nwrap = ["update.fusion=unoin"]', "there is no update 'unoin'"),
-        ('base = "mst"\nwrap = ["update.fusion=union", "update.fusion=union"]', "Union is none"),
+        (
+            'base = "mst"\nwrap = ["update.fusion=union", "update.fusion=union"]',
+            "is a Union, expected a FusionUpdate",
+        ),
     ],
 )
 def test_what_is_wrong_with_a_preset_is_one_clear_error(tmp_path, text, says):
