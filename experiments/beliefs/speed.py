@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import argparse
-import csv
 import time
 from pathlib import Path
 
 import numpy as np
 
+from mstfilter.files import write_csv
 from mstfilter.fusion import Belief
 from mstfilter.scene import Camera, Hypothesis, VoxelGrid, cache as memo, look_at
 from mstfilter.smc import Population
@@ -108,12 +108,10 @@ def main() -> None:
         occupied = int((belief.occupancy() > 0).sum())
         print(f"{case}: {cells} cells in {occupied} voxels that any hypothesis fills, "
               f"{belief.mean_object_count():.1f} objects, entropy {belief.partition_entropy():.2f} nats")  # fmt: skip
-    with arguments.out.open("w", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(["seconds of processor time", *names])
-        for name, row in rows.items():
-            writer.writerow([name, *(f"{row[case]:.4f}" for case in names)])
-            print(f"{name:50}", *(f"{row[case]:9.4f}" for case in names))
+    table = [{"seconds of processor time": name} | {c: f"{row[c]:.4f}" for c in names} for name, row in rows.items()]
+    write_csv(arguments.out, table)
+    for line in table:
+        print(*line.values(), sep="  ")
 
 
 if __name__ == "__main__":

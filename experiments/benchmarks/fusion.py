@@ -6,7 +6,6 @@ In each round there is a new table with 5 samples and 5 predictions; all program
 from __future__ import annotations
 
 import argparse
-import csv
 import json
 import subprocess
 import sys
@@ -20,6 +19,7 @@ import numpy as np
 from fusion_parents import GRID, N_OBJECTS, parents, table, table_labels
 
 from mstfilter import preset
+from mstfilter.files import write_csv
 from mstfilter.fusion import Crossover, FusionUpdate, NoDivision, NoFreeSpace, RandomOrder, canonical, conflict_graph
 from mstfilter.scene import Camera, Clip, Frame, Hypothesis, look_at, render, scene_cache
 from mstfilter.smc import Population, Systematic
@@ -220,10 +220,8 @@ def main() -> None:
         what = f"{name}: {many[0]} hypotheses x {many[1]} samples x {ETA}"
         done.append((f"{what}, peak memory", "MiB", f"{found['peak']:.0f}", "", target))
         done.append((f"{what}, time", "s", f"{found['seconds']:.1f}", "", ""))
-    with (options.out / "fusion.csv").open("w", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(["what", "unit", "median", "of_minima", "target", "clock"])
-        writer.writerows((*row, "cpu") for row in done)
+    columns = ("what", "unit", "median", "of_minima", "target", "clock")
+    write_csv(options.out / "fusion.csv", [dict(zip(columns, (*row, "cpu"), strict=True)) for row in done])
     for row in done:
         print(f"{row[0]:62s} {row[2]:>10s} {row[3]:>10s} {row[1]:6s} {row[4]}")
     print(f"{N_OBJECTS} objects, {GRID.shape[0]} x {GRID.shape[1]} x {GRID.shape[2]} voxels, {rounds} rounds")

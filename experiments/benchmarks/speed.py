@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import csv
 import json
 import math
 import subprocess
@@ -15,6 +14,7 @@ from pathlib import Path
 import numpy as np
 from loop import bootstrap_loop
 
+from mstfilter.files import write_csv
 from mstfilter.smc import (
     Always,
     Normal,
@@ -191,10 +191,8 @@ def main() -> None:
         both("systematic n=1e6 / particles' numba", "systematic_1e6", "particles_systematic_1e6", "<= 2"),
         milliseconds("a step with 5 object particles", "step_of_5_objects", "<= 0.5"),
     ]
-    with (options.out / "speed.csv").open("w", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(["what", "unit", "median", "of_minima", "target", "clock"])
-        writer.writerows((*row, options.clock) for row in table)
+    columns = ("what", "unit", "median", "of_minima", "target", "clock")
+    write_csv(options.out / "speed.csv", [dict(zip(columns, (*row, options.clock), strict=True)) for row in table])
     for row in table:
         print(f"{row[0]:50s} {row[2]:>12s} {row[3]:>12s} {row[1]:6s} {row[4]}")
     if worker:
@@ -217,12 +215,13 @@ def evidence(options: argparse.Namespace, ys: list[float]) -> None:
     )
     theirs = [json.loads(line)["log_evidence"] for line in answer.stdout.splitlines()]
     ours = [bootstrap(MODEL, n).run(ys, s)[0].log_evidence for s in seeds]
-    with (options.out / "evidence.csv").open("w", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(["filter", "T", "n", "seeds", "mean_log_evidence", "sd_log_evidence"])
-        for name, logs in (("mstfilter", ours), ("particles 0.4", theirs)):
-            writer.writerow([name, len(ys), n, len(logs), f"{np.mean(logs):.6f}", f"{np.std(logs, ddof=1):.6f}"])
-            print(f"{name:15s} mean {np.mean(logs):.4f} sd {np.std(logs, ddof=1):.4f}")
+    rows = []
+    for name, logs in (("mstfilter", ours), ("particles 0.4", theirs)):
+        mean, sd = np.mean(logs), np.std(logs, ddof=1)
+        row = {"filter": name, "T": len(ys), "n": n, "seeds": len(logs)}
+        rows.append(row | {"mean_log_evidence": f"{mean:.6f}", "sd_log_evidence": f"{sd:.6f}"})
+        print(f"{name:15s} mean {mean:.4f} sd {sd:.4f}")
+    write_csv(options.out / "evidence.csv", rows)
 
 
 if __name__ == "__main__":

@@ -21,7 +21,6 @@ Writes results/scenes.csv, a line a scene, and results/summary.csv. Resumable: a
 from __future__ import annotations
 
 import argparse
-import csv
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -29,12 +28,13 @@ from pathlib import Path
 import numpy as np
 
 import mstfilter
+from mstfilter.files import read_csv, write_csv
 from mstfilter.formats import open_recording
 from mstfilter.scene import Clip, Hypothesis, Recording
 from mstfilter.scoring import overlap, weighted_coverage
 from mstfilter.simulation import cached_recording
 from mstfilter.smc import ParticleFilter, Population, State, Transition
-from mstfilter.study import interval, write_table
+from mstfilter.study import interval
 
 SCENES = [(family, k) for family in ("s1", "s2") for k in range(6)]
 SMALL = {"width": 160, "height": 120, "n_actions": 1, "frames_per_clip": 8, "voxel_size": 0.02}
@@ -188,7 +188,7 @@ def main() -> None:
         parser.error("--smoke would overwrite the results: name another folder with --out")
     options.out.mkdir(parents=True, exist_ok=True)
     path = options.out / "scenes.csv"
-    rows = list(csv.DictReader(path.open(newline=""))) if path.exists() else []
+    rows = read_csv(path) if path.exists() else []
     rows = [row for row in rows if list(row) == FIELDS]  # others were made by an earlier form of this program
     scenes = SCENES[:2] if options.smoke else SCENES
     for k, scene in enumerate(scenes):
@@ -201,10 +201,10 @@ def main() -> None:
         here, there = (open_recording(cached_recording(f, s, **change)) for f, s in (scene, other))
         row = run(scene, there, here)
         rows.append({name: str(value) for name, value in row.items()})
-        write_table(path, FIELDS, rows)
+        write_csv(path, rows, FIELDS)
         print(k, row, flush=True)
     found = list(summary(rows))
-    write_table(options.out / "summary.csv", list(found[0]), found)
+    write_csv(options.out / "summary.csv", found)
     print(*found, sep="\n")
 
 

@@ -13,7 +13,6 @@ Writes results/runs.csv and results/summary.csv. Resumable: a run that is in run
 from __future__ import annotations
 
 import argparse
-import csv
 from itertools import combinations, count
 from pathlib import Path
 
@@ -21,9 +20,9 @@ import numpy as np
 from scenes import as_one, recorded
 
 import mstfilter
+from mstfilter.files import read_csv, write_csv
 from mstfilter.scene import Recording
 from mstfilter.scoring import weighted_coverage
-from mstfilter.study import write_table
 
 METHODS = ("mst", "samples_only", "tracking_only", "union", "paper", "authors")
 SMALL = {"width": 320, "height": 240, "frames_per_clip": 8, "voxel_size": 0.02}
@@ -82,7 +81,7 @@ def main(n_scenes: int, out: Path, smoke: bool) -> None:
     """Run what is missing; write both tables after every run."""
     out.mkdir(parents=True, exist_ok=True)
     path = out / "runs.csv"
-    rows: list[dict[str, str]] = list(csv.DictReader(path.open(newline=""))) if path.is_file() else []
+    rows = read_csv(path) if path.is_file() else []
     done = {(row["scene"], row["method"]) for row in rows}
     found = 0
     for seed in count():
@@ -98,9 +97,9 @@ def main(n_scenes: int, out: Path, smoke: bool) -> None:
                 continue
             new = pauses(method, recording, pair, seed)
             rows += [{"scene": str(seed), "method": method, **{k: str(v) for k, v in row.items()}} for row in new]
-            write_table(path, FIELDS, rows)
+            write_csv(path, rows, FIELDS)
         table = summary(rows)
-        write_table(out / "summary.csv", list(table[0]), table)
+        write_csv(out / "summary.csv", table)
         print(
             f"scene {seed}: " + "; ".join(f"{r['method']} {r['share']} {r['share parted']}" for r in table),
             flush=True,

@@ -20,6 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import mstfilter
+from mstfilter.files import write_csv
 from mstfilter.formats import open_recording
 from mstfilter.oracles import TrueMasks, bind_truth
 from mstfilter.report import colour
@@ -27,7 +28,7 @@ from mstfilter.scene import Recording
 from mstfilter.scoring import weighted_coverage
 from mstfilter.segmentation import TreeCutProposal
 from mstfilter.simulation import cached_recording
-from mstfilter.study import StudyFolder, Summary, compare, write_table
+from mstfilter.study import StudyFolder, Summary, compare
 
 FIGURES = {"quality": "", "quality_weighted": "_weighted"}  # of a study, and what its columns end in
 COLUMNS = (
@@ -146,9 +147,8 @@ def main(study: Path, out: Path) -> None:
         found = own_quality(open_recording(cached_recording(made["family"], made["seed"], **made["set"])))
         own.append({"scene": scene["name"], "quality": f"{found[0]:.4f}", "agreement": f"{found[1]:.4f}"})
     lines = table(folder.summary(), float(np.mean([float(line["quality"]) for line in own])))
-    out.mkdir(parents=True, exist_ok=True)
-    write_table(out / "own_masks.csv", list(own[0]), own)
-    write_table(out / "mask_quality.csv", COLUMNS, lines)
+    write_csv(out / "own_masks.csv", own)
+    write_csv(out / "mask_quality.csv", [line | {"masks": f"{line['masks']:g}"} for line in lines], COLUMNS)
     draw(lines, out / "mask_quality.png")
     for line in lines:
         print(*(str(line.get(c, "")).rjust(14) for c in COLUMNS))

@@ -10,7 +10,6 @@ single-frame baseline in the image and in space, and floors), summary.csv and pi
 from __future__ import annotations
 
 import argparse
-import csv
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -21,6 +20,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from mstfilter.completion import Extrude, arbitrate
+from mstfilter.files import read_csv, write_csv
 from mstfilter.scene import Clip, Frame
 from mstfilter.scoring import weighted_coverage
 from mstfilter.segmentation import OptimalCut, TreeCutProposal, optimal_cut
@@ -137,10 +137,7 @@ def fill(
     target: Path, work: Callable[[SceneFamily, int], dict[str, float]], jobs: list[tuple[SceneFamily, int]]
 ) -> list:
     """A line a scene; those in the file are kept, a new one is written as soon as it is done."""
-    lines: list[dict[str, str]] = []
-    if target.exists():
-        with target.open(newline="") as file:
-            lines = list(csv.DictReader(file))
+    lines = read_csv(target) if target.exists() else []
     done = {(line["family"], line["seed"]) for line in lines}
     for family, seed in jobs:
         if (family.name, str(seed)) in done:
@@ -148,28 +145,24 @@ def fill(
         result = {k: f"{v:.4f}" if isinstance(v, float) else str(v) for k, v in work(family, seed).items()}
         lines.append({"family": family.name, "seed": str(seed), **result})
         print(*lines[-1].values(), flush=True)
-        temporary = target.with_suffix(".partial")
-        with temporary.open("w", newline="") as file:
-            writer = csv.DictWriter(file, list(lines[-1]), lineterminator="\n")
-            writer.writeheader()
-            writer.writerows(sorted(lines, key=lambda line: (line["family"], int(line["seed"]))))
-        temporary.replace(target)
+        write_csv(target, sorted(lines, key=lambda line: (line["family"], int(line["seed"]))))
     return lines
 
 
 def summarise(target: Path, tables: list[list[dict[str, str]]]) -> None:
     """Mean, least and greatest of every column by family."""
-    with target.open("w", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(["family", "measure", "scenes", "mean", "least", "greatest", "half_width_95"])
-        for name in FAMILIES:
-            for table in tables:
-                own = [line for line in table if line["family"] == name]
-                for measure in [k for k in (own[0] if own else {}) if k not in ("family", "seed")]:
-                    values = np.array([float(line[measure]) for line in own])
-                    half = 2.0 * values.std(ddof=1) / np.sqrt(len(values)) if len(values) > 1 else np.nan
-                    row = (values.mean(), values.min(), values.max(), half)
-                    writer.writerow([name, measure, len(values), *(f"{x:.3f}" for x in row)])
+    header = ("mean", "least", "greatest", "half_width_95")
+    rows = []
+    for name in FAMILIES:
+        for table in tables:
+            own = [line for line in table if line["family"] == name]
+            for measure in [k for k in (own[0] if own else {}) if k not in ("family", "seed")]:
+                values = np.array([float(line[measure]) for line in own])
+                half = 2.0 * values.std(ddof=1) / np.sqrt(len(values)) if len(values) > 1 else np.nan
+                figures = [f"{x:.3f}" for x in (values.mean(), values.min(), values.max(), half)]
+                row = {"family": name, "measure": measure, "scenes": len(values)}
+                rows.append(row | dict(zip(header, figures, strict=True)))
+    write_csv(target, rows)
 
 
 def picture(folder: Path, small: dict[str, int]) -> None:

@@ -10,7 +10,6 @@ Trust the ratio; the seconds are those of the machine. Writes speed.csv.
 from __future__ import annotations
 
 import argparse
-import csv
 import time
 from collections.abc import Iterator
 from dataclasses import replace
@@ -18,6 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
+from mstfilter.files import write_csv
 from mstfilter.simulation import TOLERANCE, Renderer, Scene, advance, finish, scene_family
 
 HEADER = ("family", "seed", "frames", "kept_s", "full_s", "ratio", "sensor_s", "kept_cpu_s", "full_cpu_s")
@@ -67,15 +67,13 @@ def main() -> None:
     options = parser.parse_args()
     if options.smoke and options.out == parser.get_default("out"):
         parser.error("--smoke would overwrite the results: name another folder with --out")
-    options.out.mkdir(parents=True, exist_ok=True)
     small = {"width": 160, "height": 120} if options.smoke else {}
     jobs = [("s1", 0)] if options.smoke else [("s1", 0), ("s2", 0), ("s3", 0), ("s3", 3)]
     rows = []
     for name, seed in jobs:
         rows.append(measure(name, seed, 1, small))
         print(*(f"{k} {v}" for k, v in zip(HEADER, rows[-1], strict=True)), flush=True)
-    with (options.out / "speed.csv").open("w", newline="") as file:
-        csv.writer(file, lineterminator="\n").writerows([HEADER, *rows])
+    write_csv(options.out / "speed.csv", [dict(zip(HEADER, row, strict=True)) for row in rows])
 
 
 if __name__ == "__main__":

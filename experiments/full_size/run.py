@@ -19,9 +19,9 @@ import tempfile
 from dataclasses import replace
 from pathlib import Path
 
+from mstfilter.files import write_csv
 from mstfilter.runs import RunFolder
 from mstfilter.simulation import scene_family, simulate
-from mstfilter.study import write_table
 
 HERE = Path(__file__).resolve().parent
 SIZE = ["n=5", "n_proposed=10", "update.eta=5"]
@@ -59,8 +59,7 @@ def main(seed: int, out: Path, smoke: bool) -> None:
                     "peak_GiB": round(peak, 2),
                 }
             )
-    out.mkdir(parents=True, exist_ok=True)
-    write_table(out / "full_size.csv", list(rows[0]), rows)
+    write_csv(out / "full_size.csv", rows)
     print("  ".join(f"{name:>12}" for name in rows[0]))
     for row in rows:
         print("  ".join(f"{value:>12}" for value in row.values()))

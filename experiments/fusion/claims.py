@@ -15,7 +15,6 @@ by the share of all predictions that have the voxel occupied.
 from __future__ import annotations
 
 import argparse
-import csv
 from collections import defaultdict
 from dataclasses import replace
 from pathlib import Path
@@ -23,6 +22,7 @@ from pathlib import Path
 import numpy as np
 
 import mstfilter
+from mstfilter.files import write_csv
 from mstfilter.formats import open_recording
 from mstfilter.fusion import Claims
 from mstfilter.simulation import cached_recording
@@ -78,12 +78,13 @@ def count_hidden(
 
 def write(path: Path, header: list[str], found: dict) -> None:
     """One row a class: voxels, and the share of them that is right."""
-    with path.open("w", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow([*header, "voxels", "share right"])
-        for key, (n, right) in sorted(found.items()):
-            writer.writerow([*key, n, round(right / n, 3) if n else ""])
-            print(*(f"{k:24}" for k in key), f"{n:9d}  {right / max(n, 1):.3f}")
+    rows = []
+    for key, (n, right) in sorted(found.items()):
+        rows.append(
+            {**dict(zip(header, key, strict=True)), "voxels": n, "share right": round(right / n, 3) if n else ""}
+        )
+        print(*(f"{k:24}" for k in key), f"{n:9d}  {right / max(n, 1):.3f}")
+    write_csv(path, rows)
 
 
 def main(out: Path, smoke: bool) -> None:
@@ -110,7 +111,6 @@ def main(out: Path, smoke: bool) -> None:
                             doubtful = mst.update.claims.doubtful(h, r)
                             count_hidden(found_hidden, family, clip, truth, sample, r, doubtful, votes)
                 state, _ = mst.step(state, clip)
-    out.mkdir(parents=True, exist_ok=True)
     write(out / "claims.csv", ["claimed by", "where", "cleared"], found)
     write(out / "hidden.csv", ["family", "overlap", "predictions"], found_hidden)
 

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mstfilter.study import write_table
+from mstfilter.files import write_csv
 
 HERE = Path(__file__).resolve().parent
 
@@ -32,7 +32,6 @@ def main() -> None:
     parser.add_argument("--trials", type=int, default=100)
     parser.add_argument("--out", type=Path, default=HERE)
     options = parser.parse_args()
-    options.out.mkdir(parents=True, exist_ok=True)
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     command = [sys.executable, str(HERE / "victim.py")]
     rng, rows = np.random.default_rng(0), []
@@ -57,7 +56,7 @@ def main() -> None:
             rows.append(
                 dict(zip(FIELDS, (trial, f"{delay:.4f}", int(ended), t, int(same(whole, path))), strict=True))
             )
-    write_table(options.out / "trials.csv", FIELDS, rows)
+    write_csv(options.out / "trials.csv", rows)
     killed, identical = sum(not r["had_ended"] for r in rows), sum(r["identical"] for r in rows)
     print(f"{len(rows)} trials, {killed} killed while running, {identical} ended identically")
     print(f"{time.perf_counter() - start:.0f} s")

@@ -19,7 +19,8 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
-from mstfilter.study import ENDPOINT, StudyFolder, Summary, cost_columns, summarise, write_table
+from mstfilter.files import write_csv
+from mstfilter.study import ENDPOINT, StudyFolder, Summary, cost_columns, summarise
 
 Row = Mapping[str, Any]
 
@@ -153,9 +154,8 @@ def main(study: Path, out: Path, reference: str, pooled: bool) -> None:
         tables |= {name: means(found), f"{name}_scenes": by_scene(found)}
         tables |= {f"{name}_cases": cases(rows), f"{name}_time": times(rows)}
     tables[f"{name}_differences"] = differences(found)
-    out.mkdir(parents=True, exist_ok=True)
     for table, lines in tables.items():
-        write_table(out / f"{table}.csv", list(lines[0]), lines)
+        write_csv(out / f"{table}.csv", lines)
     print(markdown(tables[f"{name}_differences"]))
 
 

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-import csv
 import sys
 from pathlib import Path
+
+from mstfilter.files import read_csv
 
 COLOURS = {
     "n exact draws": "0.6",
@@ -20,12 +21,6 @@ NAMES = {"+ cover": "mst, all six changes", "n exact draws": "n draws of the exa
 RANKED = ("exact", "bootstrap", "guided", "balanced", "paper", "authors", "mst", "+ cover")
 
 
-def read(path: Path) -> list[dict[str, str]]:
-    """Rows of a CSV."""
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
-
-
 def draw(out: Path) -> None:
     """Distance against the number of particles, over time, and histograms of ranks; figure.png."""
     import matplotlib
@@ -33,7 +28,7 @@ def draw(out: Path) -> None:
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    distances, steps, ranks = (read(out / f"{f}.csv") for f in ("distances", "over_time", "calibration"))
+    distances, steps, ranks = (read_csv(out / f"{f}.csv") for f in ("distances", "over_time", "calibration"))
     fig = plt.figure(figsize=(11, 8.6), layout="constrained")
     top, bottom = fig.subfigures(2, 1, height_ratios=[1.15, 1])
     axes = top.subplots(1, 3)

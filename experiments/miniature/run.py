@@ -7,7 +7,6 @@ python experiments/miniature/run.py [--presets]
 from __future__ import annotations
 
 import argparse
-import csv
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
@@ -18,6 +17,7 @@ import numpy as np
 from scipy import stats
 
 import mstfilter
+from mstfilter.files import write_csv
 from mstfilter.oracles import (
     N_RANK_DRAWS,
     POSTERIOR_ERRORS,
@@ -135,10 +135,10 @@ def summarise(rows: list[dict], out: Path) -> None:
             mean, half = interval(values)
             entry = table.setdefault(key, {"world": key[0], "n": key[1], "arm": key[2], "worlds": len(values)})
             entry |= {m: round(mean, 4), f"{m}_pm": round(half, 4)}
-    write(out / "distances.csv", list(table.values()))
+    write_csv(out / "distances.csv", list(table.values()))
 
     steps = by_world(rows, lambda r: (r["world"], r["n"], r["arm"], r["t"]), "tv")
-    write(
+    write_csv(
         out / "over_time.csv",
         [
             {"world": w, "n": n, "arm": a, "t": t, "tv": round(interval(v)[0], 4), "tv_pm": round(interval(v)[1], 4)}
@@ -156,7 +156,7 @@ def summarise(rows: list[dict], out: Path) -> None:
                 mean, half = interval(values[world, n, name] - values[world, n, other])
                 row |= {m: round(mean, 4), f"{m}_pm": round(half, 4)}
             paired.append(row)
-    write(out / "paired.csv", paired)
+    write_csv(out / "paired.csv", paired)
 
 
 def calibrate(arms: dict[str, int], n_worlds: int, steps: int, out: Path) -> None:
@@ -184,15 +184,7 @@ def calibrate(arms: dict[str, int], n_worlds: int, steps: int, out: Path) -> Non
             }
             rows.append(row | {f"rank_{k}": c for k, c in enumerate(counts)})
         print("calibration", name, flush=True)
-    write(out / "calibration.csv", rows)
-
-
-def write(path: Path, rows: list[dict]) -> None:
-    """A CSV of rows with the same keys."""
-    with path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, rows[0].keys(), lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
+    write_csv(out / "calibration.csv", rows)
 
 
 def main() -> None:

@@ -11,7 +11,6 @@ calibration) are fitted on the frames of the other camera set-ups, and so is the
 from __future__ import annotations
 
 import argparse
-import csv
 import itertools
 import os
 import time
@@ -24,6 +23,7 @@ import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
+from mstfilter.files import write_csv
 from mstfilter.scene import Camera, Frame
 from mstfilter.scoring import weighted_coverage
 from mstfilter.segmentation import (
@@ -166,11 +166,9 @@ def components(case: Case, step: float = np.inf) -> np.ndarray:
     return np.unique(label, return_inverse=True)[1].reshape(label.shape)
 
 
-def write(target: Path, header: list[str], rows: Iterable[Iterable]) -> None:
-    temporary = target.with_suffix(".partial")
-    with temporary.open("w", newline="") as file:
-        csv.writer(file, lineterminator="\n").writerows([header, *rows])
-    temporary.replace(target)
+def write_rows(target: Path, header: list[str], rows: Iterable[Iterable]) -> None:
+    """A CSV file of rows in the order of the header."""
+    write_csv(target, [dict(zip(header, row, strict=True)) for row in rows], header)
 
 
 def main(numbers: Sequence[int], out: Path) -> None:
@@ -282,11 +280,10 @@ def main(numbers: Sequence[int], out: Path) -> None:
     print(f"  on all frames: {grid[int(scores.mean(axis=1).argmax())]}")
     print(f"{time.time() - began:.0f} s")
 
-    out.mkdir(parents=True, exist_ok=True)
-    write(out / "summary.csv", ["arm", "all", "touching", "apart"], summary)
-    write(out / "samplers.csv", ["sampler", "objects", "distinct_of_10"], sampled)
+    write_rows(out / "summary.csv", ["arm", "all", "touching", "apart"], summary)
+    write_rows(out / "samplers.csv", ["sampler", "objects", "distinct_of_10"], sampled)
     names = list(arms)
-    write(
+    write_rows(
         out / "frames.csv",
         ["frame", "set_up", "touching", "objects", *names],
         (
@@ -294,7 +291,7 @@ def main(numbers: Sequence[int], out: Path) -> None:
             for i, c in enumerate(cases)
         ),
     )
-    write(
+    write_rows(
         out / "constants.csv",
         ["set_up", "frames", "colour_weight", "centre", "slope", "colour_weight_learned"],
         ([g, f"learn{a}-{b}", *grid[chosen[g]], COLOUR_WEIGHTS[picked[g]]] for g, a, b in groups),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -12,6 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from mstfilter.files import write_csv
 from mstfilter.report import Colour, close_up, voxel_picture
 from mstfilter.scene import Camera, VoxelGrid
 
@@ -74,13 +74,10 @@ def save(figure: Figure, path: Path, dpi: int = 100) -> Path:
     return path
 
 
-def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> Path:
-    """A table; numbers with three digits after the point."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("w", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(columns)
-        writer.writerows([f"{v:.3f}" if isinstance(v, float) else v for v in row] for row in rows)
+def write_rows(path: Path, columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> Path:
+    """Write a CSV file; floats with three digits after the point."""
+    texts = ([f"{v:.3f}" if isinstance(v, float) else v for v in row] for row in rows)
+    write_csv(path, [dict(zip(columns, row, strict=True)) for row in texts], columns)
     return path
 
 

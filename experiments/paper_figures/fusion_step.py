@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
-from canvas import BLUE, FLOOR, INK, MUTED, PAPER, save, show, voxels, write_csv
+from canvas import BLUE, FLOOR, INK, MUTED, PAPER, save, show, voxels, write_rows
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -89,7 +89,7 @@ def table(
         size = round(float(np.mean([(x > 0).sum() for x in labels])))
         plain = name.replace("\n", " ")
         rows.append([plain, len(q), q.mean(), weighted, q.min(), q.max(), *floors[name], objects, size])
-    return write_csv(
+    return write_rows(
         path,
         [
             "hypotheses",

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import networkx as nx
 import numpy as np
-from canvas import INK, MUTED, page, save, show, voxels, write_csv
+from canvas import INK, MUTED, page, save, show, voxels, write_rows
 from matplotlib.axes import Axes
 from r1 import NOTICE, Particles, folder
 
@@ -228,7 +228,7 @@ def table(particles: Particles, path: Path, smoke: bool) -> Path:
         rows.append(row)
     named = [f"{what}: {name}" for name, _ in STRUCTURES for what in ("merges", "objects")]
     columns = ["form", "formula", "directed conflicts", "mean", "median", "below 1 %", "at 1", *named]
-    return write_csv(path, columns, rows)
+    return write_rows(path, columns, rows)
 
 
 def edges_of(structure: Structure, graphs: Sequence[ConflictGraph], rounds: int) -> list[tuple[int, np.ndarray]]:

@@ -7,18 +7,18 @@ with the shifted value, on simulated scenes of the tuning seeds at a quarter of 
 
 from __future__ import annotations
 
-import csv
 from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from canvas import BLUE, INK, MUTED, ORANGE, page, save, write_csv
+from canvas import BLUE, INK, MUTED, ORANGE, page, save, write_rows
 from matplotlib.axes import Axes
 from scipy import stats
 
 import mstfilter
+from mstfilter.files import read_csv
 from mstfilter.formats import open_recording
 from mstfilter.scene import Frame
 from mstfilter.scoring import weighted_coverage
@@ -56,13 +56,12 @@ def make(out: Path, smoke: bool) -> list[Path]:
     path = out / "over_segmenting.csv"
     rows = []
     if path.exists():
-        with path.open(newline="") as file:
-            rows = [list(row.values()) for row in csv.DictReader(file)]
+        rows = [list(row.values()) for row in read_csv(path)]
     done = {int(row[0]) for row in rows}
     for seed in SEEDS[:1] if smoke else SEEDS:
         if seed not in done:
             rows += scene(seed, smoke)
-            write_csv(path, COLUMNS, rows)
+            write_rows(path, COLUMNS, rows)
     return [path, picture(path, out / "over_segmenting.svg")]
 
 
@@ -86,8 +85,7 @@ def scene(seed: int, smoke: bool) -> list[list[object]]:
 
 def picture(table: Path, path: Path) -> Path:
     """Quality and number of objects over pauses, means over scenes with 95 % t intervals, and the gain of mst."""
-    with table.open(newline="") as file:
-        rows = list(csv.DictReader(file))
+    rows = read_csv(table)
     figure, axes = page(1, 3, 11.0, 3.5)
     for (value, dashes), (arm, colour) in product((("usual", (3, 2)), ("too fine", (None, None))), ARMS.items()):
         for panel, column in zip(axes[0], ("quality", "objects"), strict=False):

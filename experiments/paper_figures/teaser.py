@@ -12,7 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from canvas import INK, LINE, MUTED, crop, page, save, show, voxels, write_csv
+from canvas import INK, LINE, MUTED, crop, page, save, show, voxels, write_rows
 from matplotlib.axes import Axes
 from matplotlib.patches import Rectangle
 from scipy.spatial.transform import RigidTransform, Rotation
@@ -106,4 +106,4 @@ def table(recording: Recording, run: RunFolder, path: Path) -> Path:
                 rows.append(
                     [t, k, hypothesis.n_objects, label, status[t].get(label, ""), float(row.max(initial=0.0))]
                 )
-    return write_csv(path, ["pause", "hypothesis", "objects", "true object", "status", "IoU"], rows)
+    return write_rows(path, ["pause", "hypothesis", "objects", "true object", "status", "IoU"], rows)

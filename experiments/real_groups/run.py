@@ -12,7 +12,6 @@ group's camera set-up (experiments/osd_frames).
 from __future__ import annotations
 
 import argparse
-import csv
 import os
 import time
 from collections import defaultdict
@@ -23,12 +22,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from mstfilter.files import read_csv, write_csv
 from mstfilter.formats import PairedImages
 from mstfilter.presets import preset
 from mstfilter.scene import Recording, project, read_labels
 from mstfilter.scoring import weighted_coverage
 from mstfilter.smc import ParticleFilter, State
-from mstfilter.study import Difference, adjusted, compare, write_table
+from mstfilter.study import Difference, adjusted, compare
 
 HERE = Path(__file__).resolve().parent
 SHARED = Path(os.environ.get("MSTFILTER_SHARED", HERE.parents[2] / "shared"))
@@ -73,8 +73,7 @@ CHANGED = 0.01  # metres
 
 def held_out(group: tuple[int, int]) -> dict[str, str]:
     """Constants of both front ends, chosen on the frames of the other camera set-ups."""
-    with CONSTANTS.open(newline="") as file:
-        return next(r for r in csv.DictReader(file) if r["frames"] == f"learn{group[0]}-{group[1]}")
+    return next(r for r in read_csv(CONSTANTS) if r["frames"] == f"learn{group[0]}-{group[1]}")
 
 
 def assemble(method: str, constants: dict[str, str]) -> ParticleFilter:
@@ -199,7 +198,7 @@ def summarise(lines: Sequence[dict[str, str]], out: Path) -> None:
     found = adjusted([compare(means[m], means[own]) for m, own in OWN_SAMPLES.items()])
     past = [{"method": m, "minus": own, **columns(d)} for (m, own), d in zip(OWN_SAMPLES.items(), found, strict=True)]
     for name, rows in (("summary", summary), ("past", past)):
-        write_table(out / f"{name}.csv", list(rows[0]), rows)
+        write_csv(out / f"{name}.csv", rows)
         print(
             *("  ".join(f"{v:>{21 if k in ('method', 'minus') else 9}}" for k, v in r.items()) for r in rows),
             sep="\n",
@@ -217,17 +216,15 @@ def main() -> None:
         parser.error("--smoke would overwrite the results: name another folder with --out")
     cv2.setNumThreads(1)
     options.out.mkdir(parents=True, exist_ok=True)
-    target, lines = options.out / "pauses.csv", []
-    if target.exists():
-        with target.open(newline="") as file:
-            lines = list(csv.DictReader(file))
+    target = options.out / "pauses.csv"
+    lines = read_csv(target) if target.exists() else []
     groups = SMOKE_GROUPS if options.smoke else GROUPS
     missing = [g for g in groups if f"learn{g[0]}-{g[1]}" not in {line["group"] for line in lines}]
     for group in missing[: options.most]:
         began = time.process_time()
         lines += run(group, SEEDS[:1] if options.smoke else SEEDS, 4 if options.smoke else 1)
         lines.sort(key=lambda r: (int(r["frame"].removeprefix("learn")), list(METHODS).index(r["method"])))
-        write_table(target, FIELDS, lines)
+        write_csv(target, lines, FIELDS)
         print(f"learn{group[0]}-{group[1]}  {time.process_time() - began:.0f} s of the processor", flush=True)
     summarise(lines, options.out)
     from figure import draw

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-import csv
 from pathlib import Path
+
+from mstfilter.files import read_csv
 
 #: Part, beginning of the setting, measure, title; errors above, what is selected below.
 PANELS = (
@@ -31,8 +32,7 @@ def draw(out: Path) -> None:
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    with (out / "summary.csv").open(newline="") as file:
-        lines = list(csv.DictReader(file))
+    lines = read_csv(out / "summary.csv")
     fig, axes = plt.subplots(2, 4, figsize=(15, 9), layout="constrained")
     for ax, (part, setting, measure, title) in zip(axes.ravel(), PANELS, strict=True):
         panel = [

@@ -8,7 +8,6 @@ Every part that is finished is kept in OUT/parts; the same command goes on with 
 from __future__ import annotations
 
 import argparse
-import csv
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -20,6 +19,7 @@ from scipy import stats
 from worlds import World, branching, plain, worlds
 
 from mstfilter.errors import InputError
+from mstfilter.files import read_csv, write_csv
 from mstfilter.smc import ExactEquality, Gaussian, ParticleFilter, Population
 
 HERE = Path(__file__).resolve().parent
@@ -178,23 +178,7 @@ def summarise(found: list[dict[str, str]], out: Path) -> None:
             lines.append(line)
         for (line, d, _), certain in zip(group, holm(np.array([p for _, _, p in group])), strict=True):
             line["claim"] = ("higher" if d > 0 else "lower") if certain else "no difference can be claimed"
-    write(out / "summary.csv", lines)
-
-
-def write(path: Path, lines: list) -> None:
-    """A CSV that is there in full or not at all."""
-    partial = path.with_suffix(".partial")
-    with partial.open("w", newline="") as file:
-        writer = csv.DictWriter(file, lines[0] if lines else FIELDS, lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(lines)
-    partial.replace(path)
-
-
-def read(path: Path) -> list[dict[str, str]]:
-    """Rows of a CSV."""
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
+    write_csv(out / "summary.csv", lines)
 
 
 def main() -> None:
@@ -223,12 +207,12 @@ def main() -> None:
         path = folder / f"{name}.csv"
         if name.startswith(options.only) and not path.exists():
             start = time.perf_counter()
-            write(path, list(part()))
+            write_csv(path, part(), FIELDS)
             print(f"{name}  {time.perf_counter() - start:.0f} s", flush=True)
     missing = [name for name in parts if not (folder / f"{name}.csv").exists()]
     if missing:
         print("not yet there:", ", ".join(missing))
-    summarise([row for name in parts if name not in missing for row in read(folder / f"{name}.csv")], options.out)
+    summarise([row for name in parts if name not in missing for row in read_csv(folder / f"{name}.csv")], options.out)
     from figure import draw
 
     draw(options.out)

@@ -11,7 +11,6 @@ the peak of resident memory. Writes measured.csv, slopes.csv and figure.png.
 from __future__ import annotations
 
 import argparse
-import csv
 import json
 import os
 import subprocess
@@ -22,6 +21,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from mstfilter.files import read_csv, write_csv
 
 HERE = Path(__file__).resolve().parent
 #: Factor -> what it is drawn over, and the name of that.
@@ -211,11 +212,9 @@ def main() -> None:
     options.out.mkdir(parents=True, exist_ok=True)
     target, known = options.out / "measured.csv", {}
     if target.exists():
-        with target.open(newline="") as file:
-            known = {r["case"]: r for r in csv.DictReader(file)}
+        known = {r["case"]: r for r in read_csv(target)}
     wanted = cases(options.smoke)
     from mstfilter.simulation import cached_recording
-    from mstfilter.study import write_table
 
     for factor, chosen in wanted.items():
         for case in chosen:
@@ -229,10 +228,10 @@ def main() -> None:
             row = json.loads(done.stdout.splitlines()[-1])
             known[case.name] = {"case": case.name, **{k: str(v) for k, v in row.items()}}
             print(factor, *(f"{k} {v}" for k, v in row.items()), flush=True)
-            write_table(target, list(known[case.name]), known.values())
+            write_csv(target, known.values())
     rows = [{"factor": f, **known[c.name]} for f, chosen in wanted.items() for c in chosen if c.name in known]
     fitted = slopes(rows)
-    write_table(options.out / "slopes.csv", list(fitted[0]), fitted)
+    write_csv(options.out / "slopes.csv", fitted)
     for line in fitted:
         print("  ".join(f"{v:>12}" for v in line.values()))
     from figure import draw

@@ -9,13 +9,13 @@ Writes results/quality.csv beside this file.
 from __future__ import annotations
 
 import argparse
-import csv
 from pathlib import Path
 
 import numpy as np
 from scenes import CHECKED_SEEDS, first_pause
 
 from mstfilter.completion import Extrude
+from mstfilter.files import write_csv
 from mstfilter.scene import Clip
 from mstfilter.scoring import weighted_coverage
 from mstfilter.segmentation import (
@@ -70,10 +70,8 @@ def main(out: Path, smoke: bool) -> None:
             mean = [f"{x:.3f}" for x in np.array(found).mean(axis=0)]
             rows.append([name, arm, *mean])
             print(name, arm, *mean)
-    out.mkdir(parents=True, exist_ok=True)
-    with (out / "quality.csv").open("w", newline="") as file:
-        header = ["family", "arm", "image", "space_mean", "space_best", "distinct", "objects"]
-        csv.writer(file, lineterminator="\n").writerows([header, *rows])
+    header = ("family", "arm", "image", "space_mean", "space_best", "distinct", "objects")
+    write_csv(out / "quality.csv", [dict(zip(header, row, strict=True)) for row in rows])
 
 
 def _true_masks(pause) -> tuple[float, ...]:

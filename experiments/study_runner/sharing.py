@@ -13,8 +13,9 @@ from pathlib import Path
 
 import numpy as np
 
+from mstfilter.files import write_csv
 from mstfilter.simulation import cache_folder
-from mstfilter.study import Local, run_study, study_of, write_table
+from mstfilter.study import Local, run_study, study_of
 
 HERE = Path(__file__).parent
 ARMS = ["mst", "paper"]
@@ -53,17 +54,16 @@ def main() -> None:
                             "family": family,
                             "arm": arm,
                             "shared_work": sharing,
-                            "core_s_a_step": float(np.mean([row["core_seconds"] for row in later])),
-                            "core_s_worst_step": max(row["core_seconds"] for row in later),
-                            "peak_mb": max(row["peak_mb"] for row in later),
-                            "work_mb": work,
-                            "quality": float(np.mean([row["quality"] for row in later])),
+                            "core_s_a_step": f"{np.mean([row['core_seconds'] for row in later]):.6g}",
+                            "core_s_worst_step": f"{max(row['core_seconds'] for row in later):.6g}",
+                            "peak_mb": f"{max(row['peak_mb'] for row in later):.6g}",
+                            "work_mb": f"{work:.6g}",
+                            "quality": f"{np.mean([row['quality'] for row in later]):.6g}",
                         }
                     )
                     print(rows[-1], flush=True)
                 assert len({row["quality"] for row in rows[-3:]}) == 1, "shared work changed a result"
-    options.out.mkdir(parents=True, exist_ok=True)
-    write_table(options.out / "sharing.csv", list(rows[0]), rows)
+    write_csv(options.out / "sharing.csv", rows)
 
 
 if __name__ == "__main__":

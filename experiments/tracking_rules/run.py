@@ -14,10 +14,10 @@ from pathlib import Path
 
 import numpy as np
 
+from mstfilter.files import write_csv
 from mstfilter.scene import Hypothesis
 from mstfilter.simulation import scene_family, simulate
 from mstfilter.smc import Population
-from mstfilter.study import write_table
 from mstfilter.tracking import (
     AuthorsRule,
     DenseFlow,
@@ -89,8 +89,7 @@ def main(families: list[tuple[str, int, int]], out: Path, small: dict[str, float
                     "iou_rest_worst": f"{min(s['rest']):.2f}",
                 }
             )
-    out.mkdir(parents=True, exist_ok=True)
-    write_table(out / "results.csv", list(rows[0]), rows)
+    write_csv(out / "results.csv", rows)
 
 
 if __name__ == "__main__":
