@@ -198,7 +198,7 @@ def main() -> None:
     options = parser.parse_args()
     if options.smoke and options.out == HERE / "results":
         parser.error("--smoke would overwrite the results: name another folder with --out")
-    options.out.mkdir(include_parents=True, exist_ok=True)
+    options.out.mkdir(parents=True, exist_ok=True)
     every = (*PROPER, *PRESETS, *CHANGES, *LADDER, *UNIONS)
     if options.presets:
         options.out = options.out / "presets"
