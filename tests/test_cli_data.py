@@ -220,7 +220,7 @@ def test_a_workspace_that_misses_is_one_warning(tmp_path, capsys):
     assert code == 0, err
     told = [line for line in err.splitlines() if line.startswith("warning: ")]
     assert len(told) == 1
-    assert "holds nothing above the table" in told[0]
+    assert "has no reading above the table" in told[0]
     assert "hint: give a workspace" in err
     assert "hypotheses of 0" in out
     shutil.rmtree(tmp_path / "run")

@@ -7,7 +7,6 @@
 from __future__ import annotations
 
 import json
-from collections import OrderedDict
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -220,7 +219,7 @@ class Dsr(RecordingFormat):
             return as_labels(np.swapaxes(volumes(index)["mask_3d"], 0, 1), f"{steps[index]}: mask_3d")
 
         return Recording(
-            LazyFrames(lambda index: _draw(volumes(index), grid, camera), range(len(steps)), OrderedDict()),
+            LazyFrames(lambda index: _draw(volumes(index), grid, camera), len(steps)),
             grid,
             tuple(range(len(steps))),
             tuple(float(k) for k in range(len(steps))),

@@ -26,7 +26,6 @@ import json
 import math
 import shutil
 import zipfile
-from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
@@ -457,7 +456,7 @@ def open_recording(path: str | Path) -> Recording:
 
     truth, true_poses = path / "voxels.npz", path / "poses.json"
     return Recording(
-        LazyFrames(read_posed, range(len(entries)), OrderedDict()),
+        LazyFrames(read_posed, len(entries)),
         grid,
         pauses,
         tuple(e.time_s for e in entries),

@@ -22,7 +22,6 @@ from __future__ import annotations
 
 import warnings
 from abc import ABC, abstractmethod
-from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -281,9 +280,7 @@ class Video:
             return image if image is None else lens.nearest(image, 0)
 
         return Recording(
-            LazyFrames(
-                lambda index: self._frame(index, camera_at(index), lens), range(len(self.times)), OrderedDict()
-            ),
+            LazyFrames(lambda index: self._frame(index, camera_at(index), lens), len(self.times)),
             grid,
             found,
             tuple(t - self.times[0] for t in self.times),

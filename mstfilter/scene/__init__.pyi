@@ -26,7 +26,12 @@ from mstfilter.scene.recording import (
     find_world as find_world,
     truth_reader as truth_reader,
 )
-from mstfilter.scene.rendering import project as project, render as render, render_hypothesis as render_hypothesis
+from mstfilter.scene.rendering import (
+    Rendering as Rendering,
+    project as project,
+    render as render,
+    render_hypothesis as render_hypothesis,
+)
 from mstfilter.scene.voxels import (
     MAX_LABEL as MAX_LABEL,
     Crop as Crop,

@@ -1,4 +1,4 @@
-"""Small helpers that keep arrays frozen and give them a name by content."""
+"""Read-only arrays, and keys that identify values by their content."""
 
 from __future__ import annotations
 
@@ -19,21 +19,21 @@ def read_only(array: np.ndarray) -> np.ndarray:
 
 
 def frozen(array: np.ndarray) -> np.ndarray:
-    """A read-only array that nobody else can write to: copied unless its memory is read-only already."""
+    """A read-only array whose memory no other array can change: a copy, unless its memory is read-only already."""
     owner: object = array
     while isinstance(owner, np.ndarray):
         if owner.flags.writeable:
-            own = array.copy()
-            own.flags.writeable = False
-            return own
+            copy = array.copy()
+            copy.flags.writeable = False
+            return copy
         owner = owner.base
     return array
 
 
 def component_key(component: object) -> bytes:
-    """Name by content of a component: its class, its file where it has one, and its fields, arrays included.
+    """Key of a component: its class, its file if it has one, and its fields, arrays included.
 
-    One that was bound to a recording's truth (`mstfilter.oracles.truth`) is named by that too.
+    If a component has a ``bound_key`` (the ground truth of a recording, for oracles), the key includes it.
     """
     if dataclasses.is_dataclass(component) and not isinstance(component, type):
         cls = type(component)
@@ -48,7 +48,7 @@ def component_key(component: object) -> bytes:
 
 
 def content_key(*parts: object) -> bytes:
-    """A 16-byte name of the content of arrays, bytes, strings and numbers, in order."""
+    """A 16-byte hash of the content of arrays, bytes, strings and numbers, in order."""
     digest = hashlib.blake2b(digest_size=16)
     for part in parts:
         if isinstance(part, np.ndarray):

@@ -1,13 +1,13 @@
 """Pinhole cameras.
 
 >>> import numpy as np
->>> from mstfilter.scene.camera import Camera
+>>> from mstfilter.scene import Camera
 >>> camera = Camera(np.array([[525, 0, 319.5], [0, 525, 239.5], [0, 0, 1.0]]), 640, 480)
 >>> camera.project(np.array([0.0, 0.0, 1.0]))[0]
 array([319.5, 239.5])
 
 Axes are OpenCV's: x right, y down, z forward. Pixel (u, v) = (column, row) with (0, 0) at the centre of the
-first pixel. A camera without a pose (`T_world_camera=None`) speaks of its own axes as the world.
+first pixel. If a camera has no pose (`T_world_camera=None`), its own axes are the world axes.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class Camera:
         if K.shape != (3, 3):
             raise InputError(f"camera matrix K has shape {K.shape}, expected (3, 3)")
         if not np.isfinite(K).all():
-            raise InputError(f"camera matrix K holds a value that is not finite: {K.tolist()}")
+            raise InputError(f"camera matrix K has a value that is not finite: {K.tolist()}")
         if K[0, 0] <= 0 or K[1, 1] <= 0 or abs(np.linalg.det(K)) < 1e-9:
             raise InputError(
                 f"camera matrix K is not invertible: {K.tolist()}",
@@ -73,10 +73,10 @@ class Camera:
             if not isinstance(self.T_world_camera, RigidTransform):
                 raise InputError(
                     f"T_world_camera is a {type(self.T_world_camera).__name__}, expected a scipy RigidTransform",
-                    "convert a 4x4 matrix with mstfilter.scene.camera.rigid_from_matrix",
+                    "convert a 4x4 matrix with mstfilter.scene.rigid_from_matrix",
                 )
             if not np.isfinite(self.T_world_camera.as_matrix()).all():
-                raise InputError("camera pose T_world_camera holds a value that is not finite")
+                raise InputError("camera pose T_world_camera has a value that is not finite")
         object.__setattr__(self, "K", frozen(K))
         object.__setattr__(self, "width", int(self.width))
         object.__setattr__(self, "height", int(self.height))
@@ -97,14 +97,14 @@ class Camera:
 
     @cached_property
     def key(self) -> bytes:
-        """Name by content."""
-        # To a nanometre: reading a pose back from a file orthogonalises it anew and changes the last bits.
+        """Content key."""
+        # To a nanometre: reading a pose from a file orthogonalises it again, which changes the last bits.
         pose = b"" if self.T_world_camera is None else np.round(self.T_world_camera.as_matrix(), 9) + 0.0
         return content_key("camera", self.K, self.width, self.height, pose)
 
     @cached_property
     def pose(self) -> RigidTransform:
-        """`T_world_camera`, the identity where it is not known."""
+        """`T_world_camera`; the identity if it is not known."""
         return RigidTransform.identity() if self.T_world_camera is None else self.T_world_camera
 
     @property
@@ -134,7 +134,7 @@ class Camera:
         return directions * depth[..., None].astype(np.float64) + matrix[:3, 3]
 
     def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Where world points fall in the image.
+        """Project world points into the image.
 
         Parameters
         ----------
@@ -187,9 +187,9 @@ def look_at(position: np.ndarray, target: np.ndarray, up: tuple[float, float, fl
 
 
 def rigid_from_matrix(matrix: np.ndarray, where: str = "pose") -> RigidTransform:
-    """A RigidTransform from a 4x4 matrix, with one clear error where it is none.
+    """A RigidTransform from a 4x4 matrix.
 
-    scipy would silently orthogonalise a matrix with scale or shear; here that is an error.
+    Raises InputError if the matrix has scale or shear; scipy would orthogonalise it without an error.
     """
     try:
         matrix = np.asarray(matrix, dtype=np.float64)
@@ -199,8 +199,8 @@ def rigid_from_matrix(matrix: np.ndarray, where: str = "pose") -> RigidTransform
         raise InputError(f"{where} has shape {matrix.shape}, expected (4, 4)")
     if not np.isfinite(matrix).all():
         raise InputError(
-            f"{where} holds a value that is not finite (NaN or inf)",
-            "leave the pose out: it is then found from the support plane",
+            f"{where} has a value that is not finite (NaN or inf)",
+            "leave the pose out to find it from the support plane",
         )
     R = matrix[:3, :3]
     if np.abs(R @ R.T - np.eye(3)).max() > 1e-3 or np.linalg.det(R) < 0 or not np.allclose(matrix[3], (0, 0, 0, 1)):

@@ -42,7 +42,11 @@ SIGMA_AT_ONE_METRE = 0.00185
 
 
 def depth_sigma(z: ArrayLike, at_one_metre: float = SIGMA_AT_ONE_METRE) -> np.ndarray:
-    """Standard deviation (m) of a depth reading at z-depth `z` (m); same shape as `z`.
+    """Standard deviation (m) of a depth reading at z-depth `z` (m), of the shape of `z`.
+
+    A structured-light or stereo sensor measures disparity, so the standard deviation grows with the square of depth:
+    sigma = `at_one_metre` (z / m)^2. The default was fitted to table patches of 45 Kinect v1 and Xtion frames
+    (0.6 to 1.5 m) and fits them within 10 % up to 1.2 m.
 
     Examples
     --------
@@ -64,12 +68,12 @@ def _decode(path: Path, flags: int) -> np.ndarray:
         data = path.read_bytes()
     except FileNotFoundError:
         raise InputError(
-            f"image is missing: {path}", "record the frame again, or take it out of manifest.json"
+            f"image is missing: {path}", "record the frame again, or remove it from manifest.json"
         ) from None
     except OSError as error:
         raise InputError(f"image cannot be read: {path} ({error.strerror})") from error
     if data.startswith(_PNG_START) and not data.endswith(_PNG_END):
-        # The decoder would fill the lost rows with zeros and say nothing.
+        # The decoder would fill the missing rows with zeros without an error.
         raise InputError(f"image is truncated: {path} ({len(data)} bytes, no end of PNG)", "copy the file again")
     image = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data else None
     if image is None:
@@ -86,7 +90,7 @@ def read_rgb(path: Path) -> np.ndarray:
 
 
 def read_depth(path: Path, scale: float) -> np.ndarray:
-    """Depth image (H, W) float32 in metres, NaN where the file holds 0; `scale` is metres a unit."""
+    """Depth image (H, W) float32 in metres, NaN where the file has 0; `scale` is in metres per unit."""
     import cv2
 
     image = _decode(path, cv2.IMREAD_UNCHANGED)
@@ -127,14 +131,13 @@ class Frame:
     rgb : (H, W, 3) uint8
         Colour image.
     depth : (H, W) float
-        z-depth in metres; NaN (or anything not positive and finite) where the sensor gave no reading.
+        z-depth in metres; NaN (or any value that is not positive and finite) is no reading.
     camera : Camera
         Intrinsics and pose.
     robot_mask : (H, W) bool, optional
         Pixels that show the robot. They are unknown: never background, never free space.
     views : tuple of Frame
-        What further cameras saw at the same instant; all cameras need a pose in the same world. They have no views
-        themselves.
+        Frames of further cameras at the same instant, without views. All cameras need a pose in the same world.
     """
 
     rgb: np.ndarray
@@ -149,10 +152,10 @@ class Frame:
         if rgb.shape != (*shape, 3) or rgb.dtype != np.uint8:
             raise InputError(
                 f"colour image has shape {rgb.shape} and type {rgb.dtype}, expected {(*shape, 3)} uint8",
-                "image and camera must have the same size; colour is RGB with 8 bits a channel",
+                "image and camera must have the same size; colour is RGB with 8 bits per channel",
             )
         if depth.shape != shape:
-            raise InputError(f"depth image has shape {depth.shape}, expected {shape} as the camera says")
+            raise InputError(f"depth image has shape {depth.shape}, expected {shape}, the size of the camera")
         if not np.issubdtype(depth.dtype, np.floating):
             raise InputError(
                 f"depth image has type {depth.dtype}, expected metres as float",
@@ -170,28 +173,28 @@ class Frame:
             object.__setattr__(self, "robot_mask", frozen(robot))
         object.__setattr__(self, "views", tuple(self.views))
         if any(view.views for view in self.views):
-            raise InputError("a further view has views of its own", "list all cameras as views of one frame")
+            raise InputError("a view has views", "list all cameras as views of one frame")
         if self.views and any(view.camera.T_world_camera is None for view in self.all_views):
             raise InputError(
-                f"of {len(self.all_views)} cameras that see the same instant, at least one has no pose",
-                "give every camera its T_world_camera, calibrated to one world",
+                f"at least one of {len(self.all_views)} cameras of a frame has no pose",
+                "give every camera its T_world_camera in one world",
             )
 
     @cached_property
     def key(self) -> bytes:
-        """Name by content."""
+        """Content key."""
         robot = b"" if self.robot_mask is None else self.robot_mask
         own = content_key("frame", self.rgb, self.depth, self.camera.key, robot)
         return content_key("views", own, *(view.key for view in self.views)) if self.views else own
 
     @property
     def all_views(self) -> tuple[Frame, ...]:
-        """This image and those of the further cameras."""
+        """This frame and its views."""
         return (self, *self.views)
 
     @cached_property
     def valid(self) -> np.ndarray:
-        """(H, W) bool: a depth reading that does not show the robot."""
+        """(H, W) bool: pixels with a depth reading that do not show the robot."""
         valid = np.isfinite(self.depth)
         if self.robot_mask is not None:
             valid &= ~self.robot_mask
@@ -199,18 +202,22 @@ class Frame:
 
     @cached_property
     def points(self) -> np.ndarray:
-        """(H, W, 3) float64 world points in metres, NaN where there is no reading."""
+        """(H, W, 3) float64 world points in metres, NaN without a reading."""
         return read_only(self.camera.unproject(self.depth))
 
 
 @dataclass(frozen=True, eq=False)
 class Clip:
-    """Frames from one pause to the next, and the workspace in which they are understood.
+    """Frames from one pause to the next, and the workspace: the observation of a step.
+
+    `before` shows the scene at the previous pause, `after` at this pause; the frames between them show the action.
+    The first clip of a recording has one frame. Components have no state, so a component that needs earlier
+    observations reads them from `previous`; a resumed run reads the same ones.
 
     Parameters
     ----------
     frames : sequence of Frame
-        In time order, first and last at rest. A lazy sequence is kept as it is.
+        In time order, first and last at rest. A lazy sequence stays lazy.
     grid : VoxelGrid
         The workspace.
     index : int
@@ -218,7 +225,7 @@ class Clip:
     times : tuple of float, optional
         Seconds, one a frame.
     previous : Clip, optional
-        The clip that ended at the previous pause; None at the first, or where the past is not known.
+        The clip that ended at the previous pause; None for the first clip, or if it is not known.
     """
 
     frames: Sequence[Frame]
@@ -237,19 +244,19 @@ class Clip:
 
     @cached_property
     def frames_key(self) -> bytes:
-        """Name by content of all frames and the grid. Looks at every image once."""
+        """Content key of all frames and the grid. Reads every image once."""
         return content_key("frames", self.grid.key, *(frame.key for frame in self.frames))
 
     @cached_property
     def key(self) -> bytes:
-        """Name by content of this clip and everything before. Looks at every image once."""
+        """Content key of this clip and all clips before. Reads every image once."""
         chain: list[Clip] = []
         clip: Clip | None = self
         while clip is not None and "key" not in clip.__dict__:
             chain.append(clip)
             clip = clip.previous
         key = b"" if clip is None else clip.key
-        for clip in reversed(chain):  # not by recursion: a recording may have a thousand pauses
+        for clip in reversed(chain):  # no recursion, because a recording may have a thousand pauses
             key = content_key("clip", key, clip.frames_key)
             clip.__dict__["key"] = key
         return key

@@ -24,7 +24,7 @@ from mstfilter.errors import InputError, InputWarning
 from mstfilter.scene.arrays import read_only
 from mstfilter.scene.cache import memo
 from mstfilter.scene.camera import Camera
-from mstfilter.scene.frame import Frame
+from mstfilter.scene.frame import SIGMA_AT_ONE_METRE, Frame
 from mstfilter.scene.voxels import VoxelGrid
 
 __all__ = [
@@ -42,17 +42,17 @@ __all__ = [
 
 @dataclass(frozen=True, eq=False)
 class FrameGeometry:
-    """Voxel centres of a grid seen from a frame.
+    """Voxel centres of a grid in the image of a frame.
 
     Parameters
     ----------
     pixel : (X, Y, Z) int32
-        Flat index of the pixel that sees the centre; -1 outside the image or behind the camera.
+        Flat index of the pixel that contains the centre; -1 outside the image or behind the camera.
     z : (X, Y, Z) float32
         z-depth of the centre in metres.
     signed : (X, Y, Z) float32
-        `z` minus the measured depth there: negative in front of the surface, positive behind; NaN where
-        nothing is known (outside the image, no reading, robot).
+        `z` minus the measured depth of the pixel: negative in front of the surface, positive behind; NaN if it is
+        unknown (outside the image, no reading, robot).
     """
 
     pixel: np.ndarray
@@ -66,16 +66,16 @@ class FrameGeometry:
 
     @property
     def unknown(self) -> np.ndarray:
-        """(X, Y, Z) bool: nothing was measured along the ray of the centre."""
+        """(X, Y, Z) bool: no depth was measured along the ray of the centre."""
         return np.isnan(self.signed)
 
 
 def frame_geometry(frame: Frame, grid: VoxelGrid) -> FrameGeometry:
-    """The geometry of a frame and a grid, memoised by content."""
-    return memo("frame_geometry", (frame.key, grid.key), lambda: _compute(frame, grid))
+    """The voxel centres of a grid in the image of a frame. Cached by content."""
+    return memo("frame_geometry", (frame.key, grid.key), lambda: _frame_geometry(frame, grid))
 
 
-def _compute(frame: Frame, grid: VoxelGrid) -> FrameGeometry:
+def _frame_geometry(frame: Frame, grid: VoxelGrid) -> FrameGeometry:
     camera = frame.camera
     exact = camera.pose.as_matrix().tobytes()  # the camera's key is rounded
     pixel, z, z64 = memo("voxels in image", (camera.key, exact, grid.key), lambda: _projected(camera, grid))
@@ -87,7 +87,7 @@ def _compute(frame: Frame, grid: VoxelGrid) -> FrameGeometry:
 
 
 def _projected(camera: Camera, grid: VoxelGrid) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Pixel, and z-depth in single and in double precision, of every voxel centre: the same for all frames."""
+    """Pixel and z-depth (single and double precision) of every voxel centre: the same for all frames of a camera."""
     uv, z = camera.project(grid.centres())
     with np.errstate(invalid="ignore"):
         u, v = np.rint(uv[..., 0]), np.rint(uv[..., 1])
@@ -97,27 +97,27 @@ def _projected(camera: Camera, grid: VoxelGrid) -> tuple[np.ndarray, np.ndarray,
     return read_only(pixel), read_only(z.astype(np.float32)), read_only(z)
 
 
-BASELINE = 0.075  # metres between projector and camera of a Kinect v1; only sets the unit of disparity
-FOCAL = 525.0  # its focal length in pixels, likewise
+BASELINE = 0.075  # metres between projector and camera of a Kinect v1; sets the unit of disparity only
+_FOCAL = 525.0  # focal length of a Kinect v1 in pixels; sets the unit of disparity only
 
 
 @dataclass(frozen=True, eq=False)
 class SupportPlane:
-    """A plane that carries the scene.
+    """The plane on which the objects stand.
 
     Parameters
     ----------
     T_world_camera : RigidTransform
-        Camera pose in the plane's world: z is the plane's normal, z = 0 the plane, the origin under the middle of
-        what is seen of it, y away from the camera.
+        Camera pose in the world of the plane: z is the normal of the plane, which is at z = 0; the origin is at the
+        median of its pixels, y points away from the camera.
     coefficients : (3,)
         a, b, c of D = a u + b v + c.
     on_or_behind : (H, W) bool
         Readings on the plane or behind it.
     residual : (H, W) float32
-        Measured minus plane disparity, in 1/8 pixels; positive is in front of the plane (above it), NaN unknown.
+        Measured minus plane disparity, in 1/8 pixels; positive is in front of the plane (above it), NaN is unknown.
     inlier_share : float
-        Share of the readings that lie on the plane.
+        Share of the readings that are on the plane.
     """
 
     T_world_camera: RigidTransform
@@ -129,26 +129,31 @@ class SupportPlane:
 
 def disparity(depth: np.ndarray) -> np.ndarray:
     """Disparity (H, W) float64 in 1/8 pixel of a Kinect from depth in metres; NaN stays NaN."""
-    return 8.0 * FOCAL * BASELINE / np.asarray(depth, dtype=np.float64)
+    return 8.0 * _FOCAL * BASELINE / np.asarray(depth, dtype=np.float64)
 
 
 def fit_support_plane(
     frame: Frame, inlier: float = 1.5, tolerance: float = 2.0, n_trials: int = 400, min_share: float = 0.1
 ) -> SupportPlane:
-    """Find the plane that most readings lie on.
+    """Find the plane with the most readings (RANSAC, then least squares). Cached by content.
 
     Parameters
     ----------
     frame : Frame
-        Its pose, if it has one, is not used.
+        Its pose is not used.
     inlier : float
         Largest residual of an inlier, in 1/8 pixels.
     tolerance : float
         Readings up to this much in front of the plane count as on it, in 1/8 pixels.
     n_trials : int
-        Minimal sets drawn; the draw is seeded by a constant, so the same frame gives the same plane.
+        Number of minimal sets. They are drawn with a constant seed, so the same frame gives the same plane.
     min_share : float
-        Fewer inliers than this share of the readings is an error.
+        Smallest share of inliers among the readings.
+
+    Raises
+    ------
+    InputError
+        If there are too few readings or too few inliers.
     """
     key = (frame.key, inlier, tolerance, n_trials, min_share)
     return memo("support_plane", key, lambda: _fit(frame, inlier, tolerance, n_trials, min_share))
@@ -166,14 +171,14 @@ def _fit(frame: Frame, inlier: float, tolerance: float, n_trials: int, min_share
     design = np.stack([u, v, np.ones(len(u))], axis=1).astype(np.float64)
 
     rng = np.random.default_rng(20210927)
-    few = rng.choice(len(d), size=min(len(d), 4000), replace=False)
-    triples = rng.integers(0, len(few), size=(n_trials, 3))
-    A = design[few][triples]
-    sound = np.abs(np.linalg.det(A)) > 3e-3 * D.size  # twice the area of the triangle in pixels
-    planes = np.linalg.solve(A[sound], d[few][triples[sound]][..., None])[..., 0]
+    subset = rng.choice(len(d), size=min(len(d), 4000), replace=False)
+    triples = rng.integers(0, len(subset), size=(n_trials, 3))
+    A = design[subset][triples]
+    proper = np.abs(np.linalg.det(A)) > 3e-3 * D.size  # twice the area of the triangle in pixels
+    planes = np.linalg.solve(A[proper], d[subset][triples[proper]][..., None])[..., 0]
     if len(planes) == 0:
-        raise InputError("no support plane: all readings lie on one line of the image")
-    counts = (np.abs(design[few] @ planes.T - d[few][:, None]) < inlier).sum(axis=0)
+        raise InputError("no support plane: all readings are on one line of the image")
+    counts = (np.abs(design[subset] @ planes.T - d[subset][:, None]) < inlier).sum(axis=0)
     plane = planes[counts.argmax()]
     for _ in range(3):
         close = np.abs(design @ plane - d) < inlier
@@ -182,7 +187,7 @@ def _fit(frame: Frame, inlier: float, tolerance: float, n_trials: int, min_share
     share = float(close.mean())
     if share < min_share:
         raise InputError(
-            f"no support plane: the best plane holds {100 * share:.1f} % of the readings",
+            f"no support plane: the best plane has {100 * share:.1f} % of the readings",
             "give a camera pose (T_world_camera) if the table is not visible",
         )
     rows, columns = np.mgrid[: D.shape[0], : D.shape[1]]
@@ -194,8 +199,8 @@ def _fit(frame: Frame, inlier: float, tolerance: float, n_trials: int, min_share
 
 
 def _pose(camera: Camera, plane: np.ndarray, pixels: np.ndarray) -> RigidTransform:
-    """World frame of a plane given by its disparity: camera pose with z up and the plane at z = 0."""
-    scale = 8.0 * FOCAL * BASELINE
+    """Camera pose in the world with z up and the plane (a, b, c of its disparity) at z = 0."""
+    scale = 8.0 * _FOCAL * BASELINE
     # D = p . (u, v, 1) and (u, v, 1) = K X / z  =>  scale = p K X: the plane in camera axes.
     normal = plane @ camera.K
     offset = scale / np.linalg.norm(normal)
@@ -204,7 +209,7 @@ def _pose(camera: Camera, plane: np.ndarray, pixels: np.ndarray) -> RigidTransfo
     middle = np.linalg.inv(camera.K) @ np.append(np.median(pixels, axis=0), 1.0)
     middle = middle * (offset / (normal @ middle))
     away = np.array([0.0, 0.0, 1.0]) - up * up[2]
-    if np.linalg.norm(away) < 1e-6:  # looking straight down: the top of the image is "away"
+    if np.linalg.norm(away) < 1e-6:  # the camera looks straight down: use the top of the image
         away = np.array([0.0, -1.0, 0.0])
     away /= np.linalg.norm(away)
     R = np.stack([np.cross(away, up), away, up])
@@ -215,10 +220,10 @@ def _pose(camera: Camera, plane: np.ndarray, pixels: np.ndarray) -> RigidTransfo
 
 
 def table_residual(frame: Frame) -> np.ndarray:
-    """(H, W) float32 measured minus table disparity in 1/8 pixels, for a camera whose world has the table at z = 0.
+    """Measured minus table disparity in 1/8 pixels, (H, W) float32. Cached by content.
 
-    Positive is above the table; NaN without reading, or where the pixel's ray does not meet the table (there
-    nothing can lie on it, and the reading counts as above: +inf).
+    The table is at z = 0 of the camera's world. Positive is above the table, NaN is no reading, +inf is a reading
+    whose ray does not meet the table.
     """
 
     def compute() -> np.ndarray:
@@ -236,7 +241,7 @@ def table_residual(frame: Frame) -> np.ndarray:
 def workspace(
     frame: Frame, voxel_size: float = 0.01, shape: tuple[int, int, int] = (100, 100, 50), above: float = 0.01
 ) -> VoxelGrid:
-    """A grid around what stands on the table.
+    """A grid around the objects on the table.
 
     Parameters
     ----------
@@ -245,15 +250,17 @@ def workspace(
     voxel_size : float
         Metres.
     shape : (3,) int
-        Voxels; the grid is centred on the readings that lie more than `above` metres above the table, or on the
-        table itself where there are none.
+        Number of voxels.
+    above : float
+        The grid is centred on the readings more than this many metres above the table, or on the table if there are
+        fewer than 200.
     """
     points = frame.points[frame.valid]
-    raised = points[(points[:, 2] > max(above, 4 * 0.00185)) & (points[:, 2] < shape[2] * voxel_size)]
+    raised = points[(points[:, 2] > max(above, 4 * SIGMA_AT_ONE_METRE)) & (points[:, 2] < shape[2] * voxel_size)]
     chosen = raised if len(raised) >= 200 else points[np.abs(points[:, 2]) < above]
     if len(chosen) == 0:
         raise InputError(
-            "no workspace: no depth reading lies on or above the table",
+            "no workspace: no depth reading is on or above the table",
             "give the grid: VoxelGrid(origin, voxel_size, shape)",
         )
     low, high = np.percentile(chosen[:, :2], (2, 98), axis=0)
@@ -261,29 +268,32 @@ def workspace(
     return VoxelGrid(np.append(corner, 0.0), voxel_size, shape)
 
 
-ABOVE = 0.01
-"""Metres above the table from which a reading may show an object."""
-FEW = 30
-"""Fewer readings than this show none: single ones occur by noise."""
+_MIN_HEIGHT = 0.01
+"""Metres above the table beyond which a reading may show an object."""
+_MIN_READINGS = 30
+"""Fewer readings than this are taken for noise."""
 
 
 def warn_if_workspace_is_empty(frames: Iterable[Frame], grid: VoxelGrid, where: str) -> None:
-    """Warn where no frame has readings inside the grid and above the table.
+    """Warn if no frame has readings inside the grid and above the table.
+
+    Objects are searched inside the voxel grid only. A grid in other units, at another place, or below a pose that is
+    upside down gives hypotheses without objects and no error.
 
     Parameters
     ----------
     frames : iterable of Frame
-        With poses, at the pauses. Looked at until one has such readings.
+        With poses, at the pauses; read until one has such readings.
     grid : VoxelGrid
         Workspace.
     where : str
-        For the message.
+        Name of the recording, for the message.
     """
     spans = []
     for frame in frames:
         points = frame.points[frame.valid]
         inside = points[grid.contains(grid.index_of(points))]
-        if (inside[:, 2] > ABOVE).sum() >= FEW:
+        if (inside[:, 2] > _MIN_HEIGHT).sum() >= _MIN_READINGS:
             return
         if len(points):
             spans.append(np.percentile(points, (2, 98), axis=0))
@@ -291,13 +301,15 @@ def warn_if_workspace_is_empty(frames: Iterable[Frame], grid: VoxelGrid, where: 
         return
     low, high = np.min(spans, axis=0)[0], np.max(spans, axis=0)[1]
     seen = ", ".join(f"{axis} {a:.2f} to {b:.2f}" for axis, a, b in zip("xyz", low, high, strict=True))
-    held = ", ".join(f"{axis} {a:.2f} to {b:.2f}" for axis, a, b in zip("xyz", grid.origin, grid.upper, strict=True))
+    spanned = ", ".join(
+        f"{axis} {a:.2f} to {b:.2f}" for axis, a, b in zip("xyz", grid.origin, grid.upper, strict=True)
+    )
     warnings.warn(
         InputWarning(
-            f"the workspace of {where} holds nothing above the table, so no object can be found: it spans {held} m, "
-            f"depth readings span {seen} m",
-            "give a workspace around the objects, or none: it is then laid around what stands on the table",
-            "the world's z is up and the table at z = 0: is the pose right?",
+            f"the workspace of {where} has no reading above the table, so no object can be found: "
+            f"it spans {spanned} m, depth readings span {seen} m",
+            "give a workspace around the objects, or none: it is then placed around the objects on the table",
+            "check the pose: z of the world is up, the table is at z = 0",
         ),
         stacklevel=3,
     )

@@ -1,29 +1,20 @@
-"""Recordings: an RGB-D video with pauses, on disk or in memory.
+"""Recordings: RGB-D videos with pauses, from arrays in memory or from files.
 
+>>> recording = Recording.from_arrays(rgb, depth, K)         # depth in metres
 >>> recording = mstfilter.open_recording("recordings/table-7")
 >>> for clip in recording.clips():
-...     clip.before, clip.after                 # Frames, read when they are looked at
->>> Recording.from_arrays(rgb, depth, K)         # a user's own arrays; depth in metres
+...     clip.before, clip.after                              # Frames, read when they are used
 
-On disk a recording is a folder::
-
-    manifest.json        version, generator, seed, frames: [{index, time_s, role: static | action}]
-    camera.json          K, width, height, depth_scale (metres a unit, mandatory), T_world_camera, workspace
-    rgb/000000.png       8-bit RGB         depth/000000.png     16-bit, 0 = no reading
-    instance/000000.png  optional: object number of each pixel      robot/000000.png   optional: robot mask
-    voxels.npz           optional truth: labels (S, X, Y, Z), frame (S,), origin, voxel_size
-    poses.json           optional truth: per frame, per object a 4x4 T_world_object
-
-Frames with role ``static`` are the pauses. Without a pose the world is found from the support plane of the
-first pause; without a workspace a grid is laid around what stands on the table.
+Without a camera pose the world is found from the support plane of the first pause; without a workspace a grid is
+placed around the objects on the table.
 """
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from collections.abc import Callable, Sequence
+from copy import copy
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any, overload
 
@@ -39,14 +30,21 @@ from mstfilter.scene.voxels import VoxelGrid, as_labels
 
 __all__ = ["LazyFrames", "Recording", "check_depth_range", "find_world"]
 
-_KEPT_FRAMES = 40
-
 
 class LazyFrames(Sequence[Frame]):
-    """Frames that are made when they are looked at; the last few are kept."""
+    """Frames that are read when they are used; the last 40 are kept in memory.
 
-    def __init__(self, read: Callable[[int], Frame], indices: Sequence[int], kept: OrderedDict[int, Frame]) -> None:
-        self._read, self._indices, self._kept = read, list(indices), kept
+    Parameters
+    ----------
+    read : callable
+        Frame of an index.
+    n : int
+        Number of frames.
+    """
+
+    def __init__(self, read: Callable[[int], Frame], n: int) -> None:
+        self._read = lru_cache(maxsize=40)(read)
+        self._indices = range(n)
 
     def __len__(self) -> int:
         return len(self._indices)
@@ -57,14 +55,10 @@ class LazyFrames(Sequence[Frame]):
     def __getitem__(self, position: slice) -> LazyFrames: ...
     def __getitem__(self, position: Any) -> Any:
         if isinstance(position, slice):
-            return LazyFrames(self._read, self._indices[position], self._kept)
-        index = self._indices[position]
-        if index not in self._kept:
-            self._kept[index] = self._read(index)
-            if len(self._kept) > _KEPT_FRAMES:
-                self._kept.popitem(last=False)
-        self._kept.move_to_end(index)
-        return self._kept[index]
+            part = copy(self)
+            part._indices = self._indices[position]
+            return part
+        return self._read(self._indices[position])
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,23 +68,24 @@ class Recording:
     Parameters
     ----------
     frames : sequence of Frame
-        In time order; read when looked at.
+        In time order; they may be read when they are used.
     grid : VoxelGrid
         Workspace.
     pauses : tuple of int
-        Indices of the frames at rest, ascending.
+        Indices of the frames at the pauses, ascending.
     times : tuple of float
-        Seconds, one a frame.
+        Seconds, one per frame.
     name : str
         For messages and reports.
     path : Path, optional
-        The folder or file it was read from.
+        The folder or file that it was read from.
     depth_scale : float
-        Metres a unit of the stored depth images; what `save` writes.
+        Metres per unit of the stored depth images, used when the recording is saved.
     manifest : dict
-        What manifest.json says, for recordings read from a folder.
+        Content of manifest.json, for recordings read from a folder.
     read_truth, read_instance, read_poses : callables
-        Where volumes (by pause), instance images and poses (by frame) come from; they return None where absent.
+        The ground truth: volumes (by pause), instance images and poses (by frame); they return None if it is not
+        known.
     """
 
     frames: Sequence[Frame]
@@ -133,22 +128,22 @@ class Recording:
         times: Sequence[float] | None = None,
         name: str = "arrays",
     ) -> Recording:
-        """A recording of a user's own arrays.
+        """A recording from arrays.
 
         Parameters
         ----------
         rgb : (H, W, 3) or (T, H, W, 3) uint8
             One image or a video.
         depth : (H, W) or (T, H, W) float
-            Metres; NaN or 0 where there is no reading.
+            Metres; NaN or 0 is no reading.
         K : (3, 3) array
             Intrinsics in pixels.
         pauses : sequence of int, optional
-            Frames at which nothing moves and the hypotheses are wanted. Default: the first and the last.
+            Frames at which nothing moves; a hypothesis is estimated at each. Default: the first and the last.
         T_world_camera : (4, 4) array or RigidTransform, optional
             Camera pose; the table must be at z = 0. Default: from the support plane of the first pause.
         grid : VoxelGrid, optional
-            Workspace. Default: 1 x 1 x 0.5 m in voxels of 1 cm around what stands on the table.
+            Workspace. Default: 1 x 1 x 0.5 m in voxels of 1 cm around the objects on the table.
         robot_masks : (T, H, W) bool, optional
             Pixels that show the robot.
         times : sequence of float, optional
@@ -183,20 +178,20 @@ class Recording:
             found = sorted({np.shape(m) for m in masks if m is not None})
             raise InputError(
                 f"there are {len(masks)} robot masks of shape {found}, expected {n} of {(height, width)}",
-                "one mask a frame, of the size of the images",
+                "one mask per frame, of the size of the images",
             )
         first = Frame(rgb[chosen[0]], depth[chosen[0]], camera, masks[chosen[0]])
-        given = grid is not None
+        grid_given = grid is not None
         camera, grid = find_world(first, grid)
         frames = [Frame(rgb[i], depth[i], camera, masks[i]) for i in range(n)]
         stamps = tuple(float(t) for t in (times if times is not None else range(n)))
-        if given:
+        if grid_given:
             warn_if_workspace_is_empty((frames[p] for p in chosen), grid, f"recording {name}")
         return cls(frames, grid, chosen, stamps, name)
 
     @cached_property
     def key(self) -> bytes:
-        """Name by content of every frame, the grid, the pauses and the times. Looks at every image (see `check`)."""
+        """Content key of all frames, the grid, the pauses and the times. Reads every image."""
         keys = []
         for index in range(len(self)):
             frame = self.frames[index]
@@ -207,7 +202,7 @@ class Recording:
 
     @cached_property
     def truth_key(self) -> bytes:
-        """Name by content of all that is known to be true: volumes, label images, poses. Looks at every frame."""
+        """Content key of the ground truth: volumes, label images, poses. Reads every frame."""
         keys = []
         for t in range(len(self.pauses)):
             keys.append(content_key(self.truth(t)))
@@ -220,7 +215,7 @@ class Recording:
         return len(self.frames)
 
     def clips(self) -> tuple[Clip, ...]:
-        """One clip a pause: the first pause alone, then from each pause to the next. Each knows the one before it."""
+        """One clip per pause: the first pause alone, then from each pause to the next; `Clip.previous` is set."""
         clips: list[Clip] = []
         for t, end in enumerate(self.pauses):
             start = self.pauses[max(t - 1, 0)]
@@ -230,38 +225,38 @@ class Recording:
         return tuple(clips)
 
     def truth(self, t: int) -> np.ndarray | None:
-        """True labels (X, Y, Z) uint16 at pause `t`, on the recording's grid; None where there is none."""
+        """True labels (X, Y, Z) uint16 at pause `t`, on the grid of the recording; None if they are not known."""
         return self.read_truth(t)
 
     def instance(self, index: int) -> np.ndarray | None:
-        """True label image (H, W) of a frame; None where there is none."""
+        """True label image (H, W) of a frame; None if it is not known."""
         return self.read_instance(index)
 
     def poses(self, index: int) -> dict[int, np.ndarray] | None:
-        """True T_world_object (4, 4) of each object of a frame, by label; None where there are none."""
+        """True T_world_object (4, 4) of each object of a frame, by label; None if they are not known."""
         return self.read_poses(index)
 
     def check(self) -> None:
-        """Look at every image once, so that a broken one is known before a run begins; warn of a misplaced grid."""
+        """Read every image, so that an unreadable one raises InputError before a run; warn of a misplaced grid."""
         _ = self.key
         warn_if_workspace_is_empty((self.frames[p] for p in self.pauses), self.grid, f"recording {self.name}")
 
 
 def _check_depth(depth: np.ndarray, name: str) -> None:
-    """Depth that cannot be metres, or holds nothing."""
+    """Raise InputError if a depth image has no reading or cannot be in metres."""
     for index, image in enumerate(depth):
         with np.errstate(invalid="ignore"):
             good = np.isfinite(image) & (image > 0)
         if not good.any():
             raise InputError(
                 f"depth image of frame {index} of {name} has no reading at all",
-                "0 and NaN mean no reading; values are metres",
+                "0 and NaN are no reading; other values are metres",
             )
         check_depth_range(image[good], f"depth image of frame {index} of {name}")
 
 
 def check_depth_range(metres: np.ndarray, where: str) -> None:
-    """Readings (n,) whose median cannot be metres of a table seen by a camera."""
+    """Raise InputError if the median of readings (n,) cannot be the distance of a table in metres."""
     median = float(np.median(metres))
     if not 0.05 < median < 30:
         raise InputError(
@@ -271,7 +266,7 @@ def check_depth_range(metres: np.ndarray, where: str) -> None:
 
 
 def find_world(first: Frame, grid: VoxelGrid | None) -> tuple[Camera, VoxelGrid]:
-    """Camera with a pose, and a workspace, from what the first pause shows."""
+    """Camera with a pose, and a workspace; what is not given is found from the frame of the first pause."""
     camera = first.camera
     if camera.T_world_camera is None:
         camera = camera.at(fit_support_plane(first).T_world_camera)
@@ -284,10 +279,10 @@ def truth_reader(
     labels: np.ndarray, frames: np.ndarray, pauses: tuple[int, ...]
 ) -> Callable[[int], np.ndarray | None]:
     """A `read_truth` from labels (S, X, Y, Z) at frame indices (S,)."""
-    where = {int(frame): s for s, frame in enumerate(frames)}
+    row = {int(frame): s for s, frame in enumerate(frames)}
 
     def read(t: int) -> np.ndarray | None:
-        s = where.get(pauses[t])
+        s = row.get(pauses[t])
         return None if s is None else as_labels(labels[s], "true labels")
 
     return read

@@ -1,14 +1,13 @@
-"""What a camera sees of a label grid: exact ray casting through voxels.
+"""Rendering of label grids: exact ray casting through voxels.
 
-`project` is the paper's PROJECT (section IV-C): the label image of a hypothesis. `render` gives the z-depth
-beside it.
+>>> image = project(hypothesis, camera)            # label image (H, W): PROJECT in section IV-C of the paper
+>>> labels, depth = render_hypothesis(hypothesis, camera)
+>>> labels, depth = render(label_grid, grid, camera)
 
->>> labels, depth = render(hypothesis.labels, hypothesis.grid, camera)
-
-Every pixel's ray is followed from voxel to voxel. Inside free space it jumps: where the nearest occupied
-voxel is D voxels away (chessboard distance), the cube of half-width D - 1 around the ray's voxel is empty and
-the ray goes straight to where it leaves that cube. With D = 1 this is the voxel traversal of Amanatides and
-Woo (1987), so the result is exact; jumping only saves steps.
+The ray of each pixel is followed from voxel to voxel. In free space it jumps: if the nearest occupied voxel is at
+chessboard distance D, the cube of half-width D - 1 around the current voxel is empty, and the ray continues where it
+leaves that cube. With D = 1 this is the voxel traversal of Amanatides and Woo (1987), so the result is exact; the
+jumps only save steps.
 """
 
 from __future__ import annotations
@@ -23,57 +22,45 @@ from mstfilter.scene.cache import memo
 from mstfilter.scene.camera import Camera
 from mstfilter.scene.voxels import Hypothesis, VoxelGrid, as_labels
 
-__all__ = ["Rendering", "project", "render"]
+__all__ = ["Rendering", "project", "render", "render_hypothesis"]
 
 
 class Rendering(NamedTuple):
-    """Label image (H, W) uint16, 0 where nothing is hit, and z-depth (H, W) float32 in metres, NaN there."""
+    """Label image (H, W) uint16, 0 without a hit, and z-depth (H, W) float32 in metres, NaN without a hit."""
 
     labels: np.ndarray
     depth: np.ndarray
 
 
 def project(hypothesis: Hypothesis, camera: Camera) -> np.ndarray:
-    """Label image (H, W) uint16 of a hypothesis; 0 where no object is seen. Memoised by content."""
-    return memo(
-        "render",
-        (hypothesis.key, camera.key),
-        lambda: _frozen(render(hypothesis.labels, hypothesis.grid, camera)),
-    ).labels
+    """Label image (H, W) uint16 of a hypothesis; 0 where no object is visible. Cached by content."""
+    return render_hypothesis(hypothesis, camera).labels
 
 
 def render_hypothesis(hypothesis: Hypothesis, camera: Camera) -> Rendering:
-    """Label image and depth of a hypothesis. Memoised by content."""
-    return memo(
-        "render",
-        (hypothesis.key, camera.key),
-        lambda: _frozen(render(hypothesis.labels, hypothesis.grid, camera)),
-    )
+    """Label image and depth of a hypothesis, read-only. Cached by content."""
+
+    def compute() -> Rendering:
+        labels, depth = render(hypothesis.labels, hypothesis.grid, camera)
+        return Rendering(read_only(labels), read_only(depth))
+
+    return memo("render", (hypothesis.key, camera.key), compute)
 
 
 def render(labels: np.ndarray, grid: VoxelGrid, camera: Camera) -> Rendering:
-    """Cast one ray a pixel through a label grid.
-
-    Parameters
-    ----------
-    labels : (X, Y, Z) integer
-        0 is free; any other value is what the image shows.
-    grid : VoxelGrid
-        Where the voxels are.
-    camera : Camera
-        The rays go through its pixel centres.
-    """
+    """Cast one ray per pixel, through the pixel centre, into a label grid (X, Y, Z); label 0 is free."""
     labels = as_labels(labels)
     if labels.shape != grid.shape:
         raise InputError(f"label grid has shape {labels.shape}, the voxel grid is {grid.shape}")
     image = np.zeros((camera.height, camera.width), np.uint16)
     depth = np.full(image.shape, np.nan, np.float32)
-    lower, upper = _occupied_box(labels)
-    if lower is None or upper is None:
+    bounds = _occupied_box(labels)
+    if bounds is None:
         return Rendering(image, depth)
+    lower, upper = bounds
     box = labels[lower[0] : upper[0], lower[1] : upper[1], lower[2] : upper[2]]
 
-    # Lengths in voxels of the box; the ray parameter stays z-depth in metres.
+    # Ray: start + t * direction, in voxels of the box; the directions have z = 1 m, so that t is z-depth in metres.
     matrix = camera.pose.as_matrix()
     start = (matrix[:3, 3] - grid.origin) / grid.voxel_size - lower
     rows, columns = _window(start, box.shape, grid, lower, camera)
@@ -81,30 +68,26 @@ def render(labels: np.ndarray, grid: VoxelGrid, camera: Camera) -> Rendering:
     # A component of exactly 0 never meets a face of its axis; a tiny one behaves the same without special cases.
     directions[np.abs(directions) < 1e-12] = 1e-12
 
-    hit, where = _traverse(box, start, directions)
+    hit, voxel, t = _traverse(box, start, directions)
     window = np.zeros(directions.shape[0], np.uint16)
     window_depth = np.full(directions.shape[0], np.nan, np.float32)
-    window[hit[0]] = box.ravel()[hit[1]]
-    window_depth[hit[0]] = where
+    window[hit] = box.ravel()[voxel]
+    window_depth[hit] = t
     size = (rows.stop - rows.start, columns.stop - columns.start)
     image[rows, columns] = window.reshape(size)
     depth[rows, columns] = window_depth.reshape(size)
     return Rendering(image, depth)
 
 
-def _frozen(rendering: Rendering) -> Rendering:
-    return Rendering(read_only(rendering.labels), read_only(rendering.depth))
-
-
-def _occupied_box(labels: np.ndarray) -> tuple[np.ndarray | None, np.ndarray | None]:
-    """Tight bounds of the occupied voxels, None where there are none."""
+def _occupied_box(labels: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+    """Tight bounds of the occupied voxels; None if all are free."""
     occupied = labels != 0
     lower, upper = np.zeros(3, int), np.zeros(3, int)
     flat = occupied.any(axis=2)
     for axis, line in enumerate((flat.any(axis=1), flat.any(axis=0), occupied.any(axis=(0, 1)))):
         hits = np.flatnonzero(line)
         if len(hits) == 0:
-            return None, None
+            return None
         lower[axis], upper[axis] = hits[0], hits[-1] + 1
     return lower, upper
 
@@ -112,7 +95,7 @@ def _occupied_box(labels: np.ndarray) -> tuple[np.ndarray | None, np.ndarray | N
 def _window(
     start: np.ndarray, shape: tuple[int, ...], grid: VoxelGrid, lower: np.ndarray, camera: Camera
 ) -> tuple[slice, slice]:
-    """The image rows and columns that can see the box; all of them where a corner is not in front."""
+    """Image rows and columns that can show the box; all if a corner is not in front of the camera."""
     corners = np.array(np.meshgrid(*[(0, n) for n in shape], indexing="ij")).reshape(3, -1).T
     uv, z = camera.project(grid.origin + (corners + lower) * grid.voxel_size)
     if (z < 1e-3).any():
@@ -125,8 +108,8 @@ def _window(
 
 def _traverse(
     box: np.ndarray, start: np.ndarray, directions: np.ndarray
-) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray]:
-    """Follow the rays; ((ray numbers, flat voxel index), ray parameter) of those that hit something."""
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Follow the rays (n, 3) from `start`; ray number, flat voxel index and t of those that hit a voxel."""
     from scipy.ndimage import distance_transform_cdt
 
     distance = distance_transform_cdt(box == 0, metric="chessboard").astype(np.int32).ravel()
@@ -134,6 +117,7 @@ def _traverse(
     strides = np.array([shape[1] * shape[2], shape[2], 1])
     forward = directions > 0
     inverse = 1.0 / directions
+    # Slabs: a ray is inside the box between the last entry and the first exit of the three axes.
     near = (np.where(forward, 0.0, shape) - start) * inverse
     far = (np.where(forward, shape, 0.0) - start) * inverse
     enter = np.maximum(near.max(axis=1), 0.0)
@@ -142,7 +126,7 @@ def _traverse(
     t = enter[alive]
     inverse, forward, directions = inverse[alive], forward[alive], directions[alive]
     voxel = np.floor(start + t[:, None] * directions).astype(np.int32)
-    # The entry face decides its own axis exactly; rounding may put the point a hair outside.
+    # Rounding may put the entry point just outside the box.
     np.clip(voxel, 0, shape - 1, out=voxel)
     rays, cells, depths = [], [], []
     while len(alive):
@@ -158,7 +142,7 @@ def _traverse(
             inverse, forward, directions = inverse[go], forward[go], directions[go]
         if not len(alive):
             break
-        half = free[:, None]
+        half = free[:, None]  # D; the empty cube spans voxel - D + 1 to voxel + D
         faces = np.where(forward, voxel + half, voxel - half + 1)
         leave = (faces - start) * inverse
         axis = leave.argmin(axis=1)
@@ -173,6 +157,5 @@ def _traverse(
             inverse, forward, directions = inverse[inside], forward[inside], directions[inside]
         voxel = point
     if not rays:
-        empty = np.zeros(0, np.int64)
-        return (empty, empty), np.zeros(0)
-    return (np.concatenate(rays), np.concatenate(cells)), np.concatenate(depths)
+        return np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0)
+    return np.concatenate(rays), np.concatenate(cells), np.concatenate(depths)

@@ -49,7 +49,7 @@ __all__ = [
 
 MAX_LABEL = 65535
 MAX_VOXELS = 2**28
-_NO_MOTION = RigidTransform.identity()  # one for all: making it takes longer than all else in a record
+_NO_MOTION = RigidTransform.identity()  # shared: making it takes longer than the rest of a record
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +81,7 @@ class VoxelGrid:
         ):
             raise InputError(
                 f"grid shape is {self.shape!r}, expected three counts of at least 1",
-                "a workspace without extent along an axis holds nothing",
+                "a workspace needs an extent along every axis",
             )
         shape = tuple(int(n) for n in self.shape)
         if shape[0] * shape[1] * shape[2] > MAX_VOXELS:
@@ -101,7 +101,7 @@ class VoxelGrid:
             np.isfinite(voxel_size) and voxel_size > 0 and (upper > lower).all() and np.isfinite(upper - lower).all()
         ):
             raise InputError(
-                f"workspace from {lower.tolist()} to {upper.tolist()} in voxels of {voxel_size} m holds nothing",
+                f"workspace from {lower.tolist()} to {upper.tolist()} in voxels of {voxel_size} m has no voxel",
                 "min must be below max in all three axes, in metres",
             )
         shape = np.maximum(1, np.ceil((upper - lower) / voxel_size - 1e-6)).astype(int)
@@ -115,7 +115,7 @@ class VoxelGrid:
 
     @cached_property
     def key(self) -> bytes:
-        """Name by content."""
+        """Content key."""
         return content_key("grid", self.origin, self.voxel_size, self.shape)
 
     @property
@@ -133,18 +133,18 @@ class VoxelGrid:
         return self.origin + (np.asarray(index) + 0.5) * self.voxel_size
 
     def index_of(self, points: np.ndarray) -> np.ndarray:
-        """Voxel indices (..., 3) int64 of world points; they may lie outside the grid. NaN gives -1."""
+        """Voxel indices (..., 3) int64 of world points, also outside the grid. NaN gives -1."""
         index = np.floor((np.asarray(points) - self.origin) / self.voxel_size)
         return np.where(np.isfinite(index), index, -1).astype(np.int64)
 
     def contains(self, index: np.ndarray) -> np.ndarray:
-        """(...) bool: indices (..., 3) that lie in the grid."""
+        """(...) bool: indices (..., 3) that are inside the grid."""
         index = np.asarray(index)
         return np.asarray(((index >= 0) & (index < np.array(self.shape))).all(axis=-1))
 
 
 def _numbers(value: object) -> np.ndarray:
-    """Numbers as float64; NaN for what is none."""
+    """Values as float64; NaN if they are not numbers."""
     try:
         return np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError):
@@ -192,24 +192,25 @@ class Crop:
 
 @dataclass(frozen=True, eq=False)
 class ObjectRecord:
-    """What a hypothesis remembers of an object.
+    """What a hypothesis stores about an object.
 
     Parameters
     ----------
     label : int
         Its value in the voxel grid, 1 .. 65535.
     id : int
-        Stable identity over time within one lineage of hypotheses.
+        Identity of the object over time, within one lineage of hypotheses.
     birth : int
         Index of the pause at which it was first proposed.
     source : Crop, optional
-        Its occupancy when it was last changed by anything but a rigid motion. None: the voxels it has now.
+        Its occupancy when it was last changed other than by a rigid motion. None: its current voxels.
     motion : RigidTransform
-        Rigid motion in world metres since `source`. The identity where `source` is None.
+        Rigid motion in world metres since `source`; the identity if `source` is None.
     completion_key : str, optional
-        Which segment it was completed from (proposal's own name for it).
+        Key of the segment that it was completed from.
     apart : frozenset of int
-        Ids of objects of the same hypothesis that it has been seen to move apart from: they are surely not one.
+        Ids of objects of the same hypothesis that were observed to move apart from it, so that they are not the same
+        object.
     """
 
     label: int
@@ -222,16 +223,16 @@ class ObjectRecord:
 
     @classmethod
     def born(cls, label: int, birth: int, completion_key: str | None = None) -> ObjectRecord:
-        """A new object's record; its id is ``65536 * birth + label``: births at different times never share one."""
+        """The record of a new object, with id ``65536 * birth + label``, which differs for different births."""
         return cls(label, birth * (MAX_LABEL + 1) + label, birth, completion_key=completion_key)
 
     def changed(self) -> ObjectRecord:
-        """The record after something other than a rigid motion has changed the object's voxels."""
+        """The record after the voxels changed other than by a rigid motion."""
         return replace(self, source=None, motion=_NO_MOTION)
 
 
 def as_labels(labels: np.ndarray, where: str = "label grid") -> np.ndarray:
-    """Integer labels as uint16, with one clear error for anything that is not 0 .. 65535."""
+    """Integer labels as uint16. Raises InputError if a label is not an integer from 0 to 65535."""
     labels = np.asarray(labels)
     if labels.dtype == np.uint16:
         return labels
@@ -255,8 +256,8 @@ def _labels_on(grid: VoxelGrid, labels: np.ndarray) -> np.ndarray:
     return labels
 
 
-def _few(labels: set[int]) -> str:
-    """Labels to name in a message, not thousands of them."""
+def _shortened(labels: set[int]) -> str:
+    """At most five labels, for messages."""
     first = sorted(labels)[:5]
     return f"{first} and {len(labels) - 5} more" if len(labels) > 5 else str(first)
 
@@ -268,7 +269,7 @@ class Hypothesis:
     Parameters
     ----------
     labels : (X, Y, Z) uint16
-        0 is free or unknown, k >= 1 is an object. Labels may have gaps.
+        0 is free or unknown, k >= 1 is an object. Not every number must occur.
     grid : VoxelGrid
         Where the voxels are.
     objects : tuple of ObjectRecord
@@ -276,7 +277,7 @@ class Hypothesis:
 
     See Also
     --------
-    Hypothesis.from_labels : builds the records and checks everything.
+    Hypothesis.from_labels : makes the records.
     """
 
     labels: np.ndarray
@@ -289,9 +290,11 @@ class Hypothesis:
         if any(b <= a for a, b in pairwise(numbers)):
             raise InputError(f"object records are not in ascending order of labels: {numbers}")
         if numbers != list(self.volumes()):
-            lone, idle = (_few(set(a) - set(b)) for a, b in ((self.volumes(), numbers), (numbers, self.volumes())))
+            no_record = _shortened(set(self.volumes()) - set(numbers))
+            no_voxel = _shortened(set(numbers) - set(self.volumes()))
             raise InputError(
-                f"labels in the grid and in the object records differ: no record for {lone}, no voxel for {idle}",
+                "labels in the grid and in the object records differ: "
+                f"no record for {no_record}, no voxel for {no_voxel}",
                 "use Hypothesis.from_labels, or with_labels to change a hypothesis",
             )
 
@@ -306,25 +309,19 @@ class Hypothesis:
     def with_labels(self, labels: np.ndarray) -> Hypothesis:
         """The same objects with other voxels.
 
-        Objects that keep exactly their voxels keep source and motion; changed ones start anew; vanished
-        ones lose their record. A label without a record is an error.
+        Objects with the same voxels keep source and motion, changed ones lose them; the record of an object without
+        voxels is removed. Raises InputError if a label has no record.
         """
         labels = _labels_on(self.grid, labels)
-        changed = set(np.unique(labels[labels != self.labels]).tolist())
-        changed |= set(np.unique(self.labels[labels != self.labels]).tolist())
+        different = labels != self.labels
+        changed = set(np.unique(labels[different])) | set(np.unique(self.labels[different]))
         present = np.bincount(labels.ravel(), minlength=MAX_LABEL + 1) > 0
-        records = []
-        for record in self.objects:
-            if not present[record.label]:
-                continue
-            if record.label in changed:
-                record = record.changed()
-            records.append(record)
-        return Hypothesis(labels, self.grid, tuple(records))
+        records = (record.changed() if record.label in changed else record for record in self.objects)
+        return Hypothesis(labels, self.grid, tuple(record for record in records if present[record.label]))
 
     @cached_property
     def key(self) -> bytes:
-        """Name by content of the voxels."""
+        """Content key of the voxels."""
         return content_key("hypothesis", self.labels, self.grid.key)
 
     @cached_property
@@ -354,10 +351,16 @@ class Hypothesis:
 
 
 def encode_hypotheses(hypotheses: Sequence[Hypothesis]) -> dict[str, np.ndarray]:
-    """Hypotheses on one grid as named arrays."""
+    """Hypotheses on one grid as named arrays.
+
+    The arrays are ``labels`` (n, X, Y, Z) uint16, ``origin`` (3,), ``voxel_size`` (), and one row per object:
+    ``owner`` (index of the hypothesis), ``label``, ``id``, ``birth``, ``motion`` (4, 4), ``completion_key``,
+    ``apart`` (ids, comma separated). The source crops are stored as ``has_source``, ``source_offset`` (3,),
+    ``source_shape`` (3,) and ``source_bits``, all their bits in order.
+    """
     grid = hypotheses[0].grid
     if any(h.grid != grid for h in hypotheses):
-        raise InputError("hypotheses of a file must share one grid")
+        raise InputError("hypotheses of a file must have the same grid")
     rows = [(n, record) for n, h in enumerate(hypotheses) for record in h.objects]
     crops = [record.source for _, record in rows]
     bits = [np.packbits(c.occupied) for c in crops if c is not None]
@@ -401,7 +404,7 @@ def decode_hypotheses(arrays: dict[str, np.ndarray]) -> tuple[Hypothesis, ...]:
                 int(arrays["id"][row]),
                 int(arrays["birth"][row]),
                 crop,
-                RigidTransform(arrays["motion"][row], normalize=False),  # bit for bit
+                RigidTransform(arrays["motion"][row], normalize=False),  # bit-identical
                 str(arrays["completion_key"][row]) or None,
                 frozenset(int(other) for other in str(arrays["apart"][row]).split(",") if other),
             )
@@ -412,7 +415,7 @@ def decode_hypotheses(arrays: dict[str, np.ndarray]) -> tuple[Hypothesis, ...]:
 def save_hypotheses(path: Path, hypotheses: Sequence[Hypothesis], **extra: np.ndarray) -> None:
     """Write hypotheses and further arrays as a compressed .npz."""
     arrays: dict[str, Any] = {**encode_hypotheses(hypotheses), **extra}
-    with Path(path).open("wb") as file:  # by handle: numpy would add .npz to another name
+    with Path(path).open("wb") as file:  # a file object, because numpy would append .npz to other names
         np.savez_compressed(file, **arrays)
 
 

@@ -301,7 +301,7 @@ MORE_FAULTS = {
     "ragged K": (lambda f: change(f, "camera.json", lambda c: c.update(K=[[1, 2], [3]])), "K"),
     "workspace upside down": (
         lambda f: change(f, "camera.json", lambda c: c["workspace"].update(min=[1, 1, 1], max=[0, 0, 0])),
-        "holds nothing",
+        "has no voxel",
     ),
     "workspace in mm": (
         lambda f: change(f, "camera.json", lambda c: c["workspace"].update(min=[-500] * 3, max=[500] * 3)),

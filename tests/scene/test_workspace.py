@@ -1,4 +1,4 @@
-"""A workspace that misses the scene is told, one that holds it is not."""
+"""A workspace without readings above the table gives a warning; other workspaces give none."""
 
 from __future__ import annotations
 
@@ -23,23 +23,23 @@ def arrays(grid, pose=CAMERA.pose, noise=None):
 
 
 @pytest.mark.parametrize("grid", [ELSEWHERE, VoxelGrid((-0.3, -0.3, 0.2), 0.01, (60, 60, 30))])
-def test_a_misplaced_grid(grid, tmp_path):
-    with pytest.warns(InputWarning, match="holds nothing above the table") as told:
+def test_a_misplaced_workspace_gives_a_warning(grid, tmp_path):
+    with pytest.warns(InputWarning, match="has no reading above the table") as caught:
         recording = arrays(grid)
-    assert len(told) == 1
-    assert "is the pose right" in told[0].message.hints[1]
-    for look in (recording.check, lambda: save_recording(recording, tmp_path / "r")):
+    assert len(caught) == 1
+    assert "check the pose" in caught[0].message.hints[1]
+    for action in (recording.check, lambda: save_recording(recording, tmp_path / "r")):
         with pytest.warns(InputWarning, match=r"spans x .* depth readings span x -"):
-            look()
+            action()
 
 
-def test_an_upside_down_pose():
+def test_an_upside_down_pose_gives_a_warning():
     flipped = RigidTransform.from_rotation(Rotation.from_rotvec([np.pi, 0, 0])) * CAMERA.pose
-    with pytest.warns(InputWarning, match="holds nothing"):
+    with pytest.warns(InputWarning, match="has no reading above"):
         arrays(GRID, flipped)
 
 
-def test_good_grids_are_not_told(tmp_path):
+def test_a_workspace_with_objects_gives_no_warning(tmp_path):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         for grid in (GRID, None):
