@@ -152,9 +152,9 @@ def test_an_occupied_name_is_known_before_anything_is_read(tmp_path, capsys):
 )
 def test_what_stops_in_the_middle_leaves_nothing(tmp_path, capsys, monkeypatch, stop, expected):
     """An interruption, and a disk that is full at the fifth image."""
-    from mstfilter.formats import writer
+    from mstfilter.formats import folder
 
-    count, usual = [], writer.write_image
+    count, usual = [], folder.write_image
 
     def write_image(path, image):
         count.append(path)
@@ -162,7 +162,7 @@ def test_what_stops_in_the_middle_leaves_nothing(tmp_path, capsys, monkeypatch, 
             raise stop
         usual(path, image)
 
-    monkeypatch.setattr(writer, "write_image", write_image)
+    monkeypatch.setattr(folder, "write_image", write_image)
     data = layouts.write_redwood(tmp_path / "data")
     code, _, err = call("convert", data, tmp_path / "out", "-o", "fps=10", capsys=capsys)
     assert code == expected

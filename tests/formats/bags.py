@@ -8,7 +8,7 @@ import numpy as np
 
 from tests.formats.layouts import FPS, SHIFTS, K, units, video
 
-_COLOUR, _DEPTH = "/camera/color/image_raw", "/camera/aligned_depth_to_color/image_raw"
+COLOUR, DEPTH = "/camera/color/image_raw", "/camera/aligned_depth_to_color/image_raw"
 KINDS = ("bag", "db3", "mcap")
 
 
@@ -113,7 +113,7 @@ def write(path, kind, messages):
 
 
 def scene_messages(
-    ros1, shifts=SHIFTS, *, depth="16UC1", colour="rgb8", info=True, lag=0.003, depth_topic=_DEPTH, **more
+    ros1, shifts=SHIFTS, *, depth="16UC1", colour="rgb8", info=True, lag=0.003, depth_topic=DEPTH, **more
 ):
     """The video as messages; `more` goes to the depth images."""
     make = Messages(ros1)
@@ -122,14 +122,14 @@ def scene_messages(
     for k in range(len(rgb)):
         t = 1700000000.0 + k / FPS
         if info:
-            found.append((topic_info(_COLOUR), t, make.info(t)))
+            found.append((topic_info(COLOUR), t, make.info(t)))
         if colour == "compressed":
             found.append(
-                (_COLOUR + "/compressed", t, make.compressed(t, png(rgb[k][..., ::-1]), "rgb8; png compressed bgr8"))
+                (COLOUR + "/compressed", t, make.compressed(t, png(rgb[k][..., ::-1]), "rgb8; png compressed bgr8"))
             )
         elif colour is not None:
             pixels = rgb[k][..., ::-1] if colour == "bgr8" else rgb[k]
-            found.append((_COLOUR, t, make.image(t, pixels, colour, padding=7)))
+            found.append((COLOUR, t, make.image(t, pixels, colour, padding=7)))
         if depth in ("16UC1", "mono16"):
             found.append((depth_topic, t + lag, make.image(t + lag, units(metres[k], 0.001), depth, **more)))
         elif depth == "32FC1":

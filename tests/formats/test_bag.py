@@ -12,7 +12,7 @@ from mstfilter.formats import open_recording
 from mstfilter.formats.bag import Bag, colour_image, depth_image
 from mstfilter.formats.folder import save_recording
 from mstfilter.formats.pauses import Ends
-from tests.formats.bags import _COLOUR, _DEPTH, KINDS, Messages, scene_messages, topic_info, write
+from tests.formats.bags import COLOUR, DEPTH, KINDS, Messages, scene_messages, topic_info, write
 from tests.formats.layouts import FPS, PAUSES, SHIFTS, K, video
 from tests.formats.test_layouts import WORLD, same_frames
 
@@ -93,10 +93,10 @@ def test_registered_depth_is_chosen_by_itself(tmp_path):
 def test_the_lens_of_the_camera_info_is_used(tmp_path):
     """A raw image with distortion is straightened; a rectified one takes its matrix from P."""
     make = Messages(True)
-    for topic, same in ((_COLOUR, False), ("/camera/color/image_rect_color", True)):
+    for topic, same in ((COLOUR, False), ("/camera/color/image_rect_color", True)):
         messages = []
         for name, t, message in scene_messages(True, (0, 0), info=False):
-            messages.append((topic if name == _COLOUR else name, t, message))
+            messages.append((topic if name == COLOUR else name, t, message))
             messages.append((topic_info(topic), t, make.info(t, d=(0.3, 0.0, 0.0, 0.0, 0.0))))
         path = write(tmp_path / f"s{same}", "bag", messages)
         frame = Bag(pauses=Ends(), world=WORLD).open(path).frames[0]
@@ -109,26 +109,26 @@ def with_messages(**change):
 
 def two_colours(path):
     messages = scene_messages(False, (0, 1))
-    again = [("/left" + topic, t, message) for topic, t, message in messages if topic == _COLOUR]
+    again = [("/left" + topic, t, message) for topic, t, message in messages if topic == COLOUR]
     return write(path, "db3", messages + again)
 
 
 def other_matrix(path):
     make, messages = Messages(False), scene_messages(False, (0, 1))
     info = make.info(0.0, k=(100.0, 100.0, 80.0, 60.0))
-    return write(path, "db3", [*messages, (topic_info(_DEPTH), 1700000000.0, info)])
+    return write(path, "db3", [*messages, (topic_info(DEPTH), 1700000000.0, info)])
 
 
 def other_model(path):
-    messages = [m for m in scene_messages(False, (0, 1)) if m[0] != topic_info(_COLOUR)]
+    messages = [m for m in scene_messages(False, (0, 1)) if m[0] != topic_info(COLOUR)]
     info = Messages(False).info(0.0, d=(0.1, 0.1, 0.1, 0.1), model="equidistant")
-    return write(path, "db3", [*messages, (topic_info(_COLOUR), 1700000000.0, info)])
+    return write(path, "db3", [*messages, (topic_info(COLOUR), 1700000000.0, info)])
 
 
 def uncalibrated(path):
-    messages = [m for m in scene_messages(False, (0, 1)) if m[0] != topic_info(_COLOUR)]
+    messages = [m for m in scene_messages(False, (0, 1)) if m[0] != topic_info(COLOUR)]
     return write(
-        path, "db3", [*messages, (topic_info(_COLOUR), 1700000000.0, Messages(False).info(0.0, k=(0, 0, 0, 0)))]
+        path, "db3", [*messages, (topic_info(COLOUR), 1700000000.0, Messages(False).info(0.0, k=(0, 0, 0, 0)))]
     )
 
 
@@ -144,7 +144,7 @@ def truncated(kind, share):
 
 def small_depth(path):
     make, messages = Messages(False), scene_messages(False, (0, 1), depth=None)
-    images = [(_DEPTH, m[1], make.image(m[1], np.full((60, 80), 700, np.uint16), "16UC1")) for m in messages]
+    images = [(DEPTH, m[1], make.image(m[1], np.full((60, 80), 700, np.uint16), "16UC1")) for m in messages]
     return write(path, "db3", messages + images)
 
 
@@ -153,7 +153,7 @@ FAULTS = {
     "no colour": (with_messages(colour=None), Bag(), "no colour topic"),
     "no intrinsics": (with_messages(info=False), Bag(), "intrinsics are missing"),
     "wrong topic": (with_messages(), Bag(colour="/camera/colour"), "no image topic '/camera/colour'"),
-    "depth for colour": (with_messages(), Bag(colour=_DEPTH), "holds no colour images"),
+    "depth for colour": (with_messages(), Bag(colour=DEPTH), "holds no colour images"),
     "wrong info": (with_messages(), Bag(info="/info"), "no CameraInfo topic '/info'"),
     "two colours": (two_colours, Bag(), "2 topics could be colour"),
     "sizes differ": (small_depth, Bag(), "differ in size: depth is not registered"),
@@ -187,9 +187,9 @@ def test_ambiguous_topics_are_listed(tmp_path):
     with pytest.raises(InputError) as caught:
         Bag().open(path)
     listed = "\n".join(caught.value.hints)
-    for topic in (_COLOUR, "/left" + _COLOUR, _DEPTH):
+    for topic in (COLOUR, "/left" + COLOUR, DEPTH):
         assert re.search(rf"{topic} \(2 x \w+, 160 x 120, frame 'camera_color_optical_frame'\)", listed), listed
-    same_frames(Bag(colour="/left" + _COLOUR, K=K, pauses=Ends(), world=WORLD).open(path), (0, 1))
+    same_frames(Bag(colour="/left" + COLOUR, K=K, pauses=Ends(), world=WORLD).open(path), (0, 1))
 
 
 def test_registered_after_all(tmp_path):
@@ -204,7 +204,7 @@ def test_stamps_of_the_header_count(tmp_path):
     messages.sort(key=lambda m: m[1])
     path = write(tmp_path / "late", "mcap", messages)
     same_frames(Bag(world=WORLD).open(path), SHIFTS)
-    lost = [m for k, m in enumerate(scene_messages(False)) if m[0] != _DEPTH or k % 2]
+    lost = [m for k, m in enumerate(scene_messages(False)) if m[0] != DEPTH or k % 2]
     with pytest.warns(InputWarning, match="left out"):
         recording = Bag(pauses=Ends()).open(write(tmp_path / "lost", "mcap", lost))
     assert len(recording) < len(SHIFTS)
