@@ -26,14 +26,14 @@ from mstfilter.formats import open_recording
 from mstfilter.scene import Clip, Frame, Recording
 from mstfilter.simulation import (
     GENERATOR_VERSION,
-    Effect,
-    Push,
-    Scene,
+    FingerPush,
+    PushEffect,
     SceneFamily,
+    SimulatedScene,
     cache_folder,
     choose_push,
-    play,
-    record,
+    play_push,
+    record_scene,
     scene_family,
 )
 
@@ -55,7 +55,7 @@ TWINS = replace(
 )
 
 
-class TwinScene(Scene):
+class TwinScene(SimulatedScene):
     """A scene whose twins stand side by side.
 
     Parameters
@@ -75,17 +75,17 @@ class TwinScene(Scene):
 
     def __init__(self, family: SceneFamily, seed: int, shift: float = 0.0, turn: float = 0.0) -> None:
         super().__init__(family, seed)
-        self.twin = next(k for k, t in enumerate(self.things.twin_of) if t >= 0)
-        self.other = self.things.twin_of[self.twin]
+        self.twin = next(k for k, t in enumerate(self.objects.twin_of) if t >= 0)
+        self.other = self.objects.twin_of[self.twin]
         if not self._put_beside(shift, turn):
             raise InputError("no room for the twins")
-        if not (self.world.settle() and family.holds(self.world.positions()).all()):
+        if not (self.world.settle() and family.contains_points(self.world.positions()).all()):
             raise InputError("the twins do not rest")
 
     def _put_beside(self, shift: float, turn_by: float) -> bool:
         """Move the twin against a side of the other one; the direction is that of the face's normal."""
         rng = np.random.default_rng([self.seed, 1])
-        world, half = self.world, self.things.shapes[self.other].half
+        world, half = self.world, self.objects.shapes[self.other].half
         at, turn = world.positions()[self.other], world.rotations()[self.other]
         level = [axis for axis in range(3) if abs(turn[2, axis]) < 0.1]
         for axis in rng.permutation(level):
@@ -103,7 +103,7 @@ class TwinScene(Scene):
                     return True
         return False
 
-    def choose(self, action: int) -> Push:
+    def choose_push(self, action: int) -> FingerPush:
         """Others are pushed first, then one twin along the face that both share."""
         rng = np.random.default_rng([self.seed, 2, action])
         pair = [self.twin, self.other]
@@ -120,9 +120,9 @@ class TwinScene(Scene):
                 at = self.world.positions()[moved, :2]
                 away = at - self.world.positions()[stays, :2]
                 aim = at + 0.01 * away / np.linalg.norm(away)
-                start = aim - direction * (self.things.shapes[moved].radius + 0.02)
+                start = aim - direction * (self.objects.shapes[moved].radius + 0.02)
                 end = start + length * direction
-                push = Push(
+                push = FingerPush(
                     (float(start[0]), float(start[1])), (float(end[0]), float(end[1])), self.family.action_seconds
                 )
                 result = self._tried(push)
@@ -131,10 +131,10 @@ class TwinScene(Scene):
                     return push
         raise InputError("the twins cannot be parted")
 
-    def _tried(self, push: Push) -> Effect:
+    def _tried(self, push: FingerPush) -> PushEffect:
         """What a push would do; the world is left as it was."""
         saved = self.world.save()
-        result = play(self.world, push, self.family)
+        result = play_push(self.world, push, self.family)
         self.world.restore(saved)
         return result
 
@@ -192,10 +192,10 @@ def _record(seed: int, family: SceneFamily, ambiguous: tuple[float, float], path
         try:
             scene = TwinScene(family, seed, *(rng.uniform((-0.03, -0.3), (0.03, 0.3))))
             pair = (scene.twin + 1, scene.other + 1)
-            seen = scene.see(0)
+            seen = scene.frame_images(0)
             clip = Clip((Frame(seen["rgb"], seen["depth"], scene.camera, seen["robot_mask"]),), scene.grid)
             if ambiguous[0] <= share_as_one(clip, scene.truth(), pair) <= ambiguous[1]:
-                recording = record(scene, path)
+                recording = record_scene(scene, path)
                 shares = [
                     share_as_one(c, recording.truth(c.index), pair)
                     for c in recording.clips()

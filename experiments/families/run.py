@@ -24,14 +24,21 @@ from mstfilter.files import read_csv, write_csv
 from mstfilter.scene import Clip, Frame
 from mstfilter.scoring import weighted_coverage
 from mstfilter.segmentation import OptimalCut, TreeCutProposal, optimal_cut
-from mstfilter.simulation import FIRST_REPORTED_SEED, DepthSensor, Scene, SceneFamily, play, scene_family
+from mstfilter.simulation import (
+    FIRST_REPORTED_SEED,
+    DepthSensor,
+    SceneFamily,
+    SimulatedScene,
+    play_push,
+    scene_family,
+)
 
 FAMILIES = ("s1", "s2", "s3")
 SEEN = 150  # pixels at 640 x 480 from which an object counts as visible
 MOVED = 0.01  # metres
 
 
-def visible(scene: Scene) -> np.ndarray:
+def visible(scene: SimulatedScene) -> np.ndarray:
     """(n,) pixels of each object, noiseless, as at 640 x 480."""
     camera = scene.camera
     rays = camera.rays().reshape(-1, 3) @ camera.pose.as_matrix()[:3, :3].T
@@ -42,23 +49,23 @@ def visible(scene: Scene) -> np.ndarray:
 
 def count(family: SceneFamily, seed: int) -> dict[str, float]:
     """One scene and its pushes, without pictures."""
-    scene = Scene(replace(family, width=160, height=120, supersample=False), seed)
+    scene = SimulatedScene(replace(family, width=160, height=120, supersample=False), seed)
     world = scene.world
     pixels, contacts, deepest = [visible(scene)], [len(world.contacts())], [world.deepest_overlap()]
     moved, toppled, left, restless = [], 0, 0, 0
     for action in range(family.n_actions):
-        result = play(world, scene.choose(action), scene.family)
+        result = play_push(world, scene.choose_push(action), scene.family)
         pixels.append(visible(scene))
         contacts.append(len(world.contacts()))
         deepest.append(world.deepest_overlap())
         moved.append(result.moved(MOVED))
         toppled += int((result.turned > np.deg2rad(75)).sum())
-        left += int((~scene.family.holds(world.positions())).sum())
+        left += int((~scene.family.contains_points(world.positions())).sum())
         restless += int(not result.settled)
     seen = np.array(pixels)
     truth = scene.truth()
     pairs = {(c.first, c.second) for c in world.contacts()}
-    twins = [(min(k, t), max(k, t)) for k, t in enumerate(scene.things.twin_of) if t >= 0]
+    twins = [(min(k, t), max(k, t)) for k, t in enumerate(scene.objects.twin_of) if t >= 0]
     return {
         "objects": world.n_objects,
         "visible": float((seen >= SEEN).mean()),
@@ -82,8 +89,8 @@ def count(family: SceneFamily, seed: int) -> dict[str, float]:
 
 def judge(family: SceneFamily, seed: int) -> dict[str, float]:
     """Quality of the single-frame baseline and of floors on the first pause."""
-    scene = Scene(family, seed)
-    seen = scene.see(0)
+    scene = SimulatedScene(family, seed)
+    seen = scene.frame_images(0)
     frame = Frame(seen["rgb"], seen["depth"], scene.camera, None)
     # As on the real frames, pixels without a reading count on neither side.
     read = np.isfinite(seen["depth"])
@@ -171,13 +178,13 @@ def picture(folder: Path, small: dict[str, int]) -> None:
     for name in FAMILIES:
         shots = []
         for seed in (0, 1, 2):
-            scene = Scene(replace(scene_family(name), **small), seed)
-            shots.append(scene.see(0))
-        from mstfilter.simulation import advance
+            scene = SimulatedScene(replace(scene_family(name), **small), seed)
+            shots.append(scene.frame_images(0))
+        from mstfilter.simulation import advance_push
 
-        push = scene.choose(0)
-        advance(scene.world, push, 0.0, 0.55 * push.seconds)
-        shots.append(scene.see(1))
+        push = scene.choose_push(0)
+        advance_push(scene.world, push, 0.0, 0.55 * push.seconds)
+        shots.append(scene.frame_images(1))
         rgb = np.hstack([shot["rgb"][..., ::-1] for shot in shots])
         z = np.hstack([np.nan_to_num(shot["depth"]) for shot in shots])
         far = np.clip((z - 0.4) / 1.2, 0, 1)

@@ -18,27 +18,27 @@ from pathlib import Path
 import numpy as np
 
 from mstfilter.files import write_csv
-from mstfilter.simulation import TOLERANCE, Renderer, Scene, advance, finish, scene_family
+from mstfilter.simulation import POSE_TOLERANCE, Renderer, SimulatedScene, advance_push, finish_push, scene_family
 
 HEADER = ("family", "seed", "frames", "kept_s", "full_s", "ratio", "sensor_s", "kept_cpu_s", "full_cpu_s")
 
 
-def states(scene: Scene, actions: int) -> Iterator[None]:
+def states(scene: SimulatedScene, actions: int) -> Iterator[None]:
     """The world as it is at every frame of a recording."""
     family = scene.family
     yield
     for action in range(actions):
-        push = scene.choose(action)
+        push = scene.choose_push(action)
         for step in range(1, family.frames_per_clip):
-            advance(scene.world, push, (step - 1) / family.fps, step / family.fps)
+            advance_push(scene.world, push, (step - 1) / family.fps, step / family.fps)
             if step == family.frames_per_clip - 1:
-                finish(scene.world)
+                finish_push(scene.world)
             yield
 
 
 def measure(name: str, seed: int, actions: int, small: dict[str, int]) -> list[str]:
-    scene = Scene(replace(scene_family(name), **small), seed)
-    arguments = (scene.world, scene.things.skins, scene.room, scene.camera, scene.family.supersample, TOLERANCE)
+    scene = SimulatedScene(replace(scene_family(name), **small), seed)
+    arguments = (scene.world, scene.objects.skins, scene.room, scene.camera, scene.family.supersample, POSE_TOLERANCE)
     renderers = Renderer(*arguments), Renderer(*arguments, reuse=False)
     spent, cpu, sensor, frames = np.zeros(2), np.zeros(2), 0.0, 0
     for _ in states(scene, actions):

@@ -21,7 +21,7 @@ from pathlib import Path
 
 from mstfilter.files import write_csv
 from mstfilter.runs import RunFolder
-from mstfilter.simulation import scene_family, simulate
+from mstfilter.simulation import scene_family, simulate_recording
 
 HERE = Path(__file__).resolve().parent
 SIZE = ["n=5", "n_proposed=10", "update.eta=5"]
@@ -33,7 +33,7 @@ def main(seed: int, out: Path, smoke: bool) -> None:
     with tempfile.TemporaryDirectory() as folder:
         recording, run = Path(folder) / "recording", Path(folder) / "run"
         family = replace(scene_family("demo"), **SMALL) if smoke else scene_family("table")
-        simulate(family, seed, recording)
+        simulate_recording(family, seed, recording)
         command = [sys.executable, "-m", "mstfilter", "run", str(recording), *(["n=2"] if smoke else SIZE)]
         threads = {name: "1" for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")}
         subprocess.run(

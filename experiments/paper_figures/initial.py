@@ -13,7 +13,7 @@ from canvas import crop, page, save, show, voxels
 
 from mstfilter.report import colour, overlay, viewpoint
 from mstfilter.scoring import MIN_PIXELS
-from mstfilter.simulation import Scene, scene_family
+from mstfilter.simulation import SimulatedScene, scene_family
 
 FAMILIES = ("s1", "s2", "s3")
 SEED = 0
@@ -25,8 +25,8 @@ def make(out: Path, smoke: bool) -> list[Path]:
     figure, axes = page(3, len(FAMILIES), 12.0, 9.4)
     for k, name in enumerate(FAMILIES):
         family = replace(scene_family(name), **small)
-        scene = Scene(family, SEED)
-        shot = scene.see(0)
+        scene = SimulatedScene(family, SEED)
+        shot = scene.frame_images(0)
         truth, grid, camera = scene.truth(), family.grid(), scene.camera
         colours = {label: colour(label - 1) for label in range(1, int(truth.max()) + 1)}
         pixels = np.bincount(shot["instance"].ravel(), minlength=256)

@@ -20,7 +20,7 @@ import mstfilter
 from mstfilter.report import UNASSIGNED_COLOUR, Colour, colour, overlay
 from mstfilter.scene import Frame
 from mstfilter.segmentation import Segments, Tree, optimal_cut
-from mstfilter.simulation import Scene, scene_family
+from mstfilter.simulation import SimulatedScene, scene_family
 
 FAMILY, SEED = "s2", 0
 LEAST = -6.0
@@ -30,8 +30,8 @@ ABOVE = (176, 179, 175)
 def make(out: Path, smoke: bool) -> list[Path]:
     """The figure."""
     family = replace(scene_family(FAMILY), **({"width": 160, "height": 120} if smoke else {}))
-    scene = Scene(family, SEED)
-    shot = scene.see(0)
+    scene = SimulatedScene(family, SEED)
+    shot = scene.frame_images(0)
     frame = Frame(shot["rgb"], shot["depth"], scene.camera)
     proposal = mstfilter.preset("mst").proposal
     tree, w = proposal.tree_of(frame)

@@ -21,7 +21,7 @@ from mstfilter.report import identity_colours, overlay, viewpoint, voxel_picture
 from mstfilter.runs import RunFolder, filter_recording
 from mstfilter.scene import project, write_image
 from mstfilter.scoring import weighted_coverage
-from mstfilter.simulation import scene_family, simulate
+from mstfilter.simulation import scene_family, simulate_recording
 
 WIDTH, HEIGHT, GAP = 400, 300, 10
 SMALL = {"width": 160, "height": 120, "n_actions": 1, "frames_per_clip": 8, "voxel_size": 0.02}
@@ -62,7 +62,7 @@ def main(seed: int, out: Path, smoke: bool) -> None:
     """Simulate, filter, and paste the pauses together."""
     with tempfile.TemporaryDirectory() as folder:
         family = replace(scene_family("demo"), **SMALL) if smoke else scene_family("table")
-        recording = simulate(family, seed, Path(folder) / "recording")
+        recording = simulate_recording(family, seed, Path(folder) / "recording")
         run = filter_recording(recording, load_config("mst"), Path(folder) / "run", seed=0)
         colours, pauses = identity_colours(run), (0, 1, run.n_pauses - 1)
         everything = [h for t in pauses for h in run.hypotheses(t)]

@@ -19,7 +19,7 @@ from mstfilter.fusion import Agreement, NoFreeSpace, SameSegmentation, WeightedC
 from mstfilter.presets import REGISTRY, load_config
 from mstfilter.scene import Camera, Clip, Frame, Hypothesis, VoxelGrid
 from mstfilter.scoring import weighted_coverage
-from mstfilter.simulation import scene_family, simulate
+from mstfilter.simulation import scene_family, simulate_recording
 from mstfilter.smc import Population, Resampler, Systematic, WeightResampler
 
 
@@ -115,7 +115,7 @@ def simulated(seed: int, small: bool = False) -> dict[str, Candidates]:
         family = replace(family, **size, n_candidates=6, width=160, height=120, supersample=False)
     out = {}
     with tempfile.TemporaryDirectory() as folder:
-        recording = simulate(family, seed, Path(folder) / "recording")
+        recording = simulate_recording(family, seed, Path(folder) / "recording")
         clips = recording.clips()
         truth = recording.truth(clips[-1].index)
         for name in SIMULATED:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mstfilter.scene import Camera, Frame, VoxelGrid
-from mstfilter.simulation import SCENE_FAMILIES, Scene, SceneFamily
+from mstfilter.simulation import SCENE_FAMILIES, SceneFamily, SimulatedScene
 
 _TABLE, _DEMO = SCENE_FAMILIES["table"], SCENE_FAMILIES["demo"]
 
@@ -36,8 +36,8 @@ class Pause:
 
 def first_pause(family: SceneFamily, seed: int) -> Pause:
     """The scene before anything moves."""
-    scene = Scene(family, seed)
-    seen = scene.see(0)
+    scene = SimulatedScene(family, seed)
+    seen = scene.frame_images(0)
     robot = seen["robot_mask"]
     camera: Camera = scene.camera
     frame = Frame(seen["rgb"], seen["depth"], camera, robot if robot.any() else None)

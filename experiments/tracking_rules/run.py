@@ -16,7 +16,7 @@ import numpy as np
 
 from mstfilter.files import write_csv
 from mstfilter.scene import Hypothesis
-from mstfilter.simulation import scene_family, simulate
+from mstfilter.simulation import scene_family, simulate_recording
 from mstfilter.smc import Population
 from mstfilter.tracking import (
     AuthorsRule,
@@ -61,7 +61,9 @@ def main(families: list[tuple[str, int, int]], out: Path, small: dict[str, float
         scores: dict[str, dict[str, list[float]]] = {arm: {"moved": [], "rest": [], "s": []} for arm in ARMS}
         for seed in range(first, last):
             with tempfile.TemporaryDirectory() as folder:
-                recording = simulate(replace(scene_family(name), **small), seed=seed, path=Path(folder) / "recording")
+                recording = simulate_recording(
+                    replace(scene_family(name), **small), seed=seed, path=Path(folder) / "recording"
+                )
                 for i, clip in enumerate(recording.clips()):
                     if i == 0:
                         continue

@@ -108,11 +108,11 @@ def report(
 
 
 def _simulate(family: str, out: Path, seed: int) -> None:
-    from mstfilter.simulation import scene_family, simulate
+    from mstfilter.simulation import scene_family, simulate_recording
 
     chosen = scene_family(family)
     with bar("simulate") as advance:
-        simulate(chosen, seed, out, progress=lambda done, total, what: advance(done, total))
+        simulate_recording(chosen, seed, out, progress=lambda done, total, what: advance(done, total))
     print(f"recording   {out}")
 
 

@@ -1,8 +1,8 @@
 """Simulated recordings: physics, objects, pushes, rendered colour and depth, volumetric truth.
 
 >>> from mstfilter.simulation.families import scene_family
->>> from mstfilter.simulation.recorder import simulate
->>> recording = simulate(scene_family("demo"), seed=7, path="recordings/demo-7")  # doctest: +SKIP
+>>> from mstfilter.simulation.recorder import simulate_recording
+>>> recording = simulate_recording(scene_family("demo"), seed=7, path="recordings/demo-7")  # doctest: +SKIP
 
 `cache.cached_recording` keeps what was simulated; the families of the studies are `s1`, `s2` and `s3`.
 

@@ -6,21 +6,21 @@ from mstfilter.simulation.families import (
     scene_family as scene_family,
 )
 from mstfilter.simulation.recorder import (
-    TOLERANCE as TOLERANCE,
-    Scene as Scene,
+    POSE_TOLERANCE as POSE_TOLERANCE,
+    SimulatedScene as SimulatedScene,
     cache_folder as cache_folder,
     cached_recording as cached_recording,
     recipe_key as recipe_key,
-    record as record,
-    simulate as simulate,
+    record_scene as record_scene,
+    simulate_recording as simulate_recording,
 )
 from mstfilter.simulation.renderer import Renderer as Renderer
 from mstfilter.simulation.sensor import DepthSensor as DepthSensor
 from mstfilter.simulation.world import (
-    Effect as Effect,
-    Push as Push,
-    advance as advance,
+    FingerPush as FingerPush,
+    PushEffect as PushEffect,
+    advance_push as advance_push,
     choose_push as choose_push,
-    finish as finish,
-    play as play,
+    finish_push as finish_push,
+    play_push as play_push,
 )

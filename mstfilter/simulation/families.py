@@ -1,12 +1,12 @@
-"""Families of simulated scenes: everything that, with one integer seed, defines a recording.
+"""Families of simulated scenes: a family and one integer seed define a recording.
 
->>> from mstfilter.simulation.families import scene_family
+>>> from mstfilter.simulation import scene_family
 >>> scene_family("demo").image_size, scene_family("table").grid().shape
 ((320, 240), (100, 100, 50))
 
-A family is a frozen `SceneFamily`; `dataclasses.replace` makes variants. `s1`, `s2` and `s3` are the families
-of the studies: about 5, 9 and 15 - 20 objects with the same camera, sensor, textures and ways of touching.
-`catalogue` keeps scenes for tuning and scenes for reporting apart; in `s1` - `s3` the seed decides.
+A family is a frozen `SceneFamily`; `dataclasses.replace` makes variants. The studies use `s1`, `s2` and `s3`: 5, 9
+and 15 - 20 objects with the same camera, sensor, textures and contacts. `catalogue` separates scenes for tuning from
+scenes for reporting; in `s1` - `s3` the seed decides.
 """
 
 from __future__ import annotations
@@ -17,72 +17,72 @@ import numpy as np
 
 from mstfilter.errors import InputError
 from mstfilter.scene import Camera, VoxelGrid, look_at
-from mstfilter.simulation.shapes import ANY, FAMILIES, REPORTED, TUNING, Pool
+from mstfilter.simulation.shapes import ANY, REPORTED, SHAPE_FAMILIES, TUNING, Pool
 
-__all__ = ["SCENE_FAMILIES", "SceneFamily", "scene_family"]
+__all__ = ["FIRST_REPORTED_SEED", "GENERATOR_VERSION", "SCENE_FAMILIES", "SceneFamily", "scene_family"]
 
 _LOOKS_AT = np.array([0.02, 0.05, 0.04])
 _TOWARDS_CAMERA = np.array([0.03, -0.77, 0.54]) / np.linalg.norm([0.03, -0.77, 0.54])
 
 GENERATOR_VERSION = 7
-"""Raised whenever the same seed gives other bytes."""
+"""Raised whenever the bytes of the recording of a seed change."""
 
 FIRST_REPORTED_SEED = 1000
-"""Seeds from here on draw from the reported pool where the catalogue goes by the seed."""
+"""With the catalogue "by seed", seeds from this one on draw from the reported pool."""
 
 _CATALOGUES = ("tuning", "reported", "any", "by seed")
 
 
 @dataclass(frozen=True)
 class SceneFamily:
-    """How scenes of one kind are drawn, moved and seen.
+    """How scenes are drawn, moved and imaged.
 
     Parameters
     ----------
     name : str
-        What to call it.
+        Name of the family.
     n_objects_min, n_objects_max : int
-        Objects on the table, twins included; drawn evenly.
+        Range of the number of objects on the table, twins included; uniform.
     n_twins : int
-        Objects that repeat the shape and texture of another and are put in contact with it.
+        Objects that repeat the shape and texture of another object and touch it.
     n_stacked : int
-        Objects that are put on top of another, if there is room.
+        Objects that are put on top of another object, if there is room.
     n_hidden : int
-        Small objects that are put behind a tall one, seen from the camera; if there are any, at most a third of all
-        objects is hidden at first.
+        Small objects that are put behind a tall one, seen from the camera. If there are any, at most a third of all
+        objects is hidden at the first pause.
     contact : float
-        Probability that an object without a twin touches another one; else there is a gap of 1 - 4 cm.
+        Probability that an object without a twin touches another one; otherwise the gap is 1 - 4 cm.
     shapes : str
-        Families of objects, separated by commas; "all" for every one.
+        Families of objects, separated by commas; "all" for every family.
     catalogue : {"tuning", "reported", "any", "by seed"}
-        Which sizes and textures occur: one of two disjoint pools, or all. "by seed": the tuning pool for seeds
-        below 1000, the reported pool from 1000 on.
+        Pool of sizes and textures: one of two disjoint pools, or all. "by seed": the tuning pool for seeds below
+        1000, the reported pool from 1000 on.
     n_actions : int
-        Pushes.
+        Number of pushes.
     frames_per_clip : int
         Frames from one pause to the next, both included.
     fps : float
-        Frames a second.
+        Frames per second.
     push_speed : float
-        Of the finger, m/s.
+        Speed of the finger, m/s.
     min_moved : int
-        Objects that an action should move; one fewer is taken when no candidate moves as many.
+        Objects that an action should move; fewer if no candidate push moves as many.
     move_threshold : float
-        Displacement that counts as moved, metres.
+        Displacement from which an object counts as moved, metres.
     n_candidates : int
-        Pushes simulated to choose one from, at most.
+        A push is chosen from at most 4 `n_candidates` simulated ones.
     arm : bool
-        Whether an arm is seen behind the finger.
+        Whether the finger has a visible arm.
     width, height : int
-        Of the images, pixels. The camera is a Kinect's (K = 525 at 640 x 480), scaled.
+        Size of the images, pixels. The camera is a Kinect's (focal length 525 pixels at 640 x 480), scaled.
     supersample : bool
-        Smooth the edges of objects with three rays a pixel.
+        Smooth the edges of objects with three rays per pixel.
     camera_distance : float
         From the camera to the middle of the table, metres.
     workspace_x, workspace_y, workspace_z : float
         Edges of the voxel grid, metres; it is centred on the table and stands on it.
     voxel_size : float
-        Metres.
+        Edge of a voxel, metres.
     """
 
     name: str = "table"
@@ -112,89 +112,89 @@ class SceneFamily:
     voxel_size: float = 0.01
 
     def __post_init__(self) -> None:
-        def need(name: str, good: bool, expected: str) -> None:
-            if not good:
+        def check(name: str, valid: bool, expected: str) -> None:
+            if not valid:
                 raise InputError(
                     f"scene family {self.name!r}: {name} is {getattr(self, name)!r}, expected {expected}"
                 )
 
-        need("n_objects_min", self.n_objects_min >= 1, "at least 1")
-        need("n_objects_max", self.n_objects_min <= self.n_objects_max <= 40, "n_objects_min .. 40")
-        need("n_twins", 0 <= self.n_twins < self.n_objects_min, "0 .. n_objects_min - 1")
-        need("n_stacked", 0 <= self.n_stacked < self.n_objects_min, "0 .. n_objects_min - 1")
-        need("n_hidden", 0 <= self.n_hidden < self.n_objects_min, "0 .. n_objects_min - 1")
-        need("contact", 0.0 <= self.contact <= 1.0, "a probability")
-        need("catalogue", self.catalogue in _CATALOGUES, ", ".join(_CATALOGUES))
-        need("n_actions", self.n_actions >= 0, "at least 0")
-        need("frames_per_clip", self.frames_per_clip >= 2, "at least 2 (the two pauses)")
-        need("fps", 0.5 <= self.fps <= 60.0, "0.5 .. 60")
-        need("push_speed", 0.01 <= self.push_speed <= 0.5, "0.01 .. 0.5 m/s")
-        need("min_moved", self.min_moved >= 1, "at least 1")
-        need("move_threshold", 0.0 < self.move_threshold <= 0.5, "metres, up to 0.5")
-        need("n_candidates", self.n_candidates >= 1, "at least 1")
-        need("width", 16 <= self.width <= 4096, "16 .. 4096 pixels")
-        need("height", 16 <= self.height <= 4096, "16 .. 4096 pixels")
-        need("camera_distance", 0.5 <= self.camera_distance <= 2.0, "0.5 .. 2 m")
+        check("n_objects_min", self.n_objects_min >= 1, "at least 1")
+        check("n_objects_max", self.n_objects_min <= self.n_objects_max <= 40, "n_objects_min .. 40")
+        check("n_twins", 0 <= self.n_twins < self.n_objects_min, "0 .. n_objects_min - 1")
+        check("n_stacked", 0 <= self.n_stacked < self.n_objects_min, "0 .. n_objects_min - 1")
+        check("n_hidden", 0 <= self.n_hidden < self.n_objects_min, "0 .. n_objects_min - 1")
+        check("contact", 0.0 <= self.contact <= 1.0, "a probability")
+        check("catalogue", self.catalogue in _CATALOGUES, ", ".join(_CATALOGUES))
+        check("n_actions", self.n_actions >= 0, "at least 0")
+        check("frames_per_clip", self.frames_per_clip >= 2, "at least 2 (the two pauses)")
+        check("fps", 0.5 <= self.fps <= 60.0, "0.5 .. 60")
+        check("push_speed", 0.01 <= self.push_speed <= 0.5, "0.01 .. 0.5 m/s")
+        check("min_moved", self.min_moved >= 1, "at least 1")
+        check("move_threshold", 0.0 < self.move_threshold <= 0.5, "metres, up to 0.5")
+        check("n_candidates", self.n_candidates >= 1, "at least 1")
+        check("width", 16 <= self.width <= 4096, "16 .. 4096 pixels")
+        check("height", 16 <= self.height <= 4096, "16 .. 4096 pixels")
+        check("camera_distance", 0.5 <= self.camera_distance <= 2.0, "0.5 .. 2 m")
         for name in ("workspace_x", "workspace_y", "workspace_z"):
-            need(name, 0.1 <= getattr(self, name) <= 2.0, "0.1 .. 2 m")
-        need("voxel_size", 0.001 <= self.voxel_size <= 0.1, "0.001 .. 0.1 m")
+            check(name, 0.1 <= getattr(self, name) <= 2.0, "0.1 .. 2 m")
+        check("voxel_size", 0.001 <= self.voxel_size <= 0.1, "0.001 .. 0.1 m")
         self.shape_families()
         if self.n_actions and self.action_seconds < 1.0:
             raise InputError(
                 f"scene family {self.name!r}: an action lasts {self.action_seconds:.2f} s "
                 f"({self.frames_per_clip} frames at {self.fps} fps), too short to push anything",
-                "use more frames a clip or fewer frames a second: at least 1 s",
+                "use more frames per clip or fewer frames per second; an action needs at least 1 s",
             )
 
     @property
     def action_seconds(self) -> float:
-        """From one pause to the next, settling apart."""
+        """Seconds from one pause to the next, without the time to settle."""
         return (self.frames_per_clip - 1) / self.fps
 
     @property
     def image_size(self) -> tuple[int, int]:
-        """Width and height."""
+        """Width and height of the images."""
         return self.width, self.height
 
     @property
     def n_frames(self) -> int:
-        """Frames of a whole recording."""
+        """Frames of a recording."""
         return 1 + self.n_actions * (self.frames_per_clip - 1)
 
     def for_seed(self, seed: int) -> SceneFamily:
-        """This family with the catalogue that a seed draws from."""
+        """This family with the catalogue of a seed."""
         if self.catalogue != "by seed":
             return self
         return replace(self, catalogue="tuning" if seed < FIRST_REPORTED_SEED else "reported")
 
     @property
     def pool(self) -> Pool:
-        """What sizes and textures are drawn from."""
+        """The pool of sizes and textures."""
         return {"tuning": TUNING, "reported": REPORTED}.get(self.catalogue, ANY)
 
     def shape_families(self) -> tuple[str, ...]:
         """Names of the families of objects."""
-        names = FAMILIES if self.shapes.strip() == "all" else tuple(s.strip() for s in self.shapes.split(","))
-        unknown = [name for name in names if name not in FAMILIES]
+        names = SHAPE_FAMILIES if self.shapes.strip() == "all" else tuple(s.strip() for s in self.shapes.split(","))
+        unknown = [name for name in names if name not in SHAPE_FAMILIES]
         if unknown:
             raise InputError(
-                f"scene family {self.name!r}: no family of shapes is called {unknown[0]!r}",
-                f"there are {', '.join(FAMILIES)}; or all",
+                f"scene family {self.name!r}: unknown family of shapes {unknown[0]!r}",
+                f"known: {', '.join(SHAPE_FAMILIES)}; or all",
             )
         return names
 
     def camera(self) -> Camera:
-        """A Kinect's camera that looks down on the middle of the table, scaled to the family's images."""
+        """A Kinect's camera that looks down at the middle of the table, scaled to the images of the family."""
         eye = _LOOKS_AT + self.camera_distance * _TOWARDS_CAMERA
         kinect = Camera.from_intrinsics(525.0, 525.0, 319.5, 239.5, 640, 480, look_at(eye, _LOOKS_AT))
         scaled = kinect.scaled(self.width / 640.0)
-        # Other proportions than 4 : 3 see more or less above and below, about the same middle.
+        # Images that are not 4 : 3 are cut or extended above and below, with the same middle.
         K = scaled.K.copy()
         K[1, 2] += (self.height - scaled.height) / 2
         return Camera(K, self.width, self.height, kinect.T_world_camera)
 
-    def holds(self, points: np.ndarray) -> np.ndarray:
-        """(n,) bool: points (n, 3) above the table that are in the workspace and in view, with a margin."""
+    def contains_points(self, points: np.ndarray) -> np.ndarray:
+        """Whether points (n, 3) lie above the table, in the workspace and in view, with a margin: (n,) bool."""
         uv, depth = self.camera().project(points)
         size = np.array(self.image_size)
         with np.errstate(invalid="ignore"):
@@ -203,7 +203,7 @@ class SceneFamily:
         return seen & (np.abs(points[:, :2]) < reach).all(axis=1) & (points[:, 2] > 0)
 
     def grid(self) -> VoxelGrid:
-        """The workspace."""
+        """The voxel grid of the workspace."""
         x, y, z = self.workspace_x, self.workspace_y, self.workspace_z
         return VoxelGrid.from_bounds(np.array([-x / 2, -y / 2, 0.0]), np.array([x / 2, y / 2, z]), self.voxel_size)
 
@@ -247,13 +247,7 @@ SCENE_FAMILIES: dict[str, SceneFamily] = {
 
 
 def scene_family(name: str) -> SceneFamily:
-    """A named family.
-
-    Raises
-    ------
-    InputError
-        If there is none of that name.
-    """
+    """A named family; raises InputError if the name is unknown."""
     if name not in SCENE_FAMILIES:
-        raise InputError(f"no scene family is called {name!r}", f"there are {', '.join(SCENE_FAMILIES)}")
+        raise InputError(f"unknown scene family {name!r}", f"known: {', '.join(SCENE_FAMILIES)}")
     return SCENE_FAMILIES[name]

@@ -1,22 +1,9 @@
-"""The world as it is shown: poses that follow physics but not its trembling.
+"""Rays of the renderer and the light that they meet, updated only where something moved.
 
-Bodies at rest creep and tremble by micrometres between frames, as soft contacts do. What is shown keeps a pose
-until some point of the body is more than a tolerance away from it. Pictures, poses and volumes are all taken
-from what is shown, so they agree exactly; and a body that is shown in the same place need not be drawn again.
-
-
-Light that reaches surfaces from a few points of lamp and ceiling, and what stands in its way.
-
-A shadow changes only where a body moved: every point keeps, for each light, what it got from it, and asks
-again only if a body that moved can lie between. Light on the table is held in maps in table coordinates, so
-that a shadow costs rays of the map's resolution, not the image's.
-
-
-One ray through every pixel, with all that is known about what it meets; asked again only where needed.
-
-A ray's answer holds until a body moves that the ray meets before or after; the light at the point it meets
-holds, light by light, until a body moves between. Both are decided by bounds that err on one side only, so a
-picture is the same as if everything were cast anew.
+`Stage` holds the poses that are rendered. `PixelRays` casts one ray through each pixel and keeps what it meets.
+`LightMap` holds light on the table. A ray's result holds until a body moves that the ray meets before or after; the
+light at a point holds, for each light source, until a body moves between them. Both are decided by conservative
+bounds (`solids.CapsuleBounds`), so the images equal those of casting every ray in every frame.
 """
 
 from __future__ import annotations
@@ -27,27 +14,41 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mstfilter.simulation.shapes import Shape
-from mstfilter.simulation.solids import Bounds
-from mstfilter.simulation.textures import Atlas, Room, locate
-from mstfilter.simulation.world import FINGER_GROUP, FINGER_ID, OBJECT_GROUP, World, cast
+from mstfilter.simulation.solids import CapsuleBounds
+from mstfilter.simulation.textures import Atlas, Room, texture_coordinates
+from mstfilter.simulation.world import FINGER_GROUP, FINGER_ID, OBJECT_GROUP, PhysicsWorld
 
-__all__ = ["CASTERS", "LIFT", "Layer", "LightMap", "Stage", "shine"]
+__all__ = ["SHADOW_GROUPS", "LightMap", "PixelRays", "Stage", "cosine_to_light"]
+
+SHADOW_GROUPS = (OBJECT_GROUP, FINGER_GROUP)
+"""Geoms that cast shadows."""
+
+_LIFT = 0.0012  # metres off the surface, against shadows of a surface on itself
+_MAP_LOW, _MAP_HIGH = np.array([-0.62, -0.55]), np.array([0.62, 0.66])
+_FINGER_COLOUR = np.array([0.09, 0.095, 0.105], np.float32)
+_UNKNOWN = -2
 
 
 class Stage:
-    """What a camera sees of a world.
+    """The poses that are rendered: those of the physics without tremor.
+
+    Soft contacts make bodies at rest move by micrometres between frames. A rendered pose is kept until a point of
+    the body is farther than a tolerance from it. Images, poses and volumes all use the rendered poses, so they agree
+    exactly, and a body that has not moved need not be rendered again.
 
     Parameters
     ----------
-    world : World
-        Followed; never changed.
+    world : PhysicsWorld
+        Not changed.
     tolerance : float
-        Metres by which what is shown may lag behind. 0: it never does.
+        Greatest distance in metres between the rendered and the physical body.
     """
 
-    def __init__(self, world: World, tolerance: float = 0.0) -> None:
+    def __init__(self, world: PhysicsWorld, tolerance: float = 0.0) -> None:
+        import mujoco
+
         self.world, self.tolerance = world, tolerance
-        self._mj, self._data = world.another_data()
+        self._mj, self._data = mujoco, mujoco.MjData(world.model)
         self._radius = np.array([shape.radius for shape in world.shapes])
         # Every object lies in a capsule along its longest edge.
         half = np.array([shape.half for shape in world.shapes])
@@ -59,89 +60,85 @@ class Stage:
         self._thick = np.hypot(across, inward)
         self._poses = world.poses()
         self._finger = world.finger_position()
-        self._show(world.data.qpos)
+        self._set_coordinates(world.data.qpos)
 
-    def _show(self, qpos: np.ndarray) -> None:
+    def _set_coordinates(self, qpos: np.ndarray) -> None:
         self._data.qpos[:] = qpos
         self._mj.mj_kinematics(self.world.model, self._data)
 
     def follow(self) -> None:
-        """Catch up with the world. Following a second time changes nothing."""
+        """Update the rendered poses to those of the world, within the tolerance."""
         world = self.world
         now, finger = world.poses(), world.finger_position()
         shift = np.linalg.norm(now[:, :3, 3] - self._poses[:, :3, 3], axis=1)
         turn = np.linalg.norm(now[:, :3, :3] - self._poses[:, :3, :3], axis=(1, 2))
-        gone = shift + turn * self._radius > self.tolerance
-        if not gone.any() and (finger == self._finger).all():
+        moved = shift + turn * self._radius > self.tolerance
+        if not moved.any() and (finger == self._finger).all():
             return
-        self._poses = np.where(gone[:, None, None], now, self._poses)
+        self._poses = np.where(moved[:, None, None], now, self._poses)
         self._finger = finger
         qpos = self._data.qpos.copy()
         qpos[:3] = finger
-        for k in np.flatnonzero(gone):
+        for k in np.flatnonzero(moved):
             at = world.qpos_of(int(k))
             qpos[at] = world.data.qpos[at]
-        self._show(qpos)
+        self._set_coordinates(qpos)
 
     @property
     def poses(self) -> np.ndarray:
-        """(n, 4, 4) T_world_object as shown."""
+        """T_world_object (n, 4, 4) as rendered."""
         return self._poses.copy()
 
     def key(self) -> np.ndarray:
-        """(n + 1, 12): place and orientation of every object, then of the finger; equal rows are the same pose."""
+        """Pose of every object, then of the finger: (n + 1, 12). Equal rows are equal poses."""
         rows = self._poses[:, :3].reshape(len(self._poses), 12)
         return np.concatenate([rows, np.resize(self._finger, (1, 12))])
 
-    def bounds(self) -> tuple[Bounds, np.ndarray]:
-        """Capsules around all that is cast shadows by, and the row of `key` that each belongs to."""
+    def bounds(self) -> tuple[CapsuleBounds, np.ndarray]:
+        """Capsules around all bodies that cast shadows, and the row of `key` that each belongs to."""
         model, data = self.world.model, self._data
         at, axis = self._poses[:, :3, 3], np.einsum("nij,nj->ni", self._poses[:, :3, :3], self._axis)
         limbs = np.flatnonzero(self.world.geom_object == FINGER_ID)
-        # Capsules and cylinders alike: both lie in the capsule of their radius and axis.
+        # Capsules and cylinders alike lie in the capsule of their radius and axis.
         limb_axis = data.geom_xmat[limbs].reshape(-1, 3, 3)[:, :, 2] * model.geom_size[limbs, 1:2]
         at, axis = np.concatenate([at, data.geom_xpos[limbs]]), np.concatenate([axis, limb_axis])
         radius = np.concatenate([self._thick, model.geom_size[limbs, 0]]) + 0.002
         rows = np.minimum(np.arange(len(at)), len(self._poses))
-        return Bounds(at - axis, at + axis, radius), rows
+        return CapsuleBounds(at - axis, at + axis, radius), rows
 
     def cast(
         self, origin: ArrayLike, directions: np.ndarray, groups: Sequence[int] = (0, 1, 2)
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Rays through what is shown; see `World.cast`."""
-        return cast(self.world.model, self._data, origin, directions, groups)
+        """Cast rays through the rendered poses; see `PhysicsWorld.cast`."""
+        return self.world.cast(origin, directions, groups, self._data)
 
 
-CASTERS = (OBJECT_GROUP, FINGER_GROUP)
-LIFT = 0.0012
-"""Metres off the surface, against shadows on itself."""
-
-_MAP_LOW, _MAP_HIGH = np.array([-0.62, -0.55]), np.array([0.62, 0.66])
-
-
-def shine(stage: Stage, light: np.ndarray, points: np.ndarray, normal: np.ndarray) -> np.ndarray:
-    """(n,) float32 cosine towards a light at points (n, 3) of normals (n, 3), 0 in its shadow."""
+def cosine_to_light(stage: Stage, light: np.ndarray, points: np.ndarray, normal: np.ndarray) -> np.ndarray:
+    """Cosine (n,) float32 between the normals (n, 3) of points (n, 3) and a light source, 0 in its shadow."""
     ray = points - light
     length = np.sqrt(ray[:, 0] ** 2 + ray[:, 1] ** 2 + ray[:, 2] ** 2)
     cosine = -(ray[:, 0] * normal[:, 0] + ray[:, 1] * normal[:, 1] + ray[:, 2] * normal[:, 2]) / length
     lit = np.flatnonzero(cosine > 0.0)
-    _, distance, _ = stage.cast(light, ray[lit], CASTERS)
+    _, distance, _ = stage.cast(light, ray[lit], SHADOW_GROUPS)
     visible = (distance < 0) | (distance > 1.0 - 1e-6)
-    got = np.zeros(len(points), np.float32)
-    got[lit[visible]] = cosine[lit[visible]]
-    return got
+    result = np.zeros(len(points), np.float32)
+    result[lit[visible]] = cosine[lit[visible]]
+    return result
 
 
 class LightMap:
-    """Light on the table from some lamps, at a raster of its points, and at the table's pixels.
+    """Light on the table from some light sources, on a raster and interpolated at the table's pixels.
+
+    A shadow on the table thus costs rays at the resolution of the raster, not of the image.
 
     Parameters
     ----------
     spacing : float
         Of the raster, metres.
     lights : (k, 3) metres
+        Light sources.
     pixels : (n, 2) metres
-        Places of the table that the camera's pixels see.
+        Points of the table that the camera's pixels show.
     """
 
     def __init__(self, spacing: float, lights: np.ndarray, pixels: np.ndarray) -> None:
@@ -150,7 +147,7 @@ class LightMap:
         x, y = _MAP_LOW[0] + spacing * np.arange(nx), _MAP_LOW[1] + spacing * np.arange(ny)
         grid = np.meshgrid(x, y, indexing="ij")
         self.shape = (nx, ny)
-        self._rays = np.stack([grid[0].ravel(), grid[1].ravel(), np.full(nx * ny, LIFT)], axis=1) - lights[:, None]
+        self._rays = np.stack([grid[0].ravel(), grid[1].ravel(), np.full(nx * ny, _LIFT)], axis=1) - lights[:, None]
         self._short = self._rays.astype(np.float32)
         cosine = -self._rays[:, :, 2] / np.linalg.norm(self._rays, axis=2)
         self._cosine = cosine.astype(np.float32)
@@ -158,14 +155,14 @@ class LightMap:
         self._values = np.zeros(nx * ny, np.float32)
         self._corner, self._share = self._locate(pixels)
         self.at_pixels: np.ndarray = np.zeros(len(pixels), np.float32)
-        """(n,) mean over lights of cosine times visibility at the pixels."""
+        """Mean over the light sources of cosine times visibility at the pixels (n,)."""
 
-    def update(self, stage: Stage, bounds: Bounds, fresh: bool) -> None:
-        """Ask again where one of the bounds may stand in the way; everywhere if the map is `fresh`."""
+    def update(self, stage: Stage, bounds: CapsuleBounds, fresh: bool) -> None:
+        """Cast shadow rays again where one of the bounds may be in the way; `fresh`: the map is new."""
         maybe = np.zeros(len(self._values), bool)
         for light, rays, short, dark in zip(self._lights, self._rays, self._short, self._dark, strict=True):
-            which = np.flatnonzero(bounds.seen_from(light).meet(short))
-            _, distance, _ = stage.cast(light, rays[which], CASTERS)
+            which = np.flatnonzero(bounds.seen_from(light).may_meet(short))
+            _, distance, _ = stage.cast(light, rays[which], SHADOW_GROUPS)
             dark[which] = (distance >= 0) & (distance <= 1.0 - 1e-6)
             maybe[which] = True
         if fresh:
@@ -178,6 +175,7 @@ class LightMap:
         changed = np.zeros(len(maybe), bool)
         changed[nodes] = fresh | (total != self._values[nodes])
         self._values[nodes] = total
+        # A pixel changes with any of the four nodes around it; `corner` marks the lower one.
         ny = self.shape[1]
         corner = changed.copy()
         corner[:-1] |= changed[1:]
@@ -187,7 +185,7 @@ class LightMap:
         self.at_pixels[which] = self._between(self._corner[which], self._share[which])
 
     def sample(self, xy: np.ndarray) -> np.ndarray:
-        """Bilinear values (n,) at places (n, 2) of the table; the border's value beyond it."""
+        """Bilinear values (n,) at points (n, 2) of the table; beyond the map the value at its border."""
         return self._between(*self._locate(xy))
 
     def _locate(self, xy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -202,25 +200,21 @@ class LightMap:
         return low * (1 - share[:, 0]) + high * share[:, 0]
 
 
-_FINGER_COLOUR = np.array([0.09, 0.095, 0.105], np.float32)
-_UNKNOWN = -2
-
-
-class Layer:
-    """Rays of one camera, one a pixel.
+class PixelRays:
+    """Rays of one camera, one per pixel.
 
     Parameters
     ----------
     stage : Stage
     atlas : Atlas
-        Colours of the objects.
+        Textures of the objects.
     room : Room
         Light.
     eye : (3,) metres
     directions : (n, 3)
-        Of every pixel's ray; of length 1 along the optical axis.
+        Of each pixel's ray, with length 1 along the optical axis.
     groups : sequence of int
-        Which geoms the rays see.
+        Visible geoms.
     """
 
     def __init__(
@@ -237,24 +231,24 @@ class Layer:
         self._albedo = np.empty((n, 3), np.float32)
         self._smooth = np.empty((n, 3), np.float32)
         self._lifted = np.empty((n, 3), np.float32)
-        self._shine = np.empty(n, np.float32)
-        self._below = np.empty(n, np.float32)
-        self._got = np.empty((len(self._lights), n), np.float32)
+        self._highlight = np.empty(n, np.float32)
+        self._bounce = np.empty(n, np.float32)
+        self._cosine = np.empty((len(self._lights), n), np.float32)
 
     def forget(self) -> None:
-        """Know nothing."""
+        """Forget the results of all rays."""
         self.geom[:] = _UNKNOWN
 
-    def update(self, pixels: np.ndarray, moved: Bounds, limit: np.ndarray | None = None) -> np.ndarray:
-        """Bring some pixels up to date, forget all others; which pixels (k,) were cast anew.
+    def update(self, pixels: np.ndarray, moved: CapsuleBounds, limit: np.ndarray | None = None) -> None:
+        """Bring some pixels up to date and forget all others.
 
         Parameters
         ----------
         pixels : (m,) int
-        moved : Bounds
-            Of what moved since the last update, where it was and where it is.
+        moved : CapsuleBounds
+            Of bodies that moved since the last update, at their old and new poses.
         limit : (n,) metres, optional
-            Hits farther than this are none.
+            Hits beyond this depth are ignored.
         """
         known = self.geom[pixels] != _UNKNOWN
         other = np.ones(len(self.geom), bool)
@@ -263,90 +257,91 @@ class Layer:
         stale = ~known
         if len(moved):
             old = np.flatnonzero(known)
-            stale[old] |= moved.seen_from(self.eye).meet(self._short[pixels[old]])
-        anew, kept = pixels[stale], pixels[~stale]
-        geom, z, normal = self.stage.cast(self.eye, self.directions[anew], self._groups)
+            stale[old] |= moved.seen_from(self.eye).may_meet(self._short[pixels[old]])
+        new, kept = pixels[stale], pixels[~stale]
+        geom, z, normal = self.stage.cast(self.eye, self.directions[new], self._groups)
         if limit is not None:
             with np.errstate(invalid="ignore"):
-                geom[z > limit[anew]] = -1
-        self.geom[anew], self.depth[anew], self.normal[anew] = geom, z, normal
-        things = self.is_thing(anew)
-        self._dress(anew[things])
-        self._light(anew[things], None)
+                geom[z > limit[new]] = -1
+        self.geom[new], self.depth[new], self.normal[new] = geom, z, normal
+        bodies = self.is_body(new)
+        self._shade(new[bodies])
+        self._light(new[bodies], None)
         if len(moved):
-            self._light(kept[self.is_thing(kept)], moved)
-        return anew
+            self._light(kept[self.is_body(kept)], moved)
 
-    def owner(self, pixels: np.ndarray) -> np.ndarray:
-        """(k,) instance id of what the rays meet, 0 for the room or nothing."""
+    def instance(self, pixels: np.ndarray) -> np.ndarray:
+        """Instance id (k,) of what the rays meet, 0 for the room or nothing."""
         geom = self.geom[pixels]
         return np.where(geom >= 0, self.stage.world.geom_object[np.maximum(geom, 0)], 0)
 
-    def is_thing(self, pixels: np.ndarray) -> np.ndarray:
-        """(k,) bool: whether an object, the finger or the arm is met."""
-        return self.owner(pixels) > 0
+    def is_body(self, pixels: np.ndarray) -> np.ndarray:
+        """Whether the rays meet an object, the finger or the arm: (k,) bool."""
+        return self.instance(pixels) > 0
 
     def points(self, pixels: np.ndarray) -> np.ndarray:
-        """(k, 3) where the rays end."""
+        """End points (k, 3) of the rays."""
         return self.eye + self.directions[pixels] * self.depth[pixels, None]
 
-    def _dress(self, pixels: np.ndarray) -> None:
-        """Colour, smooth normal, highlight and cover of pixels on things: all that does not ask for rays."""
-        owner, geom = self.owner(pixels), self.geom[pixels]
+    def _shade(self, pixels: np.ndarray) -> None:
+        """Albedo, smooth normal, highlight and bounced light of pixels on bodies; casts no rays."""
+        instance, geom = self.instance(pixels), self.geom[pixels]
         points, normal = self.points(pixels), self.normal[pixels]
         world, poses = self.stage.world, self.stage.poses
         albedo = np.empty((len(pixels), 3), np.float32)
-        albedo[owner == FINGER_ID] = _FINGER_COLOUR
+        albedo[instance == FINGER_ID] = _FINGER_COLOUR
         gloss = np.full(len(pixels), 0.25, np.float32)
         smooth = normal.copy()
-        for k in np.unique(owner[owner != FINGER_ID]) - 1:
+        for k in np.unique(instance[instance != FINGER_ID]) - 1:
             shape: Shape = world.shapes[k]
-            on = np.flatnonzero(owner == k + 1)
+            on = np.flatnonzero(instance == k + 1)
             turn = poses[k, :3, :3]
-            local = _turned(points[on] - poses[k, :3, 3], turn.T)
-            facing = _turned(normal[on], turn.T)
+            local = _rotate(points[on] - poses[k, :3, 3], turn.T)
+            facing = _rotate(normal[on], turn.T)
             plain = np.array([piece.plain for piece in shape.pieces])[world.geom_piece[geom[on]]]
-            chart, place = locate(shape, local, facing, plain)
+            chart, place = texture_coordinates(shape, local, facing, plain)
             albedo[on] = self._atlas.colour(int(k), chart, place)
             gloss[on] = self._atlas.gloss[k]
-            smooth[on] = _turned(_round_off(shape, local, facing, plain), turn)
+            smooth[on] = _rotate(_round_off(shape, local, facing, plain), turn)
+        # Highlight by Blinn and Phong: the normal against the half vector between eye and lamp.
         middle = _unit(self.eye - points) + _unit(self.room.lamp.mean(axis=0) - points)
-        glint = np.clip(_dot(_unit(middle), smooth), 0, 1).astype(np.float32) ** 40
+        highlight = np.clip(_dot(_unit(middle), smooth), 0, 1).astype(np.float32) ** 40
         self._albedo[pixels], self._smooth[pixels] = albedo, smooth
-        self._lifted[pixels] = points + LIFT * normal
-        self._shine[pixels] = gloss * glint
-        # Light thrown up by the table reaches what faces down or sideways, less under cover.
-        self._below[pixels] = (0.5 - 0.5 * smooth[:, 2]) * np.clip(points[:, 2] / 0.05, 0.35, 1)
+        self._lifted[pixels] = points + _LIFT * normal
+        self._highlight[pixels] = gloss * highlight
+        # Light reflected by the table reaches surfaces that face down or sideways, less near the table.
+        self._bounce[pixels] = (0.5 - 0.5 * smooth[:, 2]) * np.clip(points[:, 2] / 0.05, 0.35, 1)
 
-    def _light(self, pixels: np.ndarray, moved: Bounds | None) -> None:
-        """What pixels on things get from each light; asked again only behind `moved`."""
+    def _light(self, pixels: np.ndarray, moved: CapsuleBounds | None) -> None:
+        """Light of each source at pixels on bodies; with `moved`, only where these bodies may cast a shadow."""
         lifted, n_lamps = self._lifted[pixels], len(self.room.lamp)
         for k, light in enumerate(self._lights):
             which = pixels
             if moved is not None:
-                which = pixels[moved.seen_from(light).meet(lifted - light.astype(np.float32))]
+                which = pixels[moved.seen_from(light).may_meet(lifted - light.astype(np.float32))]
             normal = self._smooth[which]
             if k >= n_lamps:
-                # Dark finger and arm: shadows of the ceiling's light on them are not seen.
-                finger = self.owner(which) == FINGER_ID
+                # Finger and arm are dark: shadows of the ceiling's light on them would be invisible.
+                finger = self.instance(which) == FINGER_ID
                 towards = _unit(light - self._lifted[which[finger]])
-                self._got[k, which[finger]] = np.maximum(_dot(towards, normal[finger]), 0.0)
+                self._cosine[k, which[finger]] = np.maximum(_dot(towards, normal[finger]), 0.0)
                 which, normal = which[~finger], normal[~finger]
-            self._got[k, which] = shine(self.stage, light, self._lifted[which].astype(float), normal)
+            points = self._lifted[which].astype(float)
+            self._cosine[k, which] = cosine_to_light(self.stage, light, points, normal)
 
     def colour(self, pixels: np.ndarray) -> np.ndarray:
-        """(k, 3) float32 linear colours of pixels on things."""
+        """Linear colours (k, 3) float32 of pixels on bodies."""
         room, n_lamps = self.room, len(self.room.lamp)
         total = [np.zeros(len(pixels), np.float32), np.zeros(len(pixels), np.float32)]
-        for k, got in enumerate(self._got):
-            total[int(k >= n_lamps)] += got[pixels]
+        for k, cosine in enumerate(self._cosine):
+            total[int(k >= n_lamps)] += cosine[pixels]
         lamp = (total[0] / np.float32(n_lamps))[:, None] * room.lamp_colour
         sky = (total[1] / np.float32(len(room.sky)))[:, None] * room.sky_colour
-        bounce = self._below[pixels, None] * (np.float32(0.55 / 0.6) * room.rim)
-        return self._albedo[pixels] * (lamp + sky + room.ambient + bounce) + self._shine[pixels, None] * lamp
+        bounce = self._bounce[pixels, None] * (np.float32(0.55 / 0.6) * room.rim)
+        return self._albedo[pixels] * (lamp + sky + room.ambient + bounce) + self._highlight[pixels, None] * lamp
 
 
-# Sums written out: a matrix product's last bit depends on how many rows it has.
+# Sums are written out: the last bit of a matrix product depends on the number of its rows.
 
 
 def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -357,18 +352,18 @@ def _unit(a: np.ndarray) -> np.ndarray:
     return a / np.sqrt(_dot(a, a))[:, None]
 
 
-def _turned(a: np.ndarray, turn: np.ndarray) -> np.ndarray:
+def _rotate(a: np.ndarray, turn: np.ndarray) -> np.ndarray:
     return np.stack([a[:, 0] * r[0] + a[:, 1] * r[1] + a[:, 2] * r[2] for r in turn], axis=1)
 
 
 def _round_off(shape: Shape, points: np.ndarray, normal: np.ndarray, plain: np.ndarray) -> np.ndarray:
-    """Normals of a turned solid made of flat wedges: the facets' azimuth is replaced by the point's own."""
-    if shape.print_as != "lathe" or shape.n_pieces == 1:
+    """Normals of a turned solid made of flat wedges, with the azimuth of the point instead of the facet's."""
+    if shape.print_as != "lathe" or len(shape.pieces) == 1:
         return normal
     radius = np.hypot(points[:, 0], points[:, 1])
-    good = ~plain & (radius > 1e-4)
-    outward = points[good, :2] / radius[good, None]
-    flat = np.hypot(normal[good, 0], normal[good, 1]) * np.sign((outward * normal[good, :2]).sum(axis=1))
+    valid = ~plain & (radius > 1e-4)
+    outward = points[valid, :2] / radius[valid, None]
+    flat = np.hypot(normal[valid, 0], normal[valid, 1]) * np.sign((outward * normal[valid, :2]).sum(axis=1))
     rounded = normal.copy()
-    rounded[good, :2] = outward * flat[:, None]
+    rounded[valid, :2] = outward * flat[:, None]
     return rounded

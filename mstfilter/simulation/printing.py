@@ -1,8 +1,8 @@
-"""Drawing on flat charts: printed cartons and labels, wood, cloth, speckle, glaze, peel.
+"""Drawing of flat charts: printed cartons and labels, wood, cloth, speckle, glaze, peel.
 
-Every function takes a generator and the chart's size in metres and returns an RGB uint8 image at about
-0.4 mm a pixel; `textures` scales them to what the camera can resolve. Colours are kept desaturated, as
-those of real packaging under office light seen through a cheap sensor.
+Each function takes a generator and the size of the chart in metres and returns an RGB uint8 image with 0.4 mm per
+pixel; `textures` scales the charts to the resolution of the camera. Colours have low saturation, like real packaging
+under office light seen by a cheap sensor.
 
 >>> import numpy as np
 >>> from mstfilter.simulation.printing import wood
@@ -18,12 +18,26 @@ import numpy as np
 
 from mstfilter.simulation.shapes import ANY, Pool
 
-__all__ = ["DOT", "carton_face", "cloth", "glaze", "label_side", "lid", "noise", "peel", "speckle", "wood"]
+__all__ = [
+    "DOT",
+    "brand",
+    "carton_face",
+    "cloth",
+    "glaze",
+    "label_side",
+    "lid",
+    "noise",
+    "peel",
+    "shade",
+    "speckle",
+    "wood",
+]
 
 DOT = 0.0004
-"""Metres a drawn pixel."""
+"""Size of a drawn pixel in metres."""
 
-Colour = tuple[int, int, int]
+_Rgb = tuple[int, int, int]
+_Box = tuple[int, int, int, int]  # x, y, width, height in pixels
 
 # fmt: off
 _WORDS = (
@@ -32,8 +46,6 @@ _WORDS = (
     "Quarz", "Rivo", "Solis", "Tamar", "Ulma", "Vesta", "Wiko", "Xanto",
     "Yarra", "Zephyr", "Amaro", "Bolero", "Corvo", "Dorado", "Enzian", "Falko",
 )
-# fmt: on
-# fmt: off
 _KINDS = (
     "oats", "crackers", "rice", "sugar", "tea", "cocoa", "beans", "soup",
     "pasta", "muesli", "honey", "figs", "corn", "lentils", "salt", "rusks",
@@ -43,8 +55,8 @@ _KINDS = (
 
 def shade(
     rng: np.random.Generator, light: tuple[float, float] = (0.45, 0.9), rich: float = 0.5, pool: Pool = ANY
-) -> Colour:
-    """A colour of random hue; every third is all but white or grey."""
+) -> _Rgb:
+    """A colour of random hue; every third one is nearly white or grey."""
     hue = pool.hue(rng)
     r, g, b = colorsys.hsv_to_rgb(
         hue, float(rng.uniform(0.2, rich)) * (0.25 if rng.uniform() < 0.33 else 1.0), float(rng.uniform(*light))
@@ -55,7 +67,7 @@ def shade(
 def noise(
     rng: np.random.Generator, shape: tuple[int, int], cell: tuple[float, float], octaves: int = 4
 ) -> np.ndarray:
-    """Smooth noise (H, W) float32 of mean about 0 and deviation about 1: octaves of interpolated values.
+    """Smooth noise (H, W) float32, a sum of octaves, of mean about 0 and standard deviation about 1.
 
     `cell` is the size (rows, columns) in pixels of the coarsest octave.
     """
@@ -71,7 +83,7 @@ def noise(
     return total
 
 
-def _canvas(width: float, height: float, colour: Colour, dot: float = DOT) -> np.ndarray:
+def _canvas(width: float, height: float, colour: _Rgb, dot: float = DOT) -> np.ndarray:
     shape = (max(8, round(height / dot)), max(8, round(width / dot)), 3)
     return np.ascontiguousarray(np.broadcast_to(np.array(colour, np.uint8), shape))
 
@@ -80,13 +92,13 @@ def _tint(image: np.ndarray, amount: np.ndarray) -> np.ndarray:
     return np.clip(image.astype(np.float32) * (1.0 + amount[..., None]), 0, 255).astype(np.uint8)
 
 
-def _ink(colour: Colour) -> Colour:
-    """Black or white, whichever reads better on a ground."""
+def _ink(colour: _Rgb) -> _Rgb:
+    """Black or white, the one with more contrast to a ground."""
     return (28, 26, 30) if 0.3 * colour[0] + 0.6 * colour[1] + 0.1 * colour[2] > 125 else (240, 238, 232)
 
 
-def _write(image: np.ndarray, text: str, box: tuple[int, int, int, int], ink: Colour, bold: bool = True) -> None:
-    """Text that fills a box (x, y, width, height) of the image, centred."""
+def _write(image: np.ndarray, text: str, box: _Box, ink: _Rgb, bold: bool = True) -> None:
+    """Write text that fills a box of the image, centred."""
     import cv2
 
     x, y, width, height = box
@@ -100,8 +112,8 @@ def _write(image: np.ndarray, text: str, box: tuple[int, int, int, int], ink: Co
     cv2.putText(image, text, (x + (width - w) // 2, y + (height + h) // 2), font, size, ink, thick, cv2.LINE_AA)
 
 
-def _lines(rng: np.random.Generator, image: np.ndarray, box: tuple[int, int, int, int], ink: Colour) -> None:
-    """Small print: rows of short strokes."""
+def _lines(rng: np.random.Generator, image: np.ndarray, box: _Box, ink: _Rgb) -> None:
+    """Draw small print: rows of short strokes."""
     import cv2
 
     x, y, width, height = box
@@ -114,7 +126,7 @@ def _lines(rng: np.random.Generator, image: np.ndarray, box: tuple[int, int, int
             at += word + 6
 
 
-def _barcode(rng: np.random.Generator, image: np.ndarray, box: tuple[int, int, int, int]) -> None:
+def _barcode(rng: np.random.Generator, image: np.ndarray, box: _Box) -> None:
     x, y, width, height = box
     image[y : y + height, x : x + width] = 238
     bars = np.repeat(rng.uniform(size=width // 3 + 1) < 0.5, 3)[:width]
@@ -122,7 +134,7 @@ def _barcode(rng: np.random.Generator, image: np.ndarray, box: tuple[int, int, i
 
 
 def _picture(rng: np.random.Generator, image: np.ndarray, centre: tuple[int, int], radius: int, pool: Pool) -> None:
-    """A plate of something: a heap of shaded blobs."""
+    """Draw a plate of food: a heap of shaded ellipses."""
     import cv2
 
     ground = shade(rng, (0.7, 0.95), 0.35, pool)
@@ -144,7 +156,7 @@ def _picture(rng: np.random.Generator, image: np.ndarray, centre: tuple[int, int
 
 
 def brand(rng: np.random.Generator, pool: Pool = ANY) -> tuple[str, str]:
-    """A made-up name and what is inside."""
+    """A brand name and a product."""
     return pool.name(rng, _WORDS), pool.name(rng, _KINDS)
 
 
@@ -152,7 +164,7 @@ def carton_face(
     rng: np.random.Generator,
     width: float,
     height: float,
-    colours: tuple[Colour, Colour],
+    colours: tuple[_Rgb, _Rgb],
     words: tuple[str, str],
     role: str,
     pool: Pool = ANY,
@@ -196,11 +208,11 @@ def label_side(
     rng: np.random.Generator,
     width: float,
     height: float,
-    colours: tuple[Colour, Colour],
+    colours: tuple[_Rgb, _Rgb],
     words: tuple[str, str],
     pool: Pool = ANY,
 ) -> np.ndarray:
-    """The unrolled label of a can or bottle: metal rims, bands, the name twice around, a picture, small print."""
+    """The unrolled label of a can or bottle: metal rims, bands, the name twice, a picture, small print."""
     import cv2
 
     ground, second = colours
@@ -227,7 +239,7 @@ def label_side(
     return image
 
 
-def lid(rng: np.random.Generator, size: float, colour: Colour, ridges: bool, pool: Pool = ANY) -> np.ndarray:
+def lid(rng: np.random.Generator, size: float, colour: _Rgb, ridges: bool, pool: Pool = ANY) -> np.ndarray:
     """The round end of a can: concentric ridges, or a plain printed lid."""
     import cv2
 
@@ -244,9 +256,9 @@ def lid(rng: np.random.Generator, size: float, colour: Colour, ridges: bool, poo
 
 
 def wood(
-    rng: np.random.Generator, width: float, height: float, colour: Colour | None = None, dot: float = DOT
+    rng: np.random.Generator, width: float, height: float, colour: _Rgb | None = None, dot: float = DOT
 ) -> np.ndarray:
-    """Grain along the width; `dot` metres a pixel."""
+    """Wood with grain along the width, `dot` metres per pixel."""
     if colour is None:
         r = rng.uniform(0.75, 1.0)
         colour = (int(215 * r), int(178 * r * rng.uniform(0.9, 1.03)), int(132 * r * rng.uniform(0.8, 1.1)))
@@ -260,7 +272,7 @@ def wood(
 
 
 def cloth(rng: np.random.Generator, width: float, height: float, pool: Pool = ANY) -> np.ndarray:
-    """A checked weave."""
+    """Cloth with a checked weave."""
     ground, second = shade(rng, (0.5, 0.9), 0.5, pool), shade(rng, (0.3, 0.8), 0.6, pool)
     image = _canvas(width, height, ground)
     h, w = image.shape[:2]
@@ -273,9 +285,9 @@ def cloth(rng: np.random.Generator, width: float, height: float, pool: Pool = AN
 
 
 def speckle(
-    rng: np.random.Generator, width: float, height: float, colours: tuple[Colour, Colour], dot: float = DOT
+    rng: np.random.Generator, width: float, height: float, colours: tuple[_Rgb, _Rgb], dot: float = DOT
 ) -> np.ndarray:
-    """Two colours of stone or foam, mixed by noise of several scales."""
+    """Stone or foam: two colours mixed by noise of several scales."""
     image = _canvas(width, height, colours[0], dot)
     h, w = image.shape[:2]
     share = 1.0 / (1.0 + np.exp(-3.0 * noise(rng, (h, w), (0.016 / dot, 0.016 / dot), 4)))
@@ -284,9 +296,9 @@ def speckle(
 
 
 def glaze(
-    rng: np.random.Generator, width: float, height: float, colours: tuple[Colour, Colour], motif: int
+    rng: np.random.Generator, width: float, height: float, colours: tuple[_Rgb, _Rgb], motif: int
 ) -> np.ndarray:
-    """Glazed ware: plain (motif 0), stripes (1) or dots (2)."""
+    """Glazed ceramic: plain (motif 0), stripes (1) or dots (2)."""
     import cv2
 
     image = _canvas(width, height, colours[0])
@@ -303,8 +315,8 @@ def glaze(
     return _tint(image, 0.015 * noise(rng, (h, w), (60, 60), 3))
 
 
-def peel(rng: np.random.Generator, width: float, height: float, colour: Colour) -> np.ndarray:
-    """A ripe skin: one colour with brown freckles."""
+def peel(rng: np.random.Generator, width: float, height: float, colour: _Rgb) -> np.ndarray:
+    """Fruit peel: one colour with brown freckles."""
     image = _canvas(width, height, colour)
     h, w = image.shape[:2]
     freckle = np.clip(noise(rng, (h, w), (0.01 / DOT, 0.02 / DOT), 4) - 1.3, 0, 1)

@@ -1,25 +1,23 @@
-"""Simulate a recording: one call, one integer seed, one folder.
+"""Recording of simulated scenes: one call, one integer seed, one folder.
 
->>> from mstfilter.simulation.families import scene_family
->>> from mstfilter.simulation.recorder import simulate
->>> recording = simulate(scene_family("demo"), seed=7, path="recordings/demo-7")  # doctest: +SKIP
+>>> from mstfilter.simulation import scene_family, simulate_recording
+>>> recording = simulate_recording(scene_family("demo"), seed=7, path="recordings/demo-7")  # doctest: +SKIP
 >>> recording.truth(0).shape  # doctest: +SKIP
 (80, 80, 30)
 
-The same family and seed give the same bytes (on one machine and build of the libraries). Every part draws
-from its own stream, named after the part and its index.
+The same family and seed give the same bytes (on one machine and build of the libraries). Each part draws from its own
+stream, named after the part and its index.
 
+`cached_recording` keeps recordings on disk and finds them again.
 
-Simulated recordings kept on disk: made once, found again by the content of their recipe.
-
->>> from mstfilter.formats import open_recording
->>> from mstfilter.simulation.recorder import cached_recording
+>>> from mstfilter import open_recording
+>>> from mstfilter.simulation import cached_recording
 >>> recording = open_recording(cached_recording("s2", seed=7))  # doctest: +SKIP
 >>> small = cached_recording("s2", 7, width=160, height=120, n_actions=1)  # doctest: +SKIP
 
-The name of a recording's folder holds a hash of everything that decides its bytes: every field of the family, the
-seed, the version of the simulator and of the physics library. A folder of that name is therefore complete and
-right: it is written under another name and renamed. Several processes may ask for the same recording.
+The name of a cached folder holds a hash of everything that determines its bytes: all fields of the family, the seed,
+the versions of the simulator and of MuJoCo. The folder is written under another name and renamed, so it is complete.
+Several processes can ask for the same recording.
 """
 
 from __future__ import annotations
@@ -38,33 +36,55 @@ from typing import Any
 import numpy as np
 
 from mstfilter.errors import InputError
+from mstfilter.files import write_text
 from mstfilter.formats import RecordingWriter, open_recording
 from mstfilter.scene import Recording
-from mstfilter.simulation.arrangement import Things, arrange, draw_things
+from mstfilter.simulation.arrangement import SceneObjects, arrange_objects, draw_objects
 from mstfilter.simulation.families import GENERATOR_VERSION, SceneFamily, scene_family
-from mstfilter.simulation.renderer import Renderer, seen_texel
+from mstfilter.simulation.renderer import Renderer, visible_texel
 from mstfilter.simulation.sensor import ColourSensor, DepthSensor
 from mstfilter.simulation.shapes import label_voxels
 from mstfilter.simulation.textures import Room, draw_room
-from mstfilter.simulation.world import FINGER_ID, Effect, Push, World, advance, choose_push, effect, finish
+from mstfilter.simulation.world import (
+    FINGER_ID,
+    FingerPush,
+    PhysicsWorld,
+    PushEffect,
+    advance_push,
+    choose_push,
+    finish_push,
+    push_effect,
+)
 
-__all__ = ["Progress", "Scene", "cache_folder", "cached_recording", "recipe_key", "record", "simulate"]
+__all__ = [
+    "POSE_TOLERANCE",
+    "SimulatedScene",
+    "cache_folder",
+    "cached_recording",
+    "recipe_key",
+    "record_scene",
+    "simulate_recording",
+]
 
-TOLERANCE = 0.0002
-"""Metres by which what is recorded (pictures, poses and volumes alike) may lag behind trembling physics."""
+POSE_TOLERANCE = 0.0002
+"""Metres by which recorded poses (in images, poses and volumes alike) may differ from the physics; see `Stage`."""
 
-Progress = Callable[[int, int, str], None]
-"""Called with frames done, frames in all, and what is being done."""
+_Progress = Callable[[int, int, str], None]  # called with frames done, frames in all, and a description
 
 
 def _stream(seed: int, name: str, index: int = 0) -> np.random.Generator:
-    """An own stream for each part; parts do not disturb one another."""
+    """The random stream of a part."""
     word = int.from_bytes(hashlib.sha256(name.encode()).digest()[:8], "little")
     return np.random.default_rng([seed, word, index])
 
 
-class Scene:
-    """A world with its look and its sensors: what `simulate` records, for use step by step.
+def _check_seed(seed: int) -> None:
+    if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
+        raise InputError(f"seed is {seed!r}, expected an integer of at least 0")
+
+
+class SimulatedScene:
+    """A world with its textures and sensors, for use step by step; `record_scene` records it.
 
     Parameters
     ----------
@@ -74,25 +94,24 @@ class Scene:
     """
 
     def __init__(self, family: SceneFamily, seed: int) -> None:
-        if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
-            raise InputError(f"seed is {seed!r}, expected an integer of at least 0")
+        _check_seed(seed)
         self.family, self.seed = family, int(seed)
         self.camera, self.grid = family.camera(), family.grid()
-        self.things: Things = draw_things(_stream(self.seed, "things"), family.for_seed(self.seed))
-        self.world = World(self.things.shapes, family.arm)
-        arrange(_stream(self.seed, "arrangement"), self.world, family, self.things.twin_of)
-        self.room: Room = draw_room(_stream(self.seed, "room"), seen_texel(self.camera))
+        self.objects: SceneObjects = draw_objects(_stream(self.seed, "things"), family.for_seed(self.seed))
+        self.world = PhysicsWorld(self.objects.shapes, family.arm)
+        arrange_objects(_stream(self.seed, "arrangement"), self.world, family, self.objects.twin_of)
+        self.room: Room = draw_room(_stream(self.seed, "room"), visible_texel(self.camera))
         self._renderer = Renderer(
-            self.world, self.things.skins, self.room, self.camera, family.supersample, TOLERANCE
+            self.world, self.objects.skins, self.room, self.camera, family.supersample, POSE_TOLERANCE
         )
         self._colour, self._depth = ColourSensor(), DepthSensor()
 
-    def choose(self, action: int) -> Push:
-        """The push of action `action`, from the world as it is now."""
+    def choose_push(self, action: int) -> FingerPush:
+        """Choose the push of action number `action` from the current state."""
         return choose_push(_stream(self.seed, "push", action), self.world, self.family)
 
-    def see(self, frame: int) -> dict[str, np.ndarray]:
-        """What frame number `frame` shows of the world as it is now: rgb, depth, instance, robot_mask."""
+    def frame_images(self, frame: int) -> dict[str, np.ndarray]:
+        """Images of the current state as frame number `frame`: rgb, depth, instance, robot_mask."""
         view = self._renderer.render()
         return {
             "rgb": self._colour.read(_stream(self.seed, "colour", frame), view.colour * self.room.exposure),
@@ -102,16 +121,16 @@ class Scene:
         }
 
     def truth(self) -> np.ndarray:
-        """(X, Y, Z) uint16 labels of the world as it is now."""
-        return label_voxels(self.things.shapes, self.poses(), self.grid)
+        """True labels (X, Y, Z) uint16 of the current state."""
+        return label_voxels(self.objects.shapes, self.poses(), self.grid)
 
     def poses(self) -> np.ndarray:
-        """(n, 4, 4) T_world_object of the world as it is shown now."""
+        """T_world_object (n, 4, 4) of the current state as rendered."""
         self._renderer.stage.follow()
         return self._renderer.stage.poses
 
     def describe(self) -> dict[str, Any]:
-        """What the manifest says of the scene."""
+        """Description of the scene for the manifest."""
         objects = [
             {
                 "id": k + 1,
@@ -120,7 +139,7 @@ class Scene:
                 "half_m": s.half.tolist(),
                 "twin_of": t + 1 if t >= 0 else None,
             }
-            for k, (s, t) in enumerate(zip(self.things.shapes, self.things.twin_of, strict=True))
+            for k, (s, t) in enumerate(zip(self.objects.shapes, self.objects.twin_of, strict=True))
         ]
         return {
             "name": f"{self.family.name}-{self.seed}",
@@ -132,19 +151,21 @@ class Scene:
         }
 
 
-def simulate(family: SceneFamily, seed: int, path: str | Path, progress: Progress | None = None) -> Recording:
-    """Simulate a scene, record it and write the recording.
+def simulate_recording(
+    family: SceneFamily, seed: int, path: str | Path, progress: _Progress | None = None
+) -> Recording:
+    """Simulate a scene and write its recording.
 
     Parameters
     ----------
     family : SceneFamily
-        What kind of scene; see `families.scene_family`.
+        See `scene_family`.
     seed : int
-        Decides everything else. Not negative.
+        Determines everything else. Not negative.
     path : path
-        The recording's folder; it must not exist or be empty. Nothing is left behind on failure.
+        Folder of the recording; it must not exist or be empty. Nothing is left behind on failure.
     progress : callable, optional
-        Called after each frame.
+        Called after each frame with frames done, frames in all, and a description.
 
     Returns
     -------
@@ -156,18 +177,18 @@ def simulate(family: SceneFamily, seed: int, path: str | Path, progress: Progres
     InputError
         If the folder cannot be written, or the objects cannot be arranged or pushed.
     """
-    return record(Scene(family, seed), path, progress)
+    return record_scene(SimulatedScene(family, seed), path, progress)
 
 
-def record(scene: Scene, path: str | Path, progress: Progress | None = None) -> Recording:
-    """Act in a scene, record it and write the recording: `simulate` for a scene of one's own.
+def record_scene(scene: SimulatedScene, path: str | Path, progress: _Progress | None = None) -> Recording:
+    """Simulate the actions of a scene and write the recording.
 
     Parameters
     ----------
-    scene : Scene
-        At its first pause. A subclass may arrange it and choose its pushes otherwise.
+    scene : SimulatedScene
+        At its first pause. A subclass can change the arrangement and the choice of pushes.
     path, progress
-        See `simulate`.
+        See `simulate_recording`.
 
     Raises
     ------
@@ -175,48 +196,50 @@ def record(scene: Scene, path: str | Path, progress: Progress | None = None) -> 
         If the folder cannot be written, or the objects cannot be pushed.
     """
     with RecordingWriter(path, scene.camera, scene.grid, **scene.describe()) as writer:
-        _record(scene, writer, progress or (lambda done, total, what: None))
+        _record_actions(scene, writer, progress or (lambda done, total, description: None))
     return open_recording(path)
 
 
-def _record(scene: Scene, writer: RecordingWriter, progress: Progress) -> None:
+def _record_actions(scene: SimulatedScene, writer: RecordingWriter, progress: _Progress) -> None:
     family, world = scene.family, scene.world
     start, index = world.time, 0
-    _pause(scene, writer, index, 0.0)
+    _record_pause(scene, writer, index, 0.0)
     progress(1, family.n_frames, "pause 0")
     for action in range(family.n_actions):
-        push = scene.choose(action)
-        before, turn, began = world.positions(), world.rotations(), world.time
+        push = scene.choose_push(action)
+        before, began = world.poses(), world.time
         for step in range(1, family.frames_per_clip - 1):
             index += 1
-            advance(world, push, (step - 1) / family.fps, step / family.fps)
-            _frame(scene, writer, index, began + step / family.fps - start, "action", action=action)
+            advance_push(world, push, (step - 1) / family.fps, step / family.fps)
+            _record_frame(scene, writer, index, began + step / family.fps - start, "action", action=action)
             progress(index + 1, family.n_frames, f"action {action}")
         index += 1
-        advance(world, push, (family.frames_per_clip - 2) / family.fps, push.seconds)
-        settled = finish(world)
-        result = effect(world, before, turn, settled, family)
-        _pause(scene, writer, index, world.time - start, action=action, push=_as_json(push, result))
+        advance_push(world, push, (family.frames_per_clip - 2) / family.fps, push.seconds)
+        result = push_effect(world, before, finish_push(world), family)
+        description = _describe_push(push, result)
+        _record_pause(scene, writer, index, world.time - start, action=action, push=description)
         progress(index + 1, family.n_frames, f"pause {action + 1}")
 
 
-def _frame(scene: Scene, writer: RecordingWriter, index: int, time_s: float, role: Any, **entry: Any) -> None:
-    seen = scene.see(index)
-    visible = np.bincount(seen["instance"].ravel(), minlength=256)[1 : scene.world.n_objects + 1]
+def _record_frame(
+    scene: SimulatedScene, writer: RecordingWriter, index: int, time_s: float, role: Any, **entry: Any
+) -> None:
+    images = scene.frame_images(index)
+    visible = np.bincount(images["instance"].ravel(), minlength=256)[1 : scene.world.n_objects + 1]
     poses = {str(k + 1): pose for k, pose in enumerate(scene.poses())}
     entry["visible_pixels"] = visible.tolist()
-    writer.add_frame(time_s=round(time_s, 6), role=role, poses=poses, **seen, **entry)
+    writer.add_frame(time_s=round(time_s, 6), role=role, poses=poses, **images, **entry)
 
 
-def _pause(scene: Scene, writer: RecordingWriter, index: int, time_s: float, **entry: Any) -> None:
+def _record_pause(scene: SimulatedScene, writer: RecordingWriter, index: int, time_s: float, **entry: Any) -> None:
     contacts = [[c.first + 1, c.second + 1] for c in scene.world.contacts()]
-    # Objects beyond the workspace have no (or only some) voxels in the truth, whose extent is fixed.
-    away = np.flatnonzero(~scene.family.holds(scene.poses()[:, :3, 3])) + 1
-    _frame(scene, writer, index, time_s, "static", contacts=contacts, left_workspace=away.tolist(), **entry)
+    # Objects outside the workspace have no or only some voxels in the true volume.
+    away = np.flatnonzero(~scene.family.contains_points(scene.poses()[:, :3, 3])) + 1
+    _record_frame(scene, writer, index, time_s, "static", contacts=contacts, left_workspace=away.tolist(), **entry)
     writer.add_voxels(scene.truth())
 
 
-def _as_json(push: Push, result: Effect) -> dict[str, Any]:
+def _describe_push(push: FingerPush, result: PushEffect) -> dict[str, Any]:
     return {
         "start_m": list(push.start),
         "end_m": list(push.end),
@@ -228,7 +251,7 @@ def _as_json(push: Push, result: Effect) -> dict[str, Any]:
 
 
 def cache_folder() -> Path:
-    """Where recordings are kept: MSTFILTER_CACHE, else `mstfilter` in the user's cache folder."""
+    """Folder of cached files: MSTFILTER_CACHE, else `mstfilter` in the user's cache folder."""
     own = os.environ.get("MSTFILTER_CACHE")
     if own:
         return Path(own)
@@ -236,7 +259,7 @@ def cache_folder() -> Path:
 
 
 def recipe_key(family: SceneFamily, seed: int) -> str:
-    """A hash of everything that decides the bytes of a recording."""
+    """A hash of everything that determines the bytes of a recording."""
     recipe = {
         "generator": GENERATOR_VERSION,
         "mujoco": version("mujoco"),
@@ -247,51 +270,45 @@ def recipe_key(family: SceneFamily, seed: int) -> str:
 
 
 def cached_recording(family: str | SceneFamily, seed: int, folder: Path | None = None, **overrides: Any) -> Path:
-    """The folder of a simulated recording, made now if it is not there.
+    """The folder of a simulated recording, which is simulated if it does not exist.
 
     Parameters
     ----------
     family : str or SceneFamily
-        A named family, or an own one.
+        The name of a family, or a family.
     seed : int
         Not negative.
     folder : path, optional
         Where recordings are kept. Default: `recordings` in `cache_folder()`.
     **overrides
-        Fields of the family to change: image size, frames a clip, number of actions, ...
+        Fields of the family to change: image size, frames per clip, number of actions, ...
 
     Raises
     ------
     InputError
-        If the family, a field or the seed is wrong, or the folder cannot be written.
+        If the family, a field or the seed is invalid, or the folder cannot be written.
     """
     chosen = scene_family(family) if isinstance(family, str) else family
     known = {f.name for f in fields(SceneFamily)}
     unknown = sorted(set(overrides) - known)
     if unknown:
         raise InputError(
-            f"scene family {chosen.name!r}: there is no field {unknown[0]!r}",
-            f"there are: {', '.join(sorted(known))}",
+            f"scene family {chosen.name!r} has no field {unknown[0]!r}", f"fields: {', '.join(sorted(known))}"
         )
     chosen = replace(chosen, **overrides)
-    if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
-        raise InputError(f"seed is {seed!r}, expected an integer of at least 0")
+    _check_seed(seed)
     home = Path(folder) if folder is not None else cache_folder() / "recordings"
     target = home / f"{chosen.name}-{seed}-{recipe_key(chosen, seed)}"
     if not (target / "manifest.json").is_file():
-        _make(chosen, seed, target)
+        _simulate_into_cache(chosen, seed, target)
     return target
 
 
-def _make(family: SceneFamily, seed: int, target: Path) -> None:
-    from mstfilter.simulation.recorder import simulate
-
+def _simulate_into_cache(family: SceneFamily, seed: int, target: Path) -> None:
     try:
-        target.parent.mkdir(parents=True, exist_ok=True)
-        # Wherever a user keeps recordings, they never enter version control.
-        ignore = target.parent / ".gitignore"
+        ignore = target.parent / ".gitignore"  # recordings stay out of version control
         if not ignore.exists():
-            ignore.write_text("*\n")
+            write_text(ignore, "*\n")
         work = Path(tempfile.mkdtemp(prefix=f".{target.name}-", dir=target.parent))
     except OSError as error:
         raise InputError(
@@ -299,13 +316,13 @@ def _make(family: SceneFamily, seed: int, target: Path) -> None:
             "set MSTFILTER_CACHE to a folder that can be written",
         ) from error
     try:
-        made = simulate(family, seed, work / "recording").path
+        made = simulate_recording(family, seed, work / "recording").path
         assert made is not None
         try:
             made.rename(target)
         except OSError:
             if not (target / "manifest.json").is_file():
                 raise
-            # Another process was quicker; its recording is the same.
+            # Another process has written the same recording.
     finally:
         shutil.rmtree(work, ignore_errors=True)

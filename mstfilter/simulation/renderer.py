@@ -1,8 +1,8 @@
-"""Colour, depth and instance images by ray casting: no display, no GPU, no GL.
+"""Colour, depth and instance images by ray casting; needs no display, GPU or OpenGL.
 
-One ray a pixel gives depth and instance; colours come from a few shadow rays to a lamp and to the ceiling,
-and one gather from the texture atlas. From frame to frame rays are cast only where something moved, and a
-shadow ray only where something moved between (`layer`, `light`); the picture is the same as if all were cast.
+One ray per pixel gives depth and instance. Colours come from a few shadow rays to a lamp and to the ceiling, and from
+the textures. Between frames, rays are cast only where something moved (`layers`); the images equal those of casting
+every ray.
 """
 
 from __future__ import annotations
@@ -13,28 +13,28 @@ from dataclasses import dataclass
 import numpy as np
 
 from mstfilter.scene import Camera
-from mstfilter.simulation.layers import CASTERS, Layer, LightMap, Stage
-from mstfilter.simulation.solids import Bounds
+from mstfilter.simulation.layers import SHADOW_GROUPS, LightMap, PixelRays, Stage
+from mstfilter.simulation.solids import CapsuleBounds
 from mstfilter.simulation.textures import Atlas, Room, Skin
-from mstfilter.simulation.world import FINGER_GROUP, OBJECT_GROUP, ROOM_GROUP, TABLE, World
+from mstfilter.simulation.world import FINGER_GROUP, OBJECT_GROUP, ROOM_GROUP, TABLE, PhysicsWorld
 
-__all__ = ["Renderer", "View", "seen_texel"]
+__all__ = ["Renderer", "View", "visible_texel"]
 
-_OFFSETS = ((-0.34, 0.14), (0.34, -0.14))  # of further rays within a pixel on an edge
+_OFFSETS = ((-0.34, 0.14), (0.34, -0.14))  # of further rays within a pixel on an edge: rows, columns
 
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """A noiseless picture.
+    """Images without noise.
 
     Parameters
     ----------
     colour : (H, W, 3) float32
         Linear intensity before exposure.
     depth : (H, W) float32 metres
-        z-depth of the first surface; NaN where there is none.
+        z-depth of the first surface; NaN for none.
     instance : (H, W) uint8
-        0 the room, 1 .. n objects, 255 finger and arm.
+        0 for the room, 1 .. n for objects, 255 for finger and arm.
     slant : (H, W) float32
         Cosine between the surface's normal and the ray.
     """
@@ -45,35 +45,35 @@ class View:
     slant: np.ndarray
 
 
-def seen_texel(camera: Camera) -> float:
-    """What a pixel covers at a typical range of 0.85 m, metres: finer print cannot be seen."""
+def visible_texel(camera: Camera) -> float:
+    """Size in metres of the smallest texture detail that a camera resolves at a typical range of 0.85 m."""
     return 0.85 / float(camera.K[0, 0]) * 0.8
 
 
 class Renderer:
-    """Renders a world as it is now.
+    """Renders the current state of a world.
 
     Parameters
     ----------
-    world : World
-        Read at every call of `render`.
+    world : PhysicsWorld
+        Read by each call of `render`.
     skins : sequence of Skin
-        One an object.
+        One per object.
     room : Room
         Surroundings and light.
     camera : Camera
         With a pose.
     supersample : bool
-        Further rays for pixels on edges.
+        Whether pixels on edges get further rays.
     tolerance : float
-        Metres by which what is shown may lag behind physics; see `stage`.
+        Metres by which the rendered poses may differ from the physics; see `Stage`.
     reuse : bool
-        Keep what cannot have changed since the last picture. False casts everything anew: the same pictures.
+        Keep results between frames. False casts all rays again, for the same images.
     """
 
     def __init__(
         self,
-        world: World,
+        world: PhysicsWorld,
         skins: Sequence[Skin],
         room: Room,
         camera: Camera,
@@ -81,30 +81,29 @@ class Renderer:
         tolerance: float = 0.0,
         reuse: bool = True,
     ) -> None:
-        self.world, self.room, self.camera, self.supersample = world, room, camera, supersample
+        self.room, self.camera = room, camera
         self.stage, self.reuse = Stage(world, tolerance), reuse
-        atlas = Atlas(list(skins), seen_texel(camera))
+        atlas = Atlas(list(skins), visible_texel(camera))
         turn = camera.pose.as_matrix()[:3, :3]
         self._eye = np.array(camera.position)
         rays = camera.rays().reshape(-1, 3) @ turn.T
         self._unit = (rays / np.linalg.norm(rays, axis=1)[:, None]).astype(np.float32)
         K = camera.K
-        # A further ray of a pixel is its own, shifted in the image plane.
         shifts = [np.array([du / K[0, 0], dv / K[1, 1], 0.0]) @ turn.T for dv, du in _OFFSETS]
-        self._main = Layer(self.stage, atlas, room, self._eye, rays, CASTERS)
+        self._main = PixelRays(self.stage, atlas, room, self._eye, rays, SHADOW_GROUPS)
         everything = (ROOM_GROUP, OBJECT_GROUP, FINGER_GROUP)
         self._further = [
-            Layer(self.stage, atlas, room, self._eye, rays + shift, everything)
+            PixelRays(self.stage, atlas, room, self._eye, rays + shift, everything)
             for shift in (shifts if supersample else [])
         ]
-        self._background(rays)
+        self._render_background(rays)
         fine = max(0.004, 2.0 / float(K[0, 0]))
         self._lamp_map = LightMap(fine, room.lamp, self._table_xy)
         self._sky_map = LightMap(2 * fine, room.sky, self._table_xy)
-        self._drawn: tuple[np.ndarray, Bounds, np.ndarray] | None = None
+        self._rendered: tuple[np.ndarray, CapsuleBounds, np.ndarray] | None = None
 
-    def _background(self, rays: np.ndarray) -> None:
-        """The room without objects: constant from frame to frame but for the light on the table."""
+    def _render_background(self, rays: np.ndarray) -> None:
+        """The room without objects. Between frames only the light on the table changes."""
         geom, z, normal = self.stage.cast(self._eye, rays, (ROOM_GROUP,))
         points = self._eye + rays * z[:, None]
         self._room_depth = np.where(geom >= 0, z, np.nan).astype(np.float32)
@@ -112,7 +111,7 @@ class Renderer:
         self._room_normal = normal.astype(np.float32)
         self._room_albedo = self._room_colours(geom, points, normal)
         self._on_table = (geom == 0) & (normal[:, 2] > 0.5)
-        self._room_light = self._away_light(points, normal)
+        self._room_light = self._unshadowed_light(points, normal)
         self._table_xy = points[self._on_table, :2]
 
     def _slant(self, pixels: np.ndarray, normal: np.ndarray) -> np.ndarray:
@@ -121,7 +120,7 @@ class Renderer:
         return np.abs(along).astype(np.float32)
 
     def _room_colours(self, geom: np.ndarray, points: np.ndarray, normal: np.ndarray) -> np.ndarray:
-        """(n, 3) albedo of points of the room."""
+        """Albedo (n, 3) of points of the room."""
         room = self.room
         colour = np.broadcast_to(room.wall, (len(geom), 3)).copy()
         top = (geom == 0) & (normal[:, 2] > 0.5)
@@ -137,8 +136,8 @@ class Renderer:
         colour[floor] = room.floor * room.carpet[tile[:, 0], tile[:, 1], None]
         return colour
 
-    def _away_light(self, points: np.ndarray, normal: np.ndarray) -> np.ndarray:
-        """(n, 3) light on floor, wall and the table's rim: no shadows, a soft fall-off with distance."""
+    def _unshadowed_light(self, points: np.ndarray, normal: np.ndarray) -> np.ndarray:
+        """Light (n, 3) on floor, wall and the rim of the table: no shadows, less with distance."""
         lamp = self.room.lamp.mean(axis=0)
         reach = np.linalg.norm(points - lamp, axis=1)
         with np.errstate(invalid="ignore", divide="ignore"):
@@ -151,24 +150,23 @@ class Renderer:
         room = self.room
         return lamp[:, None] * room.lamp_colour + sky[:, None] * room.sky_colour + room.ambient
 
-    def _moved(self) -> Bounds:
-        """Of what moved since the last picture, where it was and where it is; all there is before the first."""
+    def _moved_bounds(self) -> CapsuleBounds:
+        """Bounds of the bodies that moved since the last image, old and new; of all bodies before the first one."""
         key, (bounds, rows) = self.stage.key(), self.stage.bounds()
-        before, self._drawn = self._drawn, (key, bounds, rows)
+        before, self._rendered = self._rendered, (key, bounds, rows)
         if before is None or not self.reuse:
-            self._main.forget()
-            for layer in self._further:
-                layer.forget()
+            for rays in (self._main, *self._further):
+                rays.forget()
             return bounds if before is None else bounds.joined(before[1])
-        other = (key != before[0]).any(axis=1)
-        return before[1].of(other[before[2]]).joined(bounds.of(other[rows]))
+        changed = (key != before[0]).any(axis=1)
+        return before[1][changed[before[2]]].joined(bounds[changed[rows]])
 
     def render(self) -> View:
-        """The picture of the world as it is now."""
+        """Images of the world as it is now."""
         h, w = self.camera.height, self.camera.width
-        first = self._drawn is None or not self.reuse
+        first = self._rendered is None or not self.reuse
         self.stage.follow()
-        moved = self._moved()
+        moved = self._moved_bounds()
         if len(moved) or first:
             self._lamp_map.update(self.stage, moved, first)
             self._sky_map.update(self.stage, moved, first)
@@ -177,51 +175,51 @@ class Renderer:
         colour = self._room_albedo * light
 
         if first:
-            # Where nothing is in reach of a ray, nothing is hit.
+            # A ray that cannot meet any bound meets no body.
             bounds = self.stage.bounds()[0]
-            self._main.geom[~bounds.seen_from(self._eye).meet(self._unit)] = -1
+            self._main.geom[~bounds.seen_from(self._eye).may_meet(self._unit)] = -1
         self._main.update(np.arange(h * w), moved, self._room_depth)
         hit = np.flatnonzero(self._main.geom >= 0)
         depth, slant, normal = self._room_depth.copy(), self._room_slant.copy(), self._room_normal.copy()
         instance = np.zeros(h * w, np.uint8)
-        instance[hit] = self._main.owner(hit)
+        instance[hit] = self._main.instance(hit)
         depth[hit], normal[hit] = self._main.depth[hit], self._main.normal[hit]
         slant[hit] = self._slant(hit, self._main.normal[hit])
         colour[hit] = self._main.colour(hit)
         if self._further:
-            edge = _edges(instance.reshape(h, w), normal.reshape(h, w, 3))
+            edge = _edge_pixels(instance.reshape(h, w), normal.reshape(h, w, 3))
             total = np.zeros((len(edge), 3), np.float32)
-            for layer in self._further:
-                layer.update(edge, moved)
-                total += self._mixed(layer, edge)
+            for rays in self._further:
+                rays.update(edge, moved)
+                total += self._colours(rays, edge)
             colour[edge] = (colour[edge] + total) / np.float32(1 + len(self._further))
         return View(colour.reshape(h, w, 3), depth.reshape(h, w), instance.reshape(h, w), slant.reshape(h, w))
 
-    def _mixed(self, layer: Layer, pixels: np.ndarray) -> np.ndarray:
-        """(k, 3) colours of pixels on things or on the room."""
-        part = np.empty((len(pixels), 3), np.float32)
-        thing = layer.is_thing(pixels)
-        part[thing] = layer.colour(pixels[thing])
-        rest = pixels[~thing]
-        geom, points, normal = layer.geom[rest], layer.points(rest), layer.normal[rest]
-        albedo, light = self._room_colours(geom, points, normal), self._away_light(points, normal)
+    def _colours(self, rays: PixelRays, pixels: np.ndarray) -> np.ndarray:
+        """Colours (k, 3) of pixels on bodies or on the room."""
+        result = np.empty((len(pixels), 3), np.float32)
+        body = rays.is_body(pixels)
+        result[body] = rays.colour(pixels[body])
+        rest = pixels[~body]
+        geom, points, normal = rays.geom[rest], rays.points(rest), rays.normal[rest]
+        albedo, light = self._room_colours(geom, points, normal), self._unshadowed_light(points, normal)
         table = (geom == 0) & (normal[:, 2] > 0.5)
         xy = points[table, :2]
         light[table] = self._table_light(self._lamp_map.sample(xy), self._sky_map.sample(xy))
-        part[~thing] = albedo * light
-        return part
+        result[~body] = albedo * light
+        return result
 
 
-def _edges(ids: np.ndarray, normal: np.ndarray) -> np.ndarray:
-    """Pixels (k,) on borders of instances (H, W), or where the normal (H, W, 3) of a thing turns sharply."""
+def _edge_pixels(ids: np.ndarray, normal: np.ndarray) -> np.ndarray:
+    """Pixels (k,) on borders of instances (H, W), or where the normal (H, W, 3) of a body turns sharply."""
     edge = np.zeros(ids.shape, bool)
     x, y, z = (np.ascontiguousarray(normal[..., i]) for i in range(3))
     for axis in (0, 1):
         a, b = [slice(None), slice(None)], [slice(None), slice(None)]
         a[axis], b[axis] = slice(1, None), slice(None, -1)
         here, there = tuple(a), tuple(b)
-        along = x[here] * x[there] + y[here] * y[there] + z[here] * z[there]
-        step = (ids[here] != ids[there]) | (along < 0.7) & (ids[here] > 0)
+        cosine = x[here] * x[there] + y[here] * y[there] + z[here] * z[there]
+        step = (ids[here] != ids[there]) | (cosine < 0.7) & (ids[here] > 0)
         edge[here] |= step
         edge[there] |= step
     return np.flatnonzero(edge)

@@ -1,10 +1,10 @@
-"""What a structured-light sensor makes of a noiseless picture.
+"""Models of a structured-light depth sensor and of a colour camera.
 
-Depth: pixels on depth edges look a little aside, some neighbours together; Gaussian noise in disparity, rounded to
-eighths of a pixel of a Kinect's own raster (f = 525 pixels, baseline 75 mm), which gives sigma = 1.85 mm (z / m)^2
-as measured on real table tops; no reading where the projector does not shine (to the left of things), at some
-depth edges, on surfaces seen at a grazing angle, or out of range.
-Colour: exposure, a slight blur of the optics, photon noise, the display curve.
+Depth: pixels on depth edges are shifted sideways, some neighbours together. Disparity has Gaussian noise and is
+rounded to eighths of a pixel of a Kinect's raster (f = 525 pixels, baseline 75 mm), which gives
+sigma = 1.85 mm (z / m)^2, as measured on real table tops. There is no reading in the shadow of the projector (to the
+left of objects), at some depth edges, on surfaces seen at a grazing angle, and out of range.
+Colour: exposure, blur of the optics, photon noise, the sRGB curve.
 
 >>> import numpy as np
 >>> from mstfilter.simulation.sensor import DepthSensor
@@ -22,7 +22,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from mstfilter.errors import InputError
-from mstfilter.scene import SIGMA_AT_ONE_METRE
 
 __all__ = ["ColourSensor", "DepthSensor"]
 
@@ -34,22 +33,22 @@ class DepthSensor:
     Parameters
     ----------
     focal : float
-        Of the sensor's own raster, pixels (it does not change with the size of the images written).
+        Focal length in pixels of the sensor's raster of 640 pixels per row; it does not depend on the image size.
     baseline : float
         Metres.
     disparity_noise : float
         Standard deviation in eighths of a pixel, before rounding.
     lateral : float
-        Standard deviation of the shift aside on depth edges, pixels of the sensor's own raster.
+        Standard deviation of the sideways shift on depth edges, pixels of the sensor's raster.
     edge_dropout : float
-        Probability of no reading within two pixels of a depth edge, for a patch of pixels together. It and `fill`
-        are chosen by how often readings are missing 1 .. 10 pixels to each side of objects in 45 real frames.
+        Probability that a patch of pixels within two pixels of a depth edge has no reading. It and `fill` are fitted
+        to how often readings are missing 1 .. 10 pixels to each side of objects in 45 real frames.
     fill : float
-        Shadows of the projector up to this width are filled in by the sensor, pixels of its own raster.
+        Shadows of the projector up to this width are filled by the sensor, pixels of its raster.
     patch : int
-        Pixels of the sensor's own raster that share their fate on depth edges, along a row or column.
+        Side of the square of pixels of the sensor's raster that are shifted or lost together.
     edge_step : float
-        Relative difference of depth between neighbours that makes an edge.
+        Relative difference of depth between neighbours from which they form an edge.
     grazing : float
         Angle of incidence beyond which there is no reading, radians.
     nearest, farthest : float
@@ -82,25 +81,25 @@ class DepthSensor:
 
     @property
     def axial_sigma(self) -> float:
-        """Deviation of a reading at one metre, rounding included (m); near scene.depth_noise's constant."""
+        """Standard deviation of a reading at one metre, rounding included, in metres."""
         units = np.hypot(self.disparity_noise, 1 / np.sqrt(12.0))
         return float(units / (8 * self.focal * self.baseline))
 
     def read(self, rng: np.random.Generator, depth: np.ndarray, slant: np.ndarray) -> np.ndarray:
-        """A reading (H, W) float32 in metres, NaN where there is none.
+        """Depth image (H, W) float32 in metres, NaN for no reading.
 
         Parameters
         ----------
         rng : numpy.random.Generator
         depth : (H, W) metres
-            True z-depth, NaN where there is no surface.
+            True z-depth, NaN for no surface.
         slant : (H, W)
             Cosine of the angle of incidence.
         """
         h, w = depth.shape
         edge = self._edges(depth)
-        # The raster is that of 640 pixels a row; smaller images are made from it. Looking aside frays
-        # edges; within a surface it is part of the axial noise, which was measured on tilted tables.
+        # The raster has 640 pixels per row; smaller images are scaled from it. The sideways shift frays edges; within
+        # a surface it is part of the axial noise, which was measured on tilted tables.
         scale = w / 640.0
         side = max(1, round(self.patch * scale))
         aside = self.lateral * scale * edge
@@ -122,9 +121,10 @@ class DepthSensor:
         return np.where(lost | ~np.isfinite(z), np.nan, reading).astype(np.float32)
 
     def _unlit(self, depth: np.ndarray) -> np.ndarray:
-        """(H, W) bool: surfaces that the projector, `baseline` to the camera's right, does not see.
+        """Surfaces that the projector, `baseline` to the right of the camera, does not light: (H, W) bool.
 
-        In its picture they lie to the right of something that the camera sees farther right.
+        Seen by the projector, column u of depth z is at u - f b / z. A surface is in shadow if another one, farther
+        right in the camera's image, is to its left there.
         """
         w = depth.shape[1]
         disparity = self.focal * w / 640.0 * self.baseline / np.where(np.isfinite(depth), depth, np.inf)
@@ -133,7 +133,7 @@ class DepthSensor:
         return there > least + self.fill * w / 640.0
 
     def _edges(self, depth: np.ndarray) -> np.ndarray:
-        """(H, W) bool: within a pixel of a step in depth."""
+        """Whether a pixel or its neighbour is at a step in depth: (H, W) bool."""
         edge = np.zeros(depth.shape, bool)
         for axis in (0, 1):
             a: list[slice] = [slice(None), slice(None)]
@@ -149,7 +149,7 @@ class DepthSensor:
 
 
 def _patches(draw: Callable[..., np.ndarray], h: int, w: int, side: int) -> np.ndarray:
-    """(h, w) random values that squares of side x side pixels share."""
+    """Random values (h, w) that are equal within squares of side x side pixels."""
     small = draw(size=(-(-h // side), -(-w // side)))
     return np.repeat(np.repeat(small, side, axis=0), side, axis=1)[:h, :w]
 
@@ -161,11 +161,11 @@ class ColourSensor:
     Parameters
     ----------
     blur : float
-        Standard deviation of the optics' blur, pixels.
+        Standard deviation of the blur of the optics, pixels.
     photons : float
-        Deviation of noise at full white, in parts of full white; it falls with the root of the light.
+        Standard deviation of noise at white, as a share of white; proportional to the root of the light.
     read_noise : float
-        Deviation of noise in the dark, in parts of full white.
+        Standard deviation of noise in the dark, as a share of white.
     """
 
     blur: float = 0.45
@@ -173,12 +173,12 @@ class ColourSensor:
     read_noise: float = 0.002
 
     def read(self, rng: np.random.Generator, linear: np.ndarray) -> np.ndarray:
-        """(H, W, 3) uint8 from exposed linear light (H, W, 3), 1 = full white."""
+        """sRGB image (H, W, 3) uint8 of exposed linear light (H, W, 3), 1 for white."""
         import cv2
 
         light = cv2.GaussianBlur(linear, (0, 0), self.blur) if self.blur > 0 else linear
         light = np.maximum(light, 0.0)
-        # A shoulder instead of clipping, as cameras have.
+        # Compress highlights instead of clipping them, as cameras do.
         light = np.where(light > 0.7, 0.7 + 0.3 * np.tanh((light - 0.7) / 0.3), light)
         noise = rng.standard_normal(light.shape, dtype=np.float32)
         light = light + noise * np.sqrt(self.photons**2 * light + self.read_noise**2)
@@ -192,6 +192,3 @@ def _display_curve() -> np.ndarray:
 
 
 _DISPLAY = _display_curve()
-
-# The model and the rest of the package speak of the same sensor.
-assert abs(DepthSensor().axial_sigma / SIGMA_AT_ONE_METRE - 1.0) < 0.05

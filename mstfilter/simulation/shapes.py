@@ -1,42 +1,27 @@
-"""What scenes for tuning and scenes for reporting draw from: disjoint sizes, hues and printed names.
+"""Household objects made of convex pieces: their shapes, the sizes they are drawn with, the voxels they fill.
 
-Both pools cover the same range in alternate bands, so that one is not harder than the other.
-
->>> import numpy as np
->>> from mstfilter.simulation.shapes import REPORTED, TUNING
->>> sizes = [[pool.factor(np.random.default_rng(k)) for k in range(99)] for pool in (TUNING, REPORTED)]
->>> len({int(s / 0.025) for s in sizes[0]} & {int(s / 0.025) for s in sizes[1]})
-0
-
-
-Families of household objects, made of convex pieces.
-
-`draw_shape(rng, family)` gives a `Shape`: pieces in the frame of the body (origin at the middle of the
-bounding box, z up in its main pose), the poses in which it rests, its mass and how print lies on it.
+`draw_shape(rng, family)` returns a `Shape`: pieces in the frame of the body (origin at the middle of the bounding
+box, z up in the main pose), the poses in which it rests, its mass and the layout of its texture.
 
 >>> import numpy as np
 >>> from mstfilter.simulation.shapes import draw_shape
 >>> shape = draw_shape(np.random.default_rng(0), "can")
->>> shape.n_pieces, shape.family
+>>> len(shape.pieces), shape.family
 (1, 'can')
 
 Sizes and masses follow objects of the YCB set (B. Calli, A. Walsman, A. Singh, S. Srinivasa, P. Abbeel, A. M. Dollar,
 "Benchmarking in manipulation research: the YCB object and model set", IEEE Robotics & Automation Magazine 22(3),
 2015, table of objects), rounded: cracker, sugar, pudding and gelatin box, soup, tuna and coffee can, mug, bowl,
-banana, ball. Crisps are cut to 0.20 m (the set's can has 0.25 m). Tea, biscuits, bricks, bottle, soap and angle are
-of our own making, of like size. Each measure is scaled by up to 10 %. Walls of bowl and mug are 1 cm, thicker than
-the real ones: a thinner wall falls between the centres of 1 cm voxels and would be missing from the truth.
+banana, ball. The crisps can is 0.20 m high (0.25 m in the set). Tea, biscuits, bricks, bottle, soap and angle are not
+in the set and have similar sizes. Each measure is scaled by up to 10 %. Walls of bowl and mug are 1 cm, thicker than
+the real ones: a thinner wall falls between the centres of 1 cm voxels and would be missing from the true volume.
 
+`label_voxels` gives the true volume: the voxels of each object, hidden ones included.
 
-Volumetric truth: which voxels lie in which object, hidden ones included.
-
->>> import numpy as np
 >>> from mstfilter.scene import VoxelGrid
->>> from mstfilter.simulation.shapes import draw_shape
 >>> from mstfilter.simulation.shapes import label_voxels
 >>> ball = draw_shape(np.random.default_rng(0), "ball")
->>> grid = VoxelGrid((-0.2, -0.2, -0.2), 0.01, (40, 40, 40))
->>> labels = label_voxels([ball], np.eye(4)[None], grid)
+>>> labels = label_voxels([ball], np.eye(4)[None], VoxelGrid((-0.2, -0.2, -0.2), 0.01, (40, 40, 40)))
 >>> bool(abs(labels.sum() * 1e-6 / ball.pieces[0].volume - 1) < 0.1)
 True
 """
@@ -44,7 +29,7 @@ True
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
 
@@ -54,35 +39,43 @@ from mstfilter.errors import InputError
 from mstfilter.scene import VoxelGrid
 from mstfilter.simulation.solids import Piece, box, capsule, cylinder, ellipsoid, frustum, hull, ring
 
-__all__ = ["ANY", "FAMILIES", "Pool", "REPORTED", "Shape", "TUNING", "draw_shape", "label_voxels"]
+__all__ = ["ANY", "REPORTED", "SHAPE_FAMILIES", "TUNING", "Pool", "Shape", "draw_shape", "label_voxels"]
 
 _SMALLEST, _BAND = 0.90, 0.025
-# Bands of sizes from 0.9 to 1.1 of each pool; both have mean 1.
+# Bands of sizes from 0.9 to 1.1 in each pool; both have mean 1.
 _SIZE_BANDS = ((0, 3, 4, 7), (1, 2, 5, 6))
 _N_HUES = 12
-_MARGIN = 0.04  # of a band is left free at either side
+_MARGIN = 0.04  # share of a band that is left free at either side
+
+_WALL = 0.010  # thickness of the walls of bowl and mug, metres
+
+# Rest poses: which body axis points up (sign * (axis + 1)).
+_UP_X, _UP_Y, _UP_Z, _DOWN_Z = 1, 2, 3, -3
 
 
 @dataclass(frozen=True)
 class Pool:
-    """A part of all sizes, hues and names.
+    """The sizes, hues and names that scenes draw from.
+
+    Scenes for tuning and scenes for reporting use disjoint pools. Both pools cover the same range in alternate bands,
+    so neither is harder than the other.
 
     Parameters
     ----------
     half : {0, 1, None}
-        Which of the two disjoint parts; None for everything.
+        Which of the two disjoint pools; None for all sizes, hues and names.
     """
 
     half: int | None = None
 
     def factor(self, rng: np.random.Generator) -> float:
-        """By what a measure is scaled, 0.9 .. 1.1."""
+        """Factor that scales a measure, 0.9 .. 1.1."""
         u = float(rng.uniform())
         if self.half is None:
             return _SMALLEST + 8 * _BAND * u
         bands = _SIZE_BANDS[self.half]
         k = int(u * len(bands))
-        return _SMALLEST + _BAND * (bands[k] + _within(u * len(bands) - k))
+        return _SMALLEST + _BAND * (bands[k] + _within_band(u * len(bands) - k))
 
     def hue(self, rng: np.random.Generator) -> float:
         """A hue, 0 .. 1."""
@@ -90,24 +83,19 @@ class Pool:
         if self.half is None:
             return u
         k = int(u * _N_HUES / 2)
-        return (2 * k + self.half + _within(u * _N_HUES / 2 - k)) / _N_HUES
+        return (2 * k + self.half + _within_band(u * _N_HUES / 2 - k)) / _N_HUES
 
     def name(self, rng: np.random.Generator, names: Sequence[str]) -> str:
-        """One of the pool's names."""
+        """One of the names that belong to the pool."""
         own = names if self.half is None else names[self.half :: 2]
         return own[int(rng.integers(len(own)))]
 
 
-def _within(share: float) -> float:
+def _within_band(share: float) -> float:
     return _MARGIN + (1 - 2 * _MARGIN) * share
 
 
 ANY, TUNING, REPORTED = Pool(), Pool(0), Pool(1)
-
-WALL = 0.010
-
-# Rest poses: which body axis points up (sign * (axis + 1)).
-UP_X, UP_Y, UP_Z, DOWN_Z = 1, 2, 3, -3
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,21 +105,21 @@ class Shape:
     Parameters
     ----------
     family : str
-        One of FAMILIES.
+        One of SHAPE_FAMILIES.
     name : str
-        Which member of the family.
+        Member of the family.
     pieces : tuple of Piece
         Convex; their union is the object.
     half : (3,) metres
-        Half edges of the bounding box, centred on the origin.
+        Half edges of the bounding box, which is centred on the origin.
     mass : float
         Kilograms.
     print_as : {"box", "lathe"}
-        How the texture is laid on: six faces, or side / top / bottom / inside of a turned solid.
+        Layout of the texture: six faces, or side, top, bottom and inside of a turned solid.
     rests : tuple of (axis, weight)
-        Which body axis points up when it is put down, with relative frequencies.
+        Body axes that can point up at rest, with relative frequencies.
     finish : tuple of str
-        Styles of texture that suit it.
+        Styles of texture that suit the object.
     rolling : float
         Rolling friction, metres.
     """
@@ -147,13 +135,8 @@ class Shape:
     rolling: float = 0.0005
 
     @property
-    def n_pieces(self) -> int:
-        """Number of convex pieces."""
-        return len(self.pieces)
-
-    @property
     def radius(self) -> float:
-        """Of a sphere about the origin that holds the object, metres."""
+        """Radius in metres of a sphere about the origin that contains the object."""
         return float(np.linalg.norm(self.half))
 
     @cached_property
@@ -162,7 +145,7 @@ class Shape:
         return self.mass / sum(piece.volume for piece in self.pieces)
 
     def inside(self, points: np.ndarray) -> np.ndarray:
-        """(...) bool: points (..., 3) of the body's frame that lie in the object."""
+        """Whether points (..., 3) of the body's frame lie in the object: (...) bool."""
         points = np.asarray(points)
         found = np.zeros(points.shape[:-1], bool)
         for piece in self.pieces:
@@ -172,13 +155,35 @@ class Shape:
         return found
 
 
-def _centred(pieces: list[Piece]) -> tuple[tuple[Piece, ...], np.ndarray]:
-    bounds = [piece.bounds() for piece in pieces]
-    lower = np.min([b[0] for b in bounds], axis=0)
-    upper = np.max([b[1] for b in bounds], axis=0)
-    middle = (lower + upper) / 2
-    moved = tuple(Piece(p.kind, p.size, p.centre - middle, p.rotation, p.vertices, p.plain) for p in pieces)
-    return moved, (upper - lower) / 2
+def label_voxels(shapes: Sequence[Shape], poses: np.ndarray, grid: VoxelGrid) -> np.ndarray:
+    """Labels (X, Y, Z) uint16: k + 1 if the centre of the voxel lies in shape k, 0 if it lies in none.
+
+    Parameters
+    ----------
+    shapes : sequence of Shape
+        The objects.
+    poses : (n, 4, 4)
+        T_world_object of each.
+    grid : VoxelGrid
+        The workspace.
+
+    Notes
+    -----
+    Objects at rest overlap by less than a millimetre; a centre that lies in two objects belongs to the first.
+    """
+    labels = np.zeros(grid.shape, np.uint16)
+    for k, (shape, pose) in enumerate(zip(shapes, poses, strict=True)):
+        reach = np.abs(pose[:3, :3]) @ shape.half + grid.voxel_size
+        low = np.maximum(grid.index_of(pose[:3, 3] - reach), 0)
+        high = np.minimum(grid.index_of(pose[:3, 3] + reach) + 1, grid.shape)
+        if (high <= low).any():
+            continue
+        block = tuple(slice(int(a), int(b)) for a, b in zip(low, high, strict=True))
+        index = np.stack(np.meshgrid(*(np.arange(a, b) for a, b in zip(low, high, strict=True)), indexing="ij"), -1)
+        local = (grid.centre_of(index) - pose[:3, 3]) @ pose[:3, :3]
+        free = labels[block] == 0
+        labels[block][free & shape.inside(local)] = k + 1
+    return labels
 
 
 def _make(
@@ -191,8 +196,13 @@ def _make(
     finish: tuple[str, ...],
     rolling: float = 0.0005,
 ) -> Shape:
-    moved, half = _centred(pieces)
-    return Shape(family, name, moved, half, mass, print_as, rests, finish, rolling)
+    """A shape whose bounding box is centred on the origin."""
+    bounds = [piece.bounds() for piece in pieces]
+    lower = np.min([b[0] for b in bounds], axis=0)
+    upper = np.max([b[1] for b in bounds], axis=0)
+    middle = (lower + upper) / 2
+    moved = tuple(replace(piece, centre=piece.centre - middle) for piece in pieces)
+    return Shape(family, name, moved, (upper - lower) / 2, mass, print_as, rests, finish, rolling)
 
 
 def _choose(rng: np.random.Generator, table: Mapping[str, tuple[float, ...]]) -> tuple[str, tuple[float, ...]]:
@@ -211,7 +221,7 @@ def _carton(rng: np.random.Generator, scale: Callable[[], float]) -> Shape:
     name, (x, y, z, mass) = _choose(rng, table)
     half = (x * scale() / 2, y * scale() / 2, z * scale() / 2)
     # On its broad side, on its long narrow side, upright.
-    rests = ((UP_X, 0.35), (UP_Y, 0.25), (UP_Z, 0.40))
+    rests = ((_UP_X, 0.35), (_UP_Y, 0.25), (_UP_Z, 0.40))
     return _make("carton", name, [box(half)], mass, "box", rests, ("carton",))
 
 
@@ -220,7 +230,7 @@ def _brick(rng: np.random.Generator, scale: Callable[[], float]) -> Shape:
     name, edges = _choose(rng, table)
     x, y, z = (edge * scale() / 2 for edge in edges)
     mass = 600.0 * 8.0 * x * y * z
-    rests = ((UP_X, 0.5), (UP_Y, 0.3), (UP_Z, 0.2))
+    rests = ((_UP_X, 0.5), (_UP_Y, 0.3), (_UP_Z, 0.2))
     return _make("brick", name, [box((x, y, z))], mass, "box", rests, ("wood", "cloth", "speckle"))
 
 
@@ -234,7 +244,7 @@ def _can(rng: np.random.Generator, scale: Callable[[], float]) -> Shape:
     }
     name, (radius, height, mass) = _choose(rng, table)
     piece = cylinder(radius * scale(), height * scale() / 2)
-    return _make("can", name, [piece], mass, "lathe", ((UP_Z, 1.0),), ("label",))
+    return _make("can", name, [piece], mass, "lathe", ((_UP_Z, 1.0),), ("label",))
 
 
 def _bottle(rng: np.random.Generator, scale: Callable[[], float]) -> Shape:
@@ -247,35 +257,35 @@ def _bottle(rng: np.random.Generator, scale: Callable[[], float]) -> Shape:
         frustum(knee, (neck, body + shoulder)),
         cylinder(neck, cap / 2, (0, 0, body + shoulder + cap / 2)),
     ]
-    return _make("bottle", "bottle", pieces, 0.35, "lathe", ((UP_Z, 1.0),), ("label",))
+    return _make("bottle", "bottle", pieces, 0.35, "lathe", ((_UP_Z, 1.0),), ("label",))
 
 
 def _bowl(rng: np.random.Generator, scale: Callable[[], float]) -> Shape:
     rim, height, foot = 0.0795 * scale(), 0.053 * scale(), 0.042 * scale()
     knee = foot + 0.68 * (rim - foot)
-    walls = ring([(foot - WALL, foot, 0.0), (knee - WALL, knee, 0.45 * height), (rim - WALL, rim, height)])
+    walls = ring([(foot - _WALL, foot, 0.0), (knee - _WALL, knee, 0.45 * height), (rim - _WALL, rim, height)])
     # The floor's rim lies in the middle of the sloping wall.
-    middle = foot - 0.5 * WALL
-    floor = frustum((middle, 0.0), (middle + (knee - foot) * WALL / (0.45 * height), WALL))
-    return _make("bowl", "bowl", [floor, *walls], 0.25, "lathe", ((UP_Z, 0.8), (DOWN_Z, 0.2)), ("ceramic",))
+    middle = foot - 0.5 * _WALL
+    floor = frustum((middle, 0.0), (middle + (knee - foot) * _WALL / (0.45 * height), _WALL))
+    return _make("bowl", "bowl", [floor, *walls], 0.25, "lathe", ((_UP_Z, 0.8), (_DOWN_Z, 0.2)), ("ceramic",))
 
 
 def _mug(rng: np.random.Generator, scale: Callable[[], float]) -> Shape:
     radius, height = 0.041 * scale(), 0.082 * scale()
-    pieces = ring([(radius - WALL, radius, 0.0), (radius - WALL, radius, height)])
-    pieces.append(cylinder(radius - 0.5 * WALL, WALL / 2, (0, 0, WALL / 2)))
+    pieces = ring([(radius - _WALL, radius, 0.0), (radius - _WALL, radius, height)])
+    pieces.append(cylinder(radius - 0.5 * _WALL, _WALL / 2, (0, 0, _WALL / 2)))
     # Half a torus, as a chain of capsules; its ends reach into the wall.
     turn = np.linspace(-np.pi / 2, np.pi / 2, 6)
     reach, tall = 0.032, 0.32 * height
     path = [(radius - 0.003 + reach * np.cos(a), 0.0, height / 2 + tall * np.sin(a)) for a in turn]
     pieces += [capsule(a, b, 0.0075, plain=True) for a, b in pairwise(path)]
-    return _make("mug", "mug", pieces, 0.20, "lathe", ((UP_Z, 0.85), (DOWN_Z, 0.15)), ("ceramic",))
+    return _make("mug", "mug", pieces, 0.20, "lathe", ((_UP_Z, 0.85), (_DOWN_Z, 0.15)), ("ceramic",))
 
 
 def _ball(rng: np.random.Generator, scale: Callable[[], float]) -> Shape:
     radius = 0.036 * scale()
     piece = ellipsoid((radius, radius, radius))
-    return _make("ball", "ball", [piece], 0.10, "lathe", ((UP_Z, 1.0),), ("ceramic", "speckle"), rolling=0.003)
+    return _make("ball", "ball", [piece], 0.10, "lathe", ((_UP_Z, 1.0),), ("ceramic", "speckle"), rolling=0.003)
 
 
 def _soap(rng: np.random.Generator, scale: Callable[[], float]) -> Shape:
@@ -291,7 +301,7 @@ def _soap(rng: np.random.Generator, scale: Callable[[], float]) -> Shape:
     # Cut flat where it would rock: real ones do not balance on a point.
     round_ = np.clip(round_, -0.94, 0.94) / 0.94
     mass = 800.0 * 6.0 * float(np.prod(half))
-    return _make("soap", name, [hull(round_ * half)], mass, "box", ((UP_Y, 0.3), (UP_Z, 0.7)), ("speckle", "cloth"))
+    return _make("soap", name, [hull(round_ * half)], mass, "box", ((_UP_Y, 0.3), (_UP_Z, 0.7)), ("speckle", "cloth"))
 
 
 def _angle(rng: np.random.Generator, scale: Callable[[], float]) -> Shape:
@@ -300,7 +310,7 @@ def _angle(rng: np.random.Generator, scale: Callable[[], float]) -> Shape:
         box((long / 2, thick / 2, deep / 2), (long / 2, thick / 2, 0)),
         box((thick / 2, (wide - thick) / 2, deep / 2), (thick / 2, (wide + thick) / 2, 0)),
     ]
-    rests = ((UP_Z, 0.6), (UP_Y, 0.4))
+    rests = ((_UP_Z, 0.6), (_UP_Y, 0.4))
     return _make("angle", "angle", pieces, 0.22, "box", rests, ("wood", "speckle", "cloth"))
 
 
@@ -310,7 +320,7 @@ def _banana(rng: np.random.Generator, scale: Callable[[], float]) -> Shape:
     path = np.stack([bend * np.sin(turn), bend * (np.cos(turn) - 1.0), 0.0 * turn], axis=1)
     thick = 0.018 * np.array([0.62, 0.88, 1.0, 1.0, 1.0, 0.88, 0.62])
     pieces = [capsule(a, b, r) for a, b, r in zip(path, path[1:], thick, strict=False)]
-    return _make("banana", "banana", pieces, 0.12, "box", ((UP_Z, 1.0),), ("peel",), rolling=0.002)
+    return _make("banana", "banana", pieces, 0.12, "box", ((_UP_Z, 1.0),), ("peel",), rolling=0.002)
 
 
 _MAKERS: dict[str, Callable[[np.random.Generator, Callable[[], float]], Shape]] = {
@@ -326,58 +336,26 @@ _MAKERS: dict[str, Callable[[np.random.Generator, Callable[[], float]], Shape]] 
     "banana": _banana,
 }
 
-FAMILIES: tuple[str, ...] = tuple(_MAKERS)
-"""Names that `draw_shape` knows."""
+SHAPE_FAMILIES: tuple[str, ...] = tuple(_MAKERS)
+"""Names of the families of objects."""
 
 
 def draw_shape(rng: np.random.Generator, family: str, pool: Pool = ANY) -> Shape:
-    """A new member of a family.
+    """Draw a member of a family and its measures.
 
     Parameters
     ----------
     rng : numpy.random.Generator
-        Draws the member and its measures.
     family : str
-        One of FAMILIES.
+        One of SHAPE_FAMILIES.
     pool : Pool
         Each measure is scaled by a factor drawn from it.
 
     Raises
     ------
     InputError
-        If there is no such family.
+        If the family is unknown.
     """
     if family not in _MAKERS:
-        raise InputError(f"no family of shapes is called {family!r}", f"there are {', '.join(FAMILIES)}")
+        raise InputError(f"unknown family of shapes {family!r}", f"known: {', '.join(SHAPE_FAMILIES)}")
     return _MAKERS[family](rng, lambda: pool.factor(rng))
-
-
-def label_voxels(shapes: Sequence[Shape], poses: np.ndarray, grid: VoxelGrid) -> np.ndarray:
-    """Labels (X, Y, Z) uint16: k + 1 where the voxel's centre lies in shape k, 0 where it lies in none.
-
-    Parameters
-    ----------
-    shapes : sequence of Shape
-        The objects.
-    poses : (n, 4, 4)
-        T_world_object of each.
-    grid : VoxelGrid
-        Workspace.
-
-    Notes
-    -----
-    Objects at rest overlap by less than a millimetre; a centre that lies in two goes to the first.
-    """
-    labels = np.zeros(grid.shape, np.uint16)
-    for k, (shape, pose) in enumerate(zip(shapes, poses, strict=True)):
-        reach = np.abs(pose[:3, :3]) @ shape.half + grid.voxel_size
-        low = np.maximum(grid.index_of(pose[:3, 3] - reach), 0)
-        high = np.minimum(grid.index_of(pose[:3, 3] + reach) + 1, grid.shape)
-        if (high <= low).any():
-            continue
-        box = tuple(slice(int(a), int(b)) for a, b in zip(low, high, strict=True))
-        index = np.stack(np.meshgrid(*(np.arange(a, b) for a, b in zip(low, high, strict=True)), indexing="ij"), -1)
-        local = (grid.centre_of(index) - pose[:3, 3]) @ pose[:3, :3]
-        free = labels[box] == 0
-        labels[box][free & shape.inside(local)] = k + 1
-    return labels

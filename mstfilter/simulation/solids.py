@@ -1,22 +1,19 @@
-"""Convex pieces: the one description from which physics, rays and volumetric truth are made.
+"""Convex pieces of objects, and bounds that tell which rays can meet them.
 
-A rigid object is a union of convex pieces by construction. MuJoCo collides and ray-casts exactly these
-pieces and `Piece.inside` answers for the same solids, so a picture and its truth cannot disagree.
+A rigid object is a union of convex pieces. MuJoCo collides and ray-casts these pieces, and `Piece.inside` answers
+for the same solids, so images and true volumes agree.
 
 >>> from mstfilter.simulation.solids import box
 >>> box((0.02, 0.03, 0.04)).inside([[0.0, 0.0, 0.039], [0.0, 0.0, 0.041]]).tolist()
 [True, False]
 
-
-Which rays can meet which bodies: capsules that bound them, tested without casting.
-
-A capsule seen from a point lies in a cone and, if it is long, between two planes. The test errs on one side
-only: a ray that is said not to meet a bound does not meet it.
+`CapsuleBounds` are capsules around moving bodies. Seen from a point, a capsule lies in a cone and, if it is long,
+between two planes. The test is conservative: a ray that fails it does not meet the capsule.
 
 >>> import numpy as np
->>> from mstfilter.simulation.solids import Bounds
->>> ball = Bounds(np.array([[0.0, 0, 1]]), np.array([[0.0, 0, 1]]), np.array([0.1]))
->>> ball.seen_from(np.zeros(3)).meet(np.array([[0.0, 0.05, 1.0], [0.5, 0.0, 1.0]], np.float32)).tolist()
+>>> from mstfilter.simulation.solids import CapsuleBounds
+>>> ball = CapsuleBounds(np.array([[0.0, 0, 1]]), np.array([[0.0, 0, 1]]), np.array([0.1]))
+>>> ball.seen_from(np.zeros(3)).may_meet(np.array([[0.0, 0.05, 1.0], [0.5, 0.0, 1.0]], np.float32)).tolist()
 [True, False]
 """
 
@@ -30,10 +27,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-__all__ = ["Bounds", "Cones", "Piece", "box", "capsule", "cylinder", "ellipsoid", "frustum", "hull", "ring"]
+__all__ = [
+    "BoundingCones",
+    "CapsuleBounds",
+    "Piece",
+    "box",
+    "capsule",
+    "cylinder",
+    "ellipsoid",
+    "frustum",
+    "hull",
+    "ring",
+]
 
-# A voxel centre on the face that two pieces share must not fall between them.
-TOLERANCE = 1e-9
+_TOLERANCE = 1e-9  # so that a voxel centre on the face that two pieces share lies in one of them
+_ANGLE_SLACK = 1e-4  # of the bounds' angles, for single precision
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,18 +51,18 @@ class Piece:
     Parameters
     ----------
     kind : {"box", "cylinder", "ellipsoid", "capsule", "hull"}
-        Which solid.
+        Type of solid.
     size : tuple of float
-        Metres, MuJoCo's convention: half edges; radius and half height; half axes; radius and half
-        length of the axis. Empty for a hull.
+        Metres, in MuJoCo's convention: half edges; radius and half height; half axes; radius and half length of the
+        axis. Empty for a hull.
     centre : (3,) metres
-        Where its own frame lies in the body.
+        Origin of the piece's frame in the body.
     rotation : (3, 3)
-        Columns are its own axes in the body.
-    vertices : (n, 3) metres
-        Of a hull, in its own frame.
+        Columns are the axes of the piece's frame in the body.
+    vertices : (n, 3) metres, optional
+        Of a hull, in the piece's frame.
     plain : bool
-        Painted in one colour (a handle), not with the body's print.
+        Whether the piece has one colour (a handle) instead of the body's texture.
     """
 
     kind: str
@@ -65,32 +73,32 @@ class Piece:
     plain: bool = False
 
     @cached_property
-    def _hull(self) -> Any:  # scipy's ConvexHull, imported late
+    def _hull(self) -> Any:
         from scipy.spatial import ConvexHull
 
         return ConvexHull(self.vertices)
 
     def inside(self, points: ArrayLike) -> np.ndarray:
-        """(...) bool: points (..., 3) of the body's frame that lie in the solid or on its surface."""
+        """Whether points (..., 3) of the body's frame lie in the solid or on its surface: (...) bool."""
         p = (np.asarray(points, dtype=np.float64) - self.centre) @ self.rotation
         if self.kind == "box":
-            return (np.abs(p) <= np.array(self.size) + TOLERANCE).all(axis=-1)
+            return (np.abs(p) <= np.array(self.size) + _TOLERANCE).all(axis=-1)
         if self.kind == "cylinder":
             radius, half = self.size
-            return (np.hypot(p[..., 0], p[..., 1]) <= radius + TOLERANCE) & (np.abs(p[..., 2]) <= half + TOLERANCE)
+            return (np.hypot(p[..., 0], p[..., 1]) <= radius + _TOLERANCE) & (np.abs(p[..., 2]) <= half + _TOLERANCE)
         if self.kind == "ellipsoid":
-            return ((p / np.array(self.size)) ** 2).sum(axis=-1) <= 1.0 + TOLERANCE
+            return ((p / np.array(self.size)) ** 2).sum(axis=-1) <= 1.0 + _TOLERANCE
         if self.kind == "capsule":
             radius, half = self.size
             p = p.copy()
             p[..., 2] -= np.clip(p[..., 2], -half, half)
-            return (p**2).sum(axis=-1) <= radius**2 + TOLERANCE
+            return (p**2).sum(axis=-1) <= radius**2 + _TOLERANCE
         planes = self._hull.equations
-        return (p @ planes[:, :3].T + planes[:, 3] <= TOLERANCE).all(axis=-1)
+        return (p @ planes[:, :3].T + planes[:, 3] <= _TOLERANCE).all(axis=-1)
 
     @property
     def volume(self) -> float:
-        """Cubic metres."""
+        """Volume in cubic metres."""
         if self.kind == "box":
             return 8.0 * float(np.prod(self.size))
         if self.kind == "cylinder":
@@ -102,7 +110,7 @@ class Piece:
         return float(self._hull.volume)
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """Minimum and maximum corner in the body's frame, exact but for hulls' rounding."""
+        """Minimum and maximum corner of the bounding box in the body's frame."""
         if self.kind == "hull":
             corners = self.vertices @ self.rotation.T + self.centre
             return corners.min(axis=0), corners.max(axis=0)
@@ -118,24 +126,23 @@ class Piece:
         return self.centre - reach, self.centre + reach
 
 
-def _piece(kind: str, size: tuple[float, ...], at: ArrayLike, rotation: ArrayLike | None, plain: bool) -> Piece:
-    turn = np.eye(3) if rotation is None else np.asarray(rotation, dtype=np.float64)
-    return Piece(kind, tuple(float(s) for s in size), np.asarray(at, dtype=np.float64), turn, None, plain)
+def _upright(kind: str, size: tuple[float, ...], at: ArrayLike) -> Piece:
+    return Piece(kind, tuple(float(s) for s in size), np.asarray(at, dtype=np.float64), np.eye(3))
 
 
-def box(half: tuple[float, float, float], at: ArrayLike = (0, 0, 0), rotation: ArrayLike | None = None) -> Piece:
+def box(half: tuple[float, float, float], at: ArrayLike = (0, 0, 0)) -> Piece:
     """A box from its half edges."""
-    return _piece("box", half, at, rotation, False)
+    return _upright("box", half, at)
 
 
 def cylinder(radius: float, half_height: float, at: ArrayLike = (0, 0, 0)) -> Piece:
     """An upright cylinder."""
-    return _piece("cylinder", (radius, half_height), at, None, False)
+    return _upright("cylinder", (radius, half_height), at)
 
 
 def ellipsoid(half: tuple[float, float, float], at: ArrayLike = (0, 0, 0)) -> Piece:
     """An ellipsoid from its half axes."""
-    return _piece("ellipsoid", half, at, None, False)
+    return _upright("ellipsoid", half, at)
 
 
 def capsule(start: ArrayLike, end: ArrayLike, radius: float, plain: bool = False) -> Piece:
@@ -147,37 +154,41 @@ def capsule(start: ArrayLike, end: ArrayLike, radius: float, plain: bool = False
     x = np.cross(z, np.eye(3)[int(np.argmin(np.abs(z)))])
     x /= np.linalg.norm(x)
     rotation = np.stack([x, np.cross(z, x), z], axis=1)
-    return _piece("capsule", (radius, length / 2), (start + end) / 2, rotation, plain)
+    return Piece("capsule", (float(radius), float(length / 2)), (start + end) / 2, rotation, None, plain)
 
 
 def hull(vertices: ArrayLike) -> Piece:
     """The convex hull of points (n, 3) of the body's frame."""
     vertices = np.asarray(vertices, dtype=np.float64)
-    # An own frame near the centre keeps MuJoCo's re-centring of meshes well conditioned.
+    # A frame near the centre keeps MuJoCo's re-centring of meshes well conditioned.
     centre = vertices.mean(axis=0)
     return Piece("hull", (), centre, np.eye(3), vertices - centre)
 
 
+def _circle(n: int, sides: int) -> np.ndarray:
+    """Points (n, 2) of the unit circle, 1 / `sides` of a turn apart."""
+    angle = np.arange(n) * (2.0 * np.pi / sides)
+    return np.stack([np.cos(angle), np.sin(angle)], axis=1)
+
+
 def frustum(lower: tuple[float, float], upper: tuple[float, float], sides: int = 32) -> Piece:
-    """A cone's slice: (radius, z) below and above, as a prism of many sides."""
-    angle = np.arange(sides) * (2.0 * np.pi / sides)
-    circle = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    """A frustum of a cone between two circles (radius, z), as a hull with `sides` side faces."""
+    circle = _circle(sides, sides)
     rings = [np.column_stack([r * circle, np.full(sides, z)]) for r, z in (lower, upper)]
     return hull(np.concatenate(rings))
 
 
 def ring(profile: list[tuple[float, float, float]], sides: int = 20) -> list[Piece]:
-    """A lathed wall as convex wedges.
+    """The wall of a turned solid as convex wedges.
 
     Parameters
     ----------
     profile : list of (inner radius, outer radius, z)
-        Upwards; neighbouring entries bound one layer.
+        From bottom to top; neighbouring entries bound one layer.
     sides : int
-        Wedges around.
+        Wedges in each layer.
     """
-    angle = np.arange(sides + 1) * (2.0 * np.pi / sides)
-    circle = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    circle = _circle(sides + 1, sides)
     wedges = []
     for low, high in pairwise(profile):
         for a, b in pairwise(circle):
@@ -186,23 +197,20 @@ def ring(profile: list[tuple[float, float, float]], sides: int = 20) -> list[Pie
     return wedges
 
 
-_SLACK = 1e-4  # of angles, against single precision
-
-
 @dataclass(frozen=True, eq=False)
-class Cones:
-    """Bounds as seen from one point.
+class BoundingCones:
+    """Capsules as seen from one point.
 
     Parameters
     ----------
     axis : (k, 3) float32
-        Unit vectors along which they are seen.
+        Unit vectors from the point along the axes of the cones.
     cosine : (k,) float32
-        Least cosine between a ray that meets one and its axis.
+        Least cosine between the axis and a ray that meets the capsule.
     across : (k, 3) float32
-        Unit normals of the planes through the point and long ones; 0 for balls.
+        Unit normals of the planes through the point and the axes of long capsules; 0 for balls.
     slab : (k,) float32
-        Greatest sine between a ray and that plane.
+        Greatest sine between that plane and a ray that meets the capsule.
     """
 
     axis: np.ndarray
@@ -210,8 +218,8 @@ class Cones:
     across: np.ndarray
     slab: np.ndarray
 
-    def meet(self, rays: np.ndarray) -> np.ndarray:
-        """(n,) bool: whether rays (n, 3) float32 of any length, from the point, may meet one of the bounds."""
+    def may_meet(self, rays: np.ndarray) -> np.ndarray:
+        """Whether rays (n, 3) float32 of any length, from the point, may meet one of the capsules: (n,) bool."""
         met = np.zeros(len(rays), bool)
         x, y, z = (np.ascontiguousarray(rays[:, i]) for i in range(3))
         length = np.sqrt(x * x + y * y + z * z)
@@ -227,13 +235,13 @@ class Cones:
 
 
 @dataclass(frozen=True, eq=False)
-class Bounds:
-    """Capsules.
+class CapsuleBounds:
+    """Capsules around bodies.
 
     Parameters
     ----------
     a, b : (k, 3) metres
-        Ends of their axes; equal for balls.
+        Ends of the axes; equal for balls.
     radius : (k,) metres
     """
 
@@ -244,20 +252,19 @@ class Bounds:
     def __len__(self) -> int:
         return len(self.radius)
 
-    def joined(self, other: Bounds) -> Bounds:
-        """Both."""
-        return Bounds(
+    def __getitem__(self, which: np.ndarray) -> CapsuleBounds:
+        return CapsuleBounds(self.a[which], self.b[which], self.radius[which])
+
+    def joined(self, other: CapsuleBounds) -> CapsuleBounds:
+        """The capsules of both."""
+        return CapsuleBounds(
             np.concatenate([self.a, other.a]),
             np.concatenate([self.b, other.b]),
             np.concatenate([self.radius, other.radius]),
         )
 
-    def of(self, which: np.ndarray) -> Bounds:
-        """Those of an index or mask."""
-        return Bounds(self.a[which], self.b[which], self.radius[which])
-
-    def seen_from(self, point: np.ndarray) -> Cones:
-        """What rays from a point are tested with."""
+    def seen_from(self, point: np.ndarray) -> BoundingCones:
+        """Cones around the capsules with their apex at a point."""
         a, b = self.a - point, self.b - point
         along = b - a
         square = np.maximum((along**2).sum(axis=1), 1e-30)
@@ -268,11 +275,12 @@ class Bounds:
         first, second = _unit(a), _unit(b)
         spread = np.arccos(np.clip((first * second).sum(axis=1), -1.0, 1.0))
         ratio = np.minimum(self.radius / safe, 1.0)
-        angle = spread / 2 + np.arcsin(ratio) + _SLACK
+        # Half the angle between the ends, and the angle of the radius at the nearest point of the axis.
+        angle = spread / 2 + np.arcsin(ratio) + _ANGLE_SLACK
         cosine = np.where(within | (angle >= np.pi / 2), -2.0, np.cos(np.minimum(angle, np.pi)))
         across = np.where((within | (spread < 1e-3))[:, None], 0.0, _unit(np.cross(a, b)))
-        single = [np.asarray(v, np.float32) for v in (_unit(first + second), cosine, across, ratio + _SLACK)]
-        return Cones(*single)
+        single = [np.asarray(v, np.float32) for v in (_unit(first + second), cosine, across, ratio + _ANGLE_SLACK)]
+        return BoundingCones(*single)
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:

@@ -1,8 +1,8 @@
-"""Textures in body coordinates: which chart a surface point lies on, and what is printed there.
+"""Textures of objects and the room around them.
 
-A body's skin is a handful of flat charts (`draw_skin`), a point finds its chart and place by its body
-coordinates and normal alone (`locate`), and an `Atlas` holds the charts of all bodies in one array, so
-that shading is one gather. Charts are seen from outside with their upper edge up: text is never mirrored.
+The skin of a body is a few flat charts (`draw_skin`). The body coordinates and the normal of a surface point give its
+chart and its place there (`texture_coordinates`). An `Atlas` holds the charts of all bodies in one array, so shading
+is one gather. Charts are seen from outside with their upper edge up: text is never mirrored.
 
 >>> import numpy as np
 >>> from mstfilter.simulation.shapes import draw_shape
@@ -11,10 +11,8 @@ that shading is one gather. Charts are seen from outside with their upper edge u
 >>> len(skin.charts), skin.gloss < 0.2
 (7, True)
 
+The `Room` is table top, floor, wall, light and exposure; each scene draws its own (`draw_room`).
 
-What surrounds the objects: table top, floor, wall, lamps, exposure; drawn anew for every scene.
-
->>> import numpy as np
 >>> from mstfilter.simulation.textures import draw_room
 >>> room = draw_room(np.random.default_rng(0), texel=0.004)
 >>> room.table.ndim, room.lamp.shape
@@ -31,14 +29,14 @@ from mstfilter.simulation import printing
 from mstfilter.simulation.shapes import ANY, Pool, Shape
 from mstfilter.simulation.world import TABLE
 
-__all__ = ["Atlas", "Room", "Skin", "draw_room", "draw_skin", "locate", "srgb_to_linear"]
+__all__ = ["Atlas", "Room", "Skin", "draw_room", "draw_skin", "texture_coordinates"]
 
-SIDE, TOP, BOTTOM, INSIDE = range(4)
+_SIDE, _TOP, _BOTTOM, _INSIDE = range(4)
 
 
 @dataclass(frozen=True, eq=False)
 class Skin:
-    """What a body looks like.
+    """Texture of a body.
 
     Parameters
     ----------
@@ -52,8 +50,8 @@ class Skin:
     gloss: float
 
 
-def srgb_to_linear(value: np.ndarray) -> np.ndarray:
-    """Linear intensity of display values, both in 0 .. 1."""
+def _srgb_to_linear(value: np.ndarray) -> np.ndarray:
+    """Linear intensity of sRGB values, both in 0 .. 1."""
     value = np.asarray(value, dtype=np.float32)
     return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4).astype(np.float32)
 
@@ -66,8 +64,8 @@ def _face_axes(face: int) -> tuple[np.ndarray, np.ndarray]:
     return np.cross(up, normal), up
 
 
-def chart_sizes(shape: Shape) -> list[tuple[float, float]]:
-    """(width, height) in metres of each chart of a shape, the plain one left out."""
+def _chart_sizes(shape: Shape) -> list[tuple[float, float]]:
+    """Width and height in metres of each chart of a shape, without the plain one."""
     if shape.print_as == "box":
         return [(2 * abs(r @ shape.half), 2 * abs(u @ shape.half)) for r, u in map(_face_axes, range(6))]
     across = 2 * float(min(shape.half[0], shape.half[1]))
@@ -75,17 +73,18 @@ def chart_sizes(shape: Shape) -> list[tuple[float, float]]:
     return [(np.pi * across, tall), (across, across), (across, across), (np.pi * across, tall)]
 
 
-def locate(shape: Shape, points: np.ndarray, normals: np.ndarray, plain: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Chart number (n,) and place (n, 2) in it, 0 .. 1 from its upper left corner.
+def texture_coordinates(
+    shape: Shape, points: np.ndarray, normals: np.ndarray, plain: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Chart number (n,) of surface points and place (n, 2) in it, 0 .. 1 from its upper left corner.
 
     Parameters
     ----------
     shape : Shape
-        Whose surface.
     points, normals : (n, 3)
         In the body's frame, metres; outward unit normals.
     plain : (n,) bool
-        Points of pieces in plain colour.
+        Points of pieces that have one colour.
     """
     place = np.zeros((len(points), 2), np.float32)
     if shape.print_as == "box":
@@ -99,37 +98,27 @@ def locate(shape: Shape, points: np.ndarray, normals: np.ndarray, plain: np.ndar
         return np.where(plain, 6, chart), place
     radius = float(min(shape.half[0], shape.half[1]))
     outward = points[:, 0] * normals[:, 0] + points[:, 1] * normals[:, 1]
-    chart = np.where(outward < 0, INSIDE, SIDE)
-    chart = np.where(normals[:, 2] > 0.75, TOP, np.where(normals[:, 2] < -0.75, BOTTOM, chart))
-    wall = (chart == SIDE) | (chart == INSIDE)
+    chart = np.where(outward < 0, _INSIDE, _SIDE)
+    chart = np.where(normals[:, 2] > 0.75, _TOP, np.where(normals[:, 2] < -0.75, _BOTTOM, chart))
+    wall = (chart == _SIDE) | (chart == _INSIDE)
     place[:, 0] = np.where(
         wall,
         np.arctan2(points[:, 1], points[:, 0]) / (2 * np.pi) + 0.5,
-        0.5 + 0.5 * points[:, 0] / radius * np.where(chart == BOTTOM, -1.0, 1.0),
+        0.5 + 0.5 * points[:, 0] / radius * np.where(chart == _BOTTOM, -1.0, 1.0),
     )
     place[:, 1] = 0.5 - 0.5 * np.where(wall, points[:, 2] / shape.half[2], points[:, 1] / radius)
     return np.where(plain, 4, chart), place
 
 
 def draw_skin(rng: np.random.Generator, shape: Shape, pool: Pool = ANY) -> Skin:
-    """A texture that suits the shape.
-
-    Parameters
-    ----------
-    rng : numpy.random.Generator
-        Draws everything.
-    shape : Shape
-        For the charts' sizes and the styles that suit it.
-    pool : Pool
-        Which hues and names occur.
-    """
+    """Draw a texture that suits the shape, with hues and names of a pool."""
     style = shape.finish[int(rng.integers(len(shape.finish)))]
-    sizes = chart_sizes(shape)
+    sizes = _chart_sizes(shape)
     pair = (printing.shade(rng, pool=pool), printing.shade(rng, (0.55, 0.95), 0.65, pool))
     words = printing.brand(rng, pool)
     gloss = {"label": 0.30, "ceramic": 0.35, "carton": 0.12}.get(style, 0.04)
     if style == "carton":
-        # The two broadest faces carry front and back, the narrow upright ones the sides.
+        # Front and back are on the two broadest upright faces, the sides on the narrow ones.
         wide = sorted(range(4), key=lambda k: -sizes[k][0])[:2]
         charts = []
         for k, (w, h) in enumerate(sizes):
@@ -139,16 +128,16 @@ def draw_skin(rng: np.random.Generator, shape: Shape, pool: Pool = ANY) -> Skin:
         metal = (176, 176, 180)
         ends = [
             printing.lid(rng, w, metal if k == 0 else pair[1], k == 0, pool)
-            for k, (w, _) in enumerate([sizes[TOP]] * 2)
+            for k, (w, _) in enumerate([sizes[_TOP]] * 2)
         ]
         top = ends[int(rng.integers(2))]
-        charts = [printing.label_side(rng, *sizes[SIDE], pair, words, pool), top, ends[0]]
-        charts.append(printing.glaze(rng, *sizes[INSIDE], pair, 0))
+        charts = [printing.label_side(rng, *sizes[_SIDE], pair, words, pool), top, ends[0]]
+        charts.append(printing.glaze(rng, *sizes[_INSIDE], pair, 0))
     elif style == "ceramic":
         pale = printing.shade(rng, (0.7, 0.95), 0.45, pool)
         motif = int(rng.integers(3))
         charts = [
-            printing.glaze(rng, w, h, (pale, pair[0]), motif if k == SIDE else 0) for k, (w, h) in enumerate(sizes)
+            printing.glaze(rng, w, h, (pale, pair[0]), motif if k == _SIDE else 0) for k, (w, h) in enumerate(sizes)
         ]
     elif style == "wood":
         tone = printing.wood(rng, 0.01, 0.01)[0, 0]
@@ -157,30 +146,30 @@ def draw_skin(rng: np.random.Generator, shape: Shape, pool: Pool = ANY) -> Skin:
         state = rng.bit_generator.state
         charts = []
         for w, h in sizes:
-            rng.bit_generator.state = state  # the same weave on every face
+            rng.bit_generator.state = state  # every face has the same weave
             charts.append(printing.cloth(rng, w, h, pool))
     elif style == "peel":
         ripe = (int(rng.uniform(205, 228)), int(rng.uniform(175, 195)), int(rng.uniform(60, 95)))
         charts = [printing.peel(rng, w, h, ripe) for w, h in sizes]
     else:
-        # Stone and foam: tones of one colour, not camouflage.
+        # Stone and foam have tones of one colour.
         r, g, b = (int(0.65 * first + 0.35 * second) for first, second in zip(*pair, strict=True))
         charts = [printing.speckle(rng, w, h, (pair[0], (r, g, b))) for w, h in sizes]
     plain = np.ascontiguousarray(np.broadcast_to(charts[0].reshape(-1, 3).mean(axis=0).astype(np.uint8), (2, 2, 3)))
     if style == "ceramic":
-        plain = np.ascontiguousarray(np.broadcast_to(charts[INSIDE][0, 0], (2, 2, 3)))
+        plain = np.ascontiguousarray(np.broadcast_to(charts[_INSIDE][0, 0], (2, 2, 3)))
     return Skin((*charts, plain), gloss)
 
 
 class Atlas:
-    """The charts of many skins in one array, at the resolution a camera can see.
+    """The charts of many skins in one array, at the resolution of a camera.
 
     Parameters
     ----------
     skins : sequence of Skin
-        Charts are numbered skin by skin.
+        Charts are numbered in their order.
     texel : float
-        Metres a texel; charts are averaged down to it.
+        Size of a texel in metres; charts are averaged down to it.
     """
 
     def __init__(self, skins: list[Skin], texel: float) -> None:
@@ -206,10 +195,10 @@ class Atlas:
                 texels.append(chart.reshape(-1, 3))
                 start += chart.shape[0] * chart.shape[1]
         self._first, self._width, self._height = np.array(first), np.array(width), np.array(height)
-        self._texels = srgb_to_linear(np.concatenate(texels).astype(np.float32) / 255.0)
+        self._texels = _srgb_to_linear(np.concatenate(texels).astype(np.float32) / 255.0)
 
     def colour(self, skin: int, chart: np.ndarray, place: np.ndarray) -> np.ndarray:
-        """(n, 3) float32 linear albedo at places (n, 2) of charts (n,) of a skin, interpolated bilinearly."""
+        """Linear albedo (n, 3) float32 at places (n, 2) of charts (n,) of a skin, interpolated bilinearly."""
         chart = chart + self.base[skin]
         w, h = self._width[chart], self._height[chart]
         x = np.clip(place[:, 0] * w - 0.5, 0, w - 1.001)
@@ -234,17 +223,17 @@ class Room:
     rim, floor, wall : (3,) float32
         Albedo of the table's edge, the floor and the wall.
     carpet : (n, n) float32
-        Relative brightness of the floor, a tile repeated.
+        Relative brightness of a tile of the floor, which is repeated.
     lamp : (k, 3) metres
-        Points of the lamp; several make soft shadows.
+        Point sources of the lamp; several make soft shadows.
     lamp_colour : (3,) float32
-        Irradiance of the whole lamp on a surface that faces it.
+        Irradiance of all of them on a surface that faces the lamp.
     sky : (m, 3) metres
-        Points of the ceiling, for soft light from above.
+        Point sources of the ceiling, for diffuse light from above.
     sky_colour : (3,) float32
-        Irradiance of the whole ceiling.
+        Irradiance of all of them.
     ambient : (3,) float32
-        Light from everywhere.
+        Irradiance without direction.
     exposure : (3,) float32
         Gain of each channel: exposure and white balance.
     """
@@ -277,8 +266,8 @@ def _table_top(rng: np.random.Generator, texel: float) -> np.ndarray:
 
 
 def draw_room(rng: np.random.Generator, texel: float) -> Room:
-    """Surroundings of a new scene; `texel` is the resolution of the table top in metres."""
-    table = srgb_to_linear(_table_top(rng, texel).astype(np.float32) / 255.0)
+    """Draw the surroundings of a scene; `texel` is the resolution of the table top in metres."""
+    table = _srgb_to_linear(_table_top(rng, texel).astype(np.float32) / 255.0)
     side = -1.0 if rng.uniform() < 0.5 else 1.0
     centre = np.array([side * rng.uniform(0.35, 0.8), rng.uniform(-0.7, 0.1), rng.uniform(1.3, 1.7)])
     spread = rng.uniform(0.08, 0.14)
@@ -287,7 +276,7 @@ def draw_room(rng: np.random.Generator, texel: float) -> Room:
     ring = np.stack([1.6 * np.cos(angle), 1.6 * np.sin(angle), np.full(4, 1.5)], axis=1)
     warm = np.array([1.0, rng.uniform(0.93, 1.0), rng.uniform(0.82, 0.98)])
     tile = 1.0 + 0.06 * printing.noise(rng, (256, 256), (40, 40), 5)
-    # The exposure meter: the table comes out at a middle to light tone, with some error.
+    # Exposure: the table gets a middle to light tone, with some error.
     light = 1.05
     tone = float(rng.uniform(0.42, 0.58)) if table.mean() > 0.25 else float(rng.uniform(0.24, 0.36))
     gain = tone / (float(table.mean()) * light)

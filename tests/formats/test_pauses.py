@@ -128,14 +128,14 @@ def test_still_intervals_of_a_simulated_recording(seed):
 
     The truth is the simulator's: a frame belongs to a pause if it was drawn from the world at rest.
     """
-    from mstfilter.simulation import Scene, advance, finish, scene_family
+    from mstfilter.simulation import SimulatedScene, advance_push, finish_push, scene_family
 
     family = scene_family("demo")
-    scene = Scene(family, seed)
+    scene = SimulatedScene(family, seed)
     images, pause_of = [], []
 
     def see(pause):
-        images.append(scene.see(len(images))["rgb"])
+        images.append(scene.frame_images(len(images))["rgb"])
         pause_of.append(pause)
 
     fps = 6.0
@@ -144,11 +144,11 @@ def test_still_intervals_of_a_simulated_recording(seed):
             see(action)
         if action == family.n_actions:
             break
-        push = scene.choose(action)
+        push = scene.choose_push(action)
         for step in range(int(push.seconds * fps)):
-            advance(scene.world, push, step / fps, (step + 1) / fps)
+            advance_push(scene.world, push, step / fps, (step + 1) / fps)
             see(None)
-        advance(scene.world, push, int(push.seconds * fps) / fps, push.seconds)
-        finish(scene.world)
+        advance_push(scene.world, push, int(push.seconds * fps) / fps, push.seconds)
+        finish_push(scene.world)
     found = Still(hold_s=0.8).find(times_of(images, fps), lambda k: images[k])
     assert [pause_of[k] for k in found] == list(range(family.n_actions + 1))

@@ -17,7 +17,7 @@ def test_made_once_and_found_again(tmp_path, monkeypatch):
     first = cached_recording("s1", 3, tmp_path, **TINY)
     assert first.parent == tmp_path and len(open_recording(first)) == 3
     assert sorted(p.name for p in tmp_path.iterdir()) == [".gitignore", first.name]
-    monkeypatch.setattr(recorder, "_make", lambda *_: pytest.fail("made again"))
+    monkeypatch.setattr(recorder, "_simulate_into_cache", lambda *_: pytest.fail("made again"))
     assert cached_recording("s1", 3, tmp_path, **TINY) == first
     assert cached_recording(replace(scene_family("s1"), **TINY), 3, tmp_path) == first
 
@@ -36,16 +36,16 @@ def test_key_is_that_of_the_whole_recipe(monkeypatch):
 
 
 def test_a_quicker_process_wins_and_nothing_else_is_left(tmp_path, monkeypatch):
-    simulate = recorder.simulate
+    simulate_recording = recorder.simulate_recording
     expected = cached_recording("s1", 3, tmp_path / "other", **TINY).name
 
     def slow(family, seed, path, progress=None):
         rival = tmp_path / "here" / expected
         rival.mkdir()
         (rival / "manifest.json").write_text("{}")
-        return simulate(family, seed, path, progress)
+        return simulate_recording(family, seed, path, progress)
 
-    monkeypatch.setattr(recorder, "simulate", slow)
+    monkeypatch.setattr(recorder, "simulate_recording", slow)
     assert cached_recording("s1", 3, tmp_path / "here", **TINY).name == expected
     assert sorted(p.name for p in (tmp_path / "here").iterdir()) == [".gitignore", expected]
     assert (tmp_path / "here" / expected / "manifest.json").read_text() == "{}"
@@ -56,7 +56,7 @@ def test_failure_leaves_nothing(tmp_path, monkeypatch):
         (path.parent / "half").write_text("")
         raise InputError("no")
 
-    monkeypatch.setattr(recorder, "simulate", broken)
+    monkeypatch.setattr(recorder, "simulate_recording", broken)
     with pytest.raises(InputError):
         cached_recording("s1", 3, tmp_path, **TINY)
     assert [p.name for p in tmp_path.iterdir()] == [".gitignore"]

@@ -70,5 +70,7 @@ def test_unknown_name_lists_what_exists():
 
 def test_what_the_family_holds():
     demo = SCENE_FAMILIES["demo"]
-    inside = demo.holds(np.array([[0.0, 0.0, 0.05], [0.6, 0.0, 0.05], [0.0, -0.45, 0.05], [0.0, 0.0, -0.5]]))
+    inside = demo.contains_points(
+        np.array([[0.0, 0.0, 0.05], [0.6, 0.0, 0.05], [0.0, -0.45, 0.05], [0.0, 0.0, -0.5]])
+    )
     assert inside.tolist() == [True, False, False, False]

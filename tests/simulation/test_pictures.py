@@ -9,8 +9,8 @@ from mstfilter.simulation.renderer import Renderer
 from mstfilter.simulation.sensor import ColourSensor, DepthSensor
 from mstfilter.simulation.shapes import Shape, draw_shape
 from mstfilter.simulation.solids import box, ellipsoid
-from mstfilter.simulation.textures import Atlas, Skin, draw_room, draw_skin, locate
-from mstfilter.simulation.world import FLOOR, World
+from mstfilter.simulation.textures import Atlas, Skin, draw_room, draw_skin, texture_coordinates
+from mstfilter.simulation.world import FLOOR_HEIGHT, PhysicsWorld
 
 ROOM = draw_room(np.random.default_rng(0), 0.008)
 
@@ -25,7 +25,7 @@ def single(piece, half):
 
 
 def rendered(shape, at, camera, rotation=None, supersample=False):
-    world = World([shape])
+    world = PhysicsWorld([shape])
     world.place(0, at, np.eye(3) if rotation is None else rotation)
     world.forward()
     skin = draw_skin(np.random.default_rng(0), shape)
@@ -61,7 +61,7 @@ def test_floor_and_wall_are_behind_the_table():
     view = rendered(draw_shape(np.random.default_rng(0), "can"), (0, 0, 0.1), kinect())
     points = kinect().unproject(view.depth)
     assert np.isfinite(view.depth).all()
-    assert points[..., 2].min() >= FLOOR - 1e-3
+    assert points[..., 2].min() >= FLOOR_HEIGHT - 1e-3
 
 
 def test_shadow_darkens_the_table_and_smoothing_only_touches_edges():
@@ -85,7 +85,7 @@ def test_print_is_not_mirrored():
     half[:, :8] = (250, 0, 0)
     half[:, 8:] = (0, 0, 250)
     skin = Skin((half,) * 6 + (half[:2, :2],), 0.0)
-    world = World([shape])
+    world = PhysicsWorld([shape])
     world.place(0, (0, 0, shape.half[2]), np.eye(3))
     world.forward()
     for eye in ((0, -0.6, 0.1), (0.6, 0.0, 0.1), (-0.6, 0.0, 0.1), (0, 0.6, 0.1), (0.0, -0.01, 0.8)):
@@ -100,7 +100,7 @@ def test_text_on_a_can_runs_to_the_right():
     shape = draw_shape(np.random.default_rng(0), "can")
     angle = np.array([-2.0, -1.8])  # seen from y < 0, x grows to the right as the angle grows
     points = np.stack([shape.half[0] * np.cos(angle), shape.half[0] * np.sin(angle), [0, 0]], axis=1)
-    chart, place = locate(shape, points, points / shape.half[0], np.zeros(2, bool))
+    chart, place = texture_coordinates(shape, points, points / shape.half[0], np.zeros(2, bool))
     assert points[1, 0] > points[0, 0] and place[1, 0] > place[0, 0]
     assert (chart == 0).all()
     assert place[0, 1] == pytest.approx(0.5)

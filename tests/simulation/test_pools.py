@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from mstfilter.simulation import printing
-from mstfilter.simulation.arrangement import draw_things
+from mstfilter.simulation.arrangement import draw_objects
 from mstfilter.simulation.families import scene_family
 from mstfilter.simulation.shapes import ANY, REPORTED, TUNING
 
@@ -50,7 +50,7 @@ def test_scenes_of_both_sides_share_no_measure():
         found = set()
         for seed in seeds:
             family = replace(scene_family("s3"), shapes="can").for_seed(seed)
-            for shape in draw_things(np.random.default_rng(seed), family).shapes:
+            for shape in draw_objects(np.random.default_rng(seed), family).shapes:
                 nominal = {"soup": 0.033, "coffee": 0.051, "tuna": 0.0425, "crisps": 0.0375, "biscuits": 0.075}
                 found.add(int((shape.half[0] / nominal[shape.name] - 0.9) / 0.025))
         return found

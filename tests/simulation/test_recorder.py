@@ -13,8 +13,8 @@ from mstfilter.errors import InputError
 from mstfilter.formats import open_recording
 from mstfilter.scene import VoxelGrid, render
 from mstfilter.simulation.families import scene_family
-from mstfilter.simulation.recorder import Scene, simulate
-from mstfilter.simulation.shapes import FAMILIES, draw_shape, label_voxels
+from mstfilter.simulation.recorder import SimulatedScene, simulate_recording
+from mstfilter.simulation.shapes import SHAPE_FAMILIES, draw_shape, label_voxels
 from mstfilter.simulation.world import FINGER_ID
 
 SMALL = replace(scene_family("demo"), width=160, height=120, frames_per_clip=6, fps=3.0)
@@ -27,20 +27,20 @@ def digest(folder):
 
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory):
-    return simulate(SMALL, 3, tmp_path_factory.mktemp("sim") / "three")
+    return simulate_recording(SMALL, 3, tmp_path_factory.mktemp("sim") / "three")
 
 
 def test_same_seed_same_bytes_in_another_process_and_another_seed_differs(recording, tmp_path):
     program = (
         "from dataclasses import replace\n"
         "from mstfilter.simulation.families import scene_family\n"
-        "from mstfilter.simulation.recorder import simulate\n"
+        "from mstfilter.simulation.recorder import simulate_recording\n"
         "f = replace(scene_family('demo'), width=160, height=120, frames_per_clip=6, fps=3.0)\n"
-        f"simulate(f, 3, {str(tmp_path / 'again')!r})\n"
+        f"simulate_recording(f, 3, {str(tmp_path / 'again')!r})\n"
     )
     subprocess.run([sys.executable, "-c", program], check=True, timeout=120)
     assert digest(tmp_path / "again") == digest(recording.path)
-    other = simulate(SMALL, 4, tmp_path / "other")
+    other = simulate_recording(SMALL, 4, tmp_path / "other")
     assert digest(other.path)["rgb/000000.png"] != digest(recording.path)["rgb/000000.png"]
     assert (other.truth(0) != recording.truth(0)).any()
 
@@ -99,7 +99,7 @@ def test_depth_readings_lie_on_the_true_objects(recording):
         assert region[tuple(index.T)].mean() > 0.95, k
 
 
-@pytest.mark.parametrize("family", FAMILIES)
+@pytest.mark.parametrize("family", SHAPE_FAMILIES)
 def test_voxel_truth_has_the_analytic_volume(family):
     shape = draw_shape(np.random.default_rng(1), family)
     rng = np.random.default_rng(2)
@@ -114,7 +114,7 @@ def test_voxel_truth_has_the_analytic_volume(family):
     # Five deviations of the Monte Carlo share, and 1 % for the raster.
     slack = 5 * whole * np.sqrt(share * (1 - share) / len(points)) + 0.01 * share * whole
     assert voxels == pytest.approx(share * whole, abs=slack)
-    if shape.n_pieces == 1:
+    if len(shape.pieces) == 1:
         assert voxels == pytest.approx(shape.pieces[0].volume, rel=0.02)
 
 
@@ -139,7 +139,7 @@ def test_progress_is_called_once_a_frame_and_failures_leave_nothing(tmp_path):
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        simulate(SMALL, 5, tmp_path / "cut", progress)
+        simulate_recording(SMALL, 5, tmp_path / "cut", progress)
     assert calls == [(1, 11), (2, 11), (3, 11)]
     assert list(tmp_path.iterdir()) == []
 
@@ -147,13 +147,13 @@ def test_progress_is_called_once_a_frame_and_failures_leave_nothing(tmp_path):
 @pytest.mark.parametrize("seed", [-1, 1.5, "seven", True])
 def test_bad_seed(seed, tmp_path):
     with pytest.raises(InputError, match="seed"):
-        Scene(SMALL, seed)
+        SimulatedScene(SMALL, seed)
 
 
 def test_existing_folder_is_kept(recording):
     before = digest(recording.path)
     with pytest.raises(InputError):
-        simulate(SMALL, 3, recording.path)
+        simulate_recording(SMALL, 3, recording.path)
     assert digest(recording.path) == before
 
 
@@ -174,11 +174,11 @@ def test_reopened(recording):
 def test_objects_that_left_the_workspace_are_named_and_the_truth_keeps_its_extent(tmp_path):
     from mstfilter.simulation import recorder
 
-    scene = Scene(replace(SMALL, n_actions=0), 3)
+    scene = SimulatedScene(replace(SMALL, n_actions=0), 3)
     scene.world.place(1, (0.0, 5.0, 0.1), np.eye(3))
     scene.world.forward()
     with recorder.RecordingWriter(tmp_path / "away", scene.camera, scene.grid, **scene.describe()) as writer:
-        recorder._pause(scene, writer, 0, 0.0)
+        recorder._record_pause(scene, writer, 0, 0.0)
     away = open_recording(tmp_path / "away")
     assert away.manifest["frames"][0]["left_workspace"] == [2]
     assert away.truth(0).shape == SMALL.grid().shape
@@ -189,7 +189,7 @@ def test_pictures_poses_and_volumes_agree(recording):
     import json
 
     poses = json.loads((recording.path / "poses.json").read_text())
-    scene = Scene(SMALL, 3)
+    scene = SimulatedScene(SMALL, 3)
     for t, pause in enumerate(recording.pauses):
         shown = np.array([poses[pause]["T_world_object"][str(k + 1)] for k in range(5)])
-        np.testing.assert_array_equal(label_voxels(scene.things.shapes, shown, recording.grid), recording.truth(t))
+        np.testing.assert_array_equal(label_voxels(scene.objects.shapes, shown, recording.grid), recording.truth(t))

@@ -7,22 +7,22 @@ import pytest
 
 from mstfilter.simulation.families import scene_family
 from mstfilter.simulation.layers import Stage
-from mstfilter.simulation.recorder import TOLERANCE, Scene
+from mstfilter.simulation.recorder import POSE_TOLERANCE, SimulatedScene
 from mstfilter.simulation.renderer import Renderer
-from mstfilter.simulation.solids import Bounds
-from mstfilter.simulation.world import advance
+from mstfilter.simulation.solids import CapsuleBounds
+from mstfilter.simulation.world import advance_push
 
 SMALL = replace(scene_family("s1"), width=160, height=120, frames_per_clip=6, fps=3.0)
 
 
 def test_pictures_are_those_of_full_rendering():
-    scene = Scene(SMALL, 2)
-    full = Renderer(scene.world, scene.things.skins, scene.room, scene.camera, True, TOLERANCE, reuse=False)
+    scene = SimulatedScene(SMALL, 2)
+    full = Renderer(scene.world, scene.objects.skins, scene.room, scene.camera, True, POSE_TOLERANCE, reuse=False)
     kept = scene._renderer
-    push = scene.choose(0)
+    push = scene.choose_push(0)
     for step in range(SMALL.frames_per_clip - 1):
         if step:
-            advance(scene.world, push, (step - 1) / SMALL.fps, step / SMALL.fps)
+            advance_push(scene.world, push, (step - 1) / SMALL.fps, step / SMALL.fps)
         one, other = kept.render(), full.render()
         for name in ("colour", "depth", "instance", "slant"):
             np.testing.assert_array_equal(getattr(one, name), getattr(other, name), err_msg=f"{name}, step {step}")
@@ -30,10 +30,10 @@ def test_pictures_are_those_of_full_rendering():
 
 
 def test_a_picture_in_which_nothing_moved_casts_no_ray(monkeypatch):
-    scene = Scene(SMALL, 2)
+    scene = SimulatedScene(SMALL, 2)
     first = scene._renderer.render()
     monkeypatch.setattr(Stage, "cast", lambda self, eye, rays, groups=(): pytest.fail("a ray") if len(rays) else CAST)
-    scene.world.data.qpos[scene.world.qpos_of(0).start] += 0.4 * TOLERANCE
+    scene.world.data.qpos[scene.world.qpos_of(0).start] += 0.4 * POSE_TOLERANCE
     scene.world.forward()
     np.testing.assert_array_equal(scene._renderer.render().colour, first.colour)
 
@@ -42,8 +42,8 @@ CAST = (np.zeros(0, np.int32), np.zeros(0), np.zeros((0, 3)))
 
 
 def test_the_stage_lags_by_no_more_than_its_tolerance():
-    scene = Scene(SMALL, 2)
-    world, stage = scene.world, Stage(scene.world, TOLERANCE)
+    scene = SimulatedScene(SMALL, 2)
+    world, stage = scene.world, Stage(scene.world, POSE_TOLERANCE)
     shape, pose = world.shapes[0], world.poses()[0]
     rng = np.random.default_rng(0)
     corners = np.array(np.meshgrid(*[(-1, 1)] * 3)).reshape(3, -1).T * shape.half
@@ -55,12 +55,12 @@ def test_the_stage_lags_by_no_more_than_its_tolerance():
         stage.follow()
         moved += (stage.poses[0] != before).any()
         shown, true = (p[:3, :3] @ corners.T + p[:3, 3:] for p in (stage.poses[0], world.poses()[0]))
-        assert np.linalg.norm(shown - true, axis=0).max() <= TOLERANCE
+        assert np.linalg.norm(shown - true, axis=0).max() <= POSE_TOLERANCE
     assert 2 < moved < 40
 
 
 def test_rays_that_miss_the_bounds_miss_the_bodies():
-    scene = Scene(SMALL, 2)
+    scene = SimulatedScene(SMALL, 2)
     scene.world.move_finger((0.0, 0.1, 0.15))
     stage = scene._renderer.stage
     stage.follow()
@@ -70,7 +70,7 @@ def test_rays_that_miss_the_bounds_miss_the_bodies():
     for _ in range(20):
         eye = rng.normal(size=3) * 0.6 + (0, 0, 0.9)
         rays = rng.uniform((-0.6, -0.6, 0), (0.6, 0.6, 0.3), (3000, 3)) - eye
-        meets = bounds.seen_from(eye).meet(rays.astype(np.float32))
+        meets = bounds.seen_from(eye).may_meet(rays.astype(np.float32))
         geom, _, _ = stage.cast(eye, rays, (1, 2))
         assert not (geom[~meets] >= 0).any()
         shares.append((geom >= 0).sum() / max(meets.sum(), 1))
@@ -78,7 +78,7 @@ def test_rays_that_miss_the_bounds_miss_the_bodies():
 
 
 def test_long_bounds_are_seen_as_slabs():
-    rod = Bounds(np.array([[-1.0, 0, 1]]), np.array([[1.0, 0, 1]]), np.array([0.01]))
+    rod = CapsuleBounds(np.array([[-1.0, 0, 1]]), np.array([[1.0, 0, 1]]), np.array([0.01]))
     rays = np.array([[0.9, 0.005, 1], [0.9, 0.05, 1], [1.2, 0, 1], [0, 0, -1]], np.float32)
-    assert rod.seen_from(np.zeros(3)).meet(rays).tolist() == [True, False, False, False]
-    assert rod.seen_from(np.array([0.0, 0, 1.005])).meet(rays).all()  # from within, everything may
+    assert rod.seen_from(np.zeros(3)).may_meet(rays).tolist() == [True, False, False, False]
+    assert rod.seen_from(np.array([0.0, 0, 1.005])).may_meet(rays).all()  # from within, everything may

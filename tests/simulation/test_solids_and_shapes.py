@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 from mstfilter.errors import InputError
-from mstfilter.simulation.shapes import FAMILIES, draw_shape
+from mstfilter.simulation.shapes import SHAPE_FAMILIES, draw_shape
 from mstfilter.simulation.solids import box, capsule, cylinder, ellipsoid, frustum, hull, ring
-from mstfilter.simulation.world import World
+from mstfilter.simulation.world import PhysicsWorld
 
 PIECES = {
     "box": (box((0.02, 0.03, 0.05), (0.1, 0, 0)), 8 * 0.02 * 0.03 * 0.05),
@@ -57,7 +57,7 @@ def test_hull_of_a_box_is_the_box():
     np.testing.assert_array_equal(hull(corners).inside(points), expected)
 
 
-@pytest.mark.parametrize("family", FAMILIES)
+@pytest.mark.parametrize("family", SHAPE_FAMILIES)
 @settings(max_examples=5, deadline=None)
 @given(seed=st.integers(0, 10_000))
 def test_shapes_are_centred_of_plausible_size_and_fill_their_box(family, seed):
@@ -71,10 +71,10 @@ def test_shapes_are_centred_of_plausible_size_and_fill_their_box(family, seed):
     assert not shape.inside(outside[None])[0]
 
 
-@pytest.mark.parametrize("family", FAMILIES)
+@pytest.mark.parametrize("family", SHAPE_FAMILIES)
 def test_rays_meet_the_surface_of_the_analytic_shape(family):
     shape = draw_shape(np.random.default_rng(4), family)
-    world = World([shape], arm=False)
+    world = PhysicsWorld([shape], arm=False)
     world.place(0, (0.0, 0.0, 0.5), np.eye(3))
     world.forward()
     rng = np.random.default_rng(5)

@@ -6,31 +6,31 @@ import numpy as np
 import pytest
 
 from mstfilter.errors import InputError
-from mstfilter.simulation.arrangement import arrange, draw_things
+from mstfilter.simulation.arrangement import arrange_objects, draw_objects
 from mstfilter.simulation.families import scene_family
-from mstfilter.simulation.recorder import Scene
-from mstfilter.simulation.shapes import FAMILIES, draw_shape
-from mstfilter.simulation.world import FINGER_ID, Push, World, choose_push, play
+from mstfilter.simulation.recorder import SimulatedScene
+from mstfilter.simulation.shapes import SHAPE_FAMILIES, draw_shape
+from mstfilter.simulation.world import FINGER_ID, FingerPush, PhysicsWorld, choose_push, play_push
 
 DEMO = scene_family("demo")
 
 
 def arranged(seed, family=DEMO):
     rng = np.random.default_rng(seed)
-    things = draw_things(rng, family)
-    world = World(things.shapes)
-    arrange(rng, world, family, things.twin_of)
-    return world, things, rng
+    objects = draw_objects(rng, family)
+    world = PhysicsWorld(objects.shapes)
+    arrange_objects(rng, world, family, objects.twin_of)
+    return world, objects, rng
 
 
-@pytest.mark.parametrize("family", FAMILIES)
+@pytest.mark.parametrize("family", SHAPE_FAMILIES)
 def test_every_shape_rests_in_its_rest_poses(family):
-    from mstfilter.simulation.arrangement import _rest
+    from mstfilter.simulation.arrangement import _draw_rest_pose
 
     shape = draw_shape(np.random.default_rng(0), family)
     for k, rest in enumerate(shape.rests):
-        world = World([replace(shape, rests=(rest,))])
-        rotation, height = _rest(np.random.default_rng(k), world.shapes[0])
+        world = PhysicsWorld([replace(shape, rests=(rest,))])
+        rotation, height = _draw_rest_pose(np.random.default_rng(k), world.shapes[0])
         world.place(0, (0, 0, height + 2e-4), rotation)
         assert world.settle(), rest
         position, turned = world.positions()[0], world.rotations()[0]
@@ -40,22 +40,22 @@ def test_every_shape_rests_in_its_rest_poses(family):
 
 @pytest.mark.parametrize("seed", range(4))
 def test_arranged_scenes_are_settled_without_interpenetration_and_twins_touch(seed):
-    world, things, _ = arranged(seed)
+    world, objects, _ = arranged(seed)
     assert world.deepest_overlap() < 0.002
     before = world.positions()
     world.step(250)
     assert np.linalg.norm(world.positions() - before, axis=1).max() < 0.002
     pairs = {(c.first, c.second) for c in world.contacts()}
-    for k, twin in enumerate(things.twin_of):
+    for k, twin in enumerate(objects.twin_of):
         if twin >= 0:
-            assert things.shapes[k] is things.shapes[twin] and things.skins[k] is things.skins[twin]
+            assert objects.shapes[k] is objects.shapes[twin] and objects.skins[k] is objects.skins[twin]
             assert (twin, k) in pairs
 
 
 def test_hidden_objects_are_not_seen():
     family = replace(scene_family("s2"), width=160, height=120, n_stacked=0)
     for seed in range(2):
-        scene = Scene(family, seed)
+        scene = SimulatedScene(family, seed)
         camera = scene.camera
         rays = camera.rays().reshape(-1, 3) @ camera.pose.as_matrix()[:3, :3].T
         geom, _, _ = scene.world.cast(np.array(camera.position), rays, (1,))
@@ -65,11 +65,11 @@ def test_hidden_objects_are_not_seen():
 def test_a_restored_state_goes_on_bit_by_bit():
     world, _, _ = arranged(0)
     saved = world.save()
-    push = Push((0.0, -0.3), (0.0, 0.1), 1.5)
-    play(world, push, DEMO)
+    push = FingerPush((0.0, -0.3), (0.0, 0.1), 1.5)
+    play_push(world, push, DEMO)
     first = world.poses()
     world.restore(saved)
-    play(world, push, DEMO)
+    play_push(world, push, DEMO)
     np.testing.assert_array_equal(world.poses(), first)
 
 
@@ -79,7 +79,7 @@ def test_a_chosen_push_moves_something_and_drops_nothing(seed):
     before = world.poses()
     push = choose_push(rng, world, DEMO)
     np.testing.assert_array_equal(world.poses(), before)
-    result = play(world, push, DEMO)
+    result = play_push(world, push, DEMO)
     assert result.moved(DEMO.move_threshold) >= 1
     assert result.settled and result.kept
     assert (world.positions()[:, 2] > 0).all()
@@ -91,10 +91,10 @@ def test_a_chosen_push_moves_something_and_drops_nothing(seed):
 
 def test_the_finger_pushes_a_box_by_what_it_travels():
     shape = draw_shape(np.random.default_rng(0), "brick")
-    world = World([shape], arm=False)
+    world = PhysicsWorld([shape], arm=False)
     world.place(0, (0, 0, shape.half[2] + 2e-4), np.eye(3))
     assert world.settle()
-    result = play(world, Push((0.0, -shape.half[1] - 0.05), (0.0, 0.0), 2.0), DEMO)
+    result = play_push(world, FingerPush((0.0, -shape.half[1] - 0.05), (0.0, 0.0), 2.0), DEMO)
     # 50 mm of way to the box less the finger's radius of 11 mm, then it is carried along.
     travelled = shape.half[1] + 0.011
     assert result.displacement[0] == pytest.approx(travelled, abs=0.006)
@@ -103,21 +103,21 @@ def test_the_finger_pushes_a_box_by_what_it_travels():
 def test_no_objects_and_too_many():
     shape = draw_shape(np.random.default_rng(0), "can")
     with pytest.raises(InputError):
-        World([])
+        PhysicsWorld([])
     with pytest.raises(InputError):
-        World([shape] * FINGER_ID)
+        PhysicsWorld([shape] * FINGER_ID)
 
 
 def test_objects_that_cannot_be_arranged_are_one_clear_error():
     crowd = replace(DEMO, n_objects_min=40, n_objects_max=40, shapes="carton", n_twins=0)
     rng = np.random.default_rng(0)
-    things = draw_things(rng, crowd)
+    objects = draw_objects(rng, crowd)
     import mstfilter.simulation.arrangement as arrangement
 
     kept = arrangement._ATTEMPTS
     arrangement._ATTEMPTS = 2
     try:
         with pytest.raises(InputError, match="could not be arranged"):
-            arrange(rng, World(things.shapes), crowd, things.twin_of)
+            arrange_objects(rng, PhysicsWorld(objects.shapes), crowd, objects.twin_of)
     finally:
         arrangement._ATTEMPTS = kept

@@ -184,7 +184,7 @@ WRONG = {
     'arms = [{name = "a"}, {name = "a", set = "n=4"}]': "two arms are called 'a'",
     'arms = [{set = "n=4,4"}]': "two arms are the same",
     'scenes = [{family = "demo", seeds = [1, 1]}]': "two scenes are the same",
-    'scenes = [{family = "nowhere", seeds = 1}]': "no scene family is called 'nowhere'",
+    'scenes = [{family = "nowhere", seeds = 1}]': "unknown scene family 'nowhere'",
     'scenes = [{family = "demo", seeds = 1, set = {height_m = 2}}]': "has no field 'height_m'",
     'scenes = [{family = "demo", seeds = 1, set = {fps = "fast"}}]': "fps",
     'scenes = [{recordings = "absent-*"}]': "recording does not exist",
