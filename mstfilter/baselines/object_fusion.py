@@ -33,7 +33,7 @@ from mstfilter.fusion import FreeSpace, Projection
 from mstfilter.scene import Camera, Clip, Frame, Hypothesis, ObjectRecord, VoxelGrid, depth_sigma, project
 from mstfilter.scoring import overlap
 from mstfilter.smc import Population, Update, union
-from mstfilter.tracking import Array, DenseFlow, Segment, Track, apply, refine, segments_of
+from mstfilter.tracking import DenseFlow, Segment, Track, move_points, refine_motion, segments_of
 
 __all__ = ["ObjectFusion", "ObjectVolume"]
 
@@ -175,7 +175,7 @@ class ObjectFusion(Update):
         """
         tracks = DenseFlow().track(clip)  # shared with the tracker; registration does not use it
         segments = segments_of(old, clip.after)
-        poses: dict[int, Array] = {label: np.eye(4) for label in volumes if label in segments}
+        poses: dict[int, np.ndarray] = {label: np.eye(4) for label in volumes if label in segments}
         rested = {label for label in poses if label not in moved}
         taken = 0
         for position in range(len(clip) - 2, 0, -1):
@@ -184,7 +184,7 @@ class ObjectFusion(Update):
             for label in list(poses):
                 track, T = Track(segments[label], pair, tracks), poses[label]
                 if label not in rested and len(segments[label].support) >= 12:
-                    T = refine(track, T)
+                    T = refine_motion(track, T)
                 if not self._agrees(track, T, frame):
                     if label not in rested:
                         del poses[label]
@@ -195,10 +195,10 @@ class ObjectFusion(Update):
                 taken += 1
         return volumes, taken
 
-    def _agrees(self, track: Track, T: Array, frame: Frame) -> bool:
+    def _agrees(self, track: Track, T: np.ndarray, frame: Frame) -> bool:
         """Whether a moved object's visible points lie on the surface that a frame measures."""
         points = track.points[:: max(1, len(track.points) // 400)]
-        u, v, z, inside = _project(frame.camera, apply(T, points))
+        u, v, z, inside = _project(frame.camera, move_points(T, points))
         u, v, z = u[inside], v[inside], z[inside]
         known = frame.valid[v, u]
         behind = (z - frame.depth[v, u])[known]
@@ -229,15 +229,15 @@ class ObjectFusion(Update):
         return Hypothesis(labels, grid, kept)
 
 
-def _shown(segment: Segment, after: Frame, T: Array, frame: Frame) -> np.ndarray:
+def _shown(segment: Segment, after: Frame, T: np.ndarray, frame: Frame) -> np.ndarray:
     """Pixels (H, W) bool of an earlier frame that show a segment of the last frame."""
-    u, v, _, inside = _project(frame.camera, apply(T, after.points.reshape(-1, 3)[segment.support]))
+    u, v, _, inside = _project(frame.camera, move_points(T, after.points.reshape(-1, 3)[segment.support]))
     image = np.zeros(frame.depth.shape, np.uint8)
     image[v[inside], u[inside]] = 1
     return cv2.morphologyEx(image, cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8)) > 0
 
 
-def _project(camera: Camera, points: Array) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def _project(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Column and row (n,) of the pixel of each point, its depth z, and whether it lies in the image (else 0, 0)."""
     uv, z = camera.project(points)
     pixel = np.rint(np.where(np.isfinite(uv), uv, -1))
@@ -313,7 +313,7 @@ class ObjectVolume:
             everywhere.
         """
         index = np.stack(np.meshgrid(*(np.arange(n) for n in self.distance.shape), indexing="ij"), axis=-1)
-        u, v, z, inside = _project(frame.camera, apply(T, grid.centre_of(index.reshape(-1, 3) + self.offset)))
+        u, v, z, inside = _project(frame.camera, move_points(T, grid.centre_of(index.reshape(-1, 3) + self.offset)))
         inside &= (z > 1e-6) & frame.valid[v, u]
         sdf = np.where(inside, frame.depth[v, u] - z, -np.inf)
         near = np.abs(sdf) <= self.truncation

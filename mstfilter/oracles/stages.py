@@ -25,7 +25,7 @@ from mstfilter.oracles.truth import Need, UsesTruth
 from mstfilter.scene import Clip, Frame, Hypothesis, ObjectRecord, frame_geometry, render
 from mstfilter.scoring import Form, overlap, weighted_coverage
 from mstfilter.smc import Candidates, Key, Population, Resampler, Transition, Update, key_of, union
-from mstfilter.tracking import Array, Warp, apply
+from mstfilter.tracking import Warp, move_points, rigid_transform
 
 __all__ = [
     "PERFECT_STAGES",
@@ -71,7 +71,7 @@ class TrueMotions(UsesTruth, Transition):
         return Population(particles, population.log_weights, parents, {"motions": counts})
 
     def _move(
-        self, hypothesis: Hypothesis, labels: np.ndarray, motions: dict[int, Array], counts: dict[str, int]
+        self, hypothesis: Hypothesis, labels: np.ndarray, motions: dict[int, np.ndarray], counts: dict[str, int]
     ) -> Hypothesis:
         table = overlap(hypothesis.labels, labels)
         shared = np.where(table.labels_b > 0, table.counts, 0)
@@ -83,10 +83,10 @@ class TrueMotions(UsesTruth, Transition):
             if shared[row].any():
                 T = motions.get(int(table.labels_b[shared[row].argmax()]), np.eye(4))
                 centres = hypothesis.grid.centre_of(np.argwhere(hypothesis.mask(label)))
-                went = np.linalg.norm(apply(T, centres) - centres, axis=1).max()
+                went = np.linalg.norm(move_points(T, centres) - centres, axis=1).max()
                 fate = "true" if went > self.rest else "rest"
                 if fate == "true":
-                    chosen[label] = T
+                    chosen[label] = rigid_transform(T)
             counts[fate] += 1
         return self.warp.move(hypothesis, chosen).hypothesis
 

@@ -1,29 +1,34 @@
-"""Prediction: clip and hypotheses in, moved hypotheses out (paper IV-C).
+"""Prediction: hypotheses follow the video of a clip (paper IV-C).
 
->>> from mstfilter.tracking.transition import TrackingTransition
->>> TrackingTransition().predict(rng, population, clip)      # doctest: +SKIP
+>>> from mstfilter.tracking import MstRule, TrackingTransition
+>>> transition = TrackingTransition(MstRule(select="sample"))
+>>> transition.predict(rng, population, clip)                        # doctest: +SKIP
 
-==================  ====================================================================
-`transition`        the motion model: `TrackingTransition`, and the baseline that stays
-`flow`              dense flow through the clip: points, and masks of the last frame
-`features`          SIFT matches of first and last frame
-`segments`          what is tracked, once for all hypotheses that agree on it
-`track`             the evidence about one segment
-`static`            what did not change is not moved
-`rules`             the published rules; `mst_rule` the default one
-`registration`      small_gicp;  `jlinkage`, `rigid` motions from point pairs
-`residual`          what makes a motion good;  `refine` polishes one
-`photometry`        takes out changes of exposure
-`warp`              voxels follow a motion
-==================  ====================================================================
+=====================  ====================================================================
+`transition`           the motion model `TrackingTransition`; `IdentityTransition`
+`rules`                the rigid motion of an object: `PaperRule`, `AuthorsRule`, `MstRule`
+`segments`             tracked segments and their data; the test for rest
+`flow`                 dense flow through the clip
+`features`             SIFT matches, exposure matching
+`registration`         ICP by small_gicp or open3d
+`residual`             comparison of a motion with the last frame, refinement
+`rigid`                rigid motions from point pairs, J-Linkage
+`motion_segmentation`  pixels of the last frame grouped by rigid motion
+`warp`                 moves the voxels of objects
+=====================  ====================================================================
 """
 
 from mstfilter.lazy import attach
 
 __getattr__, __dir__, __all__ = attach(__name__, __file__)
 
-__interfaces__ = {"rule": "MotionRule"}
+__interfaces__ = {"rule": "MotionRule", "registration": "Registration"}
 __components__ = {
     "transition": {"tracking": "TrackingTransition", "identity": "IdentityTransition"},
     "rule": {"authors": "AuthorsRule", "mst": "MstRule", "paper": "PaperRule"},
+    "registration": {
+        "small_gicp": "SmallGicp",
+        "colored_icp": "ColouredIcp",
+        "point_to_plane": "PointToPlaneIcp",
+    },
 }

@@ -1,9 +1,13 @@
-"""SIFT matches between the first and last frame of a clip, lifted to space.
-
-Features are found once in the whole image, not once per segment, and shared by all hypotheses.
+"""Colours and features that the frames of a clip share: exposure matching and SIFT matches.
 
 >>> matches = SiftMatching().match(clip.before, clip.after)     # doctest: +SKIP
 >>> matches.p, matches.q                                        # doctest: +SKIP
+
+Features are detected once in the whole image and shared by all hypotheses and segments.
+
+Automatic exposure and white balance change the colour of the whole image when something moves: in real clips most of
+an untouched table differs by more than 12 grey levels. `matched_colour` removes this change by a gain and an offset
+per channel, fitted where the depth is unchanged.
 """
 
 from __future__ import annotations
@@ -14,19 +18,77 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mstfilter.errors import InputError
-from mstfilter.scene import Frame, memo
+from mstfilter.scene import Frame, depth_sigma, memo
 
-__all__ = ["Matches", "SiftMatching"]
+__all__ = ["Matches", "SiftMatching", "matched_colour", "same_depth", "smooth_colour"]
+
+_N_EXPOSURE_PIXELS = 20000
+_PRIOR_VARIANCE = 20.0**2  # grey levels squared; where colours vary less, the gain stays near 1
+
+
+def same_depth(first: Frame, other: Frame, sigmas: float = 4.0) -> NDArray[np.bool_]:
+    """Pixels (H, W) where both frames have a reading off the robot that agrees up to the sensor noise."""
+    limit = sigmas * np.sqrt(2.0) * depth_sigma(first.depth)
+    with np.errstate(invalid="ignore"):
+        return (np.abs(other.depth - first.depth) <= limit) & first.valid & other.valid
+
+
+def smooth_colour(frame: Frame, width: int = 3) -> NDArray[np.float32]:
+    """Colour (H, W, 3) blurred over ``width`` pixels, to reduce the effect of shifts below a pixel."""
+    import cv2
+
+    return memo(
+        "smooth colour",
+        (frame.key, width),
+        lambda: cv2.GaussianBlur(frame.rgb, (width, width), 0).astype(np.float32),
+    )
+
+
+def matched_colour(frame: Frame, reference: Frame, width: int = 3) -> NDArray[np.float32]:
+    """Smooth colour (H, W, 3) of a frame, converted to the exposure of the reference. Cached by content."""
+
+    def compute() -> NDArray[np.float32]:
+        gain, offset = _exposure(frame, reference)
+        return smooth_colour(frame, width) * gain + offset
+
+    return memo("matched colour", (frame.key, reference.key, width), compute)
+
+
+def _exposure(frame: Frame, reference: Frame) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Gain (3,) and offset (3,) that map colours of the frame to those of the reference."""
+    still = np.flatnonzero(same_depth(reference, frame))
+    if len(still) < 500:  # without depth: assume that most of the image is still
+        still = np.arange(frame.depth.size)
+    still = still[:: max(1, len(still) // _N_EXPOSURE_PIXELS)]
+    x_all = smooth_colour(frame).reshape(-1, 3)[still].astype(np.float64)
+    y_all = smooth_colour(reference).reshape(-1, 3)[still].astype(np.float64)
+    inside = ((x_all > 3) & (x_all < 252) & (y_all > 3) & (y_all < 252)).all(axis=1)  # not saturated
+    x_all, y_all = x_all[inside], y_all[inside]
+    gain, offset = np.ones(3), np.zeros(3)
+    if len(x_all) < 100:
+        return gain.astype(np.float32), offset.astype(np.float32)
+    for c in range(3):
+        x, y = x_all[:, c], y_all[:, c]
+        g, o = 1.0, float(np.median(y - x))
+        for _ in range(5):
+            error = np.abs(y - (g * x + o))
+            keep = error <= max(2.5 * float(np.median(error)), 1.0)
+            mx, my = x[keep].mean(), y[keep].mean()
+            g = (((x[keep] - mx) * (y[keep] - my)).mean() + _PRIOR_VARIANCE) / (x[keep].var() + _PRIOR_VARIANCE)
+            o = my - g * mx
+        if 0.4 < g < 2.5:
+            gain[c], offset[c] = g, o
+    return gain.astype(np.float32), offset.astype(np.float32)
 
 
 @dataclass(frozen=True, eq=False)
 class Matches:
-    """Pairs of features that look alike.
+    """Pairs of matching features.
 
     Attributes
     ----------
     before, after : (N, 2) int32 pixels (column, row) in the first and last frame.
-    p, q : (N, 3) float64 world points there, metres.
+    p, q : (N, 3) float64 world points of these pixels, metres.
     """
 
     before: NDArray[np.int32]
@@ -44,23 +106,23 @@ class Matches:
 
 @dataclass(frozen=True)
 class SiftMatching:
-    """Which SIFT features of two frames are taken for the same point (Lowe, IJCV 2004; OpenCV's defaults).
+    """Matches SIFT features of two frames (Lowe, IJCV 2004; OpenCV's defaults).
 
     Parameters
     ----------
     mutual : bool
-        Keep a pair only if each is the other's best within reach, and clearly (`ratio`). False: every pair
-        within all three radii, one to many, as the authors' code does; clustering has to sort them out.
+        Keep a pair only if each feature is the best match of the other and passes the ratio test (`ratio`). If False,
+        keep every pair within all three radii, as the authors' program does; clustering rejects wrong pairs.
     ratio : float
-        Best descriptor distance over second best, within reach; larger is ambiguous. Used if `mutual`.
+        Largest ratio of the best to the second best descriptor distance. Used if `mutual`.
     descriptor_radius : float
         Largest descriptor distance (SIFT descriptors have length 512).
     search_share : float
-        Reach in the image as a share of its width.
+        Search radius in the image, as a share of its width.
     search_distance : float
-        Reach in space, metres.
+        Search radius in space, metres.
     max_pairs : int
-        Beyond this only the most alike pairs are kept (one-to-many matching can give very many).
+        Largest number of pairs; those with the smallest descriptor distance are kept.
     """
 
     mutual: bool = True
@@ -78,13 +140,13 @@ class SiftMatching:
             )
 
     def match(self, before: Frame, after: Frame) -> Matches:
-        """Pairs between two frames. Memoised by content."""
+        """Matches of two frames. Cached by content."""
         key = (before.key, after.key, astuple(self))
         return memo("sift matches", key, lambda: _match(before, after, self), stored_as=Matches)
 
 
 def _features(frame: Frame) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
-    """Pixels (N, 2) and descriptors (N, 128) of the features with a depth reading off the robot."""
+    """Pixels (N, 2) and descriptors (N, 128) of features with a depth reading, off the robot."""
 
     def compute() -> tuple[NDArray[np.int32], NDArray[np.float32]]:
         import cv2
@@ -120,7 +182,7 @@ def _match(before: Frame, after: Frame, settings: SiftMatching) -> Matches:
             best = np.sort(np.argsort(distance[i, j], kind="stable")[: settings.max_pairs])
             i, j = i[best], j[best]
         if settings.mutual:
-            # SIFT lists a point once for every strong orientation: one point is one inlier.
+            # SIFT returns a point once per dominant orientation; keep its best match only.
             order = np.argsort(distance[i, j], kind="stable")
             _, first = np.unique(pixel_a[i[order]], axis=0, return_index=True)
             chosen = np.sort(order[first])
@@ -130,7 +192,7 @@ def _match(before: Frame, after: Frame, settings: SiftMatching) -> Matches:
 
 
 def _far(a: NDArray[np.float32], b: NDArray[np.float32], reach: float) -> NDArray[np.bool_]:
-    """(N, M) bool: farther apart than reach."""
+    """Whether points a (N, d) and b (M, d) are farther apart than reach, (N, M)."""
     squared = np.zeros((len(a), len(b)), np.float32)
     for axis in range(a.shape[1]):
         squared += (a[:, axis, None] - b[None, :, axis]) ** 2
@@ -138,12 +200,12 @@ def _far(a: NDArray[np.float32], b: NDArray[np.float32], reach: float) -> NDArra
 
 
 def _mutual(distance: NDArray[np.float32], ratio: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Pairs that are each other's best and clearly better than the row's second best."""
+    """Pairs that are mutual best matches and pass the ratio test against the second best of the row."""
     j = distance.argmin(axis=1)
     i = np.arange(len(j))
     best = distance[i, j]
     second = np.partition(distance, 1, axis=1)[:, 1]
-    # Where the best is infinite nothing is within reach; a lone match in reach has no rival.
+    # An infinite best means no match in reach. An infinite second best always passes.
     with np.errstate(invalid="ignore"):
         keep = np.isfinite(best) & (best <= ratio * second) & (distance.argmin(axis=0)[j] == i)
     return i[keep], j[keep]

@@ -1,17 +1,17 @@
 """Dense optical flow through a clip, computed once and shared by every hypothesis.
 
-Two things are chained through all the frames of the clip:
+Two results are accumulated over the frames of the clip:
 
-- a grid of POINTS of the first frame, followed forward (for rigid fits);
-- a PULL MAP that says for every pixel of the last frame where it was in the first (for masks: any number
-  of label images of ``clip.before`` becomes label images of ``clip.after`` by one gather each).
+- a grid of points of the first frame, followed forward (for rigid fits);
+- a pull map: for every pixel of the last frame its position in the first. It converts label images of ``clip.before``
+  to label images of ``clip.after`` by one gather each.
 
 >>> tracks = DenseFlow().track(clip)                     # doctest: +SKIP
 >>> labels_after = tracks.warp(project(hypothesis, clip.before.camera))   # doctest: +SKIP
 
-A point or pixel is trusted while the backward flow brings it back (within ``forward_backward`` pixels),
-its depth does not jump, and it does not touch the robot. One flow straight from first to last frame fails
-for what moves far, so the intermediate frames matter.
+A point or pixel is valid while the backward flow returns it to its start (within ``forward_backward`` pixels), its
+depth and colour do not jump, and it is not on the robot. The intermediate frames are needed because the flow from
+first to last frame fails for long motions.
 """
 
 from __future__ import annotations
@@ -27,26 +27,25 @@ from numpy.typing import NDArray
 
 from mstfilter.errors import InputError
 from mstfilter.scene import Clip, Frame, memo
-from mstfilter.tracking.photometry import matched_colour, same_depth, smooth_colour
+from mstfilter.tracking.features import matched_colour, same_depth, smooth_colour
 
-__all__ = ["ClipTracks", "DenseFlow", "track_labels"]
+__all__ = ["ClipTracks", "DenseFlow"]
 
-PRESETS = ("ultrafast", "fast", "medium")
-N_VOTERS = 5
+_PRESETS = ("ultrafast", "fast", "medium")
+_N_VOTERS = 5
 
 
 @dataclass(frozen=True, eq=False)
 class ClipTracks:
-    """What was followed through a clip.
+    """Points and pixels followed through a clip.
 
     Attributes
     ----------
     start : (N, 2) int32, pixel (column, row) of each point in the first frame.
-    end : (N, 2) float32, where it is in the last frame; meaningless where lost.
-    alive : (N,) bool, followed to the end and not on the robot there.
-    source : (H, W) int32, flat pixel of the first frame that each pixel of the last frame comes from;
-        -1 where the robot hides it.
-    unchanged : (H, W) bool, depth and colour agree between first and last frame.
+    end : (N, 2) float32, its position in the last frame; undefined for lost points.
+    alive : (N,) bool, whether the point was followed to the end and is not on the robot there.
+    source : (H, W) int32, flat pixel of the first frame for each pixel of the last frame; -1 for robot pixels.
+    unchanged : (H, W) bool, whether depth and colour agree between first and last frame.
     """
 
     start: NDArray[np.int32]
@@ -56,13 +55,13 @@ class ClipTracks:
     unchanged: NDArray[np.bool_]
 
     def warp(self, labels: NDArray[np.integer]) -> NDArray[np.integer]:
-        """A label image (H, W) of the first frame as seen in the last; 0 behind the robot."""
+        """A label image (H, W) of the first frame, moved to the last; 0 for robot pixels."""
         flat = np.append(labels.ravel(), labels.dtype.type(0))
         return flat[self.source]
 
     @cached_property
     def coherently_unchanged(self) -> NDArray[np.bool_]:
-        """(H, W) like `unchanged`, but a lone changed pixel among unchanged ones counts as noise."""
+        """As `unchanged`, but isolated changed pixels are treated as noise, (H, W) bool."""
         import cv2
 
         changed = (~self.unchanged).astype(np.uint8)
@@ -83,18 +82,18 @@ class DenseFlow:
     scale : float
         Flow is computed on images resized by this factor (1 = full size).
     frame_step : int
-        Use every k-th frame; the last one always.
+        Use every k-th frame and the last one.
     motion_share : float
-        Skip frames while what moves has moved less than this share of the image width since the last one
-        used: fewer links in the chain lose less, but flow fails on long jumps. 0 uses every frame.
+        Skip frames until the motion since the last used frame reaches this share of the image width. Errors
+        accumulate with the number of frames, but flow fails for long motions. 0 uses every frame.
     grid_step : int
         Spacing of the followed points in pixels.
     forward_backward : float
-        Pixels; larger round-trip errors end a track.
+        Largest round-trip error of a track, pixels.
     depth_jump : float
-        Metres between consecutive frames; larger jumps end a track.
+        Largest change of depth of a track between consecutive frames, metres.
     colour_jump : float
-        Grey levels, largest channel, between consecutive frames (slightly blurred); larger jumps end a track.
+        Largest change of colour of a track between consecutive frames (slightly blurred), grey levels per channel.
     """
 
     preset: str = "medium"
@@ -107,24 +106,19 @@ class DenseFlow:
     colour_jump: float = 30.0
 
     def __post_init__(self) -> None:
-        if self.preset not in PRESETS:
-            raise InputError(f"flow preset {self.preset!r} is unknown", f"one of {', '.join(PRESETS)}")
+        if self.preset not in _PRESETS:
+            raise InputError(f"flow preset {self.preset!r} is unknown", f"one of {', '.join(_PRESETS)}")
         if not 0.0 < self.scale <= 1.0:
             raise InputError(f"flow scale is {self.scale}, expected 0 < scale <= 1")
         if self.frame_step < 1 or self.grid_step < 1:
             raise InputError(f"frame_step {self.frame_step} and grid_step {self.grid_step} must be at least 1")
 
     def track(self, clip: Clip) -> ClipTracks:
-        """Follow points and pixels through the clip. Memoised by content."""
+        """Follow points and pixels through the clip. Cached by content."""
         chosen = list(range(0, len(clip.frames) - 1, self.frame_step)) + [len(clip.frames) - 1]
         frames = [clip.frames[i] for i in chosen]
         key = (tuple(f.key for f in frames), astuple(self))
         return memo("clip tracks", key, lambda: _track(_thinned(frames, self.motion_share), self), ClipTracks)
-
-
-def track_labels(labels: NDArray[np.integer], clip: Clip, flow: DenseFlow | None = None) -> NDArray[np.integer]:
-    """Label image of ``clip.after`` from one of ``clip.before``: its masks, tracked through the clip."""
-    return (flow or DenseFlow()).track(clip).warp(labels)
 
 
 def _track(frames: list[Frame], settings: DenseFlow) -> ClipTracks:
@@ -136,40 +130,40 @@ def _track(frames: list[Frame], settings: DenseFlow) -> ClipTracks:
     end = start.copy()
     alive = ~_robot(first)[::step, ::step].ravel()
     grid = np.stack([columns.ravel(), rows.ravel()], axis=1)
-    pull = grid.copy()  # first-frame position of every pixel of the current frame
+    pull = grid.copy()  # position in the first frame of every pixel of the current frame
     known = ~_robot(first).ravel()
     for previous, current in pairwise(frames):
         forward, backward = _flow(previous, current, settings)
         end, ok = _advance(end, forward, backward, previous, current, settings)
         alive &= ok
-        # One step back to the previous frame, then the map so far.
+        # One step back to the previous frame, then the accumulated map.
         back, ok = _advance(grid, backward, forward, current, previous, settings)
         u, v = _pixel(back, width, height)
         at = v * width + u
-        pull = pull[at] + (back - grid[at])  # keeps the fraction of a pixel that rounding drops
+        pull = pull[at] + (back - grid[at])  # keeps the subpixel part
         ok &= known[at]
-        same = unchanged_pixels(first, current).ravel()
+        same = _unchanged_pixels(first, current).ravel()
         pull[same] = grid[same]
         ok |= same
         robot = _robot(current).ravel()
         voted = np.flatnonzero(~ok & ~robot)
         known = ~robot
         pull[voted] = _vote(current, pull, ok, voted)
-    unchanged = unchanged_pixels(first, last)
+    unchanged = _unchanged_pixels(first, last)
     u, v = _pixel(pull, width, height)
     source = np.where(known, v * width + u, -1).astype(np.int32).reshape(height, width)
     return ClipTracks(start.astype(np.int32), end, alive, source, unchanged)
 
 
 def _thinned(frames: list[Frame], motion_share: float) -> list[Frame]:
-    """Leave out frames in which little has happened since the last one kept."""
+    """Remove frames with little motion since the last kept frame."""
     import cv2
 
     if motion_share <= 0 or len(frames) < 3:
         return frames
     shape = frames[0].depth.shape
     factor = 160.0 / shape[1]
-    dis = cv2.DISOpticalFlow_create(PRESETS.index("ultrafast"))  # type: ignore[attr-defined]
+    dis = cv2.DISOpticalFlow_create(_PRESETS.index("ultrafast"))  # type: ignore[attr-defined]
     small = [
         cv2.resize(cv2.cvtColor(f.rgb, cv2.COLOR_RGB2GRAY), None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
         for f in frames
@@ -179,7 +173,7 @@ def _thinned(frames: list[Frame], motion_share: float) -> list[Frame]:
         with _one_thread():
             flow = dis.calc(small[i - 1], small[i], None)
             following = dis.calc(small[i], small[i + 1], None)
-        # The robot moves fast and is not followed.
+        # The robot is excluded: it moves fast and is not tracked.
         moved += _speed(flow, frames[i - 1]) / 160.0
         if moved + _speed(following, frames[i]) / 160.0 > motion_share:
             kept.append(frames[i])
@@ -188,7 +182,7 @@ def _thinned(frames: list[Frame], motion_share: float) -> list[Frame]:
 
 
 def _speed(flow: NDArray[np.float32], frame: Frame) -> float:
-    """Length of flow that one pixel in two hundred, robot aside, exceeds."""
+    """99.5th percentile of the flow length of pixels off the robot."""
     import cv2
 
     length = np.hypot(flow[..., 0], flow[..., 1])
@@ -199,7 +193,7 @@ def _speed(flow: NDArray[np.float32], frame: Frame) -> float:
 
 @contextmanager
 def _one_thread() -> Iterator[None]:
-    """OpenCV splits the flow's search into one stripe a thread, and results depend on the split."""
+    """Limit OpenCV to one thread: it splits the flow's search by thread, and the result depends on the split."""
     import cv2
 
     threads = cv2.getNumThreads()
@@ -221,7 +215,7 @@ def _flow(a: Frame, b: Frame, settings: DenseFlow) -> tuple[NDArray[np.float32],
     grey = [cv2.cvtColor(f.rgb, cv2.COLOR_RGB2GRAY) for f in (a, b)]
     if settings.scale < 1.0:
         grey = [cv2.resize(g, None, fx=settings.scale, fy=settings.scale, interpolation=cv2.INTER_AREA) for g in grey]
-    dis = cv2.DISOpticalFlow_create(PRESETS.index(settings.preset))  # type: ignore[attr-defined]
+    dis = cv2.DISOpticalFlow_create(_PRESETS.index(settings.preset))  # type: ignore[attr-defined]
     with _one_thread():
         fields = [dis.calc(grey[0], grey[1], None), dis.calc(grey[1], grey[0], None)]
     if settings.scale < 1.0:
@@ -235,7 +229,7 @@ def _sample(field: NDArray[np.float32], at: NDArray[np.float32]) -> NDArray[np.f
     """Bilinear samples (N, 2) of a field (H, W, 2) at points (N, 2); the border is repeated."""
     import cv2
 
-    # OpenCV's images have at most 32767 rows: fold the list of points into a picture.
+    # OpenCV's images have at most 32767 rows: reshape the list of points to an image.
     folded = np.zeros((-(-len(at) // 1024), 1024, 2), np.float32)
     folded.reshape(-1, 2)[: len(at)] = at
     sampled = cv2.remap(field, folded, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
@@ -250,7 +244,7 @@ def _advance(
     b: Frame,
     settings: DenseFlow,
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Move points from frame a to b; which of them can be trusted."""
+    """Move points from frame a to b. Returns their positions (N, 2) and whether they are valid (N,)."""
     height, width = a.depth.shape
     moved = at + _sample(there, at)
     home = moved + _sample(back, moved)
@@ -259,7 +253,7 @@ def _advance(
     ua, va = _pixel(at, width, height)
     ub, vb = _pixel(moved, width, height)
     jump = np.abs(b.depth[vb, ub] - a.depth[va, ua])
-    ok &= ~(jump > settings.depth_jump)  # a missing reading (NaN) says nothing
+    ok &= ~(jump > settings.depth_jump)  # a missing reading (NaN) is not a jump
     ok &= np.abs(smooth_colour(b)[vb, ub] - smooth_colour(a)[va, ua]).max(axis=1) <= settings.colour_jump
     ok &= ~_robot(b)[vb, ub] & ~_robot(a)[va, ua]
     return moved, ok
@@ -271,24 +265,23 @@ def _pixel(at: NDArray[np.float32], width: int, height: int) -> tuple[NDArray[np
     return u, v
 
 
-def unchanged_pixels(first: Frame, last: Frame, sigmas: float = 4.0, colour: float = 12.0) -> NDArray[np.bool_]:
-    """Pixels (H, W) where the last frame shows what the first did.
+def _unchanged_pixels(first: Frame, last: Frame) -> NDArray[np.bool_]:
+    """Pixels (H, W) with the same content in the first and last frame.
 
-    Depth differs by less than ``sigmas`` standard deviations of a difference, and slightly blurred colour by
-    less than ``colour`` grey levels in every channel, a change of exposure aside. Robot pixels and missing depth
-    are not unchanged.
+    Depth differs by less than four standard deviations of the difference, and slightly blurred colour by at most 12
+    grey levels in every channel after exposure matching. Robot pixels and pixels without depth are not unchanged.
     """
     change = np.abs(smooth_colour(first) - matched_colour(last, first)).max(axis=2)
-    return same_depth(first, last, sigmas) & (change <= colour)
+    return same_depth(first, last) & (change <= 12.0)
 
 
 def _vote(
     frame: Frame, pull: NDArray[np.float32], known: NDArray[np.bool_], doubtful: NDArray[np.int64]
 ) -> NDArray[np.float32]:
-    """First-frame positions (D, 2) for pixels that the flow could not explain.
+    """Positions in the first frame (D, 2) of pixels without valid flow.
 
-    Each asks its five nearest explained pixels, by place in space and colour together (12 mm and 20 grey
-    levels weigh the same; without depth 6 pixels), and takes the position that most of them are near to.
+    Each takes the position of one of its five nearest valid pixels, by position in space and colour together (12 mm
+    and 20 grey levels have equal weight; without depth 6 pixels): the one closest to the others.
     """
     import cv2
     from scipy.ndimage import distance_transform_edt
@@ -306,20 +299,21 @@ def _vote(
         place = np.stack([columns, rows], axis=1) / 6.0
     colour = smooth_colour(frame).reshape(-1, 3) / 20.0
     features = np.hstack([place, colour])
-    # Explained pixels far from all doubtful ones are never asked.
+    # Only valid pixels within 12 pixels of a doubtful one are voters.
     image = np.zeros((height, width), np.uint8)
     image.ravel()[doubtful] = 1
-    asked = (cv2.dilate(image, np.ones((25, 25), np.uint8)).ravel() > 0) & known
-    candidates = np.flatnonzero(asked)
-    if len(candidates) > 20000:  # every other row and column tell enough
+    nearby = (cv2.dilate(image, np.ones((25, 25), np.uint8)).ravel() > 0) & known
+    candidates = np.flatnonzero(nearby)
+    if len(candidates) > 20000:  # every other row and column is sufficient
         candidates = candidates[(rows[candidates] % 2 == 0) & (columns[candidates] % 2 == 0)]
-    if len(candidates) < N_VOTERS:
+    if len(candidates) < _N_VOTERS:
         candidates = np.flatnonzero(known)
     tree = cKDTree(features[candidates], balanced_tree=False, compact_nodes=False)
-    _, found = tree.query(features[doubtful], k=min(N_VOTERS, len(candidates)), eps=0.5)
+    _, found = tree.query(features[doubtful], k=min(_N_VOTERS, len(candidates)), eps=0.5)
     voters = candidates[np.asarray(found).reshape(len(doubtful), -1)]
-    # The voter whose motion most others share; its own source, not its motion applied here: table that an
-    # object has just uncovered is still, but where it lies the first frame showed the object.
+    # The voter whose motion is closest to the others (distances capped at 4 pixels). The pixel takes the position of
+    # that voter in the first frame, not the motion: at an uncovered pixel of the resting table the first frame shows
+    # the object.
     offset = pull[voters] - np.stack([columns[voters], rows[voters]], axis=-1)
     distance = np.abs(offset[:, :, None] - offset[:, None, :]).sum(axis=-1)
     choice = np.minimum(distance, 4.0).sum(axis=-1).argmin(axis=1)

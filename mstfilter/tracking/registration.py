@@ -1,135 +1,289 @@
-"""Registration of a segment's surface before and after, by small_gicp with one thread.
+"""Registration of the surface of a segment before and after, by small_gicp or open3d.
 
->>> target = prepare(after_points)                                    # doctest: +SKIP
->>> register(prepare(before_points), target, init, reach=0.02).T      # doctest: +SKIP
+>>> source, target = prepare(points_before), prepare(points_after)                 # doctest: +SKIP
+>>> result = SmallGicp().register(source, target, np.eye(4), reach=0.02)           # doctest: +SKIP
+>>> result.T, result.overlap, result.iterations                                    # doctest: +SKIP
 
-One thread, always: the order of a parallel sum changes the last digits and so, in time, everything else.
+A `Surface` holds the downsampled cloud with normals, covariances and search tree. It is prepared once and used by all
+registrations of the segment. All methods run on one thread: with several threads the order of a sum changes the last
+digits of the result.
+
+=================  =====================================================================
+`SmallGicp`        generalised, point-to-plane or point-to-point ICP; the default
+`ColouredIcp`      open3d: point-to-plane distance and colour (Park et al., ICCV 2017)
+`PointToPlaneIcp`  open3d: point-to-plane distance (Chen and Medioni 1991)
+=================  =====================================================================
 """
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mstfilter.tracking import rigid
+from mstfilter.errors import InputError
+from mstfilter.open3d_import import import_open3d
+from mstfilter.tracking.rigid import move_points
 
-__all__ = ["Fit", "Surface", "centroid_shift", "prepare", "register"]
+__all__ = [
+    "ColouredIcp",
+    "PointToPlaneIcp",
+    "Registration",
+    "RegistrationResult",
+    "SmallGicp",
+    "Surface",
+    "centroid_shift",
+    "prepare",
+]
 
-Array = NDArray[np.float64]
-
-MIN_POINTS = 12
+_MIN_POINTS = 12
+_SPACING = 0.004  # metres between the points of a downsampled cloud
+_N_NEIGHBOURS = 12  # for normals and covariances
 
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """A downsampled point cloud made ready for registration.
+    """A point cloud prepared for registration; make one with `prepare`.
 
     Attributes
     ----------
-    points : (N, 3) metres.
-    cloud, tree : small_gicp's own structures (normals and covariances estimated).
+    points : (N, 3) downsampled points, metres.
+    cloud, tree : small_gicp's cloud (with normals and covariances) and search tree.
+    raw_points : (M, 3) points before downsampling, metres.
+    raw_colours : (M, 3) their colours, grey levels 0 .. 255, or None.
     """
 
-    points: Array
+    points: NDArray[np.float64]
     cloud: Any
     tree: Any
+    raw_points: NDArray[np.float64]
+    raw_colours: NDArray[np.floating] | None
+
+    @cached_property
+    def open3d_cloud(self) -> Any:
+        """open3d's cloud, downsampled, with normals and colours; made on first use."""
+        o3d = import_open3d()
+        cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(self.raw_points))
+        if self.raw_colours is not None:
+            cloud.colors = o3d.utility.Vector3dVector(np.asarray(self.raw_colours, dtype=np.float64) / 255)
+        cloud = cloud.voxel_down_sample(_SPACING)
+        cloud.estimate_normals(o3d.geometry.KDTreeSearchParamHybrid(radius=3 * _SPACING, max_nn=30))
+        return cloud
+
+    def distances(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Distance of points (M, 3) to the nearest point of the surface, (M,) metres."""
+        homogeneous = np.hstack([points, np.ones((len(points), 1))])
+        nearest, _ = self.tree.batch_nearest_neighbor_search(homogeneous, num_threads=1)
+        return np.linalg.norm(points - self.points[np.asarray(nearest)], axis=1)
 
 
-@dataclass(frozen=True)
-class Fit:
+@dataclass(frozen=True, eq=False)
+class RegistrationResult:
     """Result of a registration.
 
     Attributes
     ----------
     T : (4, 4) motion.
     rms : root mean square distance from each moved source point to its nearest target point, metres.
-    median : median of the same distances, metres.
     overlap : share of the moved source points with a target point within the reach.
+    error : objective of the method (small_gicp), or root mean square distance of the inliers in metres (open3d).
+    inliers : number of correspondences within the reach.
+    converged, iterations : whether the method converged, and the index of its last iteration; None for open3d.
+    H : (6, 6) Gauss-Newton matrix of the objective, rotation first; None for open3d.
     """
 
-    T: Array
+    T: NDArray[np.float64]
     rms: float
-    median: float
     overlap: float
+    error: float
+    inliers: int
+    converged: bool | None = None
+    iterations: int | None = None
+    H: NDArray[np.float64] | None = None
 
 
-def prepare(points: Array, spacing: float = 0.004) -> Surface | None:
-    """Downsample points (N, 3) to ``spacing`` metres and estimate covariances; None for too few points."""
+def prepare(points: NDArray[np.float64], colours: NDArray[np.floating] | None = None) -> Surface | None:
+    """Prepare points (N, 3) with colours (N, 3) in 0 .. 255 for registration; None if there are fewer than 12."""
     import small_gicp
 
-    if len(points) < MIN_POINTS:
+    if len(points) < _MIN_POINTS:
         return None
     cloud, tree = small_gicp.preprocess_points(
         np.ascontiguousarray(points, dtype=np.float64),
-        downsampling_resolution=spacing,
-        num_neighbors=12,
+        downsampling_resolution=_SPACING,
+        num_neighbors=_N_NEIGHBOURS,
         num_threads=1,
     )
-    if cloud.size() < MIN_POINTS:
+    if cloud.size() < _MIN_POINTS:
         return None
-    return Surface(np.asarray(cloud.points())[:, :3].copy(), cloud, tree)
+    return Surface(np.asarray(cloud.points())[:, :3].copy(), cloud, tree, points, colours)
 
 
-def register(
-    source: Surface, target: Surface, init: Array, reach: float, method: str = "GICP", iterations: int = 30
-) -> Fit | None:
-    """Align source to target from an initial motion.
+class Registration(ABC):
+    """Aligns two surfaces from an initial motion."""
+
+    @abstractmethod
+    def register(
+        self, source: Surface, target: Surface, init: NDArray[np.float64], reach: float
+    ) -> RegistrationResult | None:
+        """Align source to target.
+
+        Parameters
+        ----------
+        source, target : Surface
+        init : (4, 4) initial motion.
+        reach : largest correspondence distance, metres.
+
+        Returns
+        -------
+        RegistrationResult, or None if the result is not a finite rigid motion.
+        """
+
+
+@dataclass(frozen=True)
+class SmallGicp(Registration):
+    """small_gicp (Koide 2024), one thread.
 
     Parameters
     ----------
-    source, target : Surface
-    init : (4, 4) motion to start from.
-    reach : largest correspondence distance, metres.
-    method : "GICP", "PLANE_ICP" or "ICP" (point to point).
-    iterations : at most.
-
-    Returns
-    -------
-    Fit, or None where the result is not a finite rigid motion.
+    method : "GICP", "PLANE_ICP" or "ICP"
+        Generalised, point-to-plane or point-to-point ICP.
+    iterations : int
+        Largest number of iterations.
     """
-    import small_gicp
 
-    result = small_gicp.align(
-        target.cloud,
-        source.cloud,
-        target.tree,
-        init,
-        registration_type=method,
-        max_correspondence_distance=reach,
-        num_threads=1,
-        max_iterations=iterations,
-    )
-    T = np.array(result.T_target_source, dtype=np.float64)
+    method: str = "GICP"
+    iterations: int = 30
+
+    def __post_init__(self) -> None:
+        if self.method not in ("GICP", "PLANE_ICP", "ICP"):
+            raise InputError(f"registration method {self.method!r} is unknown", "one of GICP, PLANE_ICP, ICP")
+
+    def register(
+        self, source: Surface, target: Surface, init: NDArray[np.float64], reach: float
+    ) -> RegistrationResult | None:
+        """Align source to target."""
+        import small_gicp
+
+        found = small_gicp.align(
+            target.cloud,
+            source.cloud,
+            target.tree,
+            init,
+            registration_type=self.method,
+            max_correspondence_distance=reach,
+            num_threads=1,
+            max_iterations=self.iterations,
+        )
+        T = np.array(found.T_target_source, dtype=np.float64)
+        if not np.isfinite(T).all():
+            return None
+        T[:3, :3] = _nearest_rotation(T[:3, :3])
+        fit = _fit(source, target, T, reach)
+        return RegistrationResult(T, *fit, found.error, found.num_inliers, found.converged, found.iterations, found.H)
+
+
+@dataclass(frozen=True)
+class PointToPlaneIcp(Registration):
+    """open3d's point-to-plane ICP.
+
+    Parameters
+    ----------
+    iterations : int
+        Largest number of iterations.
+    """
+
+    iterations: int = 30
+
+    def register(
+        self, source: Surface, target: Surface, init: NDArray[np.float64], reach: float
+    ) -> RegistrationResult | None:
+        """Align source to target."""
+        icp = import_open3d().pipelines.registration
+        found = icp.registration_icp(
+            source.open3d_cloud,
+            target.open3d_cloud,
+            reach,
+            init,
+            icp.TransformationEstimationPointToPlane(),
+            icp.ICPConvergenceCriteria(max_iteration=self.iterations),
+        )
+        return _open3d_result(found, source, target, reach)
+
+
+@dataclass(frozen=True)
+class ColouredIcp(Registration):
+    """open3d's coloured ICP. Colour determines the motions along a surface that depth does not.
+
+    Minimises the sum of ``w d^2 + (1 - w) c^2`` over the correspondences, with d the point-to-plane distance in
+    metres, c the difference of grey values 0 .. 1, and w such that the two scales below have equal cost.
+
+    Parameters
+    ----------
+    distance_scale : float
+        Metres.
+    colour_scale : float
+        Grey levels, 0 .. 255.
+    iterations : int
+        Largest number of iterations.
+    """
+
+    distance_scale: float = 0.002
+    colour_scale: float = 25.0
+    iterations: int = 30
+
+    def __post_init__(self) -> None:
+        if not (self.distance_scale > 0 and self.colour_scale > 0):
+            raise InputError(
+                f"coloured ICP has scales {self.distance_scale!r} m and {self.colour_scale!r}, expected numbers > 0"
+            )
+
+    def register(
+        self, source: Surface, target: Surface, init: NDArray[np.float64], reach: float
+    ) -> RegistrationResult | None:
+        """Align source to target. Both need colours."""
+        if source.raw_colours is None or target.raw_colours is None:
+            raise InputError("coloured ICP needs the colours of both surfaces", "prepare(points, colours)")
+        c, d = self.colour_scale / 255, self.distance_scale
+        icp = import_open3d().pipelines.registration
+        found = icp.registration_colored_icp(
+            source.open3d_cloud,
+            target.open3d_cloud,
+            reach,
+            init,
+            icp.TransformationEstimationForColoredICP(c**2 / (c**2 + d**2)),
+            icp.ICPConvergenceCriteria(max_iteration=self.iterations),
+        )
+        return _open3d_result(found, source, target, reach)
+
+
+def _open3d_result(found: Any, source: Surface, target: Surface, reach: float) -> RegistrationResult | None:
+    T = np.array(found.transformation, dtype=np.float64)
     if not np.isfinite(T).all():
         return None
-    T[:3, :3] = _orthogonal(T[:3, :3])
-    return assess(source, target, T, reach)
+    T[:3, :3] = _nearest_rotation(T[:3, :3])
+    inliers = len(np.asarray(found.correspondence_set))
+    return RegistrationResult(T, *_fit(source, target, T, reach), float(found.inlier_rmse), inliers)
 
 
-def assess(source: Surface, target: Surface, T: Array, reach: float) -> Fit:
-    """How well a motion brings source onto target."""
-    from scipy.spatial import cKDTree
-
-    distance, _ = cKDTree(target.points).query(rigid.apply(T, source.points))
-    return Fit(
-        T,
-        float(np.sqrt((distance**2).mean())),
-        float(np.median(distance)),
-        float((distance <= reach).mean()),
-    )
+def _fit(source: Surface, target: Surface, T: NDArray[np.float64], reach: float) -> tuple[float, float]:
+    """Root mean square distance of the moved source to the target (metres), and the share within the reach."""
+    distance = target.distances(move_points(T, source.points))
+    return float(np.sqrt((distance**2).mean())), float((distance <= reach).mean())
 
 
-def centroid_shift(source: Array, target: Array) -> Array:
-    """Motion (4, 4) that carries the component-wise median of source (N, 3) onto that of target (M, 3)."""
+def centroid_shift(source: NDArray[np.float64], target: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Motion (4, 4) that moves the component-wise median of source (N, 3) to that of target (M, 3)."""
     T = np.eye(4)
     T[:3, 3] = np.median(target, axis=0) - np.median(source, axis=0)
     return T
 
 
-def _orthogonal(R: Array) -> Array:
-    """The nearest rotation: repeated products drift by rounding."""
+def _nearest_rotation(R: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The nearest rotation, which removes the rounding errors of repeated products."""
     U, _, Vt = np.linalg.svd(R)
     return U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))]) @ Vt

@@ -1,13 +1,23 @@
-"""How well a motion explains the last frame: depth and colour where the moved surface should be.
+"""Comparison of a motion with the last frame: the residual that ranks motions, and refinement.
 
-Per point, with z the predicted and m the measured depth:
+The residual compares depth and colour where the moved surface should be. Per point, with z the predicted and m the
+measured depth:
 
 - ``min(|z - m| / s, cap)^2 + min(|colour difference| / c, cap)^2``, s from the sensor's noise at that range;
-- predicted well BEHIND what is measured: something is in front, a constant;
-- outside the image: a larger constant;  no reading there, or robot: not counted.
+- z behind m by more than a margin: occluded, a constant cost;
+- outside the image: a larger constant cost;
+- no reading or robot: not counted.
 
-The score S is the mean over counted points, plus a share for visible points that land where flow says
-something else came from: depth and colour alone cannot tell an object from its twin. Lower is better.
+The score S is the mean cost of the counted points, plus a term for the share of visible points that land on pixels
+which the flow traces back to another object: depth and colour do not distinguish two objects of equal look. Lower is
+better.
+
+`refine_motion` improves a motion by Gauss-Newton steps on projective point-to-plane distances and colour. It compares
+every moved point with the measurement at the pixel that it falls on, so errors of the tracked mask have no effect.
+Colour determines the motions that depth does not, for instance the rotation of a can about its axis.
+
+>>> MotionResidual().score(track, T)                      # doctest: +SKIP
+>>> refine_motion(track, T)                               # doctest: +SKIP
 """
 
 from __future__ import annotations
@@ -16,36 +26,41 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
-from mstfilter.scene import depth_sigma
-from mstfilter.tracking import rigid
-from mstfilter.tracking.track import Track
+from mstfilter.scene import Frame, depth_sigma, memo
+from mstfilter.tracking.rigid import move_points
+from mstfilter.tracking.segments import Track
 
-__all__ = ["Residual"]
+__all__ = ["MotionResidual", "normals", "refine_motion"]
+
+_N_POINTS = 800
+_GATES = (0.03, 0.03, 0.02, 0.02, 0.015, 0.015, 0.01, 0.01)  # metres, one per iteration
+_DAMPING = 1e-3  # of the largest eigenvalue; keeps directions that the data do not determine
 
 
 @dataclass(frozen=True)
-class Residual:
+class MotionResidual:
     """Robust residual of a motion.
 
     Parameters
     ----------
     depth_scale : float
-        Depth differences are measured in this many standard deviations of a difference of two readings.
+        Unit of depth differences, in standard deviations of the difference of two readings.
     colour_scale : float
-        Colour differences (length of the RGB difference) are measured in this many grey levels.
+        Unit of colour differences (Euclidean RGB), grey levels.
     cap : float
         Largest normalised difference.
     occluded_margin : float
-        Metres behind the measured surface from which a point counts as hidden.
+        Metres; points farther behind the measured surface are occluded.
     occluded_cost, outside_cost : float
-        Constant cost of a hidden point and of one outside the image.
+        Cost of an occluded point and of a point outside the image.
     least_share : float
-        Share of the points that must be counted, or the motion is not comparable (infinite).
+        Smallest share of counted points; with fewer the score is infinite.
     n_points : int
-        At most so many points of a segment are used, evenly spread.
+        Largest number of points of a segment, evenly spaced.
     track_weight : float
-        Added to S where all visible points land on pixels that flow traces back to another object.
+        Added to S if all visible points land on pixels that the flow traces back to another object.
     """
 
     depth_scale: float = 1.5
@@ -59,17 +74,17 @@ class Residual:
     track_weight: float = 1.0
 
     def score(self, track: Track, T: NDArray[np.float64]) -> float:
-        """S of a motion (4, 4) of a segment; infinite where too little can be compared."""
+        """S of a motion (4, 4); infinite if too few points can be compared."""
         return float(self.scores(track, T[None])[0])
 
     def scores(self, track: Track, motions: NDArray[np.float64], n_points: int | None = None) -> NDArray[np.float64]:
-        """S of many motions (K, 4, 4) of a segment, (K,), on at most ``n_points`` points."""
+        """S (K,) of motions (K, 4, 4), on at most ``n_points`` points."""
         points, colours = track.sample(n_points or self.n_points)
         if not len(points):
             return np.full(len(motions), np.inf)
         after = track.clip.after
         height, width = after.depth.shape
-        uv, z = after.camera.project(rigid.apply(motions, points))
+        uv, z = after.camera.project(move_points(motions, points))
         pixel = np.rint(np.where(np.isfinite(uv), uv, -1.0))
         inside = (pixel >= 0).all(axis=-1) & (pixel[..., 0] < width) & (pixel[..., 1] < height)
         u, v = np.moveaxis(np.where(inside[..., None], pixel, 0.0).astype(np.int64), -1, 0)
@@ -86,9 +101,108 @@ class Residual:
         n_outside = (~inside).sum(axis=-1)
         n = n_outside + counted.sum(axis=-1)
         total = np.where(counted, cost, 0.0).sum(axis=-1) + self.outside_cost * n_outside
-        # Of the visible points, the share that lands where flow says that something else came from.
+        # Share of the visible points that land on pixels of another object according to the flow.
         source = track.flow.source[v, u]
         traced = counted & ~hidden & (source >= 0)
         foreign = (traced & ~track.mask.ravel()[source]).sum(axis=-1) / np.maximum(traced.sum(axis=-1), 1)
         mean = total / np.maximum(n, 1)
         return np.where(n >= max(self.least_share * len(points), 1), mean + self.track_weight * foreign, np.inf)
+
+
+def normals(frame: Frame) -> NDArray[np.float32]:
+    """World unit normals (H, W, 3) that face the camera, NaN if unknown. Cached by content."""
+
+    def compute() -> NDArray[np.float32]:
+        import cv2
+
+        valid = np.isfinite(frame.depth)
+        points = np.where(valid[..., None], frame.points, 0.0).astype(np.float32)
+        weight = cv2.blur(valid.astype(np.float32), (5, 5))
+        with np.errstate(invalid="ignore", divide="ignore"):
+            smooth = cv2.blur(points, (5, 5)) / weight[..., None]
+        out = np.full(points.shape, np.nan, np.float32)
+        across = smooth[2:-2, 4:] - smooth[2:-2, :-4]
+        down = smooth[4:, 2:-2] - smooth[:-4, 2:-2]
+        normal = np.cross(down, across)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            out[2:-2, 2:-2] = normal / np.linalg.norm(normal, axis=-1, keepdims=True)
+        # At a depth edge the difference spans two surfaces.
+        jump = np.maximum(np.linalg.norm(across, axis=-1), np.linalg.norm(down, axis=-1)) > 0.05
+        out[2:-2, 2:-2][jump | ~valid[2:-2, 2:-2]] = np.nan
+        return out
+
+    return memo("normals", (frame.key,), compute)
+
+
+def _gradients(track: Track) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+    """Smoothed grey last image and its derivatives along columns and rows, grey levels per pixel."""
+
+    def compute() -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+        grey = track.colour_after.mean(axis=2)
+        down, across = np.gradient(grey)
+        return grey, across, down
+
+    return memo("grey gradients", (track.clip.after.key, track.clip.before.key), compute)
+
+
+def refine_motion(
+    track: Track, T: NDArray[np.float64], depth_scale: float = 1.5, colour_scale: float = 25.0
+) -> NDArray[np.float64]:
+    """Improve a motion (4, 4) of a segment; the scales are those of `MotionResidual`.
+
+    Returns
+    -------
+    (4, 4) motion; unchanged if too few points can be compared.
+    """
+    points, colours = track.sample(_N_POINTS)
+    after = track.clip.after
+    surface_normals, (grey, across, down) = normals(after), _gradients(track)
+    before_grey = colours.mean(axis=1)
+    height, width = after.depth.shape
+    K, world_to_camera = after.camera.K, after.camera.pose.as_matrix()[:3, :3].T
+    for gate in _GATES:
+        x = move_points(T, points)
+        uv, z = after.camera.project(x)
+        ok = (np.isfinite(uv) & (uv >= 0.5) & (uv <= [width - 1.5, height - 1.5])).all(axis=1)
+        u, v = np.rint(uv[ok]).astype(np.int64).T
+        normal = surface_normals[v, u].astype(np.float64)
+        offset = x[ok] - after.points[v, u]
+        with np.errstate(invalid="ignore"):
+            distance = np.einsum("ni,ni->n", normal, offset)
+            near = after.valid[v, u] & np.isfinite(distance) & (np.linalg.norm(offset, axis=1) < gate)
+        if near.sum() < 12:
+            return T
+        rows = np.flatnonzero(ok)[near]
+        u, v, x, z = u[near], v[near], x[rows], z[rows]
+        centre = x.mean(axis=0)
+        radius = max(float(np.sqrt(((x - centre) ** 2).sum(axis=1).mean())), 1e-3)
+        r_depth = distance[near] / (depth_scale * np.sqrt(2.0) * depth_sigma(z))
+        j_depth = normal[near] / (depth_scale * np.sqrt(2.0) * depth_sigma(z))[:, None]
+        # Grey value at the projected point, to first order around the pixel.
+        du, dv = uv[rows, 0] - u, uv[rows, 1] - v
+        gx, gy = across[v, u].astype(np.float64), down[v, u].astype(np.float64)
+        r_colour = (grey[v, u] + gx * du + gy * dv - before_grey[rows]) / colour_scale
+        camera_x = (x - after.camera.position) @ world_to_camera.T
+        per_pixel = np.stack(
+            [
+                gx * K[0, 0],
+                gx * K[0, 1] + gy * K[1, 1],
+                -(gx * K[0, 0] * camera_x[:, 0] + gy * K[1, 1] * camera_x[:, 1]) / z,
+            ],
+            axis=1,
+        )
+        j_colour = per_pixel @ world_to_camera / (z * colour_scale)[:, None]
+        H, b = np.zeros((6, 6)), np.zeros(6)
+        for residual, slope in ((r_depth, j_depth), (r_colour, j_colour)):
+            J = np.hstack([np.cross((x - centre) / radius, slope), slope])
+            weight = (1.0 + residual**2 / 4.0) ** -2
+            H += (J * weight[:, None]).T @ J
+            b += J.T @ (weight * residual)
+        step = -np.linalg.solve(H + _DAMPING * np.linalg.eigvalsh(H)[-1] * np.eye(6), b)
+        change = np.eye(4)
+        change[:3, :3] = Rotation.from_rotvec(step[:3] / radius).as_matrix()
+        change[:3, 3] = centre + step[3:] - change[:3, :3] @ centre
+        if not np.isfinite(change).all():
+            return T
+        T = change @ T
+    return T

@@ -1,34 +1,70 @@
-"""Rigid motions from corresponding points: batched, weighted, robust, and from merged statistics.
+"""Rigid motions from corresponding points: least squares, robust fits, and J-Linkage for several motions.
 
-A motion is a (4, 4) float64 matrix T that takes points ``p`` to ``q = R p + t``.
+Functions of this module take motions as (..., 4, 4) float64 matrices T, so that they work on stacks of motions: a
+point p moves to ``q = R p + t`` with R = T[:3, :3] and t = T[:3, 3]. Components exchange single motions as scipy
+`RigidTransform`; `rigid_transform` converts without changing a bit.
 
 >>> import numpy as np
->>> p = np.random.default_rng(0).normal(size=(10, 3))
+>>> rng = np.random.default_rng(1)
+>>> p = rng.uniform(size=(40, 3))
 >>> T = kabsch(p, p + [0.1, 0.0, 0.0])
 >>> bool(np.allclose(T[:3, 3], [0.1, 0.0, 0.0]))
 True
 
-The statistics form writes everything a least-squares fit needs as 18 sums, which add: the fit of any
-union of groups follows from the sums of its parts, without looking at a point again.
+A least-squares fit depends on 18 sums over the point pairs. The sums of a union of groups are the sums of its parts,
+so `pair_sums` and `fit_sums` fit unions without reading the points again.
+
+J-Linkage (Toldo and Fusiello, ECCV 2008) finds all rigid motions among point matches when their number is unknown.
+The preference set of a match contains the sampled motions that explain it. Matches are merged bottom-up by the
+Jaccard distance of their sets, and a merged cluster keeps the intersection, so at least one motion explains all its
+members. Merging ends when all sets are disjoint.
+
+>>> q = np.where(np.arange(40)[:, None] < 20, p + [0.5, 0, 0], p - [0, 0.5, 0])
+>>> [len(m.inliers) for m in jlinkage(rng, p, q)]
+[20, 20]
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import RigidTransform
 
-N_STATISTICS = 18  # n, sum p (3), sum q (3), sum p q^T (9), sum |p|^2, sum |q|^2
+__all__ = [
+    "MotionCluster",
+    "angle",
+    "cluster",
+    "displacement",
+    "fit_sums",
+    "invert",
+    "jlinkage",
+    "kabsch",
+    "minimal_models",
+    "move_points",
+    "pair_sums",
+    "ransac",
+    "refine_robust",
+    "residuals",
+    "rigid_transform",
+]
 
-Array = NDArray[np.float64]
+_N_SUMS = 18  # n, sum p (3), sum q (3), sum p q^T (9), sum |p|^2, sum |q|^2
 
 
-def apply(T: Array, points: Array) -> Array:
-    """Move points (..., N, 3) by motions (..., 4, 4)."""
+def rigid_transform(T: NDArray[np.float64]) -> RigidTransform:
+    """A motion (4, 4) as RigidTransform with the same bits: the rotation is not normalised."""
+    return RigidTransform(T, normalize=False)
+
+
+def move_points(T: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Apply motions (..., 4, 4) to points (..., N, 3)."""
     return points @ np.swapaxes(T[..., :3, :3], -1, -2) + T[..., None, :3, 3]
 
 
-def invert(T: Array) -> Array:
-    """The inverse of motions (..., 4, 4), exact in structure (transpose of the rotation)."""
+def invert(T: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Inverse of motions (..., 4, 4), with the transpose as the inverse rotation."""
     out = np.zeros_like(T)
     Rt = np.swapaxes(T[..., :3, :3], -1, -2)
     out[..., :3, :3] = Rt
@@ -37,18 +73,20 @@ def invert(T: Array) -> Array:
     return out
 
 
-def angle(T: Array) -> Array:
+def angle(T: NDArray[np.float64]) -> NDArray[np.float64]:
     """Rotation angle of motions (..., 4, 4), radians in [0, pi]."""
     cosine = (np.trace(T[..., :3, :3], axis1=-2, axis2=-1) - 1.0) / 2.0
     return np.arccos(np.clip(cosine, -1.0, 1.0))
 
 
-def displacement(T: Array, centre: Array) -> Array:
-    """How far motions (..., 4, 4) carry the point ``centre`` (3,), metres."""
+def displacement(T: NDArray[np.float64], centre: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Distance by which motions (..., 4, 4) move the point ``centre`` (3,), metres."""
     return np.linalg.norm(T[..., :3, :3] @ centre + T[..., :3, 3] - centre, axis=-1)
 
 
-def kabsch(p: Array, q: Array, weights: Array | None = None) -> Array:
+def kabsch(
+    p: NDArray[np.float64], q: NDArray[np.float64], weights: NDArray[np.float64] | None = None
+) -> NDArray[np.float64]:
     """Least-squares rigid motions of corresponding points.
 
     Parameters
@@ -59,7 +97,7 @@ def kabsch(p: Array, q: Array, weights: Array | None = None) -> Array:
 
     Returns
     -------
-    (..., 4, 4) motions with det R = +1 (Kabsch 1976; the sign correction keeps reflections out).
+    (..., 4, 4) motions with det R = +1 (Kabsch 1976; the sign correction excludes reflections).
     """
     p = np.asarray(p, dtype=np.float64)
     q = np.asarray(q, dtype=np.float64)
@@ -71,7 +109,9 @@ def kabsch(p: Array, q: Array, weights: Array | None = None) -> Array:
     return _from_covariance(covariance, mean_p, mean_q)[0]
 
 
-def _from_covariance(covariance: Array, mean_p: Array, mean_q: Array) -> tuple[Array, Array]:
+def _from_covariance(
+    covariance: NDArray[np.float64], mean_p: NDArray[np.float64], mean_q: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Motion and the sum s1 + s2 + d s3 from C = sum (p - mean p)(q - mean q)^T."""
     U, s, Vt = np.linalg.svd(covariance)
     d = np.where(np.linalg.det(U) * np.linalg.det(Vt) < 0.0, -1.0, 1.0)
@@ -85,21 +125,27 @@ def _from_covariance(covariance: Array, mean_p: Array, mean_q: Array) -> tuple[A
     return T, (s * signs).sum(axis=-1)
 
 
-def statistics(p: Array, q: Array, group: NDArray[np.int64], n_groups: int, weights: Array | None = None) -> Array:
+def pair_sums(
+    p: NDArray[np.float64],
+    q: NDArray[np.float64],
+    group: NDArray[np.int64],
+    n_groups: int,
+    weights: NDArray[np.float64] | None = None,
+) -> NDArray[np.float64]:
     """The 18 additive sums of each group of point pairs.
 
     Parameters
     ----------
-    p, q : (N, 3) points, metres, relative to ONE common origin near them (against cancellation).
+    p, q : (N, 3) points, metres, relative to one common origin near them, against cancellation.
     group : (N,) int, the group of each pair in 0..n_groups-1.
     weights : (N,) or None
 
     Returns
     -------
-    (n_groups, 18) float64. The statistics of a union of groups are the sum of the rows.
+    (n_groups, 18) float64. The sums of a union of groups are the sum of their rows.
     """
     w = np.ones(len(p)) if weights is None else np.asarray(weights, dtype=np.float64)
-    columns = np.empty((len(p), N_STATISTICS))
+    columns = np.empty((len(p), _N_SUMS))
     columns[:, 0] = 1.0
     columns[:, 1:4] = p
     columns[:, 4:7] = q
@@ -107,18 +153,18 @@ def statistics(p: Array, q: Array, group: NDArray[np.int64], n_groups: int, weig
     columns[:, 16] = np.einsum("ni,ni->n", p, p)
     columns[:, 17] = np.einsum("ni,ni->n", q, q)
     columns *= w[:, None]
-    out = np.empty((n_groups, N_STATISTICS))
-    for c in range(N_STATISTICS):
+    out = np.empty((n_groups, _N_SUMS))
+    for c in range(_N_SUMS):
         out[:, c] = np.bincount(group, weights=columns[:, c], minlength=n_groups)
     return out
 
 
-def fit_statistics(sums: Array) -> tuple[Array, Array]:
-    """Least-squares motions and squared residuals from merged statistics (..., 18).
+def fit_sums(sums: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Least-squares motions and squared residuals from the sums (..., 18) of `pair_sums`.
 
     Returns
     -------
-    T : (..., 4, 4) motions; identity where the weight is zero.
+    T : (..., 4, 4) motions; identity if the weight is zero.
     residual : (...,) sum of weighted squared distances |R p + t - q|^2, clipped at 0.
     """
     sums = np.asarray(sums, dtype=np.float64)
@@ -134,11 +180,13 @@ def fit_statistics(sums: Array) -> tuple[Array, Array]:
     return T, np.maximum(spread - 2.0 * trace, 0.0) * (n > 0)
 
 
-def minimal_models(rng: np.random.Generator, p: Array, q: Array, eps: float, n_models: int) -> Array:
-    """Motions of random triples of pairs that could be rigid.
+def minimal_models(
+    rng: np.random.Generator, p: NDArray[np.float64], q: NDArray[np.float64], eps: float, n_models: int
+) -> NDArray[np.float64]:
+    """Motions of random triples of point pairs that are consistent with a rigid motion.
 
-    A triple is dropped where it is nearly collinear, or where a side's length differs by more than
-    ``2 eps`` between before and after: a rigid motion keeps lengths, so mixed triples die unfitted.
+    A triple is rejected without a fit if it is nearly collinear, or if the length of a side changes by more than
+    ``2 eps``, because a rigid motion preserves lengths.
 
     Returns
     -------
@@ -147,7 +195,7 @@ def minimal_models(rng: np.random.Generator, p: Array, q: Array, eps: float, n_m
     n = len(p)
     if n < 3:
         return np.empty((0, 4, 4))
-    # Three different indices without a loop: shifts of one index by distinct amounts.
+    # The second index differs from the first by a non-zero shift; triples with an equal third index are dropped.
     first = rng.integers(0, n, n_models)
     second = (first + rng.integers(1, n, n_models)) % n
     third = rng.integers(0, n, n_models)
@@ -156,27 +204,27 @@ def minimal_models(rng: np.random.Generator, p: Array, q: Array, eps: float, n_m
     a, b = p[triples], q[triples]
     sides_a, sides_b = np.roll(a, -1, axis=1) - a, np.roll(b, -1, axis=1) - b
     length_a, length_b = np.linalg.norm(sides_a, axis=-1), np.linalg.norm(sides_b, axis=-1)
-    rigid = (np.abs(length_a - length_b) <= 2.0 * eps).all(axis=1)
+    same_length = (np.abs(length_a - length_b) <= 2.0 * eps).all(axis=1)
     area = np.linalg.norm(np.cross(sides_a[:, 0], sides_a[:, 1]), axis=-1)
     wide = area > 0.1 * np.maximum(length_a.max(axis=1), 1e-12) ** 2
-    keep = rigid & wide
+    keep = same_length & wide
     return kabsch(a[keep], b[keep]) if keep.any() else np.empty((0, 4, 4))
 
 
-def residuals(models: Array, p: Array, q: Array) -> Array:
+def residuals(models: NDArray[np.float64], p: NDArray[np.float64], q: NDArray[np.float64]) -> NDArray[np.float64]:
     """Distances between ``R_k p_i + t_k`` and ``q_i``, (N, M), metres."""
     moved = np.einsum("kij,nj->nki", models[:, :3, :3], p) + models[None, :, :3, 3]
     return np.linalg.norm(moved - q[:, None, :], axis=-1)
 
 
 def ransac(
-    rng: np.random.Generator, p: Array, q: Array, eps: float, n_models: int = 300
-) -> tuple[Array, NDArray[np.bool_]] | None:
-    """The motion with the most pairs within ``eps`` metres, refitted to them; None where there is none."""
+    rng: np.random.Generator, p: NDArray[np.float64], q: NDArray[np.float64], eps: float, n_models: int = 300
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]] | None:
+    """The motion with the most pairs within ``eps`` metres, refitted to them; None if no motion has three."""
     models = minimal_models(rng, p, q, eps, n_models)
     if not len(models):
         return None
-    scoring = slice(None, None, max(1, len(p) // 400))  # 400 pairs rank the models well enough
+    scoring = slice(None, None, max(1, len(p) // 400))  # 400 pairs are sufficient to rank the models
     T = models[(residuals(models, p[scoring], q[scoring]) < eps).sum(axis=0).argmax()]
     inliers = residuals(T[None], p, q)[:, 0] < eps
     for _ in range(2):
@@ -187,15 +235,152 @@ def ransac(
     return (T, inliers) if inliers.sum() >= 3 else None
 
 
-def refine_robust(T: Array, p: Array, q: Array, scale: float, iterations: int = 10) -> Array:
+def refine_robust(
+    T: NDArray[np.float64], p: NDArray[np.float64], q: NDArray[np.float64], scale: float, iterations: int = 10
+) -> NDArray[np.float64]:
     """Iteratively reweighted fit with the Geman-McClure weight (1 + r^2 / scale^2)^-2, from ``T``.
 
-    ``scale`` in metres. Where all weights vanish the motion so far is returned.
+    ``scale`` is in metres. If all weights vanish, the present motion is returned.
     """
     for _ in range(iterations):
-        squared = ((apply(T, p) - q) ** 2).sum(axis=-1)
+        squared = ((move_points(T, p) - q) ** 2).sum(axis=-1)
         weights = (1.0 + squared / scale**2) ** -2
         if weights.sum() < 1e-6 * len(p):
             break
         T = kabsch(p, q, weights)
     return T
+
+
+@dataclass(frozen=True)
+class MotionCluster:
+    """A rigid motion and the matches that it explains.
+
+    Attributes
+    ----------
+    T : (4, 4) motion, world metres.
+    inliers : (K,) int64, indices of the matches within eps of it.
+    rms : root mean square residual of the inliers, metres.
+    """
+
+    T: NDArray[np.float64]
+    inliers: NDArray[np.int64]
+    rms: float
+
+
+def jlinkage(
+    rng: np.random.Generator,
+    p: NDArray[np.float64],
+    q: NDArray[np.float64],
+    *,
+    eps: float = 0.010,
+    n_models: int = 500,
+    min_size: int = 5,
+    max_matches: int = 300,
+) -> list[MotionCluster]:
+    """Find the rigid motions among matches (p_i, q_i).
+
+    Parameters
+    ----------
+    rng : draws the minimal sets.
+    p, q : (N, 3) world metres before and after.
+    eps : metres; at least 5 standard deviations of a match, or true clusters are split.
+    n_models : sampled triples. A motion that holds a share w of the matches is hit n_models w^3 times.
+    min_size : smallest cluster that counts (three matches always fit).
+    max_matches : beyond this an evenly spread subset is clustered (cost grows with N^2); inliers are
+        counted over all.
+
+    Returns
+    -------
+    list of MotionCluster, most inliers first (ties: smaller rms). Near-equal motions are merged.
+    """
+    p = np.ascontiguousarray(p, dtype=np.float64)
+    q = np.ascontiguousarray(q, dtype=np.float64)
+    if len(p) < max(3, min_size):
+        return []
+    chosen = np.arange(len(p))
+    if len(p) > max_matches:
+        chosen = np.sort(rng.permutation(len(p))[:max_matches])
+    models = minimal_models(rng, p[chosen], q[chosen], eps, n_models)
+    if not len(models):
+        return []
+    preference = residuals(models, p[chosen], q[chosen]) < eps
+    motions: list[MotionCluster] = []
+    for members in cluster(preference):
+        if len(members) >= min_size:
+            rows = chosen[members]
+            motion = _refit(p, q, kabsch(p[rows], q[rows]), eps)
+            if motion is not None and len(motion.inliers) >= min_size:
+                motions.append(motion)
+    motions.sort(key=lambda m: (-len(m.inliers), m.rms))
+    return _without_repeats(motions)
+
+
+def cluster(preference: NDArray[np.bool_]) -> list[NDArray[np.int64]]:
+    """Merge rows of a preference matrix (N, M) until all preference sets are disjoint.
+
+    Returns
+    -------
+    list of index arrays, largest first. Rows with an empty set are in no cluster.
+    """
+    rows = np.flatnonzero(preference.any(axis=1))
+    if not len(rows):
+        return []
+    B = preference[rows].astype(np.float32)
+    members: list[list[int]] = [[int(r)] for r in rows]
+    common = B @ B.T
+    sizes = B.sum(axis=1)
+    similarity = common / (sizes[:, None] + sizes[None, :] - common)  # 1 - Jaccard distance
+    np.fill_diagonal(similarity, 0.0)
+    best_at = similarity.argmax(axis=1)
+    best = similarity[np.arange(len(rows)), best_at]
+    while True:
+        a = int(best.argmax())
+        if best[a] <= 0.0:  # every pair is disjoint
+            break
+        a, b = sorted((a, int(best_at[a])))
+        B[a] *= B[b]
+        members[a] += members[b]
+        members[b] = []
+        B[b] = 0.0
+        sizes[b] = 0.0
+        sizes[a] = B[a].sum()
+        shared = B @ B[a]
+        row = shared / np.maximum(sizes + sizes[a] - shared, 1e-9)
+        row[a] = 0.0
+        similarity[a], similarity[:, a] = row, row
+        similarity[b], similarity[:, b] = 0.0, 0.0
+        # Update the best partner of rows whose partner was a or b, and of rows that are now closest to a.
+        stale = np.flatnonzero((best_at == a) | (best_at == b))
+        better = row > best
+        best[better], best_at[better] = row[better], a
+        for i in {*stale.tolist(), a, b}:
+            best_at[i] = similarity[i].argmax()
+            best[i] = similarity[i, best_at[i]]
+    found = [np.array(sorted(m), dtype=np.int64) for m in members if m]
+    return sorted(found, key=lambda m: (-len(m), int(m[0])))
+
+
+def _refit(
+    p: NDArray[np.float64], q: NDArray[np.float64], T: NDArray[np.float64], eps: float
+) -> MotionCluster | None:
+    """Two rounds of least squares on the inliers among all matches; None if there are fewer than three."""
+    inliers = np.flatnonzero(residuals(T[None], p, q)[:, 0] < eps)
+    for _ in range(2):
+        if len(inliers) < 3:
+            return None
+        T = kabsch(p[inliers], q[inliers])
+        distance = residuals(T[None], p, q)[:, 0]
+        inliers = np.flatnonzero(distance < eps)
+    if len(inliers) < 3:
+        return None
+    return MotionCluster(T, inliers, float(np.sqrt((distance[inliers] ** 2).mean())))
+
+
+def _without_repeats(motions: list[MotionCluster]) -> list[MotionCluster]:
+    """Drop motions of which a motion with more inliers explains more than half of the inliers."""
+    kept: list[MotionCluster] = []
+    for motion in motions:
+        shares = [np.isin(motion.inliers, other.inliers).mean() for other in kept]
+        if not shares or max(shares) <= 0.5:
+            kept.append(motion)
+    return kept

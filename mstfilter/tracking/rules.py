@@ -1,55 +1,64 @@
-"""Which rigid motion an object made: the published rules and our own.
+"""Motion rules: the rigid motion of one object in a clip.
 
-A rule works in two stages. `candidates` gathers motions once per distinct segment, shared by all
-hypotheses; `choose` picks one for each particle, which may draw.
+A rule works in two stages. `candidates` computes motions once per distinct segment, shared by all hypotheses;
+`choose` selects one of them per particle, possibly at random.
 
 ================  ===========================================================================
 `PaperRule`       paper, Algorithm 2: SIFT if it has more than 5 inliers, else ICP if its error
                   is below 1 mm, else identity; ``order="best"``: the better of the two (text)
 `AuthorsRule`     authors' program: a SIFT cluster drawn by size and used with a probability
                   that grows with it, else ICP with mean squared distance <= 0.002 m^2
-`MstRule`         many candidates, scored by one robust residual (mst_rule.py)
+`MstRule`         candidates from flow, registration and SIFT, ranked by one robust residual
 ================  ===========================================================================
+
+`MstRule` combines several estimators because each fails on some objects: flow on plain surfaces, registration on
+rotations of symmetric objects, SIFT without texture.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import RigidTransform
 
 from mstfilter.errors import InputError
+from mstfilter.tracking import rigid
 from mstfilter.tracking.features import SiftMatching
-from mstfilter.tracking.jlinkage import Motion, jlinkage
-from mstfilter.tracking.registration import Fit, centroid_shift, register
-from mstfilter.tracking.track import Track
+from mstfilter.tracking.registration import Registration, RegistrationResult, SmallGicp, centroid_shift
+from mstfilter.tracking.residual import MotionResidual, refine_motion
+from mstfilter.tracking.rigid import MotionCluster, jlinkage, rigid_transform
+from mstfilter.tracking.segments import Track
 
-__all__ = ["AuthorsRule", "Candidate", "MotionRule", "PaperRule"]
+__all__ = ["IDENTITY", "AuthorsRule", "Candidate", "MotionRule", "MstRule", "PaperRule"]
 
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """A motion that an object may have made.
+    """A possible motion of an object.
 
     Attributes
     ----------
     kind : "identity", "flow", "icp", "sift" or "search".
-    T : (4, 4) motion, world metres.
-    support : matches or points behind it.
-    error : metres, how well it fits its own evidence (rms unless the rule says otherwise).
-    score : what the rule compares; lower is better.
+    T : RigidTransform, world metres.
+    support : number of matches or points that determine it.
+    error : residual of these, metres (root mean square).
+    score : criterion of the rule; lower is better.
+    registration : result of the registration that computed it, if any.
     """
 
     kind: str
-    T: NDArray[np.float64]
+    T: RigidTransform
     support: int = 0
     error: float = 0.0
     score: float = 0.0
+    registration: RegistrationResult | None = None
 
 
-IDENTITY = Candidate("identity", np.eye(4))
+IDENTITY = Candidate("identity", RigidTransform.identity())
 
 
 class MotionRule(ABC):
@@ -57,14 +66,14 @@ class MotionRule(ABC):
 
     @abstractmethod
     def candidates(self, rng: np.random.Generator, track: Track) -> tuple[Candidate, ...]:
-        """Motions worth considering for a segment, at least one. Computed once for all hypotheses."""
+        """Possible motions of a segment, at least one. Computed once for all hypotheses."""
 
     @abstractmethod
     def choose(self, rng: np.random.Generator, candidates: tuple[Candidate, ...]) -> Candidate:
-        """The motion of one particle's object. `rng` is this particle's own."""
+        """The motion of the object in one particle; `rng` belongs to this particle."""
 
 
-def sift_motions(
+def _sift_motions(
     rng: np.random.Generator,
     track: Track,
     sift: SiftMatching,
@@ -72,19 +81,22 @@ def sift_motions(
     eps: float,
     min_size: int,
     n_models: int,
-) -> list[Motion]:
+) -> list[MotionCluster]:
     """Rigid motions among the SIFT matches of a segment, best supported first."""
     p, q = track.sift_pairs(sift, in_target)
     return jlinkage(rng, p, q, eps=eps, min_size=min_size, n_models=n_models)
 
 
-def icp(track: Track, start: str, reach: float, iterations: int, method: str) -> Fit | None:
-    """Registration of the segment to the surface under its tracked mask; None where there is none."""
+def _registered(track: Track, start: str, reach: float, registration: Registration) -> Candidate | None:
+    """The segment registered to the surface of its tracked mask; None if a surface or the result is missing."""
     source, target = track.surface, track.target_surface
     if source is None or target is None:
         return None
     init = centroid_shift(source.points, target.points) if start == "centroid" else np.eye(4)
-    return register(source, target, init, reach, method, iterations)
+    fit = registration.register(source, target, init, reach)
+    if fit is None:
+        return None
+    return Candidate("icp", rigid_transform(fit.T), len(track.points), fit.rms, fit.rms, fit)
 
 
 @dataclass(frozen=True)
@@ -94,22 +106,23 @@ class PaperRule(MotionRule):
     Parameters
     ----------
     order : "first" or "best"
-        First of SIFT and ICP that passes its test (Algorithm 2), or the one of the smaller error (text).
+        The first of SIFT and ICP that passes its test (Algorithm 2), or the one with the smaller error (text).
     min_inliers : int
-        SIFT is accepted with MORE inliers than this.
+        SIFT is accepted with more inliers than this.
     max_error : float
-        Metres; ICP is accepted with a smaller root mean square distance. 1 mm lies below the noise of a
-        depth camera at 0.7 m, so that as printed ICP is next to never accepted.
+        Metres; ICP is accepted with a smaller root mean square distance. The published 1 mm is below the noise of a
+        depth camera at 0.7 m, so ICP is almost never accepted.
     icp_start : "centroid" or "identity"
-        Where ICP starts; the paper does not say.
+        Initial motion of ICP. The paper does not state it.
     icp_reach : float
-        Metres, largest correspondence distance.
-    icp_iterations : int
+        Largest correspondence distance, metres.
+    registration : Registration
+        Performs the ICP.
     sift : SiftMatching
     eps : float
-        Metres, J-Linkage's inlier distance.
+        Inlier distance of J-Linkage, metres.
     n_models : int
-        J-Linkage's sampled motions.
+        Number of sampled motions of J-Linkage.
     """
 
     order: str = "first"
@@ -117,7 +130,7 @@ class PaperRule(MotionRule):
     max_error: float = 0.001
     icp_start: str = "centroid"
     icp_reach: float = 0.03
-    icp_iterations: int = 30
+    registration: Registration = field(default_factory=lambda: SmallGicp("ICP", 30))
     sift: SiftMatching = field(default_factory=SiftMatching)
     eps: float = 0.010
     n_models: int = 500
@@ -129,20 +142,20 @@ class PaperRule(MotionRule):
             raise InputError(f"icp_start {self.icp_start!r} is unknown", "one of centroid, identity")
 
     def candidates(self, rng: np.random.Generator, track: Track) -> tuple[Candidate, ...]:
-        """What passed its test, in the order SIFT, ICP, identity."""
+        """The motions that passed their test, in the order SIFT, ICP, identity."""
         passed = []
-        motions = sift_motions(rng, track, self.sift, True, self.eps, 3, self.n_models)
+        motions = _sift_motions(rng, track, self.sift, True, self.eps, 3, self.n_models)
         if motions and len(motions[0].inliers) > self.min_inliers:
             m = motions[0]
-            passed.append(Candidate("sift", m.T, len(m.inliers), m.rms, m.rms))
+            passed.append(Candidate("sift", rigid_transform(m.T), len(m.inliers), m.rms, m.rms))
         if self.order == "best" or not passed:
-            fit = icp(track, self.icp_start, self.icp_reach, self.icp_iterations, "ICP")
-            if fit is not None and fit.rms < self.max_error:
-                passed.append(Candidate("icp", fit.T, len(track.points), fit.rms, fit.rms))
+            fit = _registered(track, self.icp_start, self.icp_reach, self.registration)
+            if fit is not None and fit.error < self.max_error:
+                passed.append(fit)
         return (*passed, IDENTITY)
 
     def choose(self, rng: np.random.Generator, candidates: tuple[Candidate, ...]) -> Candidate:
-        """The first, or of those that passed the one of smallest error."""
+        """The first motion, or with ``order="best"`` the one with the smallest error."""
         moving = [c for c in candidates if c.kind != "identity"]
         if self.order == "best" and moving:
             return min(moving, key=lambda c: c.score)
@@ -150,29 +163,31 @@ class PaperRule(MotionRule):
 
 
 def _one_to_many() -> SiftMatching:
-    """All pairs within the radii of the authors' program (200, 1000 pixels, 1 m)."""
+    """All pairs within the radii of the authors' program: descriptor distance 200, 1000 pixels, 1 m."""
     return SiftMatching(mutual=False, descriptor_radius=200.0, search_share=10.0, search_distance=1.0)
 
 
 @dataclass(frozen=True)
 class AuthorsRule(MotionRule):
-    """The rule of the authors' program: SIFT and ICP mixed at random.
+    """The rule of the authors' program: a random choice of SIFT and ICP.
 
     Parameters
     ----------
     min_size : int
-        Smallest J-Linkage cluster.
+        Smallest cluster of J-Linkage.
     slope, offset, lowest, highest : float
         A drawn cluster of n matches is used with probability clip(slope n + offset, lowest, highest).
     max_mean_square : float
-        Square metres; ICP is accepted up to this mean SQUARED distance (0.002 is 4.5 cm rms).
-    icp_iterations : int
+        Square metres; ICP is accepted up to this mean squared distance (0.002 is 4.5 cm rms).
     icp_reach : float
-        Metres; the program sets no limit, so this is far.
+        Largest correspondence distance, metres. The authors' program has no limit.
+    registration : Registration
+        Performs the ICP, from the identity.
     sift : SiftMatching
     eps : float
-        Metres, J-Linkage's inlier distance (not published).
+        Inlier distance of J-Linkage, metres (not published).
     n_models : int
+        Number of sampled motions of J-Linkage.
     """
 
     min_size: int = 3
@@ -181,25 +196,25 @@ class AuthorsRule(MotionRule):
     lowest: float = 0.1
     highest: float = 0.9
     max_mean_square: float = 0.002
-    icp_iterations: int = 20
     icp_reach: float = 10.0
+    registration: Registration = field(default_factory=lambda: SmallGicp("ICP", 20))
     sift: SiftMatching = field(default_factory=_one_to_many)
     eps: float = 0.010
     n_models: int = 1000
 
     def candidates(self, rng: np.random.Generator, track: Track) -> tuple[Candidate, ...]:
-        """All SIFT clusters, ICP from the identity if accepted, identity."""
+        """All SIFT clusters, ICP if accepted, identity."""
         found = [
-            Candidate("sift", m.T, len(m.inliers), m.rms)
-            for m in sift_motions(rng, track, self.sift, True, self.eps, self.min_size, self.n_models)
+            Candidate("sift", rigid_transform(m.T), len(m.inliers), m.rms)
+            for m in _sift_motions(rng, track, self.sift, True, self.eps, self.min_size, self.n_models)
         ]
-        fit = icp(track, "identity", self.icp_reach, self.icp_iterations, "ICP")
-        if fit is not None and fit.rms**2 <= self.max_mean_square:
-            found.append(Candidate("icp", fit.T, len(track.points), fit.rms))
+        fit = _registered(track, "identity", self.icp_reach, self.registration)
+        if fit is not None and fit.error**2 <= self.max_mean_square:
+            found.append(fit)
         return (*found, IDENTITY)
 
     def choose(self, rng: np.random.Generator, candidates: tuple[Candidate, ...]) -> Candidate:
-        """Draw a cluster, then whether to use it; else ICP; else identity."""
+        """Draw a cluster and whether to use it; else ICP; else identity."""
         sift = [c for c in candidates if c.kind == "sift"]
         if sift:
             sizes = np.array([c.support for c in sift], dtype=np.float64)
@@ -208,3 +223,168 @@ class AuthorsRule(MotionRule):
             if rng.random() < use:
                 return drawn
         return next(c for c in candidates if c.kind != "sift")
+
+
+class _Proposal(NamedTuple):
+    """A motion (4, 4) that is not scored yet."""
+
+    kind: str
+    T: NDArray[np.float64]
+    support: int
+    registration: RegistrationResult | None = None
+
+
+@dataclass(frozen=True)
+class MstRule(MotionRule):
+    """Candidates from flow, registration and SIFT, ranked by `MotionResidual`; rest is preferred.
+
+    Parameters
+    ----------
+    select : "map" or "sample"
+        Take the candidate with the best score, or draw one with probability ~ exp(-n_eff S / 2) for each particle.
+    static_margin : float
+        Bonus in S for rest: a motion must be better by this much.
+    n_eff : float
+        Effective number of independent observations per segment, for ``select="sample"``. Residuals of neighbouring
+        pixels are correlated, so it is much smaller than the number of pixels.
+    use_flow, use_icp, use_sift : bool
+        Estimators that are used.
+    max_shift : float
+        Largest displacement of the segment's centre, metres.
+    max_angle : float
+        Largest rotation angle, radians.
+    least_overlap : float
+        Smallest overlap of the surfaces after registration, a share.
+    min_pairs : int
+        Smallest number of flow tracks or SIFT matches of a motion.
+    max_sift : int
+        Largest number of SIFT motions.
+    n_refine : int
+        Number of best candidates that are refined against the whole last frame and added as further candidates.
+    search_above : float
+        If every score is larger, the object is searched for around its last position. Negative values disable it.
+    search_radius, search_step : float
+        Radius and spacing of the search grid, metres.
+    sift : SiftMatching
+    residual : MotionResidual
+    registration : Registration
+        Aligns the surfaces of the segment before and after.
+    """
+
+    select: str = "map"
+    static_margin: float = 0.15
+    n_eff: float = 20.0
+    use_flow: bool = True
+    use_icp: bool = True
+    use_sift: bool = True
+    max_shift: float = 0.6
+    max_angle: float = 2.6
+    least_overlap: float = 0.3
+    min_pairs: int = 6
+    max_sift: int = 3
+    n_refine: int = 3
+    search_above: float = 4.0
+    search_radius: float = 0.14
+    search_step: float = 0.01
+    sift: SiftMatching = field(default_factory=SiftMatching)
+    residual: MotionResidual = field(default_factory=MotionResidual)
+    registration: Registration = field(default_factory=SmallGicp)
+
+    def __post_init__(self) -> None:
+        if self.select not in ("map", "sample"):
+            raise InputError(f"select {self.select!r} is unknown", "one of map, sample")
+
+    def candidates(self, rng: np.random.Generator, track: Track) -> tuple[Candidate, ...]:
+        """Scored motions, the identity first."""
+        rest = Candidate("identity", IDENTITY.T, score=self.residual.score(track, np.eye(4)) - self.static_margin)
+        if not len(track.segment.support):
+            return (rest,)
+        centre = track.points.mean(axis=0)
+        distinct: list[_Proposal] = []
+        for proposal in self._proposals(rng, track):
+            same = any(_nearly_equal(proposal.T, other.T, centre) for other in distinct)
+            if self._admissible(proposal.T, centre) and not same:
+                distinct.append(proposal)
+        found = [self._scored(track, proposal) for proposal in distinct]
+        best = sorted(range(len(found)), key=lambda i: found[i].score)[: self.n_refine]
+        for i in best:
+            refined = distinct[i]._replace(T=self._refined(track, distinct[i].T), registration=None)
+            if self._admissible(refined.T, centre):
+                found.append(self._scored(track, refined))
+        if self.search_above >= 0 and min(c.score for c in [rest, *found]) > self.search_above:
+            found.extend(self._search(track, centre))
+        return (rest, *(c for c in found if np.isfinite(c.score)))
+
+    def choose(self, rng: np.random.Generator, candidates: tuple[Candidate, ...]) -> Candidate:
+        """The candidate with the best score, or one drawn by score."""
+        scores = np.array([c.score for c in candidates])
+        if not np.isfinite(scores).any():
+            return IDENTITY
+        if self.select == "map":
+            return candidates[int(scores.argmin())]
+        weights = np.exp(-0.5 * self.n_eff * (scores - scores.min()))
+        return candidates[int(rng.choice(len(candidates), p=weights / weights.sum()))]
+
+    def _proposals(self, rng: np.random.Generator, track: Track) -> list[_Proposal]:
+        """Motions from every estimator, and each of them refined by registration."""
+        proposals: list[_Proposal] = []
+        starts: list[tuple[_Proposal, float]] = []  # initial motion of a registration, and its reach in metres
+        if self.use_flow:
+            p, q = track.flow_pairs
+            fit = rigid.ransac(rng, p, q, 0.008) if len(p) >= self.min_pairs else None
+            if fit is not None and fit[1].sum() >= self.min_pairs:
+                T = rigid.refine_robust(fit[0], p, q, 0.004)
+                proposals.append(_Proposal("flow", T, int(fit[1].sum())))
+                starts.append((_Proposal("icp", T, int(fit[1].sum())), 0.020))
+        if self.use_sift:
+            for m in _sift_motions(rng, track, self.sift, False, 0.010, self.min_pairs, 500)[: self.max_sift]:
+                proposals.append(_Proposal("sift", m.T, len(m.inliers)))
+                starts.append((proposals[-1], 0.015))
+        source, target = track.surface, track.target_surface
+        if self.use_icp and source is not None and target is not None:
+            shift = centroid_shift(source.points, target.points)
+            starts.append((_Proposal("icp", shift, len(source.points)), 0.030))
+            for start, reach in starts:
+                result = self.registration.register(source, target, start.T, reach)
+                if result is not None and result.overlap >= self.least_overlap:
+                    proposals.append(start._replace(T=result.T, registration=result))
+        return proposals
+
+    def _search(self, track: Track, centre: NDArray[np.float64]) -> list[Candidate]:
+        """Search a grid of shifts on the table and three rotations; refine the two best shifts of each rotation."""
+        n = round(self.search_radius / self.search_step)
+        shifts = self.search_step * np.stack(np.meshgrid(*[np.arange(-n, n + 1)] * 2), axis=-1).reshape(-1, 2)
+        shifts = shifts[np.hypot(*shifts.T) <= self.search_radius]
+        found = []
+        for yaw in (-0.35, 0.0, 0.35):
+            motions = np.tile(np.eye(4), (len(shifts), 1, 1))
+            c, s = np.cos(yaw), np.sin(yaw)
+            motions[:, :2, :2] = [[c, -s], [s, c]]
+            motions[:, :3, 3] = centre - motions[0, :3, :3] @ centre
+            motions[:, :2, 3] += shifts
+            scores = self.residual.scores(track, motions, 150)
+            for k in np.argsort(scores, kind="stable")[:2]:
+                T = self._refined(track, motions[k])
+                if np.isfinite(scores[k]) and self._admissible(T, centre):
+                    found.append(self._scored(track, _Proposal("search", T, 0)))
+        return found
+
+    def _refined(self, track: Track, T: NDArray[np.float64]) -> NDArray[np.float64]:
+        return refine_motion(track, T, self.residual.depth_scale, self.residual.colour_scale)
+
+    def _scored(self, track: Track, proposal: _Proposal) -> Candidate:
+        kind, T, support, result = proposal
+        error = 0.0 if result is None else result.rms
+        return Candidate(kind, rigid_transform(T), support, error, self.residual.score(track, T), result)
+
+    def _admissible(self, T: NDArray[np.float64], centre: NDArray[np.float64]) -> bool:
+        """Whether a motion is finite and within the limits of displacement and angle."""
+        if not np.isfinite(T).all():
+            return False
+        return bool(rigid.displacement(T, centre) <= self.max_shift and rigid.angle(T) <= self.max_angle)
+
+
+def _nearly_equal(a: NDArray[np.float64], b: NDArray[np.float64], centre: NDArray[np.float64]) -> bool:
+    """Whether two motions differ by less than 0.2 mm at the centre and 0.002 radians."""
+    change = rigid.invert(a) @ b
+    return bool(rigid.displacement(change, centre) < 2e-4 and rigid.angle(change) < 2e-3)

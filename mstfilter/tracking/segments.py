@@ -1,22 +1,32 @@
-"""What is tracked: the visible part of each object, once for all hypotheses that agree on it.
+"""Tracked segments: the visible part of each object, the data about its motion, and the test for rest.
 
-Hypotheses share most of their objects, so distinct segments are far fewer than hypotheses times objects.
-A `Segment` is named by the content of its projected mask and of its voxels.
+Hypotheses share most of their objects, so there are far fewer distinct segments than hypotheses times objects. The
+key of a `Segment` is the hash of its projected mask and of its voxels; segments with equal keys are tracked once.
 
->>> segments = segments_of(hypothesis, clip.before)      # doctest: +SKIP
->>> segments[label].key                                  # doctest: +SKIP
+>>> segments = segments_of(hypothesis, clip.before)                       # doctest: +SKIP
+>>> track = Track(segments[label], clip, DenseFlow().track(clip))         # doctest: +SKIP
+>>> StaticTest().rests(track)                                             # doctest: +SKIP
+
+A `Track` joins a segment with the flow and the features of the clip. It computes its properties on first use. Motion
+rules use nothing else.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mstfilter.scene import Frame, Hypothesis, content_key, render_hypothesis
+from mstfilter.scene import Clip, Frame, Hypothesis, content_key, render_hypothesis
+from mstfilter.tracking.features import SiftMatching, matched_colour, smooth_colour
+from mstfilter.tracking.flow import ClipTracks
+from mstfilter.tracking.registration import Surface, prepare
 
-__all__ = ["Segment", "segments_of"]
+__all__ = ["Segment", "StaticTest", "Track", "segments_of"]
+
+_TABLE_HEIGHT = 0.004  # metres; lower points belong to the table
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,10 +35,10 @@ class Segment:
 
     Attributes
     ----------
-    key : content name; equal keys are the same tracking problem.
+    key : hash of the content; equal keys are the same tracking problem.
     pixels : (M,) int64 sorted flat pixels of the projected mask.
-    support : (S,) int64 sorted flat pixels among them whose measured depth agrees with the object: the
-        mask of a voxel object reaches a little beyond the object itself.
+    support : (S,) int64 sorted flat pixels of the mask whose measured depth agrees with the object. The mask of a
+        voxel object extends slightly beyond the object itself.
     """
 
     key: bytes
@@ -36,22 +46,19 @@ class Segment:
     support: NDArray[np.int64]
 
 
-def segments_of(hypothesis: Hypothesis, frame: Frame, slack: float = 2.0, floor: float = 0.004) -> dict[int, Segment]:
-    """The segments of a hypothesis in a frame, by label; invisible objects have none.
+def segments_of(hypothesis: Hypothesis, frame: Frame) -> dict[int, Segment]:
+    """The segments of a hypothesis in a frame, by label; hidden objects have none.
 
-    Parameters
-    ----------
-    slack : measured and rendered depth may differ by this many voxels in the support.
-    floor : metres; points lower than this belong to the table, not to the support.
+    The support contains the pixels above the table where measured and rendered depth differ by less than two voxels.
     """
     labels, depth = render_hypothesis(hypothesis, frame.camera)
     flat_labels = labels.ravel()
     seen = np.flatnonzero(flat_labels)
     with np.errstate(invalid="ignore"):
-        agrees = np.abs(frame.depth - depth) < slack * hypothesis.grid.voxel_size
-        agrees &= frame.points[..., 2] > floor
+        agrees = np.abs(frame.depth - depth) < 2.0 * hypothesis.grid.voxel_size
+        agrees &= frame.points[..., 2] > _TABLE_HEIGHT
     agrees &= frame.valid
-    # Mixed pixels on the rim of a mask carry the depth and colour of what is behind.
+    # Pixels on the rim of a mask mix depth and colour with the background.
     interior = _interior(labels)
     order = seen[np.argsort(flat_labels[seen], kind="stable")]
     values, starts = np.unique(flat_labels[order], return_index=True)
@@ -68,7 +75,7 @@ def segments_of(hypothesis: Hypothesis, frame: Frame, slack: float = 2.0, floor:
 
 
 def _interior(labels: NDArray[np.uint16]) -> NDArray[np.bool_]:
-    """Pixels all of whose four neighbours carry the same label."""
+    """Pixels with the same label as their four neighbours."""
     padded = np.pad(labels, 1)
     centre = padded[1:-1, 1:-1]
     return (
@@ -80,10 +87,138 @@ def _interior(labels: NDArray[np.uint16]) -> NDArray[np.bool_]:
 
 
 def _voxel_keys(hypothesis: Hypothesis) -> dict[int, bytes]:
-    """A content name of each object's voxels."""
+    """Hash of the voxels of each object."""
     flat = hypothesis.labels.ravel()
     occupied = np.flatnonzero(flat)
     order = occupied[np.argsort(flat[occupied], kind="stable")]
     values, starts = np.unique(flat[order], return_index=True)
     bounds = [*starts.tolist(), len(order)]
     return {int(v): content_key(order[bounds[k] : bounds[k + 1]]) for k, v in enumerate(values)}
+
+
+@dataclass(frozen=True, eq=False)
+class Track:
+    """A segment in a clip.
+
+    Attributes
+    ----------
+    segment : Segment
+    clip : Clip
+    flow : ClipTracks, the dense flow of the clip.
+    """
+
+    segment: Segment
+    clip: Clip
+    flow: ClipTracks
+
+    @cached_property
+    def mask(self) -> NDArray[np.bool_]:
+        """The support in the first frame, (H, W)."""
+        image = np.zeros(self.clip.before.depth.shape, bool)
+        image.ravel()[self.segment.support] = True
+        return image
+
+    @cached_property
+    def target_mask(self) -> NDArray[np.bool_]:
+        """The support in the last frame according to the flow, (H, W)."""
+        return self.flow.warp(self.mask.astype(np.uint8)) > 0
+
+    @cached_property
+    def points(self) -> NDArray[np.float64]:
+        """World points of the support in the first frame, (S, 3) metres."""
+        return self.clip.before.points.reshape(-1, 3)[self.segment.support]
+
+    @cached_property
+    def target_points(self) -> NDArray[np.float64]:
+        """World points of the target mask in the last frame, above the table, (R, 3) metres."""
+        return self.clip.after.points[self._target_pixels]
+
+    @cached_property
+    def _target_pixels(self) -> NDArray[np.bool_]:
+        after = self.clip.after
+        with np.errstate(invalid="ignore"):
+            return self.target_mask & after.valid & (after.points[..., 2] > _TABLE_HEIGHT)
+
+    @cached_property
+    def surface(self) -> Surface | None:
+        """The visible surface in the first frame; None if it has too few points."""
+        return prepare(self.points, smooth_colour(self.clip.before, 5).reshape(-1, 3)[self.segment.support])
+
+    @cached_property
+    def target_surface(self) -> Surface | None:
+        """The surface of the target mask in the last frame; None if it has too few points."""
+        return prepare(self.target_points, self.colour_after[self._target_pixels])
+
+    @cached_property
+    def flow_pairs(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """World points (K, 3) in the first and last frame of the points that the flow followed to the end."""
+        before, after = self.clip.before, self.clip.after
+        chosen = self.flow.points_in(self.mask)
+        u, v = self.flow.start[chosen].T
+        end_u, end_v = np.rint(self.flow.end[chosen]).astype(np.int64).T
+        q = after.points[end_v, end_u]
+        keep = after.valid[end_v, end_u] & (q[:, 2] > _TABLE_HEIGHT)
+        return before.points[v, u][keep], q[keep]
+
+    def sift_pairs(self, sift: SiftMatching, in_target: bool) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """World points of SIFT matches that start in the mask and, if `in_target`, end near the target mask."""
+        import cv2
+
+        last = None
+        if in_target:
+            last = cv2.dilate(self.target_mask.astype(np.uint8), np.ones((11, 11), np.uint8)) > 0
+        matches = sift.match(self.clip.before, self.clip.after)
+        chosen = matches.within(self.mask, last)
+        return matches.p[chosen], matches.q[chosen]
+
+    def sample(self, n: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """At most n points of the support, evenly spaced, and their slightly blurred colours, (n, 3) each."""
+        chosen = np.unique(np.linspace(0, len(self.segment.support) - 1, n).astype(np.int64))
+        chosen = chosen[chosen >= 0]
+        colours = smooth_colour(self.clip.before, 5).reshape(-1, 3)[self.segment.support[chosen]]
+        return self.points[chosen], colours.astype(np.float64)
+
+    @property
+    def colour_after(self) -> NDArray[np.float32]:
+        """Slightly blurred colour (H, W, 3) of the last frame in the exposure of the first."""
+        return matched_colour(self.clip.after, self.clip.before, 5)
+
+
+@dataclass(frozen=True)
+class StaticTest:
+    """Tests whether an object rested. Objects that pass keep the identity exactly.
+
+    Tracking damages objects at rest: labels leak between touching objects of equal look, and the registration of
+    symmetric objects drifts. Objects whose pixels are unchanged are therefore not tracked.
+
+    Parameters
+    ----------
+    enabled : bool
+        If False, every object is tracked (the published algorithms).
+    changed_share : float
+        Largest share of changed pixels among the comparable ones.
+    least_share : float
+        Smallest share of comparable pixels of the object; with fewer it is tracked.
+    occluded_margin : float
+        Metres; a pixel whose depth decreased by more is occluded and not comparable.
+    """
+
+    enabled: bool = True
+    changed_share: float = 0.03
+    least_share: float = 0.3
+    occluded_margin: float = 0.015
+
+    def rests(self, track: Track) -> bool:
+        """Whether the visible part of the object is unchanged."""
+        if not self.enabled:
+            return False
+        support = track.segment.support
+        before, after = track.clip.before, track.clip.after
+        with np.errstate(invalid="ignore"):
+            nearer = before.depth.ravel()[support] - after.depth.ravel()[support] > self.occluded_margin
+        compared = after.valid.ravel()[support] & ~nearer
+        n = int(compared.sum())
+        if n < max(1.0, self.least_share * len(support)):
+            return False
+        changed = compared & ~track.flow.coherently_unchanged.ravel()[support]
+        return bool(changed.sum() <= self.changed_share * n)

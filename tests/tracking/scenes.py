@@ -193,19 +193,15 @@ class Scene:
         return Hypothesis.from_labels(self.labels(self.poses[0]), self.grid)
 
 
-def errors(T: np.ndarray, truth: np.ndarray, centre: np.ndarray) -> tuple[float, float]:
+def errors(T: np.ndarray | RigidTransform, truth: np.ndarray, centre: np.ndarray) -> tuple[float, float]:
     """Error of a motion in millimetres at a point, and degrees."""
-    D = np.linalg.inv(truth) @ T
+    D = np.linalg.inv(truth) @ (T.as_matrix() if isinstance(T, RigidTransform) else T)
     mm = 1000 * np.linalg.norm((D @ np.append(centre, 1.0))[:3] - centre)
     return float(mm), float(np.degrees(Rotation.from_matrix(D[:3, :3]).magnitude()))
 
 
 def iou(a: np.ndarray, b: np.ndarray) -> float:
     return float((a & b).sum() / max((a | b).sum(), 1))
-
-
-def rigid_transform(T: np.ndarray) -> RigidTransform:
-    return RigidTransform.from_matrix(T)
 
 
 def standard(

@@ -3,8 +3,13 @@ import pytest
 
 from mstfilter.errors import InputError
 from mstfilter.scene import Clip, Frame, cache as memo
-from mstfilter.tracking.flow import DenseFlow, track_labels
+from mstfilter.tracking.flow import DenseFlow
 from tests.tracking.scenes import Box, Scene, at, iou, slide
+
+
+def track_labels(labels, clip):
+    return DenseFlow().track(clip).warp(labels)
+
 
 MOVERS, RESTING = (1, 2, 5), (3, 4, 6)
 

@@ -2,8 +2,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from mstfilter.tracking import rigid
-from mstfilter.tracking.jlinkage import cluster, jlinkage
+from mstfilter.tracking.rigid import cluster, jlinkage, move_points
 
 
 def motions(k, rng):
@@ -19,7 +18,7 @@ def test_k_exact_motions_give_k_clusters(k):
     rng = np.random.default_rng(k)
     truth = list(motions(k, rng))
     p = rng.uniform(0, 0.15, (15 * k, 3))
-    q = np.concatenate([rigid.apply(T, p[15 * i : 15 * (i + 1)]) for i, T in enumerate(truth)])
+    q = np.concatenate([move_points(T, p[15 * i : 15 * (i + 1)]) for i, T in enumerate(truth)])
     found = jlinkage(rng, p, q, eps=1e-4, n_models=4000)
     assert len(found) == k
     for m in found:
@@ -32,7 +31,7 @@ def test_noise_and_outliers_leave_one_cluster_that_holds_all_inliers():
     rng = np.random.default_rng(7)
     (T,) = motions(1, rng)
     p = rng.uniform(0, 0.15, (100, 3))
-    q = rigid.apply(T, p) + 0.002 * rng.normal(size=p.shape)
+    q = move_points(T, p) + 0.002 * rng.normal(size=p.shape)
     q[60:] = rng.uniform(-0.4, 0.4, (40, 3))
     found = jlinkage(rng, p, q, eps=0.010)
     assert len(found) == 1
@@ -43,7 +42,7 @@ def test_two_motions_under_one_mask_are_both_found():
     rng = np.random.default_rng(8)
     a, b = motions(2, rng)
     p = rng.uniform(0, 0.15, (64, 3))
-    q = np.where(np.arange(64)[:, None] < 40, rigid.apply(a, p), rigid.apply(b, p)) + 0.001 * rng.normal(size=p.shape)
+    q = np.where(np.arange(64)[:, None] < 40, move_points(a, p), move_points(b, p)) + 0.001 * rng.normal(size=p.shape)
     found = jlinkage(rng, p, q, n_models=2000)
     assert [len(m.inliers) for m in found] == pytest.approx([40, 24], abs=2)
 

@@ -1,4 +1,4 @@
-"""Registration, residual, refinement, features and the static test on one segment at a time."""
+"""Residual, refinement, features and the static test, one segment at a time."""
 
 import numpy as np
 import pytest
@@ -6,12 +6,8 @@ import pytest
 from mstfilter.scene import Clip, Frame
 from mstfilter.tracking.features import SiftMatching
 from mstfilter.tracking.flow import DenseFlow
-from mstfilter.tracking.refinement import normals, refine
-from mstfilter.tracking.registration import assess, centroid_shift, prepare, register
-from mstfilter.tracking.residual import Residual
-from mstfilter.tracking.segments import segments_of
-from mstfilter.tracking.static import StaticTest
-from mstfilter.tracking.track import Track
+from mstfilter.tracking.residual import MotionResidual, normals, refine_motion
+from mstfilter.tracking.segments import StaticTest, Track, segments_of
 from tests.tracking.scenes import Box, Cylinder, Scene, at, errors, slide, standard
 
 RESTING, MOVING = (3, 4, 6), (1, 2, 5)
@@ -20,39 +16,6 @@ RESTING, MOVING = (3, 4, 6), (1, 2, 5)
 def tracks_of(scene, clip):
     flow = DenseFlow().track(clip)
     return {k: Track(s, clip, flow) for k, s in segments_of(scene.hypothesis(), clip.before).items()}
-
-
-def corner(rng, n=1500):
-    """Points on three faces of a box: every motion is observable."""
-    p = rng.uniform(0, 0.1, (n, 3))
-    p[np.arange(n), np.arange(n) % 3] = 0.0
-    return p + 0.0005 * rng.normal(size=p.shape)
-
-
-def test_registration_finds_a_small_motion():
-    rng = np.random.default_rng(0)
-    T = at(0.01, -0.006, 0.004, 6)
-    source, target = prepare(corner(rng)), prepare(corner(rng) @ T[:3, :3].T + T[:3, 3])
-    fit = register(source, target, np.eye(4), 0.03)
-    mm, deg = errors(fit.T, T, np.full(3, 0.03))
-    assert mm < 0.5 and deg < 0.5
-    assert fit.overlap > 0.95 and fit.median < 0.004
-    again = register(source, target, np.eye(4), 0.03)
-    np.testing.assert_array_equal(fit.T, again.T)
-
-
-def test_registration_from_the_centroid_reaches_far_motions():
-    rng = np.random.default_rng(1)
-    T = at(0.2, 0.1, 0.0, 12)
-    a, b = corner(rng), corner(rng) @ T[:3, :3].T + T[:3, 3]
-    fit = register(prepare(a), prepare(b), centroid_shift(a, b), 0.03)
-    assert errors(fit.T, T, np.full(3, 0.03))[0] < 1.0
-    assert assess(prepare(a), prepare(b), np.eye(4), 0.03).overlap < 0.5
-
-
-@pytest.mark.parametrize("n", [0, 1, 11])
-def test_too_few_points_cannot_be_registered(n):
-    assert prepare(np.random.default_rng(0).normal(size=(n, 3))) is None
 
 
 def test_what_rests_is_found_at_rest_and_what_moves_is_not(textured, plain):
@@ -80,7 +43,7 @@ def test_small_shifts_are_not_rest(shift):
 
 def test_the_true_motion_has_the_least_residual(textured):
     scene, clip = textured
-    residual = Residual()
+    residual = MotionResidual()
     for k in (1, 5):
         track, truth = tracks_of(scene, clip)[k], scene.motions()[k]
         centre = track.points.mean(axis=0)
@@ -98,14 +61,14 @@ def test_residual_knows_a_twin_by_where_flow_comes_from():
     track = tracks_of(scene, scene.clip(0))[5]
     onto_twin = scene.poses[0][3] @ np.linalg.inv(scene.poses[0][4])  # object 5 to where its twin, 4, rests
     truth = scene.motions()[5]
-    assert Residual().score(track, truth) < Residual().score(track, onto_twin)
-    by_look = Residual(track_weight=0.0)
+    assert MotionResidual().score(track, truth) < MotionResidual().score(track, onto_twin)
+    by_look = MotionResidual(track_weight=0.0)
     assert by_look.score(track, onto_twin) < by_look.score(track, truth) + 0.5
 
 
 def test_hidden_points_cost_a_constant_and_points_outside_more(textured):
     scene, clip = textured
-    track, residual = tracks_of(scene, clip)[1], Residual(track_weight=0.0)
+    track, residual = tracks_of(scene, clip)[1], MotionResidual(track_weight=0.0)
     assert residual.score(track, at(0, 0, -0.5)) == pytest.approx(residual.occluded_cost)
     assert residual.score(track, at(30, 0, 0)) == pytest.approx(residual.outside_cost)
 
@@ -114,8 +77,8 @@ def test_many_motions_are_scored_like_one(textured):
     scene, clip = textured
     track, rng = tracks_of(scene, clip)[1], np.random.default_rng(0)
     motions = np.stack([at(*rng.uniform(-0.1, 0.1, 3), 10 * rng.normal()) for _ in range(20)])
-    together = Residual().scores(track, motions)
-    np.testing.assert_array_equal(together, [Residual().score(track, T) for T in motions])
+    together = MotionResidual().scores(track, motions)
+    np.testing.assert_array_equal(together, [MotionResidual().score(track, T) for T in motions])
 
 
 def test_nothing_to_compare_is_infinite(textured):
@@ -123,7 +86,7 @@ def test_nothing_to_compare_is_infinite(textured):
     blank = Frame(clip.after.rgb, np.full_like(clip.after.depth, np.nan), clip.after.camera)
     blind = Clip((clip.before, blank), clip.grid)
     assert tracks_of(scene, blind)[1].target_points.shape == (0, 3)
-    assert Residual().score(tracks_of(scene, blind)[1], np.eye(4)) == np.inf
+    assert MotionResidual().score(tracks_of(scene, blind)[1], np.eye(4)) == np.inf
 
 
 def test_refinement_pulls_a_wrong_motion_in(textured, plain):
@@ -133,10 +96,10 @@ def test_refinement_pulls_a_wrong_motion_in(textured, plain):
             centre = track.points.mean(axis=0)
             off = at(0.006, -0.005, 0.004, 3)
             off[:3, 3] += centre - off[:3, :3] @ centre
-            refined = refine(track, truth @ off)
+            refined = refine_motion(track, truth @ off)
             mm, deg = errors(refined, truth, centre)
             assert deg < 1.2
-            assert Residual().score(track, refined) < 0.6 * Residual().score(track, truth @ off)
+            assert MotionResidual().score(track, refined) < 0.6 * MotionResidual().score(track, truth @ off)
             if kind == "textured":  # along a plain face neither depth nor colour says anything
                 assert mm < 2.0
 
@@ -145,7 +108,7 @@ def test_refinement_uses_colour_for_the_spin_of_a_can():
     poses = [[at(0, 0, 0.06)], [at(0.0, 0.0, 0.06, 6)]]
     scene = Scene([Cylinder((0.09, 0.09, 0.12), texture=0.7)], poses, (640, 480))
     track = tracks_of(scene, scene.clip(0))[1]
-    T = refine(track, np.eye(4))
+    T = refine_motion(track, np.eye(4))
     assert errors(T, scene.motions()[1], track.points.mean(axis=0))[1] < 1.5
 
 

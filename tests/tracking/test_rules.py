@@ -4,10 +4,8 @@ import pytest
 from mstfilter.errors import InputError
 from mstfilter.tracking import rigid
 from mstfilter.tracking.flow import DenseFlow
-from mstfilter.tracking.mst_rule import MstRule
-from mstfilter.tracking.rules import IDENTITY, AuthorsRule, Candidate, PaperRule
-from mstfilter.tracking.segments import segments_of
-from mstfilter.tracking.track import Track
+from mstfilter.tracking.rules import IDENTITY, AuthorsRule, Candidate, MstRule, PaperRule
+from mstfilter.tracking.segments import Track, segments_of
 from tests.tracking.scenes import Box, Scene, at, errors, slide
 
 
@@ -46,7 +44,7 @@ def test_papers_millimetre_is_below_the_noise(printed_box, plain):
 
 
 def test_papers_two_orders():
-    sift, icp = Candidate("sift", np.eye(4), 9, 0.004, 0.004), Candidate("icp", np.eye(4), 100, 0.0008, 0.0008)
+    sift, icp = Candidate("sift", IDENTITY.T, 9, 0.004, 0.004), Candidate("icp", IDENTITY.T, 100, 0.0008, 0.0008)
     rng = np.random.default_rng(0)
     assert PaperRule().choose(rng, (sift, icp, IDENTITY)) is sift
     assert PaperRule(order="best").choose(rng, (sift, icp, IDENTITY)) is icp
@@ -56,16 +54,16 @@ def test_papers_two_orders():
 def test_authors_rule_uses_a_cluster_as_often_as_its_size_says():
     """Binomial checks; each bound is 4.4 standard deviations, false alarm below 1e-4 in all."""
     n = 4000
-    icp = Candidate("icp", np.eye(4), 100)
+    icp = Candidate("icp", IDENTITY.T, 100)
     for support, p in ((3, 0.1), (6, 0.35), (9, 0.65), (30, 0.9)):
-        cluster = Candidate("sift", np.eye(4), support)
+        cluster = Candidate("sift", IDENTITY.T, support)
         rng = np.random.default_rng(support)
         used = sum(AuthorsRule().choose(rng, (cluster, icp, IDENTITY)) is cluster for _ in range(n))
         assert abs(used - n * p) < 4.4 * np.sqrt(n * p * (1 - p))
 
 
 def test_authors_rule_draws_clusters_by_size():
-    a, b = Candidate("sift", np.eye(4), 30), Candidate("sift", np.eye(4), 10)
+    a, b = Candidate("sift", IDENTITY.T, 30), Candidate("sift", IDENTITY.T, 10)
     rng = np.random.default_rng(1)
     drawn = [AuthorsRule(lowest=1.0, highest=1.0).choose(rng, (a, b, IDENTITY)) for _ in range(4000)]
     assert abs(sum(c is a for c in drawn) - 3000) < 4.4 * np.sqrt(4000 * 0.75 * 0.25)
@@ -73,7 +71,7 @@ def test_authors_rule_draws_clusters_by_size():
 
 def test_authors_rule_falls_back_to_icp_then_identity():
     rng = np.random.default_rng(2)
-    icp = Candidate("icp", np.eye(4), 100)
+    icp = Candidate("icp", IDENTITY.T, 100)
     assert AuthorsRule().choose(rng, (icp, IDENTITY)) is icp
     assert AuthorsRule().choose(rng, (IDENTITY,)) is IDENTITY
 
@@ -95,7 +93,7 @@ def test_mst_rule_places_a_cylinder_whatever_its_spin(textured, plain):
         rule, rng = MstRule(), np.random.default_rng(0)
         chosen = rule.choose(rng, rule.candidates(rng, track))
         axis = np.append(scene.poses[0][1][:3, 3], 1.0)
-        assert np.linalg.norm((chosen.T @ axis - truth @ axis)[:3]) < 0.008
+        assert np.linalg.norm((chosen.T.as_matrix() @ axis - truth @ axis)[:3]) < 0.008
 
 
 def test_mst_rule_is_not_worse_than_registration_from_the_centroid(textured, plain):
@@ -110,17 +108,17 @@ def test_mst_rule_is_not_worse_than_registration_from_the_centroid(textured, pla
 
 def test_rest_is_kept_unless_a_motion_is_clearly_better():
     rest, better, best = (
-        Candidate(k, np.eye(4), 0, 0.0, s) for k, s in (("identity", 0.85), ("icp", 0.9), ("icp", 0.8))
+        Candidate(k, IDENTITY.T, 0, 0.0, s) for k, s in (("identity", 0.85), ("icp", 0.9), ("icp", 0.8))
     )
     rng = np.random.default_rng(0)
     assert MstRule().choose(rng, (rest, better)) is rest
     assert MstRule().choose(rng, (rest, best)) is best
-    nothing = Candidate("identity", np.eye(4), 0, 0.0, np.inf)
+    nothing = Candidate("identity", IDENTITY.T, 0, 0.0, np.inf)
     assert MstRule().choose(rng, (nothing,)).kind == "identity"
 
 
 def test_sampling_follows_the_scores():
-    a, b = Candidate("identity", np.eye(4), 0, 0.0, 1.0), Candidate("icp", np.eye(4), 0, 0.0, 1.2)
+    a, b = Candidate("identity", IDENTITY.T, 0, 0.0, 1.0), Candidate("icp", IDENTITY.T, 0, 0.0, 1.2)
     rule, rng, n = MstRule(select="sample", n_eff=10.0), np.random.default_rng(3), 4000
     p = 1 / (1 + np.exp(-0.5 * 10 * 0.2))
     drawn = sum(rule.choose(rng, (a, b)) is a for _ in range(n))
@@ -133,7 +131,7 @@ def test_candidates_too_far_or_too_turned_are_dropped(printed_box):
     centre = track_of(scene, clip).points.mean(axis=0)
     assert len(MstRule(max_shift=0.005).candidates(rng, track_of(scene, clip))) < 3
     for c in MstRule(max_shift=0.02, max_angle=0.05).candidates(rng, track_of(scene, clip)):
-        assert rigid.displacement(c.T, centre) <= 0.02 and rigid.angle(c.T) <= 0.05
+        assert rigid.displacement(c.T.as_matrix(), centre) <= 0.02 and rigid.angle(c.T.as_matrix()) <= 0.05
 
 
 def test_an_object_that_flow_lost_is_searched_for():

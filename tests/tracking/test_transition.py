@@ -5,9 +5,8 @@ import pytest
 
 from mstfilter.scene import Clip, Frame, Hypothesis
 from mstfilter.smc import Population
-from mstfilter.tracking.mst_rule import MstRule
-from mstfilter.tracking.rules import AuthorsRule, PaperRule
-from mstfilter.tracking.static import StaticTest
+from mstfilter.tracking.rules import AuthorsRule, MstRule, PaperRule
+from mstfilter.tracking.segments import StaticTest
 from mstfilter.tracking.transition import IdentityTransition, TrackingTransition
 from mstfilter.tracking.warp import Warp
 from tests.tracking.scenes import Box, Cylinder, Scene, at, errors, iou, slide

@@ -1,11 +1,11 @@
 """Motion segmentation: the pixels of a clip's last frame, grouped by rigid motion.
 
->>> MotionSegmentation().labels(clip)        # (H, W) int32: 0 at rest, 1, 2, ... what moved together, -1 unknown
+>>> MotionSegmentation().labels(clip)        # (H, W) int32: 0 at rest, 1, 2, ... moving groups, -1 unknown
 
-Points that the optical flow followed through the clip are binned into small cells of the last image, and
-neighbouring cells are joined while one rigid motion explains them both, the pair with the smallest misfit first
-(Ward's rule; the sums of `rigid.statistics` make each trial one 3 x 3 SVD). Two objects that touch and look alike
-come apart here as soon as one has been pushed past the other.
+Points that the optical flow followed through the clip are binned into small cells of the last image. Neighbouring
+cells are joined while one rigid motion explains both, the pair with the smallest misfit first (Ward's rule; with
+`rigid.pair_sums` each trial is one 3 x 3 SVD). This separates touching objects of equal look when one has moved
+relative to the other.
 
 Data used: the optical flow of the clip, and the depth of its first and last frame.
 """
@@ -21,31 +21,29 @@ from scipy.spatial.distance import cdist
 
 from mstfilter.scene import Clip, component_key, memo, read_only
 from mstfilter.tracking.flow import DenseFlow
-from mstfilter.tracking.rigid import Array, apply, fit_statistics, statistics
+from mstfilter.tracking.rigid import fit_sums, move_points, pair_sums
 
 __all__ = ["FollowedPoints", "MotionSegmentation", "followed_points"]
-
-Ints = NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)
 class FollowedPoints:
-    """Points that were followed through a clip and have depth at both ends.
+    """Points that were followed through a clip and have depth in the first and last frame.
 
     Attributes
     ----------
     p, q : (n, 3) world metres, before and after.
-    column, row : (n,) pixel of the last frame where each ends.
+    column, row : (n,) pixel of each point in the last frame.
     """
 
-    p: Array
-    q: Array
-    column: Ints
-    row: Ints
+    p: NDArray[np.float64]
+    q: NDArray[np.float64]
+    column: NDArray[np.int64]
+    row: NDArray[np.int64]
 
 
 def followed_points(clip: Clip, flow: DenseFlow) -> FollowedPoints:
-    """The points of a clip's flow that lie in the workspace at the end. Memoised by content."""
+    """Points of the flow of a clip that are in the workspace in the last frame. Cached by content."""
 
     def compute() -> FollowedPoints:
         tracks = flow.track(clip)
@@ -65,29 +63,29 @@ def followed_points(clip: Clip, flow: DenseFlow) -> FollowedPoints:
 
 @dataclass(frozen=True)
 class MotionSegmentation:
-    """Cells of the image joined while one rigid motion explains them.
+    """Joins cells of the image that follow one rigid motion.
 
     Parameters
     ----------
     cell : int
         Edge of a cell in pixels.
     moved : float
-        A cell whose points went less than this on average (metres) is at rest.
+        A cell whose points moved less than this (metres) on average is at rest.
     misfit : float
-        Two neighbours are joined while the points of the smaller one lie within this (root mean square, metres) of
-        the common motion, beyond what they do under their own.
+        Largest misfit of two joined neighbours, metres: root mean square residual of the points of the smaller one
+        under the common motion, in addition to the residual under its own motion.
     noisy : float
-        A cell whose points do not follow any rigid motion within this (metres) is left out.
+        Largest root mean square residual (metres) of a cell under one rigid motion; other cells are not used.
     rival, rival_reach : float
-        A point tells nothing that another motion takes as near to where it went, to within `rival` (metres): so do
-        points near the axis about which their object turned. Such motions are rest, and those that are followed
-        within `rival_reach` (metres) of the point's cell; further away motions coincide by chance.
+        A point is ambiguous if another motion predicts its position in the last frame within `rival` (metres) as
+        well, for instance near the axis of a rotation. The motions compared are rest and those of cells within
+        `rival_reach` (metres) of the point's cell; motions farther away coincide by chance.
     reach : float
-        Neighbouring cells further apart than this in space (metres) are not neighbours.
+        Largest distance in space (metres) of neighbouring cells.
     min_points : int
-        Cells and motions with fewer points are left out.
+        Smallest number of points of a motion.
     flow : DenseFlow
-        Follows the points; the same as the transition's is computed once.
+        Follows the points. The flow is shared with a transition that uses the same settings.
     """
 
     cell: int = 10
@@ -101,7 +99,7 @@ class MotionSegmentation:
     flow: DenseFlow = field(default_factory=DenseFlow)
 
     def labels(self, clip: Clip) -> NDArray[np.int32] | None:
-        """(H, W) number of the motion of each pixel of the last frame; None for a single frame. Memoised."""
+        """Number of the motion of each pixel of the last frame, (H, W); None for a single frame. Cached."""
         if len(clip.frames) < 2:
             return None
         return memo("rigid motions", (clip.frames_key, component_key(self)), lambda: read_only(self._labels(clip)))
@@ -113,22 +111,22 @@ class MotionSegmentation:
         if not len(points.p):
             return out
         went = np.linalg.norm(points.q - points.p, axis=1) >= self.moved
-        # Points at rest and points that moved never share a cell.
+        # Cells hold either points at rest (even number) or moved points (odd number).
         across, down = (-(-n // self.cell) for n in (width, height))
         place = (points.row // self.cell) * across + points.column // self.cell
         cells, cell = np.unique(2 * place + went, return_inverse=True)
         origin = points.q.mean(axis=0)
-        sums = statistics(points.p - origin, points.q - origin, cell, len(cells))
-        _, error = fit_statistics(sums)
+        sums = pair_sums(points.p - origin, points.q - origin, cell, len(cells))
+        _, error = fit_sums(sums)
         clean = error <= sums[:, 0] * self.noisy**2
         pairs = _neighbours(cells, across, down, sums, self.reach)
-        near = np.zeros(len(cells), bool)  # what rests matters only beside what moved
+        near = np.zeros(len(cells), bool)  # cells at rest are used only next to moved cells
         touched = (cells[pairs] % 2 == 1).any(axis=1)
         near[pairs[touched].ravel()] = True
         used = clean & (near | (cells % 2 == 1))
         group = _join(sums, pairs[used[pairs].all(axis=1)], self.misfit)
         group[~used] = -1
-        group[(cells % 2 == 0) & ~near] = -2  # surely at rest
+        group[(cells % 2 == 0) & ~near] = -2  # at rest
         motions, group = self._motions(sums, group)
         centre = sums[:, 4:7] / sums[:, :1]
         rivals = [cdist(centre, centre[group == k]).min(axis=1, initial=np.inf) for k in range(len(motions))]
@@ -138,14 +136,16 @@ class MotionSegmentation:
         out[points.row, points.column] = number
         return out
 
-    def _motions(self, sums: Array, group: Ints) -> tuple[Array, Ints]:
-        """Motions (k, 4, 4), 0 the identity, and each cell's number; small ones are dropped."""
+    def _motions(
+        self, sums: NDArray[np.float64], group: NDArray[np.int64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        """Motions (k, 4, 4), the identity first, and the number of each cell's motion; -1 for too few points."""
         motions, number = [np.eye(4)], np.full(len(group), -1)
         number[group == -2] = 0
         for g in np.unique(group[group >= 0]):
             own = group == g
             total = sums[own].sum(axis=0)
-            T, _ = fit_statistics(total)
+            T, _ = fit_sums(total)
             trace = total[7] + total[11] + total[15]
             if total[16] + total[17] - 2 * trace < total[0] * self.moved**2:
                 number[own] = 0
@@ -155,8 +155,10 @@ class MotionSegmentation:
         return np.array(motions), number
 
 
-def _neighbours(cells: Ints, across: int, down: int, sums: Array, reach: float) -> Ints:
-    """(m, 2) pairs of cells that touch in the image and in space."""
+def _neighbours(
+    cells: NDArray[np.int64], across: int, down: int, sums: NDArray[np.float64], reach: float
+) -> NDArray[np.int64]:
+    """Pairs of cells (m, 2) that are adjacent in the image and close in space."""
     place, centre = cells // 2, sums[:, 4:7] / sums[:, :1]
     index = np.full((2, (down + 2) * (across + 2)), -1)
     padded = (place // across + 1) * (across + 2) + place % across + 1
@@ -174,19 +176,21 @@ def _neighbours(cells: Ints, across: int, down: int, sums: Array, reach: float) 
     return np.asarray(pairs[close], dtype=np.int64)
 
 
-def _misfit(a: Array, b: Array, error_a: Array, error_b: Array) -> Array:
-    """Distance in metres by which two groups disagree: sqrt(rise of the squared error x (n_a + n_b) / (n_a n_b))."""
-    _, error = fit_statistics(a + b)
+def _misfit(
+    a: NDArray[np.float64], b: NDArray[np.float64], error_a: NDArray[np.float64], error_b: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Misfit of two groups in metres: sqrt(increase of the squared error x (n_a + n_b) / (n_a n_b))."""
+    _, error = fit_sums(a + b)
     na, nb = a[..., 0], b[..., 0]
     return np.sqrt(np.maximum(error - error_a - error_b, 0.0) * (na + nb) / (na * nb))
 
 
-def _join(sums: Array, pairs: Ints, limit: float) -> Ints:
-    """Group number of each cell after joining neighbours, the least misfit first."""
+def _join(sums: NDArray[np.float64], pairs: NDArray[np.int64], limit: float) -> NDArray[np.int64]:
+    """Group number of each cell after joining neighbours in order of misfit."""
     n = len(sums)
     group = np.arange(n)
     sums = sums.copy()
-    _, error = fit_statistics(sums)
+    _, error = fit_sums(sums)
     adjacent: list[set[int]] = [set() for _ in range(n)]
     for a, b in pairs.tolist():
         adjacent[a].add(b)
@@ -215,7 +219,7 @@ def _join(sums: Array, pairs: Ints, limit: float) -> Ints:
         group[members[b]] = a
         members[b] = []
         sums[a] += sums[b]
-        error[a] = fit_statistics(sums[a])[1]
+        error[a] = fit_sums(sums[a])[1]
         stamp[a] += 1
         stamp[b] = -1
         for c in adjacent[b] - {a}:
@@ -230,19 +234,19 @@ def _join(sums: Array, pairs: Ints, limit: float) -> Ints:
 
 def _best(
     points: FollowedPoints,
-    cell: Ints,
-    pairs: Ints,
-    number: Ints,
-    motions: Array,
-    origin: Array,
+    cell: NDArray[np.int64],
+    pairs: NDArray[np.int64],
+    number: NDArray[np.int64],
+    motions: NDArray[np.float64],
+    origin: NDArray[np.float64],
     limit: float,
     rival: float,
     rivals: NDArray[np.bool_],
 ) -> NDArray[np.int32]:
-    """Of the motions in its cell and those around it, the one that takes each point nearest to where it went.
+    """For each point the motion, among those of its cell and of adjacent cells, with the smallest residual.
 
-    -1 where that is further off than `limit`, or where another of the `rivals` (motions, cells) comes as near to
-    within `rival`.
+    -1 if the residual exceeds `limit`, or if the residual of another of the `rivals` (motions, cells) is larger by
+    less than `rival`.
     """
     p, q = points.p - origin, points.q - origin
     n, every = len(number), np.arange(len(p))
@@ -250,7 +254,7 @@ def _best(
     a, b = pairs.T
     for here, there in ((np.arange(n), number), (a, number[b]), (b, number[a])):
         near[here[there >= 0], there[there >= 0]] = True
-    distance = np.stack([np.linalg.norm(apply(T, p) - q, axis=1) for T in motions], axis=1)
+    distance = np.stack([np.linalg.norm(move_points(T, p) - q, axis=1) for T in motions], axis=1)
     best = np.where(near[cell], distance, np.inf).argmin(axis=1)
     least = np.where(near[cell, best], distance[every, best], np.inf)
     distance[every, best] = np.inf

@@ -5,7 +5,7 @@ import pytest
 
 from mstfilter.scene import Clip, Hypothesis, VoxelGrid, cache as memo, project
 from mstfilter.tracking.flow import DenseFlow
-from mstfilter.tracking.rigid_motions import MotionSegmentation, followed_points
+from mstfilter.tracking.motion_segmentation import MotionSegmentation, followed_points
 from tests.tracking.scenes import Box, Scene, at, standard
 
 
