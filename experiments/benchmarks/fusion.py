@@ -1,6 +1,6 @@
-"""Fusion beside a straightforward program, and lazy beside built candidates; see README.md. Writes fusion.csv.
+"""Compare crossover with a direct implementation, and lazy with built candidates; writes fusion.csv. See README.md.
 
-In each round there is a new table with 5 samples and 5 predictions; all programs fuse all pairs, in random order.
+Each round has a new table with 5 samples and 5 predictions; all programs fuse all pairs, in random order.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ N, ETA, KEPT = 5, 5, 5
 
 
 def fusion_update(name: str) -> FusionUpdate:
-    """The update of a preset, without what looks at the motion in the clip: here is one frame."""
+    """The update of a preset without division, which needs motion: the clip has one frame."""
     update = preset(name).update
     assert isinstance(update, FusionUpdate)
     return replace(update, division=NoDivision(), eta=ETA)
 
 
 def clip_of(seed: int) -> Clip:
-    """What a camera sees of the true table: depth without noise, no colour."""
+    """A clip of one frame of the true table: depth without noise, no colour."""
     depth = render(table_labels(table(np.random.default_rng(seed))), GRID, CAMERA).depth
     directions = CAMERA.rays() @ CAMERA.pose.as_matrix()[:3, :3].T
     floor = -CAMERA.position[2] / np.minimum(directions[..., 2], -1e-6)
@@ -47,7 +47,7 @@ def clip_of(seed: int) -> Clip:
 
 
 def populations(seed: int, n_proposed: int, n_predicted: int) -> tuple[Population, Population]:
-    """Samples and predictions of a table, unevenly weighted."""
+    """Samples and predictions of a table with uneven weights."""
     rng = np.random.default_rng(seed)
     sides = parents(rng, n_proposed, n_predicted)
     proposed, predicted = (Population(side, 0.5 * rng.standard_normal(len(side))) for side in sides)
@@ -55,36 +55,33 @@ def populations(seed: int, n_proposed: int, n_predicted: int) -> tuple[Populatio
 
 
 @dataclass(frozen=True)
-class Recorded(RandomOrder):
-    """Keeps what it drew."""
+class RecordedOrder(RandomOrder):
+    """A random order that stores its draws."""
 
     seen: list = field(default_factory=list)
 
     def draw(self, rng, graph, component):
-        """Draw."""
         self.seen.append(super().draw(rng, graph, component))
         return self.seen[-1]
 
 
-class Tape:
-    """A generator that keeps its uniform numbers."""
+class RecordedGenerator:
+    """A generator that stores its uniform numbers."""
 
     def __init__(self, seed: int) -> None:
         self.rng, self.uniform = np.random.default_rng(seed), []
 
     def permutation(self, n: int) -> np.ndarray:
-        """Draw."""
         return self.rng.permutation(n)
 
     def random(self, n: int) -> np.ndarray:
-        """Draw."""
         self.uniform.append(self.rng.random(n))
         return self.uniform[-1]
 
 
 def agree(crossover: Crossover, proposed: Hypothesis, predicted: Hypothesis, seed: int) -> bool:
-    """Whether both programs make the same labels, up to their names, of the same random decisions."""
-    tape, structure = Tape(seed), Recorded()
+    """Whether both programs make the same labels, up to renaming, from the same random decisions."""
+    tape, structure = RecordedGenerator(seed), RecordedOrder()
     child = replace(crossover, structure=structure).mix(tape, proposed, predicted)
     graph = conflict_graph(proposed.labels, predicted.labels)
     vertex = list(zip(graph.side.tolist(), graph.label.tolist(), strict=True))
@@ -97,20 +94,20 @@ def agree(crossover: Crossover, proposed: Hypothesis, predicted: Hypothesis, see
 
 
 def cpu(work: Callable[[], object]) -> float:
-    """Seconds of processor time of a call."""
+    """Processor time of a call in seconds."""
     start = time.process_time()
     work()
     return time.process_time() - start
 
 
 def one_round(seed: int, n: int, order: np.random.Generator) -> dict[str, float]:
-    """Seconds of each program, a candidate where it makes many."""
+    """Seconds of each program; per candidate if it makes several."""
     proposed, predicted = populations(seed, n, n)
     clip, paper, mst = clip_of(seed), fusion_update("paper"), fusion_update("mst")
     unseen = replace(paper, free_space=NoFreeSpace())
     pairs = [(i, j) for i in range(n) for j in range(n)]
 
-    def by_hand() -> None:
+    def direct() -> None:
         for i, j in pairs:
             rng = np.random.default_rng([seed, i, j])
             plain.crossover(rng, proposed.particles[i].labels, predicted.particles[j].labels)
@@ -139,7 +136,7 @@ def one_round(seed: int, n: int, order: np.random.Generator) -> dict[str, float]
             paper.free_space.project(hypothesis, clip.after)
 
     work: dict[str, tuple[Callable[[], None], int]] = {
-        "plain": (by_hand, len(pairs)),
+        "plain": (direct, len(pairs)),
         "paper": (lambda: ours(paper.crossover), len(pairs)),
         "mst": (lambda: ours(mst.crossover), len(pairs)),
         "all": (lambda: step(unseen, lazy=False), 1),
@@ -153,7 +150,7 @@ def one_round(seed: int, n: int, order: np.random.Generator) -> dict[str, float]
 
 
 def large(name: str, n: int, n_proposed: int) -> dict[str, float]:
-    """One step of n hypotheses and their samples, in this process: what is kept, seconds and peak memory in MiB."""
+    """One step with n hypotheses in this process: number of particles kept, seconds, peak memory in MiB."""
     proposed, predicted = populations(0, n_proposed, n)
     clip, update = clip_of(0), fusion_update(name)
     start = time.process_time()
@@ -163,7 +160,7 @@ def large(name: str, n: int, n_proposed: int) -> dict[str, float]:
 
 
 def main() -> None:
-    """Measure."""
+    """Check that both programs agree, run the rounds and write the table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--out", type=Path, default=HERE)
@@ -185,7 +182,7 @@ def main() -> None:
 
     order = np.random.default_rng(0)
     if not options.smoke:
-        one_round(rounds, 1, order)  # warms up
+        one_round(rounds, 1, order)  # warm-up
     rows = [one_round(seed, n, order) for seed in range(rounds)]
 
     def measured(what: str, name: str) -> tuple[str, str, str, str, str]:

@@ -1,10 +1,10 @@
-"""Parents for the benchmark of fusion: a cluttered table of boxes and cylinders, seen by samples and by predictions.
+"""Parents for the benchmark of fusion: samples and predictions of a cluttered table of boxes and cylinders.
 
 >>> proposed, predicted = parents(np.random.default_rng(0), 5, 5)    # hypotheses of 20 objects, 100 x 100 x 50 voxels
 
-Both tell of the same table and disagree as they do in a run: borders are shifted (those of a sample by a voxel, from
+Both describe the same table and differ as in a run: borders are shifted (those of a sample by a voxel, from
 completion; those of a prediction by up to two, from tracking, with a rough surface), and some objects are split or
-joined to a neighbour.
+joined with a neighbour.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import numpy as np
 from mstfilter.scene import Hypothesis, VoxelGrid
 
 GRID = VoxelGrid((-0.5, -0.5, 0.0), 0.01, (100, 100, 50))
-N_OBJECTS, N_WRONG = 20, 3  # of the objects, so many pairs are joined and as many objects split in each parent
+N_OBJECTS, N_WRONG = 20, 3  # each parent joins N_WRONG pairs of objects and splits N_WRONG objects
 
 
 @dataclass(frozen=True)
@@ -41,14 +41,14 @@ class Solid:
 
 
 def table(rng: np.random.Generator) -> list[Solid]:
-    """Objects of 6 to 16 cm on 70 x 70 cm of table, each put down on what is there already."""
+    """Objects of 6 to 16 cm on 70 x 70 cm of table, each placed on top of the earlier ones."""
     top, solids = np.zeros(GRID.shape[:2]), []
     for _ in range(N_OBJECTS):
         half = np.array([*rng.uniform(3, 8, 2), rng.uniform(2.5, 6)])
         is_round = bool(rng.random() < 0.4)
         if is_round:
             half[1] = half[0]
-        places = rng.uniform(15, 85, (12, 2))  # of several places the lowest: a person piles up little
+        places = rng.uniform(15, 85, (12, 2))  # the lowest of 12 random positions is used
         angle, found = rng.uniform(0, np.pi), []
         for place in places:
             flat = Solid(is_round, np.array([*place, 0.5]), np.array([*half[:2], 1.0]), angle).mask(np.zeros(3), 0.0)
@@ -61,7 +61,7 @@ def table(rng: np.random.Generator) -> list[Solid]:
 
 
 def table_labels(solids: list[Solid]) -> np.ndarray:
-    """(X, Y, Z) uint16: the true table."""
+    """(X, Y, Z) uint16: true labels."""
     labels = np.zeros(GRID.shape, np.uint16)
     for k, solid in enumerate(solids, start=1):
         labels[solid.mask(np.zeros(3), 0.0)] = k
@@ -74,7 +74,7 @@ def _seen(rng: np.random.Generator, solids: list[Solid], shift: float, grow: flo
         mask = solid.mask(rng.uniform(-shift, shift, 3) * [1, 1, 0.5], rng.uniform(-grow, grow))
         labels[mask & (rng.random(GRID.shape) >= rough * _surface(mask))] = k
     names = rng.permutation(N_OBJECTS) + 1
-    for k in names[:N_WRONG].tolist():  # joined to the nearest
+    for k in names[:N_WRONG].tolist():  # joined with the nearest
         away = [np.linalg.norm(s.centre - solids[k - 1].centre) for s in solids]
         labels[labels == k] = int(np.argsort(away)[1]) + 1
     for new, k in enumerate(names[N_WRONG : 2 * N_WRONG].tolist(), start=N_OBJECTS + 1):

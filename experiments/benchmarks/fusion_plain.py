@@ -1,9 +1,9 @@
-"""Conflict-graph crossover as one would write it straight from the paper, with numpy and networkx.
+"""A direct implementation of the paper's conflict-graph crossover with numpy and networkx.
 
 >>> labels = crossover(np.random.default_rng(0), proposed_labels, predicted_labels)
 
-The other side of `fusion.py`: the same law as ``Crossover(RandomOrder(), "share", ModeFilter())``, by a mask for each
-object, a count for each pair of masks, and one window a voxel in the mode filter.
+`fusion.py` compares with it. It has the same distribution as ``Crossover(RandomOrder(), "share", ModeFilter())``
+and uses one mask per object, one count per pair of masks, and one window per voxel in the mode filter.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ Vertex = tuple[int, int]  # side, label
 
 
 class Decisions(NamedTuple):
-    """All that is random in a crossover, and what objects are called, to repeat one that was drawn elsewhere.
+    """The random decisions of a crossover and the labels of its objects, to repeat a crossover of another program.
 
-    priority : place of each vertex in a random order; chance : uniform number of each directed edge; name : label
-    that each vertex paints with.
+    priority : position of each vertex in a random order; chance : uniform number of each directed edge; name : label
+    that each vertex is painted with.
     """
 
     priority: Mapping[Vertex, Any]
@@ -31,7 +31,7 @@ class Decisions(NamedTuple):
 
 
 def decide(rng: np.random.Generator, graph: nx.Graph) -> Decisions:
-    """Draw."""
+    """Draw the decisions."""
     priority = dict(zip(graph.nodes, rng.random(len(graph)), strict=True))
     chance = {}
     for a, b in graph.edges:
@@ -42,7 +42,7 @@ def decide(rng: np.random.Generator, graph: nx.Graph) -> Decisions:
 def crossover(
     rng: np.random.Generator | None, proposed: np.ndarray, predicted: np.ndarray, decisions: Decisions | None = None
 ) -> np.ndarray:
-    """One hypothesis (X, Y, Z) of two. Without `decisions` they are drawn with `rng`."""
+    """Labels (X, Y, Z) from two parents. Without `decisions` they are drawn with `rng`."""
     masks: dict[Vertex, np.ndarray] = {}
     graph = nx.Graph()
     for side, labels in ((PROPOSED, proposed), (PREDICTED, predicted)):
@@ -84,7 +84,7 @@ def crossover(
 def mode_filter(
     labels: np.ndarray, window: int = 5, margin: int = 3, isolation: int = 120, sweeps: int = 100
 ) -> np.ndarray:
-    """Consensus: of each occupied voxel's window the most frequent object, if it leads by `margin`."""
+    """Give each occupied voxel the most frequent object of its window if that leads by `margin`."""
     half, outside = window // 2, np.iinfo(np.uint16).max
     names = [k for k in np.unique(labels) if k != 0]
     labels = labels.copy()

@@ -1,4 +1,4 @@
-"""The minimal hand-written loop: bootstrap filter of an AR(1) model with systematic resampling at ESS < n / 2."""
+"""A minimal loop in numpy: bootstrap filter of an AR(1) model with systematic resampling at ESS < n / 2."""
 
 from __future__ import annotations
 

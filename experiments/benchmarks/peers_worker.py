@@ -1,6 +1,7 @@
-"""Times `particles` 0.4 in its own environment; run by speed.py, one command a line on standard input.
+"""Measure `particles` 0.4 in a separate environment; run by speed.py, one command per line on standard input.
 
-Commands: ``filter SEED`` (bootstrap AR(1)) and ``systematic SEED N``; the answer is JSON. The first answers compile.
+Commands: ``filter SEED`` (bootstrap AR(1)) and ``systematic SEED N``; the answer is JSON. The first calls
+include compilation.
 """
 
 from __future__ import annotations

@@ -1,4 +1,7 @@
-"""Speed beside peers, in one interleaved run; see README.md for the command. Writes speed.csv and evidence.csv."""
+"""Compare the speed of the filter with that of other programs, interleaved; writes speed.csv and evidence.csv.
+
+README.md has the command.
+"""
 
 from __future__ import annotations
 
@@ -38,13 +41,13 @@ MODEL = StateSpaceModel.of(Normal(0.0, SD0), lambda x: Normal(RHO * x, SIGMA), l
 
 
 def program(previous, y):
-    """The same as a program."""
+    """The AR(1) model as a probabilistic program."""
     x = sample("x", Normal(0.0, SD0) if previous is None else Normal(RHO * previous["x"], SIGMA))
     observe("y", Normal(x, TAU), y)
 
 
 def data(T: int) -> list[float]:
-    """Observations of the model."""
+    """T observations simulated from the model."""
     rng, ys = np.random.default_rng(4), []
     x = rng.normal(0, SD0)
     for _ in range(T):
@@ -54,22 +57,20 @@ def data(T: int) -> list[float]:
 
 
 class Box:
-    """A particle that is an object."""
+    """A particle that is a Python object."""
 
 
 class Boxes(Proposal):
-    """The same objects always."""
+    """Proposes new objects without state."""
 
     def sample(self, rng, observation, n):
-        """Draw."""
         return Population(tuple(Box() for _ in range(n)))
 
 
 class Stay(Transition):
-    """Moves nothing."""
+    """Keeps every particle."""
 
     def predict(self, rng, population, observation):
-        """Move."""
         return Population(population.particles, population.log_weights, population.parents)
 
 
@@ -77,25 +78,25 @@ CLOCKS = {"wall": time.perf_counter, "cpu": time.process_time}
 
 
 def timed(work, clock=time.perf_counter) -> float:
-    """Seconds of a call."""
+    """Seconds that a call takes."""
     start = clock()
     work()
     return clock() - start
 
 
-def through(filter: ParticleFilter, ys: list[float], seed: int) -> float:
-    """The log evidence; like the loop and `particles`, keeps no history."""
+def log_evidence_of(filter: ParticleFilter, ys: list[float], seed: int) -> float:
+    """Log evidence of a run that keeps no history, like the loop and `particles`."""
     last = deque(filter.iterate(ys, seed), maxlen=1)
     return last[0][0].log_evidence
 
 
 def main() -> None:
-    """Measure."""
+    """Run all programs in random order in every round and write the tables."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--peers", type=Path, help="python of the environment that has particles 0.4")
     parser.add_argument("--rounds", type=int, default=15)
     parser.add_argument("--out", type=Path, default=HERE)
-    parser.add_argument("--clock", choices=CLOCKS, default="wall", help="cpu: of the process, where others work too")
+    parser.add_argument("--clock", choices=CLOCKS, default="wall", help="cpu: processor time of the process")
     parser.add_argument("--smoke", action="store_true", help="one round without peers; needs --out")
     options = parser.parse_args()
     if options.smoke:
@@ -139,26 +140,26 @@ def main() -> None:
     def one_round(seed: int) -> dict[str, float]:
         work = {
             "loop": lambda: time_of(lambda: bootstrap_loop(np.random.default_rng(seed), ys, n, RHO, SIGMA, TAU)),
-            "arrays": lambda: time_of(lambda: through(arrays, ys, seed)),
+            "arrays": lambda: time_of(lambda: log_evidence_of(arrays, ys, seed)),
             "arrays_kept": lambda: time_of(lambda: arrays.run(ys, seed)),
-            "program": lambda: time_of(lambda: through(programs, ys, seed)),
+            "program": lambda: time_of(lambda: log_evidence_of(programs, ys, seed)),
             "step_of_5_objects": lambda: time_of(lambda: objects.run(range(200), seed)) / 200,
         }
         if worker:
             work["particles"] = lambda: peer("filter", seed, n)["seconds"]
         names = list(work)
-        order.shuffle(names)  # what runs before leaves its mark on the memory of the process
+        order.shuffle(names)  # the memory state that one program leaves affects the next
         return {name: work[name]() for name in names}
 
-    # The million first: an allocator that has given back a large array keeps the small ones of what follows.
+    # A million weights come first: after a large array is freed, the allocator keeps small blocks for later use.
     big_rows: list[dict] = []
     for seed in range(options.rounds):
         big_rows.append({"systematic_1e6": systematic(seed)})
         if worker:
             big_rows[-1]["particles_systematic_1e6"] = peer("systematic", seed, 1_000_000)["seconds"]
-    rows = [one_round(seed) for seed in range(options.rounds + 2)][2:]  # the first two warm up
-    for row, more in zip(rows, big_rows, strict=True):
-        row.update(more)
+    rows = [one_round(seed) for seed in range(options.rounds + 2)][2:]  # two warm-up rounds
+    for row, big_row in zip(rows, big_rows, strict=True):
+        row.update(big_row)
     median = {name: float(np.median([r[name] for r in rows])) for name in rows[0]}
 
     def ratio(a: str, b: str) -> str:
@@ -168,12 +169,12 @@ def main() -> None:
         return f"{np.median([r[a] / r[b] for r in rows]):.2f}"
 
     def of_minima(a: str, b: str) -> str:
-        """Ratio of the shortest times: what is left where other work disturbs nothing."""
+        """Ratio of the shortest times, which other programs on the machine disturb least."""
         if a not in rows[0] or b not in rows[0]:
             return "not measured"
         return f"{min(r[a] for r in rows) / min(r[b] for r in rows):.2f}"
 
-    def both(what: str, a: str, b: str, target: str) -> tuple[str, str, str, str, str]:
+    def ratios(what: str, a: str, b: str, target: str) -> tuple[str, str, str, str, str]:
         return what, "ratio", ratio(a, b), of_minima(a, b), target
 
     def milliseconds(what: str, a: str, target: str = "") -> tuple[str, str, str, str, str]:
@@ -184,11 +185,11 @@ def main() -> None:
         milliseconds("the same with array components", "arrays"),
         milliseconds("the same, infos of all steps kept (run)", "arrays_kept"),
         milliseconds("the same as a program", "program"),
-        both("array components / minimal loop", "arrays", "loop", "<= 1.3"),
-        both("program / array components", "program", "arrays", "<= 1.5"),
-        both("array components / particles 0.4", "arrays", "particles", "<= 0.6"),
+        ratios("array components / minimal loop", "arrays", "loop", "<= 1.3"),
+        ratios("program / array components", "program", "arrays", "<= 1.5"),
+        ratios("array components / particles 0.4", "arrays", "particles", "<= 0.6"),
         milliseconds("systematic n=1e6", "systematic_1e6"),
-        both("systematic n=1e6 / particles' numba", "systematic_1e6", "particles_systematic_1e6", "<= 2"),
+        ratios("systematic n=1e6 / particles' numba", "systematic_1e6", "particles_systematic_1e6", "<= 2"),
         milliseconds("a step with 5 object particles", "step_of_5_objects", "<= 0.5"),
     ]
     columns = ("what", "unit", "median", "of_minima", "target", "clock")
@@ -196,14 +197,13 @@ def main() -> None:
     for row in table:
         print(f"{row[0]:50s} {row[2]:>12s} {row[3]:>12s} {row[1]:6s} {row[4]}")
     if worker:
-        ys8 = ys[:20]
         worker.stdin.close()
         worker.wait()
-        evidence(options, ys8)
+        compare_evidence(options, ys[:20])
 
 
-def evidence(options: argparse.Namespace, ys: list[float]) -> None:
-    """Standard deviation of the log evidence, ours and theirs, T=20, n=200, 1000 seeds."""
+def compare_evidence(options: argparse.Namespace, ys: list[float]) -> None:
+    """Write the standard deviation of the log evidence of both libraries: T = 20, n = 200, 1000 seeds."""
     described = json.dumps({"rho": RHO, "sigma": SIGMA, "tau": TAU, "ys": ys})
     seeds, n = range(1000), 200
     answer = subprocess.run(

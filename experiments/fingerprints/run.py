@@ -1,6 +1,6 @@
-"""Fingerprints: short hashes of everything that a change of structure must leave as it is.
+"""Fingerprints: hashes of the results that a change of structure must not change.
 
-    python experiments/fingerprints/run.py before.json               # on the code as it is
+    python experiments/fingerprints/run.py before.json               # before the change
     python experiments/fingerprints/run.py after.json --against before.json
 
 For each preset and scene: the hypotheses (labels, weights, parents) after every pause. For each scene: the simulated
@@ -109,7 +109,7 @@ def of_smc() -> dict[str, str]:
 
 
 def main() -> int:
-    """Write the fingerprints; compare them where another file is named."""
+    """Write the fingerprints; with `--against`, list the differences from an earlier file."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("out", type=Path)
     parser.add_argument("--against", type=Path, help="an earlier file; differences are listed and the exit code is 1")
