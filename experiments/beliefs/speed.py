@@ -1,4 +1,4 @@
-"""Seconds of every belief query at 100 x 100 x 50 voxels: `python experiments/beliefs/speed.py`, see README.md."""
+"""Measure the time of every belief query at 100 x 100 x 50 voxels; see README.md."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ CAMERA = Camera.from_intrinsics(525, 525, 319.5, 239.5, 640, 480, look_at((0.0, 
 
 
 def boxes(rng: np.random.Generator, n: int) -> np.ndarray:
-    """(n, 2, 3) lower and upper corners of boxes on the table; some overlap, the later one wins."""
+    """(n, 2, 3) lower and upper corners of boxes on the table; where two overlap, the later one is kept."""
     size = rng.integers(6, 16, (n, 3))
     lower = np.stack([rng.integers(5, 80, n), rng.integers(5, 80, n), np.zeros(n, int)], axis=1)
     return np.stack([lower, lower + size], axis=1)
 
 
 def hypothesis(rng: np.random.Generator, scene: np.ndarray, rough: bool) -> Hypothesis:
-    """The scene with objects missing (5 %), moved by a voxel (30 %), cut (20 %) and joined with another (10 %).
+    """A variation of the scene: objects are missing (5 %), moved by a voxel (30 %), cut (20 %), joined (10 %).
 
-    `rough` takes a fifth of the voxels away that have free space or another object beside them.
+    `rough` removes a fifth of the voxels that are adjacent to free space or another object.
     """
     labels, label = np.zeros(GRID.shape, np.uint16), 0
     for lower, upper in scene:
@@ -49,7 +49,7 @@ def hypothesis(rng: np.random.Generator, scene: np.ndarray, rough: bool) -> Hypo
 
 
 def queries(belief: Belief) -> dict:
-    """What is timed, by name."""
+    """The queries by name."""
     region = belief.box((-0.2, -0.2, 0.0), (0.2, 0.2, 0.2))
     voxel = np.unravel_index(int(belief.hypotheses[0].labels.argmax()), GRID.shape)
     pairs = np.random.default_rng(1).integers(0, 50, (2, 1000, 3))
@@ -77,7 +77,7 @@ def queries(belief: Belief) -> dict:
 
 
 def main() -> None:
-    """Time all of it; the shortest of the repetitions counts."""
+    """Measure all queries; the shortest repetition is kept."""
     parser = argparse.ArgumentParser()
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "speed.csv")
     parser.add_argument("--n", type=int, nargs="+", default=[5, 20, 100])

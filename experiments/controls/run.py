@@ -1,4 +1,4 @@
-"""Controls: what must hold of a filter that gains by what it has seen, and by nothing else.
+"""Controls: does the gain of the filter come from the past?
 
     python experiments/controls/run.py [--smoke] [--out FOLDER]
 
@@ -6,16 +6,17 @@ On tuning scenes, primary endpoint (objects quality against the true volumes, me
 
 - still: after each pause a clip of two frames in which no object moves (new sensor noise, the arm perhaps in view)
   must not lower quality;
-- again: shown the image of pause t alone, t + 1 times, the filter sees as many samples, and must not gain as much;
-- stranger: with the hypotheses of another scene as its past, a step must lose the gain;
-- shuffled: with the inner frames of every clip in random order the gain over samples must shrink. Beside it `ends`,
-  clips of their first and last frame alone, and `frozen`, where no motion is ever found. The same for a filter that
-  has nothing but optical flow to find motions with (`flow`), and, segmentation set aside, for the objects that moved
-  when the TRUE labels of the pause before are tracked (columns `moved: ...`, mean IoU);
-- start: at t = 0 `mst` and samples of the latest image alone hold the same hypotheses; by construction, so it checks
-  the program.
+- again: the image of pause t alone, processed t + 1 times, gives as many samples without a past; the gain must be
+  lost;
+- stranger: with the hypotheses of another scene as the past of a step, the gain must be lost;
+- shuffled: with the inner frames of every clip in random order, the gain over samples must be smaller. `ends` uses
+  only the first and last frame of a clip, and `frozen` never finds a motion. The same for a filter that finds
+  motions by optical flow only (`flow`), and, without segmentation, for the objects that moved when the true labels
+  of the pause before are tracked (columns `moved: ...`, mean IoU);
+- start: at t = 0 `mst` and samples of the latest image are the same hypotheses (by construction; it checks the
+  program).
 
-Writes results/scenes.csv, a line a scene, and results/summary.csv. Resumable: a scene that is there is not run again.
+Writes results/scenes.csv, one row per scene, and results/summary.csv. Finished scenes are not run again.
 """
 
 from __future__ import annotations
@@ -60,7 +61,7 @@ def quality(state: State, truth: np.ndarray) -> float:
 
 
 def at_rest(recording: Recording, pause: int) -> int | None:
-    """The next frame, or else the one before, if no object moves between it and the frame of a pause."""
+    """The frame after a pause, or the one before it, if no object moves in between; else None."""
     here = recording.poses(pause)
     for frame in (pause + 1, pause - 1):
         there = recording.poses(frame) if 0 <= frame < len(recording.frames) else None
@@ -70,7 +71,7 @@ def at_rest(recording: Recording, pause: int) -> int | None:
 
 
 def in_orders(clip: Clip, rng: np.random.Generator) -> dict[str, Clip]:
-    """The clip as it is, with its inner frames in random order, and without them."""
+    """The clip, the clip with its inner frames in random order, and the clip without them."""
     if len(clip) == 1:
         return dict.fromkeys(ORDERS, clip)
     first, *inner, last = clip.frames
@@ -83,7 +84,7 @@ def in_orders(clip: Clip, rng: np.random.Generator) -> dict[str, Clip]:
 
 
 def again(filter: ParticleFilter, clip: Clip) -> State:
-    """A filter that saw nothing but the last image of a clip, as often as there were pauses."""
+    """A filter that processed only the last image of a clip, once per pause."""
     state, shown = filter.start(0), None
     for k in range(clip.index + 1):
         frames = (clip.after,) * (1 if shown is None else 2)
@@ -93,7 +94,7 @@ def again(filter: ParticleFilter, clip: Clip) -> State:
 
 
 def ious(a: np.ndarray, b: np.ndarray) -> dict[int, float]:
-    """IoU of each object with the one of its label, of those that both label images have."""
+    """IoU of the objects that both label images have, by label."""
     table = overlap(a, b)
     labels, i, j = np.intersect1d(table.labels_a, table.labels_b, return_indices=True)
     found = zip(labels.tolist(), table.jaccard()[i, j].tolist(), strict=True)
@@ -179,7 +180,7 @@ def summary(rows: list[dict[str, str]]) -> Iterator[dict[str, object]]:
 
 
 def main() -> None:
-    """Run what is missing, then summarise."""
+    """Run the missing scenes, then summarise."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--smoke", action="store_true", help="two small scenes; needs --out")
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results")
@@ -189,12 +190,12 @@ def main() -> None:
     options.out.mkdir(parents=True, exist_ok=True)
     path = options.out / "scenes.csv"
     rows = read_csv(path) if path.exists() else []
-    rows = [row for row in rows if list(row) == FIELDS]  # others were made by an earlier form of this program
+    rows = [row for row in rows if list(row) == FIELDS]  # other rows come from an earlier version
     scenes = SCENES[:2] if options.smoke else SCENES
     for k, scene in enumerate(scenes):
         if f"{scene[0]}-{scene[1]}" in {r["scene"] for r in rows}:
             continue
-        # A scene of the same family lends its past.
+        # The past of `stranger` comes from another scene of the family.
         family = [s for s in scenes if s[0] == scene[0]]
         other = family[(family.index(scene) + 1) % len(family)]
         change = SMALL if options.smoke else {}

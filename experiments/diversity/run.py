@@ -1,13 +1,13 @@
-"""Do the hypotheses show the ambiguities that remain, and only those?
+"""Do the hypotheses represent the ambiguities of a scene, and only those?
 
     python experiments/diversity/run.py [--scenes 20] [--smoke] [--out FOLDER]
 
-In every scene of scenes.py two alike objects touch and our own samples find it open whether they are one or
-two. They are not moved in the first two actions and pulled apart in the third. Each method runs once a scene with
+In every scene of scenes.py two similar objects touch, and our own samples are ambiguous about whether they are one or
+two. They do not move in the first two actions and move apart in the third. Each method runs once per scene with
 n = 5. Counted: pauses 1 and 2 at which at least one hypothesis has the twins as one and at least one as two; after
 the third action, runs in which no hypothesis has them as one; and the mean quality of pairs of hypotheses (1: all
-alike).
-Writes results/runs.csv and results/summary.csv. Resumable: a run that is in runs.csv is not repeated.
+equal).
+Writes results/runs.csv and results/summary.csv. Finished runs are not repeated.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ FIELDS = ["scene", "method", "pause", "as_one", "as_two", "missing", "pairwise"]
 
 
 def pauses(method: str, recording: Recording, pair: tuple[int, int], seed: int) -> list[dict[str, object]]:
-    """One row a pause: how many of the hypotheses have the twins as one, as two, or lack one of them."""
+    """One row per pause: how many hypotheses have the twins as one, as two, or lack one of them."""
     pipeline = mstfilter.preset(method)
     state, rows = pipeline.start(seed), []
     for clip in recording.clips():
@@ -51,7 +51,7 @@ def pauses(method: str, recording: Recording, pair: tuple[int, int], seed: int) 
 
 
 def summary(rows: list[dict[str, str]]) -> list[dict[str, object]]:
-    """One row a method."""
+    """One row per method."""
     table = []
     for method in METHODS:
         own = [row for row in rows if row["method"] == method]
@@ -78,7 +78,7 @@ def summary(rows: list[dict[str, str]]) -> list[dict[str, object]]:
 
 
 def main(n_scenes: int, out: Path, smoke: bool) -> None:
-    """Run what is missing; write both tables after every run."""
+    """Run the missing scenes; write both tables after every run."""
     out.mkdir(parents=True, exist_ok=True)
     path = out / "runs.csv"
     rows = read_csv(path) if path.is_file() else []

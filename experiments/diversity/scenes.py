@@ -1,11 +1,11 @@
-"""Scenes with a planted ambiguity: two alike boxes side by side that may as well be one.
+"""Scenes with an ambiguity: two similar boxes side by side, which may be one object or two.
 
 >>> recording, pair = recorded(0)         # never moved in actions 0 and 1, pulled apart in action 2
 
-Other objects are pushed in the first two actions while the twins stay where they are; in the third one twin is
-pushed along the face they share. A scene counts only if our own proposal finds it ambiguous at the first three
-pauses: the share of sampled segmentations that have the twins as one object lies between `AMBIGUOUS`. Nothing else
-is selected on.
+Other objects are pushed in the first two actions while the twins stay in place; in the third, one twin is
+pushed along their common face. A scene is used only if our own proposal is ambiguous at the first three
+pauses: the fraction of sampled segmentations that have the twins as one object is within `AMBIGUOUS`. There is no
+other selection.
 """
 
 from __future__ import annotations
@@ -63,14 +63,14 @@ class TwinScene(SimulatedScene):
     family : SceneFamily
     seed : int
     shift : float
-        By how much one twin stands out along the face they share, metres.
+        Offset of one twin along the common face, metres.
     turn : float
-        ... and is turned about the vertical, radians.
+        Its rotation about the vertical, radians.
 
     Raises
     ------
     InputError
-        There is no room for one twin beside the other, or they do not rest.
+        There is no room for one twin next to the other, or they do not come to rest.
     """
 
     def __init__(self, family: SceneFamily, seed: int, shift: float = 0.0, turn: float = 0.0) -> None:
@@ -83,7 +83,7 @@ class TwinScene(SimulatedScene):
             raise InputError("the twins do not rest")
 
     def _put_beside(self, shift: float, turn_by: float) -> bool:
-        """Move the twin against a side of the other one; the direction is that of the face's normal."""
+        """Move the twin against a side of the other one, in the direction of the normal of the face."""
         rng = np.random.default_rng([self.seed, 1])
         world, half = self.world, self.objects.shapes[self.other].half
         at, turn = world.positions()[self.other], world.rotations()[self.other]
@@ -104,7 +104,7 @@ class TwinScene(SimulatedScene):
         return False
 
     def choose_push(self, action: int) -> FingerPush:
-        """Others are pushed first, then one twin along the face that both share."""
+        """Push other objects first, then one twin along the common face."""
         rng = np.random.default_rng([self.seed, 2, action])
         pair = [self.twin, self.other]
         if action < self.family.n_actions - 1:
@@ -132,7 +132,7 @@ class TwinScene(SimulatedScene):
         raise InputError("the twins cannot be parted")
 
     def _tried(self, push: FingerPush) -> PushEffect:
-        """What a push would do; the world is left as it was."""
+        """The result of a push; the world does not change."""
         saved = self.world.save()
         result = play_push(self.world, push, self.family)
         self.world.restore(saved)
@@ -142,7 +142,7 @@ class TwinScene(SimulatedScene):
 def as_one(labels: np.ndarray, truth: np.ndarray, pair: tuple[int, int]) -> bool | None:
     """Whether a segmentation has both twins as one object; None where one of them is missing.
 
-    A twin's label is the one that most of its true voxels have, of those that are occupied.
+    The label of a twin is the most frequent one among its true voxels that are occupied.
     """
     own = []
     for k in pair:
@@ -154,7 +154,7 @@ def as_one(labels: np.ndarray, truth: np.ndarray, pair: tuple[int, int]) -> bool
 
 
 def share_as_one(clip: Clip, truth: np.ndarray, pair: tuple[int, int]) -> float:
-    """Share of sampled segmentations of the last image of a clip that have the twins as one."""
+    """Fraction of sampled segmentations of the last image of a clip that have the twins as one object."""
     samples = mstfilter.preset("mst").proposal.sample(np.random.default_rng(0), clip, N_CUTS)
     found = [as_one(h.labels, truth, pair) for h in samples.particles]
     return float(np.mean([one for one in found if one is not None] or [np.nan]))
@@ -163,9 +163,9 @@ def share_as_one(clip: Clip, truth: np.ndarray, pair: tuple[int, int]) -> float:
 def recorded(
     seed: int, ambiguous: tuple[float, float] = AMBIGUOUS, **overrides: int | float
 ) -> tuple[Recording, tuple[int, int]] | None:
-    """A recording and the labels of its twins; None where this seed gives no ambiguous pair that can be parted.
+    """A recording and the labels of its twins; None if this seed gives no ambiguous pair that can be moved apart.
 
-    Kept beside other recordings, and so is the fact that there is none.
+    Both results are cached.
     """
     family = replace(TWINS, **overrides)
     recipe = json.dumps([GENERATOR_VERSION, asdict(family), ambiguous, N_CUTS])
@@ -186,7 +186,7 @@ def recorded(
 
 
 def _record(seed: int, family: SceneFamily, ambiguous: tuple[float, float], path: Path) -> tuple[int, int] | None:
-    """Try places of the twin until the samples of the first image are of two minds; then act and record."""
+    """Try positions of the twin until the samples of the first image are ambiguous; then act and record."""
     rng = np.random.default_rng([seed, 0])
     for _ in range(N_PLACES):
         try:

@@ -1,12 +1,12 @@
-"""What fusing over time gains when masks get better: from the folder that `mstfilter study` wrote.
+"""The gain from fusion over time, by the quality of the masks: from the folder that `mstfilter study` wrote.
 
     python experiments/error_budget/mask_quality.py STUDY experiments/error_budget/results
 
-Writes mask_quality.csv (a line a quality of the masks and method: primary endpoint over all scenes, unweighted and
+Writes mask_quality.csv (one row per quality of the masks and method: primary endpoint over all scenes, unweighted and
 weighted over the hypotheses, and `mst` minus the method, paired by scene, unadjusted t interval) and
-mask_quality.png. `source` says where masks come from: true ones made worse, with errors that are `lasting` or
-`independent`, or `own`, the cuts that `mst` samples, at their quality in the image, which is measured here
-(own_masks.csv, with how far the samples of a pause agree).
+mask_quality.png. `source` is the source of the masks: degraded true masks with `lasting` or
+`independent` errors, or `own`, the cuts that `mst` samples. The quality of the latter in the image is measured here
+(own_masks.csv, with the agreement of the samples of a pause).
 """
 
 from __future__ import annotations
@@ -43,14 +43,14 @@ SOURCES = ("lasting", "independent", "own")
 
 
 class Masks(NamedTuple):
-    """Where masks come from and how good they are in the image."""
+    """Source of masks and their quality in the image."""
 
     source: str
     quality: float
 
 
 def own_quality(recording: Recording) -> tuple[float, float]:
-    """Quality in the image of the cuts that `mst` draws, and how far they agree, means over pauses t >= 1."""
+    """Quality in the image of the cuts that `mst` samples, and their agreement; means over pauses t >= 1."""
     filter = mstfilter.preset("mst")
     proposal = filter.proposal
     assert isinstance(proposal, TreeCutProposal)
@@ -80,7 +80,7 @@ def by_masks(found: Summary, name: str, own: float) -> dict[Masks, dict[str, dic
 
 
 def table(found: Summary, own: float) -> list[dict[str, Any]]:
-    """A line a quality of the masks and method."""
+    """One row per quality of the masks and method."""
     lines: dict[tuple[Masks, str], dict[str, Any]] = {}
     for name, ending in FIGURES.items():
         for masks, methods in by_masks(found, name, own).items():
@@ -139,7 +139,7 @@ def draw(lines: list[dict[str, Any]], path: Path) -> None:
 
 
 def main(study: Path, out: Path) -> None:
-    """Read, measure the own masks, write, print."""
+    """Read the study, measure the quality of own masks, write the tables, print them."""
     folder = StudyFolder.open(study)
     own: list[dict[str, Any]] = []
     for scene in folder.description["scenes"]:

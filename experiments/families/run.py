@@ -1,9 +1,9 @@
-"""The families s1, s2, s3: what lies on the table, how stable it is, and how hard one frame of it is.
+"""The families s1, s2, s3: contents of the scenes, their stability, and the difficulty of a single frame.
 
     python experiments/families/run.py            # an hour on one core; finished scenes are not run again
     python experiments/families/run.py --smoke --out DIR    # half a minute
 
-Writes counts.csv (a line a scene: physics and visibility), difficulty.csv (a line a first pause: quality of the
+Writes counts.csv (one row per scene: physics and visibility), difficulty.csv (one row per first pause: quality of the
 single-frame baseline in the image and in space, and floors), summary.csv and pictures. Tuning seeds only.
 """
 
@@ -48,7 +48,7 @@ def visible(scene: SimulatedScene) -> np.ndarray:
 
 
 def count(family: SceneFamily, seed: int) -> dict[str, float]:
-    """One scene and its pushes, without pictures."""
+    """Simulate one scene and its pushes without rendering; counts of objects and contacts."""
     scene = SimulatedScene(replace(family, width=160, height=120, supersample=False), seed)
     world = scene.world
     pixels, contacts, deepest = [visible(scene)], [len(world.contacts())], [world.deepest_overlap()]
@@ -121,7 +121,7 @@ def judge(family: SceneFamily, seed: int) -> dict[str, float]:
 
 
 def _components(own: np.ndarray, depth: np.ndarray, least: int, step: float = np.inf) -> np.ndarray:
-    """What stands above the table, 4-connected; neighbours whose depth differs by `step` m or more are not joined."""
+    """4-connected components above the table; neighbours whose depth differs by `step` m or more are not joined."""
     index, z = np.arange(own.size).reshape(own.shape), np.where(own, depth, 0)
     links = []
     for a, b in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
@@ -143,7 +143,7 @@ def _missing(objects: np.ndarray, read: np.ndarray) -> float:
 def fill(
     target: Path, work: Callable[[SceneFamily, int], dict[str, float]], jobs: list[tuple[SceneFamily, int]]
 ) -> list:
-    """A line a scene; those in the file are kept, a new one is written as soon as it is done."""
+    """One row per scene; rows in the file are kept, a new row is written when it is done."""
     lines = read_csv(target) if target.exists() else []
     done = {(line["family"], line["seed"]) for line in lines}
     for family, seed in jobs:

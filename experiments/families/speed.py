@@ -1,10 +1,10 @@
-"""Seconds a frame of the renderer with and without keeping what cannot have changed; the pictures are compared.
+"""Time of the renderer per frame, with and without reuse of unchanged parts; the images are compared.
 
     OMP_NUM_THREADS=1 python experiments/families/speed.py            # two minutes on one core
     python experiments/families/speed.py --smoke --out DIR            # some seconds
 
-Both renderers see the same states of the same scenes, in turns, so that other work on the machine disturbs both.
-Trust the ratio; the seconds are those of the machine. Writes speed.csv.
+Both forms render the same states of the same scenes in turns, so that other programs on the machine affect both.
+The ratio is more reliable than the seconds. Writes speed.csv.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ HEADER = ("family", "seed", "frames", "kept_s", "full_s", "ratio", "sensor_s", "
 
 
 def states(scene: SimulatedScene, actions: int) -> Iterator[None]:
-    """The world as it is at every frame of a recording."""
+    """Advance the world through the frames of a recording."""
     family = scene.family
     yield
     for action in range(actions):

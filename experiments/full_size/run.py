@@ -1,10 +1,10 @@
-"""Time and memory of `mst` at full size: 640 x 480, 15 frames a clip, 100 x 100 x 50 voxels, 5 x 10 x 5 candidates.
+"""Time and memory of `mst` at full size: 640 x 480, 15 frames per clip, 100 x 100 x 50 voxels, 5 x 10 x 5 candidates.
 
     python experiments/full_size/run.py [--seed 1]
-    python experiments/full_size/run.py --smoke --out DIR    # a small recording: shows only that all works
+    python experiments/full_size/run.py --smoke --out DIR    # a small recording: shows only that it works
 
-Filters a simulated recording of the scene `table` in a process of its own with one thread a library, prints seconds
-by part of every step and the peak memory, and writes results/full_size.csv (the peak is that of the whole run).
+Filters a simulated recording of the scene `table` in a separate process with one thread, prints the seconds of every
+step by component and the peak memory, and writes results/full_size.csv (the peak is that of the whole run).
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ SMALL = {"width": 160, "height": 120, "n_actions": 1, "frames_per_clip": 8, "vox
 
 
 def main(seed: int, out: Path, smoke: bool) -> None:
-    """Simulate, run, report."""
+    """Simulate a recording, filter it, write and print the table."""
     with tempfile.TemporaryDirectory() as folder:
         recording, run = Path(folder) / "recording", Path(folder) / "run"
         family = replace(scene_family("demo"), **SMALL) if smoke else scene_family("table")

@@ -1,15 +1,15 @@
-"""How often is what one parent alone claims right?
+"""How often is a voxel right that only one parent claims?
 
     python experiments/fusion/claims.py [--smoke] [--out FOLDER]
 
 On tuning scenes (seeds 0, 1 of s1, s2, s3) every pair of a sample and a moved hypothesis is compared with the true
-volumes: the share of voxels that truly belong to the object which most of the claiming object is, by who claims them,
-by whether the last frame measures them, and by the share of the predicted object that free space has cleared.
-Writes results/claims.csv. These shares are what `Claims` of the preset `mst` stands on.
+volumes. A voxel is right if it belongs to the true object that contains most of the claiming object. Fractions are by
+the claiming parent, by whether the last frame measures the voxel, and by the fraction of the predicted object that
+free space has cleared. Writes results/claims.csv. `Claims` of the preset `mst` is based on these fractions.
 
-Hidden voxels that the prediction alone claims, and that free space does not make doubtful, are told apart further in
-results/hidden.csv: by the overlap (IoU) of the predicted object with the object of the sample that it meets most, and
-by the share of all predictions that have the voxel occupied.
+results/hidden.csv has the hidden voxels that only the prediction claims, in objects that free space hardly cleared:
+by the overlap (IoU) of the predicted object with the object of the sample that overlaps it most, and by the
+fraction of predictions that have the voxel occupied.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ def count(found: dict[tuple[str, str, str], np.ndarray], clip, truth, sample, pr
 def count_hidden(
     found: dict[tuple[str, str, str], np.ndarray], family: str, clip, truth, sample, refined, doubtful, votes
 ) -> None:
-    """Add the hidden voxels of a prediction that a sample has free; `votes` (X, Y, Z) is a share of predictions."""
+    """Add the hidden voxels of a prediction that a sample has free; `votes` (X, Y, Z): fraction of predictions."""
     hidden = ~Claims(surface="sample").exposed(clip) & (sample.labels == 0)
     n_true, n_sample = int(truth.max()) + 1, int(sample.labels.max()) + 1
     sizes = np.bincount(sample.labels.ravel(), minlength=n_sample)
@@ -77,7 +77,7 @@ def count_hidden(
 
 
 def write(path: Path, header: list[str], found: dict) -> None:
-    """One row a class: voxels, and the share of them that is right."""
+    """Write one row per class: number of voxels, and the fraction of right ones."""
     rows = []
     for key, (n, right) in sorted(found.items()):
         rows.append(
@@ -88,7 +88,7 @@ def write(path: Path, header: list[str], found: dict) -> None:
 
 
 def main(out: Path, smoke: bool) -> None:
-    """All scenes; one row a class."""
+    """Count over all scenes and write both tables."""
     found: dict[tuple[str, str, str], np.ndarray] = defaultdict(lambda: np.zeros(2, np.int64))
     found_hidden: dict[tuple[str, str, str], np.ndarray] = defaultdict(lambda: np.zeros(2, np.int64))
     # What the parents claim without limits, along the path of the preset.

@@ -1,4 +1,4 @@
-"""Kill a run at random moments and take it up again, many times; every end must be that of a run never killed."""
+"""Kill a run at random times and resume it; the result must be that of an uninterrupted run."""
 
 from __future__ import annotations
 
@@ -36,9 +36,9 @@ def main() -> None:
     command = [sys.executable, str(HERE / "victim.py")]
     rng, rows = np.random.default_rng(0), []
     with tempfile.TemporaryDirectory() as folder:
-        whole = Path(folder) / "whole.npz"
+        uninterrupted = Path(folder) / "uninterrupted.npz"
         start = time.perf_counter()
-        subprocess.run([*command, str(whole)], check=True, env=environment, stdout=subprocess.DEVNULL)
+        subprocess.run([*command, str(uninterrupted)], check=True, env=environment, stdout=subprocess.DEVNULL)
         for trial in range(options.trials):
             path = Path(folder) / f"run{trial}.npz"
             process = subprocess.Popen([*command, str(path)], env=environment, stdout=subprocess.PIPE)
@@ -54,7 +54,7 @@ def main() -> None:
                     t = str(data["head"]).split('"t": ')[1].split(",")[0]
             subprocess.run([*command, str(path)], check=True, env=environment, stdout=subprocess.DEVNULL)
             rows.append(
-                dict(zip(FIELDS, (trial, f"{delay:.4f}", int(ended), t, int(same(whole, path))), strict=True))
+                dict(zip(FIELDS, (trial, f"{delay:.4f}", int(ended), t, int(same(uninterrupted, path))), strict=True))
             )
     write_csv(options.out / "trials.csv", rows)
     killed, identical = sum(not r["had_ended"] for r in rows), sum(r["identical"] for r in rows)

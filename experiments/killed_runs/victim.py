@@ -1,4 +1,4 @@
-"""A run with a checkpoint, to be killed: ``victim.py CHECKPOINT``. Run again it goes on; says so when it begins."""
+"""The run that trials.py kills: ``victim.py CHECKPOINT``. It resumes from the checkpoint if there is one."""
 
 from __future__ import annotations
 

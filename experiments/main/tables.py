@@ -1,14 +1,15 @@
-"""The small tables of a study that are kept here, from the folder that `mstfilter study` wrote.
+"""Write the small tables of a study from the folder that `mstfilter study` wrote.
 
     python experiments/main/tables.py STUDY experiments/main/results [--reference "true masks: mst"] [--pooled]
 
-Writes, named after the study, NAME.csv (a line a family and arm: means over scenes of pauses t >= 1), NAME_scenes.csv
-(the primary endpoint of each scene) and NAME_differences.csv (reference minus arm in the primary endpoint; unadjusted
-t interval, studentised bootstrap, p by flipping signs, p after Holm over families and arms), and prints the latter as
-a table for the README. NAME_cases.csv has quality by what can be known of an object, a case being an object at a
-pause t >= 1 (mean over cases, not over scenes), and NAME_time.csv core seconds of a step t >= 1: of the first filter
-seed, in which an arm may be the first to see a recording, and of later ones, which find shared work on disk. Pooled,
-differences are over the scenes of all families together: NAME_pooled_differences.csv.
+Files are named after the study: NAME.csv (one row per family and arm: means over scenes of pauses t >= 1),
+NAME_scenes.csv (the primary endpoint of each scene) and NAME_differences.csv (reference minus arm in the primary
+endpoint; unadjusted t interval, studentised bootstrap, sign-flip p, p after Holm over families and arms), which is
+also printed as a table for the README. NAME_cases.csv has the quality of visible, hidden and never seen objects; a
+case is one object at one pause t >= 1 (mean over cases, not over scenes). NAME_time.csv has core seconds of a step
+t >= 1: of the first filter seed, in which an arm may be the first to process a recording, and of later seeds, which
+use shared work on disk. With --pooled, differences are over the scenes of all families together:
+NAME_pooled_differences.csv.
 """
 
 from __future__ import annotations
@@ -50,7 +51,7 @@ FIGURES = (
 
 
 def by_scene(found: Summary) -> list[dict[str, str]]:
-    """The primary endpoint, a line a scene and arm."""
+    """The primary endpoint, one row per scene and arm."""
     return [
         {"family": f.family, "scene": scene, "arm": f.arm, ENDPOINT: f"{value:.4f}"}
         for f in found.figures
@@ -60,7 +61,7 @@ def by_scene(found: Summary) -> list[dict[str, str]]:
 
 
 def means(found: Summary) -> list[dict[str, str]]:
-    """A line a family and arm."""
+    """One row per family and arm."""
     lines = []
     for family, arm in product(found.families, found.arms):
         if endpoint := found.figure(family, arm):
@@ -71,7 +72,7 @@ def means(found: Summary) -> list[dict[str, str]]:
 
 
 def differences(found: Summary) -> list[dict[str, str]]:
-    """A line a family and arm that is compared with the reference."""
+    """One row per family and arm that is compared with the reference."""
     lines = []
     for c in found.compared():
         d = c.difference
@@ -83,7 +84,7 @@ def differences(found: Summary) -> list[dict[str, str]]:
 
 
 def cases(rows: Sequence[Row]) -> list[dict[str, str]]:
-    """A line a family and arm: number and mean quality of the objects that are visible, hidden, never seen."""
+    """One row per family and arm: number and mean quality of visible, hidden and never seen objects."""
     lines = []
     for (family, arm), mine in grouped(rows).items():
         line = {"family": family, "arm": arm}
@@ -98,7 +99,7 @@ def cases(rows: Sequence[Row]) -> list[dict[str, str]]:
 
 
 def times(rows: Sequence[Row]) -> list[dict[str, str]]:
-    """A line a family and arm: core seconds of a step, mean and most, of the first filter seed and of later ones."""
+    """One row per family and arm: mean and largest core seconds of a step, of the first and of later filter seeds."""
     lines = []
     for (family, arm), mine in grouped(rows).items():
         line = {"family": family, "arm": arm}
@@ -121,7 +122,7 @@ def grouped(rows: Sequence[Row]) -> dict[tuple[str, str], list[Row]]:
 
 
 def markdown(rows: list[dict[str, str]]) -> str:
-    """Arms down, families across."""
+    """A markdown table: one row per arm, one column per family."""
     families, arms = (list(dict.fromkeys(r[key] for r in rows)) for key in ("family", "arm"))
     cell = {
         (r["family"], r["arm"]): f"{float(r['mean']):+.3f} [{float(r['low']):+.3f}, {float(r['high']):+.3f}]"
@@ -133,7 +134,7 @@ def markdown(rows: list[dict[str, str]]) -> str:
 
 
 def main(study: Path, out: Path, reference: str, pooled: bool) -> None:
-    """Read, write, print."""
+    """Read the study, write the tables, print the differences."""
     folder = StudyFolder.open(study)
     name, rows, tables = folder.description["name"], folder.rows(), {}
     if reference:

@@ -1,10 +1,10 @@
 """How well one image is segmented: optimal cut, sampled cuts and floors on 45 real frames, held out by set-up.
 
     python experiments/osd_frames/run.py
-    python experiments/osd_frames/run.py --smoke --out DIR    # two frames: shows only that all works
+    python experiments/osd_frames/run.py --smoke --out DIR    # two frames: shows only that it works
 
 Needs the frames in MSTFILTER_SHARED (default ../shared) under real/osd_learn. Writes results/*.csv beside this file.
-The learned tree was fitted on simulated scenes alone. SceneCut's constants (colour weight, centre and slope of the
+The learned tree was fitted on simulated scenes only. SceneCut's constants (colour weight, centre and slope of the
 calibration) are fitted on the frames of the other camera set-ups, and so is the colour weight of the first row.
 """
 
@@ -89,18 +89,18 @@ class Case:
     learned: dict[float, tuple[Tree, Segments]]
 
     def score(self, labels: np.ndarray) -> float:
-        """Objects quality; pixels without label count on neither side."""
+        """`objects` quality; pixels without a label count on neither side."""
         return weighted_coverage(np.where(self.ignored, 0, labels), self.truth, form="objects")
 
     def score_cut(self, tree: Tree, found: Segments, cut: np.ndarray) -> float:
-        """Quality of a cut, its background taken away."""
+        """Quality of a cut without its background."""
         numbers = np.where(found.is_object[cut], np.arange(1, len(cut) + 1), 0)
         return self.score(np.where(found.object_pixels, numbers[tree.label_image(cut)], 0))
 
 
 @dataclass(frozen=True)
 class _Given(TreeBuilder):
-    """A tree that is there already: both front ends begin with the same leaves."""
+    """A given tree: both front ends start from the same leaves."""
 
     tree: Tree
 
@@ -149,7 +149,7 @@ def without_labels(tree: Tree) -> Tree:
 
 
 def components(case: Case, step: float = np.inf) -> np.ndarray:
-    """Floor: what stands above the table, 4-connected; neighbours whose depth differs by `step` m are not joined."""
+    """Floor: 4-connected components above the table; neighbours whose depth differs by `step` m are not joined."""
     own = case.trees[COLOUR_WEIGHTS[0]][1].object_pixels
     index = np.arange(own.size).reshape(own.shape)
     depth = np.where(own, case.frame.depth, 0)

@@ -11,7 +11,7 @@ COLOURS = {"mst": "#1b6ca8", "tracking_only": "#b3432b", "union": "0.55"}
 
 
 def draw(lines: Sequence[dict[str, str]], out: Path) -> None:
-    """figure.png from the lines of pauses.csv."""
+    """Draw figure.png from the rows of pauses.csv."""
     import matplotlib
 
     matplotlib.use("Agg")

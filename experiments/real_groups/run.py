@@ -1,12 +1,12 @@
 """Real rearrangements: groups of frames of one fixed camera, filtered as clips of two frames, scored in the image.
 
-    python experiments/real_groups/run.py                     # what is in results/pauses.csv is not run again
+    python experiments/real_groups/run.py                     # finished groups are not run again
     python experiments/real_groups/run.py --smoke --out DIR   # one group, a quarter of the size, seconds
 
-Needs the frames in MSTFILTER_SHARED (default ../shared) under real/osd_learn. Writes pauses.csv (a line a pause and
-method), summary.csv (`mst` minus each method, paired by group), past.csv (methods minus their samples alone) and
-figure.png: figures only, nothing of the frames. Constants of the segmentation are those that were chosen without the
-group's camera set-up (experiments/osd_frames).
+Needs the frames in MSTFILTER_SHARED (default ../shared) under real/osd_learn. Writes pauses.csv (one row per pause
+and method), summary.csv (`mst` minus each method, paired by group), past.csv (methods minus their samples alone)
+and figure.png; the frames themselves are not stored. Constants of the segmentation were chosen without the camera
+set-up of the group (experiments/osd_frames).
 """
 
 from __future__ import annotations
@@ -109,13 +109,13 @@ def score(image: np.ndarray, label: np.ndarray) -> float:
 
 
 def changed(before: np.ndarray, after: np.ndarray, objects: np.ndarray) -> float:
-    """Share of the pixels `objects` with both readings whose depth (H, W) differs by more than a centimetre."""
+    """Fraction of the pixels `objects` with both readings whose depth (H, W) differs by more than a centimetre."""
     both = objects & np.isfinite(before) & np.isfinite(after)
     return float((np.abs(before - after)[both] > CHANGED).mean()) if both.any() else 0.0
 
 
 def run(group: tuple[int, int], seeds: Sequence[int], step: int = 1) -> Iterator[dict[str, str]]:
-    """A line a pause and method; figures are means over the seeds of the filter."""
+    """One row per pause and method; means over filter seeds."""
     recording, labels = load(group, step)
     constants = held_out(group)
     filters = {method: assemble(method, constants) for method in METHODS}
@@ -165,7 +165,7 @@ def group_means(lines: Sequence[dict[str, str]], what: str = "quality") -> dict[
 
 
 def differences(means: dict[str, dict[str, float]]) -> dict[str, Difference]:
-    """`mst` minus each other method, paired by group; floors stand beside and are adjusted apart."""
+    """`mst` minus each other method, paired by group; floors are adjusted separately."""
     found = {m: compare(means[REFERENCE], means[m]) for m in means if m != REFERENCE}
     for floor in (False, True):
         names = [m for m in found if m.startswith("floor") == floor]
@@ -174,7 +174,7 @@ def differences(means: dict[str, dict[str, float]]) -> dict[str, Difference]:
 
 
 def columns(d: Difference | None) -> dict[str, str]:
-    """A difference as columns; empty where there is none."""
+    """A difference as columns; empty cells if there is none."""
     names = ("difference", "low", "high", "low_bootstrap", "high_bootstrap", "p", "p_holm")
     figures = (d.mean, d.low, d.high, d.low_bootstrap, d.high_bootstrap, d.p, d.p_holm) if d else (np.nan,) * 7
     return {name: "" if np.isnan(x) else f"{x:.3f}" for name, x in zip(names, figures, strict=True)}
@@ -206,7 +206,7 @@ def summarise(lines: Sequence[dict[str, str]], out: Path) -> None:
 
 
 def main() -> None:
-    """Run the groups that are missing, then summarise and draw."""
+    """Run the missing groups, then summarise and draw."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--smoke", action="store_true", help="tiny, a few seconds; needs --out")
     parser.add_argument("--out", type=Path, default=HERE / "results")

@@ -1,4 +1,4 @@
-"""Weighted candidates to choose from: of the four models, of MST on real particles and on simulated scenes."""
+"""Weighted candidates to resample: of the four models, of MST on real particles and on simulated scenes."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def of_world(world: World, n: int, seed: int) -> Candidates:
 
 
 def real(eta: int = 5) -> Candidates | None:
-    """The 25 * eta candidates of the preset `authors` on the authors' real particles; None where these are absent."""
+    """The 25 * eta candidates of the preset `authors` on the authors' real particles; None if these are missing."""
     named = os.environ.get("MSTFILTER_SHARED")
     shared = Path(named) if named else Path(__file__).resolve().parents[3] / "shared"
     folder = shared / "r1"
@@ -132,7 +132,7 @@ def simulated(seed: int, small: bool = False) -> dict[str, Candidates]:
 
 
 def choose(candidates: Candidates, n: int, draws: int, seed: int) -> dict[str, dict[str, float]]:
-    """Measures of each scheme, choosing n again and again; draw k has the same seed for all schemes."""
+    """Measures of each scheme over repeated draws of n; draw k has the same seed for all schemes."""
     m = len(candidates.log_weights)
     population = Population(np.arange(m), candidates.log_weights)
     expected, out = n * population.weights, {}

@@ -2,7 +2,7 @@
 
     python experiments/resampling/run.py [--smoke] [--out results]
 
-Every part that is finished is kept in OUT/parts; the same command goes on with the others.
+Finished parts are stored in OUT/parts; the same command runs the missing ones.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ SMOKE = {"seeds": 2, "reference": 500, "populations": 2, "draws": 3, "scenes": 1
 
 
 def filtered(name: str, world: World, setting: str, size: dict[str, int]) -> Iterator[Row]:
-    """A filter of a model with every scheme; a unit is a seed, which names data and streams for all schemes."""
+    """A filter of a model with every scheme; a unit is a seed, with the same data for all schemes."""
     arms = schemes(world.similarity, world.equivalence)
     make, full, small = {"plain": (plain, world.sizes[0], 12), "branching": (branching, world.sizes[1], 5)}[setting]
     n = full if size is FULL else small
@@ -67,7 +67,7 @@ def one_run(world: World, filter: ParticleFilter, seed: int) -> dict[str, float]
 
 
 def rows(part: str, setting: str, scheme: str, unit: int, found: dict[str, float]) -> Iterator[Row]:
-    """One a measure."""
+    """One row per measure."""
     for measure, value in found.items():
         yield dict(zip(FIELDS, (part, setting, scheme, measure, unit, value), strict=True))
 
@@ -87,7 +87,7 @@ def from_worlds(all_worlds: dict[str, World], size: dict[str, int]) -> Iterator[
 
 
 def from_real(size: dict[str, int]) -> Iterator[Row]:
-    """The real candidates; a unit is a batch of draws, so intervals are about chance in the draws alone."""
+    """The real candidates; a unit is a batch of draws, so intervals cover the draws only."""
     candidates = real(size["eta"])
     if candidates is None:
         print("real candidates left out: no folder r1 (MSTFILTER_SHARED names the folder that holds it)")
@@ -104,7 +104,7 @@ def from_scene(seed: int, size: dict[str, int]) -> Iterator[Row]:
 
 
 def timed(size: dict[str, int]) -> Iterator[Row]:
-    """Seconds a call over those of systematic in the same round; schemes take turns."""
+    """Time per call relative to systematic in the same round; the schemes run in turns."""
     for m, n in ((100, 20), (1000, 250)):
         rng = np.random.default_rng(m)
         population = Population(rng.normal(size=m), rng.normal(size=m))
@@ -132,7 +132,7 @@ def interval(values: np.ndarray) -> tuple[float, float, float]:
 
 
 def p_value(difference: np.ndarray) -> float:
-    """Of a paired t test that the mean difference is zero."""
+    """p value of a paired t test that the mean difference is zero."""
     error = stats.sem(difference) if len(difference) > 1 else np.nan
     if not error > 0:  # one unit, or the same difference in all of them
         return 0.0 if error == 0 and difference[0] != 0 else 1.0
@@ -182,7 +182,7 @@ def summarise(found: list[dict[str, str]], out: Path) -> None:
 
 
 def main() -> None:
-    """Run the parts that are missing, then summarise and draw."""
+    """Run the missing parts, then summarise and draw."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--smoke", action="store_true", help="tiny, a few seconds; needs --out")
     parser.add_argument("--out", type=Path, default=HERE / "results")
@@ -211,7 +211,7 @@ def main() -> None:
             print(f"{name}  {time.perf_counter() - start:.0f} s", flush=True)
     missing = [name for name in parts if not (folder / f"{name}.csv").exists()]
     if missing:
-        print("not yet there:", ", ".join(missing))
+        print("missing parts:", ", ".join(missing))
     summarise([row for name in parts if name not in missing for row in read_csv(folder / f"{name}.csv")], options.out)
     from figure import draw
 

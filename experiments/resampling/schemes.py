@@ -1,4 +1,4 @@
-"""The schemes that are compared: every resampler in the registry, with what it needs to see particles."""
+"""The schemes that are compared: every registered resampler, with similarities and classes of the particles."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ BASE = "systematic"  # what all others are compared with
 
 
 def schemes(similarity: Similarity, equivalence: Equivalence) -> dict[str, Resampler]:
-    """By registered name; wrappers around the scheme that they have by default."""
+    """Schemes by registered name; wrappers around their default scheme."""
     return {
         BASE: Systematic(),
         "ssp": Ssp(),

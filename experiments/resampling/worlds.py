@@ -1,4 +1,4 @@
-"""The four models with a known answer: data, filter, and how far an estimate is from the answer."""
+"""The four models with a known posterior: data, filter, and error of an estimate."""
 
 from __future__ import annotations
 

@@ -10,7 +10,7 @@ COLOURS = {"transition": "#1b6ca8", "proposal": "#3a8f4d", "update": "#b3432b", 
 
 
 def draw(rows: list[dict[str, str]], slopes: list[dict[str, str]], out: Path) -> None:
-    """figure.png from lines of measured.csv with their factor, and those of slopes.csv."""
+    """Draw figure.png from the rows of measured.csv and slopes.csv."""
     import matplotlib
 
     matplotlib.use("Agg")

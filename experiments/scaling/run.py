@@ -1,10 +1,10 @@
-"""How time and memory of a step of `mst` grow: voxels, hypotheses, frames a clip, objects, one at a time.
+"""How time and memory of a step of `mst` grow: voxels, hypotheses, frames per clip, objects, one at a time.
 
-    python experiments/scaling/run.py                     # what is in results/measured.csv is not measured again
-    python experiments/scaling/run.py --smoke --out DIR   # two values a factor at small size, seconds
+    python experiments/scaling/run.py                     # finished cases are not measured again
+    python experiments/scaling/run.py --smoke --out DIR   # two values per factor at a small size, seconds
 
-Simulated recordings, made once and kept (`mstfilter.simulation.recorder`). Every measurement is a process of its own,
-one thread a library: processor seconds by part of the first step that has a past (objects: mean of two), and
+Simulated recordings, made once and kept (`mstfilter.simulation.recorder`). Every measurement is a separate process
+with one thread: processor seconds by component of the first step that has a past (objects: mean of two), and
 the peak of resident memory. Writes measured.csv, slopes.csv and figure.png.
 """
 
@@ -40,7 +40,7 @@ THREADS = {f"{name}_NUM_THREADS": "1" for name in ("OMP", "OPENBLAS", "MKL")}
 
 @dataclass(frozen=True)
 class Case:
-    """What is measured.
+    """One measurement.
 
     Parameters
     ----------
@@ -53,9 +53,9 @@ class Case:
     n : int
         Hypotheses, and samples.
     stride : int
-        Every so many frames of a clip are used.
+        Every `stride`-th frame of a clip is used.
     steps : int
-        How many steps with a past are averaged.
+        Number of steps with a past that are averaged.
     """
 
     family: str
@@ -68,7 +68,7 @@ class Case:
 
     @property
     def name(self) -> str:
-        """One line that tells cases apart."""
+        """A name that identifies the case."""
         changes = "".join(f" {k}={v:g}" for k, v in self.set.items())
         return f"{self.family}-{self.seed}{changes} side={self.side} n={self.n} stride={self.stride}"
 
@@ -114,7 +114,7 @@ class StageSeconds:
 
 
 def measure(case: Case) -> dict[str, Any]:
-    """One line: run the filter in this process, which must be new."""
+    """One row: run the filter in this process, which must be new."""
     import cv2
 
     import mstfilter
@@ -157,17 +157,17 @@ def measure(case: Case) -> dict[str, Any]:
 
 
 def slope(x: np.ndarray, y: np.ndarray) -> float:
-    """Slope of log y over log x, least squares; NaN where a value is 0 or the values of x are nearly one."""
+    """Slope of log y over log x, least squares; NaN if a value is 0 or the values of x are nearly equal."""
     if x.max() < 1.3 * x.min() or (y <= 0).any():
         return float("nan")
     return float(np.polyfit(np.log(x), np.log(y), 1)[0])
 
 
 def slopes(rows: list[dict[str, str]]) -> list[dict[str, str]]:
-    """A line a factor and figure: slope over all values, and from the second largest value to the largest.
+    """One row per factor and figure: slope over all values, and from the second largest value to the largest.
 
-    Objects come twice: as many as there are, and as many as the hypotheses hold. Scenes differ in more than their
-    number, so they have no slope at the end.
+    There are two rows of objects: the number of true objects, and the number in the hypotheses. The scenes differ in
+    other properties too, so these rows have no slope at the end.
     """
     lines = []
     for factor, over in [(f, f) for f in FACTORS] + [("objects", "objects_found")]:
@@ -197,7 +197,7 @@ def slopes(rows: list[dict[str, str]]) -> list[dict[str, str]]:
 
 
 def main() -> None:
-    """Measure what is missing, fit, draw."""
+    """Measure the missing cases, fit the slopes, draw the figure."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--smoke", action="store_true", help="tiny, seconds; needs --out")
     parser.add_argument("--out", type=Path, default=HERE / "results")

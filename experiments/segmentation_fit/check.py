@@ -1,4 +1,4 @@
-"""Both front ends on simulated first pauses that nothing was fitted on: quality in the image and in space.
+"""Quality of both front ends on simulated first pauses that were not used in the fit, in the image and in space.
 
     python experiments/segmentation_fit/check.py
     python experiments/segmentation_fit/check.py --smoke --out DIR    # one scene: shows only that it works
@@ -45,7 +45,7 @@ RESULTS = Path(__file__).resolve().parent / "results"
 
 
 def main(out: Path, smoke: bool) -> None:
-    """Both front ends on every scene."""
+    """Score both front ends on every scene and write the table."""
     rows = []
     for name, family in ((name, SCENE_FAMILIES[name]) for name in (("demo",) if smoke else ("demo", "table"))):
         table: dict[str, list[tuple[float, ...]]] = {arm: [] for arm in [*ARMS, "true masks"]}

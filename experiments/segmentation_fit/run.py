@@ -3,9 +3,9 @@
     python experiments/segmentation_fit/run.py
     python experiments/segmentation_fit/run.py --smoke --out FILE    # few scenes, one round: shows only that it works
 
-Regions of each scene merge best first under the present weights. A pair of different objects is noted and kept
-apart, a pair of one object is noted and merged, so the pairs are those that the tree meets. Three rounds; each fits a
-logistic regression to the pairs of all rounds so far.
+Regions of each scene are merged in the order of their odds under the present weights. A pair of different objects is
+recorded and not merged; a pair of one object is recorded and merged. So the pairs are those that the tree evaluates.
+Three rounds; each fits a logistic regression to the pairs of all rounds so far.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ def measured(seeds: Iterable[int]) -> list[tuple[Regions, np.ndarray, float]]:
 
 
 def episode(regions: Regions, pixels: np.ndarray, scale: float, weights: np.ndarray, pairs: Pairs) -> None:
-    """Merge the regions of one scene with the truth at hand, and note what is met."""
+    """Merge the regions of one scene by the ground truth and record the pairs that come up."""
     growing = Agglomeration(regions, lambda *pair: pair_features(*pair, scale) @ weights)
     true = np.zeros((2 * len(pixels), pixels.shape[1]))
     true[: len(pixels)] = pixels
@@ -100,14 +100,14 @@ def logistic(pairs: Pairs) -> np.ndarray:
 
 
 def write(weights: np.ndarray, path: Path) -> None:
-    """The module of weights with the new table."""
+    """Write the module of weights with the new table."""
     head = PACKAGED.read_text().split("JOIN_WEIGHTS", 1)[0]
     rows = "".join(f'    "{name}": {value:.4g},\n' for name, value in zip(PAIR_FEATURES, weights, strict=True))
     path.write_text(f"{head}JOIN_WEIGHTS: dict[str, float] = {{\n{rows}}}\n")
 
 
 def main(path: Path, smoke: bool) -> None:
-    """Fit, and write the module."""
+    """Fit the weights and write the module."""
     began = time.time()
     scenes = measured(FITTED_SEEDS[:2] if smoke else FITTED_SEEDS)
     print(f"{len(scenes)} scenes measured, {time.time() - began:.0f} s")

@@ -1,4 +1,4 @@
-"""Simulated first pauses with their true labels: what the judgement of joins is fitted and checked on."""
+"""Simulated first pauses with true labels, for the fit of the learned tree and its check."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class Pause:
 
 
 def first_pause(family: SceneFamily, seed: int) -> Pause:
-    """The scene before anything moves."""
+    """The first pause of a scene."""
     scene = SimulatedScene(family, seed)
     seen = scene.frame_images(0)
     robot = seen["robot_mask"]

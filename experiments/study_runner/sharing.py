@@ -1,8 +1,8 @@
-"""What work that is shared on disk saves: core seconds a step without it, when it is written, when it is there.
+"""Time saved by shared work on disk: core seconds per step without it, when it is written, and when it is found.
 
 ``python experiments/study_runner/sharing.py [--smoke --out DIR]`` writes sharing.csv beside this file.
 
-Each row is a study of its own in a fresh worker, so nothing is found in memory.
+Each row is a separate study in a new worker, so nothing is cached in memory.
 """
 
 from __future__ import annotations

@@ -1,11 +1,11 @@
-"""The study runner under load: parallel efficiency, and workers that are killed.
+"""Parallel efficiency of the study runner, and its recovery from killed workers.
 
 ``python experiments/study_runner/trials.py [--smoke --out DIR]`` writes results.csv beside this file.
 
-Efficiency is that of a machine, so 1 and 2 workers run the same study of short runs in turn, several times. Where
-others use the machine too, two workers cannot have two cores; so what others used is recorded, and beside the
-efficiency by the clock stands what the runner itself decides: the share of the time in which workers are at a run,
-times the core seconds of the study with one worker over those with two.
+1 and 2 workers run the same study of short runs in turn, several times. If other programs use the machine, two
+workers cannot use two cores. Therefore their processor time is recorded too, and a second efficiency excludes them:
+the fraction of time that workers spend in runs, times the core seconds of the study with one worker over those with
+two.
 """
 
 from __future__ import annotations

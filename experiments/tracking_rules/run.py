@@ -1,7 +1,7 @@
 """Motion rules against volumetric truth: start from the true labels, predict one clip, compare.
 
 python experiments/tracking_rules/run.py demo 0 12 table 3 7
-python experiments/tracking_rules/run.py --smoke --out DIR    # one small scene: shows only that all works
+python experiments/tracking_rules/run.py --smoke --out DIR    # one small scene: shows only that it works
 """
 
 from __future__ import annotations
