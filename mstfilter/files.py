@@ -10,14 +10,17 @@ the temporary file is removed and an earlier file is left as it was.
 from __future__ import annotations
 
 import csv
+import math
+import numbers
 import os
+import shutil
 import uuid
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-__all__ = ["atomic_path", "read_csv", "write_csv", "write_text"]
+__all__ = ["atomic_folder", "atomic_path", "read_csv", "write_csv", "write_text"]
 
 
 @contextmanager
@@ -33,13 +36,32 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         partial.unlink(missing_ok=True)
 
 
+@contextmanager
+def atomic_folder(path: str | Path) -> Iterator[Path]:
+    """A temporary path beside `path`, for a folder that the block makes and that replaces `path` at its end."""
+    target = Path(path)
+    partial = target.with_name(f".{target.name}.{uuid.uuid4().hex[:8]}.partial")
+    try:
+        yield partial
+        if target.exists():
+            shutil.rmtree(target)
+        os.replace(partial, target)
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+
+
 def write_text(path: str | Path, text: str) -> None:
     """Write a text file (UTF-8) in one step."""
     with atomic_path(path) as partial:
         partial.write_text(text, encoding="utf-8", newline="")
 
 
-def write_csv(path: str | Path, rows: Iterable[Mapping[str, Any]], columns: Iterable[str] | None = None) -> None:
+def write_csv(
+    path: str | Path,
+    rows: Iterable[Mapping[str, Any]],
+    columns: Iterable[str] | None = None,
+    float_format: str = "",
+) -> None:
     """Write rows as CSV in one step.
 
     Parameters
@@ -47,16 +69,24 @@ def write_csv(path: str | Path, rows: Iterable[Mapping[str, Any]], columns: Iter
     path : path
         The file.
     rows : iterable of mappings
-        Column name -> value; None is written as an empty cell.
+        Column name -> value; None and NaN are written as an empty cell.
     columns : iterable of str, optional
-        Their order; by default every column in the order of first appearance.
+        The columns that are written, in this order; by default all in the order of first appearance.
+    float_format : str
+        Format of floating-point numbers, for example ``.6g``. Default: all digits.
     """
-    rows = [dict(row) for row in rows]
+    rows = [{name: _cell(value, float_format) for name, value in row.items()} for row in rows]
     names = list(columns) if columns is not None else list(dict.fromkeys(name for row in rows for name in row))
     with atomic_path(path) as partial, partial.open("w", encoding="utf-8", newline="") as file:
-        writer = csv.DictWriter(file, names, lineterminator="\n")
+        writer = csv.DictWriter(file, names, extrasaction="ignore", lineterminator="\n")
         writer.writeheader()
         writer.writerows(rows)
+
+
+def _cell(value: Any, float_format: str) -> Any:
+    if isinstance(value, numbers.Real) and not isinstance(value, numbers.Integral):
+        return "" if math.isnan(value) else format(float(value), float_format)
+    return value
 
 
 def read_csv(path: str | Path) -> list[dict[str, str]]:

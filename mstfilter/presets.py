@@ -24,10 +24,12 @@ from mstfilter.registry import Registry
 from mstfilter.resources import find_preset
 from mstfilter.smc import ParticleFilter
 
-__all__ = ["REGISTRY", "build_filter", "describe_filter", "load_config", "preset"]
+__all__ = ["PACKAGES", "REGISTRY", "build_filter", "describe_filter", "load_config", "preset"]
 
+#: Packages that declare components.
+PACKAGES = (smc, segmentation, completion, tracking, fusion, formats, baselines, oracles)
 #: All components that presets and overrides can name.
-REGISTRY = Registry(smc, segmentation, completion, tracking, fusion, formats, baselines, oracles)
+REGISTRY = Registry(*PACKAGES)
 
 _META = ("description", "source")
 _PLAIN = ("n", "n_proposed", "resample")

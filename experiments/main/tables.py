@@ -76,7 +76,7 @@ def differences(found: Summary) -> list[dict[str, str]]:
     lines = []
     for c in found.compared():
         d = c.difference
-        if not c.beside:
+        if not c.reported_only:
             row = {"family": c.family, "reference": c.first, "arm": c.second, "n": str(d.n), "mean": f"{d.mean:.4f}"}
             row |= {name: f"{getattr(d, name):.4f}" for name in ("low", "high", "low_bootstrap", "high_bootstrap")}
             lines.append(row | {"p": f"{d.p:.4g}", "p_holm": f"{d.p_holm:.4g}"})
@@ -138,20 +138,22 @@ def main(study: Path, out: Path, reference: str, pooled: bool) -> None:
     folder = StudyFolder.open(study)
     name, rows, tables = folder.description["name"], folder.rows(), {}
     if reference:
-        beside = [
+        reported_only = [
             arm["name"]
             for arm in folder.description["arms"]
             if arm["name"].startswith("true masks") != reference.startswith("true masks")
         ]
-        found = summarise(rows, reference, beside=beside)
+        found = summarise(rows, reference, reported_only=reported_only)
         name += f"_{reference.split(':')[0].replace(' ', '_')}"
     elif pooled:
         found = summarise(
-            [{**row, "family": "all"} for row in rows], folder.description["reference"], beside=folder.beside
+            [{**row, "family": "all"} for row in rows],
+            folder.description["reference"],
+            reported_only=folder.reported_only,
         )
         name += "_pooled"
     else:
-        found = summarise(rows, folder.description["reference"], cost_columns(rows), folder.beside)
+        found = summarise(rows, folder.description["reference"], cost_columns(rows), folder.reported_only)
         tables |= {name: means(found), f"{name}_scenes": by_scene(found)}
         tables |= {f"{name}_cases": cases(rows), f"{name}_time": times(rows)}
     tables[f"{name}_differences"] = differences(found)

@@ -26,7 +26,7 @@ def make(out: Path, study: Path, chosen: Sequence[str] = ()) -> list[Path]:
     known = [arm["name"] for arm in folder.description["arms"]]
     if unknown := [name for name in chosen if name not in known]:
         raise InputError(f"the study has no arm {unknown[0]!r}", f"it has {', '.join(known)}")
-    arms = list(chosen) or [name for name in known if name not in folder.beside]
+    arms = list(chosen) or [name for name in known if name not in folder.reported_only]
     values: dict[str, dict[str, dict[int, list[float]]]] = {}
     scenes: dict[str, set[str]] = {}
     for row in folder.records():

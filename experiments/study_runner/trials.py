@@ -85,7 +85,7 @@ def run(
 def killer(every: float, most: int, stop: threading.Event, killed: list[int]) -> None:
     """Kill a worker of this process every `every` seconds, at most `most` of them."""
     while len(killed) < most and not stop.wait(every):
-        workers = [p for p in psutil.Process().children() if "mstfilter.study.worker" in " ".join(p.cmdline())]
+        workers = [p for p in psutil.Process().children() if "spawn_main" in " ".join(p.cmdline())]
         if workers:
             chosen = workers[len(killed) % len(workers)]
             chosen.kill()

@@ -32,18 +32,18 @@ def study(
     ] = False,
 ) -> None:
     """Compare filters on many scenes. A study that was stopped goes on; what is done is never repeated."""
-    from mstfilter.study import check_names, load_study
+    from mstfilter.study import check_arm_names, load_study
 
     wanted = load_study(config, smoke=smoke)
-    check_names(wanted, overrides or ())  # a slip is answered before anything heavy is imported
+    check_arm_names(wanted, overrides or ())  # before any large library is imported
     from mstfilter.study import Executor, Local, run_study
 
     folder = out or Path("studies") / f"{wanted.name}{'-smoke' if smoke else ''}"
-    executor: Executor = Local(workers, wanted.tries, wanted.timeout_s, folder / "logs")
+    executor: Executor = Local(workers, folder / "logs")
     if scheduler:
         from mstfilter.study import Cluster
 
-        executor = Cluster(scheduler, wanted.tries, wanted.timeout_s)
+        executor = Cluster(scheduler)
     with _shown() as progress:
         result = run_study(wanted, folder, executor, overrides or (), progress=progress)
     print(f"study       {folder}")

@@ -79,7 +79,7 @@ def _page(study: StudyFolder) -> str:
         claim=CLAIM,
         compared=[one for one in summary.compared() if one.difference.n],
         columns=[(name, heading) for name, heading in _FIGURES if name in summary.names],
-        figures=_drawn(records, summary, study.beside),
+        figures=_drawn(records, summary, study.reported_only),
         costs=_costs(summary),
         arms=_arms(study.description),
         failures=failures,
@@ -104,7 +104,7 @@ def _scenes(study: StudyFolder, group: str) -> list[str]:
     return [scene["name"] for scene in study.description["scenes"] if scene["group"] == group]
 
 
-def _drawn(records: Sequence[Mapping[str, Any]], summary: Summary, beside: Sequence[str]) -> dict[str, Any]:
+def _drawn(records: Sequence[Mapping[str, Any]], summary: Summary, reported_only: Sequence[str]) -> dict[str, Any]:
     """Inline SVG by name."""
     from markupsafe import Markup
 
@@ -113,11 +113,11 @@ def _drawn(records: Sequence[Mapping[str, Any]], summary: Summary, beside: Seque
         if row.get("qualities"):
             values[row["family"]][row["arm"]][row["pause"]].extend(row["qualities"])
     found: dict[str, Any] = {}
-    arms = [arm for arm in summary.arms if arm not in beside]
+    arms = [arm for arm in summary.arms if arm not in reported_only]
     if values:
         groups = in_groups(arms, summary.reference)
         found["time"] = [Markup(time_figure(values, group)) for group in groups]
-    ends = [summary.reference, *(arm for arm in summary.arms if arm in beside)]
+    ends = [summary.reference, *(arm for arm in summary.arms if arm in reported_only)]
     if values and len(ends) > 1:
         groups = in_groups(ends, summary.reference)
         found["ends"] = [Markup(time_figure(values, group)) for group in groups]

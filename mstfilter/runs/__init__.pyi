@@ -1,6 +1,17 @@
 from mstfilter.runs.metrics import measure_pause as measure_pause
-from mstfilter.runs.run import RunProgress as RunProgress, filter_recording as filter_recording
-from mstfilter.runs.run_folder import HypothesisCodec as HypothesisCodec, RunFolder as RunFolder
+from mstfilter.runs.run import (
+    RunProgress as RunProgress,
+    code_version as code_version,
+    component_files as component_files,
+    filter_recording as filter_recording,
+    library_versions as library_versions,
+)
+from mstfilter.runs.run_folder import (
+    HypothesisCodec as HypothesisCodec,
+    RunFolder as RunFolder,
+    as_json as as_json,
+    write_json as write_json,
+)
 from mstfilter.runs.scoring import (
     PauseEstimate as PauseEstimate,
     PauseScore as PauseScore,

@@ -1,14 +1,15 @@
-"""Run a filter over a recording into a run folder.
+"""Filter a recording into a run folder.
 
->>> folder = filter_recording(recording, load_config("mst"), Path("runs/mine"), seed=0)
+>>> run = filter_recording(recording, load_config("mst"), Path("runs/mine"), seed=0)
 
-Everything that can be wrong with the input is found before the folder is made. A run that was stopped goes on
-where it was, to the same result, when it is started again with the same configuration, seed and recording.
+All input is checked before the folder is made. A run that was stopped is resumed by the same call with the same
+configuration, seed and recording; its result equals that of an uninterrupted run.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import json
 import platform
 from collections.abc import Callable, Mapping
@@ -19,20 +20,20 @@ from typing import Any
 
 import mstfilter
 from mstfilter.errors import InputError
-from mstfilter.oracles import bind_truth
+from mstfilter.oracles import bind_truth, uses_truth
 from mstfilter.presets import build_filter, describe_filter
-from mstfilter.runs.run_folder import RunFolder, plain
+from mstfilter.runs.run_folder import RunFolder, as_json
 from mstfilter.scene import Recording
 from mstfilter.smc import Observer
 
-__all__ = ["RunProgress", "filter_recording"]
+__all__ = ["RunProgress", "code_version", "component_files", "filter_recording", "library_versions"]
 
 _LIBRARIES = ("numpy", "scipy", "networkx", "opencv-python-headless", "higra", "small_gicp")
 
 
 @dataclass(frozen=True)
 class RunProgress:
-    """What is reported while a run is going on: pauses done, pauses in all, wall seconds of the last step."""
+    """Progress of a run: pauses done, pauses in total, wall seconds of the last step."""
 
     done: int
     total: int
@@ -49,34 +50,39 @@ def filter_recording(
     progress: Callable[[RunProgress], None] = lambda progress: None,
     observer: Observer | None = None,
 ) -> RunFolder:
-    """Filter a recording; the run folder.
+    """Filter a recording and return the run folder.
 
     Parameters
     ----------
     recording : Recording
-        What was seen.
     config : mapping
         A configuration as `mstfilter.presets.load_config` returns it.
     path : Path
-        The run folder: new, empty, or one of the same run that was stopped.
+        The run folder: new, empty, or of the same run that was stopped.
     seed : int
-        Names all random streams.
+        Seed of all random streams.
     allow_files : bool
         Whether components may come from ``./file.py:Class``.
     progress : callable
         Called before the first step and after every step.
     observer : callable, optional
         ``observer(slot, begins)``, called when a component of the filter begins and ends its work.
+
+    Raises
+    ------
+    InputError
+        If the configuration or the recording is invalid, or the folder belongs to another run.
     """
     filter = build_filter(config, allow_files=allow_files)
     recording.check()
-    running = bind_truth(filter, recording)
-    wanted = plain(
+    bound = bind_truth(filter, recording)
+    description = as_json(
         {
             "seed": int(seed),
             "description": config.get("description", ""),
             "config": describe_filter(filter),
-            "files": files_of(filter),
+            "uses_truth": uses_truth(filter),
+            "files": component_files(filter),
             "recording": {
                 "name": recording.name,
                 "key": recording.key.hex(),
@@ -84,28 +90,24 @@ def filter_recording(
                 "times": [recording.times[p] for p in recording.pauses],
                 "generator": recording.manifest.get("generator"),
             },
-            "versions": versions(),
+            "versions": library_versions(),
         }
     )
-    folder = _existing(path, wanted)
+    folder = _existing_folder(path, description)
     clips = recording.clips()
     done = 0 if folder is None else folder.n_pauses
-    state = folder.state(done - 1) if folder is not None and done else running.start(int(seed))
+    state = folder.state(done - 1) if folder is not None and done else bound.start(int(seed))
     progress(RunProgress(done, len(clips)))
     try:
         for clip in clips[done:]:
-            state, info = running.step(state, clip, observer)
-            if folder is None:  # what fails at the first step leaves nothing behind
-                folder = RunFolder.create(path, wanted)
+            state, info = bound.step(state, clip, observer)
+            if folder is None:  # a run that fails in its first step leaves no folder
+                folder = RunFolder.create(path, description)
             folder.write_pause(clip, state, info, recording.truth(clip.index))
             progress(RunProgress(clip.index + 1, len(clips), sum(info.seconds.values())))
-    except KeyboardInterrupt:
+    except BaseException as error:
         if folder is not None:
-            folder.set_status("interrupted")
-        raise
-    except BaseException:
-        if folder is not None:
-            folder.set_status("failed")
+            folder.set_status("interrupted" if isinstance(error, KeyboardInterrupt) else "failed")
         raise
     assert folder is not None
     folder.write_metrics()
@@ -113,18 +115,19 @@ def filter_recording(
     return folder
 
 
-def _existing(path: Path, wanted: dict[str, Any]) -> RunFolder | None:
-    """The folder of the same run, to go on with; None where there is none yet."""
+def _existing_folder(path: Path, description: dict[str, Any]) -> RunFolder | None:
+    """The folder of the same run, to be resumed; None if there is none yet."""
     if (path / "run.json").is_file():
         folder = RunFolder.open(path)
-        for what in ("seed", "config", "files", "recording", "versions"):
-            found = folder.description.get(what)
-            if found != wanted[what]:
+        for key in ("seed", "config", "files", "recording", "versions"):
+            found = folder.description.get(key)
+            if found != description[key]:
                 raise InputError(
-                    f"run folder {path} holds another run: its {what} differs"
-                    + _first_difference(found, wanted[what]),
+                    f"run folder {path} holds another run: its {key} differs"
+                    + _first_difference(found, description[key]),
                     "choose another folder, or remove this one",
                 )
+        folder.remove_partial_pauses()
         folder.set_status("running")
         return folder
     if path.exists() and (not path.is_dir() or any(path.iterdir())):
@@ -132,23 +135,8 @@ def _existing(path: Path, wanted: dict[str, Any]) -> RunFolder | None:
     return None
 
 
-def files_of(component: Any) -> dict[str, str]:
-    """Content hashes of the users' files that components come from."""
-    found = {}
-    if dataclasses.is_dataclass(component):
-        cls = type(component)
-        if "__mst_source__" in cls.__dict__:
-            found[cls.__dict__["__mst_file__"]] = cls.__dict__["__mst_source__"]
-        for field in dataclasses.fields(component):
-            found.update(files_of(getattr(component, field.name)))
-    elif isinstance(component, tuple):
-        for part in component:
-            found.update(files_of(part))
-    return found
-
-
 def _first_difference(found: Any, wanted: Any, where: str = "") -> str:
-    """Where two descriptions differ first, in words."""
+    """The first entry in which two descriptions differ, as text."""
     if isinstance(found, dict) and isinstance(wanted, dict):
         for key in {**found, **wanted}:
             if found.get(key) != wanted.get(key):
@@ -157,8 +145,23 @@ def _first_difference(found: Any, wanted: Any, where: str = "") -> str:
     return f" ({where + ': ' if where else ''}{short[0]} there, {short[1]} now)"
 
 
-def versions() -> dict[str, str]:
-    """Versions of what a result depends on."""
+def component_files(component: Any) -> dict[str, str]:
+    """Files of the user that a component and its parts come from -> hash of their content."""
+    if isinstance(component, tuple):
+        return {path: content for part in component for path, content in component_files(part).items()}
+    if not dataclasses.is_dataclass(component):
+        return {}
+    found = {}
+    cls = type(component)
+    if "__mst_source__" in cls.__dict__:
+        found[cls.__dict__["__mst_file__"]] = cls.__dict__["__mst_source__"]
+    for field in dataclasses.fields(component):
+        found.update(component_files(getattr(component, field.name)))
+    return found
+
+
+def library_versions() -> dict[str, str]:
+    """Versions of the libraries that results depend on."""
     found = {"mstfilter": mstfilter.__version__, "python": platform.python_version()}
     for name in _LIBRARIES:
         try:
@@ -166,3 +169,12 @@ def versions() -> dict[str, str]:
         except PackageNotFoundError:
             found[name] = "absent"
     return found
+
+
+def code_version() -> str:
+    """A hash of the Python files of mstfilter."""
+    package = Path(mstfilter.__file__).parent
+    digest = hashlib.sha256()
+    for path in sorted(package.rglob("*.py")):
+        digest.update(path.relative_to(package).as_posix().encode() + b"\0" + path.read_bytes())
+    return digest.hexdigest()[:16]

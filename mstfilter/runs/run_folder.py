@@ -1,25 +1,23 @@
-"""The folder of a run: written pause by pause, enough to report from and to go on from.
+"""The folder of a run, written pause by pause. Reports are made from it, and a stopped run is resumed from it.
 
 >>> run = RunFolder.open("runs/demo")
 >>> run.n_pauses, run.hypotheses(0), run.info(0)
 
 Layout::
 
-    run.json                 what was run: configuration, seed, versions, recording, status
+    run.json                 configuration, seed, versions, recording, status
     pauses/000/rgb.png       the image at the pause          pauses/000/hypotheses.npz   particles and log weights
-    pauses/000/info.json     what happened in the step       pauses/000/camera.json      pose at the pause
-    pauses/000/truth.npz     true labels, where known        pauses/000/seconds.json     wall time by part
+    pauses/000/info.json     record of the step              pauses/000/camera.json      pose at the pause
+    pauses/000/truth.npz     true labels, if known           pauses/000/seconds.json     wall time by part
     metrics.csv              one row a pause and hypothesis
 
-A pause is written under a temporary name and renamed when it is complete, so a run that was stopped at any
-moment holds whole pauses only. Everything but seconds.json is the same for the same seed.
+A pause is written under a temporary name and renamed when it is complete, so a run that was stopped at any moment
+holds complete pauses only. All files but seconds.json are the same for the same seed.
 """
 
 from __future__ import annotations
 
-import csv
 import json
-import os
 import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -30,6 +28,7 @@ from typing import Any
 import numpy as np
 
 from mstfilter.errors import InputError
+from mstfilter.files import atomic_folder, write_csv, write_text
 from mstfilter.scene import (
     Camera,
     Clip,
@@ -45,21 +44,19 @@ from mstfilter.scene import (
 from mstfilter.scoring import FORMS, weighted_coverage
 from mstfilter.smc import Codec, Info, Key, Population, State
 
-__all__ = ["HypothesisCodec", "RunFolder", "plain", "write_json"]
+__all__ = ["HypothesisCodec", "RunFolder", "as_json", "write_json"]
 
 _FORMAT = 1
 
 
-def plain(value: Any) -> Any:
-    """A value as JSON knows it: arrays become lists, numpy numbers numbers, NaN and infinities None."""
+def as_json(value: Any) -> Any:
+    """A value as JSON can hold it: arrays become lists, NaN and infinities None, other objects their text."""
     if isinstance(value, Mapping):
-        return {str(k): plain(v) for k, v in value.items()}
-    if isinstance(value, np.ndarray):
-        return plain(value.tolist())
+        return {str(k): as_json(v) for k, v in value.items()}
+    if isinstance(value, (np.ndarray, np.generic)):
+        return as_json(value.tolist())
     if isinstance(value, (list, tuple)):
-        return [plain(v) for v in value]
-    if isinstance(value, np.generic):
-        return plain(value.item())
+        return [as_json(v) for v in value]
     if isinstance(value, float) and not np.isfinite(value):
         return None
     if value is None or isinstance(value, (str, int, float, bool)):
@@ -68,10 +65,8 @@ def plain(value: Any) -> Any:
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Write JSON under a temporary name and rename it."""
-    partial = path.with_name(f".{path.name}.partial")
-    partial.write_text(json.dumps(plain(value), indent=1) + "\n")
-    os.replace(partial, path)
+    """Write JSON in one step."""
+    write_text(path, json.dumps(as_json(value), indent=1) + "\n")
 
 
 def _read_json(path: Path) -> Any:
@@ -115,12 +110,12 @@ class RunFolder:
 
     @cached_property
     def description(self) -> dict[str, Any]:
-        """What run.json says."""
+        """The content of run.json."""
         return dict(_read_json(self.path / "run.json"))
 
     @property
     def n_pauses(self) -> int:
-        """Complete pauses."""
+        """Number of complete pauses."""
         t = 0
         while (self.path / "pauses" / f"{t:03d}").is_dir():
             t += 1
@@ -131,55 +126,59 @@ class RunFolder:
         return self.path / "pauses" / f"{t:03d}"
 
     def set_status(self, status: str) -> None:
-        """Record how far the run is: running, interrupted, failed, done."""
+        """Set the status of the run: running, interrupted, failed or done."""
         write_json(self.path / "run.json", {**_read_json(self.path / "run.json"), "status": status})
 
     def write_pause(self, clip: Clip, state: State, info: Info, truth: np.ndarray | None) -> None:
-        """Write a step as a whole, or not at all."""
+        """Write the results of a step; an interrupted call writes nothing."""
         assert state.population is not None
-        t, final = info.t, self.pause(info.t)
-        folder = final.with_name(f".{final.name}.partial")
-        shutil.rmtree(folder, ignore_errors=True)
-        folder.mkdir(parents=True)
-        camera = clip.after.camera
-        write_image(folder / "rgb.png", clip.after.rgb)
-        described = {
-            "K": camera.K,
-            "width": camera.width,
-            "height": camera.height,
-            "T_world_camera": camera.pose.as_matrix(),
-        }
-        write_json(folder / "camera.json", described)
-        hypotheses = tuple(state.population.particles)
-        save_hypotheses(
-            folder / "hypotheses.npz",
-            hypotheses,
-            log_weights=state.population.log_weights,
-            **{f"parents_{name}": index for name, index in state.population.parents.items()},
-        )
-        if truth is not None:
-            np.savez_compressed(folder / "truth.npz", labels=truth)
-        record = {
-            "t": t,
-            "n": info.n,
-            "n_frames": len(clip),
-            "n_candidates": info.n_candidates,
-            "ess": info.ess,
-            "resampled": info.resampled,
-            "unique_ancestors": info.unique_ancestors,
-            "ancestors": info.ancestors,
-            "parents": info.parents,
-            "log_weights": info.log_weights,
-            "weights": state.population.weights,
-            "quality": None if truth is None else qualities(hypotheses, truth),
-            "notes": info.notes,
-        }
-        write_json(folder / "info.json", record)
-        write_json(folder / "seconds.json", info.seconds)
-        os.replace(folder, final)
+        camera, hypotheses = clip.after.camera, tuple(state.population.particles)
+        (self.path / "pauses").mkdir(exist_ok=True)
+        with atomic_folder(self.pause(info.t)) as folder:
+            folder.mkdir()
+            write_image(folder / "rgb.png", clip.after.rgb)
+            write_json(
+                folder / "camera.json",
+                {
+                    "K": camera.K,
+                    "width": camera.width,
+                    "height": camera.height,
+                    "T_world_camera": camera.pose.as_matrix(),
+                },
+            )
+            save_hypotheses(
+                folder / "hypotheses.npz",
+                hypotheses,
+                log_weights=state.population.log_weights,
+                **{f"parents_{name}": index for name, index in state.population.parents.items()},
+            )
+            if truth is not None:
+                np.savez_compressed(folder / "truth.npz", labels=truth)
+            record = {
+                "t": info.t,
+                "n": info.n,
+                "n_frames": len(clip),
+                "n_candidates": info.n_candidates,
+                "ess": info.ess,
+                "resampled": info.resampled,
+                "unique_ancestors": info.unique_ancestors,
+                "ancestors": info.ancestors,
+                "parents": info.parents,
+                "log_weights": info.log_weights,
+                "weights": state.population.weights,
+                "quality": None if truth is None else _qualities(hypotheses, truth),
+                "notes": info.notes,
+            }
+            write_json(folder / "info.json", record)
+            write_json(folder / "seconds.json", info.seconds)
+
+    def remove_partial_pauses(self) -> None:
+        """Remove what a killed run has left of a pause."""
+        for left in (self.path / "pauses").glob(".*.partial"):
+            shutil.rmtree(left, ignore_errors=True)
 
     def info(self, t: int) -> dict[str, Any]:
-        """What happened in the step that ended at pause `t`."""
+        """Record of the step that ended at pause `t`."""
         return dict(_read_json(self.pause(t) / "info.json"))
 
     def seconds(self, t: int) -> dict[str, float]:
@@ -197,7 +196,7 @@ class RunFolder:
         return Camera(np.array(data["K"]), data["width"], data["height"], pose)
 
     def truth(self, t: int) -> np.ndarray | None:
-        """True labels (X, Y, Z) at a pause; None where unknown."""
+        """True labels (X, Y, Z) at a pause; None if unknown."""
         path = self.pause(t) / "truth.npz"
         if not path.exists():
             return None
@@ -209,7 +208,7 @@ class RunFolder:
         return load_hypotheses(self.pause(t) / "hypotheses.npz")[0]
 
     def state(self, t: int) -> State:
-        """The state after pause `t`, to go on from."""
+        """The state after pause `t`, from which the run is resumed."""
         hypotheses, arrays = load_hypotheses(self.pause(t) / "hypotheses.npz")
         prefix = "parents_"
         parents = {name[len(prefix) :]: a for name, a in arrays.items() if name.startswith(prefix)}
@@ -218,22 +217,25 @@ class RunFolder:
 
     def write_metrics(self) -> None:
         """Write metrics.csv from the pauses."""
-        partial = self.path / ".metrics.csv.partial"
-        with partial.open("w", newline="") as file:
-            writer = csv.writer(file)
-            columns = ["weight", "n_objects", "voxels", *(f"quality_{form}" for form in FORMS)]
-            writer.writerow(["pause", "hypothesis", *columns])
-            for t in range(self.n_pauses):
-                info, hypotheses = self.info(t), self.hypotheses(t)
-                for k, hypothesis in enumerate(hypotheses):
-                    q = ["" if info["quality"] is None else f"{info['quality'][form][k]:.6f}" for form in FORMS]
-                    size = sum(hypothesis.volumes().values())
-                    writer.writerow([t, k, f"{info['weights'][k]:.6g}", hypothesis.n_objects, size, *q])
-        os.replace(partial, self.path / "metrics.csv")
+        rows = []
+        for t in range(self.n_pauses):
+            info = self.info(t)
+            for k, hypothesis in enumerate(self.hypotheses(t)):
+                row = {
+                    "pause": t,
+                    "hypothesis": k,
+                    "weight": f"{info['weights'][k]:.6g}",
+                    "n_objects": hypothesis.n_objects,
+                    "voxels": sum(hypothesis.volumes().values()),
+                }
+                for form in FORMS:
+                    row[f"quality_{form}"] = "" if info["quality"] is None else f"{info['quality'][form][k]:.6f}"
+                rows.append(row)
+        write_csv(self.path / "metrics.csv", rows)
 
 
-def qualities(hypotheses: tuple[Hypothesis, ...], truth: np.ndarray) -> dict[str, list[float]]:
-    """Quality of each hypothesis against the truth, in all forms."""
+def _qualities(hypotheses: tuple[Hypothesis, ...], truth: np.ndarray) -> dict[str, list[float]]:
+    """Quality of each hypothesis against the ground truth, in all forms."""
     return {form: [weighted_coverage(h.labels, truth, form) for h in hypotheses] for form in FORMS}
 
 

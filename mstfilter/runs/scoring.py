@@ -11,16 +11,15 @@ and compared there (``where`` says image); pixels of the robot (255) do not coun
 
 from __future__ import annotations
 
-import csv
-import os
 import zipfile
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
 
 from mstfilter.errors import InputError
+from mstfilter.files import write_csv
 from mstfilter.runs.run_folder import RunFolder
 from mstfilter.scene import Camera, Recording, VoxelGrid, as_labels, render
 from mstfilter.scoring import FORMS, connected_components, one_blob, weighted_coverage
@@ -227,15 +226,16 @@ def _words(grid: VoxelGrid) -> str:
 
 
 def write_scores(path: Path, rows: Sequence[PauseScore]) -> None:
-    """Rows as a table, written under a temporary name and renamed."""
-    partial = path.with_name(f".{path.name}.partial")
+    """Write scores as a CSV table.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be written.
+    """
+    if not path.parent.is_dir():
+        raise InputError(f"cannot write {path}: its folder does not exist")
     try:
-        with partial.open("w", newline="") as file:
-            writer = csv.DictWriter(file, [f.name for f in fields(PauseScore)])
-            writer.writeheader()
-            for row in rows:
-                writer.writerow({k: f"{v:.6f}" if isinstance(v, float) else v for k, v in asdict(row).items()})
-        os.replace(partial, path)
+        write_csv(path, [asdict(row) for row in rows], float_format=".6f")
     except OSError as error:
-        partial.unlink(missing_ok=True)
         raise InputError(f"cannot write {path}: {error.strerror}") from error

@@ -1,15 +1,16 @@
-"""What a study is made of: a TOML file, checked.
+"""A study as a TOML file, and the arms that it compares.
 
 >>> study = load_study("experiments/main/study.toml")
 >>> study.arms[0].preset, study.scenes[0].family
+>>> [arm.name for arm in expand_arms(study)]
 
 The file::
 
-    description = "does a quicker resampler cost quality?"
+    description = "does a faster resampler lower the quality?"
     seeds = "0-2"                          # of the filter; the same for all arms
 
     [[scenes]]
-    family = "demo"                        # simulated, made when it is missing
+    family = "demo"                        # simulated, made if it is missing
     seeds = "0-4"
     set = { width = 160, height = 120 }    # changes to the family
 
@@ -21,21 +22,36 @@ The file::
     preset = "mst, paper"                  # a comma makes a grid
     set = ["resampler=systematic,residual", "n=5"]
 
-    [smoke]                                # replaces what stands above under --smoke
+    [smoke]                                # replaces entries above under --smoke
     seeds = [0]
 """
 
 from __future__ import annotations
 
+import contextlib
+import itertools
 import tomllib
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
 from mstfilter.errors import InputError
+from mstfilter.presets import load_config
 
-__all__ = ["ArmEntry", "SceneEntry", "StudyConfig", "load_study"]
+__all__ = [
+    "ArmEntry",
+    "ArmRequest",
+    "SceneEntry",
+    "StudyConfig",
+    "check_arm_names",
+    "expand_arms",
+    "load_study",
+    "split_grid",
+    "study_of",
+]
 
 
 def _seeds(value: Any) -> Any:
@@ -54,7 +70,7 @@ def _seeds(value: Any) -> Any:
 
 
 def _texts(value: Any) -> Any:
-    """One text as a list of one."""
+    """A single text as a list."""
     return (value,) if isinstance(value, str) else value
 
 
@@ -74,15 +90,15 @@ class SceneEntry(_Entry):
     family : str
         A simulated family; `set` changes its fields.
     seeds : numbers
-        One scene each.
+        One scene for each.
     set : table
         Fields of the family.
     recordings : list of str
         Files or folders; a ``*`` stands for any text.
     format, options, pauses
-        How they are read, as for `mstfilter run`; by default they say it themselves.
+        How they are read, as for `mstfilter run`. Default: detected.
     group : str
-        What the tables call the family. Default: the family's name, ``recordings`` for folders.
+        Name of the family in the tables. Default: the family's name, ``recordings`` for folders.
     """
 
     family: str = ""
@@ -106,7 +122,7 @@ class SceneEntry(_Entry):
 
 
 class ArmEntry(_Entry):
-    """What is compared: a preset and changes to it; commas make a grid.
+    """A filter to compare: a preset and changes to it; commas make a grid.
 
     Parameters
     ----------
@@ -115,15 +131,15 @@ class ArmEntry(_Entry):
     set : list of str
         ``path=value`` each, as `mstfilter run` takes them; ``path=a,b`` is two arms.
     name : str
-        What the tables call it. Default: the preset and what the grid varies.
-    beside : bool
-        Shown beside the others (a floor, a ceiling), and no part of the comparisons that are adjusted together.
+        Name in the tables. Default: the preset and the values that the grid varies.
+    reported_only : bool
+        Reported, but not part of the comparisons whose p values are adjusted together: a lower or an upper bound.
     """
 
     preset: Texts = ("mst",)
     set: Texts = ()
     name: str = ""
-    beside: bool = False
+    reported_only: bool = False
 
 
 class StudyConfig(_Entry):
@@ -136,17 +152,17 @@ class StudyConfig(_Entry):
     description : str
     arms, scenes : lists of tables
     seeds : numbers
-        Of the filter. Nested in scenes: averaged before arms are compared.
+        Seeds of the filter. They are nested in scenes: averaged before arms are compared.
     reference : str
         The arm that the others are compared with. Default: the first.
     keep : {"all", "tables"}
-        What stays of a run: its whole folder, from which a report can be made, or its figures alone.
+        What is kept of a run: its folder, from which a report can be made, or its metrics only.
     tries : int
-        How often a run is begun whose worker dies.
+        How many times a run is started if its worker dies.
     timeout_s : float
-        A run that takes longer counts as a worker's death. 0: no limit.
+        Time limit of a run in seconds; it is then started again, up to `tries` times. 0: no limit.
     cache_gb : float
-        Bound of the work kept on disk for other arms and later runs; 0 keeps none.
+        Maximum size in GB of intermediate results that are kept on disk for other arms and later runs; 0 keeps none.
     smoke : table
         Replaces fields of the study under ``--smoke``.
     """
@@ -162,22 +178,22 @@ class StudyConfig(_Entry):
     timeout_s: Annotated[float, Field(ge=0)] = 0.0
     cache_gb: Annotated[float, Field(ge=0)] = 4.0
     smoke: dict[str, Any] = Field(default_factory=dict)
-    folder: Path = Path()  # where relative paths begin
+    folder: Path = Path()  # relative paths start here
 
 
 def load_study(path: str | Path, *, smoke: bool = False) -> StudyConfig:
-    """The study of a TOML file.
+    """Read a study from a TOML file.
 
     Parameters
     ----------
     path : path
     smoke : bool
-        Apply the table ``[smoke]``: the small form that shows that all works.
+        Apply the table ``[smoke]``: a small study that shows that everything works.
 
     Raises
     ------
     InputError
-        The file is missing, is no TOML or says what a study does not know.
+        If the file is missing, is not valid TOML, or has an unknown or invalid entry.
     """
     path = Path(path)
     try:
@@ -189,13 +205,15 @@ def load_study(path: str | Path, *, smoke: bool = False) -> StudyConfig:
     if smoke:
         small = data.get("smoke")
         if not small:
-            raise InputError(f"study {path} has no table [smoke]", "it says what --smoke replaces, e.g. seeds = [0]")
+            raise InputError(
+                f"study {path} has no table [smoke]", "add the entries that --smoke replaces, e.g. seeds = [0]"
+            )
         data = {**data, **small}
     return study_of({"name": path.stem, **data, "folder": path.parent}, str(path))
 
 
 def study_of(data: dict[str, Any], where: str = "study") -> StudyConfig:
-    """The study of plain values."""
+    """A study from plain values."""
     try:
         return StudyConfig(**data)
     except ValidationError as error:
@@ -207,3 +225,97 @@ def study_of(data: dict[str, Any], where: str = "study") -> StudyConfig:
         )
         message = first["msg"].removeprefix("Value error, ")
         raise InputError(f"{where}: {at}: {message[:1].lower()}{message[1:]}", *hints) from error
+
+
+@dataclass(frozen=True)
+class ArmRequest:
+    """An arm before its filter is built.
+
+    Parameters
+    ----------
+    name : str
+    preset : str
+        Name or path.
+    overrides : tuple of str
+    reported_only : bool
+        Reported, but not part of the comparisons.
+    """
+
+    name: str
+    preset: str
+    overrides: tuple[str, ...]
+    reported_only: bool
+
+    def config(self, allow_files: bool) -> dict[str, Any]:
+        """The configuration of the arm; unknown names of components raise InputError."""
+        return load_config(self.preset, self.overrides, allow_files=allow_files)
+
+    @contextlib.contextmanager
+    def name_in_errors(self) -> Iterator[None]:
+        """Put the name of the arm in front of errors inside the block."""
+        try:
+            yield
+        except InputError as error:
+            raise InputError(f"arm {self.name!r}: {error.message}", *error.hints) from error
+
+
+def check_arm_names(study: StudyConfig, overrides: Sequence[str] = (), *, allow_files: bool = True) -> None:
+    """Raise InputError if an arm names an unknown preset or component; imports no component."""
+    for request in expand_arms(study, overrides):
+        with request.name_in_errors():
+            request.config(allow_files)
+
+
+def expand_arms(study: StudyConfig, overrides: Sequence[str] = ()) -> Iterator[ArmRequest]:
+    """The arms of a study, grids multiplied out. `overrides` are applied to each; commas in them make a grid too."""
+    for entry in study.arms:
+        yield from _expand(entry, study.folder, overrides)
+
+
+def _expand(entry: ArmEntry, folder: Path, overrides: Sequence[str]) -> Iterator[ArmRequest]:
+    presets = [_preset_path(folder, name.strip()) for text in entry.preset for name in text.split(",")]
+    grids = [split_grid(text) for text in (*entry.set, *overrides)]
+    if not presets or not all(presets):
+        raise InputError(f"an arm names no preset: {list(entry.preset)}")
+    varied = [k for k, grid in enumerate(grids) if len(grid) > 1]
+    for preset in presets:
+        for chosen in itertools.product(*grids):
+            if entry.name:
+                words = [entry.name, *([_stem(preset)] if len(presets) > 1 else []), *(chosen[k] for k in varied)]
+            else:
+                shown = [k for k in range(len(grids)) if k < len(entry.set) or k in varied]
+                words = [_stem(preset), *(chosen[k] for k in shown)]
+            yield ArmRequest(" ".join(words), preset, chosen, entry.reported_only)
+
+
+def _preset_path(folder: Path, name: str) -> str:
+    """The file of a preset in the study's folder if there is one, else the name."""
+    return str(folder / name) if name.endswith(".toml") and (folder / name).is_file() else name
+
+
+def _stem(preset: str) -> str:
+    return Path(preset).stem if preset.endswith(".toml") else preset
+
+
+def split_grid(text: str) -> list[str]:
+    """``"path=a,b"`` as ``["path=a", "path=b"]``; commas inside brackets and quotes do not separate."""
+    path, equals, values = text.partition("=")
+    if not equals:
+        return [text]
+    parts, depth, quote, begin = [], 0, "", 0
+    for k, letter in enumerate(values):
+        if quote:
+            quote = "" if letter == quote else quote
+        elif letter in "\"'":
+            quote = letter
+        elif letter in "[{(":
+            depth += 1
+        elif letter in "]})":
+            depth -= 1
+        elif letter == "," and depth == 0:
+            parts.append(values[begin:k])
+            begin = k + 1
+    parts.append(values[begin:])
+    if any(not part.strip() for part in parts):
+        raise InputError(f"override {text!r} has an empty value", "for example resampler=systematic,residual")
+    return [f"{path.strip()}={part.strip()}" for part in parts]

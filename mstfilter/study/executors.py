@@ -1,22 +1,46 @@
-"""What runs the jobs of a study: processes of this machine (`local`), or a cluster (`cluster`).
-
-An executor is given jobs as plain dictionaries (see `jobs.perform`) and tells what happens. It never fails because
-a job does: a job ends with a `JobOutcome`, whatever becomes of it.
+"""Executors run the jobs of a study: `Local` in processes of this machine, `Cluster` on a Dask scheduler.
 
 >>> outcomes = Local(workers=2).run(jobs, tell=print)
+
+A job is a mapping of plain values (see `mstfilter.study.jobs`). It always ends with a `JobOutcome`: an error in a
+job, a worker that dies and a time limit that is exceeded do not stop the other jobs.
 """
 
 from __future__ import annotations
 
+import contextlib
+import multiprocessing
+import os
+import queue
+import sys
+import threading
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass, replace
+from multiprocessing.connection import Connection
+from pathlib import Path
 from typing import Any
 
-__all__ = ["Event", "Executor", "Job", "JobOutcome", "Tell"]
+from mstfilter.errors import InputError
+
+__all__ = ["Event", "Executor", "Job", "JobOutcome", "Local", "Tell"]
 
 Job = Mapping[str, Any]
-"""Plain values: ``kind`` (record, run, measure), ``name``, ``share`` (jobs of one share use the same work), ..."""
+"""Plain values: ``kind`` (record or run), ``name``, ``share`` (jobs of one share use the same intermediate results),
+``tries``, ``timeout_s`` and what `mstfilter.study.jobs` needs."""
+
+_POLL_S = 0.01
+_ONE_THREAD = {
+    name: "1"
+    for name in (
+        "OMP_NUM_THREADS",
+        "OPENBLAS_NUM_THREADS",
+        "MKL_NUM_THREADS",
+        "NUMEXPR_NUM_THREADS",
+        "VECLIB_MAXIMUM_THREADS",
+    )
+}
 
 
 @dataclass(frozen=True)
@@ -27,13 +51,13 @@ class JobOutcome:
     ----------
     status : {"done", "failed"}
     error : str
-        One line: what went wrong.
+        What went wrong, in one line.
     hints : tuple of str
-        What can be done about it.
+        What the user can do about it.
     trace : str
-        Where it went wrong, for whoever mends the program.
+        Traceback of the error.
     tries : int
-        How often it was begun.
+        How many times the job was started.
     """
 
     status: str
@@ -50,11 +74,11 @@ class Event:
     Parameters
     ----------
     kind : {"begun", "step", "lost", "ended"}
-        "lost": its worker died; it will be begun again if tries are left.
+        "lost": its worker died or the time limit was exceeded; it is started again if tries are left.
     job : int
-        Its place in the list.
+        Its index in the list of jobs.
     done, total : int
-        Steps of the job, where known.
+        Steps of the job, if known.
     outcome : JobOutcome, optional
         Of a job that has ended.
     """
@@ -74,39 +98,247 @@ class Executor(ABC):
 
     @abstractmethod
     def run(self, jobs: Sequence[Job], tell: Tell) -> list[JobOutcome]:
-        """Run all jobs; their outcomes in the order given.
+        """Run all jobs and return their outcomes, in the order of `jobs`.
 
         Parameters
         ----------
         jobs : sequence of mapping
-            Begun in this order as far as workers are free; those of one ``share`` preferably by one worker.
+            Started in this order when workers are free. Jobs of one ``share`` go to the same worker if possible.
         tell : callable
-            Called for every `Event`, in the thread of the caller. What it raises stops everything.
+            Called with every `Event`, in the calling thread. An exception that it raises stops all jobs.
         """
 
 
-@dataclass
-class Queue:
-    """Jobs that wait; a worker is given what shares work with what it did before."""
+@dataclass(frozen=True)
+class Local(Executor):
+    """Runs jobs in processes of this machine, one thread each.
 
-    jobs: Sequence[Job]
-    waiting: list[int] = field(default_factory=list)
-    at: dict[int, str] = field(default_factory=dict)
+    Each worker is a `pebble.ProcessPool` of one process, which is started with ``spawn`` and does many jobs. A worker
+    that dies or exceeds the time limit of its job is replaced. As with `multiprocessing`, a script that uses this
+    class needs ``if __name__ == "__main__":``.
+
+    Parameters
+    ----------
+    workers : int
+        Number of processes. 0: the number of cores that this process may use.
+    logs : Path, optional
+        Folder for the output of the workers. Default: their output is discarded.
+    """
+
+    workers: int = 0
+    logs: Path | None = None
 
     def __post_init__(self) -> None:
-        self.waiting = list(range(len(self.jobs)))
+        if self.workers < 0:
+            raise InputError(f"workers is {self.workers}, expected 0 or more")
+
+    def run(self, jobs: Sequence[Job], tell: Tell) -> list[JobOutcome]:
+        """Run all jobs."""
+        if not jobs:
+            return []
+        jobs_left = _JobQueue(jobs)
+        events: queue.SimpleQueue[Event | BaseException] = queue.SimpleQueue()
+        n_workers = min(self.workers or _available_cores(), len(jobs))
+        workers = [_Worker(k, jobs_left, events, self.logs) for k in range(n_workers)]
+        outcomes: dict[int, JobOutcome] = {}
+        with _environment(_ONE_THREAD):  # processes inherit it when they start
+            for worker in workers:
+                worker.start()
+            try:
+                while len(outcomes) < len(jobs):
+                    event = events.get()
+                    if isinstance(event, BaseException):
+                        raise event
+                    if event.outcome is not None:
+                        outcomes[event.job] = event.outcome
+                    tell(event)
+            finally:
+                for worker in workers:
+                    worker.stopped.set()
+                for worker in workers:
+                    worker.join()
+        return [outcomes[k] for k in range(len(jobs))]
+
+
+class _JobQueue:
+    """Jobs that wait for a worker."""
+
+    def __init__(self, jobs: Sequence[Job]) -> None:
+        self.jobs = jobs
+        self._waiting = list(range(len(jobs)))
+        self._share_of: dict[int, str] = {}
+        self._lock = threading.Lock()
 
     def take(self, worker: int) -> int | None:
-        """The next job of a worker: of the share it is at, else of one where nobody is, else the next."""
-        if not self.waiting:
-            return None
-        others = {share for w, share in self.at.items() if w != worker}
+        """The next job of a worker: of its last share, else of a share that no other worker has, else the first."""
+        with self._lock:
+            if not self._waiting:
+                return None
+            other_shares = {share for w, share in self._share_of.items() if w != worker}
 
-        def rank(k: int) -> tuple[bool, bool]:
-            share = self.jobs[k].get("share", "")
-            return share != self.at.get(worker), share in others
+            def rank(k: int) -> tuple[bool, bool]:
+                share = self.jobs[k].get("share", "")
+                return share != self._share_of.get(worker), share in other_shares
 
-        chosen = min(self.waiting, key=rank)  # the first of the best
-        self.waiting.remove(chosen)
-        self.at[worker] = self.jobs[chosen].get("share", "")
-        return chosen
+            chosen = min(self._waiting, key=rank)
+            self._waiting.remove(chosen)
+            self._share_of[worker] = self.jobs[chosen].get("share", "")
+            return chosen
+
+
+class _Worker(threading.Thread):
+    """The thread that gives jobs to one process and reports their events."""
+
+    def __init__(
+        self,
+        number: int,
+        jobs_left: _JobQueue,
+        events: queue.SimpleQueue[Event | BaseException],
+        logs: Path | None,
+    ) -> None:
+        super().__init__(daemon=True)
+        self.stopped = threading.Event()
+        self._number, self._queue, self._events = number, jobs_left, events
+        self._log = None if logs is None else logs / f"worker-{number}.log"
+        self._pool: Any = None
+        self._steps: Connection | None = None
+
+    def run(self) -> None:
+        try:
+            while not self.stopped.is_set():
+                k = self._queue.take(self._number)
+                if k is None:
+                    return
+                outcome = self._do(k)
+                if outcome is not None:
+                    self._events.put(Event("ended", k, outcome=outcome))
+        except BaseException as error:
+            self._events.put(error)
+        finally:
+            self._close_pool()
+
+    def _do(self, k: int) -> JobOutcome | None:
+        """Run a job up to ``tries`` times; None if the worker is stopped."""
+        from pebble import ProcessExpired
+
+        job = self._queue.jobs[k]
+        tries = int(job.get("tries", 1))
+        reason = ""
+        for attempt in range(1, tries + 1):
+            self._events.put(Event("begun", k))
+            try:
+                outcome = self._try(k, job)
+            except TimeoutError:
+                reason = f", the last time because it took longer than {job['timeout_s']:g} s"
+            except ProcessExpired as error:
+                code = error.exitcode
+                reason = (
+                    f", the last time by signal {-code}" if code < 0 else f", the last time with exit code {code}"
+                )
+            except BrokenProcessPool:
+                reason = ", the last time before it began"
+            else:
+                return None if outcome is None else replace(outcome, tries=attempt)
+            self._close_pool()
+            self._events.put(Event("lost", k))
+        log_hint = [] if self._log is None else [f"log: {self._log}"]
+        hints = ("if memory ran out: use fewer workers or a smaller scene", *log_hint)
+        return JobOutcome("failed", f"its worker died {times(tries)}{reason}", hints, tries=tries)
+
+    def _try(self, k: int, job: Job) -> JobOutcome | None:
+        """Run a job once; None if the worker is stopped.
+
+        Raises
+        ------
+        TimeoutError, ProcessExpired, BrokenProcessPool
+            If the process took too long or died.
+        """
+        if self._pool is None:
+            self._open_pool()
+        assert self._steps is not None
+        future = self._pool.schedule(_perform, args=(dict(job),), timeout=job.get("timeout_s") or None)
+        while not self.stopped.is_set():
+            ended = future.done()
+            while self._steps.poll(0 if ended else _POLL_S):
+                done, total = self._steps.recv()
+                self._events.put(Event("step", k, done, total))
+            if ended:
+                outcome: JobOutcome = future.result()
+                return outcome
+        return None
+
+    def _open_pool(self) -> None:
+        from pebble import ProcessPool
+
+        context = multiprocessing.get_context("spawn")
+        self._steps, worker_end = context.Pipe(duplex=False)
+        arguments = (worker_end, None if self._log is None else str(self._log))
+        self._pool = ProcessPool(1, initializer=_initialise, initargs=arguments, context=context)
+
+    def _close_pool(self) -> None:
+        if self._pool is not None:
+            self._pool.stop()
+            self._pool.join()
+        if self._steps is not None:
+            self._steps.close()
+        self._pool = self._steps = None
+
+
+def times(n: int) -> str:
+    """``1 time``, ``2 times``."""
+    return f"{n} time{'s' if n > 1 else ''}"
+
+
+@contextlib.contextmanager
+def _environment(variables: Mapping[str, str]) -> Iterator[None]:
+    """Set environment variables inside the block."""
+    before = {name: os.environ.get(name) for name in variables}
+    os.environ.update(variables)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value
+
+
+def _available_cores() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+# In the worker process:
+
+_step_pipe: Connection | None = None
+
+
+def _initialise(steps: Connection, log: str | None) -> None:
+    """Prepare a worker process: output goes to the log, one thread, an end if the study ends."""
+    global _step_pipe
+    import cv2
+
+    _step_pipe = steps
+    target = os.open(log or os.devnull, os.O_WRONLY | os.O_APPEND | os.O_CREAT)
+    sys.stdout.flush()
+    os.dup2(target, 1)
+    os.dup2(target, 2)
+    os.close(target)
+    cv2.setNumThreads(1)
+    threading.Thread(target=_exit_with_parent, daemon=True).start()
+
+
+def _exit_with_parent() -> None:
+    """End this process, also in the middle of a job, when the process of the study has ended."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(1)
+
+
+def _perform(job: Job) -> JobOutcome:
+    from mstfilter.study.jobs import perform
+
+    assert _step_pipe is not None
+    send = _step_pipe.send
+    return perform(job, lambda done, total: send((done, total)))

@@ -1,76 +1,74 @@
-"""What a worker does: make a recording, run a filter on one, or measure a run again.
+"""The jobs of a study: simulate a recording, or run a filter on one.
 
 >>> perform({"kind": "run", "name": "mst on demo-0", ...}, step=lambda done, total: None)
 JobOutcome(status='done')
 
-A job is plain values and needs nothing else, so that a process on another machine can do it. A run is written
-under a name of its own and renamed when it is whole: two workers with the same run do not disturb each other,
-and what a killed one leaves is never taken for a result.
+A job is a mapping of plain values, so that a process on another machine can do it. A run is written under a temporary
+name and renamed when it is complete: two workers with the same run do not disturb each other, and the remains of a
+killed worker are never taken for a result.
 """
 
 from __future__ import annotations
 
+import contextlib
 import errno
-import importlib
-import os
+import functools
 import shutil
+import sys
 import time
 import traceback
-import uuid
 from collections.abc import Callable, Mapping
-from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
 from mstfilter.errors import InputError
+from mstfilter.files import atomic_folder
 from mstfilter.formats import open_recording
-from mstfilter.runs.run_folder import RunFolder, write_json
-from mstfilter.runs.sources import open_source
+from mstfilter.presets import PACKAGES
+from mstfilter.runs import RunProgress, code_version, filter_recording, measure_pause, open_source
 from mstfilter.scene import Recording, scene_cache
-from mstfilter.study.code_version import files_version
 from mstfilter.study.executors import Job, JobOutcome
-from mstfilter.study.memory import StagePeaks
-from mstfilter.study.results import RESULT, read_result
+from mstfilter.study.results import write_result
 
-__all__ = ["failed", "open_scene", "perform"]
+__all__ = ["StagePeaks", "peak_megabytes", "perform", "reset_peak"]
 
-_Step = Callable[[int, int], None]
+_StepCallback = Callable[[int, int], None]
 
 
-def perform(job: Job, step: _Step = lambda done, total: None) -> JobOutcome:
-    """Do a job; whatever goes wrong in it becomes its outcome.
+def perform(job: Job, step: _StepCallback = lambda done, total: None) -> JobOutcome:
+    """Do a job; an error in it becomes its outcome.
 
     Parameters
     ----------
     job : mapping
-        See `study.jobs_of`.
+        ``kind`` is "record" or "run"; the other keys are those that `mstfilter.study.study` makes.
     step : callable
-        Told steps done and steps in all.
+        Called with the number of steps done and of all steps.
     """
     try:
-        {"record": _record, "run": _run, "measure": _measure}[job["kind"]](job, step)
-    except Exception as error:
-        return failed(error)
+        if job["kind"] == "record":
+            _open_scene(job["source"], job["recordings"])
+        else:
+            _run(job, step)
+    except (Exception, SystemExit) as error:
+        return _failure(error)
     return JobOutcome("done")
 
 
-def failed(error: Exception) -> JobOutcome:
-    """What an exception says to a user."""
+def _failure(error: BaseException) -> JobOutcome:
     trace = "".join(traceback.format_exception(error))
     if isinstance(error, InputError):
         return JobOutcome("failed", error.message, error.hints, trace)
     if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
-        return JobOutcome(
-            "failed", f"no space left: {error}", ("make room; the same command repeats this run",), trace
-        )
+        hints = ("free disk space; the same command repeats this run",)
+        return JobOutcome("failed", f"no space left: {error}", hints, trace)
     if isinstance(error, MemoryError):
         return JobOutcome("failed", "out of memory", ("use fewer workers",), trace)
-    return JobOutcome(
-        "failed", f"{type(error).__name__}: {error}", ("a fault of the program or of a component",), trace
-    )
+    hints = ("this is an error in the program or in a component",)
+    return JobOutcome("failed", f"{type(error).__name__}: {error}", hints, trace)
 
 
-def open_scene(source: Mapping[str, Any], recordings: str) -> Recording:
+def _open_scene(source: Mapping[str, Any], recordings: str) -> Recording:
     """The recording of a scene; a simulated one is made if it is missing."""
     if "path" in source:
         return open_source(Path(source["path"]), source["format"], source["options"], source["pauses"])
@@ -79,52 +77,39 @@ def open_scene(source: Mapping[str, Any], recordings: str) -> Recording:
     return open_recording(cached_recording(source["family"], source["seed"], Path(recordings), **source["set"]))
 
 
-def _record(job: Job, step: _Step) -> None:
-    open_scene(job["source"], job["recordings"])
-
-
-_verified: set[str] = set()
-
-
-def _verify(job: Job) -> None:
+@functools.cache
+def _check_code(expected: str) -> None:
     """Raise InputError unless this process runs the code that the study was planned with.
 
-    Once is enough: all of it is imported then, and later changes of the files change nothing here.
+    All packages of the filter are imported, so that later changes of their files have no effect on this process.
     """
-    if job["code"] in _verified:
-        return
-    if files_version(job["modules"]) != job["code"]:
+    if code_version() != expected:
         raise InputError(
-            "the code has changed since the study began",
-            "the same command begins these runs with the code as it is now",
+            "the code has changed since the study began", "the same command starts these runs with the new code"
         )
-    for module in job["modules"]:
-        importlib.import_module(module)
-    _verified.add(job["code"])
+    for package in PACKAGES:
+        for name in package.__all__:
+            getattr(package, name)
 
 
-def _run(job: Job, step: _Step) -> None:
-    from mstfilter.runs.run import filter_recording
-
-    _verify(job)
-    final = Path(job["folder"])
-    work = final.with_name(f".{final.name}.{uuid.uuid4().hex[:8]}.partial")
+def _run(job: Job, step: _StepCallback) -> None:
+    _check_code(job["code"])
+    folder = Path(job["folder"])
     costs: list[dict[str, float]] = []
     began, peaks = time.process_time(), StagePeaks()
 
-    def progress(p: Any) -> None:
+    def progress(p: RunProgress) -> None:
         nonlocal began
-        now = time.process_time()
         if p.done:
-            costs.append({"seconds": p.seconds, "core_seconds": now - began, **peaks.figures()})
+            costs.append({"seconds": p.seconds, "core_seconds": time.process_time() - began, **peaks.megabytes()})
             peaks.begin()
         began = time.process_time()
         step(p.done, p.total)
 
-    try:
-        recording = open_scene(job["source"], job["recordings"])
-        began = time.process_time()
-        with scene_cache.on_disk(**job["work"]) if job["work"] else nullcontext():
+    recording = _open_scene(job["source"], job["recordings"])
+    with atomic_folder(folder) as work:
+        with scene_cache.on_disk(**job["work"]) if job["work"] else contextlib.nullcontext():
+            began = time.process_time()
             run = filter_recording(
                 recording,
                 job["config"],
@@ -134,27 +119,61 @@ def _run(job: Job, step: _Step) -> None:
                 progress=progress,
                 observer=peaks,
             )
-        stages = [{f"seconds_{k}": v for k, v in run.seconds(t).items()} for t in range(run.n_pauses)]
-        _write(run, recording, job, [{**cost, **stage} for cost, stage in zip(costs, stages, strict=True)])
+        for t, cost in enumerate(costs):
+            cost.update({f"seconds_{stage}": seconds for stage, seconds in run.seconds(t).items()})
+        rows = [measure_pause(run, recording, t) for t in range(run.n_pauses)]
+        write_result(work, {"identity": job["identity"], "status": "done", "rows": rows, "costs": costs})
         if job["keep"] == "tables":
-            shutil.rmtree(run.path / "pauses")
-        if final.exists():  # what failed there before
-            shutil.rmtree(final)
-        os.replace(work, final)
-    finally:
-        shutil.rmtree(work, ignore_errors=True)
+            shutil.rmtree(work / "pauses")
 
 
-def _measure(job: Job, step: _Step) -> None:
-    """Figures of a run that is done already, by what they mean now."""
-    folder = Path(job["folder"])
-    recording = open_scene(job["source"], job["recordings"])
-    _write(RunFolder.open(folder), recording, job, read_result(folder)["costs"])
+class StagePeaks:
+    """Peak memory of a step and of each of its stages; an observer of `ParticleFilter.step`.
+
+    >>> peaks = StagePeaks()
+    >>> state, info = filter.step(state, clip, observer=peaks)
+    >>> peaks.megabytes()["peak_mb"]
+    """
+
+    def __init__(self) -> None:
+        self.begin()
+
+    def begin(self) -> None:
+        """Start to measure a step."""
+        self._step, self._stages = 0.0, dict[str, float]()
+        self._by_stage = reset_peak()
+
+    def __call__(self, stage: str, begins: bool) -> None:
+        """A stage begins or ends."""
+        peak = peak_megabytes()
+        self._step = max(self._step, peak)
+        if not begins:
+            self._stages[stage] = max(peak, self._stages.get(stage, 0.0))
+        self._by_stage = reset_peak() and self._by_stage
+
+    def megabytes(self) -> dict[str, float]:
+        """``peak_mb`` of the step, and ``peak_mb_STAGE`` if the system can reset the peak (Linux)."""
+        stages = {f"peak_mb_{stage}": peak for stage, peak in self._stages.items()} if self._by_stage else {}
+        return {"peak_mb": max(self._step, peak_megabytes()), **stages}
 
 
-def _write(run: RunFolder, recording: Recording, job: Job, costs: list[dict[str, float]]) -> None:
-    from mstfilter.runs.metrics import measure_pause
+def reset_peak() -> bool:
+    """Reset the peak memory of this process; False if the system cannot (other than Linux)."""
+    with contextlib.suppress(OSError):
+        Path("/proc/self/clear_refs").write_text("5")
+        return True
+    return False
 
-    rows = [measure_pause(run, recording, t) for t in range(run.n_pauses)]
-    result = {"identity": job["identity"], "metrics": job["metrics"], "status": "done", "rows": rows, "costs": costs}
-    write_json(run.path / RESULT, result)
+
+def peak_megabytes() -> float:
+    """Peak resident memory of this process in MB since the last `reset_peak`; NaN if the system cannot tell."""
+    with contextlib.suppress(OSError):
+        for line in Path("/proc/self/status").read_text().splitlines():
+            if line.startswith("VmHWM:"):
+                return int(line.split()[1]) / 1024
+    try:
+        import resource
+    except ImportError:
+        return float("nan")
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / (2**20 if sys.platform == "darwin" else 1024)

@@ -1,11 +1,11 @@
-"""From a study to its runs: grids multiplied out, everything checked, every run named by all it depends on.
+"""The runs of a study: every combination of an arm, a scene and a seed, each named by everything that it depends on.
 
 >>> plan = make_plan(load_study("study.toml"))
 >>> [run.name for run in plan.runs]
 
-A run's identity is a hash of its resolved configuration, what recording it reads (the recipe of a simulated one,
-the content of a folder, its truth included), its seed, and the version of the code and the libraries that it
-reaches. Two studies that share a run share its identity; a run whose identity is unchanged is never repeated.
+The identity of a run is a hash of its configuration, its recording (the recipe of a simulated one, the content of any
+other, ground truth included), its seed, the files of mstfilter and of the user, and the versions of the libraries. A
+run whose identity is unchanged is not repeated; two studies that share a run share its identity.
 """
 
 from __future__ import annotations
@@ -21,19 +21,13 @@ from pathlib import Path
 from typing import Any
 
 from mstfilter.errors import InputError
+from mstfilter.oracles import uses_truth
 from mstfilter.presets import REGISTRY, build_filter, describe_filter
-from mstfilter.runs.run import files_of, versions
-from mstfilter.runs.run_folder import plain
-from mstfilter.runs.sources import open_source
+from mstfilter.runs import as_json, code_version, component_files, library_versions, open_source
 from mstfilter.scene import content_key
-from mstfilter.study.code_version import code_version
-from mstfilter.study.config import SceneEntry, StudyConfig
-from mstfilter.study.grid import Asked, expand
+from mstfilter.study.config import ArmRequest, SceneEntry, StudyConfig, expand_arms
 
 __all__ = ["Arm", "Plan", "StudyRun", "StudyScene", "make_plan"]
-
-# What every run goes through besides its components.
-_ALWAYS = ("mstfilter.smc.filter", "mstfilter.scene.recording", "mstfilter.runs.run_folder")
 
 
 @dataclass(frozen=True)
@@ -44,23 +38,23 @@ class Arm:
     ----------
     name : str
     config : dict
-        Resolved: every field of every component.
+        Every field of every component.
     key : str
-        Hash of the configuration, users' files and code.
-    ours : bool
-        Whether all components are of this package or of a file, so that their version is known.
-    modules : tuple of str
-        Where the code begins that its runs reach.
-    beside : bool
-        No part of the comparisons that are adjusted together.
+        Hash of the configuration, the code and the files of the user.
+    known_code : bool
+        Whether all components belong to mstfilter or to a file of the user, whose code is part of `key`.
+    uses_truth : tuple of str
+        Classes of its components that use the ground truth.
+    reported_only : bool
+        Not part of the comparisons whose p values are adjusted together.
     """
 
     name: str
     config: dict[str, Any]
     key: str
-    ours: bool
-    modules: tuple[str, ...]
-    beside: bool = False
+    known_code: bool
+    uses_truth: tuple[str, ...]
+    reported_only: bool = False
 
 
 @dataclass(frozen=True)
@@ -71,11 +65,11 @@ class StudyScene:
     ----------
     name : str
     group : str
-        Its family in the tables.
+        Name of its family in the tables.
     source : dict
-        ``{"family", "seed", "set"}`` of a simulated one, path and how it is read of any other.
+        ``{"family", "seed", "set"}`` of a simulated recording; path, format, options and pauses of any other.
     key : str
-        Names recipe or content.
+        Hash of the recipe or the content.
     """
 
     name: str
@@ -95,21 +89,22 @@ class StudyRun:
 
     @property
     def name(self) -> str:
-        """For people."""
+        """Name in messages."""
         return f"{self.arm.name} on {self.scene.name}, seed {self.seed}"
 
     @property
     def folder(self) -> str:
-        """Name of its folder: readable, and one a run."""
+        """Name of its folder."""
         words = re.sub(r"[^\w.=-]+", "-", f"{self.arm.name}_{self.scene.name}_{self.seed}").strip(".-")
         return f"{words[:100]}_{self.identity[:10]}"
 
 
 @dataclass(frozen=True)
 class Plan:
-    """All runs of a study, scene by scene."""
+    """All runs of a study, ordered by scene, and the version of the code that they were planned with."""
 
     config: StudyConfig
+    code: str
     arms: tuple[Arm, ...]
     scenes: tuple[StudyScene, ...]
     runs: tuple[StudyRun, ...]
@@ -134,20 +129,21 @@ def make_plan(study: StudyConfig, overrides: Sequence[str] = (), *, allow_files:
     Raises
     ------
     InputError
-        A wrong arm, two arms that are the same, a grid without runs, a recording that cannot be read.
+        If an arm is invalid, two arms are the same, there are no runs, or a recording cannot be read.
     """
-    arms = tuple(_arm(asked, allow_files) for asked in expand(study, overrides))
+    code = code_version()
+    arms = tuple(_arm(request, code, allow_files) for request in expand_arms(study, overrides))
     for what, found in (("arm", arms), ("scene", study.scenes), ("seed", study.seeds)):
         if not found:
             raise InputError(f"study {study.name} has no {what}, so there is nothing to run")
-    _all_different("arms", [(arm.name, arm.key) for arm in arms])
-    scenes = _told_apart([scene for entry in study.scenes for scene in _scenes(entry, study.folder, allow_files)])
-    _all_different("scenes", [(scene.name, scene.key) for scene in scenes])
+    _check_unique("arms", [(arm.name, arm.key) for arm in arms])
+    scenes = _unique_names([scene for entry in study.scenes for scene in _scenes(entry, study.folder, allow_files)])
+    _check_unique("scenes", [(scene.name, scene.key) for scene in scenes])
     if len(set(study.seeds)) < len(study.seeds):
         raise InputError(f"study {study.name} names a seed twice: {list(study.seeds)}")
     if study.reference and study.reference not in [arm.name for arm in arms]:
         raise InputError(
-            f"reference is {study.reference!r}, which is no arm", f"there are: {', '.join(a.name for a in arms)}"
+            f"reference is {study.reference!r}, which is not an arm", f"there are: {', '.join(a.name for a in arms)}"
         )
     runs = tuple(
         StudyRun(arm, scene, seed, _hash([arm.key, scene.key, seed]))
@@ -155,17 +151,16 @@ def make_plan(study: StudyConfig, overrides: Sequence[str] = (), *, allow_files:
         for seed in study.seeds
         for arm in arms
     )
-    return Plan(study, arms, scenes, runs)
+    return Plan(study, code, arms, scenes, runs)
 
 
-def _arm(asked: Asked, allow_files: bool) -> Arm:
-    with asked.named():
-        filter = build_filter(asked.config(allow_files), allow_files=allow_files)
-    config = plain(describe_filter(filter))
-    modules = (*sorted(_modules(filter)), *_ALWAYS)
-    ours = all(module.split(".")[0].startswith("mstfilter") for module in modules)
-    key = _hash([config, files_of(filter), versions(), code_version(modules)])
-    return Arm(asked.name, config, key, ours, modules, asked.beside)
+def _arm(request: ArmRequest, code: str, allow_files: bool) -> Arm:
+    with request.name_in_errors():
+        filter = build_filter(request.config(allow_files), allow_files=allow_files)
+    config = as_json(describe_filter(filter))
+    known_code = all(module.split(".")[0].startswith("mstfilter") for module in _modules(filter))
+    key = _hash([config, component_files(filter), library_versions(), code])
+    return Arm(request.name, config, key, known_code, tuple(uses_truth(filter)), request.reported_only)
 
 
 def _scenes(entry: SceneEntry, folder: Path, allow_files: bool) -> Iterator[StudyScene]:
@@ -188,19 +183,19 @@ def _scenes(entry: SceneEntry, folder: Path, allow_files: bool) -> Iterator[Stud
             source = {"path": str(Path(path).resolve()), "format": entry.format, "pauses": entry.pauses}
             source |= {"options": list(entry.options)}
             recording = open_source(Path(path), entry.format, entry.options, entry.pauses, allow_files=allow_files)
-            # The truth counts: figures depend on it, and all that oracles do.
+            # Metrics and oracles depend on the ground truth.
             key = content_key(recording.key, recording.truth_key).hex()
             yield StudyScene(Path(path).name, entry.group or "recordings", source, key)
 
 
-def _told_apart(scenes: list[StudyScene]) -> tuple[StudyScene, ...]:
-    """Scenes of one name in several groups get their group's name in front."""
-    often = Counter(scene.name for scene in scenes)
-    return tuple(replace(s, name=f"{s.group}-{s.name}") if often[s.name] > 1 else s for s in scenes)
+def _unique_names(scenes: list[StudyScene]) -> tuple[StudyScene, ...]:
+    """Put the group in front of names that several scenes have."""
+    count = Counter(scene.name for scene in scenes)
+    return tuple(replace(s, name=f"{s.group}-{s.name}") if count[s.name] > 1 else s for s in scenes)
 
 
-def _all_different(what: str, named: list[tuple[str, str]]) -> None:
-    """No name and no key twice."""
+def _check_unique(what: str, named: list[tuple[str, str]]) -> None:
+    """Raise InputError if a name or a key occurs twice."""
     seen: dict[str, str] = {}
     for name, key in named:
         if key in seen:
@@ -225,4 +220,4 @@ def _modules(component: Any) -> set[str]:
 
 
 def _hash(value: Any) -> str:
-    return hashlib.sha256(json.dumps(plain(value), sort_keys=True).encode()).hexdigest()[:32]
+    return hashlib.sha256(json.dumps(as_json(value), sort_keys=True).encode()).hexdigest()[:32]

@@ -21,9 +21,9 @@ __all__ = [
     "Difference",
     "adjusted",
     "compare",
+    "conclusion",
     "holm",
     "interval",
-    "said",
     "sign_flip",
     "slope",
     "studentised",
@@ -161,7 +161,7 @@ def slope(times: np.ndarray, values: np.ndarray) -> float:
     return float(centred @ values / (centred @ centred))
 
 
-def said(difference: Difference, first: str, second: str, where: str = "") -> str:
+def conclusion(difference: Difference, first: str, second: str, where: str = "") -> str:
     """What a difference says, in words that claim no more than it shows."""
     d, at = difference, f" on {where}" if where else ""
     if d.n == 0:

@@ -1,9 +1,9 @@
-"""Run a study: everything checked first, then every run that is not done yet, then the tables.
+"""Run a study: check everything first, then do every run that is not done yet, then write the tables.
 
 >>> result = run_study(load_study("study.toml"), Path("studies/first"), Local(workers=2))
 >>> result.done, result.failed
 
-A study that was stopped, killed or changed is run again by the same call: runs whose identity is unchanged are not
+The same call resumes a study that was stopped, and repeats what failed. Runs whose identity is unchanged are not
 repeated, and the tables come out the same.
 """
 
@@ -12,35 +12,35 @@ from __future__ import annotations
 import contextlib
 import shutil
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from mstfilter.errors import InputError
-from mstfilter.runs.run_folder import write_json
+from mstfilter.runs import library_versions, write_json
 from mstfilter.study.config import StudyConfig
-from mstfilter.study.executors import Event, Executor, JobOutcome
-from mstfilter.study.local import Local
+from mstfilter.study.executors import Event, Executor, Job, JobOutcome, Local
 from mstfilter.study.plan import Plan, StudyRun, make_plan
-from mstfilter.study.results import STUDY_FORMAT, StudyFolder
-from mstfilter.study.todo import ToDo
+from mstfilter.study.results import STUDY_FORMAT, StudyFolder, read_result
 
 __all__ = ["StudyProgress", "StudyResult", "run_study"]
+
+_LEAST_FREE_GB = 0.5
 
 
 @dataclass(frozen=True)
 class StudyProgress:
-    """What is reported while a study is going on.
+    """Progress of a study.
 
     Parameters
     ----------
     what : {"recordings", "runs"}
     event : Event, optional
-        What happened last; None at the beginning of a part.
+        The last event; None at the beginning of a part.
     name : str
-        Of the job it happened to.
+        Of the job that the event belongs to.
     done, failed, total : int
-        Jobs of this part; those that were done before count as done.
+        Jobs of this part; `done` includes those of earlier calls.
     """
 
     what: str
@@ -53,7 +53,7 @@ class StudyProgress:
 
 @dataclass(frozen=True)
 class StudyResult:
-    """What became of a study.
+    """Result of `run_study`.
 
     Parameters
     ----------
@@ -61,7 +61,7 @@ class StudyResult:
     done : int
         Runs that are done, earlier ones included.
     repeated : int
-        Runs that were done before.
+        Runs that were done before this call.
     failed : tuple of (str, JobOutcome)
         Names of the runs that failed, and why.
     """
@@ -88,70 +88,72 @@ def run_study(
     ----------
     study : StudyConfig
     path : Path
-        New, empty, or of an earlier call.
+        The study folder: new, empty, or of an earlier call.
     executor : Executor, optional
-        Default: one process a core of this machine.
+        Default: one process for each core of this machine.
     overrides : sequence of str
         Applied to every arm; a comma makes a grid.
     allow_files : bool
         Whether components may come from ``./file.py:Class``.
     cache : Path, optional
-        Where simulated recordings and shared work are kept. Default: the user's cache folder.
+        Folder of simulated recordings and of intermediate results. Default: the user's cache folder.
     progress : callable
-        Called for everything that happens.
+        Called with every event.
 
     Raises
     ------
     InputError
-        For whatever is wrong with the study or the folder, before any run begins. Runs that fail raise nothing.
+        If the study or the folder is invalid, before any run starts. Runs that fail do not raise.
     """
     from mstfilter.simulation import cache_folder
 
     plan = make_plan(study, overrides, allow_files=allow_files)
-    cache = cache or cache_folder()
-    with _held(path) as folder:
-        executor = executor or Local(tries=study.tries, timeout_s=study.timeout_s, logs=path / "logs")
-        todo = ToDo(plan, folder, allow_files, cache)
-        todo.check_space()
-        write_json(path / "study.json", _described(plan))
-        failed = _recordings(todo, executor, progress)
-        waiting, before = todo.runs()
-        lost = {run.name: failed[run.scene.key] for run in plan.runs if run.scene.key in failed}
-        for run in plan.runs:
-            if run.name in lost and run.folder not in before:
-                _note(folder, run, lost[run.name])
-        waiting = [(run, job) for run, job in waiting if run.name not in lost]
-        counted = _Counted(progress, "runs", [run.name for run, _ in waiting], len(before), len(plan.runs), len(lost))
+    cache = (cache or cache_folder()).absolute()
+    with _locked(path) as folder:
+        for target in (path, cache):
+            _check_free_space(target)
+        executor = executor or Local(logs=path / "logs")
+        write_json(path / "study.json", _description(plan))
+        _adopt_renamed_runs(plan, folder)
+        waiting = [run for run in plan.runs if not _is_done(run, folder)]
+        n_before = len(plan.runs) - len(waiting)
+        failed_scenes = _record_scenes(waiting, cache, plan.config, executor, progress)
+        failed = {run.name: failed_scenes[run.scene.key] for run in waiting if run.scene.key in failed_scenes}
+        for run in waiting:
+            if run.name in failed:
+                _write_failure(folder, run, failed[run.name])
+        waiting = [run for run in waiting if run.name not in failed]
+        counted = _Counter(progress, "runs", [run.name for run in waiting], n_before, len(plan.runs), len(failed))
 
         def tell(event: Event) -> None:
+            run = waiting[event.job]
             if event.kind == "lost":
-                _sweep(path, waiting[event.job][0].folder)
+                _remove_partial_runs(path, run.folder)
             if event.outcome is not None and event.outcome.status != "done":
-                _note(folder, waiting[event.job][0], event.outcome)
+                _write_failure(folder, run, event.outcome)
             counted(event)
 
-        outcomes = executor.run([job for _, job in waiting], tell)
-        for (run, _), outcome in zip(waiting, outcomes, strict=True):
+        outcomes = executor.run(_run_jobs(plan, waiting, folder, cache, allow_files), tell)
+        for run, outcome in zip(waiting, outcomes, strict=True):
             if outcome.status != "done":
-                _note(folder, run, outcome)  # again: the disk that was full then may not be so now
+                failed[run.name] = outcome
+                _write_failure(folder, run, outcome)  # again: the disk may have been full before
         folder = StudyFolder.open(path)
         try:
             folder.write_tables()
         except OSError as error:
             raise InputError(
-                f"cannot write the tables of {path}: {error.strerror}", "make room and repeat"
+                f"cannot write the tables of {path}: {error.strerror}", "free disk space and repeat the command"
             ) from error
-    ended = [(run.name, outcome) for (run, _), outcome in zip(waiting, outcomes, strict=True)]
-    bad = [*((n, o) for n, o in lost.items()), *((n, o) for n, o in ended if o.status != "done")]
-    return StudyResult(folder, len(plan.runs) - len(bad), len(before), tuple(bad))
+    return StudyResult(folder, len(plan.runs) - len(failed), n_before, tuple(failed.items()))
 
 
 @contextlib.contextmanager
-def _held(path: Path) -> Iterator[StudyFolder]:
-    """The study's folder, made if need be, for this process alone."""
-    if path.exists() and not (path / "study.json").exists() and (not path.is_dir() or any(_visible(path))):
+def _locked(path: Path) -> Iterator[StudyFolder]:
+    """The study folder, made if it is missing and locked for this process."""
+    if path.exists() and not (path / "study.json").exists() and not _is_empty(path):
         raise InputError(
-            f"cannot run a study in {path}: it exists and is no study folder", "choose another with --out"
+            f"cannot run a study in {path}: it exists and is not a study folder", "choose another with --out"
         )
     try:
         (path / "runs").mkdir(parents=True, exist_ok=True)
@@ -167,36 +169,58 @@ def _held(path: Path) -> Iterator[StudyFolder]:
 
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except ImportError:
-            pass  # a system without such locks
+            pass  # this system has no such locks
         except OSError:
             raise InputError(
                 f"another process is running the study in {path}", "wait for it, or choose --out"
             ) from None
-        _sweep(path, "*")  # what workers left that were killed with their study
+        _remove_partial_runs(path, "*")  # of workers that were killed with their study
         try:
             yield StudyFolder(path)
         finally:
-            _sweep(path, "*")
+            _remove_partial_runs(path, "*")
 
 
-def _sweep(path: Path, folder: str) -> None:
-    """Remove what a worker that died has left of a run."""
+def _is_empty(path: Path) -> bool:
+    """Whether a folder holds nothing but what a study makes before its first run."""
+    return path.is_dir() and all(p.name in (".lock", "logs", "runs") for p in path.iterdir())
+
+
+def _remove_partial_runs(path: Path, folder: str) -> None:
     for left in (path / "runs").glob(f".{folder}.*.partial"):
         shutil.rmtree(left, ignore_errors=True)
 
 
-def _visible(path: Path) -> Iterator[Path]:
-    return (p for p in path.iterdir() if p.name not in (".lock", "logs", "runs"))
+def _check_free_space(folder: Path) -> None:
+    """Raise InputError if the disk of a folder, which need not exist yet, is nearly full."""
+    existing = folder.absolute()
+    while not existing.exists():
+        existing = existing.parent
+    free_gb = shutil.disk_usage(existing).free / 1e9
+    if free_gb < _LEAST_FREE_GB:
+        raise InputError(
+            f"{folder}: the disk has {free_gb:.2g} GB free, expected at least {_LEAST_FREE_GB} GB",
+            'free disk space, choose another folder, or set keep = "tables" in the study',
+        )
 
 
-def _described(plan: Plan) -> dict[str, Any]:
+def _description(plan: Plan) -> dict[str, Any]:
+    """The content of study.json."""
     study = plan.config
     return {
         "format": STUDY_FORMAT,
         "name": study.name,
         "description": study.description,
         "reference": plan.reference,
-        "arms": [{"name": arm.name, "beside": arm.beside, "config": arm.config} for arm in plan.arms],
+        "arms": [
+            {
+                "name": arm.name,
+                "reported_only": arm.reported_only,
+                "uses_truth": arm.uses_truth,
+                "config": arm.config,
+            }
+            for arm in plan.arms
+        ],
         "scenes": [{"name": s.name, "group": s.group, "source": s.source, "key": s.key} for s in plan.scenes],
         "seeds": study.seeds,
         "runs": [
@@ -214,24 +238,97 @@ def _described(plan: Plan) -> dict[str, Any]:
     }
 
 
-def _note(folder: StudyFolder, run: StudyRun, outcome: JobOutcome) -> None:
-    """Write a failure down; where not even that is possible it is told at the end all the same."""
+def _adopt_renamed_runs(plan: Plan, folder: StudyFolder) -> None:
+    """Rename the folders of runs that are done and whose arm or scene has a new name."""
+    wanted = {run.identity: folder.run(run.folder) for run in plan.runs}
+    for path in (folder.path / "runs").glob("*"):
+        result = read_result(path)
+        target = wanted.get(result.get("identity", ""))
+        if target is not None and target != path and result.get("status") == "done" and not target.exists():
+            path.rename(target)
+
+
+def _is_done(run: StudyRun, folder: StudyFolder) -> bool:
+    result = read_result(folder.run(run.folder))
+    return result.get("identity") == run.identity and result.get("status") == "done"
+
+
+def _write_failure(folder: StudyFolder, run: StudyRun, outcome: JobOutcome) -> None:
+    """Write down why a run failed; if the disk is full, nothing is written."""
     with contextlib.suppress(OSError):
-        folder.fail({"folder": run.folder, "identity": run.identity}, outcome)
+        folder.write_failure(run.folder, run.identity, outcome)
 
 
-def _recordings(todo: ToDo, executor: Executor, progress: Callable[[StudyProgress], None]) -> dict[str, JobOutcome]:
-    """Make what is missing; why it could not be made, by the scene's key."""
-    keys, records = todo.records()
-    if not records:
+def _record_scenes(
+    runs: Sequence[StudyRun],
+    cache: Path,
+    config: StudyConfig,
+    executor: Executor,
+    progress: Callable[[StudyProgress], None],
+) -> dict[str, JobOutcome]:
+    """Simulate the recordings that are missing; key of a scene -> outcome, of those that failed."""
+    recordings = cache / "recordings"
+    scenes = {run.scene.key: run.scene for run in runs if "family" in run.scene.source}
+    missing = [scene for scene in scenes.values() if not _is_recorded(scene.source, recordings)]
+    jobs: list[Job] = [
+        {
+            "kind": "record",
+            "name": scene.name,
+            "share": scene.key,
+            "source": scene.source,
+            "recordings": str(recordings),
+            "tries": config.tries,
+            "timeout_s": config.timeout_s,
+        }
+        for scene in missing
+    ]
+    if not jobs:
         return {}
-    counted = _Counted(progress, "recordings", [job["name"] for job in records], 0, len(records), 0)
-    outcomes = executor.run(records, counted)
-    return {key: outcome for key, outcome in zip(keys, outcomes, strict=True) if outcome.status != "done"}
+    counted = _Counter(progress, "recordings", [scene.name for scene in missing], 0, len(jobs), 0)
+    outcomes = executor.run(jobs, counted)
+    return {scene.key: outcome for scene, outcome in zip(missing, outcomes, strict=True) if outcome.status != "done"}
 
 
-class _Counted:
-    """Events as progress."""
+def _is_recorded(source: dict[str, Any], recordings: Path) -> bool:
+    from mstfilter.simulation import recipe_key, scene_family
+
+    family = replace(scene_family(source["family"]), **source["set"])
+    name = f"{family.name}-{source['seed']}-{recipe_key(family, source['seed'])}"
+    return (recordings / name / "manifest.json").is_file()
+
+
+def _run_jobs(plan: Plan, runs: Sequence[StudyRun], folder: StudyFolder, cache: Path, allow_files: bool) -> list[Job]:
+    """Jobs as plain values, as `mstfilter.study.jobs` does them."""
+    libraries = "".join(f" {name}={version}" for name, version in library_versions().items())
+    work = {
+        "folder": str(cache / "work"),
+        "limit_bytes": int(plan.config.cache_gb * 1e9),
+        "version": plan.code + libraries,
+    }
+    return [
+        {
+            "kind": "run",
+            "name": run.name,
+            "share": run.scene.key,
+            "folder": str(folder.run(run.folder).absolute()),
+            "identity": run.identity,
+            "code": plan.code,
+            "config": {**run.arm.config, "description": run.arm.name},
+            "source": run.scene.source,
+            "seed": run.seed,
+            "keep": plan.config.keep,
+            "allow_files": allow_files,
+            "recordings": str(cache / "recordings"),
+            "work": work if plan.config.cache_gb and run.arm.known_code else None,
+            "tries": plan.config.tries,
+            "timeout_s": plan.config.timeout_s,
+        }
+        for run in runs
+    ]
+
+
+class _Counter:
+    """Turns events into progress."""
 
     def __init__(
         self,

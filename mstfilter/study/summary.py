@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from mstfilter.study.statistics import Difference, compare, holm, interval, said, slope
+from mstfilter.study.statistics import Difference, compare, conclusion, holm, interval, slope
 
 __all__ = ["ENDPOINT", "SLOPE", "Compared", "Figure", "Summary", "summarise"]
 
@@ -61,7 +61,7 @@ class Compared:
     family, first, second, figure : str
     difference : Difference
         p adjusted over all families and methods of the primary endpoint; not adjusted for other figures.
-    beside : bool
+    reported_only : bool
         The other arm is a floor or a ceiling: no part of the adjustment, and nothing is said of it.
     """
 
@@ -70,17 +70,17 @@ class Compared:
     second: str
     figure: str
     difference: Difference
-    beside: bool = False
+    reported_only: bool = False
 
     @property
     def adjusted(self) -> bool:
         """Whether `p_holm` of the difference is an adjusted one."""
-        return self.figure == ENDPOINT and not self.beside
+        return self.figure == ENDPOINT and not self.reported_only
 
     @property
     def words(self) -> str:
         """A conclusion."""
-        return said(self.difference, self.first, self.second, self.family)
+        return conclusion(self.difference, self.first, self.second, self.family)
 
 
 @dataclass(frozen=True)
@@ -138,7 +138,7 @@ class Summary:
 
 
 def summarise(
-    rows: Sequence[Mapping[str, Any]], reference: str, cost: Sequence[str] = (), beside: Collection[str] = ()
+    rows: Sequence[Mapping[str, Any]], reference: str, cost: Sequence[str] = (), reported_only: Collection[str] = ()
 ) -> Summary:
     """The summary of rows as `StudyFolder.rows` returns them.
 
@@ -150,7 +150,7 @@ def summarise(
     cost : sequence of str
         Columns of time and memory: averaged over all pauses, where a stage that a pause lacks took no time; never
         compared.
-    beside : collection of str
+    reported_only : collection of str
         Arms that are floors or ceilings.
     """
     families, arms = (tuple(dict.fromkeys(str(row[k]) for row in rows)) for k in ("family", "arm"))
@@ -182,14 +182,14 @@ def summarise(
                 arm,
                 name,
                 compare(values.get((family, reference, name), {}), others),
-                arm in beside,
+                arm in reported_only,
             )
             for family in families
             for arm in arms
             if arm != reference and (others := values.get((family, arm, name), {}))
         ]
         if name == ENDPOINT:
-            p = holm([float("nan") if one.beside else one.difference.p for one in table])
+            p = holm([float("nan") if one.reported_only else one.difference.p for one in table])
             table = [
                 replace(one, difference=replace(one.difference, p_holm=float(q)))
                 for one, q in zip(table, p, strict=True)

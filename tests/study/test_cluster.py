@@ -5,10 +5,10 @@ from __future__ import annotations
 import pytest
 
 from mstfilter.errors import InputError
-from mstfilter.study.local import Local
+from mstfilter.study.executors import Local
 from mstfilter.study.study import run_study
 from tests.study.scenes import slide
-from tests.study.test_failures import figures, study, table
+from tests.study.test_failures import LimitHanging, figures, study, table
 
 distributed = pytest.importorskip("distributed", reason="dask absent: pip install -e '.[dask]'")
 
@@ -60,13 +60,14 @@ def test_a_run_that_takes_too_long_is_named(cluster, tmp_path):
     from mstfilter.study.cluster import Cluster
 
     slide(tmp_path / "slide", pauses=2)
-    settings = Cluster(cluster, tries=1, timeout_s=12)
-    result = run_study(study(tmp_path, "hang", "good", seeds=[0]), tmp_path / "out", settings, cache=tmp_path)
+    executor = LimitHanging(Cluster(cluster), timeout_s=2)
+    wanted = study(tmp_path, "hang", "good", seeds=[0], tries=1)
+    result = run_study(wanted, tmp_path / "out", executor, cache=tmp_path)
     assert [(n, o.error, o.tries) for n, o in result.failed] == [
-        ("hang on slide, seed 0", "it took longer than 12 s, 1 time", 1)
+        ("hang on slide, seed 0", "it took longer than 2 s, 1 time", 1)
     ]
     assert result.done == 1
-    again = run_study(study(tmp_path, "good", seeds=[0, 1, 2]), tmp_path / "out", settings, cache=tmp_path)
+    again = run_study(study(tmp_path, "good", seeds=[0, 1, 2]), tmp_path / "out", executor, cache=tmp_path)
     assert (again.done, again.repeated) == (3, 1)
 
 

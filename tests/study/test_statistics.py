@@ -12,9 +12,9 @@ from mstfilter.study.statistics import (
     Difference,
     adjusted,
     compare,
+    conclusion,
     holm,
     interval,
-    said,
     sign_flip,
     slope,
     studentised,
@@ -115,12 +115,14 @@ def test_pairs_are_by_scene():
 
 def test_words_claim_no_more_than_they_may():
     d = Difference(0.1, -0.01, 0.2, 0, 0, 0.04, 30, 0.04)
-    assert "no difference can be claimed at n = 30" in said(d, "a", "b")
+    assert "no difference can be claimed at n = 30" in conclusion(d, "a", "b")
     d = Difference(0.1, 0.05, 0.15, 0, 0, 0.06, 5, 0.06)
-    assert "a is above b on s1" in said(d, "a", "b", "s1") and "no claim below 20 scenes" in said(d, "a", "b", "s1")
+    assert "a is above b on s1" in conclusion(d, "a", "b", "s1") and "no claim below 20 scenes" in conclusion(
+        d, "a", "b", "s1"
+    )
     d = Difference(-0.1, -0.15, -0.05, 0, 0, 0.001, 25, 0.2)
-    assert "not after adjustment" in said(d, "a", "b")
+    assert "not after adjustment" in conclusion(d, "a", "b")
     d = Difference(-0.1, -0.15, -0.05, 0, 0, 0.001, 25, 0.01)
-    assert said(d, "a", "b").startswith("a is below b (") and "claim" not in said(d, "a", "b")
-    assert "n = 1" in said(compare({"x": 1.0}, {"x": 2.0}), "a", "b")
+    assert conclusion(d, "a", "b").startswith("a is below b (") and "claim" not in conclusion(d, "a", "b")
+    assert "n = 1" in conclusion(compare({"x": 1.0}, {"x": 2.0}), "a", "b")
     assert adjusted([d, d])[0].p_holm == pytest.approx(0.002)

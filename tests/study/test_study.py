@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 
 from mstfilter.errors import InputError
-from mstfilter.study.config import SceneEntry, load_study, study_of
-from mstfilter.study.grid import split_grid
-from mstfilter.study.local import Local
+from mstfilter.runs import RunFolder
+from mstfilter.study.config import SceneEntry, load_study, split_grid, study_of
+from mstfilter.study.executors import Local
+from mstfilter.study.jobs import perform
 from mstfilter.study.plan import make_plan
-from mstfilter.study.results import StudyFolder
 from mstfilter.study.study import run_study
 from tests.study.scenes import slide
 
@@ -132,45 +132,32 @@ def test_a_study_that_grows_runs_what_is_new(folder, tmp_path):
     assert len({r["arm"] for r in table(tmp_path / "out" / "runs.csv")}) == 4
 
 
-def test_figures_that_are_defined_anew_are_measured_again(folder, tmp_path):
-    """Not run again, where the hypotheses were kept; run again where they were not. Costs are those of the run."""
+def test_keep_tables_removes_the_hypotheses(folder, tmp_path):
     study = load_study(folder / "base.toml", smoke=True)
+    scenes = (SceneEntry(recordings=("slide-0",)),)
     for keep in ("all", "tables"):
-        out = tmp_path / keep
-        scenes = (SceneEntry(recordings=("slide-0",)),)
         chosen = study.model_copy(update={"keep": keep, "scenes": scenes})
-        run_study(chosen, out, Local(1), cache=tmp_path / "cache")
-        assert all((path / "pauses").exists() == (keep == "all") for path in (out / "runs").iterdir())
-        before, kept = table(out / "runs.csv", costs=True), {}
-        for path in (out / "runs").glob("*/result.json"):
-            found = json.loads(path.read_text())
-            path.write_text(json.dumps({**found, "metrics": "earlier", "rows": [{"pause": 0, "quality": 0.0}] * 3}))
-            kept[path] = found["costs"]
-        run_study(chosen, out, Local(1), cache=tmp_path / "cache")
-        after = table(out / "runs.csv", costs=True)
-        assert [r["quality"] for r in after] == [r["quality"] for r in before]
-        same = [json.loads(path.read_text())["costs"] == costs for path, costs in kept.items()]
-        assert same == [keep == "all"] * len(same)
+        run_study(chosen, tmp_path / keep, Local(1), cache=tmp_path / "cache")
+        runs = list((tmp_path / keep / "runs").iterdir())
+        assert runs and all((path / "pauses").exists() == (keep == "all") for path in runs)
+    assert table(tmp_path / "all" / "runs.csv") == table(tmp_path / "tables" / "runs.csv")
 
 
-def test_a_run_that_cannot_be_measured_again_is_not_lost(folder, tmp_path):
-    slide(tmp_path / "mine")
-    base = {"name": "s", "folder": tmp_path, "scenes": [{"recordings": "mine"}], "arms": [{}], "seeds": [0]}
-    study, out = study_of({**base, "keep": "all"}), tmp_path / "out"
-    run_study(study, out, Local(1), cache=tmp_path / "cache")
-    before = table(out / "runs.csv", costs=True)
-    (path,) = (out / "runs").glob("*/result.json")
-    path.write_text(json.dumps({**json.loads(path.read_text()), "metrics": "earlier"}))
-    kept = path.parent / "pauses" / "001" / "hypotheses.npz"
-    whole = kept.read_bytes()
-    kept.write_bytes(b"")
-    assert len(run_study(study, out, Local(1), cache=tmp_path / "cache").failed) == 1
-    assert len(StudyFolder.open(out).failures()) == 1 and StudyFolder.open(out).rows() == []
-    kept.write_bytes(whole)
-    made = kept.stat().st_mtime_ns
-    assert run_study(study, out, Local(1), cache=tmp_path / "cache").failed == ()
-    assert table(out / "runs.csv", costs=True) == before  # costs are those of the run itself
-    assert kept.stat().st_mtime_ns == made
+def test_a_worker_with_other_code_refuses():
+    outcome = perform({"kind": "run", "code": "another", "folder": "unused"})
+    assert outcome.error == "the code has changed since the study began"
+
+
+def test_arms_that_use_the_ground_truth_are_marked(folder, tmp_path):
+    data = {"name": "s", "folder": folder, "scenes": [{"recordings": "slide-0"}], "seeds": [0]}
+    arms = [{"preset": "mst"}]
+    arms.append({"name": "oracle", "preset": "mst", "set": "resampler=true_best"})
+    result = run_study(study_of({**data, "arms": arms}), tmp_path / "out", Local(1), cache=tmp_path / "cache")
+    assert result.failed == ()
+    assert result.folder.truth_users == {"oracle": ["TrueBest"]}
+    for run in result.folder.description["runs"]:
+        marked = RunFolder.open(result.folder.run(run["folder"])).description["uses_truth"]
+        assert marked == result.folder.truth_users.get(run["arm"], [])
 
 
 def test_shared_work_changes_no_result(folder, tmp_path):
@@ -198,7 +185,7 @@ def test_memory_by_stage():
     code = """
 import numpy as np
 from mstfilter.smc import ParticleFilter, Population, Proposal, Reweight, Transition
-from mstfilter.study.memory import StagePeaks
+from mstfilter.study.jobs import StagePeaks
 
 class Zeros(Proposal):
     def sample(self, rng, observation, n):
@@ -217,10 +204,11 @@ filter = ParticleFilter(initial=Zeros(), transition=Holds20(), update=Reweight(l
 state, _ = filter.step(filter.start(0), 1)
 filter = ParticleFilter(initial=Zeros(), transition=Holds20(), update=Reweight(holds_60), n=2)
 peaks = StagePeaks()
-base = peaks.figures()["peak_mb"]
+base = peaks.megabytes()["peak_mb"]
 filter.step(state, 1, observer=peaks)
-print(*(peaks.figures()[k] - base for k in ("peak_mb_transition", "peak_mb_update", "peak_mb_resampler", "peak_mb")))
-assert len(peaks.figures()) == 5
+found = peaks.megabytes()
+print(*(found[k] - base for k in ("peak_mb_transition", "peak_mb_update", "peak_mb_resampler", "peak_mb")))
+assert len(found) == 5
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=True)
     transition, update, resampler, step = map(float, done.stdout.split())
@@ -230,7 +218,7 @@ assert len(peaks.figures()) == 5
 def test_peak_memory():
     # In a process of its own: what earlier tests left is given back at any time.
     code = (
-        "import numpy as np; from mstfilter.study.memory import *; reset_peak(); before = peak_megabytes(); "
+        "import numpy as np; from mstfilter.study.jobs import *; reset_peak(); before = peak_megabytes(); "
         "held = np.ones(40 * 2**20 // 8); print(peak_megabytes() - before)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=True)

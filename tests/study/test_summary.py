@@ -68,12 +68,12 @@ def test_differences_are_paired_and_adjusted_together():
 def test_floors_take_no_part_in_the_adjustment():
     table = list(rows())
     floor = [{**r, "arm": "floor"} for r in table if r["arm"] == "theirs"]
-    with_floor = summarise([*table, *floor], "ours", beside=["floor"])
-    assert [d.difference.p_holm for d in with_floor.compared() if not d.beside] == [
+    with_floor = summarise([*table, *floor], "ours", reported_only=["floor"])
+    assert [d.difference.p_holm for d in with_floor.compared() if not d.reported_only] == [
         d.difference.p_holm for d in summarise(table, "ours").compared()
     ]
-    beside = [d for d in with_floor.compared() if d.beside]
-    assert [d.second for d in beside] == ["floor", "floor"] and np.isnan(beside[0].difference.p_holm)
+    reported_only = [d for d in with_floor.compared() if d.reported_only]
+    assert [d.second for d in reported_only] == ["floor", "floor"] and np.isnan(reported_only[0].difference.p_holm)
     assert not [r for r in with_floor.difference_rows() if r["second"] == "floor" and r["conclusion"]]
 
 
