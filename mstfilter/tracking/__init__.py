@@ -5,7 +5,7 @@
 >>> transition.predict(rng, population, clip)                        # doctest: +SKIP
 
 =====================  ====================================================================
-`transition`           the motion model `TrackingTransition`; `IdentityTransition`
+`transition`           the motion model `TrackingTransition`; `Warp` moves the voxels
 `rules`                the rigid motion of an object: `PaperRule`, `AuthorsRule`, `MstRule`
 `segments`             tracked segments and their data; the test for rest
 `flow`                 dense flow through the clip
@@ -14,7 +14,6 @@
 `residual`             comparison of a motion with the last frame, refinement
 `rigid`                rigid motions from point pairs, J-Linkage
 `motion_segmentation`  pixels of the last frame grouped by rigid motion
-`warp`                 moves the voxels of objects
 =====================  ====================================================================
 """
 
@@ -26,9 +25,5 @@ __interfaces__ = {"rule": "MotionRule", "registration": "Registration"}
 __components__ = {
     "transition": {"tracking": "TrackingTransition", "identity": "IdentityTransition"},
     "rule": {"authors": "AuthorsRule", "mst": "MstRule", "paper": "PaperRule"},
-    "registration": {
-        "small_gicp": "SmallGicp",
-        "colored_icp": "ColouredIcp",
-        "point_to_plane": "PointToPlaneIcp",
-    },
+    "registration": {"small_gicp": "SmallGicp", "colored_icp": "ColouredIcp", "point_to_plane": "PointToPlaneIcp"},
 }

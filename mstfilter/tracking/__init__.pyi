@@ -24,5 +24,5 @@ from mstfilter.tracking.segments import (
 from mstfilter.tracking.transition import (
     IdentityTransition as IdentityTransition,
     TrackingTransition as TrackingTransition,
+    Warp as Warp,
 )
-from mstfilter.tracking.warp import Warp as Warp

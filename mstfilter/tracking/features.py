@@ -15,7 +15,6 @@ from __future__ import annotations
 from dataclasses import astuple, dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mstfilter.errors import InputError
 from mstfilter.scene import Frame, depth_sigma, memo
@@ -26,35 +25,33 @@ _N_EXPOSURE_PIXELS = 20000
 _PRIOR_VARIANCE = 20.0**2  # grey levels squared; where colours vary less, the gain stays near 1
 
 
-def same_depth(first: Frame, other: Frame, sigmas: float = 4.0) -> NDArray[np.bool_]:
+def same_depth(first: Frame, other: Frame, sigmas: float = 4.0) -> np.ndarray:
     """Pixels (H, W) where both frames have a reading off the robot that agrees up to the sensor noise."""
     limit = sigmas * np.sqrt(2.0) * depth_sigma(first.depth)
     with np.errstate(invalid="ignore"):
         return (np.abs(other.depth - first.depth) <= limit) & first.valid & other.valid
 
 
-def smooth_colour(frame: Frame, width: int = 3) -> NDArray[np.float32]:
+def smooth_colour(frame: Frame, width: int = 3) -> np.ndarray:
     """Colour (H, W, 3) blurred over ``width`` pixels, to reduce the effect of shifts below a pixel."""
     import cv2
 
     return memo(
-        "smooth colour",
-        (frame.key, width),
-        lambda: cv2.GaussianBlur(frame.rgb, (width, width), 0).astype(np.float32),
+        "smooth colour", (frame.key, width), lambda: cv2.GaussianBlur(frame.rgb, (width, width), 0).astype(np.float32)
     )
 
 
-def matched_colour(frame: Frame, reference: Frame, width: int = 3) -> NDArray[np.float32]:
+def matched_colour(frame: Frame, reference: Frame, width: int = 3) -> np.ndarray:
     """Smooth colour (H, W, 3) of a frame, converted to the exposure of the reference. Cached by content."""
 
-    def compute() -> NDArray[np.float32]:
+    def compute() -> np.ndarray:
         gain, offset = _exposure(frame, reference)
         return smooth_colour(frame, width) * gain + offset
 
     return memo("matched colour", (frame.key, reference.key, width), compute)
 
 
-def _exposure(frame: Frame, reference: Frame) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def _exposure(frame: Frame, reference: Frame) -> tuple[np.ndarray, np.ndarray]:
     """Gain (3,) and offset (3,) that map colours of the frame to those of the reference."""
     still = np.flatnonzero(same_depth(reference, frame))
     if len(still) < 500:  # without depth: assume that most of the image is still
@@ -91,12 +88,12 @@ class Matches:
     p, q : (N, 3) float64 world points of these pixels, metres.
     """
 
-    before: NDArray[np.int32]
-    after: NDArray[np.int32]
-    p: NDArray[np.float64]
-    q: NDArray[np.float64]
+    before: np.ndarray
+    after: np.ndarray
+    p: np.ndarray
+    q: np.ndarray
 
-    def within(self, first: NDArray[np.bool_], last: NDArray[np.bool_] | None = None) -> NDArray[np.int64]:
+    def within(self, first: np.ndarray, last: np.ndarray | None = None) -> np.ndarray:
         """Indices of the pairs that start inside mask ``first`` and, if given, end inside ``last`` (H, W)."""
         keep = first[self.before[:, 1], self.before[:, 0]]
         if last is not None:
@@ -145,10 +142,10 @@ class SiftMatching:
         return memo("sift matches", key, lambda: _match(before, after, self), stored_as=Matches)
 
 
-def _features(frame: Frame) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
+def _features(frame: Frame) -> tuple[np.ndarray, np.ndarray]:
     """Pixels (N, 2) and descriptors (N, 128) of features with a depth reading, off the robot."""
 
-    def compute() -> tuple[NDArray[np.int32], NDArray[np.float32]]:
+    def compute() -> tuple[np.ndarray, np.ndarray]:
         import cv2
 
         grey = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
@@ -191,7 +188,7 @@ def _match(before: Frame, after: Frame, settings: SiftMatching) -> Matches:
     return Matches(a, b, before.points[a[:, 1], a[:, 0]], after.points[b[:, 1], b[:, 0]])
 
 
-def _far(a: NDArray[np.float32], b: NDArray[np.float32], reach: float) -> NDArray[np.bool_]:
+def _far(a: np.ndarray, b: np.ndarray, reach: float) -> np.ndarray:
     """Whether points a (N, d) and b (M, d) are farther apart than reach, (N, M)."""
     squared = np.zeros((len(a), len(b)), np.float32)
     for axis in range(a.shape[1]):
@@ -199,7 +196,7 @@ def _far(a: NDArray[np.float32], b: NDArray[np.float32], reach: float) -> NDArra
     return squared > reach**2
 
 
-def _mutual(distance: NDArray[np.float32], ratio: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _mutual(distance: np.ndarray, ratio: float) -> tuple[np.ndarray, np.ndarray]:
     """Pairs that are mutual best matches and pass the ratio test against the second best of the row."""
     j = distance.argmin(axis=1)
     i = np.arange(len(j))

@@ -23,7 +23,6 @@ from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mstfilter.errors import InputError
 from mstfilter.scene import Clip, Frame, memo
@@ -48,26 +47,26 @@ class ClipTracks:
     unchanged : (H, W) bool, whether depth and colour agree between first and last frame.
     """
 
-    start: NDArray[np.int32]
-    end: NDArray[np.float32]
-    alive: NDArray[np.bool_]
-    source: NDArray[np.int32]
-    unchanged: NDArray[np.bool_]
+    start: np.ndarray
+    end: np.ndarray
+    alive: np.ndarray
+    source: np.ndarray
+    unchanged: np.ndarray
 
-    def warp(self, labels: NDArray[np.integer]) -> NDArray[np.integer]:
+    def warp(self, labels: np.ndarray) -> np.ndarray:
         """A label image (H, W) of the first frame, moved to the last; 0 for robot pixels."""
         flat = np.append(labels.ravel(), labels.dtype.type(0))
         return flat[self.source]
 
     @cached_property
-    def coherently_unchanged(self) -> NDArray[np.bool_]:
+    def coherently_unchanged(self) -> np.ndarray:
         """As `unchanged`, but isolated changed pixels are treated as noise, (H, W) bool."""
         import cv2
 
         changed = (~self.unchanged).astype(np.uint8)
         return cv2.morphologyEx(changed, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)) == 0
 
-    def points_in(self, mask: NDArray[np.bool_]) -> NDArray[np.int64]:
+    def points_in(self, mask: np.ndarray) -> np.ndarray:
         """Indices of the points that start inside a mask (H, W) and reached the end."""
         return np.flatnonzero(mask[self.start[:, 1], self.start[:, 0]] & self.alive)
 
@@ -79,10 +78,6 @@ class DenseFlow:
     Parameters
     ----------
     preset : "ultrafast", "fast" or "medium"
-    scale : float
-        Flow is computed on images resized by this factor (1 = full size).
-    frame_step : int
-        Use every k-th frame and the last one.
     motion_share : float
         Skip frames until the motion since the last used frame reaches this share of the image width. Errors
         accumulate with the number of frames, but flow fails for long motions. 0 uses every frame.
@@ -97,8 +92,6 @@ class DenseFlow:
     """
 
     preset: str = "medium"
-    scale: float = 1.0
-    frame_step: int = 1
     motion_share: float = 0.03
     grid_step: int = 2
     forward_backward: float = 1.0
@@ -108,15 +101,12 @@ class DenseFlow:
     def __post_init__(self) -> None:
         if self.preset not in _PRESETS:
             raise InputError(f"flow preset {self.preset!r} is unknown", f"one of {', '.join(_PRESETS)}")
-        if not 0.0 < self.scale <= 1.0:
-            raise InputError(f"flow scale is {self.scale}, expected 0 < scale <= 1")
-        if self.frame_step < 1 or self.grid_step < 1:
-            raise InputError(f"frame_step {self.frame_step} and grid_step {self.grid_step} must be at least 1")
+        if self.grid_step < 1:
+            raise InputError(f"grid_step is {self.grid_step}, expected at least 1")
 
     def track(self, clip: Clip) -> ClipTracks:
         """Follow points and pixels through the clip. Cached by content."""
-        chosen = list(range(0, len(clip.frames) - 1, self.frame_step)) + [len(clip.frames) - 1]
-        frames = [clip.frames[i] for i in chosen]
+        frames = list(clip.frames)
         key = (tuple(f.key for f in frames), astuple(self))
         return memo("clip tracks", key, lambda: _track(_thinned(frames, self.motion_share), self), ClipTracks)
 
@@ -133,7 +123,7 @@ def _track(frames: list[Frame], settings: DenseFlow) -> ClipTracks:
     pull = grid.copy()  # position in the first frame of every pixel of the current frame
     known = ~_robot(first).ravel()
     for previous, current in pairwise(frames):
-        forward, backward = _flow(previous, current, settings)
+        forward, backward = _flow(previous, current, settings.preset)
         end, ok = _advance(end, forward, backward, previous, current, settings)
         alive &= ok
         # One step back to the previous frame, then the accumulated map.
@@ -181,7 +171,7 @@ def _thinned(frames: list[Frame], motion_share: float) -> list[Frame]:
     return [*kept, frames[-1]]
 
 
-def _speed(flow: NDArray[np.float32], frame: Frame) -> float:
+def _speed(flow: np.ndarray, frame: Frame) -> float:
     """99.5th percentile of the flow length of pixels off the robot."""
     import cv2
 
@@ -204,28 +194,21 @@ def _one_thread() -> Iterator[None]:
         cv2.setNumThreads(threads)
 
 
-def _robot(frame: Frame) -> NDArray[np.bool_]:
+def _robot(frame: Frame) -> np.ndarray:
     return np.zeros(frame.depth.shape, bool) if frame.robot_mask is None else frame.robot_mask
 
 
-def _flow(a: Frame, b: Frame, settings: DenseFlow) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def _flow(a: Frame, b: Frame, preset: str) -> tuple[np.ndarray, np.ndarray]:
     """Flow a -> b and b -> a, (H, W, 2) pixels."""
     import cv2
 
     grey = [cv2.cvtColor(f.rgb, cv2.COLOR_RGB2GRAY) for f in (a, b)]
-    if settings.scale < 1.0:
-        grey = [cv2.resize(g, None, fx=settings.scale, fy=settings.scale, interpolation=cv2.INTER_AREA) for g in grey]
-    dis = cv2.DISOpticalFlow_create(_PRESETS.index(settings.preset))  # type: ignore[attr-defined]
+    dis = cv2.DISOpticalFlow_create(_PRESETS.index(preset))  # type: ignore[attr-defined]
     with _one_thread():
-        fields = [dis.calc(grey[0], grey[1], None), dis.calc(grey[1], grey[0], None)]
-    if settings.scale < 1.0:
-        size = (a.depth.shape[1], a.depth.shape[0])
-        factor = np.array([size[0] / grey[0].shape[1], size[1] / grey[0].shape[0]], np.float32)
-        fields = [cv2.resize(f, size, interpolation=cv2.INTER_LINEAR) * factor for f in fields]
-    return fields[0], fields[1]
+        return dis.calc(grey[0], grey[1], None), dis.calc(grey[1], grey[0], None)
 
 
-def _sample(field: NDArray[np.float32], at: NDArray[np.float32]) -> NDArray[np.float32]:
+def _sample(field: np.ndarray, at: np.ndarray) -> np.ndarray:
     """Bilinear samples (N, 2) of a field (H, W, 2) at points (N, 2); the border is repeated."""
     import cv2
 
@@ -237,13 +220,8 @@ def _sample(field: NDArray[np.float32], at: NDArray[np.float32]) -> NDArray[np.f
 
 
 def _advance(
-    at: NDArray[np.float32],
-    there: NDArray[np.float32],
-    back: NDArray[np.float32],
-    a: Frame,
-    b: Frame,
-    settings: DenseFlow,
-) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    at: np.ndarray, there: np.ndarray, back: np.ndarray, a: Frame, b: Frame, settings: DenseFlow
+) -> tuple[np.ndarray, np.ndarray]:
     """Move points from frame a to b. Returns their positions (N, 2) and whether they are valid (N,)."""
     height, width = a.depth.shape
     moved = at + _sample(there, at)
@@ -259,13 +237,13 @@ def _advance(
     return moved, ok
 
 
-def _pixel(at: NDArray[np.float32], width: int, height: int) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+def _pixel(at: np.ndarray, width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
     u = np.clip(np.rint(at[:, 0]), 0, width - 1).astype(np.int32)
     v = np.clip(np.rint(at[:, 1]), 0, height - 1).astype(np.int32)
     return u, v
 
 
-def _unchanged_pixels(first: Frame, last: Frame) -> NDArray[np.bool_]:
+def _unchanged_pixels(first: Frame, last: Frame) -> np.ndarray:
     """Pixels (H, W) with the same content in the first and last frame.
 
     Depth differs by less than four standard deviations of the difference, and slightly blurred colour by at most 12
@@ -275,9 +253,7 @@ def _unchanged_pixels(first: Frame, last: Frame) -> NDArray[np.bool_]:
     return same_depth(first, last) & (change <= 12.0)
 
 
-def _vote(
-    frame: Frame, pull: NDArray[np.float32], known: NDArray[np.bool_], doubtful: NDArray[np.int64]
-) -> NDArray[np.float32]:
+def _vote(frame: Frame, pull: np.ndarray, known: np.ndarray, doubtful: np.ndarray) -> np.ndarray:
     """Positions in the first frame (D, 2) of pixels without valid flow.
 
     Each takes the position of one of its five nearest valid pixels, by position in space and colour together (12 mm

@@ -16,7 +16,6 @@ from dataclasses import dataclass, field
 from heapq import heappop, heappush
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
 from mstfilter.scene import Clip, component_key, memo, read_only
@@ -36,10 +35,10 @@ class FollowedPoints:
     column, row : (n,) pixel of each point in the last frame.
     """
 
-    p: NDArray[np.float64]
-    q: NDArray[np.float64]
-    column: NDArray[np.int64]
-    row: NDArray[np.int64]
+    p: np.ndarray
+    q: np.ndarray
+    column: np.ndarray
+    row: np.ndarray
 
 
 def followed_points(clip: Clip, flow: DenseFlow) -> FollowedPoints:
@@ -98,13 +97,13 @@ class MotionSegmentation:
     min_points: int = 40
     flow: DenseFlow = field(default_factory=DenseFlow)
 
-    def labels(self, clip: Clip) -> NDArray[np.int32] | None:
+    def labels(self, clip: Clip) -> np.ndarray | None:
         """Number of the motion of each pixel of the last frame, (H, W); None for a single frame. Cached."""
         if len(clip.frames) < 2:
             return None
         return memo("rigid motions", (clip.frames_key, component_key(self)), lambda: read_only(self._labels(clip)))
 
-    def _labels(self, clip: Clip) -> NDArray[np.int32]:
+    def _labels(self, clip: Clip) -> np.ndarray:
         points = followed_points(clip, self.flow)
         height, width = clip.after.depth.shape
         out = np.full((height, width), -1, np.int32)
@@ -136,9 +135,7 @@ class MotionSegmentation:
         out[points.row, points.column] = number
         return out
 
-    def _motions(
-        self, sums: NDArray[np.float64], group: NDArray[np.int64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    def _motions(self, sums: np.ndarray, group: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Motions (k, 4, 4), the identity first, and the number of each cell's motion; -1 for too few points."""
         motions, number = [np.eye(4)], np.full(len(group), -1)
         number[group == -2] = 0
@@ -155,9 +152,7 @@ class MotionSegmentation:
         return np.array(motions), number
 
 
-def _neighbours(
-    cells: NDArray[np.int64], across: int, down: int, sums: NDArray[np.float64], reach: float
-) -> NDArray[np.int64]:
+def _neighbours(cells: np.ndarray, across: int, down: int, sums: np.ndarray, reach: float) -> np.ndarray:
     """Pairs of cells (m, 2) that are adjacent in the image and close in space."""
     place, centre = cells // 2, sums[:, 4:7] / sums[:, :1]
     index = np.full((2, (down + 2) * (across + 2)), -1)
@@ -176,16 +171,14 @@ def _neighbours(
     return np.asarray(pairs[close], dtype=np.int64)
 
 
-def _misfit(
-    a: NDArray[np.float64], b: NDArray[np.float64], error_a: NDArray[np.float64], error_b: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _misfit(a: np.ndarray, b: np.ndarray, error_a: np.ndarray, error_b: np.ndarray) -> np.ndarray:
     """Misfit of two groups in metres: sqrt(increase of the squared error x (n_a + n_b) / (n_a n_b))."""
     _, error = fit_sums(a + b)
     na, nb = a[..., 0], b[..., 0]
     return np.sqrt(np.maximum(error - error_a - error_b, 0.0) * (na + nb) / (na * nb))
 
 
-def _join(sums: NDArray[np.float64], pairs: NDArray[np.int64], limit: float) -> NDArray[np.int64]:
+def _join(sums: np.ndarray, pairs: np.ndarray, limit: float) -> np.ndarray:
     """Group number of each cell after joining neighbours in order of misfit."""
     n = len(sums)
     group = np.arange(n)
@@ -234,15 +227,15 @@ def _join(sums: NDArray[np.float64], pairs: NDArray[np.int64], limit: float) -> 
 
 def _best(
     points: FollowedPoints,
-    cell: NDArray[np.int64],
-    pairs: NDArray[np.int64],
-    number: NDArray[np.int64],
-    motions: NDArray[np.float64],
-    origin: NDArray[np.float64],
+    cell: np.ndarray,
+    pairs: np.ndarray,
+    number: np.ndarray,
+    motions: np.ndarray,
+    origin: np.ndarray,
     limit: float,
     rival: float,
-    rivals: NDArray[np.bool_],
-) -> NDArray[np.int32]:
+    rivals: np.ndarray,
+) -> np.ndarray:
     """For each point the motion, among those of its cell and of adjacent cells, with the smallest residual.
 
     -1 if the residual exceeds `limit`, or if the residual of another of the `rivals` (motions, cells) is larger by

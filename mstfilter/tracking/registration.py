@@ -23,7 +23,6 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mstfilter.errors import InputError
 from mstfilter.open3d_import import import_open3d
@@ -57,11 +56,11 @@ class Surface:
     raw_colours : (M, 3) their colours, grey levels 0 .. 255, or None.
     """
 
-    points: NDArray[np.float64]
+    points: np.ndarray
     cloud: Any
     tree: Any
-    raw_points: NDArray[np.float64]
-    raw_colours: NDArray[np.floating] | None
+    raw_points: np.ndarray
+    raw_colours: np.ndarray | None
 
     @cached_property
     def open3d_cloud(self) -> Any:
@@ -74,7 +73,7 @@ class Surface:
         cloud.estimate_normals(o3d.geometry.KDTreeSearchParamHybrid(radius=3 * _SPACING, max_nn=30))
         return cloud
 
-    def distances(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    def distances(self, points: np.ndarray) -> np.ndarray:
         """Distance of points (M, 3) to the nearest point of the surface, (M,) metres."""
         homogeneous = np.hstack([points, np.ones((len(points), 1))])
         nearest, _ = self.tree.batch_nearest_neighbor_search(homogeneous, num_threads=1)
@@ -96,17 +95,17 @@ class RegistrationResult:
     H : (6, 6) Gauss-Newton matrix of the objective, rotation first; None for open3d.
     """
 
-    T: NDArray[np.float64]
+    T: np.ndarray
     rms: float
     overlap: float
     error: float
     inliers: int
     converged: bool | None = None
     iterations: int | None = None
-    H: NDArray[np.float64] | None = None
+    H: np.ndarray | None = None
 
 
-def prepare(points: NDArray[np.float64], colours: NDArray[np.floating] | None = None) -> Surface | None:
+def prepare(points: np.ndarray, colours: np.ndarray | None = None) -> Surface | None:
     """Prepare points (N, 3) with colours (N, 3) in 0 .. 255 for registration; None if there are fewer than 12."""
     import small_gicp
 
@@ -127,9 +126,7 @@ class Registration(ABC):
     """Aligns two surfaces from an initial motion."""
 
     @abstractmethod
-    def register(
-        self, source: Surface, target: Surface, init: NDArray[np.float64], reach: float
-    ) -> RegistrationResult | None:
+    def register(self, source: Surface, target: Surface, init: np.ndarray, reach: float) -> RegistrationResult | None:
         """Align source to target.
 
         Parameters
@@ -163,9 +160,7 @@ class SmallGicp(Registration):
         if self.method not in ("GICP", "PLANE_ICP", "ICP"):
             raise InputError(f"registration method {self.method!r} is unknown", "one of GICP, PLANE_ICP, ICP")
 
-    def register(
-        self, source: Surface, target: Surface, init: NDArray[np.float64], reach: float
-    ) -> RegistrationResult | None:
+    def register(self, source: Surface, target: Surface, init: np.ndarray, reach: float) -> RegistrationResult | None:
         """Align source to target."""
         import small_gicp
 
@@ -199,9 +194,7 @@ class PointToPlaneIcp(Registration):
 
     iterations: int = 30
 
-    def register(
-        self, source: Surface, target: Surface, init: NDArray[np.float64], reach: float
-    ) -> RegistrationResult | None:
+    def register(self, source: Surface, target: Surface, init: np.ndarray, reach: float) -> RegistrationResult | None:
         """Align source to target."""
         icp = import_open3d().pipelines.registration
         found = icp.registration_icp(
@@ -242,9 +235,7 @@ class ColouredIcp(Registration):
                 f"coloured ICP has scales {self.distance_scale!r} m and {self.colour_scale!r}, expected numbers > 0"
             )
 
-    def register(
-        self, source: Surface, target: Surface, init: NDArray[np.float64], reach: float
-    ) -> RegistrationResult | None:
+    def register(self, source: Surface, target: Surface, init: np.ndarray, reach: float) -> RegistrationResult | None:
         """Align source to target. Both need colours."""
         if source.raw_colours is None or target.raw_colours is None:
             raise InputError("coloured ICP needs the colours of both surfaces", "prepare(points, colours)")
@@ -270,20 +261,20 @@ def _open3d_result(found: Any, source: Surface, target: Surface, reach: float) -
     return RegistrationResult(T, *_fit(source, target, T, reach), float(found.inlier_rmse), inliers)
 
 
-def _fit(source: Surface, target: Surface, T: NDArray[np.float64], reach: float) -> tuple[float, float]:
+def _fit(source: Surface, target: Surface, T: np.ndarray, reach: float) -> tuple[float, float]:
     """Root mean square distance of the moved source to the target (metres), and the share within the reach."""
     distance = target.distances(move_points(T, source.points))
     return float(np.sqrt((distance**2).mean())), float((distance <= reach).mean())
 
 
-def centroid_shift(source: NDArray[np.float64], target: NDArray[np.float64]) -> NDArray[np.float64]:
+def centroid_shift(source: np.ndarray, target: np.ndarray) -> np.ndarray:
     """Motion (4, 4) that moves the component-wise median of source (N, 3) to that of target (M, 3)."""
     T = np.eye(4)
     T[:3, 3] = np.median(target, axis=0) - np.median(source, axis=0)
     return T
 
 
-def _nearest_rotation(R: NDArray[np.float64]) -> NDArray[np.float64]:
+def _nearest_rotation(R: np.ndarray) -> np.ndarray:
     """The nearest rotation, which removes the rounding errors of repeated products."""
     U, _, Vt = np.linalg.svd(R)
     return U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))]) @ Vt

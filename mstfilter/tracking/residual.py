@@ -25,7 +25,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from mstfilter.scene import Frame, depth_sigma, memo
@@ -73,11 +72,11 @@ class MotionResidual:
     n_points: int = 1200
     track_weight: float = 1.0
 
-    def score(self, track: Track, T: NDArray[np.float64]) -> float:
+    def score(self, track: Track, T: np.ndarray) -> float:
         """S of a motion (4, 4); infinite if too few points can be compared."""
         return float(self.scores(track, T[None])[0])
 
-    def scores(self, track: Track, motions: NDArray[np.float64], n_points: int | None = None) -> NDArray[np.float64]:
+    def scores(self, track: Track, motions: np.ndarray, n_points: int | None = None) -> np.ndarray:
         """S (K,) of motions (K, 4, 4), on at most ``n_points`` points."""
         points, colours = track.sample(n_points or self.n_points)
         if not len(points):
@@ -109,10 +108,10 @@ class MotionResidual:
         return np.where(n >= max(self.least_share * len(points), 1), mean + self.track_weight * foreign, np.inf)
 
 
-def normals(frame: Frame) -> NDArray[np.float32]:
+def normals(frame: Frame) -> np.ndarray:
     """World unit normals (H, W, 3) that face the camera, NaN if unknown. Cached by content."""
 
-    def compute() -> NDArray[np.float32]:
+    def compute() -> np.ndarray:
         import cv2
 
         valid = np.isfinite(frame.depth)
@@ -134,10 +133,10 @@ def normals(frame: Frame) -> NDArray[np.float32]:
     return memo("normals", (frame.key,), compute)
 
 
-def _gradients(track: Track) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+def _gradients(track: Track) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Smoothed grey last image and its derivatives along columns and rows, grey levels per pixel."""
 
-    def compute() -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+    def compute() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         grey = track.colour_after.mean(axis=2)
         down, across = np.gradient(grey)
         return grey, across, down
@@ -145,9 +144,7 @@ def _gradients(track: Track) -> tuple[NDArray[np.float32], NDArray[np.float32], 
     return memo("grey gradients", (track.clip.after.key, track.clip.before.key), compute)
 
 
-def refine_motion(
-    track: Track, T: NDArray[np.float64], depth_scale: float = 1.5, colour_scale: float = 25.0
-) -> NDArray[np.float64]:
+def refine_motion(track: Track, T: np.ndarray, depth_scale: float = 1.5, colour_scale: float = 25.0) -> np.ndarray:
     """Improve a motion (4, 4) of a segment; the scales are those of `MotionResidual`.
 
     Returns

@@ -29,7 +29,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
 __all__ = [
@@ -53,17 +52,17 @@ __all__ = [
 _N_SUMS = 18  # n, sum p (3), sum q (3), sum p q^T (9), sum |p|^2, sum |q|^2
 
 
-def rigid_transform(T: NDArray[np.float64]) -> RigidTransform:
+def rigid_transform(T: np.ndarray) -> RigidTransform:
     """A motion (4, 4) as RigidTransform with the same bits: the rotation is not normalised."""
     return RigidTransform(T, normalize=False)
 
 
-def move_points(T: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.float64]:
+def move_points(T: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Apply motions (..., 4, 4) to points (..., N, 3)."""
     return points @ np.swapaxes(T[..., :3, :3], -1, -2) + T[..., None, :3, 3]
 
 
-def invert(T: NDArray[np.float64]) -> NDArray[np.float64]:
+def invert(T: np.ndarray) -> np.ndarray:
     """Inverse of motions (..., 4, 4), with the transpose as the inverse rotation."""
     out = np.zeros_like(T)
     Rt = np.swapaxes(T[..., :3, :3], -1, -2)
@@ -73,20 +72,18 @@ def invert(T: NDArray[np.float64]) -> NDArray[np.float64]:
     return out
 
 
-def angle(T: NDArray[np.float64]) -> NDArray[np.float64]:
+def angle(T: np.ndarray) -> np.ndarray:
     """Rotation angle of motions (..., 4, 4), radians in [0, pi]."""
     cosine = (np.trace(T[..., :3, :3], axis1=-2, axis2=-1) - 1.0) / 2.0
     return np.arccos(np.clip(cosine, -1.0, 1.0))
 
 
-def displacement(T: NDArray[np.float64], centre: NDArray[np.float64]) -> NDArray[np.float64]:
+def displacement(T: np.ndarray, centre: np.ndarray) -> np.ndarray:
     """Distance by which motions (..., 4, 4) move the point ``centre`` (3,), metres."""
     return np.linalg.norm(T[..., :3, :3] @ centre + T[..., :3, 3] - centre, axis=-1)
 
 
-def kabsch(
-    p: NDArray[np.float64], q: NDArray[np.float64], weights: NDArray[np.float64] | None = None
-) -> NDArray[np.float64]:
+def kabsch(p: np.ndarray, q: np.ndarray, weights: np.ndarray | None = None) -> np.ndarray:
     """Least-squares rigid motions of corresponding points.
 
     Parameters
@@ -109,9 +106,7 @@ def kabsch(
     return _from_covariance(covariance, mean_p, mean_q)[0]
 
 
-def _from_covariance(
-    covariance: NDArray[np.float64], mean_p: NDArray[np.float64], mean_q: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _from_covariance(covariance: np.ndarray, mean_p: np.ndarray, mean_q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Motion and the sum s1 + s2 + d s3 from C = sum (p - mean p)(q - mean q)^T."""
     U, s, Vt = np.linalg.svd(covariance)
     d = np.where(np.linalg.det(U) * np.linalg.det(Vt) < 0.0, -1.0, 1.0)
@@ -125,26 +120,18 @@ def _from_covariance(
     return T, (s * signs).sum(axis=-1)
 
 
-def pair_sums(
-    p: NDArray[np.float64],
-    q: NDArray[np.float64],
-    group: NDArray[np.int64],
-    n_groups: int,
-    weights: NDArray[np.float64] | None = None,
-) -> NDArray[np.float64]:
+def pair_sums(p: np.ndarray, q: np.ndarray, group: np.ndarray, n_groups: int) -> np.ndarray:
     """The 18 additive sums of each group of point pairs.
 
     Parameters
     ----------
     p, q : (N, 3) points, metres, relative to one common origin near them, against cancellation.
     group : (N,) int, the group of each pair in 0..n_groups-1.
-    weights : (N,) or None
 
     Returns
     -------
     (n_groups, 18) float64. The sums of a union of groups are the sum of their rows.
     """
-    w = np.ones(len(p)) if weights is None else np.asarray(weights, dtype=np.float64)
     columns = np.empty((len(p), _N_SUMS))
     columns[:, 0] = 1.0
     columns[:, 1:4] = p
@@ -152,14 +139,13 @@ def pair_sums(
     columns[:, 7:16] = (p[:, :, None] * q[:, None, :]).reshape(len(p), 9)
     columns[:, 16] = np.einsum("ni,ni->n", p, p)
     columns[:, 17] = np.einsum("ni,ni->n", q, q)
-    columns *= w[:, None]
     out = np.empty((n_groups, _N_SUMS))
     for c in range(_N_SUMS):
         out[:, c] = np.bincount(group, weights=columns[:, c], minlength=n_groups)
     return out
 
 
-def fit_sums(sums: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def fit_sums(sums: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Least-squares motions and squared residuals from the sums (..., 18) of `pair_sums`.
 
     Returns
@@ -180,9 +166,7 @@ def fit_sums(sums: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np
     return T, np.maximum(spread - 2.0 * trace, 0.0) * (n > 0)
 
 
-def minimal_models(
-    rng: np.random.Generator, p: NDArray[np.float64], q: NDArray[np.float64], eps: float, n_models: int
-) -> NDArray[np.float64]:
+def minimal_models(rng: np.random.Generator, p: np.ndarray, q: np.ndarray, eps: float, n_models: int) -> np.ndarray:
     """Motions of random triples of point pairs that are consistent with a rigid motion.
 
     A triple is rejected without a fit if it is nearly collinear, or if the length of a side changes by more than
@@ -211,15 +195,15 @@ def minimal_models(
     return kabsch(a[keep], b[keep]) if keep.any() else np.empty((0, 4, 4))
 
 
-def residuals(models: NDArray[np.float64], p: NDArray[np.float64], q: NDArray[np.float64]) -> NDArray[np.float64]:
+def residuals(models: np.ndarray, p: np.ndarray, q: np.ndarray) -> np.ndarray:
     """Distances between ``R_k p_i + t_k`` and ``q_i``, (N, M), metres."""
     moved = np.einsum("kij,nj->nki", models[:, :3, :3], p) + models[None, :, :3, 3]
     return np.linalg.norm(moved - q[:, None, :], axis=-1)
 
 
 def ransac(
-    rng: np.random.Generator, p: NDArray[np.float64], q: NDArray[np.float64], eps: float, n_models: int = 300
-) -> tuple[NDArray[np.float64], NDArray[np.bool_]] | None:
+    rng: np.random.Generator, p: np.ndarray, q: np.ndarray, eps: float, n_models: int = 300
+) -> tuple[np.ndarray, np.ndarray] | None:
     """The motion with the most pairs within ``eps`` metres, refitted to them; None if no motion has three."""
     models = minimal_models(rng, p, q, eps, n_models)
     if not len(models):
@@ -235,9 +219,7 @@ def ransac(
     return (T, inliers) if inliers.sum() >= 3 else None
 
 
-def refine_robust(
-    T: NDArray[np.float64], p: NDArray[np.float64], q: NDArray[np.float64], scale: float, iterations: int = 10
-) -> NDArray[np.float64]:
+def refine_robust(T: np.ndarray, p: np.ndarray, q: np.ndarray, scale: float, iterations: int = 10) -> np.ndarray:
     """Iteratively reweighted fit with the Geman-McClure weight (1 + r^2 / scale^2)^-2, from ``T``.
 
     ``scale`` is in metres. If all weights vanish, the present motion is returned.
@@ -262,15 +244,15 @@ class MotionCluster:
     rms : root mean square residual of the inliers, metres.
     """
 
-    T: NDArray[np.float64]
-    inliers: NDArray[np.int64]
+    T: np.ndarray
+    inliers: np.ndarray
     rms: float
 
 
 def jlinkage(
     rng: np.random.Generator,
-    p: NDArray[np.float64],
-    q: NDArray[np.float64],
+    p: np.ndarray,
+    q: np.ndarray,
     *,
     eps: float = 0.010,
     n_models: int = 500,
@@ -315,7 +297,7 @@ def jlinkage(
     return _without_repeats(motions)
 
 
-def cluster(preference: NDArray[np.bool_]) -> list[NDArray[np.int64]]:
+def cluster(preference: np.ndarray) -> list[np.ndarray]:
     """Merge rows of a preference matrix (N, M) until all preference sets are disjoint.
 
     Returns
@@ -360,9 +342,7 @@ def cluster(preference: NDArray[np.bool_]) -> list[NDArray[np.int64]]:
     return sorted(found, key=lambda m: (-len(m), int(m[0])))
 
 
-def _refit(
-    p: NDArray[np.float64], q: NDArray[np.float64], T: NDArray[np.float64], eps: float
-) -> MotionCluster | None:
+def _refit(p: np.ndarray, q: np.ndarray, T: np.ndarray, eps: float) -> MotionCluster | None:
     """Two rounds of least squares on the inliers among all matches; None if there are fewer than three."""
     inliers = np.flatnonzero(residuals(T[None], p, q)[:, 0] < eps)
     for _ in range(2):

@@ -22,7 +22,6 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
 from mstfilter.errors import InputError
@@ -229,7 +228,7 @@ class _Proposal(NamedTuple):
     """A motion (4, 4) that is not scored yet."""
 
     kind: str
-    T: NDArray[np.float64]
+    T: np.ndarray
     support: int
     registration: RegistrationResult | None = None
 
@@ -350,7 +349,7 @@ class MstRule(MotionRule):
                     proposals.append(start._replace(T=result.T, registration=result))
         return proposals
 
-    def _search(self, track: Track, centre: NDArray[np.float64]) -> list[Candidate]:
+    def _search(self, track: Track, centre: np.ndarray) -> list[Candidate]:
         """Search a grid of shifts on the table and three rotations; refine the two best shifts of each rotation."""
         n = round(self.search_radius / self.search_step)
         shifts = self.search_step * np.stack(np.meshgrid(*[np.arange(-n, n + 1)] * 2), axis=-1).reshape(-1, 2)
@@ -369,7 +368,7 @@ class MstRule(MotionRule):
                     found.append(self._scored(track, _Proposal("search", T, 0)))
         return found
 
-    def _refined(self, track: Track, T: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _refined(self, track: Track, T: np.ndarray) -> np.ndarray:
         return refine_motion(track, T, self.residual.depth_scale, self.residual.colour_scale)
 
     def _scored(self, track: Track, proposal: _Proposal) -> Candidate:
@@ -377,14 +376,14 @@ class MstRule(MotionRule):
         error = 0.0 if result is None else result.rms
         return Candidate(kind, rigid_transform(T), support, error, self.residual.score(track, T), result)
 
-    def _admissible(self, T: NDArray[np.float64], centre: NDArray[np.float64]) -> bool:
+    def _admissible(self, T: np.ndarray, centre: np.ndarray) -> bool:
         """Whether a motion is finite and within the limits of displacement and angle."""
         if not np.isfinite(T).all():
             return False
         return bool(rigid.displacement(T, centre) <= self.max_shift and rigid.angle(T) <= self.max_angle)
 
 
-def _nearly_equal(a: NDArray[np.float64], b: NDArray[np.float64], centre: NDArray[np.float64]) -> bool:
+def _nearly_equal(a: np.ndarray, b: np.ndarray, centre: np.ndarray) -> bool:
     """Whether two motions differ by less than 0.2 mm at the centre and 0.002 radians."""
     change = rigid.invert(a) @ b
     return bool(rigid.displacement(change, centre) < 2e-4 and rigid.angle(change) < 2e-3)

@@ -17,7 +17,6 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mstfilter.scene import Clip, Frame, Hypothesis, content_key, render_hypothesis
 from mstfilter.tracking.features import SiftMatching, matched_colour, smooth_colour
@@ -42,8 +41,8 @@ class Segment:
     """
 
     key: bytes
-    pixels: NDArray[np.int64]
-    support: NDArray[np.int64]
+    pixels: np.ndarray
+    support: np.ndarray
 
 
 def segments_of(hypothesis: Hypothesis, frame: Frame) -> dict[int, Segment]:
@@ -74,7 +73,7 @@ def segments_of(hypothesis: Hypothesis, frame: Frame) -> dict[int, Segment]:
     return out
 
 
-def _interior(labels: NDArray[np.uint16]) -> NDArray[np.bool_]:
+def _interior(labels: np.ndarray) -> np.ndarray:
     """Pixels with the same label as their four neighbours."""
     padded = np.pad(labels, 1)
     centre = padded[1:-1, 1:-1]
@@ -112,29 +111,29 @@ class Track:
     flow: ClipTracks
 
     @cached_property
-    def mask(self) -> NDArray[np.bool_]:
+    def mask(self) -> np.ndarray:
         """The support in the first frame, (H, W)."""
         image = np.zeros(self.clip.before.depth.shape, bool)
         image.ravel()[self.segment.support] = True
         return image
 
     @cached_property
-    def target_mask(self) -> NDArray[np.bool_]:
+    def target_mask(self) -> np.ndarray:
         """The support in the last frame according to the flow, (H, W)."""
         return self.flow.warp(self.mask.astype(np.uint8)) > 0
 
     @cached_property
-    def points(self) -> NDArray[np.float64]:
+    def points(self) -> np.ndarray:
         """World points of the support in the first frame, (S, 3) metres."""
         return self.clip.before.points.reshape(-1, 3)[self.segment.support]
 
     @cached_property
-    def target_points(self) -> NDArray[np.float64]:
+    def target_points(self) -> np.ndarray:
         """World points of the target mask in the last frame, above the table, (R, 3) metres."""
         return self.clip.after.points[self._target_pixels]
 
     @cached_property
-    def _target_pixels(self) -> NDArray[np.bool_]:
+    def _target_pixels(self) -> np.ndarray:
         after = self.clip.after
         with np.errstate(invalid="ignore"):
             return self.target_mask & after.valid & (after.points[..., 2] > _TABLE_HEIGHT)
@@ -150,7 +149,7 @@ class Track:
         return prepare(self.target_points, self.colour_after[self._target_pixels])
 
     @cached_property
-    def flow_pairs(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def flow_pairs(self) -> tuple[np.ndarray, np.ndarray]:
         """World points (K, 3) in the first and last frame of the points that the flow followed to the end."""
         before, after = self.clip.before, self.clip.after
         chosen = self.flow.points_in(self.mask)
@@ -160,7 +159,7 @@ class Track:
         keep = after.valid[end_v, end_u] & (q[:, 2] > _TABLE_HEIGHT)
         return before.points[v, u][keep], q[keep]
 
-    def sift_pairs(self, sift: SiftMatching, in_target: bool) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def sift_pairs(self, sift: SiftMatching, in_target: bool) -> tuple[np.ndarray, np.ndarray]:
         """World points of SIFT matches that start in the mask and, if `in_target`, end near the target mask."""
         import cv2
 
@@ -171,7 +170,7 @@ class Track:
         chosen = matches.within(self.mask, last)
         return matches.p[chosen], matches.q[chosen]
 
-    def sample(self, n: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def sample(self, n: int) -> tuple[np.ndarray, np.ndarray]:
         """At most n points of the support, evenly spaced, and their slightly blurred colours, (n, 3) each."""
         chosen = np.unique(np.linspace(0, len(self.segment.support) - 1, n).astype(np.int64))
         chosen = chosen[chosen >= 0]
@@ -179,7 +178,7 @@ class Track:
         return self.points[chosen], colours.astype(np.float64)
 
     @property
-    def colour_after(self) -> NDArray[np.float32]:
+    def colour_after(self) -> np.ndarray:
         """Slightly blurred colour (H, W, 3) of the last frame in the exposure of the first."""
         return matched_colour(self.clip.after, self.clip.before, 5)
 

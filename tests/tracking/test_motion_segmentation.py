@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mstfilter.scene import Clip, Hypothesis, VoxelGrid, cache as memo, project
+from mstfilter.scene import Clip, Hypothesis, VoxelGrid, project, scene_cache
 from mstfilter.tracking.flow import DenseFlow
 from mstfilter.tracking.motion_segmentation import MotionSegmentation, followed_points
 from tests.tracking.scenes import Box, Scene, at, standard
@@ -54,9 +54,9 @@ def test_what_is_remembered_belongs_to_one_clip(pushed, change):
     def found(c):
         return MotionSegmentation().labels(c), followed_points(c, DenseFlow()).p
 
-    memo.clear()
+    scene_cache.clear()
     alone = found(other)
-    memo.clear()
+    scene_cache.clear()
     first, second = found(clip), found(other)
     np.testing.assert_array_equal(alone[0], second[0])
     np.testing.assert_array_equal(alone[1], second[1])

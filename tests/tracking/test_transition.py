@@ -7,8 +7,7 @@ from mstfilter.scene import Clip, Frame, Hypothesis
 from mstfilter.smc import Population
 from mstfilter.tracking.rules import AuthorsRule, MstRule, PaperRule
 from mstfilter.tracking.segments import StaticTest
-from mstfilter.tracking.transition import IdentityTransition, TrackingTransition
-from mstfilter.tracking.warp import Warp
+from mstfilter.tracking.transition import IdentityTransition, TrackingTransition, Warp
 from tests.tracking.scenes import Box, Cylinder, Scene, at, errors, iou, slide
 
 RULES = {"mst": MstRule(), "paper": PaperRule(), "authors": AuthorsRule()}

@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 from mstfilter.errors import InputError
 from mstfilter.scene import Hypothesis, VoxelGrid
 from mstfilter.tracking.rigid import rigid_transform
-from mstfilter.tracking.warp import Warp
+from mstfilter.tracking.transition import Warp
 from tests.tracking.scenes import at, iou
 
 
