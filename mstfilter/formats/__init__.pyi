@@ -22,4 +22,5 @@ from mstfilter.formats.video import (
     RecordingFormat as RecordingFormat,
     RgbdImages as RgbdImages,
     Video as Video,
+    VideoFormat as VideoFormat,
 )

@@ -16,19 +16,17 @@ a PNG. The files are read with rosbags (extra ``bags``), without ROS.
 from __future__ import annotations
 
 import contextlib
-import math
 import struct
 import weakref
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from mstfilter.errors import InputError, MissingLibraryError
-from mstfilter.formats.pauses import PauseRule, Still
-from mstfilter.formats.video import KnownWorld, RecordingFormat, RgbdImages, Video, pair_stamps
+from mstfilter.formats.video import RgbdImages, Video, VideoFormat, pair_stamps
 from mstfilter.scene import Recording
 
 __all__ = [
@@ -61,7 +59,7 @@ class Topic:
 
 @dataclass(frozen=True)
 class Entry:
-    """A message: stamp of its header (s), when it was logged (ns), which of those logged then."""
+    """A message: stamp of its header (s), time when it was logged (ns), index among those logged at that time."""
 
     stamp: float
     logged: int
@@ -69,7 +67,11 @@ class Entry:
 
 
 class BagFile:
-    """An open bag. It is closed when nothing refers to it.
+    """An open bag, closed when it is garbage collected.
+
+    >>> bag = BagFile(Path("session.mcap"))
+    >>> entries = bag.index("/camera/color/image_raw")
+    >>> message = bag.message("/camera/color/image_raw", entries[3])
 
     Parameters
     ----------
@@ -106,11 +108,11 @@ class BagFile:
             yield
         except InputError:
             raise
-        except Exception as error:  # rosbags lets errors of storage and compression libraries through
-            said = " ".join(str(error).split())[:160]  # one line
+        except Exception as error:  # rosbags passes on errors of storage and compression libraries
+            reason = " ".join(str(error).split())[:160]  # one line
             raise InputError(
-                f"bag cannot be read: {self.path} ({type(error).__name__}: {said})",
-                "was it closed properly? copy it again, or mend it: rosbag reindex, ros2 bag reindex, mcap recover",
+                f"bag cannot be read: {self.path} ({type(error).__name__}: {reason})",
+                "copy it again, or repair it: rosbag reindex, ros2 bag reindex, mcap recover",
             ) from error
 
     def _messages(self, topic: str, start: int | None = None, stop: int | None = None) -> Iterator[tuple[int, Any]]:
@@ -123,7 +125,7 @@ class BagFile:
         """The first message of a topic."""
         for _, message in self._messages(topic):
             return message
-        raise InputError(f"bag {self.path} says it holds messages of {topic}, and there are none", "is it damaged?")
+        raise InputError(f"bag {self.path} lists messages of {topic} but holds none", "copy it again")
 
     def index(self, topic: str) -> list[Entry]:
         """Every message of a topic with a header, in the order of the file. Reads all of them once."""
@@ -136,11 +138,11 @@ class BagFile:
         return entries
 
     def message(self, topic: str, entry: Entry) -> Any:
-        """A message of a topic again."""
+        """The message of an entry."""
         for k, (_, message) in enumerate(self._messages(topic, entry.logged, entry.logged + 1)):
             if k == entry.ordinal:
                 return message
-        raise InputError(f"bag {self.path} changed while it was read: a message of {topic} is gone")
+        raise InputError(f"bag {self.path} changed while it was read: a message of {topic} is missing")
 
 
 def _close(reader: Any) -> None:
@@ -149,11 +151,8 @@ def _close(reader: Any) -> None:
 
 
 _COLOUR = ("rgb8", "bgr8", "rgba8", "bgra8", "mono8", "8UC1", "8UC3", "8UC4", "yuv422", "yuv422_yuy2", "uyvy", "yuyv")
-"""Encodings of colour images that are read."""
 _GREY = ("mono8", "8UC1")
-"""Those of them without colour."""
 _DEPTH = ("16UC1", "mono16", "32FC1")
-"""Encodings of depth images that are read."""
 _PNG = b"\x89PNG\r\n\x1a\n"
 
 
@@ -179,7 +178,8 @@ def colour_image(message: Any, compressed: bool, where: str) -> np.ndarray:
     encoding = str(message.encoding)
     if encoding not in _COLOUR:
         raise InputError(
-            f"{where} has encoding {encoding!r}, which is not read as colour", f"read are: {', '.join(_COLOUR)}"
+            f"{where} has encoding {encoding!r}, which is not supported for colour",
+            f"supported: {', '.join(_COLOUR)}",
         )
     if encoding in _GREY:
         return np.repeat(_pixels(message, np.dtype(np.uint8), 1, where), 3, axis=2)
@@ -192,10 +192,12 @@ def colour_image(message: Any, compressed: bool, where: str) -> np.ndarray:
 
 
 def depth_image(message: Any, compressed: bool, depth_scale: float, where: str) -> np.ndarray:
-    """Depth image (H, W) float32 in metres, NaN where there is no reading."""
+    """Depth image (H, W) float32 in metres, NaN without a reading."""
     encoding = image_encoding(message, compressed)
     if encoding not in _DEPTH:
-        raise InputError(f"{where} has encoding {encoding!r}, which is no depth", f"depth is: {', '.join(_DEPTH)}")
+        raise InputError(
+            f"{where} has encoding {encoding!r}, which is not supported for depth", f"supported: {', '.join(_DEPTH)}"
+        )
     if compressed:
         metres = _compressed_depth(bytes(message.data), encoding, depth_scale, where)
     elif encoding == "32FC1":
@@ -212,7 +214,7 @@ def _pixels(message: Any, kind: np.dtype[Any], channels: int, where: str) -> np.
     data = np.asarray(message.data, dtype=np.uint8)
     if min(height, width) < 1 or step < width * channels * kind.itemsize or data.size < height * step:
         raise InputError(
-            f"{where} says {width} x {height} of {message.encoding} in rows of {step} bytes, holds {data.size} bytes"
+            f"{where} has {data.size} bytes for {width} x {height} of {message.encoding} in rows of {step} bytes"
         )
     rows = data[: height * step].reshape(height, step)[:, : width * channels * kind.itemsize]
     order = kind.newbyteorder(">" if message.is_bigendian else "<")
@@ -229,7 +231,7 @@ def _compressed_depth(data: bytes, encoding: str, depth_scale: float, where: str
     if image is None or image.ndim != 2 or image.dtype != np.uint16:
         raise InputError(
             f"{where} is not a 16-bit PNG ({len(data)} bytes)",
-            "compressed depth is read as PNG only, not RVL or JPEG",
+            "compressed depth must be PNG, not RVL or JPEG",
         )
     if encoding != "32FC1":
         return image * np.float32(depth_scale)
@@ -246,7 +248,7 @@ _INFO = "sensor_msgs/msg/CameraInfo"
 
 @dataclass(frozen=True)
 class _Stream:
-    """An image topic and what its first message says."""
+    """An image topic, with properties of its first message."""
 
     topic: Topic
     encoding: str
@@ -261,8 +263,10 @@ class _Stream:
 
 
 @dataclass(frozen=True)
-class Bag(RecordingFormat):
+class Bag(VideoFormat):
     """ROS 1 bag, ROS 2 bag or MCAP: image, compressed image, depth and CameraInfo topics.
+
+    Further parameters: `VideoFormat`. `K` replaces the CameraInfo.
 
     Parameters
     ----------
@@ -272,47 +276,31 @@ class Bag(RecordingFormat):
         Depth topic. Default: the only one that is registered to colour.
     info : str
         CameraInfo topic. Default: ``camera_info`` beside the colour topic.
-    K : tuple of 4 float
-        fx, fy, cx, cy in pixels, instead of a CameraInfo.
-    depth_scale : float
-        Metres a unit of 16-bit depth.
     tolerance_s : float
-        A colour and a depth image at most this far apart are one frame.
+        Largest difference of the time stamps of a colour and a depth image of one frame.
     registered : bool
-        Take depth as registered to colour although its frame_id or camera matrix differs.
-    start_s, stop_s : float
-        Part of the video that is used, in seconds after its first frame.
-    pauses : PauseRule
-        Where the video is cut.
-    world : KnownWorld
-        Pose and workspace, where known.
+        Treat depth as registered to colour although its frame_id or camera matrix differs.
     """
 
     colour: str = ""
     depth: str = ""
     info: str = ""
-    K: tuple[float, ...] = ()
-    depth_scale: float = 0.001
     tolerance_s: float = 0.02
     registered: bool = False
-    start_s: float = 0.0
-    stop_s: float = math.inf
-    pauses: PauseRule = field(default_factory=Still)
-    world: KnownWorld = field(default_factory=KnownWorld)
 
     @classmethod
     def detects(cls, path: Path) -> bool:
-        """See `RecordingFormat`."""
         if path.is_file():
             return path.suffix in (".bag", ".mcap", ".db3")
         return (path / "metadata.yaml").is_file()
 
     def open(self, path: Path) -> Recording:
-        """See `RecordingFormat`."""
         bag = BagFile(path)
         streams = [_stream(bag, t) for t in bag.topics.values() if t.kind in _IMAGES and t.count]
         pictures = [s for s in streams if s.encoding not in _DEPTH]
-        pictures = [s for s in pictures if s.encoding not in _GREY] or pictures  # infrared beside a colour camera
+        pictures = [
+            s for s in pictures if s.encoding not in _GREY
+        ] or pictures  # grey images may be those of an infrared camera
         colour = _choose(path, "colour", self.colour, pictures, streams)
         depth = self._depth(path, colour, streams)
         K, distortion = self._intrinsics(bag, colour, depth)
@@ -334,20 +322,17 @@ class Bag(RecordingFormat):
                 read_rgb(index), metres, f"colour message {pairs[index][0]} of {colour.topic.name}", where
             )
 
-        return (
-            Video(
-                path.resolve().stem,
-                tuple(stamps[0][i] for i, _ in pairs),
-                read,
-                K,
-                path,
-                self.depth_scale if depth.encoding != "32FC1" else 0.00025,
-                read_rgb=read_rgb,
-                distortion=distortion,
-            )
-            .part(self.start_s, self.stop_s)
-            .recording(self.pauses, self.world)
+        video = Video(
+            path.resolve().stem,
+            tuple(stamps[0][i] for i, _ in pairs),
+            read,
+            K,
+            path,
+            self.depth_scale if depth.encoding != "32FC1" else 0.00025,
+            read_rgb=read_rgb,
+            distortion=distortion,
         )
+        return self.recording_of(video)
 
     def _depth(self, path: Path, colour: _Stream, streams: list[_Stream]) -> _Stream:
         found = [s for s in streams if s.encoding in _DEPTH]
@@ -361,8 +346,8 @@ class Bag(RecordingFormat):
             )
         if depth.frame_id != colour.frame_id and not self.registered:
             raise InputError(
-                f"{path}: depth {depth} is seen from another frame than colour {colour}: it is not registered",
-                "record the aligned depth; or, if it is registered after all: registered=true",
+                f"{path}: depth {depth} has another frame than colour {colour}: it is not registered",
+                "record the aligned depth; or, if it is registered: registered=true",
             )
         return depth
 
@@ -373,15 +358,15 @@ class Bag(RecordingFormat):
         if self.K:
             return self.K, ()
         infos = [t.name for t in bag.topics.values() if t.kind == _INFO and t.count]
-        beside = _info_beside(colour.topic)
+        usual = _info_topic(colour.topic)
         if self.info and self.info not in infos:
             raise InputError(
                 f"{bag.path}: no CameraInfo topic {self.info!r}", f"there are: {', '.join(infos) or 'none'}"
             )
-        name = self.info or (beside if beside in infos else "")
+        name = self.info or (usual if usual in infos else "")
         if not name:
             raise InputError(
-                f"{bag.path}: intrinsics are missing, there is no {beside} beside {colour.topic.name}",
+                f"{bag.path}: intrinsics are missing, there is no {usual} for {colour.topic.name}",
                 f"choose one: info=TOPIC, of {', '.join(infos)}" if infos else "give them: K=fx,fy,cx,cy",
             )
         info = _camera_info(bag, name, "rect" in colour.topic.name)
@@ -390,13 +375,13 @@ class Bag(RecordingFormat):
                 f"{bag.path}: {name} is of images of {info['width']} x {info['height']}, {colour} is not",
                 "choose the CameraInfo of the colour camera: info=TOPIC",
             )
-        other = _info_beside(depth.topic)
+        other = _info_topic(depth.topic)
         if not self.registered and not self.info and other in infos and other != name:
-            theirs = _camera_info(bag, other, "rect" in depth.topic.name)
-            if not np.allclose(theirs["matrix"], info["matrix"], atol=1.0) and theirs["width"]:
+            of_depth = _camera_info(bag, other, "rect" in depth.topic.name)
+            if not np.allclose(of_depth["matrix"], info["matrix"], atol=1.0) and of_depth["width"]:
                 raise InputError(
                     f"{bag.path}: camera matrices of {name} and {other} differ: depth is not registered to colour",
-                    "record the aligned depth; or, if it is registered after all: registered=true",
+                    "record the aligned depth; or, if it is registered: registered=true",
                 )
         matrix = info["matrix"]
         return (matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]), info["distortion"]
@@ -422,7 +407,7 @@ def _choose(path: Path, what: str, name: str, candidates: list[_Stream], streams
         if chosen is None:
             raise InputError(f"{path}: no image topic {name!r} for {what}", "image topics are:", *listed)
         if (chosen.encoding in _DEPTH) != (what == "depth"):
-            raise InputError(f"{path}: {chosen} holds no {what} images", "image topics are:", *listed)
+            raise InputError(f"{path}: {chosen} has no {what} images", "image topics are:", *listed)
         return chosen
     if not candidates:
         raise InputError(f"{path}: there is no {what} topic", *(["image topics are:", *listed] if listed else []))
@@ -435,8 +420,8 @@ def _choose(path: Path, what: str, name: str, candidates: list[_Stream], streams
     return candidates[0]
 
 
-def _info_beside(topic: Topic) -> str:
-    """Where image_transport puts the CameraInfo of an image topic."""
+def _info_topic(topic: Topic) -> str:
+    """The CameraInfo topic of an image topic, as image_transport names it."""
     parts = topic.name.split("/")
     if parts[-1] in ("compressed", "compressedDepth"):
         parts = parts[:-1]
@@ -444,21 +429,21 @@ def _info_beside(topic: Topic) -> str:
 
 
 def _camera_info(bag: BagFile, name: str, rectified: bool) -> dict[str, Any]:
-    """Camera matrix of what the images show, distortion still in them, and their size."""
+    """Camera matrix, distortion and size of the images."""
     message = bag.first(name)
     D, K, P = (message.d, message.k, message.p) if bag.is_ros2 else (message.D, message.K, message.P)
     raw, projection = np.reshape(np.asarray(K, float), (3, 3)), np.reshape(np.asarray(P, float), (3, 4))[:, :3]
     if raw[0, 0] <= 0:
         raise InputError(
-            f"{bag.path}: {name} has an empty camera matrix: the camera is not calibrated", "K=fx,fy,cx,cy"
+            f"{bag.path}: {name} has an empty camera matrix: the camera is not calibrated", "give it: K=fx,fy,cx,cy"
         )
     model, distortion = str(message.distortion_model), tuple(float(v) for v in D)
     if rectified and projection[0, 0] > 0:
         raw, distortion = projection, ()
     if any(distortion) and model not in ("plumb_bob", "rational_polynomial", ""):
         raise InputError(
-            f"{bag.path}: {name} has distortion model {model!r}, which is not read",
-            "rectify the images (image_proc), or give K=fx,fy,cx,cy to leave the distortion in",
+            f"{bag.path}: {name} has distortion model {model!r}, which is not supported",
+            "rectify the images (image_proc), or give K=fx,fy,cx,cy to ignore the distortion",
         )
     return {
         "matrix": raw,

@@ -37,18 +37,23 @@ __all__ = ["Bop", "Dsr"]
 
 @dataclass(frozen=True)
 class Bop(RecordingFormat):
-    """BOP: a scene's folder with scene_camera.json, rgb/, depth/; mask_visib/ as true instances.
+    """BOP: the folder of a scene with scene_camera.json, rgb/, depth/; mask_visib/ as true instances.
+
+    ``scene_camera.json`` gives ``cam_K`` and ``depth_scale`` (millimetres per unit) of each image, and sometimes the
+    camera pose ``cam_R_w2c``, ``cam_t_w2c`` (mm). The mask of the k-th annotated object has label k + 1 in the
+    instance image. By default every image is a pause, because the scenes are single images rather than videos.
+    Format: Hodan et al. 2018, https://github.com/thodan/bop_toolkit.
 
     Parameters
     ----------
     images : tuple of int
         Numbers of the images to use, in order. Default: all.
     fps : float
-        The layout has no times: image k is at k / fps seconds.
+        Images per second; the layout stores no times.
     pauses : PauseRule
-        Which images are pauses.
+        The rule that finds the pauses.
     world : KnownWorld
-        Pose and workspace, where known.
+        Pose and workspace, if they are known.
     """
 
     images: tuple[int, ...] = ()
@@ -58,11 +63,9 @@ class Bop(RecordingFormat):
 
     @classmethod
     def detects(cls, path: Path) -> bool:
-        """See `RecordingFormat`."""
         return (path / "scene_camera.json").is_file()
 
     def open(self, path: Path) -> Recording:
-        """See `RecordingFormat`."""
         cameras = _cameras(path / "scene_camera.json")
         chosen = self.images or tuple(sorted(cameras))
         absent = [k for k in chosen if k not in cameras]
@@ -113,12 +116,12 @@ def _cameras(path: Path) -> dict[int, dict[str, Any]]:
             entry["depth_scale"] = float(entry["depth_scale"])
     except FileNotFoundError:
         raise InputError(
-            f"not a BOP scene: {path} is missing", "give the folder of one scene, like test/000048"
+            f"not a BOP scene: {path} is missing", "give the folder of one scene, for example test/000048"
         ) from None
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise InputError(
             f"{path} does not give cam_K and depth_scale of each image: {error}",
-            "depth_scale times a stored value is millimetres",
+            "depth_scale is in millimetres per unit",
         ) from error
     return found
 
@@ -132,12 +135,12 @@ def _image(path: Path, parts: tuple[str, ...], k: int) -> Path:
                 return file
     raise InputError(
         f"image is missing: {path / parts[0] / f'{k:06d}.png'}",
-        "scene_camera.json names it; each image needs colour and depth",
+        "scene_camera.json lists it; each image needs colour and depth",
     )
 
 
 def _motion(cameras: dict[int, dict[str, Any]], chosen: tuple[int, ...]) -> list[RigidTransform] | None:
-    """T_world_camera of each image in BOP's world, None where one is unknown."""
+    """T_world_camera of each image in the world of BOP; None if one is unknown."""
     if not all("cam_R_w2c" in cameras[k] and "cam_t_w2c" in cameras[k] for k in chosen):
         return None
     poses = []
@@ -147,13 +150,13 @@ def _motion(cameras: dict[int, dict[str, Any]], chosen: tuple[int, ...]) -> list
             matrix[:3, :3] = np.reshape(cameras[k]["cam_R_w2c"], (3, 3))
             matrix[:3, 3] = np.asarray(cameras[k]["cam_t_w2c"], dtype=float) / 1000
         except ValueError as error:
-            raise InputError(f"scene_camera.json: pose of image {k} is no pose: {error}") from error
+            raise InputError(f"scene_camera.json: pose of image {k} is not a pose: {error}") from error
         poses.append(rigid_from_matrix(matrix, f"scene_camera.json: pose of image {k}").inv())
     return poses
 
 
 def _instances(path: Path, k: int) -> np.ndarray | None:
-    """Label image (H, W) uint16 from the masks of an image; None where there are none."""
+    """Label image (H, W) uint16 from the masks of an image; None if there are none."""
     masks = sorted((path / "mask_visib").glob(f"{k:06d}_*.png"))
     if not masks:
         return None
@@ -168,22 +171,28 @@ def _instances(path: Path, k: int) -> np.ndarray | None:
 
 
 _KEYS = ("tsdf", "mask_3d", "color_heightmap")
-_ABOVE = 1.0  # metres from the table to the drawn camera
-_PIXELS = 2  # along a voxel at the table
+_CAMERA_HEIGHT = 1.0  # metres above the table
+_PIXELS = 2  # per voxel at the table
 
 
 @dataclass(frozen=True)
 class Dsr(RecordingFormat):
-    """DSR-Net: hdf5 volumes of each step; frames are drawn from above, mask_3d is the truth.
+    """DSR-Net: hdf5 volumes of each step; frames are rendered from above, mask_3d is the ground truth.
+
+    The data are one file per step, ``ID_k.hdf5``, with volumes at 4 mm: ``tsdf`` and ``mask_3d`` (true objects, also
+    hidden parts), both (y, x, z), and a top view ``color_heightmap``. There are no camera images. The frames are
+    rendered: a camera 1 m above the table looks down on the heights of the tsdf, with the colours of the height map.
+    They show less than a slanted view and have no sensor noise; the manifest says so. Every step is a pause.
+    Needs h5py (extra ``h5py``). Format: Xu, He et al. 2020, https://github.com/columbia-ai-robotics/dsr.
 
     Parameters
     ----------
     sequence : str or int
-        Which sequence, the part of the file names before the last ``_``. Default: the only one.
+        The sequence: the part of the file names before the last ``_``. Default: the only one.
     voxel_size : float
         Metres.
     origin : tuple of 3 float
-        World x, y, z (metres) of voxel 0, 0, 0; its z is the table's.
+        World x, y, z (metres) of voxel 0, 0, 0; z is the height of the table.
     """
 
     sequence: str | int = ""
@@ -192,11 +201,9 @@ class Dsr(RecordingFormat):
 
     @classmethod
     def detects(cls, path: Path) -> bool:
-        """See `RecordingFormat`."""
         return path.is_dir() and any(path.glob("*_0.hdf5"))
 
     def open(self, path: Path) -> Recording:
-        """See `RecordingFormat`."""
         steps = self._steps(path)
         shape = _read(steps[0])["tsdf"].shape
         # Voxel k of the data is centred at origin + k * size, of ours at origin + (k + 1/2) * size.
@@ -205,8 +212,8 @@ class Dsr(RecordingFormat):
         middle = self.voxel_size * np.array(grid.shape) / 2 + corner
         table = np.array([middle[0], middle[1], self.origin[2]])
         width, height = grid.shape[0] * _PIXELS, grid.shape[1] * _PIXELS
-        focal = _PIXELS * _ABOVE / self.voxel_size
-        pose = look_at(table + [0, 0, _ABOVE], table, up=(0, 1, 0))
+        focal = _PIXELS * _CAMERA_HEIGHT / self.voxel_size
+        pose = look_at(table + [0, 0, _CAMERA_HEIGHT], table, up=(0, 1, 0))
         camera = Camera.from_intrinsics(focal, focal, (width - 1) / 2, (height - 1) / 2, width, height, pose)
 
         def volumes(index: int) -> dict[str, np.ndarray]:
@@ -219,7 +226,7 @@ class Dsr(RecordingFormat):
             return as_labels(np.swapaxes(volumes(index)["mask_3d"], 0, 1), f"{steps[index]}: mask_3d")
 
         return Recording(
-            LazyFrames(lambda index: _draw(volumes(index), grid, camera), len(steps)),
+            LazyFrames(lambda index: _rendered(volumes(index), grid, camera), len(steps)),
             grid,
             tuple(range(len(steps))),
             tuple(float(k) for k in range(len(steps))),
@@ -273,7 +280,7 @@ def _read(path: Path) -> dict[str, np.ndarray]:
     return data
 
 
-def _draw(data: dict[str, np.ndarray], grid: VoxelGrid, camera: Camera) -> Frame:
+def _rendered(data: dict[str, np.ndarray], grid: VoxelGrid, camera: Camera) -> Frame:
     """Colour and depth from above: columns up to the highest voxel behind the surface, the table elsewhere."""
     behind = np.swapaxes(data["tsdf"], 0, 1) < 0
     behind[..., 0] = False  # the table itself

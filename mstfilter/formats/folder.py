@@ -64,7 +64,7 @@ VERSION = 1
 
 
 def check_writable(path: Path) -> None:
-    """Whether a new recording may be called so: nothing is there, or an empty folder."""
+    """Raise InputError unless the path does not exist or is an empty folder."""
     if path.exists() and (not path.is_dir() or any(path.iterdir())):
         raise InputError(
             f"cannot write a recording to {path}: it exists and is not an empty folder",
@@ -78,15 +78,15 @@ class RecordingWriter:
     Parameters
     ----------
     path : path
-        The folder to make. It must not exist, or be empty.
+        The new folder. It must not exist, or be empty.
     camera : Camera
         Intrinsics, and the pose if it is known.
     grid : VoxelGrid, optional
         Workspace.
     depth_scale : float
-        Metres a unit of the 16-bit depth images.
+        Metres per unit of the 16-bit depth images.
     **manifest
-        What else manifest.json should say: generator, seed, ...
+        Further entries of manifest.json: generator, seed, ...
     """
 
     def __init__(
@@ -126,7 +126,7 @@ class RecordingWriter:
         poses: Mapping[Any, Any] | None = None,
         **entry: Any,
     ) -> int:
-        """Add a frame; its index.
+        """Add a frame and return its index.
 
         Parameters
         ----------
@@ -137,7 +137,7 @@ class RecordingWriter:
         time_s : float
             Seconds.
         role : {"static", "action"}
-            At a pause, or between.
+            At a pause, or between pauses.
         instance : (H, W) uint8 or uint16, optional
             True object of each pixel.
         robot_mask : (H, W) bool, optional
@@ -145,11 +145,11 @@ class RecordingWriter:
         poses : dict, optional
             True 4x4 T_world_object by object number.
         **entry
-            What else the manifest should say of the frame.
+            Further entries of the frame in the manifest.
         """
         index = len(self._frames)
         units = np.rint(np.nan_to_num(np.asarray(depth, dtype=np.float64) / self._scale, nan=0.0, posinf=0.0))
-        units[(units < 0) | (units > 65535)] = 0  # out of the file's range: no reading, not its largest number
+        units[(units < 0) | (units > 65535)] = 0  # out of range: no reading
         images: dict[str, np.ndarray | None] = {
             "rgb": rgb,
             "depth": units.astype(np.uint16),
@@ -174,7 +174,7 @@ class RecordingWriter:
         return index
 
     def add_voxels(self, labels: np.ndarray) -> None:
-        """True labels (X, Y, Z) at the frame added last."""
+        """Add the true labels (X, Y, Z) at the frame that was added last."""
         if self._grid is None or labels.shape != self._grid.shape:
             raise InputError(
                 f"true labels have shape {labels.shape}, the workspace is {self._grid and self._grid.shape}"
@@ -183,7 +183,7 @@ class RecordingWriter:
         self._voxel_frames.append(len(self._frames) - 1)
 
     def close(self) -> Path:
-        """Write what is left and give the folder its name."""
+        """Write the remaining files and rename the folder to its final name."""
         camera = self._camera
         described: dict[str, Any] = {
             "K": camera.K.tolist(),
@@ -223,16 +223,16 @@ class RecordingWriter:
 
     @contextlib.contextmanager
     def _writing(self) -> Iterator[None]:
-        """A disk that is full or not writable is the user's to mend."""
+        """Turn errors of the disk into InputError."""
         try:
             yield
         except OSError as error:
             raise InputError(
-                f"cannot write recording {self.path}: {error.strerror}", "nothing of it is left behind"
+                f"cannot write recording {self.path}: {error.strerror}", "the unfinished files are removed"
             ) from error
 
     def discard(self) -> None:
-        """Leave nothing behind."""
+        """Remove all files written so far."""
         shutil.rmtree(self._folder, ignore_errors=True)
 
     def __enter__(self) -> RecordingWriter:
@@ -258,18 +258,18 @@ def save_recording(
     progress: Callable[[int, int], None] = lambda done, total: None,
     **manifest: Any,
 ) -> Path:
-    """Write any recording as a folder of our own; a camera that moves keeps its pose in every frame.
+    """Write a recording as a recording folder; if the camera moves, every frame stores its pose.
 
     Parameters
     ----------
     recording : Recording
-        What to write. Its depth is stored in units of its `depth_scale`.
+        The recording. Depth is stored in units of its `depth_scale`.
     path : path
-        The folder to make. It must not exist, or be empty.
+        The new folder. It must not exist, or be empty.
     progress : callable
-        Called with (frames done, frames in all).
+        Called with the number of frames written and the number of all frames.
     **manifest
-        What else manifest.json should say: generator, ...
+        Further entries of manifest.json: generator, ...
     """
     home, total = recording.frames[recording.pauses[0]].camera, len(recording)
     manifest = {"name": recording.name, "depth_scale": recording.depth_scale, **manifest}
@@ -280,14 +280,14 @@ def save_recording(
             if not np.array_equal(frame.camera.K, home.K):
                 raise InputError(
                     f"frame {index} of {recording.name} has camera matrix {frame.camera.K.tolist()}, frame "
-                    f"{recording.pauses[0]} has {home.K.tolist()}: a recording folder holds one",
+                    f"{recording.pauses[0]} has {home.K.tolist()}: a recording folder stores one",
                     "convert frames of one camera only",
                 )
             if frame.views:
                 raise InputError(
                     f"frame {index} of {recording.name} has images of {len(frame.all_views)} cameras: a recording "
-                    "folder holds those of one",
-                    "write one recording a camera, and join their frames by Frame(..., views=...)",
+                    "folder stores one",
+                    "write one recording per camera, and join their frames by Frame(..., views=...)",
                 )
             moved = {} if frame.camera.key == home.key else {"T_world_camera": frame.camera.pose.as_matrix().tolist()}
             writer.add_frame(
@@ -357,9 +357,9 @@ def _load(path: Path, model: type[BaseModel]) -> Any:
         first = error.errors()[0]
         where = ".".join(str(part) for part in first["loc"])
         hint = (
-            "metres a unit: 0.001 for millimetres, 0.0002 for TUM images; there is no safe default"
+            "metres per unit: 0.001 for millimetres, 0.0002 for TUM images; it has no default"
             if "depth_scale" in where
-            else "the layout is described in mstfilter.scene.recording"
+            else "the layout is described in mstfilter.formats.folder"
         )
         found = first["input"]
         value = "nothing" if first["type"] == "missing" else repr(found)[:80]
@@ -368,23 +368,20 @@ def _load(path: Path, model: type[BaseModel]) -> Any:
 
 @dataclass(frozen=True)
 class RecordingFolder(RecordingFormat):
-    """Our own recording folder: manifest.json, camera.json, rgb/, depth/."""
+    """The recording folder of mstfilter: manifest.json, camera.json, rgb/, depth/."""
 
     @classmethod
     def detects(cls, path: Path) -> bool:
-        """See `RecordingFormat`."""
         return (path / "manifest.json").is_file()
 
     def open(self, path: Path) -> Recording:
-        """See `RecordingFormat`."""
         return open_recording(path)
 
 
 def open_recording(path: str | Path) -> Recording:
-    """Read a recording folder.
+    """Read a recording folder. Images are read when they are used; everything else is checked now.
 
-    Everything but the images is checked now. Images are read when they are first used; `Recording.check` reads them
-    all.
+    `Recording.check` reads all images.
     """
     path = Path(path)
     if not path.is_dir():
@@ -394,13 +391,13 @@ def open_recording(path: str | Path) -> Recording:
             f"recording folder is empty: {path}",
             "a recording folder holds manifest.json, camera.json, rgb/, depth/",
         )
-    manifest, raw = _load(path / "manifest.json", _Manifest)
-    described, _ = _load(path / "camera.json", _CameraFile)
+    manifest, manifest_data = _load(path / "manifest.json", _Manifest)
+    camera_file, _ = _load(path / "camera.json", _CameraFile)
     if manifest.version != VERSION:
-        raise InputError(f"{path / 'manifest.json'}: version is {manifest.version}, this program reads {VERSION}")
-    if not (math.isfinite(described.depth_scale) and described.depth_scale > 0):
+        raise InputError(f"{path / 'manifest.json'}: version is {manifest.version}, expected {VERSION}")
+    if not (math.isfinite(camera_file.depth_scale) and camera_file.depth_scale > 0):
         raise InputError(
-            f"{path / 'camera.json'}: depth_scale is {described.depth_scale}, expected metres a unit > 0"
+            f"{path / 'camera.json'}: depth_scale is {camera_file.depth_scale}, expected metres per unit > 0"
         )
     entries = manifest.frames
     if [e.index for e in entries] != list(range(len(entries))):
@@ -409,11 +406,11 @@ def open_recording(path: str | Path) -> Recording:
         raise InputError(f"{path / 'manifest.json'}: there are no frames")
 
     where = f"{path / 'camera.json'}: T_world_camera"
-    pose = None if described.T_world_camera is None else rigid_from_matrix(described.T_world_camera, where)
-    camera = Camera(described.K, described.width, described.height, pose)
+    pose = None if camera_file.T_world_camera is None else rigid_from_matrix(camera_file.T_world_camera, where)
+    camera = Camera(camera_file.K, camera_file.width, camera_file.height, pose)
     grid = None
-    if described.workspace is not None:
-        w = described.workspace
+    if camera_file.workspace is not None:
+        w = camera_file.workspace
         grid = VoxelGrid.from_bounds(np.array(w.min), np.array(w.max), w.voxel)
     pauses = tuple(e.index for e in entries if e.role == "static")
     if not pauses:
@@ -425,9 +422,11 @@ def open_recording(path: str | Path) -> Recording:
         if e.T_world_camera is not None
     }
 
+    scale = camera_file.depth_scale
+
     def read(index: int, view: Camera) -> Frame:
         name = f"{index:06d}.png"
-        rgb, depth = read_rgb(path / "rgb" / name), read_depth(path / "depth" / name, described.depth_scale)
+        rgb, depth = read_rgb(path / "rgb" / name), read_depth(path / "depth" / name, scale)
         for what, image in (("rgb", rgb), ("depth", depth)):
             if image.shape[:2] != (view.height, view.width):
                 raise InputError(
@@ -437,7 +436,9 @@ def open_recording(path: str | Path) -> Recording:
         readings = depth[np.isfinite(depth)]
         if readings.size == 0:
             raise InputError(f"depth image {path / 'depth' / name} has no reading at all: every pixel is 0")
-        check_depth_range(readings, f"depth image {path / 'depth' / name} with depth_scale {described.depth_scale:g}")
+        check_depth_range(
+            readings, f"depth image {path / 'depth' / name} with depth_scale {camera_file.depth_scale:g}"
+        )
         robot_path = path / "robot" / name
         robot = read_labels(robot_path) > 0 if robot_path.exists() else None
         return Frame(rgb, depth, view, robot)
@@ -460,10 +461,10 @@ def open_recording(path: str | Path) -> Recording:
         grid,
         pauses,
         tuple(e.time_s for e in entries),
-        name=str(raw.get("name") or path.name),
-        depth_scale=described.depth_scale,
+        name=str(manifest_data.get("name") or path.name),
+        depth_scale=scale,
         path=path,
-        manifest=raw,
+        manifest=manifest_data,
         read_truth=_read_voxels(truth, grid, pauses) if truth.exists() else lambda t: None,
         read_instance=read_instance,
         read_poses=_read_poses(true_poses) if true_poses.exists() else lambda index: None,
@@ -471,7 +472,7 @@ def open_recording(path: str | Path) -> Recording:
 
 
 def _read_poses(path: Path) -> Any:
-    """A `read_poses`; the file is looked at when it is first asked for."""
+    """A `read_poses` that reads the file when it is first called."""
 
     @cache
     def load() -> dict[int, dict[int, np.ndarray]]:

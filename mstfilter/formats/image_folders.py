@@ -8,17 +8,15 @@
 from __future__ import annotations
 
 import json
-import math
 import re
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from mstfilter.errors import InputError
-from mstfilter.formats.pauses import PauseRule, Still
-from mstfilter.formats.video import KnownWorld, RecordingFormat, RgbdImages, Video, pair_stamps
+from mstfilter.formats.video import RecordingFormat, RgbdImages, Video, VideoFormat, pair_stamps
 from mstfilter.scene import Recording, read_depth, read_rgb, rigid_from_matrix
 
 __all__ = ["PairedImages", "Redwood", "Tum"]
@@ -27,6 +25,9 @@ __all__ = ["PairedImages", "Redwood", "Tum"]
 @dataclass(frozen=True)
 class PairedImages(RecordingFormat):
     """A folder of pairs NAME_rgb.png, NAME_depth.png with an info.json; every frame is a pause.
+
+    ``info.json`` holds ``K`` (fx, fy, cx, cy, or a 3x3 matrix) and ``depth_scale_m``, metres per unit of the 16-bit
+    depth images. There is no pose: the world is found from the support plane.
 
     Parameters
     ----------
@@ -38,11 +39,9 @@ class PairedImages(RecordingFormat):
 
     @classmethod
     def detects(cls, path: Path) -> bool:
-        """See `RecordingFormat`."""
         return (path / "info.json").is_file() and any(path.glob("*_rgb.png"))
 
     def open(self, path: Path) -> Recording:
-        """See `RecordingFormat`."""
         try:
             info = json.loads((path / "info.json").read_text())
             K = np.asarray(info["K"], dtype=float)
@@ -74,48 +73,36 @@ _INTRINSICS = ("intrinsic.json", "camera_intrinsic.json", "intrinsics.json")
 
 
 @dataclass(frozen=True)
-class Redwood(RecordingFormat):
-    """Redwood / Open3D: color/, depth/, intrinsic.json, and a trajectory .log where the camera moves.
+class Redwood(VideoFormat):
+    """Redwood / Open3D: color/, depth/, intrinsic.json, and a trajectory .log if the camera moves.
+
+    ``intrinsic.json`` (or ``camera_intrinsic.json``) is the file of Open3D: width, height, ``intrinsic_matrix``
+    column by column. A trajectory has five lines per frame: three numbers, then a 4x4 camera-to-world matrix. Images
+    are paired by the first number in their names. Format: http://redwood-data.org/indoor/fileformat.html.
+
+    Further parameters: `VideoFormat`.
 
     Parameters
     ----------
-    K : tuple of 4 float
-        fx, fy, cx, cy in pixels. Default: from intrinsic.json.
     distortion : tuple of float
         OpenCV's k1, k2, p1, p2, k3.
-    depth_scale : float
-        Metres a unit.
     fps : float
-        The layout has no times: frame k is at k / fps seconds.
+        Frames per second; the layout stores no times.
     moving : bool
-        Use the trajectory where there is one.
-    start_s, stop_s : float
-        Part of the video that is used, in seconds after its first frame.
-    pauses : PauseRule
-        Where the video is cut.
-    world : KnownWorld
-        Pose and workspace, where known.
+        Use the trajectory, if there is one.
     """
 
-    K: tuple[float, ...] = ()
     distortion: tuple[float, ...] = ()
-    depth_scale: float = 0.001
     fps: float = 30.0
     moving: bool = True
-    start_s: float = 0.0
-    stop_s: float = math.inf
-    pauses: PauseRule = field(default_factory=Still)
-    world: KnownWorld = field(default_factory=KnownWorld)
 
     @classmethod
     def detects(cls, path: Path) -> bool:
-        """See `RecordingFormat`."""
         known = any((path / name).is_file() for name in _INTRINSICS) or any(path.glob("*.log"))
-        folders = _COLOUR if known else _COLOUR[:2]  # rgb/ and depth/ alone may be anything
+        folders = _COLOUR if known else _COLOUR[:2]  # rgb/ and depth/ occur in other layouts, too
         return (path / "depth").is_dir() and any((path / name).is_dir() for name in folders)
 
     def open(self, path: Path) -> Recording:
-        """See `RecordingFormat`."""
         folder = next((path / name for name in _COLOUR if (path / name).is_dir()), path / _COLOUR[0])
         colour, depth = _numbered(folder), _numbered(path / "depth")
         if len(colour) != len(depth):
@@ -126,7 +113,7 @@ class Redwood(RecordingFormat):
         for a, b in zip(colour, depth, strict=True):
             if _number(a) != _number(b):
                 raise InputError(
-                    f"{path}: colour image {a.name} would be paired with depth image {b.name}",
+                    f"{path}: colour image {a.name} does not fit depth image {b.name}",
                     "an image is missing, or the two are numbered differently; rename one side to match",
                 )
 
@@ -136,37 +123,36 @@ class Redwood(RecordingFormat):
 
         logs = sorted(path.glob("*.log")) if self.moving else []
         if len(logs) > 1:
-            raise InputError(f"{path} holds {len(logs)} trajectories: {', '.join(p.name for p in logs)}", "keep one")
-        return (
-            Video(
-                path.resolve().name,
-                tuple(k / self.fps for k in range(len(colour))),
-                read,
-                self.K or _intrinsics(path),
-                path,
-                self.depth_scale,
-                read_rgb=lambda index: read_rgb(colour[index]),
-                motion=_trajectory(logs[0], len(colour)) if logs else None,
-                distortion=self.distortion,
+            raise InputError(
+                f"{path} has {len(logs)} trajectories: {', '.join(p.name for p in logs)}", "remove all but one"
             )
-            .part(self.start_s, self.stop_s)
-            .recording(self.pauses, self.world)
+        video = Video(
+            path.resolve().name,
+            tuple(k / self.fps for k in range(len(colour))),
+            read,
+            self.K or _intrinsics(path),
+            path,
+            self.depth_scale,
+            read_rgb=lambda index: read_rgb(colour[index]),
+            motion=_trajectory(logs[0], len(colour)) if logs else None,
+            distortion=self.distortion,
         )
+        return self.recording_of(video)
 
 
 def _numbered(folder: Path) -> list[Path]:
-    """Images of a folder in the order of the first number in their names."""
+    """Images of a folder, ordered by the first number in their names."""
     if not folder.is_dir():
         raise InputError(f"not a Redwood folder: {folder} is missing", "it holds color/ and depth/")
     files = [p for p in folder.iterdir() if p.suffix.lower() in _SUFFIXES and not p.name.startswith(".")]
     if not files:
-        raise InputError(f"{folder} holds no image", f"expected {', '.join(_SUFFIXES)}")
+        raise InputError(f"{folder} has no image", f"expected {', '.join(_SUFFIXES)}")
 
     return sorted(files, key=lambda file: (_number(file), file.name))
 
 
 def _number(file: Path) -> int:
-    """The first number in the name; -1 without any."""
+    """The first number in the name; -1 if there is none."""
     found = re.search(r"\d+", file.stem)
     return int(found.group()) if found else -1
 
@@ -177,12 +163,12 @@ def _intrinsics(path: Path) -> tuple[float, ...]:
     if file is None:
         raise InputError(
             f"{path}: intrinsics are missing, there is no {_INTRINSICS[0]}",
-            "give them: K=fx,fy,cx,cy (Redwood's own default is 525,525,319.5,239.5)",
+            "give them: K=fx,fy,cx,cy (the default of Redwood is 525,525,319.5,239.5)",
         )
     try:
         matrix = np.reshape(np.asarray(json.loads(file.read_text())["intrinsic_matrix"], dtype=float), (3, 3)).T
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(f"{file} does not hold Open3D's intrinsic_matrix: {error!r}") from error
+        raise InputError(f"{file} does not hold an Open3D intrinsic_matrix: {error!r}") from error
     if not np.allclose(matrix[2], (0, 0, 1)):
         raise InputError(
             f"{file}: intrinsic_matrix is {matrix.T.ravel().tolist()}, expected 9 numbers column by column",
@@ -196,61 +182,49 @@ def _trajectory(path: Path, n: int) -> list[RigidTransform]:
     try:
         rows = [[float(v) for v in line.split()] for line in path.read_text().splitlines() if line.strip()]
     except (OSError, ValueError) as error:
-        raise InputError(f"trajectory cannot be read: {path} ({error})", "or leave it out: moving=false") from error
+        raise InputError(f"trajectory cannot be read: {path} ({error})", "or ignore it: moving=false") from error
     if len(rows) != 5 * n or any(len(row) != (3 if k % 5 == 0 else 4) for k, row in enumerate(rows)):
         raise InputError(
-            f"trajectory {path} has {len(rows)} lines for {n} frames, expected five a frame: 3 numbers, then 4 x 4",
-            "or leave it out: moving=false",
+            f"trajectory {path} has {len(rows)} lines for {n} frames, expected five per frame: 3 numbers, then 4 x 4",
+            "or ignore it: moving=false",
         )
     return [rigid_from_matrix(np.array(rows[5 * k + 1 : 5 * k + 5]), f"{path}: pose of frame {k}") for k in range(n)]
 
 
 @dataclass(frozen=True)
-class Tum(RecordingFormat):
-    """TUM RGB-D: rgb.txt, depth.txt, groundtruth.txt where the camera moves; K has to be given.
+class Tum(VideoFormat):
+    """TUM RGB-D: rgb.txt, depth.txt, groundtruth.txt if the camera moves; K must be given.
+
+    Lines of rgb.txt and depth.txt are ``timestamp filename``, those of groundtruth.txt
+    ``timestamp tx ty tz qx qy qz qw``. Depth is in units of 1/5000 m. Format: Sturm et al. 2012.
+
+    Further parameters: `VideoFormat`.
 
     Parameters
     ----------
-    K : tuple of 4 float
-        fx, fy, cx, cy in pixels.
     distortion : tuple of float
         OpenCV's k1, k2, p1, p2, k3.
-    depth_scale : float
-        Metres a unit.
     tolerance_s : float
-        A colour and a depth image at most this far apart are one frame.
+        Largest difference of the time stamps of a colour and a depth image of one frame.
     moving : bool
-        Use groundtruth.txt where it is present.
-    start_s, stop_s : float
-        Part of the video that is used, in seconds after its first frame.
-    pauses : PauseRule
-        Where the video is cut.
-    world : KnownWorld
-        Pose and workspace, where known.
+        Use groundtruth.txt, if it exists.
     """
 
-    K: tuple[float, ...] = ()
-    distortion: tuple[float, ...] = ()
     depth_scale: float = 0.0002
+    distortion: tuple[float, ...] = ()
     tolerance_s: float = 0.02
     moving: bool = True
-    start_s: float = 0.0
-    stop_s: float = math.inf
-    pauses: PauseRule = field(default_factory=Still)
-    world: KnownWorld = field(default_factory=KnownWorld)
 
     @classmethod
     def detects(cls, path: Path) -> bool:
-        """See `RecordingFormat`."""
         return (path / "rgb.txt").is_file() and (path / "depth.txt").is_file()
 
     def open(self, path: Path) -> Recording:
-        """See `RecordingFormat`."""
         colour, depth = (_table(path / name, 2) for name in ("rgb.txt", "depth.txt"))
         if not self.K:
             raise InputError(
-                f"{path}: intrinsics are missing, TUM folders hold none",
-                "give them: K=fx,fy,cx,cy (TUM's own default is 525,525,319.5,239.5)",
+                f"{path}: intrinsics are missing, TUM folders do not store them",
+                "give them: K=fx,fy,cx,cy (the default of TUM is 525,525,319.5,239.5)",
             )
         stamps = [[float(row[0]) for row in table] for table in (colour, depth)]
         pairs = pair_stamps(stamps[0], stamps[1], self.tolerance_s, str(path))
@@ -266,25 +240,22 @@ class Tum(RecordingFormat):
 
         times = tuple(stamps[0][i] for i, _ in pairs)
         truth = path / "groundtruth.txt"
-        return (
-            Video(
-                path.resolve().name,
-                times,
-                read,
-                self.K,
-                path,
-                self.depth_scale,
-                read_rgb=lambda index: read_rgb(path / colour[pairs[index][0]][1]),
-                motion=_motion(truth, times) if self.moving and truth.is_file() else None,
-                distortion=self.distortion,
-            )
-            .part(self.start_s, self.stop_s)
-            .recording(self.pauses, self.world)
+        video = Video(
+            path.resolve().name,
+            times,
+            read,
+            self.K,
+            path,
+            self.depth_scale,
+            read_rgb=lambda index: read_rgb(path / colour[pairs[index][0]][1]),
+            motion=_motion(truth, times) if self.moving and truth.is_file() else None,
+            distortion=self.distortion,
         )
+        return self.recording_of(video)
 
 
 def _table(path: Path, columns: int) -> list[list[str]]:
-    """Rows of a text file, comments left out."""
+    """Rows of a text file without comments."""
     try:
         lines = path.read_text().splitlines()
     except FileNotFoundError:
@@ -309,7 +280,7 @@ def _table(path: Path, columns: int) -> list[list[str]]:
 
 
 def _motion(path: Path, times: tuple[float, ...]) -> list[RigidTransform]:
-    """Camera poses at given times, from the nearest line."""
+    """Camera poses at given times: those of the nearest lines."""
     try:
         rows = np.array([[float(v) for v in row[:8]] for row in _table(path, 8)])
         if not np.isfinite(rows).all():
@@ -317,12 +288,12 @@ def _motion(path: Path, times: tuple[float, ...]) -> list[RigidTransform]:
         stamps = rows[:, 0]
         poses = RigidTransform.from_components(rows[:, 1:4], Rotation.from_quat(rows[:, 4:8]))
     except (ValueError, IndexError) as error:
-        raise InputError(f"{path} does not hold poses: {error}", "or leave it out: moving=false") from error
+        raise InputError(f"{path} does not hold poses: {error}", "or ignore it: moving=false") from error
     nearest = [int(np.abs(stamps - t).argmin()) for t in times]
-    apart = max(abs(stamps[k] - t) for k, t in zip(nearest, times, strict=True))
-    if apart > 0.1:
+    difference = max(abs(stamps[k] - t) for k, t in zip(nearest, times, strict=True))
+    if difference > 0.1:
         raise InputError(
-            f"{path}: the nearest pose is {apart:.2f} s from an image, expected at most 0.1 s",
-            "is it of another recording? leave it out: moving=false",
+            f"{path}: the nearest pose is {difference:.2f} s from an image, expected at most 0.1 s",
+            "check that it belongs to this recording, or ignore it: moving=false",
         )
     return [poses[k] for k in nearest]

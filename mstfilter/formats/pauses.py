@@ -43,7 +43,7 @@ class PauseRule(ABC):
         Parameters
         ----------
         times : tuple of float
-            Seconds, one a frame.
+            Seconds, one per frame.
         read_rgb : callable
             Colour image (H, W, 3) uint8 of a frame index.
         """
@@ -54,18 +54,17 @@ class Ends(PauseRule):
     """First and last frame: one clip."""
 
     def find(self, times: tuple[float, ...], read_rgb: Callable[[int], np.ndarray]) -> tuple[int, ...]:
-        """See `PauseRule`."""
         return tuple(sorted({0, len(times) - 1}))
 
 
 @dataclass(frozen=True)
 class EveryNth(PauseRule):
-    """Every n-th frame is a pause: shots of a scene that was changed in between.
+    """Every n-th frame is a pause: single images of a scene that was changed in between.
 
     Parameters
     ----------
     n : int
-        1 is every frame.
+        Distance of the pauses in frames.
     """
 
     n: int = 1
@@ -75,7 +74,6 @@ class EveryNth(PauseRule):
             raise InputError(f"n is {self.n}, expected at least 1")
 
     def find(self, times: tuple[float, ...], read_rgb: Callable[[int], np.ndarray]) -> tuple[int, ...]:
-        """See `PauseRule`."""
         return tuple(range(0, len(times), self.n))
 
 
@@ -95,7 +93,6 @@ class At(PauseRule):
     seconds: tuple[float, ...] = ()
 
     def find(self, times: tuple[float, ...], read_rgb: Callable[[int], np.ndarray]) -> tuple[int, ...]:
-        """See `PauseRule`."""
         n, since = len(times), np.asarray(times) - times[0]
         if not self.frames and not self.seconds:
             raise InputError("no pause is given", "give frames or seconds")
@@ -111,7 +108,7 @@ class At(PauseRule):
 
 @dataclass(frozen=True)
 class Listed(PauseRule):
-    """A text file of frame indices, or of seconds with an ``s`` behind; ``#`` starts a comment.
+    """A text file of frame indices, or of seconds that end in ``s``; ``#`` starts a comment.
 
     Parameters
     ----------
@@ -122,7 +119,6 @@ class Listed(PauseRule):
     file: str = "pauses.txt"
 
     def find(self, times: tuple[float, ...], read_rgb: Callable[[int], np.ndarray]) -> tuple[int, ...]:
-        """See `PauseRule`."""
         try:
             lines = Path(self.file).read_text().splitlines()
         except (OSError, UnicodeDecodeError) as error:
@@ -149,7 +145,7 @@ def _numbers(words: list[str]) -> dict[str, Any]:
 
 
 def pauses_from_text(text: str) -> dict[str, Any]:
-    """The configuration of a rule from what a user types: a rule's name, numbers, or the path of a file."""
+    """The configuration of a rule from the text of a user: the name of a rule, numbers, or the path of a file."""
     words = text.replace(",", " ").split()
     if words and all(w[0].isdigit() or w[0] in "-." for w in words):
         return {"component": "at", **{k: v for k, v in _numbers(words).items() if v}}
@@ -158,38 +154,47 @@ def pauses_from_text(text: str) -> dict[str, Any]:
     return {"component": text}
 
 
-_ACROSS = 80  # blocks
-_MOST = 4.0  # times `levels`: a block that never rests must not hide motion
+_BLOCKS_ACROSS = 80
+_MAX_LEVELS = 4.0  # largest threshold of a block in units of `levels`, also if the block never rests
 
 
 def grey_blocks(rgb: np.ndarray) -> np.ndarray:
     """Mean grey level of square blocks, about 80 across: (h, w) float32 of an image (H, W, 3)."""
     grey = np.asarray(rgb, dtype=np.float32).mean(axis=2)
-    side = max(1, grey.shape[1] // _ACROSS)
+    side = max(1, grey.shape[1] // _BLOCKS_ACROSS)
     h, w = grey.shape[0] // side, grey.shape[1] // side
     return grey[: h * side, : w * side].reshape(h, side, w, side).mean(axis=(1, 3))
 
 
 def _changes(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """(...) absolute change of each block from a to b less what all share."""
+    """(...) absolute change of each block from a to b minus the median change."""
     difference = b - a
     return np.abs(difference - np.median(difference))
 
 
 @dataclass(frozen=True)
 class Still(PauseRule):
-    """Middle frames of the intervals in which the image does not change.
+    """Middle frames of the intervals in which the image does not change, for a camera that stands still.
+
+    Images are reduced to blocks of grey levels. There is motion between two images if more than a small share of the
+    blocks differ by more than their noise. A still interval is a run of frames in which none differs from the first,
+    so that slow motion adds up. Each interval of at least `hold_s` seconds gives one pause, its middle frame.
+    Changes that all blocks share (exposure, flicker) do not count. The noise of each block is measured in the video,
+    which must be at rest for a quarter of its time.
+
+    A robot that holds still in the image, or that moves by less than a grey level in a whole interval, is also taken
+    for a pause: check the pauses, and give them explicitly if they are wrong.
 
     Parameters
     ----------
     hold_s : float
         Shortest interval, in seconds.
     share : float
-        More blocks than this share that differ are motion.
+        Largest share of blocks that differ without motion.
     levels : float
-        A block differs from here on, in grey levels of 255, or from six times its noise if that is more.
+        Change in grey levels (of 255) from which a block differs, or six times its noise if that is more.
     region : tuple of 4 float
-        Part of the image that is looked at: left, top, right, bottom as shares of its width and height. Leaves out
+        Part of the image that is used: left, top, right, bottom as shares of its width and height. It can exclude
         people behind the table.
     """
 
@@ -203,15 +208,14 @@ class Still(PauseRule):
             raise InputError(f"region has {len(self.region)} numbers, expected left, top, right, bottom from 0 to 1")
 
     def find(self, times: tuple[float, ...], read_rgb: Callable[[int], np.ndarray]) -> tuple[int, ...]:
-        """See `PauseRule`."""
         intervals = self.intervals(times, read_rgb)
         if not intervals:
             raise InputError(
-                f"no pause found: nowhere in {len(times)} frames ({times[-1] - times[0]:.1f} s) does the image hold "
-                f"still for {self.hold_s:g} s",
-                "does the camera move? name the pauses: --pauses 0,40,85 (frames) or --pauses 0s,4.2s",
-                "does something else move (people, shadows)? look at a part: -o pauses.region=0.2,0.1,0.8,0.9",
-                "a shorter interval: -o pauses.hold_s=0.2; first and last frame only: --pauses ends",
+                f"no pause found: in {len(times)} frames ({times[-1] - times[0]:.1f} s) the image is never still for "
+                f"{self.hold_s:g} s",
+                "if the camera moves, give the pauses: --pauses 0,40,85 (frames) or --pauses 0s,4.2s",
+                "if people or shadows move, use a part of the image: -o pauses.region=0.2,0.1,0.8,0.9",
+                "accept shorter intervals: -o pauses.hold_s=0.2; or use the first and last frame: --pauses ends",
             )
         return tuple((first + last) // 2 for first, last in intervals)
 
@@ -243,10 +247,10 @@ class Still(PauseRule):
         return part
 
     def _limit(self, images: list[np.ndarray]) -> np.ndarray:
-        """Change (h, w) in grey levels from which a block differs: some multiples of its own noise at rest."""
+        """Change (h, w) in grey levels from which a block differs: a multiple of its noise at rest."""
         changes = np.stack([_changes(a, b) for a, b in pairwise(images)])
-        quarter = np.quantile(changes, 0.25, axis=0) / 0.3186  # of |x| for x normal with deviation 1
-        whole = 1.4826 * np.quantile(np.median(changes, axis=(1, 2)), 0.25)
-        limit = np.clip(6 * np.maximum(quarter, whole), self.levels, None)
-        most: np.ndarray = np.minimum(limit, max(_MOST * self.levels, 6 * whole))
-        return most
+        quarter = np.quantile(changes, 0.25, axis=0) / 0.3186  # the quartile of |x| for a standard normal x is 0.3186
+        overall = 1.4826 * np.quantile(np.median(changes, axis=(1, 2)), 0.25)
+        limit = np.clip(6 * np.maximum(quarter, overall), self.levels, None)
+        bounded: np.ndarray = np.minimum(limit, max(_MAX_LEVELS * self.levels, 6 * overall))
+        return bounded

@@ -20,6 +20,7 @@ table at z = 0. Cameras have no distortion: distorted images are undistorted whe
 
 from __future__ import annotations
 
+import math
 import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
@@ -32,7 +33,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from mstfilter.errors import InputError, InputWarning
-from mstfilter.formats.pauses import PauseRule
+from mstfilter.formats.pauses import PauseRule, Still
 from mstfilter.scene import (
     Camera,
     Frame,
@@ -44,20 +45,20 @@ from mstfilter.scene import (
     rigid_from_matrix,
 )
 
-__all__ = ["RecordingFormat", "RgbdImages", "Lens", "Video", "KnownWorld", "pair_stamps"]
+__all__ = ["KnownWorld", "Lens", "RecordingFormat", "RgbdImages", "Video", "VideoFormat", "pair_stamps"]
 
 
 class RecordingFormat(ABC):
-    """A layout of RGB-D data on disk. Subclasses are frozen dataclasses; their fields say what the files do not."""
+    """A layout of RGB-D data on disk. Subclasses are frozen dataclasses; fields hold what the files do not store."""
 
     @classmethod
     @abstractmethod
     def detects(cls, path: Path) -> bool:
-        """Whether a file or folder looks like this layout; looks at names only, raises nothing."""
+        """Whether the names of files show that a path has this layout. Raises no error."""
 
     @abstractmethod
     def open(self, path: Path) -> Recording:
-        """The recording. Images may be read when they are looked at; what is wrong raises one `InputError`."""
+        """The recording; its images may be read when they are used. Raises InputError if the data are not valid."""
 
 
 _NEGLIGIBLE = 0.5  # pixels
@@ -65,25 +66,25 @@ _NEGLIGIBLE = 0.5  # pixels
 
 @dataclass(frozen=True, eq=False)
 class Lens:
-    """Where each pixel of a straight image comes from.
+    """Source pixels of an undistorted image.
 
     Parameters
     ----------
     source : (H, W, 2) float32, optional
-        Column and row in the distorted image; None where the lens is straight.
+        Column and row in the distorted image; None if the lens has no distortion.
     """
 
     source: np.ndarray | None = None
 
     @classmethod
     def of(cls, camera: Camera, distortion: tuple[float, ...]) -> Lens:
-        """The lens of OpenCV's coefficients k1, k2, p1, p2, k3, ...; less than half a pixel anywhere is straight."""
+        """The lens of OpenCV's coefficients k1, k2, p1, p2, k3, ...; distortion below half a pixel is ignored."""
         if not any(distortion):
             return cls()
         if len(distortion) not in (4, 5, 8, 12, 14) or not np.isfinite(distortion).all():
             raise InputError(
                 f"distortion has {len(distortion)} numbers {tuple(distortion)}, expected 4, 5, 8, 12 or 14",
-                "k1, k2, p1, p2, k3, ... as OpenCV orders them",
+                "k1, k2, p1, p2, k3, ... in the order of OpenCV",
             )
         import cv2
 
@@ -95,14 +96,14 @@ class Lens:
         v, u = np.mgrid[: camera.height, : camera.width]
         return cls() if np.abs(source - np.stack([u, v], axis=-1)).max() < _NEGLIGIBLE else cls(source)
 
-    def smooth(self, image: np.ndarray) -> np.ndarray:
-        """A straight colour image."""
+    def undistort(self, image: np.ndarray) -> np.ndarray:
+        """Undistort a colour image."""
         import cv2
 
         return image if self.source is None else self._remap(image, cv2.INTER_LINEAR, 0)
 
-    def nearest(self, image: np.ndarray, outside: float) -> np.ndarray:
-        """A straight image of depth or labels: values are picked, never mixed."""
+    def undistort_nearest(self, image: np.ndarray, outside: float) -> np.ndarray:
+        """Undistort an image of depth or labels, without interpolation."""
         import cv2
 
         return image if self.source is None else self._remap(image, cv2.INTER_NEAREST, outside)
@@ -128,7 +129,7 @@ class RgbdImages:
     depth : (H, W) float32
         Metres, registered to the colour image; NaN = no reading.
     rgb_name, depth_name : str
-        Where they are, for messages.
+        Names of the images, for messages.
     """
 
     rgb: np.ndarray
@@ -139,7 +140,7 @@ class RgbdImages:
 
 @dataclass(frozen=True)
 class KnownWorld:
-    """What a user knows of the place; whatever is empty is found from the first pause.
+    """Camera pose and workspace, if they are known; what is empty is found from the first pause.
 
     Parameters
     ----------
@@ -157,7 +158,7 @@ class KnownWorld:
 
     @cached_property
     def pose(self) -> RigidTransform | None:
-        """The pose, None where it is not given."""
+        """The pose; None if it is not given."""
         if not self.T_world_camera:
             return None
         if len(self.T_world_camera) != 16:
@@ -166,7 +167,7 @@ class KnownWorld:
 
     @cached_property
     def grid(self) -> VoxelGrid | None:
-        """The workspace, None where it is not given."""
+        """The workspace; None if it is not given."""
         if not self.workspace:
             return None
         if len(self.workspace) != 6:
@@ -177,45 +178,45 @@ class KnownWorld:
 
 
 def _camera_from(K: Sequence[float], width: int, height: int, where: str) -> Camera:
-    """A camera from fx, fy, cx, cy that fits its images."""
+    """A camera from fx, fy, cx, cy. Raises InputError if they do not fit the image size."""
     if len(K) != 4:
         raise InputError(f"{where}: K has {len(K)} numbers, expected fx, fy, cx, cy in pixels")
     fx, fy, cx, cy = (float(v) for v in K)
     camera = Camera.from_intrinsics(fx, fy, cx, cy, width, height)
     if not (0 < cx < width and 0 < cy < height):
         raise InputError(
-            f"{where}: K has its principal point at ({cx:g}, {cy:g}), outside images of {width} x {height}",
-            "K is fx, fy, cx, cy in pixels of these images; were they resized or cropped?",
+            f"{where}: K has the principal point ({cx:g}, {cy:g}), outside images of {width} x {height}",
+            "K is fx, fy, cx, cy in pixels of these images; adapt it if they were resized or cropped",
         )
     return camera
 
 
 @dataclass(frozen=True, eq=False)
 class Video:
-    """Frames on disk and what is known of them.
+    """Frames on disk and their calibration.
 
     Parameters
     ----------
     name : str
         For messages and reports.
     times : tuple of float
-        Seconds, one a frame, ascending.
+        Seconds, one per frame, ascending.
     read : callable
-        Images of a frame index.
+        Images of a frame, by index.
     K : tuple of float
         fx, fy, cx, cy in pixels.
     path : Path
-        Where it is.
+        File or folder.
     depth_scale : float
-        Metres a unit of the stored depth.
+        Metres per unit of the stored depth.
     read_rgb : callable, optional
-        The colour image alone, where that is cheaper.
+        The colour image of a frame, if reading it alone is faster.
     motion : sequence of RigidTransform, optional
-        T_any_camera, one a frame, in any world.
+        Camera poses in any world, one per frame.
     read_instance : callable, optional
-        True label image of a frame index.
+        True label image of a frame, by index.
     distortion : tuple of float
-        OpenCV's k1, k2, p1, p2, k3, ... of both images; they are straightened.
+        OpenCV's k1, k2, p1, p2, k3, ... of both images; they are undistorted.
     """
 
     name: str
@@ -229,55 +230,53 @@ class Video:
     read_instance: Callable[[int], np.ndarray | None] = field(default=lambda index: None)
     distortion: tuple[float, ...] = ()
 
-    def part(self, start_s: float, stop_s: float) -> Video:
+    def between(self, start_s: float, stop_s: float) -> Video:
         """The frames from `start_s` to `stop_s` seconds after the first."""
         kept = [k for k, t in enumerate(self.times) if start_s <= t - self.times[0] <= stop_s]
         if len(kept) == len(self.times):
             return self
         if not kept:
             raise InputError(
-                f"{self.path}: no frame lies between start_s={start_s:g} and stop_s={stop_s:g}; the video lasts "
+                f"{self.path}: no frame is between start_s={start_s:g} and stop_s={stop_s:g}; the video lasts "
                 f"{self.times[-1] - self.times[0]:.1f} s"
             )
-        look = self.read_rgb
+        read_rgb = self.read_rgb
         return replace(
             self,
             times=tuple(self.times[k] for k in kept),
             read=lambda index: self.read(kept[index]),
-            read_rgb=None if look is None else lambda index: look(kept[index]),
+            read_rgb=None if read_rgb is None else lambda index: read_rgb(kept[index]),
             motion=None if self.motion is None else [self.motion[k] for k in kept],
             read_instance=lambda index: self.read_instance(kept[index]),
         )
 
     def recording(self, pauses: PauseRule, world: KnownWorld) -> Recording:
-        """The recording; pose and workspace are found now, images are read when they are looked at."""
+        """The recording; pose and workspace are found now, images are read when they are used."""
         if not self.times:
-            raise InputError(f"{self.path} holds no pair of a colour and a depth image")
+            raise InputError(f"{self.path} has no pair of a colour and a depth image")
         first = self.read(0)
         height, width = first.rgb.shape[:2]
         camera = _camera_from(self.K, width, height, str(self.path))
         lens = Lens.of(camera, self.distortion)
-        self._frame(0, camera, lens)  # what is wrong with the first frame is known before the pauses are looked for
-        look = self.read_rgb or (lambda index: self.read(index).rgb)
-        found = pauses.find(self.times, look)
-        home, grid = found[0], world.grid
-        camera, grid = find_world(
-            self._frame(home, camera if world.pose is None else camera.at(world.pose), lens), grid
-        )
+        self._frame(0, camera, lens)  # raises an error in the first frame before all frames are searched for pauses
+        found = pauses.find(self.times, self.read_rgb or (lambda index: self.read(index).rgb))
+        first_pause = found[0]
+        camera = camera if world.pose is None else camera.at(world.pose)
+        camera, grid = find_world(self._frame(first_pause, camera, lens), world.grid)
         cameras: dict[int, Camera] = {}
 
         def camera_at(index: int) -> Camera:
             if self.motion is None:
                 return camera
             if index not in cameras:
-                cameras[index] = camera.at(camera.pose * (self.motion[home].inv() * self.motion[index]))
+                cameras[index] = camera.at(camera.pose * (self.motion[first_pause].inv() * self.motion[index]))
             return cameras[index]
 
         def instance(index: int) -> np.ndarray | None:
             image = self.read_instance(index)
             if image is not None and image.shape != (height, width):
                 raise InputError(f"instance image of frame {index} of {self.path} has shape {image.shape}")
-            return image if image is None else lens.nearest(image, 0)
+            return image if image is None else lens.undistort_nearest(image, 0)
 
         return Recording(
             LazyFrames(lambda index: self._frame(index, camera_at(index), lens), len(self.times)),
@@ -304,18 +303,48 @@ class Video:
         if readings.size == 0:
             raise InputError(
                 f"{images.depth_name} has no reading at all",
-                "leave the start out with start_s=1, or the end with stop_s",
+                "omit the start with start_s=1, or the end with stop_s",
             )
-        check_depth_range(readings, f"{images.depth_name} with {self.depth_scale:g} m a unit")
-        return Frame(lens.smooth(images.rgb), lens.nearest(images.depth, np.nan), camera)
+        check_depth_range(readings, f"{images.depth_name} with {self.depth_scale:g} m per unit")
+        return Frame(lens.undistort(images.rgb), lens.undistort_nearest(images.depth, np.nan), camera)
+
+
+@dataclass(frozen=True)
+class VideoFormat(RecordingFormat):
+    """A layout of videos.
+
+    Parameters
+    ----------
+    K : tuple of 4 float
+        fx, fy, cx, cy in pixels. Default: from the files.
+    depth_scale : float
+        Metres per unit of 16-bit depth.
+    start_s, stop_s : float
+        Part of the video that is used, in seconds after its first frame.
+    pauses : PauseRule
+        The rule that finds the pauses.
+    world : KnownWorld
+        Pose and workspace, if they are known.
+    """
+
+    K: tuple[float, ...] = ()
+    depth_scale: float = 0.001
+    start_s: float = 0.0
+    stop_s: float = math.inf
+    pauses: PauseRule = field(default_factory=Still)
+    world: KnownWorld = field(default_factory=KnownWorld)
+
+    def recording_of(self, video: Video) -> Recording:
+        """The recording of the part of a video that is used."""
+        return video.between(self.start_s, self.stop_s).recording(self.pauses, self.world)
 
 
 def pair_stamps(
     colour: Sequence[float], depth: Sequence[float], tolerance_s: float, where: str
 ) -> tuple[tuple[int, int], ...]:
-    """Pairs (colour index, depth index) in order of time: each the other's nearest, at most `tolerance_s` apart.
+    """Pairs (colour index, depth index) in order of time: mutually nearest stamps, at most `tolerance_s` apart.
 
-    Warns where more than a tenth of the colour images find no partner; none at all is an error.
+    Warns if more than a tenth of the colour images are in no pair. Raises InputError if there is no pair.
     """
     if len(colour) == 0 or len(depth) == 0:
         raise InputError(f"{where}: there are {len(colour)} colour and {len(depth)} depth images")
@@ -328,14 +357,14 @@ def pair_stamps(
         raise InputError(
             f"{where}: no colour image has a depth image within {tolerance_s:g} s; the closest pair is "
             f"{np.abs(a - b[to_b]).min():.3g} s apart",
-            "are both on one clock? a wider limit: tolerance_s=0.1",
+            "check that both use the same clock, or raise the limit: tolerance_s=0.1",
         )
     if len(kept) < 0.9 * len(a):
         warnings.warn(
             InputWarning(
-                f"{where}: {len(a) - len(kept)} of {len(a)} colour images have no depth image of their own within "
-                f"{tolerance_s:g} s and are left out ({len(b)} depth images)",
-                "a wider limit: tolerance_s=0.1",
+                f"{where}: {len(a) - len(kept)} of {len(a)} colour images are omitted, without a depth image within "
+                f"{tolerance_s:g} s ({len(b)} depth images)",
+                "raise the limit: tolerance_s=0.1",
             ),
             stacklevel=2,
         )
@@ -343,7 +372,7 @@ def pair_stamps(
 
 
 def _nearest(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Index in b of the nearest to each of a."""
+    """Index of the element of b nearest to each element of a."""
     order = np.argsort(b, kind="stable")
     right = np.searchsorted(b[order], a).clip(0, len(b) - 1)
     left = (right - 1).clip(0)

@@ -124,14 +124,13 @@ def weighted_coverage(a: np.ndarray, b: np.ndarray, form: Form = "objects") -> f
     a, b : integer arrays of the same shape
         Labels, 0 is background or free.
     form : {"objects", "paper", "authors"}
-        See the module. Two segmentations without objects are perfectly alike (1); one without against one
-        with objects scores 0.
+        See the module. The quality is 1 if neither segmentation has objects and 0 if only one has.
     """
     return quality_of(overlap(a, b), form)
 
 
 def quality_of(table: Overlap, form: Form = "objects") -> float:
-    """`weighted_coverage` of two segmentations whose contingency table is known."""
+    """`weighted_coverage` of two segmentations from their contingency table."""
     if form not in FORMS:
         raise InputError(f"quality has no form {form!r}", f"there are: {', '.join(FORMS)}")
     if form == "paper":
@@ -177,8 +176,8 @@ MIN_PIXELS = 100  # of a 640 x 480 image: 2.3 cm^2 at 0.8 m
 def object_status(recording: Recording, t: int, min_pixels: float = MIN_PIXELS) -> dict[int, Status]:
     """Status of every object that has true voxels at pause `t`, by its label, ascending.
 
-    *visible*: the instance image of the pause shows it; *hidden*: that of an earlier pause did; *unseen*: none
-    did. Frames between pauses do not count: hypotheses are made at pauses.
+    *visible*: the instance image of the pause shows it; *hidden*: only that of an earlier pause does; *unseen*: none
+    does. Frames between pauses do not count.
 
     Parameters
     ----------
@@ -187,7 +186,7 @@ def object_status(recording: Recording, t: int, min_pixels: float = MIN_PIXELS) 
     t : int
         Number of the pause.
     min_pixels : float
-        An object is shown by an image if so many pixels show it; of a 640 x 480 image, scales with its area.
+        Number of pixels from which an image shows an object, for 640 x 480 pixels; scales with the area.
 
     Raises
     ------
@@ -211,7 +210,7 @@ def object_status(recording: Recording, t: int, min_pixels: float = MIN_PIXELS) 
 
 
 def split_truth(recording: Recording, t: int, min_pixels: float = MIN_PIXELS) -> dict[Status, np.ndarray]:
-    """True labels (X, Y, Z) uint16 at pause `t` of the objects of each status alone; parameters as above."""
+    """True labels (X, Y, Z) uint16 at pause `t`, by status of the objects; parameters of `object_status`."""
     status = object_status(recording, t, min_pixels)
     labels = recording.truth(t)
     assert labels is not None
@@ -222,7 +221,7 @@ def split_truth(recording: Recording, t: int, min_pixels: float = MIN_PIXELS) ->
 
 
 def _shown(recording: Recording, t: int, min_pixels: float) -> set[int]:
-    """Labels that the instance image of a pause shows in enough pixels."""
+    """Labels with enough pixels in the instance image of a pause."""
     image = recording.instance(recording.pauses[t])
     if image is None:
         raise InputError(f"recording {recording.name} has no instance image at pause {t}")

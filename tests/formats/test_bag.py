@@ -153,7 +153,7 @@ FAULTS = {
     "no colour": (with_messages(colour=None), Bag(), "no colour topic"),
     "no intrinsics": (with_messages(info=False), Bag(), "intrinsics are missing"),
     "wrong topic": (with_messages(), Bag(colour="/camera/colour"), "no image topic '/camera/colour'"),
-    "depth for colour": (with_messages(), Bag(colour=DEPTH), "holds no colour images"),
+    "depth for colour": (with_messages(), Bag(colour=DEPTH), "has no colour images"),
     "wrong info": (with_messages(), Bag(info="/info"), "no CameraInfo topic '/info'"),
     "two colours": (two_colours, Bag(), "2 topics could be colour"),
     "sizes differ": (small_depth, Bag(), "differ in size: depth is not registered"),
@@ -205,7 +205,7 @@ def test_stamps_of_the_header_count(tmp_path):
     path = write(tmp_path / "late", "mcap", messages)
     same_frames(Bag(world=WORLD).open(path), SHIFTS)
     lost = [m for k, m in enumerate(scene_messages(False)) if m[0] != DEPTH or k % 2]
-    with pytest.warns(InputWarning, match="left out"):
+    with pytest.warns(InputWarning, match="are omitted"):
         recording = Bag(pauses=Ends()).open(write(tmp_path / "lost", "mcap", lost))
     assert len(recording) < len(SHIFTS)
     recording.check()

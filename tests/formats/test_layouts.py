@@ -251,7 +251,7 @@ FAULTS = {
         write_redwood,
         Redwood(),
         lambda p: (first_file(p, "depth").unlink(), sorted((p / "color").iterdir())[5].unlink()),
-        "would be paired with depth image",
+        "does not fit depth image",
     ),
     "redwood, no intrinsics": (write_redwood, Redwood(), lambda p: (p / "intrinsic.json").unlink(), "intrinsics are"),
     "redwood, row by row": (
@@ -329,7 +329,7 @@ def test_a_distorted_lens_is_straightened():
     np.testing.assert_allclose(lens.source[..., 0], u, atol=1e-3)
     np.testing.assert_allclose(lens.source[..., 1], v, atol=1e-3)
     depth = np.where(np.arange(160) % 2, 1.0, 2.0)[None].repeat(120, axis=0).astype(np.float32)
-    assert set(np.unique(lens.nearest(depth, np.nan)[20:100, 30:130])) == {1.0, 2.0}
+    assert set(np.unique(lens.undistort_nearest(depth, np.nan)[20:100, 30:130])) == {1.0, 2.0}
     assert Lens.of(CAMERA, (1e-4, 0, 0, 0)).source is None
     with pytest.raises(InputError, match="3 numbers"):
         Lens.of(CAMERA, (0.1, 0.1, 0.1))
