@@ -250,7 +250,7 @@ def iid_weights(rng: np.random.Generator, p: np.ndarray, n: int) -> np.ndarray:
 
 
 def total_variation(p: np.ndarray, q: np.ndarray) -> float:
-    """Total variation distance sum_i |p_i - q_i| / 2, in [0, 1]."""
+    """Total variation distance ``sum_i |p_i - q_i| / 2``, in [0, 1]."""
     return 0.5 * float(np.abs(p - q).sum())
 
 
