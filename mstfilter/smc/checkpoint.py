@@ -37,7 +37,7 @@ _FORMAT = 1
 
 
 def save_state(path: Path, state: State, codec: Codec | None = None, **description: Any) -> None:
-    """Write a state as a whole or not at all.
+    """Write a state atomically.
 
     Parameters
     ----------
@@ -48,12 +48,12 @@ def save_state(path: Path, state: State, codec: Codec | None = None, **descripti
     codec : Codec, optional
         For particles other than arrays, mappings of arrays and dataclasses of arrays.
     **description
-        JSON-able values to be stored beside.
+        Further values to store, of types that JSON represents.
 
     Raises
     ------
     InputError
-        Where the particles cannot be stored or the file cannot be written.
+        If the particles cannot be stored or the file cannot be written.
     """
     population = state.population
     if population is None:
@@ -82,7 +82,7 @@ def save_state(path: Path, state: State, codec: Codec | None = None, **descripti
 
 
 def load_state(path: Path, codec: Codec | None = None) -> tuple[State, dict[str, Any]]:
-    """The state in a file, and what was stored beside it."""
+    """The state in a file, and the description stored with it."""
     try:
         with np.load(path, allow_pickle=False) as data:
             arrays = {name: data[name] for name in data.files}
@@ -90,7 +90,7 @@ def load_state(path: Path, codec: Codec | None = None) -> tuple[State, dict[str,
     except FileNotFoundError:
         raise InputError(f"checkpoint is missing: {path}") from None
     except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile) as error:
-        raise InputError(f"checkpoint cannot be read: {path} ({error})", "remove it to start anew") from error
+        raise InputError(f"checkpoint cannot be read: {path} ({error})", "remove it to start again") from error
     if head.get("format") != _FORMAT:
         raise InputError(f"checkpoint {path} has format {head.get('format')}, expected {_FORMAT}")
     particles = (codec or ArrayCodec()).decode(_below(arrays, "particles/"))
@@ -105,14 +105,14 @@ def _below(arrays: dict[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:
 
 @dataclasses.dataclass(frozen=True)
 class Checkpoint:
-    """Where a run keeps its state.
+    """The file that holds the state of a run.
 
     Parameters
     ----------
     path : Path
         The .npz file.
     codec : Codec, optional
-        For particles of your own.
+        For other particles than those of `ArrayCodec`.
     """
 
     path: Path
@@ -123,12 +123,12 @@ class Checkpoint:
         save_state(self.path, state, self.codec, filter=_outline(filter))
 
     def load(self, filter: Any, start: State) -> State | None:
-        """The state to go on from; None where nothing is stored.
+        """The stored state; None if there is no file.
 
         Raises
         ------
         InputError
-            Where the file is of another run: other seed, other components or fields, or earlier than `start`.
+            If the file is of another run: another seed, other components or fields, or a step before `start`.
             Functions and observations are not compared.
         """
         if not self.path.exists():
@@ -141,16 +141,16 @@ class Checkpoint:
         if wrong is not None:
             what, found, wanted = wrong
             raise InputError(
-                f"checkpoint {self.path} is of another run: its {what} is {found}, that of this run {wanted}",
+                f"checkpoint {self.path} is of another run: its {what} is {found}, expected {wanted}",
                 "choose another file, or remove this one",
             )
         if state.t < start.t:
-            raise InputError(f"checkpoint {self.path} is at step {state.t}, before the state to go on from")
+            raise InputError(f"checkpoint {self.path} is at step {state.t}, before the state to continue from")
         return state
 
 
 def _outline(filter: Any) -> dict[str, Any]:
-    """What can be said of a filter without knowing its models: its components with their plain fields, its sizes."""
+    """Components of a filter and their plain fields; functions and arrays by type only."""
     return {
         field.name: _plain(value)
         for field in dataclasses.fields(filter)
@@ -159,7 +159,7 @@ def _outline(filter: Any) -> dict[str, Any]:
 
 
 def _plain(value: Any) -> Any:
-    """A value as JSON keeps it; of what it cannot keep (functions, arrays) the type."""
+    """A value as JSON stores it; the type of functions and arrays."""
     if isinstance(value, np.generic):
         return _plain(value.item())
     if value is None or isinstance(value, (bool, int, float, str)):
@@ -173,7 +173,7 @@ def _plain(value: Any) -> Any:
 
 
 def _difference(what: str, found: Any, wanted: Any) -> tuple[str, Any, Any] | None:
-    """The first entry that differs, by name."""
+    """Name, found and expected value of the first entry that differs."""
     if isinstance(found, dict) and isinstance(wanted, dict):
         for name in {**found, **wanted}:
             first = _difference(f"{what}.{name}", found.get(name), wanted.get(name))
@@ -193,13 +193,13 @@ class ArrayCodec(Codec):
     Parameters
     ----------
     particle : type, optional
-        The dataclass of the particles, where it cannot be found by name (it is defined inside a function).
+        The dataclass of the particles, if it cannot be found by name because it is defined inside a function.
     """
 
     particle: type | None = None
 
     def encode(self, particles: Any) -> dict[str, np.ndarray]:
-        """Named arrays; ``form`` says in JSON what they were."""
+        """Named arrays; ``form`` describes the particles in JSON."""
         if isinstance(particles, np.ndarray):
             return {_FORM: _json({"kind": "array"}), "x": _storable(particles, "the particles")}
         if isinstance(particles, Mapping):
@@ -221,7 +221,7 @@ class ArrayCodec(Codec):
                 _find(form["type"], kind)
         else:
             raise InputError(f"particles of type {kind.__qualname__} cannot be stored", _HINT)
-        # Shared objects are stored once: resampled particles are references.
+        # Resampled particles are references: each object is stored once.
         first: dict[int, int] = {}
         index: list[int] = []
         described: list[dict[str, Any]] = []
@@ -262,11 +262,11 @@ class ArrayCodec(Codec):
         return tuple(made[k] for k in arrays["index"].tolist())
 
 
-_HINT = "pass codec= a mstfilter.smc.interfaces.Codec that stores them as arrays"
+_HINT = "pass codec=, a mstfilter.smc.Codec that stores them as arrays"
 
 
 def _describe(value: Any, what: str) -> Any:
-    """A value as JSON: arrays by kind, tuples and dicts marked, the rest as it is (JSON keeps floats exactly)."""
+    """A value as JSON, which keeps floats exactly; arrays and tuples are marked."""
     if isinstance(value, np.ndarray):
         return {"is": "array"}
     if isinstance(value, np.generic):
@@ -307,7 +307,7 @@ def _json(value: Any) -> np.ndarray:
 
 
 def _find(location: str, expected: type | None = None) -> type:
-    """A dataclass by name among the modules that are loaded already."""
+    """A dataclass by its name, among the loaded modules."""
     module, _, path = location.partition(":")
     found: Any = sys.modules.get(module)
     for part in path.split("."):
@@ -316,6 +316,6 @@ def _find(location: str, expected: type | None = None) -> type:
     if not usable or (expected is not None and found is not expected):
         raise InputError(
             f"dataclass {location} cannot be found by its name",
-            "define it at the top of a module that is imported before, or pass codec=ArrayCodec(TheClass)",
+            "define it at the top level of a module that is imported first, or pass codec=ArrayCodec(TheClass)",
         )
     return found

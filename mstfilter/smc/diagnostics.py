@@ -56,12 +56,12 @@ def ess(state: State, info: Info) -> float:
 
 
 def unique_ancestors(state: State, info: Info) -> int:
-    """Different particles of the previous population that have descendants."""
+    """Number of particles of the previous population that have descendants."""
     return info.unique_ancestors
 
 
 def weight_entropy(state: State, info: Info) -> float:
-    """Entropy of the normalised weights in nats: log n where they are equal, 0 where one has all."""
+    """Entropy of the normalised weights in nats: log n if they are equal, 0 if one particle has all weight."""
     assert state.population is not None
     w = state.population.weights
     w = w[w > 0]
@@ -69,13 +69,13 @@ def weight_entropy(state: State, info: Info) -> float:
 
 
 def log_evidence(state: State, info: Info) -> float:
-    """Log evidence so far; NaN where the filter does not report it."""
+    """Log evidence so far; NaN if the filter does not report it."""
     found = state.log_evidence
     return np.nan if found is None else found
 
 
 def resampled(state: State, info: Info) -> bool:
-    """Whether the resampler was called."""
+    """Whether the step resampled."""
     return info.resampled
 
 
@@ -85,7 +85,7 @@ def n_particles(state: State, info: Info) -> int:
 
 
 def mean(state: State, info: Info) -> Any:
-    """Weighted mean of particles that are an array."""
+    """Weighted mean of array particles."""
     assert state.population is not None
     if not isinstance(state.population.particles, np.ndarray):
         raise InputError(
@@ -97,7 +97,7 @@ def mean(state: State, info: Info) -> Any:
 
 @dataclass(frozen=True, eq=False)
 class History(Mapping[str, np.ndarray]):
-    """What was collected.
+    """Collected arrays by name.
 
     Parameters
     ----------
@@ -118,7 +118,7 @@ class History(Mapping[str, np.ndarray]):
 
     def __getitem__(self, name: str) -> np.ndarray:
         if name not in self.values_:
-            raise KeyError(f"nothing was collected as {name!r}; there is {', '.join(self.values_) or 'nothing'}")
+            raise KeyError(f"nothing was collected as {name!r}; there are: {', '.join(self.values_) or 'no arrays'}")
         return self.values_[name]
 
     def __iter__(self) -> Any:
@@ -128,13 +128,7 @@ class History(Mapping[str, np.ndarray]):
         return len(self.values_)
 
     def to_xarray(self) -> Any:
-        """An ``xarray.Dataset`` with the dimensions named.
-
-        Raises
-        ------
-        MissingLibraryError
-            Where xarray is not installed.
-        """
+        """An ``xarray.Dataset`` with named dimensions; MissingLibraryError if xarray is not installed."""
         try:
             import xarray
         except ImportError:
@@ -149,7 +143,7 @@ class History(Mapping[str, np.ndarray]):
 
 
 def collect(steps: Iterable[tuple[State, Info]], /, **collectors: Collector) -> History:
-    """Go through a run and keep what the collectors return.
+    """Iterate over a run and keep the results of the collectors.
 
     Parameters
     ----------
@@ -185,20 +179,20 @@ def run_many(
     workers: int = 1,
     **collectors: Collector,
 ) -> History:
-    """Run every filter with every seed.
+    """Run each filter with each seed.
 
     Parameters
     ----------
     arms : mapping
         Name -> filter.
     observations : iterable
-        The same for all.
+        The same for all filters.
     seeds : sequence of int
-        One a run; the same for all arms.
+        One per run; the same for all filters.
     workers : int
-        Processes; 1 runs in this one.
+        Number of processes; 1 uses the calling process.
     **collectors
-        As for `collect`; the log evidence where there are none.
+        As for `collect`; default `log_evidence`.
 
     Returns
     -------
@@ -234,8 +228,10 @@ def _one(job: Mapping[str, Any], arm: str, seed: int) -> dict[str, np.ndarray]:
 
 
 def _in_pool(job: dict[str, Any], tasks: list[tuple[str, int]], workers: int) -> list[dict[str, np.ndarray]]:
-    """Results in order. Fresh processes, not forks: a fork of a process whose libraries run threads may never return.
-    The job is sent once to each batch; closures and classes of a notebook travel too (cloudpickle)."""
+    """Results in order, from new processes: a fork of a process with threads can deadlock.
+
+    The job is sent once per batch, by cloudpickle, so closures and classes of a notebook can be sent.
+    """
     from joblib import Parallel, delayed, parallel_config
 
     batches = [tasks[k :: 4 * workers] for k in range(min(4 * workers, len(tasks)))]
@@ -246,7 +242,7 @@ def _in_pool(job: dict[str, Any], tasks: list[tuple[str, int]], workers: int) ->
 
 
 def _batch(job: dict[str, Any], tasks: list[tuple[str, int]]) -> list[tuple[tuple[str, int], dict[str, np.ndarray]]]:
-    """In a worker: one thread a library. Those that read no environment variable are told."""
+    """Run a batch in a worker, with one thread in libraries that ignore the environment variables."""
     if "torch" in sys.modules:
         sys.modules["torch"].set_num_threads(1)
     if "cv2" in sys.modules:

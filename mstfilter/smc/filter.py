@@ -152,10 +152,9 @@ class ParticleFilter:
         proposed = step.propose(predicted)
         fused = step.fuse(predicted, proposed)
         chosen, resampled_after = step.select_after(fused, past)
-        resampled = resampled_before or resampled_after
-        if resampled:
+        if resampled_before or resampled_after:
             chosen = step.rejuvenate(chosen, past)
-        return step.finish(past, fused, chosen, resampled)
+        return step.finish(past, fused, chosen, resampled_before, resampled_after)
 
     def iterate(
         self,
@@ -246,21 +245,18 @@ class _Step:
 
     def select_before(self) -> tuple[Population | None, bool]:
         """The particles x_{t-1} to move, and whether they were resampled."""
-        if self.state.population is None:
-            return None, False
-        unchanged, priority = self.state.population.labelled({}), None
-        if self.filter.resample == "after":
-            return unchanged, False
-        population = unchanged
+        population, priority = self.state.population, None
+        if population is None or self.filter.resample == "after":
+            return population, False
         if self.filter.lookahead is not None and self.observation is not None:
             with self.slot("lookahead"):
                 priority = _priority(self.filter.lookahead, population, self.observation)
                 population = population.reweighted(priority)
         with self.slot("resampler"):
             if not self.filter.trigger.wants(population, self.state.t):
-                return unchanged, False
+                return self.state.population, False
             n = self.filter.n if self.filter.size is None else self.filter.size.choose(population)
-            selected = self._resample(population, n)
+            selected = self._resample(population.labelled({}), n)
             if priority is not None:
                 ancestors = selected.parents["ancestor"]
                 if (ancestors < 0).any():
@@ -332,6 +328,8 @@ class _Step:
         """The particles to keep, and whether they were resampled."""
         size, after = self.filter.size, self.filter.resample == "after"
         n = limit = self.filter.n
+        if len(fused) <= n and not after and size is None:
+            return fused, False
         with self.slot("resampler"):
             if size is not None:
                 # With resample="before" the size was chosen before the prediction: only excess particles go.
@@ -344,7 +342,7 @@ class _Step:
                 if selected.notes is not fused.notes:
                     self.slot.record(selected.notes)
                 return selected, True
-        return fused.with_ancestors(identity(len(fused))), False
+        return fused, False
 
     def rejuvenate(self, chosen: Population, past: Population | None) -> Population:
         """Particles after the move, with the parents that they had."""
@@ -368,19 +366,25 @@ class _Step:
         return moved.labelled(population.parents, moved.notes)
 
     def finish(
-        self, past: Population | None, fused: Population, chosen: Population, resampled: bool
+        self,
+        past: Population | None,
+        fused: Population,
+        chosen: Population,
+        resampled_before: bool,
+        resampled_after: bool,
     ) -> tuple[State, Info]:
         """The next state and the record of the step."""
         with self.slot("build"):
             chosen = chosen.realised()
-        population = chosen.traced_through(past)
+        ess = fused.ess  # the population keeps it for the trigger of the next step
+        population = chosen.traced_through(past if resampled_before else None)
         info = Info(
             t=self.state.t,
             n=len(population),
             n_candidates=len(fused),
-            ess=fused.ess,
-            resampled=resampled,
-            ancestors=chosen.parents["ancestor"],
+            ess=ess,
+            resampled=resampled_before or resampled_after,
+            ancestors=chosen.parents["ancestor"] if resampled_after else identity(len(chosen)),
             parents=population.parents,
             log_weights=population.log_weights,
             notes=self.slot.notes,

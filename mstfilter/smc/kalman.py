@@ -36,7 +36,7 @@ def linear_gaussian(F: Any, Q: Any, H: Any, R: Any, m0: Any, P0: Any) -> StateSp
     """x_0 ~ N(m0, P0), x_t = F x_{t-1} + N(0, Q), y_t = H x_t + N(0, R); particles are (n, d)."""
     F, Q, H, R, m0, P0 = (np.asarray(a, dtype=np.float64) for a in (F, Q, H, R, m0, P0))
     if m0.ndim != 1:
-        raise InputError(f"m0 has shape {m0.shape}, expected one number an entry of the state: (d,)")
+        raise InputError(f"m0 has shape {m0.shape}, expected one number per entry of the state: (d,)")
     d, k = m0.shape, H.shape[:1]
     shapes = {"F": (F, d * 2), "Q": (Q, d * 2), "H": (H, k + d), "R": (R, k * 2), "m0": (m0, d), "P0": (P0, d * 2)}
     for name, (array, shape) in shapes.items():
@@ -74,7 +74,7 @@ def linear_gaussian(F: Any, Q: Any, H: Any, R: Any, m0: Any, P0: Any) -> StateSp
 
 
 class Linear(NamedTuple):
-    """Matrices of the linear part for each particle; any may leave the particle axis out.
+    """Matrices of the linear part for each particle, or without the particle axis if shared by all.
 
     Parameters
     ----------
@@ -94,7 +94,7 @@ class Linear(NamedTuple):
 
 @dataclass(frozen=True)
 class ConditionallyLinear:
-    """A model that is linear and Gaussian given a drawn part.
+    """A model that is linear and Gaussian given the part u, which is drawn.
 
     Parameters
     ----------
@@ -105,7 +105,7 @@ class ConditionallyLinear:
     linear : callable
         ``(u) -> Linear``.
     mean, cov : (d,) and (d, d) array_like
-        Of z_0, whatever u_0 is.
+        Of z_0, for any u_0.
     """
 
     sample_initial: Callable[[np.random.Generator, int], np.ndarray]
@@ -120,7 +120,6 @@ class _Initial(Proposal):
     model: ConditionallyLinear
 
     def sample(self, rng: np.random.Generator, observation: Any, n: int) -> Population:
-        """u_0 with the first mean and covariance."""
         mean, cov = np.asarray(self.model.mean, np.float64), np.asarray(self.model.cov, np.float64)
         return Population(
             {
@@ -158,7 +157,7 @@ class _Correct(Update):
         proposed: Population | None,
         observation: Any,
     ) -> Population:
-        """Weigh by the predictive density, then correct mean and covariance (Joseph form)."""
+        """Weight by the predictive density N(y; H m, S), then correct mean and covariance (Joseph form)."""
         population = union(predicted, proposed)
         p, y = population.particles, np.atleast_1d(np.asarray(observation, dtype=np.float64))
         m = self.model.linear(p["u"])
@@ -178,16 +177,17 @@ class _Correct(Update):
         return Population(particles, population.log_weights + log_p, population.parents)
 
 
-def rao_blackwellised(model: ConditionallyLinear, n: int, **parts: Any) -> ParticleFilter:
-    """The filter of a model that is linear and Gaussian given a drawn part.
+def rao_blackwellised(model: ConditionallyLinear, n: int, **components: Any) -> ParticleFilter:
+    """The Rao-Blackwellised filter of a model.
 
     Parameters
     ----------
     model : ConditionallyLinear
-        The model.
     n : int
         Particles.
-    **parts
+    **components
         Further fields of `ParticleFilter`, such as ``resampler``.
     """
-    return ParticleFilter(initial=_Initial(model), transition=_Predict(model), update=_Correct(model), n=n, **parts)
+    return ParticleFilter(
+        initial=_Initial(model), transition=_Predict(model), update=_Correct(model), n=n, **components
+    )

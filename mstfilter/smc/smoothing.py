@@ -1,20 +1,19 @@
-"""Smoothing: the state at every time given all observations, from a filter's populations.
+"""Smoothing: the states given all observations, from the populations of a filter.
 
 >>> record = keep(bootstrap(model, n=500), observations, seed=0)
 >>> paths = backward_paths(np.random.default_rng(1), record, Dynamics(model), n=200)
 >>> [population.weights @ population.particles for population in paths]        # E[x_t | y_0 .. y_T], t = 0 .. T
 
-Three smoothers, each a tuple of populations, one a time:
+Three smoothers return a tuple with one population per time:
 
-- `genealogy` follows the ancestors of the last particles back (Kitagawa 1996). It needs nothing but the record; after
-  many selections all paths share their beginning.
-- `fixed_lag` does so from `lag` steps later only (Kitagawa and Sato 2001): more different particles, and a bias where
-  the past is not forgotten in that time.
-- `backward_paths` draws paths backwards by the density of the transition (Godsill, Doucet, West 2004, FFBSi). No
-  path degeneracy, at the cost of n densities a particle and step.
+- `genealogy` follows the ancestors of the last particles (Kitagawa 1996). It needs only the record; after many
+  resamplings all paths share their beginning.
+- `fixed_lag` follows the ancestors of the particles `lag` steps later (Kitagawa and Sato 2001): more distinct
+  particles, and a bias if the state depends on observations more than `lag` steps later.
+- `backward_paths` draws paths backwards by the density of the transition (Godsill, Doucet, West 2004, FFBSi). No path
+  degeneracy, at the cost of n densities per path and step.
 
-All hold for any filter whose weights are proper: guided, auxiliary, with moves, resampled before or after. What is
-smoothed is the filter's own approximation; where its weights are a heuristic, so is this.
+They are valid for any filter with proper weights: guided, auxiliary, with moves, resampled before or after.
 """
 
 from __future__ import annotations
@@ -32,7 +31,7 @@ from mstfilter.smc.population import Population, take
 
 __all__ = ["Record", "backward_paths", "fixed_lag", "genealogy", "keep"]
 
-#: Pairs of particles whose density is asked for at once.
+#: Pairs of particles per call of `log_prob`.
 _PAIRS = 1_000_000
 
 
@@ -45,7 +44,7 @@ class Record:
     populations : tuple of Population
         After each observation; ``parents["previous"]`` are indices into the one before.
     observations : tuple
-        None where one was missing.
+        None if missing.
     """
 
     populations: tuple[Population, ...]
@@ -59,14 +58,14 @@ class Record:
         index = self.populations[t].parents.get("previous")
         if index is None or (index < 0).any():
             raise InputError(
-                f"step {t}: {'no' if index is None else 'not every'} particle says what it came from",
-                "a filter with a proposal of new particles has no paths; smooth one without",
+                f"step {t}: {'no' if index is None else 'not every'} particle has a known parent",
+                "a filter with a proposal of new particles has no paths",
             )
         return index
 
 
 def keep(filter: ParticleFilter, observations: Iterable[Any], seed: int | State = 0) -> Record:
-    """Run a filter and keep every population: memory grows with n times the number of steps."""
+    """Run a filter and keep every population; memory grows with n times the number of steps."""
     ys = tuple(observations)
     if not ys:
         raise InputError("there are no observations to smooth over")
@@ -78,7 +77,7 @@ def keep(filter: ParticleFilter, observations: Iterable[Any], seed: int | State 
 
 
 def genealogy(record: Record) -> tuple[Population, ...]:
-    """Paths of the last particles: row k of all populations is one path, with the last weight of particle k."""
+    """Paths of the last particles: row k of all populations is one path, weighted by the last particle."""
     return _traced(record, len(record) - 1, 0)
 
 
@@ -88,9 +87,8 @@ def fixed_lag(record: Record, lag: int) -> tuple[Population, ...]:
     Parameters
     ----------
     record : Record
-        Of a run.
     lag : int
-        Steps; 0 is the filter itself.
+        Steps; 0 returns the filter's populations.
     """
     check_integer("lag", lag, at_least=0)
     last = len(record) - 1
@@ -112,17 +110,16 @@ def _traced(record: Record, end: int, begin: int) -> tuple[Population, ...]:
 def backward_paths(
     rng: np.random.Generator, record: Record, transition: DensityTransition, n: int
 ) -> tuple[Population, ...]:
-    """`n` paths drawn from the smoothing law of the record, all of weight one: row k of all populations is a path.
+    """Draw `n` equally weighted paths from the smoothing distribution: row k of all populations is a path.
 
     Parameters
     ----------
     rng : Generator
-        For whatever is drawn.
     record : Record
-        Of a run; parents are not needed.
+        Its parents are not needed.
     transition : DensityTransition
-        The MODEL's transition, ``Dynamics(model)``, also where the filter was guided: a guided transition has the
-        density of its proposal.
+        The transition of the model, ``Dynamics(model)``. The density of a guided transition is that of its proposal,
+        so it cannot be used.
     n : int
         Paths.
     """
@@ -148,16 +145,16 @@ def backward_paths(
 
 
 def _drawn(rng: np.random.Generator, log_weights: np.ndarray, t: int | None = None) -> np.ndarray:
-    """One index a row of (n, m) log weights."""
+    """Draw one index per row of (n, m) log weights."""
     top = log_weights.max(axis=1, keepdims=True)
     if not np.isfinite(top).all():
         where = "" if t is None else f"from step {t} to {t + 1}: "
         raise InputError(
-            f"{where}no particle can have led to one that was there, or a density is NaN or +inf",
+            f"{where}a particle has no possible predecessor, or a density is NaN or +inf",
             "backward paths need the density of the transition that moved the particles",
         )
     cumulative = np.cumsum(np.exp(log_weights - top), axis=1)
     points = rng.random((len(cumulative), 1)) * cumulative[:, -1:]
-    # As many entries as lie at or below the point come before it; "at" passes over weights of zero.
+    # The index is the number of entries at or below the point; "at" skips weights of zero.
     index = (cumulative <= points).sum(axis=1)
     return np.minimum(index, (cumulative < cumulative[:, -1:]).sum(axis=1))

@@ -74,14 +74,14 @@ class StateSpaceModel:
 
     @classmethod
     def of(cls, initial: Any, transition: Callable[[Any], Any], observation: Callable[[Any], Any]) -> StateSpaceModel:
-        """A model from distributions: ours, frozen ones of scipy.stats, or those of torch.
+        """A model from distributions of this package, frozen ones of scipy.stats, or those of torch.
 
         Parameters
         ----------
         initial : distribution
             Of x_0.
         transition : callable
-            ``(particles) -> distribution`` of x_t, one row a particle.
+            ``(particles) -> distribution`` of x_t, one row per particle.
         observation : callable
             ``(particles) -> distribution`` of y_t.
         """
@@ -105,7 +105,7 @@ class StateSpaceModel:
         Raises
         ------
         InputError
-            Where the model was made without it.
+            If the model was made without it.
         """
         found = self.log_initial if which == "log_initial" else self.log_transition
         if found is None:
@@ -120,28 +120,25 @@ class Prior(Proposal):
     model: StateSpaceModel
 
     def sample(self, rng: np.random.Generator, observation: Any, n: int) -> Population:
-        """Draw `n`."""
         return Population(self.model.sample_initial(rng, n))
 
 
 @dataclass(frozen=True)
 class Dynamics(DensityTransition):
-    """Moves by the model's own transition."""
+    """Moves by the transition of the model."""
 
     model: StateSpaceModel
 
     def predict(self, rng: np.random.Generator, population: Population, observation: Any) -> Population:
-        """Move all particles; weights stay."""
         return population.moved(self.model.sample_transition(rng, population.particles))
 
     def log_prob(self, previous: Any, new: Any, observation: Any) -> np.ndarray:
-        """Log density of the model's transition."""
         return self.model.density("log_transition")(previous, new)
 
 
 @dataclass(frozen=True)
 class GuidedInitial(Proposal):
-    """First particles from q(x_0 | y_0), weighted by p(x_0) / q.
+    """First particles from q(x_0 | y_0), weighted by p(x_0) / q; from the prior if y_0 is missing.
 
     Parameters
     ----------
@@ -155,7 +152,6 @@ class GuidedInitial(Proposal):
     proposal: Callable[[Any], Any]
 
     def sample(self, rng: np.random.Generator, observation: Any, n: int) -> Population:
-        """Draw `n`; from the prior where the observation is missing."""
         if observation is None:
             return Population(self.model.sample_initial(rng, n))
         q = as_distribution(self.proposal(observation))
@@ -165,14 +161,14 @@ class GuidedInitial(Proposal):
 
 @dataclass(frozen=True)
 class GuidedTransition(DensityTransition):
-    """Moves by q(x_t | x_{t-1}, y_t) and adds log f - log q to the log weights.
+    """Moves by q(x_t | x_{t-1}, y_t) and adds log f - log q to the log weights; by f if y_t is missing.
 
     Parameters
     ----------
     model : StateSpaceModel
         With `log_transition`.
     proposal : callable
-        ``(particles, y) -> distribution`` of x_t, one row a particle. Its tails must not be lighter than those of
+        ``(particles, y) -> distribution`` of x_t, one row per particle. Its tails must not be lighter than those of
         f(x_t | x_{t-1}) p(y_t | x_t).
     """
 
@@ -180,7 +176,6 @@ class GuidedTransition(DensityTransition):
     proposal: Callable[[Any, Any], Any]
 
     def predict(self, rng: np.random.Generator, population: Population, observation: Any) -> Population:
-        """Move all particles; by the model's own transition where the observation is missing."""
         old = population.particles
         if observation is None:
             return population.moved(self.model.sample_transition(rng, old))
@@ -190,7 +185,7 @@ class GuidedTransition(DensityTransition):
         return Population(new, population.log_weights + gain, population.parents)
 
     def log_prob(self, previous: Any, new: Any, observation: Any) -> np.ndarray:
-        """Log density of the move that is made: q, or f where the observation is missing."""
+        """Log density of the move: q, or f if the observation is missing."""
         if observation is None:
             return self.model.density("log_transition")(previous, new)
         return as_distribution(self.proposal(previous, observation)).log_prob(new)
@@ -198,7 +193,7 @@ class GuidedTransition(DensityTransition):
 
 @dataclass(frozen=True)
 class PriorityLookahead(Lookahead):
-    """Priority by a function.
+    """Priority given by a function.
 
     Parameters
     ----------
@@ -209,22 +204,24 @@ class PriorityLookahead(Lookahead):
     function: Callable[[Any, Any], np.ndarray]
 
     def log_priority(self, population: Population, observation: Any) -> np.ndarray:
-        """(n,) log priority."""
         return self.function(population.particles, observation)
 
 
 @dataclass(frozen=True)
 class RandomWalkMove(Rejuvenation):
-    """Metropolis steps with Gaussian increments on an array of particles.
+    """Metropolis steps with Gaussian increments on an array of particles; ``notes["accepted"]`` is their rate.
+
+    After a resampling several particles share a parent. The move separates them by a Markov kernel that leaves
+    p(x_t | x_{t-1}, y_t) invariant; the weights do not change.
 
     Parameters
     ----------
     model : StateSpaceModel
         With its log densities. Particles are floating-point arrays (n,) or (n, d), or mappings of such.
     scale : float or array_like
-        Standard deviation of a step, in the units of the state. Fixed, so that the evidence stays unbiased.
+        Standard deviation of a step, in the units of the state. Fixed, so that the evidence is unbiased.
     steps : int
-        Metropolis steps a move.
+        Metropolis steps per move.
     """
 
     model: StateSpaceModel
@@ -245,8 +242,6 @@ class RandomWalkMove(Rejuvenation):
         previous: Population | None,
         observation: Any,
     ) -> Population:
-        """Move; `notes` hold the share of accepted steps."""
-
         def log_target(x: Any) -> np.ndarray:
             if previous is None:
                 prior = self.model.density("log_initial")(x)
@@ -273,12 +268,12 @@ class RandomWalkMove(Rejuvenation):
 
 
 def accept_moves(rng: np.random.Generator, log_ratio: np.ndarray) -> np.ndarray:
-    """(n,) bool: Metropolis-Hastings decisions; a ratio that is NaN (impossible to impossible) is refused."""
+    """(n,) bool: Metropolis-Hastings decisions; a ratio of NaN (both states impossible) is rejected."""
     return np.log1p(-rng.random(len(log_ratio))) < log_ratio
 
 
 def choose_rows(accepted: np.ndarray, new: Particles, old: Particles) -> Particles:
-    """Row by row `new` where accepted, else `old`."""
+    """Rows of `new` where `accepted` is True, else of `old`."""
     if isinstance(old, np.ndarray):
         return np.where(accepted.reshape(-1, *(1,) * (old.ndim - 1)), new, old)
     return {name: choose_rows(accepted, new[name], a) for name, a in old.items()}
@@ -321,9 +316,9 @@ def guided(
     n : int
         Particles.
     initial : callable, optional
-        ``(y) -> distribution`` of x_0; the model's prior where left out.
+        ``(y) -> distribution`` of x_0; default the prior of the model.
     resampler, trigger : Resampler, Trigger, optional
-        Systematic at an effective sample size below half where left out.
+        Default: `Systematic`, if the effective sample size is below half of the particles.
     """
     return replace(
         bootstrap(model, n, resampler, trigger),
@@ -341,21 +336,21 @@ def auxiliary(
     resampler: Resampler | None = None,
     trigger: Trigger | None = None,
 ) -> ParticleFilter:
-    """The auxiliary filter (Pitt and Shephard 1999): selects by weight times priority, then takes that off again.
+    """The auxiliary filter (Pitt and Shephard 1999): selects by weight times priority, then divides by the priority.
 
     Parameters
     ----------
     model : StateSpaceModel
-        With its log densities where there is a proposal.
+        With its log densities if `proposal` is given.
     log_priority : callable
-        ``(particles, y) -> (n,)``, close to log p(y_t | x_{t-1}); any finite one is exact.
+        ``(particles, y) -> (n,)``, close to log p(y_t | x_{t-1}); the filter is exact for any finite priority.
     n : int
         Particles.
     proposal, initial : callable, optional
         As in `guided`. With p(y_t | x_{t-1}) as priority and p(x_t | x_{t-1}, y_t) as proposal the filter is fully
         adapted.
     resampler, trigger : Resampler, Trigger, optional
-        Systematic at an effective sample size (of the weights times the priorities) below half where left out.
+        Default: `Systematic`, if the effective sample size of weights times priorities is below half.
     """
     if proposal is None:
         filter = bootstrap(model, n, resampler, trigger)

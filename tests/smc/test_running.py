@@ -234,10 +234,10 @@ def test_a_run_goes_on_from_its_checkpoint(filter, ys, tmp_path):
         filter.run(ys, 5, checkpoint=tmp_path / "no" / "run.npz")
     # A field of a component that changed would give neither run.
     for other, message in (
-        (replace(filter, trigger=EssBelow(0.9)), r"its filter.trigger.share is 0.5, that of this run 0.9"),
+        (replace(filter, trigger=EssBelow(0.9)), r"its filter.trigger.share is 0.5, expected 0.9"),
         (
             replace(filter, resampler=Tempered(power=0.5)),
-            "filter.resampler.class is Systematic, that of this run Temp",
+            "filter.resampler.class is Systematic, expected Temp",
         ),
         (replace(filter, n=31), "its filter.n is 30|its filter.n is 8"),
     ):

@@ -226,7 +226,7 @@ def test_what_cannot_be_smoothed():
     record = keep(bootstrap(AR1, 20), YS, 1)
     rng = np.random.default_rng(0)
     mixed = keep(replace(bootstrap(AR1, 20), proposal=Fresh()), YS[:3], 1)
-    with pytest.raises(InputError, match="step 2: not every particle says what it came from"):
+    with pytest.raises(InputError, match="step 2: not every particle has a known parent"):
         genealogy(mixed)
     with pytest.raises(InputError, match="transition is StateSpaceModel"):
         backward_paths(rng, record, AR1, 5)

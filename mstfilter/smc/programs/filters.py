@@ -38,7 +38,7 @@ Model = Callable[[Any, Any], Any]
 
 @dataclass(frozen=True)
 class Program:
-    """A model as a function, and the filters that come from it.
+    """A model given as a function, and its filters.
 
     Parameters
     ----------
@@ -56,7 +56,7 @@ class Program:
             )
 
     def bootstrap(self, n: int, resampler: Resampler | None = None, trigger: Trigger | None = None) -> ParticleFilter:
-        """Bootstrap filter: draws from the model, weighs by what is observed."""
+        """Bootstrap filter: draws from the model, weights by the observations."""
         return self._filter(None, n, resampler, trigger)
 
     def guided(
@@ -67,12 +67,12 @@ class Program:
         Parameters
         ----------
         guide : callable
-            Program that draws every site of the model, by its name, knowing the observation. Where the observation
-            is missing the model draws itself.
+            Program that draws every site of the model, by name, given the observation. If the observation is missing,
+            the model draws.
         n : int
             Particles.
         resampler, trigger : Resampler, Trigger, optional
-            Systematic at an effective sample size below half where left out.
+            Default: `Systematic`, if the effective sample size is below half of the particles.
         """
         return self._filter(guide, n, resampler, trigger)
 
@@ -84,7 +84,7 @@ class Program:
         trigger: Trigger | None = None,
         power: float = 1.0,
     ) -> ParticleFilter:
-        """Auxiliary filter with the automatic lookahead: exact for every model.
+        """Auxiliary filter with an automatic lookahead, exact for every model.
 
         Parameters
         ----------
@@ -93,9 +93,9 @@ class Program:
         guide : callable, optional
             As in `guided`.
         resampler, trigger : Resampler, Trigger, optional
-            Systematic at an effective sample size below half where left out.
+            Default: `Systematic`, if the effective sample size is below half of the particles.
         power : float
-            Priority to this power: below 1 where the mean of a site says too much.
+            Power of the priority; below 1 if the lookahead at the mean is too confident.
         """
         return replace(self._filter(guide, n, resampler, trigger), lookahead=ProgramLookahead(self.model, power))
 
@@ -108,10 +108,7 @@ class Program:
         resampler: Resampler | None = None,
         trigger: Trigger | None = None,
     ) -> ParticleFilter:
-        """Resample-move filter: `steps` Metropolis steps on all sites at the end of a step that resampled.
-
-        `scale` is the step in standard deviations of each site's distribution.
-        """
+        """Resample-move filter: `steps` Metropolis steps of `ProgramMove` at the end of a step that resampled."""
         return replace(self._filter(guide, n, resampler, trigger), rejuvenation=ProgramMove(self.model, scale, steps))
 
     def _filter(
@@ -129,7 +126,7 @@ class Program:
 def _advance(
     rng: np.random.Generator, model: Model, guide: Model | None, previous: Any, observation: Any, n: int
 ) -> tuple[Any, np.ndarray]:
-    """Particles after a step and what their log weights gain."""
+    """Particles after a step and the gain of their log weights."""
     if guide is None or observation is None:
         return run_program(model, SampleHandler(rng), previous, observation, n)
     if isinstance(guide, PerParticle) != isinstance(model, PerParticle):
@@ -141,14 +138,14 @@ def _advance(
 
 @dataclass(frozen=True)
 class ProgramInitial(Proposal):
-    """First step of a program: draws and weighs.
+    """First step of a program: draws and weights.
 
     Parameters
     ----------
     model : callable
         The program.
     guide : callable, optional
-        Draws in its place.
+        Draws instead of the program.
     """
 
     model: Model
@@ -160,14 +157,14 @@ class ProgramInitial(Proposal):
 
 @dataclass(frozen=True)
 class ProgramTransition(Transition):
-    """A step of a program: draws and weighs.
+    """A step of a program: draws and weights.
 
     Parameters
     ----------
     model : callable
         The program.
     guide : callable, optional
-        Draws in its place.
+        Draws instead of the program.
     """
 
     model: Model
@@ -181,7 +178,7 @@ class ProgramTransition(Transition):
 
 @dataclass(frozen=True)
 class ProgramLookahead(Lookahead):
-    """Priority from a run in which the mean (mode of a discrete site) stands in place of each draw.
+    """Priority from a run with the mean (mode of a discrete site) instead of each draw.
 
     Parameters
     ----------
@@ -198,9 +195,9 @@ class ProgramLookahead(Lookahead):
         check_number("power", self.power, at_least=0)
 
     def log_priority(self, population: Population, observation: Any) -> np.ndarray:
-        """(n,) log of what would be observed; bounded so that no particle is ruled out."""
+        """(n,) log probability of the observation, bounded from below."""
         _, priority = run_program(self.model, CentreHandler(), population.particles, observation, len(population))
-        # What a mean rules out a draw may allow: the priority is kept within 50 of the best (e^-50).
+        # An observation that is impossible at the mean may be possible for a draw: at most 50 below the best.
         top = priority.max()
         if not np.isfinite(top):
             return np.zeros(len(priority))
@@ -211,18 +208,18 @@ class ProgramLookahead(Lookahead):
 class ProgramMove(Rejuvenation):
     """Metropolis-Hastings on all sites of a step at once.
 
-    Continuous sites take a Gaussian step, `scale` standard deviations of the site's distribution long; discrete sites
-    are drawn anew from theirs. Both distributions depend on earlier sites, so the way back is weighed by a second run
-    at the proposed values. Sites of branches keep to the branch that was drawn.
+    Continuous sites take a Gaussian step of `scale` standard deviations of the site's distribution; discrete sites
+    are drawn from theirs. Both distributions depend on earlier sites, so the reverse density takes a second run at
+    the proposed values. The branches of `switch` stay. ``notes["accepted"]`` is the rate of accepted steps.
 
     Parameters
     ----------
     model : callable
         The program.
     scale : float
-        Length of a step.
+        Standard deviation of a step relative to that of the site.
     steps : int
-        Steps a move.
+        Steps per move.
     """
 
     model: Model
@@ -240,7 +237,6 @@ class ProgramMove(Rejuvenation):
         previous: Population | None,
         observation: Any,
     ) -> Population:
-        """Move; `notes` hold the share of accepted steps."""
         before = None if previous is None else previous.particles
         particles, accepted = _metropolis(
             rng, self.model, population.particles, before, observation, len(population), self.scale, self.steps
@@ -258,14 +254,14 @@ def _metropolis(
     scale: float,
     steps: int,
 ) -> tuple[Particles, float]:
-    """Particles after `steps` Metropolis-Hastings steps on all sites, and the share that was accepted."""
+    """Particles after `steps` Metropolis-Hastings steps on all sites, and the rate of accepted steps."""
     if not isinstance(model, PerParticle):
         return _move_rows(rng, model, particles, previous, observation, n, scale, steps, False)
     moved, shares = [], []
     for i, particle in enumerate(particles):
         past = None if previous is None else previous[i]
-        own = child(rng, "particle", i)
-        new, share = _move_rows(own, model.function, particle, past, observation, 1, scale, steps, True)
+        stream = child(rng, "particle", i)
+        new, share = _move_rows(stream, model.function, particle, past, observation, 1, scale, steps, True)
         moved.append(Trace(new))
         shares.append(share)
     return tuple(moved), float(np.mean(shares))
@@ -282,10 +278,10 @@ def _move_rows(
     steps: int,
     single: bool,
 ) -> tuple[Mapping[str, Any], float]:
-    """Steps of all particles at once, or of a single one."""
+    """Steps of all particles together, or of a single one without the particle axis."""
 
-    def score(values: Mapping[str, Any], bare: bool = False) -> tuple[ProgramRun, list[Site]]:
-        handler = ScoreHandler(values, bare)
+    def score(values: Mapping[str, Any], no_axis: bool = False) -> tuple[ProgramRun, list[Site]]:
+        handler = ScoreHandler(values, no_axis)
         return _run_once(model, handler, previous, observation, n, single), handler.sites
 
     now, sites = score(particles, single)
@@ -297,7 +293,7 @@ def _move_rows(
         except InputError:
             if not single:
                 raise
-            continue  # a particle of another structure, for which there are no values: refused both ways
+            continue  # other sites are reached, which have no values: rejected in both directions
         if [s.name for s in new_sites] != [s.name for s in sites]:
             continue
         backward = _log_density(values, now.values, new_sites, scale, n)
@@ -330,7 +326,7 @@ def _propose(
 def _log_density(
     old: Mapping[str, np.ndarray], new: Mapping[str, np.ndarray], sites: list[Site], scale: float, n: int
 ) -> np.ndarray:
-    """(n,) log density of proposing `new` at `old`, where the program meets `sites`."""
+    """(n,) log density of proposing `new` at `old`, for the given sites."""
     total = np.zeros(n)
     for site in sites:
         if site.branch:
@@ -357,20 +353,20 @@ def run_program(
     model : callable
         The program, or its guide.
     handler : SiteHandler
-        Decides the values of sites.
+        Decides the values of the sites.
     previous : particles or None
         x_{t-1}.
     observation : Any
         y_t.
     n : int
-        Particles.
+        Number of particles.
 
     Returns
     -------
     particles : mapping of arrays (n, ...), or tuple of n `Trace`
-        Values of the sites, and what the program returned.
+        Values of the sites, and the values that the program returned.
     gain : (n,) float64
-        What the log weights gain.
+        Added to the log weights.
     """
     if not isinstance(model, PerParticle):
         run = _run_once(model, handler, previous, observation, n, False)
@@ -412,7 +408,7 @@ def _run_once(
 
 
 def _returned(returned: Any, n: int, single: bool) -> dict[str, Any]:
-    """What a program returns: one row a particle, or a single particle's values as they are."""
+    """Check the values that a program returned: one row per particle, or any value of a single particle."""
     if returned is None:
         return {}
     if not isinstance(returned, Mapping):
@@ -425,13 +421,15 @@ def _returned(returned: Any, n: int, single: bool) -> dict[str, Any]:
     for name, value in returned.items():
         array = np.asarray(value)
         if array.ndim == 0 or len(array) != n:
-            raise InputError(f"a program returned {name!r} of shape {array.shape}, expected one row a particle ({n})")
+            raise InputError(
+                f"a program returned {name!r} of shape {array.shape}, expected one row per particle ({n})"
+            )
         out[str(name)] = array
     return out
 
 
 def _values_of(run: ProgramRun) -> dict[str, Any]:
-    """What a particle (or all of them) is after a run: values of the sites, and what was returned."""
+    """The particle (or all particles) after a run: values of the sites, and returned values."""
     values = {name: a[0] for name, a in run.values.items()} if run.single else run.values
     particles = {**values, **run.returned}
     if not particles:

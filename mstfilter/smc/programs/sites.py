@@ -47,29 +47,29 @@ def sample(name: str, distribution: Any) -> Any:
     Parameters
     ----------
     name : str
-        Once a step.
+        Unique within a step.
     distribution : Distribution
-        Ours, a frozen one of scipy.stats, or one of torch; parameters have one row a particle.
+        Of this package, frozen of scipy.stats, or of torch; parameters have one row per particle.
 
     Returns
     -------
     ndarray (n, ...)
-        One row a particle; a number or array without that axis in a `per_particle` program.
+        One row per particle; a number or array without that axis in a `per_particle` program.
     """
     return _current().sample(name, distribution)
 
 
 def observe(name: str, distribution: Any, value: Any) -> None:
-    """Weigh the particles by the probability of an observed value; None is missing and weighs nothing.
+    """Weight the particles by the probability of an observed value; None is a missing value and has no effect.
 
     Parameters
     ----------
     name : str
-        For messages.
+        Used in messages.
     distribution : Distribution
         Of the observation given the particle.
     value : array_like or None
-        What was observed.
+        The observation.
     """
     _current().observe(name, distribution, value)
 
@@ -80,20 +80,20 @@ def switch(name: str, probs: Any, branches: Sequence[Callable[..., Any]], *args:
     Parameters
     ----------
     name : str
-        The number of the branch (n,) is kept under this name.
+        The index of the branch (n,) is stored in the particles under this name.
     probs : (k,) or (n, k) array_like
         Probabilities of the k branches.
     branches : sequence of callables
         Each is called once with the rows of `args` that belong to its particles, and may `sample`, `observe` and
-        `switch`. A site with the same name in several branches is one array; where a particle did not visit a site
-        its value is NaN (0 for whole numbers).
+        `switch`. A site with the same name in several branches is one array; the value is NaN (0 for integers) for
+        particles that did not reach the site.
     *args : array (n, ...), mapping of such, or None
-        Split by rows. What all particles share, such as the observation, comes by closure.
+        Split by rows. Values shared by all particles, such as the observation, come by closure.
 
     Returns
     -------
     None, array (n, ...) or mapping
-        What the branches returned, put together by rows.
+        The values returned by the branches, merged by rows.
     """
     return _current().switch(name, probs, branches, args)
 
@@ -110,7 +110,7 @@ def _current() -> ProgramRun:
 
 @dataclass(frozen=True)
 class PerParticle:
-    """A program that is run once for every particle; made by `per_particle`.
+    """A program that runs once for every particle; made by `per_particle`.
 
     Parameters
     ----------
@@ -121,17 +121,16 @@ class PerParticle:
     function: Callable[[Any, Any], Any]
 
     def __call__(self, previous: Any, observation: Any) -> Any:
-        """Run it."""
         return self.function(previous, observation)
 
 
 def per_particle(function: Callable[[Any, Any], Any]) -> PerParticle:
-    """Mark a program whose set of sites may differ between particles. It runs once for every particle: slower."""
+    """Mark a program whose set of sites may differ between particles. It runs once for every particle, so slower."""
     return PerParticle(function)
 
 
 class Trace(Mapping[str, Any]):
-    """Values by name; what a `per_particle` program makes of one particle.
+    """An immutable mapping from names to values: a particle of a `per_particle` program.
 
     Parameters
     ----------
@@ -313,10 +312,9 @@ class ProgramRun:
         self.returned: dict[str, Any] = {}
         self.gain = np.zeros(n)
         self._rows: np.ndarray | None = None
-        self._split: set[str] = set()  # sites that were met inside a branch
+        self._split: set[str] = set()  # sites inside a branch
 
     def sample(self, name: str, distribution: Any, branch: bool = False) -> Any:
-        """A site."""
         rows = self._rows
         size = self.n if rows is None else len(rows)
         value, gain = self.handler.value(Site(name, as_distribution(distribution), size, rows, branch))
@@ -326,12 +324,10 @@ class ProgramRun:
         return value[0] if self.single else value
 
     def observe(self, name: str, distribution: Any, value: Any) -> None:
-        """An observation; None is missing."""
         if value is not None:
             self._add(as_distribution(distribution).log_prob(value), f"observation {name!r}")
 
     def switch(self, name: str, probs: Any, branches: Sequence[Callable[..., Any]], args: tuple[Any, ...]) -> Any:
-        """Branches by a drawn number."""
         distribution = Categorical(probs)
         if distribution.probs.shape[-1] != len(branches):
             raise InputError(
@@ -341,7 +337,7 @@ class ProgramRun:
         if self.single:
             return branches[int(index)](*args)
         outer, results, groups = self._rows, [], []
-        for k, branch in enumerate(branches):  # empty groups too: every branch's sites exist at every step
+        for k, branch in enumerate(branches):  # also empty groups: the sites of all branches exist at every step
             group = np.flatnonzero(index == k)
             self._rows = group if outer is None else outer[group]
             groups.append(group)
@@ -362,12 +358,10 @@ class ProgramRun:
             self._split.add(name)
         if name not in self._split:
             raise InputError(f"site {name!r} is sampled inside and outside of a branch", "give them two names")
-        whole = self.values[name]
-        dtype = np.result_type(whole, value)
-        if dtype != whole.dtype:
-            whole = whole.astype(dtype)
-        whole[rows] = value
-        self.values[name] = whole
+        values = self.values[name]
+        values = values.astype(np.result_type(values, value), copy=False)
+        values[rows] = value
+        self.values[name] = values
 
     def _add(self, log_prob: Any, what: str) -> None:
         log_prob = np.asarray(log_prob)
@@ -377,9 +371,9 @@ class ProgramRun:
         target = self.gain if self._rows is None else self.gain[self._rows]
         if log_prob.ndim > 1 or (log_prob.ndim == 1 and len(log_prob) not in (1, len(target))):
             raise InputError(
-                f"log probability of {what} has shape {log_prob.shape}, expected one number a particle, "
+                f"log probability of {what} has shape {log_prob.shape}, expected one number per particle, "
                 f"({len(target)},)",
-                "give the distribution one row a particle: parameters (n,) or (n, d)",
+                "give the distribution one row per particle: parameters (n,) or (n, d)",
             )
         if self._rows is None:
             self.gain += log_prob
@@ -388,13 +382,13 @@ class ProgramRun:
 
 
 def _blank(value: np.ndarray, n: int) -> np.ndarray:
-    """n rows in place of a site that was not visited: NaN where there is one, else 0."""
+    """(n, ...) values of a site that was not reached: NaN for floats, else 0."""
     fill = np.nan if np.issubdtype(value.dtype, np.floating) else 0
     return np.full((n, *value.shape[1:]), fill, dtype=value.dtype)
 
 
 def _merge(results: list[Any], groups: list[np.ndarray], n: int, name: str) -> Any:
-    """What the branches returned, each in its rows."""
+    """Values returned by the branches, each in its rows."""
     if all(r is None for r in results):
         return None
     if all(isinstance(r, Mapping) for r in results):
@@ -405,7 +399,7 @@ def _merge(results: list[Any], groups: list[np.ndarray], n: int, name: str) -> A
         raise InputError(f"branches of switch {name!r} return different kinds of values")
     arrays = [np.asarray(r) for r in results]
     inner = next((a.shape[1:] for a in arrays if a.ndim), ())
-    whole = np.zeros((n, *inner), dtype=np.result_type(*arrays))
+    merged = np.zeros((n, *inner), dtype=np.result_type(*arrays))
     for group, array in zip(groups, arrays, strict=True):
-        whole[group] = array
-    return whole
+        merged[group] = array
+    return merged
