@@ -235,7 +235,7 @@ def test_what_cannot_be_smoothed():
     with pytest.raises(InputError, match="no observations"):
         keep(bootstrap(AR1, 20), [], 1)
     for bad, message in (
-        (lambda old, new: np.full(len(old), -np.inf), "from step 6 to 7: no particle can have led"),
+        (lambda old, new: np.full(len(old), -np.inf), "from step 6 to 7: a particle has no possible predecessor"),
         (lambda old, new: np.full(len(old), np.nan), "from step 6 to 7"),
         (lambda old, new: np.zeros(3), r"log_prob returned shape \(3,\)"),
     ):
