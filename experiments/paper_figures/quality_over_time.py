@@ -11,7 +11,7 @@ from pathlib import Path
 
 import mstfilter.report
 from mstfilter.errors import InputError
-from mstfilter.report import SERIES, colour, hexadecimal, in_groups, time_figure
+from mstfilter.report import SERIES, colour, figure_groups, hexadecimal, time_figure
 from mstfilter.study import StudyFolder
 
 PAGE = 'xmlns="http://www.w3.org/2000/svg" style="background:var(--paper);font-family:sans-serif"'
@@ -39,7 +39,7 @@ def make(out: Path, study: Path, chosen: Sequence[str] = ()) -> list[Path]:
     out.mkdir(parents=True, exist_ok=True)
     titled = {f"{family}, n = {len(scenes[family])} scenes": of_arms for family, of_arms in values.items()}
     paths = []
-    for k, group in enumerate(in_groups(arms, folder.description["reference"])):
+    for k, group in enumerate(figure_groups(arms, folder.description["reference"])):
         paths.append(out / f"quality_over_time{f'_{k + 1}' if k else ''}.svg")
         paths[-1].write_text(standalone(time_figure(titled, group)))
     return paths

@@ -19,7 +19,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from mstfilter.formats import open_recording
 from mstfilter.presets import load_config
-from mstfilter.report import TRUTH, Identities, by_weight, identity_colours, viewpoint
+from mstfilter.report import TRUTH, Identities, assign_identities, order_by_weight, viewpoint
 from mstfilter.runs import RunFolder, filter_recording
 from mstfilter.scene import Camera, Recording
 from mstfilter.scoring import object_status, overlap
@@ -42,7 +42,7 @@ def make(out: Path, smoke: bool) -> list[Path]:
 
 def picture(recording: Recording, run: RunFolder, path: Path, smoke: bool) -> Path:
     """One column a pause."""
-    identities, grid = identity_colours(run), recording.grid
+    identities, grid = assign_identities(run), recording.grid
     truths = [recording.truth(t) for t in range(run.n_pauses)]
     everything = np.max([truth > 0 for truth in truths], axis=0)
     camera = run.camera(0)
@@ -72,7 +72,7 @@ def hypotheses(column: np.ndarray, run: RunFolder, t: int, identities: Identitie
     found, weights = run.hypotheses(t), run.info(t)["weights"]
     first: dict[bytes, int] = {}
     total: dict[int, float] = {}
-    for k in by_weight(weights):
+    for k in order_by_weight(weights):
         same = first.setdefault(found[k].key, k)
         total[same] = total.get(same, 0.0) + weights[k]
     order = sorted(total, key=lambda k: -total[k])

@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from mstfilter.presets import load_config
-from mstfilter.report import identity_colours, overlay, viewpoint, voxel_picture
+from mstfilter.report import assign_identities, overlay, viewpoint, voxel_picture
 from mstfilter.runs import RunFolder, filter_recording
 from mstfilter.scene import project, write_image
 from mstfilter.scoring import weighted_coverage
@@ -64,7 +64,7 @@ def main(seed: int, out: Path, smoke: bool) -> None:
         family = replace(scene_family("demo"), **SMALL) if smoke else scene_family("table")
         recording = simulate_recording(family, seed, Path(folder) / "recording")
         run = filter_recording(recording, load_config("mst"), Path(folder) / "run", seed=0)
-        colours, pauses = identity_colours(run), (0, 1, run.n_pauses - 1)
+        colours, pauses = assign_identities(run), (0, 1, run.n_pauses - 1)
         everything = [h for t in pauses for h in run.hypotheses(t)]
         view = viewpoint(everything, run.camera(0), WIDTH, HEIGHT)
         masks = [project(h, run.camera(0)) > 0 for h in everything]

@@ -1,15 +1,15 @@
 from mstfilter.report.export import export_mesh as export_mesh, export_run as export_run
-from mstfilter.report.figures import SERIES as SERIES, in_groups as in_groups, time_figure as time_figure
+from mstfilter.report.figures import SERIES as SERIES, figure_groups as figure_groups, time_figure as time_figure
 from mstfilter.report.identities import (
     TRUTH as TRUTH,
     Identities as Identities,
-    by_weight as by_weight,
-    close_up as close_up,
-    identity_colours as identity_colours,
+    assign_identities as assign_identities,
+    order_by_weight as order_by_weight,
 )
 from mstfilter.report.pictures import (
     UNASSIGNED_COLOUR as UNASSIGNED_COLOUR,
     Colour as Colour,
+    close_up as close_up,
     colour as colour,
     hexadecimal as hexadecimal,
     overlay as overlay,

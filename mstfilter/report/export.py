@@ -27,7 +27,7 @@ import numpy as np
 from mstfilter.errors import InputError
 from mstfilter.files import atomic_path, write_csv
 from mstfilter.open3d_import import import_open3d
-from mstfilter.report.identities import identity_colours
+from mstfilter.report.identities import assign_identities
 from mstfilter.report.pictures import UNASSIGNED_COLOUR, Colour, colour, hexadecimal
 from mstfilter.runs import RunFolder
 from mstfilter.scene import Hypothesis, VoxelGrid, project, write_image
@@ -178,7 +178,7 @@ def export_run(
             raise InputError(f"unknown mesh {option} {value!r}", f"known: {', '.join(known)}")
     import_open3d()  # a missing library is reported before anything is written
     run = run if isinstance(run, RunFolder) else RunFolder.open(run)
-    identities = identity_colours(run)
+    identities = assign_identities(run)
     paths: list[Path] = []
     rows: list[dict[str, object]] = []
     for t in range(run.n_pauses):

@@ -1,24 +1,10 @@
-"""Figures as inline SVG that takes its colours and fonts from the page it stands in, so that it follows its theme.
-
->>> with style("quality"):
-...     figure, (axes,) = new_figure(6.6, 3.3)
-...     axes.plot([0, 1], [0.5, 0.7], color=ACCENT)
-...     text = svg_text(figure, "Quality over time")
-
-The same values give the same text.
-
-
-Figures over time as inline SVG: quality, effective sample size and ancestors, genealogy.
+"""Figures of runs and studies as inline SVG.
 
 >>> svg = quality_figure(times, qualities, weights, {"one blob": [...], "connected components": [...]})
-
-Every function returns the text of an ``<svg>`` element that takes its colours and fonts from the page it stands
-in, so that it follows a light or a dark theme. The same values give the same text.
-
-
-Figures of a study as inline SVG: quality over time by family and method, paired differences.
-
 >>> svg = time_figure({"s1": {"mst": {0: [0.5, 0.6], 1: [0.7]}}}, arms=["mst"])
+
+Each function returns the text of an ``<svg>`` element that uses the colours and fonts of its page, so it follows a
+light or a dark theme. The same values give the same text.
 """
 
 from __future__ import annotations
@@ -40,73 +26,64 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 __all__ = [
-    "ACCENT",
-    "FLOOR",
-    "INK",
-    "LINE",
-    "MUTED",
     "SERIES",
-    "colour_of",
     "differences_figure",
+    "figure_groups",
     "genealogy_figure",
     "health_figure",
-    "in_groups",
-    "new_figure",
     "quality_figure",
-    "style",
-    "svg_text",
     "time_figure",
 ]
 
-# Stand-ins that are replaced by the page's own colours.
-INK, MUTED, LINE, ACCENT, FLOOR = "#010203", "#020304", "#030405", "#040506", "#050607"
-#: Colours of things that are compared.
+# Placeholders, which are replaced by the colours of the page.
+_INK, _MUTED, _LINE, _ACCENT, _BASELINE = "#010203", "#020304", "#030405", "#040506", "#050607"
 SERIES = tuple(f"#06{k:02x}08" for k in range(12))
+"""Placeholders of the colours of arms."""
 _PAGE = {
-    INK: "currentColor",
-    MUTED: "var(--muted)",
-    LINE: "var(--line)",
-    ACCENT: "var(--accent)",
-    FLOOR: "var(--floor)",
+    _INK: "currentColor",
+    _MUTED: "var(--muted)",
+    _LINE: "var(--line)",
+    _ACCENT: "var(--accent)",
+    _BASELINE: "var(--baseline)",
     **{mark: f"var(--s{k})" for k, mark in enumerate(SERIES)},
 }
 
 
 @contextmanager
-def style(name: str) -> Iterator[None]:
-    """Settings of figures; `name` keeps their element names apart in one page."""
+def _style(name: str) -> Iterator[None]:
+    """Settings of figures; `name` makes the ids of their elements unique in a page."""
     import matplotlib
 
     settings = {
         "svg.fonttype": "none",
         "svg.hashsalt": f"mstfilter {name}",
         "font.size": 9.5,
-        "axes.edgecolor": LINE,
-        "axes.labelcolor": MUTED,
-        "axes.titlecolor": INK,
+        "axes.edgecolor": _LINE,
+        "axes.labelcolor": _MUTED,
+        "axes.titlecolor": _INK,
         "axes.titlesize": 10,
         "axes.titlelocation": "left",
         "axes.spines.top": False,
         "axes.spines.right": False,
         "axes.spines.left": False,
         "axes.axisbelow": True,
-        "text.color": INK,
-        "xtick.color": LINE,
-        "ytick.color": LINE,
-        "xtick.labelcolor": MUTED,
-        "ytick.labelcolor": MUTED,
+        "text.color": _INK,
+        "xtick.color": _LINE,
+        "ytick.color": _LINE,
+        "xtick.labelcolor": _MUTED,
+        "ytick.labelcolor": _MUTED,
         "ytick.left": False,
-        "grid.color": LINE,
+        "grid.color": _LINE,
         "grid.linewidth": 0.7,
         "legend.frameon": False,
-        "legend.labelcolor": MUTED,
+        "legend.labelcolor": _MUTED,
     }
     with matplotlib.rc_context(settings):
         yield
 
 
-def new_figure(width: float, height: float, n: int = 1, *, below: bool = False) -> tuple[Figure, list[Axes]]:
-    """A figure of so many inches with `n` axes side by side, or one below the other."""
+def _new_figure(width: float, height: float, n: int = 1, *, below: bool = False) -> tuple[Figure, list[Axes]]:
+    """A figure of a size in inches with `n` axes in a row, or `below` each other."""
     from matplotlib.backends.backend_svg import FigureCanvasSVG
     from matplotlib.figure import Figure
 
@@ -120,8 +97,8 @@ def new_figure(width: float, height: float, n: int = 1, *, below: bool = False) 
     return figure, axes
 
 
-def svg_text(figure: Figure, title: str) -> str:
-    """The figure as an element to stand in a page, without prolog, links, size or fonts of its own."""
+def _svg_text(figure: Figure, title: str) -> str:
+    """The figure as an SVG element of a page, without prolog, links, size and fonts."""
     buffer = io.StringIO()
     figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
     text = buffer.getvalue()
@@ -131,16 +108,16 @@ def svg_text(figure: Figure, title: str) -> str:
     assert view is not None
     head = f'<svg class="figure" viewBox="{view[1]}" role="img" aria-label="{title}">'
     text = head + text[text.index(">") + 1 :]
-    text = re.sub(r"font(-family)?: ?[^;\"]*'[^;\"]*(;|(?=\"))", _font, text)
+    text = re.sub(r"font(-family)?: ?[^;\"]*'[^;\"]*(;|(?=\"))", _keep_font_size, text)
     text = text.replace("xlink:href", "href")
-    text = re.sub(r"(<g [^>]*)>\n((?:\s*<use [^>]*/>\n){2,})", _once, text)
+    text = re.sub(r"(<g [^>]*)>\n((?:\s*<use [^>]*/>\n){2,})", _merge_styles, text)
     for mark, colour in _PAGE.items():
         text = text.replace(mark, colour)
     return text.strip()
 
 
-def _once(match: re.Match[str]) -> str:
-    """Marks of one group that look alike: their style once, their places to a tenth of a point."""
+def _merge_styles(match: re.Match[str]) -> str:
+    """Write the common style of the marks of a group once, and their positions to a tenth of a point."""
     styles = set(re.findall(r'style="([^"]*)"', match[2]))
     marks = re.sub(r'([xy]="-?\d+\.\d)\d+"', r'\1"', match[2])
     if len(styles) > 1 or "style=" in match[1]:
@@ -148,8 +125,8 @@ def _once(match: re.Match[str]) -> str:
     return f'{match[1]} style="{styles.pop()}">\n' + re.sub(r' style="[^"]*"', "", marks)
 
 
-def _font(match: re.Match[str]) -> str:
-    """Keep the size of a ``font`` shorthand, drop the family."""
+def _keep_font_size(match: re.Match[str]) -> str:
+    """Keep the size of a ``font`` shorthand and drop the family."""
     size = re.search(r"([\d.]+)px", match[0])
     return "" if size is None else f"font-size: {size[1]}px;"
 
@@ -157,7 +134,7 @@ def _font(match: re.Match[str]) -> str:
 _MOST_NAMED = 24  # particles of a pause that are still named in a genealogy
 
 
-def _pauses(axes: Axes, times: Sequence[int]) -> None:
+def _pause_axis(axes: Axes, times: Sequence[int]) -> None:
     axes.set_xlim(min(times) - 0.5, max(times) + 0.5)
     step = max(1, len(times) // 12)
     axes.set_xticks(list(times)[::step])
@@ -168,34 +145,34 @@ def quality_figure(
     times: Sequence[int],
     qualities: Sequence[Sequence[float]],
     weights: Sequence[Sequence[float]],
-    floors: Mapping[str, Sequence[float]],
+    baselines: Mapping[str, Sequence[float]],
 ) -> str:
-    """Quality of every hypothesis (points, area by weight), their weighted mean (line) and floors (dashed).
+    """Quality of every hypothesis (points, area by weight), their weighted mean (line) and baselines (dashed).
 
     Parameters
     ----------
     times : sequence of int
-        Pauses with truth.
+        Pauses with ground truth.
     qualities, weights : sequence of sequences
-        One value a hypothesis, for each of those pauses.
-    floors : mapping
-        Name to one value a pause.
+        One value per hypothesis, for each of these pauses.
+    baselines : mapping
+        Name -> one value per pause.
     """
-    with style("quality"):
-        figure, (axes,) = new_figure(6.6, 3.3)
+    with _style("quality"):
+        figure, (axes,) = _new_figure(6.6, 3.3)
         mean = [float(np.dot(q, w) / np.sum(w)) for q, w in zip(qualities, weights, strict=True)]
-        for (name, values), dash in zip(floors.items(), ((4, 2), (1, 2)), strict=False):
-            axes.plot(times, values, color=FLOOR, lw=1.3, dashes=dash, marker="_", ms=12, label=name)
+        for (name, values), dash in zip(baselines.items(), ((4, 2), (1, 2)), strict=False):
+            axes.plot(times, values, color=_BASELINE, lw=1.3, dashes=dash, marker="_", ms=12, label=name)
         for t, q, w in zip(times, qualities, weights, strict=True):
             offset = np.linspace(-0.09, 0.09, len(q)) if len(q) > 1 else np.zeros(1)
-            axes.scatter(t + offset, q, s=16 + 130 * np.asarray(w), color=ACCENT, alpha=0.4, lw=0)
-        axes.plot(times, mean, color=ACCENT, lw=2, marker="o", ms=4.5, label="weighted mean")
-        axes.scatter([], [], s=30, color=ACCENT, alpha=0.4, lw=0, label="hypothesis")
+            axes.scatter(t + offset, q, s=16 + 130 * np.asarray(w), color=_ACCENT, alpha=0.4, lw=0)
+        axes.plot(times, mean, color=_ACCENT, lw=2, marker="o", ms=4.5, label="weighted mean")
+        axes.scatter([], [], s=30, color=_ACCENT, alpha=0.4, lw=0, label="hypothesis")
         axes.set_ylim(0, 1.02)
-        _pauses(axes, times)
-        axes.set_title("Quality against the truth")
+        _pause_axis(axes, times)
+        axes.set_title("Quality against the ground truth")
         figure.legend(loc="outside lower center", ncols=4, fontsize=8.5, handlelength=2.2, columnspacing=1.4)
-        return svg_text(figure, "Quality of the hypotheses over time")
+        return _svg_text(figure, "Quality of the hypotheses over time")
 
 
 def health_figure(
@@ -210,18 +187,18 @@ def health_figure(
     times : sequence of int
         Pauses.
     ess, ancestors : sequence of (value, most) or None
-        Drawn as a share of the most there can be; None where there is nothing to count.
+        Drawn as a share of the most possible value; None for no bar.
     """
-    with style("health"):
-        figure, axes = new_figure(6.6, 2.3, 2)
+    with _style("health"):
+        figure, axes = _new_figure(6.6, 2.3, 2)
         both = (("Effective sample size", ess), ("Previous particles with descendants", ancestors))
         for a, (title, values) in zip(axes, both, strict=True):
             known = [(t, *pair) for t, pair in zip(times, values, strict=True) if pair is not None]
             at = [t for t, _, _ in known]
             share = [100 * value / max(most, 1) for _, value, most in known]
-            a.bar(at, 100, width=0.62, color=LINE, lw=0, alpha=0.55)
-            a.bar(at, share, width=0.62, color=ACCENT, lw=0, alpha=0.85)
-            _pauses(a, times)
+            a.bar(at, 100, width=0.62, color=_LINE, lw=0, alpha=0.55)
+            a.bar(at, share, width=0.62, color=_ACCENT, lw=0, alpha=0.85)
+            _pause_axis(a, times)
             a.set_ylim(0, 116)
             a.set_yticks([0, 50, 100], ["0", "50 %", "100 %"])
             for (t, value, most), s in zip(known, share, strict=True):
@@ -229,7 +206,7 @@ def health_figure(
                     text = f"{value:.3g} of {most}"
                     a.annotate(text, (t, s), (0, 2), textcoords="offset points", ha="center", fontsize=8)
             a.set_title(title)
-        return svg_text(figure, "Effective sample size and unique ancestors over time")
+        return _svg_text(figure, "Effective sample size and unique ancestors over time")
 
 
 def genealogy_figure(
@@ -237,33 +214,33 @@ def genealogy_figure(
     previous: Sequence[Sequence[int] | None],
     proposed: Sequence[Sequence[int] | None],
 ) -> str:
-    """Who descends from whom: particles of each pause in a column, disc area by weight.
+    """Genealogy of the particles: those of a pause in a column, disc area by weight.
 
     Parameters
     ----------
     weights : sequence of sequences
-        For each pause, one a particle.
+        For each pause, one value per particle.
     previous, proposed : sequence of sequences or None
-        For each pause, the particle of the previous pause and the proposal that each one comes from; -1 none.
+        For each pause, the previous particle and the proposed sample of each particle; -1 for none.
 
     The lineage of the heaviest particle of the last pause is drawn in colour.
     """
     n = max(len(w) for w in weights)
     named = n <= _MOST_NAMED
     line = _lineage(weights, previous)
-    with style("genealogy"):
-        figure, (axes,) = new_figure(6.6, float(np.clip(1.0 + 0.62 * n, 2.2, 6.2)))
+    with _style("genealogy"):
+        figure, (axes,) = _new_figure(6.6, float(np.clip(1.0 + 0.62 * n, 2.2, 6.2)))
         axes.grid(visible=False)
         for t, parents in enumerate(previous):
             for k, parent in enumerate(parents or ()):
                 if t and 0 <= parent < len(weights[t - 1]):
                     own = line.get(t) == k
-                    x, y = _bend(t - 1, parent, t, k)
-                    axes.plot(x, y, color=ACCENT if own else MUTED, lw=2.2 if own else 1, alpha=1 if own else 0.45)
+                    x, y = _curve(t - 1, parent, t, k)
+                    axes.plot(x, y, color=_ACCENT if own else _MUTED, lw=2.2 if own else 1, alpha=1 if own else 0.45)
         for t, indices in enumerate(proposed):
             for k, index in enumerate(indices or ()):
                 if index >= 0:
-                    axes.plot([t - 0.11, t], [k - 0.26, k], color=FLOOR, lw=1, solid_capstyle="round")
+                    axes.plot([t - 0.11, t], [k - 0.26, k], color=_BASELINE, lw=1, solid_capstyle="round")
                     if named:
                         axes.annotate(
                             f"p{index}",
@@ -271,26 +248,26 @@ def genealogy_figure(
                             ha="right",
                             va="center",
                             fontsize=7.5,
-                            color=FLOOR,
+                            color=_BASELINE,
                         )
         for t, w in enumerate(weights):
             share = np.asarray(w) / np.sum(w)
             on = np.array([line.get(t) == k for k in range(len(w))])
             size = (18 if named else 4) + (260 if named else 60) * share
-            for mask, colour in ((~on, INK), (on, ACCENT)):
+            for mask, colour in ((~on, _INK), (on, _ACCENT)):
                 axes.scatter(np.full(mask.sum(), t), np.flatnonzero(mask), s=size[mask], color=colour, lw=0, zorder=3)
             if named:
                 for k in range(len(w)):
-                    axes.annotate(f"#{k}", (t, k), (7, 6), textcoords="offset points", fontsize=8, color=MUTED)
+                    axes.annotate(f"#{k}", (t, k), (7, 6), textcoords="offset points", fontsize=8, color=_MUTED)
         axes.set_ylim(n - 0.4, -0.75)
         axes.set_yticks([])
-        _pauses(axes, range(len(weights)))
+        _pause_axis(axes, range(len(weights)))
         axes.set_title("Genealogy")
-        return svg_text(figure, "Genealogy of the particles")
+        return _svg_text(figure, "Genealogy of the particles")
 
 
 def _lineage(weights: Sequence[Sequence[float]], previous: Sequence[Sequence[int] | None]) -> dict[int, int]:
-    """Pause to particle on the way back from the heaviest of the last pause."""
+    """Pause -> particle, for the ancestors of the heaviest particle of the last pause."""
     t, k = len(weights) - 1, int(np.argmax(weights[-1]))
     line = {t: k}
     while t > 0:
@@ -302,22 +279,22 @@ def _lineage(weights: Sequence[Sequence[float]], previous: Sequence[Sequence[int
     return line
 
 
-def _bend(x0: float, y0: float, x1: float, y1: float) -> tuple[np.ndarray, np.ndarray]:
-    """A smooth line between two points that leaves and arrives level."""
+def _curve(x0: float, y0: float, x1: float, y1: float) -> tuple[np.ndarray, np.ndarray]:
+    """A smooth line between two points, horizontal at both ends: y = y0 + (y1 - y0) (3 s^2 - 2 s^3)."""
     s = np.linspace(0, 1, 24)
     return x0 + (x1 - x0) * s, y0 + (y1 - y0) * (3 * s**2 - 2 * s**3)
 
 
-_MOST, _GROUP = len(SERIES), 8  # arms that one figure can tell apart, and that each of several holds
+_MOST, _GROUP = len(SERIES), 8  # arms in a single figure, and in each of several
 
 
-def colour_of(arms: Sequence[str]) -> dict[str, str]:
-    """A colour for every arm; they repeat after twelve."""
+def _arm_colours(arms: Sequence[str]) -> dict[str, str]:
+    """Colour of each arm; colours repeat after twelve."""
     return {arm: SERIES[k % len(SERIES)] for k, arm in enumerate(arms)}
 
 
-def in_groups(arms: Sequence[str], reference: str) -> list[list[str]]:
-    """Arms for one figure each: all of them up to twelve, else the reference with seven others in each."""
+def figure_groups(arms: Sequence[str], reference: str) -> list[list[str]]:
+    """Arms of each figure: all in one figure up to twelve, otherwise the reference with seven others in each."""
     if len(arms) <= _MOST:
         return [list(arms)]
     others, first = [arm for arm in arms if arm != reference], [reference] if reference in arms else []
@@ -326,24 +303,23 @@ def in_groups(arms: Sequence[str], reference: str) -> list[list[str]]:
 
 
 def time_figure(values: Mapping[str, Mapping[str, Mapping[int, Sequence[float]]]], arms: Sequence[str]) -> str:
-    """Quality of all hypotheses over time, one panel a family.
+    """Quality of all hypotheses over time, one panel per family.
 
     Parameters
     ----------
     values : mapping
         Family -> arm -> pause -> quality of every hypothesis of every scene and seed.
     arms : sequence of str
-        In the order in which they stand beside each other; see `in_groups` where there are many.
+        In the order of their boxes; see `figure_groups` for many arms.
 
-    Arms that the values lack are left out, and so are values of other arms. Boxes hold the middle half of the
-    hypotheses, the bar is their median, whiskers reach the 5th and 95th per cent; points are hypotheses, lines join
-    the means.
+    Arms without values are left out. Boxes contain the middle half of the hypotheses, the bar is their median,
+    whiskers reach the 5th and 95th percentile; points are hypotheses, lines join the means.
     """
     values = {family: {a: v for a, v in of_arms.items() if a in arms} for family, of_arms in values.items()}
-    colours, n = colour_of(arms), len(values)
+    colours, n = _arm_colours(arms), len(values)
     shown = [arm for arm in arms if any(arm in of_arms for of_arms in values.values())]
-    with style("study over time"):
-        figure, panels = new_figure(max(6.6, 1.1 + 0.42 * _slots(values, len(shown))), 3.4 * n, n, below=True)
+    with _style("study over time"):
+        figure, panels = _new_figure(max(6.6, 1.1 + 0.42 * _slots(values, len(shown))), 3.4 * n, n, below=True)
         for axes, (family, of_arms) in zip(panels, values.items(), strict=True):
             pauses = sorted({t for by_pause in of_arms.values() for t in by_pause})
             width = 0.84 / max(len(shown), 1)
@@ -357,7 +333,7 @@ def time_figure(values: Mapping[str, Mapping[str, Mapping[int, Sequence[float]]]
                     list(at.values()), means, color=colours[arm], lw=1.3, marker="D", ms=3.6, label=arm, zorder=4
                 )
             for t in pauses[1:]:
-                axes.axvline(t - 0.5, color=LINE, lw=0.7)
+                axes.axvline(t - 0.5, color=_LINE, lw=0.7)
             axes.set_xlim(min(pauses) - 0.5, max(pauses) + 0.5)
             axes.set_xticks(pauses)
             drawn = np.concatenate([np.asarray(q) for by_pause in of_arms.values() for q in by_pause.values()])
@@ -373,21 +349,21 @@ def time_figure(values: Mapping[str, Mapping[str, Mapping[int, Sequence[float]]]
             ncols=min(4, len(shown)),
             fontsize=8.5,
         )
-        return svg_text(figure, "Quality of the hypotheses over time by family and method")
+        return _svg_text(figure, "Quality of the hypotheses over time by family and method")
 
 
 def _slots(values: Mapping[str, Mapping[str, Mapping[int, Sequence[float]]]], n_arms: int) -> int:
-    """Boxes side by side in the widest panel."""
+    """Number of boxes in the widest panel."""
     return max(len({t for by_pause in of_arms.values() for t in by_pause}) for of_arms in values.values()) * n_arms
 
 
 def _boxes(
     axes: Axes, at: Mapping[int, float], by_pause: Mapping[int, Sequence[float]], width: float, colour: str
 ) -> None:
-    """A box and the points of every pause."""
+    """Draw a box and the points of each pause."""
     for t, x in at.items():
         q = np.sort(np.asarray(by_pause[t]))
-        # Points beside one another, in an order that does not depend on their height.
+        # Points are spread horizontally, in an order that does not depend on their height.
         place = (np.arange(len(q)) * 0.618) % 1.0 - 0.5
         axes.scatter(x + 0.6 * width * place, q, s=5, color=colour, alpha=0.35, lw=0, zorder=2)
         axes.boxplot(
@@ -406,14 +382,14 @@ def _boxes(
 
 
 def differences_figure(compared: Sequence[Compared], arms: Sequence[str]) -> str:
-    """Paired differences with their t intervals, by family; right of zero the reference is better."""
+    """Paired differences with their t intervals, by family; the reference is better to the right of zero."""
     known = [one for one in compared if one.difference.n]
-    colours = colour_of(arms)
-    with style("study differences"):
-        figure, (axes,) = new_figure(6.6, 0.9 + 0.26 * len(known) + 0.3 * len({one.family for one in known}))
+    colours = _arm_colours(arms)
+    with _style("study differences"):
+        figure, (axes,) = _new_figure(6.6, 0.9 + 0.26 * len(known) + 0.3 * len({one.family for one in known}))
         axes.grid(axis="y", visible=False)
         axes.grid(axis="x")
-        axes.axvline(0, color=MUTED, lw=1.0)
+        axes.axvline(0, color=_MUTED, lw=1.0)
         y, ticks, family = 0.0, [], None
         for one in known:
             if one.family != family:
@@ -423,7 +399,7 @@ def differences_figure(compared: Sequence[Compared], arms: Sequence[str]) -> str
                     "textcoords": "offset points",
                     "va": "center",
                 }
-                axes.annotate(one.family, (0, y), (4, 0), fontsize=9, color=INK, fontweight="bold", **where)
+                axes.annotate(one.family, (0, y), (4, 0), fontsize=9, color=_INK, fontweight="bold", **where)
                 family, y = one.family, y + 0.9
             d = one.difference
             if np.isfinite(d.low):
@@ -435,4 +411,4 @@ def differences_figure(compared: Sequence[Compared], arms: Sequence[str]) -> str
         axes.set_ylim(y - 0.3, -0.7)
         reference = known[0].first if known else ""
         axes.set_xlabel(f"quality of {reference} minus quality of the method")
-        return svg_text(figure, "Paired differences of quality with 95 % intervals")
+        return _svg_text(figure, "Paired differences of quality with 95 % intervals")

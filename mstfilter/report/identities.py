@@ -1,54 +1,57 @@
-"""Which object is which, over hypotheses and over time, so that the same object keeps its colour.
+"""Identities of objects over hypotheses and pauses, so that an object keeps its colour, and the cards of a pause.
 
->>> identities = identity_colours(run)              # Identities of a whole run
->>> identities.of(t, hypothesis_index)              # {label: identity 0, 1, 2, ...}
->>> identities.colours(t, hypothesis_index)         # {label: (r, g, b)}
+>>> identities = assign_identities(run)
+>>> identities.of(t, k)                             # {label: identity 0, 1, 2, ...} of hypothesis k at pause t
+>>> identities.colours(t, k)                        # {label: (r, g, b)}
 
-Hypotheses number their objects on their own, so labels say nothing across them. Within one pause, objects are
-alike where their voxels overlap. From pause to pause an object is followed through the hypothesis it descends
-from by its stable id, wherever it has moved; else by the overlap with what was seen there at the last pause.
-Truth, where present, takes part first, as one more hypothesis whose labels persist. The assignment is for the
-eye alone: it enters no number.
-
-
-The pictures of a pause, ready for a page: hypotheses that are the same share a card.
+Each hypothesis numbers its objects independently. Within a pause, objects are matched by the overlap of their voxels.
+From pause to pause, an object is followed by its stable id through the hypothesis it descends from, otherwise by the
+overlap with the last pause. The ground truth, if there is one, is matched first; its labels persist.
+Identities are used for colours only and change no number.
 
 >>> cards, hidden = cards_of_pause(run, t, identities, view)
->>> cards[0].overlay, cards[0].voxels           # data URIs of RGBA pictures
+>>> cards[0].overlay, cards[0].voxels               # data URIs of RGBA pictures
 """
 
 from __future__ import annotations
 
-from base64 import b64encode
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
-from mstfilter.report.pictures import Colour, colour, hexadecimal, layer, png_bytes, voxel_picture
+from mstfilter.report.pictures import (
+    Colour,
+    colour,
+    data_uri,
+    overlay_layer,
+    png_bytes,
+    voxel_picture,
+)
 from mstfilter.runs import RunFolder
-from mstfilter.scene import Camera, Hypothesis, VoxelGrid, project
+from mstfilter.scene import Camera, Hypothesis, project
 from mstfilter.scoring import overlap
 
 __all__ = [
+    "TRUTH",
     "Card",
     "Identities",
     "Tag",
-    "by_weight",
+    "assign_identities",
     "cards_of_pause",
-    "close_up",
-    "data_uri",
-    "identity_colours",
+    "order_by_weight",
     "truth_card",
 ]
 
-TRUTH = -1  # stands where the index of a hypothesis stands
+TRUTH = -1
+"""Index of the ground truth in place of a hypothesis."""
 
-_INHERITED = 0.5  # what descent is worth beside an overlap (Jaccard index) of 1 at this pause
-_EARLIER = 0.4  # what an overlap of 1 with the last pause is worth
-_LEAST = 0.2  # less evidence than this makes a new identity
-_PERSISTS = 2.0  # labels of the truth outweigh any overlap
-_REFERENCES = 6  # hypotheses of a pause that later ones are compared with
+_DESCENT_SCORE = 0.5  # score of descent; an overlap (Jaccard index) of 1 at this pause scores 1
+_EARLIER_SCORE = 0.4  # score of an overlap of 1 with the last pause
+_LEAST_SCORE = 0.2  # below, an object gets a new identity
+_TRUTH_SCORE = 2.0  # score of the same label of the truth, more than any overlap
+_REFERENCES = 6  # hypotheses of a pause that others are compared with
+_MOST_CARDS = 12
 
 
 @dataclass(frozen=True)
@@ -58,7 +61,7 @@ class Identities:
     Parameters
     ----------
     table : mapping
-        ``(pause, hypothesis) -> {label: identity}``; hypothesis -1 is the truth.
+        ``(pause, hypothesis) -> {label: identity}``; hypothesis -1 is the ground truth.
     """
 
     table: Mapping[tuple[int, int], Mapping[int, int]] = field(default_factory=dict)
@@ -72,23 +75,23 @@ class Identities:
         return {label: colour(identity) for label, identity in self.of(t, k).items()}
 
 
-def identity_colours(run: RunFolder) -> Identities:
+def assign_identities(run: RunFolder) -> Identities:
     """Identities of all objects of a run, pause by pause."""
-    book = _Book()
+    assignment = _Assignment()
     for t in range(run.n_pauses):
         info = run.info(t)
         parents = dict(info.get("parents") or {}).get("previous")
-        book.add(t, run.hypotheses(t), info["weights"], parents, run.truth(t))
-    return Identities(book.table)
+        assignment.add(t, run.hypotheses(t), info["weights"], parents, run.truth(t))
+    return Identities(assignment.table)
 
 
-class _Book:
-    """Identities so far, and where each was last seen."""
+class _Assignment:
+    """Identities of the pauses so far."""
 
     def __init__(self) -> None:
         self.table: dict[tuple[int, int], dict[int, int]] = {}
         self._ids: dict[tuple[int, int], dict[int, int]] = {}  # (pause, hypothesis) -> {stable id: identity}
-        # Voxels with identity + 1 (0 none) of the truth and the heaviest hypotheses: of this pause, of the last.
+        # Voxels with identity + 1 (0 for none) of the truth and the heaviest hypotheses: of this pause, of the last.
         self._now: list[np.ndarray] = []
         self._before: list[np.ndarray] = []
         self._n = 0
@@ -101,14 +104,14 @@ class _Book:
         parents: Sequence[int] | None,
         truth: np.ndarray | None,
     ) -> None:
-        """All hypotheses of a pause: truth first, then by weight."""
+        """Add all hypotheses of a pause: the truth first, then by weight."""
         self._before, self._now = self._now, []
         if truth is not None:
             labels = np.flatnonzero(np.bincount(truth.ravel(), minlength=1)[1:]) + 1
             ids = {int(k): int(k) for k in labels}
-            self._assign(t, TRUTH, truth, ids, self._ids.get((t - 1, TRUTH), {}), _PERSISTS)
+            self._assign(t, TRUTH, truth, ids, self._ids.get((t - 1, TRUTH), {}), _TRUTH_SCORE)
         first: dict[bytes, int] = {}
-        for k in by_weight(weights):
+        for k in order_by_weight(weights):
             h = hypotheses[k]
             ids = {o.label: o.id for o in h.objects}
             same = first.setdefault(h.key, k)
@@ -117,7 +120,7 @@ class _Book:
                 self._ids[t, k] = {ids[label]: identity for label, identity in self.table[t, k].items()}
                 continue
             parent = -2 if parents is None else int(parents[k])
-            self._assign(t, k, h.labels, ids, self._ids.get((t - 1, parent), {}), _INHERITED)
+            self._assign(t, k, h.labels, ids, self._ids.get((t - 1, parent), {}), _DESCENT_SCORE)
 
     def _assign(
         self,
@@ -126,24 +129,24 @@ class _Book:
         labels: np.ndarray,
         ids: Mapping[int, int],
         inherited: Mapping[int, int],
-        descent: float,
+        descent_score: float,
     ) -> None:
         from scipy.optimize import linear_sum_assignment
 
         own = list(ids)
         score = np.zeros((len(own), self._n))
         if own and self._n:
-            for images, worth in ((self._now, 1.0), (self._before, _EARLIER)):
+            for images, worth in ((self._now, 1.0), (self._before, _EARLIER_SCORE)):
                 overlaps = [_overlaps(labels, image, own, self._n) for image in images]
                 if overlaps:
                     score += worth * np.max(overlaps, axis=0)
         for row, label in enumerate(own):
             identity = inherited.get(ids[label])
             if identity is not None:
-                score[row, identity] += descent
+                score[row, identity] += descent_score
         rows, columns = linear_sum_assignment(-score)
         pairs = zip(rows.tolist(), columns.tolist(), strict=True)
-        found = {own[r]: int(c) for r, c in pairs if score[r, c] >= _LEAST}
+        found = {own[r]: int(c) for r, c in pairs if score[r, c] >= _LEAST_SCORE}
         for label in own:
             if label not in found:
                 found[label] = self._n
@@ -155,11 +158,6 @@ class _Book:
             for label, identity in found.items():
                 lookup[label] = identity + 1
             self._now.append(lookup[labels])
-
-
-def by_weight(weights: Sequence[float]) -> list[int]:
-    """Indices from the heaviest to the lightest; equal ones in their order."""
-    return sorted(range(len(weights)), key=lambda k: -weights[k])
 
 
 def _overlaps(labels: np.ndarray, image: np.ndarray, own: list[int], n: int) -> np.ndarray:
@@ -175,22 +173,23 @@ def _overlaps(labels: np.ndarray, image: np.ndarray, own: list[int], n: int) -> 
     return out
 
 
-MOST_CARDS = 12
+def order_by_weight(weights: Sequence[float]) -> list[int]:
+    """Indices from the heaviest to the lightest; ties keep their order."""
+    return sorted(range(len(weights)), key=lambda k: -weights[k])
 
 
 @dataclass(frozen=True)
 class Tag:
-    """The number of an object, where it stands in the image; x, y in pixels."""
+    """The number of an object and its position in the image; x, y in pixels."""
 
     text: str
-    colour: str
     x: float
     y: float
 
 
 @dataclass(frozen=True)
 class Card:
-    """One hypothesis (or several that are the same, or the truth) at one pause."""
+    """Pictures and numbers of equal hypotheses, or of the ground truth (without indices), at one pause."""
 
     indices: tuple[int, ...]
     weight: float
@@ -203,7 +202,7 @@ class Card:
 
     @property
     def name(self) -> str:
-        """``#0`` or ``#0, #3``, ``truth`` where it is that."""
+        """``#0`` or ``#0, #3``; ``truth`` for the ground truth."""
         if not self.indices:
             return "truth"
         names = [f"#{k}" for k in self.indices[:4]]
@@ -211,60 +210,34 @@ class Card:
         return ", ".join(names) + (f" and {more} more" if more else "")
 
 
-def data_uri(data: bytes, kind: str = "png") -> str:
-    """Bytes of an image as a data URI."""
-    return f"data:image/{kind};base64,{b64encode(data).decode()}"
-
-
 def cards_of_pause(run: RunFolder, t: int, identities: Identities, view: Camera) -> tuple[list[Card], float]:
-    """Cards of the distinct hypotheses of a pause, heaviest first, and the weight of those that are not shown."""
+    """Cards of the distinct hypotheses of a pause, heaviest first, and the weight of those without a card."""
     info, hypotheses, camera = run.info(t), run.hypotheses(t), run.camera(t)
     groups: dict[bytes, list[int]] = {}
     for k, h in enumerate(hypotheses):
         groups.setdefault(h.key, []).append(k)
     weight = [sum(info["weights"][k] for k in members) for members in groups.values()]
-    order = by_weight(weight)
+    order = order_by_weight(weight)
     members = list(groups.values())
     quality = info.get("quality")
     cards = []
-    for g in order[:MOST_CARDS]:
+    for g in order[:_MOST_CARDS]:
         k = members[g][0]
         q = None if quality is None else quality["objects"][k]
-        cards.append(_card(hypotheses[k], camera, tuple(members[g]), weight[g], q, identities.of(t, k), view))
-    return cards, float(sum(weight[g] for g in order[MOST_CARDS:]))
+        cards.append(_make_card(hypotheses[k], camera, tuple(members[g]), weight[g], q, identities.of(t, k), view))
+    return cards, float(sum(weight[g] for g in order[_MOST_CARDS:]))
 
 
 def truth_card(run: RunFolder, t: int, identities: Identities, view: Camera) -> Card | None:
-    """The truth of a pause; None where it is unknown."""
+    """The card of the ground truth of a pause; None if it is unknown."""
     truth = run.truth(t)
     if truth is None:
         return None
     hypothesis = Hypothesis.from_labels(truth, run.hypotheses(t)[0].grid)
-    return _card(hypothesis, run.camera(t), (), 0.0, None, identities.of(t, TRUTH), view)
+    return _make_card(hypothesis, run.camera(t), (), 0.0, None, identities.of(t, TRUTH), view)
 
 
-def close_up(volumes: Sequence[tuple[np.ndarray, VoxelGrid]], camera: Camera) -> tuple[float, float, float, float]:
-    """The part of the image that shows all occupied voxels, with a margin: x, y, width, height in pixels.
-
-    It has the proportions of the image, and is the whole image where nothing is occupied.
-    """
-    occupied: dict[bytes, tuple[np.ndarray, VoxelGrid]] = {}
-    for labels, grid in volumes:
-        seen = occupied.get(grid.key)
-        occupied[grid.key] = ((labels > 0) if seen is None else seen[0] | (labels > 0), grid)
-    size = np.array([camera.width, camera.height], float)
-    uv = np.concatenate([camera.project(g.centre_of(np.argwhere(mask)))[0] for mask, g in occupied.values()])
-    uv = np.clip(uv[np.isfinite(uv).all(axis=-1)], 0, size)
-    if len(uv) == 0:
-        return 0.0, 0.0, *size.tolist()
-    lower, upper = uv.min(axis=0), uv.max(axis=0)
-    share = float(np.clip(((upper - lower) / size).max() * 1.3 + 0.06, 0.2, 1))
-    corner = np.clip((lower + upper - share * size) / 2, 0, (1 - share) * size)
-    x, y, width, height = np.round([*corner, *(share * size)], 1).tolist()
-    return x, y, width, height
-
-
-def _card(
+def _make_card(
     hypothesis: Hypothesis,
     camera: Camera,
     indices: Sequence[int],
@@ -275,22 +248,23 @@ def _card(
 ) -> Card:
     colours = {label: colour(i) for label, i in identity.items()}
     image = project(hypothesis, camera)
-    # Contours stay about as fine on a small image as on a large one.
+    # Small images are enlarged, so that contours are about as fine as on large ones.
     scale = max(1, round(960 / camera.width))
+    line = max(2, round(scale * camera.width / 340))
     return Card(
         tuple(indices),
         float(weight),
         hypothesis.n_objects,
         sum(hypothesis.volumes().values()),
         quality,
-        data_uri(png_bytes(layer(image, colours, scale=scale, line=max(2, round(scale * camera.width / 340))))),
+        data_uri(png_bytes(overlay_layer(image, colours, scale=scale, line=line))),
         data_uri(png_bytes(voxel_picture(hypothesis.labels, hypothesis.grid, view, colours))),
-        tuple(_tags(image, identity)),
+        tuple(_place_tags(image, identity)),
     )
 
 
-def _tags(image: np.ndarray, identity: Mapping[int, int]) -> list[Tag]:
-    """A number in the widest place of every object that shows enough of itself; larger objects go first."""
+def _place_tags(image: np.ndarray, identity: Mapping[int, int]) -> list[Tag]:
+    """Numbers at the widest place of each object that is large enough in the image; larger objects come first."""
     from scipy.ndimage import distance_transform_edt, find_objects
 
     least, apart = 0.009 * image.shape[1], 0.03 * image.shape[1]
@@ -304,5 +278,5 @@ def _tags(image: np.ndarray, identity: Mapping[int, int]) -> list[Tag]:
     tags: list[Tag] = []
     for radius, label, x, y in sorted(places, reverse=True):
         if radius >= least and all(np.hypot(tag.x - x, tag.y - y) > apart for tag in tags):
-            tags.append(Tag(str(identity[label] + 1), hexadecimal(colour(identity[label])), x + 0.5, y + 0.5))
+            tags.append(Tag(str(identity[label] + 1), x + 0.5, y + 0.5))
     return tags

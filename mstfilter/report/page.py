@@ -1,19 +1,14 @@
-"""One HTML page: filled in from a template, written whole or not at all.
+"""HTML pages: templates, and values of unknown structure as short text.
 
->>> write_page(path, render("study.html", filters, study=...))
-
-
-Notes and configurations of unknown structure as rows of text.
-
+>>> write_page(path, fill_template("study.html", filters, study=...))  # doctest: +SKIP
 >>> flatten({"sampler": {"acceptance": 0.25}, "sizes": [3, 3, 4]})
 {'sampler.acceptance': 0.25, 'sizes': [3, 3, 4]}
->>> shown([3, 3, 4]), shown(0.123456)
+>>> short_text([3, 3, 4]), short_text(0.123456)
 ('3, 3, 4', '0.1235')
 """
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Mapping, Sequence
 from importlib.resources import files
 from pathlib import Path
@@ -22,12 +17,15 @@ from typing import Any
 import numpy as np
 
 from mstfilter.errors import InputError
+from mstfilter.files import write_text
 
-__all__ = ["counts", "flatten", "note_rows", "render", "shown", "write_page"]
+__all__ = ["counts_by_key", "fill_template", "flatten", "note_rows", "seconds_text", "short_text", "write_page"]
+
+_LONGEST = 6  # lists up to this length are written in full
 
 
-def render(template: str, filters: Mapping[str, Callable[..., Any]], **content: Any) -> str:
-    """Text of a template of this package with the style sheet; what is not given is an error."""
+def fill_template(template: str, filters: Mapping[str, Callable[..., Any]], **content: Any) -> str:
+    """Text of a template of this package with the style sheet; a missing variable is an error."""
     from jinja2 import Environment, FunctionLoader, StrictUndefined
 
     folder = files("mstfilter.report") / "templates"
@@ -44,22 +42,25 @@ def render(template: str, filters: Mapping[str, Callable[..., Any]], **content: 
 
 
 def write_page(path: Path, text: str) -> Path:
-    """Write a page under a temporary name and rename it; an `InputError` where that is not possible."""
-    partial = path.with_name(f".{path.name}.partial")
+    """Write a page; raises InputError if the file cannot be written."""
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        partial.write_text(text, encoding="utf-8")
-        os.replace(partial, path)
+        write_text(path, text)
     except OSError as error:
         raise InputError(f"cannot write report {path}: {error.strerror}", "choose another file") from error
     return path
 
 
-_LONGEST = 6
+def seconds_text(value: float) -> str:
+    """Seconds in a suitable unit."""
+    if 0 < value < 0.0005:
+        return "< 1 ms"
+    if value < 0.0995:
+        return f"{1000 * value:.0f} ms"
+    return f"{value:.2f} s" if value < 9.95 else f"{value:.0f} s"
 
 
 def flatten(value: Any, path: str = "") -> dict[str, Any]:
-    """Nested mappings as one, keys joined by dots; an empty mapping leaves nothing."""
+    """Nested mappings as one, with keys joined by dots; empty mappings are left out."""
     if not isinstance(value, Mapping):
         return {path or "value": value}
     rows: dict[str, Any] = {}
@@ -68,7 +69,7 @@ def flatten(value: Any, path: str = "") -> dict[str, Any]:
     return rows
 
 
-def shown(value: Any) -> str:
+def short_text(value: Any) -> str:
     """A value as short text: four digits, long lists by their range."""
     if value is None:
         return "–"
@@ -79,38 +80,38 @@ def shown(value: Any) -> str:
     if isinstance(value, float):
         return f"{value:.4g}"
     if isinstance(value, Sequence) and not isinstance(value, str):
-        return _shown_list(value)
+        return _list_text(value)
     if isinstance(value, Mapping):
-        return ", ".join(f"{k}: {shown(v)}" for k, v in value.items())
+        return ", ".join(f"{k}: {short_text(v)}" for k, v in value.items())
     return str(value)
 
 
-def _shown_list(values: Sequence[Any]) -> str:
+def _list_text(values: Sequence[Any]) -> str:
     if len(values) == 0:
         return "none"
-    texts = [shown(v) for v in values]
+    texts = [short_text(v) for v in values]
     if len(set(texts)) == 1 and len(texts) > 1:
         return f"{texts[0]} (all {len(texts)})"
     if len(texts) <= _LONGEST:
         return ", ".join(texts)
     if all(isinstance(v, (int, float)) for v in values):
-        return f"median {shown(float(np.median(values)))}, {shown(min(values))} to {shown(max(values))}"
+        middle = short_text(float(np.median(values)))
+        return f"median {middle}, {short_text(min(values))} to {short_text(max(values))}"
     return f"{', '.join(texts[:_LONGEST])}, … ({len(texts)})"
 
 
 def note_rows(notes: Sequence[Mapping[str, Any]]) -> list[tuple[str, list[str]]]:
-    """One row a key, one column a pause; a key that a pause lacks is shown empty."""
+    """One row per key and one column per pause; empty text for a key that a pause lacks."""
     flat = [flatten(n) if n else {} for n in notes]
     keys = list(dict.fromkeys(key for rows in flat for key in rows))
-    return [(key, [shown(rows[key]) if key in rows else "" for rows in flat]) for key in keys]
+    return [(key, [short_text(rows[key]) if key in rows else "" for rows in flat]) for key in keys]
 
 
-def counts(notes: Sequence[Mapping[str, Any]]) -> dict[str, list[dict[str, int]]]:
-    """Entries that count kinds of things (a mapping of names to whole numbers), by key, one a pause."""
+def counts_by_key(notes: Sequence[Mapping[str, Any]]) -> dict[str, list[dict[str, int]]]:
+    """Entries of notes that are counts (mappings of names to non-negative integers): key -> one table per pause."""
     found: dict[str, list[dict[str, int]]] = {}
     for t, note in enumerate(notes):
         for key, value in note.items():
-            whole = isinstance(value, Mapping) and len(value) > 0
-            if whole and all(type(v) is int and v >= 0 for v in value.values()):
+            if isinstance(value, Mapping) and value and all(type(v) is int and v >= 0 for v in value.values()):
                 found.setdefault(key, [{} for _ in notes])[t] = dict(value)
     return found

@@ -1,25 +1,22 @@
-"""Colours for objects: far apart also for eyes that do not tell red from green.
-
->>> colour(0), colour(1)
-((51, 111, 185), (238, 145, 56))
-
-Six calm colours were set by hand; the rest follow by taking, again and again, the colour that is farthest from
-all chosen ones, where distance is the smallest Oklab distance in three views: as it is, and as seen with
-protanopia and with deuteranopia (Machado, Oliveira, Fernandes 2009, severity 1). The first six differ most.
-
-
-Pictures of hypotheses: overlays on the camera's image, and the voxels seen from a fixed oblique viewpoint.
+"""Pictures of hypotheses: colours, overlays on the camera's image, voxels seen from an oblique viewpoint.
 
 >>> picture = overlay(rgb, project(hypothesis, camera), {1: (51, 111, 185)})        # (H, W, 3) uint8
 >>> view = viewpoint(hypotheses, camera)
 >>> picture = voxel_picture(hypothesis.labels, hypothesis.grid, view, {1: (51, 111, 185)})   # (h, w, 4) uint8
+>>> colour(0), colour(1)                                                            # of identities
+((51, 111, 185), (238, 145, 56))
 
-Voxels are drawn by the package's own ray caster: every ray's first face gives the normal, a blurred occupancy
-gives soft shadows in corners and on the table, and lines are drawn where one object or face meets another.
+The first six colours of the palette were chosen by hand. Each further one is the colour that is farthest from all
+earlier ones; the distance is the smallest Oklab distance in three views: normal vision, protanopia and deuteranopia
+(Machado, Oliveira, Fernandes 2009, severity 1).
+
+Voxels are rendered by ray casting: the first face that a ray meets gives the normal, blurred occupancy gives soft
+shadows in corners and on the table, and lines are drawn where objects or faces meet.
 """
 
 from __future__ import annotations
 
+from base64 import b64encode
 from collections.abc import Iterable, Mapping
 
 import numpy as np
@@ -29,10 +26,14 @@ from mstfilter.scene import Camera, Hypothesis, VoxelGrid, look_at, memo, render
 __all__ = [
     "PALETTE",
     "UNASSIGNED_COLOUR",
+    "Colour",
+    "close_up",
     "colour",
+    "data_uri",
     "hexadecimal",
-    "layer",
+    "jpeg_bytes",
     "overlay",
+    "overlay_layer",
     "png_bytes",
     "viewpoint",
     "voxel_picture",
@@ -45,15 +46,19 @@ _HEX = (
     "a95317 876888 eba9b2 968727 52a9fe e66d71 577251 075c70 9dbe7c 6892ac"
 )
 
-#: Twenty colours, 8-bit sRGB.
 PALETTE: tuple[Colour, ...] = tuple((int(h[:2], 16), int(h[2:4], 16), int(h[4:], 16)) for h in _HEX.split())
+"""Twenty colours, 8-bit sRGB."""
 
-#: For what has no identity.
 UNASSIGNED_COLOUR: Colour = (140, 143, 148)
+"""Colour of objects without an identity."""
+
+_Volume = Hypothesis | tuple[np.ndarray, VoxelGrid]
+_LIGHT = np.array([-0.35, -0.45, 0.82])  # direction to the light in axes of the view: right, towards the eye, up
+_TABLE_GREY = 128.0
 
 
 def colour(identity: int) -> Colour:
-    """Colour of an identity 0, 1, 2, ...; they repeat after twenty. Grey for negative ones."""
+    """Colour of an identity 0, 1, 2, ...; the palette repeats after twenty. Grey for negative ones."""
     return UNASSIGNED_COLOUR if identity < 0 else PALETTE[identity % len(PALETTE)]
 
 
@@ -62,12 +67,8 @@ def hexadecimal(rgb: Colour) -> str:
     return "#{:02x}{:02x}{:02x}".format(*rgb)
 
 
-_LIGHT = np.array([-0.35, -0.45, 0.82])  # towards the light, in axes of the view: right, towards the eye, up
-_TABLE = 128.0  # grey of the table
-
-
 def png_bytes(image: np.ndarray) -> bytes:
-    """PNG of (H, W, 3) RGB or (H, W, 4) RGBA uint8; the same pixels give the same bytes."""
+    """PNG file of an RGB (H, W, 3) or RGBA (H, W, 4) uint8 image; the same pixels give the same bytes."""
     import cv2
 
     order = [2, 1, 0, 3][: image.shape[2]]
@@ -75,14 +76,19 @@ def png_bytes(image: np.ndarray) -> bytes:
 
 
 def jpeg_bytes(image: np.ndarray, quality: int = 92) -> bytes:
-    """JPEG of (H, W, 3) RGB uint8."""
+    """JPEG file of an RGB (H, W, 3) uint8 image."""
     import cv2
 
     return bytes(cv2.imencode(".jpg", np.ascontiguousarray(image[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, quality])[1])
 
 
-def _painted(labels: np.ndarray, colours: Mapping[int, Colour]) -> np.ndarray:
-    """(..., 3) float colour of each label; grey where none is named."""
+def data_uri(data: bytes, kind: str = "png") -> str:
+    """An image file as a data URI."""
+    return f"data:image/{kind};base64,{b64encode(data).decode()}"
+
+
+def _label_colours(labels: np.ndarray, colours: Mapping[int, Colour]) -> np.ndarray:
+    """Colour (..., 3) float of each label; grey for labels without a colour."""
     table = np.tile(np.array(UNASSIGNED_COLOUR, float), (int(labels.max(initial=0)) + 1, 1))
     for label, rgb in colours.items():
         if 0 <= label < len(table):
@@ -90,19 +96,19 @@ def _painted(labels: np.ndarray, colours: Mapping[int, Colour]) -> np.ndarray:
     return table[labels]
 
 
-def layer(
+def overlay_layer(
     labels: np.ndarray, colours: Mapping[int, Colour], *, scale: int = 1, fill: float = 0.42, line: int = 2
 ) -> np.ndarray:
-    """The overlay of a label image as a picture of its own: translucent fill, opaque contours.
+    """The overlay of a label image without the image below: translucent fill, opaque contours.
 
     Parameters
     ----------
     labels : (H, W) integer
-        0 stays transparent.
+        0 is transparent.
     colours : mapping
         ``{label: (r, g, b)}``.
     scale : int
-        Pixels of the result for one of the label image, for crisp contours.
+        Pixels of the result per pixel of the label image and axis.
     fill : float
         Opacity inside.
     line : int
@@ -121,14 +127,14 @@ def layer(
             for sign in (step, -step):
                 other = np.roll(labels, sign, axis=axis)
                 differs = other != labels
-                # What np.roll brings in from the other side of the image is no neighbour.
+                # np.roll wraps around: pixels of the opposite border are no neighbours.
                 ends = [slice(None)] * 2
                 ends[axis] = slice(0, sign) if sign > 0 else slice(sign, None)
                 differs[tuple(ends)] = False
                 edge |= differs
     edge &= inside
     out = np.zeros((*labels.shape, 4), np.uint8)
-    out[..., :3] = np.rint(_painted(labels, colours))
+    out[..., :3] = np.rint(_label_colours(labels, colours))
     out[..., 3] = np.where(edge, 255, np.where(inside, round(255 * fill), 0))
     out[~inside] = 0
     return out
@@ -137,38 +143,60 @@ def layer(
 def overlay(
     rgb: np.ndarray, labels: np.ndarray, colours: Mapping[int, Colour], *, fill: float = 0.42, line: int = 2
 ) -> np.ndarray:
-    """An image (H, W, 3) with a label image (H, W) drawn over it: translucent fill and contours."""
-    above = layer(labels, colours, fill=fill, line=line).astype(float)
+    """An image (H, W, 3) with a label image (H, W) over it: translucent fill and contours."""
+    above = overlay_layer(labels, colours, fill=fill, line=line).astype(float)
     alpha = above[..., 3:] / 255
     return np.rint(rgb * (1 - alpha) + above[..., :3] * alpha).astype(np.uint8)
 
 
+def _occupied_points(volumes: Iterable[_Volume]) -> tuple[np.ndarray, VoxelGrid]:
+    """Centres (n, 3) of all voxels that are occupied in a volume, and the last grid."""
+    occupied: dict[bytes, tuple[np.ndarray, VoxelGrid]] = {}
+    for item in volumes:
+        labels, grid = (item.labels, item.grid) if isinstance(item, Hypothesis) else item
+        earlier = occupied.get(grid.key)
+        occupied[grid.key] = ((labels > 0) if earlier is None else earlier[0] | (labels > 0), grid)
+    return np.concatenate([g.centre_of(np.argwhere(mask)) for mask, g in occupied.values()]), grid
+
+
+def close_up(volumes: Iterable[_Volume], camera: Camera) -> tuple[float, float, float, float]:
+    """Part of the image that shows all occupied voxels, with a margin: x, y, width, height in pixels.
+
+    It has the proportions of the image; without occupied voxels it is the whole image.
+    """
+    size = np.array([camera.width, camera.height], float)
+    uv = camera.project(_occupied_points(volumes)[0])[0]
+    uv = np.clip(uv[np.isfinite(uv).all(axis=-1)], 0, size)
+    if len(uv) == 0:
+        return 0.0, 0.0, *size.tolist()
+    lower, upper = uv.min(axis=0), uv.max(axis=0)
+    share = float(np.clip(((upper - lower) / size).max() * 1.3 + 0.06, 0.2, 1))
+    corner = np.clip((lower + upper - share * size) / 2, 0, (1 - share) * size)
+    x, y, width, height = np.round([*corner, *(share * size)], 1).tolist()
+    return x, y, width, height
+
+
 def viewpoint(
-    hypotheses: Iterable[Hypothesis | tuple[np.ndarray, VoxelGrid]],
+    volumes: Iterable[_Volume],
     camera: Camera | None = None,
     width: int = 600,
     height: int = 450,
 ) -> Camera:
-    """A camera that looks down obliquely at all occupied voxels of all hypotheses and fits them all.
+    """A camera that looks down obliquely at the occupied voxels of all volumes and shows all of them.
 
     Parameters
     ----------
-    hypotheses : iterable of Hypothesis or (labels, grid)
-        Where nothing is occupied the middle of the workspace is looked at.
+    volumes : iterable of Hypothesis or (labels, grid)
+        If no voxel is occupied, the view shows the middle of the workspace.
     camera : Camera, optional
-        The real one. The view is from its side, turned by 35 degrees, so that right stays right.
+        The real camera. The view is from its side, turned by 35 degrees.
     width, height : int
-        Pixels of the picture.
+        Size of the picture in pixels.
     """
-    occupied: dict[bytes, tuple[np.ndarray, VoxelGrid]] = {}
-    for item in hypotheses:
-        labels, grid = (item.labels, item.grid) if isinstance(item, Hypothesis) else item
-        seen = occupied.get(grid.key)
-        occupied[grid.key] = ((labels > 0) if seen is None else seen[0] | (labels > 0), grid)
-    points = np.concatenate([g.centre_of(np.argwhere(mask)) for mask, g in occupied.values()])
+    points, grid = _occupied_points(volumes)
     if len(points) == 0:
         points = (grid.origin + grid.upper) / 2 * [1, 1, 0] + [[-0.15, -0.15, 0], [0.15, 0.15, 0.1]]
-    points = np.concatenate([points, points * [1, 1, 0]])  # what stands under an object belongs to the picture
+    points = np.concatenate([points, points * [1, 1, 0]])  # with the table below the objects
     target = (points.min(axis=0) + points.max(axis=0)) / 2
 
     away = np.array([0.0, -1.0, 0.0]) if camera is None else camera.position - target
@@ -177,12 +205,12 @@ def viewpoint(
     direction = np.array(
         [np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)]
     )
-    focal = 2.6 * width  # a long lens: nearly parallel, calm edges
+    focal = 2.6 * width  # a long lens: nearly parallel projection
     axes = look_at(target + direction, target).rotation.as_matrix()
     local = (points - target) @ axes
     middle = (local.min(axis=0) + local.max(axis=0)) / 2 * [1, 1, 0]
     target, local = target + axes @ middle, local - middle
-    # Far enough for every voxel to fall inside the picture with a margin.
+    # At this distance every voxel is inside the picture, with a margin.
     half = 0.5 * np.array([width, height]) * 0.8
     distance = max(float((focal * np.abs(local[:, :2]) / half - local[:, 2:]).max()), 0.2)
     centre = ((width - 1) / 2, (height - 1) / 2)
@@ -194,26 +222,25 @@ def viewpoint(
 def voxel_picture(
     labels: np.ndarray, grid: VoxelGrid, view: Camera, colours: Mapping[int, Colour], supersample: int = 2
 ) -> np.ndarray:
-    """The voxels from a viewpoint, on the table plane, as RGBA (view.height, view.width, 4) uint8.
+    """Render voxels on the table plane as RGBA (view.height, view.width, 4) uint8.
 
     Parameters
     ----------
     labels : (X, Y, Z) integer
         0 is free.
     grid : VoxelGrid
-        Where the voxels are.
+        Of the labels.
     view : Camera
         See `viewpoint`.
     colours : mapping
         ``{label: (r, g, b)}``.
     supersample : int
-        Rays a pixel and axis.
+        Rays per pixel and axis.
     """
     camera = view.scaled(supersample)
     seen = render(labels, grid, camera)
     hit = seen.labels > 0
-    frame = _view_axes(camera)
-    light = _LIGHT @ frame
+    light = _LIGHT @ _view_axes(camera)
     light = light / np.linalg.norm(light)
 
     rays = camera.rays() @ camera.pose.rotation.as_matrix().T
@@ -231,7 +258,7 @@ def voxel_picture(
         diffuse = 0.5 + 0.5 * (n @ light)
         open_sky = 1.0 - 0.62 * shade.at(p + n * 1.6 * grid.voxel_size)
         value = (0.50 + 0.58 * diffuse) * open_sky
-        base = _painted(seen.labels[hit], colours)
+        base = _label_colours(seen.labels[hit], colours)
         bright = np.clip(value, 0, 1.12)[:, None]
         colour[hit] = np.where(bright <= 1, base * bright, base + (255 - base) * (bright - 1))
         alpha[hit] = 1.0
@@ -243,7 +270,7 @@ def voxel_picture(
 
 
 def _view_axes(camera: Camera) -> np.ndarray:
-    """Rows: right, level towards the eye, up."""
+    """Rows: right, horizontal direction towards the eye, up."""
     R = camera.pose.rotation.as_matrix()
     right = R[:, 0] * np.array([1, 1, 0])
     right /= np.linalg.norm(right)
@@ -252,14 +279,14 @@ def _view_axes(camera: Camera) -> np.ndarray:
 
 
 def _normals(points: np.ndarray, rays: np.ndarray, grid: VoxelGrid) -> np.ndarray:
-    """Signed axis (+-1, +-2, +-3) of the face that each ray meets: the axis that is nearest to a lattice plane."""
+    """Signed axis (+-1, +-2, +-3) of the face that each ray meets: the axis with the nearest lattice plane."""
     u = (points - grid.origin) / grid.voxel_size
     axis = np.abs(u - np.rint(u)).argmin(axis=1)
     return np.where(rays[np.arange(len(rays)), axis] > 0, -1, 1) * (axis + 1)
 
 
 class _Shade:
-    """Blurred occupancy: how much stands around a point."""
+    """Blurred occupancy, for shadows."""
 
     def __init__(self, labels: np.ndarray, grid: VoxelGrid) -> None:
         from scipy.ndimage import gaussian_filter
@@ -268,7 +295,7 @@ class _Shade:
         self._grid = grid
         solid = np.pad((labels > 0).astype(np.float32), self._pad)
         self._near = gaussian_filter(solid, 1.8, truncate=3)
-        # On the table, the first layers above it say it all.
+        # Shadows on the table come from the first layers above it.
         floor = self._pad + int(np.clip(round(-grid.origin[2] / grid.voxel_size), 0, labels.shape[2] - 1))
         far = gaussian_filter(solid[:, :, floor : floor + 8].max(axis=2), 4.0, truncate=3)
         self._ground = 0.35 * far + 0.65 * self._near[:, :, floor]
@@ -290,7 +317,7 @@ class _Shade:
 
 
 def _lines(labels: np.ndarray, side: np.ndarray, hit: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels where the face changes within an object, and where the object changes."""
+    """Pixels where the face changes within an object, and pixels where the object changes."""
     crease, border = np.zeros(hit.shape, bool), np.zeros(hit.shape, bool)
     for axis in (0, 1):
         a = [slice(None)] * 2
@@ -305,14 +332,14 @@ def _lines(labels: np.ndarray, side: np.ndarray, hit: np.ndarray) -> tuple[np.nd
 
 
 def _table(view: Camera, grid: VoxelGrid, shade: _Shade) -> np.ndarray:
-    """The plane z = 0, (H, W, 4) float: soft shadows, a line every 10 cm, fading towards the rim of the picture."""
+    """The plane z = 0 as (H, W, 4) float: soft shadows, a line every 10 cm, transparent at the border."""
 
     def bare() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         rays = view.rays() @ view.pose.rotation.as_matrix().T
         below = rays[..., 2] < -1e-6
         along = np.where(below, -view.position[2] / np.where(below, rays[..., 2], -1), 0)
         xy = (view.position + rays * along[..., None])[..., :2]
-        # A line is a pixel wide, softened by half a pixel on both sides.
+        # Lines are a pixel wide, with soft borders of half a pixel.
         pixel = along / view.K[0, 0]
         to_line = np.abs(xy / 0.1 - np.rint(xy / 0.1)).min(axis=-1) * 0.1
         line = np.clip(1.2 - to_line / np.maximum(pixel, 1e-9), 0, 1)
@@ -323,14 +350,14 @@ def _table(view: Camera, grid: VoxelGrid, shade: _Shade) -> np.ndarray:
     xy, line, fade = memo("report_table", (view.key,), bare)
     shadow = 0.85 * np.clip(shade.on_table(xy) * 1.35, 0, 1)
     wash = 0.13 + 0.16 * line
-    # Black shadow over a grey wash, both translucent: it suits a light and a dark page.
+    # A black shadow over a grey wash, both translucent: for light and dark pages.
     alpha = shadow + wash * (1 - shadow)
-    grey = _TABLE * (wash * (1 - shadow) / alpha)
+    grey = _TABLE_GREY * (wash * (1 - shadow) / alpha)
     return np.concatenate([np.repeat(grey[..., None], 3, axis=-1), 255 * (alpha * fade)[..., None]], axis=-1)
 
 
 def _over(front: np.ndarray, back: np.ndarray) -> np.ndarray:
-    """One RGBA picture (H, W, 4) float over another, as uint8."""
+    """Alpha composition of RGBA pictures (H, W, 4) float, as uint8."""
     a, b = front[..., 3:] / 255, back[..., 3:] / 255
     alpha = a + b * (1 - a)
     rgb = (front[..., :3] * a + back[..., :3] * b * (1 - a)) / np.maximum(alpha, 1e-9)
@@ -338,7 +365,7 @@ def _over(front: np.ndarray, back: np.ndarray) -> np.ndarray:
 
 
 def _reduced(colour: np.ndarray, alpha: np.ndarray, factor: int) -> np.ndarray:
-    """Mean over blocks, colour weighted by opacity."""
+    """Mean over blocks of factor x factor pixels, with colour weighted by opacity."""
     h, w = alpha.shape[0] // factor, alpha.shape[1] // factor
     blocks = (h, factor, w, factor)
     opacity = alpha.reshape(blocks).mean(axis=(1, 3))

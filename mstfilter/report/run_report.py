@@ -1,17 +1,16 @@
-"""What the report says, in numbers and words, from a run folder alone.
-
->>> content = numbers_of(run)
->>> content.summary, content.tiles
-
-
-The report of a run: one HTML file that needs nothing beside it.
+"""The report of a run: one self-contained HTML file.
 
 >>> write_report("runs/demo")                     # runs/demo/report.html
 >>> write_report("runs/demo", "demo.html")
 
-It is made from the run folder alone, of a run that is done or was interrupted, wherever the folder has been moved,
-and loads no code of the user: components are known by what they recorded. Pictures are embedded, figures are inline
-SVG, there is no script and no link. Times of the steps aside, the same run gives the same bytes.
+The report is made from the run folder alone, of a finished or an interrupted run, and loads no code of the user.
+Pictures are embedded, figures are inline SVG, there are no scripts and no links. The same run gives the same bytes,
+except for the times of the steps.
+
+`read_numbers` collects the numbers and sentences of the report.
+
+>>> numbers = read_numbers(run)
+>>> numbers.summary, numbers.tiles
 """
 
 from __future__ import annotations
@@ -25,42 +24,58 @@ from typing import Any
 import numpy as np
 
 from mstfilter.report.figures import genealogy_figure, health_figure, quality_figure
-from mstfilter.report.identities import cards_of_pause, close_up, data_uri, identity_colours, truth_card
-from mstfilter.report.page import counts, flatten, note_rows, render, shown, write_page
-from mstfilter.report.pictures import jpeg_bytes, viewpoint
+from mstfilter.report.identities import assign_identities, cards_of_pause, truth_card
+from mstfilter.report.page import (
+    counts_by_key,
+    fill_template,
+    flatten,
+    note_rows,
+    seconds_text,
+    short_text,
+    write_page,
+)
+from mstfilter.report.pictures import close_up, data_uri, jpeg_bytes, viewpoint
 from mstfilter.runs import RunFolder
 from mstfilter.scoring import connected_components, one_blob, weighted_coverage
 
-__all__ = ["Numbers", "Step", "different", "numbers_of", "seconds_text", "write_report"]
+__all__ = ["PauseNumbers", "RunNumbers", "read_numbers", "write_report"]
 
-_SLOTS = ("initial", "transition", "proposal", "update", "resampler", "build")
+_TITLES = {
+    "initial": "Initial particles",
+    "transition": "Transition",
+    "proposal": "Proposal",
+    "update": "Update",
+    "resampler": "Resampling",
+    "build": "Building the resampled hypotheses",
+}
+_BASELINES = {"one blob": one_blob, "connected components": connected_components}
 
 
 @dataclass(frozen=True)
-class Step:
-    """One pause: what info.json and seconds.json say, and the floors.
+class PauseNumbers:
+    """Numbers of one pause.
 
     Parameters
     ----------
     info, seconds : mapping
-        As in the run folder.
-    objects : list of int
+        Contents of info.json and seconds.json.
+    objects : sequence of int
         Number of objects of each hypothesis.
-    distinct : int
-        Different hypotheses.
-    floors : mapping or None
-        Weighted mean quality of trivial baselines; None without truth.
+    n_distinct : int
+        Number of distinct hypotheses.
+    baselines : mapping or None
+        Weighted mean quality of trivial baselines; None without ground truth.
     true_objects : int or None
-        Number of objects of the truth.
+        Number of objects in the ground truth.
     time, clip_seconds : float or None
-        Time of the pause, and since the last one, in the recording.
+        Time of the pause in the recording, and time since the last pause.
     """
 
     info: Mapping[str, Any]
     seconds: Mapping[str, float]
     objects: Sequence[int]
-    distinct: int
-    floors: Mapping[str, float] | None
+    n_distinct: int
+    baselines: Mapping[str, float] | None
     true_objects: int | None
     time: float | None
     clip_seconds: float | None
@@ -72,12 +87,12 @@ class Step:
 
     @property
     def quality(self) -> Mapping[str, Sequence[float]] | None:
-        """Quality of each hypothesis, by form."""
+        """Quality of each hypothesis, by form; None without ground truth."""
         return self.info.get("quality")
 
     @property
-    def wall(self) -> float:
-        """Seconds of the whole step."""
+    def step_seconds(self) -> float:
+        """Seconds of the step."""
         return float(sum(self.seconds.values()))
 
     @property
@@ -85,27 +100,29 @@ class Step:
         """Weighted mean number of objects."""
         return float(np.dot(self.objects, self.weights))
 
+    @property
+    def distinct_text(self) -> str:
+        """How many hypotheses differ, in words."""
+        if self.n_distinct == len(self.weights):
+            return "all different"
+        return "all the same" if self.n_distinct == 1 else f"{self.n_distinct} different"
+
     def mean(self, form: str = "objects") -> float | None:
-        """Weighted mean quality; None without truth."""
+        """Weighted mean quality; None without ground truth."""
         return None if self.quality is None else float(np.dot(self.quality[form], self.weights))
 
     @property
     def best(self) -> float | None:
-        """Quality of the hypothesis that is nearest to the truth: what choosing perfectly would give."""
+        """Quality of the best hypothesis; None without ground truth."""
         return None if self.quality is None else max(self.quality["objects"])
 
-    @property
-    def floor(self) -> float | None:
-        """The better of the floors."""
-        return None if self.floors is None else max(self.floors.values())
-
     def parents(self, kind: str) -> list[int] | None:
-        """``"previous"`` or ``"proposed"`` parents, None where they were not recorded."""
+        """``"previous"`` or ``"proposed"`` parents; None if they were not recorded."""
         found = (self.info.get("parents") or {}).get(kind)
         return None if found is None else list(found)
 
     def notes(self, slot: str) -> Mapping[str, Any]:
-        """What a component recorded; nothing where it only passed another's notes on."""
+        """Notes of a component, without those that it only passed on from an earlier one."""
         notes = self.info.get("notes") or {}
         own = notes.get(slot) or {}
         for earlier in notes:
@@ -117,11 +134,11 @@ class Step:
 
 
 @dataclass(frozen=True)
-class Numbers:
-    """A whole run in numbers."""
+class RunNumbers:
+    """Numbers of a run."""
 
     description: Mapping[str, Any]
-    steps: Sequence[Step] = field(default_factory=tuple)
+    steps: Sequence[PauseNumbers] = field(default_factory=tuple)
 
     @property
     def title(self) -> str:
@@ -130,8 +147,13 @@ class Numbers:
 
     @property
     def status(self) -> str:
-        """How far the run went: running, interrupted, failed, done."""
+        """Status of the run: running, interrupted, failed, done."""
         return str(self.description.get("status", "unknown"))
+
+    @property
+    def truth_users(self) -> list[str]:
+        """Classes of the components that use the ground truth."""
+        return list(self.description.get("uses_truth") or ())
 
     @property
     def _recording(self) -> Mapping[str, Any]:
@@ -140,12 +162,12 @@ class Numbers:
 
     @cached_property
     def slots(self) -> list[str]:
-        """Parts that took time or recorded something, in the order of a step."""
+        """Slots with times or notes, in the order of a step."""
         used = {s for step in self.steps for s in (*step.seconds, *(step.info.get("notes") or {}))}
-        return [s for s in _SLOTS if s in used] + sorted(used - set(_SLOTS))
+        return [s for s in _TITLES if s in used] + sorted(used - set(_TITLES))
 
     def component(self, slot: str) -> str:
-        """Name of the component of a slot, empty where unknown."""
+        """Name of the component of a slot; empty if unknown."""
         config = self.description.get("config")
         part = config.get(slot) if isinstance(config, Mapping) else None
         name = part.get("component", "") if isinstance(part, Mapping) else part
@@ -161,28 +183,28 @@ class Numbers:
         """The run in one to four sentences."""
         planned = len(self._recording.get("pauses") or ())
         done = len(self.steps)
-        first = []
+        sentences = []
         if self.status != "done":
-            said = {"running": "has not ended", "interrupted": "was interrupted", "failed": "failed"}
-            first.append(f"The run {said.get(self.status, self.status)}: {done} of {planned or '?'} pauses are here.")
+            verbs = {"running": "has not ended", "interrupted": "was interrupted", "failed": "failed"}
+            verb = verbs.get(self.status, self.status)
+            sentences.append(f"The run {verb}: {done} of {planned or '?'} pauses are complete.")
         if not done:
-            return first or ["The run holds no pause."]
+            return sentences or ["The run has no pauses."]
         last = self.steps[-1]
         n = len(last.weights)
-        same = "" if last.distinct == n else f" ({different(last)})"
+        same = "" if last.n_distinct == n else f" ({last.distinct_text})"
         objects = sorted(set(last.objects))
-        held = _count(objects[0], "object") if len(objects) == 1 else f"{objects[0]} to {objects[-1]} objects"
-        there = "" if last.true_objects is None else f"; there are {last.true_objects}"
+        count = _count(objects[0], "object") if len(objects) == 1 else f"{objects[0]} to {objects[-1]} objects"
+        truth = "" if last.true_objects is None else f"; the ground truth has {last.true_objects}"
         hypotheses = _count(n, "hypothesis", "hypotheses")
-        first.append(f"{hypotheses}{same} after {_count(done, 'pause')}, holding {held}{there}.")
-        if last.quality is not None and last.floors is not None:
-            mean, floor = last.mean(), last.floor
-            assert mean is not None and floor is not None
-            floors = " and ".join(f"{name} {value:.2f}" for name, value in last.floors.items())
-            first.append(f"Their mean quality against the truth is {mean:.2f}; trivial baselines: {floors}.")
-            if mean <= floor + 0.005:
-                first.append("That is no better than the baselines.")
-        return first
+        sentences.append(f"{hypotheses}{same} after {_count(done, 'pause')}, with {count}{truth}.")
+        mean = last.mean()
+        if mean is not None and last.baselines is not None:
+            baselines = " and ".join(f"{name} {value:.2f}" for name, value in last.baselines.items())
+            sentences.append(f"Their mean quality is {mean:.2f}; trivial baselines: {baselines}.")
+            if mean <= max(last.baselines.values()) + 0.005:
+                sentences.append("That is no better than the baselines.")
+        return sentences
 
     @property
     def tiles(self) -> list[tuple[str, str, str]]:
@@ -191,98 +213,65 @@ class Numbers:
             return []
         last = self.steps[-1]
         n = len(last.weights)
+        truth = "" if last.true_objects is None else f", true {last.true_objects}"
         tiles = [
-            ("hypotheses", str(n), different(last)),
-            ("objects", f"{last.mean_objects:.1f}", _truth_remark(last)),
+            ("hypotheses", str(n), last.distinct_text),
+            ("objects", f"{last.mean_objects:.1f}", f"weighted mean{truth}"),
         ]
-        mean, floor = last.mean(), last.floor
-        if mean is not None and floor is not None:
-            tiles.append(("quality", f"{mean:.3f}", f"best {last.best:.3f}, floor {floor:.3f}"))
+        mean = last.mean()
+        if mean is not None and last.baselines is not None:
+            baseline = max(last.baselines.values())
+            tiles.append(("quality", f"{mean:.3f}", f"best {last.best:.3f}, baseline {baseline:.3f}"))
         tiles.append(
             ("effective sample size", f"{last.info['ess']:.3g}", f"of {last.info['n_candidates']} candidates")
         )
         if len(self.steps) > 1:
             tiles.append(("unique ancestors", str(last.info["unique_ancestors"]), f"of {n} particles"))
-        walls = [step.wall for step in self.steps]
-        tiles.append(("time per step", seconds_text(float(np.mean(walls))), f"slowest {seconds_text(max(walls))}"))
+        seconds = [step.step_seconds for step in self.steps]
+        slowest = f"slowest {seconds_text(max(seconds))}"
+        tiles.append(("time per step", seconds_text(float(np.mean(seconds))), slowest))
         return tiles
 
 
-def different(step: Step) -> str:
-    """How many hypotheses differ, in words."""
-    n = len(step.weights)
-    return (
-        "all different"
-        if step.distinct == n
-        else "all the same"
-        if step.distinct == 1
-        else f"{step.distinct} different"
-    )
+def _count(n: int, one: str, several: str = "") -> str:
+    return f"{n} {one if n == 1 else several or one + 's'}"
 
 
-def _count(n: int, one: str, many: str = "") -> str:
-    return f"{n} {one if n == 1 else many or one + 's'}"
-
-
-def _truth_remark(step: Step) -> str:
-    return "weighted mean" if step.true_objects is None else f"weighted mean, true {step.true_objects}"
-
-
-def seconds_text(value: float) -> str:
-    """Seconds in a readable unit."""
-    if 0 < value < 0.0005:
-        return "< 1 ms"
-    if value < 0.0995:
-        return f"{1000 * value:.0f} ms"
-    return f"{value:.2f} s" if value < 9.95 else f"{value:.0f} s"
-
-
-def numbers_of(run: RunFolder) -> Numbers:
-    """Read all that is no picture."""
+def read_numbers(run: RunFolder) -> RunNumbers:
+    """Numbers of a run folder."""
     description = run.description
-    recording = description.get("recording") or {}
-    times = list(recording.get("times") or ())
+    times = list((description.get("recording") or {}).get("times") or ())
     steps = []
     for t in range(run.n_pauses):
         info, hypotheses, truth = run.info(t), run.hypotheses(t), run.truth(t)
-        floors = None
+        baselines = None
         if truth is not None:
-            floors = {"one blob": 0.0, "connected components": 0.0}
-            known: dict[bytes, tuple[float, float]] = {}
+            weight: dict[bytes, float] = {}
             for h, w in zip(hypotheses, info["weights"], strict=True):
-                if h.key not in known:
-                    both = (one_blob(h.labels), connected_components(h.labels))
-                    known[h.key] = tuple(weighted_coverage(b, truth) for b in both)  # type: ignore[assignment]
-                for name, value in zip(floors, known[h.key], strict=True):
-                    floors[name] += w * value
+                weight[h.key] = weight.get(h.key, 0.0) + w
+            distinct = {h.key: h.labels for h in hypotheses}
+            baselines = {
+                name: sum(w * weighted_coverage(baseline(distinct[key]), truth) for key, w in weight.items())
+                for name, baseline in _BASELINES.items()
+            }
         time = float(times[t]) if t < len(times) else None
         steps.append(
-            Step(
+            PauseNumbers(
                 info=info,
                 seconds=run.seconds(t),
                 objects=[h.n_objects for h in hypotheses],
-                distinct=len({h.key for h in hypotheses}),
-                floors=floors,
+                n_distinct=len({h.key for h in hypotheses}),
+                baselines=baselines,
                 true_objects=None if truth is None else len(set(np.unique(truth).tolist()) - {0}),
                 time=time,
                 clip_seconds=None if time is None or t == 0 else time - float(times[t - 1]),
             )
         )
-    return Numbers(description, tuple(steps))
-
-
-_TITLES = {
-    "initial": "Initial particles",
-    "transition": "Transition",
-    "proposal": "Proposal",
-    "update": "Update",
-    "resampler": "Resampling",
-    "build": "Building the chosen",
-}
+    return RunNumbers(description, tuple(steps))
 
 
 def write_report(run: RunFolder | str | Path, out: str | Path | None = None) -> Path:
-    """Write the report of a run folder.
+    """Write the report of a run.
 
     Parameters
     ----------
@@ -294,40 +283,36 @@ def write_report(run: RunFolder | str | Path, out: str | Path | None = None) -> 
     Returns
     -------
     Path
-        The file, written under a temporary name and renamed.
+        The file.
 
     Raises
     ------
     InputError
-        The folder is no run folder, or the file cannot be written.
+        If the folder is no run folder, or the file cannot be written.
     """
     run = RunFolder.open(run.path if isinstance(run, RunFolder) else run)
-    path = run.path / "report.html" if out is None else Path(out)
-    return write_page(path, _page(run))
-
-
-def _page(run: RunFolder) -> str:
+    numbers = read_numbers(run)
     filters: dict[str, Callable[..., Any]] = dict(
-        different=different, shown=shown, seconds=seconds_text, percent=lambda x: f"{100 * x:.3g} %"
+        short_text=short_text, seconds=seconds_text, percent=lambda x: f"{100 * x:.3g} %"
     )
-    numbers = numbers_of(run)
-    return render(
+    page = fill_template(
         "report.html",
         filters,
         run=numbers,
         pauses=_pauses(run, numbers),
         figures=_figures(numbers),
         parts=[_part(numbers, slot) for slot in numbers.slots],
-        config=_config(numbers.description.get("config") or {}),
+        config=_config_rows(numbers.description.get("config") or {}),
         facts=_facts(numbers.description),
     )
+    return write_page(run.path / "report.html" if out is None else Path(out), page)
 
 
-def _pauses(run: RunFolder, numbers: Numbers) -> list[dict[str, Any]]:
+def _pauses(run: RunFolder, numbers: RunNumbers) -> list[dict[str, Any]]:
     """Pictures of all pauses."""
     if not numbers.steps:
         return []
-    identities = identity_colours(run)
+    identities = assign_identities(run)
     volumes: list[tuple[Any, Any]] = []
     for t in range(len(numbers.steps)):
         hypotheses, truth = run.hypotheses(t), run.truth(t)
@@ -355,39 +340,39 @@ def _pauses(run: RunFolder, numbers: Numbers) -> list[dict[str, Any]]:
     return pauses
 
 
-def _figures(numbers: Numbers) -> dict[str, Any]:
+def _figures(numbers: RunNumbers) -> dict[str, Any]:
     """Inline SVG by name."""
     from markupsafe import Markup
 
     steps = numbers.steps
-    if not steps:
-        return {}
     found = {}
     known = numbers.with_truth
     if known:
-        floors = {name: [steps[t].floors[name] for t in known] for name in steps[known[0]].floors or ()}  # type: ignore[index]
-        qualities = [steps[t].quality["objects"] for t in known]  # type: ignore[index]
-        found["quality"] = quality_figure(known, qualities, [steps[t].weights for t in known], floors)
-    if len(steps) == 1:  # the tiles say it all
-        return {name: Markup(svg) for name, svg in found.items()}
-    found["health"] = health_figure(
+        at = [steps[t] for t in known]
+        names = at[0].baselines or ()
+        baselines = {name: [step.baselines[name] for step in at if step.baselines] for name in names}
+        qualities = [step.quality["objects"] for step in at if step.quality]
+        found["quality"] = Markup(quality_figure(known, qualities, [step.weights for step in at], baselines))
+    if len(steps) <= 1:
+        return found
+    health = health_figure(
         range(len(steps)),
         [(step.info["ess"], step.info["n_candidates"]) for step in steps],
         [None if t == 0 else (step.info["unique_ancestors"], step.info["n"]) for t, step in enumerate(steps)],
     )
-    found["genealogy"] = genealogy_figure(
+    genealogy = genealogy_figure(
         [step.weights for step in steps],
         [step.parents("previous") for step in steps],
         [step.parents("proposed") for step in steps],
     )
-    return {name: Markup(svg) for name, svg in found.items()}
+    return {**found, "health": Markup(health), "genealogy": Markup(genealogy)}
 
 
-def _part(numbers: Numbers, slot: str) -> dict[str, Any]:
-    """What a component did, over all pauses."""
+def _part(numbers: RunNumbers, slot: str) -> dict[str, Any]:
+    """Notes and times of a component over all pauses."""
     notes = [step.notes(slot) for step in numbers.steps]
     bars = []
-    for key, table in counts(notes).items():
+    for key, table in counts_by_key(notes).items():
         names = sorted({name for row in table for name in row}, key=lambda n: (-sum(r.get(n, 0) for r in table), n))
         bars.append({"key": key, "names": names, "rows": table})
     barred = {bar["key"] for bar in bars}
@@ -402,27 +387,27 @@ def _part(numbers: Numbers, slot: str) -> dict[str, Any]:
     }
 
 
-def _config(config: Mapping[str, Any]) -> list[tuple[str, list[tuple[str, str]]]]:
-    """Configuration as ``path = value``, grouped by slot, plain values of the filter first."""
-    plain = [(k, shown(v)) for k, v in config.items() if not isinstance(v, Mapping)]
+def _config_rows(config: Mapping[str, Any]) -> list[tuple[str, list[tuple[str, str]]]]:
+    """Configuration as ``path = value``, grouped by slot; first the values of the filter."""
+    plain = [(k, short_text(v)) for k, v in config.items() if not isinstance(v, Mapping)]
     groups = [("filter", plain)] if plain else []
     for slot, part in config.items():
         if isinstance(part, Mapping):
-            rows = [(k.removesuffix(".component"), shown(v)) for k, v in flatten(part, slot).items()]
+            rows = [(k.removesuffix(".component"), short_text(v)) for k, v in flatten(part, slot).items()]
             groups.append((_TITLES.get(slot, slot), rows))
     return groups
 
 
 def _facts(description: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """What was run, for the end of the page."""
+    """Preset, seed, recording and versions."""
     recording = description.get("recording") or {}
     facts = [
         ("preset", str(description.get("description") or "–")),
-        ("seed", shown(description.get("seed"))),
+        ("seed", short_text(description.get("seed"))),
         ("status", str(description.get("status", "–"))),
         ("recording", str(recording.get("name", "–"))),
         ("recording key", str(recording.get("key", "–"))),
-        ("generator", shown(recording.get("generator"))),
+        ("generator", short_text(recording.get("generator"))),
     ]
     facts += [(name, str(version)) for name, version in (description.get("versions") or {}).items()]
     return [fact for fact in facts if fact[1] not in ("", "–")]

@@ -1,9 +1,9 @@
-"""The report of a study: one HTML file that needs nothing beside it.
+"""The report of a study: one self-contained HTML file.
 
 >>> write_study_report("studies/first")                     # studies/first/report.html
 
-It is made from the study's folder alone, finished or not, and runs no code of a user. Conclusions are in words that
-claim no more than the scenes show.
+The report is made from the study folder alone, of a finished or an unfinished study, and runs no code of the user.
+Conclusions are sentences that claim no more than the intervals show.
 """
 
 from __future__ import annotations
@@ -13,14 +13,13 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from mstfilter.report.figures import differences_figure, in_groups, time_figure
-from mstfilter.report.page import flatten, render, shown, write_page
-from mstfilter.report.run_report import seconds_text
+from mstfilter.report.figures import differences_figure, figure_groups, time_figure
+from mstfilter.report.page import fill_template, flatten, seconds_text, short_text, write_page
 from mstfilter.study import CLAIM, ENDPOINT, SLOPE, StudyFolder, Summary
 
 __all__ = ["write_study_report"]
 
-#: Columns of the table of figures: name in the study, heading.
+# Columns of the table of results: name in the study, heading.
 _FIGURES = (
     (ENDPOINT, "quality"),
     (SLOPE, "slope a pause"),
@@ -39,8 +38,8 @@ _FIGURES = (
     ("brier", "Brier"),
     ("quality_authors", "authors' form"),
     ("quality_paper", "paper's form"),
-    ("quality_one_blob", "floor: one blob"),
-    ("quality_components", "floor: components"),
+    ("quality_one_blob", "baseline: one blob"),
+    ("quality_components", "baseline: components"),
 )
 
 
@@ -52,12 +51,12 @@ def write_study_report(study: StudyFolder | str | Path, out: str | Path | None =
     study : StudyFolder or path
         Finished or not.
     out : path, optional
-        The HTML file. Default: ``report.html`` in the study's folder.
+        The HTML file. Default: ``report.html`` in the study folder.
 
     Raises
     ------
     InputError
-        The folder is no study, or the file cannot be written.
+        If the folder is no study folder, or the file cannot be written.
     """
     study = StudyFolder.open(study.path if isinstance(study, StudyFolder) else study)
     path = study.path / "report.html" if out is None else Path(out)
@@ -68,7 +67,7 @@ def _page(study: StudyFolder) -> str:
     filters = dict(seconds=seconds_text, number=_number, signed=lambda x: _number(x, "+"), range=_range)
     records, summary, failures = study.records(), study.summary(), study.failures()
     sources: list[dict[str, Any]] = [scene["source"] for scene in study.description["scenes"]]
-    return render(
+    return fill_template(
         "study.html",
         filters,
         study=study.description,
@@ -82,17 +81,18 @@ def _page(study: StudyFolder) -> str:
         figures=_drawn(records, summary, study.reported_only),
         costs=_costs(summary),
         arms=_arms(study.description),
+        truth_users=study.truth_users,
         failures=failures,
     )
 
 
 def _number(value: float | None, sign: str = "") -> str:
-    """Three digits; a dash for what is not known."""
+    """Three digits; a dash for an unknown value."""
     return "–" if value is None or value != value else f"{value:{sign}.3f}"
 
 
 def _range(ends: tuple[float, float], sign: str = "") -> str:
-    """An interval; a dash where there is none."""
+    """An interval; a dash for an unknown one."""
     return "–" if ends[0] != ends[0] else f"{ends[0]:{sign}.3f} to {ends[1]:{sign}.3f}"
 
 
@@ -115,11 +115,11 @@ def _drawn(records: Sequence[Mapping[str, Any]], summary: Summary, reported_only
     found: dict[str, Any] = {}
     arms = [arm for arm in summary.arms if arm not in reported_only]
     if values:
-        groups = in_groups(arms, summary.reference)
+        groups = figure_groups(arms, summary.reference)
         found["time"] = [Markup(time_figure(values, group)) for group in groups]
     ends = [summary.reference, *(arm for arm in summary.arms if arm in reported_only)]
     if values and len(ends) > 1:
-        groups = in_groups(ends, summary.reference)
+        groups = figure_groups(ends, summary.reference)
         found["ends"] = [Markup(time_figure(values, group)) for group in groups]
     compared = [one for one in summary.compared() if one.difference.n]
     if compared:
@@ -128,7 +128,7 @@ def _drawn(records: Sequence[Mapping[str, Any]], summary: Summary, reported_only
 
 
 def _costs(summary: Summary) -> dict[str, Any]:
-    """Seconds and memory by stage and family, core seconds, means over pauses."""
+    """Seconds, core seconds and memory by stage, family and arm; means over pauses."""
     stages = [n.removeprefix("seconds_") for n in summary.names if n.startswith("seconds_")]
     rows: list[dict[str, Any]] = []
     per = ("seconds_", "peak_mb")
@@ -147,14 +147,14 @@ def _costs(summary: Summary) -> dict[str, Any]:
 
 
 def _arms(description: Mapping[str, Any]) -> list[tuple[str, list[tuple[str, str]]]]:
-    """Every arm and where its configuration differs from the reference's."""
+    """Each arm and the fields in which its configuration differs from the reference."""
     flat = {arm["name"]: flatten(arm["config"]) for arm in description["arms"]}
     base = flat[description["reference"]]
     found = []
     for name, config in flat.items():
         keys = [k for k in {**base, **config} if config.get(k) != base.get(k)]
-        # A component that is another one says enough: its fields go without saying.
+        # For another component only its name is listed, not its fields.
         slots = [k.removesuffix("component") for k in keys if k.endswith("component")]
-        told = [k for k in keys if k.endswith("component") or not k.startswith(tuple(slots))]
-        found.append((name, [(k.removesuffix(".component"), shown(config.get(k))) for k in told]))
+        listed = [k for k in keys if k.endswith("component") or not k.startswith(tuple(slots))]
+        found.append((name, [(k.removesuffix(".component"), short_text(config.get(k))) for k in listed]))
     return found

@@ -7,14 +7,15 @@ import itertools
 import numpy as np
 import pytest
 
-from mstfilter.report.identities import TRUTH, close_up, identity_colours
-from mstfilter.report.page import counts, flatten, note_rows, shown
+from mstfilter.report.identities import TRUTH, assign_identities
+from mstfilter.report.page import counts_by_key, flatten, note_rows, short_text
 from mstfilter.report.pictures import (
     PALETTE,
     UNASSIGNED_COLOUR,
+    close_up,
     colour,
-    layer,
     overlay,
+    overlay_layer,
     png_bytes,
     viewpoint,
     voxel_picture,
@@ -52,7 +53,7 @@ def test_palette_is_distinct_for_every_eye(view):
 
 def test_identities_follow_objects_through_relabelling_and_time(tmp_path):
     run = make_run(tmp_path / "run")
-    identities = identity_colours(run)
+    identities = assign_identities(run)
     for t in range(run.n_pauses):
         truth = identities.of(t, TRUTH)
         assert truth == {1: 0, 2: 1}
@@ -66,9 +67,9 @@ def test_identities_follow_objects_through_relabelling_and_time(tmp_path):
 
 
 def test_identity_of_a_moved_object_comes_from_its_line_of_descent(tmp_path):
-    from mstfilter.report.identities import _Book
+    from mstfilter.report.identities import _Assignment
 
-    book = _Book()
+    book = _Assignment()
     first = Hypothesis.from_labels(labels_of((1, 1, 3), (12, 12, 3)), GRID)
     # Both have moved to where neither was; labels are swapped, ids are kept.
     moved = labels_of((7, 2, 3), (2, 8, 3))
@@ -95,7 +96,7 @@ def test_overlay_touches_objects_only():
     np.testing.assert_array_equal(picture[6:14, 20], np.tile([0, 0, 255], (8, 1)))
     inside = rgb[10, 10] * 0.5 + np.array([127.5, 0, 0])
     assert np.abs(picture[10, 10] - inside).max() <= 1
-    big = layer(labels, colours, scale=3)
+    big = overlay_layer(labels, colours, scale=3)
     assert big.shape == (60, 90, 4)
     assert ((big[..., 3] > 0) == (labels > 0).repeat(3, 0).repeat(3, 1)).all()
 
@@ -103,10 +104,10 @@ def test_overlay_touches_objects_only():
 def test_objects_at_the_rim_have_no_contour_from_the_other_side():
     labels = np.zeros((8, 8), np.uint16)
     labels[:, 0] = 1
-    alpha = layer(labels, {}, line=2)[..., 3]
+    alpha = overlay_layer(labels, {}, line=2)[..., 3]
     assert (alpha[:, 0] == 255).all()  # its right neighbour is free
     labels[:] = 1
-    assert (layer(labels, {}, line=2)[..., 3] < 255).all()
+    assert (overlay_layer(labels, {}, line=2)[..., 3] < 255).all()
 
 
 def test_viewpoint_holds_every_voxel():
@@ -162,7 +163,7 @@ def test_close_up_holds_the_objects_and_keeps_the_proportions():
 
 def test_tables():
     assert flatten({"a": {"b": 1, "c": {}}, "d": [1]}) == {"a.b": 1, "d": [1]}
-    assert [shown(v) for v in (None, True, 3, 0.123456, "x", [], [2, 2, 2])] == [
+    assert [short_text(v) for v in (None, True, 3, 0.123456, "x", [], [2, 2, 2])] == [
         "–",
         "yes",
         "3",
@@ -171,8 +172,8 @@ def test_tables():
         "none",
         "2 (all 3)",
     ]
-    assert shown(list(range(100))) == "median 49.5, 0 to 99"
+    assert short_text(list(range(100))) == "median 49.5, 0 to 99"
     assert note_rows([{"a": 1}, {"b": {"c": 2}}]) == [("a", ["1", ""]), ("b.c", ["", "2"])]
-    assert counts([{"m": {"icp": 2}, "r": {"x": 0.5}}, {"m": {"flow": 1}}, {}]) == {
+    assert counts_by_key([{"m": {"icp": 2}, "r": {"x": 0.5}}, {"m": {"flow": 1}}, {}]) == {
         "m": [{"icp": 2}, {"flow": 1}, {}]
     }

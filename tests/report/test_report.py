@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from mstfilter.errors import InputError
-from mstfilter.report.run_report import numbers_of, write_report
+from mstfilter.report.run_report import read_numbers, write_report
 from mstfilter.runs import RunFolder
 from mstfilter.scoring import weighted_coverage
 from tests.report.runs import make_run
@@ -125,12 +125,12 @@ def test_only_times_differ_between_equal_runs(finished, tmp_path):
 
 def test_floors_are_the_quality_of_what_is_occupied(finished):
     run, _ = finished
-    numbers = numbers_of(run)
+    numbers = read_numbers(run)
     for t, step in enumerate(numbers.steps):
         truth, expected = run.truth(t), 0.0
         for h, w in zip(run.hypotheses(t), step.weights, strict=True):
             expected += w * weighted_coverage((h.labels > 0).astype(int), truth)
-        assert step.floors["one blob"] == pytest.approx(expected)
+        assert step.baselines["one blob"] == pytest.approx(expected)
         assert step.mean() == pytest.approx(np.dot(step.quality["objects"], step.weights))
         assert step.true_objects == 2
 
@@ -141,11 +141,11 @@ def test_floors_are_the_quality_of_what_is_occupied(finished):
 def test_kinds_of_runs(kind, tmp_path):
     _text, page = read(write_report(make_run(tmp_path / "run", **kind)))
     if not kind.get("truth", True):
-        assert "no truth" in page.text and "one blob" not in page.text and "Truth" not in page.text
+        assert "no ground truth" in page.text and "one blob" not in page.text and "Truth" not in page.text
     if kind.get("pauses") == 1:
         assert "after 1 pause," in page.text and "Genealogy" not in page.text
     if kind.get("empty"):
-        assert "holding 0 objects" in page.text
+        assert "with 0 objects" in page.text
 
 
 def test_truth_at_some_pauses_only(tmp_path):
@@ -154,7 +154,7 @@ def test_truth_at_some_pauses_only(tmp_path):
     info = run.info(2)
     (run.pause(2) / "info.json").write_text(json.dumps({**info, "quality": None}))
     _, page = read(write_report(run))
-    assert "Quality against the truth" in page.text
+    assert "Quality against the ground truth" in page.text
 
 
 def test_interrupted_runs(tmp_path):
@@ -162,7 +162,7 @@ def test_interrupted_runs(tmp_path):
     shutil.rmtree(run.pause(2))
     run.set_status("interrupted")
     _, page = read(write_report(run))
-    assert "The run was interrupted: 2 of 3 pauses are here." in page.text
+    assert "The run was interrupted: 2 of 3 pauses are complete." in page.text
     shutil.rmtree(run.path / "pauses")
     _, page = read(write_report(run))
     assert "0 of 3 pauses" in page.text and "Full configuration" in page.text
@@ -199,7 +199,7 @@ def test_many_particles_are_cut_to_the_heaviest(tmp_path):
     info["parents"] = {"proposed": list(range(20))}
     (run.pause(0) / "info.json").write_text(json.dumps(info))
     _, page = read(write_report(run))
-    assert "The 12 heaviest are shown; the others hold 40 % of the weight." in page.text
+    assert "The 12 heaviest are shown; the others have 40 % of the weight." in page.text
 
 
 def test_errors(tmp_path):
@@ -214,3 +214,12 @@ def test_errors(tmp_path):
 def test_templates_are_part_of_the_package():
     folder = files("mstfilter.report") / "templates"
     assert {p.name for p in folder.iterdir()} >= {"report.html", "style.css"}
+
+
+def test_a_run_that_uses_the_ground_truth_is_marked(finished, tmp_path):
+    assert "uses the ground truth" not in read(finished[1])[1].text
+    run = make_run(tmp_path / "run", pauses=1)
+    description = json.loads((run.path / "run.json").read_text())
+    (run.path / "run.json").write_text(json.dumps({**description, "uses_truth": ["TrueMasks"]}))
+    page = read(write_report(run))[1].text
+    assert "uses the ground truth" in page and "from images alone: TrueMasks" in page

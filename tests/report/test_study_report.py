@@ -11,13 +11,13 @@ import pytest
 from hypothesis import given, strategies as st
 
 from mstfilter.errors import InputError
-from mstfilter.report.figures import SERIES, in_groups
+from mstfilter.report.figures import SERIES, figure_groups
 from mstfilter.report.study_report import write_study_report
 from mstfilter.study import RESULT, StudyFolder
 from tests.test_cli import call
 
 
-def make_study(path, n_scenes=4, arms=("ours", "<theirs>"), groups=("s1", "s2"), fail=True, beside=()):
+def make_study(path, n_scenes=4, arms=("ours", "<theirs>"), groups=("s1", "s2"), fail=True, reported_only=()):
     """A study folder written by hand: ours is better by 0.1."""
     rng, runs = np.random.default_rng(0), []
     scenes = [
@@ -54,7 +54,8 @@ def make_study(path, n_scenes=4, arms=("ours", "<theirs>"), groups=("s1", "s2"),
                 (path / "runs" / folder / RESULT).write_text(json.dumps(done))
     config = {"n": 5, "resampler": {"component": "systematic"}}
     described = [
-        {"name": arm, "beside": arm in beside, "config": {**config, "n": 5 + k}} for k, arm in enumerate(arms)
+        {"name": arm, "reported_only": arm in reported_only, "uses_truth": [], "config": {**config, "n": 5 + k}}
+        for k, arm in enumerate(arms)
     ]
     description = {"format": 1, "name": "a study", "description": "", "reference": arms[0], "arms": described}
     (path / "study.json").write_text(json.dumps({**description, "scenes": scenes, "seeds": [0, 1], "runs": runs}))
@@ -67,7 +68,7 @@ def test_it_says_what_was_found(tmp_path):
     assert "ours is above &lt;theirs&gt; on s1" in text and "no claim below 20 scenes" in text
     assert "31 of 32 runs" in text and "1 failed" in text
     assert "it &lt;broke&gt;" in text and "mend it" in text and "<broke>" not in text
-    assert "made by this program itself" in text
+    assert "simulated by mstfilter" in text
     assert text.count('<svg class="figure"') == 2
     assert not re.search(r"(src|href)=\"(http|//)", text) and "<script" not in text
     assert "n = 6" in text  # where the arms differ
@@ -104,24 +105,24 @@ def test_more_arms_than_colours_are_drawn_in_several_figures(tmp_path):
     for svg, others in zip(times, (arms[1:8], arms[8:]), strict=True):
         assert set(re.findall(r">(arm \d+)<", svg)) == {arms[0], *others}
         assert svg.count("<use") >= points * (1 + len(others))
-    assert text.count("<figcaption>Every point") == 1
+    assert text.count("<figcaption>Each point") == 1
 
 
 @given(st.lists(st.integers(), unique=True, min_size=1, max_size=60), st.data())
 def test_groups_hold_every_arm_once_and_the_reference_always(numbers, data):
     arms = [str(k) for k in numbers]
     reference = data.draw(st.sampled_from(arms))
-    groups = in_groups(arms, reference)
+    groups = figure_groups(arms, reference)
     assert all(reference in group and len(group) == len(set(group)) <= len(SERIES) for group in groups)
     assert [a for group in groups for a in group if a != reference] == [a for a in arms if a != reference]
 
 
-def test_floors_stand_beside_and_are_not_spoken_of(tmp_path):
+def test_conclusions_leave_out_arms_that_are_reported_only(tmp_path):
     arms = ("ours", "theirs", "floor")
     text = write_study_report(
-        make_study(tmp_path, arms=arms, groups=("s1",), fail=False, beside=("floor",))
+        make_study(tmp_path, arms=arms, groups=("s1",), fail=False, reported_only=("floor",))
     ).read_text()
-    assert "Beside floors and ceilings" in text and text.count('<svg class="figure"') == 3
+    assert "With baselines and oracles" in text and text.count('<svg class="figure"') == 3
     assert "ours is above theirs" in text and "ours is above floor" not in text
 
 
@@ -145,3 +146,15 @@ def test_every_arm_has_a_colour():
     style = (files("mstfilter.report") / "templates" / "style.css").read_text()
     for k in range(len(SERIES)):
         assert f"--s{k}: #" in style and f".s{k} {{" in style
+
+
+def test_arms_that_use_the_ground_truth_are_marked(tmp_path):
+    study = make_study(tmp_path, groups=("s1",), fail=False)
+    assert "uses the ground truth" not in write_study_report(study).read_text()
+    description = json.loads((study / "study.json").read_text())
+    description["arms"][1]["uses_truth"] = ["TrueMasks"]
+    (study / "study.json").write_text(json.dumps(description))
+    text = write_study_report(study).read_text()
+    assert (
+        "uses the ground truth: TrueMasks" in text and "&lt;theirs&gt; *</td>" in text and "ours *</td>" not in text
+    )
