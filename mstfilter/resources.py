@@ -1,8 +1,9 @@
-"""Where presets and weights lie: an explicit path, the installed package, or the repository.
+"""Files that come with the package: presets and weights (`models/`), example components (`docs/examples/`).
 
 >>> models_folder() / "mst.toml"
+>>> examples_folder() / "resampler.py"
 
-A wheel carries `models/` inside the package; in a checkout or an editable install it lies beside the package.
+A wheel holds both inside the package; in a checkout or an editable install they lie beside the package.
 """
 
 from __future__ import annotations
@@ -11,19 +12,27 @@ from pathlib import Path
 
 from mstfilter.errors import InputError
 
-__all__ = ["find_preset", "models_folder", "preset_names"]
+__all__ = ["examples_folder", "find_preset", "models_folder", "preset_names"]
 
 
 def models_folder() -> Path:
     """The folder that holds presets and weights."""
+    return _folder_with("mst.toml", "_models", "models")
+
+
+def examples_folder() -> Path:
+    """The folder that holds the example components of the documentation, and their tests."""
+    return _folder_with("resampler.py", "_examples", "docs/examples")
+
+
+def _folder_with(file: str, installed: str, in_checkout: str) -> Path:
+    """A folder inside the installed package, or beside it in a checkout."""
     package = Path(__file__).resolve().parent
-    for folder in (package / "_models", package.parent / "models"):
-        if (folder / "mst.toml").is_file():
+    folders = (package / installed, package.parent / in_checkout)
+    for folder in folders:
+        if (folder / file).is_file():
             return folder
-    raise InputError(
-        f"presets are missing: no mst.toml in {package / '_models'} nor in {package.parent / 'models'}",
-        "install the package again",
-    )
+    raise InputError(f"{file} is missing in {folders[0]} and in {folders[1]}", "install the package again")
 
 
 def preset_names() -> list[str]:

@@ -35,37 +35,37 @@ def list_(
 def check(
     component: Annotated[str, typer.Argument(help="./file.py:Class, or KIND.NAME such as resampler.systematic.")],
     overrides: Annotated[
-        list[str] | None, typer.Argument(metavar="[FIELD=VALUE]...", help="Fields that are not the default.")
+        list[str] | None, typer.Argument(metavar="[FIELD=VALUE]...", help="Values of fields.")
     ] = None,
 ) -> None:
-    """Test whether a component keeps what its interface promises, and say in words what it does not."""
+    """Test whether a component keeps the contract of its interface, and state which properties are broken."""
     from mstfilter.presets import REGISTRY, settings
-    from mstfilter.testing import FALSE_ALARM, example_of, verify
 
+    try:
+        from mstfilter.testing import FALSE_ALARM, check_component
+    except ModuleNotFoundError as error:
+        if error.name != "pytest":
+            raise
+        raise InputError("check needs pytest, which is not installed", "pip install 'mstfilter[check]'") from error
     kind, _, name = ("", "", component) if ".py:" in component else component.partition(".")
     if ".py:" not in component and kind not in REGISTRY.kinds:
         raise InputError(
             f"{component!r} is no component", "give ./file.py:Class, or KIND.NAME as `mstfilter list` shows"
         )
     cls = REGISTRY.find_class(kind, name, component, allow_files=True)
-    made = REGISTRY.make(cls, settings(overrides or ()), allow_files=True)
-    failed = statistical = 0
-    for outcome in verify(made, example_of(cls)):
-        state = "broken" if outcome.broken else "skipped" if outcome.skipped else "holds"
-        print(f"{state:<9}{outcome.property.says}")
-        if outcome.broken or outcome.skipped:
-            print(f"{'':<9}  {outcome.broken or outcome.skipped}  [{outcome.property.name}]")
-        failed += outcome.broken is not None
-        statistical += outcome.property.statistical and not outcome.skipped
+    results = check_component(REGISTRY.make(cls, settings(overrides or ()), allow_files=True))
+    for result in results:
+        state = "broken" if result.failure else "skipped" if result.skipped else "holds"
+        print(f"{state:<9}{result.statement}")
+        if result.failure or result.skipped:
+            print(f"{'':<9}  {result.failure or result.skipped}  [{result.name}]")
+    statistical = sum(result.statistical and not result.skipped for result in results)
     if statistical:
-        print(
-            f"{statistical} of these are statistical: each alarms falsely with probability {FALSE_ALARM:.0e} at most"
-        )
-    verdict = {0: "all properties that apply hold", 1: "1 property is broken"}.get(
-        failed, f"{failed} properties are broken"
-    )
-    print(f"{cls.__name__}: {verdict}")
-    if failed:
+        print(f"{statistical} of these are statistical, each with a false-alarm rate of at most {FALSE_ALARM:.0e}")
+    broken = sum(result.failure is not None for result in results)
+    verdict = f"{broken} {'property is' if broken == 1 else 'properties are'} broken"
+    print(f"{cls.__name__}: {verdict if broken else 'all properties that apply hold'}")
+    if broken:
         raise typer.Exit(1)
 
 
@@ -77,9 +77,9 @@ def new(
             help="resampler, transition, proposal, update, trigger, size, lookahead, rejuvenation or codec."
         ),
     ],
-    path: Annotated[Path, typer.Argument(help="Python file to make, for example mine.py.")],
+    path: Annotated[Path, typer.Argument(help="Python file to write, for example mine.py.")],
 ) -> None:
-    """Write a commented component of your own that works, and its test."""
+    """Write a commented component that works, as a start for a new one, and its test."""
     from mstfilter.testing import write_starter
 
     file, test = write_starter(kind, path)
@@ -89,7 +89,7 @@ def new(
 
 
 def _lines(kind: str) -> Iterator[str]:
-    """One line a preset, family or component."""
+    """One line per preset, family or component."""
     import tomllib
 
     from mstfilter.oracles import UsesTruth
@@ -121,7 +121,7 @@ def _first_line(cls: type) -> str:
 
 
 def _fields(cls: type) -> str:
-    """Fields of a component with their defaults."""
+    """Fields of a component and their defaults."""
     import dataclasses
 
     from mstfilter.presets import REGISTRY

@@ -1,15 +1,18 @@
-"""Contracts that every component keeps, ours or yours.
+"""Contracts: properties that every component of a kind has, as pytest classes, for your components and ours.
 
-With pytest, five lines test your own component:
+Inherit the contract of the interface and define `make`:
 
->>> from mstfilter.testing import ResamplerContract
+>>> from mstfilter.testing import WeightResamplerContract
 >>> from mine import MyResampler
->>> class TestMyResampler(ResamplerContract):
+>>> class TestMyResampler(WeightResamplerContract):
 ...     def make(self):
 ...         return MyResampler()
 
-Without pytest, ``mstfilter check ./mine.py:MyResampler`` runs the same properties and says in words which one does
-not hold; `verify` does so from Python.
+``pytest`` then tests the component. ``mstfilter check ./mine.py:MyResampler`` runs the same class and states in words
+which property is violated; `check_component` does so from Python. ``mstfilter new resampler mine.py`` writes a
+component to start from, and its test (`write_starter`).
+
+Contracts need pytest: ``pip install 'mstfilter[check]'``.
 """
 
 from mstfilter.lazy import attach

@@ -1,26 +1,33 @@
-from mstfilter.testing.contracts import (
-    CodecContract as CodecContract,
+from mstfilter.testing.check import (
+    CheckResult as CheckResult,
+    check_component as check_component,
+    contract_of as contract_of,
+)
+from mstfilter.testing.contract import (
+    FALSE_ALARM as FALSE_ALARM,
     Contract as Contract,
+    RandomContract as RandomContract,
+    number_example as number_example,
+)
+from mstfilter.testing.moves import (
+    DensityTransitionContract as DensityTransitionContract,
+    ProposalContract as ProposalContract,
+    RejuvenationContract as RejuvenationContract,
+    TransitionContract as TransitionContract,
+    UpdateContract as UpdateContract,
+)
+from mstfilter.testing.resampling import (
+    ResamplerContract as ResamplerContract,
+    WeightResamplerContract as WeightResamplerContract,
+)
+from mstfilter.testing.scenes import scene_example as scene_example
+from mstfilter.testing.starters import starter_kinds as starter_kinds, write_starter as write_starter
+from mstfilter.testing.values import (
+    CodecContract as CodecContract,
     EquivalenceContract as EquivalenceContract,
     EvidenceContract as EvidenceContract,
     LookaheadContract as LookaheadContract,
-    ProposalContract as ProposalContract,
-    RejuvenationContract as RejuvenationContract,
-    ResamplerContract as ResamplerContract,
     SimilarityContract as SimilarityContract,
     SizeContract as SizeContract,
-    TransitionContract as TransitionContract,
     TriggerContract as TriggerContract,
-    UpdateContract as UpdateContract,
-    verify as verify,
 )
-from mstfilter.testing.properties import (
-    FALSE_ALARM as FALSE_ALARM,
-    Broken as Broken,
-    Outcome as Outcome,
-    Property as Property,
-    Suite as Suite,
-    example as example,
-)
-from mstfilter.testing.scenes import scene_example as scene_example
-from mstfilter.testing.starters import example_of as example_of, write_starter as write_starter

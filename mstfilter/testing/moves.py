@@ -1,236 +1,300 @@
-"""Properties of transitions, proposals and updates."""
+"""Contracts of transitions, proposals, updates and rejuvenations."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import pytest
 
-from mstfilter.smc import Population, Proposal, Transition, Update
-from mstfilter.testing.properties import (
+from mstfilter.smc import (
+    DensityTransition,
+    Population,
+    Proposal,
+    Rejuvenation,
+    Transition,
+    Update,
+    as_matrix,
+)
+from mstfilter.testing.contract import (
     FALSE_ALARM,
-    Broken,
-    Example,
-    NotApplicable,
-    Suite,
-    Untouched,
-    add_generator_properties,
-    guarded,
-    needs_proper_weights,
-    only_in_place,
+    RandomContract,
+    reports_errors,
     same,
+    skip_unless_properly_weighted,
+    statistical,
 )
 
-__all__ = ["PROPOSAL", "TRANSITION", "UPDATE"]
+__all__ = [
+    "DensityTransitionContract",
+    "ProposalContract",
+    "RejuvenationContract",
+    "TransitionContract",
+    "UpdateContract",
+]
 
-TRANSITION, PROPOSAL, UPDATE = Suite("transition"), Suite("proposal"), Suite("update")
 _N = 6
 
 
-def _rng(seed: int = 0) -> np.random.Generator:
+def _rng(seed: int = 3) -> np.random.Generator:
     return np.random.default_rng(seed)
 
 
-def _is_population(found: Any, what: str) -> Population:
-    if not isinstance(found, Population):
-        raise Broken(f"{what}: it returns {type(found).__name__}, expected a Population")
+def _check_population(found: Any, method: str) -> Population:
+    assert isinstance(found, Population), f"{method} returns {type(found).__name__}, expected a Population"
     return found
 
 
-# -- transition ------------------------------------------------------------------------------------------------------
+def _check_shift(a: Population, b: Population, shift: float) -> None:
+    """`b` is the result for the same particles with `shift` added to their log weights."""
+    assert len(a) == len(b) and np.allclose(b.log_weights - shift, a.log_weights, atol=1e-9, rtol=0), (
+        f"log weights + {shift:g} in do not give log weights + {shift:g} out"
+    )
 
 
-def _predict(component: Transition, population: Population, observation: Any, seed: int = 3) -> Population:
-    with guarded(f"{len(population)} particles, observation {'None' if observation is None else 'given'}"):
-        return _is_population(component.predict(_rng(seed), population, observation), "predict")
+class TransitionContract(RandomContract):
+    """The contract of every `Transition`. Its one statistical test has a false-alarm rate of at most 1e-6."""
 
+    def call(self, component: Transition, rng: np.random.Generator, inputs: dict[str, Any]) -> Population:
+        """Predict."""
+        return component.predict(rng, inputs["population"], inputs["observation"])
 
-@TRANSITION.property("it leaves its input alone", essential=True)
-def leaves_input_alone(component: Transition, example: Example) -> None:
-    """Particles, weights and observation are the same afterwards."""
-    population, observation = example(_rng(), _N)
-    before = Untouched(population=population, observation=observation)
-    with only_in_place():
-        _predict(component, population, observation)
-    before.verify()
+    def predict(self, component: Transition, population: Population, observation: Any, seed: int = 3) -> Population:
+        """Predict, and check the type of the result."""
+        with reports_errors(f"{len(population)} particles, observation {'None' if observation is None else 'given'}"):
+            moved = component.predict(_rng(seed), population, observation)
+        return _check_population(moved, "predict")
 
+    def test_says_where_particles_come_from(self) -> None:
+        """It keeps the number of particles, or sets parents "previous" to indices of old particles."""
+        component = self.make()
+        for n in (1, 2, _N):
+            moved = self.predict(component, *self.example(_rng(0), n))
+            previous = moved.parents.get("previous")
+            if previous is None:
+                assert len(moved) == n, f'{n} particles became {len(moved)}, and there are no parents "previous"'
+            else:
+                assert ((previous >= -1) & (previous < n)).all(), (
+                    f'parents "previous" contain {int(np.max(previous))}, and there were {n} particles'
+                )
 
-@TRANSITION.property("every particle is moved, or parents say where the particles come from")
-def says_where_particles_come_from(component: Transition, example: Example) -> None:
-    """As many particles as before, or parents "previous" in range."""
-    for n in (1, 2, _N):
-        population, observation = example(_rng(), n)
-        moved = _predict(component, population, observation)
-        previous = moved.parents.get("previous")
-        if previous is None and len(moved) != n:
-            raise Broken(f'{n} particles became {len(moved)}, and parents "previous" do not say which is which')
-        if previous is not None and not ((previous >= -1) & (previous < n)).all():
-            raise Broken(f'parents "previous" hold {int(np.max(previous))} where there were {n} particles')
+    def test_takes_a_missing_observation(self) -> None:
+        """It moves particles if the observation is missing (None)."""
+        self.predict(self.make(), self.example(_rng(0), _N)[0], None)
 
+    def test_scale_of_weights_is_irrelevant(self) -> None:
+        """A common factor of the weights is kept and has no other effect."""
+        component = self.make()
+        skip_unless_properly_weighted(component)
+        population, observation = self.example(_rng(0), _N)
+        unshifted = self.predict(component, population, observation)
+        for shift in (50.0, -50.0):
+            shifted = self.predict(component, population.reweighted(np.full(_N, shift)), observation)
+            _check_shift(unshifted, shifted, shift)
 
-@TRANSITION.property("it moves particles where the observation is missing (None)")
-def takes_a_missing_observation(component: Transition, example: Example) -> None:
-    """None is an observation like any other."""
-    _predict(component, example(_rng(), _N)[0], None)
+    @statistical
+    def test_order_of_particles_is_irrelevant(self) -> None:
+        """The move of a particle does not depend on its position among the others."""
+        from scipy.stats import ks_2samp
 
-
-add_generator_properties(
-    TRANSITION, lambda component, example, rng: component.predict(rng, *example(np.random.default_rng(0), _N))
-)
-
-
-@TRANSITION.property("multiplying all weights by a constant multiplies them afterwards and changes nothing else")
-def scale_of_weights_is_irrelevant(component: Transition, example: Example) -> None:
-    """Log weights + c in, the same + c out (components that are properly weighted)."""
-    needs_proper_weights(component)
-    population, observation = example(_rng(), _N)
-    a = _predict(component, population, observation)
-    for shift in (50.0, -50.0):
-        b = _predict(component, population.reweighted(np.full(_N, shift)), observation)
-        if len(a) != len(b) or not np.allclose(b.log_weights - shift, a.log_weights, atol=1e-9, rtol=0):
-            raise Broken(f"log weights + {shift:g} in do not give log weights + {shift:g} out")
-
-
-@TRANSITION.property("a particle's move does not depend on its place among the others", statistical=True)
-def order_of_particles_is_irrelevant(component: Transition, example: Example) -> None:
-    """Distribution-free comparison (Kolmogorov-Smirnov) of every particle's moves in two orders; arrays only."""
-    from scipy.stats import ks_2samp
-
-    from mstfilter.smc import as_matrix
-
-    population, observation = example(_rng(), _N)
-    if not isinstance(population.particles, (np.ndarray, dict)):
-        raise NotApplicable("moves of objects are not compared")
-    if len(_predict(component, population, observation)) != _N:
-        raise NotApplicable("the number of particles changes")
-    order = np.arange(_N)[::-1]
-    samples: list[list[np.ndarray]] = [[], []]
-    for seed in range(300):
-        for side, taken in enumerate((np.arange(_N), order)):
-            given = population.take(taken)
-            moved = _predict(component, given, observation, seed + 1000 * side)
-            rows = np.column_stack([as_matrix(moved.particles), moved.log_weights - given.log_weights])
-            samples[side].append(rows[np.argsort(taken)])
-    a, b = np.array(samples[0]), np.array(samples[1])
-    level = FALSE_ALARM / a[0].size
-    for i in range(_N):
-        for j in range(a.shape[2]):
-            # The weights of equal moves may differ in the last bits with the order of a sum.
-            x, y = np.round(a[:, i, j], 9), np.round(b[:, i, j], 9)
-            if ks_2samp(x, y).pvalue < level:
-                raise Broken(
-                    f"particle {i} moves differently as number {order[i]} (mean {x.mean():.3g}, {y.mean():.3g})"
+        component = self.make()
+        population, observation = self.example(_rng(0), _N)
+        if not isinstance(population.particles, (np.ndarray, dict)):
+            pytest.skip("the particles are objects, whose moves are not compared")
+        if len(self.predict(component, population, observation)) != _N:
+            pytest.skip("the number of particles changes")
+        orders = (np.arange(_N), np.arange(_N)[::-1])
+        samples: list[list[np.ndarray]] = [[], []]
+        for seed in range(300):
+            for side, order in enumerate(orders):
+                given = population.take(order)
+                moved = self.predict(component, given, observation, seed + 1000 * side)
+                rows = np.column_stack([as_matrix(moved.particles), moved.log_weights - given.log_weights])
+                samples[side].append(rows[np.argsort(order)])
+        # Kolmogorov-Smirnov tests of each coordinate of each particle. Rounding: equal weights may differ in the last
+        # bits, since the order of a sum differs.
+        a, b = (np.round(np.array(s), 9) for s in samples)
+        for i in range(_N):
+            for j in range(a.shape[2]):
+                x, y = a[:, i, j], b[:, i, j]
+                assert ks_2samp(x, y).pvalue >= FALSE_ALARM / a[0].size, (
+                    f"particle {i} moves differently as number {orders[1][i]} (mean {x.mean():.3g}, {y.mean():.3g})"
                 )
 
 
-# -- proposal --------------------------------------------------------------------------------------------------------
+class DensityTransitionContract(TransitionContract):
+    """The contract of every `DensityTransition`: that of a `Transition`, and properties of `log_prob`."""
+
+    def test_log_prob_of_own_moves_is_finite(self) -> None:
+        """`log_prob` gives one finite number for each move that `predict` makes."""
+        component: DensityTransition = self.make()
+        for n in (1, _N):
+            population, observation = self.example(_rng(0), n)
+            moved = self.predict(component, population, observation)
+            found = self._log_prob(component, population.particles, moved.particles, observation)
+            assert found.shape == (n,), f"log densities of {n} moves have shape {found.shape}, expected ({n},)"
+            assert np.isfinite(found).all(), f"log density of a move is {found[~np.isfinite(found)][0]}"
+
+    def test_log_prob_of_a_move_does_not_depend_on_others(self) -> None:
+        """`log_prob` treats every pair of rows alone."""
+        component: DensityTransition = self.make()
+        population, observation = self.example(_rng(0), _N)
+        moved = self.predict(component, population, observation)
+        found = self._log_prob(component, population.particles, moved.particles, observation)
+        rows = np.array([4, 0, 3])
+        fewer = self._log_prob(component, population.take(rows).particles, moved.take(rows).particles, observation)
+        assert np.allclose(fewer, found[rows], atol=1e-9), "three of six moves have other log densities alone"
+
+    @staticmethod
+    def _log_prob(component: DensityTransition, previous: Any, new: Any, observation: Any) -> np.ndarray:
+        with reports_errors("log_prob"):
+            return np.asarray(component.log_prob(previous, new, observation))
 
 
-def _sample(component: Proposal, observation: Any, n: int, seed: int = 3) -> Population:
-    with guarded(f"{n} particles"):
-        return _is_population(component.sample(_rng(seed), observation, n), "sample")
+class ProposalContract(RandomContract):
+    """The contract of every `Proposal`."""
+
+    def inputs(self, n: int, seed: int = 0) -> dict[str, Any]:
+        """The observation of the example, and a number of particles."""
+        return {"observation": self.example(_rng(0), 2)[1], "n": n}
+
+    def call(self, component: Proposal, rng: np.random.Generator, inputs: dict[str, Any]) -> Population:
+        """Sample."""
+        return component.sample(rng, inputs["observation"], inputs["n"])
+
+    def test_gives_n_particles(self) -> None:
+        """It returns n particles for any n."""
+        component, observation = self.make(), self.example(_rng(0), 2)[1]
+        for n in (1, 2, 7, 20):
+            with reports_errors(f"{n} particles"):
+                found = _check_population(component.sample(_rng(), observation, n), "sample")
+            assert len(found) == n, f"asked for {n} particles it returns {len(found)}: repeat some if needed"
 
 
-@PROPOSAL.property("it leaves its input alone", essential=True)
-def leaves_observation_alone(component: Proposal, example: Example) -> None:
-    """The observation is the same afterwards."""
-    observation = example(_rng(), 2)[1]
-    before = Untouched(observation=observation)
-    with only_in_place():
-        _sample(component, observation, 5)
-    before.verify()
+class UpdateContract(RandomContract):
+    """The contract of every `Update`."""
+
+    def inputs(self, n: int, seed: int = 0) -> dict[str, Any]:
+        """Predicted and proposed particles, and an observation."""
+        predicted, observation = self.example(_rng(seed), n)
+        proposed = replace(self.example(_rng(seed + 1), 4)[0], log_weights=np.zeros(4))
+        return {"predicted": predicted, "proposed": proposed, "observation": observation}
+
+    def call(self, component: Update, rng: np.random.Generator, inputs: dict[str, Any]) -> Population:
+        """Update."""
+        return component.update(rng, **inputs)
+
+    def update(self, component: Update, **inputs: Any) -> Population:
+        """Update, and check the type of the result."""
+        given = [name for name in ("predicted", "proposed") if inputs[name] is not None]
+        with reports_errors(f"{' and '.join(given)} particles"):
+            return _check_population(component.update(_rng(), **inputs), "update")
+
+    def test_takes_any_of_its_inputs(self) -> None:
+        """It accepts predicted particles, proposed ones, or both."""
+        component, inputs = self.make(), self.inputs(_N)
+        self.update(component, **{**inputs, "proposed": None})
+        self.update(component, **{**inputs, "predicted": None})
+        self.update(component, **inputs)
+
+    def test_parents_exist(self) -> None:
+        """Parents are indices of particles that exist, or -1."""
+        inputs = self.inputs(_N)
+        sizes = {"previous": len(inputs["predicted"]), "proposed": len(inputs["proposed"])}
+        for name, slot in (("previous", "predicted"), ("proposed", "proposed")):
+            inputs[slot] = replace(inputs[slot], parents={name: np.arange(sizes[name])})
+        out = self.update(self.make(), **inputs)
+        for name, n in sizes.items():
+            index = out.parents.get(name, np.array([-1]))
+            assert ((index >= -1) & (index < n)).all(), (
+                f'parents "{name}" contain {int(np.max(index))}, and there were {n} particles'
+            )
+
+    def test_scale_of_weights_is_irrelevant(self) -> None:
+        """A common factor of the weights is kept and has no other effect."""
+        component, inputs = self.make(), {**self.inputs(_N), "proposed": None}
+        skip_unless_properly_weighted(component)
+        unshifted = self.update(component, **inputs)
+        for shift in (50.0, -50.0):
+            predicted = inputs["predicted"].reweighted(np.full(_N, shift))
+            _check_shift(unshifted, self.update(component, **{**inputs, "predicted": predicted}), shift)
 
 
-@PROPOSAL.property("it returns n particles, whatever n")
-def gives_n_particles(component: Proposal, example: Example) -> None:
-    """Exactly n, repeated where there are fewer different ones."""
-    observation = example(_rng(), 2)[1]
-    for n in (1, 2, 7, 20):
-        found = len(_sample(component, observation, n))
-        if found != n:
-            raise Broken(f"asked for {n} particles it returns {found}: repeat some where there are too few")
+class RejuvenationContract(RandomContract):
+    """The contract of every `Rejuvenation`. Its one statistical test has a false-alarm rate of at most 1e-6.
+
+    That test needs exact draws of p(x_t | x_{t-1}, y_t). Define a method ``exact(self, rng, n)`` that returns a
+    population of `n` rows x_{t-1} (None: the first step), a population of draws x_t given them and y_t, and y_t.
+    """
+
+    exact: Callable[[np.random.Generator, int], tuple[Population | None, Population, Any]] | None = None
+
+    def inputs(self, n: int, seed: int = 0) -> dict[str, Any]:
+        """Particles, the previous ones that they come from, and an observation."""
+        return {**super().inputs(n, seed), "previous": self.example(_rng(seed + 1), n)[0]}
+
+    def call(self, component: Rejuvenation, rng: np.random.Generator, inputs: dict[str, Any]) -> Population:
+        """Move."""
+        return component.move(rng, inputs["population"], inputs["previous"], inputs["observation"])
+
+    def move(
+        self,
+        component: Rejuvenation,
+        population: Population,
+        previous: Population | None,
+        observation: Any,
+        rng: np.random.Generator | None = None,
+    ) -> Population:
+        """Move, and check the type of the result."""
+        given = "no previous ones" if previous is None else "previous ones"
+        missing = ", observation None" if observation is None else ""
+        with reports_errors(f"{len(population)} particles, {given}{missing}"):
+            moved = component.move(_rng() if rng is None else rng, population, previous, observation)
+        return _check_population(moved, "move")
+
+    def test_keeps_number_and_weights(self) -> None:
+        """It returns as many particles, with unchanged log weights, also if the past or the observation is None."""
+        component = self.make()
+        for n in (1, 2, _N):
+            inputs = self.inputs(n)
+            for absent in ({}, {"previous": None}, {"observation": None}):
+                moved = self.move(component, **{**inputs, **absent})
+                assert len(moved) == n, f"{n} particles became {len(moved)}"
+                assert same(moved.log_weights, inputs["population"].log_weights), (
+                    "it changes log weights: a kernel that keeps the distribution leaves them unchanged"
+                )
+
+    @statistical
+    def test_keeps_the_distribution(self) -> None:
+        """It leaves p(x_t | x_{t-1}, y_t) unchanged."""
+        from scipy.stats import ks_2samp
+
+        component = self.make()
+        skip_unless_properly_weighted(component)
+        if self.exact is None:
+            pytest.skip("there are no exact draws to compare with: write exact(rng, n)")
+        # Exact draws after five moves against other exact draws: x_t, and x_t - x_{t-1}.
+        n, rng = 4000, _rng(2)
+        previous, population, observation = self.exact(_rng(1), n)
+        for _ in range(5):
+            population = self.move(component, population, previous, observation, rng)
+        moved = _columns(previous, population)
+        fresh_previous, fresh, _ = self.exact(_rng(3), n)
+        expected = _columns(fresh_previous, fresh)
+        for j in range(moved.shape[1]):
+            what = f"x_t ({j})" if j < moved.shape[1] / 2 or previous is None else "x_t - x_{t-1}"
+            assert ks_2samp(moved[:, j], expected[:, j]).pvalue >= FALSE_ALARM / moved.shape[1], (
+                f"exact draws are no longer exact after five moves: {what} has mean {moved[:, j].mean():.4g} and sd "
+                f"{moved[:, j].std():.4g}, expected {expected[:, j].mean():.4g} and {expected[:, j].std():.4g}"
+            )
 
 
-@PROPOSAL.property("it keeps no memory: an earlier call changes nothing")
-def has_no_memory(component: Proposal, example: Example) -> None:
-    """The same call before and after another one."""
-    observation = example(_rng(), 2)[1]
-    first = _sample(component, observation, 5, seed=1)
-    _sample(component, observation, 9, seed=2)
-    again = _sample(component, observation, 5, seed=1)
-    if not (
-        same(first.realised().particles, again.realised().particles) and same(first.log_weights, again.log_weights)
-    ):
-        raise Broken("the same call gives another result after a call in between: it keeps something")
-
-
-add_generator_properties(
-    PROPOSAL, lambda component, example, rng: component.sample(rng, example(np.random.default_rng(0), 2)[1], 5)
-)
-
-
-# -- update ----------------------------------------------------------------------------------------------------------
-
-
-def _pair(example: Example) -> tuple[Population, Population, Any]:
-    predicted, observation = example(_rng(), _N)
-    proposed = replace(example(_rng(1), 4)[0], log_weights=np.zeros(4))
-    return predicted, proposed, observation
-
-
-def _update(component: Update, predicted: Population | None, proposed: Population | None, y: Any) -> Population:
-    names = [name for name, p in (("predicted", predicted), ("proposed", proposed)) if p is not None]
-    with guarded(f"{' and '.join(names)} particles"):
-        return _is_population(component.update(_rng(3), predicted, proposed, y), "update")
-
-
-@UPDATE.property("it leaves its input alone", essential=True)
-def update_leaves_input_alone(component: Update, example: Example) -> None:
-    """Particles, weights and observation are the same afterwards."""
-    predicted, proposed, observation = _pair(example)
-    before = Untouched(predicted=predicted, proposed=proposed, observation=observation)
-    with only_in_place():
-        _update(component, predicted, proposed, observation)
-    before.verify()
-
-
-@UPDATE.property("it takes predicted particles, proposed ones, or both")
-def takes_any_of_its_inputs(component: Update, example: Example) -> None:
-    """At the first step of MST there is no prediction; without a proposal there is nothing proposed."""
-    predicted, proposed, observation = _pair(example)
-    _update(component, predicted, None, observation)
-    _update(component, None, proposed, observation)
-    _update(component, predicted, proposed, observation)
-
-
-@UPDATE.property("parents point at particles that exist")
-def parents_exist(component: Update, example: Example) -> None:
-    """Indices in [-1, n)."""
-    predicted, proposed, observation = _pair(example)
-    predicted = replace(predicted, parents={"previous": np.arange(len(predicted))})
-    proposed = replace(proposed, parents={"proposed": np.arange(len(proposed))})
-    out = _update(component, predicted, proposed, observation)
-    for name, n in (("previous", len(predicted)), ("proposed", len(proposed))):
-        index = out.parents.get(name)
-        if index is not None and not ((index >= -1) & (index < n)).all():
-            raise Broken(f'parents "{name}" hold {int(np.max(index))} where there are {n} particles')
-
-
-def _run_update(component: Update, example: Example, rng: np.random.Generator) -> Population:
-    return component.update(rng, *_pair(example))
-
-
-add_generator_properties(UPDATE, _run_update)
-
-
-@UPDATE.property("multiplying all weights by a constant multiplies them afterwards and changes nothing else")
-def update_scales_with_weights(component: Update, example: Example) -> None:
-    """Log weights + c in, the same + c out (components that are properly weighted)."""
-    needs_proper_weights(component)
-    predicted, _, observation = _pair(example)
-    a = _update(component, predicted, None, observation)
-    for shift in (50.0, -50.0):
-        b = _update(component, predicted.reweighted(np.full(len(predicted), shift)), None, observation)
-        if len(a) != len(b) or not np.allclose(b.log_weights - shift, a.log_weights, atol=1e-9, rtol=0):
-            raise Broken(f"log weights + {shift:g} in do not give log weights + {shift:g} out")
+def _columns(previous: Population | None, population: Population) -> np.ndarray:
+    """x_t, and x_t - x_{t-1} if both have as many columns."""
+    x = as_matrix(population.particles)
+    if previous is None:
+        return x
+    old = as_matrix(previous.particles)
+    return np.concatenate([x, x - old], axis=1) if old.shape == x.shape else x

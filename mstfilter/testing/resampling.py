@@ -1,194 +1,364 @@
-"""Properties of resamplers that must hold in every run (those of many runs: `mstfilter.testing.resampling_law`)."""
+"""Contracts of resamplers, with the law of proper weighting.
+
+A resampler is properly weighted if the mean over its output of w f(x) has, for every f, the expectation of the mean
+over its input. Particle i of m *carries* the sum of the output weights of its copies, divided by the number n of
+copies and by the mean input weight. For a properly weighted resampler it carries W_i on average. With equal output
+weights this means that it gets n W_i copies on average. The tests repeat a resampling 3000 times, which detects a
+bias of 0.1 copies.
+"""
 
 from __future__ import annotations
 
-import numpy as np
+from dataclasses import dataclass
+from typing import Any
 
-from mstfilter.smc import Population, Resampler, WeightResampler
-from mstfilter.testing.properties import (
-    Broken,
-    Example,
-    Suite,
-    Untouched,
-    add_generator_properties,
-    guarded,
-    needs_proper_weights,
-    only_in_place,
+import numpy as np
+import pytest
+
+from mstfilter.smc import Population, Resampler, WeightResampler, log_mean_exp
+from mstfilter.testing.contract import (
+    FALSE_ALARM,
+    RandomContract,
+    prerequisite,
+    reports_errors,
+    skip_unless_properly_weighted,
+    statistical,
 )
 
-__all__ = ["RESAMPLER", "log_of", "population_of", "resampled"]
+__all__ = ["ResamplerContract", "WeightResamplerContract"]
 
-RESAMPLER = Suite("resampler")
+_REPEATS = 3000
+#: Weights and numbers of particles for the law. No weight is so small that a particle is hardly ever selected.
+_CASES: tuple[tuple[tuple[float, ...], int], ...] = (
+    ((0.11, 0.36, 0.15, 0.38), 3),
+    ((0.41, 0.24, 0.2, 0.1, 0.05), 7),
+    ((0.05, 0.1, 0.2, 0.24, 0.41), 2),
+)
+_OTHER_ORDER = (2, 0, 4, 1, 3)
+_ZEROS = ((0, 0, 1, 2, 3), (1, 2, 3, 0, 0), (1, 0, 2, 0, 3))
+_N_COMPARISONS = sum(len(weights) for weights, _ in _CASES)
 
 
-def population_of(example: Example, log_weights: np.ndarray) -> Population:
-    """Example particles with given weights, and parents that tell them apart."""
-    n = len(log_weights)
-    particles = example(np.random.default_rng(0), n)[0].realised().particles
-    return Population(particles, log_weights, {"previous": np.arange(n)[::-1]})
+class ResamplerContract(RandomContract):
+    """The contract of every `Resampler`. Its three statistical tests have a false-alarm rate of at most 1e-6 each."""
+
+    _kept_samples: list[tuple[int, _Sample]]
+
+    def population(self, weights: Any) -> Population:
+        """The particles of the example with given weights, and with parents that identify them."""
+        n = len(weights)
+        particles = self.example(np.random.default_rng(0), n)[0].realised().particles
+        return Population(particles, _log(weights), {"previous": np.arange(n)[::-1]})
+
+    def inputs(self, n: int, seed: int = 0) -> dict[str, Any]:
+        """40 particles to select from; `seed` changes their weights."""
+        return {"population": self.population(np.linspace(1, 2 + seed, 40)), "n": 25}
+
+    def call(self, component: Resampler, rng: np.random.Generator, inputs: dict[str, Any]) -> Population:
+        """Resample."""
+        return component.resample(rng, inputs["population"], inputs["n"])
+
+    def resample(self, component: Resampler, population: Population, n: int, rng: np.random.Generator) -> Population:
+        """Resample, and check what every result must fulfil."""
+        m = len(population)
+        with reports_errors(f"{m} particles to {n}"):
+            chosen = component.resample(rng, population, n)
+        assert isinstance(chosen, Population), f"resample returns {type(chosen).__name__}, expected a Population"
+        ancestors = chosen.parents.get("ancestor")
+        assert ancestors is not None, 'the result has no parents "ancestor"'
+        wrong = ancestors[(ancestors < 0) | (ancestors >= m)]
+        assert not len(wrong), f"ancestor {wrong[0]} is out of range: there are {m} particles; off by one?"
+        return chosen
+
+    @prerequisite
+    def test_ancestors_in_range(self) -> None:
+        """Ancestors are indices of particles that exist."""
+        component = self.make()
+        for m, n in ((5, 5), (5, 3), (5, 12), (2, 9)):
+            for seed in range(40):
+                self.resample(component, self.population(np.linspace(1, 2, m)), n, np.random.default_rng(seed))
+
+    @prerequisite
+    def test_gives_n_particles(self) -> None:
+        """It returns n particles for any n; at most n if ``exact_size`` is False."""
+        component = self.make()
+        for m in (1, 4, 7):
+            for n in (1, 2, m, 2 * m + 3, 50):
+                rng = np.random.default_rng(n)
+                found = len(self.resample(component, self.population(np.linspace(1, 3, m)), n, rng))
+                enough = found == n if component.exact_size else 1 <= found <= n
+                assert enough, f"asked to make {n} particles of {m} it returns {found}"
+
+    def test_takes_one_particle(self) -> None:
+        """It works for a single particle, whose weight it keeps."""
+        component = self.make()
+        chosen = self.resample(component, self.population([np.exp(-3.0)]), 1, np.random.default_rng(0))
+        if component.properly_weighted:
+            assert abs(chosen.log_weights[0] + 3.0) <= 1e-9, (
+                f"the only particle had log weight -3 and has {chosen.log_weights[0]:.4g} afterwards"
+            )
+
+    def test_zero_weights_are_never_chosen(self) -> None:
+        """A particle of weight zero is never selected."""
+        component = self.make()
+        for weights in (*_ZEROS, (0, 0, 0, 1, 0), (0, 1, 0, 0, 0)):
+            for seed in range(60):
+                n = (1, 4, 11)[seed % 3]
+                chosen = self.resample(component, self.population(weights), n, np.random.default_rng(seed))
+                wrong = _without_weight(chosen, weights)
+                assert not len(wrong), f"of weights {weights} it selects particle {wrong[0]}, weight 0"
+
+    def test_copes_with_extreme_uniforms(self) -> None:
+        """It handles the smallest and the largest uniform number, 0 and 1 - 2^-53."""
+        component = self.make()
+        for value in (0.0, 1 - 2.0**-53):
+            for weights in (*_ZEROS, (0.1, 0.2, 0.3)):
+                for n in (1, 3, 10):
+                    chosen = self.resample(component, self.population(weights), n, _ConstantGenerator(value))
+                    wrong = _without_weight(chosen, weights)
+                    assert not len(wrong), (
+                        f"if rng.random() gives {value:.17g}, of weights {weights} it selects particle {wrong[0]}, "
+                        'weight 0: use np.searchsorted with side="right", and end at a particle with weight'
+                    )
+
+    def test_parents_come_along(self) -> None:
+        """Selected particles keep their parents."""
+        population = self.population((1.0, 2.0, 1.5, 0.5, 2.0))
+        chosen = self.resample(self.make(), population, 4, np.random.default_rng(1))
+        expected = population.parents["previous"][chosen.parents["ancestor"]]
+        assert "previous" in chosen.parents and np.array_equal(chosen.parents["previous"], expected), (
+            'parents "previous" of the result are not those of the ancestors'
+        )
+
+    def test_listens_to_the_generator(self) -> None:
+        """Different generators give different results, if n W_i are not integers."""
+        component = self.make()
+        skip_unless_properly_weighted(component)
+        population = self.population((0.41, 0.24, 0.2, 0.1, 0.05))
+        chosen = [self.resample(component, population, 2, np.random.default_rng(seed)) for seed in range(40)]
+        assert len({tuple(c.parents["ancestor"].tolist()) for c in chosen}) > 1, (
+            "forty generators with different seeds give the same result: it ignores `rng`"
+        )
+
+    def test_scale_of_weights_is_irrelevant(self) -> None:
+        """A common factor of the weights does not change the selection."""
+        component, population = self.make(), self.population((0.11, 0.36, 0.15, 0.38))
+        for seed in range(10):
+            a = self.resample(component, population, 6, np.random.default_rng(seed))
+            for shift in (0.5, 100.0, -100.0, 1e4, -1e4):
+                shifted = population.reweighted(np.full(4, shift))
+                with np.errstate(all="ignore"):
+                    try:
+                        b = self.resample(component, shifted, 6, np.random.default_rng(seed))
+                    except AssertionError as error:
+                        raise AssertionError(f"log weights + {shift:g} (overflow or underflow?): {error}") from error
+                assert np.array_equal(a.parents["ancestor"], b.parents["ancestor"]), (
+                    f"adding {shift:g} to all log weights changes the selection (overflow or underflow?)"
+                )
+                if component.properly_weighted:
+                    assert np.allclose(b.log_weights - shift, a.log_weights, atol=1e-8), (
+                        f"adding {shift:g} to all log weights does not add it to those of the result"
+                    )
+
+    # --- proper weighting ---
+
+    @statistical
+    def test_mean_number_of_copies(self) -> None:
+        """A particle gets n W_i copies on average, if all copies have equal weights."""
+        component = self.make()
+        skip_unless_properly_weighted(component)
+        cases = [(n, sample) for n, sample in self._samples(component) if sample.equal_weights]
+        if not cases:
+            pytest.skip("copies have different weights")
+        for n, sample in cases:
+            mean, expected = sample.copies.mean(axis=0), n * sample.expected
+            excess = np.abs(mean - expected) - _tolerance(sample.copies, 1.0, _N_COMPARISONS)
+            i = int(np.argmax(excess))
+            assert excess[i] <= 0, (
+                f"copies are biased: of {len(mean)} particles to {n}, particle {i} (W = {sample.expected[i]:.3g}) "
+                f"gets {mean[i]:.3f} copies on average, expected {expected[i]:.3f}{_shift_hint(mean, expected)}"
+            )
+
+    @statistical
+    def test_output_weights(self) -> None:
+        """The mean of w f(x) over the result is unbiased; equal output weights keep the mean weight exactly."""
+        component = self.make()
+        skip_unless_properly_weighted(component)
+        for n, sample in self._samples(component):
+            total = sample.carried.sum(axis=1)
+            if sample.equal_weights:
+                assert np.abs(total - 1).max() <= 1e-9, (
+                    f"the mean weight after selection is {total[0]:.4g} of the one before, expected the same"
+                )
+                continue
+            mean = sample.carried.mean(axis=0)
+            excess = np.abs(mean - sample.expected) - _tolerance(sample.carried, 1.0 / n, _N_COMPARISONS)
+            i = int(np.argmax(excess))
+            assert excess[i] <= 0, (
+                f"output weights are wrong: of {len(mean)} particles to {n}, particle {i} carries {mean[i]:.3f} of "
+                f"the weight on average, expected {sample.expected[i]:.3f}"
+            )
+
+    @statistical
+    def test_order_of_particles_is_irrelevant(self) -> None:
+        """The order of the particles does not change what each carries on average."""
+        component = self.make()
+        skip_unless_properly_weighted(component)
+        weights, n = _CASES[1][0], 4
+        orders = (tuple(range(5)), _OTHER_ORDER)
+        samples = [self._sample(component, weights, n, seed, order).carried for seed, order in enumerate(orders)]
+        a, b = (s.mean(axis=0) for s in samples)
+        excess = np.abs(a - b) - sum(_tolerance(s, 1.0 / n, 2 * len(weights)) for s in samples)
+        i = int(np.argmax(excess))
+        assert excess[i] <= 0, (
+            f"the result depends on the order of the particles: the one of W = {weights[i]:.3g} carries {a[i]:.3f} "
+            f"of the weight as number {i}, and {b[i]:.3f} as number {_OTHER_ORDER.index(i)}"
+        )
+
+    def _samples(self, component: Resampler) -> list[tuple[int, _Sample]]:
+        """(n, sample) of all cases; kept by the class, since two tests use them."""
+        cls = type(self)
+        if "_kept_samples" not in cls.__dict__:
+            cls._kept_samples = [
+                (n, self._sample(component, weights, n, seed)) for seed, (weights, n) in enumerate(_CASES)
+            ]
+        return cls._kept_samples
+
+    def _sample(
+        self,
+        component: Resampler,
+        weights: tuple[float, ...],
+        n: int,
+        seed: int,
+        order: tuple[int, ...] | None = None,
+    ) -> _Sample:
+        """Resample many times, with the particles in an order; results are in the order of `weights`."""
+        m = len(weights)
+        positions = np.arange(m) if order is None else np.asarray(order)
+        population = self.population(weights).reweighted(np.full(m, 3.0))
+        given = population.take(positions)
+        rng, mean = np.random.default_rng(seed), log_mean_exp(population.log_weights)
+        carried, copies, equal = np.zeros((_REPEATS, m)), np.zeros((_REPEATS, m), np.int64), True
+        for r in range(_REPEATS):
+            chosen = self.resample(component, given, n, rng)
+            original = positions[chosen.parents["ancestor"]]
+            out = np.exp(chosen.log_weights - mean)
+            equal = equal and bool(np.ptp(out) <= 1e-9 * out.max())
+            carried[r] = np.bincount(original, out, minlength=m) / len(out)
+            copies[r] = np.bincount(original, minlength=m)
+        return _Sample(carried, copies, equal, np.asarray(weights) / np.sum(weights))
 
 
-def log_of(weights: tuple[float, ...] | np.ndarray) -> np.ndarray:
+class WeightResamplerContract(ResamplerContract):
+    """The contract of every `WeightResampler`: that of a `Resampler`, and properties of `select`."""
+
+    @prerequisite
+    def test_select_leaves_its_input_alone(self) -> None:
+        """It leaves an array of log weights unchanged."""
+        log_weights = _log((1.0, 2.0, 3.0, 4.0))
+        given = log_weights.copy()
+        try:
+            self.make().select(np.random.default_rng(0), given, 3)
+        except Exception:  # other tests report errors
+            return
+        assert np.array_equal(given, log_weights), "it changes its input in place (log_weights): make a copy first"
+
+    @prerequisite
+    def test_select_returns_integers(self) -> None:
+        """`select` returns (n,) integer ancestors."""
+        component: WeightResampler = self.make()
+        for m, n in ((5, 3), (2, 9)):
+            with reports_errors(f"{m} particles to {n}"):
+                ancestors = np.asarray(component.select(np.random.default_rng(0), _log(np.linspace(1, 2, m)), n)[0])
+            assert ancestors.ndim == 1 and np.issubdtype(ancestors.dtype, np.integer), (
+                f"ancestors are {ancestors.dtype} of shape {ancestors.shape}, expected int ({n},)"
+            )
+
+    def test_many_particles(self) -> None:
+        """Small weights are not lost by rounding among 100 000 particles."""
+        component: WeightResampler = self.make()
+        # One particle of weight 1, then 100 000 that share a thousandth: they get 100 copies on average.
+        m, n = 100_001, 100_000
+        weights = np.full(m, 1e-8)
+        weights[0] = 1.0
+        expected = n * weights[1:].sum() / weights.sum()
+        population = Population(np.arange(float(m)), np.log(weights))
+        for seed in range(3):
+            try:
+                chosen = self.resample(component, population, n, np.random.default_rng(seed))
+            except AssertionError as error:
+                raise AssertionError(f"cumulated in single precision? {error}") from error
+            if not component.properly_weighted:
+                continue
+            share = np.exp(chosen.log_weights - population.log_mean_weight)
+            light = share[chosen.parents["ancestor"] > 0].sum() * (n / len(chosen))
+            # Eight standard deviations of the noisiest scheme: the false-alarm rate is below 1e-10.
+            assert abs(light - expected) <= 8 * np.sqrt(expected), (
+                f"the particles of small weight get {light:.0f} copies in total, expected {expected:.0f}: "
+                "cumulated in single precision, or biased?"
+            )
+
+
+@dataclass(frozen=True)
+class _Sample:
+    """What each particle carries over many runs.
+
+    Parameters
+    ----------
+    carried : (repeats, m) float64
+        Sum of the output weights of a particle's copies, divided by the number of copies and the mean input weight.
+    copies : (repeats, m) int
+        Number of copies.
+    equal_weights : bool
+        Whether all output weights were equal in every run.
+    expected : (m,) float64
+        Expectation of `carried` for a properly weighted resampler: W_i.
+    """
+
+    carried: np.ndarray
+    copies: np.ndarray
+    equal_weights: bool
+    expected: np.ndarray
+
+
+def _tolerance(samples: np.ndarray, unit: float, n_comparisons: int) -> np.ndarray:
+    """Empirical Bernstein bound of |sample mean - expectation| (Audibert, Munos, Szepesvari 2009, theorem 1).
+
+    It holds with probability 1 - FALSE_ALARM for all comparisons together, without a normal approximation. For
+    variance s^2, range R (the observed one, at least `unit`), N samples and x = log(3 comparisons / FALSE_ALARM) the
+    bound is sqrt(2 s^2 x / N) + 3 R x / N.
+    """
+    level = np.log(3 * n_comparisons / FALSE_ALARM)
+    span = np.maximum(np.ptp(samples, axis=0), unit)
+    return np.sqrt(2 * samples.var(axis=0) * level / len(samples)) + 3 * span * level / len(samples)
+
+
+def _shift_hint(mean: np.ndarray, expected: np.ndarray) -> str:
+    """A hint if the copies are those of the neighbouring particle."""
+    for shift in (-1, 1):
+        if np.abs(np.roll(mean, -shift) - expected).max() < np.abs(mean - expected).max() / 4:
+            return "; the copies are those of the particle next to it: off by one?"
+    return ""
+
+
+def _log(weights: Any) -> np.ndarray:
     """Log weights, -inf for zero."""
     with np.errstate(divide="ignore"):
         return np.log(np.asarray(weights, dtype=np.float64))
 
 
-def resampled(resampler: Resampler, population: Population, n: int, rng: np.random.Generator) -> Population:
-    """Resample, with everything that can go wrong in words."""
-    m = len(population)
-    with guarded(f"{m} particles to {n}"):
-        chosen = resampler.resample(rng, population, n)
-    if not isinstance(chosen, Population):
-        raise Broken(f"resample returns {type(chosen).__name__}, expected a Population")
-    ancestors = chosen.parents.get("ancestor")
-    if ancestors is None:
-        raise Broken('the result has no parents "ancestor"')
-    if ((ancestors < 0) | (ancestors >= m)).any():
-        wrong = ancestors[(ancestors < 0) | (ancestors >= m)][0]
-        raise Broken(f"ancestor {wrong} is out of range: there are {m} particles, counted from 0; off by one?")
-    return chosen
+def _without_weight(chosen: Population, weights: tuple[float, ...]) -> np.ndarray:
+    """Ancestors whose weight is zero."""
+    ancestors = chosen.parents["ancestor"]
+    return ancestors[np.asarray(weights)[ancestors] == 0]
 
 
-@RESAMPLER.property("it leaves its input alone", essential=True)
-def leaves_input_alone(resampler: Resampler, example: Example) -> None:
-    """Neither the population nor an array of log weights is changed."""
-    lw = log_of((1.0, 2.0, 3.0, 4.0))
-    population = population_of(example, lw.copy())
-    before, mine = Untouched(population=population), lw.copy()
-    with only_in_place():
-        resampler.resample(np.random.default_rng(0), population, 3)
-    if isinstance(resampler, WeightResampler):
-        with only_in_place():
-            resampler.select(np.random.default_rng(0), mine, 3)
-    before.verify()
-    if (mine != lw).any():
-        raise Broken("it changes its input in place (log_weights): make a copy first")
-
-
-@RESAMPLER.property("ancestors are indices of particles that exist", essential=True)
-def ancestors_in_range(resampler: Resampler, example: Example) -> None:
-    """Whole numbers in [0, m), for more and for fewer particles than before."""
-    for m, n in ((5, 5), (5, 3), (5, 12), (2, 9)):
-        for seed in range(40):
-            rng = np.random.default_rng(seed)
-            population = population_of(example, log_of(np.linspace(1, 2, m)))
-            resampled(resampler, population, n, rng)
-            if not isinstance(resampler, WeightResampler):
-                continue
-            with guarded(f"{m} particles to {n}"):
-                ancestors = np.asarray(resampler.select(rng, population.log_weights.copy(), n)[0])
-            if ancestors.ndim != 1 or not np.issubdtype(ancestors.dtype, np.integer):
-                raise Broken(f"ancestors are {ancestors.dtype} of shape {ancestors.shape}, expected int ({n},)")
-
-
-@RESAMPLER.property("it returns n particles, whatever n", essential=True)
-def gives_n_particles(resampler: Resampler, example: Example) -> None:
-    """Exactly n; at most n, and at least one, where the class says ``exact_size = False``."""
-    for m in (1, 4, 7):
-        for n in (1, 2, m, 2 * m + 3, 50):
-            population = population_of(example, log_of(np.linspace(1, 3, m)))
-            found = len(resampled(resampler, population, n, np.random.default_rng(n)))
-            if found != n and (resampler.exact_size or not 1 <= found <= n):
-                raise Broken(f"asked to make {n} particles of {m} it returns {found}")
-
-
-@RESAMPLER.property("it works for a single particle")
-def takes_one_particle(resampler: Resampler, example: Example) -> None:
-    """One in, one out, with its weight."""
-    population = population_of(example, np.array([-3.0]))
-    chosen = resampled(resampler, population, 1, np.random.default_rng(0))
-    if resampler.properly_weighted and abs(chosen.log_weights[0] + 3.0) > 1e-9:
-        raise Broken(f"the only particle had log weight -3 and has {chosen.log_weights[0]:.4g} afterwards")
-
-
-@RESAMPLER.property("a particle of weight zero is never chosen")
-def zero_weights_are_never_chosen(resampler: Resampler, example: Example) -> None:
-    """Zeros leading, trailing, interleaved, and all but one."""
-    for weights in ((0, 0, 1, 2, 3), (1, 2, 3, 0, 0), (1, 0, 2, 0, 3), (0, 0, 0, 1, 0), (0, 1, 0, 0, 0)):
-        lw = log_of(weights)
-        population = population_of(example, lw)
-        for seed in range(60):
-            n = (1, 4, 11)[seed % 3]
-            chosen = resampled(resampler, population, n, np.random.default_rng(seed))
-            wrong = np.flatnonzero(np.isneginf(lw[chosen.parents["ancestor"]]))
-            if len(wrong):
-                raise Broken(
-                    f"of weights {weights} it chose particle {chosen.parents['ancestor'][wrong[0]]}, weight 0"
-                )
-
-
-class _Extreme(np.random.Generator):
-    """A generator whose `random` gives one value only: the smallest or the largest that there is."""
+class _ConstantGenerator(np.random.Generator):
+    """A generator whose `random` always returns the same value."""
 
     def __init__(self, value: float) -> None:
         super().__init__(np.random.PCG64(np.random.SeedSequence(0)))
         self._value = value
 
     def random(self, size=None, dtype=np.float64, out=None):  # type: ignore[no-untyped-def]
-        """The value."""
         return self._value if size is None else np.full(size, self._value)
-
-
-@RESAMPLER.property("it copes with the smallest and the largest uniform, 0 and 1 - 2^-53")
-def copes_with_extreme_uniforms(resampler: Resampler, example: Example) -> None:
-    """They do come up, once in a long run: the index stays in range, and a weight of zero is not chosen even then."""
-    for value in (0.0, 1 - 2.0**-53):
-        for weights in ((0, 0, 1, 2, 3), (1, 2, 3, 0, 0), (1, 0, 2, 0, 3), (0.1, 0.2, 0.3)):
-            lw = log_of(weights)
-            for n in (1, 3, 10):
-                chosen = resampled(resampler, population_of(example, lw), n, _Extreme(value))
-                wrong = chosen.parents["ancestor"][np.isneginf(lw[chosen.parents["ancestor"]])]
-                if len(wrong):
-                    raise Broken(
-                        f"where rng.random() gives {value:.17g}, of weights {weights} it chose particle {wrong[0]}, "
-                        'weight 0: np.searchsorted wants side="right", and an end that has weight'
-                    )
-
-
-@RESAMPLER.property("chosen particles bring their parents along")
-def parents_come_along(resampler: Resampler, example: Example) -> None:
-    """Row k of the result is particle ``parents["ancestor"][k]``."""
-    population = population_of(example, log_of((1.0, 2.0, 1.5, 0.5, 2.0)))
-    chosen = resampled(resampler, population, 4, np.random.default_rng(1))
-    expected = population.parents["previous"][chosen.parents["ancestor"]]
-    if "previous" not in chosen.parents or not np.array_equal(chosen.parents["previous"], expected):
-        raise Broken('parents "previous" of the result are not those of the ancestors')
-
-
-def _run(resampler: Resampler, example: Example, rng: np.random.Generator) -> Population:
-    return resampler.resample(rng, population_of(example, log_of(np.linspace(1, 2, 40))), 25)
-
-
-add_generator_properties(RESAMPLER, _run)
-
-
-@RESAMPLER.property("different generators give different results")
-def listens_to_the_generator(resampler: Resampler, example: Example) -> None:
-    """A proper scheme has to leave something to chance where n W_i are no whole numbers."""
-    needs_proper_weights(resampler)
-    population = population_of(example, log_of((0.41, 0.24, 0.2, 0.1, 0.05)))
-    results = {
-        tuple(resampled(resampler, population, 2, np.random.default_rng(seed)).parents["ancestor"].tolist())
-        for seed in range(40)
-    }
-    if len(results) < 2:
-        raise Broken("forty generators of different seeds give one and the same result: it ignores `rng`")
-
-
-@RESAMPLER.property("the scale of the weights does not matter")
-def scale_of_weights_is_irrelevant(resampler: Resampler, example: Example) -> None:
-    """Log weights + c choose the same particles; nothing over- or underflows."""
-    lw = log_of((0.11, 0.36, 0.15, 0.38))
-    for seed in range(10):
-        a = resampled(resampler, population_of(example, lw), 6, np.random.default_rng(seed))
-        for shift in (0.5, 100.0, -100.0, 1e4, -1e4):
-            with np.errstate(all="ignore"):
-                try:
-                    b = resampled(resampler, population_of(example, lw + shift), 6, np.random.default_rng(seed))
-                except Broken as broken:
-                    raise Broken(f"log weights + {shift:g} (overflow or underflow?): {broken}") from broken
-            if not np.array_equal(a.parents["ancestor"], b.parents["ancestor"]):
-                raise Broken(f"adding {shift:g} to all log weights chooses other particles (overflow or underflow?)")
-            if resampler.properly_weighted and not np.allclose(b.log_weights - shift, a.log_weights, atol=1e-8):
-                raise Broken(f"adding {shift:g} to all log weights does not add it to the output's")

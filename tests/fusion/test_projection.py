@@ -13,7 +13,7 @@ from mstfilter.fusion.update import FusionUpdate
 from mstfilter.presets import REGISTRY
 from mstfilter.scene import Clip, Frame, Hypothesis, VoxelGrid
 from mstfilter.smc import ParticleFilter, Population, ProjectOnto, Proposal, Transition
-from mstfilter.testing import UpdateContract, scenes
+from mstfilter.testing import UpdateContract, scene_example
 from tests.scene.scenes import CAMERA, GRID, table_scene
 
 RGB, DEPTH, LABELS = table_scene()
@@ -34,11 +34,11 @@ class TestProjectionUpdate(UpdateContract):
         return ProjectionUpdate()
 
     def example(self, rng, n):
-        return scenes.scene_example(rng, n)
+        return scene_example(rng, n)
 
 
 def test_it_is_fusion_without_a_proposal():
-    predicted, clip = scenes.scene_example(np.random.default_rng(1), 6)
+    predicted, clip = scene_example(np.random.default_rng(1), 6)
     for exponent in (0.0, 3.0):
         mine = ProjectionUpdate(quality_exponent=exponent).update(None, predicted, None, clip)
         fused = FusionUpdate(quality_exponent=exponent).update(np.random.default_rng(0), predicted, None, clip)
@@ -49,7 +49,7 @@ def test_it_is_fusion_without_a_proposal():
 
 
 def test_the_manifold_update_for_vectors_takes_the_same_projection():
-    predicted, clip = scenes.scene_example(np.random.default_rng(1), 6)
+    predicted, clip = scene_example(np.random.default_rng(1), 6)
     onto = ProjectOnto(lambda particles, y: FreeSpace().refine(particles, y)[0])
     found = onto.update(None, predicted, None, clip)
     mine = ProjectionUpdate(quality_exponent=0.0).update(None, predicted, None, clip)
@@ -87,8 +87,8 @@ def test_particles_of_ones_own_in_a_filter_without_a_proposal():
 
 
 def test_proposed_particles_join_and_are_projected():
-    predicted, clip = scenes.scene_example(np.random.default_rng(0), 2)
-    proposed, _ = scenes.scene_example(np.random.default_rng(1), 3)
+    predicted, clip = scene_example(np.random.default_rng(0), 2)
+    proposed, _ = scene_example(np.random.default_rng(1), 3)
     predicted = predicted.labelled({"previous": np.arange(2)})
     both = ProjectionUpdate().update(None, predicted, proposed.labelled({"proposed": np.arange(3)}), clip)
     assert both.parents["previous"].tolist() == [0, 1, -1, -1, -1]

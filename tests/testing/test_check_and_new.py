@@ -7,14 +7,14 @@ import sys
 
 import pytest
 
-from mstfilter.testing.starters import KINDS, write_starter
+from mstfilter.testing import starter_kinds, write_starter
 from tests.conftest import REPOSITORY
 from tests.test_cli import call
 
 FAULTS_FILE = REPOSITORY / "tests" / "testing" / "faults.py"
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", starter_kinds())
 def test_a_new_component_passes_its_check(kind, tmp_path, capsys):
     mine = tmp_path / "mine.py"
     code, out, err = call("new", kind, mine, capsys=capsys)
@@ -29,7 +29,7 @@ def test_a_new_component_passes_its_check(kind, tmp_path, capsys):
 
 def test_new_components_pass_their_tests(tmp_path):
     """All in one run of pytest, which takes its time to start."""
-    for kind in KINDS:
+    for kind in starter_kinds():
         write_starter(kind, tmp_path / f"my_{kind}.py")
     command = [sys.executable, "-m", "pytest", "-q", "-rs", "-p", "no:cacheprovider", str(tmp_path)]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=300)
@@ -49,10 +49,10 @@ def test_nothing_is_overwritten(tmp_path, capsys):
     (tmp_path / "test_mine.py").write_text("x")
     code, _, err = call("new", "resampler", tmp_path / "mine.py", capsys=capsys)
     assert code == 2
-    assert "test_mine.py is there already" in err
+    assert "test_mine.py exists already" in err
     assert [p.name for p in tmp_path.iterdir()] == ["test_mine.py"]
     for kind, name, message in (
-        ("spoon", "mine.py", "there are: resampler"),
+        ("spoon", "mine.py", "there are: codec"),
         ("update", "my-own.py", "cannot be imported"),
         ("update", "mine.txt", "cannot be imported"),
     ):
@@ -64,7 +64,7 @@ def test_nothing_is_overwritten(tmp_path, capsys):
 def test_check_names_what_is_broken(capsys):
     code, out, _ = call("check", f"{FAULTS_FILE}:BiasedResidual", capsys=capsys)
     assert code == 1
-    assert "broken   a particle gets n W_i copies on average" in out
+    assert "broken   A particle gets n W_i copies on average" in out
     assert "copies are biased" in out
     assert "1e-06" in out
     assert "BiasedResidual: 1 property is broken" in out

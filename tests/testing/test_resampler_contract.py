@@ -21,16 +21,16 @@ from mstfilter.smc import (
     Shuffled,
     Tempered,
 )
-from mstfilter.testing import ResamplerContract, verify
+from mstfilter.testing import WeightResamplerContract, check_component
 from tests.testing.faults import FAULTS, Correct, CorrectWeighted
 
 
-class TestCorrect(ResamplerContract):
+class TestCorrect(WeightResamplerContract):
     def make(self):
         return Correct()
 
 
-class TestCorrectWeighted(ResamplerContract):
+class TestCorrectWeighted(WeightResamplerContract):
     def make(self):
         return CorrectWeighted()
 
@@ -38,7 +38,7 @@ class TestCorrectWeighted(ResamplerContract):
 @pytest.mark.parametrize("fault", FAULTS, ids=lambda f: f.__name__)
 def test_planted_faults_are_named(fault):
     name, words = FAULTS[fault]
-    broken = {o.property.name: o.broken for o in verify(fault()) if o.broken}
+    broken = {r.name: r.failure for r in check_component(fault()) if r.failure}
     assert name in broken, broken
     assert words in broken[name]
 
@@ -47,7 +47,7 @@ def test_the_global_generators_are_put_back():
     from tests.testing.faults import GlobalGenerator
 
     before = np.random.get_state()[1].copy()  # noqa: NPY002
-    list(verify(GlobalGenerator()))
+    check_component(GlobalGenerator())
     np.testing.assert_array_equal(before, np.random.get_state()[1])  # noqa: NPY002
 
 
@@ -67,10 +67,10 @@ OURS = {
 
 @pytest.mark.parametrize("name", OURS)
 def test_our_own(name):
-    outcomes = list(verify(OURS[name]))
-    assert [(o.property.name, o.broken) for o in outcomes if o.broken] == []
-    law = {o.property.name: o.skipped is None for o in outcomes}["output_weights"]
-    assert law == OURS[name].properly_weighted
+    results = check_component(OURS[name])
+    assert [r for r in results if r.failure] == []
+    tested = {r.name: r.skipped is None for r in results}["output_weights"]
+    assert tested == OURS[name].properly_weighted
 
 
 def test_ours_on_other_particles():
@@ -86,4 +86,4 @@ def test_ours_on_other_particles():
         return Population(tuple(f"particle {i}" for i in range(n))), None
 
     for scheme, example in ((KDpp(), vectors), (Coalesced(), mapping), (Coalesced(), objects)):
-        assert [o.broken for o in verify(scheme, example) if o.broken] == []
+        assert [r for r in check_component(scheme, example) if r.failure] == []

@@ -1,6 +1,6 @@
-"""A size of my own: how many particles a resampling makes.
+"""A size: how many particles a resampling makes.
 
-mstfilter check ./size.py:MySize                        what holds and what does not, in words
+mstfilter check ./size.py:MySize
 mstfilter run RECORDING size=./size.py:MySize
 """
 
@@ -16,12 +16,12 @@ from mstfilter.smc import Population, Size
 
 @dataclass(frozen=True)
 class MySize(Size):
-    """More particles where the weights are spread over many. Fields are settings.
+    """More particles if the weights are spread over many. Fields need an annotation and a default.
 
     Parameters
     ----------
     factor : float
-        Particles for each particle of the perplexity, which is the exponential of the entropy of the weights.
+        Number of particles per unit of the perplexity, the exponential of the entropy of the weights.
     n_min, n_max : int
         Bounds of the answer.
     """
@@ -35,8 +35,8 @@ class MySize(Size):
             raise InputError(f"factor is {self.factor}, n_min {self.n_min} and n_max {self.n_max}")
 
     def choose(self, population: Population) -> int:
-        """A whole number of at least 1, from the weighted particles that are about to be resampled."""
+        """An integer of at least 1, from the weighted particles before the resampling."""
         weights = population.weights[population.weights > 0]
         perplexity = float(np.exp(-(weights @ np.log(weights))))
-        # Rounded first: the order of the particles must not matter, not even in the last bit of a sum.
+        # Rounded, since the last bits of a sum depend on the order of the particles.
         return int(np.clip(np.ceil(round(self.factor * perplexity, 6)), self.n_min, self.n_max))

@@ -1,6 +1,6 @@
-"""A rejuvenation of my own: a move that leaves p(x_t | x_{t-1}, y_t) as it is. It makes a resample-move filter.
+"""A rejuvenation: a move that leaves p(x_t | x_{t-1}, y_t) unchanged. With one, a filter is a resample-move filter.
 
-mstfilter check ./rejuvenation.py:MyRejuvenation        what holds and what does not, in words
+mstfilter check ./rejuvenation.py:MyRejuvenation
 replace(bootstrap(model, n=100), rejuvenation=MyRejuvenation())
 """
 
@@ -16,7 +16,9 @@ from mstfilter.smc import Population, Rejuvenation
 
 @dataclass(frozen=True)
 class MyRejuvenation(Rejuvenation):
-    """A Metropolis step for x_0 ~ N(0, 1), x_t ~ N(0.9 x_{t-1}, 1), y_t ~ N(x_t, 1). Fields are settings.
+    """A Metropolis step for x_0 ~ N(0, 1), x_t ~ N(0.9 x_{t-1}, 1), y_t ~ N(x_t, 1).
+
+    Fields need an annotation and a default.
 
     Parameters
     ----------
@@ -43,17 +45,17 @@ class MyRejuvenation(Rejuvenation):
         x = population.particles
         new = x + self.step * rng.standard_normal(len(population))
         accepted = np.log1p(-rng.random(len(population))) < log_target(new) - log_target(x)
-        # Weights stay: the kernel leaves the law alone.
+        # The weights do not change, since the kernel keeps the distribution.
         return replace(population, particles=np.where(accepted, new, x))
 
 
 def example(rng: np.random.Generator, n: int) -> tuple[Population, Any]:
-    """What the checks let it work on: n particles, and an observation."""
+    """Input for the contract: n particles, and an observation."""
     return Population(rng.standard_normal(n), rng.standard_normal(n)), 0.5
 
 
 def exact(rng: np.random.Generator, n: int) -> tuple[Population | None, Population, Any]:
-    """x_{t-1}, exact draws of x_t given them and y_t, and y_t: what the law of the move is tested with."""
+    """x_{t-1}, exact draws of x_t given them and y_t, and y_t: the contract tests the distribution with them."""
     previous = rng.standard_normal(n)
     x = (0.9 * previous + 0.5) / 2 + np.sqrt(0.5) * rng.standard_normal(n)
     return Population(previous), Population(x), 0.5

@@ -1,6 +1,6 @@
-"""A proposal of my own: new particles from an observation alone.
+"""A proposal: new particles from an observation alone.
 
-mstfilter check ./proposal.py:MyProposal                what holds and what does not, in words
+mstfilter check ./proposal.py:MyProposal
 mstfilter run RECORDING proposal=./proposal.py:MyProposal
 """
 
@@ -16,7 +16,7 @@ from mstfilter.smc import Population, Proposal
 
 @dataclass(frozen=True)
 class MyProposal(Proposal):
-    """Particles around the observation. Fields, with annotation and default, are settings.
+    """Particles around the observation. Fields need an annotation and a default.
 
     Parameters
     ----------
@@ -26,18 +26,18 @@ class MyProposal(Proposal):
 
     spread: float = 1.0
 
-    # Say False where the weights are not those of draws from the model (heuristic scores, for example).
+    # Set to False if the weights are not those of draws from the model (for example heuristic scores).
     properly_weighted = False
 
     def sample(self, rng: np.random.Generator, observation: Any, n: int) -> Population:
-        """Draw n particles: exactly n, repeated where there are too few different ones."""
-        # All that is random comes from rng.
+        """Draw exactly n particles; repeat some if there are fewer different ones."""
+        # Random numbers come from rng only.
         centre = np.asarray(observation, dtype=np.float64)
         particles = centre + self.spread * rng.standard_normal((n, *centre.shape))
-        # Log weights: 0 for draws from the prior, log prior - log density of the draw where that is known.
+        # Log weights: 0 for draws from the prior; log prior - log density of the draw if that is known.
         return Population(particles, np.zeros(n))
 
 
 def example(rng: np.random.Generator, n: int) -> tuple[Population, Any]:
-    """What the checks let it work on: a population (not used here) and an observation."""
+    """Input for the contract: a population (not used here) and an observation."""
     return Population(rng.standard_normal((n, 2))), np.array([0.3, -0.1])

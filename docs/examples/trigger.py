@@ -1,6 +1,6 @@
-"""A trigger of my own: when to resample.
+"""A trigger: when to resample.
 
-mstfilter check ./trigger.py:MyTrigger                  what holds and what does not, in words
+mstfilter check ./trigger.py:MyTrigger
 mstfilter run RECORDING trigger=./trigger.py:MyTrigger
 """
 
@@ -14,12 +14,12 @@ from mstfilter.smc import Population, Trigger
 
 @dataclass(frozen=True)
 class MyTrigger(Trigger):
-    """Resamples where one particle has more than a share of all weight. Fields are settings.
+    """Resamples if one particle has more than a given share of the weight. Fields need an annotation and a default.
 
     Parameters
     ----------
     share : float
-        Of the total weight, in (0, 1).
+        Share of the total weight, in (0, 1).
     """
 
     share: float = 0.5

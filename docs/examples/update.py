@@ -1,6 +1,6 @@
-"""An update of my own: what an observation does to the particles.
+"""An update: how an observation changes the particles.
 
-mstfilter check ./update.py:MyUpdate                    what holds and what does not, in words
+mstfilter check ./update.py:MyUpdate
 mstfilter run RECORDING update=./update.py:MyUpdate
 """
 
@@ -16,7 +16,7 @@ from mstfilter.smc import Population, Update, union
 
 @dataclass(frozen=True)
 class MyUpdate(Update):
-    """Weighs particles by a Gaussian likelihood. Fields, with annotation and default, are settings.
+    """Weights particles by a Gaussian likelihood. Fields need an annotation and a default.
 
     Parameters
     ----------
@@ -26,7 +26,7 @@ class MyUpdate(Update):
 
     noise: float = 0.5
 
-    # Say False where the weights afterwards are not those of an exact filter.
+    # Set to False if the weights of the result are not those of an exact filter.
     properly_weighted = True
 
     def update(
@@ -36,12 +36,12 @@ class MyUpdate(Update):
         proposed: Population | None,
         observation: Any,
     ) -> Population:
-        """Any number of particles may come out; `predicted` or `proposed` may be None, but not both."""
+        """The result may have any number of particles; `predicted` or `proposed` may be None, but not both."""
         population = union(predicted, proposed)
         distance = (population.particles - np.asarray(observation)) / self.noise
         return population.reweighted(-0.5 * (distance**2).reshape(len(population), -1).sum(axis=1))
 
 
 def example(rng: np.random.Generator, n: int) -> tuple[Population, Any]:
-    """What the checks let it work on: n particles, and an observation."""
+    """Input for the contract: n particles, and an observation."""
     return Population(rng.standard_normal((n, 2)), rng.standard_normal(n)), np.array([0.3, -0.1])

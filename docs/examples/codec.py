@@ -1,6 +1,6 @@
-"""A codec of my own: how particles of my own are stored in a checkpoint.
+"""A codec: how particles of a user's class are stored in a checkpoint.
 
-mstfilter check ./codec.py:MyCodec                      what holds and what does not, in words
+mstfilter check ./codec.py:MyCodec
 filter.run(observations, seed=0, checkpoint="run.npz", codec=MyCodec())
 """
 
@@ -19,7 +19,7 @@ from mstfilter.smc import Codec, Population
 class Shelf:
     """A particle: boxes on a shelf, in order.
 
-    (A dataclass of arrays, numbers and strings needs no codec. This one holds a tuple of changing length.)
+    A dataclass of arrays, numbers and strings needs no codec. This one holds a tuple of variable length.
     """
 
     boxes: tuple[str, ...]
@@ -27,7 +27,7 @@ class Shelf:
 
 @dataclass(frozen=True)
 class MyCodec(Codec):
-    """Stores shelves as all boxes in a row and the number on each shelf."""
+    """Stores shelves as a list of all boxes and the number of boxes on each shelf."""
 
     def encode(self, particles: Any) -> Mapping[str, np.ndarray]:
         """Named arrays of any shape; numbers and strings, no Python objects."""
@@ -35,13 +35,13 @@ class MyCodec(Codec):
         return {"boxes": np.array(boxes, dtype="U"), "lengths": np.array([len(s.boxes) for s in particles], np.int64)}
 
     def decode(self, arrays: Mapping[str, np.ndarray]) -> Any:
-        """The particles of `encode`, bit for bit, in a process that has encoded nothing."""
+        """The particles that were encoded, bit by bit, also in another process."""
         ends = np.cumsum(arrays["lengths"])
         boxes = arrays["boxes"].tolist()
         return tuple(Shelf(tuple(boxes[e - n : e])) for e, n in zip(ends, arrays["lengths"], strict=True))
 
 
 def example(rng: np.random.Generator, n: int) -> tuple[Population, Any]:
-    """What the checks let it work on: n particles; the observation is not used."""
+    """Input for the contract: n particles; the observation is not used."""
     shelves = tuple(Shelf(tuple(rng.choice(["a", "bb", "c"], rng.integers(4)).tolist())) for _ in range(n))
     return Population(shelves), None

@@ -1,6 +1,6 @@
-"""A transition of my own: how particles move from one time to the next.
+"""A transition: how particles move from one time to the next.
 
-mstfilter check ./transition.py:MyTransition            what holds and what does not, in words
+mstfilter check ./transition.py:MyTransition
 mstfilter run RECORDING transition=./transition.py:MyTransition
 """
 
@@ -17,7 +17,7 @@ from mstfilter.smc import Population, Transition
 
 @dataclass(frozen=True)
 class MyTransition(Transition):
-    """A random walk. Fields, with annotation and default, are settings.
+    """A random walk. Fields need an annotation and a default.
 
     Parameters
     ----------
@@ -27,7 +27,7 @@ class MyTransition(Transition):
 
     scale: float = 1.0
 
-    # Say False where the weights afterwards are not those of an exact filter.
+    # Set to False if the weights of the result are not those of an exact filter.
     properly_weighted = True
 
     def __post_init__(self) -> None:
@@ -35,13 +35,13 @@ class MyTransition(Transition):
             raise InputError(f"scale is {self.scale}, expected a number of at least 0")
 
     def predict(self, rng: np.random.Generator, population: Population, observation: Any) -> Population:
-        """Move all particles at once; `observation` is the new one, or None where it is missing."""
-        # Arrays are read-only: make new ones. All that is random comes from rng.
+        """Move all particles; `observation` is the new one, or None if it is missing."""
+        # Arrays are read-only: make new ones. Random numbers come from rng only.
         particles = population.particles + self.scale * rng.standard_normal(population.particles.shape)
         # A guided move, drawn from q(x | previous, observation), adds log f - log q to the log weights here.
         return Population(particles, population.log_weights, population.parents)
 
 
 def example(rng: np.random.Generator, n: int) -> tuple[Population, Any]:
-    """What the checks let it work on: n particles of the kind it moves, and an observation."""
+    """Input for the contract: n particles of the kind it moves, and an observation."""
     return Population(rng.standard_normal((n, 2)), rng.standard_normal(n)), np.array([0.3, -0.1])

@@ -1,0 +1,13 @@
+"""MyUpdate keeps the contract of its interface."""
+
+from update import MyUpdate, example
+
+from mstfilter.testing import UpdateContract
+
+
+class TestMyUpdate(UpdateContract):
+    def make(self):
+        return MyUpdate()
+
+    def example(self, rng, n):
+        return example(rng, n)

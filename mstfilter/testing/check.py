@@ -1,0 +1,215 @@
+"""Running a contract on a component, without a test file: what ``mstfilter check`` does.
+
+>>> for result in check_component(MyResampler()):
+...     print(result.statement, "-", result.failure or result.skipped or "holds")
+
+pytest runs the contract class of the component in this process and without output; a small plugin collects the
+outcomes.
+"""
+
+from __future__ import annotations
+
+import inspect
+import os
+import sys
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pytest
+
+from mstfilter.errors import InputError
+from mstfilter.fusion import Evidence
+from mstfilter.smc import (
+    Codec,
+    DensityTransition,
+    Equivalence,
+    Lookahead,
+    Proposal,
+    Rejuvenation,
+    Resampler,
+    Similarity,
+    Size,
+    Transition,
+    Trigger,
+    Update,
+    WeightResampler,
+)
+from mstfilter.testing import moves, resampling, values
+from mstfilter.testing.contract import Contract
+from mstfilter.testing.scenes import scene_example
+
+__all__ = ["CheckResult", "check_component", "contract_of"]
+
+#: Contract of each interface, the more special interface first.
+_CONTRACTS: dict[type, type[Contract]] = {
+    WeightResampler: resampling.WeightResamplerContract,
+    Resampler: resampling.ResamplerContract,
+    DensityTransition: moves.DensityTransitionContract,
+    Transition: moves.TransitionContract,
+    Proposal: moves.ProposalContract,
+    Update: moves.UpdateContract,
+    Rejuvenation: moves.RejuvenationContract,
+    Trigger: values.TriggerContract,
+    Size: values.SizeContract,
+    Lookahead: values.LookaheadContract,
+    Similarity: values.SimilarityContract,
+    Equivalence: values.EquivalenceContract,
+    Codec: values.CodecContract,
+    Evidence: values.EvidenceContract,
+}
+
+
+@dataclass(frozen=True)
+class CheckResult:
+    """The outcome of one property.
+
+    Parameters
+    ----------
+    name : str
+        Name of the test without ``test_``.
+    statement : str
+        The property: the first line of the docstring of the test.
+    statistical : bool
+        Whether the test looks at random samples, and so fails for a correct component with probability `FALSE_ALARM`.
+    failure : str or None
+        How the property is violated; None if it holds or was not tested.
+    skipped : str or None
+        Why it was not tested.
+    """
+
+    name: str
+    statement: str
+    statistical: bool
+    failure: str | None = None
+    skipped: str | None = None
+
+
+def contract_of(cls: type) -> type[Contract]:
+    """The contract of a class of components.
+
+    Raises
+    ------
+    InputError
+        If no interface of the class has a contract.
+    """
+    for interface, contract in _CONTRACTS.items():
+        if issubclass(cls, interface):
+            return contract
+    names = ", ".join(interface.__name__ for interface in _CONTRACTS)
+    raise InputError(f"{cls.__name__} is no component with a contract", f"inherit one of {names}")
+
+
+def check_component(
+    component: Any, example: Callable[..., Any] | None = None, exact: Callable[..., Any] | None = None
+) -> list[CheckResult]:
+    """Test all properties of a component.
+
+    Parameters
+    ----------
+    component : component
+        Of an interface that has a contract.
+    example : callable, optional
+        ``(rng, n) -> (population, observation)`` that the component can handle. Default: the function ``example`` in
+        the module of its class; without one, a scene for components of images and numbers for others.
+    exact : callable, optional
+        For a `Rejuvenation`: ``(rng, n) -> (previous, population, observation)``, rows of x_{t-1} and exact draws of
+        x_t given them and the observation. Default: the function ``exact`` in the module of its class, if any.
+    """
+    cls = type(component)
+    contract = contract_of(cls)
+    example = example or _function_beside(cls, "example") or (scene_example if _uses_images(cls) else None)
+    exact = exact or _function_beside(cls, "exact")
+    body: dict[str, Any] = {"make": lambda self: component}
+    if example is not None:
+        body["example"] = lambda self, rng, n: example(rng, n)
+    if exact is not None:
+        body["exact"] = lambda self, rng, n: exact(rng, n)
+    plugin = _Plugin(type(f"Test{cls.__name__}", (contract,), body))
+    with tempfile.TemporaryDirectory() as folder, _quiet_pytest():
+        path = Path(folder, "test_component.py")
+        path.touch()  # pytest needs a file to collect; the plugin replaces its content
+        options = [
+            "--capture=no",
+            "--assert=plain",
+            "--noconftest",
+            f"--rootdir={folder}",
+            f"-c{os.devnull}",
+        ]
+        disabled = [f"-pno:{name}" for name in ("cacheprovider", "faulthandler", "terminal", "warnings")]
+        status = pytest.main([*options, *disabled, str(path)], plugins=[plugin])
+    if status not in (pytest.ExitCode.OK, pytest.ExitCode.TESTS_FAILED):
+        raise RuntimeError(f"pytest ended with status {status!r}")
+    return plugin.results
+
+
+def _function_beside(cls: type, name: str) -> Callable[..., Any] | None:
+    """A function in the module of a class."""
+    found = getattr(sys.modules.get(cls.__module__), name, None)
+    return found if callable(found) else None
+
+
+def _uses_images(cls: type) -> bool:
+    """Whether a class belongs to a package of mstfilter other than smc."""
+    return cls.__module__.startswith("mstfilter.") and not cls.__module__.startswith("mstfilter.smc.")
+
+
+class _Plugin:
+    """Makes pytest collect one class, and keeps the outcomes of its tests."""
+
+    def __init__(self, tests: type[Contract]) -> None:
+        self.tests = tests
+        self.results: list[CheckResult] = []
+        self._stopped = False
+
+    @pytest.hookimpl(tryfirst=True)
+    def pytest_pycollect_makemodule(self, module_path: Path, parent: Any) -> pytest.Module:
+        """A module that holds the class."""
+        module: pytest.Module = pytest.Module.from_parent(parent, path=module_path)
+        module.obj = ModuleType(module_path.stem)
+        setattr(module.obj, self.tests.__name__, self.tests)
+        return module
+
+    def pytest_runtest_setup(self, item: Any) -> None:
+        """Skip the test if one failed that it relies on."""
+        if self._stopped:
+            pytest.skip("not tested: first fix what is broken above")
+
+    def pytest_runtest_makereport(self, item: Any, call: Any) -> None:
+        """Keep the outcome; a failure with the same message as an earlier one is reported once."""
+        error = None if call.excinfo is None else call.excinfo.value
+        if call.when == "teardown" or (call.when == "setup" and error is None):
+            return
+        failure = skipped = None
+        if isinstance(error, pytest.skip.Exception):
+            skipped = str(error)
+        elif isinstance(error, AssertionError):
+            failure = str(error)
+        elif error is not None:
+            failure = f"{type(error).__name__}: {error}"
+        test = item.function
+        if failure is not None:
+            self._stopped = getattr(test, "prerequisite", False)
+            if any(result.failure == failure for result in self.results):
+                failure, skipped = None, "same failure as above"
+        statement = (inspect.getdoc(test) or item.name).split("\n")[0]
+        statistical = getattr(test, "statistical", False)
+        self.results.append(CheckResult(item.name.removeprefix("test_"), statement, statistical, failure, skipped))
+
+
+@contextmanager
+def _quiet_pytest() -> Iterator[None]:
+    """Ignore the pytest settings of the environment, and restore the environment afterwards."""
+    before = dict(os.environ)
+    os.environ["PYTEST_DISABLE_PLUGIN_AUTOLOAD"] = "1"
+    for name in ("PYTEST_ADDOPTS", "PYTEST_PLUGINS"):
+        os.environ.pop(name, None)
+    try:
+        yield
+    finally:
+        os.environ.clear()
+        os.environ.update(before)

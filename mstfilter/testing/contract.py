@@ -1,0 +1,216 @@
+"""What all contracts share: the base classes, and helpers that turn what goes wrong into words.
+
+A contract is a pytest class. Each ``test_`` method checks one property; the first line of its docstring states the
+property, and the message of a failed assertion states how it is violated:
+
+>>> class TriggerContract(Contract):
+...     def test_returns_bool(self):
+...         \"\"\"It returns True or False.\"\"\"
+...         population, _ = self.example(np.random.default_rng(0), 5)
+...         answer = self.make().wants(population, 0)
+...         assert isinstance(answer, bool), f"it returns {answer!r}, expected True or False"
+"""
+
+from __future__ import annotations
+
+import copy
+import random
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import fields, is_dataclass
+from typing import Any, TypeVar
+
+import numpy as np
+import pytest
+
+from mstfilter.errors import InputError
+from mstfilter.smc import Population
+
+__all__ = [
+    "FALSE_ALARM",
+    "Contract",
+    "RandomContract",
+    "number_example",
+    "prerequisite",
+    "reports_errors",
+    "same",
+    "skip_unless_properly_weighted",
+    "statistical",
+]
+
+#: Largest probability that a statistical test fails for a correct component.
+FALSE_ALARM = 1e-6
+
+_Test = TypeVar("_Test", bound=Callable[..., None])
+
+
+def statistical(test: _Test) -> _Test:
+    """Mark a test that looks at random samples. It fails with probability `FALSE_ALARM` for a correct component."""
+    test.statistical = True  # type: ignore[attr-defined]
+    return test
+
+
+def prerequisite(test: _Test) -> _Test:
+    """Mark a test that the tests after it rely on. If it fails, ``mstfilter check`` skips them."""
+    test.prerequisite = True  # type: ignore[attr-defined]
+    return test
+
+
+def number_example(rng: np.random.Generator, n: int) -> tuple[Population, Any]:
+    """`n` numbers with unequal weights, and a number as observation."""
+    return Population(rng.standard_normal(n), 0.5 * rng.standard_normal(n)), 0.5
+
+
+class Contract:
+    """Base class of all contracts. Inherit one of its subclasses and define `make`; pytest does the rest.
+
+    A contract for another interface defines `inputs` and `call`, and adds tests.
+    """
+
+    def make(self) -> Any:
+        """The component to test."""
+        raise NotImplementedError(f"{type(self).__name__} needs a method make(self) that returns the component")
+
+    def example(self, rng: np.random.Generator, n: int) -> tuple[Population, Any]:
+        """A population of `n` particles that the component can handle, and an observation. Default: numbers."""
+        return number_example(rng, n)
+
+    def inputs(self, n: int, seed: int = 0) -> dict[str, Any]:
+        """Arguments of a typical call, without the generator: the example of `n` particles."""
+        population, observation = self.example(np.random.default_rng(seed), n)
+        return {"population": population, "observation": observation}
+
+    def call(self, component: Any, rng: np.random.Generator, inputs: dict[str, Any]) -> Any:
+        """Use the component once."""
+        raise NotImplementedError
+
+    def setup_method(self) -> None:
+        """Store the state of the global generators."""
+        self._global_state = _global_state()
+
+    def teardown_method(self) -> None:
+        """Restore the state of the global generators."""
+        numpy_state, python_state = self._global_state
+        np.random.set_state(numpy_state)  # noqa: NPY002
+        random.setstate(python_state)
+
+    @prerequisite
+    def test_leaves_input_alone(self) -> None:
+        """It leaves its input unchanged."""
+        inputs = self.inputs(6)
+        before = copy.deepcopy(_plain(inputs))
+        try:
+            self.call(self.make(), np.random.default_rng(3), inputs)
+        except Exception as error:  # other tests report other errors
+            assert not _writes_to_read_only(error), "it changes its input in place: make a copy first"
+        for name, value in _plain(inputs).items():
+            assert same(value, before[name]), f"it changes its input in place ({name}): make a copy first"
+
+    def test_keeps_no_state(self) -> None:
+        """A call does not change the result of later calls."""
+        component = self.make()
+        with skips_errors():
+            first = self.call(component, np.random.default_rng(1), self.inputs(6))
+            self.call(component, np.random.default_rng(2), self.inputs(9, seed=1))
+            again = self.call(component, np.random.default_rng(1), self.inputs(6))
+        assert same(_plain(first), _plain(again)), (
+            "a repeated call gives another result after a call in between: it keeps state, or draws numbers"
+        )
+
+
+class RandomContract(Contract):
+    """Base class of contracts for components that draw random numbers."""
+
+    @prerequisite
+    def test_repeats_with_the_same_generator(self) -> None:
+        """Equal generators give equal results."""
+        results = []
+        component, inputs = self.make(), self.inputs(6)
+        with skips_errors():
+            for seed in (7, 7, 8, 8, 9, 9):
+                np.random.seed(seed)  # noqa: NPY002 (draws from global generators are the subject of another test)
+                random.seed(seed)
+                results.append(_plain(self.call(component, np.random.default_rng(seed), inputs)))
+        for a, b in zip(results[::2], results[1::2], strict=True):
+            assert same(a, b), "two runs with equal generators differ: a random number does not come from `rng`"
+
+    @prerequisite
+    def test_leaves_global_generators_alone(self) -> None:
+        """It does not use the global generators of numpy and Python."""
+        before = _global_state()
+        with skips_errors():
+            self.call(self.make(), np.random.default_rng(7), self.inputs(6))
+        after = _global_state()
+        assert same(before[0], after[0]), "it draws from numpy's global generator (np.random.*): draw from `rng`"
+        assert before[1] == after[1], "it draws from Python's global generator (random.*): draw from `rng`"
+
+
+def skip_unless_properly_weighted(component: Any) -> None:
+    """Skip a test of the weights if the component declares ``properly_weighted = False``."""
+    if not component.properly_weighted:
+        pytest.skip("the component declares properly_weighted = False")
+
+
+@contextmanager
+def reports_errors(what: str) -> Iterator[None]:
+    """Turn any exception of a component into an AssertionError that describes the call."""
+    try:
+        yield
+    except AssertionError:
+        raise
+    except Exception as error:
+        if _writes_to_read_only(error):
+            raise AssertionError("it changes its input in place: make a copy first") from error
+        if isinstance(error, IndexError):
+            raise AssertionError(f"{what}: an index is out of range ({error}); off by one?") from error
+        message = str(error) if isinstance(error, InputError) else f"{type(error).__name__}: {error}"
+        raise AssertionError(f"{what}: it raises {message}") from error
+
+
+@contextmanager
+def skips_errors() -> Iterator[None]:
+    """Skip a general test if the component raises an exception, which the tests of its interface report."""
+    try:
+        yield
+    except Exception as error:
+        pytest.skip(f"a call raises {type(error).__name__}, see the other tests")
+
+
+def _writes_to_read_only(error: Exception) -> bool:
+    return isinstance(error, ValueError) and "read-only" in str(error)
+
+
+def same(a: Any, b: Any) -> bool:
+    """Whether two values are equal: arrays bit by bit, dataclasses by field. Without equality they count as equal."""
+    if a is b:
+        return True
+    if type(a) is not type(b):
+        return bool(isinstance(a, (float, np.floating)) and isinstance(b, (float, np.floating)) and a == b)
+    if isinstance(a, np.ndarray):
+        if a.dtype == object:
+            return a.shape == b.shape and all(same(x, y) for x, y in zip(a.ravel(), b.ravel(), strict=True))
+        return a.shape == b.shape and a.dtype == b.dtype and a.tobytes() == b.tobytes()
+    if isinstance(a, Mapping):
+        return list(a) == list(b) and all(same(a[k], b[k]) for k in a)
+    if isinstance(a, str):
+        return bool(a == b)
+    if isinstance(a, Sequence):
+        return len(a) == len(b) and all(same(x, y) for x, y in zip(a, b, strict=True))
+    if is_dataclass(a):
+        return all(same(getattr(a, f.name), getattr(b, f.name)) for f in fields(a))
+    if type(a).__eq__ is object.__eq__:
+        return True
+    return bool(np.all(a == b))
+
+
+def _plain(value: Any) -> Any:
+    """A population, or a mapping that holds some, as lists of particles, log weights and parents."""
+    if isinstance(value, Population):
+        return [value.realised().particles, value.log_weights, dict(value.parents)]
+    if isinstance(value, dict):
+        return {name: _plain(inner) for name, inner in value.items()}
+    return value
+
+
+def _global_state() -> tuple[Any, Any]:
+    return np.random.get_state(), random.getstate()  # noqa: NPY002
