@@ -26,7 +26,6 @@ __components__ = {
     "transition": {"true_motions": "TrueMotions"},
     "proposal": {"true_masks": "TrueMasks"},
     "update": {"true_fusion": "TrueFusion"},
-    "resampler": {"true_best": "TrueBest"},
     "boundary": {"true_boundary": "TrueBoundary"},
     "completer": {"true_completion": "TrueCompletion"},
     "free_space": {"true_free_space": "TrueFreeSpace"},

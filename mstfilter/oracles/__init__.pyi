@@ -26,7 +26,6 @@ from mstfilter.oracles.miniature_mst import (
 )
 from mstfilter.oracles.stages import (
     STAGES as STAGES,
-    TrueBest as TrueBest,
     TrueFreeSpace as TrueFreeSpace,
     TrueFusion as TrueFusion,
     TrueMotions as TrueMotions,

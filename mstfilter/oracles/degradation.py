@@ -1,16 +1,16 @@
-"""Masks made worse to a set quality: objects split, touching objects merged, borders displaced.
+"""Masks degraded to a given quality: objects split, touching objects merged, borders displaced.
 
 >>> worse = degrade(rng, labels, quality=0.8, over=0.35, under=0.35)
 >>> abs(weighted_coverage(worse, labels) - 0.8) < 0.01
 True
 
-The loss 1 - quality is spent in this order: splits by random lines until `over` of it is gone, merges of touching
-objects until `under` is, then a smooth random displacement of all borders, as strong as the rest asks for. Splits and
-displacements are found by bisection, so the quality is met whatever the image; merges cannot be dosed, and one that
-costs too much is not made. Pieces of one object are not joined again.
+The loss 1 - quality has three parts, in this order: splits of objects by random lines (a share `over` of the loss),
+merges of touching objects (a share `under`), and a smooth random displacement of all borders (the rest). The sizes of
+splits and displacements are found by bisection, so the quality is reached for any image. The loss of a merge is
+fixed; merges that cost too much are not made. Pieces of one object are not merged again.
 
-Draws are named by the objects that they are about, and the displacement by its place in the image: the same stream
-makes similar errors in similar images, so errors can be made to last while a scene changes.
+Random streams have keys: the objects that a draw is about, and for the displacement the position in the image. So the
+same generator makes similar errors in similar images, and errors can persist while a scene changes.
 """
 
 from __future__ import annotations
@@ -40,25 +40,25 @@ def degrade(
     under: float = 0.35,
     tolerance: float = 0.01,
 ) -> np.ndarray:
-    """A worse label image.
+    """Degrade a label image.
 
     Parameters
     ----------
     rng : Generator
-        Names the draws (`mstfilter.smc.streams.child`); not consumed.
+        Source of the streams (`mstfilter.smc.child`); its state does not change.
     labels : (H, W) int
         True objects, 0 elsewhere.
     quality : float
-        Weighted coverage (form ``objects``) that the result is to have against `labels`.
+        Weighted coverage (form ``objects``) of the result against `labels`.
     over, under : float
-        Shares of the loss that splits and merges may take.
+        Shares of the loss due to splits and merges.
     tolerance : float
         Distance from `quality` at which the search ends.
 
     Returns
     -------
     (H, W) int32
-        An image without objects comes back unchanged.
+        Unchanged if there are no objects.
     """
     labels = np.asarray(labels, dtype=np.int32)
     if quality >= 1 or not labels.any():
@@ -77,9 +77,9 @@ def degrade(
 
 
 def _split(rng: np.random.Generator, true: np.ndarray, target: float, tol: float) -> tuple[np.ndarray, _Names]:
-    """Cut objects in two until the quality is `target`; the last cut takes as little as is needed.
+    """Cut objects in two until the quality is `target`; the last cut is as small as needed.
 
-    Returns the labels and what each stands for: the true object, then which side of each cut.
+    Returns the labels and the name of each: the true object, then the side of each cut.
     """
 
     def draw(name: tuple[int, ...]) -> np.ndarray:
@@ -92,7 +92,7 @@ def _split(rng: np.random.Generator, true: np.ndarray, target: float, tol: float
         if weighted_coverage(labels, true) <= target + tol / 2:
             break
         sizes = np.bincount(labels.ravel())
-        # The first of exponential times at the rate of their sizes: a part is chosen in proportion to its size.
+        # Exponential race: the piece with least -log(1 - u) / size, so a piece is chosen in proportion to its size.
         chosen = min(names, key=lambda k: -np.log1p(-draws[k][0]) / sizes[k])
         where = np.nonzero(labels == chosen)
         angle = np.pi * draws[chosen][1]
@@ -122,7 +122,7 @@ def _split(rng: np.random.Generator, true: np.ndarray, target: float, tol: float
             names[fresh], names[chosen] = (*names[chosen], 1), (*names[chosen], 0)
             draws |= {k: draw(names[k]) for k in (fresh, chosen)}
         else:
-            break  # a cut that takes nothing: no smaller loss is possible
+            break  # the cut is empty: no smaller loss is possible
     return labels, names
 
 
@@ -133,7 +133,7 @@ def _merge(
 
     @cache
     def turn(pair: tuple[int, int]) -> float:
-        """When a pair is tried."""
+        """Random rank of a pair."""
         x, y = sorted(names[k] for k in pair)
         return float(child(rng, "merge", len(x), *x, *y).random())
 
@@ -142,7 +142,7 @@ def _merge(
     for _ in range(_TRIES):
         if weighted_coverage(labels, true) <= target + tol / 2:
             break
-        # Joining what was one object would undo a split.
+        # Merging two pieces of one object would undo a split.
         pairs = {(a, b) for a, b in _touching(labels) - refused if not roots[a] & roots[b]}
         if not pairs:
             break
@@ -176,7 +176,7 @@ def _displace(
     image: tuple[int, ...],
     box: tuple[slice, ...],
 ) -> np.ndarray:
-    """Move every pixel's label along a smooth random field over the image, as far as the quality asks for."""
+    """Move the label of every pixel along a smooth random field, as far as the target quality requires."""
     from scipy.ndimage import gaussian_filter
 
     resize = image[1] / 640
@@ -195,7 +195,7 @@ def _displace(
 
 
 def _bisect(quality: Callable[[float], float], low: float, high: float, target: float, tol: float) -> float:
-    """Where a (nearly) falling quality meets the target: of all places looked at, the closest."""
+    """The argument at which a decreasing quality reaches the target: the closest one of all that were tried."""
     best, closest = low, np.inf
     for k in range(24):
         at = high if k == 0 else (low + high) / 2
@@ -206,7 +206,7 @@ def _bisect(quality: Callable[[float], float], low: float, high: float, target: 
             break
         if k == 0:
             if value > target:
-                break  # not even the strongest reaches it
+                break  # the largest argument does not reach the target
             continue
         low, high = (at, high) if value > target else (low, at)
     return best

@@ -39,18 +39,18 @@ class TrueMasks(UsesTruth, Proposal):
     ----------
     completer : Completer
     quality : float
-        2-D quality (form ``objects``) of each sample's masks against the true ones, 0.3 .. 1.
+        2-D quality (form ``objects``) of the masks of each sample, 0.3 to 1.
     errors : {"independent", "lasting"}
-        Below quality 1. *independent*: every sample of every pause is wrong in its own way, so that errors average
-        out over samples and pauses. *lasting*: all samples have the same masks, and an object is cut and joined
-        alike at every pause, as a front end does whose errors have a cause.
+        Errors if `quality` is below 1. *independent*: each sample of each pause has different errors, which average
+        out over samples and pauses. *lasting*: all samples have the same masks, and an object is split and merged in
+        the same way at every pause, like the systematic errors of a real front end.
     over, under : float
-        Shares of the lost quality that come from splitting and from merging objects, 0 .. 1 together at most. The
-        rest comes from displaced borders, and what splitting and merging could not reach too.
+        Shares of the lost quality that come from splitting and from merging objects; their sum is at most 1. The
+        rest comes from displaced borders, as does any loss that splitting and merging could not reach.
     tolerance : float
-        Largest deviation from the set quality.
+        Largest deviation from `quality`.
     min_pixels : float
-        Objects with fewer pixels in a 640 x 480 image are not seen; scales with the image's area.
+        Objects with fewer pixels are ignored; for a 640 x 480 image, scaled with the area of the image.
     objects : ObjectRule
         Which pixels can belong to an object (only its `object_pixels` is used).
     threshold : float
@@ -124,14 +124,14 @@ class TrueBoundary(UsesTruth, BoundaryModel):
     Parameters
     ----------
     form : {"crisp", "cleaned"}
-        *crisp*: 1 on both sides of every true border, 0 elsewhere, as `UcmTree` wants it. *cleaned*: the measured
-        strength near true borders, 0 elsewhere, for trees that were fitted to measured strengths: the learned one
-        merges whole objects across borders of strength 1 (quality of its best cut on 16 simulated images: measured
-        .914, crisp .485, cleaned .952; of the best cut of `UcmTree`: .868, .998, .901).
+        *crisp*: 1 on both sides of every true border, 0 elsewhere, for `UcmTree`. *cleaned*: the measured strength
+        near true borders, 0 elsewhere, for the learned tree, which is fitted to measured strengths. Quality of the
+        best cut on 16 simulated images with measured, crisp and cleaned boundaries: .914, .485, .952 for the learned
+        tree; .868, .998, .901 for `UcmTree`.
     measured : BoundaryModel
-        What is cleaned.
+        Model of the measured strength.
     reach : float
-        How near, in pixels of a 640 px wide image.
+        Distance to a true border up to which strength is kept, in pixels of an image of 640 px width.
     """
 
     form: Literal["crisp", "cleaned"] = "crisp"
@@ -164,12 +164,12 @@ class TrueBoundary(UsesTruth, BoundaryModel):
 
 @dataclass(frozen=True)
 class TrueCompletion(UsesTruth, Completer):
-    """True voxels of what a mask shows. A mask that shows no true object keeps its visible surface.
+    """The true voxels of what a mask shows. A mask that shows no true object keeps its visible surface.
 
     Parameters
     ----------
     objects : ObjectRule
-        Which pixels can belong to an object: masks hold no others, so voxels are given to these.
+        Which pixels can belong to an object; true voxels are assigned to these pixels.
     """
 
     objects: ObjectRule = ObjectRule()  # noqa: RUF009 (frozen)

@@ -4,8 +4,10 @@
 >>> FusionUpdate(free_space=TrueFreeSpace())                       # exactly the free space that is visible
 >>> FusionUpdate(evidence=(TrueQuality(),), n_scored=100)          # the best of fusion's own candidates
 >>> TrueFusion()                                                   # the best that both parents allow
->>> ParticleFilter(..., resampler=TrueBest())                      # the n best candidates
->>> filter = mstfilter.preset("mst", *STAGES["motions"])
+>>> filter = mstfilter.preset("mst", *STAGES["selection"])            # the n best of the candidates
+
+The time of an observation is the index of its clip. A resampler gets no clip, so for true selection the candidates
+are weighted by their true quality (`TrueQuality`), and `LargestWeights` selects the n best.
 
 Replacing one stage shows what a perfect one would add to the present filter. Replacing all but one shows what that
 stage costs a filter that is perfect elsewhere. The two differ because stages correct errors of each other.
@@ -19,18 +21,16 @@ from typing import ClassVar
 
 import numpy as np
 
-from mstfilter.errors import InputError
 from mstfilter.fusion import Evidence, FreeSpace, Projection
 from mstfilter.oracles.truth import Need, UsesTruth
 from mstfilter.scene import Clip, Frame, Hypothesis, ObjectRecord, frame_geometry, render
 from mstfilter.scoring import Form, overlap, weighted_coverage
-from mstfilter.smc import Candidates, Key, Population, Resampler, Transition, Update, key_of, union
+from mstfilter.smc import Candidates, Population, Transition, Update, union
 from mstfilter.tracking import Warp, move_points, rigid_transform
 
 __all__ = [
     "PERFECT_STAGES",
     "STAGES",
-    "TrueBest",
     "TrueFreeSpace",
     "TrueFusion",
     "TrueMotions",
@@ -42,15 +42,17 @@ __all__ = [
 
 @dataclass(frozen=True)
 class TrueMotions(UsesTruth, Transition):
-    """Move the objects of hypotheses by true motions.
+    """Moves the objects of hypotheses by the true motions.
+
+    Only the motion is true: the object of the hypothesis is moved by the ordinary warp. An object that covers two
+    true objects moves as the one that it shares more voxels with.
 
     Parameters
     ----------
     warp : Warp
         Moves the voxels.
     rest : float
-        Objects none of whose voxels moves farther than this (metres) stay exactly: simulated objects settle a
-        little.
+        Objects whose voxels all move less than this (metres) are not moved, since simulated objects settle a little.
     """
 
     warp: Warp = field(default_factory=lambda: Warp("smooth"))
@@ -60,7 +62,7 @@ class TrueMotions(UsesTruth, Transition):
     needs: ClassVar[tuple[Need, ...]] = ("voxels", "poses")
 
     def predict(self, rng: np.random.Generator, population: Population, observation: Clip | None) -> Population:
-        """Move all hypotheses; weights stay. Objects that meet no true object stay."""
+        """Move all hypotheses; weights are unchanged. Objects that overlap no true object are not moved."""
         parents = {"previous": np.arange(len(population))}
         particles: tuple[Hypothesis, ...] = tuple(population.particles)
         counts = {"true": 0, "rest": 0, "no object": 0}
@@ -93,18 +95,18 @@ class TrueMotions(UsesTruth, Transition):
 
 @dataclass(frozen=True)
 class TrueFreeSpace(UsesTruth, Projection):
-    """Clears voxels that are free in truth.
+    """Clears voxels that are truly free.
 
     Parameters
     ----------
     hidden : bool
-        Also those that the camera does not see: more than any sensor could tell.
+        Also clear voxels that the camera does not see, which no sensor could observe.
     """
 
     hidden: bool = False
 
     def project(self, hypothesis: Hypothesis, frame: Frame) -> tuple[Hypothesis, float]:
-        """The hypothesis without these voxels, and the share that it keeps."""
+        """The hypothesis without these voxels, and the fraction of occupied voxels that it keeps."""
         labels = self.truth.labels(self.truth.pause_of(frame))
         free = labels == 0
         if not self.hidden:
@@ -127,9 +129,9 @@ class TrueQuality(UsesTruth, Evidence):
     Parameters
     ----------
     strength : float
-        Nats for a quality of 1. The default leaves the best of all candidates alone with weight.
+        Nats for a quality of 1. With the default practically all weight is on the best candidate.
     form : {"objects", "paper", "authors"}
-        Of quality.
+        Form of the quality.
     """
 
     strength: float = 1e4
@@ -142,52 +144,22 @@ class TrueQuality(UsesTruth, Evidence):
 
 
 @dataclass(frozen=True)
-class TrueBest(UsesTruth, Resampler):
-    """Keeps the n candidates of best true quality; draws nothing. All candidates are built.
-
-    Parameters
-    ----------
-    form : {"objects", "paper", "authors"}
-        Of quality.
-    """
-
-    form: Form = "objects"
-
-    properly_weighted: ClassVar[bool] = False
-
-    def resample(self, rng: np.random.Generator, population: Population, n: int) -> Population:
-        """Select by quality at the pause of the filter's step."""
-        labels = self.truth.labels(step_of(rng))
-        population = population.realised()
-        quality = np.array([weighted_coverage(h.labels, labels, self.form) for h in population.particles])
-        best_first = np.argsort(-quality, kind="stable")
-        ancestors = best_first[np.arange(n) % len(best_first)]
-        return population.select(ancestors, np.full(n, population.log_mean_weight))
-
-
-def step_of(rng: np.random.Generator) -> int:
-    """The step of the filter that a generator's stream belongs to: a resampler is told it by nothing else."""
-    path, word = key_of(rng).path, Key(0).child("step").path[0]
-    for k in range(len(path) - 2, -1, -1):
-        if path[k] == word:
-            return path[k + 1]
-    raise InputError("this generator belongs to no step of a filter, so the pause to judge by is unknown")
-
-
-@dataclass(frozen=True)
 class TrueFusion(UsesTruth, Update):
-    """The best hypothesis that the objects of two parents allow: fusion without its chances.
+    """The best hypothesis that the objects of two parents allow, without random draws.
 
-    For every true object, the best object of either parent (by Jaccard index) and what improves it when merged
-    with it; better ones are painted over worse ones, all others are dropped. Each pair makes one candidate.
+    For every true object: the best object of either parent (by Jaccard index), merged with all objects that improve
+    it. Better objects are painted over worse ones; other objects are dropped. Each pair makes one candidate.
 
     Parameters
     ----------
     free_space : Projection
         Projects the predicted hypotheses first.
+    evidence : tuple of Evidence
+        Terms that weight the candidates, which are then all built. Default: the weights of the pairs.
     """
 
     free_space: Projection = FreeSpace()  # noqa: RUF009 (frozen)
+    evidence: tuple[Evidence, ...] = ()
 
     properly_weighted: ClassVar[bool] = False
     draws: ClassVar[bool] = False
@@ -199,7 +171,7 @@ class TrueFusion(UsesTruth, Update):
         proposed: Population | None,
         observation: Clip,
     ) -> Population:
-        """One candidate for each pair, unbuilt; one parent alone is fused with nothing."""
+        """One candidate per pair; a single parent passes unchanged."""
         if predicted is None:
             return union(None, proposed)
         refined, _ = self.free_space.refine(predicted.particles, observation)
@@ -213,11 +185,16 @@ class TrueFusion(UsesTruth, Update):
             "proposed": proposed.parents.get("proposed", none_i)[i],
         }
         candidates = Candidates(lambda c: best_of_both(samples[i[c]], refined[j[c]], labels), len(i))
-        return Population(candidates, proposed.log_weights[i] + predicted.log_weights[j], parents)
+        fused = Population(candidates, proposed.log_weights[i] + predicted.log_weights[j], parents)
+        if not self.evidence:
+            return fused
+        built = fused.realised()
+        scores = [term.log_score(tuple(built.particles), observation) for term in self.evidence]
+        return Population(built.particles, np.sum(scores, axis=0), parents)
 
 
 def best_of_both(proposed: Hypothesis, predicted: Hypothesis, true: np.ndarray) -> Hypothesis:
-    """What `TrueFusion` makes of two hypotheses."""
+    """The candidate that `TrueFusion` builds from two hypotheses."""
     masks: list[np.ndarray] = []
     records: list[ObjectRecord] = []
     claims: list[dict[int, float]] = []  # Jaccard index with each true object that an object meets
@@ -260,29 +237,29 @@ def best_of_both(proposed: Hypothesis, predicted: Hypothesis, true: np.ndarray) 
     return Hypothesis(labels, predicted.grid, tuple(out))
 
 
-#: Changes to the preset ``mst`` by stage. Fields that are named beside a component keep those of ``mst``.
+#: Overrides of the preset ``mst`` by stage. A new component keeps the fields of ``mst`` that it has too.
 STAGES: dict[str, tuple[str, ...]] = {
     "boundary": ('proposal.boundary={component="true_boundary", form="cleaned"}',),
     "masks": ("proposal=true_masks",),
     "completion": ("proposal.completer=true_completion",),
     "motions": ("transition=true_motions",),
     "choice": ('update.evidence=["true_quality"]', "update.n_scored=100"),
-    "fusion": ("update=true_fusion",),
+    "fusion": ("update=true_fusion", "update.evidence=[]"),
     "free space": ("update.free_space=true_free_space",),
-    "selection": ("resampler=true_best",),
+    "selection": ('update.evidence=["true_quality"]', "resampler=largest_weights"),
 }
 
-#: The stages of a filter that is perfect throughout. True masks need no boundary, true fusion leaves no choice.
+#: Stages to replace for a filter without any estimate: true masks need no boundary, true fusion no choice.
 PERFECT_STAGES: tuple[str, ...] = ("masks", "completion", "motions", "fusion", "free space", "selection")
 
 
 def overrides_of(*stages: str) -> tuple[str, ...]:
-    """Changes to ``mst`` that replace several stages, in an order in which none undoes another."""
+    """Overrides of ``mst`` that replace several stages, in an order in which no override undoes another."""
     return tuple(change for stage in STAGES if stage in stages for change in STAGES[stage])
 
 
 def budget_arms() -> dict[str, tuple[str, ...]]:
-    """Arms of the error budget by name: ``mst``, one stage true, all true, all true but one."""
+    """Arms of the error budget: ``mst``, each stage replaced alone, all stages, all stages but one."""
     arms: dict[str, tuple[str, ...]] = {"mst": ()}
     arms |= {f"true {stage}": overrides_of(stage) for stage in STAGES}
     arms["all true"] = overrides_of(*PERFECT_STAGES)

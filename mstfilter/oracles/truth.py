@@ -1,14 +1,14 @@
-"""Components that use the truth of a recording, and how they get it.
+"""Components that use the ground truth of a recording, and how they get it.
 
-A component sees a clip, and a clip holds no truth. One that inherits `UsesTruth` is bound to a recording before a
-run; `bind_truth` finds all of them in a filter, however deep they stand:
+A component gets a clip, and a clip holds no truth. So a component that inherits `UsesTruth` is bound to a recording
+before a run. `bind_truth` binds all such components of a filter, also nested ones:
 
 >>> filter = mstfilter.preset("mst", "proposal=true_masks", "transition=true_motions")
->>> filter = bind_truth(filter, recording)            # the same filter where nothing uses truth
+>>> filter = bind_truth(filter, recording)            # the same filter if no component uses the truth
 >>> state, infos = filter.run(recording.clips(), seed=0)
 
-``mstfilter run`` and studies do so by themselves. The truth is no hyperparameter: it is no field, so a component's
-description and its equality are those of the unbound one. What is kept by content (`component_key`) names it.
+``mstfilter run`` and studies bind automatically. The truth is not a field: the description of a component and its
+equality do not change when it is bound. Its `component_key` does change.
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ T = TypeVar("T")
 
 
 class RecordingTruth:
-    """What is true at the pauses of a recording.
+    """The ground truth at the pauses of a recording.
 
     Parameters
     ----------
     recording : Recording
-        One that was simulated, or otherwise knows.
+        Usually a simulated one.
     """
 
     def __init__(self, recording: Recording) -> None:
@@ -46,7 +46,7 @@ class RecordingTruth:
         self._objects: np.ndarray | None = None
 
     def check(self, needs: tuple[Need, ...], who: str) -> None:
-        """One clear error if something that a component needs is missing at any pause."""
+        """Raise InputError if something that the component `who` needs is missing at any pause."""
         recording = self.recording
         look = {
             "voxels": recording.truth,
@@ -58,7 +58,7 @@ class RecordingTruth:
                 if look[need](t) is None:
                     raise InputError(
                         f"{who} uses the truth, and recording {recording.name} has no {_WORDS[need]} at pause {t}",
-                        "simulated recordings have all: `mstfilter simulate`",
+                        "simulated recordings have all of it: `mstfilter simulate`",
                     )
 
     def labels(self, t: int) -> np.ndarray:
@@ -69,7 +69,7 @@ class RecordingTruth:
         return labels
 
     def instance(self, t: int) -> np.ndarray:
-        """(H, W) int32 true object of each pixel at pause `t`; 0 for all that is no object with true voxels."""
+        """(H, W) int32 true object of each pixel at pause `t`; 0 if it has no true voxels."""
         if t not in self._instance:
             image = self.recording.instance(self.recording.pauses[t])
             if image is None:
@@ -89,7 +89,7 @@ class RecordingTruth:
         return {k: after[k] @ np.linalg.inv(before[k]) for k in before.keys() & after.keys()}
 
     def pause_of(self, frame: Frame) -> int:
-        """The pause that a frame was taken at, known by its content."""
+        """The pause at which a frame was taken, found by its content."""
         if self._pauses is None:
             self._pauses = {}
             for t, index in enumerate(self.recording.pauses):
@@ -97,69 +97,70 @@ class RecordingTruth:
         if frame.key not in self._pauses:
             raise InputError(
                 f"a frame is none of the {len(self.recording.pauses)} pauses of recording {self.recording.name}",
-                "components that use the truth work on the recording that they were bound to",
+                "components that use the truth need the recording to which they are bound",
             )
         return self._pauses[frame.key]
 
 
 class UsesTruth:
-    """A component that knows the truth; inherited beside the interface that it implements."""
+    """A component that uses the truth. Inherit it together with the interface of the component."""
 
-    #: What it asks a recording for.
+    #: What the component needs from a recording.
     needs: ClassVar[tuple[Need, ...]] = ("voxels",)
 
     def bind(self: T, truth: RecordingTruth) -> T:
-        """The same component, knowing this truth."""
+        """The same component, bound to this truth."""
         bound = copy.copy(self)
         object.__setattr__(bound, "_truth", truth)  # components are frozen
         return bound
 
     @property
     def bound_key(self) -> bytes:
-        """Name by content of the truth it was bound to; empty before."""
+        """Key of the content of the truth; empty if the component is not bound."""
         truth = self.__dict__.get("_truth")
         return b"" if truth is None else truth.recording.truth_key
 
     @property
     def truth(self) -> RecordingTruth:
-        """The truth it was bound to."""
+        """The truth; raises InputError if the component is not bound."""
         truth = self.__dict__.get("_truth")
         if truth is None:
             raise InputError(
-                f"{type(self).__name__} uses the truth of a recording and was not told which",
-                "mstfilter.oracles.truth.bind_truth(filter, recording) does",
+                f"{type(self).__name__} uses the truth and is bound to no recording",
+                "call mstfilter.oracles.bind_truth(filter, recording)",
             )
         return truth
 
 
 def uses_truth(component: Any) -> list[str]:
-    """Class names of all parts of a component that use the truth, in the order they are found."""
+    """Class names of a component and its components that use the truth, in order."""
     found = [type(component).__name__] if isinstance(component, UsesTruth) else []
-    for part in _parts(component).values():
-        for inner in part if isinstance(part, tuple) else (part,):
+    for value in _components(component).values():
+        for inner in value if isinstance(value, tuple) else (value,):
             found.extend(uses_truth(inner))
     return found
 
 
 def bind_truth(component: T, recording: Recording) -> T:
-    """The same filter (or component) with every part that uses the truth bound to a recording.
+    """The same filter (or component) with all components that use the truth bound to a recording.
 
     Raises
     ------
     InputError
-        If the recording lacks what a part needs, at any pause.
+        If the recording lacks something that a component needs, at any pause.
     """
     return _bind(component, RecordingTruth(recording)) if uses_truth(component) else component
 
 
 def _bind(component: Any, truth: RecordingTruth) -> Any:
     changed = {}
-    for name, part in _parts(component).items():
-        new = tuple(_bind(inner, truth) for inner in part) if isinstance(part, tuple) else _bind(part, truth)
-        if new is not part and (
-            not isinstance(part, tuple) or any(a is not b for a, b in zip(new, part, strict=True))
-        ):
-            changed[name] = new
+    for name, value in _components(component).items():
+        if isinstance(value, tuple):
+            bound = tuple(_bind(inner, truth) for inner in value)
+            if any(a is not b for a, b in zip(bound, value, strict=True)):
+                changed[name] = bound
+        elif (bound := _bind(value, truth)) is not value:
+            changed[name] = bound
     if changed:
         component = dataclasses.replace(component, **changed)
     if isinstance(component, UsesTruth):
@@ -168,8 +169,8 @@ def _bind(component: Any, truth: RecordingTruth) -> Any:
     return component
 
 
-def _parts(component: Any) -> dict[str, Any]:
-    """Fields of a component that are components, or tuples of them."""
+def _components(component: Any) -> dict[str, Any]:
+    """Fields of a component that may hold components: dataclasses and tuples."""
     if not dataclasses.is_dataclass(component) or isinstance(component, type):
         return {}
     values = {f.name: getattr(component, f.name) for f in dataclasses.fields(component) if f.init}

@@ -22,6 +22,7 @@ __components__ = {
         "systematic": "Systematic",
         "ssp": "Ssp",
         "killing": "Killing",
+        "largest_weights": "LargestWeights",
         "fearnhead_clifford": "FearnheadClifford",
         "clusters": "ClusterStratified",
         "kdpp": "KDpp",

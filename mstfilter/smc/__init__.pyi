@@ -82,6 +82,7 @@ from mstfilter.smc.resampling import (
     FearnheadClifford as FearnheadClifford,
     KeepWeights as KeepWeights,
     Killing as Killing,
+    LargestWeights as LargestWeights,
     Multinomial as Multinomial,
     ResamplerWrapper as ResamplerWrapper,
     Residual as Residual,

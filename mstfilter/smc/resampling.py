@@ -54,6 +54,7 @@ __all__ = [
     "FearnheadClifford",
     "KeepWeights",
     "Killing",
+    "LargestWeights",
     "Multinomial",
     "Residual",
     "ResamplerWrapper",
@@ -311,6 +312,22 @@ def optimal_threshold(weights: np.ndarray, n: int) -> tuple[float, np.ndarray]:
             heavy[np.argsort(-weights, kind="stable")[: n - 1]] = True
             return float(weights[~heavy].sum()), heavy
         c = float(weights[~heavy].sum()) / (n - kept)
+
+
+@dataclass(frozen=True)
+class LargestWeights(WeightResampler):
+    """Selects the n particles of largest weight, with equal weights; draws nothing. Not properly weighted.
+
+    Ties are broken by position. If fewer than n particles have weight, they are repeated in turn.
+    """
+
+    properly_weighted: ClassVar[bool] = False
+
+    def select(self, rng: np.random.Generator, log_weights: np.ndarray, n: int) -> tuple[np.ndarray, None]:
+        checked_weights(log_weights, n)
+        # By log weight: weights that differ may all round to zero.
+        largest = np.argsort(-log_weights, kind="stable")[: np.isfinite(log_weights).sum()]
+        return largest[np.arange(n) % len(largest)], None
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ WHERE = {
     "choice": ["update.evidence", "update.n_scored"],
     "fusion": ["update"],
     "free space": ["update.free_space"],
-    "selection": ["resampler"],
+    "selection": ["resampler", "update.evidence"],
 }
 
 
@@ -53,7 +53,7 @@ def test_with_all_stages_true_nothing_is_estimated():
         "TrueCompletion",
         "TrueFusion",
         "TrueFreeSpace",
-        "TrueBest",
+        "TrueQuality",
     }
     assert filter.transition.warp.method == "smooth"
     for left in PERFECT_STAGES:

@@ -12,7 +12,6 @@ from scipy.ndimage import distance_transform_edt
 from mstfilter.errors import InputError
 from mstfilter.fusion import FusionUpdate
 from mstfilter.oracles import (
-    TrueBest,
     TrueBoundary,
     TrueCompletion,
     TrueFreeSpace,
@@ -31,14 +30,14 @@ from mstfilter.runs import filter_recording
 from mstfilter.scene import Hypothesis
 from mstfilter.scoring import weighted_coverage
 from mstfilter.segmentation import ColourDepthBoundary
-from mstfilter.smc import Key, Population
+from mstfilter.smc import Key, LargestWeights, Population
 from tests.baselines.scenes import slide
 
 ALL = (
     'proposal={component="true_masks", completer="true_completion"}',
     "transition=true_motions",
-    'update={component="true_fusion", free_space="true_free_space"}',
-    "resampler=true_best",
+    'update={component="true_fusion", free_space="true_free_space", evidence=["true_quality"]}',
+    "resampler=largest_weights",
 )
 RNG = np.random.default_rng(0)
 
@@ -57,7 +56,7 @@ def bound(component, recording):
 
 def test_every_part_is_found_and_bound_and_nothing_else_changes(recording):
     filter = build_filter(load_config("mst", [*ALL[:2], 'update.evidence=["true_quality"]', ALL[3]]))
-    assert uses_truth(filter) == ["TrueMotions", "TrueMasks", "TrueCompletion", "TrueQuality", "TrueBest"]
+    assert uses_truth(filter) == ["TrueMotions", "TrueMasks", "TrueCompletion", "TrueQuality"]
     ready = bind_truth(filter, recording)
     assert ready == filter
     assert describe_filter(ready) == describe_filter(filter)
@@ -66,11 +65,10 @@ def test_every_part_is_found_and_bound_and_nothing_else_changes(recording):
         ready.proposal,
         ready.proposal.completer,
         ready.update.evidence[0],
-        ready.resampler,
     ):
         assert part.truth.recording is recording
-    with pytest.raises(InputError, match="was not told which"):
-        filter.resampler.truth  # noqa: B018 (the unbound one stays unbound)
+    with pytest.raises(InputError, match="is bound to no recording"):
+        filter.transition.truth  # noqa: B018 (the unbound one stays unbound)
     plain = build_filter(load_config("mst"))
     assert bind_truth(plain, recording) is plain
 
@@ -80,7 +78,11 @@ def test_every_part_is_found_and_bound_and_nothing_else_changes(recording):
     [
         ("read_poses", "transition=true_motions", "TrueMotions uses the truth, and .* has no true poses at pause 0"),
         ("read_instance", "proposal=true_masks", "TrueMasks uses the truth, and .* has no instance image at pause 0"),
-        ("read_truth", "resampler=true_best", "TrueBest uses the truth, and .* has no true voxels at pause 0"),
+        (
+            "read_truth",
+            'update.evidence=["true_quality"]',
+            "TrueQuality uses the truth, and .* has no true voxels at pause 0",
+        ),
         ("read_truth", "update.free_space=true_free_space", "TrueFreeSpace uses the truth"),
     ],
 )
@@ -118,21 +120,14 @@ def test_a_run_by_the_truth_goes_on_after_a_stop(recording, tmp_path):
 # Streams
 
 
-class _Watch:
-    def enter(self, slot):
-        pass
-
-    def leave(self, population=None):
-        pass
-
-
 def samples_of(recording, *overrides):
     """Keys of what the proposal draws at each pause of a run."""
     config = load_config("mst", ["proposal.sampler.temperature=8", "update.eta=1", *overrides])
     filter, drawn = bind_truth(build_filter(config), recording), []
     state = filter.start(2)
     for clip in recording.clips():
-        proposed = filter._propose(None, clip, state.key.child("step", state.t), _Watch())
+        stream = state.key.child("step", state.t).child("proposal").generator()
+        proposed = filter.proposal.sample(stream, clip, filter.n_proposed)
         drawn.append([h.key for h in proposed.particles])
         state, _ = filter.step(state, clip)
     return drawn
@@ -143,13 +138,13 @@ def plain_samples(recording):
     return samples_of(recording)
 
 
-@pytest.mark.parametrize("override", ["transition=true_motions", "resampler=true_best"])
+@pytest.mark.parametrize("override", ["transition=true_motions", 'update.evidence=["true_quality"]'])
 def test_an_oracle_leaves_the_streams_of_other_stages_alone(recording, plain_samples, override):
     """The samples of every pause are those of the filter without it."""
     assert samples_of(recording, override) == plain_samples
 
 
-@pytest.mark.parametrize("make", [TrueMasks, TrueMotions, TrueFusion, TrueBest, lambda: TrueMasks(quality=0.8)])
+@pytest.mark.parametrize("make", [TrueMasks, TrueMotions, TrueFusion, lambda: TrueMasks(quality=0.8)])
 def test_no_oracle_uses_up_its_generator(recording, make):
     """Whatever they draw comes from children, so the stream they are given stands where it stood."""
     component, clip = bound(make(), recording), recording.clips()[1]
@@ -161,10 +156,8 @@ def test_no_oracle_uses_up_its_generator(recording, make):
         component.sample(rng, clip, 2)
     elif isinstance(component, TrueMotions):
         component.predict(rng, population, clip)
-    elif isinstance(component, TrueFusion):
-        component.update(rng, population, population, clip).realised()
     else:
-        component.resample(rng, population, 2)
+        component.update(rng, population, population, clip).realised()
     assert rng.bit_generator.state == before
 
 
@@ -344,13 +337,9 @@ def test_choice_and_selection_prefer_true_quality(recording):
     assert score.argmax() == 1
     np.testing.assert_allclose(score / 1e4, [weighted_coverage(h.labels, true) for h in hypotheses])
     population = Population(hypotheses, np.log([1.0, 1e-9, 2.0, 1.0]))
-    rng = Key(4).child("step", 1, "resampler").generator()
-    chosen = bound(TrueBest(), recording).resample(rng, population, 2)
+    chosen = LargestWeights().resample(RNG, population.reweighted(score), 2)
     order = np.argsort(-score, kind="stable")
     assert chosen.parents["ancestor"].tolist() == order[:2].tolist()
-    assert chosen.log_mean_weight == pytest.approx(population.log_mean_weight)
-    with pytest.raises(InputError, match="belongs to no step of a filter"):
-        bound(TrueBest(), recording).resample(np.random.default_rng(0), population, 2)
 
 
 def test_the_best_of_fusions_own_candidates_is_kept(recording):
@@ -379,6 +368,8 @@ def test_true_fusion_keeps_parents_and_passes_single_parents(recording):
     assert fused.parents["proposed"].tolist() == [0, 0, 1, 1, 2, 2]
     assert len(update.update(RNG, None, proposed, clip)) == 3
     assert len(update.update(RNG, predicted, None, clip)) == 2
+    scored = bound(TrueFusion(evidence=(TrueQuality(),)), recording).update(RNG, predicted, proposed, clip)
+    np.testing.assert_allclose(scored.log_weights, 1e4)
 
 
 def test_oracles_are_components_like_any_other():
