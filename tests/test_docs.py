@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import re
 
 import numpy as np
@@ -21,7 +22,7 @@ def blocks(page):
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)
 def test_examples_run(page, tmp_path, capsys, monkeypatch):
-    """One namespace a page, in order, as a reader would type them; the reader's own data are given."""
+    """The examples of a page run in order in one namespace, with arrays in place of the reader's data."""
     from mstfilter.scene import Hypothesis
 
     noise = np.random.default_rng(0)
@@ -44,3 +45,9 @@ def test_the_first_example_of_the_readme_is_short():
     lines = [line for line in first.splitlines() if line.strip() and not line.strip().startswith("#")]
     assert len(lines) <= 6
     assert "weights" in first
+
+
+@pytest.mark.parametrize("page", sorted((REPOSITORY / "docs/reference").glob("*.md")), ids=lambda p: p.name)
+def test_reference_names_modules_that_exist(page):
+    for name in re.findall(r"automodule:: (\S+)", page.read_text()):
+        importlib.import_module(name)
