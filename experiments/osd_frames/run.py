@@ -1,4 +1,4 @@
-"""How well one image is segmented: optimal cut, sampled cuts and floors on 45 real frames, held out by set-up.
+"""Segmentation quality on 45 real frames: optimal cut, sampled cuts and floors; constants held out by set-up.
 
     python experiments/osd_frames/run.py
     python experiments/osd_frames/run.py --smoke --out DIR    # two frames: shows only that it works
@@ -45,14 +45,14 @@ from mstfilter.segmentation import (
 HERE = Path(__file__).resolve().parent
 SHARED = Path(os.environ.get("MSTFILTER_SHARED", HERE.parents[2] / "shared"))
 
-# Frames of one camera set-up (inclusive); the others stand alone.
+# First and last frame of each camera set-up.
 GROUPS = [(0, 1), (2, 4), (5, 5), (6, 16), (17, 24), (25, 26), (27, 29), (30, 30), (31, 32), (33, 44)]
 COLOUR_WEIGHTS = (0.0, 0.2, 0.4, 0.6)
 CENTRES = (0.4, 0.45, 0.5, 0.55, 0.6)
 SLOPES = (8.0, 12.0, 20.0)
-# Constants that no label was used for: colour weight of the notes; logistic through .15 and .8 at the .9 and .995
+# Constants chosen without labels: the colour weight; a logistic curve with values .15 and .8 at the .9 and .995
 # quantiles of the merge heights of each tree.
-NOTES_COLOUR = 0.6
+UNFITTED_COLOUR = 0.6
 
 # Samplers under the learned tree's log odds, and under SceneCut's value on the contour tree.
 LEARNED_SAMPLERS = {
@@ -78,7 +78,7 @@ ODDS = MergeLogOdds()
 
 @dataclass
 class Case:
-    """A frame with its truth and the trees of all colour weights, heights not yet calibrated."""
+    """A frame with its true labels, and the trees of all colour weights before calibration."""
 
     name: str
     frame: Frame
@@ -109,7 +109,7 @@ class _Given(TreeBuilder):
 
 
 def touching(label: np.ndarray) -> bool:
-    """Whether two objects share a border: pixels of both labels (>= 2) within 3 px of each other."""
+    """Whether pixels of two objects (labels >= 2) are within 3 px of each other."""
     objects = label >= 2
     square = np.ones((7, 7), np.uint8)
     return any(
@@ -142,7 +142,7 @@ def calibrated(tree: Tree, centre: float, slope: float) -> Tree:
 
 
 def without_labels(tree: Tree) -> Tree:
-    """The notes' calibration by quantiles of the heights, which needs no labelled frame."""
+    """Calibration by quantiles of the heights, which needs no labels."""
     low, high = np.quantile(tree.start[tree.n_leaves :], (0.9, 0.995))
     slope = (np.log(0.8 / 0.2) - np.log(0.15 / 0.85)) / (high - low)
     return calibrated(tree, low - np.log(0.15 / 0.85) / slope, slope)
@@ -167,12 +167,12 @@ def components(case: Case, step: float = np.inf) -> np.ndarray:
 
 
 def write_rows(target: Path, header: list[str], rows: Iterable[Iterable]) -> None:
-    """A CSV file of rows in the order of the header."""
+    """Write rows to a CSV file in the order of the header."""
     write_csv(target, [dict(zip(header, row, strict=True)) for row in rows], header)
 
 
 def main(numbers: Sequence[int], out: Path) -> None:
-    """Score every arm on the frames of these numbers."""
+    """Score every arm on the given frames."""
     began = time.time()
     cases = [load(number) for number in numbers]
     setup = np.array([next(g for g, (a, b) in enumerate(GROUPS) if a <= i <= b) for i in numbers])
@@ -203,14 +203,14 @@ def main(numbers: Sequence[int], out: Path) -> None:
             [judged[picked[g], i] for i, g in enumerate(setup)]
         ),
         "learned tree, optimal cut, colour 0.4 (default)": judged[default],
-        "learned tree, optimal cut, colour 0.6 (no labels used)": judged[COLOUR_WEIGHTS.index(NOTES_COLOUR)],
+        "learned tree, optimal cut, colour 0.6 (no labels used)": judged[COLOUR_WEIGHTS.index(UNFITTED_COLOUR)],
         "scenecut, optimal cut, constants held out": np.array([scores[chosen[g], i] for i, g in enumerate(setup)]),
         "scenecut, optimal cut, constants of all frames": scores[scores.mean(axis=1).argmax()],
     }
     unlabelled, unlabelled_best = [], []
     best_node: dict[str, list[float]] = {"learned": [], "contour": []}
     for case in cases:
-        for weight, sink in ((NOTES_COLOUR, unlabelled), (0.4, unlabelled_best)):
+        for weight, sink in ((UNFITTED_COLOUR, unlabelled), (0.4, unlabelled_best)):
             tree, found = case.trees[weight]
             tree = without_labels(tree)
             sink.append(case.score_cut(tree, found, optimal_cut(tree, VALUE.values(tree, case.frame))))

@@ -1,4 +1,4 @@
-"""The figure of the study of real groups: differences from `mst` by group, and what changes between two frames."""
+"""The figure of the study of real groups: differences from `mst` by group, and change of depth between two frames."""
 
 from __future__ import annotations
 

@@ -50,7 +50,7 @@ METHODS = {
     "tracking_only": ("tracking_only", (), "proposal.proposal"),
     "samples_only": ("samples_only", (), "proposal"),
     "single_frame": ("single_frame", (), "proposal"),
-    # The front end of `paper` and of `authors` without their past.
+    # The proposals of `paper` and `authors` without a past.
     "paper, samples only": ("paper", ALONE, "proposal"),
     "authors, samples only": ("authors", ALONE, "proposal"),
     "floor_one_blob": ("floor_one_blob", (), ""),
@@ -72,7 +72,7 @@ CHANGED = 0.01  # metres
 
 
 def held_out(group: tuple[int, int]) -> dict[str, str]:
-    """Constants of both front ends, chosen on the frames of the other camera set-ups."""
+    """Constants of both segmentation methods, chosen on the frames of the other camera set-ups."""
     return next(r for r in read_csv(CONSTANTS) if r["frames"] == f"learn{group[0]}-{group[1]}")
 
 
@@ -104,7 +104,7 @@ def load(group: tuple[int, int], step: int = 1) -> tuple[Recording, list[np.ndar
 
 
 def score(image: np.ndarray, label: np.ndarray) -> float:
-    """Objects quality of an image (H, W), 0 no object, against labels (H, W): 1 table, 2.. objects, 0 left out."""
+    """Objects quality of an image (H, W), 0 no object, against labels (H, W): 1 table, 2.. objects, 0 ignored."""
     return weighted_coverage(np.where(label == 0, 0, image.astype(np.int64)), np.where(label >= 2, label - 1, 0))
 
 
@@ -119,7 +119,7 @@ def run(group: tuple[int, int], seeds: Sequence[int], step: int = 1) -> Iterator
     recording, labels = load(group, step)
     constants = held_out(group)
     filters = {method: assemble(method, constants) for method in METHODS}
-    # All methods see a pause before the next one comes: what they share is computed once.
+    # All methods process a pause before the next one, so that they share cached work.
     states: dict[tuple[str, int], State] = {
         (m, s): f.start(s) for m, f in filters.items() for s in (seeds[:1] if m in FIXED else seeds)
     }
@@ -181,7 +181,7 @@ def columns(d: Difference | None) -> dict[str, str]:
 
 
 def summarise(lines: Sequence[dict[str, str]], out: Path) -> None:
-    """Print and write summary.csv (`mst` minus each method) and past.csv (methods minus their samples alone)."""
+    """Print and write summary.csv (`mst` minus each method) and past.csv (methods minus their samples only)."""
     means, best, objects = (group_means(lines, what) for what in ("quality", "best", "objects"))
     against = differences(means)
     summary = [

@@ -1,4 +1,4 @@
-"""The figure of the scaling study: seconds of a step by part, and peak memory, over each factor; log-log."""
+"""The figure of the scaling study: seconds of a step by stage, and peak memory, over each factor; log-log."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def draw(rows: list[dict[str, str]], slopes: list[dict[str, str]], out: Path) ->
     for column, (factor, (over, name)) in enumerate(FACTORS.items()):
         own = sorted((r for r in rows if r["factor"] == factor), key=lambda r: float(r[over]))
         x = np.array([float(r[over]) for r in own])
-        style = "o" if factor == "objects" else "o-"  # scenes are no steps along one line
+        style = "o" if factor == "objects" else "o-"  # scenes are not values of one variable
         top, bottom = axes[:, column]
         for part, colour in COLOURS.items():
             y = np.array([float(r[f"{part}_s"]) for r in own])

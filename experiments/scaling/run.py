@@ -33,8 +33,8 @@ FACTORS = {
     "objects": ("objects_found", "objects found a hypothesis (5 - 17 on the table)"),
 }
 STAGES = ("transition", "proposal", "update", "resampler", "build")
-FRAMES = 28  # from one pause to the next: divisible by 1, 2, 4, 7, 14, 28
-NOTHING = 0.01  # seconds below which a part has no slope
+FRAMES = 28  # between two pauses: divisible by 1, 2, 4, 7, 14, 28
+NOTHING = 0.01  # seconds; stages below have no slope
 THREADS = {f"{name}_NUM_THREADS": "1" for name in ("OMP", "OPENBLAS", "MKL")}
 
 
@@ -73,7 +73,7 @@ class Case:
         return f"{self.family}-{self.seed}{changes} side={self.side} n={self.n} stride={self.stride}"
 
 
-# 9 objects, 15 of 29 frames a clip, 1 cm voxels, 5 hypotheses.
+# 9 objects, 15 of 29 frames per clip, 1 cm voxels, 5 hypotheses.
 LONG = {"frames_per_clip": FRAMES + 1, "fps": 10.0, "n_actions": 1}
 BASE = Case("s2", 0, LONG)
 SMALL = {"width": 160, "height": 120, "n_actions": 1, "frames_per_clip": 8, "voxel_size": 0.02}
@@ -93,7 +93,7 @@ def cases(smoke: bool) -> dict[str, list[Case]]:
         "voxels": [replace(BASE, side=side) for side in (50, 71, 100, 141, 200)],
         "n": [replace(BASE, n=n) for n in (1, 2, 5, 10, 30, 100)],
         "frames": [replace(BASE, stride=stride) for stride in (28, 7, 4, 2, 1)],
-        # The families as they are, with 15 frames a clip: the recordings of the other studies.
+        # The unchanged families with 15 frames per clip: the recordings of the other studies.
         "objects": [Case(family, seed, {}, stride=1, steps=2) for family in ("s1", "s2", "s3") for seed in (0, 1)],
     }
 
@@ -140,7 +140,7 @@ def measure(case: Case) -> dict[str, Any]:
     for clip in recording.clips()[: 1 + case.steps]:
         began, stages = time.process_time(), StageSeconds()
         state, _ = filter.step(state, clip, observer=stages)
-        # The first step has no past, and imports what is imported late.
+        # The first step has no previous particles and contains late imports.
         if clip.index:
             steps.append({"step": time.process_time() - began, **stages.seconds})
             found.append(np.mean([h.n_objects for h in state.population.particles]))
@@ -202,7 +202,7 @@ def main() -> None:
     parser.add_argument("--smoke", action="store_true", help="tiny, seconds; needs --out")
     parser.add_argument("--out", type=Path, default=HERE / "results")
     parser.add_argument("--only", choices=list(FACTORS), help="measure this factor alone")
-    parser.add_argument("--measure", help=argparse.SUPPRESS)  # a case as JSON: what the processes of this study do
+    parser.add_argument("--measure", help=argparse.SUPPRESS)  # a case as JSON; used by the processes of this study
     options = parser.parse_args()
     if options.measure:
         print(json.dumps(measure(Case(**json.loads(options.measure)))))
@@ -220,7 +220,7 @@ def main() -> None:
         for case in chosen:
             if case.name in known or options.only not in (None, factor):
                 continue
-            cached_recording(case.family, case.seed, **case.set)  # made in another process than it is measured in
+            cached_recording(case.family, case.seed, **case.set)  # simulated in another process than the measurement
             command = [sys.executable, str(Path(__file__).resolve()), "--measure", json.dumps(asdict(case))]
             done = subprocess.run(
                 command, check=True, stdout=subprocess.PIPE, text=True, env={**os.environ, **THREADS}

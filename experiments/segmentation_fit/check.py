@@ -1,7 +1,7 @@
 """Quality of both front ends on simulated first pauses that were not used in the fit, in the image and in space.
 
     python experiments/segmentation_fit/check.py
-    python experiments/segmentation_fit/check.py --smoke --out DIR    # one scene: shows only that it works
+    python experiments/segmentation_fit/check.py --smoke --out DIR    # one scene: a quick test
 
 Writes results/quality.csv beside this file.
 """

@@ -1,7 +1,7 @@
 """Fit the weights of `mstfilter.segmentation.join_weights` on simulated scenes; no real image is used.
 
     python experiments/segmentation_fit/run.py
-    python experiments/segmentation_fit/run.py --smoke --out FILE    # few scenes, one round: shows only that it works
+    python experiments/segmentation_fit/run.py --smoke --out FILE    # few scenes, one round: a quick test
 
 Regions of each scene are merged in the order of their odds under the present weights. A pair of different objects is
 recorded and not merged; a pair of one object is recorded and merged. So the pairs are those that the tree evaluates.
@@ -31,7 +31,7 @@ from mstfilter.segmentation import (
 )
 
 ROUNDS = 3
-PURE = 0.8  # regions that mix objects teach nothing
+PURE = 0.8  # smallest share of one object in a region that is used
 RIDGE = 1.0
 PACKAGED = Path(join_weights.__file__)
 
@@ -70,7 +70,7 @@ def episode(regions: Regions, pixels: np.ndarray, scale: float, weights: np.ndar
         first, second = (int(true[r].argmax()) for r in (i, j))
         if all(true[r].max() >= PURE * true[r].sum() for r in (i, j)):
             size = growing.sums[[i, j], REGION["pixels"].start].min() / scale**2
-            # Large mistakes cost more; noise that no object shows, less.
+            # Large regions have more weight; pairs with a region of no object have less.
             weight = min(size / 200, 5) ** 0.5 * (1.0 if first and second else 0.3)
             for sink, value in zip(pairs, (x, first != second, weight), strict=True):
                 sink.append(value)
@@ -82,7 +82,7 @@ def episode(regions: Regions, pixels: np.ndarray, scale: float, weights: np.ndar
 
 
 def logistic(pairs: Pairs) -> np.ndarray:
-    """Weights of the ridge logistic regression, features standardised for the penalty."""
+    """Weights of the ridge logistic regression; the penalty is on standardised features."""
     X, different, weight = (np.array(part) for part in pairs)
     mean, scale = X.mean(axis=0), X.std(axis=0) + 1e-9
     mean[0], scale[0] = 0.0, 1.0
@@ -112,7 +112,7 @@ def main(path: Path, smoke: bool) -> None:
     scenes = measured(FITTED_SEEDS[:2] if smoke else FITTED_SEEDS)
     print(f"{len(scenes)} scenes measured, {time.time() - began:.0f} s")
     weights = np.zeros(len(PAIR_FEATURES))
-    weights[:2] = -6.0, 12.0  # to begin with: the strength of the border
+    weights[:2] = -6.0, 12.0  # initial weights: bias and strength of the border
     pairs: Pairs = ([], [], [])
     for _ in range(1 if smoke else ROUNDS):
         before = len(pairs[0])
@@ -122,7 +122,7 @@ def main(path: Path, smoke: bool) -> None:
         X, different = np.array(pairs[0][before:]), np.array(pairs[1][before:])
         wrong = ((X @ weights > 0) != different).mean()
         print(
-            f"{len(X)} pairs, {different.mean():.3f} different, {wrong:.4f} judged wrongly, "
+            f"{len(X)} pairs, {different.mean():.3f} different, {wrong:.4f} misclassified, "
             f"{time.time() - began:.0f} s"
         )
     write(weights, path)

@@ -26,7 +26,7 @@ CHECKED_SEEDS = range(16)
 
 @dataclass(frozen=True, eq=False)
 class Pause:
-    """A frame with its truth in the image (H, W) and in space (X, Y, Z); 0 is no object."""
+    """A frame with its true labels in the image (H, W) and in space (X, Y, Z); 0 is no object."""
 
     frame: Frame
     image: np.ndarray

@@ -1,4 +1,4 @@
-"""Motion rules against volumetric truth: start from the true labels, predict one clip, compare.
+"""Accuracy of motion rules: predict one clip from the true labels and compare with the volumetric ground truth.
 
 python experiments/tracking_rules/run.py demo 0 12 table 3 7
 python experiments/tracking_rules/run.py --smoke --out DIR    # one small scene: shows only that it works
@@ -22,6 +22,7 @@ from mstfilter.tracking import (
     AuthorsRule,
     DenseFlow,
     IdentityTransition,
+    MotionResidual,
     MstRule,
     PaperRule,
     StaticTest,
@@ -44,7 +45,7 @@ ARMS = {
     "mst, splat": TrackingTransition(warp=Warp("splat", "deepest")),
     "mst, no search": TrackingTransition(MstRule(search_above=-1.0)),
     "mst, no refinement": TrackingTransition(MstRule(n_refine=0)),
-    "mst, no twin term": TrackingTransition(MstRule(residual=type(MstRule().residual)(track_weight=0.0))),
+    "mst, no twin term": TrackingTransition(MstRule(residual=MotionResidual(track_weight=0.0))),
     "mst, no static test": TrackingTransition(static=StaticTest(enabled=False)),
     "mst, flow fast": TrackingTransition(flow=DenseFlow("fast")),
     "mst, flow ultrafast": TrackingTransition(flow=DenseFlow("ultrafast")),

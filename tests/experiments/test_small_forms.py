@@ -117,7 +117,7 @@ def test_readme_picture(tmp_path):
 
 
 def test_segmentation_fit(tmp_path):
-    assert "judged wrongly" in run_script("segmentation_fit/run.py", "--smoke", "--out", tmp_path / "weights.py")
+    assert "misclassified" in run_script("segmentation_fit/run.py", "--smoke", "--out", tmp_path / "weights.py")
     made = runpy.run_path(str(tmp_path / "weights.py"))["JOIN_WEIGHTS"]
     present = runpy.run_path(str(REPOSITORY / "mstfilter/segmentation/join_weights.py"))["JOIN_WEIGHTS"]
     assert list(made) == list(present) and all(math.isfinite(w) for w in made.values())

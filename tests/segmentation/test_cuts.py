@@ -48,7 +48,7 @@ def test_optimal_cut_is_the_best_of_all(seed, leaves, most):
     assert w[cut].sum() == pytest.approx(max(w[list(c)].sum() for c in all_cuts(tree)))
 
 
-def test_ties_keep_the_parent():
+def test_optimal_cut_keeps_the_parent_in_ties():
     tree = Tree(np.array([2, 2, 2]), np.array([[0, 1]]), np.zeros(3))
     assert optimal_cut(tree, np.array([1.0, 1.0, 2.0])).tolist() == [2]
     assert optimal_cut(tree, np.array([0.1, 0.2, 0.1 + 0.2])).tolist() == [2]
@@ -80,7 +80,7 @@ def test_the_authors_rule_is_not_stationary(leaves, most):
     assert law @ sizes < p @ sizes  # too coarse
 
 
-def test_the_samplers_chain_follows_the_matrix():
+def test_the_chain_has_the_target_law():
     """Frequencies of the default sampler's chain against the target; false alarm 1e-4."""
     tree, w = case(5, 2)
     cuts, p, _, _ = target(tree, w, 0.05)
@@ -161,7 +161,7 @@ def test_every_sample_is_a_cut(seed, leaves, most, sigma2):
         assert all((a == b).all() for a, b in zip(sample.cuts, again.cuts, strict=True))
 
 
-def test_authors_sampler_begins_with_the_optimal_cut():
+def test_authors_sampler_returns_the_optimal_cut_first():
     tree, w = case(9, 2)
     sampler = MetropolisHastingsCuts(0.25, 0, 20, "authors", 0.0, restart=True, include_optimal=True)
     sample = sampler.sample(np.random.default_rng(0), tree, w, 5)
@@ -178,7 +178,7 @@ def test_diagnostics():
     assert 1 <= d["autocorrelation_steps"] < 100
 
 
-def test_bad_fields_are_named():
+def test_invalid_fields_are_reported():
     with pytest.raises(InputError, match="move rule 'x'"):
         MetropolisHastingsCuts(moves="x")
     with pytest.raises(InputError, match="sigma2"):
@@ -209,7 +209,7 @@ def test_samplers_at_a_temperature_follow_the_gibbs_law(leaves, most):
         assert np.allclose(sample.log_p, (sample.values - v.max()) / 2.0)
 
 
-def test_a_negative_temperature_is_named():
+def test_a_negative_temperature_is_reported():
     for sampler in (MetropolisHastingsCuts, ExactCuts):
         with pytest.raises(InputError, match="temperature is -1"):
             sampler(temperature=-1)

@@ -70,7 +70,7 @@ def test_depth_holes_and_robot():
 
 @pytest.mark.parametrize("depth", [np.nan, 1.0])
 def test_no_depth_or_no_relief(depth):
-    """Boundaries exist without any reading; nothing is an object then."""
+    """Boundaries are finite without any reading."""
     frame = frame_of(TWO)
     flat = Frame(frame.rgb, np.full(frame.depth.shape, depth, np.float32), frame.camera)
     assert np.isfinite(ColourDepthBoundary().boundary(flat)).all()
@@ -113,7 +113,7 @@ def test_each_object_shows_in_its_own_mask():
     ],
 )
 @pytest.mark.parametrize("rule", ["equal", "p"])
-def test_parts_are_swappable(tree, value, rule):
+def test_components_are_interchangeable(tree, value, rule):
     sampler = MetropolisHastingsCuts(0.25, 0, 20, "authors", 0.0, True, True, True)
     proposal = TreeCutProposal(tree=tree, value=value, sampler=sampler, completer=SurfaceOnly(), weight_rule=rule)
     population = proposal.sample(np.random.default_rng(0), clip_of(TOUCHING, width=640, noise=0.6), 5)

@@ -47,7 +47,7 @@ def test_helpers_match_brute_force(seed, leaves, most):
     assert leaves == 1 or not is_cut(tree, np.array([0, tree.root]))
 
 
-def test_malformed_trees_are_refused():
+def test_malformed_trees_raise_an_error():
     with pytest.raises(InputError, match="not ordered"):
         Tree([2, 2, 1], [[0, 1]], [0, 0, 0])
     with pytest.raises(InputError, match="leaves must come before"):
@@ -94,7 +94,7 @@ def test_degenerate_maps(boundary):
     assert tree.area[tree.root] == boundary.size
 
 
-def test_bad_maps_are_named():
+def test_invalid_maps_are_reported():
     with pytest.raises(InputError, match="not finite"):
         UcmTree().build(np.full((3, 3), np.nan))
     with pytest.raises(InputError, match="shape"):

@@ -24,7 +24,7 @@ def label_images(scene):
 
 
 @pytest.mark.parametrize("kind", ["textured", "plain"])
-def test_masks_follow_what_moves_and_stay_on_what_rests(kind, request):
+def test_masks_follow_moving_objects_and_stay_on_static_ones(kind, request):
     scene, clip = request.getfixturevalue(kind)
     before, after = label_images(scene)
     tracked = track_labels(before, clip)
@@ -36,7 +36,7 @@ def test_masks_follow_what_moves_and_stay_on_what_rests(kind, request):
     assert min(iou(tracked == k, after == k) for k in RESTING) > 0.7
 
 
-def test_a_clip_in_which_nothing_happens_returns_the_masks_unchanged():
+def test_a_static_clip_returns_the_masks_unchanged():
     frame = Scene([Box((0.1, 0.1, 0.1))], [[at(0, 0, 0.05)]]).frame(np.random.default_rng(0), [at(0, 0, 0.05)])
     clip = Clip((frame, frame, frame), Scene([], [[]]).grid)
     labels = np.random.default_rng(1).integers(0, 9, frame.depth.shape).astype(np.uint16)
@@ -99,7 +99,7 @@ def test_a_change_of_exposure_is_not_a_change_of_the_scene():
     assert tracks.unchanged[both].mean() > 0.98
 
 
-def test_same_answer_after_the_store_is_emptied(textured):
+def test_the_result_is_equal_after_the_cache_is_cleared(textured):
     _, clip = textured
     first = DenseFlow().track(clip)
     scene_cache.clear()
@@ -110,6 +110,6 @@ def test_same_answer_after_the_store_is_emptied(textured):
 
 
 @pytest.mark.parametrize("fields", [{"preset": "slow"}, {"grid_step": 0}])
-def test_senseless_settings_are_refused(fields):
+def test_invalid_fields_raise_an_error(fields):
     with pytest.raises(InputError):
         DenseFlow(**fields)

@@ -47,7 +47,7 @@ def test_two_motions_under_one_mask_are_both_found():
     assert [len(m.inliers) for m in found] == pytest.approx([40, 24], abs=2)
 
 
-def test_clusters_are_disjoint_and_own_a_common_model():
+def test_clusters_are_disjoint_and_share_a_model():
     rng = np.random.default_rng(9)
     preference = rng.random((40, 60)) < 0.15
     groups = cluster(preference)
@@ -59,7 +59,7 @@ def test_clusters_are_disjoint_and_own_a_common_model():
         assert not any((s & t).any() for t in shared[i + 1 :])
 
 
-def test_same_seed_same_answer():
+def test_the_same_seed_gives_the_same_result():
     rng = np.random.default_rng(10)
     p, q = rng.normal(size=(2, 30, 3))
     a, b = (jlinkage(np.random.default_rng(1), p, q, eps=0.5) for _ in range(2))
@@ -67,5 +67,5 @@ def test_same_seed_same_answer():
 
 
 @pytest.mark.parametrize("n", [0, 2, 4])
-def test_too_few_matches_give_nothing(n):
+def test_too_few_matches_give_no_motion(n):
     assert jlinkage(np.random.default_rng(0), np.zeros((n, 3)), np.zeros((n, 3))) == []

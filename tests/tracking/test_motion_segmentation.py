@@ -1,4 +1,4 @@
-"""What moved apart in a clip: one number a rigid motion."""
+"""Motion segmentation: one number per rigid motion of a clip."""
 
 import numpy as np
 import pytest

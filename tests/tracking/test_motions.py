@@ -18,14 +18,14 @@ def tracks_of(scene, clip):
     return {k: Track(s, clip, flow) for k, s in segments_of(scene.hypothesis(), clip.before).items()}
 
 
-def test_what_rests_is_found_at_rest_and_what_moves_is_not(textured, plain):
+def test_static_objects_pass_the_test_for_rest_and_moving_ones_do_not(textured, plain):
     for scene, clip in (textured, plain):
         tracks = tracks_of(scene, clip)
         assert [k for k, t in tracks.items() if StaticTest().rests(t)] == list(RESTING)
         assert not any(StaticTest(enabled=False).rests(t) for t in tracks.values())
 
 
-def test_an_object_that_something_moved_in_front_of_still_rests():
+def test_an_occluded_static_object_passes_the_test_for_rest():
     wall = slide(at(-0.22, -0.12, 0.06), at(-0.03, -0.12, 0.06), 5)
     scene = Scene(
         [Box((0.12, 0.1, 0.1)), Box((0.05, 0.04, 0.12), (60, 120, 60))], [[at(0, 0.05, 0.05), p] for p in wall]
@@ -36,7 +36,7 @@ def test_an_object_that_something_moved_in_front_of_still_rests():
 
 
 @pytest.mark.parametrize("shift", [0.004, 0.01])
-def test_small_shifts_are_not_rest(shift):
+def test_small_shifts_fail_the_test_for_rest(shift):
     scene = Scene([Box((0.1, 0.08, 0.07))], [[at(0, 0, 0.035)], [at(shift, 0, 0.035)]])
     assert not StaticTest().rests(tracks_of(scene, scene.clip(0))[1])
 
@@ -56,7 +56,7 @@ def test_the_true_motion_has_the_least_residual(textured):
         assert residual.score(track, np.eye(4)) > best + 5
 
 
-def test_residual_knows_a_twin_by_where_flow_comes_from():
+def test_the_residual_distinguishes_equal_objects_by_the_flow():
     scene = standard(9, size=(480, 360))
     track = tracks_of(scene, scene.clip(0))[5]
     onto_twin = scene.poses[0][3] @ np.linalg.inv(scene.poses[0][4])  # object 5 to where its twin, 4, rests
@@ -66,14 +66,14 @@ def test_residual_knows_a_twin_by_where_flow_comes_from():
     assert by_look.score(track, onto_twin) < by_look.score(track, truth) + 0.5
 
 
-def test_hidden_points_cost_a_constant_and_points_outside_more(textured):
+def test_occluded_points_and_points_outside_have_constant_costs(textured):
     scene, clip = textured
     track, residual = tracks_of(scene, clip)[1], MotionResidual(track_weight=0.0)
     assert residual.score(track, at(0, 0, -0.5)) == pytest.approx(residual.occluded_cost)
     assert residual.score(track, at(30, 0, 0)) == pytest.approx(residual.outside_cost)
 
 
-def test_many_motions_are_scored_like_one(textured):
+def test_scores_of_several_motions_equal_single_scores(textured):
     scene, clip = textured
     track, rng = tracks_of(scene, clip)[1], np.random.default_rng(0)
     motions = np.stack([at(*rng.uniform(-0.1, 0.1, 3), 10 * rng.normal()) for _ in range(20)])
@@ -81,7 +81,7 @@ def test_many_motions_are_scored_like_one(textured):
     np.testing.assert_array_equal(together, [MotionResidual().score(track, T) for T in motions])
 
 
-def test_nothing_to_compare_is_infinite(textured):
+def test_the_residual_is_infinite_without_depth(textured):
     scene, clip = textured
     blank = Frame(clip.after.rgb, np.full_like(clip.after.depth, np.nan), clip.after.camera)
     blind = Clip((clip.before, blank), clip.grid)
@@ -89,7 +89,7 @@ def test_nothing_to_compare_is_infinite(textured):
     assert MotionResidual().score(tracks_of(scene, blind)[1], np.eye(4)) == np.inf
 
 
-def test_refinement_pulls_a_wrong_motion_in(textured, plain):
+def test_refinement_reduces_the_error_of_a_motion(textured, plain):
     for kind, (scene, clip) in (("textured", textured), ("plain", plain)):
         for k in (1, 5):
             track, truth = tracks_of(scene, clip)[k], scene.motions()[k]

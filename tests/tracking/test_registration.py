@@ -114,7 +114,7 @@ def test_too_few_points_cannot_be_registered(n):
     assert prepare(np.random.default_rng(0).normal(size=(n, 3))) is None
 
 
-def test_bad_fields_are_named():
+def test_invalid_fields_are_reported():
     with pytest.raises(InputError, match="method 'icp'"):
         SmallGicp("icp")
     with pytest.raises(InputError, match="expected numbers > 0"):

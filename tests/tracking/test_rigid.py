@@ -53,7 +53,7 @@ def test_no_rotation_beats_kabsch():
 
 @settings(max_examples=30, deadline=None)
 @given(seed=st.integers(0, 10**6), parts=st.integers(1, 6))
-def test_merged_statistics_fit_like_the_points_themselves(seed, parts):
+def test_merged_sums_give_the_fit_of_the_points(seed, parts):
     rng = np.random.default_rng(seed)
     n = 60
     p = rng.normal(size=(n, 3))
@@ -65,7 +65,7 @@ def test_merged_statistics_fit_like_the_points_themselves(seed, parts):
     assert residual == pytest.approx((((rigid.move_points(direct, p) - q) ** 2).sum(1)).sum(), rel=1e-6)
 
 
-def test_statistics_of_nothing_are_the_identity():
+def test_empty_sums_give_the_identity():
     T, residual = rigid.fit_sums(np.zeros((2, 18)))
     np.testing.assert_array_equal(T, [np.eye(4)] * 2)
     np.testing.assert_array_equal(residual, 0.0)

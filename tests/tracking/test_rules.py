@@ -21,7 +21,7 @@ def printed_box():
     return scene, scene.clip(0)
 
 
-def test_paper_takes_sift_with_enough_inliers(printed_box):
+def test_paper_rule_accepts_sift_with_enough_inliers(printed_box):
     scene, clip = printed_box
     rng = np.random.default_rng(0)
     track = track_of(scene, clip)
@@ -32,7 +32,7 @@ def test_paper_takes_sift_with_enough_inliers(printed_box):
     assert mm < 4 and deg < 3
 
 
-def test_papers_millimetre_is_below_the_noise(printed_box, plain):
+def test_the_published_limit_of_1_mm_is_below_the_noise(printed_box, plain):
     """As printed ICP is not accepted, and without texture everything becomes the identity."""
     rng = np.random.default_rng(0)
     scene, clip = plain
@@ -43,7 +43,7 @@ def test_papers_millimetre_is_below_the_noise(printed_box, plain):
         assert loose.candidates(rng, track_of(scene, clip, label))[0].kind == "icp"
 
 
-def test_papers_two_orders():
+def test_the_two_orders_of_the_paper_rule():
     sift, icp = Candidate("sift", IDENTITY.T, 9, 0.004, 0.004), Candidate("icp", IDENTITY.T, 100, 0.0008, 0.0008)
     rng = np.random.default_rng(0)
     assert PaperRule().choose(rng, (sift, icp, IDENTITY)) is sift
@@ -51,7 +51,7 @@ def test_papers_two_orders():
     assert PaperRule(order="best").choose(rng, (IDENTITY,)) is IDENTITY
 
 
-def test_authors_rule_uses_a_cluster_as_often_as_its_size_says():
+def test_authors_rule_uses_clusters_with_the_stated_probability():
     """Binomial checks; each bound is 4.4 standard deviations, false alarm below 1e-4 in all."""
     n = 4000
     icp = Candidate("icp", IDENTITY.T, 100)
@@ -87,7 +87,7 @@ def test_mst_rule_finds_the_motion_of_boxes(kind, request):
         assert mm < (3 if kind == "textured" else 9) and deg < 2
 
 
-def test_mst_rule_places_a_cylinder_whatever_its_spin(textured, plain):
+def test_mst_rule_finds_the_position_of_a_cylinder(textured, plain):
     for scene, clip in (textured, plain):
         track, truth = track_of(scene, clip, 2), scene.motions()[2]
         rule, rng = MstRule(), np.random.default_rng(0)
@@ -106,7 +106,7 @@ def test_mst_rule_is_not_worse_than_registration_from_the_centroid(textured, pla
             assert ours <= simple + 1e-9
 
 
-def test_rest_is_kept_unless_a_motion_is_clearly_better():
+def test_mst_rule_prefers_rest_by_the_margin():
     rest, better, best = (
         Candidate(k, IDENTITY.T, 0, 0.0, s) for k, s in (("identity", 0.85), ("icp", 0.9), ("icp", 0.8))
     )
@@ -125,7 +125,7 @@ def test_sampling_follows_the_scores():
     assert abs(drawn - n * p) < 4.4 * np.sqrt(n * p * (1 - p))
 
 
-def test_candidates_too_far_or_too_turned_are_dropped(printed_box):
+def test_candidates_with_large_shift_or_rotation_are_rejected(printed_box):
     scene, clip = printed_box
     rng = np.random.default_rng(0)
     centre = track_of(scene, clip).points.mean(axis=0)
@@ -148,7 +148,7 @@ def test_an_object_that_flow_lost_is_searched_for():
     assert [c.kind for c in never.candidates(rng, track)] == ["identity"]
 
 
-def test_unknown_choices_are_refused():
+def test_unknown_options_raise_an_error():
     for make in (lambda: PaperRule(order="last"), lambda: PaperRule(icp_start="far"), lambda: MstRule(select="all")):
         with pytest.raises(InputError):
             make()

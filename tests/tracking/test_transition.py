@@ -39,7 +39,7 @@ def test_hypotheses_follow_the_scene(kind, request):
 
 
 @pytest.mark.parametrize("rule", RULES)
-def test_a_static_clip_changes_no_byte(rule):
+def test_a_static_clip_returns_the_same_hypothesis(rule):
     poses = [[at(-0.1, 0, 0.04, 20), at(0.08, 0, 0.05)]] * 4
     scene = Scene([Box((0.1, 0.08, 0.08)), Cylinder((0.08, 0.08, 0.1), texture=0.0)], poses)
     h = scene.hypothesis()
@@ -62,7 +62,7 @@ def test_population_bookkeeping(textured):
 
 
 @pytest.mark.parametrize("rule", RULES)
-def test_the_order_of_hypotheses_changes_nothing(rule, textured):
+def test_the_order_of_hypotheses_has_no_effect(rule, textured):
     scene, clip = textured
     h = scene.hypothesis()
     hs = [h, merged(h, 4, 5), merged(h, 3, 1)]
@@ -84,14 +84,14 @@ def test_a_stochastic_rule_moves_copies_differently_and_repeats_with_the_seed(te
     assert grids != [p.labels.tobytes() for p in c.particles]
 
 
-def test_a_hundred_copies_are_tracked_once(textured):
+def test_equal_hypotheses_are_tracked_once(textured):
     scene, clip = textured
     moved = predict(clip, *[scene.hypothesis()] * 100)
     assert len(moved) == 100 and moved.notes["segments"] == 6
     assert len({p.labels.tobytes() for p in moved.particles}) == 1
 
 
-def test_without_video_nothing_moves(textured):
+def test_without_video_no_object_moves(textured):
     scene, clip = textured
     h = scene.hypothesis()
     single = Clip((clip.before,), clip.grid)
@@ -106,7 +106,7 @@ def test_an_empty_hypothesis_stays_empty(textured):
     assert predict(clip, empty).particles[0].n_objects == 0
 
 
-def test_an_object_that_cannot_be_seen_stays():
+def test_an_occluded_object_does_not_move():
     """Box 2 is hidden behind box 1 all the time."""
     poses = [[at(0, -0.05, 0.09), at(0.0, 0.06, 0.02)]] * 2
     scene = Scene([Box((0.3, 0.06, 0.18)), Box((0.05, 0.05, 0.04))], poses)
@@ -125,7 +125,7 @@ def test_full_occlusion_at_the_end_leaves_the_object_where_it_was(rule):
     assert iou(moved.labels == 1, h.labels == 1) > 0.9
 
 
-def test_an_object_that_leaves_the_workspace_is_counted_out():
+def test_voxels_that_leave_the_workspace_are_counted():
     scene = Scene([Box((0.08, 0.08, 0.06))], [[p] for p in slide(at(0.30, 0, 0.03), at(0.40, 0, 0.03), 6)])
     moved = predict(scene.clip(0), scene.hypothesis())
     volume = scene.hypothesis().volumes()[1]
@@ -133,7 +133,7 @@ def test_an_object_that_leaves_the_workspace_is_counted_out():
     assert moved.particles[0].volumes()[1] < 0.7 * volume
 
 
-def test_an_object_that_leaves_the_view_does_no_harm():
+def test_an_object_that_leaves_the_view_does_not_affect_others():
     scene = Scene(
         [Box((0.08, 0.08, 0.06)), Box((0.08, 0.08, 0.06), (60, 120, 60))],
         [[p, at(0, 0.1, 0.03)] for p in slide(at(-0.1, -0.12, 0.03), at(-0.1, -0.5, 0.03), 6)],
@@ -157,7 +157,7 @@ def test_a_mask_without_depth_stays(rule, textured):
 
 
 @pytest.mark.parametrize("rule", RULES)
-def test_no_depth_at_all_moves_nothing(rule, textured):
+def test_without_depth_no_object_moves(rule, textured):
     scene, clip = textured
     h = scene.hypothesis()
     blind = [Frame(f.rgb, np.full_like(f.depth, np.nan), f.camera) for f in clip.frames]
@@ -165,7 +165,7 @@ def test_no_depth_at_all_moves_nothing(rule, textured):
 
 
 @pytest.mark.parametrize("rule", RULES)
-def test_one_voxel_is_no_trouble(rule, textured):
+def test_an_object_of_one_voxel_raises_no_error(rule, textured):
     scene, clip = textured
     labels = scene.labels(scene.poses[0])
     x, y, z = np.argwhere(labels == 1)[-1]
@@ -187,7 +187,7 @@ def test_twins_are_not_exchanged():
     assert iou(moved.labels == 2, truth == 2) > 0.8
 
 
-def test_half_of_an_object_moves_like_the_whole(plain):
+def test_half_of_an_object_moves_like_the_complete_object(plain):
     scene, clip = plain
     labels = scene.labels(scene.poses[0])
     where = np.argwhere(labels == 1)
@@ -212,7 +212,7 @@ def test_records_carry_the_composed_motion(textured):
     assert iou(twice.labels == 1, h.labels == 1) > 0.9  # and not 0.9 of 0.9
 
 
-def test_splat_forgets_the_source(textured):
+def test_splat_removes_the_source(textured):
     scene, clip = textured
     transition = TrackingTransition(warp=Warp("splat", "label"))
     moved = predict(clip, scene.hypothesis(), transition=transition).particles[0]

@@ -107,7 +107,7 @@ def test_pull_matches_the_exactly_voxelised_box_better_than_splat():
     assert iou(splat, truth) < 0.95
 
 
-def test_voxels_that_leave_are_counted_and_a_lost_object_is_dropped():
+def test_voxels_that_leave_are_counted_and_empty_objects_removed():
     h = hypothesis(BOX, OTHER)
     moved = move(Warp(), h, {2: at(0.15, 0, 0)})
     assert moved.voxels_left == 3 * 8 * 6
@@ -148,7 +148,7 @@ def test_collisions_do_not_depend_on_label_order():
     np.testing.assert_array_equal(run([0, 1, 2]), run([1, 2, 0]))
 
 
-def test_what_an_object_at_rest_lost_in_a_collision_comes_back():
+def test_voxels_lost_in_a_collision_are_restored():
     h = hypothesis(BOX, OTHER)
     bitten = move(Warp(), h, {1: at(0.13, 0, 0)}).hypothesis
     assert bitten.volumes()[2] < 384
@@ -167,7 +167,7 @@ def test_single_voxels_survive_any_turn():
         assert move(Warp(), h, {1: turn(deg, (0.0132, 0.0047, 0))}).hypothesis.n_objects == 1
 
 
-def test_unknown_choices_are_refused():
+def test_unknown_options_raise_an_error():
     with pytest.raises(InputError):
         Warp("push")
     with pytest.raises(InputError):
