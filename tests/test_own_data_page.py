@@ -1,4 +1,4 @@
-"""Every command on the page about one's own data runs, on data of that layout."""
+"""Every command of docs/own-data.md runs on data of its layout."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ COMMANDS = [
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory):
-    """A folder that holds what the page speaks of."""
+    """A folder with the data that the page uses."""
     path = tmp_path_factory.mktemp("data")
     write(path / "table-7")
     write_bag(path / "session", "bag", scene_messages(True))

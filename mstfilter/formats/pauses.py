@@ -3,7 +3,8 @@
 >>> pauses_from_text("still"), pauses_from_text("0,40,85"), pauses_from_text("0s,4.2s")
 
 A clip goes from one pause to the next. At a pause nothing moves, and neither the robot nor a hand should be in the
-image. Only our own recording folder stores the pauses. For other layouts they are found by one of these rules:
+image. Only the recording folder of mstfilter stores the pauses. For other layouts they are found by one of these
+rules:
 
 ``still``
     By image motion.

@@ -7,7 +7,7 @@
 >>> project(hypothesis, clip.after.camera)            # label image of the hypothesis  # doctest: +SKIP
 
 Units are metres, radians and seconds; rigid motions are scipy `RigidTransform` objects named ``T_to_from``. The
-package knows nothing of filters, components or file formats.
+package does not depend on filters, components or file formats.
 """
 
 from mstfilter.lazy import attach
