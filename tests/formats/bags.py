@@ -81,7 +81,7 @@ def png(pixels):
 
 
 def compressed_depth(depth, floats):
-    """What the compressedDepth transport writes: 16UC1, or 32FC1 quantised in inverse depth."""
+    """Data of the compressedDepth transport: 16UC1, or 32FC1 quantised in inverse depth."""
     if not floats:
         return struct.pack("<iff", 0, 0.0, 0.0) + png(units(depth, 0.001))
     a, b = 500.0, 0.0

@@ -1,4 +1,4 @@
-"""ROS 1 bags, ROS 2 bags and MCAP files give the frames that were written, or one clear error."""
+"""Reading of ROS 1 bags, ROS 2 bags and MCAP files, and errors of invalid ones."""
 
 from __future__ import annotations
 
@@ -74,8 +74,8 @@ def test_pixels_of_other_encodings():
             depth_image(wrong, False, 0.001, "m")
 
 
-def test_registered_depth_is_chosen_by_itself(tmp_path):
-    """Beside the aligned depth there is the raw one of another frame, and an infrared image: no question arises."""
+def test_registered_depth_is_the_default(tmp_path):
+    """The aligned depth is chosen if there are also raw depth of another frame and an infrared image."""
     make, messages = Messages(False), scene_messages(False, (0, 0))
     for k in range(2):
         t = 1700000000.0 + k / FPS
@@ -91,7 +91,7 @@ def test_registered_depth_is_chosen_by_itself(tmp_path):
 
 
 def test_the_lens_of_the_camera_info_is_used(tmp_path):
-    """A raw image with distortion is straightened; a rectified one takes its matrix from P."""
+    """A raw image is undistorted; for a rectified image the camera matrix is read from P."""
     make = Messages(True)
     for topic, same in ((COLOUR, False), ("/camera/color/image_rect_color", True)):
         messages = []
@@ -172,7 +172,7 @@ FAULTS = {
 
 
 @pytest.mark.parametrize("fault", FAULTS)
-def test_what_is_wrong_is_one_clear_error(tmp_path, fault):
+def test_invalid_data_raise_an_error(tmp_path, fault):
     make, reader, message = FAULTS[fault]
     path = make(tmp_path / "session")
     with pytest.raises(InputError, match=message) as caught:
@@ -192,13 +192,13 @@ def test_ambiguous_topics_are_listed(tmp_path):
     same_frames(Bag(colour="/left" + COLOUR, K=K, pauses=Ends(), world=WORLD).open(path), (0, 1))
 
 
-def test_registered_after_all(tmp_path):
+def test_depth_can_be_declared_registered(tmp_path):
     path = with_messages(frame="camera_depth_optical_frame")(tmp_path / "session")
     same_frames(Bag(registered=True, pauses=Ends(), world=WORLD).open(path), (0, 1))
 
 
-def test_stamps_of_the_header_count(tmp_path):
-    """Messages that were logged late, out of step, are paired by when they were taken; lost ones are told."""
+def test_images_are_paired_by_the_stamps_of_their_headers(tmp_path):
+    """Also if messages were logged late; lost messages give a warning."""
     rng = np.random.default_rng(1)
     messages = [(topic, t + float(rng.uniform(0, 0.3)), m) for topic, t, m in scene_messages(False)]
     messages.sort(key=lambda m: m[1])

@@ -1,4 +1,4 @@
-"""Every layout gives the frames that were written into it, and one clear error for what is wrong."""
+"""Reading of every layout, and errors of invalid data."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def same_frames(recording, shifts, atol=2e-7):
 
 
 def same_on_disk(recording, path):
-    """Converted, the recording is the same byte for byte."""
+    """A converted recording is byte-identical."""
     assert open_recording(save_recording(recording, path)).key == recording.key
     assert not list(path.parent.glob(".*"))
 
@@ -73,12 +73,12 @@ def test_the_pose_is_found_and_the_workspace_can_be_given(tmp_path):
 
 
 def camera_to_world(k):
-    """The true pose at frame k of a moving camera, in a world of its own."""
+    """The true pose at frame k of a moving camera, in another world than that of the table."""
     return RigidTransform.from_components([1 + 0.01 * k, -2, 0.9], Rotation.from_rotvec([0.3, -0.2, 0.02 * k]))
 
 
 def check_motion(recording):
-    """Relative to the first pause the camera moves as the trajectory says."""
+    """Check the camera motion relative to the first pause."""
     home = recording.pauses[0]
     # At the first pause the pose is the one that the table gives, not the trajectory's.
     assert abs(recording.frames[home].camera.position[2] - CAMERA.position[2]) < 5e-3
@@ -157,7 +157,7 @@ def test_bop_motion(tmp_path):
 
 
 def test_dsr(tmp_path):
-    """Volumes turn into x, y, z; what is drawn from above lies where the boxes are, in their colours."""
+    """Volumes are transposed to x, y, z; the rendered image shows the boxes at their places, in their colours."""
     path = write_dsr(tmp_path / "dsr")
     assert Dsr.detects(path)
     recording = Dsr(origin=(0.1, -0.1, 0.0)).open(path)
@@ -286,7 +286,7 @@ FAULTS = {
 
 
 @pytest.mark.parametrize("fault", FAULTS)
-def test_what_is_wrong_is_one_clear_error(tmp_path, fault):
+def test_invalid_data_raise_an_error(tmp_path, fault):
     write, reader, spoil, message = FAULTS[fault]
     path = write(tmp_path / "data")
     spoil(path)
@@ -296,7 +296,7 @@ def test_what_is_wrong_is_one_clear_error(tmp_path, fault):
 
 
 def test_pairs_of_stamps():
-    """Each image is used once; jitter, gaps and another rate are no matter; many left out are told."""
+    """Each image is used once, also with jitter, gaps and different rates; many omitted images give a warning."""
     rng = np.random.default_rng(0)
     colour = np.arange(60) / 30 + 100
     depth = np.delete(colour + rng.uniform(-0.01, 0.01, 60), [7, 30])
@@ -315,8 +315,8 @@ def test_pairs_of_stamps():
         pair_stamps([5.0], [5.5], 0.02, "bag")
 
 
-def test_a_distorted_lens_is_straightened():
-    """A straight image, bent by the lens model, comes back; depth values are picked, never mixed."""
+def test_images_are_undistorted():
+    """An image distorted by the lens model is recovered; depth is not interpolated."""
     bend = (0.2, -0.5, 0.001, -0.002, 0.1)
     lens = Lens.of(CAMERA, bend)
     k1, k2, p1, p2, k3 = bend
@@ -335,7 +335,7 @@ def test_a_distorted_lens_is_straightened():
         Lens.of(CAMERA, (0.1, 0.1, 0.1))
 
 
-def test_distorted_images_are_read_straight(tmp_path):
+def test_distorted_images_are_undistorted_when_read(tmp_path):
     path = write_tum(tmp_path / "tum", shifts=(0, 0))
     straight = Tum(K=K, distortion=(0.3, 0.0, 0.0, 0.0), pauses=Ends(), world=WORLD).open(path).frames[0]
     bent = Tum(K=K, pauses=Ends(), world=WORLD).open(path).frames[0]
@@ -349,8 +349,8 @@ def test_distorted_images_are_read_straight(tmp_path):
     assert np.isnan(straight.depth[~inside]).all()
 
 
-def test_depth_beyond_the_file_is_no_reading(tmp_path):
-    """A recording that cannot hold a value says "no reading", not the largest number it has."""
+def test_depth_out_of_the_range_of_the_file_is_no_reading(tmp_path):
+    """Depth beyond 65535 units is stored as no reading, not as 65535."""
     from mstfilter.formats.folder import RecordingWriter
 
     _, depth, _ = video((0,))
@@ -362,9 +362,8 @@ def test_depth_beyond_the_file_is_no_reading(tmp_path):
     assert units(depth, 0.002).max() == 40000
 
 
-def test_a_disk_that_is_full_at_the_end(tmp_path, monkeypatch):
-    """The last files do not fit: nothing is left of those before."""
-    from mstfilter.formats.folder import RecordingWriter
+def test_a_disk_that_is_full_at_the_end_leaves_no_files(tmp_path, monkeypatch):
+        from mstfilter.formats.folder import RecordingWriter
 
     def full(self, described):
         raise OSError(28, "No space left on device")
@@ -376,7 +375,7 @@ def test_a_disk_that_is_full_at_the_end(tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_two_camera_matrices_do_not_fit_into_one_folder(tmp_path):
+def test_two_camera_matrices_in_one_folder_raise_an_error(tmp_path):
     from dataclasses import replace
 
     rgb, depth, _ = video((0, 1))
@@ -389,7 +388,7 @@ def test_two_camera_matrices_do_not_fit_into_one_folder(tmp_path):
 
 
 def test_a_part_of_a_video(tmp_path):
-    """A sensor that shows nothing at first; the trajectory and the times go with the frames."""
+    """Frames at the start without depth are omitted, with their poses and times."""
     path = write_redwood(tmp_path / "redwood")
     lines = [
         f"{k} {k} {k + 1}\n" + "\n".join(" ".join(map(repr, row)) for row in camera_to_world(k).as_matrix().tolist())

@@ -1,4 +1,4 @@
-"""Where a video is cut: given pauses, and pauses found by image motion on simulated recordings."""
+"""Pauses of a video: given ones, and ones found by image motion on simulated recordings."""
 
 from __future__ import annotations
 
@@ -66,8 +66,8 @@ def test_still_intervals_of_an_exact_video():
     assert Still().find((0.0,), lambda k: rgb[k]) == (0,)
 
 
-def test_what_all_pixels_share_is_no_motion():
-    """Exposure that drifts, flickers and steps, with noise, hides no pause."""
+def test_changes_of_all_pixels_are_no_motion():
+    """Exposure that drifts, flickers and steps, with noise, does not change the pauses."""
     rng = np.random.default_rng(0)
     rgb, _, _ = video()
     steady = np.zeros(len(rgb))
@@ -81,8 +81,8 @@ def test_what_all_pixels_share_is_no_motion():
         assert Still().intervals(times_of(noisy), lambda k, v=noisy: v[k]) == ((0, 5), (10, 16))
 
 
-def test_a_region_leaves_out_what_moves_elsewhere():
-    """Somebody walks behind the table through every frame."""
+def test_a_region_excludes_motion_elsewhere():
+    """A person moves behind the table in every frame."""
     rgb, _, _ = video()
     walking = rgb.copy()
     for k, image in enumerate(walking):
@@ -95,8 +95,8 @@ def test_a_region_leaves_out_what_moves_elsewhere():
             Still(region=wrong).intervals(times_of(rgb), lambda k: rgb[k])
 
 
-def test_blocks_that_shimmer_have_a_noise_of_their_own():
-    """A shimmering edge, which is a percent of the image, is no motion; a box that moves beside it is."""
+def test_the_noise_is_measured_per_block():
+    """A flickering edge of one percent of the image is no motion; a box that moves beside it is."""
     rng = np.random.default_rng(0)
     rgb, _, _ = video()
     shimmer = [image.astype(float) for image in rgb]
@@ -106,7 +106,7 @@ def test_blocks_that_shimmer_have_a_noise_of_their_own():
 
 
 def test_slow_motion_adds_up():
-    """A twentieth of a pixel a frame changes no block by three levels, ten frames of it do."""
+    """Motion of a twentieth of a pixel per frame changes a block by three levels only after several frames."""
     image = video((0,))[0][0].astype(float)
     slow = [(1 - f) * image + f * np.roll(image, 1, axis=1) for f in np.arange(20) * 0.05]
     changes = [np.abs(grey_blocks(b) - grey_blocks(a)).max() for a, b in pairwise(slow)]
@@ -124,7 +124,7 @@ def test_blocks_are_means():
 
 @pytest.mark.parametrize("seed", [3, 8])
 def test_still_intervals_of_a_simulated_recording(seed):
-    """Pushes with sensor noise, each pause held for a second: every pause is found, in order, and nothing else.
+    """Pushes with sensor noise, each pause held for a second: exactly the pauses are found.
 
     The truth is the simulator's: a frame belongs to a pause if it was drawn from the world at rest.
     """

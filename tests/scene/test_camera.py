@@ -1,4 +1,4 @@
-"""Cameras and frames: projection against the formula, and bad input."""
+"""Cameras and frames: projection against the formula, and errors of invalid input."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def test_projection_inverts_unprojection(position, rotation, skew):
     np.testing.assert_allclose(z, depth, atol=1e-9)
 
 
-def test_look_at_centres_the_target_with_up_at_the_top():
+def test_look_at_centres_the_target():
     uv, z = CAMERA.project(np.array([0.02, 0.05, 0.04]))
     np.testing.assert_allclose(uv, [319.5, 239.5], atol=1e-9)
     assert z == pytest.approx(np.linalg.norm([0.03, 0.77, 0.54]))
@@ -63,12 +63,12 @@ def test_scaling_keeps_rays():
         ([["a"] * 3] * 3, "numeric"),
     ],
 )
-def test_bad_intrinsics(matrix, message):
+def test_invalid_intrinsics(matrix, message):
     with pytest.raises(InputError, match=message):
         Camera(matrix, 640, 480)
 
 
-def test_bad_poses():
+def test_invalid_poses():
     bad = np.eye(4)
     bad[0, 3] = np.nan
     with pytest.raises(InputError, match="NaN"):
@@ -81,7 +81,7 @@ def test_bad_poses():
         Camera(K, 640, 480, np.eye(4))
 
 
-def test_frames_check_and_freeze():
+def test_frames_are_checked_and_read_only():
     rgb, depth = np.zeros((480, 640, 3), np.uint8), np.ones((480, 640), np.float32)
     depth[0, 0], depth[0, 1], depth[0, 2] = 0, np.inf, -1
     robot = np.zeros((480, 640), bool)

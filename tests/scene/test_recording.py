@@ -1,4 +1,4 @@
-"""Recordings: round trips, clips, and one clear error for every kind of broken input."""
+"""Recordings: round trips, clips, errors of invalid input, the support plane."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def test_round_trip(folder):
     assert open_recording(again).key == recording.key
 
 
-def test_true_poses_come_back_and_broken_ones_are_one_clear_error(tmp_path):
+def test_true_poses_are_read_and_invalid_ones_raise_an_error(tmp_path):
     assert open_recording(write(tmp_path / "none")).poses(0) is None
     pose = look_at((0.3, 0.1, 0.5), (0, 0, 0)).as_matrix()
     with RecordingWriter(tmp_path / "r", CAMERA, GRID) as writer:
@@ -71,7 +71,7 @@ def test_true_poses_come_back_and_broken_ones_are_one_clear_error(tmp_path):
             open_recording(tmp_path / "r").poses(0)
 
 
-def test_a_failed_writer_leaves_nothing(tmp_path):
+def test_a_failed_writer_leaves_no_files(tmp_path):
     with pytest.raises(RuntimeError), RecordingWriter(tmp_path / "r", CAMERA, GRID) as writer:
         rgb, depth, _ = table_scene()
         writer.add_frame(rgb, depth, 0.0, "static")
@@ -140,7 +140,7 @@ FAULTS = {
 
 
 @pytest.mark.parametrize("fault", FAULTS)
-def test_broken_recordings(folder, fault):
+def test_invalid_recordings(folder, fault):
     spoil, message = FAULTS[fault]
     spoil(folder)
     with pytest.raises(InputError, match=message):
@@ -166,7 +166,7 @@ def labels_of(depth):
     return render(table_scene()[2], GRID, CAMERA).labels
 
 
-def test_arrays_that_cannot_be_used():
+def test_invalid_arrays():
     rgb, depth, _ = table_scene()
     K = CAMERA.K
     for arguments, message in (
@@ -185,7 +185,7 @@ def test_arrays_that_cannot_be_used():
 
 
 def test_support_plane_of_known_pose():
-    """A noisy tilted table and a box: pose and plane come back."""
+    """Pose and plane of a noisy tilted table with a box are estimated."""
     rgb, depth, _ = table_scene(noise=np.random.default_rng(0))
     recording = Recording.from_arrays(rgb, depth, CAMERA.K)
     plane = fit_support_plane(recording.frames[0])
@@ -199,7 +199,7 @@ def test_support_plane_of_known_pose():
     assert both.sum() / (plane.on_or_behind | (truth & recording.frames[0].valid)).sum() > 0.97
 
 
-def test_no_plane_is_a_clear_error():
+def test_no_plane_raises_an_error():
     from mstfilter.scene.frame import Frame
 
     depth = np.full((CAMERA.height, CAMERA.width), np.nan)
@@ -251,7 +251,7 @@ def test_real_frames_find_their_table(shared_data):
     assert np.mean(scores) > 0.9
 
 
-def test_grids_of_any_kind_are_kept(tmp_path):
+def test_grids_are_stored_exactly(tmp_path):
     rgb, depth, _ = table_scene()
     grid = VoxelGrid((-0.2, -0.25, -0.01), 0.015, (30, 31, 17))
     recording = Recording.from_arrays(rgb, depth, CAMERA.K, T_world_camera=CAMERA.pose, grid=grid)
@@ -281,8 +281,8 @@ def test_a_moving_camera_keeps_its_poses(tmp_path):
     np.testing.assert_allclose([again.frames[k].camera.position for k in range(3)], positions, atol=1e-12)
 
 
-def test_what_was_recorded_cannot_be_changed_from_outside():
-    """A buffer that is used again for the next image does not reach into the last one."""
+def test_frames_do_not_share_writable_memory():
+    """Changing the arrays of a caller does not change the frame."""
     from mstfilter.scene.frame import Frame
 
     rgb, depth, _ = table_scene()
@@ -294,7 +294,7 @@ def test_what_was_recorded_cannot_be_changed_from_outside():
     assert not frame.robot_mask.any()
     assert np.nanmax(frame.depth) < 9
     again = Frame(frame.rgb, frame.depth, CAMERA)
-    assert np.shares_memory(again.rgb, frame.rgb)  # what is frozen already is shared
+    assert np.shares_memory(again.rgb, frame.rgb)  # read-only memory is shared
 
 
 MORE_FAULTS = {
@@ -319,15 +319,15 @@ MORE_FAULTS = {
 
 
 @pytest.mark.parametrize("fault", MORE_FAULTS)
-def test_more_broken_recordings(folder, fault):
+def test_more_invalid_recordings(folder, fault):
     spoil, message = MORE_FAULTS[fault]
     spoil(folder)
     with pytest.raises(InputError, match=message):
         open_recording(folder).check()
 
 
-def test_small_images_find_their_table_too():
-    """Thresholds are in units of the sensor, not of pixels: a quarter of the size, the same plane."""
+def test_the_plane_does_not_depend_on_the_image_size():
+    """Thresholds are in units of the sensor, not of pixels, so a smaller image gives the same plane."""
     rgb, depth, _ = table_scene(noise=np.random.default_rng(0))
     small = CAMERA.scaled(0.5)
     recording = Recording.from_arrays(rgb[::2, ::2], depth[::2, ::2], small.K)

@@ -36,7 +36,7 @@ def test_centres_and_indices_are_inverse():
         ((0, 0, 0), 1, (0, 1, 1)),
     ],
 )
-def test_bad_grids(arguments):
+def test_invalid_grids(arguments):
     with pytest.raises(InputError, match="grid|voxel"):
         VoxelGrid(*arguments)
 
@@ -61,7 +61,7 @@ def test_volumes_and_crops(array):
 
 @settings(max_examples=60, deadline=None)
 @given(labels, labels)
-def test_with_labels_keeps_exactly_what_did_not_change(before, after):
+def test_with_labels_keeps_the_records_of_unchanged_objects(before, after):
     start = Hypothesis.from_labels(before, GRID)
     moved = tuple(
         replace(o, source=Crop.of(before == o.label), motion=RigidTransform.from_translation([1.0, 0, 0]))
@@ -86,7 +86,7 @@ def test_with_labels_keeps_exactly_what_did_not_change(before, after):
         (np.full(GRID.shape, 70000), "70000"),
     ],
 )
-def test_bad_labels(array, message):
+def test_invalid_labels(array, message):
     with pytest.raises(InputError, match=message):
         Hypothesis.from_labels(array, GRID)
 

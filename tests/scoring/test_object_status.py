@@ -37,7 +37,7 @@ def image_of(**pixels):
     return image
 
 
-def test_what_is_visible_hidden_and_unseen():
+def test_status_of_visible_hidden_and_unseen_objects():
     labels = np.zeros(GRID.shape, np.uint16)
     for k in (1, 2, 3, 4):
         labels[10 * k, 5, :3] = k
@@ -53,7 +53,7 @@ def test_what_is_visible_hidden_and_unseen():
     assert set(np.unique(parts["unseen"])) == {0, 3, 4}
 
 
-def test_what_is_missing_is_one_clear_error():
+def test_missing_ground_truth_raises_an_error():
     labels = np.zeros(GRID.shape, np.uint16)
     recording = recording_of([image_of(), image_of()], labels)
     assert object_status(recording, 1) == {}

@@ -1,4 +1,4 @@
-"""Weighted coverage: by hand, by brute force, and on the authors' real particles."""
+"""Weighted coverage: by hand, by brute force, and on real particles of the authors."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def test_all_forms_by_definition(a, b):
 
 @settings(max_examples=100, deadline=None)
 @given(labels, labels, st.permutations(range(1, 6)))
-def test_names_do_not_matter_and_objects_is_symmetric(a, b, order):
+def test_quality_does_not_depend_on_label_values_and_objects_is_symmetric(a, b, order):
     renamed = np.array([0, *order])[a]
     assert weighted_coverage(renamed, b) == pytest.approx(weighted_coverage(a, b), abs=1e-12)
     assert weighted_coverage(a, b) == pytest.approx(weighted_coverage(b, a), abs=1e-12)
@@ -46,7 +46,7 @@ def test_names_do_not_matter_and_objects_is_symmetric(a, b, order):
     assert 0 <= weighted_coverage(a, b) <= 1
 
 
-def test_every_kind_of_mistake_costs():
+def test_every_kind_of_error_reduces_quality():
     truth = np.repeat([0, 1, 2, 3], 10)
     merged, split = np.where(truth == 3, 2, truth), truth.copy()
     split[35:] = 4
