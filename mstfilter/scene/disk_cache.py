@@ -67,11 +67,12 @@ class DiskCache:
                 timeout=10,
                 disk=_BytesDisk,
                 size_limit=limit_bytes,
-                cull_limit=10,
+                cull_limit=3,  # entries removed per entry that is written beyond the limit
                 eviction_policy="least-recently-used",
                 # A folder may be on a network file system, which has no memory shared between machines.
                 sqlite_journal_mode="delete",
                 sqlite_mmap_size=0,
+                sqlite_synchronous=0,  # entries carry checksums, so a lost write is only a missing entry
             )
         except (OSError, sqlite3.Error, diskcache.Timeout):
             self._entries = None

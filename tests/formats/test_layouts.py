@@ -363,7 +363,7 @@ def test_depth_out_of_the_range_of_the_file_is_no_reading(tmp_path):
 
 
 def test_a_disk_that_is_full_at_the_end_leaves_no_files(tmp_path, monkeypatch):
-        from mstfilter.formats.folder import RecordingWriter
+    from mstfilter.formats.folder import RecordingWriter
 
     def full(self, described):
         raise OSError(28, "No space left on device")
