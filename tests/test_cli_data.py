@@ -181,7 +181,9 @@ def test_run_reads_a_bag_as_its_conversion(tmp_path, capsys):
     assert call("convert", path, tmp_path / "r", capsys=capsys)[0] == 0
     assert call("run", tmp_path / "r", "--out", tmp_path / "later", *options, capsys=capsys)[0] == 0
     for t in ("000", "001"):
-        a, b = (np.load(tmp_path / run / "pauses" / t / "hypotheses.npz")["labels"] for run in ("direct", "later"))
+        a, b = (
+            np.load(tmp_path / run / "pauses" / t / "state.npz")["particles/labels"] for run in ("direct", "later")
+        )
         np.testing.assert_array_equal(a, b)
 
 

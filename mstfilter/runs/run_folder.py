@@ -6,7 +6,7 @@
 Layout::
 
     run.json                 configuration, seed, versions, recording, status
-    pauses/000/rgb.png       the image at the pause          pauses/000/hypotheses.npz   particles and log weights
+    pauses/000/rgb.png       the image at the pause          pauses/000/state.npz        particles and log weights
     pauses/000/info.json     record of the step              pauses/000/camera.json      pose at the pause
     pauses/000/truth.npz     true labels, if known           pauses/000/seconds.json     wall time by part
     metrics.csv              one row a pause and hypothesis
@@ -35,18 +35,16 @@ from mstfilter.scene import (
     Hypothesis,
     decode_hypotheses,
     encode_hypotheses,
-    load_hypotheses,
     read_rgb,
     rigid_from_matrix,
-    save_hypotheses,
     write_image,
 )
 from mstfilter.scoring import FORMS, weighted_coverage
-from mstfilter.smc import Codec, Info, Key, Population, State
+from mstfilter.smc import Codec, Info, State, load_state, save_state
 
 __all__ = ["HypothesisCodec", "RunFolder", "as_json", "write_json"]
 
-_FORMAT = 1
+_FORMAT = 2
 
 
 def as_json(value: Any) -> Any:
@@ -76,6 +74,19 @@ def _read_json(path: Path) -> Any:
         raise InputError(f"not a run folder: {path} is missing", "a run folder is made by `mstfilter run`") from None
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
         raise InputError(f"{path} is not valid JSON: {error}") from error
+
+
+@dataclass(frozen=True)
+class HypothesisCodec(Codec):
+    """Hypotheses on one grid as arrays, bit for bit."""
+
+    def encode(self, particles: Any) -> Mapping[str, np.ndarray]:
+        """Named arrays of a sequence of hypotheses."""
+        return encode_hypotheses(particles)
+
+    def decode(self, arrays: Mapping[str, np.ndarray]) -> Any:
+        """The hypotheses."""
+        return decode_hypotheses(arrays)
 
 
 @dataclass(frozen=True)
@@ -146,12 +157,7 @@ class RunFolder:
                     "T_world_camera": camera.pose.as_matrix(),
                 },
             )
-            save_hypotheses(
-                folder / "hypotheses.npz",
-                hypotheses,
-                log_weights=state.population.log_weights,
-                **{f"parents_{name}": index for name, index in state.population.parents.items()},
-            )
+            save_state(folder / "state.npz", state, HypothesisCodec(), compress=True)
             if truth is not None:
                 np.savez_compressed(folder / "truth.npz", labels=truth)
             record = {
@@ -205,15 +211,13 @@ class RunFolder:
 
     def hypotheses(self, t: int) -> tuple[Hypothesis, ...]:
         """The particles after the step."""
-        return load_hypotheses(self.pause(t) / "hypotheses.npz")[0]
+        population = self.state(t).population
+        assert population is not None
+        return tuple(population.particles)
 
     def state(self, t: int) -> State:
         """The state after pause `t`, from which the run is resumed."""
-        hypotheses, arrays = load_hypotheses(self.pause(t) / "hypotheses.npz")
-        prefix = "parents_"
-        parents = {name[len(prefix) :]: a for name, a in arrays.items() if name.startswith(prefix)}
-        population = Population(hypotheses, arrays["log_weights"], parents)
-        return State(t + 1, population, Key(int(self.description["seed"])), False)
+        return load_state(self.pause(t) / "state.npz", HypothesisCodec())[0]
 
     def write_metrics(self) -> None:
         """Write metrics.csv from the pauses."""
@@ -237,16 +241,3 @@ class RunFolder:
 def _qualities(hypotheses: tuple[Hypothesis, ...], truth: np.ndarray) -> dict[str, list[float]]:
     """Quality of each hypothesis against the ground truth, in all forms."""
     return {form: [weighted_coverage(h.labels, truth, form) for h in hypotheses] for form in FORMS}
-
-
-@dataclass(frozen=True)
-class HypothesisCodec(Codec):
-    """Hypotheses on one grid as arrays, bit for bit."""
-
-    def encode(self, particles: Any) -> Mapping[str, np.ndarray]:
-        """Named arrays of a sequence of hypotheses."""
-        return encode_hypotheses(particles)
-
-    def decode(self, arrays: Mapping[str, np.ndarray]) -> Any:
-        """The hypotheses."""
-        return decode_hypotheses(dict(arrays))

@@ -132,7 +132,11 @@ def _read_volumes(path: Path, what: str) -> tuple[np.ndarray, list[int | None], 
     try:
         loaded = np.load(path, allow_pickle=False)
         data: Mapping[str, np.ndarray] = {"labels": loaded} if isinstance(loaded, np.ndarray) else dict(loaded)
+        if "particles/labels" in data:
+            raise InputError(f"{path} holds the hypotheses of one pause of a run", "give the run folder")
         labels = data["labels"]
+    except InputError:
+        raise
     except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile) as error:
         raise InputError(
             f"{what} cannot be read: {path} ({error})", "expected .npz with an array `labels` (S, X, Y, Z), or .npy"
@@ -141,10 +145,6 @@ def _read_volumes(path: Path, what: str) -> tuple[np.ndarray, list[int | None], 
     labels = labels[None] if labels.ndim == 3 else labels
     if labels.ndim != 4 or len(labels) == 0:
         raise InputError(f"{path}: labels have shape {labels.shape}, expected (S, X, Y, Z), one volume a pause")
-    if "owner" in data:
-        raise InputError(
-            f"{path} holds {len(labels)} hypotheses of one pause, not one volume a pause", "give the run folder"
-        )
     frames: list[int | None] = [int(f) for f in data["frame"]] if "frame" in data else [None] * len(labels)
     if len(frames) != len(labels):
         raise InputError(f"{path}: there are {len(labels)} label grids for {len(frames)} frames")

@@ -41,6 +41,4 @@ from mstfilter.scene.voxels import (
     as_labels as as_labels,
     decode_hypotheses as decode_hypotheses,
     encode_hypotheses as encode_hypotheses,
-    load_hypotheses as load_hypotheses,
-    save_hypotheses as save_hypotheses,
 )

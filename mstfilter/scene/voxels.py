@@ -1,4 +1,4 @@
-"""Voxel grids, hypotheses, and the files that store them.
+"""Voxel grids and hypotheses.
 
 A `Hypothesis` is the particle of MST: it says which object every voxel belongs to. World z is up, the table is at
 z = 0.
@@ -11,21 +11,18 @@ z = 0.
 >>> Hypothesis.from_labels(labels, grid).volumes()
 {1: 1000}
 
-Hypotheses are stored as .npz files without pickle. The same hypotheses give the same bytes.
+Hypotheses are stored as plain arrays, without pickle.
 
->>> save_hypotheses(path, hypotheses, log_weights=log_weights)  # doctest: +SKIP
->>> hypotheses, arrays = load_hypotheses(path)  # doctest: +SKIP
+>>> np.savez_compressed(path, **encode_hypotheses(hypotheses))  # doctest: +SKIP
+>>> hypotheses = decode_hypotheses(dict(np.load(path)))  # doctest: +SKIP
 """
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
@@ -42,8 +39,6 @@ __all__ = [
     "as_labels",
     "decode_hypotheses",
     "encode_hypotheses",
-    "load_hypotheses",
-    "save_hypotheses",
 ]
 
 
@@ -384,7 +379,7 @@ def encode_hypotheses(hypotheses: Sequence[Hypothesis]) -> dict[str, np.ndarray]
     }
 
 
-def decode_hypotheses(arrays: dict[str, np.ndarray]) -> tuple[Hypothesis, ...]:
+def decode_hypotheses(arrays: Mapping[str, np.ndarray]) -> tuple[Hypothesis, ...]:
     """Hypotheses from the arrays of `encode_hypotheses`."""
     labels = arrays["labels"]
     grid = VoxelGrid(arrays["origin"], float(arrays["voxel_size"]), labels.shape[1:])
@@ -410,25 +405,3 @@ def decode_hypotheses(arrays: dict[str, np.ndarray]) -> tuple[Hypothesis, ...]:
             )
         )
     return tuple(Hypothesis(grid_labels, grid, tuple(r)) for grid_labels, r in zip(labels, records, strict=True))
-
-
-def save_hypotheses(path: Path, hypotheses: Sequence[Hypothesis], **extra: np.ndarray) -> None:
-    """Write hypotheses and further arrays as a compressed .npz."""
-    arrays: dict[str, Any] = {**encode_hypotheses(hypotheses), **extra}
-    with Path(path).open("wb") as file:  # a file object, because numpy would append .npz to other names
-        np.savez_compressed(file, **arrays)
-
-
-def load_hypotheses(path: Path) -> tuple[tuple[Hypothesis, ...], dict[str, np.ndarray]]:
-    """Hypotheses of a file, and all its arrays."""
-    try:
-        with np.load(path, allow_pickle=False) as data:
-            arrays = {name: data[name] for name in data.files}
-    except FileNotFoundError:
-        raise InputError(f"file of hypotheses is missing: {path}") from None
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise InputError(f"file of hypotheses cannot be read: {path} ({error})") from error
-    try:
-        return decode_hypotheses(arrays), arrays
-    except (KeyError, IndexError, ValueError) as error:
-        raise InputError(f"not a file of hypotheses: {path} ({error!r})") from error

@@ -1,5 +1,5 @@
 from mstfilter.smc.adapters import as_distribution as as_distribution
-from mstfilter.smc.checkpoint import ArrayCodec as ArrayCodec
+from mstfilter.smc.checkpoint import ArrayCodec as ArrayCodec, load_state as load_state, save_state as save_state
 from mstfilter.smc.components import (
     Branching as Branching,
     CrossVectors as CrossVectors,

@@ -36,7 +36,9 @@ __all__ = ["ArrayCodec", "Checkpoint", "load_state", "save_state"]
 _FORMAT = 1
 
 
-def save_state(path: Path, state: State, codec: Codec | None = None, **description: Any) -> None:
+def save_state(
+    path: Path, state: State, codec: Codec | None = None, *, compress: bool = False, **description: Any
+) -> None:
     """Write a state atomically.
 
     Parameters
@@ -47,6 +49,8 @@ def save_state(path: Path, state: State, codec: Codec | None = None, **descripti
         After at least one step.
     codec : Codec, optional
         For particles other than arrays, mappings of arrays and dataclasses of arrays.
+    compress : bool
+        Compress the arrays: smaller, but slower.
     **description
         Further values to store, of types that JSON represents.
 
@@ -74,7 +78,7 @@ def save_state(path: Path, state: State, codec: Codec | None = None, **descripti
     }
     try:
         with atomic_path(path) as partial, partial.open("wb") as file:
-            np.savez(file, allow_pickle=False, **arrays)
+            (np.savez_compressed if compress else np.savez)(file, allow_pickle=False, **arrays)
             file.flush()
             os.fsync(file.fileno())
     except OSError as error:

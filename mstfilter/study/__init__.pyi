@@ -5,16 +5,16 @@ from mstfilter.study.config import (
     load_study as load_study,
     study_of as study_of,
 )
-from mstfilter.study.executors import (
-    Event as Event,
-    Executor as Executor,
-    Job as Job,
-    JobOutcome as JobOutcome,
-    Local as Local,
-)
+from mstfilter.study.executors import Event as Event, Executor as Executor, Local as Local
 from mstfilter.study.jobs import peak_megabytes as peak_megabytes, perform as perform, reset_peak as reset_peak
 from mstfilter.study.plan import make_plan as make_plan
-from mstfilter.study.results import RESULT as RESULT, StudyFolder as StudyFolder, cost_columns as cost_columns
+from mstfilter.study.results import (
+    RESULT as RESULT,
+    Job as Job,
+    JobOutcome as JobOutcome,
+    StudyFolder as StudyFolder,
+    cost_columns as cost_columns,
+)
 from mstfilter.study.statistics import (
     CLAIM as CLAIM,
     Difference as Difference,

@@ -19,7 +19,9 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from mstfilter.errors import InputError, MissingLibraryError
-from mstfilter.study.executors import Event, Executor, Job, JobOutcome, Tell, times
+from mstfilter.study.executors import Event, Executor, Tell, times
+from mstfilter.study.jobs import perform
+from mstfilter.study.results import Job, JobOutcome
 
 __all__ = ["Cluster"]
 
@@ -188,8 +190,6 @@ def _perform(job: Job, k: int, topic: str) -> dict[str, Any]:
     """In a worker: do a job and log its steps as events of the scheduler."""
     import cv2
     from distributed import get_worker
-
-    from mstfilter.study.jobs import perform
 
     worker = get_worker()
 

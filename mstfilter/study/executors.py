@@ -23,12 +23,10 @@ from pathlib import Path
 from typing import Any
 
 from mstfilter.errors import InputError
+from mstfilter.study.jobs import perform
+from mstfilter.study.results import Job, JobOutcome
 
-__all__ = ["Event", "Executor", "Job", "JobOutcome", "Local", "Tell"]
-
-Job = Mapping[str, Any]
-"""Plain values: ``kind`` (record or run), ``name``, ``share`` (jobs of one share use the same intermediate results),
-``tries``, ``timeout_s`` and what `mstfilter.study.jobs` needs."""
+__all__ = ["Event", "Executor", "Local", "Tell"]
 
 _POLL_S = 0.01
 _ONE_THREAD = {
@@ -41,30 +39,6 @@ _ONE_THREAD = {
         "VECLIB_MAXIMUM_THREADS",
     )
 }
-
-
-@dataclass(frozen=True)
-class JobOutcome:
-    """How a job ended.
-
-    Parameters
-    ----------
-    status : {"done", "failed"}
-    error : str
-        What went wrong, in one line.
-    hints : tuple of str
-        What the user can do about it.
-    trace : str
-        Traceback of the error.
-    tries : int
-        How many times the job was started.
-    """
-
-    status: str
-    error: str = ""
-    hints: tuple[str, ...] = ()
-    trace: str = ""
-    tries: int = 1
 
 
 @dataclass(frozen=True)
@@ -337,8 +311,6 @@ def _exit_with_parent() -> None:
 
 
 def _perform(job: Job) -> JobOutcome:
-    from mstfilter.study.jobs import perform
-
     assert _step_pipe is not None
     send = _step_pipe.send
     return perform(job, lambda done, total: send((done, total)))

@@ -27,8 +27,7 @@ from mstfilter.formats import open_recording
 from mstfilter.presets import PACKAGES
 from mstfilter.runs import RunProgress, code_version, filter_recording, measure_pause, open_source
 from mstfilter.scene import Recording, scene_cache
-from mstfilter.study.executors import Job, JobOutcome
-from mstfilter.study.results import write_result
+from mstfilter.study.results import Job, JobOutcome, write_result
 
 __all__ = ["StagePeaks", "peak_megabytes", "perform", "reset_peak"]
 

@@ -26,10 +26,18 @@ from typing import Any
 from mstfilter.errors import InputError
 from mstfilter.files import write_csv
 from mstfilter.runs import write_json
-from mstfilter.study.executors import JobOutcome
 from mstfilter.study.summary import Summary, summarise
 
-__all__ = ["RESULT", "STUDY_FORMAT", "StudyFolder", "cost_columns", "read_result", "write_result"]
+__all__ = [
+    "RESULT",
+    "Job",
+    "JobOutcome",
+    "STUDY_FORMAT",
+    "StudyFolder",
+    "cost_columns",
+    "read_result",
+    "write_result",
+]
 
 STUDY_FORMAT = 2
 RESULT = "result.json"  # in a run's folder
@@ -39,6 +47,35 @@ _DIFFERENCE_COLUMNS = (
     *("low_bootstrap", "high_bootstrap", "p", "p_holm", "conclusion"),
 )
 _FAILURE_COLUMNS = ("run", "error", "hints", "tries", "folder")
+
+
+Job = Mapping[str, Any]
+"""Plain values: ``kind`` (record or run), ``name``, ``share`` (jobs of one share use the same intermediate results),
+``tries``, ``timeout_s`` and what `mstfilter.study.jobs` needs."""
+
+
+@dataclass(frozen=True)
+class JobOutcome:
+    """How a job ended.
+
+    Parameters
+    ----------
+    status : {"done", "failed"}
+    error : str
+        What went wrong, in one line.
+    hints : tuple of str
+        What the user can do about it.
+    trace : str
+        Traceback of the error.
+    tries : int
+        How many times the job was started.
+    """
+
+    status: str
+    error: str = ""
+    hints: tuple[str, ...] = ()
+    trace: str = ""
+    tries: int = 1
 
 
 def read_result(folder: Path) -> dict[str, Any]:

@@ -19,9 +19,9 @@ from typing import Any
 from mstfilter.errors import InputError
 from mstfilter.runs import library_versions, write_json
 from mstfilter.study.config import StudyConfig
-from mstfilter.study.executors import Event, Executor, Job, JobOutcome, Local
+from mstfilter.study.executors import Event, Executor, Local
 from mstfilter.study.plan import Plan, StudyRun, make_plan
-from mstfilter.study.results import STUDY_FORMAT, StudyFolder, read_result
+from mstfilter.study.results import STUDY_FORMAT, Job, JobOutcome, StudyFolder, read_result
 
 __all__ = ["StudyProgress", "StudyResult", "run_study"]
 

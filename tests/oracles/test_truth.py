@@ -113,7 +113,7 @@ def test_a_run_by_the_truth_goes_on_after_a_stop(recording, tmp_path):
         filter_recording(recording, config, tmp_path / "b", seed=1, progress=stop)
     filter_recording(recording, config, tmp_path / "b", seed=1)
     for t in range(3):
-        name = f"pauses/{t:03d}/hypotheses.npz"
+        name = f"pauses/{t:03d}/state.npz"
         assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
 
 

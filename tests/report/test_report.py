@@ -13,8 +13,9 @@ import pytest
 
 from mstfilter.errors import InputError
 from mstfilter.report.run_report import read_numbers, write_report
-from mstfilter.runs import RunFolder
+from mstfilter.runs import HypothesisCodec, RunFolder
 from mstfilter.scoring import weighted_coverage
+from mstfilter.smc import Key, Population, State, save_state
 from tests.report.runs import make_run
 
 
@@ -184,8 +185,6 @@ def test_many_particles_are_cut_to_the_heaviest(tmp_path):
     run = make_run(tmp_path / "run", pauses=1)
     from dataclasses import replace
 
-    from mstfilter.scene import save_hypotheses
-
     first = run.hypotheses(0)[0]
     many = []
     for k in range(20):
@@ -193,7 +192,8 @@ def test_many_particles_are_cut_to_the_heaviest(tmp_path):
         labels[k % 15, 3:6, :2] = 1
         labels[15 - k % 15, 9:12, : 1 + k // 15] = 2
         many.append(replace(first, labels=labels, objects=type(first).from_labels(labels, first.grid).objects))
-    save_hypotheses(run.pause(0) / "hypotheses.npz", many)
+    state = State(1, Population(tuple(many)), Key(0), False)
+    save_state(run.pause(0) / "state.npz", state, HypothesisCodec())
     info = run.info(0)
     info |= {"weights": [1 / 20] * 20, "n": 20, "quality": {f: [0.5] * 20 for f in info["quality"]}}
     info["parents"] = {"proposed": list(range(20))}

@@ -77,7 +77,7 @@ def test_the_same_seed_gives_the_same_bytes(recording, tmp_path):
     assert [k for k in a if a[k] != b[k]] == []
     filter_recording(recording, load_config("mst"), tmp_path / "c", seed=8)
     c = content(tmp_path / "c")
-    assert any(a[k] != c[k] for k in a if k.endswith("hypotheses.npz"))
+    assert any(a[k] != c[k] for k in a if k.endswith("state.npz"))
 
 
 @pytest.mark.parametrize("stop", [0, 1, 2])

@@ -31,7 +31,7 @@ class Breaks(Transition):
             if self.how == "exit":
                 os._exit(7)
             if self.how == "full":
-                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "hypotheses.npz")
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "state.npz")
             if self.how == "hang":
                 time.sleep(600)
             if self.how == "print":

@@ -49,7 +49,7 @@ def test_a_cluster_gives_the_same_bytes(cluster, tmp_path):
     died = next(outcome for name, outcome in there.failed if name.startswith("die"))
     assert "its worker died 4 times" in died.error  # Dask's own number of tries
     assert not list((tmp_path / "there" / "runs").glob(".*"))
-    for one in (tmp_path / "here" / "runs").glob("good*/pauses/*/hypotheses.npz"):
+    for one in (tmp_path / "here" / "runs").glob("good*/pauses/*/state.npz"):
         assert one.read_bytes() == (tmp_path / "there" / one.relative_to(tmp_path / "here")).read_bytes()
     again = run_study(study(tmp_path, "good"), tmp_path / "there", Cluster(cluster), cache=tmp_path / "cache-2")
     assert again.repeated == 2
