@@ -70,7 +70,7 @@ def test_missing_data_are_reported(tmp_path):
 
 
 def test_quality_over_time_is_a_complete_file(tmp_path):
-    study = make_study(tmp_path / "study", arms=("ours", "<theirs>", "a ceiling"), beside=("a ceiling",))
+    study = make_study(tmp_path / "study", arms=("ours", "<theirs>", "a ceiling"), reported_only=("a ceiling",))
     (path,) = script("quality_over_time").make(tmp_path / "out", study)
     text = path.read_text()
     ElementTree.fromstring(text)

@@ -57,7 +57,7 @@ def make_study(path, n_scenes=4, arms=("ours", "<theirs>"), groups=("s1", "s2"),
         {"name": arm, "reported_only": arm in reported_only, "uses_truth": [], "config": {**config, "n": 5 + k}}
         for k, arm in enumerate(arms)
     ]
-    description = {"format": 1, "name": "a study", "description": "", "reference": arms[0], "arms": described}
+    description = {"format": 2, "name": "a study", "description": "", "reference": arms[0], "arms": described}
     (path / "study.json").write_text(json.dumps({**description, "scenes": scenes, "seeds": [0, 1], "runs": runs}))
     return path
 
