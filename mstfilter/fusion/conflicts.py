@@ -103,11 +103,11 @@ class ConflictGraph:
         Vertices carry ``side``, ``label`` and ``size``, edges carry ``intersection``, in voxels. Neighbours ascend.
         """
         graph = nx.Graph()
-        for v, (side, label, size) in enumerate(
-            zip(self.side.tolist(), self.label.tolist(), self.size.tolist(), strict=True)
-        ):
+        objects = zip(self.side.tolist(), self.label.tolist(), self.size.tolist(), strict=True)
+        for v, (side, label, size) in enumerate(objects):
             graph.add_node(v, side=side, label=label, size=size)
-        for (a, b), common in sorted(zip(map(tuple, self.edges.tolist()), self.intersection.tolist(), strict=True)):
+        order = np.lexsort((self.edges[:, 1], self.edges[:, 0]))
+        for (a, b), common in zip(self.edges[order].tolist(), self.intersection[order].tolist(), strict=True):
             graph.add_edge(a, b, intersection=common)
         return graph
 
@@ -241,9 +241,16 @@ class SpanningTree(Structure):
         self, rng: np.random.Generator, graph: nx.Graph, component: Sequence[int]
     ) -> tuple[list[int], list[tuple[int, int]]]:
         root, parent = random_spanning_tree(rng, graph, component)
-        tree = nx.DiGraph((parent[v], v) for v in component if v != root)
-        tree.add_node(root)
-        order = list(nx.dfs_postorder_nodes(tree, root))
+        children: dict[int, list[int]] = {v: [] for v in component}
+        for v in component:
+            if v != root:
+                children[parent[v]].append(v)
+        order, stack = [], [root]
+        while stack:  # parents first; the reverse has every child before its parent
+            v = stack.pop()
+            order.append(v)
+            stack.extend(children[v])
+        order.reverse()
         return order, [(v, parent[v]) for v in order if v != root]
 
 
@@ -262,14 +269,15 @@ def random_spanning_tree(
     parent : dict
         Parent of every other vertex.
     """
+    neighbours = {v: list(graph[v]) for v in component}
     root = component[int(rng.integers(len(component)))]
     inside = {root}
     parent: dict[int, int] = {}
     for start in component:
         v = start
         while v not in inside:
-            neighbours = list(graph[v])
-            parent[v] = neighbours[int(rng.integers(len(neighbours)))]  # the last exit from v erases its loops
+            # The last exit from v counts, which erases the loops of the walk.
+            parent[v] = neighbours[v][int(rng.integers(len(neighbours[v])))]
             v = parent[v]
         v = start
         while v not in inside:

@@ -120,16 +120,16 @@ class ModeFilter:
             slice(max(int(w.min()) - half, 0), min(int(w.max()) + half + 1, n))
             for w, n in zip(where, labels.shape, strict=True)
         )
-        part = np.pad(np.ascontiguousarray(labels[box]), half)
-        at = np.ravel_multi_index([w - b.start + half for w, b in zip(where, box, strict=True)], part.shape)
-        votes = _Votes(self, part, at, _window_cells(where, labels.shape, half))
+        padded = np.pad(np.ascontiguousarray(labels[box]), half)
+        at = np.ravel_multi_index([w - b.start + half for w, b in zip(where, box, strict=True)], padded.shape)
+        votes = _Votes(self, padded, at, _window_cells(where, labels.shape, half))
         changed = votes.sweep(votes.unsettled())
         for _ in range(self.max_sweeps - 1):
             if not len(changed):
                 break
             changed = votes.sweep(votes.near(changed))
         out = labels.copy()
-        out[box] = part[(slice(half, -half),) * 3]
+        out[box] = padded[(slice(half, -half),) * 3]
         return out
 
 
@@ -367,7 +367,9 @@ class _Votes:
         """Positions in `at` of voxels that a sweep may change."""
         window, half = self.filter.window, self.filter.window // 2
         inner = self.labels[(slice(half, -half),) * 3]
-        below = self.labels - np.uint16(1)  # free becomes the largest: the smallest label of a window is an object's
+        below = self.labels - np.uint16(
+            1
+        )  # free wraps to the largest number, so the smallest is the label of an object
         mixed = _over_window(np.maximum, self.labels, window) != inner
         mixed |= _over_window(np.minimum, below, window) != below[(slice(half, -half),) * 3]
         taken = _over_window(np.add, (self.labels != 0).astype(self.count_type), window)
@@ -386,7 +388,7 @@ class _Votes:
         return np.flatnonzero(touched[self.at] & (self.flat[self.at] != 0))
 
     def sweep(self, positions: np.ndarray) -> np.ndarray:
-        """All voxels at these positions vote at once; flat indices of those that changed."""
+        """All voxels at these positions vote at the same time. Returns the flat indices of those that changed."""
         at, cells = self.at[positions], self.cells[positions]
         new = np.empty(len(at), np.uint16)
         for k in range(0, len(at), self.chunk):
@@ -403,12 +405,12 @@ class _Votes:
         own_count = self._count(is_own)
         taken = self._count(windows != 0)
         out = own.copy()
-        # Only where the others together would win need they be told apart.
+        # Other labels are counted one by one only where all of them together would win.
         open_ = np.flatnonzero(taken - own_count >= own_count + self.filter.margin)
         others = windows[:, open_] * ~is_own[:, open_]
         left = (taken - own_count)[open_]
         best, winner = np.zeros(len(own), np.int64), np.zeros(len(own), np.uint16)
-        while True:  # label by label, the largest first: a tie stays with it
+        while True:  # count the labels from the largest down; a tie goes to the larger label
             going = left > best[open_]
             open_, left, others = open_[going], left[going], others[:, going]
             if not len(open_):
@@ -427,12 +429,12 @@ class _Votes:
         return out
 
     def _count(self, hit: np.ndarray) -> np.ndarray:
-        """(m,) how many of the window's cells are True in (cells, m)."""
+        """Number (m,) of True cells in each window, from (cells, m)."""
         return hit.sum(axis=0, dtype=self.count_type).astype(np.int64)
 
 
 def _over_window(function: np.ufunc, cells: np.ndarray, window: int) -> np.ndarray:
-    """`function` over the window of every cell that has a whole one: each axis is shorter by ``window - 1``."""
+    """`function` over every window that lies in the grid: each axis gets shorter by ``window - 1``."""
     for axis in range(3):
         n = cells.shape[axis] - window + 1
         along = np.moveaxis(cells, axis, 0)

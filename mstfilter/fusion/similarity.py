@@ -1,9 +1,9 @@
-"""Which hypotheses are alike: weighted coverage of all pairs, and equality up to the names of labels.
+"""Similarity of hypotheses: weighted coverage of all pairs, and equality up to renamed labels.
 
 >>> WeightedCoverage().matrix(population.particles)      # (n, n), 1 on the diagonal
 >>> SameSegmentation().classes(population.particles)     # (n,) classes of equal segmentations
 
-For the resamplers of `mstfilter.smc` that see particles: ``KDpp(similarity=WeightedCoverage())``,
+For the resamplers of `mstfilter.smc` that compare particles: ``KDpp(similarity=WeightedCoverage())``,
 ``Coalesced(equivalence=SameSegmentation())``.
 """
 
@@ -34,10 +34,10 @@ def canonical(labels: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class SameSegmentation(Equivalence):
-    """Hypotheses with the same regions, whatever their labels are called."""
+    """Hypotheses with the same regions are equal, also if their labels differ."""
 
     def classes(self, particles: Sequence[Hypothesis]) -> np.ndarray:
-        """(n,) classes; particles that share their label grid are looked at once."""
+        """Classes (n,). A label grid that several particles share is compared once."""
         known: dict[int, bytes] = {}
 
         def key(hypothesis: Hypothesis) -> bytes:
@@ -56,7 +56,7 @@ class WeightedCoverage(Similarity):
     Parameters
     ----------
     stride : int
-        Look at every stride-th voxel along each axis: faster by stride^3.
+        Uses every stride-th voxel along each axis: faster by stride^3.
     """
 
     stride: int = 1
@@ -66,7 +66,7 @@ class WeightedCoverage(Similarity):
             raise InputError(f"stride is {self.stride} voxels, expected at least 1")
 
     def matrix(self, particles: Sequence[Hypothesis]) -> np.ndarray:
-        """(n, n); each row is one contingency table against the objects of all hypotheses together."""
+        """Quality (n, n). Each row is one contingency table against the objects of all hypotheses."""
         step = slice(None, None, self.stride)
         grids = [h.labels[step, step, step] for h in particles]
         if len({g.shape for g in grids}) != 1:
@@ -74,7 +74,7 @@ class WeightedCoverage(Similarity):
         occupied = np.zeros(grids[0].shape, bool)
         for grid in grids:
             occupied |= grid > 0
-        # (n, voxels) labels numbered through over all hypotheses; number start[i] is the free space of i.
+        # (n, voxels) labels numbered over all hypotheses; number start[i] is the free space of i.
         flat = np.empty((len(grids), int(occupied.sum())), np.int64)
         start = np.zeros(len(grids) + 1, np.int64)
         for i, grid in enumerate(grids):
@@ -101,7 +101,7 @@ def _coverage(flat: np.ndarray, start: np.ndarray) -> np.ndarray:
         best = np.maximum.reduceat(jaccard, start[:-1], axis=1) if own > 1 else np.zeros((0, n))
         side[i] = own_sizes @ best / max(int(volumes[i]), 1)
     quality = (side + side.T) / 2
-    # Nothing against nothing is alike, nothing against something is not.
+    # Two empty hypotheses have quality 1; an empty and another one have 0.
     empty = volumes == 0
     quality[np.ix_(empty, empty)] = 1.0
     return quality
@@ -109,10 +109,10 @@ def _coverage(flat: np.ndarray, start: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Agreement(Evidence):
-    """How much a candidate agrees with the others: the errors of one are not those of another.
+    """Scores a candidate by its mean quality against the other candidates.
 
-    No data of its own. The candidate of greatest mean quality against draws of a posterior is the one of least
-    expected loss (minimum Bayes risk); weighting by it sharpens the population.
+    It uses no data. The candidate with the largest mean quality against draws from a posterior has the least expected
+    loss (minimum Bayes risk). The score concentrates the population.
 
     Parameters
     ----------
@@ -126,7 +126,7 @@ class Agreement(Evidence):
     similarity: Similarity = WeightedCoverage()
 
     def log_score(self, hypotheses: Sequence[Hypothesis], clip: Clip) -> np.ndarray:
-        """`strength` times the mean quality against the other hypotheses."""
+        """`strength` times the mean quality (n,) against the other hypotheses."""
         n = len(hypotheses)
         if n < 2:
             return np.zeros(n)
