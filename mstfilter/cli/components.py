@@ -42,7 +42,7 @@ def check(
     from mstfilter.presets import REGISTRY, settings
 
     try:
-        from mstfilter.testing import FALSE_ALARM, check_component
+        from mstfilter.testing import FALSE_ALARM, run_contract
     except ModuleNotFoundError as error:
         if error.name != "pytest":
             raise
@@ -53,7 +53,7 @@ def check(
             f"{component!r} is no component", "give ./file.py:Class, or KIND.NAME as `mstfilter list` shows"
         )
     cls = REGISTRY.find_class(kind, name, component, allow_files=True)
-    results = check_component(REGISTRY.make(cls, settings(overrides or ()), allow_files=True))
+    results = run_contract(REGISTRY.make(cls, settings(overrides or ()), allow_files=True))
     for result in results:
         state = "broken" if result.failure else "skipped" if result.skipped else "holds"
         print(f"{state:<9}{result.statement}")

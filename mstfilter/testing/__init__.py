@@ -9,7 +9,7 @@ Inherit the contract of the interface and define `make`:
 ...         return MyResampler()
 
 ``pytest`` then tests the component. ``mstfilter check ./mine.py:MyResampler`` runs the same class and states in words
-which property is violated; `check_component` does so from Python. ``mstfilter new resampler mine.py`` writes a
+which property is violated; `run_contract` does so from Python. ``mstfilter new resampler mine.py`` writes a
 component to start from, and its test (`write_starter`).
 
 Contracts need pytest: ``pip install 'mstfilter[check]'``.

@@ -1,7 +1,7 @@
 from mstfilter.testing.check import (
     CheckResult as CheckResult,
-    check_component as check_component,
     contract_of as contract_of,
+    run_contract as run_contract,
 )
 from mstfilter.testing.contract import (
     FALSE_ALARM as FALSE_ALARM,

@@ -1,6 +1,6 @@
 """Running a contract on a component, without a test file: what ``mstfilter check`` does.
 
->>> for result in check_component(MyResampler()):
+>>> for result in run_contract(MyResampler()):
 ...     print(result.statement, "-", result.failure or result.skipped or "holds")
 
 pytest runs the contract class of the component in this process and without output; a small plugin collects the
@@ -43,7 +43,7 @@ from mstfilter.testing import moves, resampling, values
 from mstfilter.testing.contract import Contract
 from mstfilter.testing.scenes import scene_example
 
-__all__ = ["CheckResult", "check_component", "contract_of"]
+__all__ = ["CheckResult", "run_contract", "contract_of"]
 
 #: Contract of each interface, the more special interface first.
 _CONTRACTS: dict[type, type[Contract]] = {
@@ -104,7 +104,7 @@ def contract_of(cls: type) -> type[Contract]:
     raise InputError(f"{cls.__name__} is no component with a contract", f"inherit one of {names}")
 
 
-def check_component(
+def run_contract(
     component: Any, example: Callable[..., Any] | None = None, exact: Callable[..., Any] | None = None
 ) -> list[CheckResult]:
     """Test all properties of a component.

@@ -1,10 +1,10 @@
-"""Hypotheses and a clip, to test components that look at scenes: a small table with three boxes, one of them pushed.
+"""An example for components that use images: hypotheses and a clip of a table with three boxes, one of them pushed.
 
 >>> population, clip = scene_example(np.random.default_rng(0), 4)
 >>> len(population), clip.before.depth.shape
 (4, (96, 128))
 
-Give it to a contract class as `example`, or import it into the file that ``mstfilter check`` is to test.
+Return it from the method `example` of a contract, or define ``example = scene_example`` in the file of a component.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _COLOURS = np.array([[160, 140, 110], [190, 60, 50], [60, 100, 180], [70, 160, 8
 
 
 def _labels(shift: int) -> np.ndarray:
-    """(24, 24, 8) three boxes; the first stands `shift` voxels further along x."""
+    """(24, 24, 8) three boxes; the first stands `shift` voxels farther along x."""
     labels = np.zeros(_GRID.shape, np.uint16)
     labels[4 + shift : 9 + shift, 9:14, :4] = 1
     labels[15:20, 5:12, :3] = 2
@@ -33,10 +33,10 @@ def _labels(shift: int) -> np.ndarray:
 
 @lru_cache(maxsize=1)
 def _clip() -> Clip:
-    """Three frames of the push, seen from the front and above, with a printed pattern and without noise."""
+    """Three frames of the push, seen from the front and above, with a texture and without noise."""
     pose = look_at(np.array([0.0, -0.5, 0.45]), np.array([0.0, 0.0, 0.03]))
     camera = Camera.from_intrinsics(105, 105, 63.5, 47.5, 128, 96, pose)
-    print_ = np.random.default_rng(1).integers(-35, 36, (4, 64, 64))
+    texture = np.random.default_rng(1).integers(-35, 36, (4, 64, 64))
     directions = camera.rays() @ camera.pose.as_matrix()[:3, :3].T
     frames = []
     for shift in (0, 1, 2):
@@ -44,9 +44,9 @@ def _clip() -> Clip:
         table = -camera.position[2] / np.minimum(directions[..., 2], -1e-6)
         depth = np.where(seen.labels > 0, seen.depth, table)
         point = camera.position + depth[..., None] * directions
-        point[..., 0] -= np.where(seen.labels == 1, shift * _GRID.voxel_size, 0.0)  # the print moves with its box
+        point[..., 0] -= np.where(seen.labels == 1, shift * _GRID.voxel_size, 0.0)  # the texture moves with its box
         cell = np.floor(point / 0.008).astype(int)
-        pattern = print_[seen.labels, cell[..., 0] % 64, (cell[..., 1] + 7 * cell[..., 2]) % 64]
+        pattern = texture[seen.labels, cell[..., 0] % 64, (cell[..., 1] + 7 * cell[..., 2]) % 64]
         rgb = np.clip(_COLOURS[seen.labels] + pattern[..., None], 0, 255).astype(np.uint8)
         frames.append(Frame(rgb, depth.astype(np.float32), camera))
     return Clip(tuple(frames), _GRID, index=1, times=(0.0, 0.2, 0.4))
@@ -55,7 +55,7 @@ def _clip() -> Clip:
 def scene_example(rng: np.random.Generator, n: int) -> tuple[Population, Clip]:
     """`n` hypotheses before the push, unevenly weighted, and the clip of the push.
 
-    Some are right; in others two boxes are one, a box is missing, or a box is two.
+    Some are correct; in others two boxes are merged, a box is missing, or a box is split.
     """
     hypotheses = []
     for _ in range(n):

@@ -1,4 +1,4 @@
-"""Masks of a set quality: the quality is met, by the means that were asked for."""
+"""Degraded masks have the given quality, by splits, merges and displacements as requested."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def picture(rng, n=6):
     quality=st.sampled_from([0.5, 0.6, 0.7, 0.8, 0.9, 0.95]),
     shares=st.sampled_from([(0.35, 0.35), (1.0, 0.0), (0.0, 0.0), (0.5, 0.5), (0.0, 1.0)]),
 )
-def test_the_set_quality_is_met(seed, quality, shares):
+def test_the_given_quality_is_reached(seed, quality, shares):
     rng = np.random.default_rng(seed)
     true = picture(rng)
     worse = degrade(rng, true, quality, *shares, tolerance=0.01)
@@ -41,7 +41,7 @@ def test_the_set_quality_is_met(seed, quality, shares):
     assert not worse[true == 0].any()
 
 
-def test_each_means_does_what_it_says():
+def test_splits_merges_and_displacements_have_their_effect():
     rng = np.random.default_rng(1)
     true = picture(rng)
     table = overlap(degrade(rng, true, 0.8, 1.0, 0.0), true)
@@ -56,7 +56,7 @@ def test_each_means_does_what_it_says():
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_what_was_split_is_not_joined_again(seed):
+def test_split_objects_are_not_merged_again(seed):
     """Merges after splits: each object stays in as many pieces as it was cut into."""
     rng = np.random.default_rng(seed)
     true = np.kron(np.arange(1, 7).reshape(2, 3), np.ones((40, 45), np.int32))  # all touch
@@ -68,7 +68,7 @@ def test_what_was_split_is_not_joined_again(seed):
 
 
 def test_similar_images_get_similar_errors():
-    """An object that went some pixels is cut where it was cut before."""
+    """An object that has moved by some pixels is split at the same place."""
     rng = np.random.default_rng(3)
     true = picture(rng)
     later = np.where(true == 2, 0, true)
@@ -82,7 +82,7 @@ def test_similar_images_get_similar_errors():
     assert weighted_coverage(one * still, other * still) < 0.8
 
 
-def test_perfect_masks_and_empty_images_come_back_unchanged():
+def test_perfect_masks_and_empty_images_are_unchanged():
     true = picture(np.random.default_rng(0))
     assert (degrade(np.random.default_rng(0), true, 1.0) == true).all()
     assert not degrade(np.random.default_rng(0), true * 0, 0.5).any()
@@ -94,7 +94,7 @@ def test_the_same_stream_makes_the_same_masks():
     assert (a == b).all() and (a != c).any()
 
 
-def test_samples_are_wrong_each_in_its_own_way_and_calibrated(tmp_path):
+def test_samples_have_different_errors_and_the_given_quality(tmp_path):
     recording = slide(tmp_path / "r")
     clip = recording.clips()[0]
     found = {}
@@ -111,7 +111,7 @@ def test_samples_are_wrong_each_in_its_own_way_and_calibrated(tmp_path):
     assert found[0.9] > found[0.6] + 0.1
 
 
-def test_lasting_errors_are_those_of_all_samples_and_pauses(tmp_path):
+def test_lasting_errors_are_the_same_in_all_samples_and_pauses(tmp_path):
     recording = slide(tmp_path / "r")
     one, two, *_ = recording.clips()
     proposal = bind_truth(TrueMasks(quality=0.6, errors="lasting"), recording)
@@ -122,7 +122,7 @@ def test_lasting_errors_are_those_of_all_samples_and_pauses(tmp_path):
         np.testing.assert_allclose(population.notes["mask_quality"], 0.6, atol=0.011)
 
 
-def test_what_is_kept_by_content_names_the_truth(tmp_path):
+def test_component_key_depends_on_the_truth(tmp_path):
     first, second = slide(tmp_path / "a"), slide(tmp_path / "b")
     second = replace(second, read_truth=lambda t: first.truth(t) * 2)
     keys = {component_key(bind_truth(TrueBoundary(), r)) for r in (first, second)} | {component_key(TrueBoundary())}
@@ -139,6 +139,6 @@ def test_what_is_kept_by_content_names_the_truth(tmp_path):
         ({"errors": "often"}, "errors of masks are 'often'"),
     ],
 )
-def test_useless_fields_are_one_clear_error(fields, says):
+def test_invalid_fields_are_an_error(fields, says):
     with pytest.raises(InputError, match=says):
         TrueMasks(**fields)

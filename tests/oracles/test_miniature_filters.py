@@ -134,7 +134,7 @@ def test_cuts_follow_their_distribution(world):
     assert chi_square(world.states.index(drawn.particles), proposal.state_probability(observations[0])) > FALSE_ALARM
 
 
-def test_cuts_on_a_picture():
+def test_cuts_of_a_known_observation():
     """Two pixels with a surface, sensed as joined: one object or two, in the proportion of the error rates."""
     world = Miniature((3, 2), split=0.2, merge=0.1)
     law = cut_distribution(world, MiniatureObservation(np.array([1, 1, 2]), np.array([True, False])), 0.4)
@@ -147,7 +147,7 @@ def test_cuts_on_a_picture():
     )
 
 
-def test_what_is_seen_through_is_cleared():
+def test_cells_in_front_of_the_reading_are_cleared():
     hypothesis = WORLD.states.hypotheses[state_of(WORLD, ["11", "02", "30"])]
     refined, quality = MiniatureFreeSpace().project(
         hypothesis, MiniatureObservation(np.array([1, 0, 2]), np.array([False, False]))
@@ -170,7 +170,7 @@ def test_presets_run_and_report_no_evidence(name):
     assert state_weights(WORLD, a.population).sum() == pytest.approx(1)
 
 
-def test_scoring_terms_become_the_likelihood_of_the_reading():
+def test_evidence_becomes_the_likelihood_of_the_observation():
     mst = mstfilter.preset("mst")
     scored = replace(mst, update=replace(mst.update, evidence=(LikelihoodEvidence(Miniature((2, 2))),), n_scored=99))
     filter = adapt_to_miniature(scored, WORLD, 10)
@@ -182,13 +182,13 @@ def test_scoring_terms_become_the_likelihood_of_the_reading():
     np.testing.assert_array_equal(score, WORLD.log_likelihood(observations[1]))
 
 
-def test_other_updates_cannot_be_shrunk():
+def test_other_updates_cannot_be_adapted():
     filter = replace(mstfilter.preset("mst"), update=Reweight(lambda p, y: np.zeros(len(p))))
     with pytest.raises(InputError, match="expected a FusionUpdate"):
         adapt_to_miniature(filter, WORLD, 5)
 
 
-def test_scored_candidates_count_once_and_carry_prediction_times_likelihood():
+def test_scored_candidates_are_distinct_and_weighted_by_prediction_times_likelihood():
     _, observations = WORLD.simulate(np.random.default_rng(1), 2)
     rng, y = np.random.default_rng(2), observations[1]
     proposed = MiniatureCuts(WORLD).sample(rng, y, 10)
@@ -204,7 +204,7 @@ def test_scored_candidates_count_once_and_carry_prediction_times_likelihood():
     np.testing.assert_allclose(np.diff(fused.log_weights), np.diff(expected[states]), atol=1e-10)
 
 
-def test_scoring_without_crossover_keeps_to_the_parents():
+def test_scoring_without_crossover_returns_the_parents():
     _, observations = WORLD.simulate(np.random.default_rng(1), 2)
     proposed = MiniatureCuts(WORLD).sample(np.random.default_rng(2), observations[1], 6)
     predicted = Population(WORLD.states.take(WORLD.draw_prior(np.random.default_rng(3), 6)))
@@ -258,7 +258,7 @@ def test_ranks_of_a_proper_filter_are_uniform(name):
         assert rank_uniformity(ranks) > FALSE_ALARM
 
 
-def test_ranks_find_a_filter_that_counts_its_evidence_twice():
+def test_ranks_detect_a_filter_that_uses_its_evidence_twice():
     def twice(observations, seed):
         p = exact_filter(WORLD, observations).posterior[-1] ** 3
         return p / p.sum()

@@ -26,7 +26,7 @@ def state_of(world, rows):
     return world.states.index_of_labels(np.array([[int(k) for k in row] for row in rows], np.uint16))
 
 
-def glances_of(world):
+def observations_of(world):
     X, Y = world.shape
     for depth in product(range(Y + 1), repeat=X):
         for joined in product((False, True), repeat=X - 1):
@@ -49,7 +49,7 @@ def test_names_of_objects_do_not_matter():
     np.testing.assert_array_equal(states.index(states.hypotheses), np.arange(len(states)))
 
 
-def test_too_many_cells_are_one_clear_error():
+def test_too_many_cells_are_an_error():
     with pytest.raises(InputError, match="3 x 3 cells, expected 1 to 7"):
         miniature_states((3, 3))
     with pytest.raises(InputError, match=r"slip is 1\.5"):
@@ -70,11 +70,11 @@ def test_prior_and_motion_sum_to_one(world):
 
 @ids
 def test_the_sensors_probabilities_sum_to_one(world):
-    total = sum(np.exp(world.log_likelihood(g)) for g in glances_of(world))
+    total = sum(np.exp(world.log_likelihood(g)) for g in observations_of(world))
     np.testing.assert_allclose(total, 1.0, rtol=1e-10)
 
 
-def test_pushes_on_pictures():
+def test_pushes_of_known_states():
     """x downwards, y (away from the camera) to the right."""
     world = Miniature((3, 2))
     cases = [
@@ -83,7 +83,7 @@ def test_pushes_on_pictures():
         (["10", "20", "00"], (0, (1, 0)), ["10", "20", "00"]),  # the other object is in the way
         (["10", "10", "10"], (0, (1, 0)), ["10", "10", "10"]),  # the rim is in the way
         (["10", "11", "00"], (2, (1, 0)), ["00", "10", "11"]),  # whichever of its cells is pushed
-        (["10", "00", "02"], (3, (0, -1)), ["10", "00", "02"]),  # nobody there
+        (["10", "00", "02"], (3, (0, -1)), ["10", "00", "02"]),  # an empty cell
     ]
     for before, (cell, step), after in cases:
         action = world.actions.index((cell, step))
@@ -97,7 +97,7 @@ def test_hidden_cells_are_not_seen():
     assert world.same_surface[a].tolist() == [False, False]
     one = state_of(world, ["10", "11", "00"])
     assert world.same_surface[one].tolist() == [True, False]
-    for g in list(glances_of(world))[::7]:
+    for g in list(observations_of(world))[::7]:
         assert world.log_likelihood(g)[a] == world.log_likelihood(g)[b]
 
 
@@ -105,7 +105,7 @@ def test_sensor_and_motion_follow_their_probabilities():
     world = Miniature((3, 2))
     rng = np.random.default_rng(2)
     state, n = state_of(world, ["10", "11", "02"]), 4000
-    observations = list(glances_of(world))
+    observations = list(observations_of(world))
     number = {(tuple(g.depth), tuple(g.joined)): k for k, g in enumerate(observations)}
     p = np.exp([world.log_likelihood(g)[state] for g in observations])
     drawn = [world.observe(rng, state) for _ in range(n)]
@@ -116,7 +116,7 @@ def test_sensor_and_motion_follow_their_probabilities():
 
 
 def chi_square(drawn, p):
-    """p value; rare classes are thrown together."""
+    """p value; rare classes are merged."""
     counts, expected = np.bincount(drawn, minlength=len(p)), p * len(drawn)
     rare = expected < 5
     observed = np.append(counts[~rare], counts[rare].sum())
@@ -190,12 +190,12 @@ def test_the_exact_filter_is_the_sum_over_all_paths():
     np.testing.assert_allclose(exact.posterior[-1], joint.sum(axis=(0, 1)) / joint.sum(), atol=1e-14)
 
 
-def test_a_missing_observation_is_summed_out():
-    """Its push, too: the mean over all pushes."""
+def test_a_missing_observation_is_marginalised():
+    """Its push is unknown too: the mean over all pushes."""
     world = SMALL
     _, observations = world.simulate(np.random.default_rng(6), 3)
     total = 0.0
-    for y in glances_of(world):
+    for y in observations_of(world):
         for action in range(len(world.actions)):
             whole = [observations[0], MiniatureObservation(y.depth, y.joined, action), observations[2]]
             total += np.exp(exact_filter(world, whole).log_evidence[-1]) / len(world.actions)

@@ -32,7 +32,7 @@ def described(*overrides):
 
 
 @pytest.mark.parametrize("stage", STAGES)
-def test_a_stage_changes_itself_alone(stage):
+def test_a_stage_changes_only_itself(stage):
     config = described(*overrides_of(stage))
     assert sorted(differences(config, MST)) == sorted(WHERE[stage])
     for slot, fields in {
@@ -45,7 +45,7 @@ def test_a_stage_changes_itself_alone(stage):
                 assert config[slot][field] == MST[slot][field], (slot, field)
 
 
-def test_with_all_stages_true_nothing_is_estimated():
+def test_with_all_stages_replaced_nothing_is_estimated():
     filter = build_filter(load_config("mst", overrides_of(*PERFECT_STAGES)))
     assert set(uses_truth(filter)) == {
         "TrueMotions",
@@ -61,8 +61,8 @@ def test_with_all_stages_true_nothing_is_estimated():
         assert differences(fewer, describe_filter(filter)), left
 
 
-def test_the_experiment_holds_all_arms():
-    """Write the arms of study.toml anew from `budget_arms` where they differ."""
+def test_the_experiment_has_all_arms():
+    """If they differ, write the arms of study.toml again from `budget_arms`."""
     data = tomllib.loads((REPOSITORY / "experiments/error_budget/study.toml").read_text())
     assert {arm["name"]: tuple(arm.get("set", ())) for arm in data["arms"]} == budget_arms()
     assert data["reference"] == "mst"

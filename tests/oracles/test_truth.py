@@ -1,4 +1,4 @@
-"""Stages replaced by the truth: binding, what each gives, and what it leaves alone."""
+"""Stages replaced by the truth: binding, results, and random streams of the other stages."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def bound(component, recording):
 # Binding
 
 
-def test_every_part_is_found_and_bound_and_nothing_else_changes(recording):
+def test_all_nested_components_are_bound_and_nothing_else_changes(recording):
     filter = build_filter(load_config("mst", [*ALL[:2], 'update.evidence=["true_quality"]', ALL[3]]))
     assert uses_truth(filter) == ["TrueMotions", "TrueMasks", "TrueCompletion", "TrueQuality"]
     ready = bind_truth(filter, recording)
@@ -86,7 +86,7 @@ def test_every_part_is_found_and_bound_and_nothing_else_changes(recording):
         ("read_truth", "update.free_space=true_free_space", "TrueFreeSpace uses the truth"),
     ],
 )
-def test_a_recording_without_truth_is_one_clear_error_before_anything_is_written(
+def test_a_recording_without_truth_is_an_error_before_anything_is_written(
     recording, tmp_path, lacking, override, says
 ):
     blind = replace(recording, **{lacking: lambda index: None})
@@ -95,13 +95,13 @@ def test_a_recording_without_truth_is_one_clear_error_before_anything_is_written
     assert not (tmp_path / "run").exists()
 
 
-def test_the_truth_of_one_recording_says_nothing_of_another(recording, tmp_path):
+def test_a_frame_of_another_recording_is_an_error(recording, tmp_path):
     other = slide(tmp_path / "other", (5, 6, 7))
     with pytest.raises(InputError, match="is none of the 3 pauses"):
         bound(TrueBoundary(), recording).boundary(other.frames[0])
 
 
-def test_a_run_by_the_truth_goes_on_after_a_stop(recording, tmp_path):
+def test_a_run_with_oracles_resumes(recording, tmp_path):
     config = load_config("mst", ALL)
     filter_recording(recording, config, tmp_path / "a", seed=1)
 
@@ -145,8 +145,8 @@ def test_an_oracle_leaves_the_streams_of_other_stages_alone(recording, plain_sam
 
 
 @pytest.mark.parametrize("make", [TrueMasks, TrueMotions, TrueFusion, lambda: TrueMasks(quality=0.8)])
-def test_no_oracle_uses_up_its_generator(recording, make):
-    """Whatever they draw comes from children, so the stream they are given stands where it stood."""
+def test_oracles_do_not_advance_their_generator(recording, make):
+    """They draw from child streams only."""
     component, clip = bound(make(), recording), recording.clips()[1]
     rng = Key(0).child("step", 1, "x").generator()
     before = rng.bit_generator.state
@@ -173,8 +173,8 @@ def test_with_every_stage_true_visible_objects_are_exact(recording):
             assert weighted_coverage(hypothesis.labels, recording.truth(clip.index)) >= 0.97
 
 
-def test_a_hidden_object_is_remembered_where_it_was_carried(tmp_path):
-    """Box 2 is not in the last images at all; what was known of it follows its true motion."""
+def test_a_hidden_object_follows_its_true_motion(tmp_path):
+    """Box 2 is not visible in the last images; its remembered volume follows its true motion."""
     made = slide(tmp_path / "r")
     last = len(made.frames) - 1
     blind = replace(
@@ -208,7 +208,7 @@ def test_true_masks_are_the_instance_image_where_the_sensor_sees(recording):
     assert few.sample(RNG, clip, 1).particles[0].n_objects == 0
 
 
-def test_the_robot_is_no_object(recording):
+def test_the_robot_is_not_an_object(recording):
     """255 in an instance image stands for the robot; it has no true voxels."""
 
     def with_robot(index):
@@ -342,7 +342,7 @@ def test_choice_and_selection_prefer_true_quality(recording):
     assert chosen.parents["ancestor"].tolist() == order[:2].tolist()
 
 
-def test_the_best_of_fusions_own_candidates_is_kept(recording):
+def test_choice_by_true_quality_is_not_worse(recording):
     config = load_config("mst", ['update.evidence=["true_quality"]', "update.n_scored=50"])
     filter = bind_truth(build_filter(config), recording)
     plain = build_filter(load_config("mst"))
@@ -372,7 +372,7 @@ def test_true_fusion_keeps_parents_and_passes_single_parents(recording):
     np.testing.assert_allclose(scored.log_weights, 1e4)
 
 
-def test_oracles_are_components_like_any_other():
+def test_oracles_are_frozen_dataclasses():
     for cls in UsesTruth.__subclasses__():
         assert dataclasses.is_dataclass(cls) and cls.__dataclass_params__.frozen, cls
         assert cls() == cls()

@@ -1,4 +1,4 @@
-"""Resamplers with one fault each, and a correct one: what `mstfilter check` has to tell apart."""
+"""Resamplers with one fault each, and two correct ones."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class CorrectWeighted(WeightResampler):
 
 @dataclass(frozen=True)
 class BiasedResidual(WeightResampler):
-    """The remainder is drawn from W - copies instead of n W - copies: light particles hardly survive."""
+    """The remainder is drawn from W - copies instead of n W - copies: light particles are selected too rarely."""
 
     def select(self, rng, log_weights, n):
         W = normalise(log_weights)
@@ -53,7 +53,7 @@ class IgnoresN(WeightResampler):
 
 @dataclass(frozen=True)
 class PicksZeroWeights(WeightResampler):
-    """Gives what rounding leaves over to the last particle, whatever it weighs."""
+    """Gives the remainder to the last particle, for any weight."""
 
     def select(self, rng, log_weights, n):
         W = normalise(log_weights)
@@ -73,7 +73,7 @@ class ZeroAtTheEdge(WeightResampler):
 
 @dataclass(frozen=True)
 class RemainderFromWeights(WeightResampler):
-    """Residual as one library has it: W - copies, negative numbers and all."""
+    """The remainder is W - copies, which may be negative (a fault of a published library)."""
 
     def select(self, rng, log_weights, n):
         W = normalise(log_weights)
@@ -88,7 +88,7 @@ class RemainderFromWeights(WeightResampler):
 
 @dataclass(frozen=True)
 class FirstAlwaysStays(WeightResampler):
-    """Elitism by place."""
+    """Always selects the first particle with weight."""
 
     def select(self, rng, log_weights, n):
         drawn = systematic(rng, normalise(log_weights), max(n - 1, 1))
@@ -110,7 +110,7 @@ class GlobalGenerator(WeightResampler):
 
 @dataclass(frozen=True)
 class OldWeightsKept(WeightResampler):
-    """Chosen by weight, and the weight kept: the same evidence twice."""
+    """Selects by weight and keeps the weight, so the weight counts twice."""
 
     def select(self, rng, log_weights, n):
         ancestors = systematic(rng, normalise(log_weights), n)
@@ -135,7 +135,7 @@ class OffByOne(WeightResampler):
 
 @dataclass(frozen=True)
 class OffByOneClipped(WeightResampler):
-    """The neighbour of the particle that was meant, inside the range."""
+    """Selects the next particle, inside the range."""
 
     def select(self, rng, log_weights, n):
         return (systematic(rng, normalise(log_weights), n) + 1) % len(log_weights), None
@@ -167,7 +167,7 @@ class SinglePrecisionOverflow(WeightResampler):
 
 @dataclass(frozen=True)
 class SinglePrecisionSum(WeightResampler):
-    """Cumulated in single precision: light particles vanish behind a heavy one."""
+    """Cumulates in single precision: small weights are lost."""
 
     def select(self, rng, log_weights, n):
         return systematic(rng, normalise(log_weights).astype(np.float32), n), None

@@ -1,4 +1,4 @@
-"""Planted faults of components other than resamplers, and the property that must name each."""
+"""Components other than resamplers with one fault each, and the property that each violates."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 from mstfilter.fusion import Evidence
 from mstfilter.smc import (
     Codec,
+    DensityTransition,
     Equivalence,
     Lookahead,
     Population,
@@ -62,6 +63,27 @@ class NormalisesWeights(Transition):
 class GlobalMove(Transition):
     def predict(self, rng, population, observation):
         return replace(population, particles=population.particles + np.random.randn())  # noqa: NPY002
+
+
+@dataclass(frozen=True)
+class RandomStep(DensityTransition):
+    def predict(self, rng, population, observation):
+        return replace(population, particles=population.particles + rng.standard_normal(len(population)))
+
+
+@dataclass(frozen=True)
+class OneDensity(RandomStep):
+    """The density of all moves together."""
+
+    def log_prob(self, previous, new, observation):
+        return -0.5 * np.sum((new - previous) ** 2)
+
+
+@dataclass(frozen=True)
+class NormalisedDensity(RandomStep):
+    def log_prob(self, previous, new, observation):
+        log_f = -0.5 * (new - previous) ** 2
+        return log_f - np.logaddexp.reduce(log_f)
 
 
 @dataclass(frozen=True)
@@ -184,7 +206,7 @@ class PriorityInPlace(Lookahead):
 
 @dataclass(frozen=True)
 class MovesAll(Rejuvenation):
-    """Accepts every step: no Metropolis."""
+    """Accepts every step."""
 
     def move(self, rng, population, previous, observation):
         return replace(population, particles=population.particles + 0.5 * rng.standard_normal(len(population)))
@@ -192,7 +214,7 @@ class MovesAll(Rejuvenation):
 
 @dataclass(frozen=True)
 class ForgetsTheParent(Rejuvenation):
-    """Draws from p(x_t | y_t) for x_{t-1} as exact_ar1 draws it: right alone, wrong beside its parent."""
+    """Draws from p(x_t | y_t): the marginal is right, the joint distribution with x_{t-1} is wrong."""
 
     def move(self, rng, population, previous, observation):
         if previous is None or observation is None:
@@ -245,7 +267,7 @@ class Pickles(Codec):
 
 @dataclass(frozen=True)
 class Keeps(Codec):
-    """Decodes what it has kept: a new process has nothing."""
+    """Decodes what it has stored in itself, which a new process has not."""
 
     kept: list = field(default_factory=list)
 
@@ -302,7 +324,7 @@ class HighNamesWin(Evidence):
 
 @dataclass(frozen=True)
 class ByIdentity(Evidence):
-    """Knows what it has seen before by its object and not by its content."""
+    """Compares hypotheses by identity, not by content."""
 
     def log_score(self, hypotheses, clip):
         born = {id(h.objects): k for k, h in reversed(list(enumerate(hypotheses)))}
@@ -343,6 +365,8 @@ FAULTS = [
     (FirstIsSpecial, "order_of_particles_is_irrelevant", "moves differently"),
     (NormalisesWeights, "scale_of_weights_is_irrelevant", "log weights + 50"),
     (GlobalMove, "leaves_global_generators_alone", "global generator"),
+    (OneDensity, "log_prob_of_own_moves_is_finite", "have shape ()"),
+    (NormalisedDensity, "log_prob_of_a_move_does_not_depend_on_others", "three of six"),
     (OneTooFew, "gives_n_particles", "asked for 2 particles it returns 1"),
     (Remembers, "keeps_no_state", "keeps state"),
     (NeedsPrediction, "takes_any_of_its_inputs", "proposed particles"),

@@ -15,7 +15,7 @@ FAULTS_FILE = REPOSITORY / "tests" / "testing" / "faults.py"
 
 
 @pytest.mark.parametrize("kind", starter_kinds())
-def test_a_new_component_passes_its_check(kind, tmp_path, capsys):
+def test_a_starting_file_passes_its_check(kind, tmp_path, capsys):
     mine = tmp_path / "mine.py"
     code, out, err = call("new", kind, mine, capsys=capsys)
     assert code == 0, err
@@ -27,8 +27,8 @@ def test_a_new_component_passes_its_check(kind, tmp_path, capsys):
     assert "exact draws" not in out, "the starting file gives those that its law is tested with"
 
 
-def test_new_components_pass_their_tests(tmp_path):
-    """All in one run of pytest, which takes its time to start."""
+def test_starting_files_pass_their_tests(tmp_path):
+    """All in one run of pytest, since pytest starts slowly."""
     for kind in starter_kinds():
         write_starter(kind, tmp_path / f"my_{kind}.py")
     command = [sys.executable, "-m", "pytest", "-q", "-rs", "-p", "no:cacheprovider", str(tmp_path)]
@@ -38,7 +38,7 @@ def test_new_components_pass_their_tests(tmp_path):
     assert "exact draws" not in done.stdout
 
 
-def test_the_resampler_to_start_from_has_three_lines_of_logic(tmp_path, capsys):
+def test_the_starting_resampler_has_three_lines_of_logic(tmp_path, capsys):
     call("new", "resampler", tmp_path / "mine.py", capsys=capsys)
     body = (tmp_path / "mine.py").read_text().split("def select(")[1].split('"""')[2]
     logic = [line for line in body.splitlines() if line.strip() and not line.strip().startswith("#")]
@@ -84,3 +84,13 @@ def test_check_of_registered_components_with_fields(capsys):
         code, _, err = call("check", *arguments, capsys=capsys)
         assert code == 2
         assert message in err
+
+
+def test_a_missing_pytest_is_one_line():
+    program = "import sys; sys.modules['pytest'] = None; from mstfilter.cli import main; main()"
+    command = [sys.executable, "-c", program, "check", "resampler.systematic"]
+    done = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 2
+    assert "check needs pytest, which is not installed" in done.stderr
+    assert "mstfilter[check]" in done.stderr
+    assert "Traceback" not in done.stderr

@@ -1,4 +1,4 @@
-"""Contracts of the other interfaces: ours pass, planted faults are named."""
+"""Contracts of the other interfaces: components of the package pass, planted faults are reported."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ from mstfilter.testing import (
     SizeContract,
     TriggerContract,
     UpdateContract,
-    check_component,
+    run_contract,
     scene_example,
 )
 from tests.smc.models import AR1, RHO, SD0, SIGMA, TAU, Box, optimal, predictive
@@ -178,27 +178,27 @@ class TestAgreement(EvidenceContract):
 @pytest.mark.parametrize(
     "kind", ["trigger", "size", "similarity", "equivalence", "evidence", "transition", "proposal", "update"]
 )
-def test_our_own(kind):
+def test_components_of_the_package_keep_their_contract(kind):
     """All components but oracles, which need the ground truth of a recording."""
     for name, where in REGISTRY.known(kind).items():
         if where.startswith("mstfilter.oracles:"):
             continue
         component = REGISTRY.build(kind, name)
-        assert [r for r in check_component(component) if r.failure] == [], name
+        assert [r for r in run_contract(component) if r.failure] == [], name
 
 
 @pytest.mark.parametrize(("fault", "name", "words"), FAULTS, ids=lambda f: getattr(f, "__name__", ""))
-def test_planted_faults_are_named(fault, name, words):
-    broken = {r.name: r.failure for r in check_component(fault(), exact=exact_ar1) if r.failure}
+def test_planted_faults_are_reported(fault, name, words):
+    broken = {r.name: r.failure for r in run_contract(fault(), exact=exact_ar1) if r.failure}
     assert name in broken, broken
     assert words in broken[name]
 
 
 def test_a_distribution_without_exact_draws_is_not_tested():
-    skipped = {r.name: r.skipped for r in check_component(RandomWalkMove(AR1, 0.7))}
+    skipped = {r.name: r.skipped for r in run_contract(RandomWalkMove(AR1, 0.7))}
     assert "write exact(rng, n)" in skipped["keeps_the_distribution"]
 
 
-def test_what_is_no_component():
+def test_an_object_without_an_interface_is_an_error():
     with pytest.raises(InputError, match="no component"):
-        check_component(3)
+        run_contract(3)

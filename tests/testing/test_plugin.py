@@ -1,4 +1,4 @@
-"""The worked plugin of the documentation: installed beside, its component has a name."""
+"""The package of the documentation: if it is installed, its component has a name."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import tomllib
 from tests.conftest import REPOSITORY
 
 
-def test_a_plugin_has_a_name(tmp_path):
+def test_components_of_an_installed_package_have_a_name(tmp_path):
     page = (REPOSITORY / "docs" / "components.md").read_text()
     blocks = re.findall(r"```python\n(.*?)```", page, flags=re.DOTALL)
     top = next(b for b in blocks if "class Top(" in b)

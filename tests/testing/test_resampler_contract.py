@@ -1,4 +1,4 @@
-"""Planted faults are found and named; correct resamplers, ours among them, pass.
+"""The resampler contract: planted faults are reported, correct resamplers and those of the package pass.
 
 False alarms: each contract has three statistical properties at 1e-6, so below 1e-4 for this file.
 """
@@ -21,7 +21,7 @@ from mstfilter.smc import (
     Shuffled,
     Tempered,
 )
-from mstfilter.testing import WeightResamplerContract, check_component
+from mstfilter.testing import WeightResamplerContract, run_contract
 from tests.testing.faults import FAULTS, Correct, CorrectWeighted
 
 
@@ -36,18 +36,18 @@ class TestCorrectWeighted(WeightResamplerContract):
 
 
 @pytest.mark.parametrize("fault", FAULTS, ids=lambda f: f.__name__)
-def test_planted_faults_are_named(fault):
+def test_planted_faults_are_reported(fault):
     name, words = FAULTS[fault]
-    broken = {r.name: r.failure for r in check_component(fault()) if r.failure}
+    broken = {r.name: r.failure for r in run_contract(fault()) if r.failure}
     assert name in broken, broken
     assert words in broken[name]
 
 
-def test_the_global_generators_are_put_back():
+def test_the_global_generators_are_restored():
     from tests.testing.faults import GlobalGenerator
 
     before = np.random.get_state()[1].copy()  # noqa: NPY002
-    check_component(GlobalGenerator())
+    run_contract(GlobalGenerator())
     np.testing.assert_array_equal(before, np.random.get_state()[1])  # noqa: NPY002
 
 
@@ -66,14 +66,14 @@ OURS = {
 
 
 @pytest.mark.parametrize("name", OURS)
-def test_our_own(name):
-    results = check_component(OURS[name])
+def test_components_of_the_package_keep_their_contract(name):
+    results = run_contract(OURS[name])
     assert [r for r in results if r.failure] == []
     tested = {r.name: r.skipped is None for r in results}["output_weights"]
     assert tested == OURS[name].properly_weighted
 
 
-def test_ours_on_other_particles():
+def test_resamplers_work_on_other_particles():
     """Vectors, mappings and objects."""
 
     def vectors(rng, n):
@@ -86,4 +86,4 @@ def test_ours_on_other_particles():
         return Population(tuple(f"particle {i}" for i in range(n))), None
 
     for scheme, example in ((KDpp(), vectors), (Coalesced(), mapping), (Coalesced(), objects)):
-        assert [r for r in check_component(scheme, example) if r.failure] == []
+        assert [r for r in run_contract(scheme, example) if r.failure] == []
