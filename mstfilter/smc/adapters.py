@@ -20,8 +20,6 @@ import numpy as np
 from mstfilter.errors import InputError
 from mstfilter.smc.distributions import Bernoulli, Categorical, Distribution, Poisson, sum_rows
 
-__all__ = ["FromScipy", "FromTorch", "as_distribution"]
-
 
 def as_distribution(value: Any) -> Distribution:
     """Convert a distribution of this package, of scipy.stats (frozen or new style) or of torch.

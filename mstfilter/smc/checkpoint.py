@@ -31,8 +31,6 @@ from mstfilter.smc.population import Population
 from mstfilter.smc.programs.sites import Trace
 from mstfilter.smc.streams import Key
 
-__all__ = ["ArrayCodec", "Checkpoint", "load_state", "save_state"]
-
 _FORMAT = 1
 
 

@@ -22,8 +22,6 @@ from mstfilter.errors import InputError, check_component, check_integer, check_n
 from mstfilter.smc.interfaces import Transition, Update
 from mstfilter.smc.population import Population, union
 
-__all__ = ["Branching", "CrossVectors", "ProjectOnto", "Reweight"]
-
 
 @dataclass(frozen=True)
 class Reweight(Update):

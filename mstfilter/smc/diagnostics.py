@@ -33,20 +33,6 @@ from mstfilter.errors import InputError, MissingLibraryError
 from mstfilter.smc.filter import ParticleFilter
 from mstfilter.smc.interfaces import Info, State
 
-__all__ = [
-    "Collector",
-    "History",
-    "collect",
-    "ess",
-    "log_evidence",
-    "mean",
-    "n_particles",
-    "resampled",
-    "run_many",
-    "unique_ancestors",
-    "weight_entropy",
-]
-
 Collector = Callable[[State, Info], Any]
 
 

@@ -23,19 +23,6 @@ import numpy as np
 
 from mstfilter.errors import InputError
 
-__all__ = [
-    "Bernoulli",
-    "Categorical",
-    "Distribution",
-    "Gamma",
-    "MultivariateNormal",
-    "Normal",
-    "Poisson",
-    "Student",
-    "Uniform",
-    "sum_rows",
-]
-
 _HALF_LOG_2PI = 0.5 * math.log(2 * math.pi)
 
 

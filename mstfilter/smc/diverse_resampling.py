@@ -44,8 +44,6 @@ from mstfilter.smc.population import Population, log_mean_exp
 from mstfilter.smc.resampling import FearnheadClifford, Systematic, checked_weights
 from mstfilter.smc.similarity import Gaussian, Similarity
 
-__all__ = ["ClusterStratified", "GreedyDiverse", "KDpp"]
-
 #: Similarities of more particles than this are not computed: the matrix alone would take gigabytes.
 MAX_PARTICLES = 10_000
 

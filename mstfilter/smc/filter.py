@@ -50,8 +50,6 @@ from mstfilter.smc.resampling import Systematic
 from mstfilter.smc.streams import Key
 from mstfilter.smc.triggers import EssBelow
 
-__all__ = ["ParticleFilter"]
-
 _INTERFACES: dict[str, type] = {
     "initial": Proposal,
     "transition": Transition,

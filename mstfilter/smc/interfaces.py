@@ -36,24 +36,6 @@ import numpy as np
 from mstfilter.smc.population import Population
 from mstfilter.smc.streams import Key
 
-__all__ = [
-    "Codec",
-    "Component",
-    "DensityTransition",
-    "Info",
-    "Lookahead",
-    "Observer",
-    "Proposal",
-    "Rejuvenation",
-    "Resampler",
-    "Size",
-    "State",
-    "Transition",
-    "Trigger",
-    "Update",
-    "WeightResampler",
-]
-
 #: ``observer(slot, begins)`` is called when the component in a slot of a filter begins and ends its work.
 Observer = Callable[[str, bool], None]
 

@@ -29,8 +29,6 @@ from mstfilter.smc.interfaces import Proposal, Transition, Update
 from mstfilter.smc.population import Population, union
 from mstfilter.smc.state_space import StateSpaceModel
 
-__all__ = ["ConditionallyLinear", "Linear", "linear_gaussian", "rao_blackwellised"]
-
 
 def linear_gaussian(F: Any, Q: Any, H: Any, R: Any, m0: Any, P0: Any) -> StateSpaceModel:
     """x_0 ~ N(m0, P0), x_t = F x_{t-1} + N(0, Q), y_t = H x_t + N(0, R); particles are (n, d)."""

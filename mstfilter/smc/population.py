@@ -27,18 +27,6 @@ import numpy as np
 
 from mstfilter.errors import InputError
 
-__all__ = [
-    "Candidates",
-    "Particles",
-    "Population",
-    "count_particles",
-    "identity",
-    "log_mean_exp",
-    "normalise",
-    "take",
-    "union",
-]
-
 _T = TypeVar("_T")
 _U = TypeVar("_U")
 

@@ -49,24 +49,6 @@ from mstfilter.smc.interfaces import Resampler, WeightResampler
 from mstfilter.smc.population import Population
 from mstfilter.smc.similarity import Equivalence, ExactEquality
 
-__all__ = [
-    "Coalesced",
-    "FearnheadClifford",
-    "KeepWeights",
-    "Killing",
-    "LargestWeights",
-    "Multinomial",
-    "Residual",
-    "ResamplerWrapper",
-    "Shuffled",
-    "Ssp",
-    "Stratified",
-    "Systematic",
-    "Tempered",
-    "checked_weights",
-    "coalesce",
-]
-
 
 def checked_weights(log_weights: np.ndarray, n: int) -> np.ndarray:
     """(m,) float64 weights with maximum 1, from log weights of any float type.

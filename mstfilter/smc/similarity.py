@@ -23,8 +23,6 @@ import numpy as np
 
 from mstfilter.errors import InputError, check_number
 
-__all__ = ["Bins", "Equivalence", "ExactEquality", "Gaussian", "Similarity", "as_matrix", "first_seen"]
-
 
 class Similarity(ABC):
     """Similarity of particles."""

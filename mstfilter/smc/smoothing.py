@@ -29,8 +29,6 @@ from mstfilter.smc.filter import ParticleFilter
 from mstfilter.smc.interfaces import DensityTransition, State
 from mstfilter.smc.population import Population, take
 
-__all__ = ["Record", "backward_paths", "fixed_lag", "genealogy", "keep"]
-
 #: Pairs of particles per call of `log_prob`.
 _PAIRS = 1_000_000
 

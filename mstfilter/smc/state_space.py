@@ -31,22 +31,6 @@ from mstfilter.smc.population import Particles, Population, count_particles
 from mstfilter.smc.resampling import Systematic
 from mstfilter.smc.triggers import EssBelow
 
-__all__ = [
-    "Dynamics",
-    "GuidedInitial",
-    "GuidedTransition",
-    "Prior",
-    "PriorityLookahead",
-    "RandomWalkMove",
-    "StateSpaceModel",
-    "accept_moves",
-    "auxiliary",
-    "bootstrap",
-    "choose_rows",
-    "guided",
-    "resample_move",
-]
-
 
 @dataclass(frozen=True)
 class StateSpaceModel:

@@ -27,8 +27,6 @@ import numpy as np
 
 from mstfilter.errors import InputError
 
-__all__ = ["Key", "child"]
-
 _PREFIX = 0x6D7374  # "mst"; spawn() numbers its children from 0
 
 

@@ -20,8 +20,6 @@ from mstfilter.smc.interfaces import Size, Trigger
 from mstfilter.smc.population import Population
 from mstfilter.smc.similarity import Bins, Equivalence
 
-__all__ = ["Always", "EssBelow", "EveryKth", "Fixed", "Kld", "Never"]
-
 
 @dataclass(frozen=True)
 class EssBelow(Trigger):

@@ -31,8 +31,6 @@ from mstfilter.smc.state_space import accept_moves, choose_rows
 from mstfilter.smc.streams import child
 from mstfilter.smc.triggers import EssBelow
 
-__all__ = ["Program", "ProgramInitial", "ProgramLookahead", "ProgramMove", "ProgramTransition", "run_program"]
-
 Model = Callable[[Any, Any], Any]
 
 

@@ -20,24 +20,6 @@ from mstfilter.smc.distributions import Categorical, Distribution
 from mstfilter.smc.population import take
 from mstfilter.smc.streams import child
 
-__all__ = [
-    "CentreHandler",
-    "GuideHandler",
-    "PerParticle",
-    "ProgramRun",
-    "ReplayHandler",
-    "SampleHandler",
-    "ScoreHandler",
-    "Site",
-    "SiteHandler",
-    "Trace",
-    "active_run",
-    "observe",
-    "per_particle",
-    "sample",
-    "switch",
-]
-
 active_run: ContextVar[ProgramRun | None] = ContextVar("run of a program", default=None)
 
 
