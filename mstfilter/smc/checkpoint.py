@@ -122,7 +122,7 @@ class Checkpoint:
 
     def save(self, filter: Any, state: State) -> None:
         """Write the state of a run of `filter`."""
-        save_state(self.path, state, self.codec, filter=_outline(filter))
+        save_state(self.path, state, self.codec, filter=_plain(filter))
 
     def load(self, filter: Any, start: State) -> State | None:
         """The stored state; None if there is no file.
@@ -139,7 +139,7 @@ class Checkpoint:
             return None
         state, head = load_state(self.path, self.codec)
         wrong = _difference("seed", state.key, start.key)
-        wrong = wrong or _difference("filter", head.get("filter"), _outline(filter))
+        wrong = wrong or _difference("filter", head.get("filter"), _plain(filter))
         if wrong is not None:
             what, found, wanted = wrong
             raise InputError(
@@ -149,15 +149,6 @@ class Checkpoint:
         if state.t < start.t:
             raise InputError(f"checkpoint {self.path} is at step {state.t}, before the state to continue from")
         return state
-
-
-def _outline(filter: Any) -> dict[str, Any]:
-    """Components of a filter and their plain fields; functions and arrays by type only."""
-    return {
-        field.name: _plain(value)
-        for field in dataclasses.fields(filter)
-        if (value := getattr(filter, field.name)) is not None
-    }
 
 
 def _plain(value: Any) -> Any:
@@ -267,23 +258,17 @@ class ArrayCodec(Codec):
 _HINT = "pass codec=, a mstfilter.smc.Codec that stores them as arrays"
 
 
-def _describe(value: Any, what: str) -> Any:
+def _describe(value: Any, what: str, in_tuple: bool = False) -> Any:
     """A value as JSON, which keeps floats exactly; arrays and tuples are marked."""
-    if isinstance(value, np.ndarray):
-        return {"is": "array"}
-    if isinstance(value, np.generic):
-        return {"is": "number"}
+    if isinstance(value, (np.ndarray, np.generic)):
+        if in_tuple:
+            raise InputError(f"{what} is a tuple that holds arrays, which cannot be stored", _HINT)
+        return {"is": "array" if isinstance(value, np.ndarray) else "number"}
     if isinstance(value, tuple):
-        return {"is": "tuple", "of": [_describe(v, what) for v in value if not _is_array(v, what)]}
+        return {"is": "tuple", "of": [_describe(v, what, True) for v in value]}
     if value is None or isinstance(value, (str, bool, int, float)):
         return value
     raise InputError(f"{what} is of type {type(value).__qualname__}, which cannot be stored", _HINT)
-
-
-def _is_array(value: Any, what: str) -> bool:
-    if isinstance(value, (np.ndarray, np.generic)):
-        raise InputError(f"{what} is a tuple that holds arrays, which cannot be stored", _HINT)
-    return False
 
 
 def _restore(described: Any, array: np.ndarray | None) -> Any:

@@ -180,7 +180,6 @@ class Branching(Transition):
 
     @property
     def properly_weighted(self) -> bool:
-        """As the inner transition."""
         return self.inner.properly_weighted
 
     def predict(self, rng: np.random.Generator, population: Population, observation: Any) -> Population:

@@ -103,13 +103,7 @@ def _standardised(value: Any, loc: Any, scale: Any) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class Normal(Distribution):
-    """Gaussian.
-
-    Parameters
-    ----------
-    loc, scale : array_like
-        Mean and standard deviation (> 0).
-    """
+    """Gaussian with mean `loc` and standard deviation `scale` > 0."""
 
     loc: Any = 0.0
     scale: Any = 1.0
@@ -143,14 +137,9 @@ class Normal(Distribution):
 
 @dataclass(frozen=True, eq=False)
 class Student(Distribution):
-    """Student's t, shifted and scaled.
+    """Student's t with `df` > 0 degrees of freedom, centre `loc` and scale `scale` > 0.
 
-    Parameters
-    ----------
-    df : array_like
-        Degrees of freedom (> 0).
-    loc, scale : array_like
-        Centre and scale (> 0); the standard deviation is larger, and infinite for df <= 2.
+    The standard deviation is larger than the scale, and infinite for df <= 2.
     """
 
     df: Any
@@ -173,7 +162,6 @@ class Student(Distribution):
 
     @property
     def mean(self) -> np.ndarray:
-        """Centre (the mean if df > 1)."""
         return np.broadcast_arrays(np.asarray(self.loc, np.float64), self.scale, self.df)[0]
 
     @property
@@ -184,13 +172,7 @@ class Student(Distribution):
 
 @dataclass(frozen=True, eq=False)
 class Uniform(Distribution):
-    """Uniform on [low, high).
-
-    Parameters
-    ----------
-    low, high : array_like
-        Ends, low < high.
-    """
+    """Uniform on [low, high)."""
 
     low: Any = 0.0
     high: Any = 1.0
@@ -219,13 +201,7 @@ class Uniform(Distribution):
 
 @dataclass(frozen=True, eq=False)
 class Gamma(Distribution):
-    """Gamma by shape and rate.
-
-    Parameters
-    ----------
-    shape, rate : array_like
-        Both > 0; the mean is shape / rate.
-    """
+    """Gamma with `shape` > 0 and `rate` > 0; the mean is shape / rate."""
 
     shape: Any
     rate: Any = 1.0
@@ -300,20 +276,13 @@ class MultivariateNormal(Distribution):
 
     @property
     def sd(self) -> np.ndarray:
-        """Standard deviation of each entry."""
         root = self.__dict__["_root"]
         return np.broadcast_arrays(np.sqrt((root * root).sum(axis=-1)), self.mean)[0]
 
 
 @dataclass(frozen=True, eq=False)
 class Poisson(Distribution):
-    """Counts.
-
-    Parameters
-    ----------
-    rate : array_like
-        Mean (>= 0).
-    """
+    """Poisson counts with mean `rate` >= 0."""
 
     rate: Any
     discrete: ClassVar[bool] = True
@@ -339,19 +308,12 @@ class Poisson(Distribution):
 
     @property
     def centre(self) -> np.ndarray:
-        """The mode."""
         return np.floor(self.mean).astype(np.int64)
 
 
 @dataclass(frozen=True, eq=False)
 class Bernoulli(Distribution):
-    """True with probability `p`; values are booleans.
-
-    Parameters
-    ----------
-    p : array_like
-        In [0, 1].
-    """
+    """Booleans, True with probability `p`."""
 
     p: Any
     discrete: ClassVar[bool] = True
@@ -367,7 +329,6 @@ class Bernoulli(Distribution):
 
     @property
     def mean(self) -> np.ndarray:
-        """Probability of True."""
         return np.asarray(self.p, np.float64)
 
     @property
@@ -376,7 +337,6 @@ class Bernoulli(Distribution):
 
     @property
     def centre(self) -> np.ndarray:
-        """The mode."""
         return np.asarray(self.p) > 0.5
 
 
@@ -430,16 +390,13 @@ class Categorical(Distribution):
 
     @property
     def mean(self) -> np.ndarray:
-        """Mean category number."""
         return self.probs @ np.arange(self.probs.shape[-1], dtype=np.float64)
 
     @property
     def sd(self) -> np.ndarray:
-        """Standard deviation of the category number."""
         numbers = np.arange(self.probs.shape[-1], dtype=np.float64)
         return np.sqrt(np.maximum(self.probs @ numbers**2 - self.mean**2, 0.0))
 
     @property
     def centre(self) -> np.ndarray:
-        """The most probable category."""
         return np.argmax(self.probs, axis=-1)

@@ -101,7 +101,6 @@ class ClusterStratified(Resampler):
 
     @property
     def properly_weighted(self) -> bool:
-        """As the scheme inside."""
         return self.scheme.properly_weighted
 
     def resample(self, rng: np.random.Generator, population: Population, n: int) -> Population:
@@ -199,7 +198,6 @@ class KDpp(Resampler):
 
     @property
     def properly_weighted(self) -> bool:
-        """As the fallback."""
         return self.scheme.properly_weighted
 
     def likelihood(self, population: Population) -> np.ndarray:
@@ -324,11 +322,6 @@ class GreedyDiverse(Resampler):
     The first is the heaviest; each next one maximises w_i times the squared norm of its component orthogonal to the
     selected ones. If no different particle is left, the heaviest of the others follow. The weight of a particle that
     is not selected moves to the most similar selected one, so the total stays.
-
-    Parameters
-    ----------
-    similarity : Similarity
-        Compares particles.
     """
 
     similarity: Similarity = Gaussian()  # noqa: RUF009 (frozen)

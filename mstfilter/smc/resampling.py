@@ -329,12 +329,10 @@ class ResamplerWrapper(Resampler):
 
     @property
     def properly_weighted(self) -> bool:
-        """As the wrapped resampler."""
         return self.scheme.properly_weighted
 
     @property
     def exact_size(self) -> bool:
-        """As the wrapped resampler."""
         return self.scheme.exact_size
 
 
@@ -347,8 +345,6 @@ class Coalesced(ResamplerWrapper):
 
     Parameters
     ----------
-    scheme : Resampler
-        Selects among the merged particles.
     equivalence : Equivalence
         Decides which particles are equal. The heaviest of a class is kept.
     """
@@ -396,8 +392,6 @@ class Tempered(ResamplerWrapper):
 
     Parameters
     ----------
-    scheme : Resampler
-        Selects.
     power : float
         In [0, 1]. 1 is the wrapped scheme, 0 ignores positive weights.
     """
@@ -423,11 +417,6 @@ class Tempered(ResamplerWrapper):
 class Shuffled(ResamplerWrapper):
     """Permutes the particles at random before the selection, so that systematic and stratified schemes do not depend
     on their order.
-
-    Parameters
-    ----------
-    scheme : Resampler
-        Selects.
     """
 
     def resample(self, rng: np.random.Generator, population: Population, n: int) -> Population:
@@ -441,11 +430,6 @@ class KeepWeights(ResamplerWrapper):
     """Selected particles keep their weights, as in the program of the MST authors.
 
     Selecting by weight and keeping the weight counts the same evidence twice, so this is not properly weighted.
-
-    Parameters
-    ----------
-    scheme : Resampler
-        Chooses the ancestors.
     """
 
     scheme: Resampler = Multinomial()

@@ -177,13 +177,7 @@ class GuidedTransition(DensityTransition):
 
 @dataclass(frozen=True)
 class PriorityLookahead(Lookahead):
-    """Priority given by a function.
-
-    Parameters
-    ----------
-    function : callable
-        ``(particles, y) -> (n,)`` log priority of x_{t-1} given y_t.
-    """
+    """Priority given by a function ``(particles, y) -> (n,)`` of x_{t-1} and y_t."""
 
     function: Callable[[Any, Any], np.ndarray]
 
@@ -266,18 +260,17 @@ def choose_rows(accepted: np.ndarray, new: Particles, old: Particles) -> Particl
 def bootstrap(
     model: StateSpaceModel,
     n: int,
-    resampler: Resampler | None = None,
-    trigger: Trigger | None = None,
+    resampler: Resampler = Systematic(),  # noqa: B008 (frozen)
+    trigger: Trigger = EssBelow(0.5),  # noqa: B008 (frozen)
 ) -> ParticleFilter:
     """The bootstrap filter of a model (Gordon, Salmond, Smith 1993) with `n` particles."""
     return ParticleFilter(
         initial=Prior(model),
         transition=Dynamics(model),
         update=Reweight(model.log_likelihood),
-        resampler=resampler if resampler is not None else Systematic(),
-        trigger=trigger if trigger is not None else EssBelow(0.5),
+        resampler=resampler,
+        trigger=trigger,
         n=n,
-        resample="before",
     )
 
 
@@ -286,8 +279,7 @@ def guided(
     proposal: Callable[[Any, Any], Any],
     n: int,
     initial: Callable[[Any], Any] | None = None,
-    resampler: Resampler | None = None,
-    trigger: Trigger | None = None,
+    **components: Any,
 ) -> ParticleFilter:
     """The guided filter: moves by q(x_t | x_{t-1}, y_t), weights by f g / q.
 
@@ -301,13 +293,14 @@ def guided(
         Particles.
     initial : callable, optional
         ``(y) -> distribution`` of x_0; default the prior of the model.
-    resampler, trigger : Resampler, Trigger, optional
-        Default: `Systematic`, if the effective sample size is below half of the particles.
+    **components
+        Further fields of `ParticleFilter`, such as ``resampler`` or ``trigger``.
     """
     return replace(
-        bootstrap(model, n, resampler, trigger),
+        bootstrap(model, n),
         initial=Prior(model) if initial is None else GuidedInitial(model, initial),
         transition=GuidedTransition(model, proposal),
+        **components,
     )
 
 
@@ -317,8 +310,7 @@ def auxiliary(
     n: int,
     proposal: Callable[[Any, Any], Any] | None = None,
     initial: Callable[[Any], Any] | None = None,
-    resampler: Resampler | None = None,
-    trigger: Trigger | None = None,
+    **components: Any,
 ) -> ParticleFilter:
     """The auxiliary filter (Pitt and Shephard 1999): selects by weight times priority, then divides by the priority.
 
@@ -333,24 +325,18 @@ def auxiliary(
     proposal, initial : callable, optional
         As in `guided`. With p(y_t | x_{t-1}) as priority and p(x_t | x_{t-1}, y_t) as proposal the filter is fully
         adapted.
-    resampler, trigger : Resampler, Trigger, optional
-        Default: `Systematic`, if the effective sample size of weights times priorities is below half.
+    **components
+        Further fields of `ParticleFilter`, such as ``resampler`` or ``trigger``.
     """
-    if proposal is None:
-        filter = bootstrap(model, n, resampler, trigger)
-        if initial is not None:
-            filter = replace(filter, initial=GuidedInitial(model, initial))
-    else:
-        filter = guided(model, proposal, n, initial, resampler, trigger)
-    return replace(filter, lookahead=PriorityLookahead(log_priority))
+    return replace(
+        bootstrap(model, n),
+        initial=Prior(model) if initial is None else GuidedInitial(model, initial),
+        transition=Dynamics(model) if proposal is None else GuidedTransition(model, proposal),
+        lookahead=PriorityLookahead(log_priority),
+        **components,
+    )
 
 
-def resample_move(
-    model: StateSpaceModel,
-    move: Rejuvenation,
-    n: int,
-    resampler: Resampler | None = None,
-    trigger: Trigger | None = None,
-) -> ParticleFilter:
+def resample_move(model: StateSpaceModel, move: Rejuvenation, n: int, **components: Any) -> ParticleFilter:
     """The bootstrap filter with a move at the end of each step that resampled (Gilks and Berzuini 2001)."""
-    return replace(bootstrap(model, n, resampler, trigger), rejuvenation=move)
+    return replace(bootstrap(model, n), rejuvenation=move, **components)

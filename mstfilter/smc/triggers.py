@@ -38,7 +38,6 @@ class EssBelow(Trigger):
         check_number("share", self.share, f"{hint}; see also the triggers Always and Never", above=0, at_most=1)
 
     def wants(self, population: Population, t: int) -> bool:
-        """True if ESS < share * n."""
         return population.ess < self.share * len(population)
 
 
@@ -47,7 +46,6 @@ class Always(Trigger):
     """Resample at every step."""
 
     def wants(self, population: Population, t: int) -> bool:
-        """True."""
         return True
 
 
@@ -56,19 +54,12 @@ class Never(Trigger):
     """Resample only if there are more particles than the filter keeps."""
 
     def wants(self, population: Population, t: int) -> bool:
-        """False."""
         return False
 
 
 @dataclass(frozen=True)
 class EveryKth(Trigger):
-    """Resample at every k-th step.
-
-    Parameters
-    ----------
-    k : int
-        Steps from one resampling to the next.
-    """
+    """Resample at every k-th step."""
 
     k: int = 2
 
@@ -76,19 +67,12 @@ class EveryKth(Trigger):
         check_integer("resampling at every k-th step: k", self.k)
 
     def wants(self, population: Population, t: int) -> bool:
-        """True if t is a multiple of k."""
         return t % self.k == 0
 
 
 @dataclass(frozen=True)
 class Fixed(Size):
-    """A fixed number of particles.
-
-    Parameters
-    ----------
-    n : int
-        Particles, at least 1.
-    """
+    """A fixed number of particles `n`."""
 
     n: int = 100
 
@@ -96,7 +80,6 @@ class Fixed(Size):
         check_integer("n", self.n)
 
     def choose(self, population: Population) -> int:
-        """`n`."""
         return self.n
 
 

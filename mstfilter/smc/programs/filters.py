@@ -11,7 +11,7 @@ import numpy as np
 from mstfilter.errors import InputError, check_integer, check_number
 from mstfilter.smc.distributions import Normal
 from mstfilter.smc.filter import ParticleFilter
-from mstfilter.smc.interfaces import Lookahead, Proposal, Rejuvenation, Resampler, Transition, Trigger
+from mstfilter.smc.interfaces import Lookahead, Proposal, Rejuvenation, Transition
 from mstfilter.smc.population import Particles, Population
 from mstfilter.smc.programs.sites import (
     CentreHandler,
@@ -26,10 +26,8 @@ from mstfilter.smc.programs.sites import (
     Trace,
     active_run,
 )
-from mstfilter.smc.resampling import Systematic
 from mstfilter.smc.state_space import accept_moves, choose_rows
 from mstfilter.smc.streams import child
-from mstfilter.smc.triggers import EssBelow
 
 Model = Callable[[Any, Any], Any]
 
@@ -53,13 +51,11 @@ class Program:
                 f"model is {self.model!r}, expected a function of the previous state and the observation"
             )
 
-    def bootstrap(self, n: int, resampler: Resampler | None = None, trigger: Trigger | None = None) -> ParticleFilter:
+    def bootstrap(self, n: int, **components: Any) -> ParticleFilter:
         """Bootstrap filter: draws from the model, weights by the observations."""
-        return self._filter(None, n, resampler, trigger)
+        return self._filter(None, n, components)
 
-    def guided(
-        self, guide: Model, n: int, resampler: Resampler | None = None, trigger: Trigger | None = None
-    ) -> ParticleFilter:
+    def guided(self, guide: Model, n: int, **components: Any) -> ParticleFilter:
         """Guided filter.
 
         Parameters
@@ -69,56 +65,24 @@ class Program:
             the model draws.
         n : int
             Particles.
-        resampler, trigger : Resampler, Trigger, optional
-            Default: `Systematic`, if the effective sample size is below half of the particles.
+        **components
+            Further fields of `ParticleFilter`, such as ``resampler`` or ``trigger``.
         """
-        return self._filter(guide, n, resampler, trigger)
+        return self._filter(guide, n, components)
 
-    def auxiliary(
-        self,
-        n: int,
-        guide: Model | None = None,
-        resampler: Resampler | None = None,
-        trigger: Trigger | None = None,
-        power: float = 1.0,
-    ) -> ParticleFilter:
-        """Auxiliary filter with an automatic lookahead, exact for every model.
-
-        Parameters
-        ----------
-        n : int
-            Particles.
-        guide : callable, optional
-            As in `guided`.
-        resampler, trigger : Resampler, Trigger, optional
-            Default: `Systematic`, if the effective sample size is below half of the particles.
-        power : float
-            Power of the priority; below 1 if the lookahead at the mean is too confident.
-        """
-        return replace(self._filter(guide, n, resampler, trigger), lookahead=ProgramLookahead(self.model, power))
+    def auxiliary(self, n: int, guide: Model | None = None, power: float = 1.0, **components: Any) -> ParticleFilter:
+        """Auxiliary filter with an automatic lookahead, exact for every model; see `ProgramLookahead`."""
+        return replace(self._filter(guide, n, components), lookahead=ProgramLookahead(self.model, power))
 
     def resample_move(
-        self,
-        n: int,
-        steps: int = 1,
-        scale: float = 0.5,
-        guide: Model | None = None,
-        resampler: Resampler | None = None,
-        trigger: Trigger | None = None,
+        self, n: int, steps: int = 1, scale: float = 0.5, guide: Model | None = None, **components: Any
     ) -> ParticleFilter:
-        """Resample-move filter: `steps` Metropolis steps of `ProgramMove` at the end of a step that resampled."""
-        return replace(self._filter(guide, n, resampler, trigger), rejuvenation=ProgramMove(self.model, scale, steps))
+        """Resample-move filter; see `ProgramMove`."""
+        return replace(self._filter(guide, n, components), rejuvenation=ProgramMove(self.model, scale, steps))
 
-    def _filter(
-        self, guide: Model | None, n: int, resampler: Resampler | None, trigger: Trigger | None
-    ) -> ParticleFilter:
-        return ParticleFilter(
-            initial=ProgramInitial(self.model, guide),
-            transition=ProgramTransition(self.model, guide),
-            resampler=resampler if resampler is not None else Systematic(),
-            trigger=trigger if trigger is not None else EssBelow(0.5),
-            n=n,
-        )
+    def _filter(self, guide: Model | None, n: int, components: dict[str, Any]) -> ParticleFilter:
+        initial, transition = ProgramInitial(self.model, guide), ProgramTransition(self.model, guide)
+        return ParticleFilter(initial=initial, transition=transition, n=n, **components)
 
 
 def _advance(
@@ -136,15 +100,7 @@ def _advance(
 
 @dataclass(frozen=True)
 class ProgramInitial(Proposal):
-    """First step of a program: draws and weights.
-
-    Parameters
-    ----------
-    model : callable
-        The program.
-    guide : callable, optional
-        Draws instead of the program.
-    """
+    """First step of a program: draws, by the guide if there is one, and weights."""
 
     model: Model
     guide: Model | None = None
@@ -155,15 +111,7 @@ class ProgramInitial(Proposal):
 
 @dataclass(frozen=True)
 class ProgramTransition(Transition):
-    """A step of a program: draws and weights.
-
-    Parameters
-    ----------
-    model : callable
-        The program.
-    guide : callable, optional
-        Draws instead of the program.
-    """
+    """A step of a program: draws, by the guide if there is one, and weights."""
 
     model: Model
     guide: Model | None = None
@@ -183,7 +131,7 @@ class ProgramLookahead(Lookahead):
     model : callable
         The program.
     power : float
-        Power of the priority.
+        Power of the priority; below 1 if the lookahead at the mean is too confident.
     """
 
     model: Model
@@ -235,106 +183,82 @@ class ProgramMove(Rejuvenation):
         previous: Population | None,
         observation: Any,
     ) -> Population:
-        before = None if previous is None else previous.particles
-        particles, accepted = _metropolis(
-            rng, self.model, population.particles, before, observation, len(population), self.scale, self.steps
-        )
+        past, n = None if previous is None else previous.particles, len(population)
+        particles: Particles
+        if not isinstance(self.model, PerParticle):
+            particles, accepted = self._moved(rng, self.model, population.particles, past, observation, n, False)
+        else:
+            moved, rates = [], []
+            for i, particle in enumerate(population.particles):
+                stream, before = child(rng, "particle", i), None if past is None else past[i]
+                new, rate = self._moved(stream, self.model.function, particle, before, observation, 1, True)
+                moved.append(Trace(new))
+                rates.append(rate)
+            particles, accepted = tuple(moved), float(np.mean(rates))
         return Population(particles, population.log_weights, population.parents, {"accepted": accepted})
 
+    def _moved(
+        self, rng: np.random.Generator, function: Model, x: Any, previous: Any, observation: Any, n: int, single: bool
+    ) -> tuple[Mapping[str, Any], float]:
+        """Values after the steps, and the rate of accepted steps; `single` for one particle without particle axis."""
 
-def _metropolis(
-    rng: np.random.Generator,
-    model: Callable[[Any, Any], Any],
-    particles: Particles,
-    previous: Particles | None,
-    observation: Any,
-    n: int,
-    scale: float,
-    steps: int,
-) -> tuple[Particles, float]:
-    """Particles after `steps` Metropolis-Hastings steps on all sites, and the rate of accepted steps."""
-    if not isinstance(model, PerParticle):
-        return _move_rows(rng, model, particles, previous, observation, n, scale, steps, False)
-    moved, shares = [], []
-    for i, particle in enumerate(particles):
-        past = None if previous is None else previous[i]
-        stream = child(rng, "particle", i)
-        new, share = _move_rows(stream, model.function, particle, past, observation, 1, scale, steps, True)
-        moved.append(Trace(new))
-        shares.append(share)
-    return tuple(moved), float(np.mean(shares))
+        def score(values: Mapping[str, Any], no_axis: bool = False) -> tuple[ProgramRun, list[Site]]:
+            handler = ScoreHandler(values, no_axis)
+            return _run_once(function, handler, previous, observation, n, single), handler.sites
 
+        now, sites = score(x, single)
+        taken = 0
+        for _ in range(self.steps):
+            values = self._propose(rng, now.values, sites)
+            try:
+                new, new_sites = score(values)
+            except InputError:
+                if not single:
+                    raise
+                continue  # other sites are reached, which have no values: rejected in both directions
+            if [s.name for s in new_sites] != [s.name for s in sites]:
+                continue
+            forward = self._log_density(now.values, values, sites, n)
+            backward = self._log_density(values, now.values, new_sites, n)
+            with np.errstate(invalid="ignore"):
+                yes = accept_moves(rng, new.gain - now.gain + backward - forward)
+            taken += int(yes.sum())
+            if yes.all():
+                now, sites = new, new_sites
+            elif yes.any():
+                now, sites = score(choose_rows(yes, new.values, now.values))
+        return _values_of(now), taken / (self.steps * n)
 
-def _move_rows(
-    rng: np.random.Generator,
-    model: Callable[[Any, Any], Any],
-    particles: Mapping[str, Any],
-    previous: Any,
-    observation: Any,
-    n: int,
-    scale: float,
-    steps: int,
-    single: bool,
-) -> tuple[Mapping[str, Any], float]:
-    """Steps of all particles together, or of a single one without the particle axis."""
+    def _propose(
+        self, rng: np.random.Generator, x: Mapping[str, np.ndarray], sites: list[Site]
+    ) -> dict[str, np.ndarray]:
+        """New values of all sites."""
+        values = {name: np.array(a) for name, a in x.items()}
+        for site in sites:
+            old = x[site.name][site.index]
+            if site.branch:
+                continue
+            if site.distribution.discrete:
+                new = site.distribution.sample(rng, len(old))
+            else:
+                new = old + self.scale * site.distribution.sd * rng.standard_normal(old.shape)
+            values[site.name][site.index] = new
+        return values
 
-    def score(values: Mapping[str, Any], no_axis: bool = False) -> tuple[ProgramRun, list[Site]]:
-        handler = ScoreHandler(values, no_axis)
-        return _run_once(model, handler, previous, observation, n, single), handler.sites
-
-    now, sites = score(particles, single)
-    taken = 0
-    for _ in range(steps):
-        values, forward = _propose(rng, now.values, sites, scale, n)
-        try:
-            new, new_sites = score(values)
-        except InputError:
-            if not single:
-                raise
-            continue  # other sites are reached, which have no values: rejected in both directions
-        if [s.name for s in new_sites] != [s.name for s in sites]:
-            continue
-        backward = _log_density(values, now.values, new_sites, scale, n)
-        with np.errstate(invalid="ignore"):
-            yes = accept_moves(rng, new.gain - now.gain + backward - forward)
-        taken += int(yes.sum())
-        if yes.all():
-            now, sites = new, new_sites
-        elif yes.any():
-            now, sites = score(choose_rows(yes, new.values, now.values))
-    return _values_of(now), taken / (steps * n)
-
-
-def _propose(
-    rng: np.random.Generator, x: Mapping[str, np.ndarray], sites: list[Site], scale: float, n: int
-) -> tuple[dict[str, np.ndarray], np.ndarray]:
-    """New values of all sites, and the log density (n,) of proposing them."""
-    values = {name: np.array(a) for name, a in x.items()}
-    for site in sites:
-        if site.branch:
-            continue
-        old = x[site.name][site.index]
-        if site.distribution.discrete:
-            values[site.name][site.index] = site.distribution.sample(rng, len(old))
-        else:
-            values[site.name][site.index] = old + scale * site.distribution.sd * rng.standard_normal(old.shape)
-    return values, _log_density(x, values, sites, scale, n)
-
-
-def _log_density(
-    old: Mapping[str, np.ndarray], new: Mapping[str, np.ndarray], sites: list[Site], scale: float, n: int
-) -> np.ndarray:
-    """(n,) log density of proposing `new` at `old`, for the given sites."""
-    total = np.zeros(n)
-    for site in sites:
-        if site.branch:
-            continue
-        to = new[site.name][site.index]
-        if site.distribution.discrete:
-            total[site.index] += site.distribution.log_prob(to)
-        else:
-            total[site.index] += Normal(old[site.name][site.index], scale * site.distribution.sd).log_prob(to)
-    return total
+    def _log_density(
+        self, old: Mapping[str, np.ndarray], new: Mapping[str, np.ndarray], sites: list[Site], n: int
+    ) -> np.ndarray:
+        """(n,) log density of proposing `new` at `old`, for the given sites."""
+        total = np.zeros(n)
+        for site in sites:
+            if site.branch:
+                continue
+            if site.distribution.discrete:
+                step = site.distribution
+            else:
+                step = Normal(old[site.name][site.index], self.scale * site.distribution.sd)
+            total[site.index] += step.log_prob(new[site.name][site.index])
+        return total
 
 
 def run_program(
