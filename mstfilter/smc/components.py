@@ -40,11 +40,7 @@ class Reweight(Update):
     draws: ClassVar[bool] = False
 
     def update(
-        self,
-        rng: np.random.Generator,
-        predicted: Population | None,
-        proposed: Population | None,
-        observation: Any,
+        self, rng: np.random.Generator, predicted: Population | None, proposed: Population | None, observation: Any
     ) -> Population:
         population = union(predicted, proposed)
         found = np.asarray(self.log_likelihood(population.particles, observation))
@@ -76,11 +72,7 @@ class ProjectOnto(Update):
     draws: ClassVar[bool] = False
 
     def update(
-        self,
-        rng: np.random.Generator,
-        predicted: Population | None,
-        proposed: Population | None,
-        observation: Any,
+        self, rng: np.random.Generator, predicted: Population | None, proposed: Population | None, observation: Any
     ) -> Population:
         population = union(predicted, proposed)
         projected = self.project(population.particles, observation)
@@ -119,11 +111,7 @@ class CrossVectors(Update):
         check_number("share", self.share, above=0)
 
     def update(
-        self,
-        rng: np.random.Generator,
-        predicted: Population | None,
-        proposed: Population | None,
-        observation: Any,
+        self, rng: np.random.Generator, predicted: Population | None, proposed: Population | None, observation: Any
     ) -> Population:
         population = union(predicted, proposed)
         mates = predicted if self.among else proposed

@@ -102,22 +102,16 @@ class Update(Component):
 
     @abstractmethod
     def update(
-        self,
-        rng: np.random.Generator,
-        predicted: Population | None,
-        proposed: Population | None,
-        observation: Any,
+        self, rng: np.random.Generator, predicted: Population | None, proposed: Population | None, observation: Any
     ) -> Population:
         """Any number of particles, from the predicted and the proposed ones.
 
         Parameters
         ----------
-        rng : Generator
         predicted : Population or None
             The moved particles; None at the first step of a filter that starts from its proposal.
         proposed : Population or None
             New particles; None if the filter has no proposal. At least one of the two is given.
-        observation : Any
         """
 
 
@@ -148,7 +142,6 @@ class WeightResampler(Resampler):
 
         Parameters
         ----------
-        rng : Generator
         log_weights : (m,) float64
             Unnormalised; finite or -inf, at least one finite.
         n : int
@@ -204,17 +197,12 @@ class Rejuvenation(Component):
 
     @abstractmethod
     def move(
-        self,
-        rng: np.random.Generator,
-        population: Population,
-        previous: Population | None,
-        observation: Any,
+        self, rng: np.random.Generator, population: Population, previous: Population | None, observation: Any
     ) -> Population:
         """Move x_t without changing its distribution.
 
         Parameters
         ----------
-        rng : Generator
         population : Population
             Weighted particles x_t after the observation.
         previous : Population or None

@@ -120,11 +120,7 @@ class _Initial(Proposal):
     def sample(self, rng: np.random.Generator, observation: Any, n: int) -> Population:
         mean, cov = np.asarray(self.model.mean, np.float64), np.asarray(self.model.cov, np.float64)
         return Population(
-            {
-                "u": self.model.sample_initial(rng, n),
-                "mean": np.tile(mean, (n, 1)),
-                "cov": np.tile(cov, (n, 1, 1)),
-            }
+            {"u": self.model.sample_initial(rng, n), "mean": np.tile(mean, (n, 1)), "cov": np.tile(cov, (n, 1, 1))}
         )
 
 
@@ -149,11 +145,7 @@ class _Correct(Update):
     draws: ClassVar[bool] = False
 
     def update(
-        self,
-        rng: np.random.Generator,
-        predicted: Population | None,
-        proposed: Population | None,
-        observation: Any,
+        self, rng: np.random.Generator, predicted: Population | None, proposed: Population | None, observation: Any
     ) -> Population:
         """Weight by the predictive density N(y; H m, S), then correct mean and covariance (Joseph form)."""
         population = union(predicted, proposed)

@@ -214,11 +214,7 @@ class RandomWalkMove(Rejuvenation):
             raise InputError(f"scale is {self.scale!r}, expected positive finite numbers")
 
     def move(
-        self,
-        rng: np.random.Generator,
-        population: Population,
-        previous: Population | None,
-        observation: Any,
+        self, rng: np.random.Generator, population: Population, previous: Population | None, observation: Any
     ) -> Population:
         def log_target(x: Any) -> np.ndarray:
             if previous is None:

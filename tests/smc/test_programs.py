@@ -304,7 +304,7 @@ def test_errors_name_the_site():
         run(nothing)
     with pytest.raises(InputError, match="'x' is sampled twice"):
         run(twice)
-    with pytest.raises(InputError, match=r"observation 'y' has shape \(3,\), expected one number a particle"):
+    with pytest.raises(InputError, match=r"observation 'y' has shape \(3,\), expected one number per particle"):
         run(matrix)
     with pytest.raises(InputError, match="step 0, initial: expected a distribution, found a builtins.float"):
         run(text)

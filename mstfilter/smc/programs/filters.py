@@ -177,11 +177,7 @@ class ProgramMove(Rejuvenation):
         check_integer("steps", self.steps)
 
     def move(
-        self,
-        rng: np.random.Generator,
-        population: Population,
-        previous: Population | None,
-        observation: Any,
+        self, rng: np.random.Generator, population: Population, previous: Population | None, observation: Any
     ) -> Population:
         past, n = None if previous is None else previous.particles, len(population)
         particles: Particles
@@ -262,11 +258,7 @@ class ProgramMove(Rejuvenation):
 
 
 def run_program(
-    model: Callable[[Any, Any], Any],
-    handler: SiteHandler,
-    previous: Particles | None,
-    observation: Any,
-    n: int,
+    model: Callable[[Any, Any], Any], handler: SiteHandler, previous: Particles | None, observation: Any, n: int
 ) -> tuple[Particles, np.ndarray]:
     """Run a program over n particles.
 
