@@ -15,15 +15,6 @@ import math
 from numbers import Integral, Real
 from typing import Any
 
-__all__ = [
-    "InputError",
-    "InputWarning",
-    "MissingLibraryError",
-    "check_component",
-    "check_integer",
-    "check_number",
-]
-
 
 class InputError(ValueError):
     """Input that cannot be used.

@@ -20,8 +20,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-__all__ = ["atomic_folder", "atomic_path", "read_csv", "write_csv", "write_text"]
-
 
 @contextmanager
 def atomic_path(path: str | Path) -> Iterator[Path]:

@@ -19,8 +19,6 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-__all__ = ["attach", "exported"]
-
 
 def exported(init: str | Path) -> dict[str, str]:
     """Name -> module, as the stub beside an ``__init__.py`` lists them."""

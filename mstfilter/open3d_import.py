@@ -14,8 +14,6 @@ from types import ModuleType
 
 from mstfilter.errors import MissingLibraryError
 
-__all__ = ["import_open3d"]
-
 SYSTEM_PACKAGES = ("libusb-1.0-0", "libgl1", "libegl1", "libgomp1")
 
 

@@ -24,8 +24,6 @@ from mstfilter.registry import Registry
 from mstfilter.resources import find_preset
 from mstfilter.smc import ParticleFilter
 
-__all__ = ["PACKAGES", "REGISTRY", "build_filter", "describe_filter", "load_config", "preset"]
-
 #: Packages that declare components.
 PACKAGES = (smc, segmentation, completion, tracking, fusion, formats, baselines, oracles)
 #: All components that presets and overrides can name.

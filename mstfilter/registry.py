@@ -39,8 +39,6 @@ from typing import Any
 
 from mstfilter.errors import InputError
 
-__all__ = ["Registry", "default_of"]
-
 _ENTRY_POINTS = "mstfilter.components"
 
 

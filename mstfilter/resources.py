@@ -12,8 +12,6 @@ from pathlib import Path
 
 from mstfilter.errors import InputError
 
-__all__ = ["examples_folder", "find_preset", "models_folder", "preset_names"]
-
 
 def models_folder() -> Path:
     """The folder that holds presets and weights."""

@@ -35,8 +35,6 @@ from mstfilter.scoring import overlap
 from mstfilter.smc import Population, Update, union
 from mstfilter.tracking import DenseFlow, Segment, Track, move_points, refine_motion, segments_of
 
-__all__ = ["ObjectFusion", "ObjectVolume"]
-
 
 class _Match(NamedTuple):
     """Masks (H, W) bool by the label of the object that they show, and labels of the sample that are new objects."""

@@ -22,8 +22,6 @@ from mstfilter.scoring import connected_components, one_blob
 from mstfilter.segmentation import ObjectRule, TreeCutProposal, hypothesis_of
 from mstfilter.smc import Population, Proposal, child
 
-__all__ = ["FirstPause", "ImageComponents", "OccupiedComponents", "OneBlob"]
-
 
 @dataclass(frozen=True)
 class FirstPause(Proposal):

@@ -19,8 +19,6 @@ from mstfilter.fusion import FreeSpace, FusionUpdate, Projection, log_quality
 from mstfilter.scene import Clip
 from mstfilter.smc import Population, Update, union
 
-__all__ = ["SamplesOnly", "TrackingOnly", "Union"]
-
 
 @dataclass(frozen=True)
 class SamplesOnly(Update):

@@ -11,8 +11,6 @@ import typer
 from mstfilter.cli.root import app
 from mstfilter.errors import InputError
 
-__all__ = ["check", "list_", "new"]
-
 
 @app.command("list")
 def list_(

@@ -11,8 +11,6 @@ import typer
 from mstfilter.cli.root import FormatOption, Options, Pauses, app
 from mstfilter.cli.shared import bar, read_source
 
-__all__ = ["convert", "quality"]
-
 
 @app.command()
 def convert(

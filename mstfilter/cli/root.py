@@ -8,8 +8,6 @@ import typer
 
 from mstfilter import __version__
 
-__all__ = ["FormatOption", "Options", "Overrides", "Pauses", "Seed", "app"]
-
 app = typer.Typer(
     add_completion=False,
     no_args_is_help=True,

@@ -11,8 +11,6 @@ from mstfilter.cli.root import FormatOption, Options, Overrides, Pauses, Seed, a
 from mstfilter.cli.shared import bar, read_source, safe_name, summary
 from mstfilter.errors import InputError
 
-__all__ = ["demo", "report", "run", "simulate_"]
-
 
 @app.command()
 def run(

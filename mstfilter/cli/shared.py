@@ -12,8 +12,6 @@ from typing import Any, TextIO
 
 from mstfilter.errors import InputWarning
 
-__all__ = ["bar", "read_source", "safe_name", "summary", "warnings_as_lines"]
-
 
 def safe_name(name: str) -> str:
     """A name as part of a file name; nothing in it leads to another folder."""

@@ -12,8 +12,6 @@ import typer
 
 from mstfilter.cli.root import app
 
-__all__ = ["study"]
-
 
 @app.command()
 def study(

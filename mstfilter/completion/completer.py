@@ -33,8 +33,6 @@ from scipy.spatial import cKDTree
 from mstfilter.errors import InputError
 from mstfilter.scene import Frame, VoxelGrid, component_key, content_key, depth_sigma, frame_geometry, memo, read_only
 
-__all__ = ["Completer", "Completion", "ObservedBox", "arbitrate", "observed_box"]
-
 
 @dataclass(frozen=True, eq=False)
 class Completion:

@@ -11,8 +11,6 @@ import numpy as np
 
 from mstfilter.completion.completer import Completer, ObservedBox
 
-__all__ = ["Extrude", "SurfaceOnly"]
-
 
 @dataclass(frozen=True)
 class SurfaceOnly(Completer):

@@ -29,19 +29,6 @@ from mstfilter.errors import InputError, MissingLibraryError
 from mstfilter.formats.video import RgbdImages, Video, VideoFormat, pair_stamps
 from mstfilter.scene import Recording
 
-__all__ = [
-    "Bag",
-    "BagFile",
-    "_COLOUR",
-    "_DEPTH",
-    "Entry",
-    "_GREY",
-    "Topic",
-    "colour_image",
-    "depth_image",
-    "image_encoding",
-]
-
 
 @dataclass(frozen=True)
 class Topic:

@@ -32,8 +32,6 @@ from mstfilter.scene import (
     rigid_from_matrix,
 )
 
-__all__ = ["Bop", "Dsr"]
-
 
 @dataclass(frozen=True)
 class Bop(RecordingFormat):

@@ -56,9 +56,6 @@ from mstfilter.scene import (
     write_image,
 )
 
-__all__ = ["RecordingFolder", "RecordingWriter", "VERSION", "check_writable", "open_recording", "save_recording"]
-
-
 VERSION = 1
 """Version of the layout."""
 

@@ -19,8 +19,6 @@ from mstfilter.errors import InputError
 from mstfilter.formats.video import RecordingFormat, RgbdImages, Video, VideoFormat, pair_stamps
 from mstfilter.scene import Recording, read_depth, read_rgb, rigid_from_matrix
 
-__all__ = ["PairedImages", "Redwood", "Tum"]
-
 
 @dataclass(frozen=True)
 class PairedImages(RecordingFormat):

@@ -31,8 +31,6 @@ import numpy as np
 
 from mstfilter.errors import InputError
 
-__all__ = ["At", "Ends", "EveryNth", "Listed", "PauseRule", "Still", "grey_blocks", "pauses_from_text"]
-
 
 class PauseRule(ABC):
     """Finds the pauses of a video."""

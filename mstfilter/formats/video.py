@@ -45,8 +45,6 @@ from mstfilter.scene import (
     rigid_from_matrix,
 )
 
-__all__ = ["KnownWorld", "Lens", "RecordingFormat", "RgbdImages", "Video", "VideoFormat", "pair_stamps"]
-
 
 class RecordingFormat(ABC):
     """A layout of RGB-D data on disk. Subclasses are frozen dataclasses; fields hold what the files do not store."""

@@ -45,8 +45,6 @@ from mstfilter.fusion.information import (
 from mstfilter.scene import Camera, Hypothesis, VoxelGrid, project, render_hypothesis
 from mstfilter.smc import Population, first_seen
 
-__all__ = ["Belief"]
-
 _DEPTH_STEP = 0.01  # voxels: depths are rounded to this step before they are compared
 
 

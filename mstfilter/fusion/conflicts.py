@@ -41,25 +41,6 @@ from mstfilter.errors import InputError
 from mstfilter.fusion.interfaces import Structure
 from mstfilter.scene import MAX_LABEL, as_labels
 
-__all__ = [
-    "MERGE_RULES",
-    "PREDICTED",
-    "PROPOSED",
-    "ClaimedVoxels",
-    "ConflictGraph",
-    "MergeRule",
-    "OneSideLast",
-    "RandomOrder",
-    "SpanningTree",
-    "claimed_voxels",
-    "components_in_conflict",
-    "conflict_graph",
-    "graph_of",
-    "merge_probability",
-    "overlapping_pairs",
-    "random_spanning_tree",
-]
-
 PROPOSED, PREDICTED = 0, 1
 MergeRule = Literal["share", "printed", "iou", "match", "covered", "always", "never"]
 MERGE_RULES: tuple[MergeRule, ...] = get_args(MergeRule)

@@ -34,8 +34,6 @@ from mstfilter.fusion.division import inherit_apart, split_like
 from mstfilter.fusion.interfaces import Structure
 from mstfilter.scene import MAX_LABEL, Hypothesis, ObjectRecord, as_labels
 
-__all__ = ["ConflictResolution", "Crossover", "ModeFilter"]
-
 _CHUNK = 2**19  # cells of windows that are read together: they fit in the cache
 
 

@@ -20,8 +20,6 @@ from mstfilter.fusion.interfaces import Division
 from mstfilter.scene import MAX_LABEL, Clip, Hypothesis, ObjectRecord, frame_geometry, project
 from mstfilter.tracking import MotionSegmentation
 
-__all__ = ["NoDivision", "PartRule", "RigidMotions", "inherit_apart", "split_by_motion", "split_like"]
-
 _INSIDE = 0.5  # share of a predicted object that must lie in a proposed object to count as inside
 
 

@@ -36,8 +36,6 @@ from mstfilter.scene import (
 )
 from mstfilter.smc import Population, Update, union
 
-__all__ = ["FreeSpace", "LabelledVoxels", "NoFreeSpace", "ProjectionUpdate", "log_quality"]
-
 _SMALLEST_QUALITY = 1e-3
 
 

@@ -47,19 +47,6 @@ from mstfilter.errors import InputError
 from mstfilter.fusion.similarity import canonical
 from mstfilter.smc import first_seen
 
-__all__ = [
-    "CommonRefinement",
-    "binary_entropy",
-    "canonical_rows",
-    "check_tolerance",
-    "common_refinement",
-    "entropy",
-    "hamming",
-    "noisy_information",
-    "outcome_information",
-    "partition_distance",
-]
-
 
 def entropy(probabilities: np.ndarray) -> float:
     """``-sum p log p`` of probabilities (k,) that sum to one."""

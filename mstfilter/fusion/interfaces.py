@@ -23,8 +23,6 @@ import numpy as np
 
 from mstfilter.scene import Clip, Frame, Hypothesis
 
-__all__ = ["Division", "Evidence", "Projection", "Structure"]
-
 
 class Projection(ABC):
     """Projects a hypothesis onto the set of hypotheses that agree with a frame."""

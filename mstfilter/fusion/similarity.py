@@ -19,8 +19,6 @@ from mstfilter.fusion.interfaces import Evidence
 from mstfilter.scene import Clip, Hypothesis
 from mstfilter.smc import Equivalence, Similarity, first_seen
 
-__all__ = ["Agreement", "SameSegmentation", "WeightedCoverage", "canonical"]
-
 
 def canonical(labels: np.ndarray) -> np.ndarray:
     """The same segmentation with labels 1, 2, ... in the order of their first voxel; 0 stays."""

@@ -27,8 +27,6 @@ from mstfilter.fusion.interfaces import Division, Evidence, Projection
 from mstfilter.scene import Clip, Hypothesis, VoxelGrid, frame_geometry
 from mstfilter.smc import Candidates, Population, Systematic, Update, child, key_of, union
 
-__all__ = ["Claims", "FusionUpdate"]
-
 _SURFACE_VOXELS = 1.5  # a voxel up to this far behind the reading counts as surface, as in completion
 
 

@@ -23,8 +23,6 @@ import numpy as np
 from mstfilter.scoring import weighted_coverage
 from mstfilter.smc import child
 
-__all__ = ["degrade"]
-
 _TRIES = 30
 _REACH = 120.0  # largest displacement in pixels of a 640 px wide image
 _SMOOTH = 15.0  # of the displacement, pixels of a 640 px wide image

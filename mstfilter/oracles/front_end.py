@@ -28,8 +28,6 @@ from mstfilter.scoring import MIN_PIXELS, weighted_coverage
 from mstfilter.segmentation import BoundaryModel, ColourDepthBoundary, ObjectRule, hypothesis_of
 from mstfilter.smc import Key, Population, Proposal, child
 
-__all__ = ["TrueBoundary", "TrueCompletion", "TrueMasks"]
-
 
 @dataclass(frozen=True)
 class TrueMasks(UsesTruth, Proposal):

@@ -31,8 +31,6 @@ import numpy as np
 from mstfilter.errors import InputError
 from mstfilter.scene import Hypothesis, VoxelGrid, read_only
 
-__all__ = ["Miniature", "MiniatureObservation", "MiniatureStates", "draw_states", "miniature_states"]
-
 MAX_CELLS = 7  # 4140 states; 8 cells have 21147
 
 

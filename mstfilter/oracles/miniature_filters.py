@@ -33,27 +33,6 @@ from mstfilter.smc import (
     Reweight,
 )
 
-__all__ = [
-    "N_RANK_DRAWS",
-    "POSTERIOR_ERRORS",
-    "ExactPosterior",
-    "GuidedMiniatureMotion",
-    "GuidedMiniaturePrior",
-    "MiniatureMotion",
-    "MiniaturePrior",
-    "bootstrap_filter",
-    "exact_filter",
-    "guided_filter",
-    "iid_weights",
-    "miniature_likelihood",
-    "posterior_errors",
-    "rank_of_truth",
-    "rank_uniformity",
-    "state_statistics",
-    "state_weights",
-    "total_variation",
-]
-
 N_RANK_DRAWS = 9  # ranks 0 .. 9: ten bins
 #: Keys of the result of `posterior_errors`.
 POSTERIOR_ERRORS = ("tv", "same_object_error", "occupancy_error", "same_object_brier", "occupancy_brier", "p_truth")

@@ -48,19 +48,6 @@ from mstfilter.smc import (
     union,
 )
 
-__all__ = [
-    "BalancedUpdate",
-    "CutDistribution",
-    "LikelihoodEvidence",
-    "MiniatureCuts",
-    "MiniatureFreeSpace",
-    "ScoredFusion",
-    "adapt_to_miniature",
-    "balanced_filter",
-    "cut_distribution",
-    "predictive_distribution",
-]
-
 
 @dataclass(frozen=True)
 class MiniatureFreeSpace(Projection):

@@ -28,17 +28,6 @@ from mstfilter.scoring import Form, overlap, weighted_coverage
 from mstfilter.smc import Candidates, Population, Transition, Update, union
 from mstfilter.tracking import Warp, move_points, rigid_transform
 
-__all__ = [
-    "PERFECT_STAGES",
-    "STAGES",
-    "TrueFreeSpace",
-    "TrueFusion",
-    "TrueMotions",
-    "TrueQuality",
-    "budget_arms",
-    "overrides_of",
-]
-
 
 @dataclass(frozen=True)
 class TrueMotions(UsesTruth, Transition):

@@ -22,8 +22,6 @@ import numpy as np
 from mstfilter.errors import InputError
 from mstfilter.scene import Frame, Recording
 
-__all__ = ["Need", "RecordingTruth", "UsesTruth", "bind_truth", "uses_truth"]
-
 Need = Literal["voxels", "instance", "poses"]
 _WORDS: dict[Need, str] = {"voxels": "true voxels", "instance": "instance image", "poses": "true poses"}
 

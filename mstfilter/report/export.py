@@ -32,8 +32,6 @@ from mstfilter.report.pictures import UNASSIGNED_COLOUR, Colour, colour, hexadec
 from mstfilter.runs import RunFolder
 from mstfilter.scene import Hypothesis, VoxelGrid, project, write_image
 
-__all__ = ["MESH_FORMATS", "MESH_STYLES", "export_mesh", "export_run", "hypothesis_mesh", "voxel_faces"]
-
 MESH_FORMATS = ("ply", "obj", "glb")
 MESH_STYLES = ("blocky", "smooth")
 

@@ -25,15 +25,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = [
-    "SERIES",
-    "differences_figure",
-    "figure_groups",
-    "genealogy_figure",
-    "health_figure",
-    "quality_figure",
-    "time_figure",
-]
 
 # Placeholders, which are replaced by the colours of the page.
 _INK, _MUTED, _LINE, _ACCENT, _BASELINE = "#010203", "#020304", "#030405", "#040506", "#050607"

@@ -32,17 +32,6 @@ from mstfilter.runs import RunFolder
 from mstfilter.scene import Camera, Hypothesis, project
 from mstfilter.scoring import overlap
 
-__all__ = [
-    "TRUTH",
-    "Card",
-    "Identities",
-    "Tag",
-    "assign_identities",
-    "cards_of_pause",
-    "order_by_weight",
-    "truth_card",
-]
-
 TRUTH = -1
 """Index of the ground truth in place of a hypothesis."""
 

@@ -19,8 +19,6 @@ import numpy as np
 from mstfilter.errors import InputError
 from mstfilter.files import write_text
 
-__all__ = ["counts_by_key", "fill_template", "flatten", "note_rows", "seconds_text", "short_text", "write_page"]
-
 _LONGEST = 6  # lists up to this length are written in full
 
 

@@ -23,22 +23,6 @@ import numpy as np
 
 from mstfilter.scene import Camera, Hypothesis, VoxelGrid, look_at, memo, render
 
-__all__ = [
-    "PALETTE",
-    "UNASSIGNED_COLOUR",
-    "Colour",
-    "close_up",
-    "colour",
-    "data_uri",
-    "hexadecimal",
-    "jpeg_bytes",
-    "overlay",
-    "overlay_layer",
-    "png_bytes",
-    "viewpoint",
-    "voxel_picture",
-]
-
 Colour = tuple[int, int, int]
 
 _HEX = (

@@ -38,8 +38,6 @@ from mstfilter.report.pictures import close_up, data_uri, jpeg_bytes, viewpoint
 from mstfilter.runs import RunFolder
 from mstfilter.scoring import connected_components, one_blob, weighted_coverage
 
-__all__ = ["PauseNumbers", "RunNumbers", "read_numbers", "write_report"]
-
 _TITLES = {
     "initial": "Initial particles",
     "transition": "Transition",

@@ -17,8 +17,6 @@ from mstfilter.report.figures import differences_figure, figure_groups, time_fig
 from mstfilter.report.page import fill_template, flatten, seconds_text, short_text, write_page
 from mstfilter.study import CLAIM, ENDPOINT, SLOPE, StudyFolder, Summary
 
-__all__ = ["write_study_report"]
-
 # Columns of the table of results: name in the study, heading.
 _FIGURES = (
     (ENDPOINT, "quality"),

@@ -38,17 +38,6 @@ from mstfilter.scoring import (
     weighted_coverage,
 )
 
-__all__ = [
-    "coverage_of",
-    "diversity",
-    "errors_of",
-    "figures",
-    "measure_pause",
-    "object_f",
-    "occupancy_iou",
-    "pair_brier",
-]
-
 MOST = 0.5
 FRAGMENT = 0.1
 _PAIRS_AT_ONCE = 2**22

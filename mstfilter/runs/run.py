@@ -26,8 +26,6 @@ from mstfilter.runs.run_folder import RunFolder, as_json
 from mstfilter.scene import Recording
 from mstfilter.smc import Observer
 
-__all__ = ["RunProgress", "code_version", "component_files", "filter_recording", "library_versions"]
-
 _LIBRARIES = ("numpy", "scipy", "networkx", "opencv-python-headless", "higra", "small_gicp")
 
 

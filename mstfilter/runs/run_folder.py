@@ -42,8 +42,6 @@ from mstfilter.scene import (
 from mstfilter.scoring import FORMS, weighted_coverage
 from mstfilter.smc import Codec, Info, State, load_state, save_state
 
-__all__ = ["HypothesisCodec", "RunFolder", "as_json", "write_json"]
-
 _FORMAT = 2
 
 

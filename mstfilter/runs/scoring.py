@@ -24,8 +24,6 @@ from mstfilter.runs.run_folder import RunFolder
 from mstfilter.scene import Camera, Recording, VoxelGrid, as_labels, render
 from mstfilter.scoring import FORMS, connected_components, one_blob, weighted_coverage
 
-__all__ = ["PauseEstimate", "PauseScore", "PauseTruth", "read_estimate", "read_truth", "score_pauses", "write_scores"]
-
 _ROBOT = 255
 
 

@@ -18,8 +18,6 @@ from mstfilter.formats import RecordingFormat
 from mstfilter.presets import REGISTRY, settings
 from mstfilter.scene import Recording
 
-__all__ = ["detect_format", "format_settings", "open_source"]
-
 
 def open_source(
     path: Path, format: str = "", options: Sequence[str] = (), pauses: str = "", *, allow_files: bool = True

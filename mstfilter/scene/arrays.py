@@ -8,8 +8,6 @@ from collections.abc import Mapping
 
 import numpy as np
 
-__all__ = ["component_key", "content_key", "frozen", "read_only"]
-
 
 def read_only(array: np.ndarray) -> np.ndarray:
     """A read-only view of an array (the data are shared, not copied)."""

@@ -29,7 +29,6 @@ import numpy as np
 if TYPE_CHECKING:
     from mstfilter.scene.disk_cache import DiskCache
 
-__all__ = ["Cache", "memo", "scene_cache"]
 
 _Value = TypeVar("_Value")
 

@@ -21,8 +21,6 @@ from scipy.spatial.transform import RigidTransform
 from mstfilter.errors import InputError
 from mstfilter.scene.arrays import content_key, frozen, read_only
 
-__all__ = ["Camera", "look_at", "rigid_from_matrix"]
-
 
 @dataclass(frozen=True, eq=False)
 class Camera:

@@ -22,8 +22,6 @@ import numpy as np
 
 from mstfilter.scene.arrays import content_key
 
-__all__ = ["DiskCache"]
-
 _UNREADABLE = (OSError, ValueError, TypeError, KeyError, EOFError, zipfile.BadZipFile, sqlite3.Error)
 
 

@@ -26,18 +26,6 @@ from mstfilter.scene.arrays import content_key, frozen, read_only
 from mstfilter.scene.camera import Camera
 from mstfilter.scene.voxels import VoxelGrid
 
-__all__ = [
-    "Clip",
-    "Frame",
-    "SIGMA_AT_ONE_METRE",
-    "depth_sigma",
-    "read_depth",
-    "read_labels",
-    "read_rgb",
-    "write_image",
-]
-
-
 SIGMA_AT_ONE_METRE = 0.00185
 
 

@@ -27,18 +27,6 @@ from mstfilter.scene.camera import Camera
 from mstfilter.scene.frame import SIGMA_AT_ONE_METRE, Frame
 from mstfilter.scene.voxels import VoxelGrid
 
-__all__ = [
-    "BASELINE",
-    "FrameGeometry",
-    "SupportPlane",
-    "disparity",
-    "fit_support_plane",
-    "frame_geometry",
-    "table_residual",
-    "warn_if_workspace_is_empty",
-    "workspace",
-]
-
 
 @dataclass(frozen=True, eq=False)
 class FrameGeometry:

@@ -28,8 +28,6 @@ from mstfilter.scene.frame import Clip, Frame
 from mstfilter.scene.geometry import fit_support_plane, warn_if_workspace_is_empty, workspace
 from mstfilter.scene.voxels import VoxelGrid, as_labels
 
-__all__ = ["LazyFrames", "Recording", "check_depth_range", "find_world"]
-
 
 class LazyFrames(Sequence[Frame]):
     """Frames that are read when they are used; the last 40 are kept in memory.

@@ -22,8 +22,6 @@ from mstfilter.scene.cache import memo
 from mstfilter.scene.camera import Camera
 from mstfilter.scene.voxels import Hypothesis, VoxelGrid, as_labels
 
-__all__ = ["Rendering", "project", "render", "render_hypothesis"]
-
 
 class Rendering(NamedTuple):
     """Label image (H, W) uint16, 0 without a hit, and z-depth (H, W) float32 in metres, NaN without a hit."""

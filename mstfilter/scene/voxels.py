@@ -30,18 +30,6 @@ from scipy.spatial.transform import RigidTransform
 from mstfilter.errors import InputError
 from mstfilter.scene.arrays import content_key, frozen
 
-__all__ = [
-    "Crop",
-    "Hypothesis",
-    "MAX_LABEL",
-    "ObjectRecord",
-    "VoxelGrid",
-    "as_labels",
-    "decode_hypotheses",
-    "encode_hypotheses",
-]
-
-
 MAX_LABEL = 65535
 MAX_VOXELS = 2**28
 _NO_MOTION = RigidTransform.identity()  # shared: making it takes longer than the rest of a record

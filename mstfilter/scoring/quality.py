@@ -44,23 +44,6 @@ import numpy as np
 from mstfilter.errors import InputError
 from mstfilter.scene import Recording, as_labels
 
-__all__ = [
-    "FORMS",
-    "Form",
-    "MIN_PIXELS",
-    "Overlap",
-    "STATUSES",
-    "Status",
-    "connected_components",
-    "object_status",
-    "one_blob",
-    "overlap",
-    "quality_of",
-    "split_truth",
-    "weighted_coverage",
-]
-
-
 Form = Literal["objects", "paper", "authors"]
 FORMS: tuple[Form, ...] = get_args(Form)
 

@@ -19,8 +19,6 @@ import numpy as np
 from mstfilter.errors import InputError
 from mstfilter.scene import BASELINE, Frame, fit_support_plane, table_residual
 
-__all__ = ["BoundaryModel", "ColourDepthBoundary", "above_table", "fill_from_nearest"]
-
 #: Focal length in pixels that defines the sensor's disparity unit: 1/8 pixel of a 640 x 480 Kinect, whatever the
 #: size of the image. The noise (0.58 units) and all thresholds then stay the same when an image is resized.
 SENSOR_FOCAL = 525.0

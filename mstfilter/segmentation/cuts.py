@@ -32,22 +32,6 @@ from mstfilter.scene import Frame
 from mstfilter.segmentation.boundary import above_table
 from mstfilter.segmentation.tree import Tree
 
-__all__ = [
-    "CutSample",
-    "CutSampler",
-    "CutValue",
-    "ExactCuts",
-    "Gibbs",
-    "MergeLogOdds",
-    "OptimalCut",
-    "SceneCutObjectness",
-    "best_envelope",
-    "check_target_law",
-    "check_values",
-    "gibbs",
-    "optimal_cut",
-]
-
 
 class CutValue(ABC):
     """Rates how well a region fits one object."""

@@ -22,8 +22,6 @@ from mstfilter.segmentation.join_weights import JOIN_WEIGHTS
 from mstfilter.segmentation.regions import BORDER, PAIR_FEATURES, REGION, Regions, measure_regions, pair_features
 from mstfilter.segmentation.tree import Tree, TreeBuilder, UcmTree
 
-__all__ = ["Agglomeration", "LearnedTree", "tree_of_merges"]
-
 #: Log odds (k,) that the regions of k pairs belong to different objects:
 #: (rows of a, rows of b, borders, table borders of a, of b).
 PairLogOdds = Callable[[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray], np.ndarray]

@@ -47,8 +47,6 @@ from mstfilter.segmentation.cuts import (
 )
 from mstfilter.segmentation.tree import Tree
 
-__all__ = ["AuthorsMoves", "CutChain", "CutState", "MetropolisHastingsCuts", "Move", "MoveRule", "NodeMoves"]
-
 
 class Move(NamedTuple):
     """Nodes that leave and enter the cut, and log g(back) - log g(forward) of the proposal."""

@@ -30,8 +30,6 @@ from mstfilter.segmentation.mh import MetropolisHastingsCuts
 from mstfilter.segmentation.tree import Tree, TreeBuilder
 from mstfilter.smc import Population, Proposal, child
 
-__all__ = ["ObjectRule", "Segments", "TreeCutProposal", "hypothesis_of"]
-
 WEIGHT_RULES = ("equal", "p")
 
 

@@ -19,8 +19,6 @@ import numpy as np
 from mstfilter.scene import BASELINE, Camera, Frame, fit_support_plane
 from mstfilter.segmentation.boundary import SENSOR_FOCAL, above_table, fill_from_nearest
 
-__all__ = ["BORDER", "PAIR_FEATURES", "REGION", "Regions", "measure_regions", "pair_features", "quadric_residual"]
-
 #: Bin width of the height histogram in metres; the last bin has no upper limit.
 _HEIGHT_BIN = 0.01
 _BINS = 32

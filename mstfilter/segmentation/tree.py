@@ -29,8 +29,6 @@ import numpy as np
 from mstfilter.errors import InputError
 from mstfilter.scene import Frame, content_key, read_only
 
-__all__ = ["Tree", "TreeBuilder", "UcmTree", "merge_tree", "prune"]
-
 
 @dataclass(frozen=True, eq=False)
 class Tree:

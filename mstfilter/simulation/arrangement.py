@@ -18,8 +18,6 @@ from mstfilter.simulation.shapes import Shape, draw_shape
 from mstfilter.simulation.textures import Skin, draw_skin
 from mstfilter.simulation.world import OBJECT_GROUP, PhysicsWorld
 
-__all__ = ["SceneObjects", "arrange_objects", "draw_objects"]
-
 _RestPose = Literal["any", "tall", "low"]  # which of its rest poses a shape takes
 
 _TOUCH = 0.0003  # gap between objects put in contact, metres; settling closes it

@@ -19,8 +19,6 @@ from mstfilter.errors import InputError
 from mstfilter.scene import Camera, VoxelGrid, look_at
 from mstfilter.simulation.shapes import ANY, REPORTED, SHAPE_FAMILIES, TUNING, Pool
 
-__all__ = ["FIRST_REPORTED_SEED", "GENERATOR_VERSION", "SCENE_FAMILIES", "SceneFamily", "scene_family"]
-
 _LOOKS_AT = np.array([0.02, 0.05, 0.04])
 _TOWARDS_CAMERA = np.array([0.03, -0.77, 0.54]) / np.linalg.norm([0.03, -0.77, 0.54])
 

@@ -18,8 +18,6 @@ from mstfilter.simulation.solids import CapsuleBounds
 from mstfilter.simulation.textures import Atlas, Room, texture_coordinates
 from mstfilter.simulation.world import FINGER_GROUP, FINGER_ID, OBJECT_GROUP, PhysicsWorld
 
-__all__ = ["SHADOW_GROUPS", "LightMap", "PixelRays", "Stage", "cosine_to_light"]
-
 SHADOW_GROUPS = (OBJECT_GROUP, FINGER_GROUP)
 """Geoms that cast shadows."""
 

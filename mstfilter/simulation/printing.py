@@ -18,21 +18,6 @@ import numpy as np
 
 from mstfilter.simulation.shapes import ANY, Pool
 
-__all__ = [
-    "DOT",
-    "brand",
-    "carton_face",
-    "cloth",
-    "glaze",
-    "label_side",
-    "lid",
-    "noise",
-    "peel",
-    "shade",
-    "speckle",
-    "wood",
-]
-
 DOT = 0.0004
 """Size of a drawn pixel in metres."""
 

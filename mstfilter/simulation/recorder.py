@@ -56,16 +56,6 @@ from mstfilter.simulation.world import (
     push_effect,
 )
 
-__all__ = [
-    "POSE_TOLERANCE",
-    "SimulatedScene",
-    "cache_folder",
-    "cached_recording",
-    "recipe_key",
-    "record_scene",
-    "simulate_recording",
-]
-
 POSE_TOLERANCE = 0.0002
 """Metres by which recorded poses (in images, poses and volumes alike) may differ from the physics; see `Stage`."""
 

@@ -18,8 +18,6 @@ from mstfilter.simulation.solids import CapsuleBounds
 from mstfilter.simulation.textures import Atlas, Room, Skin
 from mstfilter.simulation.world import FINGER_GROUP, OBJECT_GROUP, ROOM_GROUP, TABLE, PhysicsWorld
 
-__all__ = ["Renderer", "View", "visible_texel"]
-
 _OFFSETS = ((-0.34, 0.14), (0.34, -0.14))  # of further rays within a pixel on an edge: rows, columns
 
 

@@ -23,8 +23,6 @@ import numpy as np
 
 from mstfilter.errors import InputError
 
-__all__ = ["ColourSensor", "DepthSensor"]
-
 
 @dataclass(frozen=True)
 class DepthSensor:

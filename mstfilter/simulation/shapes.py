@@ -39,8 +39,6 @@ from mstfilter.errors import InputError
 from mstfilter.scene import VoxelGrid
 from mstfilter.simulation.solids import Piece, box, capsule, cylinder, ellipsoid, frustum, hull, ring
 
-__all__ = ["ANY", "REPORTED", "SHAPE_FAMILIES", "TUNING", "Pool", "Shape", "draw_shape", "label_voxels"]
-
 _SMALLEST, _BAND = 0.90, 0.025
 # Bands of sizes from 0.9 to 1.1 in each pool; both have mean 1.
 _SIZE_BANDS = ((0, 3, 4, 7), (1, 2, 5, 6))

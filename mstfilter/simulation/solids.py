@@ -27,19 +27,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-__all__ = [
-    "BoundingCones",
-    "CapsuleBounds",
-    "Piece",
-    "box",
-    "capsule",
-    "cylinder",
-    "ellipsoid",
-    "frustum",
-    "hull",
-    "ring",
-]
-
 _TOLERANCE = 1e-9  # so that a voxel centre on the face that two pieces share lies in one of them
 _ANGLE_SLACK = 1e-4  # of the bounds' angles, for single precision
 

@@ -29,8 +29,6 @@ from mstfilter.simulation import printing
 from mstfilter.simulation.shapes import ANY, Pool, Shape
 from mstfilter.simulation.world import TABLE
 
-__all__ = ["Atlas", "Room", "Skin", "draw_room", "draw_skin", "texture_coordinates"]
-
 _SIDE, _TOP, _BOTTOM, _INSIDE = range(4)
 
 

@@ -31,24 +31,6 @@ from mstfilter.simulation.families import SceneFamily
 from mstfilter.simulation.shapes import Shape
 from mstfilter.simulation.solids import Piece
 
-__all__ = [
-    "FINGER_GROUP",
-    "FINGER_ID",
-    "FLOOR_HEIGHT",
-    "OBJECT_GROUP",
-    "ROOM_GROUP",
-    "TABLE",
-    "Contact",
-    "FingerPush",
-    "PhysicsWorld",
-    "PushEffect",
-    "advance_push",
-    "choose_push",
-    "finish_push",
-    "play_push",
-    "push_effect",
-]
-
 FINGER_ID = 255
 """Instance id of finger and arm."""
 

@@ -23,8 +23,6 @@ from mstfilter.study.executors import Event, Executor, Tell, times
 from mstfilter.study.jobs import perform
 from mstfilter.study.results import Job, JobOutcome
 
-__all__ = ["Cluster"]
-
 _CHECK_INTERVAL_S = 0.5  # of time limits
 
 

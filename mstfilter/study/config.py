@@ -41,18 +41,6 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationEr
 from mstfilter.errors import InputError
 from mstfilter.presets import load_config
 
-__all__ = [
-    "ArmEntry",
-    "ArmRequest",
-    "SceneEntry",
-    "StudyConfig",
-    "check_arm_names",
-    "expand_arms",
-    "load_study",
-    "split_grid",
-    "study_of",
-]
-
 
 def _seeds(value: Any) -> Any:
     """``"0-4, 7"``, one number or a list of numbers as a tuple of numbers."""

@@ -26,8 +26,6 @@ from mstfilter.errors import InputError
 from mstfilter.study.jobs import perform
 from mstfilter.study.results import Job, JobOutcome
 
-__all__ = ["Event", "Executor", "Local", "Tell"]
-
 _POLL_S = 0.01
 _ONE_THREAD = {
     name: "1"

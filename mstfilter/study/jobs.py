@@ -29,8 +29,6 @@ from mstfilter.runs import RunProgress, code_version, filter_recording, measure_
 from mstfilter.scene import Recording, scene_cache
 from mstfilter.study.results import Job, JobOutcome, write_result
 
-__all__ = ["StagePeaks", "peak_megabytes", "perform", "reset_peak"]
-
 _StepCallback = Callable[[int, int], None]
 
 

@@ -27,8 +27,6 @@ from mstfilter.runs import as_json, code_version, component_files, library_versi
 from mstfilter.scene import content_key
 from mstfilter.study.config import ArmRequest, SceneEntry, StudyConfig, expand_arms
 
-__all__ = ["Arm", "Plan", "StudyRun", "StudyScene", "make_plan"]
-
 
 @dataclass(frozen=True)
 class Arm:

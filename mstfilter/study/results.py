@@ -28,17 +28,6 @@ from mstfilter.files import write_csv
 from mstfilter.runs import write_json
 from mstfilter.study.summary import Summary, summarise
 
-__all__ = [
-    "RESULT",
-    "Job",
-    "JobOutcome",
-    "STUDY_FORMAT",
-    "StudyFolder",
-    "cost_columns",
-    "read_result",
-    "write_result",
-]
-
 STUDY_FORMAT = 2
 RESULT = "result.json"  # in a run's folder
 _SUMMARY_COLUMNS = ("family", "arm", "figure", "n", "mean", "low", "high")

@@ -16,19 +16,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-__all__ = [
-    "CLAIM",
-    "Difference",
-    "adjusted",
-    "compare",
-    "conclusion",
-    "holm",
-    "interval",
-    "sign_flip",
-    "slope",
-    "studentised",
-]
-
 LEVEL = 0.95
 CLAIM = 20  # scenes below which nothing is claimed
 EXACT = 12  # scenes up to which all sign flips are tried

@@ -23,8 +23,6 @@ from mstfilter.study.executors import Event, Executor, Local
 from mstfilter.study.plan import Plan, StudyRun, make_plan
 from mstfilter.study.results import STUDY_FORMAT, Job, JobOutcome, StudyFolder, read_result
 
-__all__ = ["StudyProgress", "StudyResult", "run_study"]
-
 _LEAST_FREE_GB = 0.5
 
 

@@ -18,8 +18,6 @@ import numpy as np
 
 from mstfilter.study.statistics import Difference, compare, conclusion, holm, interval, slope
 
-__all__ = ["ENDPOINT", "SLOPE", "Compared", "Figure", "Summary", "summarise"]
-
 ENDPOINT = "quality"
 SLOPE = "quality_slope"  # a pause, over all pauses, t = 0 included
 _NAMES = ("family", "scene", "arm", "seed", "pause", "time_s")

@@ -43,8 +43,6 @@ from mstfilter.testing import moves, resampling, values
 from mstfilter.testing.contract import Contract
 from mstfilter.testing.scenes import scene_example
 
-__all__ = ["CheckResult", "run_contract", "contract_of"]
-
 #: Contract of each interface, the more special interface first.
 _CONTRACTS: dict[type, type[Contract]] = {
     WeightResampler: resampling.WeightResamplerContract,

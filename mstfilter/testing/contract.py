@@ -26,18 +26,6 @@ import pytest
 from mstfilter.errors import InputError
 from mstfilter.smc import Population
 
-__all__ = [
-    "FALSE_ALARM",
-    "Contract",
-    "RandomContract",
-    "number_example",
-    "prerequisite",
-    "reports_errors",
-    "same",
-    "skip_unless_properly_weighted",
-    "statistical",
-]
-
 #: Largest probability that a statistical test fails for a correct component.
 FALSE_ALARM = 1e-6
 

@@ -27,14 +27,6 @@ from mstfilter.testing.contract import (
     statistical,
 )
 
-__all__ = [
-    "DensityTransitionContract",
-    "ProposalContract",
-    "RejuvenationContract",
-    "TransitionContract",
-    "UpdateContract",
-]
-
 _N = 6
 
 

@@ -25,8 +25,6 @@ from mstfilter.testing.contract import (
     statistical,
 )
 
-__all__ = ["ResamplerContract", "WeightResamplerContract"]
-
 _REPEATS = 3000
 #: Weights and numbers of particles for the law. No weight is so small that a particle is hardly ever selected.
 _CASES: tuple[tuple[tuple[float, ...], int], ...] = (

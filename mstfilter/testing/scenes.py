@@ -16,8 +16,6 @@ import numpy as np
 from mstfilter.scene import Camera, Clip, Frame, Hypothesis, VoxelGrid, look_at, render
 from mstfilter.smc import Population
 
-__all__ = ["scene_example"]
-
 _GRID = VoxelGrid(np.array([-0.24, -0.24, 0.0]), 0.02, (24, 24, 8))
 _COLOURS = np.array([[160, 140, 110], [190, 60, 50], [60, 100, 180], [70, 160, 80]])
 

@@ -11,8 +11,6 @@ from pathlib import Path
 from mstfilter.errors import InputError
 from mstfilter.resources import examples_folder
 
-__all__ = ["starter_kinds", "write_starter"]
-
 
 def starter_kinds() -> list[str]:
     """Kinds of component that have a starting file."""

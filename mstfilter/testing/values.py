@@ -15,16 +15,6 @@ from mstfilter.smc import Codec, Equivalence, Lookahead, Population, Similarity,
 from mstfilter.testing.contract import Contract, prerequisite, reports_errors, same
 from mstfilter.testing.scenes import scene_example
 
-__all__ = [
-    "CodecContract",
-    "EquivalenceContract",
-    "EvidenceContract",
-    "LookaheadContract",
-    "SimilarityContract",
-    "SizeContract",
-    "TriggerContract",
-]
-
 
 def _rng(seed: int = 0) -> np.random.Generator:
     return np.random.default_rng(seed)

@@ -19,8 +19,6 @@ import numpy as np
 from mstfilter.errors import InputError
 from mstfilter.scene import Frame, depth_sigma, memo
 
-__all__ = ["Matches", "SiftMatching", "matched_colour", "same_depth", "smooth_colour"]
-
 _N_EXPOSURE_PIXELS = 20000
 _PRIOR_VARIANCE = 20.0**2  # grey levels squared; where colours vary less, the gain stays near 1
 

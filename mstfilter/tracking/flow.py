@@ -28,8 +28,6 @@ from mstfilter.errors import InputError
 from mstfilter.scene import Clip, Frame, memo
 from mstfilter.tracking.features import matched_colour, same_depth, smooth_colour
 
-__all__ = ["ClipTracks", "DenseFlow"]
-
 _PRESETS = ("ultrafast", "fast", "medium")
 _N_VOTERS = 5
 

@@ -22,8 +22,6 @@ from mstfilter.scene import Clip, component_key, memo, read_only
 from mstfilter.tracking.flow import DenseFlow
 from mstfilter.tracking.rigid import fit_sums, move_points, pair_sums
 
-__all__ = ["FollowedPoints", "MotionSegmentation", "followed_points"]
-
 
 @dataclass(frozen=True, eq=False)
 class FollowedPoints:

@@ -28,17 +28,6 @@ from mstfilter.errors import InputError
 from mstfilter.open3d_import import import_open3d
 from mstfilter.tracking.rigid import move_points
 
-__all__ = [
-    "ColouredIcp",
-    "PointToPlaneIcp",
-    "Registration",
-    "RegistrationResult",
-    "SmallGicp",
-    "Surface",
-    "centroid_shift",
-    "prepare",
-]
-
 _MIN_POINTS = 12
 _SPACING = 0.004  # metres between the points of a downsampled cloud
 _N_NEIGHBOURS = 12  # for normals and covariances

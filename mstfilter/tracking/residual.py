@@ -31,8 +31,6 @@ from mstfilter.scene import Frame, depth_sigma, memo
 from mstfilter.tracking.rigid import move_points
 from mstfilter.tracking.segments import Track
 
-__all__ = ["MotionResidual", "normals", "refine_motion"]
-
 _N_POINTS = 800
 _GATES = (0.03, 0.03, 0.02, 0.02, 0.015, 0.015, 0.01, 0.01)  # metres, one per iteration
 _DAMPING = 1e-3  # of the largest eigenvalue; keeps directions that the data do not determine

@@ -31,24 +31,6 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-__all__ = [
-    "MotionCluster",
-    "angle",
-    "cluster",
-    "displacement",
-    "fit_sums",
-    "invert",
-    "jlinkage",
-    "kabsch",
-    "minimal_models",
-    "move_points",
-    "pair_sums",
-    "ransac",
-    "refine_robust",
-    "residuals",
-    "rigid_transform",
-]
-
 _N_SUMS = 18  # n, sum p (3), sum q (3), sum p q^T (9), sum |p|^2, sum |q|^2
 
 

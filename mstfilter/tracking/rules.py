@@ -32,8 +32,6 @@ from mstfilter.tracking.residual import MotionResidual, refine_motion
 from mstfilter.tracking.rigid import MotionCluster, jlinkage, rigid_transform
 from mstfilter.tracking.segments import Track
 
-__all__ = ["IDENTITY", "AuthorsRule", "Candidate", "MotionRule", "MstRule", "PaperRule"]
-
 
 @dataclass(frozen=True, eq=False)
 class Candidate:

@@ -23,8 +23,6 @@ from mstfilter.tracking.features import SiftMatching, matched_colour, smooth_col
 from mstfilter.tracking.flow import ClipTracks
 from mstfilter.tracking.registration import Surface, prepare
 
-__all__ = ["Segment", "StaticTest", "Track", "segments_of"]
-
 _TABLE_HEIGHT = 0.004  # metres; lower points belong to the table
 
 

@@ -41,8 +41,6 @@ from mstfilter.tracking.rigid import invert, move_points
 from mstfilter.tracking.rules import IDENTITY, Candidate, MotionRule, MstRule
 from mstfilter.tracking.segments import Segment, StaticTest, Track, segments_of
 
-__all__ = ["IdentityTransition", "Moved", "TrackingTransition", "Warp"]
-
 _SMOOTHING = 0.5  # voxels, standard deviation; .3 to .6 differ little
 
 
