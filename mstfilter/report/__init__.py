@@ -1,4 +1,13 @@
-"""What a run looks like: pictures, figures, one self-contained HTML page, and exports. Stands on the run folder."""
+"""Reports of runs and studies, pictures of hypotheses, and export to other programs.
+
+>>> from mstfilter.report import export_run, write_report, write_study_report
+>>> write_report("runs/demo")                                        # doctest: +SKIP
+>>> export_run("runs/demo", "out", "glb", "smooth")                  # doctest: +SKIP
+>>> write_study_report("studies/first")                              # doctest: +SKIP
+
+`overlay` and `voxel_picture` draw a hypothesis; `assign_identities` gives an object the same colour in all pictures
+of a run. Reports are made from folders alone and load no code of the user.
+"""
 
 from mstfilter.lazy import attach
 

@@ -1,14 +1,25 @@
-"""Simulated recordings: physics, objects, pushes, rendered colour and depth, volumetric truth.
+"""Simulated recordings of a robot finger that pushes objects on a table, with true volumes.
 
->>> from mstfilter.simulation.families import scene_family
->>> from mstfilter.simulation.recorder import simulate_recording
+A scene family and a seed define a recording:
+
+>>> from mstfilter.simulation import cached_recording, scene_family, simulate_recording
 >>> recording = simulate_recording(scene_family("demo"), seed=7, path="recordings/demo-7")  # doctest: +SKIP
+>>> folder = cached_recording("s1", seed=7)  # found again by the next call  # doctest: +SKIP
 
-`cache.cached_recording` keeps what was simulated; the families of the studies are `s1`, `s2` and `s3`.
+The studies use the families `s1`, `s2` and `s3`. A scene can also be simulated step by step:
 
-What is missing, so that nobody is misled: camera motion, glossy and transparent surfaces, light that bounces
-between objects, articulated and soft objects, a hand. Depth noise, the projector's shadow and losses at edges are
-calibrated to real frames; within surfaces noise is not correlated from pixel to pixel.
+>>> from mstfilter.simulation import SimulatedScene, play_push
+>>> scene = SimulatedScene(scene_family("demo"), seed=7)  # doctest: +SKIP
+>>> images, labels = scene.frame_images(0), scene.truth()  # doctest: +SKIP
+>>> effect = play_push(scene.world, scene.choose_push(0), scene.family)  # doctest: +SKIP
+
+Modules, from bottom to top: `solids` and `shapes` (objects), `families` (what defines a scene), `world` (MuJoCo
+physics, pushes), `printing` and `textures` (appearance), `arrangement` (placement), `layers` and `renderer` (images
+by ray casting), `sensor` (noise), `recorder` (recordings and their cache).
+
+The simulation lacks camera motion, glossy and transparent surfaces, light reflected between objects, articulated and
+soft objects, and a hand. Depth noise, the shadow of the projector and losses at edges are calibrated to real frames;
+within surfaces, noise is not correlated between pixels.
 """
 
 from mstfilter.lazy import attach

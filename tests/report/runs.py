@@ -1,4 +1,4 @@
-"""Small runs over an exact scene, made by components that need no image."""
+"""Small runs on an exact scene with components that need no image."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Palette, identities and pictures against what can be known without looking."""
+"""Palette, identities and pictures."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def oklab(linear):
 
 
 @pytest.mark.parametrize("view", VIEWS)
-def test_palette_is_distinct_for_every_eye(view):
+def test_colours_differ_for_normal_and_colour_blind_vision(view):
     x = np.array(PALETTE) / 255
     linear = np.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4)
     lab = oklab(np.clip(linear @ np.transpose(VIEWS[view]), 0, 1))
@@ -66,7 +66,7 @@ def test_identities_follow_objects_through_relabelling_and_time(tmp_path):
             assert identities.colours(t, k) == {label: colour(i) for label, i in own.items()}
 
 
-def test_identity_of_a_moved_object_comes_from_its_line_of_descent(tmp_path):
+def test_the_identity_of_a_moved_object_is_inherited_from_its_ancestor(tmp_path):
     from mstfilter.report.identities import _Assignment
 
     book = _Assignment()
@@ -101,7 +101,7 @@ def test_overlay_touches_objects_only():
     assert ((big[..., 3] > 0) == (labels > 0).repeat(3, 0).repeat(3, 1)).all()
 
 
-def test_objects_at_the_rim_have_no_contour_from_the_other_side():
+def test_contours_do_not_wrap_around_the_image():
     labels = np.zeros((8, 8), np.uint16)
     labels[:, 0] = 1
     alpha = overlay_layer(labels, {}, line=2)[..., 3]
@@ -142,7 +142,7 @@ def test_voxel_picture_shows_what_the_camera_would_see():
     assert png_bytes(again) == png_bytes(picture)
 
 
-def test_an_empty_grid_is_a_bare_table():
+def test_an_empty_grid_shows_the_table():
     labels = np.zeros(GRID.shape, np.uint16)
     view = viewpoint([(labels, GRID)], CAMERA, 80, 60)
     picture = voxel_picture(labels, GRID, view, {})

@@ -1,4 +1,4 @@
-"""The report: self-contained, made from the folder alone, the same every time, for every kind of run."""
+"""The report of a run: self-contained, made from the folder alone, deterministic, for all kinds of runs."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def finished(tmp_path_factory):
     return run, write_report(run)
 
 
-def test_it_stands_alone(finished):
+def test_the_page_is_self_contained(finished):
     run, path = finished
     assert path == run.path / "report.html"
     text, page = read(path)
@@ -83,7 +83,7 @@ def test_it_stands_alone(finished):
     assert str(run.path) not in text and str(run.path.parent) not in text
 
 
-def test_it_says_what_happened(finished):
+def test_contents_of_the_page(finished):
     _run, path = finished
     text, page = read(path)
     assert "two boxes" in page.text and "seed 7" in page.text
@@ -96,14 +96,14 @@ def test_it_says_what_happened(finished):
     assert text.count("Truth</b>") == 3
 
 
-def test_text_of_a_user_is_no_markup(finished):
+def test_text_of_the_user_is_escaped(finished):
     _, path = finished
     text, page = read(path)
     assert "<b>odd" not in text and "</script>" not in text
     assert "<b>odd & named</b>" in page.text
 
 
-def test_it_is_the_same_after_the_folder_moved(finished, tmp_path):
+def test_the_page_does_not_depend_on_the_place_of_the_folder(finished, tmp_path):
     run, path = finished
     moved = tmp_path / "elsewhere"
     shutil.copytree(run.path, moved)
@@ -124,7 +124,7 @@ def test_only_times_differ_between_equal_runs(finished, tmp_path):
     assert pictures[0] == pictures[1]
 
 
-def test_floors_are_the_quality_of_what_is_occupied(finished):
+def test_baselines_are_the_quality_of_the_occupied_voxels(finished):
     run, _ = finished
     numbers = read_numbers(run)
     for t, step in enumerate(numbers.steps):
@@ -181,7 +181,7 @@ def test_notes_of_any_shape(tmp_path):
     assert "deep.er" in page.text and "own slot" in page.text and "1e-09" in page.text
 
 
-def test_many_particles_are_cut_to_the_heaviest(tmp_path):
+def test_only_the_heaviest_of_many_hypotheses_have_cards(tmp_path):
     run = make_run(tmp_path / "run", pauses=1)
     from dataclasses import replace
 

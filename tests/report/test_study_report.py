@@ -1,4 +1,4 @@
-"""The report of a study: from its folder alone, with conclusions that claim no more than they may."""
+"""The report of a study: made from its folder alone; its conclusions follow the intervals."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def make_study(path, n_scenes=4, arms=("ours", "<theirs>"), groups=("s1", "s2"),
     return path
 
 
-def test_it_says_what_was_found(tmp_path):
+def test_contents_of_the_study_page(tmp_path):
     study = make_study(tmp_path)
     text = write_study_report(study).read_text()
     assert "ours is above &lt;theirs&gt; on s1" in text and "no claim below 20 scenes" in text

@@ -1,4 +1,4 @@
-"""Configurations: defaults hold, mistakes give one clear error."""
+"""Scene families: defaults and invalid fields."""
 
 from dataclasses import replace
 
@@ -29,7 +29,7 @@ def test_the_seed_decides_the_catalogue_of_the_studied_families():
     assert table.for_seed(0) is table and table.pool == ANY
 
 
-def test_families_differ_in_what_lies_on_the_table_only():
+def test_studied_families_differ_only_in_their_objects():
     s1, s2, s3 = (scene_family(name) for name in ("s1", "s2", "s3"))
     number = ("name", "n_objects_min", "n_objects_max", "n_twins", "n_stacked", "n_hidden", "min_moved")
     for other in (s2, s3):
@@ -62,13 +62,13 @@ def test_bad_fields(field, value):
         replace(SceneFamily(), **{field: value})
 
 
-def test_unknown_name_lists_what_exists():
+def test_an_unknown_family_lists_the_known_ones():
     with pytest.raises(InputError) as caught:
         scene_family("kitchen")
     assert "demo" in caught.value.hints[0]
 
 
-def test_what_the_family_holds():
+def test_points_in_workspace_and_view():
     demo = SCENE_FAMILIES["demo"]
     inside = demo.contains_points(
         np.array([[0.0, 0.0, 0.05], [0.6, 0.0, 0.05], [0.0, -0.45, 0.05], [0.0, 0.0, -0.5]])

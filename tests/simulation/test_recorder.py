@@ -1,4 +1,4 @@
-"""Whole recordings: determinism, truth, and that pictures and truth tell the same story."""
+"""Recordings: determinism, agreement of images and true volumes, and the cache."""
 
 import hashlib
 import subprocess
@@ -12,8 +12,15 @@ from scipy.spatial.transform import Rotation
 from mstfilter.errors import InputError
 from mstfilter.formats import open_recording
 from mstfilter.scene import VoxelGrid, render
+from mstfilter.simulation import recorder
 from mstfilter.simulation.families import scene_family
-from mstfilter.simulation.recorder import SimulatedScene, simulate_recording
+from mstfilter.simulation.recorder import (
+    SimulatedScene,
+    cache_folder,
+    cached_recording,
+    recipe_key,
+    simulate_recording,
+)
 from mstfilter.simulation.shapes import SHAPE_FAMILIES, draw_shape, label_voxels
 from mstfilter.simulation.world import FINGER_ID
 
@@ -59,7 +66,7 @@ def test_layout_of_the_recording(recording):
     recording.check()
 
 
-def test_the_finger_is_seen_in_actions_and_away_at_pauses(recording):
+def test_the_finger_is_visible_in_actions_and_not_at_pauses(recording):
     seen = [(recording.instance(i) == FINGER_ID).sum() for i in range(len(recording))]
     assert all(seen[p] == 0 for p in recording.pauses)
     assert sum(n > 0 for n in seen) >= 4
@@ -118,12 +125,12 @@ def test_voxel_truth_has_the_analytic_volume(family):
         assert voxels == pytest.approx(shape.pieces[0].volume, rel=0.02)
 
 
-def test_truth_holds_objects_that_are_hidden(recording):
+def test_true_volumes_include_hidden_objects(recording):
     for t in range(len(recording.pauses)):
         assert set(np.unique(recording.truth(t))) == {0, 1, 2, 3, 4, 5}
 
 
-def test_objects_beyond_the_grid_are_left_out():
+def test_objects_outside_the_grid_have_no_voxels():
     shape = draw_shape(np.random.default_rng(0), "can")
     pose = np.eye(4)
     pose[:3, 3] = (5.0, 0, 0)
@@ -150,7 +157,7 @@ def test_bad_seed(seed, tmp_path):
         SimulatedScene(SMALL, seed)
 
 
-def test_existing_folder_is_kept(recording):
+def test_an_existing_folder_is_not_overwritten(recording):
     before = digest(recording.path)
     with pytest.raises(InputError):
         simulate_recording(SMALL, 3, recording.path)
@@ -166,7 +173,7 @@ def test_camera_of_families():
     np.testing.assert_allclose(uv, [319.5, 239.5], atol=1e-6)
 
 
-def test_reopened(recording):
+def test_a_recording_is_read_back(recording):
     again = open_recording(recording.path)
     np.testing.assert_array_equal(again.truth(2), recording.truth(2))
 
@@ -185,7 +192,7 @@ def test_objects_that_left_the_workspace_are_named_and_the_truth_keeps_its_exten
     assert set(np.unique(away.truth(0))) == {0, 1, 3, 4, 5}
 
 
-def test_pictures_poses_and_volumes_agree(recording):
+def test_images_poses_and_volumes_agree(recording):
     import json
 
     poses = json.loads((recording.path / "poses.json").read_text())
@@ -193,3 +200,75 @@ def test_pictures_poses_and_volumes_agree(recording):
     for t, pause in enumerate(recording.pauses):
         shown = np.array([poses[pause]["T_world_object"][str(k + 1)] for k in range(5)])
         np.testing.assert_array_equal(label_voxels(scene.objects.shapes, shown, recording.grid), recording.truth(t))
+
+
+TINY = {"width": 80, "height": 60, "n_actions": 1, "frames_per_clip": 3, "fps": 1.0, "supersample": False}
+
+
+def test_a_cached_recording_is_simulated_once(tmp_path, monkeypatch):
+    first = cached_recording("s1", 3, tmp_path, **TINY)
+    assert first.parent == tmp_path and len(open_recording(first)) == 3
+    assert sorted(p.name for p in tmp_path.iterdir()) == [".gitignore", first.name]
+    monkeypatch.setattr(recorder, "_simulate_into_cache", lambda *_: pytest.fail("made again"))
+    assert cached_recording("s1", 3, tmp_path, **TINY) == first
+    assert cached_recording(replace(scene_family("s1"), **TINY), 3, tmp_path) == first
+
+
+def test_the_key_depends_on_all_fields_seed_and_version(monkeypatch):
+    s1 = scene_family("s1")
+    keys = {
+        recipe_key(s1, 3),
+        recipe_key(s1, 4),
+        recipe_key(replace(s1, fps=6.0), 3),
+        recipe_key(scene_family("s2"), 3),
+    }
+    assert len(keys) == 4 and recipe_key(s1, 3) in keys
+    monkeypatch.setattr(recorder, "GENERATOR_VERSION", -1)
+    assert recipe_key(s1, 3) not in keys
+
+
+def test_a_recording_that_another_process_wrote_meanwhile_is_kept(tmp_path, monkeypatch):
+    simulate_recording = recorder.simulate_recording
+    expected = cached_recording("s1", 3, tmp_path / "other", **TINY).name
+
+    def slow(family, seed, path, progress=None):
+        rival = tmp_path / "here" / expected
+        rival.mkdir()
+        (rival / "manifest.json").write_text("{}")
+        return simulate_recording(family, seed, path, progress)
+
+    monkeypatch.setattr(recorder, "simulate_recording", slow)
+    assert cached_recording("s1", 3, tmp_path / "here", **TINY).name == expected
+    assert sorted(p.name for p in (tmp_path / "here").iterdir()) == [".gitignore", expected]
+    assert (tmp_path / "here" / expected / "manifest.json").read_text() == "{}"
+
+
+def test_a_failed_simulation_leaves_no_files(tmp_path, monkeypatch):
+    def broken(family, seed, path, progress=None):
+        (path.parent / "half").write_text("")
+        raise InputError("no")
+
+    monkeypatch.setattr(recorder, "simulate_recording", broken)
+    with pytest.raises(InputError):
+        cached_recording("s1", 3, tmp_path, **TINY)
+    assert [p.name for p in tmp_path.iterdir()] == [".gitignore"]
+
+
+def test_default_folder(monkeypatch, tmp_path):
+    monkeypatch.setenv("MSTFILTER_CACHE", str(tmp_path / "a"))
+    assert cache_folder() == tmp_path / "a"
+    monkeypatch.delenv("MSTFILTER_CACHE")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "b"))
+    assert cache_folder() == tmp_path / "b" / "mstfilter"
+
+
+def test_invalid_arguments_of_the_cache(tmp_path):
+    with pytest.raises(InputError, match="no field 'colour'"):
+        cached_recording("s1", 3, tmp_path, colour=3)
+    with pytest.raises(InputError, match="seed"):
+        cached_recording("s1", -1, tmp_path)
+    with pytest.raises(InputError, match="scene family"):
+        cached_recording("s9", 3, tmp_path)
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match="cannot keep recordings"):
+        cached_recording("s1", 3, tmp_path / "file", **TINY)

@@ -1,9 +1,11 @@
-"""The renderer against closed forms; the sensors against the figures of real ones."""
+"""The renderer against closed forms and open3d; the sensors against measurements of real ones."""
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
-from mstfilter.errors import InputError
+from mstfilter.errors import InputError, MissingLibraryError
+from mstfilter.open3d_import import import_open3d
 from mstfilter.scene import Camera, depth_sigma, look_at
 from mstfilter.simulation.renderer import Renderer
 from mstfilter.simulation.sensor import ColourSensor, DepthSensor
@@ -57,6 +59,48 @@ def test_depth_of_a_box_from_above_and_of_the_table():
     np.testing.assert_allclose(points[~on][:, 2][np.abs(points[~on][:, 0]) < 0.4], 0.0, atol=1e-4)
 
 
+def test_depth_and_instances_agree_with_the_ray_caster_of_open3d():
+    """A scene of boxes and hulls, which are exact meshes; open3d computes in single precision."""
+    try:
+        o3d = import_open3d()
+    except MissingLibraryError as error:
+        pytest.skip(error.message)
+    shapes = [
+        draw_shape(np.random.default_rng(k), name) for k, name in enumerate(("carton", "bowl", "angle", "soap"))
+    ]
+    world, camera = PhysicsWorld(shapes), kinect(320)
+    for k, (shape, place) in enumerate(
+        zip(shapes, ((-0.1, 0.05), (0.1, 0.0), (-0.05, -0.15), (0.2, 0.2)), strict=True)
+    ):
+        world.place(k, (*place, shape.half[2]), Rotation.from_euler("z", 0.4 + k).as_matrix())
+    world.forward()
+    skins = [draw_skin(np.random.default_rng(k), shape) for k, shape in enumerate(shapes)]
+    view = Renderer(world, skins, ROOM, camera, False).render()
+
+    scene, owner = o3d.t.geometry.RaycastingScene(), {}
+    for k, (shape, pose) in enumerate(zip(shapes, world.poses(), strict=True)):
+        for piece in shape.pieces:
+            corners = piece.vertices
+            if piece.kind == "box":
+                corners = np.array(np.meshgrid(*[(-1, 1)] * 3)).reshape(3, -1).T * piece.size
+            points = corners @ piece.rotation.T + piece.centre
+            cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points @ pose[:3, :3].T + pose[:3, 3]))
+            mesh = o3d.t.geometry.TriangleMesh.from_legacy(cloud.compute_convex_hull()[0])
+            owner[scene.add_triangles(mesh)] = k + 1
+    rays = camera.rays().reshape(-1, 3) @ camera.pose.as_matrix()[:3, :3].T
+    rays = np.concatenate([np.broadcast_to(camera.position, rays.shape), rays], axis=1).astype(np.float32)
+    hits = scene.cast_rays(o3d.core.Tensor(rays))
+    depth = hits["t_hit"].numpy().reshape(view.depth.shape)
+    expected = np.array([owner.get(i, 0) for i in hits["geometry_ids"].numpy().ravel()]).reshape(view.depth.shape)
+
+    assert (np.bincount(expected.ravel()) > 500).all()
+    # Rays that graze an edge within single precision may differ.
+    assert (view.instance == expected).mean() > 0.9995
+    same = (view.instance == expected) & (expected > 0)
+    difference = np.abs(view.depth[same] - depth[same])
+    assert np.quantile(difference, 0.999) < 2e-5 and difference.max() < 0.02
+
+
 def test_floor_and_wall_are_behind_the_table():
     view = rendered(draw_shape(np.random.default_rng(0), "can"), (0, 0, 0.1), kinect())
     points = kinect().unproject(view.depth)
@@ -64,7 +108,7 @@ def test_floor_and_wall_are_behind_the_table():
     assert points[..., 2].min() >= FLOOR_HEIGHT - 1e-3
 
 
-def test_shadow_darkens_the_table_and_smoothing_only_touches_edges():
+def test_shadows_darken_the_table_and_supersampling_changes_edges_only():
     shape, camera = draw_shape(np.random.default_rng(0), "carton"), kinect()
     plain = rendered(shape, (0, 0, shape.half[2]), camera)
     empty = rendered(shape, (0, 30.0, -5.0), camera)
@@ -78,7 +122,7 @@ def test_shadow_darkens_the_table_and_smoothing_only_touches_edges():
     np.testing.assert_array_equal(plain.depth, smooth.depth)
 
 
-def test_print_is_not_mirrored():
+def test_textures_are_not_mirrored():
     # Charts that are red left of the middle: seen from outside, red must be on the left of each face.
     shape = draw_shape(np.random.default_rng(0), "carton")
     half = np.zeros((16, 16, 3), np.uint8)
@@ -151,7 +195,7 @@ def test_depth_noise_has_the_deviation_of_real_table_tops():
         assert 1000 * np.median(found[inside, 1]) == pytest.approx(real, rel=slack), (low, high)
 
 
-def test_depth_noise_is_unbiased_and_of_the_scene_s_deviation():
+def test_depth_noise_is_unbiased_and_has_the_modelled_deviation():
     for z in (0.7, 1.0):
         flat = np.full((200, 200), z, np.float32)
         noisy = DepthSensor(lateral=0.0).read(np.random.default_rng(0), flat, np.ones_like(flat))
@@ -212,7 +256,7 @@ def test_readings_are_missing_to_each_side_of_objects_as_on_real_frames():
     assert shares[0, -1][1] > shares[0, 1][1] + 0.1
 
 
-def test_colour_keeps_grey_and_order():
+def test_the_colour_sensor_keeps_grey_and_order():
     steps = np.repeat(np.linspace(0, 1.5, 12)[None, :, None], 50, axis=0)
     steps = np.repeat(np.repeat(steps, 8, axis=1), 3, axis=2).astype(np.float32)
     image = ColourSensor().read(np.random.default_rng(0), steps)

@@ -1,11 +1,17 @@
-"""Pieces and shapes against closed forms and against MuJoCo."""
+"""Pieces and shapes against closed forms and MuJoCo; pools of tuning and reported scenes are disjoint."""
+
+import colorsys
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
 from mstfilter.errors import InputError
-from mstfilter.simulation.shapes import SHAPE_FAMILIES, draw_shape
+from mstfilter.simulation import printing
+from mstfilter.simulation.arrangement import draw_objects
+from mstfilter.simulation.families import scene_family
+from mstfilter.simulation.shapes import ANY, REPORTED, SHAPE_FAMILIES, TUNING, draw_shape
 from mstfilter.simulation.solids import box, capsule, cylinder, ellipsoid, frustum, hull, ring
 from mstfilter.simulation.world import PhysicsWorld
 
@@ -31,7 +37,7 @@ def test_volume_matches_closed_form_and_monte_carlo(name):
 
 
 @pytest.mark.parametrize("name", PIECES)
-def test_nothing_outside_the_bounds(name):
+def test_a_piece_lies_within_its_bounds(name):
     piece, _ = PIECES[name]
     low, high = piece.bounds()
     points = np.random.default_rng(1).uniform(low - 0.03, high + 0.03, (20_000, 3))
@@ -39,7 +45,7 @@ def test_nothing_outside_the_bounds(name):
     assert not piece.inside(points[outside]).any()
 
 
-def test_wedges_fill_the_ring_without_gaps():
+def test_wedges_fill_the_ring():
     wedges = ring([(0.03, 0.04, 0.0), (0.03, 0.04, 0.05)], 24)
     assert sum(w.volume for w in wedges) == pytest.approx(
         0.05 * 24 / 2 * np.sin(2 * np.pi / 24) * (0.04**2 - 0.03**2), rel=1e-9
@@ -93,3 +99,51 @@ def test_rays_meet_the_surface_of_the_analytic_shape(family):
 def test_unknown_family():
     with pytest.raises(InputError, match="teapot"):
         draw_shape(np.random.default_rng(0), "teapot")
+
+
+POOLS = (TUNING, REPORTED)
+
+
+@pytest.mark.parametrize(("draw", "whole"), [("factor", (0.9, 1.1)), ("hue", (0.0, 1.0))])
+def test_bands_of_the_pools_are_disjoint_and_cover_the_same_range(draw, whole):
+    rng = np.random.default_rng(0)
+    first, second = (np.sort([getattr(pool, draw)(rng) for _ in range(3000)]) for pool in POOLS)
+    step = np.searchsorted(first, second)
+    near = np.minimum(np.abs(second - first[np.minimum(step, 2999)]), np.abs(second - first[np.maximum(step - 1, 0)]))
+    assert near.min() > 0.0015
+    for values in (first, second, np.sort([getattr(ANY, draw)(rng) for _ in range(3000)])):
+        assert values[0] >= whole[0] and values[-1] <= whole[1]
+        # Six deviations of the mean of a uniform variable.
+        assert abs(values.mean() - np.mean(whole)) < 0.05 * np.diff(whole)[0] + 6 * np.diff(whole)[0] / 12**0.5 / 54
+
+
+def test_names_of_the_pools_are_disjoint():
+    rng = np.random.default_rng(0)
+    first, second = ({word for _ in range(200) for word in printing.brand(rng, pool)} for pool in POOLS)
+    assert len(first) > 20 and len(second) > 20 and not first & second
+
+
+def test_hues_of_the_pools_are_disjoint():
+    rng = np.random.default_rng(0)
+    for pool in POOLS:
+        for _ in range(300):
+            r, g, b = printing.shade(rng, (0.8, 0.9), 0.5, pool)
+            hue, saturation, _ = colorsys.rgb_to_hsv(r / 255, g / 255, b / 255)
+            if saturation > 0.3:
+                # Colours are whole numbers: the hue is known to about 0.004.
+                assert (int((hue + 0.004) * 12) % 2 == pool.half) or (int((hue - 0.004) * 12) % 2 == pool.half)
+
+
+def test_tuning_and_reported_scenes_share_no_size():
+    # Seeds from 5000 on stand for the reported side: those of the reports are not looked at.
+    def measures(seeds):
+        found = set()
+        for seed in seeds:
+            family = replace(scene_family("s3"), shapes="can").for_seed(seed)
+            for shape in draw_objects(np.random.default_rng(seed), family).shapes:
+                nominal = {"soup": 0.033, "coffee": 0.051, "tuna": 0.0425, "crisps": 0.0375, "biscuits": 0.075}
+                found.add(int((shape.half[0] / nominal[shape.name] - 0.9) / 0.025))
+        return found
+
+    tuning, reported = measures((0, 1)), measures((5000, 5001))
+    assert tuning <= {0, 3, 4, 7} and reported <= {1, 2, 5, 6}

@@ -1,4 +1,4 @@
-"""What is kept from picture to picture: the same pictures, and only what cannot have changed."""
+"""Reuse between frames: the images equal those of casting all rays."""
 
 from dataclasses import replace
 
@@ -15,7 +15,7 @@ from mstfilter.simulation.world import advance_push
 SMALL = replace(scene_family("s1"), width=160, height=120, frames_per_clip=6, fps=3.0)
 
 
-def test_pictures_are_those_of_full_rendering():
+def test_images_equal_those_of_full_rendering():
     scene = SimulatedScene(SMALL, 2)
     full = Renderer(scene.world, scene.objects.skins, scene.room, scene.camera, True, POSE_TOLERANCE, reuse=False)
     kept = scene._renderer
@@ -29,7 +29,7 @@ def test_pictures_are_those_of_full_rendering():
     assert (one.instance == 255).any()
 
 
-def test_a_picture_in_which_nothing_moved_casts_no_ray(monkeypatch):
+def test_no_ray_is_cast_if_nothing_moved(monkeypatch):
     scene = SimulatedScene(SMALL, 2)
     first = scene._renderer.render()
     monkeypatch.setattr(Stage, "cast", lambda self, eye, rays, groups=(): pytest.fail("a ray") if len(rays) else CAST)
@@ -41,7 +41,7 @@ def test_a_picture_in_which_nothing_moved_casts_no_ray(monkeypatch):
 CAST = (np.zeros(0, np.int32), np.zeros(0), np.zeros((0, 3)))
 
 
-def test_the_stage_lags_by_no_more_than_its_tolerance():
+def test_rendered_poses_are_within_the_tolerance():
     scene = SimulatedScene(SMALL, 2)
     world, stage = scene.world, Stage(scene.world, POSE_TOLERANCE)
     shape, pose = world.shapes[0], world.poses()[0]
@@ -77,7 +77,7 @@ def test_rays_that_miss_the_bounds_miss_the_bodies():
     assert np.mean(shares) > 0.3  # and they are no wider than need be
 
 
-def test_long_bounds_are_seen_as_slabs():
+def test_long_bounds_lie_between_planes():
     rod = CapsuleBounds(np.array([[-1.0, 0, 1]]), np.array([[1.0, 0, 1]]), np.array([0.01]))
     rays = np.array([[0.9, 0.005, 1], [0.9, 0.05, 1], [1.2, 0, 1], [0, 0, -1]], np.float32)
     assert rod.seen_from(np.zeros(3)).may_meet(rays).tolist() == [True, False, False, False]

@@ -52,7 +52,7 @@ def test_arranged_scenes_are_settled_without_interpenetration_and_twins_touch(se
             assert (twin, k) in pairs
 
 
-def test_hidden_objects_are_not_seen():
+def test_hidden_objects_are_not_visible():
     family = replace(scene_family("s2"), width=160, height=120, n_stacked=0)
     for seed in range(2):
         scene = SimulatedScene(family, seed)
@@ -62,7 +62,7 @@ def test_hidden_objects_are_not_seen():
         assert len(np.unique(scene.world.geom_object[geom[geom >= 0]])) < 9
 
 
-def test_a_restored_state_goes_on_bit_by_bit():
+def test_a_restored_state_continues_bit_by_bit():
     world, _, _ = arranged(0)
     saved = world.save()
     push = FingerPush((0.0, -0.3), (0.0, 0.1), 1.5)
@@ -108,7 +108,7 @@ def test_no_objects_and_too_many():
         PhysicsWorld([shape] * FINGER_ID)
 
 
-def test_objects_that_cannot_be_arranged_are_one_clear_error():
+def test_objects_that_do_not_fit_on_the_table():
     crowd = replace(DEMO, n_objects_min=40, n_objects_max=40, shapes="carton", n_twins=0)
     rng = np.random.default_rng(0)
     objects = draw_objects(rng, crowd)
