@@ -30,7 +30,6 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Literal
 
 import numpy as np
@@ -58,6 +57,17 @@ from mstfilter.scene import (
 
 VERSION = 1
 """Version of the layout."""
+
+
+class _Workspace(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+    min: tuple[float, float, float]
+    max: tuple[float, float, float]
+    voxel: float
+
+    @classmethod
+    def of(cls, grid: VoxelGrid) -> _Workspace:
+        return cls(min=tuple(grid.origin.tolist()), max=tuple(grid.upper.tolist()), voxel=grid.voxel_size)
 
 
 def check_writable(path: Path) -> None:
@@ -181,21 +191,15 @@ class RecordingWriter:
 
     def close(self) -> Path:
         """Write the remaining files and rename the folder to its final name."""
-        camera = self._camera
+        camera, grid = self._camera, self._grid
         described: dict[str, Any] = {
             "K": camera.K.tolist(),
             "width": camera.width,
             "height": camera.height,
             "depth_scale": self._scale,
             "T_world_camera": None if camera.T_world_camera is None else camera.T_world_camera.as_matrix().tolist(),
-            "workspace": None,
+            "workspace": None if grid is None else _Workspace.of(grid).model_dump(),
         }
-        if self._grid is not None:
-            described["workspace"] = {
-                "min": self._grid.origin.tolist(),
-                "max": self._grid.upper.tolist(),
-                "voxel": self._grid.voxel_size,
-            }
         with self._writing():
             self._finish(described)
         return self.path
@@ -235,9 +239,7 @@ class RecordingWriter:
     def __enter__(self) -> RecordingWriter:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *error: Any) -> None:
         if kind is not None:
             self.discard()
             return
@@ -305,13 +307,6 @@ def save_recording(
         (recording.frames[p] for p in recording.pauses), recording.grid, f"recording {recording.name}"
     )
     return writer.path
-
-
-class _Workspace(BaseModel):
-    model_config = ConfigDict(extra="forbid")
-    min: tuple[float, float, float]
-    max: tuple[float, float, float]
-    voxel: float
 
 
 class _CameraFile(BaseModel):
@@ -485,12 +480,8 @@ def _read_poses(path: Path) -> Any:
 def _read_voxels(path: Path, grid: VoxelGrid, pauses: tuple[int, ...]) -> Any:
     try:
         with np.load(path, allow_pickle=False) as data:
-            labels, frames, origin, size = (
-                data["labels"],
-                data["frame"],
-                data["origin"],
-                float(data["voxel_size"]),
-            )
+            labels, frames = data["labels"], data["frame"]
+            origin, size = data["origin"], float(data["voxel_size"])
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
         raise InputError(f"true volumes cannot be read: {path} ({error})") from error
     if labels.shape[1:] != grid.shape or not np.allclose(origin, grid.origin) or abs(size - grid.voxel_size) > 1e-9:
