@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field, replace
+
 import numpy as np
 import pytest
 
@@ -9,7 +11,7 @@ from mstfilter.baselines.updates import SamplesOnly, TrackingOnly, Union
 from mstfilter.fusion import Division, Evidence, FreeSpace, FusionUpdate, NoFreeSpace
 from mstfilter.presets import build_filter, load_config
 from mstfilter.scene import Hypothesis
-from mstfilter.smc import Population
+from mstfilter.smc import Population, Proposal
 from mstfilter.testing import UpdateContract, scene_example
 from tests.baselines.scenes import slide
 
@@ -49,25 +51,28 @@ def test_another_seed_breaks_the_tie(recording, mst):
     assert keys(run("samples_only", recording, 3, sampler)[0]) != keys(run("samples_only", recording, 4, sampler)[0])
 
 
+@dataclass(frozen=True)
+class Recorded(Proposal):
+    """Keeps the samples of another proposal."""
+
+    proposal: Proposal
+    seen: list = field(default_factory=list)
+
+    def sample(self, rng, observation, n):
+        self.seen.append(self.proposal.sample(rng, observation, n))
+        return self.seen[-1]
+
+
 def test_samples_are_those_that_the_filter_draws_at_the_same_pause(recording):
     """The proposal's stream is the same in both arms at every pause."""
     seen = {}
     for name in ("mst", "samples_only"):
         filter = build_filter(load_config(name, ["proposal.sampler.temperature=8"]))
-        state = filter.start(5)
-        for clip in recording.clips():
-            proposed = filter._propose(None, clip, state.key.child("step", state.t), _Watch())
-            seen.setdefault(name, []).append(keys(proposed))
-            state, _ = filter.step(state, clip)
+        recorded = Recorded(filter.proposal)
+        replace(filter, proposal=recorded).run(recording.clips(), seed=5)
+        seen[name] = [keys(population) for population in recorded.seen]
+    assert len(seen["mst"]) == len(recording.clips())
     assert seen["mst"] == seen["samples_only"]
-
-
-class _Watch:
-    def enter(self, slot):
-        pass
-
-    def leave(self, population=None):
-        pass
 
 
 def test_the_single_frame_baseline_is_the_optimal_cut_and_knows_no_past(recording):

@@ -74,4 +74,4 @@ def test_terms_are_named_in_presets():
     scores = infos[1].notes["update"]["scores"]
     assert set(scores) == {"Agreement"} and len(scores["Agreement"]) == 12
     with pytest.raises(Exception, match="there is no evidence 'smell'"):
-        load_config("mst", ['update.evidence=["smell"]'])
+        build_filter(load_config("mst", ['update.evidence=["smell"]']))

@@ -187,7 +187,7 @@ def test_views_belong_to_the_content_of_a_frame_and_are_checked(tmp_path):
     assert with_view.key != plain.key
     assert with_view.key == frame_of(plain.depth, CAMERAS[0], views=[other]).key
     assert with_view.all_views == (with_view, other)
-    with pytest.raises(InputError, match="views of its own"):
+    with pytest.raises(InputError, match="a view has views"):
         frame_of(plain.depth, CAMERAS[0], views=(with_view,))
     with pytest.raises(InputError, match="images of 2 cameras"):
         save_recording(Recording((with_view,), SMALL, (0,), (0.0,)), tmp_path / "two")
