@@ -4,11 +4,11 @@
 >>> mst = mstfilter.preset("mst")
 >>> mst = mstfilter.preset("mst", "n=10", "resampler=multinomial", "transition.rule=paper")
 
-``mst`` is our best, ``paper`` the published algorithm, ``authors`` the authors' own program. A preset is a TOML
-file: the fields of `ParticleFilter`, with one table a component. It may stand on another one:
+``mst`` is the default, ``paper`` the published algorithm, ``authors`` the program of its authors. A preset is a TOML
+file with the fields of `ParticleFilter`, one table for each component. It may extend another preset:
 
-    base = "mst"                            # everything else as there
-    wrap = ["update.fusion=union"]          # the base's update becomes the field `fusion` of the component union
+    base = "mst"                            # all other fields are those of mst
+    wrap = ["update.fusion=union"]          # the update of mst becomes the field `fusion` of the component `union`
     overrides = ["transition=identity"]     # changes, as on the command line
 """
 
@@ -30,29 +30,31 @@ PACKAGES = (smc, segmentation, completion, tracking, fusion, formats, baselines,
 REGISTRY = Registry(*PACKAGES)
 
 _META = ("description", "source")
-_PLAIN = ("n", "n_proposed", "resample")
-_SLOTS = ("initial", "transition", "proposal", "update", "resampler", "trigger", "size")
+_FIELDS = (
+    *("n", "n_proposed", "resample"),
+    *("initial", "transition", "proposal", "update", "resampler", "trigger", "size"),
+)
 
 
 def preset(name: str = "mst", *overrides: str, allow_files: bool = True) -> ParticleFilter:
-    """A filter by preset name (or path of a TOML file) with overrides ``path=value``."""
+    """The filter of a preset, by name or path of a TOML file, with overrides ``path=value``."""
     return build_filter(load_config(name, overrides, allow_files=allow_files), allow_files=allow_files)
 
 
 def load_config(name: str, overrides: Iterable[str] = (), *, allow_files: bool = True) -> dict[str, Any]:
-    """The configuration of a preset after overrides, names checked; imports no component."""
+    """The configuration of a preset with overrides. Unknown names raise InputError; no component is imported."""
     config = _read(name)
     for override in overrides:
         _override(config, override)
-    unknown = set(config) - {*_META, *_PLAIN, *_SLOTS}
+    unknown = set(config) - {*_META, *_FIELDS}
     if unknown:
-        raise InputError(f"a filter has no field {sorted(unknown)[0]!r}", f"fields: {', '.join((*_PLAIN, *_SLOTS))}")
+        raise InputError(f"a filter has no field {sorted(unknown)[0]!r}", f"fields: {', '.join(_FIELDS)}")
     REGISTRY.check_names(ParticleFilter, config, allow_files)
     return config
 
 
-def _read(name: str, above: tuple[str, ...] = ()) -> dict[str, Any]:
-    """What a preset's file says, on top of what its base says."""
+def _read(name: str, parents: tuple[str, ...] = ()) -> dict[str, Any]:
+    """The content of a preset's file, added to that of its base."""
     path = find_preset(name)
     try:
         config = tomllib.loads(path.read_text())
@@ -61,10 +63,10 @@ def _read(name: str, above: tuple[str, ...] = ()) -> dict[str, Any]:
     base, wraps, changes = config.pop("base", ""), config.pop("wrap", []), config.pop("overrides", [])
     if not isinstance(base, str) or any(not isinstance(v, list) for v in (wraps, changes)):
         raise InputError(f"preset {path}: base must be a name, wrap and overrides lists of path=value")
-    if base in (*above, name):
-        raise InputError(f"preset {path} stands on itself: {' -> '.join((*above, name, base))}")
+    if base in (*parents, name):
+        raise InputError(f"preset {path} extends itself: {' -> '.join((*parents, name, base))}")
     if base:
-        config = {**_read(base, (*above, name)), **config}
+        config = {**_read(base, (*parents, name)), **config}
     for wrap in wraps:
         path_text, _, component = str(wrap).partition("=")
         slot, _, field = path_text.partition(".")
@@ -86,14 +88,14 @@ def build_filter(config: Mapping[str, Any], *, allow_files: bool = False) -> Par
 
 
 def describe_filter(filter: ParticleFilter) -> dict[str, Any]:
-    """The full configuration that builds a filter again, defaults included."""
+    """The configuration that builds a filter again, defaults included."""
     config = REGISTRY.describe(filter)
     config.pop("component")
     return config
 
 
 def settings(overrides: Iterable[str]) -> dict[str, Any]:
-    """Nested settings of ``path=value`` texts alone."""
+    """Nested settings from ``path=value`` texts."""
     config: dict[str, Any] = {}
     for override in overrides:
         _override(config, override)
@@ -120,7 +122,7 @@ def _override(config: dict[str, Any], text: str) -> None:
 
 
 def _value(text: str) -> Any:
-    """A number, a truth value, or the text itself; TOML's syntax where it applies."""
+    """The value of a text in TOML syntax, or the text itself if it is not valid TOML."""
     try:
         return tomllib.loads(f"v = {text}")["v"]
     except tomllib.TOMLDecodeError:

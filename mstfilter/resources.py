@@ -39,11 +39,11 @@ def preset_names() -> list[str]:
 
 
 def find_preset(name: str) -> Path:
-    """The TOML file of a preset by name, or of a user's own by path."""
-    own = Path(name)
-    if own.suffix == ".toml":
-        if own.is_file():
-            return own
+    """The TOML file of a preset, by name or path."""
+    given = Path(name)
+    if given.suffix == ".toml":
+        if given.is_file():
+            return given
         raise InputError(f"preset file does not exist: {name}")
     path = models_folder() / f"{name}.toml"
     if name not in preset_names():

@@ -11,7 +11,9 @@ import pytest
 
 from mstfilter.cli import main
 from mstfilter.runs import RunFolder
+from tests.runs.test_run import content
 from tests.scene.test_recording import FAULTS, write
+from tests.study.test_failures import BROKEN, wait_for
 
 HEAVY = ("torch", "open3d", "cv2", "scipy", "higra", "mujoco", "matplotlib")
 
@@ -145,23 +147,20 @@ def test_the_default_path_needs_neither_open3d_nor_torch(recording, tmp_path):
     assert (tmp_path / "run" / "report.html").is_file()
 
 
-def test_a_kill_at_any_moment_leaves_a_run_that_resumes(recording, tmp_path):
-    """The process is killed mid-run; the same command ends with the same bytes as an undisturbed run."""
-    import time
-
-    from tests.runs.test_run import content
-
-    command = [sys.executable, "-m", "mstfilter", "run", str(recording), "--no-report"]
-    subprocess.run([*command, "--out", tmp_path / "whole"], check=True, capture_output=True, timeout=300)
+def test_a_run_that_was_killed_is_resumed(recording, tmp_path):
+    """The process is killed in its second step; the same command ends with the bytes of an undisturbed run."""
+    marker = tmp_path / "marker"
+    hangs = [f"transition={BROKEN}:Breaks", "transition.how=hang", f'transition.marker="{marker}"']
+    command = [sys.executable, "-m", "mstfilter", "run", recording, *hangs, "--no-report"]
     part = tmp_path / "part"
     process = subprocess.Popen([*command, "--out", part], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    deadline = time.monotonic() + 120
-    while not (part / "pauses" / "000").exists() and process.poll() is None and time.monotonic() < deadline:
-        time.sleep(0.01)
+    wait_for(marker)
     process.kill()
-    assert process.wait() != 0, "the run was over before it could be killed"
+    process.wait()
+    assert RunFolder.open(part).n_pauses == 1
     assert not (part / "metrics.csv").exists()
     subprocess.run([*command, "--out", part], check=True, capture_output=True, timeout=300)
+    subprocess.run([*command, "--out", tmp_path / "whole"], check=True, capture_output=True, timeout=300)
     whole, resumed = content(tmp_path / "whole"), content(part)
     assert whole.keys() == resumed.keys()
     assert [k for k in whole if whole[k] != resumed[k]] == []

@@ -68,14 +68,14 @@ def own_quality(recording: Recording) -> tuple[float, float]:
 
 
 def by_masks(found: Summary, name: str, own: float) -> dict[Masks, dict[str, dict[str, float]]]:
-    """Masks -> method -> scene -> a figure of the study."""
+    """Masks -> method -> scene -> a metric of the study."""
     scenes: dict[Masks, dict[str, dict[str, float]]] = {}
     for arm in found.arms:
         source, method, _, quality = re.fullmatch(r"(\w+) (.+?)( proposal\.quality=([\d.]+))?", arm).groups()
         masks = Masks(source, float(quality) if quality else own)
         for family in found.families:
-            if figure := found.figure(family, arm, name):
-                scenes.setdefault(masks, {}).setdefault(method, {}).update(figure.by_scene)
+            if metric := found.metric(family, arm, name):
+                scenes.setdefault(masks, {}).setdefault(method, {}).update(metric.by_scene)
     return scenes
 
 

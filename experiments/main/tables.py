@@ -25,7 +25,7 @@ from mstfilter.study import ENDPOINT, StudyFolder, Summary, cost_columns, summar
 
 Row = Mapping[str, Any]
 
-FIGURES = (
+METRICS = (
     "quality",
     "quality_weighted",
     "quality_top",
@@ -54,7 +54,7 @@ def by_scene(found: Summary) -> list[dict[str, str]]:
     """The primary endpoint, one row per scene and arm."""
     return [
         {"family": f.family, "scene": scene, "arm": f.arm, ENDPOINT: f"{value:.4f}"}
-        for f in found.figures
+        for f in found.metrics
         if f.name == ENDPOINT
         for scene, value in f.by_scene.items()
     ]
@@ -64,10 +64,10 @@ def means(found: Summary) -> list[dict[str, str]]:
     """One row per family and arm."""
     lines = []
     for family, arm in product(found.families, found.arms):
-        if endpoint := found.figure(family, arm):
-            figures = {name: found.figure(family, arm, name) for name in FIGURES}
+        if endpoint := found.metric(family, arm):
+            metrics = {name: found.metric(family, arm, name) for name in METRICS}
             row = {"family": family, "arm": arm, "n": str(len(endpoint.by_scene))}
-            lines.append(row | {name: f"{f.mean:.4g}" if f else "" for name, f in figures.items()})
+            lines.append(row | {name: f"{f.mean:.4g}" if f else "" for name, f in metrics.items()})
     return lines
 
 

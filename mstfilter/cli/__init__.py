@@ -8,16 +8,15 @@ from __future__ import annotations
 
 import sys
 
-from mstfilter.cli import running, studying, data, components  # isort: skip (the order of the help page)
-from mstfilter.cli.root import app
-from mstfilter.cli.shared import warnings_as_lines
+from mstfilter.cli import running, studying, components  # isort: skip (the order of the help page)
+from mstfilter.cli.root import app, warnings_as_lines
 from mstfilter.errors import InputError
 
-__all__ = ["app", "components", "data", "main", "running", "studying"]
+__all__ = ["app", "components", "main", "running", "studying"]
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Run the command line; bad input is one clear error and exit code 2."""
+    """Run the command line. Invalid input is reported as one ``error:`` line and exit code 2."""
     given = sys.argv[1:] if arguments is None else list(arguments)
     debug = "--debug" in given
     given = [a for a in given if a != "--debug"]
@@ -32,15 +31,15 @@ def main(arguments: list[str] | None = None) -> None:
             print(f"hint: {hint}", file=sys.stderr)
         sys.exit(2)
     except SystemExit as end:
-        if end.code == 130:  # Ctrl-C, as the application tells it
-            print("interrupted: the same command goes on from here", file=sys.stderr)
+        if end.code == 130:  # Ctrl-C
+            print("interrupted: repeat the command to resume", file=sys.stderr)
         raise
     except KeyboardInterrupt:
-        print("interrupted: the same command goes on from here", file=sys.stderr)
+        print("interrupted: repeat the command to resume", file=sys.stderr)
         sys.exit(130)
     except Exception as error:
         if debug:
             raise
         print(f"error: {type(error).__name__}: {error}", file=sys.stderr)
-        print("hint: this is a fault of the program; --debug shows where it happened", file=sys.stderr)
+        print("hint: this is an error in the program or in a component; --debug shows the traceback", file=sys.stderr)
         sys.exit(1)

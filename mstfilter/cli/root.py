@@ -1,12 +1,19 @@
-"""The typer application that the command groups register with, and options that several of them share."""
+"""The typer application that the commands register with, and what several commands share."""
 
 from __future__ import annotations
 
-from typing import Annotated
+import contextlib
+import re
+import sys
+import warnings
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Annotated, Any, TextIO
 
 import typer
 
 from mstfilter import __version__
+from mstfilter.errors import InputWarning
 
 app = typer.Typer(
     add_completion=False,
@@ -37,7 +44,7 @@ Pauses = Annotated[
         metavar="RULE", help="Pauses of a video: still, ends, every, frames 0,40,85, seconds 0s,4.2s, a file."
     ),
 ]
-Seed = Annotated[int, typer.Option(min=0, help="Names all random streams.")]
+Seed = Annotated[int, typer.Option(min=0, help="Seed of all random streams.")]
 
 
 def _version(wanted: bool) -> None:
@@ -51,6 +58,85 @@ def _root(
     version: Annotated[
         bool, typer.Option("--version", callback=_version, is_eager=True, help="Show the version.")
     ] = False,
-    debug: Annotated[bool, typer.Option("--debug", help="Show a traceback where something fails.")] = False,
+    debug: Annotated[bool, typer.Option("--debug", help="Show the traceback of an error.")] = False,
 ) -> None:
-    """Take the options of all commands."""
+    """Options of all commands."""
+
+
+def safe_name(name: str) -> str:
+    """A name without characters that have a meaning in paths."""
+    return re.sub(r"[^\w.-]+", "-", name).strip(".-") or "recording"
+
+
+def read_source(path: Path, format: str, options: list[str] | None, pauses: str, frames: str = "") -> Any:
+    """Open a recording of any format."""
+    from mstfilter.runs import open_source
+
+    names = ",".join(name.strip() for name in frames.split(",") if name.strip())
+    chosen = [*(options or []), *([f"frames={names},"] if names else [])]
+    from rich.console import Console
+
+    with Console(stderr=True).status(f"reading {path.name}"):  # shown on a terminal only
+        return open_source(path, format, chosen, pauses)
+
+
+@contextlib.contextmanager
+def warnings_as_lines() -> Iterator[None]:
+    """Print an `InputWarning` as one ``warning:`` line with its hints; other warnings are unchanged."""
+    with warnings.catch_warnings():
+        show_other = warnings.showwarning
+        warnings.simplefilter("always", InputWarning)
+
+        def show(
+            message: Warning | str,
+            category: type[Warning],
+            filename: str,
+            lineno: int,
+            file: TextIO | None = None,
+            line: str | None = None,
+        ) -> None:
+            if not isinstance(message, InputWarning):
+                show_other(message, category, filename, lineno, file, line)
+                return
+            print(f"warning: {message.message}", file=sys.stderr)
+            for hint in message.hints:
+                print(f"hint: {hint}", file=sys.stderr)
+
+        warnings.showwarning = show
+        yield
+
+
+@contextlib.contextmanager
+def progress_bar(what: str) -> Iterator[Callable[[int, int], None]]:
+    """A progress bar on standard error; yields ``advance(done, total)``."""
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+    columns = (TextColumn("{task.description:<12}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    bars = Progress(*columns, console=Console(stderr=True))
+    task = bars.add_task(what, total=None)
+
+    def advance(done: int, total: int) -> None:
+        bars.start()  # not before the first call, so that an earlier error is printed without a bar
+        bars.update(task, completed=done, total=total)
+
+    try:
+        yield advance
+    finally:
+        bars.stop()
+
+
+def print_summary(run: Path) -> None:
+    """Print one line a pause: hypotheses, their objects, effective sample size, quality."""
+    from mstfilter.runs import RunFolder
+
+    folder = RunFolder.open(run)
+    for t in range(folder.n_pauses):
+        info, hypotheses = folder.info(t), folder.hypotheses(t)
+        objects = " ".join(str(h.n_objects) for h in hypotheses)
+        line = f"pause {t}     {len(hypotheses)} hypotheses of {objects} objects, "
+        line += f"ESS {info['ess']:.1f} of {info['n_candidates']} candidates"
+        if info["quality"] is not None:
+            q = info["quality"]["objects"]
+            line += f", quality {sum(q) / len(q):.3f} (mean), {max(q):.3f} (best)"
+        print(line)

@@ -1,14 +1,25 @@
-"""Commands that filter recordings: run, demo, simulate, report."""
+"""Commands about recordings and runs: run, demo, simulate, report, convert, quality."""
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from mstfilter.cli.root import FormatOption, Options, Overrides, Pauses, Seed, app
-from mstfilter.cli.shared import bar, read_source, safe_name, summary
+from mstfilter.cli.root import (
+    FormatOption,
+    Options,
+    Overrides,
+    Pauses,
+    Seed,
+    app,
+    print_summary,
+    progress_bar,
+    read_source,
+    safe_name,
+)
 from mstfilter.errors import InputError
 
 
@@ -27,7 +38,7 @@ def run(
     frames: Annotated[str, typer.Option(help="Frames of a folder of pairs, separated by commas.")] = "",
     report: Annotated[bool, typer.Option(help="Write report.html into the run folder.")] = True,
 ) -> None:
-    """Filter a recording into a run folder. A run that was stopped goes on."""
+    """Filter a recording into a run folder, or resume a run that was stopped."""
     from mstfilter.presets import build_filter, load_config
 
     config = load_config(preset, overrides or ())
@@ -38,7 +49,7 @@ def run(
     _execute(source, config, folder, seed)
     if report:
         _report(folder, None)
-    summary(folder)
+    print_summary(folder)
 
 
 @app.command()
@@ -58,16 +69,16 @@ def demo(
         raise InputError(f"{out} is a file, expected a folder for the demo")
     if out.exists() and any(out.iterdir()):
         known = {"recording", "run", "report.html"}
-        strange = sorted(p.name for p in out.iterdir() if p.name.lstrip(".").removesuffix(".partial") not in known)
-        if strange:
+        others = sorted(p.name for p in out.iterdir() if p.name not in known and p.suffix != ".partial")
+        if others:
             raise InputError(
-                f"{out} holds something that is not a demo: {strange[0]}", "choose another folder with --out"
+                f"{out} holds a file that is not of a demo: {others[0]}", "choose another folder with --out"
             )
         shutil.rmtree(out)
     _simulate("demo", out / "recording", seed)
     _execute(open_recording(out / "recording"), load_config("mst"), out / "run", 0)
     _report(out / "run", out / "report.html")
-    summary(out / "run")
+    print_summary(out / "run")
 
 
 @app.command("simulate")
@@ -76,7 +87,7 @@ def simulate_(
     out: Annotated[Path, typer.Argument(help="Recording folder to make.")],
     seed: Seed = 0,
 ) -> None:
-    """Simulate a recording with its true volumes."""
+    """Simulate a recording with ground truth."""
     _simulate(family, out, seed)
 
 
@@ -88,7 +99,7 @@ def report(
     mesh_format: Annotated[str, typer.Option(help="Format of exported meshes: ply, obj or glb.")] = "ply",
     mesh_style: Annotated[str, typer.Option(help="Style of exported meshes: blocky or smooth.")] = "blocky",
 ) -> None:
-    """Write the report of a run or a study, finished or not."""
+    """Write the report of a run or a study, which need not be finished."""
     if (run / "study.json").is_file():
         from mstfilter.report import write_study_report
 
@@ -105,11 +116,67 @@ def report(
         print(f"hypotheses  {export}")
 
 
+@app.command()
+def convert(
+    source: Annotated[Path, typer.Argument(help="Folder or file of a format that `mstfilter list format` shows.")],
+    out: Annotated[Path, typer.Argument(help="Recording folder to make.")],
+    format: FormatOption = "",
+    option: Options = None,
+    pauses: Pauses = "",
+    frames: Annotated[str, typer.Option(help="Frames of a folder of pairs, separated by commas.")] = "",
+) -> None:
+    """Convert data of another format to a recording folder; a stopped or failed conversion leaves no folder."""
+    from mstfilter.formats import check_writable, save_recording
+
+    check_writable(out)
+    recording = read_source(source, format, option, pauses, frames)
+    generator = recording.manifest.get("generator") or f"converted from {source.name}"
+    try:
+        with progress_bar("convert") as advance:
+            save_recording(recording, out, progress=advance, generator=generator)
+    except KeyboardInterrupt:
+        print("interrupted: nothing was written", file=sys.stderr)
+        raise typer.Exit(130) from None
+    print(f"recording   {out}")
+    marks = ", ".join(f"{p} ({recording.times[p]:.1f} s)" for p in recording.pauses[:12])
+    more = ", ..." if len(recording.pauses) > 12 else ""
+    print(f"pauses      {len(recording.pauses)} of {len(recording)} frames: {marks}{more}")
+
+
+@app.command()
+def quality(
+    run: Annotated[Path, typer.Argument(help="Run folder, or label volumes (.npz or .npy).")],
+    truth: Annotated[Path, typer.Argument(help="Recording with ground truth, or its voxels.npz.")],
+    csv: Annotated[Path | None, typer.Option(help="Also write the table into this file.")] = None,
+    format: FormatOption = "",
+    option: Options = None,
+) -> None:
+    """Score the hypotheses of a run and trivial baselines against the ground truth."""
+    from statistics import fmean
+
+    from mstfilter.runs import read_estimate, read_truth, score_pauses, write_scores
+
+    volumes = truth.is_file() and truth.suffix in (".npz", ".npy")
+    known = truth if volumes else read_source(truth, format, option, "")
+    rows = score_pauses(read_estimate(run), read_truth(known))
+    if csv is not None:
+        write_scores(csv, rows)
+    names = ("mean", "weighted", "best", "top", "one_blob", "components")
+    print(f"{'pause':<7}{'form':<9}{'n':>4}" + "".join(f"{name:>12}" for name in names))
+    for row in rows:
+        print(f"{row.pause:<7}{row.form:<9}{row.n:>4}" + "".join(f"{getattr(row, name):>12.3f}" for name in names))
+    for form in dict.fromkeys(row.form for row in rows):
+        these = [row for row in rows if row.form == form]
+        print(f"{'all':<7}{form:<9}{'':>4}" + "".join(f"{fmean(getattr(r, n) for r in these):>12.3f}" for n in names))
+    if rows[0].where == "image":
+        print("scored in the image: hypotheses are projected, hidden parts do not count")
+
+
 def _simulate(family: str, out: Path, seed: int) -> None:
     from mstfilter.simulation import scene_family, simulate_recording
 
     chosen = scene_family(family)
-    with bar("simulate") as advance:
+    with progress_bar("simulate") as advance:
         simulate_recording(chosen, seed, out, progress=lambda done, total, what: advance(done, total))
     print(f"recording   {out}")
 
@@ -117,7 +184,7 @@ def _simulate(family: str, out: Path, seed: int) -> None:
 def _execute(recording: Any, config: dict[str, Any], folder: Path, seed: int) -> None:
     from mstfilter.runs import filter_recording
 
-    with bar("filter") as advance:
+    with progress_bar("filter") as advance:
         filter_recording(
             recording, config, folder, seed, allow_files=True, progress=lambda p: advance(p.done, p.total)
         )

@@ -1,4 +1,4 @@
-"""Commands about many runs: study."""
+"""The command study."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from mstfilter.cli.root import app
 
 @app.command()
 def study(
-    config: Annotated[Path, typer.Argument(help="TOML file that says what is compared.")],
+    config: Annotated[Path, typer.Argument(help="TOML file of the study.")],
     overrides: Annotated[
         list[str] | None,
         typer.Argument(metavar="[PATH=VALUE]...", help="Changes to every arm; a comma makes a grid: update.eta=3,5"),
@@ -23,13 +23,13 @@ def study(
     out: Annotated[Path | None, typer.Option(help="Study folder. Default: studies/NAME.")] = None,
     workers: Annotated[int, typer.Option(min=0, help="Processes; 0 is one a core.")] = 0,
     scheduler: Annotated[
-        str, typer.Option(help="Address of a running Dask scheduler, tcp://HOST:PORT, in place of own processes.")
+        str, typer.Option(help="Address of a Dask scheduler, tcp://HOST:PORT. Default: processes of this machine.")
     ] = "",
     smoke: Annotated[
-        bool, typer.Option("--smoke", help="The small form that the file's table [smoke] describes.")
+        bool, typer.Option("--smoke", help="Run the small form that the table [smoke] of the file describes.")
     ] = False,
 ) -> None:
-    """Compare filters on many scenes. A study that was stopped goes on; what is done is never repeated."""
+    """Compare filters on many scenes, or resume a study that was stopped."""
     from mstfilter.study import check_arm_names, load_study
 
     wanted = load_study(config, smoke=smoke)
@@ -42,24 +42,24 @@ def study(
         from mstfilter.study import Cluster
 
         executor = Cluster(scheduler)
-    with _shown() as progress:
+    with _progress_bars() as progress:
         result = run_study(wanted, folder, executor, overrides or (), progress=progress)
     print(f"study       {folder}")
-    print(f"runs        {result.done} done, {result.repeated} of them before; table {folder / 'runs.csv'}")
+    print(f"runs        {result.done} done, {result.repeated} of them earlier; table {folder / 'runs.csv'}")
     _print_summary(result.folder.summary())
     for name, outcome in result.failed:
         print(f"failed      {name}: {outcome.error}")
     if result.failed:
-        print(f"hint: the same command repeats what failed; more in {folder / 'failures.csv'}", file=sys.stderr)
+        print(f"hint: the same command repeats the runs that failed; see {folder / 'failures.csv'}", file=sys.stderr)
         raise typer.Exit(1)
 
 
 def _print_summary(summary: Any) -> None:
-    """The primary endpoint by family and arm, and how the reference compares."""
+    """Print the primary endpoint by family and arm, and the differences to the reference."""
     from rich.console import Console
     from rich.table import Table
 
-    if not summary.figures or "quality" not in summary.names:
+    if not summary.metrics or "quality" not in summary.names:
         return
     table = Table(
         "family", "arm", "n", "quality, t >= 1", "95 %", f"{summary.reference} - arm", "95 %", "slope", "s a step"
@@ -67,16 +67,16 @@ def _print_summary(summary: Any) -> None:
     for family in summary.families:
         compared = {one.second: one.difference for one in summary.compared() if one.family == family}
         for arm in summary.arms:
-            figure, d = summary.figure(family, arm), compared.get(arm)
-            if figure is None:
+            metric, d = summary.metric(family, arm), compared.get(arm)
+            if metric is None:
                 continue
-            slope, seconds = (summary.figure(family, arm, name) for name in ("quality_slope", "core_seconds"))
+            slope, seconds = (summary.metric(family, arm, name) for name in ("quality_slope", "core_seconds"))
             table.add_row(
                 family,
                 arm,
-                str(len(figure.by_scene)),
-                f"{figure.mean:.3f}",
-                _range(*figure.interval),
+                str(len(metric.by_scene)),
+                f"{metric.mean:.3f}",
+                _range(*metric.interval),
                 "" if d is None else f"{d.mean:+.3f}",
                 "" if d is None else _range(d.low, d.high, "+"),
                 "" if slope is None else f"{slope.mean:+.3f}",
@@ -86,13 +86,13 @@ def _print_summary(summary: Any) -> None:
 
 
 def _range(low: float, high: float, sign: str = "") -> str:
-    """An interval; a dash where there is none."""
+    """An interval; a dash if there is none."""
     return "–" if low != low else f"{low:{sign}.3f} .. {high:{sign}.3f}"
 
 
 @contextlib.contextmanager
-def _shown() -> Iterator[Callable[[Any], None]]:
-    """Bars on standard error: one for the whole, one for every run that is going on."""
+def _progress_bars() -> Iterator[Callable[[Any], None]]:
+    """Progress bars on standard error: one for all jobs and one for every running job."""
     from rich.console import Console
     from rich.progress import (
         BarColumn,
@@ -111,29 +111,29 @@ def _shown() -> Iterator[Callable[[Any], None]]:
         TimeRemainingColumn(),
     )
     bars = Progress(*columns, console=Console(stderr=True))
-    whole: dict[str, Any] = {}
-    parts: dict[str, Any] = {}
+    overall: dict[str, Any] = {}
+    running: dict[str, Any] = {}
 
-    def tell(p: Any) -> None:
+    def update(p: Any) -> None:
         bars.start()
-        if p.what not in whole:
-            whole[p.what] = bars.add_task(p.what, total=p.total)
+        if p.what not in overall:
+            overall[p.what] = bars.add_task(p.what, total=p.total)
         failed = f", {p.failed} failed" if p.failed else ""
-        bars.update(whole[p.what], completed=p.done + p.failed, description=f"{p.what}{failed}")
+        bars.update(overall[p.what], completed=p.done + p.failed, description=f"{p.what}{failed}")
         if p.event is None:
             return
         if p.event.kind == "begun":
-            parts[p.name] = bars.add_task(f"  {p.name}", total=None)
-        elif p.event.kind == "step" and p.name in parts:
-            bars.update(parts[p.name], completed=p.event.done, total=p.event.total)
-        elif p.event.kind in ("ended", "lost") and p.name in parts:
-            bars.remove_task(parts.pop(p.name))
+            running[p.name] = bars.add_task(f"  {p.name}", total=None)
+        elif p.event.kind == "step" and p.name in running:
+            bars.update(running[p.name], completed=p.event.done, total=p.event.total)
+        elif p.event.kind in ("ended", "lost") and p.name in running:
+            bars.remove_task(running.pop(p.name))
         if p.event.kind == "lost":
             bars.console.print(f"a worker died in {p.name}")
         elif p.event.outcome is not None and p.event.outcome.status != "done":
             bars.console.print(f"failed: {p.name}: {p.event.outcome.error}", markup=False)
 
     try:
-        yield tell
+        yield update
     finally:
         bars.stop()

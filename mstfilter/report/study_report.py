@@ -133,9 +133,9 @@ def _costs(summary: Summary) -> dict[str, Any]:
     for family in summary.families:
         for arm in summary.arms:
             cells = {
-                name: figure.mean
+                name: metric.mean
                 for name in ("seconds", "core_seconds", *(n for n in summary.names if n.startswith(per)))
-                if (figure := summary.figure(family, arm, name)) is not None
+                if (metric := summary.metric(family, arm, name)) is not None
             }
             if cells:
                 rows.append({"family": family, "arm": arm, **cells})

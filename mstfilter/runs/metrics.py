@@ -1,19 +1,21 @@
-"""Figures of a run at a pause: what the protocol of the studies asks for.
+"""Metrics of the hypotheses at one pause of a run.
 
 >>> row = measure_pause(run, recording, t=2)
 >>> row["quality"], row["quality_hidden"], row["split"], row["brier"]
 
-All are means over the hypotheses, each counting the same, unless they say otherwise; truth is volumetric.
+Unless stated otherwise, a metric is the unweighted mean over the hypotheses, measured in volume against the ground
+truth.
 
-``quality``: weighted coverage, form ``objects``: missing, invented, split and merged objects all cost;
-``quality_paper``, ``quality_authors``: its other forms (`mstfilter.scoring.quality`).
-``quality_top``, ``quality_weighted``, ``quality_best``: of the heaviest hypothesis; mean by weight; of the best one
-(to be compared between equal n only).
-``quality_visible``, ``_hidden``, ``_unseen``: coverage of the true objects of that status alone (`coverage_of`).
-``quality_one_blob``, ``quality_components``: floors; the same occupied voxels as one object, and as components.
-``occupancy``: intersection over union of all that is occupied. ``object_f``: F score of objects at IoU 0.5.
-``split``, ``merged``, ``missed``, ``invented``: numbers of objects (`errors_of`).
-``diversity``: 1 - mean quality of one hypothesis against another; 0 if all are alike.
+``quality``: weighted coverage in the form ``objects``; missed, invented, split and merged objects reduce it.
+``quality_paper``, ``quality_authors``: the other forms (see `mstfilter.scoring`).
+``quality_top``, ``quality_weighted``, ``quality_best``: quality of the hypothesis of largest weight, weighted mean,
+and maximum. The maximum can only be compared at equal numbers of hypotheses.
+``quality_visible``, ``quality_hidden``, ``quality_unseen``: coverage of the true objects of that status only.
+``quality_one_blob``, ``quality_components``: trivial baselines: the occupied voxels as one object, or as their
+connected components.
+``occupancy``: intersection over union of the occupied voxels. ``object_f``: F score of objects at IoU 0.5.
+``split``, ``merged``, ``missed``, ``invented``: numbers of objects (see `object_errors`).
+``diversity``: 1 - mean quality of one hypothesis against another; 0 if all are equal.
 ``brier``, ``disputed``: see `pair_brier`.
 """
 
@@ -38,15 +40,15 @@ from mstfilter.scoring import (
     weighted_coverage,
 )
 
-MOST = 0.5
-FRAGMENT = 0.1
+_MOST = 0.5
+_FRAGMENT = 0.1
 _PAIRS_AT_ONCE = 2**22
 
 
 def measure_pause(run: RunFolder, recording: Recording, t: int) -> dict[str, Any]:
-    """One row: the figures of the hypotheses of a run at pause `t`; without true volumes only what needs none.
+    """The metrics of a run at pause `t`; without ground truth only those that need none.
 
-    The list ``qualities``, one a hypothesis, is for figures; tables leave it out.
+    ``qualities`` is the list of the quality of each hypothesis; tables leave it out.
     """
     info, hypotheses = run.info(t), run.hypotheses(t)
     labels, weights = [h.labels for h in hypotheses], np.array(info["weights"], dtype=float)
@@ -56,14 +58,14 @@ def measure_pause(run: RunFolder, recording: Recording, t: int) -> dict[str, Any
     if truth is None:
         return {**row, "diversity": diversity(labels)}
     known = all(recording.instance(p) is not None for p in recording.pauses[: t + 1])
-    found, q = _figures(labels, weights, truth, object_status(recording, t) if known else {})
+    found, q = _metrics_and_quality(labels, weights, truth, object_status(recording, t) if known else {})
     return {**row, **found, "qualities": q.tolist()}
 
 
-def figures(
+def pause_metrics(
     labels: Sequence[np.ndarray], weights: np.ndarray, truth: np.ndarray, status: Mapping[int, str]
 ) -> dict[str, float]:
-    """The figures of hypotheses against the truth.
+    """Metrics of hypotheses against the ground truth.
 
     Parameters
     ----------
@@ -73,15 +75,15 @@ def figures(
         Sum 1.
     truth : (X, Y, Z) int
     status : mapping
-        True label -> visible, hidden or unseen; empty where not known.
+        True label -> visible, hidden or unseen; empty if unknown.
     """
-    return _figures(labels, weights, truth, status)[0]
+    return _metrics_and_quality(labels, weights, truth, status)[0]
 
 
-def _figures(
+def _metrics_and_quality(
     labels: Sequence[np.ndarray], weights: np.ndarray, truth: np.ndarray, status: Mapping[int, str]
 ) -> tuple[dict[str, float], np.ndarray]:
-    """The figures, and the quality of every hypothesis (n,)."""
+    """The metrics, and the quality of every hypothesis (n,)."""
     (truth, *labels), n_free = _cropped([truth, *labels])
     distinct, which = _distinct(labels)
     tables = [_with_free(overlap(one, truth), n_free) for one in distinct]
@@ -108,7 +110,7 @@ def _figures(
     row["quality_components"] = mean([weighted_coverage(connected_components(one), truth) for one in distinct])
     row["occupancy"] = mean([occupancy_iou(table) for table in tables])
     row["object_f"] = mean([object_f(table) for table in tables])
-    errors = [errors_of(table) for table in tables]
+    errors = [object_errors(table) for table in tables]
     for kind in errors[0]:
         row[kind] = mean([e[kind] for e in errors])
     row["true_objects"] = float(np.count_nonzero(tables[0].labels_b))
@@ -118,9 +120,9 @@ def _figures(
 
 
 def _cropped(grids: Sequence[np.ndarray]) -> tuple[list[np.ndarray], int]:
-    """The grids cut to where any of them is occupied, and how many voxels were cut away, which are free in all.
+    """The grids cropped to the voxels that any of them occupies, and the number of voxels removed.
 
-    A layer of free voxels stays wherever something is cut, so that free space is still a region of every grid.
+    A layer of free voxels is kept at each side that is cropped, so that free space remains a region of every grid.
     """
     occupied = np.any([grid > 0 for grid in grids], axis=0)
     box = []
@@ -132,7 +134,7 @@ def _cropped(grids: Sequence[np.ndarray]) -> tuple[list[np.ndarray], int]:
 
 
 def _with_free(table: Overlap, n_free: int) -> Overlap:
-    """The table of the whole grids."""
+    """The table of the grids before cropping."""
     counts = table.counts.copy()
     if n_free:
         counts[0, 0] += n_free
@@ -140,7 +142,7 @@ def _with_free(table: Overlap, n_free: int) -> Overlap:
 
 
 def _distinct(labels: Sequence[np.ndarray]) -> tuple[list[np.ndarray], np.ndarray]:
-    """The different ones, and which of them each is (n,)."""
+    """The distinct arrays, and the index (n,) of each array among them."""
     found: dict[bytes, int] = {}
     which = np.array([found.setdefault(one.tobytes(), len(found)) for one in labels])
     return [labels[int(np.flatnonzero(which == k)[0])] for k in range(len(found))], which
@@ -154,8 +156,8 @@ def _objects(table: Overlap) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.nda
 
 
 def coverage_of(table: Overlap, labels: Sequence[int]) -> float:
-    """Coverage of some true objects: how well the best object of the hypothesis overlaps each (intersection over
-    union), averaged by size; NaN if there are none of them."""
+    """Coverage of some true objects: the largest intersection over union of each with an object of the hypothesis,
+    averaged by size; NaN if there are none."""
     _, _, sizes, jaccard = _objects(table)
     chosen = np.isin(table.labels_b[table.labels_b > 0], np.asarray(labels, dtype=np.int64))
     if not chosen.any():
@@ -165,32 +167,32 @@ def coverage_of(table: Overlap, labels: Sequence[int]) -> float:
 
 
 def occupancy_iou(table: Overlap) -> float:
-    """Intersection over union of all occupied voxels, whatever object they belong to; 1 if both are empty."""
+    """Intersection over union of the occupied voxels; 1 if both are empty."""
     counts, sizes_a, sizes_b, _ = _objects(table)
     union = sizes_a.sum() + sizes_b.sum() - counts.sum()
     return float(counts.sum() / union) if union else 1.0
 
 
 def object_f(table: Overlap) -> float:
-    """F score of objects; a match is an intersection over union above 0.5, so nothing can match twice (Kirillov et
-    al. 2019). 1 if both are empty."""
+    """F score of objects, matched by an intersection over union above 0.5, so that no object matches twice (Kirillov
+    et al. 2019); 1 if both are empty."""
     _, sizes_a, sizes_b, jaccard = _objects(table)
     total = len(sizes_a) + len(sizes_b)
     return float(2 * np.count_nonzero(jaccard > 0.5) / total) if total else 1.0
 
 
-def errors_of(table: Overlap) -> dict[str, float]:
-    """Counts of what is wrong, in the manner of Hoover et al. 1996.
+def object_errors(table: Overlap) -> dict[str, float]:
+    """Numbers of split, merged, missed and invented objects (as in Hoover et al. 1996).
 
-    *split*: true objects in which two or more objects of the hypothesis mostly lie, each at least a tenth of the true
-    one's size. *merged*: objects of the hypothesis that hold most of two or more true ones. *missed*: true objects
-    that neither lie mostly in an object of the hypothesis nor hold most of one. *invented*: the same the other way
-    round. Most is more than half.
+    *split*: true objects that contain more than half of each of two or more objects of the hypothesis, which have at
+    least a tenth of its size. *merged*: objects of the hypothesis that contain more than half of each of two or more
+    true objects. *missed*: true objects of which no object of the hypothesis contains more than half, and that
+    contain more than half of none. *invented*: the same with the roles exchanged.
     """
     counts, sizes_a, sizes_b, _ = _objects(table)
-    lies = counts > MOST * sizes_a[:, None]
-    holds = counts > MOST * sizes_b[None, :]
-    fragment = sizes_a[:, None] >= FRAGMENT * sizes_b[None, :]
+    lies = counts > _MOST * sizes_a[:, None]
+    holds = counts > _MOST * sizes_b[None, :]
+    fragment = sizes_a[:, None] >= _FRAGMENT * sizes_b[None, :]
     related = lies | holds
     return {
         "split": float(((lies & fragment).sum(axis=0) >= 2).sum()),
@@ -201,7 +203,7 @@ def errors_of(table: Overlap) -> dict[str, float]:
 
 
 def diversity(labels: Sequence[np.ndarray]) -> float:
-    """1 - mean quality over all pairs of different hypotheses (by number, so two equal ones count); NaN for one."""
+    """1 - mean quality over all pairs of hypotheses, equal ones included; NaN for a single hypothesis."""
     n = len(labels)
     if n < 2:
         return float("nan")
@@ -215,9 +217,9 @@ def diversity(labels: Sequence[np.ndarray]) -> float:
 
 
 def pair_brier(labels: Sequence[np.ndarray], weights: np.ndarray, truth: np.ndarray) -> tuple[float, float]:
-    """Brier score of "these two voxels belong to the same object", where the hypotheses disagree about it.
+    """Brier score of the statement "these two voxels belong to the same object", over pairs that are disputed.
 
-    The forecast for a pair is the weight of the hypotheses in which both belong to one object.
+    The forecast for a pair is the total weight of the hypotheses in which both voxels belong to one object.
 
     Parameters
     ----------
@@ -229,10 +231,10 @@ def pair_brier(labels: Sequence[np.ndarray], weights: np.ndarray, truth: np.ndar
     Returns
     -------
     (float, float)
-        Mean squared error over the pairs that some hypotheses have in one object and others not (NaN if there is
-        none); their share among the pairs that any hypothesis has in one object.
+        Mean squared error over the disputed pairs, which some but not all hypotheses put into one object (NaN if
+        there are none), and their share of the pairs that any hypothesis puts into one object.
     """
-    # Voxels with the same labels in all hypotheses and in the truth behave alike: count them once.
+    # Voxels with equal labels in all hypotheses and in the truth form a pattern; pairs of patterns are counted.
     stacked = np.stack([np.asarray(one).ravel() for one in labels])
     occupied = (stacked > 0).any(axis=0)
     names, sizes = _patterns(np.vstack([stacked[:, occupied], np.asarray(truth).ravel()[occupied]]))
@@ -250,7 +252,7 @@ def pair_brier(labels: Sequence[np.ndarray], weights: np.ndarray, truth: np.ndar
         true = (names[n, block, None] == names[n][None, :]) & (names[n, block, None] > 0)
         pairs = np.outer(sizes[block], sizes)
         own = np.arange(block.stop - begin)
-        pairs[own, own + begin] -= sizes[block]  # no voxel with itself; every other pair is met twice
+        pairs[own, own + begin] -= sizes[block]  # no pair of a voxel with itself
         joined += float(pairs[times > 0].sum())
         doubt = (times > 0) & (times < n)
         disputed += float(pairs[doubt].sum())
@@ -261,9 +263,9 @@ def pair_brier(labels: Sequence[np.ndarray], weights: np.ndarray, truth: np.ndar
 
 
 def _patterns(columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Different columns of (k, m) small whole numbers, and how often each occurs."""
+    """Distinct columns of (k, m) small integers, and the number of times that each occurs."""
     code = np.zeros(columns.shape[1], np.int64)
-    for row in columns:  # renumbered after every row, so that the code stays small
+    for row in columns:  # renumbered after each row to keep the code small
         code = code * (int(row.max(initial=0)) + 1) + row
         _, code = np.unique(code, return_inverse=True)
     _, first, sizes = np.unique(code, return_index=True, return_counts=True)

@@ -1,12 +1,12 @@
-"""Quality of a run, or of any label volumes, against the truth.
+"""Scores of a run, or of label volumes, against the ground truth.
 
->>> rows = score_pauses(read_estimate(Path("runs/mine")), read_truth(Path("recordings/mine")))
+>>> rows = score_pauses(read_estimate(Path("runs/mine")), read_truth(Path("recordings/mine/voxels.npz")))
 >>> rows[0].form, rows[0].mean, rows[0].best, rows[0].one_blob
 
-One row a pause and form of weighted coverage (`mstfilter.scoring.quality`): mean over the hypotheses, mean by weight,
-best, that of the heaviest one; beside them the floors of the same hypotheses: their occupied voxels as one blob and
-as connected components. Where the truth has instance images and no volumes, hypotheses are projected into the image
-and compared there (``where`` says image); pixels of the robot (255) do not count.
+There is one row for each pause and form of weighted coverage (`mstfilter.scoring`): the mean over the hypotheses, the
+weighted mean, the maximum, the value of the hypothesis of largest weight, and two trivial baselines: the occupied
+voxels of the same hypotheses as one blob and as connected components. If the ground truth has instance images but no
+volumes, hypotheses are rendered and compared in the image; pixels of the robot (255) are ignored.
 """
 
 from __future__ import annotations
@@ -29,18 +29,18 @@ _ROBOT = 255
 
 @dataclass(frozen=True, eq=False)
 class PauseEstimate:
-    """Hypotheses at one pause.
+    """Hypotheses at one pause of a run.
 
     Parameters
     ----------
     labels : sequence of (X, Y, Z) arrays
-        One a hypothesis.
+        One array for each hypothesis.
     weights : (n,) array
-        They sum to 1.
+        Their sum is 1.
     frame : int, optional
-        Frame of the recording at this pause, where known.
+        Frame of the recording at this pause.
     grid : VoxelGrid, optional
-        Where the voxels are, where known.
+        Grid of the volumes.
     """
 
     labels: Sequence[np.ndarray]
@@ -55,14 +55,14 @@ class PauseTruth:
 
     Parameters
     ----------
-    labels : (X, Y, Z) array, or (H, W) where `camera` is given
-        0 is no object.
+    labels : (X, Y, Z) array, or (H, W) if `camera` is given
+        0: no object.
     frame : int, optional
-        Frame of the recording, where known.
+        Frame of the recording.
     grid : VoxelGrid, optional
-        Of volumes, where known.
+        Grid of a volume.
     camera : Camera, optional
-        Of an image.
+        Camera of an image.
     """
 
     labels: np.ndarray
@@ -73,7 +73,7 @@ class PauseTruth:
 
 @dataclass(frozen=True)
 class PauseScore:
-    """Quality at one pause in one form."""
+    """Quality at one pause in one form of weighted coverage."""
 
     pause: int
     where: str
@@ -104,7 +104,7 @@ def read_estimate(path: Path) -> list[PauseEstimate]:
 
 
 def read_truth(source: Path | Recording) -> list[PauseTruth]:
-    """Truth of a recording (its volumes, else its instance images), or of a .npz or .npy file of volumes."""
+    """Ground truth of a recording (its volumes, else its instance images), or of a .npz or .npy file of volumes."""
     if isinstance(source, Path):
         volumes, frames, grid = _read_volumes(source, "true volumes")
         return [PauseTruth(one, frame, grid) for one, frame in zip(volumes, frames, strict=True)]
@@ -117,16 +117,16 @@ def read_truth(source: Path | Recording) -> list[PauseTruth]:
             found.append(PauseTruth(image, index, None, source.frames[index].camera))
     if not found:
         raise InputError(
-            f"recording {source.name} holds no truth: neither volumes (voxels.npz) nor instance images",
+            f"recording {source.name} has no ground truth: neither volumes (voxels.npz) nor instance images",
             "give volumes as .npz: labels (S, X, Y, Z), frame (S,), origin (3,), voxel_size",
         )
     return found
 
 
 def _read_volumes(path: Path, what: str) -> tuple[np.ndarray, list[int | None], VoxelGrid | None]:
-    """Labels (S, X, Y, Z), frame of each or None, and the grid where it is known."""
+    """Labels (S, X, Y, Z), the frame of each or None, and the grid or None."""
     if not path.exists():
-        raise InputError(f"{what}: there is no {path}")
+        raise InputError(f"{what}: file does not exist: {path}")
     try:
         loaded = np.load(path, allow_pickle=False)
         data: Mapping[str, np.ndarray] = {"labels": loaded} if isinstance(loaded, np.ndarray) else dict(loaded)
@@ -153,13 +153,13 @@ def _read_volumes(path: Path, what: str) -> tuple[np.ndarray, list[int | None], 
 
 
 def score_pauses(estimates: Sequence[PauseEstimate], truths: Sequence[PauseTruth]) -> list[PauseScore]:
-    """Rows of quality of each pause that both know; pauses are matched by frame where both tell it, else in order."""
+    """Scores of all pauses that have both; pauses are matched by frame if both have frames, else by order."""
     by_frame = {t.frame: t for t in truths}
     named = None not in by_frame and all(e.frame is not None for e in estimates)
     if not named and len(estimates) != len(truths):
         raise InputError(
             f"there are {len(estimates)} pauses with hypotheses and {len(truths)} with truth, and no frame numbers",
-            "an array `frame` (S,) in the .npz files says which belong together",
+            "add an array `frame` (S,) to the .npz files",
         )
     rows = []
     for pause, estimate in enumerate(estimates):
@@ -169,7 +169,7 @@ def score_pauses(estimates: Sequence[PauseEstimate], truths: Sequence[PauseTruth
     if not rows:
         raise InputError(
             f"no pause has both: hypotheses are at frames {[e.frame for e in estimates]}, truth at {list(by_frame)}",
-            "is it the truth of another recording?",
+            "check that they belong to the same recording",
         )
     return rows
 
@@ -188,10 +188,11 @@ def _score_pause(pause: int, estimate: PauseEstimate, truth: PauseTruth) -> list
         def seen(labels: np.ndarray) -> np.ndarray:
             return render(labels, grid, camera).labels[known]
     else:
-        if estimate.grid is not None and truth.grid is not None and not _same(estimate.grid, truth.grid):
+        if estimate.grid is not None and truth.grid is not None and not _same_grid(estimate.grid, truth.grid):
             raise InputError(
-                f"pause {pause}: hypotheses are on a grid {_words(estimate.grid)}, truth on {_words(truth.grid)}",
-                "run the filter on the recording that holds the truth, or give it the same workspace",
+                f"pause {pause}: hypotheses are on a grid {_grid_text(estimate.grid)}, "
+                f"truth on {_grid_text(truth.grid)}",
+                "run the filter on the recording that has the ground truth, or give it the same workspace",
             )
 
         def seen(labels: np.ndarray) -> np.ndarray:
@@ -208,18 +209,18 @@ def _score_pause(pause: int, estimate: PauseEstimate, truth: PauseTruth) -> list
         q = np.array([weighted_coverage(labels, true, form) for labels in found])
         low = [float(w @ [weighted_coverage(labels, true, form) for labels in floor]) for floor in floors]
         where = "volume" if truth.camera is None else "image"
-        figures = float(q.mean()), float(w @ q), float(q.max()), float(q[w.argmax()])
-        rows.append(PauseScore(pause, where, form, len(q), *figures, *low))
+        values = float(q.mean()), float(w @ q), float(q.max()), float(q[w.argmax()])
+        rows.append(PauseScore(pause, where, form, len(q), *values, *low))
     return rows
 
 
-def _same(a: VoxelGrid, b: VoxelGrid) -> bool:
+def _same_grid(a: VoxelGrid, b: VoxelGrid) -> bool:
     return (
         a.shape == b.shape and np.allclose(a.origin, b.origin, atol=1e-6) and abs(a.voxel_size - b.voxel_size) < 1e-9
     )
 
 
-def _words(grid: VoxelGrid) -> str:
+def _grid_text(grid: VoxelGrid) -> str:
     return f"{' x '.join(map(str, grid.shape))} at {np.round(grid.origin, 4).tolist()} of {grid.voxel_size:g} m"
 
 

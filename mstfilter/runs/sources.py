@@ -1,10 +1,10 @@
-"""Recordings from whatever is on disk: which format it is, with what options.
+"""Open recordings of any format.
 
 >>> open_source(Path("session.mcap"))
 >>> open_source(Path("rgbd_dataset"), options=["K=525,525,319.5,239.5"], pauses="0s,4.2s")
 
 Options are fields of the format (``mstfilter list format`` shows them) in the syntax of overrides; a comma makes a
-list. ``--format ./file.py:Class`` is a reader of the user's own.
+list. The format ``./file.py:Class`` is a reader that the user wrote.
 """
 
 from __future__ import annotations
@@ -57,12 +57,12 @@ def _reader(name: str, allow_files: bool = False) -> type[RecordingFormat]:
     """The class of a format."""
     cls = REGISTRY.find_class("format", name, "format", allow_files)
     if not issubclass(cls, RecordingFormat):
-        raise InputError(f"{name} is no reader of recordings", "subclass mstfilter.formats.RecordingFormat")
+        raise InputError(f"{name} is not a reader of recordings", "subclass mstfilter.formats.RecordingFormat")
     return cls
 
 
 def detect_format(path: Path) -> str:
-    """The one format that a file or folder looks like."""
+    """The name of the format of a file or folder."""
     if not path.exists():
         raise InputError(f"recording folder or file does not exist: {path}")
     names = REGISTRY.known("format")
@@ -76,11 +76,11 @@ def detect_format(path: Path) -> str:
     if path.is_dir() and (
         not any(path.iterdir()) or any((path / n).exists() for n in ("camera.json", "rgb", "depth"))
     ):
-        return "recording"  # its reader says what is missing
+        return "recording"  # its reader reports what is missing
     raise InputError(
-        f"{path} is of no format that is known here",
-        f"known are {', '.join(names)}; `mstfilter list format` says what each looks like",
-        "from Python, any arrays will do: mstfilter.Recording.from_arrays",
+        f"{path} has no known format",
+        f"known formats: {', '.join(names)}; `mstfilter list format` describes them",
+        "in Python, mstfilter.Recording.from_arrays makes a recording from arrays",
     )
 
 
@@ -90,7 +90,7 @@ def format_settings(options: Sequence[str]) -> dict[str, Any]:
 
 
 def _with_lists(text: str) -> str:
-    """``K=1,2,3`` as ``K=[1,2,3]``; words become strings."""
+    """``K=1,2,3`` as ``K=[1, 2, 3]``; words are quoted."""
     path, equals, value = text.partition("=")
     if not equals or "," not in value or value.strip()[:1] in "[{\"'":
         return text
@@ -99,7 +99,7 @@ def _with_lists(text: str) -> str:
 
 
 def _quoted(word: str) -> str:
-    """A number or a text as TOML writes it; 007 is a name."""
+    """A word as a TOML value; numbers with leading zeros are texts."""
     try:
         number = float(word)
     except ValueError:

@@ -1,4 +1,13 @@
-"""Runs and their folders."""
+"""Studies: filters compared on many scenes.
+
+>>> from mstfilter.study import Local, load_study, run_study
+>>> study = load_study("experiments/main/study.toml", smoke=True)
+>>> result = run_study(study, Path("studies/main"), Local(workers=2))
+>>> result.folder.summary().compared()[0].words
+
+`run_study` plans the runs (every arm on every scene with every seed), runs those that are not done yet by an executor
+(`Local` or `Cluster`), and writes the tables of the study folder. Each run is a `mstfilter.runs.RunFolder`.
+"""
 
 from mstfilter.lazy import attach
 

@@ -30,9 +30,9 @@ from mstfilter.study.summary import Summary, summarise
 
 STUDY_FORMAT = 2
 RESULT = "result.json"  # in a run's folder
-_SUMMARY_COLUMNS = ("family", "arm", "figure", "n", "mean", "low", "high")
+_SUMMARY_COLUMNS = ("family", "arm", "metric", "n", "mean", "low", "high")
 _DIFFERENCE_COLUMNS = (
-    *("family", "first", "second", "figure", "n", "mean", "low", "high"),
+    *("family", "first", "second", "metric", "n", "mean", "low", "high"),
     *("low_bootstrap", "high_bootstrap", "p", "p_holm", "conclusion"),
 )
 _FAILURE_COLUMNS = ("run", "error", "hints", "tries", "folder")
@@ -170,7 +170,7 @@ class StudyFolder:
         failed = [{"run": f["name"], **f, "hints": "; ".join(f["hints"] or ())} for f in self.failures()]
         for name, table, names in (
             ("runs", rows, columns),
-            ("summary", found.figure_rows(), _SUMMARY_COLUMNS),
+            ("summary", found.metric_rows(), _SUMMARY_COLUMNS),
             ("differences", found.difference_rows(), _DIFFERENCE_COLUMNS),
             ("failures", failed, _FAILURE_COLUMNS),
         ):

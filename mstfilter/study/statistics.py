@@ -1,12 +1,12 @@
-"""Differences between arms, paired by scene, and what may be said of them.
+"""Differences between arms, paired by scene, and the conclusions that they allow.
 
 >>> difference = compare({"a": 0.9, "b": 0.8, "c": 0.8}, {"a": 0.7, "b": 0.7, "c": 0.6})
 >>> round(difference.mean, 3), difference.n
 (0.167, 3)
 
-The unit is the scene: what seeds of the filter give on one scene is averaged first. A t interval, a studentised
-bootstrap interval beside it, and the p value of flipping the signs of the differences, which assumes no more than
-that they are symmetric about zero if there is no difference. p values of one table are adjusted by Holm's rule.
+The unit is the scene: values of filter seeds on one scene are averaged first. A difference has a t interval, a
+studentised bootstrap interval, and the p value of a sign-flip test, which assumes that the differences are symmetric
+about zero under the null hypothesis. p values of one table are adjusted by Holm's method.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 LEVEL = 0.95
-CLAIM = 20  # scenes below which nothing is claimed
-EXACT = 12  # scenes up to which all sign flips are tried
+CLAIM = 20  # fewest scenes for a claim
+EXACT = 12  # most scenes for which all sign flips are enumerated
 N_FLIPS = 9999
 N_BOOTSTRAP = 4999
 
@@ -33,13 +33,13 @@ class Difference:
     low, high : float
         t interval; NaN for one scene.
     low_bootstrap, high_bootstrap : float
-        Studentised bootstrap; NaN below five scenes.
+        Studentised bootstrap interval; NaN for fewer than five scenes.
     p : float
-        Of sign flips, two-sided; NaN for one scene.
+        Two-sided p value of the sign-flip test; NaN for one scene.
     n : int
-        Scenes that both arms have.
+        Number of scenes that both arms have.
     p_holm : float
-        After adjustment for all comparisons of the table; `p` where there is one only.
+        p value adjusted for all comparisons of the table; equals `p` for a single comparison.
     """
 
     mean: float
@@ -58,7 +58,7 @@ def compare(first: Mapping[str, float], second: Mapping[str, float]) -> Differen
     Parameters
     ----------
     first, second : mapping
-        Scene -> figure. Scenes without a finite figure are left out.
+        Scene -> value. Scenes without a finite value are left out.
     """
     scenes = [s for s in first if s in second and np.isfinite(first[s]) and np.isfinite(second[s])]
     d = np.array([first[s] - second[s] for s in scenes])
@@ -81,9 +81,11 @@ def interval(values: np.ndarray, level: float = LEVEL) -> tuple[float, float]:
 
 
 def studentised(values: np.ndarray, level: float = LEVEL, n_resamples: int = N_BOOTSTRAP) -> tuple[float, float]:
-    """Studentised bootstrap interval of the mean (Efron, Tibshirani 1993, section 12.5); NaN below five values.
+    """Studentised bootstrap interval of the mean (Efron, Tibshirani 1993, section 12.5); NaN for fewer
+    than five values.
 
-    The same values give the same interval. Resamples in which all values are equal have no scale and are left out.
+    The random generator is fixed, so the same values give the same interval. Resamples whose values are all equal
+    have no standard error and are left out.
     """
     n = len(values)
     if n < 5:
@@ -101,7 +103,7 @@ def studentised(values: np.ndarray, level: float = LEVEL, n_resamples: int = N_B
 
 
 def sign_flip(values: np.ndarray) -> float:
-    """Two-sided p value of a mean of zero by flipping signs: all of them up to 12 values, else 9999 drawn ones."""
+    """Two-sided p value of the sign-flip test of a zero mean: exact up to 12 values, else 9999 random flips."""
     from scipy.stats import permutation_test
 
     n = len(values)
@@ -123,7 +125,7 @@ def sign_flip(values: np.ndarray) -> float:
 
 
 def holm(p: Sequence[float]) -> np.ndarray:
-    """p values adjusted by Holm's rule (1979); what is NaN is no comparison and stays so."""
+    """p values adjusted by Holm's method (1979). NaN marks a missing comparison and stays NaN."""
     values = np.asarray(p, dtype=float)
     out = np.full(len(values), np.nan)
     order = [k for k in np.argsort(values) if np.isfinite(values[k])]
@@ -135,7 +137,7 @@ def holm(p: Sequence[float]) -> np.ndarray:
 
 
 def adjusted(differences: Sequence[Difference]) -> list[Difference]:
-    """The comparisons of one table, their p values adjusted together."""
+    """The differences of one table with p values adjusted together."""
     return [replace(d, p_holm=float(p)) for d, p in zip(differences, holm([d.p for d in differences]), strict=True)]
 
 
@@ -149,7 +151,7 @@ def slope(times: np.ndarray, values: np.ndarray) -> float:
 
 
 def conclusion(difference: Difference, first: str, second: str, where: str = "") -> str:
-    """What a difference says, in words that claim no more than it shows."""
+    """The conclusion that a difference allows, as a sentence."""
     d, at = difference, f" on {where}" if where else ""
     if d.n == 0:
         return f"{first} and {second}{at}: no scene has both."

@@ -1,10 +1,10 @@
-"""From one row a pause to what a study says: means by family and arm, and paired differences.
+"""The summary of a study: means by family and arm, and paired differences to the reference.
 
->>> found = summarise(folder.rows(), reference="mst")
->>> found.figure("s1", "mst", "quality").mean, found.differences[0].words
+>>> summary = summarise(folder.rows(), reference="mst")
+>>> summary.metric("s1", "mst", "quality").mean, summary.differences[0].words
 
-The primary endpoint is the mean over pauses t >= 1 of the unweighted mean ``objects`` quality; other figures are
-averaged the same way, so that all rows of a table are about the same pauses. Filter seeds are averaged before scenes.
+The primary endpoint is the mean over pauses t >= 1 of the unweighted mean ``objects`` quality. Other metrics are
+averaged over the same pauses. Values are averaged over filter seeds first, then over scenes.
 """
 
 from __future__ import annotations
@@ -19,19 +19,19 @@ import numpy as np
 from mstfilter.study.statistics import Difference, compare, conclusion, holm, interval, slope
 
 ENDPOINT = "quality"
-SLOPE = "quality_slope"  # a pause, over all pauses, t = 0 included
+SLOPE = "quality_slope"  # change of quality from pause to pause, t = 0 included
 _NAMES = ("family", "scene", "arm", "seed", "pause", "time_s")
 
 
 @dataclass(frozen=True)
-class Figure:
-    """A figure of an arm on the scenes of a family.
+class ArmMetric:
+    """A metric of an arm on the scenes of a family.
 
     Parameters
     ----------
     family, arm, name : str
     by_scene : mapping
-        Scene -> mean over filter seeds; scenes where it is not defined are left out.
+        Scene -> mean over filter seeds. Scenes where the metric is not defined are left out.
     """
 
     family: str
@@ -41,7 +41,7 @@ class Figure:
 
     @property
     def mean(self) -> float:
-        """Over scenes; NaN if there are none."""
+        """Mean over scenes; NaN if there are none."""
         return float(np.mean(list(self.by_scene.values()))) if self.by_scene else float("nan")
 
     @property
@@ -56,78 +56,78 @@ class Compared:
 
     Parameters
     ----------
-    family, first, second, figure : str
+    family, first, second, metric : str
     difference : Difference
-        p adjusted over all families and methods of the primary endpoint; not adjusted for other figures.
+        For the primary endpoint, p is adjusted over all families and arms.
     reported_only : bool
-        The other arm is a floor or a ceiling: no part of the adjustment, and nothing is said of it.
+        The other arm is not part of the adjustment, and no conclusion is drawn.
     """
 
     family: str
     first: str
     second: str
-    figure: str
+    metric: str
     difference: Difference
     reported_only: bool = False
 
     @property
     def adjusted(self) -> bool:
-        """Whether `p_holm` of the difference is an adjusted one."""
-        return self.figure == ENDPOINT and not self.reported_only
+        """Whether `p_holm` of the difference is adjusted."""
+        return self.metric == ENDPOINT and not self.reported_only
 
     @property
     def words(self) -> str:
-        """A conclusion."""
+        """The conclusion in words."""
         return conclusion(self.difference, self.first, self.second, self.family)
 
 
 @dataclass(frozen=True)
 class Summary:
-    """What a study says.
+    """Means and differences of a study.
 
     Parameters
     ----------
     families, arms, names : tuple of str
-        In the order of the study; `names` are those of the figures.
+        In the order of the study; `names` are those of the metrics.
     reference : str
-    figures : tuple of Figure
+    metrics : tuple of ArmMetric
     differences : tuple of Compared
-        Primary endpoint first, then the slope, then all other figures.
+        Primary endpoint first, then its slope, then all other metrics.
     """
 
     families: tuple[str, ...]
     arms: tuple[str, ...]
     names: tuple[str, ...]
     reference: str
-    figures: tuple[Figure, ...]
+    metrics: tuple[ArmMetric, ...]
     differences: tuple[Compared, ...]
 
-    def figure(self, family: str, arm: str, name: str = ENDPOINT) -> Figure | None:
-        """A figure; None where there is none."""
-        for one in self.figures:
+    def metric(self, family: str, arm: str, name: str = ENDPOINT) -> ArmMetric | None:
+        """A metric; None if the arm has no value on the family."""
+        for one in self.metrics:
             if (one.family, one.arm, one.name) == (family, arm, name):
                 return one
         return None
 
     def compared(self, name: str = ENDPOINT) -> list[Compared]:
-        """Differences of a figure."""
-        return [one for one in self.differences if one.figure == name]
+        """Differences of a metric."""
+        return [one for one in self.differences if one.metric == name]
 
-    def figure_rows(self) -> list[dict[str, Any]]:
-        """For summary.csv."""
+    def metric_rows(self) -> list[dict[str, Any]]:
+        """Rows of summary.csv."""
         rows = []
-        for one in self.figures:
+        for one in self.metrics:
             low, high = one.interval
-            named = {"family": one.family, "arm": one.arm, "figure": one.name}
+            named = {"family": one.family, "arm": one.arm, "metric": one.name}
             rows.append({**named, "n": len(one.by_scene), "mean": one.mean, "low": low, "high": high})
         return rows
 
     def difference_rows(self) -> list[dict[str, Any]]:
-        """For differences.csv."""
+        """Rows of differences.csv."""
         rows = []
         for one in self.differences:
             d = one.difference
-            row = {"family": one.family, "first": one.first, "second": one.second, "figure": one.figure, "n": d.n}
+            row = {"family": one.family, "first": one.first, "second": one.second, "metric": one.metric, "n": d.n}
             row |= {"mean": d.mean, "low": d.low, "high": d.high, "p": d.p}
             row["p_holm"] = d.p_holm if one.adjusted else None
             row |= {"low_bootstrap": d.low_bootstrap, "high_bootstrap": d.high_bootstrap}
@@ -138,7 +138,7 @@ class Summary:
 def summarise(
     rows: Sequence[Mapping[str, Any]], reference: str, cost: Sequence[str] = (), reported_only: Collection[str] = ()
 ) -> Summary:
-    """The summary of rows as `StudyFolder.rows` returns them.
+    """Summarise rows as `StudyFolder.rows` returns them.
 
     Parameters
     ----------
@@ -146,30 +146,30 @@ def summarise(
     reference : str
         The arm that others are compared with.
     cost : sequence of str
-        Columns of time and memory: averaged over all pauses, where a stage that a pause lacks took no time; never
-        compared.
+        Columns of time and memory. They are averaged over all pauses and not compared; a stage that a step lacks
+        took 0 seconds.
     reported_only : collection of str
-        Arms that are floors or ceilings.
+        Arms that are not part of the comparisons.
     """
     families, arms = (tuple(dict.fromkeys(str(row[k]) for row in rows)) for k in ("family", "arm"))
     named = list(dict.fromkeys(k for row in rows for k in row if k not in _NAMES))
     measured = [name for name in named if name not in cost]
     values = _by_scene(rows, measured, lambda row: row["pause"] >= 1)
     spent = [k for k in named if k in cost]
-    nothing = {k: 0.0 for k in spent if not k.startswith("peak_mb")}  # no time, but no less memory
-    values.update(_by_scene([{**nothing, **row} for row in rows], spent, lambda row: True))
+    zero = {k: 0.0 for k in spent if not k.startswith("peak_mb")}
+    values.update(_by_scene([{**zero, **row} for row in rows], spent, lambda row: True))
     if ENDPOINT in measured:
         values.update(_slopes(rows))
         measured.insert(1 + measured.index(ENDPOINT), SLOPE)
     names = tuple([*measured, *(k for k in named if k in cost)])
-    figures = tuple(
-        Figure(family, arm, name, values[family, arm, name])
+    metrics = tuple(
+        ArmMetric(family, arm, name, values[family, arm, name])
         for family in families
         for arm in arms
         for name in names
         if values.get((family, arm, name))
     )
-    # What is compared first stands first; all else is exploration.
+    # The primary endpoint first, then its slope; all other comparisons are exploratory.
     order = sorted(measured, key=lambda name: (name != ENDPOINT, name != SLOPE))
     differences = []
     for name in order:
@@ -193,14 +193,14 @@ def summarise(
                 for one, q in zip(table, p, strict=True)
             ]
         differences.extend(table)
-    return Summary(families, arms, names, reference, figures, tuple(differences))
+    return Summary(families, arms, names, reference, metrics, tuple(differences))
 
 
 _Values = dict[tuple[str, str, str], dict[str, float]]
 
 
 def _by_scene(rows: Sequence[Mapping[str, Any]], names: Sequence[str], wanted: Any) -> _Values:
-    """(family, arm, figure) -> scene -> mean over seeds of the mean over pauses."""
+    """(family, arm, metric) -> scene -> mean over seeds of the mean over pauses."""
     runs: dict[tuple[str, str, str, str], dict[Any, list[float]]] = defaultdict(lambda: defaultdict(list))
     for row in rows:
         if not wanted(row):

@@ -123,7 +123,7 @@ def test_a_preset_does_not_stand_on_itself(tmp_path):
     a, b = tmp_path / "a.toml", tmp_path / "b.toml"
     a.write_text(f'base = "{b}"')
     b.write_text(f'base = "{a}"')
-    with pytest.raises(InputError, match="stands on itself"):
+    with pytest.raises(InputError, match="extends itself"):
         load_config(str(a))
 
 

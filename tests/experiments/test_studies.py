@@ -60,7 +60,7 @@ def test_main_study_runs_and_resumes(tmp_path, capsys):
     for _ in range(2):
         folder = run_small(tmp_path, MAIN)
     arms = [arm.name for arm in make_plan(load_study(MAIN)).arms]
-    assert f"{len(arms)} of them before" in capsys.readouterr().out  # the second time no run is left to do
+    assert f"{len(arms)} of them earlier" in capsys.readouterr().out  # the second time no run is left to do
     rows = read_csv(folder / "runs.csv")
     assert {row["arm"] for row in rows} == set(arms) and len(rows) == len(arms) * 2
 

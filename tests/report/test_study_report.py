@@ -72,7 +72,7 @@ def test_contents_of_the_study_page(tmp_path):
     assert text.count('<svg class="figure"') == 2
     assert not re.search(r"(src|href)=\"(http|//)", text) and "<script" not in text
     assert "n = 6" in text  # where the arms differ
-    mean = StudyFolder.open(study).summary().figure("s1", "ours").mean
+    mean = StudyFolder.open(study).summary().metric("s1", "ours").mean
     assert f"<b>{mean:.3f}</b>" in text
 
 

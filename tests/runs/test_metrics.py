@@ -1,4 +1,4 @@
-"""Every figure against a plain oracle that counts voxel by voxel."""
+"""Every metric against a simple reference that counts voxel by voxel."""
 
 from __future__ import annotations
 
@@ -10,7 +10,15 @@ import pytest
 from hypothesis import given, settings, strategies as st
 from hypothesis.extra import numpy as hnp
 
-from mstfilter.runs.metrics import coverage_of, diversity, errors_of, figures, object_f, occupancy_iou, pair_brier
+from mstfilter.runs.metrics import (
+    coverage_of,
+    diversity,
+    object_errors,
+    object_f,
+    occupancy_iou,
+    pair_brier,
+    pause_metrics,
+)
 from mstfilter.scoring import overlap, weighted_coverage
 
 SMALL = hnp.arrays(np.uint16, (3, 3, 2), elements=st.integers(0, 3))
@@ -26,7 +34,7 @@ def regions(labels):
     return found
 
 
-def plain_figures(hypothesis, truth):
+def plain_metrics(hypothesis, truth):
     """One hypothesis, by sets."""
     A, B = regions(hypothesis), regions(truth)
     iou = {(a, b): len(A[a] & B[b]) / len(A[a] | B[b]) for a in A for b in B}
@@ -61,10 +69,10 @@ def plain_brier(labels, weights, truth):
 def test_against_sets(world):
     labels, truth = world
     for one in labels:
-        table, expected = overlap(one, truth), plain_figures(one, truth)
+        table, expected = overlap(one, truth), plain_metrics(one, truth)
         assert occupancy_iou(table) == pytest.approx(expected["occupancy"])
         assert object_f(table) == pytest.approx(expected["object_f"])
-        assert errors_of(table) == {k: expected[k] for k in ("split", "merged", "missed", "invented")}
+        assert object_errors(table) == {k: expected[k] for k in ("split", "merged", "missed", "invented")}
         some = [b for b in expected["coverage"] if b != 2]
         if some:
             sizes, best = np.array([expected["coverage"][b] for b in some]).T
@@ -99,16 +107,18 @@ def test_known_errors():
     truth = np.array([1] * 6 + [2] * 3 + [3] * 3 + [4] * 3 + [0] * 3)
     found = np.array([5] * 3 + [6] * 3 + [7] * 6 + [0] * 3 + [8] * 3)
     table = overlap(found, truth)
-    assert errors_of(table) == {"split": 1, "merged": 1, "missed": 1, "invented": 1}
+    assert object_errors(table) == {"split": 1, "merged": 1, "missed": 1, "invented": 1}
     assert object_f(table) == 0.0
     assert occupancy_iou(table) == 12 / 18
 
 
-def test_figures_of_a_population():
+def test_metrics_of_a_population():
     truth = np.zeros((6, 6, 3), int)
     truth[:2], truth[3:5], truth[5] = 1, 2, 3
     worse = np.where(truth == 2, 1, truth)
-    row = figures([truth, truth, worse], np.array([0.2, 0.2, 0.6]), truth, {1: "visible", 2: "hidden", 3: "unseen"})
+    row = pause_metrics(
+        [truth, truth, worse], np.array([0.2, 0.2, 0.6]), truth, {1: "visible", 2: "hidden", 3: "unseen"}
+    )
     q = weighted_coverage(worse, truth)
     assert row["quality"] == pytest.approx((2 + q) / 3)
     assert row["quality_top"] == q
@@ -120,7 +130,7 @@ def test_figures_of_a_population():
     assert row["brier"] == pytest.approx(0.36)  # the heavier hypothesis is wrong about every disputed pair
     assert row["quality_one_blob"] == pytest.approx(weighted_coverage((truth > 0).astype(int), truth))
     assert (row["n_visible"], row["n_hidden"], row["n_unseen"], row["true_objects"]) == (1, 1, 1, 3)
-    one = figures([truth], np.ones(1), truth, {})
+    one = pause_metrics([truth], np.ones(1), truth, {})
     assert math.isnan(one["diversity"]) and math.isnan(one["brier"]) and math.isnan(one["quality_hidden"])
 
 
@@ -131,16 +141,16 @@ def test_free_space_around_changes_no_more_than_it_should(world, margin):
     small, true = world
     labels, truth = [np.pad(one, margin) for one in small], np.pad(true, margin)
     n = len(labels)
-    row = figures(labels, np.full(n, 1 / n), truth, dict.fromkeys(range(1, 4), "visible"))
+    row = pause_metrics(labels, np.full(n, 1 / n), truth, dict.fromkeys(range(1, 4), "visible"))
     for form, name in (("objects", "quality"), ("paper", "quality_paper"), ("authors", "quality_authors")):
         assert row[name] == pytest.approx(np.mean([weighted_coverage(one, truth, form) for one in labels])), name
-    tight = figures(small, np.full(n, 1 / n), true, dict.fromkeys(range(1, 4), "visible"))
+    tight = pause_metrics(small, np.full(n, 1 / n), true, dict.fromkeys(range(1, 4), "visible"))
     for name in set(row) - {"quality_paper"}:
         assert row[name] == pytest.approx(tight[name], nan_ok=True), name
 
 
 def test_empty_worlds():
     nothing, some = np.zeros((2, 2, 2), int), np.ones((2, 2, 2), int)
-    assert figures([nothing], np.ones(1), nothing, {})["quality"] == 1.0
-    assert figures([nothing], np.ones(1), some, {1: "visible"})["missed"] == 1
-    assert figures([some], np.ones(1), nothing, {})["invented"] == 1
+    assert pause_metrics([nothing], np.ones(1), nothing, {})["quality"] == 1.0
+    assert pause_metrics([nothing], np.ones(1), some, {1: "visible"})["missed"] == 1
+    assert pause_metrics([some], np.ones(1), nothing, {})["invented"] == 1

@@ -124,7 +124,7 @@ def test_what_does_not_fit(tmp_path):
     ):
         with pytest.raises(InputError, match=message):
             score_pauses(estimate, truth)
-    with pytest.raises(InputError, match="holds no truth"):
+    with pytest.raises(InputError, match="has no ground truth"):
         read_truth(open_recording(write_recording(tmp_path / "bare", volumes=False, instance=False)))
     (tmp_path / "bad.npz").write_bytes(b"PK")
     np.save(tmp_path / "flat.npy", np.zeros((3, 3), int))
@@ -133,7 +133,7 @@ def test_what_does_not_fit(tmp_path):
         ("bad.npz", "cannot be read"),
         ("flat.npy", r"shape \(3, 3\)"),
         ("real.npy", "expected integers"),
-        ("none.npz", "there is no"),
+        ("none.npz", "does not exist"),
     ):
         with pytest.raises(InputError, match=message):
             read_estimate(tmp_path / name)

@@ -1,4 +1,4 @@
-"""Components that fail in the ways that studies must survive; loaded by file."""
+"""A component that fails in the ways that runs and studies must survive; loaded by file."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from mstfilter.smc import Transition
 
 @dataclass(frozen=True)
 class Breaks(Transition):
-    """Fails at a pause in a way of choice; what is `once` does so only while its marker file is missing."""
+    """Fails at a pause in the way `how`; with a marker file, which it makes, it fails only once."""
 
     how: str = "raise"
     at: int = 1
@@ -33,7 +33,8 @@ class Breaks(Transition):
             if self.how == "full":
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "state.npz")
             if self.how == "hang":
-                time.sleep(600)
+                while True:
+                    time.sleep(60)
             if self.how == "print":
                 print('{"outcome": {"status": "done"}}', flush=True)
                 os.write(1, b"noise of a library\n")

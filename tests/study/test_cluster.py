@@ -8,7 +8,7 @@ from mstfilter.errors import InputError
 from mstfilter.study.executors import Local
 from mstfilter.study.study import run_study
 from tests.study.scenes import slide
-from tests.study.test_failures import LimitHanging, figures, study, table
+from tests.study.test_failures import LimitHanging, metrics, study, table
 
 distributed = pytest.importorskip("distributed", reason="dask absent: pip install -e '.[dask]'")
 
@@ -39,7 +39,7 @@ def test_a_cluster_gives_the_same_bytes(cluster, tmp_path):
         assert events.count(("begun", job)) == events.count(("ended", job)) == 1
         assert events.index(("begun", job)) < events.index(("ended", job))
     assert max(e.done for e in seen if e is not None and e.kind == "step") == 2
-    assert figures(tmp_path / "there") == figures(tmp_path / "here")
+    assert metrics(tmp_path / "there") == metrics(tmp_path / "here")
     assert (tmp_path / "there" / "differences.csv").read_bytes() == (
         tmp_path / "here" / "differences.csv"
     ).read_bytes()

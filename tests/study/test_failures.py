@@ -47,7 +47,7 @@ def table(path, name="runs.csv"):
         return list(csv.DictReader(file))
 
 
-def figures(path):
+def metrics(path):
     """The table without time and memory."""
     cost = ("core_seconds", "seconds", "peak_mb")
     return [{k: v for k, v in r.items() if not k.startswith(cost)} for r in table(path)]
@@ -138,40 +138,44 @@ def test_a_recording_that_cannot_be_made_fails_its_runs_only(folder, tmp_path):
     assert table(tmp_path / "out", "failures.csv")[0]["run"] == name
 
 
-def test_killing_the_study_and_resuming_ends_with_the_same_table(folder, tmp_path):
-    """SIGKILL to the study alone: its workers end too, and the same command goes on."""
-    config = tmp_path / "study.toml"
-    config.write_text(
-        f'seeds = "0-5"\nscenes = [{{recordings = "{folder / "slide"}"}}]\narms = [{{set = "transition=identity"}}]\n'
+def wait_for(path):
+    """Return when a file exists; the process that makes it then waits to be stopped."""
+    deadline = time.monotonic() + 600
+    while not path.exists():
+        assert time.monotonic() < deadline, f"{path} was not made"
+        time.sleep(0.05)
+
+
+def hanging_study(path, recording, marker):
+    """A study file whose second run hangs until it is stopped, and makes `marker` before."""
+    hangs = [f"transition={BROKEN}:Breaks", "transition.how=hang", f'transition.marker="{marker}"']
+    path.write_text(
+        f"seeds = [0, 1]\nscenes = [{{recordings = '{recording}'}}]\n"
+        f"arms = [{{name = 'good', set = 'transition=identity'}}, {{name = 'hangs', set = {hangs!r}}}]\n"
     )
-    command = [
-        sys.executable,
-        "-m",
-        "mstfilter",
-        "study",
-        str(config),
-        "--workers",
-        "1",
-        "--out",
-        str(tmp_path / "out"),
-    ]
+    return path
+
+
+def test_killing_the_study_and_resuming_ends_with_the_same_table(folder, tmp_path):
+    """SIGKILL to the study alone: its workers end too, and the same command resumes it."""
+    marker, out = tmp_path / "marker", tmp_path / "out"
+    config = hanging_study(tmp_path / "study.toml", folder / "slide", marker)
+    command = [sys.executable, "-m", "mstfilter", "study", config, "--workers", "1", "--out", out]
     environment = {**os.environ, "MSTFILTER_CACHE": str(tmp_path / "cache")}
     process = subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    deadline = time.monotonic() + 120
-    while len(list(tmp_path.glob("out/runs/*/result.json"))) < 2 and time.monotonic() < deadline:
-        time.sleep(0.02)
+    wait_for(marker)
     process.send_signal(signal.SIGKILL)
     process.wait()
-    done = {p: p.stat().st_mtime_ns for p in tmp_path.glob("out/runs/*/result.json")}
-    assert 2 <= len(done) < 6
-    assert not (tmp_path / "out" / "runs.csv").exists()
-    resumed = run_study(load_study(config), tmp_path / "out", Local(2), cache=tmp_path / "cache")
-    assert resumed.repeated >= len(done) and resumed.done == 6
+    done = {p: p.stat().st_mtime_ns for p in out.glob("runs/*/result.json")}
+    assert len(done) == 1
+    assert not (out / "runs.csv").exists()
+    resumed = run_study(load_study(config), out, Local(2), cache=tmp_path / "cache")
+    assert resumed.repeated == 1 and resumed.done == 4
     assert {p: p.stat().st_mtime_ns for p in done} == done
     whole = run_study(load_study(config), tmp_path / "whole", Local(1), cache=tmp_path / "cache")
     assert whole.repeated == 0
-    assert figures(tmp_path / "out") == figures(tmp_path / "whole")
-    assert not list((tmp_path / "out" / "runs").glob(".*"))
+    assert metrics(out) == metrics(tmp_path / "whole")
+    assert not list((out / "runs").glob(".*"))
 
 
 def test_one_process_a_study(folder, tmp_path):

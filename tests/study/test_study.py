@@ -151,10 +151,10 @@ def test_a_worker_with_other_code_refuses():
 def test_arms_that_use_the_ground_truth_are_marked(folder, tmp_path):
     data = {"name": "s", "folder": folder, "scenes": [{"recordings": "slide-0"}], "seeds": [0]}
     arms = [{"preset": "mst"}]
-    arms.append({"name": "oracle", "preset": "mst", "set": "resampler=true_best"})
+    arms.append({"name": "oracle", "preset": "mst", "set": ['update.evidence=["true_quality"]']})
     result = run_study(study_of({**data, "arms": arms}), tmp_path / "out", Local(1), cache=tmp_path / "cache")
     assert result.failed == ()
-    assert result.folder.truth_users == {"oracle": ["TrueBest"]}
+    assert result.folder.truth_users == {"oracle": ["TrueQuality"]}
     for run in result.folder.description["runs"]:
         marked = RunFolder.open(result.folder.run(run["folder"])).description["uses_truth"]
         assert marked == result.folder.truth_users.get(run["arm"], [])

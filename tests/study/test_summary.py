@@ -27,7 +27,7 @@ def rows():
 def test_means_are_over_later_pauses_then_seeds_then_scenes():
     table = list(rows())
     found = summarise(table, "ours", ["core_seconds"])
-    chosen = found.figure("g", "ours")
+    chosen = found.metric("g", "ours")
     for scene in ("g0", "g1", "g2"):
         seeds = [
             np.mean(
@@ -41,15 +41,15 @@ def test_means_are_over_later_pauses_then_seeds_then_scenes():
         ]
         assert chosen.by_scene[scene] == pytest.approx(np.mean(seeds))
     assert chosen.mean == pytest.approx(np.mean(list(chosen.by_scene.values())))
-    assert found.figure("f", "ours", "quality_hidden").mean == 0.5
-    assert found.figure("f", "ours", "core_seconds").mean == 1.0  # of all pauses
-    assert found.figure("f", "ours", "time_s") is None
+    assert found.metric("f", "ours", "quality_hidden").mean == 0.5
+    assert found.metric("f", "ours", "core_seconds").mean == 1.0  # of all pauses
+    assert found.metric("f", "ours", "time_s") is None
     assert set(found.names) == {"quality", "quality_slope", "quality_hidden", "core_seconds"}
 
 
 def test_slope_is_a_pause():
     table = [{**r, "quality": 0.9 - 0.1 * r["pause"]} for r in rows()]
-    assert summarise(table, "ours").figure("f", "theirs", "quality_slope").mean == pytest.approx(-0.1)
+    assert summarise(table, "ours").metric("f", "theirs", "quality_slope").mean == pytest.approx(-0.1)
 
 
 def test_differences_are_paired_and_adjusted_together():
@@ -57,12 +57,12 @@ def test_differences_are_paired_and_adjusted_together():
     primary = found.compared()
     assert [(d.family, d.first, d.second) for d in primary] == [("f", "ours", "theirs"), ("g", "ours", "theirs")]
     for one in primary:
-        expected = compare(found.figure(one.family, "ours").by_scene, found.figure(one.family, "theirs").by_scene)
+        expected = compare(found.metric(one.family, "ours").by_scene, found.metric(one.family, "theirs").by_scene)
         assert one.difference.mean == expected.mean and one.difference.p == expected.p
         assert one.difference.p_holm >= one.difference.p
         assert "n = 3" in one.words
     assert found.compared("core_seconds") == []
-    assert {d.figure for d in found.differences} == {"quality", "quality_slope", "quality_hidden"}
+    assert {d.metric for d in found.differences} == {"quality", "quality_slope", "quality_hidden"}
 
 
 def test_floors_take_no_part_in_the_adjustment():
@@ -81,7 +81,7 @@ def test_a_scene_that_one_arm_lacks_is_left_out_of_the_pairs():
     table = [r for r in rows() if not (r["arm"] == "theirs" and r["scene"] == "f1")]
     found = summarise(table, "ours")
     assert found.compared()[0].difference.n == 2
-    assert len(found.figure("f", "ours").by_scene) == 3
+    assert len(found.metric("f", "ours").by_scene) == 3
 
 
 def test_nothing_gives_nothing():
