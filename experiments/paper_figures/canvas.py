@@ -1,4 +1,4 @@
-"""What the figures have in common: a page of panels on paper, tables, and files that stay small."""
+"""Shared parts of the figures: pages of panels, voxel pictures, tables, small files."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ STYLE = {
 
 
 def page(rows: int, columns: int, width: float, height: float, **layout: Any) -> tuple[Figure, np.ndarray]:
-    """A figure of so many inches and its axes (rows, columns)."""
+    """A figure of a size in inches and its axes (rows, columns)."""
     figure = Figure((width, height), layout="constrained", facecolor=PAPER)
     FigureCanvasAgg(figure)
     axes = figure.subplots(rows, columns, squeeze=False, gridspec_kw=layout or None)
@@ -52,14 +52,14 @@ def page(rows: int, columns: int, width: float, height: float, **layout: Any) ->
 
 
 def show(axes: Axes, image: np.ndarray, title: str = "") -> None:
-    """A picture without axes."""
+    """Show a picture without axes."""
     axes.imshow(image, interpolation="antialiased")
     axes.set_axis_off()
     axes.set_title(title)
 
 
 def voxels(labels: np.ndarray, grid: VoxelGrid, view: Camera, colours: Mapping[int, Colour]) -> np.ndarray:
-    """The voxels from a viewpoint, on paper, (h, w, 3) uint8."""
+    """Voxels from a viewpoint on the colour of the page, (h, w, 3) uint8."""
     picture = voxel_picture(np.asarray(labels).astype(np.uint16), grid, view, colours)
     alpha = picture[..., 3:] / 255
     paper = np.array([int(PAPER[k : k + 2], 16) for k in (1, 3, 5)])
@@ -82,6 +82,6 @@ def write_rows(path: Path, columns: Sequence[str], rows: Iterable[Sequence[Any]]
 
 
 def crop(labels: np.ndarray, grid: VoxelGrid, camera: Camera) -> tuple[slice, slice]:
-    """Rows and columns of the part of the image that shows all objects, in the image's proportions."""
+    """Rows and columns of the part of the image that shows all objects, with the proportions of the image."""
     x, y, width, height = close_up([(labels, grid)], camera)
     return slice(round(y), round(y + height)), slice(round(x), round(x + width))

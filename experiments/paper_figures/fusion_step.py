@@ -1,7 +1,7 @@
-"""Figure `fusion_step`: the crossover on the authors' real particles at t = 1, beside what scores well for nothing.
+"""Figure `fusion_step`: the crossover of the authors' real particles at t = 1, with trivial baselines.
 
 The score compares a hypothesis with a partition of its own voxels (r1.py). One blob scores .7 - .8 on it, connected
-components of a single sample 1.0: it shows what the fusion step does, never how good it is.
+components of a single sample 1.0: it shows what the fusion step does, not how good the result is.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ PRESETS = ("authors", "paper", "mst")
 
 
 def make(out: Path, smoke: bool) -> list[Path]:
-    """The figure and its numbers; nothing where the data are absent."""
+    """Draw the figure and write its numbers; returns no paths if the data are missing."""
     found = folder()
     if found is None:
         return []
@@ -57,7 +57,7 @@ def score(particles: Particles, labels: np.ndarray, of: np.ndarray) -> float:
 
 
 def fused(particles: Particles, preset: str, eta: int) -> Iterator[np.ndarray]:
-    """Labels of every pair's candidates. There is no image: a preset's claims, division and evidence play no part."""
+    """Labels of each pair's candidates, without the preset's claims, division and evidence, which need images."""
     crossover = REGISTRY.build("crossover", load_config(preset)["update"]["crossover"])
     rng = np.random.default_rng(0)
     for sample in particles.samples:
@@ -67,7 +67,7 @@ def fused(particles: Particles, preset: str, eta: int) -> Iterator[np.ndarray]:
 
 
 def weights(particles: Particles, eta: int) -> np.ndarray:
-    """(25 eta,) the authors' weights of the pairs, log w = log w_i + log w_j + 3 log Q_j."""
+    """The authors' log weights of the pairs (25 eta,): log w = log w_i + log w_j + 3 log Q_j."""
     sample, previous, kept = particles.log_weights
     log_w = (sample[:, None] + previous + 3 * np.log(kept)).ravel().repeat(eta)
     return np.exp(log_w - log_w.max())
@@ -80,7 +80,7 @@ def table(
     w: np.ndarray,
     path: Path,
 ) -> Path:
-    """A row a group: scores, floors on the same voxels, objects, voxels."""
+    """One row per group: scores, baselines on the same voxels, objects, voxels."""
     rows = []
     for name, labels in groups.items():
         q = scores[name]
@@ -115,7 +115,7 @@ def picture(
     path: Path,
     smoke: bool,
 ) -> Path:
-    """Scores of all hypotheses above; below, of each kind of fused ones the one with the median score."""
+    """Scores of all hypotheses; below, the fused hypothesis with the median score of each kind."""
     figure = Figure((11.5, 7.0), layout="constrained", facecolor=PAPER)
     FigureCanvasAgg(figure)
     shown = list(groups)[2:]
@@ -139,7 +139,7 @@ def picture(
 
 
 def strip(axes: Axes, scores: dict[str, np.ndarray], floors: dict[str, list[float]]) -> None:
-    """A point a hypothesis, the mean of each group, and its floors."""
+    """One point per hypothesis, the mean of each group, and its baselines."""
     for k, (name, q) in enumerate(scores.items()):
         place = ((np.arange(len(q)) * 0.618) % 1.0 - 0.5) * 0.5
         axes.scatter(k + place, np.sort(q), s=22 if len(q) < 20 else 12, color=BLUE, alpha=0.55, lw=0)
@@ -147,10 +147,10 @@ def strip(axes: Axes, scores: dict[str, np.ndarray], floors: dict[str, list[floa
         for value, dash, what in zip(
             floors[name], ((4, 2), (1, 1.5)), ("one blob", "connected components"), strict=True
         ):
-            label = f"floor: {what}" if k == 0 else None
+            label = f"baseline: {what}" if k == 0 else None
             axes.plot([k - 0.42, k + 0.42], [value] * 2, color=FLOOR, lw=1.6, dashes=dash, label=label)
     axes.set_xticks(range(len(scores)), list(scores), color=INK)
     axes.set(ylim=(0, 1.04), xlim=(-0.6, len(scores) - 0.4), ylabel="score against a partition\nof its own voxels")
     axes.grid(axis="y")
-    axes.set_title("Segmentation score at t = 1 (no evidence of quality: see the floors)")
+    axes.set_title("Segmentation score at t = 1 (no evidence of quality: see the baselines)")
     axes.legend(loc="lower center", ncols=3, bbox_to_anchor=(0.5, -0.33))

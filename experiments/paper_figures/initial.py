@@ -1,6 +1,6 @@
 """Figure `initial`: the first pause of a scene of each family: the image, and the true objects over it and as voxels.
 
-Scenes are simulated by this program; seed 0 of each family, not chosen by its looks.
+Scenes are simulated; seed 0 of each family.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ SEED = 0
 
 
 def make(out: Path, smoke: bool) -> list[Path]:
-    """The figure."""
+    """Draw the figure."""
     small = {"width": 160, "height": 120} if smoke else {}
     figure, axes = page(3, len(FAMILIES), 12.0, 9.4)
     for k, name in enumerate(FAMILIES):

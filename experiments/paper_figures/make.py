@@ -1,12 +1,12 @@
-"""All figures of the paper's kinds, drawn by this program.
+"""Figures like those of the paper, drawn from simulated scenes and the authors' data.
 
     python experiments/paper_figures/make.py                       # all, about a quarter of an hour
     python experiments/paper_figures/make.py merging sampled_cuts  # some
     python experiments/paper_figures/make.py quality_over_time --study studies/main
     python experiments/paper_figures/make.py --smoke --out DIR     # all at small size, a minute
 
-`merging` and `fusion_step` need the authors' particles (r1.py) and are left out, with a word, where they are absent;
-`quality_over_time` needs the folder of a study.
+`merging` and `fusion_step` need the authors' particles (r1.py) and are left out, with a message, if these are
+missing; `quality_over_time` needs the folder of a study.
 """
 
 from __future__ import annotations

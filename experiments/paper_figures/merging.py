@@ -1,4 +1,4 @@
-"""Figure `merging`: how two real hypotheses become one, step by step; and how often each merge probability merges.
+"""Figure `merging`: the merge of two real hypotheses, step by step, and how often each merge probability merges.
 
 Rows: a sample, a prediction and their conflict graph; then, twice, the same random order with other merges, what is
 painted, and what the mode filter leaves. The particles are the authors' (see r1.py), the fusion is that of `paper`.
@@ -42,17 +42,17 @@ Chance = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
 @dataclass(frozen=True)
 class Replay(Structure):
-    """A structure that was drawn before: by a component's first vertex, its order and its edges."""
+    """A structure with a given draw: by the first vertex of a component, its order and its edges."""
 
     drawn: dict[int, tuple[list[int], Edges]]
 
     def draw(self, rng: np.random.Generator, graph: nx.Graph, component: Sequence[int]) -> tuple[list[int], Edges]:
-        """What was drawn."""
+        """The given draw."""
         return self.drawn[component[0]]
 
 
 def make(out: Path, smoke: bool) -> list[Path]:
-    """The figure and the table; nothing where the data are absent."""
+    """Draw the figure and write the table; returns no paths if the data are missing."""
     found = folder()
     if found is None:
         return []
@@ -70,7 +70,7 @@ def picture(particles: Particles, path: Path, smoke: bool) -> Path:
     drawn = {c[0]: crossover.structure.draw(rng, links, c) for c in graph.components()}
     fixed = replace(crossover, structure=Replay(drawn))
     first = second = fixed.resolve(rng, graph)
-    while np.array_equal(first.group, second.group):  # many merges are certain or out of the question
+    while np.array_equal(first.group, second.group):  # many merges are certain or impossible
         second = fixed.resolve(rng, graph)
 
     colours, places = colours_of(graph), layout(graph)
@@ -99,12 +99,12 @@ def picture(particles: Particles, path: Path, smoke: bool) -> Path:
 
 
 def count(labels: np.ndarray) -> int:
-    """Objects in a label grid."""
+    """Number of objects in a label grid."""
     return int(np.count_nonzero(np.bincount(labels.ravel())[1:]))
 
 
 def colours_of(graph: ConflictGraph) -> list[Colour]:
-    """Cool colours for the sample's objects, warm ones for the prediction's; neighbours in number far apart."""
+    """Cool colours for the objects of the sample, warm ones for those of the prediction; successive ones differ."""
     from matplotlib.colors import LinearSegmentedColormap
 
     colours: list[Colour] = [(0, 0, 0)] * len(graph)
@@ -117,7 +117,7 @@ def colours_of(graph: ConflictGraph) -> list[Colour]:
 
 
 def layout(graph: ConflictGraph) -> np.ndarray:
-    """(n, 2) places: sample above, prediction below, components side by side, few crossings."""
+    """Positions (n, 2): sample above, prediction below, components side by side, few crossings."""
     places, left = np.zeros((len(graph), 2)), 0.0
     neighbours = graph.networkx().adj
     for component in graph.components():
@@ -125,7 +125,7 @@ def layout(graph: ConflictGraph) -> np.ndarray:
         width = max(len(row) for row in rows.values())
         for turn in range(16):
             y, row = list(rows.items())[turn % 2]
-            if turn:  # each vertex near the mean of its neighbours
+            if turn:  # each vertex at the mean of its neighbours
                 row.sort(key=lambda v: float(np.mean(places[list(neighbours[v]), 0])))
             for k, v in enumerate(row):
                 places[v] = left + (k + 0.5) * width / len(row), y
@@ -141,7 +141,7 @@ def draw_graph(
     directed: Edges = (),
     draw: ConflictResolution | None = None,
 ) -> None:
-    """The conflict graph; with a draw, arrows run from the one painted first, and merged conflicts are bold."""
+    """The conflict graph; with a draw, arrows start at the object painted first, and merged conflicts are bold."""
     conflicts = directed or [(a, b) for a, b in graph.edges.tolist()]
     for a, b in conflicts:
         merged = draw is not None and draw.group[a] == draw.group[b]
@@ -197,7 +197,7 @@ STRUCTURES: tuple[tuple[str, Structure], ...] = (
 
 
 def table(particles: Particles, path: Path, smoke: bool) -> Path:
-    """How often each form merges on the conflicts of all 25 pairs: both directions, and as structures draw them.
+    """How often each form merges the conflicts of all 25 pairs: in both directions, and as structures draw them.
 
     ``mean`` .. ``at 1`` count every conflict in both directions. For each structure: the share of the edges that it
     draws along which a merge happens, and the mean number of objects after all merges.
@@ -232,7 +232,7 @@ def table(particles: Particles, path: Path, smoke: bool) -> Path:
 
 
 def edges_of(structure: Structure, graphs: Sequence[ConflictGraph], rounds: int) -> list[tuple[int, np.ndarray]]:
-    """Directed edges (m, 2) that a structure draws: graph by graph, so many times."""
+    """Directed edges (m, 2) that a structure draws in repeated draws of each graph."""
     rng, found = np.random.default_rng(SEED), []
     for k, graph in enumerate(graphs):
         links = graph.networkx()

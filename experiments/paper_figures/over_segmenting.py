@@ -1,4 +1,4 @@
-"""Figure `over_segmenting`: samples that cut everything too finely: does keeping hypotheses over time help?
+"""Figure `over_segmenting`: over-segmented samples, with and without hypotheses over time.
 
 Every merge of the segmentation tree gets `SHIFT` more log odds of joining different objects, so that the sampled cuts
 hold two to three times as many segments as there are objects. `mst` and its samples alone, each with the usual and
@@ -35,7 +35,7 @@ COLUMNS = ("seed", "value", "arm", "pause", "quality", "objects", "true objects"
 
 @dataclass(frozen=True)
 class TooFine(CutValue):
-    """Each merge inside a node counts `shift` less: cuts are finer than the odds of the tree say.
+    """Merge log odds reduced by `shift` for each merge inside a node: cuts are finer than the tree's odds imply.
 
     Parameters
     ----------
@@ -46,13 +46,13 @@ class TooFine(CutValue):
     shift: float = SHIFT
 
     def values(self, tree: Tree, frame: Frame) -> np.ndarray:
-        """Of `MergeLogOdds`, minus `shift` for every merge inside the node."""
+        """Values of `MergeLogOdds` minus `shift` for each merge inside the node."""
         merges = tree.accumulate(np.ones(tree.n_leaves)) - 1
         return MergeLogOdds().values(tree, frame) - self.shift * merges
 
 
 def make(out: Path, smoke: bool) -> list[Path]:
-    """The table, to which missing scenes are added, and the figure of it."""
+    """Add missing scenes to the table and draw the figure."""
     path = out / "over_segmenting.csv"
     rows = []
     if path.exists():
@@ -66,7 +66,7 @@ def make(out: Path, smoke: bool) -> list[Path]:
 
 
 def scene(seed: int, smoke: bool) -> list[list[object]]:
-    """A row an arm, value and pause: mean quality and number of objects of the hypotheses."""
+    """One row per arm, value and pause: mean quality and number of objects of the hypotheses."""
     recording = open_recording(cached_recording(FAMILY, seed, **(SMALL if smoke else SIZE)))
     rows: list[list[object]] = []
     for value in ("usual", "too fine"):
@@ -117,7 +117,7 @@ def picture(table: Path, path: Path) -> Path:
 
 
 def by_pause(rows: list[dict[str, str]], value: str, arm: str, column: str) -> dict[int, np.ndarray]:
-    """Pause -> one figure a scene, in the order of the scenes."""
+    """Pause -> one number per scene, in the order of the scenes."""
     found: dict[int, list[float]] = {}
     for row in rows:
         if row["value"] == value and row["arm"] == arm:

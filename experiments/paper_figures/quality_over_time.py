@@ -1,6 +1,6 @@
-"""Figure `quality_over_time`: quality of all hypotheses over pauses, methods by families, from a study's folder.
+"""Figure `quality_over_time`: quality of all hypotheses over pauses, by family and method, from a study folder.
 
-The drawing is that of the study's report; here it stands alone, in the report's light colours.
+It is the figure of the study report as a file, in the report's light colours.
 """
 
 from __future__ import annotations
@@ -46,10 +46,10 @@ def make(out: Path, study: Path, chosen: Sequence[str] = ()) -> list[Path]:
 
 
 def standalone(svg: str) -> str:
-    """A report's figure as a file of its own: the report's style sheet says what its colours are."""
+    """A figure of a report as a complete SVG file, with the colours of the report's style sheet."""
     css = (Path(mstfilter.report.__file__).parent / "templates" / "style.css").read_text()
     light = css[: css.index("}")]
-    colours = {f"--s{k}": hexadecimal(colour(k)) for k in range(len(SERIES))}  # also those that the sheet lacks
+    colours = {f"--s{k}": hexadecimal(colour(k)) for k in range(len(SERIES))}  # also for colours that the sheet lacks
     colours |= dict(re.findall(r"(--[a-z0-9]+): (#[0-9a-f]{3,6})", light))
     width, height = re.findall(r"[\d.]+", svg[svg.index("viewBox") :])[2:4]
     svg = svg.replace("<svg ", f'<svg {PAGE} width="{width}pt" height="{height}pt" ', 1)

@@ -1,4 +1,4 @@
-"""The authors' own real particles (experiment R1 of the paper), found by MSTFILTER_SHARED, else in ``../shared``.
+"""The authors' own real particles (experiment R1 of the paper), in the folder MSTFILTER_SHARED or ``../shared``.
 
 They are Copyright (c) 2020 The Autonomous Robotic Manipulation Lab, MIT licence (results/LICENSE-R1), and no part of
 this program.
@@ -20,7 +20,7 @@ REPOSITORY = Path(__file__).resolve().parents[2]
 
 
 def folder() -> Path | None:
-    """Where the data are; None where they are not."""
+    """Folder of the data; None if they are missing."""
     named = os.environ.get("MSTFILTER_SHARED")
     path = (Path(named) if named else REPOSITORY.parent / "shared") / "r1"
     return path if (path / "measurement.npz").exists() else None
@@ -28,7 +28,7 @@ def folder() -> Path | None:
 
 @dataclass(frozen=True)
 class Particles:
-    """R1 at t = 1: what was sampled, what was predicted, and what the authors' program made of them.
+    """R1 at t = 1: samples, predictions, and the fused hypotheses of the authors' program.
 
     Parameters
     ----------
@@ -44,7 +44,7 @@ class Particles:
 
     @cached_property
     def grid(self) -> VoxelGrid:
-        """Voxels of 1 cm."""
+        """The grid, with voxels of 1 cm."""
         return VoxelGrid(self._load("measurement", "region_min"), 0.01, (61, 61, 41))
 
     def _hypotheses(self, labels: np.ndarray, birth: int) -> tuple[Hypothesis, ...]:
@@ -52,32 +52,32 @@ class Particles:
 
     @cached_property
     def samples(self) -> tuple[Hypothesis, ...]:
-        """The five samples of t = 1 that the authors fused, of ten."""
+        """The five of ten samples at t = 1 that the authors fused."""
         return self._hypotheses(self._load("measurement", "labels")[1, :5], 1)
 
     @cached_property
     def predictions(self) -> tuple[Hypothesis, ...]:
-        """Five hypotheses of t = 0, moved to t = 1 and cleared by free space."""
+        """Five hypotheses of t = 0, moved to t = 1, without voxels in free space."""
         return self._hypotheses(self._load("freespace_refined", "labels")[0], 0)
 
     @cached_property
     def estimates(self) -> tuple[Hypothesis, ...]:
-        """The five that the authors' program kept of 125 fused ones."""
+        """The five of 125 fused hypotheses that the authors' program kept."""
         return self._hypotheses(self._load("estimate", "labels")[0], 1)
 
     @cached_property
     def log_weights(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Log weights of samples and predictions (5,), and the predictions' share kept by free space (5,)."""
+        """Log weights of samples and predictions (5,), and the share of the predictions outside free space (5,)."""
         measured = self._load("measurement", "weight")
         return measured[1, :5], measured[0, :5], self._load("freespace_refined", "weight")[0]
 
     def partition(self, labels: np.ndarray) -> np.ndarray:
-        """A hypothesis' own voxels parted in can (2) and carton (1): the pseudo-truth of its segmentation."""
+        """The voxels of a hypothesis divided into can (2) and carton (1): the reference of its segmentation."""
         can = self._load("pseudo_truth", "can_footprint")[1].astype(bool)
         return np.where(labels > 0, np.where(can[:, :, None], 2, 1), 0).astype(np.uint16)
 
     def score(self, labels: np.ndarray) -> float:
-        """Objects quality against that partition: segmentation only, what is missing or invented costs nothing."""
+        """Objects quality against that partition; it measures segmentation only, not missing or invented voxels."""
         return weighted_coverage(labels, self.partition(labels))
 
 

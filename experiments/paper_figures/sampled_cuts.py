@@ -1,4 +1,4 @@
-"""Figure `sampled_cuts`: cuts of the segmentation tree of one simulated frame: on the tree, and over the image.
+"""Figure `sampled_cuts`: cuts of the segmentation tree of one simulated frame, on the tree and over the image.
 
 The best cut, and the first two cuts drawn by the sampler of `mst` that show other objects. Height in the tree is the
 log odds that a merge joins different objects (where a merge above has less, that of the strongest inside it). Merges
@@ -28,7 +28,7 @@ ABOVE = (176, 179, 175)
 
 
 def make(out: Path, smoke: bool) -> list[Path]:
-    """The figure."""
+    """Draw the figure."""
     family = replace(scene_family(FAMILY), **({"width": 160, "height": 120} if smoke else {}))
     scene = SimulatedScene(family, SEED)
     shot = scene.frame_images(0)
@@ -64,7 +64,7 @@ def objects(found: Segments, cut: np.ndarray) -> list[int]:
 
 
 def colours_of(tree: Tree, found: Segments, cuts: Sequence[np.ndarray]) -> dict[int, Colour]:
-    """A colour for every object; one that is mostly the same as one of an earlier cut has its colour."""
+    """A colour for each object; an object that overlaps one of an earlier cut has the same colour."""
     names: dict[int, int] = {}
     for cut in cuts:
         used: set[int] = set()
@@ -84,7 +84,7 @@ def jaccard(a: np.ndarray, b: np.ndarray) -> float:
 
 @dataclass(frozen=True)
 class Drawn:
-    """The upper part of a tree, ready to be drawn.
+    """The upper part of a tree, for drawing.
 
     Parameters
     ----------
@@ -102,9 +102,9 @@ class Drawn:
 
     @classmethod
     def of(cls, tree: Tree, cuts: Sequence[np.ndarray]) -> Drawn:
-        """Merges above `LEAST`, and whatever a cut takes apart."""
+        """Merges above `LEAST`, and all merges that a cut divides."""
         odds = np.where(np.arange(tree.n_nodes) < tree.n_leaves, -np.inf, tree.odds)
-        taken = np.zeros(tree.n_nodes, bool)  # holds a node of a cut strictly inside
+        taken = np.zeros(tree.n_nodes, bool)  # has a node of a cut strictly inside
         for cut in cuts:
             for node in cut.tolist():
                 while node != tree.root:
@@ -112,7 +112,7 @@ class Drawn:
                     taken[node] = True
         for node in range(tree.n_nodes - 1):
             odds[tree.parent[node]] = max(odds[tree.parent[node]], odds[node])
-        top = float(odds[:-1].max()) + 2  # the root joins the table and what never touched: for certain
+        top = float(odds[:-1].max()) + 2  # the root joins different objects with certainty
         inside: dict[int, list[int]] = {}
         x: dict[int, float] = {}
         y: dict[int, float] = {}
@@ -132,7 +132,7 @@ class Drawn:
 
 
 def draw_tree(axes: Axes, part: Drawn, cut: dict[int, Colour], ylabel: bool) -> None:
-    """The tree: below the cut in the colours of its segments, above it grey; a disc on every node of the cut."""
+    """The tree: in the colours of the segments below the cut, grey above it; a disc on each node of the cut."""
     lines, colours, widths = [], [], []
     stack: list[tuple[int, Colour | None]] = [(part.root, None)]
     while stack:

@@ -1,8 +1,8 @@
 """Figure `teaser`: several hypotheses about one simulated table over time, while an object is hidden.
 
-Columns are pauses. Rows: the image; the true volumes; the three heaviest different hypotheses of `mst` with their
-weights (those that are equal voxel by voxel are one). Voxels are seen from the camera's right. An object keeps its
-colour over time and in all hypotheses.
+Columns are pauses. Rows: the image; the true volumes; the three heaviest distinct hypotheses of `mst` with their
+weights (equal hypotheses are counted as one). Voxels are seen from the camera's right. An object has
+the same colour at all pauses and in all hypotheses.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ TURN = RigidTransform.from_rotation(Rotation.from_euler("z", 125, degrees=True))
 
 
 def make(out: Path, smoke: bool) -> list[Path]:
-    """The figure."""
+    """Draw the figure."""
     recording = open_recording(cached_recording(FAMILY, SEED, **(SMALL if smoke else {})))
     with tempfile.TemporaryDirectory() as folder:
         run = filter_recording(recording, load_config("mst"), Path(folder) / "run", seed=0)
@@ -41,13 +41,13 @@ def make(out: Path, smoke: bool) -> list[Path]:
 
 
 def picture(recording: Recording, run: RunFolder, path: Path, smoke: bool) -> Path:
-    """One column a pause."""
+    """One column per pause."""
     identities, grid = assign_identities(run), recording.grid
     truths = [recording.truth(t) for t in range(run.n_pauses)]
     everything = np.max([truth > 0 for truth in truths], axis=0)
     camera = run.camera(0)
     box = crop(everything, grid, camera)
-    # From the camera's right, where one sees what is hidden from it.
+    # From the camera's right, where hidden objects are visible.
     aside = replace(camera, T_world_camera=TURN * camera.pose)
     view = viewpoint([(everything, grid)], aside, *((160, 120) if smoke else (480, 360)))
     figure, axes = page(2 + SHOWN, run.n_pauses, 2.7 * run.n_pauses, 2.15 * (2 + SHOWN))
@@ -68,7 +68,7 @@ def picture(recording: Recording, run: RunFolder, path: Path, smoke: bool) -> Pa
 
 
 def hypotheses(column: np.ndarray, run: RunFolder, t: int, identities: Identities, view: Camera) -> None:
-    """The heaviest different hypotheses of a pause."""
+    """The heaviest distinct hypotheses of a pause."""
     found, weights = run.hypotheses(t), run.info(t)["weights"]
     first: dict[bytes, int] = {}
     total: dict[int, float] = {}
@@ -84,7 +84,7 @@ def hypotheses(column: np.ndarray, run: RunFolder, t: int, identities: Identitie
 
 
 def bar(axes: Axes, weight: float, said: str) -> None:
-    """Weight as a bar above the picture, and what there is to say."""
+    """A caption with the weight, also as a bar above the picture."""
     for width, colour in ((0.4, LINE), (0.4 * weight, INK)):
         axes.add_patch(
             Rectangle((0.02, 1.02), width, 0.025, transform=axes.transAxes, color=colour, lw=0, clip_on=False)
@@ -93,7 +93,7 @@ def bar(axes: Axes, weight: float, said: str) -> None:
 
 
 def table(recording: Recording, run: RunFolder, path: Path) -> Path:
-    """A row a pause, hypothesis and object that is out of sight at some pause: IoU with what is most like it."""
+    """One row per pause, hypothesis and object that is hidden at some pause: its largest IoU with an object."""
     status = [object_status(recording, t) for t in range(run.n_pauses)]
     watched = sorted({k for one in status for k, s in one.items() if s != "visible"})
     rows = []
