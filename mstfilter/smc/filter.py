@@ -4,17 +4,19 @@
 >>> state, infos = filter.run(observations, seed=0)
 >>> state.population.weights, state.log_evidence
 
-A step selects particles, moves them, proposes new ones, fuses the two with the observation, and selects again:
+A step selects, predicts, proposes, fuses and selects (y is the observation):
 
-    past      = resampler.resample(previous, n)          resample="before", the textbook order
+    past      = resampler.resample(previous, n)          only with resample="before", the textbook order
     predicted = transition.predict(past, y)
     proposed  = proposal.sample(y, n_proposed)
     fused     = update.update(predicted, proposed, y)
-    next      = resampler.resample(fused, n)             resample="after", the order of MST
+    next      = resampler.resample(fused, n)             with resample="after", the order of MST; with "before"
+                                                         only if there are more than n particles
 
-Textbook filters have no `proposal`; MST (Price, Huang, Berenson 2021, Alg. 1) has all four components. Guided filters
-have a transition that weights its moves, auxiliary filters a `lookahead`, resample-move filters a `rejuvenation`.
-`step` is a pure function of a `State`, so a run can be stopped, stored and resumed at any step.
+`ParticleFilter.step` has one line for each of these; `_Step` has one method for each. Textbook filters have no
+`proposal`; MST (Price, Huang, Berenson 2021) has all four components. Guided filters have a transition that weights
+its moves, auxiliary filters have a `lookahead`, resample-move filters have a `rejuvenation`. `step` is a pure
+function of a `State`, so a run can be stopped, stored and resumed at any step.
 """
 
 from __future__ import annotations
@@ -70,30 +72,32 @@ class ParticleFilter:
     Parameters
     ----------
     initial : Proposal
-        Draws the particles of the first step; the first observation updates them before any prediction. If it is left
-        out or equal to `proposal`, the first step has no predicted particles, only proposed ones, as in MST.
+        Draws the particles of the first step. The first observation updates them; the first prediction is in the
+        second step. If `initial` is None or equal to `proposal`, the first step has proposed particles only, as in
+        MST.
     transition : Transition
-        Prediction.
+        Moves the particles from the previous time to this one. If None, they stay.
     proposal : Proposal, optional
-        New particles at every step.
+        Draws new particles from the observation at every step.
     update : Update
-        Uses the observation. Not needed if the transition weights the particles (probabilistic programs).
+        Weights the particles by the observation. Not needed if the transition weights them (probabilistic programs).
     resampler : Resampler
-        Selection.
+        Selects particles by weight.
     trigger : Trigger
-        When to resample. More than `n` particles are always resampled.
+        Decides whether a step resamples. More than `n` particles are always resampled.
     lookahead : Lookahead, optional
-        Auxiliary filter: selects by weight times priority. Needs ``resample="before"``.
+        For auxiliary filters: particles are selected by weight times priority. Needs ``resample="before"``.
     rejuvenation : Rejuvenation, optional
-        Resample-move: moves the particles at the end of a step that resampled.
+        For resample-move filters: moves the particles at the end of a step that resampled.
     size : Size, optional
-        Number of particles of a resampling; default `n`.
+        Chooses the number of particles that are selected. Default: always `n`.
     n : int
-        Particles to start with, and to keep.
+        Number of particles at the start and after each resampling (unless `size` chooses another).
     n_proposed : int
-        Particles of the proposal at each step; 0 stands for `n`.
+        Number of particles that `proposal` draws at each step. 0: as many as `n`.
     resample : {"after", "before"}
-        After the update (MST), or before the next prediction (textbook: estimates at time t then use all weights).
+        "after": resample after the update, as in MST. "before": resample before the next prediction, as in textbooks;
+        the population after a step then has the weights of its observation.
     """
 
     initial: Proposal | None = None
@@ -126,7 +130,10 @@ class ParticleFilter:
 
     @property
     def properly_weighted(self) -> bool:
-        """Whether every component is, and no proposal adds particles to weights that carry the evidence so far."""
+        """Whether all components are properly weighted and there is no `proposal`.
+
+        A proposal adds particles whose weights do not contain the evidence of earlier observations.
+        """
         if self.proposal is not None:
             return False
         components = (getattr(self, slot) for slot in _INTERFACES)
@@ -137,12 +144,12 @@ class ParticleFilter:
         return State(0, None, seed if isinstance(seed, Key) else Key(seed), self.properly_weighted)
 
     def step(self, state: State, observation: Any, observer: Observer | None = None) -> tuple[State, Info]:
-        """Assimilate one observation. None is a missing observation: the particles are only moved.
+        """Process one observation; None if it is missing, then the particles are only moved.
 
         Raises
         ------
         InputError
-            From a component; the message starts with the step and the slot of the component.
+            If a component raises it. The message starts with the step and the slot of the component.
         """
         step = _Step(self, state, observation, observer)
         past, resampled_before = step.select_before()
@@ -168,14 +175,14 @@ class ParticleFilter:
         Parameters
         ----------
         observations : iterable
-            One for each step; None if it is missing.
+            One observation for each step. An observation that is missing is None.
         state : State or int
             The state to continue from, or a seed.
         checkpoint : path, optional
-            A file that holds the state after every step. If it exists, the run continues from it: the observations
-            that it has used are skipped, and the result is that of an uninterrupted run.
+            A file to which the state is written after every step. If it exists, the run continues from its state: the
+            observations used before are skipped, and the result equals that of an uninterrupted run.
         codec : Codec, optional
-            For particles other than arrays, mappings of arrays and dataclasses of arrays.
+            Stores particles that are not arrays, mappings of arrays or dataclasses of arrays.
         observer : callable, optional
             ``observer(slot, begins)``, called when a component begins and ends its work.
         """
@@ -190,9 +197,9 @@ class ParticleFilter:
         codec: Codec | None = None,
         observer: Observer | None = None,
     ) -> tuple[State, list[Info]]:
-        """The last state and the infos of all steps; parameters as in `iterate`.
+        """Run all steps; returns the last state and the infos. Parameters as in `iterate`.
 
-        A run that continues from a checkpoint returns the infos of the steps after it.
+        If the run continues from a checkpoint, it returns the infos of the later steps only.
         """
         observations, state, store = self._begin(observations, seed, checkpoint, codec)
         infos = []
@@ -204,7 +211,7 @@ class ParticleFilter:
     def _begin(
         self, observations: Iterable[Any], state: State | int, checkpoint: str | Path | None, codec: Codec | None
     ) -> tuple[Iterable[Any], State, Any]:
-        """Observations that remain, the state to continue from, and the `Checkpoint` if there is one."""
+        """The remaining observations, the state to continue from, and the `Checkpoint` or None."""
         _keep_freed_memory()
         current = state if isinstance(state, State) else self.start(state)
         if checkpoint is None:
@@ -242,7 +249,7 @@ class _Step:
         return self.streams.child(slot).generator()
 
     def select_before(self) -> tuple[Population | None, bool]:
-        """The particles x_{t-1} to move, and whether they were resampled."""
+        """Select: the particles x_{t-1} to move, and whether they were resampled."""
         population, priority = self.state.population, None
         if population is None or self.filter.resample == "after":
             return population, False
@@ -271,7 +278,7 @@ class _Step:
         return selected.with_ancestors(np.full(len(selected), -1))
 
     def predict(self, past: Population | None) -> Population | None:
-        """Predicted particles; None at the first step of a filter that starts from its proposal."""
+        """Predict: the moved particles; None at the first step of a filter that starts from its proposal."""
         if past is None:
             return self._first()
         stayed = {"previous": identity(len(past))}
@@ -297,7 +304,7 @@ class _Step:
         return population
 
     def propose(self, predicted: Population | None) -> Population | None:
-        """Particles from the observation; None without a proposal or an observation."""
+        """Propose: particles drawn from the observation; None if there is no proposal or no observation."""
         proposal = self.filter.proposal
         if proposal is None or (self.observation is None and predicted is not None):
             return None
@@ -310,7 +317,7 @@ class _Step:
         return proposed.labelled({"proposed": identity(len(proposed))}, proposed.notes)
 
     def fuse(self, predicted: Population | None, proposed: Population | None) -> Population:
-        """The particles after the update."""
+        """Fuse: the particles after the update."""
         update = self.filter.update
         if self.observation is None or update is None:
             fused = predicted if predicted is not None else proposed
@@ -323,14 +330,14 @@ class _Step:
         return fused
 
     def select_after(self, fused: Population, past: Population | None) -> tuple[Population, bool]:
-        """The particles to keep, and whether they were resampled."""
+        """Select: the particles to keep, and whether they were resampled."""
         size, after = self.filter.size, self.filter.resample == "after"
         n = limit = self.filter.n
         if len(fused) <= n and not after and size is None:
             return fused, False
         with self.slot("resampler"):
             if size is not None:
-                # With resample="before" the size was chosen before the prediction: only excess particles go.
+                # With resample="before", the size was chosen before the prediction: only remove excess particles.
                 limit = max(n, 0 if past is None else len(past))
                 if after or len(fused) > limit:
                     n = size.choose(fused)
@@ -343,7 +350,7 @@ class _Step:
         return fused, False
 
     def rejuvenate(self, chosen: Population, past: Population | None) -> Population:
-        """Particles after the move, with the parents that they had."""
+        """Move the particles by `rejuvenation`; their parents do not change."""
         rejuvenation = self.filter.rejuvenation
         if rejuvenation is None:
             return chosen
@@ -374,7 +381,7 @@ class _Step:
         """The next state and the record of the step."""
         with self.slot("build"):
             chosen = chosen.realised()
-        ess = fused.ess  # the population keeps it for the trigger of the next step
+        ess = fused.ess  # stored in the population, where the trigger of the next step reads it
         population = chosen.traced_through(past if resampled_before else None)
         info = Info(
             t=self.state.t,
@@ -445,13 +452,13 @@ def _priority(lookahead: Lookahead, population: Population, observation: Any) ->
 def _keep_freed_memory() -> None:
     """Free one large block, once per process.
 
-    glibc then keeps freed memory instead of returning the arrays of every step to the system, which takes a filter of
-    10,000 particles a fifth of its time. Other C libraries are unaffected.
+    After this, glibc keeps freed memory. Otherwise it returns the arrays of every step to the system, which takes a
+    fifth of the time of a filter of 10,000 particles. Other C libraries are not affected.
     """
     np.empty(1 << 21, np.uint8)
 
 
 @lru_cache(maxsize=1)
 def _unused_generator() -> np.random.Generator:
-    """For components that draw nothing; saves the time to make a stream."""
+    """A generator for components that draw no random numbers. Saves the time to make a stream."""
     return Key(0).child("unused").generator()

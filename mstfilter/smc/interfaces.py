@@ -48,15 +48,17 @@ class Component(ABC):
 
     @property
     def properly_weighted(self) -> bool:
-        """Whether the weights after it are those of an exact filter, in expectation.
+        """Whether weighted means of its result are unbiased up to the normalising constant.
 
-        The log evidence is reported only if this holds for all components.
+        The author of a component states this: True is the default, ``properly_weighted = False`` in the class changes
+        it. `mstfilter check` tests it for resamplers. A filter reports the log evidence only if all its components
+        are properly weighted.
         """
         return True
 
     @property
     def draws(self) -> bool:
-        """Whether it uses the generator. If False, it gets a generator that it must not use."""
+        """Whether the component uses the generator that it is given. If False, it must not use it."""
         return True
 
 
@@ -116,9 +118,9 @@ class Update(Component):
 
 
 class Resampler(Component):
-    """Selects particles by weight.
+    """Selects particles by weight. Base class of schemes that look at particles; define `resample`.
 
-    A scheme that needs only the weights is a `WeightResampler`.
+    A scheme that needs only the weights inherits `WeightResampler` and defines `select`.
     """
 
     @property
@@ -132,7 +134,7 @@ class Resampler(Component):
 
 
 class WeightResampler(Resampler):
-    """A resampler that needs only the weights of the particles."""
+    """A resampler that needs only the weights of the particles. Define `select`."""
 
     @abstractmethod
     def select(
@@ -152,8 +154,8 @@ class WeightResampler(Resampler):
         ancestors : (n,) int
             Indices into the m particles.
         log_weights : (n,) float or None
-            Log weights of the selected particles. None: equal weights, the log mean of the old ones, which keeps
-            the evidence.
+            Log weights of the selected particles. None: all get the log mean of the old weights, which keeps the
+            estimate of the evidence.
         """
 
     def resample(self, rng: np.random.Generator, population: Population, n: int) -> Population:

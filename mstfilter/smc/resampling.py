@@ -1,13 +1,14 @@
 """Resampling by weight: the classical schemes, and wrappers around a scheme.
 
-All schemes are unbiased: particle i gets n W_i copies on average, W its normalised weight. They differ in the
-variance of the number of copies N_i. Notation: f = frac(n W_i).
+W_i is the normalised weight of particle i, N_i its number of copies among the n selected particles, f = frac(n W_i).
+The schemes with equal output weights are unbiased: E[N_i] = n W_i. `FearnheadClifford` is unbiased due to its output
+weights. The schemes differ in the variance of N_i.
 
 ==================  =================================================  ====================================
 scheme              N_i                                                variance of N_i
 ==================  =================================================  ====================================
 Multinomial         n independent draws                                n W_i (1 - W_i)
-Residual            floor(n W_i), the rest by another scheme           r_i (1 - r_i / R), r_i = f, R = sum r
+Residual            floor(n W_i), the rest by another scheme           f (1 - f / R), R = sum of all f
 Stratified          one draw in each of n equal strata of [0, 1)       sum over strata of p (1 - p)
 Systematic          one draw, shifted to each stratum                  f (1 - f)
 Ssp                 floor or ceil, fractions decided pair by pair      f (1 - f)
@@ -20,9 +21,12 @@ FearnheadClifford   at most 1, with unequal weights                    least exp
 >>> Systematic().select(rng, np.log([0.5, 0.25, 0.25]), 4)[0]
 array([0, 0, 1, 2])
 
-(The variance of `Residual` is that of its default, the multinomial remainder.) Weights may be unnormalised, of any
-float type, and zero (log weight -inf); n may differ from their number. A particle of weight zero is never selected.
-NaN, +inf, or only zeros raise an `InputError`.
+The variance of `Residual` is that of its default, the multinomial remainder. Weights need not sum to 1, may have any
+float type, and may be zero (log weight -inf); n may differ from their number. A particle of weight zero is never
+selected. `InputError` is raised if a log weight is NaN or +inf, or if all weights are zero.
+
+Ties: the random schemes do not compare weights. Of particles with equal weights, `LargestWeights.select` (a stable
+sort), `coalesce`, and the diverse schemes of `mstfilter.smc.diverse_resampling` take the first.
 
 `Coalesced`, `Tempered`, `Shuffled` and `KeepWeights` wrap another resampler:
 
@@ -31,7 +35,7 @@ NaN, +inf, or only zeros raise an `InputError`.
 array([2., 1., 3.])
 
 Residual-systematic resampling (Bolic, Djuric, Hong 2004) has no class: in exact arithmetic it selects the same
-particles as `Systematic` from the same uniform, and as ``Residual("systematic")``.
+particles as `Systematic` and as ``Residual("systematic")`` if all use the same uniform number.
 
 References: Douc, Cappe, Moulines (2005), "Comparison of resampling schemes for particle filtering"; Kitagawa (1996);
 Liu and Chen (1998).
@@ -60,7 +64,7 @@ def checked_weights(log_weights: np.ndarray, n: int) -> np.ndarray:
     """
     lw = np.asarray(log_weights, dtype=np.float64)
     if lw.ndim != 1 or len(lw) == 0:
-        raise InputError(f"log weights have shape {lw.shape}, expected one number a particle")
+        raise InputError(f"log weights have shape {lw.shape}, expected one number per particle")
     if not isinstance(n, (int, np.integer)) or n < 1:
         raise InputError(f"resampling to {n} particles, expected an integer of at least 1")
     top = lw.max()
@@ -78,7 +82,7 @@ def _cumulative(log_weights: np.ndarray, n: int) -> np.ndarray:
 
 
 def _certain_copies(weights: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray, int]:
-    """floor(n W_i) as (m,) int64, the fractions that remain (m,), and their sum, the number of copies to draw."""
+    """floor(n W_i) (m,) int64, the fractions frac(n W_i) (m,), and the sum of the fractions: the copies to draw."""
     expected = weights * (n / weights.sum())
     copies = np.floor(expected * (1 + 1e-13))  # an integer up to rounding counts as that integer
     return copies.astype(np.int64), np.clip(expected - copies, 0.0, None), n - int(copies.sum())
@@ -91,7 +95,7 @@ def ordered_uniforms(rng: np.random.Generator, n: int) -> np.ndarray:
 
 
 def _from_points(cumulative: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Index of the interval of the cumulative weights that holds each point of [0, total)."""
+    """For each point of [0, total), the index of the interval of the cumulative weights that contains it."""
     index = np.searchsorted(cumulative, points, side="right")  # "right" skips weights of zero
     # A point rounded up to the total belongs to the last particle of positive weight.
     last = int(np.searchsorted(cumulative, cumulative[-1], side="left"))
@@ -118,7 +122,7 @@ def _repeated(copies: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Multinomial(WeightResampler):
-    """Independent draws by weight (Gordon, Salmond, Smith 1993). The largest variance; a reference for the others."""
+    """Independent draws by weight (Gordon, Salmond, Smith 1993). It has the largest variance; used as a reference."""
 
     def select(self, rng: np.random.Generator, log_weights: np.ndarray, n: int) -> tuple[np.ndarray, None]:
         cumulative = _cumulative(log_weights, n)
@@ -146,7 +150,7 @@ class Systematic(WeightResampler):
 
 @dataclass(frozen=True)
 class Residual(WeightResampler):
-    """floor(n W_i) copies for certain, the rest by another scheme (Liu and Chen 1998).
+    """floor(n W_i) copies of each particle; the rest is drawn by another scheme (Liu and Chen 1998).
 
     Parameters
     ----------
@@ -181,9 +185,10 @@ _SETTLED = 1e-12  # a fraction this close to 0 or 1 is 0 or 1 up to rounding
 class Ssp(WeightResampler):
     """Srinivasan sampling process: N_i is floor or ceil of n W_i, for any order of the particles.
 
-    Two fractions a and b are paired: with probability down / (up + down), up = min(1-a, b), down = min(a, 1-b), a
-    takes `up` from b, else b takes `down` from a. One of them is then 0 or 1 and settled; the other is paired again.
-    Here all pairs of a round are decided together: log2(n) rounds instead of n steps (Gerber, Chopin, Whiteley 2019,
+    Two fractions a and b form a pair, with up = min(1 - a, b) and down = min(a, 1 - b). With probability
+    down / (up + down), a grows and b shrinks by `up`; otherwise a shrinks and b grows by `down`. Then one of the two
+    is 0 or 1, which is final; the other one is paired again. Here all pairs of a round are
+    processed together, so log2(n) rounds replace n steps (Gerber, Chopin, Whiteley 2019,
     "Negative association, ordering and convergence of resampling methods").
     """
 
@@ -237,12 +242,13 @@ class Killing(WeightResampler):
 
 @dataclass(frozen=True)
 class FearnheadClifford(WeightResampler):
-    """Optimal resampling: particles with w_i >= c for certain, the others with probability w_i / c and weight c.
+    """Optimal resampling: keeps particles with w_i >= c, and others with probability w_i / c and weight c.
 
     c solves sum min(1, w_i / c) = n. The light particles are selected systematically, so there are no duplicates. The
     total weight is kept exactly. Of all unbiased random weights with at most n positive ones, these have the least
-    expected squared error. If n or fewer particles have positive weight, these are kept, so fewer than n may be
-    returned: a filter that selects n of n particles degenerates; use more candidates than particles (`Branching`).
+    expected squared error. If n or fewer particles have positive weight, all of these are kept, so fewer than n may
+    be returned. A filter that selects n of n particles therefore degenerates: use more candidates than particles
+    (`Branching`).
 
     >>> log_weights = np.log([4.0, 3.0, 1.0, 1.0, 1.0])
     >>> ancestors, log_weights = FearnheadClifford().select(np.random.default_rng(1), log_weights, 4)
@@ -283,13 +289,13 @@ def optimal_threshold(weights: np.ndarray, n: int) -> tuple[float, np.ndarray]:
         Number of particles to select.
     """
     heavy, kept, c = np.zeros(len(weights), bool), 0, float(weights.sum()) / n
-    while True:  # c decreases and more weights become heavy, until all light ones are below c: a few rounds
-        # Light means lighter than c by more than rounding, so that no light interval can hold two points.
+    while True:  # c decreases until all light weights are below c; takes a few rounds
+        # Light weights are below c by more than rounding errors, so no light interval contains two points.
         heavy |= weights >= c * (1 - 1e-9)
         if int(heavy.sum()) == kept:
             return c, heavy
         kept = int(heavy.sum())
-        if kept >= n:  # only by rounding: the light weights together are negligible beside the n-th heaviest
+        if kept >= n:  # only by rounding: the sum of the light weights is negligible
             heavy = np.zeros(len(weights), bool)
             heavy[np.argsort(-weights, kind="stable")[: n - 1]] = True
             return float(weights[~heavy].sum()), heavy
@@ -300,21 +306,24 @@ def optimal_threshold(weights: np.ndarray, n: int) -> tuple[float, np.ndarray]:
 class LargestWeights(WeightResampler):
     """Selects the n particles of largest weight, with equal weights; draws nothing. Not properly weighted.
 
-    Ties are broken by position. If fewer than n particles have weight, they are repeated in turn.
+    Of particles with equal weights the first is selected: the sort in `select` is stable. If fewer than n particles
+    have positive weight, they are repeated in turn.
     """
 
     properly_weighted: ClassVar[bool] = False
 
     def select(self, rng: np.random.Generator, log_weights: np.ndarray, n: int) -> tuple[np.ndarray, None]:
         checked_weights(log_weights, n)
-        # By log weight: weights that differ may all round to zero.
+        # Sorted by log weight, because different weights may all underflow to zero.
         largest = np.argsort(-log_weights, kind="stable")[: np.isfinite(log_weights).sum()]
         return largest[np.arange(n) % len(largest)], None
 
 
 @dataclass(frozen=True)
 class ResamplerWrapper(Resampler):
-    """Base of resamplers that change what another resampler is given or returns; as proper as that one.
+    """Base class of resamplers that change the input or the result of another resampler.
+
+    It is properly weighted if the wrapped resampler is.
 
     Parameters
     ----------
@@ -338,15 +347,15 @@ class ResamplerWrapper(Resampler):
 
 @dataclass(frozen=True)
 class Coalesced(ResamplerWrapper):
-    """Merges equal particles before the selection, which loses nothing.
+    """Merges equal particles, with the sum of their weights, before the selection.
 
-    The population shrinks by the merged particles; only a transition or update that makes more candidates lets it
-    grow again. ``notes["distinct"]`` is the number of different particles of positive weight.
+    The result represents the same distribution with fewer particles. The population grows again only if a transition
+    or update makes more candidates. ``notes["distinct"]`` is the number of different particles of positive weight.
 
     Parameters
     ----------
     equivalence : Equivalence
-        Decides which particles are equal. The heaviest of a class is kept.
+        Decides which particles are equal. The heaviest particle of a class is kept, the first of several.
     """
 
     scheme: Resampler = FearnheadClifford()
@@ -366,12 +375,13 @@ class Coalesced(ResamplerWrapper):
 
 
 def coalesce(log_weights: np.ndarray, classes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """One particle for each class: the heaviest, with the weight of the class.
+    """Select one particle for each class: the heaviest, with the weight of the class.
 
     Returns
     -------
     representatives : (k,) int
-        The heaviest particle of each class (the first of equals), ascending. Classes without weight are left out.
+        The heaviest particle of each class (the first, if several have equal weights), ascending. Classes of weight
+        zero are left out.
     log_weights : (k,) float64
         Log of the summed weights times k / m, which keeps the log mean of the weights.
     """
@@ -393,7 +403,7 @@ class Tempered(ResamplerWrapper):
     Parameters
     ----------
     power : float
-        In [0, 1]. 1 is the wrapped scheme, 0 ignores positive weights.
+        In [0, 1]. 1: same as the wrapped scheme. 0: all particles of positive weight are equally likely.
     """
 
     power: float = 0.5
@@ -415,8 +425,9 @@ class Tempered(ResamplerWrapper):
 
 @dataclass(frozen=True)
 class Shuffled(ResamplerWrapper):
-    """Permutes the particles at random before the selection, so that systematic and stratified schemes do not depend
-    on their order.
+    """Permutes the particles at random before the selection.
+
+    Systematic and stratified schemes then do not depend on the order of the particles.
     """
 
     def resample(self, rng: np.random.Generator, population: Population, n: int) -> Population:
