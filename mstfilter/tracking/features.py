@@ -20,6 +20,7 @@ from mstfilter.errors import InputError
 from mstfilter.scene import Frame, depth_sigma, memo
 
 _N_EXPOSURE_PIXELS = 20000
+_MAX_PAIRS = 20000  # matches with the smallest descriptor distances are kept
 _PRIOR_VARIANCE = 20.0**2  # grey levels squared; where colours vary less, the gain stays near 1
 
 
@@ -113,11 +114,9 @@ class SiftMatching:
     descriptor_radius : float
         Largest descriptor distance (SIFT descriptors have length 512).
     search_share : float
-        Search radius in the image, as a share of its width.
+        Search radius in the image, as a fraction of its width.
     search_distance : float
         Search radius in space, metres.
-    max_pairs : int
-        Largest number of pairs; those with the smallest descriptor distance are kept.
     """
 
     mutual: bool = True
@@ -125,7 +124,6 @@ class SiftMatching:
     descriptor_radius: float = 250.0
     search_share: float = 0.35
     search_distance: float = 0.40
-    max_pairs: int = 20000
 
     def __post_init__(self) -> None:
         if self.descriptor_radius <= 0 or self.search_share <= 0 or self.search_distance <= 0:
@@ -173,8 +171,8 @@ def _match(before: Frame, after: Frame, settings: SiftMatching) -> Matches:
         distance[_far(points_a, points_b, settings.search_distance)] = np.inf
         distance[distance > settings.descriptor_radius] = np.inf
         i, j = _mutual(distance, settings.ratio) if settings.mutual else np.nonzero(np.isfinite(distance))
-        if len(i) > settings.max_pairs:
-            best = np.sort(np.argsort(distance[i, j], kind="stable")[: settings.max_pairs])
+        if len(i) > _MAX_PAIRS:
+            best = np.sort(np.argsort(distance[i, j], kind="stable")[:_MAX_PAIRS])
             i, j = i[best], j[best]
         if settings.mutual:
             # SIFT returns a point once per dominant orientation; keep its best match only.

@@ -9,8 +9,8 @@ Two results are accumulated over the frames of the clip:
 >>> tracks = DenseFlow().track(clip)                     # doctest: +SKIP
 >>> labels_after = tracks.warp(project(hypothesis, clip.before.camera))   # doctest: +SKIP
 
-A point or pixel is valid while the backward flow returns it to its start (within ``forward_backward`` pixels), its
-depth and colour do not jump, and it is not on the robot. The intermediate frames are needed because the flow from
+A point or pixel is valid while the backward flow returns it to its start, its depth and colour do not jump, and it is
+not on the robot. The intermediate frames are needed because the flow from
 first to last frame fails for long motions.
 """
 
@@ -30,6 +30,12 @@ from mstfilter.tracking.features import matched_colour, same_depth, smooth_colou
 
 _PRESETS = ("ultrafast", "fast", "medium")
 _N_VOTERS = 5
+#: Frames are skipped until the motion since the last used frame reaches this fraction of the image width: errors
+#: accumulate with the number of frames, but flow fails for long motions.
+_FRAME_MOTION = 0.03
+_ROUND_TRIP = 1.0  # pixels, largest forward-backward error of a track
+_DEPTH_JUMP = 0.03  # metres, largest change of depth of a track between consecutive frames
+_COLOUR_JUMP = 30.0  # grey levels per channel, largest change of colour of a track between consecutive frames
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,25 +82,12 @@ class DenseFlow:
     Parameters
     ----------
     preset : "ultrafast", "fast" or "medium"
-    motion_share : float
-        Skip frames until the motion since the last used frame reaches this share of the image width. Errors
-        accumulate with the number of frames, but flow fails for long motions. 0 uses every frame.
     grid_step : int
         Spacing of the followed points in pixels.
-    forward_backward : float
-        Largest round-trip error of a track, pixels.
-    depth_jump : float
-        Largest change of depth of a track between consecutive frames, metres.
-    colour_jump : float
-        Largest change of colour of a track between consecutive frames (slightly blurred), grey levels per channel.
     """
 
     preset: str = "medium"
-    motion_share: float = 0.03
     grid_step: int = 2
-    forward_backward: float = 1.0
-    depth_jump: float = 0.03
-    colour_jump: float = 30.0
 
     def __post_init__(self) -> None:
         if self.preset not in _PRESETS:
@@ -106,14 +99,13 @@ class DenseFlow:
         """Follow points and pixels through the clip. Cached by content."""
         frames = list(clip.frames)
         key = (tuple(f.key for f in frames), astuple(self))
-        return memo("clip tracks", key, lambda: _track(_thinned(frames, self.motion_share), self), ClipTracks)
+        return memo("clip tracks", key, lambda: _track(_thinned(frames), self.preset, self.grid_step), ClipTracks)
 
 
-def _track(frames: list[Frame], settings: DenseFlow) -> ClipTracks:
+def _track(frames: list[Frame], preset: str, step: int) -> ClipTracks:
     first, last = frames[0], frames[-1]
     height, width = first.depth.shape
     columns, rows = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
-    step = settings.grid_step
     start = np.stack([columns[::step, ::step].ravel(), rows[::step, ::step].ravel()], axis=1)
     end = start.copy()
     alive = ~_robot(first)[::step, ::step].ravel()
@@ -121,11 +113,11 @@ def _track(frames: list[Frame], settings: DenseFlow) -> ClipTracks:
     pull = grid.copy()  # position in the first frame of every pixel of the current frame
     known = ~_robot(first).ravel()
     for previous, current in pairwise(frames):
-        forward, backward = _flow(previous, current, settings.preset)
-        end, ok = _advance(end, forward, backward, previous, current, settings)
+        forward, backward = _flow(previous, current, preset)
+        end, ok = _advance(end, forward, backward, previous, current)
         alive &= ok
         # One step back to the previous frame, then the accumulated map.
-        back, ok = _advance(grid, backward, forward, current, previous, settings)
+        back, ok = _advance(grid, backward, forward, current, previous)
         u, v = _pixel(back, width, height)
         at = v * width + u
         pull = pull[at] + (back - grid[at])  # keeps the subpixel part
@@ -143,14 +135,13 @@ def _track(frames: list[Frame], settings: DenseFlow) -> ClipTracks:
     return ClipTracks(start.astype(np.int32), end, alive, source, unchanged)
 
 
-def _thinned(frames: list[Frame], motion_share: float) -> list[Frame]:
+def _thinned(frames: list[Frame]) -> list[Frame]:
     """Remove frames with little motion since the last kept frame."""
     import cv2
 
-    if motion_share <= 0 or len(frames) < 3:
+    if len(frames) < 3:
         return frames
-    shape = frames[0].depth.shape
-    factor = 160.0 / shape[1]
+    factor = 160.0 / frames[0].depth.shape[1]
     dis = cv2.DISOpticalFlow_create(_PRESETS.index("ultrafast"))  # type: ignore[attr-defined]
     small = [
         cv2.resize(cv2.cvtColor(f.rgb, cv2.COLOR_RGB2GRAY), None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
@@ -163,7 +154,7 @@ def _thinned(frames: list[Frame], motion_share: float) -> list[Frame]:
             following = dis.calc(small[i], small[i + 1], None)
         # The robot is excluded: it moves fast and is not tracked.
         moved += _speed(flow, frames[i - 1]) / 160.0
-        if moved + _speed(following, frames[i]) / 160.0 > motion_share:
+        if moved + _speed(following, frames[i]) / 160.0 > _FRAME_MOTION:
             kept.append(frames[i])
             moved = 0.0
     return [*kept, frames[-1]]
@@ -218,19 +209,19 @@ def _sample(field: np.ndarray, at: np.ndarray) -> np.ndarray:
 
 
 def _advance(
-    at: np.ndarray, there: np.ndarray, back: np.ndarray, a: Frame, b: Frame, settings: DenseFlow
+    at: np.ndarray, there: np.ndarray, back: np.ndarray, a: Frame, b: Frame
 ) -> tuple[np.ndarray, np.ndarray]:
     """Move points from frame a to b. Returns their positions (N, 2) and whether they are valid (N,)."""
     height, width = a.depth.shape
     moved = at + _sample(there, at)
     home = moved + _sample(back, moved)
     inside = (moved >= 0).all(axis=1) & (moved[:, 0] <= width - 1) & (moved[:, 1] <= height - 1)
-    ok = inside & (((home - at) ** 2).sum(axis=1) < settings.forward_backward**2)
+    ok = inside & (((home - at) ** 2).sum(axis=1) < _ROUND_TRIP**2)
     ua, va = _pixel(at, width, height)
     ub, vb = _pixel(moved, width, height)
     jump = np.abs(b.depth[vb, ub] - a.depth[va, ua])
-    ok &= ~(jump > settings.depth_jump)  # a missing reading (NaN) is not a jump
-    ok &= np.abs(smooth_colour(b)[vb, ub] - smooth_colour(a)[va, ua]).max(axis=1) <= settings.colour_jump
+    ok &= ~(jump > _DEPTH_JUMP)  # a missing reading (NaN) is not a jump
+    ok &= np.abs(smooth_colour(b)[vb, ub] - smooth_colour(a)[va, ua]).max(axis=1) <= _COLOUR_JUMP
     ok &= ~_robot(b)[vb, ub] & ~_robot(a)[va, ua]
     return moved, ok
 

@@ -22,6 +22,9 @@ from mstfilter.scene import Clip, component_key, memo, read_only
 from mstfilter.tracking.flow import DenseFlow
 from mstfilter.tracking.rigid import fit_sums, move_points, pair_sums
 
+_MAX_NOISE = 0.006  # metres; cells with a larger root mean square residual under one rigid motion are not used
+_RIVAL_REACH = 0.15  # metres; largest distance of cells whose motions are compared
+
 
 @dataclass(frozen=True, eq=False)
 class FollowedPoints:
@@ -71,12 +74,10 @@ class MotionSegmentation:
     misfit : float
         Largest misfit of two joined neighbours, metres: root mean square residual of the points of the smaller one
         under the common motion, in addition to the residual under its own motion.
-    noisy : float
-        Largest root mean square residual (metres) of a cell under one rigid motion; other cells are not used.
-    rival, rival_reach : float
+    rival : float
         A point is ambiguous if another motion predicts its position in the last frame within `rival` (metres) as
-        well, for instance near the axis of a rotation. The motions compared are rest and those of cells within
-        `rival_reach` (metres) of the point's cell; motions farther away coincide by chance.
+        well, for instance near the axis of a rotation. The motions compared are rest and those of nearby cells;
+        motions farther away coincide by chance.
     reach : float
         Largest distance in space (metres) of neighbouring cells.
     min_points : int
@@ -88,9 +89,7 @@ class MotionSegmentation:
     cell: int = 10
     moved: float = 0.008
     misfit: float = 0.015
-    noisy: float = 0.006
     rival: float = 0.006
-    rival_reach: float = 0.15
     reach: float = 0.04
     min_points: int = 40
     flow: DenseFlow = field(default_factory=DenseFlow)
@@ -115,7 +114,7 @@ class MotionSegmentation:
         origin = points.q.mean(axis=0)
         sums = pair_sums(points.p - origin, points.q - origin, cell, len(cells))
         _, error = fit_sums(sums)
-        clean = error <= sums[:, 0] * self.noisy**2
+        clean = error <= sums[:, 0] * _MAX_NOISE**2
         pairs = _neighbours(cells, across, down, sums, self.reach)
         near = np.zeros(len(cells), bool)  # cells at rest are used only next to moved cells
         touched = (cells[pairs] % 2 == 1).any(axis=1)
@@ -127,7 +126,7 @@ class MotionSegmentation:
         motions, group = self._motions(sums, group)
         centre = sums[:, 4:7] / sums[:, :1]
         rivals = [cdist(centre, centre[group == k]).min(axis=1, initial=np.inf) for k in range(len(motions))]
-        close = np.array(rivals) < self.rival_reach
+        close = np.array(rivals) < _RIVAL_REACH
         close[0] = True
         number = _best(points, cell, pairs, group, motions, origin, 3 * self.misfit, self.rival, close)
         out[points.row, points.column] = number

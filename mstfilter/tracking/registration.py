@@ -7,12 +7,6 @@
 A `Surface` holds the downsampled cloud with normals, covariances and search tree. It is prepared once and used by all
 registrations of the segment. All methods run on one thread: with several threads the order of a sum changes the last
 digits of the result.
-
-=================  =====================================================================
-`SmallGicp`        generalised, point-to-plane or point-to-point ICP; the default
-`ColouredIcp`      open3d: point-to-plane distance and colour (Park et al., ICCV 2017)
-`PointToPlaneIcp`  open3d: point-to-plane distance (Chen and Medioni 1991)
-=================  =====================================================================
 """
 
 from __future__ import annotations
@@ -77,7 +71,7 @@ class RegistrationResult:
     ----------
     T : (4, 4) motion.
     rms : root mean square distance from each moved source point to its nearest target point, metres.
-    overlap : share of the moved source points with a target point within the reach.
+    overlap : fraction of the moved source points with a target point within the reach.
     error : objective of the method (small_gicp), or root mean square distance of the inliers in metres (open3d).
     inliers : number of correspondences within the reach.
     converged, iterations : whether the method converged, and the index of its last iteration; None for open3d.
@@ -163,17 +157,13 @@ class SmallGicp(Registration):
             num_threads=1,
             max_iterations=self.iterations,
         )
-        T = np.array(found.T_target_source, dtype=np.float64)
-        if not np.isfinite(T).all():
-            return None
-        T[:3, :3] = _nearest_rotation(T[:3, :3])
-        fit = _fit(source, target, T, reach)
-        return RegistrationResult(T, *fit, found.error, found.num_inliers, found.converged, found.iterations, found.H)
+        statistics = (found.error, found.num_inliers, found.converged, found.iterations, found.H)
+        return _result(found.T_target_source, source, target, reach, *statistics)
 
 
 @dataclass(frozen=True)
 class PointToPlaneIcp(Registration):
-    """open3d's point-to-plane ICP.
+    """open3d's point-to-plane ICP (Chen and Medioni 1991).
 
     Parameters
     ----------
@@ -199,7 +189,7 @@ class PointToPlaneIcp(Registration):
 
 @dataclass(frozen=True)
 class ColouredIcp(Registration):
-    """open3d's coloured ICP. Colour determines the motions along a surface that depth does not.
+    """open3d's coloured ICP (Park et al., ICCV 2017). Colour determines motions along a surface; depth does not.
 
     Minimises the sum of ``w d^2 + (1 - w) c^2`` over the correspondences, with d the point-to-plane distance in
     metres, c the difference of grey values 0 .. 1, and w such that the two scales below have equal cost.
@@ -242,18 +232,23 @@ class ColouredIcp(Registration):
 
 
 def _open3d_result(found: Any, source: Surface, target: Surface, reach: float) -> RegistrationResult | None:
-    T = np.array(found.transformation, dtype=np.float64)
+    inliers = len(np.asarray(found.correspondence_set))
+    return _result(found.transformation, source, target, reach, float(found.inlier_rmse), inliers)
+
+
+def _result(
+    motion: np.ndarray, source: Surface, target: Surface, reach: float, *statistics: Any
+) -> RegistrationResult | None:
+    """The result of a registration, with the nearest rotation; None if the motion (4, 4) is not finite."""
+    T = np.array(motion, dtype=np.float64)
     if not np.isfinite(T).all():
         return None
-    T[:3, :3] = _nearest_rotation(T[:3, :3])
-    inliers = len(np.asarray(found.correspondence_set))
-    return RegistrationResult(T, *_fit(source, target, T, reach), float(found.inlier_rmse), inliers)
-
-
-def _fit(source: Surface, target: Surface, T: np.ndarray, reach: float) -> tuple[float, float]:
-    """Root mean square distance of the moved source to the target (metres), and the share within the reach."""
+    # The nearest rotation removes the rounding errors of repeated products.
+    U, _, Vt = np.linalg.svd(T[:3, :3])
+    T[:3, :3] = U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))]) @ Vt
     distance = target.distances(move_points(T, source.points))
-    return float(np.sqrt((distance**2).mean())), float((distance <= reach).mean())
+    rms, overlap = float(np.sqrt((distance**2).mean())), float((distance <= reach).mean())
+    return RegistrationResult(T, rms, overlap, *statistics)
 
 
 def centroid_shift(source: np.ndarray, target: np.ndarray) -> np.ndarray:
@@ -261,9 +256,3 @@ def centroid_shift(source: np.ndarray, target: np.ndarray) -> np.ndarray:
     T = np.eye(4)
     T[:3, 3] = np.median(target, axis=0) - np.median(source, axis=0)
     return T
-
-
-def _nearest_rotation(R: np.ndarray) -> np.ndarray:
-    """The nearest rotation, which removes the rounding errors of repeated products."""
-    U, _, Vt = np.linalg.svd(R)
-    return U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))]) @ Vt

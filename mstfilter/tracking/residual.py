@@ -8,7 +8,7 @@ measured depth:
 - outside the image: a larger constant cost;
 - no reading or robot: not counted.
 
-The score S is the mean cost of the counted points, plus a term for the share of visible points that land on pixels
+The score S is the mean cost of the counted points, plus a term for the fraction of visible points that land on pixels
 which the flow traces back to another object: depth and colour do not distinguish two objects of equal look. Lower is
 better.
 
@@ -31,7 +31,12 @@ from mstfilter.scene import Frame, depth_sigma, memo
 from mstfilter.tracking.rigid import move_points
 from mstfilter.tracking.segments import Track
 
-_N_POINTS = 800
+_DEPTH_SCALE = 1.5  # unit of depth differences, in standard deviations of the difference of two readings
+_COLOUR_SCALE = 25.0  # unit of colour differences (Euclidean RGB), grey levels
+_CAP = 4.0  # largest normalised difference
+_OCCLUDED_MARGIN = 0.015  # metres; points farther behind the measured surface are occluded
+_MIN_COUNTED = 0.3  # smallest fraction of counted points; with fewer the score is infinite
+_N_SCORED, _N_REFINED = 1200, 800  # largest numbers of points of a segment, evenly spaced
 _GATES = (0.03, 0.03, 0.02, 0.02, 0.015, 0.015, 0.01, 0.01)  # metres, one per iteration
 _DAMPING = 1e-3  # of the largest eigenvalue; keeps directions that the data do not determine
 
@@ -42,41 +47,23 @@ class MotionResidual:
 
     Parameters
     ----------
-    depth_scale : float
-        Unit of depth differences, in standard deviations of the difference of two readings.
-    colour_scale : float
-        Unit of colour differences (Euclidean RGB), grey levels.
-    cap : float
-        Largest normalised difference.
-    occluded_margin : float
-        Metres; points farther behind the measured surface are occluded.
     occluded_cost, outside_cost : float
         Cost of an occluded point and of a point outside the image.
-    least_share : float
-        Smallest share of counted points; with fewer the score is infinite.
-    n_points : int
-        Largest number of points of a segment, evenly spaced.
     track_weight : float
         Added to S if all visible points land on pixels that the flow traces back to another object.
     """
 
-    depth_scale: float = 1.5
-    colour_scale: float = 25.0
-    cap: float = 4.0
-    occluded_margin: float = 0.015
     occluded_cost: float = 5.6
     outside_cost: float = 16.0
-    least_share: float = 0.3
-    n_points: int = 1200
     track_weight: float = 1.0
 
     def score(self, track: Track, T: np.ndarray) -> float:
         """S of a motion (4, 4); infinite if too few points can be compared."""
         return float(self.scores(track, T[None])[0])
 
-    def scores(self, track: Track, motions: np.ndarray, n_points: int | None = None) -> np.ndarray:
+    def scores(self, track: Track, motions: np.ndarray, n_points: int = _N_SCORED) -> np.ndarray:
         """S (K,) of motions (K, 4, 4), on at most ``n_points`` points."""
-        points, colours = track.sample(n_points or self.n_points)
+        points, colours = track.sample(n_points)
         if not len(points):
             return np.full(len(motions), np.inf)
         after = track.clip.after
@@ -88,22 +75,22 @@ class MotionResidual:
         measured = after.depth[v, u].astype(np.float64)
         counted = inside & after.valid[v, u]
         behind = z - measured
-        scale = self.depth_scale * np.sqrt(2.0) * depth_sigma(measured)
+        scale = _DEPTH_SCALE * np.sqrt(2.0) * depth_sigma(measured)
         colour = np.linalg.norm(track.colour_after[v, u] - colours, axis=-1)
         with np.errstate(invalid="ignore"):
-            hidden = behind > self.occluded_margin
-            cost = np.minimum(np.abs(behind) / scale, self.cap) ** 2
-            cost = cost + np.minimum(colour / self.colour_scale, self.cap) ** 2
+            hidden = behind > _OCCLUDED_MARGIN
+            cost = np.minimum(np.abs(behind) / scale, _CAP) ** 2
+            cost = cost + np.minimum(colour / _COLOUR_SCALE, _CAP) ** 2
         cost = np.where(hidden, self.occluded_cost, cost)
         n_outside = (~inside).sum(axis=-1)
         n = n_outside + counted.sum(axis=-1)
         total = np.where(counted, cost, 0.0).sum(axis=-1) + self.outside_cost * n_outside
-        # Share of the visible points that land on pixels of another object according to the flow.
+        # Fraction of the visible points that land on pixels of another object according to the flow.
         source = track.flow.source[v, u]
         traced = counted & ~hidden & (source >= 0)
         foreign = (traced & ~track.mask.ravel()[source]).sum(axis=-1) / np.maximum(traced.sum(axis=-1), 1)
         mean = total / np.maximum(n, 1)
-        return np.where(n >= max(self.least_share * len(points), 1), mean + self.track_weight * foreign, np.inf)
+        return np.where(n >= max(_MIN_COUNTED * len(points), 1), mean + self.track_weight * foreign, np.inf)
 
 
 def normals(frame: Frame) -> np.ndarray:
@@ -142,14 +129,9 @@ def _gradients(track: Track) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return memo("grey gradients", (track.clip.after.key, track.clip.before.key), compute)
 
 
-def refine_motion(track: Track, T: np.ndarray, depth_scale: float = 1.5, colour_scale: float = 25.0) -> np.ndarray:
-    """Improve a motion (4, 4) of a segment; the scales are those of `MotionResidual`.
-
-    Returns
-    -------
-    (4, 4) motion; unchanged if too few points can be compared.
-    """
-    points, colours = track.sample(_N_POINTS)
+def refine_motion(track: Track, T: np.ndarray) -> np.ndarray:
+    """Improve a motion (4, 4) of a segment; it is returned unchanged if too few points can be compared."""
+    points, colours = track.sample(_N_REFINED)
     after = track.clip.after
     surface_normals, (grey, across, down) = normals(after), _gradients(track)
     before_grey = colours.mean(axis=1)
@@ -171,12 +153,13 @@ def refine_motion(track: Track, T: np.ndarray, depth_scale: float = 1.5, colour_
         u, v, x, z = u[near], v[near], x[rows], z[rows]
         centre = x.mean(axis=0)
         radius = max(float(np.sqrt(((x - centre) ** 2).sum(axis=1).mean())), 1e-3)
-        r_depth = distance[near] / (depth_scale * np.sqrt(2.0) * depth_sigma(z))
-        j_depth = normal[near] / (depth_scale * np.sqrt(2.0) * depth_sigma(z))[:, None]
+        unit = _DEPTH_SCALE * np.sqrt(2.0) * depth_sigma(z)
+        r_depth = distance[near] / unit
+        j_depth = normal[near] / unit[:, None]
         # Grey value at the projected point, to first order around the pixel.
         du, dv = uv[rows, 0] - u, uv[rows, 1] - v
         gx, gy = across[v, u].astype(np.float64), down[v, u].astype(np.float64)
-        r_colour = (grey[v, u] + gx * du + gy * dv - before_grey[rows]) / colour_scale
+        r_colour = (grey[v, u] + gx * du + gy * dv - before_grey[rows]) / _COLOUR_SCALE
         camera_x = (x - after.camera.position) @ world_to_camera.T
         per_pixel = np.stack(
             [
@@ -186,7 +169,7 @@ def refine_motion(track: Track, T: np.ndarray, depth_scale: float = 1.5, colour_
             ],
             axis=1,
         )
-        j_colour = per_pixel @ world_to_camera / (z * colour_scale)[:, None]
+        j_colour = per_pixel @ world_to_camera / (z * _COLOUR_SCALE)[:, None]
         H, b = np.zeros((6, 6)), np.zeros(6)
         for residual, slope in ((r_depth, j_depth), (r_colour, j_colour)):
             J = np.hstack([np.cross((x - centre) / radius, slope), slope])

@@ -1,8 +1,7 @@
 """Rigid motions from corresponding points: least squares, robust fits, and J-Linkage for several motions.
 
-Functions of this module take motions as (..., 4, 4) float64 matrices T, so that they work on stacks of motions: a
-point p moves to ``q = R p + t`` with R = T[:3, :3] and t = T[:3, 3]. Components exchange single motions as scipy
-`RigidTransform`; `rigid_transform` converts without changing a bit.
+Motions are (..., 4, 4) float64 matrices T: a point p moves to ``q = R p + t`` with R = T[:3, :3] and t = T[:3, 3].
+Components exchange single motions as scipy `RigidTransform`; `rigid_transform` converts without changing a bit.
 
 >>> import numpy as np
 >>> rng = np.random.default_rng(1)
@@ -32,6 +31,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 _N_SUMS = 18  # n, sum p (3), sum q (3), sum p q^T (9), sum |p|^2, sum |q|^2
+_MAX_CLUSTERED = 300  # J-Linkage clusters a random subset of more matches: its cost grows with N^2
 
 
 def rigid_transform(T: np.ndarray) -> RigidTransform:
@@ -183,38 +183,6 @@ def residuals(models: np.ndarray, p: np.ndarray, q: np.ndarray) -> np.ndarray:
     return np.linalg.norm(moved - q[:, None, :], axis=-1)
 
 
-def ransac(
-    rng: np.random.Generator, p: np.ndarray, q: np.ndarray, eps: float, n_models: int = 300
-) -> tuple[np.ndarray, np.ndarray] | None:
-    """The motion with the most pairs within ``eps`` metres, refitted to them; None if no motion has three."""
-    models = minimal_models(rng, p, q, eps, n_models)
-    if not len(models):
-        return None
-    scoring = slice(None, None, max(1, len(p) // 400))  # 400 pairs are sufficient to rank the models
-    T = models[(residuals(models, p[scoring], q[scoring]) < eps).sum(axis=0).argmax()]
-    inliers = residuals(T[None], p, q)[:, 0] < eps
-    for _ in range(2):
-        if inliers.sum() < 3:
-            return None
-        T = kabsch(p[inliers], q[inliers])
-        inliers = residuals(T[None], p, q)[:, 0] < eps
-    return (T, inliers) if inliers.sum() >= 3 else None
-
-
-def refine_robust(T: np.ndarray, p: np.ndarray, q: np.ndarray, scale: float, iterations: int = 10) -> np.ndarray:
-    """Iteratively reweighted fit with the Geman-McClure weight (1 + r^2 / scale^2)^-2, from ``T``.
-
-    ``scale`` is in metres. If all weights vanish, the present motion is returned.
-    """
-    for _ in range(iterations):
-        squared = ((move_points(T, p) - q) ** 2).sum(axis=-1)
-        weights = (1.0 + squared / scale**2) ** -2
-        if weights.sum() < 1e-6 * len(p):
-            break
-        T = kabsch(p, q, weights)
-    return T
-
-
 @dataclass(frozen=True)
 class MotionCluster:
     """A rigid motion and the matches that it explains.
@@ -231,6 +199,40 @@ class MotionCluster:
     rms: float
 
 
+def ransac(rng: np.random.Generator, p: np.ndarray, q: np.ndarray, eps: float) -> MotionCluster | None:
+    """The motion with the most pairs within ``eps`` metres, refitted to them; None if no motion has three."""
+    models = minimal_models(rng, p, q, eps, 300)
+    if not len(models):
+        return None
+    scoring = slice(None, None, max(1, len(p) // 400))  # 400 pairs are sufficient to rank the models
+    return _refit(p, q, models[(residuals(models, p[scoring], q[scoring]) < eps).sum(axis=0).argmax()], eps)
+
+
+def _refit(p: np.ndarray, q: np.ndarray, T: np.ndarray, eps: float) -> MotionCluster | None:
+    """Two rounds of least squares on the inliers among all matches; None if there are fewer than three."""
+    inliers = np.flatnonzero(residuals(T[None], p, q)[:, 0] < eps)
+    for _ in range(2):
+        if len(inliers) < 3:
+            return None
+        T = kabsch(p[inliers], q[inliers])
+        distance = residuals(T[None], p, q)[:, 0]
+        inliers = np.flatnonzero(distance < eps)
+    if len(inliers) < 3:
+        return None
+    return MotionCluster(T, inliers, float(np.sqrt((distance[inliers] ** 2).mean())))
+
+
+def refine_robust(T: np.ndarray, p: np.ndarray, q: np.ndarray, scale: float) -> np.ndarray:
+    """Reweighted least squares from ``T``: Geman-McClure weights (1 + r^2 / scale^2)^-2, scale in metres."""
+    for _ in range(10):
+        squared = ((move_points(T, p) - q) ** 2).sum(axis=-1)
+        weights = (1.0 + squared / scale**2) ** -2
+        if weights.sum() < 1e-6 * len(p):
+            break
+        T = kabsch(p, q, weights)
+    return T
+
+
 def jlinkage(
     rng: np.random.Generator,
     p: np.ndarray,
@@ -239,7 +241,6 @@ def jlinkage(
     eps: float = 0.010,
     n_models: int = 500,
     min_size: int = 5,
-    max_matches: int = 300,
 ) -> list[MotionCluster]:
     """Find the rigid motions among matches (p_i, q_i).
 
@@ -248,10 +249,8 @@ def jlinkage(
     rng : draws the minimal sets.
     p, q : (N, 3) world metres before and after.
     eps : metres; at least 5 standard deviations of a match, or true clusters are split.
-    n_models : sampled triples. A motion that holds a share w of the matches is hit n_models w^3 times.
+    n_models : sampled triples. A motion that explains a fraction w of the matches is sampled n_models w^3 times.
     min_size : smallest cluster that counts (three matches always fit).
-    max_matches : beyond this an evenly spread subset is clustered (cost grows with N^2); inliers are
-        counted over all.
 
     Returns
     -------
@@ -262,8 +261,8 @@ def jlinkage(
     if len(p) < max(3, min_size):
         return []
     chosen = np.arange(len(p))
-    if len(p) > max_matches:
-        chosen = np.sort(rng.permutation(len(p))[:max_matches])
+    if len(p) > _MAX_CLUSTERED:
+        chosen = np.sort(rng.permutation(len(p))[:_MAX_CLUSTERED])
     models = minimal_models(rng, p[chosen], q[chosen], eps, n_models)
     if not len(models):
         return []
@@ -322,20 +321,6 @@ def cluster(preference: np.ndarray) -> list[np.ndarray]:
             best[i] = similarity[i, best_at[i]]
     found = [np.array(sorted(m), dtype=np.int64) for m in members if m]
     return sorted(found, key=lambda m: (-len(m), int(m[0])))
-
-
-def _refit(p: np.ndarray, q: np.ndarray, T: np.ndarray, eps: float) -> MotionCluster | None:
-    """Two rounds of least squares on the inliers among all matches; None if there are fewer than three."""
-    inliers = np.flatnonzero(residuals(T[None], p, q)[:, 0] < eps)
-    for _ in range(2):
-        if len(inliers) < 3:
-            return None
-        T = kabsch(p[inliers], q[inliers])
-        distance = residuals(T[None], p, q)[:, 0]
-        inliers = np.flatnonzero(distance < eps)
-    if len(inliers) < 3:
-        return None
-    return MotionCluster(T, inliers, float(np.sqrt((distance[inliers] ** 2).mean())))
 
 
 def _without_repeats(motions: list[MotionCluster]) -> list[MotionCluster]:

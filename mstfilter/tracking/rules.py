@@ -32,6 +32,12 @@ from mstfilter.tracking.residual import MotionResidual, refine_motion
 from mstfilter.tracking.rigid import MotionCluster, jlinkage, rigid_transform
 from mstfilter.tracking.segments import Track
 
+# Limits of `MstRule`.
+_MIN_OVERLAP = 0.3  # fraction of the moved surface that has a correspondence after registration
+_MIN_PAIRS = 6  # flow tracks or SIFT matches of a motion
+_MAX_SIFT = 3  # SIFT motions of a segment
+_SEARCH_RADIUS, _SEARCH_STEP = 0.14, 0.01  # metres
+
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
@@ -55,6 +61,7 @@ class Candidate:
     registration: RegistrationResult | None = None
 
 
+#: Rest, the motion of objects that are not tracked.
 IDENTITY = Candidate("identity", RigidTransform.identity())
 
 
@@ -71,25 +78,19 @@ class MotionRule(ABC):
 
 
 def _sift_motions(
-    rng: np.random.Generator,
-    track: Track,
-    sift: SiftMatching,
-    in_target: bool,
-    eps: float,
-    min_size: int,
-    n_models: int,
+    rng: np.random.Generator, track: Track, sift: SiftMatching, in_target: bool, min_size: int, n_models: int
 ) -> list[MotionCluster]:
     """Rigid motions among the SIFT matches of a segment, best supported first."""
     p, q = track.sift_pairs(sift, in_target)
-    return jlinkage(rng, p, q, eps=eps, min_size=min_size, n_models=n_models)
+    return jlinkage(rng, p, q, min_size=min_size, n_models=n_models)
 
 
-def _registered(track: Track, start: str, reach: float, registration: Registration) -> Candidate | None:
+def _registered(track: Track, from_centroid: bool, reach: float, registration: Registration) -> Candidate | None:
     """The segment registered to the surface of its tracked mask; None if a surface or the result is missing."""
     source, target = track.surface, track.target_surface
     if source is None or target is None:
         return None
-    init = centroid_shift(source.points, target.points) if start == "centroid" else np.eye(4)
+    init = centroid_shift(source.points, target.points) if from_centroid else np.eye(4)
     fit = registration.register(source, target, init, reach)
     if fit is None:
         return None
@@ -109,44 +110,30 @@ class PaperRule(MotionRule):
     max_error : float
         Metres; ICP is accepted with a smaller root mean square distance. The published 1 mm is below the noise of a
         depth camera at 0.7 m, so ICP is almost never accepted.
-    icp_start : "centroid" or "identity"
-        Initial motion of ICP. The paper does not state it.
-    icp_reach : float
-        Largest correspondence distance, metres.
     registration : Registration
-        Performs the ICP.
+        Performs the ICP. The paper does not state its initial motion; here it aligns the centroids.
     sift : SiftMatching
-    eps : float
-        Inlier distance of J-Linkage, metres.
-    n_models : int
-        Number of sampled motions of J-Linkage.
     """
 
     order: str = "first"
     min_inliers: int = 5
     max_error: float = 0.001
-    icp_start: str = "centroid"
-    icp_reach: float = 0.03
     registration: Registration = field(default_factory=lambda: SmallGicp("ICP", 30))
     sift: SiftMatching = field(default_factory=SiftMatching)
-    eps: float = 0.010
-    n_models: int = 500
 
     def __post_init__(self) -> None:
         if self.order not in ("first", "best"):
             raise InputError(f"order {self.order!r} is unknown", "one of first, best")
-        if self.icp_start not in ("centroid", "identity"):
-            raise InputError(f"icp_start {self.icp_start!r} is unknown", "one of centroid, identity")
 
     def candidates(self, rng: np.random.Generator, track: Track) -> tuple[Candidate, ...]:
         """The motions that passed their test, in the order SIFT, ICP, identity."""
         passed = []
-        motions = _sift_motions(rng, track, self.sift, True, self.eps, 3, self.n_models)
+        motions = _sift_motions(rng, track, self.sift, True, 3, 500)
         if motions and len(motions[0].inliers) > self.min_inliers:
             m = motions[0]
             passed.append(Candidate("sift", rigid_transform(m.T), len(m.inliers), m.rms, m.rms))
         if self.order == "best" or not passed:
-            fit = _registered(track, self.icp_start, self.icp_reach, self.registration)
+            fit = _registered(track, True, 0.03, self.registration)
             if fit is not None and fit.error < self.max_error:
                 passed.append(fit)
         return (*passed, IDENTITY)
@@ -170,42 +157,30 @@ class AuthorsRule(MotionRule):
 
     Parameters
     ----------
-    min_size : int
-        Smallest cluster of J-Linkage.
     slope, offset, lowest, highest : float
         A drawn cluster of n matches is used with probability clip(slope n + offset, lowest, highest).
     max_mean_square : float
         Square metres; ICP is accepted up to this mean squared distance (0.002 is 4.5 cm rms).
-    icp_reach : float
-        Largest correspondence distance, metres. The authors' program has no limit.
     registration : Registration
         Performs the ICP, from the identity.
     sift : SiftMatching
-    eps : float
-        Inlier distance of J-Linkage, metres (not published).
-    n_models : int
-        Number of sampled motions of J-Linkage.
     """
 
-    min_size: int = 3
     slope: float = 0.1
     offset: float = -0.25
     lowest: float = 0.1
     highest: float = 0.9
     max_mean_square: float = 0.002
-    icp_reach: float = 10.0
     registration: Registration = field(default_factory=lambda: SmallGicp("ICP", 20))
     sift: SiftMatching = field(default_factory=_one_to_many)
-    eps: float = 0.010
-    n_models: int = 1000
 
     def candidates(self, rng: np.random.Generator, track: Track) -> tuple[Candidate, ...]:
         """All SIFT clusters, ICP if accepted, identity."""
         found = [
             Candidate("sift", rigid_transform(m.T), len(m.inliers), m.rms)
-            for m in _sift_motions(rng, track, self.sift, True, self.eps, self.min_size, self.n_models)
+            for m in _sift_motions(rng, track, self.sift, True, 3, 1000)
         ]
-        fit = _registered(track, "identity", self.icp_reach, self.registration)
+        fit = _registered(track, False, 10.0, self.registration)  # the authors' program has no limit of distance
         if fit is not None and fit.error**2 <= self.max_mean_square:
             found.append(fit)
         return (*found, IDENTITY)
@@ -250,18 +225,10 @@ class MstRule(MotionRule):
         Largest displacement of the segment's centre, metres.
     max_angle : float
         Largest rotation angle, radians.
-    least_overlap : float
-        Smallest overlap of the surfaces after registration, a share.
-    min_pairs : int
-        Smallest number of flow tracks or SIFT matches of a motion.
-    max_sift : int
-        Largest number of SIFT motions.
     n_refine : int
         Number of best candidates that are refined against the whole last frame and added as further candidates.
     search_above : float
         If every score is larger, the object is searched for around its last position. Negative values disable it.
-    search_radius, search_step : float
-        Radius and spacing of the search grid, metres.
     sift : SiftMatching
     residual : MotionResidual
     registration : Registration
@@ -276,13 +243,8 @@ class MstRule(MotionRule):
     use_sift: bool = True
     max_shift: float = 0.6
     max_angle: float = 2.6
-    least_overlap: float = 0.3
-    min_pairs: int = 6
-    max_sift: int = 3
     n_refine: int = 3
     search_above: float = 4.0
-    search_radius: float = 0.14
-    search_step: float = 0.01
     sift: SiftMatching = field(default_factory=SiftMatching)
     residual: MotionResidual = field(default_factory=MotionResidual)
     registration: Registration = field(default_factory=SmallGicp)
@@ -305,7 +267,7 @@ class MstRule(MotionRule):
         found = [self._scored(track, proposal) for proposal in distinct]
         best = sorted(range(len(found)), key=lambda i: found[i].score)[: self.n_refine]
         for i in best:
-            refined = distinct[i]._replace(T=self._refined(track, distinct[i].T), registration=None)
+            refined = distinct[i]._replace(T=refine_motion(track, distinct[i].T), registration=None)
             if self._admissible(refined.T, centre):
                 found.append(self._scored(track, refined))
         if self.search_above >= 0 and min(c.score for c in [rest, *found]) > self.search_above:
@@ -328,13 +290,13 @@ class MstRule(MotionRule):
         starts: list[tuple[_Proposal, float]] = []  # initial motion of a registration, and its reach in metres
         if self.use_flow:
             p, q = track.flow_pairs
-            fit = rigid.ransac(rng, p, q, 0.008) if len(p) >= self.min_pairs else None
-            if fit is not None and fit[1].sum() >= self.min_pairs:
-                T = rigid.refine_robust(fit[0], p, q, 0.004)
-                proposals.append(_Proposal("flow", T, int(fit[1].sum())))
-                starts.append((_Proposal("icp", T, int(fit[1].sum())), 0.020))
+            fit = rigid.ransac(rng, p, q, 0.008) if len(p) >= _MIN_PAIRS else None
+            if fit is not None and len(fit.inliers) >= _MIN_PAIRS:
+                T = rigid.refine_robust(fit.T, p, q, 0.004)
+                proposals.append(_Proposal("flow", T, len(fit.inliers)))
+                starts.append((_Proposal("icp", T, len(fit.inliers)), 0.020))
         if self.use_sift:
-            for m in _sift_motions(rng, track, self.sift, False, 0.010, self.min_pairs, 500)[: self.max_sift]:
+            for m in _sift_motions(rng, track, self.sift, False, _MIN_PAIRS, 500)[:_MAX_SIFT]:
                 proposals.append(_Proposal("sift", m.T, len(m.inliers)))
                 starts.append((proposals[-1], 0.015))
         source, target = track.surface, track.target_surface
@@ -343,15 +305,15 @@ class MstRule(MotionRule):
             starts.append((_Proposal("icp", shift, len(source.points)), 0.030))
             for start, reach in starts:
                 result = self.registration.register(source, target, start.T, reach)
-                if result is not None and result.overlap >= self.least_overlap:
+                if result is not None and result.overlap >= _MIN_OVERLAP:
                     proposals.append(start._replace(T=result.T, registration=result))
         return proposals
 
     def _search(self, track: Track, centre: np.ndarray) -> list[Candidate]:
         """Search a grid of shifts on the table and three rotations; refine the two best shifts of each rotation."""
-        n = round(self.search_radius / self.search_step)
-        shifts = self.search_step * np.stack(np.meshgrid(*[np.arange(-n, n + 1)] * 2), axis=-1).reshape(-1, 2)
-        shifts = shifts[np.hypot(*shifts.T) <= self.search_radius]
+        n = round(_SEARCH_RADIUS / _SEARCH_STEP)
+        shifts = _SEARCH_STEP * np.stack(np.meshgrid(*[np.arange(-n, n + 1)] * 2), axis=-1).reshape(-1, 2)
+        shifts = shifts[np.hypot(*shifts.T) <= _SEARCH_RADIUS]
         found = []
         for yaw in (-0.35, 0.0, 0.35):
             motions = np.tile(np.eye(4), (len(shifts), 1, 1))
@@ -361,13 +323,10 @@ class MstRule(MotionRule):
             motions[:, :2, 3] += shifts
             scores = self.residual.scores(track, motions, 150)
             for k in np.argsort(scores, kind="stable")[:2]:
-                T = self._refined(track, motions[k])
+                T = refine_motion(track, motions[k])
                 if np.isfinite(scores[k]) and self._admissible(T, centre):
                     found.append(self._scored(track, _Proposal("search", T, 0)))
         return found
-
-    def _refined(self, track: Track, T: np.ndarray) -> np.ndarray:
-        return refine_motion(track, T, self.residual.depth_scale, self.residual.colour_scale)
 
     def _scored(self, track: Track, proposal: _Proposal) -> Candidate:
         kind, T, support, result = proposal

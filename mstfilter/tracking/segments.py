@@ -7,8 +7,7 @@ key of a `Segment` is the hash of its projected mask and of its voxels; segments
 >>> track = Track(segments[label], clip, DenseFlow().track(clip))         # doctest: +SKIP
 >>> StaticTest().rests(track)                                             # doctest: +SKIP
 
-A `Track` joins a segment with the flow and the features of the clip. It computes its properties on first use. Motion
-rules use nothing else.
+A `Track` joins a segment with the flow and the features of the clip: the data of the motion rules.
 """
 
 from __future__ import annotations
@@ -24,6 +23,9 @@ from mstfilter.tracking.flow import ClipTracks
 from mstfilter.tracking.registration import Surface, prepare
 
 _TABLE_HEIGHT = 0.004  # metres; lower points belong to the table
+_MAX_CHANGED = 0.03  # largest fraction of changed pixels, among the comparable ones, of an object at rest
+_MIN_COMPARED = 0.3  # smallest fraction of comparable pixels of an object at rest
+_OCCLUDED_MARGIN = 0.015  # metres; a pixel whose depth decreased by more is occluded and not comparable
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,25 +51,19 @@ def segments_of(hypothesis: Hypothesis, frame: Frame) -> dict[int, Segment]:
     The support contains the pixels above the table where measured and rendered depth differ by less than two voxels.
     """
     labels, depth = render_hypothesis(hypothesis, frame.camera)
-    flat_labels = labels.ravel()
-    seen = np.flatnonzero(flat_labels)
     with np.errstate(invalid="ignore"):
         agrees = np.abs(frame.depth - depth) < 2.0 * hypothesis.grid.voxel_size
         agrees &= frame.points[..., 2] > _TABLE_HEIGHT
     agrees &= frame.valid
     # Pixels on the rim of a mask mix depth and colour with the background.
     interior = _interior(labels)
-    order = seen[np.argsort(flat_labels[seen], kind="stable")]
-    values, starts = np.unique(flat_labels[order], return_index=True)
-    bounds = [*starts.tolist(), len(order)]
-    voxel_keys = _voxel_keys(hypothesis)
+    voxels = _indices_by_label(hypothesis.labels)
     out = {}
-    for k, label in enumerate(values.tolist()):
-        pixels = order[bounds[k] : bounds[k + 1]]
+    for label, pixels in _indices_by_label(labels).items():
         support = pixels[agrees.ravel()[pixels]]
         inner = support[interior.ravel()[support]]
         support = inner if len(inner) >= 60 else support
-        out[label] = Segment(content_key(pixels, voxel_keys[label]), pixels, support)
+        out[label] = Segment(content_key(pixels, content_key(voxels[label])), pixels, support)
     return out
 
 
@@ -83,14 +79,13 @@ def _interior(labels: np.ndarray) -> np.ndarray:
     )
 
 
-def _voxel_keys(hypothesis: Hypothesis) -> dict[int, bytes]:
-    """Hash of the voxels of each object."""
-    flat = hypothesis.labels.ravel()
-    occupied = np.flatnonzero(flat)
-    order = occupied[np.argsort(flat[occupied], kind="stable")]
+def _indices_by_label(labels: np.ndarray) -> dict[int, np.ndarray]:
+    """Ascending flat indices of each non-zero label of an array."""
+    flat = labels.ravel()
+    labelled = np.flatnonzero(flat)
+    order = labelled[np.argsort(flat[labelled], kind="stable")]
     values, starts = np.unique(flat[order], return_index=True)
-    bounds = [*starts.tolist(), len(order)]
-    return {int(v): content_key(order[bounds[k] : bounds[k + 1]]) for k, v in enumerate(values)}
+    return dict(zip(values.tolist(), np.split(order, starts)[1:], strict=True))
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,18 +187,9 @@ class StaticTest:
     ----------
     enabled : bool
         If False, every object is tracked (the published algorithms).
-    changed_share : float
-        Largest share of changed pixels among the comparable ones.
-    least_share : float
-        Smallest share of comparable pixels of the object; with fewer it is tracked.
-    occluded_margin : float
-        Metres; a pixel whose depth decreased by more is occluded and not comparable.
     """
 
     enabled: bool = True
-    changed_share: float = 0.03
-    least_share: float = 0.3
-    occluded_margin: float = 0.015
 
     def rests(self, track: Track) -> bool:
         """Whether the visible part of the object is unchanged."""
@@ -212,10 +198,10 @@ class StaticTest:
         support = track.segment.support
         before, after = track.clip.before, track.clip.after
         with np.errstate(invalid="ignore"):
-            nearer = before.depth.ravel()[support] - after.depth.ravel()[support] > self.occluded_margin
+            nearer = before.depth.ravel()[support] - after.depth.ravel()[support] > _OCCLUDED_MARGIN
         compared = after.valid.ravel()[support] & ~nearer
         n = int(compared.sum())
-        if n < max(1.0, self.least_share * len(support)):
+        if n < max(1.0, _MIN_COMPARED * len(support)):
             return False
         changed = compared & ~track.flow.coherently_unchanged.ravel()[support]
-        return bool(changed.sum() <= self.changed_share * n)
+        return bool(changed.sum() <= _MAX_CHANGED * n)

@@ -28,7 +28,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
@@ -36,10 +36,10 @@ from scipy.spatial.transform import RigidTransform
 from mstfilter.errors import InputError
 from mstfilter.scene import Clip, Crop, Hypothesis, ObjectRecord, VoxelGrid
 from mstfilter.smc import Population, Transition, child
-from mstfilter.tracking.flow import ClipTracks, DenseFlow
+from mstfilter.tracking.flow import DenseFlow
 from mstfilter.tracking.rigid import invert, move_points
 from mstfilter.tracking.rules import IDENTITY, Candidate, MotionRule, MstRule
-from mstfilter.tracking.segments import Segment, StaticTest, Track, segments_of
+from mstfilter.tracking.segments import StaticTest, Track, segments_of
 
 _SMOOTHING = 0.5  # voxels, standard deviation; .3 to .6 differ little
 
@@ -62,18 +62,12 @@ class Moved:
     dropped: tuple[int, ...] = ()
 
 
-@dataclass(eq=False)
-class _Claims:
-    """Voxels that objects claim: for each object its record, flat indices (N,) and depths inside it (N,)."""
+class _Claim(NamedTuple):
+    """Voxels that an object claims: flat indices (N,) and their depths inside it (N,)."""
 
-    index: list[np.ndarray] = field(default_factory=list)
-    depth: list[np.ndarray] = field(default_factory=list)
-    record: list[ObjectRecord] = field(default_factory=list)
-
-    def add(self, record: ObjectRecord, index: np.ndarray, depth: np.ndarray) -> None:
-        self.index.append(index)
-        self.depth.append(depth)
-        self.record.append(record)
+    record: ObjectRecord
+    voxels: np.ndarray
+    depth: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -126,30 +120,30 @@ class Warp:
         residuals = residuals or {}
         labels = hypothesis.labels.copy()
         labels[np.isin(labels, list(moving))] = 0
-        claims, records, left = _Claims(), {}, 0
+        claims: list[_Claim] = []
+        records, left = {}, 0
         for record in hypothesis.objects:
             if record.label not in moving:
                 records[record.label] = record
                 continue
-            index, depth, moved = self._claim(record, hypothesis, moving[record.label])
+            index, depth, moved = self._moved_voxels(record, hypothesis, moving[record.label])
             inside = grid.contains(index)
             left += int((~inside).sum())
             flat = np.ravel_multi_index(tuple(index[inside].T), grid.shape)
-            claims.add(record, flat.astype(np.int64), depth[inside])
+            claims.append(_Claim(record, flat.astype(np.int64), depth[inside]))
             records[record.label] = moved
-        disturbed = self._standing_claims(hypothesis, labels, claims)
-        contested = self._paint(labels, claims, residuals)
-        for label in disturbed:
-            record = records[label]
+        resting = _resting_claims(hypothesis, labels, claims)
+        contested = self._paint(labels, claims + resting, residuals)
+        for record, *_ in resting:
             if record.source is None and self.method != "splat":
                 # Voxels lost in this collision are restored when the object moves.
-                records[label] = replace(record, source=Crop.of(hypothesis.mask(label)))
+                records[record.label] = replace(record, source=Crop.of(hypothesis.mask(record.label)))
         present = np.bincount(labels.ravel(), minlength=max(records) + 1) > 0
         kept = tuple(records[k] for k in sorted(records) if present[k])
         dropped = tuple(records[k].id for k in sorted(records) if not present[k])
         return Moved(Hypothesis(labels, grid, kept), left, contested, dropped)
 
-    def _claim(
+    def _moved_voxels(
         self, record: ObjectRecord, hypothesis: Hypothesis, T: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, ObjectRecord]:
         """Voxels (N, 3) that a moved object claims, their depth inside it (N,) in voxels, and its new record."""
@@ -165,36 +159,37 @@ class Warp:
             index, depth = _push(crop, total, grid)
         return index, depth, replace(record, source=crop, motion=RigidTransform.from_matrix(total))
 
-    def _standing_claims(self, hypothesis: Hypothesis, labels: np.ndarray, claims: _Claims) -> list[int]:
-        """Add the claims of resting objects on voxels that moved objects claim. Returns the labels of these."""
-        wanted = np.unique(np.concatenate(claims.index))
-        holder = labels.ravel()[wanted]
-        disturbed = np.unique(holder[holder > 0]).tolist()
-        for label in disturbed:
-            crop = Crop.of(hypothesis.mask(label))
-            flat = wanted[holder == label]
-            local = np.stack(np.unravel_index(flat, hypothesis.grid.shape), axis=1) - crop.offset
-            claims.add(hypothesis.record(label), flat, _depth_inside(crop)[tuple(local.T)])
-        return disturbed
-
-    def _paint(self, labels: np.ndarray, claims: _Claims, residuals: Mapping[int, float]) -> int:
+    def _paint(self, labels: np.ndarray, claims: list[_Claim], residuals: Mapping[int, float]) -> int:
         """Assign every claimed voxel to one object; returns the number of contested voxels."""
-        index = np.concatenate(claims.index)
+        index = np.concatenate([c.voxels for c in claims])
         if not len(index):
             return 0
-        sizes = [len(i) for i in claims.index]
-        owner = np.repeat([r.label for r in claims.record], sizes)
+        sizes = [len(c.voxels) for c in claims]
+        owner = np.repeat([c.record.label for c in claims], sizes)
         if self.collisions == "label":
             order = np.lexsort((-owner, index))
         else:
-            depth = np.round(np.concatenate(claims.depth), 3)
-            residual = np.repeat([residuals.get(r.label, 0.0) for r in claims.record], sizes)
-            identity = np.repeat([r.id for r in claims.record], sizes)
+            depth = np.round(np.concatenate([c.depth for c in claims]), 3)
+            residual = np.repeat([residuals.get(c.record.label, 0.0) for c in claims], sizes)
+            identity = np.repeat([c.record.id for c in claims], sizes)
             order = np.lexsort((identity, residual, -depth, index))
         index, owner = index[order], owner[order]
         first = np.append(True, index[1:] != index[:-1])
         labels.ravel()[index[first]] = owner[first]
         return len(np.unique(index[~first]))
+
+
+def _resting_claims(hypothesis: Hypothesis, labels: np.ndarray, claims: list[_Claim]) -> list[_Claim]:
+    """The claims of resting objects on voxels that moved objects claim."""
+    wanted = np.unique(np.concatenate([c.voxels for c in claims]))
+    holder = labels.ravel()[wanted]
+    resting = []
+    for label in np.unique(holder[holder > 0]).tolist():
+        crop = Crop.of(hypothesis.mask(label))
+        flat = wanted[holder == label]
+        local = np.stack(np.unravel_index(flat, hypothesis.grid.shape), axis=1) - crop.offset
+        resting.append(_Claim(hypothesis.record(label), flat, _depth_inside(crop)[tuple(local.T)]))
+    return resting
 
 
 def _depth_inside(crop: Crop) -> np.ndarray:
@@ -327,7 +322,10 @@ class TrackingTransition(Transition):
             segments = segments_of(hypothesis, clip.before) if hypothesis.n_objects else {}
             motions, scores = {}, {}
             for record in hypothesis.objects:
-                kind, candidates = self._track(rng, clip, tracks, segments.get(record.label), cache)
+                segment = segments.get(record.label)
+                if segment is not None and segment.key not in cache:
+                    cache[segment.key] = self._track(rng, Track(segment, clip, tracks))
+                kind, candidates = ("invisible", ()) if segment is None else cache[segment.key]
                 chosen = IDENTITY
                 if candidates:
                     chosen = self.rule.choose(child(stream, "object", record.label), candidates)
@@ -346,30 +344,13 @@ class TrackingTransition(Transition):
         }
         return _successor(population, tuple(m.hypothesis for m in moved), notes)
 
-    def _track(
-        self,
-        rng: np.random.Generator,
-        clip: Clip,
-        tracks: ClipTracks,
-        segment: Segment | None,
-        cache: dict[bytes, tuple[str, tuple[Candidate, ...]]],
-    ) -> tuple[str, tuple[Candidate, ...]]:
-        """Kind of a segment and its candidate motions, from the cache if possible; no candidate means no motion."""
-        if segment is None:
-            return "invisible", ()
-        if segment.key not in cache:
-            cache[segment.key] = self._track_segment(rng, clip, tracks, segment)
-        return cache[segment.key]
-
-    def _track_segment(
-        self, rng: np.random.Generator, clip: Clip, tracks: ClipTracks, segment: Segment
-    ) -> tuple[str, tuple[Candidate, ...]]:
-        if len(segment.support) < self.min_support:
+    def _track(self, rng: np.random.Generator, track: Track) -> tuple[str, tuple[Candidate, ...]]:
+        """Kind of a segment and its candidate motions; no candidate means no motion."""
+        if len(track.segment.support) < self.min_support:
             return "unsupported", ()
-        track = Track(segment, clip, tracks)
         if self.static.rests(track):
             return "static", ()
-        candidates = self.rule.candidates(child(rng, "segment", _number(segment.key)), track)
+        candidates = self.rule.candidates(child(rng, "segment", _number(track.segment.key)), track)
         return ("tracked" if track.target_mask.any() else "lost"), candidates
 
 

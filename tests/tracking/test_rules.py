@@ -149,6 +149,6 @@ def test_an_object_that_flow_lost_is_searched_for():
 
 
 def test_unknown_options_raise_an_error():
-    for make in (lambda: PaperRule(order="last"), lambda: PaperRule(icp_start="far"), lambda: MstRule(select="all")):
+    for make in (lambda: PaperRule(order="last"), lambda: MstRule(select="all")):
         with pytest.raises(InputError):
             make()
