@@ -17,8 +17,8 @@ A configuration is a nested mapping. A component is its name, or a mapping with 
 a field follows from its annotation: a field of type ``Resampler`` or ``Resampler | None`` holds a resampler, one of
 type ``tuple[Evidence, ...]`` a list of evidence.
 
-A component is imported when it is first built; looking up a name imports nothing. A class of the user is named as
-``./file.py:Class`` (only where files are allowed), or added by an entry point ``kind.name`` of the group
+A component is imported when it is first built; looking up a name imports nothing. Users name their own class as
+``./file.py:Class`` (if `allow_files` is True), or add it by an entry point ``kind.name`` of the group
 ``mstfilter.components``.
 """
 
@@ -168,7 +168,7 @@ class Registry:
     def make(
         self, cls: type, fields: Mapping[str, Any], where: str = "", allow_files: bool = False, base: Any = None
     ) -> Any:
-        """A dataclass from plain values, nested components included; fields that are not given are those of `base`.
+        """Build a dataclass from plain values and nested components. Other fields have the values of `base`.
 
         Raises
         ------
@@ -198,7 +198,7 @@ class Registry:
             raise InputError(f"{where}: {error}") from error
 
     def _value(self, hint: Any, value: Any, current: Any, path: str, allow_files: bool) -> Any:
-        """The value of a field with annotation `hint`, which holds `current` if nothing is given."""
+        """The value of a field with annotation `hint`; `current` is its default or its value in `base`."""
         kind = self.kind_of(hint)
         default = current if dataclasses.is_dataclass(current) else None
         if kind is not None and isinstance(value, list):
@@ -208,7 +208,7 @@ class Registry:
         if kind is not None:
             return self.build(kind, value, path, allow_files, default)
         if default is not None and isinstance(value, Mapping):
-            # A settings object: it has fields, but no other class can replace it.
+            # A nested dataclass that is not a component: only its fields can be set.
             inner = {k: v for k, v in value.items() if k != "component"}
             return self.make(type(default), inner, path, allow_files, default)
         return _plain(hint, value, path)
@@ -239,7 +239,7 @@ class Registry:
 
 
 def default_of(field: dataclasses.Field[Any]) -> Any:
-    """The default of a dataclass field, made if it has a factory; MISSING if it has none."""
+    """The default of a dataclass field, from its factory if it has one; MISSING if there is no default."""
     return field.default if field.default_factory is dataclasses.MISSING else field.default_factory()
 
 

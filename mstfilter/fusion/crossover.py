@@ -34,14 +34,16 @@ from mstfilter.fusion.division import inherit_apart, split_like
 from mstfilter.fusion.interfaces import Structure
 from mstfilter.scene import MAX_LABEL, Hypothesis, ObjectRecord, as_labels
 
-_CHUNK = 2**19  # cells of windows that are read together: they fit in the cache
+_CHUNK = 2**19  # number of window cells processed together, so that they fit in the cache of the processor
 
 
 class ConflictResolution(NamedTuple):
     """One resolution of all conflicts of a conflict graph.
 
-    order : vertices in painting order, first to last; group : representative vertex of the merge group of each
-    vertex, the one that is painted last (-1: the object is dropped).
+    Attributes
+    ----------
+    order : vertices in painting order, first to last.
+    group : for each vertex, the vertex of its merge group that is painted last; -1 if the object is dropped.
     """
 
     order: list[int]
@@ -52,24 +54,25 @@ class ConflictResolution(NamedTuple):
 class ModeFilter:
     """Majority filter over label grids.
 
-    For an occupied voxel, the most frequent other label of the window replaces the label of the voxel if it occurs
-    at least `margin` times more often; ties between other labels go to the larger label. Free space never replaces
-    a label in this vote, but an occupied voxel with more than `isolation` free cells in its window becomes free.
-    All voxels change at the same time, sweep after sweep, until no voxel changes.
+    The label of an occupied voxel is replaced by the most frequent other label in its window, if this label occurs
+    at least `margin` times more often than its own. Of equally frequent labels the larger one is used. Free cells are
+    not counted as a label, but an occupied voxel with more than `isolation` free cells in its window becomes free.
+    All voxels of a sweep change at the same time. Sweeps are repeated until no voxel changes.
 
     Parameters
     ----------
     window : int
         Edge of the cubic window in voxels, odd. 1 switches the filter off.
     margin : int
-        Cells by which another label must win.
+        Least difference of the counts of the other label and the voxel's own label.
     isolation : int
-        More free cells than this in the window set a voxel free. A value of at least ``window**3`` never does.
+        Largest number of free cells in the window of an occupied voxel; with more it becomes free. No effect if at
+        least ``window**3``.
     max_sweeps : int
         Largest number of sweeps.
     scope : {"everywhere", "disputed"}
-        Voxels that may change: all, or only those that fusion marks as disputed between the two parents. The filter
-        everywhere erases objects that are thinner than half a window: a 2 cm book or a rod.
+        Voxels that may change: all, or only disputed ones (see `Crossover.paint`). "everywhere" removes objects
+        that are thinner than half a window, for example a 2 cm book or a rod.
     """
 
     window: int = 5
@@ -224,10 +227,10 @@ class Crossover:
     def paint(
         self, graph: ConflictGraph, resolution: ConflictResolution, proposed: np.ndarray, predicted: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Labels (X, Y, Z) uint16, group k painted as k + 1, and the voxels (X, Y, Z) bool that stay disputed.
+        """Labels (X, Y, Z) uint16, with k + 1 for group k, and the disputed voxels (X, Y, Z) bool.
 
-        A voxel is disputed if the parents still disagree on it after merging, and its object overlaps one of the
-        other parent. Objects that both parents see alike, or that only one parent sees, are not disputed.
+        A voxel is disputed if the parents assign it to different groups, and its group overlaps another one. Objects
+        that are equal in both parents, or that occur in one parent only, have no disputed voxels.
         """
         voxels = claimed_voxels(proposed, predicted)
         painted, disputed = _painted(graph, resolution, voxels)
@@ -261,7 +264,7 @@ def _painted(
 
 
 def _numbered(labels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Labels > 0 that occur, ascending, and the array with each label replaced by its position 1, 2, ..."""
+    """The labels > 0 that occur, ascending, and the array with these labels renumbered to 1, 2, ..."""
     counts = np.bincount(labels, minlength=1)
     counts[0] = 0
     present = np.flatnonzero(counts)
@@ -271,7 +274,7 @@ def _numbered(labels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _vertices_apart(graph: ConflictGraph, proposed: Hypothesis, predicted: Hypothesis) -> dict[int, set[int]]:
-    """For each vertex, the vertices of its side that were seen to move apart from it (`ObjectRecord.apart`)."""
+    """For each vertex, the objects of the same parent that moved differently from it (`ObjectRecord.apart`)."""
     if not any(r.apart for h in (proposed, predicted) for r in h.objects):
         return {}
     record_of = {(side, r.label): r for side, h in ((PROPOSED, proposed), (PREDICTED, predicted)) for r in h.objects}
@@ -340,8 +343,8 @@ def _with_records(
 class _Votes:
     """A label grid under the filter, swept in place.
 
-    If no cell in the window of a voxel has changed since the last sweep, its vote is the same. So only the first
-    sweep reads all voxels, and of these only those whose window holds another object or much free space.
+    A voxel can change only if a cell in its window has changed since the last sweep. So the first sweep processes the
+    voxels whose window contains another object or much free space, and each later sweep those near a changed cell.
 
     Parameters
     ----------

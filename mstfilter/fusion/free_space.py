@@ -3,13 +3,13 @@
 >>> refined, quality = FreeSpace().project(hypothesis, frame)           # one hypothesis, one frame
 >>> refined, quality = FreeSpace().refine(hypotheses, clip)             # several, at the end of a clip
 
-The quality Q of a hypothesis is the share of its voxels that it keeps. A prediction with objects in free space loses
-voxels and weight.
+The quality of a hypothesis is Q = 1 - (occupied voxels that are cleared) / (occupied voxels). The update adds
+lambda log Q to the log weight, so a prediction with objects in free space loses voxels and weight.
 
-`ProjectionUpdate` is an update that consists of this projection alone. If an observation rules out all but a thin set
-of states, hardly any draw of the dynamics lies in the set; a projection moves every particle there (Koval, Pollard,
-Srinivasa 2015; for vectors `mstfilter.smc.ProjectOnto`). Here the set has all scenes without voxels in observed free
-space.
+`ProjectionUpdate` is an update that consists of this projection alone. If an observation is compatible only with a
+thin set of states, predictions hardly ever lie in this set; a projection moves every particle into it (Koval,
+Pollard, Srinivasa 2015; for vectors `mstfilter.smc.ProjectOnto`). Here it is the set of scenes without voxels in
+observed free space.
 
 >>> filter = ParticleFilter(proposal=None, initial=..., transition=..., update=ProjectionUpdate(), ...)
 """
@@ -104,7 +104,7 @@ class FreeSpace(Projection):
         free, hit = np.zeros(grid.shape, bool), np.zeros(grid.shape, bool)
         for view in frame.all_views:
             geometry = frame_geometry(view, grid)
-            # The noise belongs to the reading, so its range is that of the measured surface.
+            # The noise is that of the reading, so it is computed at the range of the measured surface.
             noise = depth_sigma(geometry.z - geometry.signed)
             margin = self.margin_voxels * grid.voxel_size + self.margin_sigmas * noise
             with np.errstate(invalid="ignore"):
@@ -122,7 +122,7 @@ class FreeSpace(Projection):
 
 
 def _cleared(particle: P, free: np.ndarray) -> tuple[P, float]:
-    """The particle without the voxels `free`, and the share of voxels that it keeps."""
+    """The particle without the voxels `free`, and Q = 1 - cleared / occupied, the share of voxels that it keeps."""
     occupied = particle.labels != 0
     hit = occupied & free
     n_hit = int(hit.sum())
@@ -144,7 +144,7 @@ def _cleared(particle: P, free: np.ndarray) -> tuple[P, float]:
 
 
 def log_quality(quality: np.ndarray) -> np.ndarray:
-    """log Q (n,) of qualities (n,) of at least 1e-3: if all predictions lose all voxels, weights stay positive."""
+    """log max(Q, 1e-3) (n,) of qualities Q (n,), so that a prediction that loses all voxels has positive weight."""
     return np.log(np.maximum(quality, _SMALLEST_QUALITY))
 
 

@@ -1,4 +1,4 @@
-"""The folder of a run, written pause by pause. Reports are made from it, and a stopped run is resumed from it.
+"""The folder of a run, written pause by pause. Reports read it, and a run that was stopped resumes from it.
 
 >>> run = RunFolder.open("runs/demo")
 >>> run.n_pauses, run.hypotheses(0), run.info(0)
@@ -8,11 +8,12 @@ Layout::
     run.json                 configuration, seed, versions, recording, status
     pauses/000/rgb.png       the image at the pause          pauses/000/state.npz        particles and log weights
     pauses/000/info.json     record of the step              pauses/000/camera.json      pose at the pause
-    pauses/000/truth.npz     true labels, if known           pauses/000/seconds.json     wall time by part
-    metrics.csv              one row a pause and hypothesis
+    pauses/000/truth.npz     true labels, if known           pauses/000/seconds.json     wall time by component
+    metrics.csv              one row per pause and hypothesis
 
 A pause is written under a temporary name and renamed when it is complete, so a run that was stopped at any moment
-holds complete pauses only. All files but seconds.json are the same for the same seed.
+holds complete pauses only. `filter_recording` resumes from state.npz of the last one. The same seed gives the same
+bytes in all files except seconds.json.
 """
 
 from __future__ import annotations
@@ -46,7 +47,7 @@ _FORMAT = 2
 
 
 def as_json(value: Any) -> Any:
-    """A value as JSON can hold it: arrays become lists, NaN and infinities None, other objects their text."""
+    """Convert a value for JSON: arrays to lists, NaN and infinities to None, other objects to strings."""
     if isinstance(value, Mapping):
         return {str(k): as_json(v) for k, v in value.items()}
     if isinstance(value, (np.ndarray, np.generic)):
@@ -177,7 +178,7 @@ class RunFolder:
             write_json(folder / "seconds.json", info.seconds)
 
     def remove_partial_pauses(self) -> None:
-        """Remove what a killed run has left of a pause."""
+        """Remove the incomplete folder of a pause that a killed run left."""
         for left in (self.path / "pauses").glob(".*.partial"):
             shutil.rmtree(left, ignore_errors=True)
 
@@ -186,7 +187,7 @@ class RunFolder:
         return dict(_read_json(self.pause(t) / "info.json"))
 
     def seconds(self, t: int) -> dict[str, float]:
-        """Wall time of the step by part."""
+        """Wall time of the step by component, in seconds."""
         return dict(_read_json(self.pause(t) / "seconds.json"))
 
     def rgb(self, t: int) -> np.ndarray:

@@ -1,7 +1,7 @@
 """Voxel grids and hypotheses.
 
-A `Hypothesis` is the particle of MST: it says which object every voxel belongs to. World z is up, the table is at
-z = 0.
+A `Hypothesis` is the particle of MST: an object label for every voxel, 0 for free space. World z is up, the table is
+at z = 0.
 
 >>> import numpy as np
 >>> from mstfilter.scene import Hypothesis, VoxelGrid
@@ -186,7 +186,7 @@ class ObjectRecord:
     birth : int
         Index of the pause at which it was first proposed.
     source : Crop, optional
-        Its occupancy when it was last changed other than by a rigid motion. None: its current voxels.
+        Occupancy of the object after its last change other than a rigid motion. None: its current voxels.
     motion : RigidTransform
         Rigid motion in world metres since `source`; the identity if `source` is None.
     completion_key : str, optional
@@ -252,7 +252,7 @@ class Hypothesis:
     Parameters
     ----------
     labels : (X, Y, Z) uint16
-        0 is free or unknown, k >= 1 is an object. Not every number must occur.
+        0 is free or unknown, k >= 1 is an object. Labels need not be consecutive.
     grid : VoxelGrid
         Where the voxels are.
     objects : tuple of ObjectRecord
@@ -292,8 +292,8 @@ class Hypothesis:
     def with_labels(self, labels: np.ndarray) -> Hypothesis:
         """The same objects with other voxels.
 
-        Objects with the same voxels keep source and motion, changed ones lose them; the record of an object without
-        voxels is removed. Raises InputError if a label has no record.
+        Objects whose voxels change lose `source` and `motion`. Records of objects without voxels are removed.
+        Raises InputError if a label has no record.
         """
         labels = _labels_on(self.grid, labels)
         different = labels != self.labels
@@ -339,7 +339,7 @@ def encode_hypotheses(hypotheses: Sequence[Hypothesis]) -> dict[str, np.ndarray]
     The arrays are ``labels`` (n, X, Y, Z) uint16, ``origin`` (3,), ``voxel_size`` (), and one row per object:
     ``owner`` (index of the hypothesis), ``label``, ``id``, ``birth``, ``motion`` (4, 4), ``completion_key``,
     ``apart`` (ids, comma separated). The source crops are stored as ``has_source``, ``source_offset`` (3,),
-    ``source_shape`` (3,) and ``source_bits``, all their bits in order.
+    ``source_shape`` (3,) and ``source_bits``, the packed bits of all crops in order.
     """
     grid = hypotheses[0].grid
     if any(h.grid != grid for h in hypotheses):

@@ -62,14 +62,14 @@ class ObjectRule:
     Parameters
     ----------
     table_tolerance : float
-        Readings up to this much above the table are table, in sensor disparity units (1/8 px at f = 525 px;
-        one is 3.2 mm of depth at 1 m).
+        Largest height of a table reading above the table, in units of sensor disparity (1/8 px at f = 525 px, which
+        is 3.2 mm of depth at 1 m).
     object_share : float
         Smallest share of a region's readings that must lie above the table and in the workspace.
     min_points : int
-        Smallest number of such readings, in pixels of a 640 x 480 image; scales with the image's area.
+        Smallest number of such readings for an image of 640 x 480 pixels; scaled by the area of the image.
     min_core : int
-        Smallest number of pixels that remain after an erosion by `core_radius`, in pixels of a 640 x 480 image.
+        Smallest number of pixels after an erosion by `core_radius`, for an image of 640 x 480 pixels.
         Removes slivers along the borders of objects (the authors erode by 5 x 5 and require more than 25 points).
     core_radius : int
         Radius of that erosion in pixels of a 640 px wide image.
@@ -125,7 +125,7 @@ def _core(tree: Tree, own: np.ndarray, radius: int) -> np.ndarray:
     import cv2
 
     square = np.ones((2 * radius + 1, 2 * radius + 1), np.uint8)
-    # Single missing readings inside an object are closed first.
+    # First fill single missing readings inside an object.
     closed = cv2.morphologyEx(own.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
     inside = (cv2.erode(closed, square, borderValue=0) > 0) & own
     position = tree.leaf_position[tree.leaves].astype(np.float32)
@@ -151,8 +151,8 @@ class TreeCutProposal(Proposal):
         Decides which regions of a cut are objects.
     completer : Completer
     weight_rule : {"equal", "p"}
-        "equal": equal weights, correct for draws from p. "p": log weight ``log p(c) - log p(c*)`` as in the paper and
-        the authors' program, which applies p twice.
+        "equal": equal weights, which is correct for cuts drawn from p. "p": log weight ``log p(c) - log p(c*)`` as in
+        the paper and the authors' program; p then counts twice, in the draw and in the weight.
     include_optimal : bool
         Replace the first sample by the optimal cut.
     threshold : float
@@ -252,7 +252,7 @@ def hypothesis_of(
     Parameters
     ----------
     completions : sequence of Completion
-        Of one frame. `mstfilter.completion.arbitrate` assigns voxels that several claim.
+        Completed segments of one frame. `mstfilter.completion.arbitrate` assigns voxels that several of them claim.
     grid : VoxelGrid
     birth : int
         Index of the pause.

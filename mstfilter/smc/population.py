@@ -8,8 +8,9 @@ array([0.25, 0.25, 0.5 ])
 >>> round(population.ess, 3)
 2.667
 
-Particles are an array (n, ...), a mapping of arrays (n, ...), a tuple of frozen objects, or `Candidates`, which are
-built when they are accessed. `take` selects from any of these: rows of arrays are copied, objects are shared.
+Particles are an array (n, ...), a mapping of arrays (n, ...), a tuple of frozen objects, or `Candidates`, whose
+particles are built when they are accessed. `take` selects from any of these: rows of arrays are copied, objects are
+shared.
 
 A population is immutable, but it does not copy the arrays that it is given: it holds read-only views of them. Do not
 write to an array after a population was made from it; pass ``array.copy()`` if you need to.
@@ -61,7 +62,7 @@ class Candidates(Sequence[_T], Generic[_T]):
     """Particles that are built when they are accessed.
 
     In MST the weight of a candidate depends only on the pair that it is made from, so candidates can be resampled
-    before they are built. What was built is kept.
+    before they are built. Candidates that have been built are stored.
 
     Parameters
     ----------
@@ -94,7 +95,7 @@ class Candidates(Sequence[_T], Generic[_T]):
 
     @property
     def n_built(self) -> int:
-        """Number of distinct candidates built so far, shared by all selections."""
+        """Number of distinct candidates built so far; selections by `take` share them."""
         return len(self._built)
 
     def take(self, positions: np.ndarray) -> Candidates[_T]:
@@ -102,7 +103,7 @@ class Candidates(Sequence[_T], Generic[_T]):
         return Candidates(self._build, self._indices[np.asarray(positions)], self._built)
 
     def map(self, function: Callable[[_T], _U]) -> Candidates[_U]:
-        """Candidates of ``function(candidate)``, not built."""
+        """Candidates ``function(candidate)``, computed when they are accessed."""
         return Candidates(lambda position: function(self[position]), len(self))
 
 
@@ -166,7 +167,7 @@ class Population:
     particles : ndarray (n, ...) | mapping of ndarray (n, ...) | sequence of n objects | Candidates
         Treated as immutable; shared, not copied.
     log_weights : (n,) float
-        Natural log, unnormalised. -inf is a weight of 0; NaN and +inf are errors. None: all 0.
+        Natural log, unnormalised. -inf is a weight of 0; NaN and +inf raise InputError. Default: all 0.
     parents : mapping
         ``"previous"`` and ``"proposed"``: (n,) index of the parent in the previous population or among the
         proposed particles, -1 for none. A resampler adds ``"ancestor"``: the index before the resampling.
@@ -217,7 +218,7 @@ class Population:
         return self._summary()[1]
 
     def _summary(self) -> tuple[float, float]:
-        """Effective sample size and log mean weight from one pass, kept because several parts of a step need them."""
+        """Effective sample size and log mean weight, computed together and stored: a step uses them repeatedly."""
         if "_both" not in self.__dict__:
             top = self.log_weights.max()
             weights = self.log_weights - top
@@ -229,7 +230,7 @@ class Population:
 
     @property
     def best(self) -> Any:
-        """The particle of largest weight, the first if several have it."""
+        """The particle of largest weight; the first, if several have equal weights."""
         index = int(np.argmax(self.log_weights))
         if isinstance(self.particles, Mapping):
             return {name: a[index] for name, a in self.particles.items()}
@@ -261,7 +262,7 @@ class Population:
         return new
 
     def traced_through(self, resampled: Population | None) -> Population:
-        """The same particles with parents among the particles that `resampled` was selected from.
+        """The same particles, with parents traced through a resampling before the prediction.
 
         ``parents["previous"]`` are indices into `resampled`; they become ``ancestor[previous]`` if `resampled` has
         ancestors. ``parents["ancestor"]`` and the notes are dropped.
@@ -275,7 +276,7 @@ class Population:
         return self.labelled(parents)
 
     def moved(self, particles: Particles) -> Population:
-        """As many other particles with the same weights and parents; notes are dropped."""
+        """Replace the particles by as many new ones; weights and parents stay, notes are dropped."""
         particles = _freeze(particles)
         if count_particles(particles) != len(self):
             raise InputError(f"{len(self)} particles became {count_particles(particles)}, expected as many")
