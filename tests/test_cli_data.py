@@ -101,7 +101,7 @@ ERRORS = {
     "intrinsics lost": (unnamed, [], "intrinsics are missing"),
     "table 1 km away": (layouts.write_redwood, ["-o", "depth_scale=1.25"], "expected between 0.05 and 30 m"),
     "table 1 mm away": (layouts.write_redwood, ["-o", "depth_scale=1.25e-6"], "expected between 0.05 and 30 m"),
-    "unknown format": (photos, [], "no format that is known"),
+    "unknown format": (photos, [], "has no known format"),
     "wrong format": (layouts.write_redwood, ["--format", "tum"], "not a TUM folder"),
     "wrong topic": (bag(), ["-o", "colour=/rgb"], "no image topic '/rgb'"),
     "sizes differ": (small_depth, [], "differ in size"),
@@ -115,7 +115,7 @@ ERRORS = {
 
 @pytest.mark.parametrize("fault", ERRORS)
 @pytest.mark.parametrize("command", ["convert", "run"])
-def test_errors_leave_nothing_behind(tmp_path, capsys, command, fault):
+def test_errors_leave_no_files(tmp_path, capsys, command, fault):
     make, options, message = ERRORS[fault]
     path = make(tmp_path / "data")
     before = sorted(tmp_path.iterdir())
@@ -150,7 +150,7 @@ def test_an_occupied_name_is_known_before_anything_is_read(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("stop", "expected"), [(KeyboardInterrupt(), 130), (OSError(28, "No space left on device"), 2)]
 )
-def test_what_stops_in_the_middle_leaves_nothing(tmp_path, capsys, monkeypatch, stop, expected):
+def test_a_stopped_conversion_leaves_no_folder(tmp_path, capsys, monkeypatch, stop, expected):
     """An interruption, and a disk that is full at the fifth image."""
     from mstfilter.formats import folder
 
@@ -206,7 +206,7 @@ def test_quality(tmp_path, capsys):
     for arguments, message in (
         ((tmp_path / "run", tmp_path / "none"), "does not exist"),
         ((tmp_path, recording), "not a run folder"),
-        ((tmp_path / "run", tmp_path / "q.csv"), "no format that is known"),
+        ((tmp_path / "run", tmp_path / "q.csv"), "has no known format"),
     ):
         code, _, err = call("quality", *arguments, capsys=capsys)
         assert code == 2

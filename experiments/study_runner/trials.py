@@ -50,7 +50,7 @@ def run(
     spent: list[float] = []
 
     def watch(p) -> None:
-        if p.event is not None and p.event.kind == "begun":
+        if p.event is not None and p.event.kind == "started":
             begun[p.name] = time.perf_counter()
         elif p.event is not None and p.event.kind in ("ended", "lost"):
             spent.append(time.perf_counter() - begun[p.name])

@@ -122,7 +122,7 @@ def _progress_bars() -> Iterator[Callable[[Any], None]]:
         bars.update(overall[p.what], completed=p.done + p.failed, description=f"{p.what}{failed}")
         if p.event is None:
             return
-        if p.event.kind == "begun":
+        if p.event.kind == "started":
             running[p.name] = bars.add_task(f"  {p.name}", total=None)
         elif p.event.kind == "step" and p.name in running:
             bars.update(running[p.name], completed=p.event.done, total=p.event.total)

@@ -251,8 +251,8 @@ def pair_brier(labels: Sequence[np.ndarray], weights: np.ndarray, truth: np.ndar
             forecast += np.float32(weight) * same
         true = (names[n, block, None] == names[n][None, :]) & (names[n, block, None] > 0)
         pairs = np.outer(sizes[block], sizes)
-        own = np.arange(block.stop - begin)
-        pairs[own, own + begin] -= sizes[block]  # no pair of a voxel with itself
+        rows_here = np.arange(block.stop - begin)
+        pairs[rows_here, rows_here + begin] -= sizes[block]  # no pair of a voxel with itself
         joined += float(pairs[times > 0].sum())
         doubt = (times > 0) & (times < n)
         disputed += float(pairs[doubt].sum())

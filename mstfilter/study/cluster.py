@@ -104,11 +104,11 @@ class _ClusterRun:
             return
         if "ended" in message:
             self._end(k, _outcome(self._futures[k], self._tries.get(k, 1)))
-        elif "begun" in message:
+        elif "started" in message:
             if k not in self._tries:
-                self._tell(Event("begun", k))
+                self._tell(Event("started", k))
             self._tries[k] = self._tries.get(k, 0) + 1
-            self._running[k] = (message["begun"], time.monotonic())
+            self._running[k] = (message["started"], time.monotonic())
         else:
             self._tell(Event("step", k, message["done"], message["total"]))
 
@@ -130,7 +130,7 @@ class _ClusterRun:
             hints = ["raise timeout_s, or set it to 0"]
             try:
                 self._client.restart_workers([worker], timeout=30, raise_for_error=False)
-            except Exception as failure:  # it has no nanny, so the job goes on there
+            except Exception as failure:  # it has no nanny, so the job continues there
                 self._client.cancel([self._futures[k]], force=True)
                 hints.append(f"{worker} could not be restarted ({failure}): start workers with their nanny")
                 last = True
@@ -195,5 +195,5 @@ def _perform(job: Job, k: int, topic: str) -> dict[str, Any]:
         worker.log_event(topic, {"job": k, **message})
 
     cv2.setNumThreads(1)
-    send(begun=worker.address)
+    send(started=worker.address)
     return asdict(perform(job, lambda done, total: send(done=done, total=total)))

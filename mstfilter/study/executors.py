@@ -45,7 +45,7 @@ class Event:
 
     Parameters
     ----------
-    kind : {"begun", "step", "lost", "ended"}
+    kind : {"started", "step", "lost", "ended"}
         "lost": its worker died or the time limit was exceeded; it is started again if tries are left.
     job : int
         Its index in the list of jobs.
@@ -197,7 +197,7 @@ class _Worker(threading.Thread):
         tries = int(job.get("tries", 1))
         reason = ""
         for attempt in range(1, tries + 1):
-            self._events.put(Event("begun", k))
+            self._events.put(Event("started", k))
             try:
                 outcome = self._try(k, job)
             except TimeoutError:

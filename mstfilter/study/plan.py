@@ -120,7 +120,7 @@ def make_plan(study: StudyConfig, overrides: Sequence[str] = (), *, allow_files:
     ----------
     study : StudyConfig
     overrides : sequence of str
-        Applied to every arm after its own; a comma makes a grid.
+        Applied to every arm after those of the arm; a comma makes a grid.
     allow_files : bool
         Whether components may come from ``./file.py:Class``.
 
@@ -203,7 +203,7 @@ def _check_unique(what: str, named: list[tuple[str, str]]) -> None:
         if name in seen.values():
             raise InputError(
                 f"two {what} are called {name!r}",
-                "give each a name" if what == "arms" else "give each a group of its own",
+                "give each a name" if what == "arms" else "give each a different group",
             )
         seen[key] = name
 

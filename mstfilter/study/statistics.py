@@ -164,5 +164,5 @@ def conclusion(difference: Difference, first: str, second: str, where: str = "")
     if d.n < CLAIM:
         return f"{first} is {word} {second}{at} ({found}): a first look, no claim below {CLAIM} scenes."
     if not d.p_holm < 1 - LEVEL:
-        return f"{first} is {word} {second}{at} by its own interval, not after adjustment ({found}): no claim."
+        return f"{first} is {word} {second}{at} by its interval, but not after adjustment ({found}): no claim."
     return f"{first} is {word} {second}{at} ({found})."

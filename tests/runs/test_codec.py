@@ -33,7 +33,7 @@ class Relabel(Transition):
         return Population(tuple(moved), population.log_weights + rng.normal(size=len(moved)))
 
 
-def test_a_run_of_hypotheses_goes_on_from_its_checkpoint(tmp_path):
+def test_a_run_of_hypotheses_resumes_from_its_checkpoint(tmp_path):
     filter = ParticleFilter(initial=Scenes(), transition=Relabel(), n=3)
     whole, _ = filter.run(range(4), 1)
     filter.run(range(2), 1, checkpoint=tmp_path / "c.npz", codec=HypothesisCodec())

@@ -73,7 +73,7 @@ def test_volumes_against_a_recording(tmp_path):
     assert score_pauses(read_estimate(tmp_path / "e.npy"), read_truth(path / "voxels.npz"))[3].mean == 0.0
 
 
-def test_instance_images_score_what_is_seen(tmp_path):
+def test_instance_images_score_visible_parts(tmp_path):
     """Without volumes the truth is the image: right volumes are perfect there, wrong hidden voxels cost nothing."""
     recording = open_recording(write_recording(tmp_path / "r", volumes=False))
     truth = read_truth(recording)
@@ -112,7 +112,7 @@ def test_a_run_scores_as_its_own_metrics_say(tmp_path):
         write_scores(tmp_path / "none" / "q.csv", rows)
 
 
-def test_what_does_not_fit(tmp_path):
+def test_input_that_does_not_match_is_an_error(tmp_path):
     path = write_recording(tmp_path / "r")
     truth = read_truth(open_recording(path))
     other = VoxelGrid((1, 1, 0), 0.01, GRID.shape)

@@ -33,7 +33,7 @@ def test_unknown_and_ambiguous(tmp_path):
     (tmp_path / "notes" / "a.txt").write_text("x")
     (tmp_path / "video.mp4").write_bytes(b"x")
     for name in ("notes", "video.mp4"):
-        with pytest.raises(InputError, match="no format that is known") as caught:
+        with pytest.raises(InputError, match="has no known format") as caught:
             open_source(tmp_path / name)
         assert "tum, bop, redwood, dsr, bag" in caught.value.hints[0]
     path = layouts.write_redwood(layouts.write_tum(tmp_path / "both") / "x").rename(tmp_path / "both2")

@@ -58,7 +58,7 @@ def default_interrupts():
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
-def test_ctrl_c_ends_workers_and_loses_nothing(config, tmp_path):
+def test_ctrl_c_ends_workers_and_keeps_results(config, tmp_path):
     marker = tmp_path / "marker"
     hanging_study(config, tmp_path / "slide", marker)
     command = [sys.executable, "-m", "mstfilter", "study", str(config), "--workers", "1"]

@@ -71,7 +71,7 @@ def test_failures_are_isolated_listed_and_explained(folder, tmp_path):
         assert log.name.startswith("worker-")
 
 
-def test_what_failed_is_repeated_and_what_is_done_is_not(folder, tmp_path):
+def test_only_failed_runs_are_repeated(folder, tmp_path):
     marker = tmp_path / "once"
     wanted, out = study(folder, "good", f"raise@{marker}", seeds=[0]), tmp_path / "out"
     first = run_study(wanted, out, Local(1), cache=tmp_path)
@@ -102,7 +102,7 @@ def test_a_run_whose_worker_died_is_begun_again(folder, tmp_path):
         wanted, tmp_path / "out", Local(1), cache=tmp_path, progress=lambda p: seen.append(p.event and p.event.kind)
     )
     assert result.failed == () and result.done == 1
-    assert seen.count("begun") == 2 and seen.count("lost") == 1
+    assert seen.count("started") == 2 and seen.count("lost") == 1
 
 
 @dataclass(frozen=True)

@@ -36,7 +36,7 @@ def test_sign_flips_are_enumerated(n):
     assert sign_flip(values) == pytest.approx(expected)
 
 
-def test_sign_flips_of_many_and_of_nothing():
+def test_sign_flips_of_many_and_of_no_values():
     values = np.random.default_rng(1).normal(0.4, 1, size=40)
     assert sign_flip(values) == sign_flip(values)
     assert sign_flip(values) == pytest.approx(scipy.stats.ttest_1samp(values, 0).pvalue, abs=0.02)
@@ -121,7 +121,7 @@ def test_words_claim_no_more_than_they_may():
         d, "a", "b", "s1"
     )
     d = Difference(-0.1, -0.15, -0.05, 0, 0, 0.001, 25, 0.2)
-    assert "not after adjustment" in conclusion(d, "a", "b")
+    assert "but not after adjustment" in conclusion(d, "a", "b")
     d = Difference(-0.1, -0.15, -0.05, 0, 0, 0.001, 25, 0.01)
     assert conclusion(d, "a", "b").startswith("a is below b (") and "claim" not in conclusion(d, "a", "b")
     assert "n = 1" in conclusion(compare({"x": 1.0}, {"x": 2.0}), "a", "b")

@@ -53,7 +53,7 @@ def table(path, costs=False):
     return [{k: row[k] for k in kept} for row in rows]
 
 
-def test_a_study_runs_resumes_and_repeats_nothing(folder, tmp_path):
+def test_a_finished_study_repeats_no_run(folder, tmp_path):
     study = load_study(folder / "base.toml")
     first = run_study(study, tmp_path / "out", Local(2), cache=tmp_path / "cache")
     assert (first.done, first.repeated, first.failed) == (8, 0, ())
@@ -85,7 +85,7 @@ def test_smoke_replaces(folder):
     assert load_study(folder / "base.toml", smoke=True).seeds == (3,)
 
 
-def test_identity_is_of_what_matters(folder):
+def test_identity_depends_on_the_configuration(folder):
     study = load_study(folder / "base.toml")
     runs = make_plan(study).runs
     assert len({run.identity for run in runs}) == len(runs) == 8
@@ -121,10 +121,10 @@ def test_recordings_of_one_name_in_two_groups(tmp_path):
     unnamed = [{"recordings": s["recordings"]} for s in scenes]
     with pytest.raises(InputError, match="two scenes are called 'recordings-000001'") as caught:
         make_plan(study_of({**base, "scenes": unnamed}))
-    assert caught.value.hints == ("give each a group of its own",)
+    assert caught.value.hints == ("give each a different group",)
 
 
-def test_a_study_that_grows_runs_what_is_new(folder, tmp_path):
+def test_a_larger_study_runs_new_runs_only(folder, tmp_path):
     study = load_study(folder / "base.toml", smoke=True)
     assert run_study(study, tmp_path / "out", Local(1), cache=tmp_path / "cache").done == 4
     more = run_study(study, tmp_path / "out", Local(1), ["n=5,4"], cache=tmp_path / "cache")

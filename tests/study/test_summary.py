@@ -84,5 +84,5 @@ def test_a_scene_that_one_arm_lacks_is_left_out_of_the_pairs():
     assert len(found.metric("f", "ours").by_scene) == 3
 
 
-def test_nothing_gives_nothing():
+def test_no_rows_give_no_differences():
     assert summarise([], "ours").differences == ()
