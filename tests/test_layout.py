@@ -72,13 +72,14 @@ def source_of(module: str, name: str) -> str:
     return module
 
 
-def test_the_package_has_the_stated_size():
-    assert n_lines(FILES) <= 28_000
-    assert len(FILES) <= 160
-    smc = [path for path in FILES if path.is_relative_to(PACKAGE / "smc")]
-    assert n_lines(smc) <= 4_800
-    modules = [path for path in smc if path.name != "__init__.py"]
-    assert len(modules) <= 18
+def test_the_package_does_not_grow():
+    """A new capability replaces code more often than it adds some. Lower a bound when code is removed."""
+    assert n_lines(FILES) <= 31_000
+    assert len(FILES) <= 145
+    smc = [path for path in FILES if path.is_relative_to(PACKAGE / "smc") and path.name != "__init__.py"]
+    assert n_lines(smc) <= 5_050
+    assert len(smc) <= 18
+    assert max(n_lines([path]) for path in FILES) <= 500
 
 
 def test_a_public_name_is_defined_once():
