@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
+
 import numpy as np
 
 from mstfilter.formats import RecordingWriter, open_recording
 from mstfilter.scene import render
+from mstfilter.smc import Proposal
 from tests.scene.scenes import CAMERA, GRID, table_scene
 
 
@@ -28,3 +31,16 @@ def slide(path, shifts=(0, 1, 2, 3, 4), noise=True):
             if index % 2 == 0:
                 writer.add_voxels(labels)
     return open_recording(path)
+
+
+@dataclass(frozen=True)
+class ProposalRecorder(Proposal):
+    """Another proposal, with the keys of the hypotheses that it has drawn, by pause."""
+
+    proposal: Proposal
+    drawn: list = field(default_factory=list)
+
+    def sample(self, rng, observation, n):
+        population = self.proposal.sample(rng, observation, n)
+        self.drawn.append([h.key for h in population.particles])
+        return population

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,9 +11,9 @@ from mstfilter.baselines.updates import SamplesOnly, TrackingOnly, Union
 from mstfilter.fusion import Division, Evidence, FreeSpace, FusionUpdate, NoFreeSpace
 from mstfilter.presets import build_filter, load_config
 from mstfilter.scene import Hypothesis
-from mstfilter.smc import Population, Proposal
+from mstfilter.smc import Population
 from mstfilter.testing import UpdateContract, scene_example
-from tests.baselines.scenes import slide
+from tests.baselines.scenes import ProposalRecorder, slide
 
 
 @pytest.fixture(scope="module")
@@ -51,26 +51,14 @@ def test_another_seed_breaks_the_tie(recording, mst):
     assert keys(run("samples_only", recording, 3, sampler)[0]) != keys(run("samples_only", recording, 4, sampler)[0])
 
 
-@dataclass(frozen=True)
-class Recorded(Proposal):
-    """Keeps the samples of another proposal."""
-
-    proposal: Proposal
-    seen: list = field(default_factory=list)
-
-    def sample(self, rng, observation, n):
-        self.seen.append(self.proposal.sample(rng, observation, n))
-        return self.seen[-1]
-
-
 def test_samples_are_those_that_the_filter_draws_at_the_same_pause(recording):
     """The proposal's stream is the same in both arms at every pause."""
     seen = {}
     for name in ("mst", "samples_only"):
         filter = build_filter(load_config(name, ["proposal.sampler.temperature=8"]))
-        recorded = Recorded(filter.proposal)
-        replace(filter, proposal=recorded).run(recording.clips(), seed=5)
-        seen[name] = [keys(population) for population in recorded.seen]
+        recorder = ProposalRecorder(filter.proposal)
+        replace(filter, proposal=recorder).run(recording.clips(), seed=5)
+        seen[name] = recorder.drawn
     assert len(seen["mst"]) == len(recording.clips())
     assert seen["mst"] == seen["samples_only"]
 

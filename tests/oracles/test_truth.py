@@ -31,7 +31,7 @@ from mstfilter.scene import Hypothesis
 from mstfilter.scoring import weighted_coverage
 from mstfilter.segmentation import ColourDepthBoundary
 from mstfilter.smc import Key, LargestWeights, Population
-from tests.baselines.scenes import slide
+from tests.baselines.scenes import ProposalRecorder, slide
 
 ALL = (
     'proposal={component="true_masks", completer="true_completion"}',
@@ -123,14 +123,10 @@ def test_a_run_with_oracles_resumes(recording, tmp_path):
 def samples_of(recording, *overrides):
     """Keys of what the proposal draws at each pause of a run."""
     config = load_config("mst", ["proposal.sampler.temperature=8", "update.eta=1", *overrides])
-    filter, drawn = bind_truth(build_filter(config), recording), []
-    state = filter.start(2)
-    for clip in recording.clips():
-        stream = state.key.child("step", state.t).child("proposal").generator()
-        proposed = filter.proposal.sample(stream, clip, filter.n_proposed)
-        drawn.append([h.key for h in proposed.particles])
-        state, _ = filter.step(state, clip)
-    return drawn
+    filter = bind_truth(build_filter(config), recording)
+    recorder = ProposalRecorder(filter.proposal)
+    replace(filter, proposal=recorder).run(recording.clips(), 2)
+    return recorder.drawn
 
 
 @pytest.fixture(scope="module")
