@@ -16,12 +16,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mstfilter.errors import InputError
 from mstfilter.scene import BASELINE, Frame, fit_support_plane, table_residual
 
 #: Focal length in pixels that defines the sensor's disparity unit: 1/8 pixel of a 640 x 480 Kinect, whatever the
 #: size of the image. The noise (0.58 units) and all thresholds then stay the same when an image is resized.
 SENSOR_FOCAL = 525.0
+#: Readings up to this much above the table are table, in sensor disparity units.
+TABLE_TOLERANCE = 2.0
+_LIGHTNESS_UNIT, _CHROMA_UNIT = 20.0, 8.0  # differences of L and of a, b (CIE Lab) of colour strength 1
 
 
 def above_table(frame: Frame) -> np.ndarray:
@@ -31,6 +33,12 @@ def above_table(frame: Frame) -> np.ndarray:
     most readings.
     """
     return fit_support_plane(frame).residual if frame.camera.T_world_camera is None else table_residual(frame)
+
+
+def pixels_above_table(frame: Frame) -> np.ndarray:
+    """Pixels (H, W) with a reading above the table that is not on the robot."""
+    with np.errstate(invalid="ignore"):
+        return frame.valid & (above_table(frame) > TABLE_TOLERANCE)
 
 
 class BoundaryModel(ABC):
@@ -49,34 +57,13 @@ class ColourDepthBoundary(BoundaryModel):
     ----------
     colour_weight : float
         Weight of the colour edges; 0 disables them.
-    depth_weight : float
-        Weight of the depth edges; 0 disables them.
-    depth_scale : float
-        Standard deviation of the blur before the Hessian, in pixels of a 640 px wide image.
-    depth_half : float
-        Hessian response that maps to strength 0.5, in sensor disparity units (1/8 px at f = 525 px).
-    lightness_unit, chroma_unit : float
-        Differences of L and of a, b (CIE Lab) that equal one unit of colour strength.
     quiet_table : float
         Pixels (of a 640 px wide image). The boundary is 0 where everything within this distance is table, so that
         print, grain and shadows on the table do not enter the tree. Negative values disable the rule.
-    table_tolerance : float
-        Readings up to this much above the table are table, in sensor disparity units.
     """
 
     colour_weight: float = 0.4
-    depth_weight: float = 1.0
-    depth_scale: float = 2.5
-    depth_half: float = 2.0
-    lightness_unit: float = 20.0
-    chroma_unit: float = 8.0
     quiet_table: float = 12.0
-    table_tolerance: float = 2.0
-
-    def __post_init__(self) -> None:
-        for name in ("depth_scale", "depth_half", "lightness_unit", "chroma_unit"):
-            if not getattr(self, name) > 0:
-                raise InputError(f"boundary field {name} is {getattr(self, name)!r}, expected a number > 0")
 
     def boundary(self, frame: Frame) -> np.ndarray:
         """Boundary strength (H, W). Robot pixels are 1 at their rim and 0 inside, so that they separate regions."""
@@ -85,12 +72,15 @@ class ColourDepthBoundary(BoundaryModel):
         resize = frame.camera.width / 640
         edges: np.ndarray = np.zeros(frame.depth.shape, np.float32)
         if self.colour_weight > 0:
-            edges = self.colour_weight * self._colour(frame.rgb, resize)
-        if self.depth_weight > 0 and frame.valid.any():
-            edges = np.maximum(edges, self.depth_weight * self._concave(frame, resize))
+            edges = self.colour_weight * _colour_edges(frame.rgb, resize)
+        if frame.valid.any():
+            concave, _ = curvature(filled_disparity(frame), resize)
+            # The response is reduced where missing depth was filled in.
+            missing = cv2.GaussianBlur((~frame.valid).astype(np.float32), (0, 0), _blur(resize))
+            edges = np.maximum(edges, concave * (1 - missing))
         if self.quiet_table >= 0 and frame.valid.any():
             with np.errstate(invalid="ignore"):
-                object_like = (above_table(frame) > self.table_tolerance).astype(np.uint8)
+                object_like = (above_table(frame) > TABLE_TOLERANCE).astype(np.uint8)
             # Single pixels above the table are noise; blocks of 3 x 3 are not.
             object_like = cv2.morphologyEx(object_like, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
             reach = 2 * max(1, round(self.quiet_table * resize)) + 1
@@ -102,47 +92,61 @@ class ColourDepthBoundary(BoundaryModel):
             edges = np.where(inside > 0, 0, np.where(robot > 0, 1, edges))
         return np.clip(edges, 0, 1).astype(np.float32)
 
-    def _colour(self, rgb: np.ndarray, resize: float) -> np.ndarray:
-        """e / (1 + e) with e the strength of the Lab structure tensor, averaged over three scales."""
-        import cv2
 
-        lab = cv2.cvtColor(rgb.astype(np.float32) / 255, cv2.COLOR_RGB2Lab)
-        lab /= np.array([self.lightness_unit, self.chroma_unit, self.chroma_unit], np.float32)
-        xx = np.zeros(rgb.shape[:2], np.float32)
-        yy, xy = xx.copy(), xx.copy()
-        for scale in (1.0, 2.0, 4.0):
-            s = max(0.7, scale * resize)
-            smooth = cv2.GaussianBlur(lab, (0, 0), s)
-            # A Sobel filter gives 8 times the derivative per pixel; the factor s makes scales comparable.
-            gx = cv2.Sobel(smooth, cv2.CV_32F, 1, 0) * (s / 8)
-            gy = cv2.Sobel(smooth, cv2.CV_32F, 0, 1) * (s / 8)
-            xx += (gx * gx).sum(axis=2) / 3
-            yy += (gy * gy).sum(axis=2) / 3
-            xy += (gx * gy).sum(axis=2) / 3
-        strength = np.sqrt(np.maximum(_largest_eigenvalue(xx, yy, xy), 0))
-        return strength / (1 + strength)
+def _colour_edges(rgb: np.ndarray, resize: float) -> np.ndarray:
+    """e / (1 + e) with e the strength of the Lab structure tensor, averaged over three scales."""
+    import cv2
 
-    def _concave(self, frame: Frame, resize: float) -> np.ndarray:
-        """x / (x + depth_half) with x the largest positive curvature of disparity, reduced at filled-in depth."""
-        import cv2
-
-        holes = ~frame.valid
-        depth = fill_from_nearest(frame.depth, holes)
-        D = (8 * SENSOR_FOCAL * BASELINE / depth).astype(np.float32)
-        s = max(1.0, self.depth_scale * resize)
-        smooth = cv2.GaussianBlur(D, (0, 0), s)
-        factor = s * s / 4
-        xx = cv2.Sobel(smooth, cv2.CV_32F, 2, 0) * factor
-        yy = cv2.Sobel(smooth, cv2.CV_32F, 0, 2) * factor
-        xy = cv2.Sobel(smooth, cv2.CV_32F, 1, 1) * factor
-        x = np.maximum(_largest_eigenvalue(xx, yy, xy), 0)
-        known = 1 - cv2.GaussianBlur(holes.astype(np.float32), (0, 0), s)
-        return x / (x + self.depth_half) * known
+    lab = cv2.cvtColor(rgb.astype(np.float32) / 255, cv2.COLOR_RGB2Lab)
+    lab /= np.array([_LIGHTNESS_UNIT, _CHROMA_UNIT, _CHROMA_UNIT], np.float32)
+    xx = np.zeros(rgb.shape[:2], np.float32)
+    yy, xy = xx.copy(), xx.copy()
+    for scale in (1.0, 2.0, 4.0):
+        s = max(0.7, scale * resize)
+        smooth = cv2.GaussianBlur(lab, (0, 0), s)
+        # A Sobel filter gives 8 times the derivative per pixel; the factor s makes scales comparable.
+        gx = cv2.Sobel(smooth, cv2.CV_32F, 1, 0) * (s / 8)
+        gy = cv2.Sobel(smooth, cv2.CV_32F, 0, 1) * (s / 8)
+        xx += (gx * gx).sum(axis=2) / 3
+        yy += (gy * gy).sum(axis=2) / 3
+        xy += (gx * gy).sum(axis=2) / 3
+    middle, radius = _eigenvalues(xx, yy, xy)
+    strength = np.sqrt(np.maximum(middle + radius, 0))
+    return strength / (1 + strength)
 
 
-def _largest_eigenvalue(xx: np.ndarray, yy: np.ndarray, xy: np.ndarray) -> np.ndarray:
-    """Largest eigenvalue of the symmetric matrices [[xx, xy], [xy, yy]]."""
-    return (xx + yy) / 2 + np.sqrt(((xx - yy) / 2) ** 2 + xy * xy)
+def filled_disparity(frame: Frame) -> np.ndarray:
+    """Disparity (H, W) float32 in sensor units; missing readings take the nearest one."""
+    return (8 * SENSOR_FOCAL * BASELINE / fill_from_nearest(frame.depth, ~frame.valid)).astype(np.float32)
+
+
+def curvature(disparity: np.ndarray, resize: float) -> tuple[np.ndarray, np.ndarray]:
+    """Strength x / (x + 2) of the concave and the convex curvature x of disparity (H, W).
+
+    Concave curvature is the largest eigenvalue of the Hessian, convex curvature minus the smallest. `resize` is the
+    image width / 640.
+    """
+    import cv2
+
+    s = _blur(resize)
+    smooth = cv2.GaussianBlur(disparity, (0, 0), s)
+    factor = s * s / 4
+    xx = cv2.Sobel(smooth, cv2.CV_32F, 2, 0) * factor
+    yy = cv2.Sobel(smooth, cv2.CV_32F, 0, 2) * factor
+    xy = cv2.Sobel(smooth, cv2.CV_32F, 1, 1) * factor
+    middle, radius = _eigenvalues(xx, yy, xy)
+    concave, convex = np.maximum(middle + radius, 0), np.maximum(radius - middle, 0)
+    return concave / (concave + 2), convex / (convex + 2)
+
+
+def _blur(resize: float) -> float:
+    """Standard deviation of the blur before the Hessian, pixels."""
+    return max(1.0, 2.5 * resize)
+
+
+def _eigenvalues(xx: np.ndarray, yy: np.ndarray, xy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and half the difference of the eigenvalues of the symmetric matrices [[xx, xy], [xy, yy]]."""
+    return (xx + yy) / 2, np.sqrt(((xx - yy) / 2) ** 2 + xy * xy)
 
 
 def fill_from_nearest(depth: np.ndarray, holes: np.ndarray) -> np.ndarray:

@@ -23,14 +23,18 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from math import exp, log1p
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
 from mstfilter.errors import InputError
 from mstfilter.scene import Frame
-from mstfilter.segmentation.boundary import above_table
+from mstfilter.segmentation.boundary import pixels_above_table
 from mstfilter.segmentation.tree import Tree
+
+_MAX_TRIES = 100000  # Gibbs draws of `ExactCuts` for each cut
+
+_Value = TypeVar("_Value", float, np.ndarray)
 
 
 class CutValue(ABC):
@@ -60,13 +64,11 @@ class SceneCutObjectness(CutValue):
     floor : float
         Objectness of a region outside the area limits.
     min_area, max_area : float
-        Area limits as shares of the image. SceneCut's 1000 and 150,000 px at 640 x 480.
+        Area limits as fractions of the image. SceneCut's 1000 and 150,000 px at 640 x 480.
     background_weight : float
         Area of a pixel that is not above the table; 1 in SceneCut. With 1 the table contributes most of v*. The width
         of the sampled law is relative to v*, so a larger table gives more random samples. With 0 cuts of the
         table have no cost, and chains spend their steps on them.
-    table_tolerance : float
-        Readings up to this much above the table are table, in sensor disparity units.
     """
 
     start_scale: float = 0.3
@@ -76,7 +78,6 @@ class SceneCutObjectness(CutValue):
     min_area: float = 1000 / 307200
     max_area: float = 150000 / 307200
     background_weight: float = 0.003
-    table_tolerance: float = 2.0
 
     def __post_init__(self) -> None:
         for name in ("start_scale", "end_scale", "power", "floor"):
@@ -87,17 +88,15 @@ class SceneCutObjectness(CutValue):
         """``ln(s) area^power`` of every node."""
         area = tree.area.astype(np.float64)
         if self.background_weight < 1:
-            with np.errstate(invalid="ignore"):
-                above = frame.valid & (above_table(frame) > self.table_tolerance)
-            foreground = tree.accumulate_pixels(above).astype(np.float64)
+            foreground = tree.accumulate_pixels(pixels_above_table(frame)).astype(np.float64)
             background = self.background_weight * (area - foreground)
             limited = foreground > background
             area = foreground + background
         else:
             limited = np.ones(len(area), dtype=bool)
-        share = area / tree.leaves.size
+        fraction = area / tree.leaves.size
         log_s = np.log(0.5) - (tree.start / self.start_scale) ** 2 - ((1 - tree.end) / self.end_scale) ** 2
-        outside = limited & ((share < self.min_area) | (share > self.max_area))
+        outside = limited & ((fraction < self.min_area) | (fraction > self.max_area))
         return np.where(outside, np.log(self.floor), log_s) * area**self.power
 
 
@@ -211,10 +210,10 @@ def optimal_cut(tree: Tree, w: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class OptimalCut(CutSampler):
-    """The optimal cut, `n` times, without randomness. The single-frame baseline (SceneCut)."""
+    """The optimal cut, without randomness. The single-frame baseline (SceneCut)."""
 
     def sample(self, rng: np.random.Generator, tree: Tree, w: np.ndarray, n: int) -> CutSample:
-        """The optimal cut, `n` times."""
+        """Return the optimal cut `n` times."""
         cut = optimal_cut(tree, w)
         value = float(np.asarray(w, dtype=np.float64)[cut].sum())
         return CutSample((cut,) * n, np.full(n, value), np.zeros(n), {"size_of_best": len(cut)})
@@ -305,6 +304,18 @@ def best_envelope(tree: Tree, w: np.ndarray, best: float, s2: float) -> Gibbs:
     return law
 
 
+def proposal_law(tree: Tree, w: np.ndarray, best: float, s2: float, temperature: float) -> Gibbs:
+    """The target itself if it is a Gibbs law (temperature > 0), else the best envelope of the law of the paper."""
+    return gibbs(tree, w, 1 / temperature) if temperature > 0 else best_envelope(tree, w, best, s2)
+
+
+def log_target(value: _Value, best: float, s2: float, temperature: float) -> _Value:
+    """Log probability of cuts with these values relative to the optimal cut."""
+    if temperature > 0:
+        return (value - best) / temperature
+    return -((best - value) ** 2) / s2
+
+
 @dataclass(frozen=True)
 class ExactCuts(CutSampler):
     """Independent exact draws from exp(-(v* - v)^2 / s2), or from exp(v / temperature).
@@ -313,15 +324,12 @@ class ExactCuts(CutSampler):
     ----------
     sigma2 : float
         s2 relative to the squared value of the optimal cut: ``s2 = sigma2 v*^2``. No unit.
-    max_tries : int
-        Largest number of Gibbs draws per cut.
     temperature : float
         0: the law of the paper. > 0: the Gibbs law at this temperature, in units of value; no draw is rejected and
         sigma2 is not used.
     """
 
     sigma2: float = 1e-3
-    max_tries: int = 100000
     temperature: float = 0.0
 
     def __post_init__(self) -> None:
@@ -331,21 +339,20 @@ class ExactCuts(CutSampler):
         """Draw `n` independent cuts."""
         best = float(check_values(tree, w)[optimal_cut(tree, w)].sum())
         s2 = max(self.sigma2 * best**2, 1e-300)
-        warm = self.temperature > 0
-        law = gibbs(tree, w, 1 / self.temperature) if warm else best_envelope(tree, w, best, s2)
+        law = proposal_law(tree, w, best, s2, self.temperature)
         cuts: list[np.ndarray] = []
         values: list[float] = []
         tries = 0
         while len(cuts) < n:
             tries += 1
-            if tries > self.max_tries * n:
+            if tries > _MAX_TRIES * n:
                 raise InputError(
                     f"exact cut sampler accepted {len(cuts)} of {tries - 1} draws, {n} are needed",
-                    "use the `mh` sampler for this tree, or raise max_tries",
+                    "use the `mh` sampler for this tree",
                 )
             cut = law.draw(rng.random, tree.root)
             d = best - sum(law.w[x] for x in cut)
-            if warm or rng.random() < exp(-((d - law.b * s2 / 2) ** 2) / s2):
+            if self.temperature > 0 or rng.random() < exp(-((d - law.b * s2 / 2) ** 2) / s2):
                 cuts.append(np.sort(np.array(cut, dtype=np.int64)))
                 values.append(best - d)
         v = np.array(values)
@@ -353,5 +360,4 @@ class ExactCuts(CutSampler):
             "acceptance": n / tries if tries else 1.0,
             "distinct": len({c.tobytes() for c in cuts}) / max(n, 1),
         }
-        log_p = (v - best) / self.temperature if warm else -((best - v) ** 2) / s2
-        return CutSample(tuple(cuts), v, log_p, diagnostics)
+        return CutSample(tuple(cuts), v, log_target(v, best, s2, self.temperature), diagnostics)

@@ -44,7 +44,6 @@ class Agglomeration:
     def __init__(self, regions: Regions, log_odds: PairLogOdds) -> None:
         n = len(regions.sums)
         self.log_odds = log_odds
-        self.n_regions = n
         self.sums = np.zeros((2 * n, regions.sums.shape[1]))
         self.sums[:n] = regions.sums
         self.borders: list[dict[int, np.ndarray]] = [dict(near) for near in regions.borders]
@@ -79,7 +78,7 @@ class Agglomeration:
 
     def merge(self, i: int, j: int, odds: float) -> int:
         """Merge two regions and return the number of the new one."""
-        new = self.n_regions + len(self.merges)
+        new = len(self.borders)
         self.merges.append((i, j, odds))
         self.sums[new] = self.sums[i] + self.sums[j]
         common = self.borders[i].pop(j, _NO_BORDER)
@@ -94,8 +93,7 @@ class Agglomeration:
         self.alive -= {i, j}
         self.alive.add(new)
         for k in near:
-            back = self.borders[k].pop(i, _NO_BORDER) + self.borders[k].pop(j, _NO_BORDER)
-            self.borders[k][new] = back
+            self.borders[k][new] = self.borders[k].pop(i, _NO_BORDER) + self.borders[k].pop(j, _NO_BORDER)
         self._push(new, list(near))
         return new
 
@@ -110,20 +108,14 @@ class LearnedTree(TreeBuilder):
     ----------
     leaves : TreeBuilder
         The leaves of its tree are the initial regions.
-    table_tolerance : float
-        Readings up to this much above the table are table, in sensor disparity units.
-    clear_step : float
-        Smallest clear step of disparity, in sensor disparity units.
     """
 
     leaves: TreeBuilder = field(default_factory=UcmTree)
-    table_tolerance: float = 2.0
-    clear_step: float = 4.0
 
     def regions(self, boundary: np.ndarray, frame: Frame) -> tuple[Tree, Regions]:
         """The initial tree and its measured leaves."""
         tree = self.leaves.build(boundary, frame)
-        return tree, measure_regions(tree.leaves, frame, boundary, self.table_tolerance, self.clear_step)
+        return tree, measure_regions(tree.leaves, frame, boundary)
 
     def build(self, boundary: np.ndarray, frame: Frame | None = None) -> Tree:
         """Build the tree. `odds` are the log odds of each merge, `start` the maximum of their probabilities below."""

@@ -39,11 +39,11 @@ from mstfilter.segmentation.cuts import (
     CutSample,
     CutSampler,
     Gibbs,
-    best_envelope,
     check_target_law,
     check_values,
-    gibbs,
+    log_target,
     optimal_cut,
+    proposal_law,
 )
 from mstfilter.segmentation.tree import Tree
 
@@ -273,17 +273,19 @@ class CutChain:
     def __init__(
         self, tree: Tree, w: np.ndarray, best: float, s2: float, cut: np.ndarray, temperature: float = 0.0
     ) -> None:
-        self.state = CutState(tree, cut.tolist())
-        self.w = w.tolist()
+        self.tree, self.w = tree, w.tolist()
         self.best, self.s2, self.temperature = best, s2, temperature
-        self.value = sum(self.w[x] for x in self.state.nodes)
         self.steps = self.accepted = 0
+        self.restart(cut)
+
+    def restart(self, cut: np.ndarray) -> None:
+        """Continue from another cut."""
+        self.state = CutState(self.tree, cut.tolist())
+        self.value = sum(self.w[x] for x in self.state.nodes)
 
     def log_target(self, value: float) -> float:
         """Unnormalised log p of a cut of this value."""
-        if self.temperature > 0:
-            return (value - self.best) / self.temperature
-        return -((self.best - value) ** 2) / self.s2
+        return log_target(value, self.best, self.s2, self.temperature)
 
     def judge(self, rule: MoveRule, choice: Any) -> tuple[Move | None, float, float]:
         """Move of a choice (None: stay), value after it, and log of its acceptance ratio."""
@@ -326,7 +328,7 @@ class MetropolisHastingsCuts(CutSampler):
     moves : {"node", "authors"}
         Local moves: the paper's (exact), or the authors' program's, whose forward probability is wrong.
     redraw_share : float
-        Share of the steps that redraw a random subtree instead of making a local move.
+        Fraction of the steps that redraw a random subtree instead of making a local move.
     restart : bool
         Start a new chain at the optimal cut for each sample.
     include_optimal : bool
@@ -365,13 +367,11 @@ class MetropolisHastingsCuts(CutSampler):
         local = LOCAL_MOVES[self.moves]()
         redraw = None
         if self.redraw_share > 0:
-            warm = self.temperature > 0
-            redraw = SubtreeRedraw(gibbs(tree, w, 1 / self.temperature) if warm else best_envelope(tree, w, best, s2))
+            redraw = SubtreeRedraw(proposal_law(tree, w, best, s2, self.temperature))
         random = _uniforms(rng)
 
         chain = CutChain(tree, w, best, s2, optimal, self.temperature)
         trace: list[float] = []
-        steps = accepted = 0
 
         def advance(n_steps: int) -> None:
             for _ in range(n_steps):
@@ -382,10 +382,8 @@ class MetropolisHastingsCuts(CutSampler):
                 trace.append(chain.value)
 
         def draw() -> np.ndarray:
-            nonlocal chain, steps, accepted
             if self.restart:
-                steps, accepted = steps + chain.steps, accepted + chain.accepted
-                chain = CutChain(tree, w, best, s2, optimal, self.temperature)
+                chain.restart(optimal)
                 advance(self.burn_in)
             advance(self.thinning)
             return chain.cut()
@@ -400,17 +398,16 @@ class MetropolisHastingsCuts(CutSampler):
                 cut = draw()
             seen.add(cut.tobytes())
             cuts.append(cut)
-        steps, accepted = steps + chain.steps, accepted + chain.accepted
         v = np.array([w[cut].sum() for cut in cuts])
         diagnostics: dict[str, Any] = {
-            "steps": steps,
-            "acceptance": accepted / steps if steps else 0.0,
+            "steps": chain.steps,
+            "acceptance": chain.accepted / chain.steps if chain.steps else 0.0,
             "distinct": len(seen) / max(n, 1),
             "size_of_best": len(optimal),
         }
         if not self.restart:
             diagnostics["autocorrelation_steps"] = _autocorrelation(np.array(trace[self.burn_in :]))
-        return CutSample(tuple(cuts), v, np.array([chain.log_target(float(x)) for x in v]), diagnostics)
+        return CutSample(tuple(cuts), v, log_target(v, best, s2, self.temperature), diagnostics)
 
 
 def _uniforms(rng: np.random.Generator, block: int = 1024) -> Callable[[], float]:

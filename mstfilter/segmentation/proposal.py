@@ -23,32 +23,35 @@ import numpy as np
 from mstfilter.completion import Completer, Completion, Extrude, arbitrate
 from mstfilter.errors import InputError
 from mstfilter.scene import Clip, Frame, Hypothesis, ObjectRecord, VoxelGrid, component_key, memo
-from mstfilter.segmentation.boundary import BoundaryModel, ColourDepthBoundary, above_table
+from mstfilter.segmentation.boundary import BoundaryModel, ColourDepthBoundary, pixels_above_table
 from mstfilter.segmentation.cuts import CutSampler, CutValue, MergeLogOdds, optimal_cut
 from mstfilter.segmentation.learned_tree import LearnedTree
 from mstfilter.segmentation.mh import MetropolisHastingsCuts
 from mstfilter.segmentation.tree import Tree, TreeBuilder
 from mstfilter.smc import Population, Proposal, child
 
-WEIGHT_RULES = ("equal", "p")
+# Limits of `ObjectRule`; pixels are those of a 640 x 480 image.
+_MIN_RAISED = 0.5  # fraction of a region's readings that are above the table and in the workspace
+#: Pixels that remain after an erosion by `_CORE_RADIUS` pixels. Removes slivers along the borders of objects (the
+#: authors erode by 5 x 5 and require more than 25 points).
+_MIN_CORE = 25
+_CORE_RADIUS = 2
+_MIN_READINGS = 0.004  # fraction of a region's pixels with a depth reading (the authors' value)
 
 
 @dataclass(frozen=True, eq=False)
 class Segments:
-    """Object pixels of an image, and which nodes of its tree are objects.
+    """Object pixels of an image, and the nodes of its tree that are objects.
 
     Parameters
     ----------
     object_pixels : (H, W) bool
         Pixels that can belong to an object: a depth reading above the table and in the workspace, not the robot.
-    points : (N,) int
-        Number of these pixels in each node.
     is_object : (N,) bool
         Whether the node is an object if it is part of a cut.
     """
 
     object_pixels: np.ndarray
-    points: np.ndarray
     is_object: np.ndarray
 
 
@@ -61,33 +64,16 @@ class ObjectRule:
 
     Parameters
     ----------
-    table_tolerance : float
-        Largest height of a table reading above the table, in units of sensor disparity (1/8 px at f = 525 px, which
-        is 3.2 mm of depth at 1 m).
-    object_share : float
-        Smallest share of a region's readings that must lie above the table and in the workspace.
     min_points : int
-        Smallest number of such readings for an image of 640 x 480 pixels; scaled by the area of the image.
-    min_core : int
-        Smallest number of pixels after an erosion by `core_radius`, for an image of 640 x 480 pixels.
-        Removes slivers along the borders of objects (the authors erode by 5 x 5 and require more than 25 points).
-    core_radius : int
-        Radius of that erosion in pixels of a 640 px wide image.
-    min_readings : float
-        Smallest share of a region's pixels with a depth reading (the authors' 0.004).
+        Smallest number of readings above the table and in the workspace, for an image of 640 x 480 pixels; scaled by
+        the area of the image.
     """
 
-    table_tolerance: float = 2.0
-    object_share: float = 0.5
     min_points: int = 60
-    min_core: int = 25
-    core_radius: int = 2
-    min_readings: float = 0.004
 
     def object_pixels(self, frame: Frame, grid: VoxelGrid | None = None) -> np.ndarray:
         """Pixels that can belong to an object, (H, W) bool, as `Segments.object_pixels`."""
-        with np.errstate(invalid="ignore"):
-            found = frame.valid & (above_table(frame) > self.table_tolerance)
+        found = pixels_above_table(frame)
         if grid is not None:
             found &= grid.contains(grid.index_of(frame.points))
         return found
@@ -97,15 +83,15 @@ class ObjectRule:
         own = self.object_pixels(frame, grid)
         readings = tree.accumulate_pixels(frame.valid)
         points = tree.accumulate_pixels(own)
-        core = _core(tree, own, max(1, round(self.core_radius * frame.camera.width / 640)))
+        core = _core(tree, own, max(1, round(_CORE_RADIUS * frame.camera.width / 640)))
         resize = own.size / 307200
         is_object = (
             (points >= max(1.0, self.min_points * resize))
-            & (core >= self.min_core * resize)
-            & (points >= self.object_share * readings)
-            & (readings >= self.min_readings * tree.area)
+            & (core >= _MIN_CORE * resize)
+            & (points >= _MIN_RAISED * readings)
+            & (readings >= _MIN_READINGS * tree.area)
         )
-        return Segments(own, points, is_object)
+        return Segments(own, is_object)
 
     def label_image(self, tree: Tree, cut: np.ndarray, frame: Frame, grid: VoxelGrid | None = None) -> np.ndarray:
         """(H, W) int32 segments of a cut: 0 is background, k + 1 the k-th node of the cut."""
@@ -172,10 +158,8 @@ class TreeCutProposal(Proposal):
     properly_weighted: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
-        if self.weight_rule not in WEIGHT_RULES:
-            raise InputError(
-                f"weight rule {self.weight_rule!r} is not known", f"known rules: {', '.join(WEIGHT_RULES)}"
-            )
+        if self.weight_rule not in ("equal", "p"):
+            raise InputError(f"weight rule {self.weight_rule!r} is not known", "known rules: equal, p")
 
     def tree_of(self, frame: Frame) -> tuple[Tree, np.ndarray]:
         """The tree of a frame and its node values (N,). Cached by content."""
@@ -206,7 +190,12 @@ class TreeCutProposal(Proposal):
             lambda: self.objects.segments(tree, frame, grid),
         )
         kept = [cut[found.is_object[cut]] for cut in cuts]
-        completed = self._complete(rng, tree, found, frame, grid, kept)
+        completed: dict[int, Completion] = {}
+        for node in np.unique(np.concatenate([np.zeros(0, np.int64), *kept])).tolist():
+            mask = tree.mask(node) & found.object_pixels
+            # One stream per segment, so the result does not depend on the other segments.
+            stream = child(rng, "completion", node)
+            completed[node] = self.completer.complete(stream, frame, [mask], grid)[0]
         built: dict[bytes, Hypothesis] = {}
         for nodes in kept:
             if nodes.tobytes() not in built:
@@ -223,25 +212,6 @@ class TreeCutProposal(Proposal):
         }
         log_weights = log_p if self.weight_rule == "p" else np.zeros(n)
         return Population(particles, log_weights, notes=notes)
-
-    def _complete(
-        self,
-        rng: np.random.Generator,
-        tree: Tree,
-        found: Segments,
-        frame: Frame,
-        grid: VoxelGrid,
-        kept: list[np.ndarray],
-    ) -> dict[int, Completion]:
-        """Completion of every distinct node of the cuts."""
-        nodes = np.unique(np.concatenate([np.zeros(0, np.int64), *kept])).tolist()
-        completed = {}
-        for node in nodes:
-            mask = tree.mask(node) & found.object_pixels
-            # One stream per segment, so the result does not depend on the other segments.
-            stream = child(rng, "completion", node)
-            completed[node] = self.completer.complete(stream, frame, [mask], grid)[0]
-        return completed
 
 
 def hypothesis_of(

@@ -2,7 +2,7 @@
 
 Regions and borders are measured as sums over pixels, so the row of a merged region is the sum of two rows.
 
->>> regions = measure_regions(leaves, frame, boundary, table_tolerance=2.0, clear_step=4.0)
+>>> regions = measure_regions(leaves, frame, boundary)
 >>> regions.of_leaf[leaf], regions.sums.shape, regions.borders[0]              # region 0 is the table
 >>> x = pair_features(sums[a], sums[b], border, table_a, table_b, scale)       # (k, len(PAIR_FEATURES))
 
@@ -16,8 +16,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mstfilter.scene import BASELINE, Camera, Frame, fit_support_plane
-from mstfilter.segmentation.boundary import SENSOR_FOCAL, above_table, fill_from_nearest
+from mstfilter.scene import Frame, fit_support_plane
+from mstfilter.segmentation.boundary import (
+    TABLE_TOLERANCE,
+    above_table,
+    curvature,
+    filled_disparity,
+    pixels_above_table,
+)
 
 #: Bin width of the height histogram in metres; the last bin has no upper limit.
 _HEIGHT_BIN = 0.01
@@ -25,6 +31,8 @@ _BINS = 32
 _QUADRIC = 6
 #: Smallest share of pixels above the table of a leaf that is part of an object.
 _MIXED = 0.1
+#: Smallest clear step of disparity, in sensor disparity units.
+_CLEAR_STEP = 4.0
 
 _WIDTHS = {
     "pixels": 1,
@@ -78,42 +86,27 @@ class Regions:
     borders: list[dict[int, np.ndarray]]
 
 
-def measure_regions(
-    leaves: np.ndarray, frame: Frame, boundary: np.ndarray, table_tolerance: float, clear_step: float
-) -> Regions:
-    """Measure the leaves (H, W) of a tree.
+def measure_regions(leaves: np.ndarray, frame: Frame, boundary: np.ndarray) -> Regions:
+    """Measure the leaves (H, W) of a tree of a boundary map (H, W).
 
-    Parameters
-    ----------
-    leaves : (H, W) int
-    frame : Frame
-    boundary : (H, W) float
-        Boundary strength.
-    table_tolerance : float
-        Readings up to this much above the table are table, in sensor disparity units. A leaf belongs to the table if
-        most of its pixels are.
-    clear_step : float
-        Step that counts as clear, in sensor disparity units.
+    A leaf belongs to the table if most of its pixels do.
     """
     height, width = leaves.shape
     n_leaves = int(leaves.max()) + 1
     flat = leaves.ravel()
     above = above_table(frame)
-    with np.errstate(invalid="ignore"):
-        own = frame.valid & (above > table_tolerance)
+    own = pixels_above_table(frame)
     areas = np.bincount(flat, minlength=n_leaves)
     # A leaf that contains object and table pixels is an object. Rays above the horizon of the table (infinite
     # disparity above it) make a leaf an object only if they are the majority.
     meets = own & (above < np.inf)
-    some, most = (
-        _raised(flat, above, mask, areas, table_tolerance, share) for mask, share in ((meets, _MIXED), (own, 0.5))
-    )
-    of_leaf = np.where(some | most, 1, 0)
+    of_leaf = np.where(_raised(flat, above, meets, areas, _MIXED) | _raised(flat, above, own, areas, 0.5), 1, 0)
     of_leaf[of_leaf > 0] = 1 + np.arange(int(of_leaf.sum()))
     region = of_leaf[leaves]
     n = int(of_leaf.max()) + 1
 
-    disparity, hollow, convex = _curvature(frame)
+    D = filled_disparity(frame)
+    hollow, convex = curvature(D, width / 640)
     sums = np.zeros((n, sum(_WIDTHS.values())))
     at = np.nonzero(own & (region > 0))
     which = region[at]
@@ -133,59 +126,31 @@ def measure_regions(
     terms = np.stack([np.ones(len(u)), u, v, u * u, u * v, v * v])
     # Relative to the table the numbers are smaller; the table is affine, so the residuals are the same.
     d = np.minimum(above[at], 1e3)
-    gram = {}
-    for i in range(_QUADRIC):
-        for j in range(i, _QUADRIC):
-            gram[i, j] = np.bincount(which, weights=terms[i] * terms[j], minlength=n)
-    start = REGION["gram"].start
-    for i in range(_QUADRIC):
-        for j in range(_QUADRIC):
-            sums[:, start + i * _QUADRIC + j] = gram[min(i, j), max(i, j)]
+    put("gram", *(a * b for a in terms for b in terms))
     put("moment", *(terms * d))
     put("square", d * d)
-    points = _camera(frame).unproject(frame.depth)[at]
+    camera = frame.camera
+    if camera.T_world_camera is None:
+        camera = camera.at(fit_support_plane(frame).T_world_camera)
+    points = camera.unproject(frame.depth)[at]
     put("ground", points[:, 0], points[:, 1])
     put("spread", points[:, 0] ** 2 + points[:, 1] ** 2)
     put("bend", (hollow - convex)[at])
     bins = np.clip(points[:, 2] / _HEIGHT_BIN, 0, _BINS - 1).astype(np.int64)
     sums[:, REGION["heights"]] = np.bincount(which * _BINS + bins, minlength=n * _BINS).reshape(n, _BINS)
 
-    borders = _borders(region, n, boundary, hollow, convex, disparity, clear_step)
+    smooth = cv2.GaussianBlur(D, (0, 0), max(0.7, 1.5 * width / 640))
+    borders = _borders(region, n, boundary, hollow, convex, smooth)
     sums[:, REGION["perimeter"].start] = [sum(row[0] for row in near.values()) for near in borders]
     return Regions(of_leaf, sums, borders)
 
 
-def _raised(
-    flat: np.ndarray, above: np.ndarray, mask: np.ndarray, areas: np.ndarray, tolerance: float, share: float
-) -> np.ndarray:
-    """Leaves with more than `share` of their pixels in the mask, and a mean height there above 1.75 tolerances."""
+def _raised(flat: np.ndarray, above: np.ndarray, mask: np.ndarray, areas: np.ndarray, fraction: float) -> np.ndarray:
+    """Leaves with more than this fraction of pixels in the mask, and a mean height there above 1.75 tolerances."""
     inside = np.bincount(flat[mask.ravel()], minlength=len(areas))
     rise = np.bincount(flat[mask.ravel()], weights=np.minimum(above[mask], 1e3), minlength=len(areas))
-    raised: np.ndarray = (inside > share * areas) & (rise > 1.75 * tolerance * inside)
+    raised: np.ndarray = (inside > fraction * areas) & (rise > 1.75 * TABLE_TOLERANCE * inside)
     return raised
-
-
-def _camera(frame: Frame) -> Camera:
-    """The camera of the frame; its pose is estimated from the support plane if it has none."""
-    camera = frame.camera
-    return camera if camera.T_world_camera is not None else camera.at(fit_support_plane(frame).T_world_camera)
-
-
-def _curvature(frame: Frame) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Smoothed disparity in sensor units, and x / (x + 2) of its concave and convex curvature; (H, W) each."""
-    import cv2
-
-    resize = frame.camera.width / 640
-    D = (8 * SENSOR_FOCAL * BASELINE / fill_from_nearest(frame.depth, ~frame.valid)).astype(np.float32)
-    smooth = cv2.GaussianBlur(D, (0, 0), max(0.7, 1.5 * resize))
-    s = max(1.0, 2.5 * resize)
-    wide = cv2.GaussianBlur(D, (0, 0), s)
-    xx = cv2.Sobel(wide, cv2.CV_32F, 2, 0) * (s * s / 4)
-    yy = cv2.Sobel(wide, cv2.CV_32F, 0, 2) * (s * s / 4)
-    xy = cv2.Sobel(wide, cv2.CV_32F, 1, 1) * (s * s / 4)
-    middle, radius = (xx + yy) / 2, np.sqrt(((xx - yy) / 2) ** 2 + xy * xy)
-    hollow, convex = np.maximum(middle + radius, 0), np.maximum(radius - middle, 0)
-    return smooth, hollow / (hollow + 2), convex / (convex + 2)
 
 
 def _borders(
@@ -195,7 +160,6 @@ def _borders(
     hollow: np.ndarray,
     convex: np.ndarray,
     disparity: np.ndarray,
-    clear_step: float,
 ) -> list[dict[int, np.ndarray]]:
     """For every region its neighbours and the border rows (columns `BORDER`)."""
     reach = max(1, round(3 * region.shape[1] / 640))
@@ -226,7 +190,7 @@ def _borders(
                 (convex[here] + convex[there]) / 2,
                 step,
                 np.abs(step),
-                np.abs(step) > clear_step,
+                np.abs(step) > _CLEAR_STEP,
             ],
             axis=1,
         )

@@ -28,7 +28,7 @@ def measured(n: int = 6, seed: int = 0):
     height, width = frame.depth.shape
     leaves = (np.arange(height) * n // height)[:, None] * n + np.arange(width) * n // width
     boundary = np.random.default_rng(seed).random(frame.depth.shape)
-    return leaves, measure_regions(leaves, frame, boundary, 2.0, 4.0), frame, boundary
+    return leaves, measure_regions(leaves, frame, boundary), frame, boundary
 
 
 def test_sums_of_merged_regions_are_the_sums_of_the_merged_image():
@@ -37,7 +37,7 @@ def test_sums_of_merged_regions_are_the_sums_of_the_merged_image():
     together = leaves.copy()
     first, second = (int(np.flatnonzero(regions.of_leaf == r)[0]) for r in (a, b))
     together[leaves == second] = first
-    merged = measure_regions(np.unique(together, return_inverse=True)[1].reshape(leaves.shape), frame, boundary, 2, 4)
+    merged = measure_regions(np.unique(together, return_inverse=True)[1].reshape(leaves.shape), frame, boundary)
     growing = Agglomeration(regions, lambda *pair: np.zeros(len(pair[0])))
     new = growing.merge(a, b, 0.0)
     k = a  # regions are numbered in order of their leaves, and `a` kept its leaf
