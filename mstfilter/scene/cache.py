@@ -1,8 +1,8 @@
-"""Results that several parts of a step need, computed once and kept under the content of their input.
+"""Cache of intermediate results, found by the content of their input.
 
 The boundary map of a frame, the flow between two frames or the pixel of every voxel depend on the data alone, not on
-the hypothesis that needs them. `memo` keeps such results, so that all hypotheses of a step share them and a repeated
-run on the same data in one process finds them again.
+the hypothesis that needs them. `memo` stores such results. All hypotheses of a step share them, and so does a
+repeated run on the same data in one process.
 
 >>> from mstfilter.scene import memo, scene_cache
 >>> memo("square", (3,), lambda: 9)
