@@ -10,7 +10,7 @@ import numpy as np
 
 from mstfilter.files import write_csv
 from mstfilter.fusion import Belief
-from mstfilter.scene import Camera, Hypothesis, VoxelGrid, cache as memo, look_at
+from mstfilter.scene import Camera, Hypothesis, VoxelGrid, look_at, scene_cache
 from mstfilter.smc import Population
 
 GRID = VoxelGrid((-0.5, -0.5, 0.0), 0.01, (100, 100, 50))
@@ -91,7 +91,7 @@ def main() -> None:
         scene = boxes(rng, 20)
         population = Population(tuple(hypothesis(rng, scene, rough) for _ in range(n)), rng.normal(size=n))
         for _ in range(arguments.repeat):
-            memo.clear()
+            scene_cache.clear()
             belief = Belief(population)
             for h in population.particles:
                 h.__dict__.pop("key", None)

@@ -68,7 +68,7 @@ def colours_of(tree: Tree, found: Segments, cuts: Sequence[np.ndarray]) -> dict[
     names: dict[int, int] = {}
     for cut in cuts:
         used: set[int] = set()
-        for node in sorted(objects(found, cut), key=lambda n: -int(found.points[n])):
+        for node in sorted(objects(found, cut), key=lambda n: -int((tree.mask(n) & found.object_pixels).sum())):
             mask = tree.mask(node)
             like = [(jaccard(mask, tree.mask(other)), name) for other, name in names.items() if name not in used]
             best = max(like, default=(0.0, -1))
