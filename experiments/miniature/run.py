@@ -1,7 +1,7 @@
 """How far the filters are from the exact posterior of the miniature world.
 
 python experiments/miniature/run.py [--presets]
-    python experiments/miniature/run.py --smoke --out DIR
+python experiments/miniature/run.py --smoke --out DIR
 """
 
 from __future__ import annotations
@@ -14,17 +14,9 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
-from scipy import stats
-
-import mstfilter
-from mstfilter.files import write_csv
-from mstfilter.oracles import (
+from miniature_filters import (
     N_RANK_DRAWS,
     POSTERIOR_ERRORS,
-    Miniature,
-    ScoredFusion,
-    adapt_to_miniature,
-    balanced_filter,
     bootstrap_filter,
     exact_filter,
     guided_filter,
@@ -35,6 +27,12 @@ from mstfilter.oracles import (
     state_statistics,
     state_weights,
 )
+from miniature_mst import ScoredFusion, adapt_to_miniature, balanced_filter
+from miniature_world import Miniature
+from scipy import stats
+
+import mstfilter
+from mstfilter.files import write_csv
 from mstfilter.smc import FearnheadClifford, KeepWeights, Multinomial, ParticleFilter, Systematic
 
 HERE = Path(__file__).resolve().parent

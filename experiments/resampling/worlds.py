@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from scipy import stats
 
+sys.path.append(str(Path(__file__).resolve().parent.parent / "miniature"))
+from miniature_filters import bootstrap_filter, exact_filter, state_weights
+from miniature_world import Miniature
+
 from mstfilter.fusion import SameSegmentation, WeightedCoverage
-from mstfilter.oracles import Miniature, bootstrap_filter, exact_filter, state_weights
 from mstfilter.smc import (
     Branching,
     Equivalence,

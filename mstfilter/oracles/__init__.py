@@ -1,6 +1,6 @@
-"""Oracles: stages of a filter replaced by the truth of a recording, and a small world with a known posterior.
+"""Oracles: stages of a filter replaced by the truth of a recording.
 
-**Stages replaced by the truth.** A simulated recording holds its true voxels, instance images and poses. Components
+A simulated recording holds its true voxels, instance images and poses. Components
 named ``true_...`` use them in place of an estimate, which shows how much each stage loses:
 
 >>> filter = mstfilter.preset("mst", "proposal=true_masks", "transition=true_motions")
@@ -8,14 +8,6 @@ named ``true_...`` use them in place of an estimate, which shows how much each s
 >>> state, infos = filter.run(recording.clips(), seed=0)
 
 `STAGES` lists the overrides by stage, `budget_arms` the arms of an error budget.
-
-**A world with a known posterior.** `Miniature` is a table of a few cells whose states can be enumerated:
-
->>> world = Miniature()
->>> truth, observations = world.simulate(np.random.default_rng(0), 5)
->>> exact = exact_filter(world, observations)
->>> state, infos = adapt_to_miniature(mstfilter.preset("mst"), world, n=20).run(observations, seed=0)
->>> total_variation(state_weights(world, state.population), exact.posterior[-1])
 """
 
 from mstfilter.lazy import attach

@@ -1,4 +1,4 @@
-"""The programs in models/programs run, alone and as modules."""
+"""The example programs run."""
 
 from __future__ import annotations
 
@@ -9,7 +9,10 @@ import pytest
 
 from tests.conftest import REPOSITORY
 
-PROGRAMS = sorted((REPOSITORY / "models" / "programs").glob("*.py"))
+PROGRAMS = [
+    *sorted((REPOSITORY / "models" / "programs").glob("*.py")),
+    REPOSITORY / "experiments" / "miniature" / "program.py",
+]
 
 
 @pytest.mark.parametrize("path", PROGRAMS, ids=lambda p: p.stem)

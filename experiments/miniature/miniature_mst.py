@@ -10,14 +10,9 @@ segmentation, free space by the cells in front of the depth reading, and evidenc
 likelihood of the observation. Crossover, weights and resampler are those of the preset; the mode filter is sized to
 the grid, and what needs a video (division by motion, measured surfaces) is left out.
 
-The weights of MST depend on the parents of a candidate, not on the candidate. `ScoredFusion` weights the built
-candidate x by the likelihood g(y | x), in three steps that can be switched on one by one:
-
-1. the pair's weight omits Q, which is computed from the same observation, and the candidate gets g(y | x);
-2. `distinct`: equal candidates count once, since how often crossover makes a candidate is no evidence for it;
-3. `predictive`: the candidate is also weighted by p(x | past), a mixture of the moved particles and the prior.
-
-With all three, and candidates that cover the probable states, the weights are those of the exact filter.
+The weights of MST depend on the parents of a candidate, not on the candidate. `ScoredFusion` repairs this
+(docs/exactness.md). With all its options, and candidates that cover the probable states, the weights are those of the
+exact filter.
 """
 
 from __future__ import annotations
@@ -26,14 +21,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
 from itertools import product
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
+from miniature_filters import PriorProposal, PushTransition, state_weights
+from miniature_world import Miniature, Observation, draw_states
 
-from mstfilter.errors import InputError
 from mstfilter.fusion import Claims, Evidence, FusionUpdate, NoDivision, Projection
-from mstfilter.oracles.miniature import Miniature, MiniatureObservation, draw_states
-from mstfilter.oracles.miniature_filters import MiniatureMotion, MiniaturePrior, state_weights
 from mstfilter.scene import Hypothesis
 from mstfilter.smc import (
     Multinomial,
@@ -50,11 +44,10 @@ from mstfilter.smc import (
 
 
 @dataclass(frozen=True)
-class MiniatureFreeSpace(Projection):
+class DepthFreeSpace(Projection):
     """Clears the cells in front of the depth reading; Q is the fraction of cells that remain."""
 
     def project(self, hypothesis: Hypothesis, frame: Any) -> tuple[Hypothesis, float]:
-        """`frame` is a `MiniatureObservation`; a hypothesis without cells has quality 1."""
         free = np.arange(hypothesis.labels.shape[1])[None, :, None] < frame.depth[:, None, None]
         occupied = hypothesis.labels != 0
         hit = occupied & free
@@ -66,25 +59,18 @@ class MiniatureFreeSpace(Projection):
 
 @dataclass(frozen=True)
 class LikelihoodEvidence(Evidence):
-    """Scores a candidate by the exact log likelihood of depth and segmentation.
-
-    Parameters
-    ----------
-    world : Miniature
-    """
+    """Scores a candidate by the exact log likelihood of depth and segmentation."""
 
     world: Miniature
 
     def log_score(self, hypotheses: Sequence[Hypothesis], clip: Any) -> np.ndarray:
-        """(n,) log p(y | x); `clip` is a `MiniatureObservation`."""
         return self.world.log_likelihood(clip)[self.world.states.index(hypotheses)]
 
 
-@dataclass(frozen=True, eq=False)
-class CutDistribution:
-    """The distribution that `MiniatureCuts` draws from.
+class Cuts(NamedTuple):
+    """The distribution that `CutProposal` draws from.
 
-    Parameters
+    Attributes
     ----------
     states : (m,) int
         Outcomes; a state may occur more than once.
@@ -99,45 +85,40 @@ class CutDistribution:
     log_cut: np.ndarray
 
 
-def cut_distribution(world: Miniature, observation: MiniatureObservation, completion: float) -> CutDistribution:
+def cut_distribution(world: Miniature, observation: Observation, completion: float) -> Cuts:
     """The distribution of cuts of the reported segmentation, with the cells behind the surface completed.
 
     Pixels with a surface are placed at the measured depth. Two neighbouring ones are one object with the posterior
     probability that the error rates of the sensor give, for even prior odds. From the surface backwards, each next
     cell is filled with probability `completion` until one is left free.
     """
-    X, Y = world.shape
-    joins, splits = world.join_probability[1], world.join_probability[0]
-    same_surface = np.where(observation.joined, joins / (joins + splits), (1 - joins) / (2 - joins - splits))
+    Y = world.shape[1]
+    merge, join = world.join_probability
+    same_surface = np.where(observation.joined, join / (join + merge), (1 - join) / (2 - join - merge))
     hit = observation.depth < Y
     edges = np.flatnonzero(hit[1:] & hit[:-1])
-    columns = np.flatnonzero(hit)
-    depths = [range(Y - int(observation.depth[x])) for x in columns]  # how many cells behind are filled
+    columns = np.flatnonzero(hit).tolist()
+    n_behind = [range(Y - int(observation.depth[x])) for x in columns]  # how many cells behind are filled
     states, probability, cut = [], [], []
-    for keep in product((False, True), repeat=len(edges)):
-        p_cut = float(
-            np.prod([same_surface[e] if k else 1 - same_surface[e] for e, k in zip(edges, keep, strict=True)])
-        )
-        kept = set(edges[list(keep)].tolist()) if len(edges) else set()
-        label, pixel = 0, np.zeros(X, np.int64)
-        for x in columns.tolist():
-            label += x - 1 not in kept
-            pixel[x] = label
-        for fill in product(*depths):
-            labels, p = np.zeros((X, Y), np.uint16), p_cut
-            for x, behind in zip(columns.tolist(), fill, strict=True):
-                d = int(observation.depth[x])
-                labels[x, d : d + behind + 1] = pixel[x]
-                p *= completion**behind * (1 - completion if d + behind + 1 < Y else 1.0)
+    for kept in product((False, True), repeat=len(edges)):
+        p_cut = float(np.prod(np.where(kept, same_surface[edges], 1 - same_surface[edges])))
+        kept_edges = set(edges[np.array(kept, bool)].tolist())
+        objects = np.cumsum([x - 1 not in kept_edges for x in columns]).tolist()
+        for fill in product(*n_behind):
+            labels, p = np.zeros(world.shape, np.uint16), p_cut
+            for x, behind, label in zip(columns, fill, objects, strict=True):
+                end = int(observation.depth[x]) + behind + 1
+                labels[x, end - behind - 1 : end] = label
+                p *= completion**behind * (1 - completion if end < Y else 1.0)
             states.append(world.states.index_of_labels(labels))
             probability.append(p)
             cut.append(p_cut)
     log_cut = np.log(cut)
-    return CutDistribution(np.array(states), np.array(probability), log_cut - log_cut.max())
+    return Cuts(np.array(states), np.array(probability), log_cut - log_cut.max())
 
 
 @dataclass(frozen=True)
-class MiniatureCuts(Proposal):
+class CutProposal(Proposal):
     """Hypotheses from the observation alone: cuts of the sensed segmentation.
 
     Parameters
@@ -161,8 +142,7 @@ class MiniatureCuts(Proposal):
 
     properly_weighted: ClassVar[bool] = False
 
-    def sample(self, rng: np.random.Generator, observation: MiniatureObservation, n: int) -> Population:
-        """Draw `n` hypotheses."""
+    def sample(self, rng: np.random.Generator, observation: Observation, n: int) -> Population:
         cuts = cut_distribution(self.world, observation, self.completion)
         k = draw_states(rng, cuts.probability, n)
         if self.include_optimal:
@@ -174,7 +154,7 @@ class MiniatureCuts(Proposal):
         weights = cuts.log_cut[k] if self.weight_rule == "p" else np.zeros(n)
         return Population(self.world.states.take(states), weights)
 
-    def state_probability(self, observation: MiniatureObservation) -> np.ndarray:
+    def state_probability(self, observation: Observation) -> np.ndarray:
         """(S,) probability of each state in a sample that is not replaced by the best cut."""
         cuts = cut_distribution(self.world, observation, self.completion)
         q = np.bincount(cuts.states, cuts.probability, len(self.world.states))
@@ -190,30 +170,15 @@ def adapt_to_miniature(
 ) -> ParticleFilter:
     """A filter of MST on the miniature world, with `n` particles and `n` samples per step.
 
-    Parameters
-    ----------
-    filter : ParticleFilter
-        A preset; its update is a `FusionUpdate`.
-    world : Miniature
-    n : int
-    weight_rule, include_optimal : str, bool
-        Fields of `MiniatureCuts`, which the preset's proposal defines.
-
-    Raises
-    ------
-    InputError
-        If the update is not a `FusionUpdate`.
+    The update of `filter` must be a `FusionUpdate`. `weight_rule` and `include_optimal` are fields of `CutProposal`;
+    give those of the preset's proposal.
     """
-    if not isinstance(filter.update, FusionUpdate):
-        raise InputError(
-            f"the update is a {type(filter.update).__name__}, expected a FusionUpdate", "give a preset of MST"
-        )
     crossover = filter.update.crossover
     small = replace(crossover.mode_filter, window=3, isolation=27)  # the window holds 27 cells: none is isolated
     evidence = (LikelihoodEvidence(world),) if filter.update.evidence else ()
     update = replace(
         filter.update,
-        free_space=MiniatureFreeSpace(),
+        free_space=DepthFreeSpace(),
         division=NoDivision(),
         claims=Claims(),
         crossover=replace(crossover, mode_filter=small),
@@ -222,8 +187,8 @@ def adapt_to_miniature(
     )
     return replace(
         filter,
-        transition=MiniatureMotion(world, rearranged=False),
-        proposal=MiniatureCuts(world, weight_rule, include_optimal),
+        transition=PushTransition(world, rearranged=False),
+        proposal=CutProposal(world, weight_rule, include_optimal),
         update=update,
         n=n,
         n_proposed=n,
@@ -247,7 +212,7 @@ class ScoredFusion(Update):
     fusion : FusionUpdate
         Makes the candidates.
     built_per_particle : int
-        Number of candidates that are built per predicted particle. 0: no crossover (needs `include_parents`).
+        Number of candidates that are built per predicted particle. 0: no crossover; needs `include_parents`.
     distinct : bool
         Whether equal candidates count once.
     predictive : bool
@@ -265,20 +230,13 @@ class ScoredFusion(Update):
 
     properly_weighted: ClassVar[bool] = False
 
-    def __post_init__(self) -> None:
-        if self.built_per_particle < 0 or (self.built_per_particle == 0 and not self.include_parents):
-            raise InputError(
-                f"built_per_particle is {self.built_per_particle} and include_parents is False: no candidates"
-            )
-
     def update(
         self,
         rng: np.random.Generator,
         predicted: Population | None,
         proposed: Population | None,
-        observation: MiniatureObservation,
+        observation: Observation,
     ) -> Population:
-        """Weighted candidates."""
         world = self.world
         if predicted is None or proposed is None:
             built = union(predicted, proposed)
@@ -315,16 +273,14 @@ class BalancedUpdate(Update):
     Parameters
     ----------
     world : Miniature
-    samples : MiniatureCuts
-        Draws one sample per moved hypothesis if the filter has no proposal. Needs `prior_share` > 0, so that every
-        state can be drawn. A filter with a `proposal` does not count as properly weighted, since the filter cannot
-        know that the update divides by its density.
+    samples : CutProposal
+        Draws one sample per moved hypothesis. Needs `prior_share` > 0, so that every state can be drawn.
     share : float
         Weight of the samples in the mixture.
     """
 
     world: Miniature
-    samples: MiniatureCuts
+    samples: CutProposal
     share: float = 0.5
 
     def update(
@@ -332,29 +288,24 @@ class BalancedUpdate(Update):
         rng: np.random.Generator,
         predicted: Population | None,
         proposed: Population | None,
-        observation: MiniatureObservation,
+        observation: Observation,
     ) -> Population:
-        """The weighted union. The log mean of its weights is the log evidence."""
         world = self.world
-        if predicted is None:
-            raise InputError("the balanced update needs predicted hypotheses, and there are none")
-        if proposed is None:
-            proposed = self.samples.sample(child(rng, "samples"), observation, len(predicted))
-        log_g = world.log_likelihood(observation)
+        assert predicted is not None
+        n = len(predicted)
+        samples = self.samples.sample(child(rng, "samples"), observation, n)
         if observation.action < 0:  # the first step: the particles are draws from the prior
             past = moved = world.prior
         else:
             moved = state_weights(world, predicted)
             past = predictive_distribution(world, predicted)
         q = (1 - self.share) * moved + self.share * self.samples.state_probability(observation)
-        both = union(predicted, proposed)
-        states = world.states.index(both.particles)
-        n_new, w_old = len(proposed), predicted.weights
+        both = union(predicted, samples)
         with np.errstate(divide="ignore"):
-            base = np.concatenate([np.log((1 - self.share) * w_old), np.full(n_new, np.log(self.share / n_new))])
-            ratio = np.log(past) + log_g - np.log(q)
+            base = np.concatenate([np.log((1 - self.share) * predicted.weights), np.full(n, np.log(self.share / n))])
+            ratio = np.log(past) + world.log_likelihood(observation) - np.log(q)
         level = log_mean_exp(predicted.log_weights) + np.log(len(both))
-        return replace(both, log_weights=level + base + ratio[states])
+        return replace(both, log_weights=level + base + ratio[world.states.index(both.particles)])
 
 
 def balanced_filter(world: Miniature, n: int, **changes: Any) -> ParticleFilter:
@@ -363,9 +314,9 @@ def balanced_filter(world: Miniature, n: int, **changes: Any) -> ParticleFilter:
     No observation may be missing.
     """
     return ParticleFilter(
-        initial=MiniaturePrior(world),
-        transition=MiniatureMotion(world, rearranged=False),
-        update=BalancedUpdate(world, MiniatureCuts(world, prior_share=0.1)),
+        initial=PriorProposal(world),
+        transition=PushTransition(world, rearranged=False),
+        update=BalancedUpdate(world, CutProposal(world, prior_share=0.1)),
         n=n,
         **changes,
     )

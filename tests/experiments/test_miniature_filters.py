@@ -9,16 +9,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-
-import mstfilter
-from mstfilter.errors import InputError
-from mstfilter.oracles import (
+from miniature_filters import (
     N_RANK_DRAWS,
-    Miniature,
-    MiniatureObservation,
-    ScoredFusion,
-    adapt_to_miniature,
-    balanced_filter,
+    GuidedPush,
     bootstrap_filter,
     exact_filter,
     guided_filter,
@@ -29,16 +22,21 @@ from mstfilter.oracles import (
     state_weights,
     total_variation,
 )
-from mstfilter.oracles.miniature_filters import GuidedMiniatureMotion, MiniatureMotion
-from mstfilter.oracles.miniature_mst import (
+from miniature_mst import (
+    CutProposal,
+    DepthFreeSpace,
     LikelihoodEvidence,
-    MiniatureCuts,
-    MiniatureFreeSpace,
+    ScoredFusion,
+    adapt_to_miniature,
+    balanced_filter,
     cut_distribution,
     predictive_distribution,
 )
-from mstfilter.smc import Always, FearnheadClifford, Population, Reweight
-from tests.oracles.test_miniature_world import FALSE_ALARM, chi_square, ids, state_of
+from miniature_world import Miniature, Observation
+
+import mstfilter
+from mstfilter.smc import Always, FearnheadClifford, Population
+from tests.experiments.test_miniature_world import FALSE_ALARM, chi_square, ids, state_of
 
 WORLD = Miniature((3, 2))
 PROPER = {"bootstrap": bootstrap_filter, "guided": guided_filter, "balanced": balanced_filter}
@@ -96,18 +94,16 @@ def test_proper_filters_converge(name, world):
 
 
 def test_a_guided_move_is_an_importance_draw_of_the_motion_model():
-    """log q sums to one; f / q is the weight that `predict` adds, up to the likelihood."""
+    """q is proportional to f g, so the log weight is log f - log q = log sum f g - log g."""
     _, observations = WORLD.simulate(np.random.default_rng(4), 2)
     y, S = observations[1], len(WORLD.states)
-    hypotheses = WORLD.states.hypotheses
-    old = (hypotheses[321],) * S
-    log_q = GuidedMiniatureMotion(WORLD).log_prob(old, hypotheses, y)
-    assert np.exp(log_q).sum() == pytest.approx(1)
-    moved = GuidedMiniatureMotion(WORLD).predict(np.random.default_rng(0), Population(old), y)
+    log_g = WORLD.log_likelihood(y)
+    joint = WORLD.predict(np.eye(S)[321], y.action) * np.exp(log_g)
+    old = Population((WORLD.states.hypotheses[321],) * S)
+    moved = GuidedPush(WORLD).predict(np.random.default_rng(0), old, y)
     x = WORLD.states.index(moved.particles)
-    gain = MiniatureMotion(WORLD).log_prob(old, moved.particles, y) - log_q[x]
-    np.testing.assert_allclose(moved.log_weights, gain, atol=1e-10)
-    assert chi_square(x, np.exp(log_q)) > FALSE_ALARM
+    np.testing.assert_allclose(moved.log_weights, np.log(joint.sum()) - log_g[x], atol=1e-10)
+    assert chi_square(x, joint / joint.sum()) > FALSE_ALARM
 
 
 def test_a_missing_observation_moves_the_particles_only():
@@ -128,7 +124,7 @@ def test_cuts_follow_their_distribution(world):
     law = cut_distribution(world, observations[0], 0.4)
     assert law.probability.sum() == pytest.approx(1)
     assert law.log_cut.max() == 0
-    proposal = MiniatureCuts(world, prior_share=0.2)
+    proposal = CutProposal(world, prior_share=0.2)
     drawn = proposal.sample(np.random.default_rng(0), observations[0], 4000)
     assert proposal.state_probability(observations[0]).sum() == pytest.approx(1)
     assert chi_square(world.states.index(drawn.particles), proposal.state_probability(observations[0])) > FALSE_ALARM
@@ -137,11 +133,11 @@ def test_cuts_follow_their_distribution(world):
 def test_cuts_of_a_known_observation():
     """Two pixels with a surface, sensed as joined: one object or two, in the proportion of the error rates."""
     world = Miniature((3, 2), split=0.2, merge=0.1)
-    law = cut_distribution(world, MiniatureObservation(np.array([1, 1, 2]), np.array([True, False])), 0.4)
+    law = cut_distribution(world, Observation(np.array([1, 1, 2]), np.array([True, False])), 0.4)
     assert dict(zip(law.states.tolist(), law.probability.tolist(), strict=True)) == pytest.approx(
         {state_of(world, ["01", "01", "00"]): 8 / 9, state_of(world, ["01", "02", "00"]): 1 / 9}
     )
-    deep = cut_distribution(world, MiniatureObservation(np.array([0, 2, 2]), np.array([True, True])), 0.4)
+    deep = cut_distribution(world, Observation(np.array([0, 2, 2]), np.array([True, True])), 0.4)
     assert dict(zip(deep.states.tolist(), deep.probability.tolist(), strict=True)) == pytest.approx(
         {state_of(world, ["10", "00", "00"]): 0.6, state_of(world, ["11", "00", "00"]): 0.4}
     )
@@ -149,8 +145,8 @@ def test_cuts_of_a_known_observation():
 
 def test_cells_in_front_of_the_reading_are_cleared():
     hypothesis = WORLD.states.hypotheses[state_of(WORLD, ["11", "02", "30"])]
-    refined, quality = MiniatureFreeSpace().project(
-        hypothesis, MiniatureObservation(np.array([1, 0, 2]), np.array([False, False]))
+    refined, quality = DepthFreeSpace().project(
+        hypothesis, Observation(np.array([1, 0, 2]), np.array([False, False]))
     )
     assert WORLD.states.index([refined])[0] == state_of(WORLD, ["01", "02", "00"])
     assert quality == pytest.approx(2 / 4)
@@ -182,16 +178,10 @@ def test_evidence_becomes_the_likelihood_of_the_observation():
     np.testing.assert_array_equal(score, WORLD.log_likelihood(observations[1]))
 
 
-def test_other_updates_cannot_be_adapted():
-    filter = replace(mstfilter.preset("mst"), update=Reweight(lambda p, y: np.zeros(len(p))))
-    with pytest.raises(InputError, match="expected a FusionUpdate"):
-        adapt_to_miniature(filter, WORLD, 5)
-
-
 def test_scored_candidates_are_distinct_and_weighted_by_prediction_times_likelihood():
     _, observations = WORLD.simulate(np.random.default_rng(1), 2)
     rng, y = np.random.default_rng(2), observations[1]
-    proposed = MiniatureCuts(WORLD).sample(rng, y, 10)
+    proposed = CutProposal(WORLD).sample(rng, y, 10)
     predicted = Population(WORLD.states.take(WORLD.draw_prior(rng, 10)), np.log(np.arange(1.0, 11.0)))
     law = predictive_distribution(WORLD, predicted)
     assert law.sum() == pytest.approx(1)
@@ -206,7 +196,7 @@ def test_scored_candidates_are_distinct_and_weighted_by_prediction_times_likelih
 
 def test_scoring_without_crossover_returns_the_parents():
     _, observations = WORLD.simulate(np.random.default_rng(1), 2)
-    proposed = MiniatureCuts(WORLD).sample(np.random.default_rng(2), observations[1], 6)
+    proposed = CutProposal(WORLD).sample(np.random.default_rng(2), observations[1], 6)
     predicted = Population(WORLD.states.take(WORLD.draw_prior(np.random.default_rng(3), 6)))
     fusion = preset("mst", WORLD, 6).update
     fused = ScoredFusion(WORLD, fusion, built_per_particle=0, include_parents=True).update(
@@ -215,8 +205,6 @@ def test_scoring_without_crossover_returns_the_parents():
     np.testing.assert_array_equal(
         WORLD.states.index(fused.particles), WORLD.states.index([*predicted.particles, *proposed.particles])
     )
-    with pytest.raises(InputError, match="no candidates"):
-        ScoredFusion(WORLD, fusion, built_per_particle=0)
 
 
 def test_errors_of_the_exact_posterior_are_zero():

@@ -1,4 +1,4 @@
-"""ExactPosterior filtering of the miniature world, properly weighted filters of it, and distances between the two.
+"""Exact filtering of the miniature world, properly weighted filters of it, and distances between the two.
 
 >>> exact = exact_filter(world, observations)
 >>> exact.posterior[-1] @ world.states.same_object         # (P,) probability that two cells are one object
@@ -20,41 +20,27 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from miniature_world import Miniature, Observation, draw_states
+from scipy import stats
 
-from mstfilter.oracles.miniature import Miniature, MiniatureObservation, draw_states
-from mstfilter.smc import (
-    DensityTransition,
-    ParticleFilter,
-    Population,
-    Proposal,
-    Reweight,
-)
+from mstfilter.smc import ParticleFilter, Population, Proposal, Reweight, Transition
 
 N_RANK_DRAWS = 9  # ranks 0 .. 9: ten bins
 #: Keys of the result of `posterior_errors`.
 POSTERIOR_ERRORS = ("tv", "same_object_error", "occupancy_error", "same_object_brier", "occupancy_brier", "p_truth")
 
 
-@dataclass(frozen=True, eq=False)
-class ExactPosterior:
-    """The result of `exact_filter`.
-
-    Parameters
-    ----------
-    posterior : (T, S)
-        p(x_t | y_0 .. y_t).
-    log_evidence : (T,)
-        log p(y_0 .. y_t).
-    """
+class ExactPosterior(NamedTuple):
+    """p(x_t | y_0 .. y_t) (T, S) and log p(y_0 .. y_t) (T,)."""
 
     posterior: np.ndarray
     log_evidence: np.ndarray
 
 
-def exact_filter(world: Miniature, observations: Sequence[MiniatureObservation | None]) -> ExactPosterior:
+def exact_filter(world: Miniature, observations: Sequence[Observation | None]) -> ExactPosterior:
     """The forward algorithm over all states. None is a missing observation; its push is unknown too."""
     p, total = world.prior, 0.0
     posterior, evidence = [], []
@@ -71,24 +57,18 @@ def exact_filter(world: Miniature, observations: Sequence[MiniatureObservation |
 
 
 @dataclass(frozen=True)
-class MiniaturePrior(Proposal):
-    """Hypotheses from the prior.
-
-    Parameters
-    ----------
-    world : Miniature
-    """
+class PriorProposal(Proposal):
+    """Hypotheses from the prior."""
 
     world: Miniature
 
-    def sample(self, rng: np.random.Generator, observation: MiniatureObservation | None, n: int) -> Population:
-        """Draw `n`."""
+    def sample(self, rng: np.random.Generator, observation: Observation | None, n: int) -> Population:
         return Population(self.world.states.take(self.world.draw_prior(rng, n)))
 
 
 @dataclass(frozen=True)
-class MiniatureMotion(DensityTransition):
-    """The motion model.
+class PushTransition(Transition):
+    """Moves the hypotheses by the push of the observation; by random pushes if it is missing.
 
     Parameters
     ----------
@@ -101,93 +81,58 @@ class MiniatureMotion(DensityTransition):
     rearranged: bool = True
 
     def predict(
-        self, rng: np.random.Generator, population: Population, observation: MiniatureObservation | None
+        self, rng: np.random.Generator, population: Population, observation: Observation | None
     ) -> Population:
-        """Move all hypotheses by the push of the observation; by a random push if it is missing."""
-        world = self.world
-        old = world.states.index(population.particles)
-        new = world.move(rng, old, _action(observation), self.rearranged)
-        return Population(world.states.take(new), population.log_weights, population.parents)
-
-    def log_prob(self, previous: Any, new: Any, observation: MiniatureObservation | None) -> np.ndarray:
-        """(n,) log f."""
-        index = self.world.states.index
-        return self.world.log_transition(index(previous), index(new), _action(observation), self.rearranged)
+        states = self.world.states
+        action = None if observation is None else observation.action
+        new = self.world.move(rng, states.index(population.particles), action, self.rearranged)
+        return Population(states.take(new), population.log_weights, population.parents)
 
 
 @dataclass(frozen=True)
-class GuidedMiniaturePrior(Proposal):
-    """Hypotheses from p(x_0 | y_0) with weights p(y_0) / g(y_0 | x_0), so that the likelihood makes them equal.
-
-    Parameters
-    ----------
-    world : Miniature
-    """
+class GuidedPrior(Proposal):
+    """Hypotheses from p(x_0 | y_0) with weights p(y_0) / g(y_0 | x_0), so that the likelihood makes them equal."""
 
     world: Miniature
 
-    def sample(self, rng: np.random.Generator, observation: MiniatureObservation | None, n: int) -> Population:
-        """Draw `n`."""
-        world = self.world
-        log_g = world.log_likelihood(observation)
-        q = world.prior * np.exp(log_g)
+    def sample(self, rng: np.random.Generator, observation: Observation | None, n: int) -> Population:
+        log_g = self.world.log_likelihood(observation)
+        q = self.world.prior * np.exp(log_g)
         x = draw_states(rng, q, n)
-        return Population(world.states.take(x), np.log(q.sum()) - log_g[x])
+        return Population(self.world.states.take(x), np.log(q.sum()) - log_g[x])
 
 
 @dataclass(frozen=True)
-class GuidedMiniatureMotion(DensityTransition):
+class GuidedPush(Transition):
     """Moves by the optimal proposal p(x_t | x_{t-1}, y_t), and adds log f - log q to the log weights.
 
     The distribution is a mixture of three: the push, the slip and the rearranged table. Each is weighted by the
-    likelihood of the resulting state.
-
-    Parameters
-    ----------
-    world : Miniature
+    likelihood of the resulting state. If the observation is missing, the moves are those of `PushTransition`.
     """
 
     world: Miniature
 
     def predict(
-        self, rng: np.random.Generator, population: Population, observation: MiniatureObservation | None
+        self, rng: np.random.Generator, population: Population, observation: Observation | None
     ) -> Population:
-        """Draw the moves; from the motion model if the observation is missing."""
-        if observation is None:
-            return MiniatureMotion(self.world).predict(rng, population, None)
         world, n = self.world, len(population)
+        if observation is None:
+            return PushTransition(world).predict(rng, population, None)
         old = world.states.index(population.particles)
+        pushed = world.pushed[observation.action][old]
         log_g = world.log_likelihood(observation)
-        components, rearranged = self._components(old, observation, log_g)
+        g = np.exp(log_g)
+        rearranged, kept = world.prior * g, 1 - world.rearranged
+        stays, moves = world.slip * g[old], (1 - world.slip) * g[pushed]
+        components = np.stack([kept * moves, kept * stays, np.full(n, world.rearranged * rearranged.sum())], axis=1)
         total = components.sum(axis=1)
         which = (np.cumsum(components, axis=1) <= (rng.random(n) * total)[:, None]).sum(axis=1)
-        fresh = draw_states(rng, rearranged, n)
-        new = np.choose(np.minimum(which, 2), [world.pushed[observation.action][old], old, fresh])
+        new = np.choose(np.minimum(which, 2), [pushed, old, draw_states(rng, rearranged, n)])
         gain = np.log(total) - log_g[new]
         return Population(world.states.take(new), population.log_weights + gain, population.parents)
 
-    def log_prob(self, previous: Any, new: Any, observation: MiniatureObservation | None) -> np.ndarray:
-        """(n,) log q."""
-        if observation is None:
-            return MiniatureMotion(self.world).log_prob(previous, new, None)
-        old, x = self.world.states.index(previous), self.world.states.index(new)
-        log_g = self.world.log_likelihood(observation)
-        components, _ = self._components(old, observation, log_g)
-        return self.world.log_transition(old, x, observation.action) + log_g[x] - np.log(components.sum(axis=1))
 
-    def _components(
-        self, old: np.ndarray, y: MiniatureObservation, log_g: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """(n, 3) weight of each mixture component, and (S,) the unnormalised distribution of the last one."""
-        world, g = self.world, np.exp(log_g)
-        rearranged = world.prior * g
-        stays, moves = world.slip * g[old], (1 - world.slip) * g[world.pushed[y.action][old]]
-        kept = 1 - world.rearranged
-        last = np.full(len(old), world.rearranged * rearranged.sum())
-        return np.stack([kept * moves, kept * stays, last], axis=1), rearranged
-
-
-def miniature_likelihood(world: Miniature) -> Reweight:
+def likelihood_update(world: Miniature) -> Reweight:
     """The update by log p(y | x)."""
     return Reweight(lambda particles, y: world.log_likelihood(y)[world.states.index(particles)])
 
@@ -195,9 +140,9 @@ def miniature_likelihood(world: Miniature) -> Reweight:
 def bootstrap_filter(world: Miniature, n: int, **changes: Any) -> ParticleFilter:
     """A filter that draws from the prior and the motion model. `changes` are fields of the `ParticleFilter`."""
     return ParticleFilter(
-        initial=MiniaturePrior(world),
-        transition=MiniatureMotion(world),
-        update=miniature_likelihood(world),
+        initial=PriorProposal(world),
+        transition=PushTransition(world),
+        update=likelihood_update(world),
         n=n,
         **changes,
     )
@@ -206,16 +151,12 @@ def bootstrap_filter(world: Miniature, n: int, **changes: Any) -> ParticleFilter
 def guided_filter(world: Miniature, n: int, **changes: Any) -> ParticleFilter:
     """A filter that draws from p(x_0 | y_0) and p(x_t | x_{t-1}, y_t). `changes` as in `bootstrap_filter`."""
     return ParticleFilter(
-        initial=GuidedMiniaturePrior(world),
-        transition=GuidedMiniatureMotion(world),
-        update=miniature_likelihood(world),
+        initial=GuidedPrior(world),
+        transition=GuidedPush(world),
+        update=likelihood_update(world),
         n=n,
         **changes,
     )
-
-
-def _action(observation: MiniatureObservation | None) -> int | None:
-    return None if observation is None else observation.action
 
 
 def state_weights(world: Miniature, population: Population) -> np.ndarray:
@@ -225,7 +166,7 @@ def state_weights(world: Miniature, population: Population) -> np.ndarray:
 
 def iid_weights(rng: np.random.Generator, p: np.ndarray, n: int) -> np.ndarray:
     """(S,) relative frequencies of `n` independent draws from p: a bound for `n` equally weighted particles."""
-    return np.asarray(rng.multinomial(n, p / p.sum()) / n)
+    return rng.multinomial(n, p / p.sum()) / n
 
 
 def total_variation(p: np.ndarray, q: np.ndarray) -> float:
@@ -276,6 +217,4 @@ def rank_of_truth(rng: np.random.Generator, statistic: np.ndarray, p: np.ndarray
 
 def rank_uniformity(ranks: np.ndarray) -> float:
     """p value of the chi-square test that ranks 0 .. N_RANK_DRAWS are uniform."""
-    from scipy.stats import chisquare
-
-    return float(chisquare(np.bincount(ranks, minlength=N_RANK_DRAWS + 1)).pvalue)
+    return float(stats.chisquare(np.bincount(ranks, minlength=N_RANK_DRAWS + 1)).pvalue)

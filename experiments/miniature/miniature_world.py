@@ -4,9 +4,9 @@
 >>> truth, observations = world.simulate(np.random.default_rng(0), T=5)      # states (T,), observations
 
 A table of a few cells holds a few objects. A *state* assigns each cell to an object or to free space; two labellings
-that differ only by the names of the objects are one state, so 6 cells have 877 states (the Bell number of 7). An
-object may consist of several pieces, since crossover can make such objects. The camera looks along +y from y = 0:
-pixel x shows the first occupied cell of column x, which occludes the cells behind it.
+that differ only by the names of the objects are one state, so 6 cells have 877 states (the Bell number of 7; 7 cells
+have 4140, 8 have 21147). An object may consist of several pieces, since crossover can make such objects. The camera
+looks along +y from y = 0: pixel x shows the first occupied cell of column x, which occludes the cells behind it.
 
 **Motion.** At each step the robot pushes at a cell in a direction; both are uniform and known. With probability
 `slip` nothing moves. Otherwise the object in the cell moves by one cell, unless it would leave the table or hit
@@ -22,45 +22,40 @@ object (or both the background) are split with probability `split`; two others a
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field
-from functools import cached_property, lru_cache
+from dataclasses import dataclass
+from functools import cached_property
 from itertools import combinations
 
 import numpy as np
+from scipy import ndimage
 
-from mstfilter.errors import InputError
-from mstfilter.scene import Hypothesis, VoxelGrid, read_only
-
-MAX_CELLS = 7  # 4140 states; 8 cells have 21147
+from mstfilter.scene import Hypothesis, VoxelGrid
 
 
-@dataclass(frozen=True, eq=False)
-class MiniatureStates:
-    """The state space of a miniature world.
+class States:
+    """All states of a table of X by Y cells.
 
-    Parameters
+    Attributes
     ----------
-    grid : VoxelGrid
-        (X, Y, 1) cells.
     labels : (S, X Y) uint8
         Label of each cell in each state, cell (x, y) at x Y + y; 0 is free.
+    hypotheses : tuple of S Hypothesis
+        The states as particles on a grid of (X, Y, 1) voxels.
     """
 
-    grid: VoxelGrid
-    labels: np.ndarray
-    _known: dict[bytes, int] = field(default_factory=dict, repr=False)  # bytes of raw labels -> state
+    def __init__(self, shape: tuple[int, int]) -> None:
+        X, Y = shape
+        rows: list[tuple[int, ...]] = [()]
+        for _ in range(X * Y):
+            rows = [(*row, k) for row in rows for k in range(max(row, default=0) + 2)]
+        self.shape = shape
+        self.labels = np.array(rows, dtype=np.uint8)
+        self._number = {row: s for s, row in enumerate(rows)}
+        grid = VoxelGrid((0.0, 0.0, 0.0), 0.1, (X, Y, 1))
+        self.hypotheses = tuple(Hypothesis.from_labels(row.reshape(X, Y, 1), grid) for row in self.labels)
 
     def __len__(self) -> int:
         return len(self.labels)
-
-    @cached_property
-    def hypotheses(self) -> tuple[Hypothesis, ...]:
-        """The states as particles."""
-        return tuple(Hypothesis.from_labels(row.reshape(self.grid.shape), self.grid) for row in self.labels)
-
-    @cached_property
-    def _number(self) -> dict[bytes, int]:
-        return {row.tobytes(): s for s, row in enumerate(self.labels)}
 
     def index(self, hypotheses: Iterable[Hypothesis]) -> np.ndarray:
         """(n,) int: the state of each hypothesis."""
@@ -68,14 +63,8 @@ class MiniatureStates:
 
     def index_of_labels(self, labels: np.ndarray) -> int:
         """The state of a label grid; the names of the objects do not matter."""
-        raw = np.asarray(labels, dtype=np.uint16).tobytes()
-        found = self._known.get(raw)
-        if found is None:
-            names: dict[int, int] = {0: 0}
-            flat = np.asarray(labels).ravel().tolist()
-            row = np.array([names.setdefault(int(k), len(names)) for k in flat], dtype=np.uint8)
-            found = self._known[raw] = self._number[row.tobytes()]
-        return found
+        names = {0: 0}
+        return self._number[tuple(names.setdefault(k, len(names)) for k in labels.ravel().tolist())]
 
     def take(self, index: np.ndarray) -> tuple[Hypothesis, ...]:
         """Particles of the given states."""
@@ -89,55 +78,26 @@ class MiniatureStates:
     @cached_property
     def occupied(self) -> np.ndarray:
         """(S, cells) bool."""
-        return read_only(self.labels > 0)
-
-    @cached_property
-    def pairs(self) -> np.ndarray:
-        """(P, 2) all pairs of cells."""
-        return np.array(list(combinations(range(self.labels.shape[1]), 2)), dtype=np.int64)
+        return self.labels > 0
 
     @cached_property
     def same_object(self) -> np.ndarray:
-        """(S, P) bool: the two cells of a pair belong to one object."""
-        a, b = self.labels[:, self.pairs[:, 0]], self.labels[:, self.pairs[:, 1]]
-        return read_only((a == b) & (a > 0))
+        """(S, P) bool: the two cells of each pair of cells belong to one object."""
+        i, j = np.array(list(combinations(range(self.labels.shape[1]), 2))).T
+        return (self.labels[:, i] == self.labels[:, j]) & self.occupied[:, i]
 
     @cached_property
     def extra_pieces(self) -> np.ndarray:
         """(S,) number of pieces (connected by edges) beyond one per object."""
-        from scipy.ndimage import label
-
-        X, Y, _ = self.grid.shape
-        extra = np.zeros(len(self), np.int64)
-        for s, row in enumerate(self.labels):
-            grid = row.reshape(X, Y)
-            extra[s] = sum(label(grid == k)[1] - 1 for k in range(1, int(row.max()) + 1))
-        return extra
-
-
-@lru_cache(maxsize=16)
-def miniature_states(shape: tuple[int, int]) -> MiniatureStates:
-    """Every state of a table of X by Y cells.
-
-    Raises
-    ------
-    InputError
-        If there are more than `MAX_CELLS` cells.
-    """
-    X, Y = shape
-    if X < 1 or Y < 1 or X * Y > MAX_CELLS:
-        raise InputError(
-            f"the miniature world has {X} x {Y} cells, expected 1 to {MAX_CELLS} cells",
-            "the number of states grows as the Bell numbers: 877 for 6 cells, 4140 for 7, 21147 for 8",
-        )
-    rows: list[tuple[int, ...]] = [()]
-    for _ in range(X * Y):
-        rows = [(*row, k) for row in rows for k in range(max(row, default=0) + 2)]
-    return MiniatureStates(VoxelGrid((0.0, 0.0, 0.0), 0.1, (X, Y, 1)), read_only(np.array(rows, dtype=np.uint8)))  # type: ignore[arg-type]
+        pieces = [
+            sum(ndimage.label(row.reshape(self.shape) == k)[1] for k in range(1, row.max() + 1))
+            for row in self.labels
+        ]
+        return np.array(pieces) - self.n_objects
 
 
 @dataclass(frozen=True, eq=False)
-class MiniatureObservation:
+class Observation:
     """The observation of a step.
 
     Parameters
@@ -155,7 +115,7 @@ class MiniatureObservation:
     action: int = -1
 
     @property
-    def after(self) -> MiniatureObservation:
+    def after(self) -> Observation:
         """This observation, under the name of the last frame of a `Clip`."""
         return self
 
@@ -167,7 +127,7 @@ class Miniature:
     Parameters
     ----------
     shape : (X, Y)
-        Pixels and depth in cells; at most 7 cells.
+        Pixels and depth in cells.
     occupied : float
         Prior probability that a cell is occupied, before the penalties below.
     object_penalty, piece_penalty : float
@@ -191,32 +151,23 @@ class Miniature:
     split: float = 0.25
     merge: float = 0.15
 
-    def __post_init__(self) -> None:
-        for name in ("occupied", "slip", "rearranged", "miss", "false_alarm", "split", "merge"):
-            if not 0 < getattr(self, name) < 1:
-                raise InputError(f"{name} is {getattr(self, name)}, expected a probability between 0 and 1")
-        if self.miss + self.false_alarm >= 1:
-            raise InputError(f"miss is {self.miss} and false_alarm {self.false_alarm}, expected a sum below 1")
-
-    @property
-    def states(self) -> MiniatureStates:
-        """All states."""
-        return miniature_states(self.shape)
-
-    # --- prior ---------------------------------------------------------------------------------------------------
     @cached_property
-    def log_prior(self) -> np.ndarray:
-        """(S,) log prior probability of each state."""
+    def states(self) -> States:
+        """All states."""
+        return States(self.shape)
+
+    @cached_property
+    def prior(self) -> np.ndarray:
+        """(S,) probability of each state."""
         s = self.states
         full = s.occupied.sum(axis=1)
         lp = full * np.log(self.occupied) + (s.occupied.shape[1] - full) * np.log1p(-self.occupied)
         lp = lp - self.object_penalty * s.n_objects - self.piece_penalty * s.extra_pieces
-        return read_only(lp - np.log(np.exp(lp - lp.max()).sum()) - lp.max())
+        return np.exp(lp - np.log(np.exp(lp - lp.max()).sum()) - lp.max())
 
-    @cached_property
-    def prior(self) -> np.ndarray:
-        """(S,) sums to one."""
-        return read_only(np.exp(self.log_prior))
+    def draw_prior(self, rng: np.random.Generator, n: int) -> np.ndarray:
+        """(n,) states."""
+        return draw_states(rng, self.prior, n)
 
     # --- motion --------------------------------------------------------------------------------------------------
     @cached_property
@@ -229,53 +180,30 @@ class Miniature:
     @cached_property
     def pushed(self) -> np.ndarray:
         """(A, S) int: the state after each push that does not slip."""
-        out = np.empty((len(self.actions), len(self.states)), np.int64)
-        done: dict[tuple[int, int, tuple[int, int]], int] = {}
-        for a, (cell, step) in enumerate(self.actions):
-            for s, row in enumerate(self.states.labels):
-                label = int(row[cell])
-                if label == 0:
-                    out[a, s] = s
-                    continue
-                key = (s, label, step)
-                if key not in done:
-                    done[key] = self._shifted(s, label, step)
-                out[a, s] = done[key]
-        return read_only(out)
+        return np.array([[self._push(s, cell, step) for s in range(len(self.states))] for cell, step in self.actions])
 
-    def _shifted(self, state: int, label: int, step: tuple[int, int]) -> int:
-        grid = self.states.labels[state].reshape(self.shape)
-        here = np.argwhere(grid == label)
-        there = here + np.array(step)
-        if (there < 0).any() or (there >= np.array(self.shape)).any():
+    def _push(self, state: int, cell: int, step: tuple[int, int]) -> int:
+        row = self.states.labels[state]
+        if row[cell] == 0:
             return state
-        rest = np.where(grid == label, 0, grid)
-        if rest[tuple(there.T)].any():
+        grid, moving = row.reshape(self.shape), (row == row[cell]).reshape(self.shape)
+        target = np.argwhere(moving) + step
+        if (target < 0).any() or (target >= self.shape).any():
             return state
-        rest[tuple(there.T)] = label
-        return self.states.index_of_labels(rest)
+        after = np.where(moving, 0, grid)
+        if after[tuple(target.T)].any():
+            return state
+        after[tuple(target.T)] = row[cell]
+        return self.states.index_of_labels(after)
 
     def predict(self, p: np.ndarray, action: int | None, rearranged: bool = True) -> np.ndarray:
         """(S,) distribution of the state after a push, from the one before; None is an unknown push."""
-        moved = [
-            np.bincount(self.pushed[a], p, len(p)) for a in (range(len(self.actions)) if action is None else [action])
-        ]
+        actions = range(len(self.actions)) if action is None else [action]
+        moved = [np.bincount(self.pushed[a], p, len(p)) for a in actions]
         out = self.slip * p + (1 - self.slip) * np.mean(moved, axis=0)
         if rearranged:
             out = (1 - self.rearranged) * out + self.rearranged * p.sum() * self.prior
-        return np.asarray(out)
-
-    def log_transition(
-        self, old: np.ndarray, new: np.ndarray, action: int | None, rearranged: bool = True
-    ) -> np.ndarray:
-        """(n,) log f(new | old, push) of paired states."""
-        f = self.slip * (old == new)
-        which = range(len(self.actions)) if action is None else [action]
-        f = f + (1 - self.slip) * np.mean([self.pushed[a][old] == new for a in which], axis=0)
-        if rearranged:
-            f = (1 - self.rearranged) * f + self.rearranged * self.prior[new]
-        with np.errstate(divide="ignore"):
-            return np.asarray(np.log(f))
+        return out
 
     def move(
         self, rng: np.random.Generator, old: np.ndarray, action: int | None, rearranged: bool = True
@@ -288,25 +216,20 @@ class Miniature:
         new = np.where(slips, old, self.pushed[push, old])
         return np.where(replaced, fresh, new) if rearranged else new
 
-    def draw_prior(self, rng: np.random.Generator, n: int) -> np.ndarray:
-        """(n,) states."""
-        return draw_states(rng, self.prior, n)
-
     # --- sensors -------------------------------------------------------------------------------------------------
     @cached_property
     def surface(self) -> np.ndarray:
         """(S, X) int: free cells in front of the first occupied cell of a column; Y if there is none."""
         X, Y = self.shape
         full = self.states.occupied.reshape(-1, X, Y)
-        return read_only(np.where(full.any(axis=2), full.argmax(axis=2), Y))
+        return np.where(full.any(axis=2), full.argmax(axis=2), Y)
 
     @cached_property
     def same_surface(self) -> np.ndarray:
         """(S, X - 1) bool: neighbouring pixels show the same object, or both the background."""
-        X, Y = self.shape
-        padded = np.concatenate([self.states.labels.reshape(-1, X, Y), np.zeros((len(self.states), X, 1))], axis=2)
-        seen = np.take_along_axis(padded, self.surface[:, :, None], axis=2)[:, :, 0]
-        return read_only(seen[:, 1:] == seen[:, :-1])
+        labels = np.pad(self.states.labels.reshape(-1, *self.shape), ((0, 0), (0, 0), (0, 1)))
+        seen = np.take_along_axis(labels, self.surface[:, :, None], axis=2)[:, :, 0]
+        return seen[:, 1:] == seen[:, :-1]
 
     @cached_property
     def depth_probability(self) -> np.ndarray:
@@ -317,29 +240,29 @@ class Miniature:
             p[d, :d] = self.false_alarm / max(d, 1)
             p[d, d + 1 :] = self.miss / max(Y - d, 1)
             p[d, d] = 1 - p[d].sum()
-        return read_only(p)
+        return p
 
     @cached_property
     def join_probability(self) -> np.ndarray:
         """(2,) probability that neighbouring pixels are joined: if they show different objects, if the same one."""
-        return read_only(np.array([self.merge, 1 - self.split]))
+        return np.array([self.merge, 1 - self.split])
 
-    def log_likelihood(self, observation: MiniatureObservation | None) -> np.ndarray:
+    def log_likelihood(self, observation: Observation | None) -> np.ndarray:
         """(S,) log p(depth, segmentation | state); zeros if the observation is missing."""
         if observation is None:
             return np.zeros(len(self.states))
         depth = np.log(self.depth_probability)[self.surface, observation.depth].sum(axis=1)
         p = self.join_probability[self.same_surface.astype(int)]
-        return np.asarray(depth + np.log(np.where(observation.joined, p, 1 - p)).sum(axis=1))
+        return depth + np.log(np.where(observation.joined, p, 1 - p)).sum(axis=1)
 
-    def observe(self, rng: np.random.Generator, state: int, action: int = -1) -> MiniatureObservation:
+    def observe(self, rng: np.random.Generator, state: int, action: int = -1) -> Observation:
         """Draw an observation of a state."""
         cumulative = np.cumsum(self.depth_probability, axis=1)[self.surface[state]]
         depth = (cumulative <= rng.random(self.shape[0])[:, None]).sum(axis=1)
         joined = rng.random(self.shape[0] - 1) < self.join_probability[self.same_surface[state].astype(int)]
-        return MiniatureObservation(read_only(np.minimum(depth, self.shape[1])), read_only(joined), action)
+        return Observation(np.minimum(depth, self.shape[1]), joined, action)
 
-    def simulate(self, rng: np.random.Generator, T: int) -> tuple[np.ndarray, list[MiniatureObservation]]:
+    def simulate(self, rng: np.random.Generator, T: int) -> tuple[np.ndarray, list[Observation]]:
         """True states (T,) and observations of T steps; the first has no push."""
         state = self.draw_prior(rng, 1)
         truth, observations = [int(state[0])], [self.observe(rng, int(state[0]))]

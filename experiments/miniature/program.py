@@ -1,32 +1,32 @@
-"""The miniature MST: a table of six cells, pushes, two noisy sensors, and an exact answer to compare with.
+"""The miniature world as a probabilistic program, with its exact posterior to compare with.
 
-    python models/programs/miniature_mst.py
+    python experiments/miniature/program.py
 
-A particle is the number of a configuration (which cell belongs to which object). The step is written as it happens:
-somebody may lay the table anew, the push may slip, depth and segmentation are read off what is visible. All
-configurations can be enumerated, so the run ends with the distance from the exact posterior.
+A particle is the number of a state (which cell belongs to which object). Each run ends with the distance from the
+exact posterior.
 """
 
 from __future__ import annotations
 
 import numpy as np
+from miniature_filters import exact_filter, total_variation
+from miniature_world import Miniature, Observation
 
-from mstfilter.oracles import Miniature, MiniatureObservation, exact_filter, total_variation
 from mstfilter.smc import Bernoulli, Categorical, Program, observe, sample
 
 WORLD = Miniature(shape=(3, 2))
 
 
-def model(previous, y: MiniatureObservation):
-    """One step for all particles; `previous` is None at the first."""
+def model(previous, y: Observation):
+    """One step of all particles; `previous` is None at the first step."""
     fresh = sample("fresh", Categorical(WORLD.prior))
     if previous is None:
         state = fresh
     else:
         n, old = len(fresh), previous["state"]
-        anew = sample("anew", Bernoulli(np.full(n, WORLD.rearranged)))
+        rearranged = sample("rearranged", Bernoulli(np.full(n, WORLD.rearranged)))
         slips = sample("slips", Bernoulli(np.full(n, WORLD.slip)))
-        state = np.where(anew, fresh, np.where(slips, old, WORLD.pushed[y.action, old]))
+        state = np.where(rearranged, fresh, np.where(slips, old, WORLD.pushed[y.action, old]))
     surface, same_surface = WORLD.surface[state], WORLD.same_surface[state].astype(int)
     for pixel, reading in enumerate(y.depth):
         observe(f"depth {pixel}", Categorical(WORLD.depth_probability[surface[:, pixel]]), reading)
@@ -34,24 +34,23 @@ def model(previous, y: MiniatureObservation):
     return {"state": state}
 
 
-def guide(previous, y: MiniatureObservation):
-    """Draws the first scene near what is seen (half the log likelihood: later observations can correct it)."""
+def guide(previous, y: Observation):
+    """Draws the first state from the prior times the root of the likelihood."""
     first = previous is None
     fresh = sample(
         "fresh", Categorical(WORLD.prior * np.exp(0.5 * WORLD.log_likelihood(y)) if first else WORLD.prior)
     )
     if not first:
-        sample("anew", Bernoulli(np.full(len(fresh), WORLD.rearranged)))
+        sample("rearranged", Bernoulli(np.full(len(fresh), WORLD.rearranged)))
         sample("slips", Bernoulli(np.full(len(fresh), WORLD.slip)))
 
 
-def simulate(T: int, seed: int = 0) -> tuple[np.ndarray, list[MiniatureObservation]]:
-    """True configurations and observations."""
+def simulate(T: int, seed: int = 0) -> tuple[np.ndarray, list[Observation]]:
+    """True states and observations."""
     return WORLD.simulate(np.random.default_rng(seed), T)
 
 
 def filters(n: int) -> dict:
-    """From the one program."""
     program = Program(model)
     return {"bootstrap": program.bootstrap(n), "guided at first": program.guided(guide, n)}
 
