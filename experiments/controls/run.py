@@ -85,11 +85,10 @@ def in_orders(clip: Clip, rng: np.random.Generator) -> dict[str, Clip]:
 
 def again(filter: ParticleFilter, clip: Clip) -> State:
     """A filter that processed only the last image of a clip, once per pause."""
-    state, shown = filter.start(0), None
+    state = filter.start(0)
     for k in range(clip.index + 1):
-        frames = (clip.after,) * (1 if shown is None else 2)
-        shown = Clip(frames, clip.grid, k, previous=shown)
-        state, _ = filter.step(state, shown)
+        frames = (clip.after,) * (1 if k == 0 else 2)
+        state, _ = filter.step(state, Clip(frames, clip.grid, k))
     return state
 
 

@@ -232,7 +232,7 @@ class Dsr(RecordingFormat):
             path=path,
             depth_scale=0.0001,
             manifest={"generator": "frames drawn from DSR-Net volumes, camera 1 m above the table"},
-            read_truth=truth,
+            truth=truth,
         )
 
     def _steps(self, path: Path) -> list[Path]:

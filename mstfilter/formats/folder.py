@@ -44,7 +44,7 @@ from mstfilter.scene import (
     Recording,
     VoxelGrid,
     as_labels,
-    check_depth_range,
+    check_depth,
     find_world,
     read_depth,
     read_labels,
@@ -425,12 +425,7 @@ def open_recording(path: str | Path) -> Recording:
                     f"image {path / what / name} is {image.shape[1]} x {image.shape[0]}, "
                     f"camera.json says {view.width} x {view.height}"
                 )
-        readings = depth[np.isfinite(depth)]
-        if readings.size == 0:
-            raise InputError(f"depth image {path / 'depth' / name} has no reading at all: every pixel is 0")
-        check_depth_range(
-            readings, f"depth image {path / 'depth' / name} with depth_scale {camera_file.depth_scale:g}"
-        )
+        check_depth(depth, f"depth image {path / 'depth' / name} with depth_scale {scale:g}")
         robot_path = path / "robot" / name
         robot = read_labels(robot_path) > 0 if robot_path.exists() else None
         return Frame(rgb, depth, view, robot)
@@ -457,14 +452,14 @@ def open_recording(path: str | Path) -> Recording:
         depth_scale=scale,
         path=path,
         manifest=manifest_data,
-        read_truth=_read_voxels(truth, grid, pauses) if truth.exists() else lambda t: None,
-        read_instance=read_instance,
-        read_poses=_read_poses(true_poses) if true_poses.exists() else lambda index: None,
+        truth=_read_voxels(truth, grid, pauses) if truth.exists() else lambda t: None,
+        instance=read_instance,
+        poses=_read_poses(true_poses) if true_poses.exists() else lambda index: None,
     )
 
 
 def _read_poses(path: Path) -> Any:
-    """A `read_poses` that reads the file when it is first called."""
+    """The function `Recording.poses`; it reads the file when it is first called."""
 
     @cache
     def load() -> dict[int, dict[int, np.ndarray]]:

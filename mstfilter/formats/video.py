@@ -40,7 +40,7 @@ from mstfilter.scene import (
     LazyFrames,
     Recording,
     VoxelGrid,
-    check_depth_range,
+    check_depth,
     find_world,
     rigid_from_matrix,
 )
@@ -284,7 +284,7 @@ class Video:
             name=self.name,
             path=self.path,
             depth_scale=self.depth_scale,
-            read_instance=instance,
+            instance=instance,
         )
 
     def _frame(self, index: int, camera: Camera, lens: Lens) -> Frame:
@@ -297,13 +297,7 @@ class Video:
             )
         if (h, w) != (camera.height, camera.width):
             raise InputError(f"{images.rgb_name} is {w} x {h}, the first is {camera.width} x {camera.height}")
-        readings = images.depth[np.isfinite(images.depth) & (images.depth > 0)]
-        if readings.size == 0:
-            raise InputError(
-                f"{images.depth_name} has no reading at all",
-                "omit the start with start_s=1, or the end with stop_s",
-            )
-        check_depth_range(readings, f"{images.depth_name} with {self.depth_scale:g} m per unit")
+        check_depth(images.depth, f"{images.depth_name} with {self.depth_scale:g} m per unit")
         return Frame(lens.undistort(images.rgb), lens.undistort_nearest(images.depth, np.nan), camera)
 
 

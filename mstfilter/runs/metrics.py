@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 
 from mstfilter.runs.run_folder import RunFolder
-from mstfilter.scene import Recording
+from mstfilter.scene import Recording, occupied_box
 from mstfilter.scoring import (
     FORMS,
     STATUSES,
@@ -58,14 +58,14 @@ def measure_pause(run: RunFolder, recording: Recording, t: int) -> dict[str, Any
     if truth is None:
         return {**row, "diversity": diversity(labels)}
     known = all(recording.instance(p) is not None for p in recording.pauses[: t + 1])
-    found, q = _metrics_and_quality(labels, weights, truth, object_status(recording, t) if known else {})
+    found, q = pause_metrics(labels, weights, truth, object_status(recording, t) if known else {})
     return {**row, **found, "qualities": q.tolist()}
 
 
 def pause_metrics(
     labels: Sequence[np.ndarray], weights: np.ndarray, truth: np.ndarray, status: Mapping[int, str]
-) -> dict[str, float]:
-    """Metrics of hypotheses against the ground truth.
+) -> tuple[dict[str, float], np.ndarray]:
+    """Metrics of hypotheses against the ground truth, and the quality (n,) of every hypothesis.
 
     Parameters
     ----------
@@ -77,16 +77,12 @@ def pause_metrics(
     status : mapping
         True label -> visible, hidden or unseen; empty if unknown.
     """
-    return _metrics_and_quality(labels, weights, truth, status)[0]
-
-
-def _metrics_and_quality(
-    labels: Sequence[np.ndarray], weights: np.ndarray, truth: np.ndarray, status: Mapping[int, str]
-) -> tuple[dict[str, float], np.ndarray]:
-    """The metrics, and the quality of every hypothesis (n,)."""
     (truth, *labels), n_free = _cropped([truth, *labels])
     distinct, which = _distinct(labels)
-    tables = [_with_free(overlap(one, truth), n_free) for one in distinct]
+    tables = [overlap(one, truth) for one in distinct]
+    if n_free:  # the cropped grids have free voxels, too
+        for table in tables:
+            table.counts[0, 0] += n_free
     share = np.bincount(which, minlength=len(distinct)) / len(labels)
 
     def mean(values: Sequence[float] | np.ndarray) -> float:
@@ -125,20 +121,10 @@ def _cropped(grids: Sequence[np.ndarray]) -> tuple[list[np.ndarray], int]:
     A layer of free voxels is kept at each side that is cropped, so that free space remains a region of every grid.
     """
     occupied = np.any([grid > 0 for grid in grids], axis=0)
-    box = []
-    for axis in range(occupied.ndim):
-        hit = np.flatnonzero(occupied.any(axis=tuple(a for a in range(occupied.ndim) if a != axis)))
-        box.append(slice(max(hit[0] - 1, 0), hit[-1] + 2) if len(hit) else slice(0, 1))
-    cut = [np.ascontiguousarray(grid[tuple(box)]) for grid in grids]
+    tight = occupied_box(occupied) or (slice(0, 0),) * occupied.ndim
+    box = tuple(slice(max(side.start - 1, 0), side.stop + 1) for side in tight)
+    cut = [np.ascontiguousarray(grid[box]) for grid in grids]
     return cut, occupied.size - cut[0].size
-
-
-def _with_free(table: Overlap, n_free: int) -> Overlap:
-    """The table of the grids before cropping."""
-    counts = table.counts.copy()
-    if n_free:
-        counts[0, 0] += n_free
-    return Overlap(table.labels_a, table.labels_b, counts)
 
 
 def _distinct(labels: Sequence[np.ndarray]) -> tuple[list[np.ndarray], np.ndarray]:

@@ -3,7 +3,6 @@ from mstfilter.scene.cache import Cache as Cache, memo as memo, scene_cache as s
 from mstfilter.scene.camera import Camera as Camera, look_at as look_at, rigid_from_matrix as rigid_from_matrix
 from mstfilter.scene.disk_cache import DiskCache as DiskCache
 from mstfilter.scene.frame import (
-    SIGMA_AT_ONE_METRE as SIGMA_AT_ONE_METRE,
     Clip as Clip,
     Frame as Frame,
     depth_sigma as depth_sigma,
@@ -22,7 +21,7 @@ from mstfilter.scene.geometry import (
 from mstfilter.scene.recording import (
     LazyFrames as LazyFrames,
     Recording as Recording,
-    check_depth_range as check_depth_range,
+    check_depth as check_depth,
     find_world as find_world,
     truth_reader as truth_reader,
 )
@@ -41,4 +40,5 @@ from mstfilter.scene.voxels import (
     as_labels as as_labels,
     decode_hypotheses as decode_hypotheses,
     encode_hypotheses as encode_hypotheses,
+    occupied_box as occupied_box,
 )

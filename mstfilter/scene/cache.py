@@ -29,7 +29,6 @@ import numpy as np
 if TYPE_CHECKING:
     from mstfilter.scene.disk_cache import DiskCache
 
-
 _Value = TypeVar("_Value")
 
 
@@ -133,8 +132,10 @@ class Cache:
 scene_cache = Cache()
 """The cache of this process."""
 
-memo = scene_cache.get
-"""`Cache.get` of `scene_cache`."""
+
+def memo(name: str, key: Hashable, compute: Callable[[], _Value], stored_as: Any = None) -> _Value:
+    """The value of ``compute()``, computed if it is not in `scene_cache`. Parameters: `Cache.get`."""
+    return scene_cache.get(name, key, compute, stored_as)
 
 
 def _size_of(value: Any) -> int:

@@ -46,15 +46,11 @@ class Camera:
             K = np.asarray(self.K, dtype=np.float64)
         except (TypeError, ValueError) as error:
             raise InputError(f"camera matrix K is not numeric: {self.K!r}") from error
-        if K.shape == (4,):
+        if K.shape != (3, 3) or not np.isfinite(K).all():
             raise InputError(
-                "camera matrix K has 4 numbers, expected a 3x3 matrix",
-                "build it: Camera.from_intrinsics(fx, fy, cx, cy, width, height)",
+                f"camera matrix K is {K.tolist()}, expected 3 x 3 finite numbers",
+                "from four numbers: Camera.from_intrinsics(fx, fy, cx, cy, width, height)",
             )
-        if K.shape != (3, 3):
-            raise InputError(f"camera matrix K has shape {K.shape}, expected (3, 3)")
-        if not np.isfinite(K).all():
-            raise InputError(f"camera matrix K has a value that is not finite: {K.tolist()}")
         if K[0, 0] <= 0 or K[1, 1] <= 0 or abs(np.linalg.det(K)) < 1e-9:
             raise InputError(
                 f"camera matrix K is not invertible: {K.tolist()}",

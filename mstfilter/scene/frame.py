@@ -26,23 +26,18 @@ from mstfilter.scene.arrays import content_key, frozen, read_only
 from mstfilter.scene.camera import Camera
 from mstfilter.scene.voxels import VoxelGrid
 
-SIGMA_AT_ONE_METRE = 0.00185
+_SIGMA_AT_ONE_METRE = 0.00185
 
 
-def depth_sigma(z: ArrayLike, at_one_metre: float = SIGMA_AT_ONE_METRE) -> np.ndarray:
+def depth_sigma(z: ArrayLike) -> np.ndarray:
     """Standard deviation (m) of a depth reading at z-depth `z` (m), of the shape of `z`.
 
     A structured-light or stereo sensor measures disparity, so the standard deviation grows with the square of depth:
-    sigma = `at_one_metre` (z / m)^2. The default was fitted to table patches of 45 Kinect v1 and Xtion frames
-    (0.6 to 1.5 m) and fits them within 10 % up to 1.2 m.
-
-    Examples
-    --------
-    >>> float(depth_sigma(1.0))
-    0.00185
+    sigma = 0.00185 m (z / m)^2. The factor was fitted to table patches of 45 Kinect v1 and Xtion frames (0.6 to
+    1.5 m); it fits them within 10 % up to 1.2 m.
     """
     z = np.asarray(z)
-    return at_one_metre * z * z
+    return _SIGMA_AT_ONE_METRE * z * z
 
 
 _PNG_START = b"\x89PNG\r\n\x1a\n"
@@ -172,8 +167,8 @@ class Frame:
     def key(self) -> bytes:
         """Content key."""
         robot = b"" if self.robot_mask is None else self.robot_mask
-        own = content_key("frame", self.rgb, self.depth, self.camera.key, robot)
-        return content_key("views", own, *(view.key for view in self.views)) if self.views else own
+        key = content_key("frame", self.rgb, self.depth, self.camera.key, robot)
+        return content_key("views", key, *(view.key for view in self.views)) if self.views else key
 
     @property
     def all_views(self) -> tuple[Frame, ...]:
@@ -199,8 +194,7 @@ class Clip:
     """Frames from one pause to the next, and the workspace: the observation of a step.
 
     `before` shows the scene at the previous pause, `after` at this pause; the frames between them show the action.
-    The first clip of a recording has one frame. Components have no state, so a component that needs earlier
-    observations reads them from `previous`; a resumed run reads the same ones.
+    The first clip of a recording has one frame.
 
     Parameters
     ----------
@@ -211,43 +205,24 @@ class Clip:
     index : int
         Number of the pause that the clip ends at; 0 is the first.
     times : tuple of float, optional
-        Seconds, one a frame.
-    previous : Clip, optional
-        The clip that ended at the previous pause; None for the first clip, or if it is not known.
+        Seconds, one per frame.
     """
 
     frames: Sequence[Frame]
     grid: VoxelGrid
     index: int = 0
     times: tuple[float, ...] = ()
-    previous: Clip | None = None
 
     def __post_init__(self) -> None:
         if len(self.frames) == 0:
             raise InputError(f"clip {self.index} has no frames")
         if self.times and len(self.times) != len(self.frames):
             raise InputError(f"clip {self.index} has {len(self.frames)} frames and {len(self.times)} times")
-        if self.previous is not None and self.previous.grid != self.grid:
-            raise InputError(f"clip {self.index} and the one before it have different grids")
-
-    @cached_property
-    def frames_key(self) -> bytes:
-        """Content key of all frames and the grid. Reads every image once."""
-        return content_key("frames", self.grid.key, *(frame.key for frame in self.frames))
 
     @cached_property
     def key(self) -> bytes:
-        """Content key of this clip and all clips before. Reads every image once."""
-        chain: list[Clip] = []
-        clip: Clip | None = self
-        while clip is not None and "key" not in clip.__dict__:
-            chain.append(clip)
-            clip = clip.previous
-        key = b"" if clip is None else clip.key
-        for clip in reversed(chain):  # no recursion, because a recording may have a thousand pauses
-            key = content_key("clip", key, clip.frames_key)
-            clip.__dict__["key"] = key
-        return key
+        """Content key of all frames and the grid. Reads every image once."""
+        return content_key("frames", self.grid.key, *(frame.key for frame in self.frames))
 
     @property
     def before(self) -> Frame:

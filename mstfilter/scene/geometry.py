@@ -24,7 +24,7 @@ from mstfilter.errors import InputError, InputWarning
 from mstfilter.scene.arrays import read_only
 from mstfilter.scene.cache import memo
 from mstfilter.scene.camera import Camera
-from mstfilter.scene.frame import SIGMA_AT_ONE_METRE, Frame
+from mstfilter.scene.frame import Frame
 from mstfilter.scene.voxels import VoxelGrid
 
 
@@ -98,21 +98,15 @@ class SupportPlane:
     T_world_camera : RigidTransform
         Camera pose in the world of the plane: z is the normal of the plane, which is at z = 0; the origin is at the
         median of its pixels, y points away from the camera.
-    coefficients : (3,)
-        a, b, c of D = a u + b v + c.
     on_or_behind : (H, W) bool
         Readings on the plane or behind it.
     residual : (H, W) float32
         Measured minus plane disparity, in 1/8 pixels; positive is in front of the plane (above it), NaN is unknown.
-    inlier_share : float
-        Share of the readings that are on the plane.
     """
 
     T_world_camera: RigidTransform
-    coefficients: np.ndarray
     on_or_behind: np.ndarray
     residual: np.ndarray
-    inlier_share: float
 
 
 def disparity(depth: np.ndarray) -> np.ndarray:
@@ -120,34 +114,27 @@ def disparity(depth: np.ndarray) -> np.ndarray:
     return 8.0 * _FOCAL * BASELINE / np.asarray(depth, dtype=np.float64)
 
 
-def fit_support_plane(
-    frame: Frame, inlier: float = 1.5, tolerance: float = 2.0, n_trials: int = 400, min_share: float = 0.1
-) -> SupportPlane:
+_N_TRIALS = 400  # minimal sets of RANSAC
+_INLIER = 1.5  # largest residual of an inlier, in 1/8 pixels
+_TOLERANCE = 2.0  # readings up to this much in front of the plane count as on it, in 1/8 pixels
+_MIN_SHARE = 0.1  # smallest share of inliers among the readings
+
+
+def fit_support_plane(frame: Frame) -> SupportPlane:
     """Find the plane with the most readings (RANSAC, then least squares). Cached by content.
 
-    Parameters
-    ----------
-    frame : Frame
-        Its pose is not used.
-    inlier : float
-        Largest residual of an inlier, in 1/8 pixels.
-    tolerance : float
-        Readings up to this much in front of the plane count as on it, in 1/8 pixels.
-    n_trials : int
-        Number of minimal sets. They are drawn with a constant seed, so the same frame gives the same plane.
-    min_share : float
-        Smallest share of inliers among the readings.
+    The pose of the frame is not used. The minimal sets are drawn with a constant seed, so the same frame gives the
+    same plane.
 
     Raises
     ------
     InputError
         If there are too few readings or too few inliers.
     """
-    key = (frame.key, inlier, tolerance, n_trials, min_share)
-    return memo("support_plane", key, lambda: _fit(frame, inlier, tolerance, n_trials, min_share))
+    return memo("support_plane", frame.key, lambda: _fit(frame))
 
 
-def _fit(frame: Frame, inlier: float, tolerance: float, n_trials: int, min_share: float) -> SupportPlane:
+def _fit(frame: Frame) -> SupportPlane:
     D = disparity(np.where(frame.valid, frame.depth, np.nan))
     v, u = np.nonzero(np.isfinite(D))
     if len(v) < 100:
@@ -160,20 +147,20 @@ def _fit(frame: Frame, inlier: float, tolerance: float, n_trials: int, min_share
 
     rng = np.random.default_rng(20210927)
     subset = rng.choice(len(d), size=min(len(d), 4000), replace=False)
-    triples = rng.integers(0, len(subset), size=(n_trials, 3))
+    triples = rng.integers(0, len(subset), size=(_N_TRIALS, 3))
     A = design[subset][triples]
     proper = np.abs(np.linalg.det(A)) > 3e-3 * D.size  # twice the area of the triangle in pixels
     planes = np.linalg.solve(A[proper], d[subset][triples[proper]][..., None])[..., 0]
     if len(planes) == 0:
         raise InputError("no support plane: all readings are on one line of the image")
-    counts = (np.abs(design[subset] @ planes.T - d[subset][:, None]) < inlier).sum(axis=0)
+    counts = (np.abs(design[subset] @ planes.T - d[subset][:, None]) < _INLIER).sum(axis=0)
     plane = planes[counts.argmax()]
     for _ in range(3):
-        close = np.abs(design @ plane - d) < inlier
+        close = np.abs(design @ plane - d) < _INLIER
         plane = np.linalg.lstsq(design[close], d[close], rcond=None)[0]
-    close = np.abs(design @ plane - d) < inlier
+    close = np.abs(design @ plane - d) < _INLIER
     share = float(close.mean())
-    if share < min_share:
+    if share < _MIN_SHARE:
         raise InputError(
             f"no support plane: the best plane has {100 * share:.1f} % of the readings",
             "give a camera pose (T_world_camera) if the table is not visible",
@@ -181,9 +168,9 @@ def _fit(frame: Frame, inlier: float, tolerance: float, n_trials: int, min_share
     rows, columns = np.mgrid[: D.shape[0], : D.shape[1]]
     residual = (D - (plane[0] * columns + plane[1] * rows + plane[2])).astype(np.float32)
     with np.errstate(invalid="ignore"):
-        on_or_behind = residual < tolerance
+        on_or_behind = residual < _TOLERANCE
     pose = _pose(frame.camera, plane, np.stack([u, v], axis=1)[close])
-    return SupportPlane(pose, read_only(plane), read_only(on_or_behind), read_only(residual), share)
+    return SupportPlane(pose, read_only(on_or_behind), read_only(residual))
 
 
 def _pose(camera: Camera, plane: np.ndarray, pixels: np.ndarray) -> RigidTransform:
@@ -226,26 +213,23 @@ def table_residual(frame: Frame) -> np.ndarray:
     return memo("table_residual", frame.key, compute)
 
 
-def workspace(
-    frame: Frame, voxel_size: float = 0.01, shape: tuple[int, int, int] = (100, 100, 50), above: float = 0.01
-) -> VoxelGrid:
-    """A grid around the objects on the table.
+_MIN_HEIGHT = 0.01  # metres above the table beyond which a reading may show an object
+
+
+def workspace(frame: Frame) -> VoxelGrid:
+    """A grid of 1 x 1 x 0.5 m in voxels of 1 cm around the objects on the table.
+
+    The grid is centred on the readings more than 1 cm above the table, or on the table if there are fewer than 200.
 
     Parameters
     ----------
     frame : Frame
         With a pose whose world has the table at z = 0.
-    voxel_size : float
-        Metres.
-    shape : (3,) int
-        Number of voxels.
-    above : float
-        The grid is centred on the readings more than this many metres above the table, or on the table if there are
-        fewer than 200.
     """
+    voxel_size, shape = 0.01, (100, 100, 50)
     points = frame.points[frame.valid]
-    raised = points[(points[:, 2] > max(above, 4 * SIGMA_AT_ONE_METRE)) & (points[:, 2] < shape[2] * voxel_size)]
-    chosen = raised if len(raised) >= 200 else points[np.abs(points[:, 2]) < above]
+    raised = points[(points[:, 2] > _MIN_HEIGHT) & (points[:, 2] < shape[2] * voxel_size)]
+    chosen = raised if len(raised) >= 200 else points[np.abs(points[:, 2]) < _MIN_HEIGHT]
     if len(chosen) == 0:
         raise InputError(
             "no workspace: no depth reading is on or above the table",
@@ -256,10 +240,7 @@ def workspace(
     return VoxelGrid(np.append(corner, 0.0), voxel_size, shape)
 
 
-_MIN_HEIGHT = 0.01
-"""Metres above the table beyond which a reading may show an object."""
-_MIN_READINGS = 30
-"""Fewer readings than this are taken for noise."""
+_MIN_READINGS = 30  # fewer are taken for noise
 
 
 def warn_if_workspace_is_empty(frames: Iterable[Frame], grid: VoxelGrid, where: str) -> None:

@@ -81,9 +81,13 @@ class Recording:
         Metres per unit of the stored depth images, used when the recording is saved.
     manifest : dict
         Content of manifest.json, for recordings read from a folder.
-    read_truth, read_instance, read_poses : callables
-        The ground truth: volumes (by pause), instance images and poses (by frame); they return None if it is not
-        known.
+    truth : callable
+        ``truth(t)`` gives the true labels (X, Y, Z) uint16 at pause `t`, on `grid`; None if they are not known.
+    instance : callable
+        ``instance(index)`` gives the true label image (H, W) of a frame; None if it is not known.
+    poses : callable
+        ``poses(index)`` gives the true T_world_object (4, 4) of each object of a frame, by label; None if they are
+        not known.
     """
 
     frames: Sequence[Frame]
@@ -94,9 +98,9 @@ class Recording:
     path: Path | None = None
     depth_scale: float = 0.001
     manifest: dict[str, Any] = field(default_factory=dict)
-    read_truth: Callable[[int], np.ndarray | None] = lambda t: None
-    read_instance: Callable[[int], np.ndarray | None] = lambda index: None
-    read_poses: Callable[[int], dict[int, np.ndarray] | None] = lambda index: None
+    truth: Callable[[int], np.ndarray | None] = lambda t: None
+    instance: Callable[[int], np.ndarray | None] = lambda index: None
+    poses: Callable[[int], dict[int, np.ndarray] | None] = lambda index: None
 
     def __post_init__(self) -> None:
         n, pauses = len(self.frames), tuple(int(p) for p in self.pauses)
@@ -164,7 +168,8 @@ class Recording:
                 "multiply raw readings by the depth scale: depth * 0.001 for millimetres",
             )
         n, height, width = depth.shape
-        _check_depth(depth, name)
+        for index, image in enumerate(depth):
+            check_depth(image, f"depth image of frame {index} of {name}")
         if T_world_camera is not None and not isinstance(T_world_camera, RigidTransform):
             T_world_camera = rigid_from_matrix(T_world_camera, "T_world_camera")
         camera = Camera(K, width, height, T_world_camera)
@@ -190,20 +195,12 @@ class Recording:
     @cached_property
     def key(self) -> bytes:
         """Content key of all frames, the grid, the pauses and the times. Reads every image."""
-        keys = []
-        for index in range(len(self)):
-            frame = self.frames[index]
-            if not np.isfinite(frame.depth).any():
-                raise InputError(f"depth image of frame {index} of {self.name} has no reading at all")
-            keys.append(frame.key)
-        return content_key(self.grid.key, self.pauses, self.times, *keys)
+        return content_key(self.grid.key, self.pauses, self.times, *(frame.key for frame in self.frames))
 
     @cached_property
     def truth_key(self) -> bytes:
         """Content key of the ground truth: volumes, label images, poses. Reads every frame."""
-        keys = []
-        for t in range(len(self.pauses)):
-            keys.append(content_key(self.truth(t)))
+        keys = [content_key(self.truth(t)) for t in range(len(self.pauses))]
         for index in range(len(self)):
             poses = sorted((self.poses(index) or {}).items())
             keys.append(content_key(self.instance(index), *(part for pair in poses for part in pair)))
@@ -213,26 +210,12 @@ class Recording:
         return len(self.frames)
 
     def clips(self) -> tuple[Clip, ...]:
-        """One clip per pause: the first pause alone, then from each pause to the next; `Clip.previous` is set."""
-        clips: list[Clip] = []
+        """One clip per pause: the first pause alone, then from each pause to the next."""
+        clips = []
         for t, end in enumerate(self.pauses):
-            start = self.pauses[max(t - 1, 0)]
-            frames = self.frames[start : end + 1]
-            previous = clips[-1] if clips else None
-            clips.append(Clip(frames, self.grid, t, tuple(self.times[start : end + 1]), previous))
+            span = slice(self.pauses[max(t - 1, 0)], end + 1)
+            clips.append(Clip(self.frames[span], self.grid, t, tuple(self.times[span])))
         return tuple(clips)
-
-    def truth(self, t: int) -> np.ndarray | None:
-        """True labels (X, Y, Z) uint16 at pause `t`, on the grid of the recording; None if they are not known."""
-        return self.read_truth(t)
-
-    def instance(self, index: int) -> np.ndarray | None:
-        """True label image (H, W) of a frame; None if it is not known."""
-        return self.read_instance(index)
-
-    def poses(self, index: int) -> dict[int, np.ndarray] | None:
-        """True T_world_object (4, 4) of each object of a frame, by label; None if they are not known."""
-        return self.read_poses(index)
 
     def check(self) -> None:
         """Read every image, so that an unreadable one raises InputError before a run; warn of a misplaced grid."""
@@ -240,21 +223,15 @@ class Recording:
         warn_if_workspace_is_empty((self.frames[p] for p in self.pauses), self.grid, f"recording {self.name}")
 
 
-def _check_depth(depth: np.ndarray, name: str) -> None:
-    """Raise InputError if a depth image has no reading or cannot be in metres."""
-    for index, image in enumerate(depth):
-        with np.errstate(invalid="ignore"):
-            good = np.isfinite(image) & (image > 0)
-        if not good.any():
-            raise InputError(
-                f"depth image of frame {index} of {name} has no reading at all",
-                "0 and NaN are no reading; other values are metres",
-            )
-        check_depth_range(image[good], f"depth image of frame {index} of {name}")
-
-
-def check_depth_range(metres: np.ndarray, where: str) -> None:
-    """Raise InputError if the median of readings (n,) cannot be the distance of a table in metres."""
+def check_depth(depth: np.ndarray, where: str) -> None:
+    """Raise InputError if a depth image (H, W) has no reading, or its median cannot be that of a table in metres."""
+    with np.errstate(invalid="ignore"):
+        metres = depth[np.isfinite(depth) & (depth > 0)]
+    if metres.size == 0:
+        raise InputError(
+            f"{where} has no reading at all",
+            "0 and NaN are no reading; leave such frames out, for a video with start_s or stop_s",
+        )
     median = float(np.median(metres))
     if not 0.05 < median < 30:
         raise InputError(
@@ -276,7 +253,7 @@ def find_world(first: Frame, grid: VoxelGrid | None) -> tuple[Camera, VoxelGrid]
 def truth_reader(
     labels: np.ndarray, frames: np.ndarray, pauses: tuple[int, ...]
 ) -> Callable[[int], np.ndarray | None]:
-    """A `read_truth` from labels (S, X, Y, Z) at frame indices (S,)."""
+    """The function `Recording.truth` from labels (S, X, Y, Z) at frame indices (S,)."""
     row = {int(frame): s for s, frame in enumerate(frames)}
 
     def read(t: int) -> np.ndarray | None:

@@ -16,11 +16,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mstfilter.errors import InputError
 from mstfilter.scene.arrays import read_only
 from mstfilter.scene.cache import memo
 from mstfilter.scene.camera import Camera
-from mstfilter.scene.voxels import Hypothesis, VoxelGrid, as_labels
+from mstfilter.scene.voxels import Hypothesis, VoxelGrid, labels_on, occupied_box
 
 
 class Rendering(NamedTuple):
@@ -47,16 +46,13 @@ def render_hypothesis(hypothesis: Hypothesis, camera: Camera) -> Rendering:
 
 def render(labels: np.ndarray, grid: VoxelGrid, camera: Camera) -> Rendering:
     """Cast one ray per pixel, through the pixel centre, into a label grid (X, Y, Z); label 0 is free."""
-    labels = as_labels(labels)
-    if labels.shape != grid.shape:
-        raise InputError(f"label grid has shape {labels.shape}, the voxel grid is {grid.shape}")
+    labels = labels_on(grid, labels)
     image = np.zeros((camera.height, camera.width), np.uint16)
     depth = np.full(image.shape, np.nan, np.float32)
-    bounds = _occupied_box(labels)
+    bounds = occupied_box(labels != 0)
     if bounds is None:
         return Rendering(image, depth)
-    lower, upper = bounds
-    box = labels[lower[0] : upper[0], lower[1] : upper[1], lower[2] : upper[2]]
+    box, lower = labels[bounds], np.array([side.start for side in bounds])
 
     # Ray: start + t * direction, in voxels of the box; the directions have z = 1 m, so that t is z-depth in metres.
     matrix = camera.pose.as_matrix()
@@ -75,19 +71,6 @@ def render(labels: np.ndarray, grid: VoxelGrid, camera: Camera) -> Rendering:
     image[rows, columns] = window.reshape(size)
     depth[rows, columns] = window_depth.reshape(size)
     return Rendering(image, depth)
-
-
-def _occupied_box(labels: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-    """Tight bounds of the occupied voxels; None if all are free."""
-    occupied = labels != 0
-    lower, upper = np.zeros(3, int), np.zeros(3, int)
-    flat = occupied.any(axis=2)
-    for axis, line in enumerate((flat.any(axis=1), flat.any(axis=0), occupied.any(axis=(0, 1)))):
-        hits = np.flatnonzero(line)
-        if len(hits) == 0:
-            return None
-        lower[axis], upper[axis] = hits[0], hits[-1] + 1
-    return lower, upper
 
 
 def _window(

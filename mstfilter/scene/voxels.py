@@ -134,6 +134,17 @@ def _numbers(value: object) -> np.ndarray:
         return np.array(np.nan)
 
 
+def occupied_box(mask: np.ndarray) -> tuple[slice, ...] | None:
+    """Slices of the smallest box that contains all True cells of a mask; None if there are none."""
+    box = []
+    for axis in range(mask.ndim):
+        hits = np.flatnonzero(mask.any(axis=tuple(a for a in range(mask.ndim) if a != axis)))
+        if len(hits) == 0:
+            return None
+        box.append(slice(int(hits[0]), int(hits[-1]) + 1))
+    return tuple(box)
+
+
 @dataclass(frozen=True, eq=False)
 class Crop:
     """Occupied voxels of one object inside a small box of the grid.
@@ -156,15 +167,10 @@ class Crop:
     @classmethod
     def of(cls, mask: np.ndarray) -> Crop:
         """The tight crop of a boolean grid; an empty mask gives an empty crop."""
-        bounds = []
-        for axis in range(3):
-            others = tuple(a for a in range(3) if a != axis)
-            hit = np.flatnonzero(mask.any(axis=others))
-            if len(hit) == 0:
-                return cls(np.zeros((0, 0, 0), bool), np.zeros(3, np.int64))
-            bounds.append((int(hit[0]), int(hit[-1]) + 1))
-        box = tuple(slice(a, b) for a, b in bounds)
-        return cls(mask[box].copy(), np.array([a for a, _ in bounds]))
+        box = occupied_box(mask)
+        if box is None:
+            return cls(np.zeros((0, 0, 0), bool), np.zeros(3, np.int64))
+        return cls(mask[box].copy(), np.array([side.start for side in box]))
 
     @property
     def box(self) -> tuple[slice, slice, slice]:
@@ -231,18 +237,12 @@ def as_labels(labels: np.ndarray, where: str = "label grid") -> np.ndarray:
     return labels.astype(np.uint16)
 
 
-def _labels_on(grid: VoxelGrid, labels: np.ndarray) -> np.ndarray:
-    """Labels as uint16 of the grid's shape."""
+def labels_on(grid: VoxelGrid, labels: np.ndarray) -> np.ndarray:
+    """Labels as uint16. Raises InputError if they do not have the shape of the grid."""
     labels = as_labels(labels)
     if labels.shape != grid.shape:
         raise InputError(f"label grid has shape {labels.shape}, the voxel grid is {grid.shape}")
     return labels
-
-
-def _shortened(labels: set[int]) -> str:
-    """At most five labels, for messages."""
-    first = sorted(labels)[:5]
-    return f"{first} and {len(labels) - 5} more" if len(labels) > 5 else str(first)
 
 
 @dataclass(frozen=True, eq=False)
@@ -268,23 +268,23 @@ class Hypothesis:
     objects: tuple[ObjectRecord, ...] = ()
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "labels", frozen(_labels_on(self.grid, self.labels)))
+        object.__setattr__(self, "labels", frozen(labels_on(self.grid, self.labels)))
         numbers = [o.label for o in self.objects]
         if any(b <= a for a, b in pairwise(numbers)):
             raise InputError(f"object records are not in ascending order of labels: {numbers}")
         if numbers != list(self.volumes()):
-            no_record = _shortened(set(self.volumes()) - set(numbers))
-            no_voxel = _shortened(set(numbers) - set(self.volumes()))
+            no_record = sorted(set(self.volumes()) - set(numbers))
+            no_voxel = sorted(set(numbers) - set(self.volumes()))
             raise InputError(
                 "labels in the grid and in the object records differ: "
-                f"no record for {no_record}, no voxel for {no_voxel}",
+                f"no record for {len(no_record)} labels {no_record[:5]}, no voxel for {len(no_voxel)} {no_voxel[:5]}",
                 "use Hypothesis.from_labels, or with_labels to change a hypothesis",
             )
 
     @classmethod
     def from_labels(cls, labels: np.ndarray, grid: VoxelGrid, birth: int = 0) -> Hypothesis:
         """A hypothesis whose objects are all new."""
-        labels = _labels_on(grid, labels)
+        labels = labels_on(grid, labels)
         present = np.flatnonzero(np.bincount(labels.ravel()))
         records = tuple(ObjectRecord.born(int(k), birth) for k in present if k > 0)
         return cls(labels, grid, records)
@@ -295,7 +295,7 @@ class Hypothesis:
         Objects whose voxels change lose `source` and `motion`. Records of objects without voxels are removed.
         Raises InputError if a label has no record.
         """
-        labels = _labels_on(self.grid, labels)
+        labels = labels_on(self.grid, labels)
         different = labels != self.labels
         changed = set(np.unique(labels[different])) | set(np.unique(self.labels[different]))
         present = np.bincount(labels.ravel(), minlength=MAX_LABEL + 1) > 0

@@ -58,7 +58,7 @@ def followed_points(clip: Clip, flow: DenseFlow) -> FollowedPoints:
         known &= clip.grid.contains(clip.grid.index_of(q))
         return FollowedPoints(p[known], q[known], end[known, 0], end[known, 1])
 
-    return memo("followed points", (clip.frames_key, component_key(flow)), compute)
+    return memo("followed points", (clip.key, component_key(flow)), compute)
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,7 @@ class MotionSegmentation:
         """Number of the motion of each pixel of the last frame, (H, W); None for a single frame. Cached."""
         if len(clip.frames) < 2:
             return None
-        return memo("rigid motions", (clip.frames_key, component_key(self)), lambda: read_only(self._labels(clip)))
+        return memo("rigid motions", (clip.key, component_key(self)), lambda: read_only(self._labels(clip)))
 
     def _labels(self, clip: Clip) -> np.ndarray:
         points = followed_points(clip, self.flow)

@@ -124,7 +124,7 @@ def test_lasting_errors_are_the_same_in_all_samples_and_pauses(tmp_path):
 
 def test_component_key_depends_on_the_truth(tmp_path):
     first, second = slide(tmp_path / "a"), slide(tmp_path / "b")
-    second = replace(second, read_truth=lambda t: first.truth(t) * 2)
+    second = replace(second, truth=lambda t: first.truth(t) * 2)
     keys = {component_key(bind_truth(TrueBoundary(), r)) for r in (first, second)} | {component_key(TrueBoundary())}
     assert len(keys) == 3
     assert component_key(bind_truth(TrueBoundary(), first)) in keys

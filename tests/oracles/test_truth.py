@@ -76,14 +76,14 @@ def test_all_nested_components_are_bound_and_nothing_else_changes(recording):
 @pytest.mark.parametrize(
     "lacking, override, says",
     [
-        ("read_poses", "transition=true_motions", "TrueMotions uses the truth, and .* has no true poses at pause 0"),
-        ("read_instance", "proposal=true_masks", "TrueMasks uses the truth, and .* has no instance image at pause 0"),
+        ("poses", "transition=true_motions", "TrueMotions uses the truth, and .* has no true poses at pause 0"),
+        ("instance", "proposal=true_masks", "TrueMasks uses the truth, and .* has no instance image at pause 0"),
         (
-            "read_truth",
+            "truth",
             'update.evidence=["true_quality"]',
             "TrueQuality uses the truth, and .* has no true voxels at pause 0",
         ),
-        ("read_truth", "update.free_space=true_free_space", "TrueFreeSpace uses the truth"),
+        ("truth", "update.free_space=true_free_space", "TrueFreeSpace uses the truth"),
     ],
 )
 def test_a_recording_without_truth_is_an_error_before_anything_is_written(
@@ -174,7 +174,7 @@ def test_a_hidden_object_follows_its_true_motion(tmp_path):
     made = slide(tmp_path / "r")
     last = len(made.frames) - 1
     blind = replace(
-        made, read_instance=lambda index: np.where(made.instance(index) == 2, 0, made.instance(index))
+        made, instance=lambda index: np.where(made.instance(index) == 2, 0, made.instance(index))
         if index == last else made.instance(index)
     )  # fmt: skip
     filter = bind_truth(build_filter(load_config("mst", ALL)), blind)
@@ -212,7 +212,7 @@ def test_the_robot_is_not_an_object(recording):
         image[:20] = 255
         return image
 
-    truth = RecordingTruth(replace(recording, read_instance=with_robot))
+    truth = RecordingTruth(replace(recording, instance=with_robot))
     assert set(np.unique(truth.instance(0))) == {0, 1, 2}
 
 

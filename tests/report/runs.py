@@ -89,7 +89,7 @@ def recording(pauses: int = 3, truth: bool = True) -> Recording:
         grid=GRID,
         name="two boxes",
     )
-    return replace(arrays, read_truth=truth_at) if truth else arrays
+    return replace(arrays, truth=truth_at) if truth else arrays
 
 
 def make_run(path: Path, pauses: int = 3, truth: bool = True, empty: bool = False, done: bool = True) -> RunFolder:

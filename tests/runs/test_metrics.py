@@ -116,7 +116,7 @@ def test_metrics_of_a_population():
     truth = np.zeros((6, 6, 3), int)
     truth[:2], truth[3:5], truth[5] = 1, 2, 3
     worse = np.where(truth == 2, 1, truth)
-    row = pause_metrics(
+    row, _ = pause_metrics(
         [truth, truth, worse], np.array([0.2, 0.2, 0.6]), truth, {1: "visible", 2: "hidden", 3: "unseen"}
     )
     q = weighted_coverage(worse, truth)
@@ -130,7 +130,7 @@ def test_metrics_of_a_population():
     assert row["brier"] == pytest.approx(0.36)  # the heavier hypothesis is wrong about every disputed pair
     assert row["quality_one_blob"] == pytest.approx(weighted_coverage((truth > 0).astype(int), truth))
     assert (row["n_visible"], row["n_hidden"], row["n_unseen"], row["true_objects"]) == (1, 1, 1, 3)
-    one = pause_metrics([truth], np.ones(1), truth, {})
+    one, _ = pause_metrics([truth], np.ones(1), truth, {})
     assert math.isnan(one["diversity"]) and math.isnan(one["brier"]) and math.isnan(one["quality_hidden"])
 
 
@@ -141,16 +141,16 @@ def test_free_space_around_changes_no_more_than_it_should(world, margin):
     small, true = world
     labels, truth = [np.pad(one, margin) for one in small], np.pad(true, margin)
     n = len(labels)
-    row = pause_metrics(labels, np.full(n, 1 / n), truth, dict.fromkeys(range(1, 4), "visible"))
+    row, _ = pause_metrics(labels, np.full(n, 1 / n), truth, dict.fromkeys(range(1, 4), "visible"))
     for form, name in (("objects", "quality"), ("paper", "quality_paper"), ("authors", "quality_authors")):
         assert row[name] == pytest.approx(np.mean([weighted_coverage(one, truth, form) for one in labels])), name
-    tight = pause_metrics(small, np.full(n, 1 / n), true, dict.fromkeys(range(1, 4), "visible"))
+    tight, _ = pause_metrics(small, np.full(n, 1 / n), true, dict.fromkeys(range(1, 4), "visible"))
     for name in set(row) - {"quality_paper"}:
         assert row[name] == pytest.approx(tight[name], nan_ok=True), name
 
 
 def test_empty_worlds():
     nothing, some = np.zeros((2, 2, 2), int), np.ones((2, 2, 2), int)
-    assert pause_metrics([nothing], np.ones(1), nothing, {})["quality"] == 1.0
-    assert pause_metrics([nothing], np.ones(1), some, {1: "visible"})["missed"] == 1
-    assert pause_metrics([some], np.ones(1), nothing, {})["invented"] == 1
+    assert pause_metrics([nothing], np.ones(1), nothing, {})[0]["quality"] == 1.0
+    assert pause_metrics([nothing], np.ones(1), some, {1: "visible"})[0]["missed"] == 1
+    assert pause_metrics([some], np.ones(1), nothing, {})[0]["invented"] == 1

@@ -56,10 +56,10 @@ def test_scaling_keeps_rays():
     [
         (np.zeros((3, 3)), "not invertible"),
         (np.diag([525.0, 0.0, 1.0]), "not invertible"),
-        (np.array([525.0, 525, 319.5, 239.5]), "4 numbers"),
-        (np.eye(4), "shape"),
+        (np.array([525.0, 525, 319.5, 239.5]), "expected 3 x 3 finite"),
+        (np.eye(4), "expected 3 x 3 finite"),
         (K.T, "upper triangular"),
-        (K * np.nan, "not finite"),
+        (K * np.nan, "expected 3 x 3 finite"),
         ([["a"] * 3] * 3, "numeric"),
     ],
 )

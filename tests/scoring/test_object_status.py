@@ -27,7 +27,7 @@ def recording_of(images, labels, action=None):
     made = Recording.from_arrays(
         np.stack(frames), np.stack(depths), CAMERA.K, pauses=pauses, T_world_camera=CAMERA.pose, grid=GRID
     )
-    return replace(made, read_truth=lambda t: labels, read_instance=lambda index: shown[index])
+    return replace(made, truth=lambda t: labels, instance=lambda index: shown[index])
 
 
 def image_of(**pixels):
@@ -60,6 +60,6 @@ def test_missing_ground_truth_raises_an_error():
     with pytest.raises(InputError, match="has no pause 2, it has 2"):
         object_status(recording, 2)
     with pytest.raises(InputError, match="no true voxels at pause 1"):
-        object_status(replace(recording, read_truth=lambda t: None), 1)
+        object_status(replace(recording, truth=lambda t: None), 1)
     with pytest.raises(InputError, match="no instance image at pause 0"):
-        object_status(replace(recording, read_instance=lambda index: None), 0)
+        object_status(replace(recording, instance=lambda index: None), 0)
