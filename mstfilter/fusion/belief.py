@@ -22,26 +22,25 @@ With `tolerance` (in voxels or pixels), outcomes that differ by much less than i
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Mapping
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
 
-from mstfilter.errors import InputError
+from mstfilter.errors import InputError, check_component, check_integer, check_number
+from mstfilter.fusion.conflicts import check_grid
 from mstfilter.fusion.information import (
-    CommonRefinement,
     binary_entropy,
     canonical_rows,
-    check_tolerance,
-    common_refinement,
     entropy,
     hamming,
     noisy_information,
     outcome_information,
     partition_distance,
 )
+from mstfilter.fusion.similarity import CommonRefinement, common_refinement
 from mstfilter.scene import Camera, Hypothesis, VoxelGrid, project, render_hypothesis
 from mstfilter.smc import Population, first_seen
 
@@ -58,10 +57,6 @@ class Belief:
         Hypotheses on one grid with unnormalised log weights, such as ``state.population``. Equal hypotheses are
         merged, and hypotheses of weight 0 are ignored.
 
-    Raises
-    ------
-    InputError
-        If the population is empty or does not hold hypotheses, or if their grids differ.
     """
 
     population: Population
@@ -69,20 +64,13 @@ class Belief:
     def __post_init__(self) -> None:
         if not isinstance(self.population, Population):
             raise InputError(
-                f"Belief takes a Population, not a {type(self.population).__name__}",
-                "Belief(state.population), or Belief(Population(hypotheses, log_weights))",
+                f"Belief takes a Population, not a {type(self.population).__name__}", "Belief(state.population)"
             )
         particles = self.population.particles
-        if isinstance(particles, Mapping | np.ndarray) or not all(isinstance(h, Hypothesis) for h in particles):
+        if not all(isinstance(h, Hypothesis) for h in particles):
             raise InputError("the particles of a belief must be hypotheses, not vectors or other objects")
         for k, h in enumerate(particles):
-            if h.grid != self.grid:
-                raise InputError(
-                    f"hypothesis {k} has a grid of {h.grid.shape} voxels of {h.grid.voxel_size:g} m from "
-                    f"{h.grid.origin.tolist()}, hypothesis 0 one of {self.grid.shape} voxels of "
-                    f"{self.grid.voxel_size:g} m from {self.grid.origin.tolist()}",
-                    "the hypotheses of a belief share one grid",
-                )
+            check_grid(f"hypothesis {k}", h, self.grid)
 
     def __len__(self) -> int:
         return len(self.population)
@@ -190,8 +178,8 @@ class Belief:
 
     def object_at(self, voxel: Any) -> np.ndarray:
         """Extent (X, Y, Z) of the object at a voxel (3,): ``same_object(voxel, v)`` for every voxel v."""
-        own = self._refined.objects[:, self._cells(_one_index(voxel, 3))]
-        same = (self._refined.objects == own[:, None]) & (own > 0)[:, None]
+        at_voxel = self._refined.objects[:, self._cells(_one_index(voxel, 3)), None]
+        same = (self._refined.objects == at_voxel) & (at_voxel > 0)
         return (self._mass @ same)[self._refined.cells]
 
     def same_object_at_pixels(self, camera: Camera, a: Any, b: Any) -> np.ndarray:
@@ -284,7 +272,6 @@ class Belief:
         the information of the true segmentation of the region. Without region and tolerance it is an upper bound of
         every information. The distance for the tolerance is `information.partition_distance`.
         """
-        tolerance = check_tolerance(tolerance)
         cells, sizes = self._region(region)
         rows = canonical_rows(self._refined.objects[:, cells])
         return outcome_information(self._mass, rows, partition_distance, sizes, tolerance)
@@ -296,7 +283,6 @@ class Belief:
 
         Outcome: ``{v in region: L_i(v) > 0}``. For one voxel this is `occupancy_entropy`.
         """
-        tolerance = check_tolerance(tolerance)
         cells, sizes = self._region(region)
         return outcome_information(self._mass, self._refined.objects[:, cells] > 0, hamming, sizes, tolerance)
 
@@ -315,7 +301,6 @@ class Belief:
             Outcome: the depth image of the objects (rounded to a hundredth of a voxel, without the table), or the
             true segmentation of the image.
         """
-        tolerance = check_tolerance(tolerance)
         if sees == "objects":
             image = common_refinement(self._images(camera))
             rows = canonical_rows(image.objects)
@@ -323,7 +308,8 @@ class Belief:
         if sees != "depth":
             raise InputError(f'sees is {sees!r}, expected "depth" or "objects"')
         step = _DEPTH_STEP * self.grid.voxel_size
-        depths = (render_hypothesis(h, _check_camera(camera)).depth.ravel() for h in self._merged[0])
+        check_component("camera", camera, Camera)
+        depths = (render_hypothesis(h, camera).depth.ravel() for h in self._merged[0])
         pixels = np.stack([np.nan_to_num(np.round(d / step), nan=-1).astype(np.int32) for d in depths])
         pixels = pixels[:, (pixels != pixels[0]).any(axis=0)]
         return outcome_information(self._mass, pixels, hamming, np.ones(pixels.shape[1]), tolerance)
@@ -334,22 +320,21 @@ class Belief:
         Outcome: ``{v: L_i(v) = L_i(u) > 0 for a u in region}``, all voxels of all objects with a voxel in the region.
         Further objects that these objects push are left out.
         """
-        tolerance = check_tolerance(tolerance)
         moved = self._refined.objects_in(self._region(region)[0])[self._refined.objects]
         return outcome_information(self._mass, moved, hamming, self._refined.sizes, tolerance)
 
     def push_map(self, tolerance: float = 0.0) -> np.ndarray:
         """`push_information` (X, Y, Z) of each voxel."""
-        tolerance = check_tolerance(tolerance)
+        check_number("tolerance", tolerance, at_least=0, unit="number of voxels")
         refined, mass = self._refined, self._mass
         overlap = refined.overlaps()
         volume = overlap.diagonal()
-        apart = volume[:, None] + volume[None, :] - 2 * overlap
-        near = np.exp(-apart / tolerance) if tolerance else (apart == 0).astype(np.float64)
+        distance = volume[:, None] + volume[None, :] - 2 * overlap
+        near = np.exp(-distance / tolerance) if tolerance else (distance == 0).astype(np.float64)
         information = np.zeros(len(refined.sizes))
-        for w, own in zip(mass, refined.objects, strict=True):
-            alike = sum(v * near[own, other] for v, other in zip(mass, refined.objects, strict=True))
-            information -= w * np.log(alike)
+        for w, row in zip(mass, refined.objects, strict=True):
+            same_outcome = sum(v * near[row, other] for v, other in zip(mass, refined.objects, strict=True))
+            information -= w * np.log(same_outcome)
         return np.maximum(information, 0.0)[refined.cells]
 
     # Functions of the user ------------------------------------------------------------------------------------
@@ -392,18 +377,12 @@ class Belief:
 
     def sample(self, rng: np.random.Generator, n: int = 1) -> tuple[Hypothesis, ...]:
         """n independent draws, each ``h_i`` with probability ``w_i``."""
-        if n < 1:
-            raise InputError(f"the number of samples is {n}, expected at least 1")
+        check_integer("number of samples", n)
         return tuple(self.hypotheses[int(k)] for k in rng.choice(len(self), size=n, p=self.weights))
 
     def _images(self, camera: Camera) -> list[np.ndarray]:
-        return [project(h, _check_camera(camera)) for h in self._merged[0]]
-
-
-def _check_camera(camera: Any) -> Camera:
-    if not isinstance(camera, Camera):
-        raise InputError(f"a view takes a Camera, not a {type(camera).__name__}")
-    return camera
+        check_component("camera", camera, Camera)
+        return [project(h, camera) for h in self._merged[0]]
 
 
 def _one_index(index: Any, k: int) -> np.ndarray:
@@ -414,17 +393,22 @@ def _one_index(index: Any, k: int) -> np.ndarray:
     return index
 
 
+def _check_indices(name: str, index: np.ndarray, shape: tuple[int, ...], hint: str) -> None:
+    """Raise InputError unless `index` (..., k) holds integers from 0 to below `shape` (k,)."""
+    if index.shape[-1:] != (len(shape),) or not np.issubdtype(index.dtype, np.integer):
+        raise InputError(
+            f"{name}s have type {index.dtype} and shape {index.shape}, expected integers (..., {len(shape)})", hint
+        )
+    outside = ((index < 0) | (index >= shape)).any(axis=-1)
+    if outside.any():
+        size = " x ".join(str(n) for n in shape)
+        raise InputError(f"{name} {index[outside][0].tolist()} lies outside the {size} {name}s", hint)
+
+
 def _flat_voxels(grid: VoxelGrid, voxels: Any) -> np.ndarray:
     """Flat indices (...) of voxels (..., 3)."""
     index = np.asarray(voxels)
-    if index.shape[-1:] != (3,) or not np.issubdtype(index.dtype, np.integer):
-        raise InputError(
-            f"voxels have type {index.dtype} and shape {index.shape}, expected integers (..., 3)",
-            "belief.voxel(points) finds the voxels of points in metres",
-        )
-    outside = ~grid.contains(index)
-    if outside.any():
-        raise InputError(f"voxel {index[outside][0].tolist()} lies outside the grid of {grid.shape} voxels")
+    _check_indices("voxel", index, grid.shape, "belief.voxel(points) finds the voxels of points in metres")
     return np.ravel_multi_index(tuple(np.moveaxis(index, -1, 0)), grid.shape)
 
 
@@ -441,17 +425,7 @@ def _flat_region(grid: VoxelGrid, region: Any) -> np.ndarray:
 def _rows_and_columns(camera: Camera, pixels: Any) -> tuple[np.ndarray, np.ndarray]:
     """Rows (...) and columns (...) of pixels (..., 2), which are (column, row)."""
     index = np.asarray(pixels)
-    if index.shape[-1:] != (2,) or not np.issubdtype(index.dtype, np.integer):
-        raise InputError(
-            f"pixels have type {index.dtype} and shape {index.shape}, expected integers (..., 2)",
-            "a pixel is (column, row)",
-        )
-    outside = ((index < 0) | (index >= (camera.width, camera.height))).any(axis=-1)
-    if outside.any():
-        raise InputError(
-            f"pixel {index[outside][0].tolist()} lies outside the image of {camera.width} x {camera.height}",
-            "a pixel is (column, row)",
-        )
+    _check_indices("pixel", index, (camera.width, camera.height), "a pixel is (column, row)")
     return index[..., 1], index[..., 0]
 
 

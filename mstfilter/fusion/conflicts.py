@@ -39,7 +39,7 @@ import numpy as np
 
 from mstfilter.errors import InputError
 from mstfilter.fusion.interfaces import Structure
-from mstfilter.scene import MAX_LABEL, as_labels
+from mstfilter.scene import MAX_LABEL, Hypothesis, VoxelGrid, as_labels
 
 PROPOSED, PREDICTED = 0, 1
 MergeRule = Literal["share", "printed", "iou", "match", "covered", "always", "never"]
@@ -121,6 +121,18 @@ class ClaimedVoxels(NamedTuple):
         out = np.zeros(self.shape, values.dtype)
         out.reshape(-1)[self.at] = values
         return out
+
+
+def check_grid(name: str, hypothesis: Hypothesis, grid: VoxelGrid) -> None:
+    """Raise InputError if a hypothesis has another grid."""
+    if hypothesis.grid != grid:
+        found, expected = (
+            f"{g.shape} voxels of {g.voxel_size:g} m at {g.origin.tolist()}" for g in (hypothesis.grid, grid)
+        )
+        raise InputError(
+            f"grid of {name} is {found}, expected {expected}",
+            "all hypotheses of a run share the workspace of its clips",
+        )
 
 
 def claimed_voxels(proposed: np.ndarray, predicted: np.ndarray) -> ClaimedVoxels:

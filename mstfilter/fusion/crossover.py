@@ -25,6 +25,7 @@ from mstfilter.fusion.conflicts import (
     ConflictGraph,
     MergeRule,
     SpanningTree,
+    check_grid,
     claimed_voxels,
     components_in_conflict,
     graph_of,
@@ -162,15 +163,7 @@ class Crossover:
         If one parent has no objects, the result is the other one. An object keeps the identity of the largest
         predicted object in it, and its motion history if its voxels are exactly those predicted.
         """
-        if proposed.grid != predicted.grid:
-            one, other = (
-                f"{g.shape} voxels of {g.voxel_size:g} m at {g.origin.tolist()}"
-                for g in (proposed.grid, predicted.grid)
-            )
-            raise InputError(
-                f"hypotheses lie on different grids: the proposed one has {one}, the predicted one {other}",
-                "all hypotheses of a run share one workspace",
-            )
+        check_grid("the proposed hypothesis", proposed, predicted.grid)
         if not predicted.objects:
             return proposed
         if not proposed.objects:

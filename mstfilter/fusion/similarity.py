@@ -1,16 +1,27 @@
-"""Similarity of hypotheses: weighted coverage of all pairs, and equality up to renamed labels.
+"""Similarity of hypotheses: weighted coverage of all pairs, equality up to renamed labels, and common refinement.
 
 >>> WeightedCoverage().matrix(population.particles)      # (n, n), 1 on the diagonal
 >>> SameSegmentation().classes(population.particles)     # (n,) classes of equal segmentations
 
 For the resamplers of `mstfilter.smc` that compare particles: ``KDpp(similarity=WeightedCoverage())``,
 ``Coalesced(equivalence=SameSegmentation())``.
+
+In the common refinement of several segmentations, a cell holds the voxels (or pixels) that belong to the same object
+in every segmentation. There are far fewer cells than voxels.
+
+>>> both = common_refinement([np.array([0, 1, 1, 2]), np.array([0, 7, 7, 7])])
+>>> both.cells, both.sizes
+(array([0, 1, 1, 2]), array([1, 2, 1]))
+>>> both.objects                       # numbered over both segmentations
+array([[0, 1, 2],
+       [0, 3, 3]])
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -21,7 +32,7 @@ from mstfilter.smc import Equivalence, Similarity, first_seen
 
 
 def canonical(labels: np.ndarray) -> np.ndarray:
-    """The same segmentation with labels 1, 2, ... in the order of their first voxel; 0 stays."""
+    """The same segmentation with labels numbered 1, 2, ... by their first voxel; 0 is free."""
     flat = np.asarray(labels).ravel()
     present, first = np.unique(flat, return_index=True)
     order = np.argsort(np.where(present == 0, -1, first), kind="stable")
@@ -30,31 +41,98 @@ def canonical(labels: np.ndarray) -> np.ndarray:
     return table[flat].reshape(np.shape(labels))
 
 
+@dataclass(frozen=True, eq=False)
+class CommonRefinement:
+    """Cells of several segmentations, and the objects that they belong to.
+
+    Parameters
+    ----------
+    cells : int array of the segmentations' shape
+        The cell of every position. Cell 0 is free in all segmentations and may be empty.
+    objects : (n, k) int
+        Object of each of k cells in each of n segmentations; 0 is free. Objects are numbered from 1 over all
+        segmentations, so different segmentations have different objects.
+    sizes : (k,) int
+        Positions in each cell.
+    first : (n + 1,) int
+        Segmentation i has the objects first[i] + 1 .. first[i + 1].
+    """
+
+    cells: np.ndarray
+    objects: np.ndarray
+    sizes: np.ndarray
+    first: np.ndarray
+
+    @property
+    def n_objects(self) -> int:
+        return int(self.first[-1])
+
+    def objects_in(self, cells: np.ndarray) -> np.ndarray:
+        """Whether each object (n_objects + 1,) has one of these cells; False for 0, free."""
+        present = np.zeros(self.n_objects + 1, bool)
+        present[self.objects[:, cells]] = True
+        present[0] = False
+        return present
+
+    def overlaps(self) -> np.ndarray:
+        """Positions (n_objects + 1, n_objects + 1) that two objects share; row and column 0 (free) are 0."""
+        total = self.n_objects + 1
+        found = np.zeros((total, total))
+        sizes = np.broadcast_to(self.sizes, self.objects.shape).ravel()
+        for row, below, above in zip(self.objects, self.first, self.first[1:], strict=False):
+            codes = np.where(row > 0, row - below, 0) * total + self.objects
+            counts = np.bincount(codes.ravel(), sizes, (above - below + 1) * total).reshape(-1, total)
+            found[below + 1 : above + 1, 1:] = counts[1:, 1:]
+        return found
+
+
+def common_refinement(segmentations: Sequence[np.ndarray]) -> CommonRefinement:
+    """The common refinement of n label arrays of one shape, 0 is free."""
+    occupied = np.logical_or.reduce([labels != 0 for labels in segmentations])
+    count = int(occupied.sum())
+    cell = np.zeros(count, np.int64)
+    numbered = []
+    first = np.zeros(len(segmentations) + 1, np.int64)
+    for i, labels in enumerate(segmentations):
+        present, compact = _renumbered(labels[occupied])
+        numbered.append(np.where(compact > 0, compact + first[i], 0))
+        first[i + 1] = first[i] + present
+        cell = _renumbered(cell * (present + 1) + compact + 1)[1] - 1  # + 1: no code is 0, the free one
+    k = int(cell.max(initial=-1)) + 2
+    cells = np.zeros(occupied.shape, np.int64)
+    cells[occupied] = cell + 1
+    example = np.zeros(k, np.int64)
+    example[cell + 1] = np.arange(count)
+    objects = np.zeros((len(segmentations), k), np.int64)
+    for row, numbers in zip(objects, numbered, strict=True):
+        row[1:] = numbers[example[1:]]
+    return CommonRefinement(cells, objects, np.bincount(cells.ravel(), minlength=k), first)
+
+
+def _renumbered(codes: np.ndarray) -> tuple[int, np.ndarray]:
+    """The number of distinct codes other than 0, and the codes renumbered 1, 2, ... in ascending order; 0 stays."""
+    present, index = np.unique(np.append(codes, 0), return_inverse=True)
+    return len(present) - 1, index[:-1]
+
+
 @dataclass(frozen=True)
 class SameSegmentation(Equivalence):
     """Hypotheses with the same regions are equal, also if their labels differ."""
 
     def classes(self, particles: Sequence[Hypothesis]) -> np.ndarray:
-        """Classes (n,). A label grid that several particles share is compared once."""
-        known: dict[int, bytes] = {}
-
-        def key(hypothesis: Hypothesis) -> bytes:
-            name = id(hypothesis.labels)
-            if name not in known:
-                known[name] = canonical(hypothesis.labels).tobytes()
-            return known[name]
-
-        return first_seen((key(h), h.grid.key) for h in particles)
+        distinct = {id(h.labels): h.labels for h in particles}
+        segmentation = {k: canonical(labels).tobytes() for k, labels in distinct.items()}
+        return first_seen((segmentation[id(h.labels)], h.grid.key) for h in particles)
 
 
 @dataclass(frozen=True)
 class WeightedCoverage(Similarity):
-    """Quality of one hypothesis against the other (form ``objects`` of `mstfilter.scoring.quality`), for all pairs.
+    """Weighted coverage (form ``objects`` of `mstfilter.scoring.quality`) of all pairs of hypotheses.
 
     Parameters
     ----------
     stride : int
-        Uses every stride-th voxel along each axis: faster by stride^3.
+        Step between the voxels that are used, along each axis. The time falls with stride^3.
     """
 
     stride: int = 1
@@ -64,67 +142,43 @@ class WeightedCoverage(Similarity):
             raise InputError(f"stride is {self.stride} voxels, expected at least 1")
 
     def matrix(self, particles: Sequence[Hypothesis]) -> np.ndarray:
-        """Quality (n, n). Each row is one contingency table against the objects of all hypotheses."""
         step = slice(None, None, self.stride)
         grids = [h.labels[step, step, step] for h in particles]
         if len({g.shape for g in grids}) != 1:
             raise InputError("hypotheses have label grids of different shapes, expected the same for all")
-        occupied = np.zeros(grids[0].shape, bool)
-        for grid in grids:
-            occupied |= grid > 0
-        # (n, voxels) labels numbered over all hypotheses; number start[i] is the free space of i.
-        flat = np.empty((len(grids), int(occupied.sum())), np.int64)
-        start = np.zeros(len(grids) + 1, np.int64)
-        for i, grid in enumerate(grids):
-            present, compact = np.unique(np.append(grid[occupied], 0), return_inverse=True)
-            flat[i] = compact[:-1] + start[i]
-            start[i + 1] = start[i] + len(present)
-        return _coverage(flat, start)
-
-
-def _coverage(flat: np.ndarray, start: np.ndarray) -> np.ndarray:
-    n, total = len(flat), int(start[-1])
-    sizes = np.bincount(flat.ravel(), minlength=total)
-    is_object = np.ones(total, bool)
-    is_object[start[:-1]] = False
-    volumes = np.add.reduceat(np.where(is_object, sizes, 0), start[:-1])
-    side = np.zeros((n, n))  # side[i, j]: how well the objects of i are covered by those of j
-    for i in range(n):
-        own = int(start[i + 1] - start[i])
-        pairs = (flat[i] - start[i])[None, :] * total + flat
-        counts = np.bincount(pairs.ravel(), minlength=own * total).reshape(own, total)[1:]
-        own_sizes = sizes[start[i] + 1 : start[i + 1]]
-        jaccard = counts / np.maximum(own_sizes[:, None] + sizes[None, :] - counts, 1)
-        jaccard[:, ~is_object] = 0.0
-        best = np.maximum.reduceat(jaccard, start[:-1], axis=1) if own > 1 else np.zeros((0, n))
-        side[i] = own_sizes @ best / max(int(volumes[i]), 1)
-    quality = (side + side.T) / 2
-    # Two empty hypotheses have quality 1; an empty and another one have 0.
-    empty = volumes == 0
-    quality[np.ix_(empty, empty)] = 1.0
-    return quality
+        refined = common_refinement(grids)
+        common = refined.overlaps()[1:, 1:]
+        sizes = common.diagonal().copy()
+        jaccard = common / (sizes[:, None] + sizes - common)
+        objects = [slice(a, b) for a, b in pairwise(refined.first)]  # of each hypothesis
+        best = np.stack([jaccard[:, k].max(axis=1, initial=0.0) for k in objects], axis=1)
+        volumes = np.array([sizes[k].sum() for k in objects])
+        covered = np.stack([sizes[k] @ best[k] for k in objects]) / np.maximum(volumes, 1)[:, None]
+        quality = (covered + covered.T) / 2
+        empty = volumes == 0
+        quality[np.ix_(empty, empty)] = 1.0  # an empty and another hypothesis have quality 0
+        return quality
 
 
 @dataclass(frozen=True)
 class Agreement(Evidence):
-    """Scores a candidate by its mean quality against the other candidates.
+    """Scores a candidate by its mean similarity to the other candidates.
 
-    It uses no data. The candidate with the largest mean quality against draws from a posterior has the least expected
+    It uses no data. The candidate with the largest mean similarity to draws from a posterior has the least expected
     loss (minimum Bayes risk). The score concentrates the population.
 
     Parameters
     ----------
     strength : float
-        Nats for a mean quality of 1 against the other candidates.
+        Score in nats of a candidate with mean similarity 1.
     similarity : Similarity
-        Quality of one hypothesis against another.
+        Compares two hypotheses.
     """
 
     strength: float = 30.0
     similarity: Similarity = WeightedCoverage()
 
     def log_score(self, hypotheses: Sequence[Hypothesis], clip: Clip) -> np.ndarray:
-        """`strength` times the mean quality (n,) against the other hypotheses."""
         n = len(hypotheses)
         if n < 2:
             return np.zeros(n)

@@ -20,11 +20,12 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from mstfilter.errors import InputError
+from mstfilter.fusion.conflicts import check_grid
 from mstfilter.fusion.crossover import Crossover
 from mstfilter.fusion.division import NoDivision, PartRule, split_by_motion
 from mstfilter.fusion.free_space import FreeSpace, log_quality
 from mstfilter.fusion.interfaces import Division, Evidence, Projection
-from mstfilter.scene import Clip, Hypothesis, VoxelGrid, frame_geometry
+from mstfilter.scene import Clip, Hypothesis, frame_geometry
 from mstfilter.smc import Candidates, Population, Systematic, Update, child, key_of, union
 
 _SURFACE_VOXELS = 1.5  # a voxel up to this far behind the reading counts as surface, as in completion
@@ -157,7 +158,10 @@ class FusionUpdate(Update):
         key, crossover = key_of(rng), self.crossover
         samples = self.divided(tuple(proposed.particles), observation, proposed=True)
         claims, exposed = self.claims, self.claims.exposed(observation)
-        _check_grids(refined, samples, refined[0].grid if exposed is None else observation.grid)
+        grid = refined[0].grid if exposed is None else observation.grid
+        for name, hypotheses in (("predicted", refined), ("proposed", samples)):
+            for k, hypothesis in enumerate(hypotheses):
+                check_grid(f"{name} hypothesis {k}", hypothesis, grid)
 
         def build(candidate: int) -> Hypothesis:
             stream = key.child("candidate", candidate).generator()
@@ -201,20 +205,6 @@ class FusionUpdate(Update):
         distinct = {id(h): h for h in hypotheses}
         split = {name: split_by_motion(h, motions, clip, self.parts, proposed) for name, h in distinct.items()}
         return tuple(split[id(h)] for h in hypotheses)
-
-
-def _check_grids(predicted: tuple[Hypothesis, ...], proposed: tuple[Hypothesis, ...], grid: VoxelGrid) -> None:
-    """Raise InputError if a hypothesis lies on another grid, before any candidate is built."""
-    for name, hypotheses in (("predicted", predicted), ("proposed", proposed)):
-        for k, hypothesis in enumerate(hypotheses):
-            if hypothesis.grid != grid:
-                found, wanted = (
-                    f"{g.shape} voxels of {g.voxel_size:g} m at {g.origin.tolist()}" for g in (hypothesis.grid, grid)
-                )
-                raise InputError(
-                    f"grid of {name} hypothesis {k} is {found}, expected {wanted}",
-                    "all hypotheses of a run share the workspace of its clips",
-                )
 
 
 def _pairs(rng: np.random.Generator, n_proposed: int, n_predicted: int, eta: int) -> tuple[np.ndarray, np.ndarray]:

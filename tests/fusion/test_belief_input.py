@@ -9,7 +9,8 @@ import pytest
 
 from mstfilter.errors import InputError
 from mstfilter.fusion.belief import Belief
-from mstfilter.fusion.information import common_refinement, partition_distance
+from mstfilter.fusion.information import partition_distance
+from mstfilter.fusion.similarity import common_refinement
 from mstfilter.scene import Hypothesis, VoxelGrid
 from mstfilter.smc import Population
 from tests.fusion.test_belief import CAMERA, GRID, SHAPE, belief_of, scenes, voxels_of
@@ -96,5 +97,5 @@ def test_bad_input_is_one_clear_error(name):
 def test_different_grids():
     labels = scenes(0)[0][0]
     for other in (VoxelGrid(GRID.origin, 0.02, SHAPE), VoxelGrid(GRID.origin + 0.01, 0.01, SHAPE)):
-        with pytest.raises(InputError, match="hypothesis 1 has a grid"):
+        with pytest.raises(InputError, match="grid of hypothesis 1"):
             Belief(Population((Hypothesis.from_labels(labels, GRID), Hypothesis.from_labels(labels, other))))

@@ -44,7 +44,7 @@ def mixed(proposed, predicted, seed=0, **fields):
 def test_grids_that_differ(grid, found):
     other = on(np.ones(grid.shape, int), grid)
     for parents in ((on(A), other), (other, on(A)), (on(0 * A), other)):  # an empty one too
-        with pytest.raises(InputError, match=f"different grids: .*{found}") as caught:
+        with pytest.raises(InputError, match=f"grid of the proposed hypothesis is .*{found}") as caught:
             mixed(*parents)
         assert caught.value.hints
 

@@ -110,7 +110,7 @@ def test_identity_and_motion_history():
 def test_grids_must_agree():
     a = Hypothesis.from_labels(np.ones(SMALL.shape, np.uint16), SMALL)
     other = VoxelGrid((1, 0, 0), 0.01, SMALL.shape)
-    with pytest.raises(InputError, match="different grids"):
+    with pytest.raises(InputError, match="grid of the proposed hypothesis"):
         Crossover().mix(np.random.default_rng(0), a, Hypothesis.from_labels(a.labels, other))
 
 
