@@ -64,7 +64,7 @@ def count(family: SceneFamily, seed: int) -> dict[str, float]:
         restless += int(not result.settled)
     seen = np.array(pixels)
     truth = scene.truth()
-    pairs = {(c.first, c.second) for c in world.contacts()}
+    pairs = set(world.contacts())
     twins = [(min(k, t), max(k, t)) for k, t in enumerate(scene.objects.twin_of) if t >= 0]
     return {
         "objects": world.n_objects,

@@ -18,7 +18,16 @@ from pathlib import Path
 import numpy as np
 
 from mstfilter.files import write_csv
-from mstfilter.simulation import POSE_TOLERANCE, Renderer, SimulatedScene, advance_push, finish_push, scene_family
+from mstfilter.simulation import (
+    POSE_TOLERANCE,
+    DepthSensor,
+    Renderer,
+    SimulatedScene,
+    advance_push,
+    colour_reading,
+    finish_push,
+    scene_family,
+)
 
 HEADER = ("family", "seed", "frames", "kept_s", "full_s", "ratio", "sensor_s", "kept_cpu_s", "full_cpu_s")
 
@@ -51,8 +60,8 @@ def measure(name: str, seed: int, actions: int, small: dict[str, int]) -> list[s
         for part in ("colour", "depth", "instance", "slant"):
             np.testing.assert_array_equal(*(getattr(view, part) for view in views))
         wall = time.perf_counter()
-        scene._colour.read(np.random.default_rng(0), views[0].colour)
-        scene._depth.read(np.random.default_rng(0), views[0].depth, views[0].slant)
+        colour_reading(np.random.default_rng(0), views[0].colour)
+        DepthSensor().read(np.random.default_rng(0), views[0].depth, views[0].slant)
         sensor += time.perf_counter() - wall
         frames += 1
     ratio = cpu[1] / cpu[0]

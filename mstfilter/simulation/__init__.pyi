@@ -15,7 +15,7 @@ from mstfilter.simulation.recorder import (
     simulate_recording as simulate_recording,
 )
 from mstfilter.simulation.renderer import Renderer as Renderer
-from mstfilter.simulation.sensor import DepthSensor as DepthSensor
+from mstfilter.simulation.sensor import DepthSensor as DepthSensor, colour_reading as colour_reading
 from mstfilter.simulation.world import (
     FingerPush as FingerPush,
     PushEffect as PushEffect,

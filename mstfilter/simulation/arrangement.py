@@ -14,7 +14,7 @@ import numpy as np
 from mstfilter.errors import InputError
 from mstfilter.scene import Camera
 from mstfilter.simulation.families import SceneFamily
-from mstfilter.simulation.shapes import Shape, draw_shape
+from mstfilter.simulation.shapes import Pool, Shape, draw_shape
 from mstfilter.simulation.textures import Skin, draw_skin
 from mstfilter.simulation.world import OBJECT_GROUP, PhysicsWorld
 
@@ -45,7 +45,7 @@ class SceneObjects:
     twin_of: tuple[int, ...]
 
 
-def draw_objects(rng: np.random.Generator, family: SceneFamily) -> SceneObjects:
+def draw_objects(rng: np.random.Generator, family: SceneFamily, pool: Pool) -> SceneObjects:
     """Draw the shapes and textures of a scene; a family of shapes repeats only after all others have been used."""
     count = int(rng.integers(family.n_objects_min, family.n_objects_max + 1))
     names = list(family.shape_families())
@@ -57,9 +57,9 @@ def draw_objects(rng: np.random.Generator, family: SceneFamily) -> SceneObjects:
             # Cartons and cans, which are common on tables, are more frequent.
             extra = [name for name in names for _ in range({"carton": 3, "can": 2}.get(name, 0))]
             bag = [str(name) for name in rng.permutation(names + extra)]
-        shape = draw_shape(rng, bag.pop(), family.pool)
+        shape = draw_shape(rng, bag.pop(), pool)
         shapes.append(shape)
-        skins.append(draw_skin(rng, shape, family.pool))
+        skins.append(draw_skin(rng, shape, pool))
     twin_of = [-1] * len(shapes)
     # Twins have a recognisable texture and stand firmly.
     fit = [k for k, s in enumerate(shapes) if s.family not in ("bowl", "ball")] or list(range(len(shapes)))
@@ -243,7 +243,7 @@ def _try_arrangement(
         unseen = int((_visible_pixels(world, camera) == 0).sum())
         if unseen < n_unseen or unseen > world.n_objects / 3:
             return False
-    touching = {(c.first, c.second) for c in world.contacts()}
+    touching = set(world.contacts())
     return sum((min(k, t), max(k, t)) in touching for k, t in enumerate(twin_of) if t >= 0) >= n_touching
 
 

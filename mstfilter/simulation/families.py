@@ -1,8 +1,8 @@
 """Families of simulated scenes: a family and one integer seed define a recording.
 
 >>> from mstfilter.simulation import scene_family
->>> scene_family("demo").image_size, scene_family("table").grid().shape
-((320, 240), (100, 100, 50))
+>>> scene_family("demo").n_frames, scene_family("table").grid().shape
+(15, (100, 100, 50))
 
 A family is a frozen `SceneFamily`; `dataclasses.replace` makes variants. The studies use `s1`, `s2` and `s3`: 5, 9
 and 15 - 20 objects with the same camera, sensor, textures and contacts. `catalogue` separates scenes for tuning from
@@ -28,7 +28,26 @@ GENERATOR_VERSION = 7
 FIRST_REPORTED_SEED = 1000
 """With the catalogue "by seed", seeds from this one on draw from the reported pool."""
 
-_CATALOGUES = ("tuning", "reported", "any", "by seed")
+_POOLS = {"tuning": TUNING, "reported": REPORTED, "any": ANY}
+
+_LIMITS: dict[str, tuple[float, float]] = {
+    "n_objects_min": (1, np.inf),
+    "contact": (0.0, 1.0),
+    "n_actions": (0, np.inf),
+    "frames_per_clip": (2, np.inf),
+    "fps": (0.5, 60.0),
+    "push_speed": (0.01, 0.5),
+    "min_moved": (1, np.inf),
+    "move_threshold": (0.0001, 0.5),
+    "n_candidates": (1, np.inf),
+    "width": (16, 4096),
+    "height": (16, 4096),
+    "camera_distance": (0.5, 2.0),
+    "workspace_x": (0.1, 2.0),
+    "workspace_y": (0.1, 2.0),
+    "workspace_z": (0.1, 2.0),
+    "voxel_size": (0.001, 0.1),
+}
 
 
 @dataclass(frozen=True)
@@ -110,32 +129,19 @@ class SceneFamily:
     voxel_size: float = 0.01
 
     def __post_init__(self) -> None:
-        def check(name: str, valid: bool, expected: str) -> None:
-            if not valid:
-                raise InputError(
-                    f"scene family {self.name!r}: {name} is {getattr(self, name)!r}, expected {expected}"
-                )
-
-        check("n_objects_min", self.n_objects_min >= 1, "at least 1")
-        check("n_objects_max", self.n_objects_min <= self.n_objects_max <= 40, "n_objects_min .. 40")
-        check("n_twins", 0 <= self.n_twins < self.n_objects_min, "0 .. n_objects_min - 1")
-        check("n_stacked", 0 <= self.n_stacked < self.n_objects_min, "0 .. n_objects_min - 1")
-        check("n_hidden", 0 <= self.n_hidden < self.n_objects_min, "0 .. n_objects_min - 1")
-        check("contact", 0.0 <= self.contact <= 1.0, "a probability")
-        check("catalogue", self.catalogue in _CATALOGUES, ", ".join(_CATALOGUES))
-        check("n_actions", self.n_actions >= 0, "at least 0")
-        check("frames_per_clip", self.frames_per_clip >= 2, "at least 2 (the two pauses)")
-        check("fps", 0.5 <= self.fps <= 60.0, "0.5 .. 60")
-        check("push_speed", 0.01 <= self.push_speed <= 0.5, "0.01 .. 0.5 m/s")
-        check("min_moved", self.min_moved >= 1, "at least 1")
-        check("move_threshold", 0.0 < self.move_threshold <= 0.5, "metres, up to 0.5")
-        check("n_candidates", self.n_candidates >= 1, "at least 1")
-        check("width", 16 <= self.width <= 4096, "16 .. 4096 pixels")
-        check("height", 16 <= self.height <= 4096, "16 .. 4096 pixels")
-        check("camera_distance", 0.5 <= self.camera_distance <= 2.0, "0.5 .. 2 m")
-        for name in ("workspace_x", "workspace_y", "workspace_z"):
-            check(name, 0.1 <= getattr(self, name) <= 2.0, "0.1 .. 2 m")
-        check("voxel_size", 0.001 <= self.voxel_size <= 0.1, "0.001 .. 0.1 m")
+        limits = dict(_LIMITS)
+        limits["n_objects_max"] = (self.n_objects_min, 40)
+        limits |= dict.fromkeys(("n_twins", "n_stacked", "n_hidden"), (0, self.n_objects_min - 1))
+        for field, (low, high) in limits.items():
+            value = getattr(self, field)
+            if not low <= value <= high:
+                expected = f"at least {low}" if high == np.inf else f"{low} .. {high}"
+                raise InputError(f"scene family {self.name!r}: {field} is {value!r}, expected {expected}")
+        if self.catalogue not in (*_POOLS, "by seed"):
+            raise InputError(
+                f"scene family {self.name!r}: unknown catalogue {self.catalogue!r}",
+                f"known: {', '.join(_POOLS)}, by seed",
+            )
         self.shape_families()
         if self.n_actions and self.action_seconds < 1.0:
             raise InputError(
@@ -150,25 +156,15 @@ class SceneFamily:
         return (self.frames_per_clip - 1) / self.fps
 
     @property
-    def image_size(self) -> tuple[int, int]:
-        """Width and height of the images."""
-        return self.width, self.height
-
-    @property
     def n_frames(self) -> int:
         """Frames of a recording."""
         return 1 + self.n_actions * (self.frames_per_clip - 1)
 
-    def for_seed(self, seed: int) -> SceneFamily:
-        """This family with the catalogue of a seed."""
-        if self.catalogue != "by seed":
-            return self
-        return replace(self, catalogue="tuning" if seed < FIRST_REPORTED_SEED else "reported")
-
-    @property
-    def pool(self) -> Pool:
-        """The pool of sizes and textures."""
-        return {"tuning": TUNING, "reported": REPORTED}.get(self.catalogue, ANY)
+    def pool(self, seed: int) -> Pool:
+        """The pool of sizes and textures for a seed."""
+        if self.catalogue == "by seed":
+            return TUNING if seed < FIRST_REPORTED_SEED else REPORTED
+        return _POOLS[self.catalogue]
 
     def shape_families(self) -> tuple[str, ...]:
         """Names of the families of objects."""
@@ -194,7 +190,7 @@ class SceneFamily:
     def contains_points(self, points: np.ndarray) -> np.ndarray:
         """Whether points (n, 3) lie above the table, in the workspace and in view, with a margin: (n,) bool."""
         uv, depth = self.camera().project(points)
-        size = np.array(self.image_size)
+        size = np.array((self.width, self.height))
         with np.errstate(invalid="ignore"):
             seen = (depth > 0) & ((uv > 0.05 * size) & (uv < 0.95 * size)).all(axis=1)
         reach = np.array([self.workspace_x, self.workspace_y]) / 2 - 0.05

@@ -42,7 +42,7 @@ from mstfilter.scene import Recording
 from mstfilter.simulation.arrangement import SceneObjects, arrange_objects, draw_objects
 from mstfilter.simulation.families import GENERATOR_VERSION, SceneFamily, scene_family
 from mstfilter.simulation.renderer import Renderer, visible_texel
-from mstfilter.simulation.sensor import ColourSensor, DepthSensor
+from mstfilter.simulation.sensor import DepthSensor, colour_reading
 from mstfilter.simulation.shapes import label_voxels
 from mstfilter.simulation.textures import Room, draw_room
 from mstfilter.simulation.world import (
@@ -87,14 +87,13 @@ class SimulatedScene:
         _check_seed(seed)
         self.family, self.seed = family, int(seed)
         self.camera, self.grid = family.camera(), family.grid()
-        self.objects: SceneObjects = draw_objects(_stream(self.seed, "things"), family.for_seed(self.seed))
+        self.objects: SceneObjects = draw_objects(_stream(self.seed, "things"), family, family.pool(self.seed))
         self.world = PhysicsWorld(self.objects.shapes, family.arm)
         arrange_objects(_stream(self.seed, "arrangement"), self.world, family, self.objects.twin_of)
         self.room: Room = draw_room(_stream(self.seed, "room"), visible_texel(self.camera))
         self._renderer = Renderer(
             self.world, self.objects.skins, self.room, self.camera, family.supersample, POSE_TOLERANCE
         )
-        self._colour, self._depth = ColourSensor(), DepthSensor()
 
     def choose_push(self, action: int) -> FingerPush:
         """Choose the push of action number `action` from the current state."""
@@ -104,8 +103,8 @@ class SimulatedScene:
         """Images of the current state as frame number `frame`: rgb, depth, instance, robot_mask."""
         view = self._renderer.render()
         return {
-            "rgb": self._colour.read(_stream(self.seed, "colour", frame), view.colour * self.room.exposure),
-            "depth": self._depth.read(_stream(self.seed, "depth", frame), view.depth, view.slant),
+            "rgb": colour_reading(_stream(self.seed, "colour", frame), view.colour * self.room.exposure),
+            "depth": DepthSensor().read(_stream(self.seed, "depth", frame), view.depth, view.slant),
             "instance": view.instance,
             "robot_mask": view.instance == FINGER_ID,
         }
@@ -222,7 +221,7 @@ def _record_frame(
 
 
 def _record_pause(scene: SimulatedScene, writer: RecordingWriter, index: int, time_s: float, **entry: Any) -> None:
-    contacts = [[c.first + 1, c.second + 1] for c in scene.world.contacts()]
+    contacts = [[i + 1, j + 1] for i, j in scene.world.contacts()]
     # Objects outside the workspace have no or only some voxels in the true volume.
     away = np.flatnonzero(~scene.family.contains_points(scene.poses()[:, :3, 3])) + 1
     _record_frame(scene, writer, index, time_s, "static", contacts=contacts, left_workspace=away.tolist(), **entry)

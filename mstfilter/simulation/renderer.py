@@ -14,6 +14,7 @@ import numpy as np
 
 from mstfilter.scene import Camera
 from mstfilter.simulation.layers import SHADOW_GROUPS, LightMap, PixelRays, Stage
+from mstfilter.simulation.sensor import NEIGHBOURS
 from mstfilter.simulation.solids import CapsuleBounds
 from mstfilter.simulation.textures import Atlas, Room, Skin
 from mstfilter.simulation.world import FINGER_GROUP, OBJECT_GROUP, ROOM_GROUP, TABLE, PhysicsWorld
@@ -212,10 +213,7 @@ def _edge_pixels(ids: np.ndarray, normal: np.ndarray) -> np.ndarray:
     """Pixels (k,) on borders of instances (H, W), or where the normal (H, W, 3) of a body turns sharply."""
     edge = np.zeros(ids.shape, bool)
     x, y, z = (np.ascontiguousarray(normal[..., i]) for i in range(3))
-    for axis in (0, 1):
-        a, b = [slice(None), slice(None)], [slice(None), slice(None)]
-        a[axis], b[axis] = slice(1, None), slice(None, -1)
-        here, there = tuple(a), tuple(b)
+    for here, there in NEIGHBOURS:
         cosine = x[here] * x[there] + y[here] * y[there] + z[here] * z[there]
         step = (ids[here] != ids[there]) | (cosine < 0.7) & (ids[here] > 0)
         edge[here] |= step

@@ -23,6 +23,21 @@ import numpy as np
 
 from mstfilter.errors import InputError
 
+_FOCAL, _BASELINE = 525.0, 0.075  # pixels of the sensor's raster of 640 pixels per row, metres
+_EIGHTHS = 8.0 * _FOCAL * _BASELINE  # disparity at one metre, eighths of a pixel
+_DISPARITY_NOISE = 0.5  # standard deviation before rounding, eighths of a pixel
+_EDGE_STEP = 0.02  # relative difference of depth between neighbours from which they form an edge
+_PATCH = 3  # side of the square of pixels of the raster that are shifted or lost together
+_GRAZING = 1.4  # angle of incidence beyond which there is no reading, radians
+_NEAREST, _FARTHEST = 0.4, 4.0  # range, metres
+
+_BLUR = 0.45  # standard deviation of the blur of the colour camera's optics, pixels
+_PHOTON_NOISE = 0.010  # standard deviation at white, as a share of white; proportional to the root of the light
+_READ_NOISE = 0.002  # standard deviation in the dark, as a share of white
+
+NEIGHBOURS = ((np.s_[1:], np.s_[:-1]), (np.s_[:, 1:], np.s_[:, :-1]))
+"""Pairs of views of an image that hold vertical and horizontal neighbours."""
+
 
 @dataclass(frozen=True)
 class DepthSensor:
@@ -30,12 +45,6 @@ class DepthSensor:
 
     Parameters
     ----------
-    focal : float
-        Focal length in pixels of the sensor's raster of 640 pixels per row; it does not depend on the image size.
-    baseline : float
-        Metres.
-    disparity_noise : float
-        Standard deviation in eighths of a pixel, before rounding.
     lateral : float
         Standard deviation of the sideways shift on depth edges, pixels of the sensor's raster.
     edge_dropout : float
@@ -43,45 +52,20 @@ class DepthSensor:
         to how often readings are missing 1 .. 10 pixels to each side of objects in 45 real frames.
     fill : float
         Shadows of the projector up to this width are filled by the sensor, pixels of its raster.
-    patch : int
-        Side of the square of pixels of the sensor's raster that are shifted or lost together.
-    edge_step : float
-        Relative difference of depth between neighbours from which they form an edge.
-    grazing : float
-        Angle of incidence beyond which there is no reading, radians.
-    nearest, farthest : float
-        Range, metres.
     """
 
-    focal: float = 525.0
-    baseline: float = 0.075
-    disparity_noise: float = 0.5
     lateral: float = 0.5
     edge_dropout: float = 0.12
-    edge_step: float = 0.02
     fill: float = 2.5
-    patch: int = 3
-    grazing: float = 1.4
-    nearest: float = 0.4
-    farthest: float = 4.0
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.edge_dropout <= 1.0:
             raise InputError(f"edge_dropout is {self.edge_dropout!r}, expected a probability")
-        for name in ("focal", "baseline", "edge_step", "farthest"):
-            if not getattr(self, name) > 0:
-                raise InputError(f"{name} is {getattr(self, name)!r}, expected more than 0")
-        if self.patch < 1:
-            raise InputError(f"patch is {self.patch!r}, expected at least 1 pixel")
-        for name in ("disparity_noise", "lateral", "nearest", "grazing"):
-            if not getattr(self, name) >= 0:
-                raise InputError(f"{name} is {getattr(self, name)!r}, expected at least 0")
 
     @property
     def axial_sigma(self) -> float:
         """Standard deviation of a reading at one metre, rounding included, in metres."""
-        units = np.hypot(self.disparity_noise, 1 / np.sqrt(12.0))
-        return float(units / (8 * self.focal * self.baseline))
+        return float(np.hypot(_DISPARITY_NOISE, 1 / np.sqrt(12.0)) / _EIGHTHS)
 
     def read(self, rng: np.random.Generator, depth: np.ndarray, slant: np.ndarray) -> np.ndarray:
         """Depth image (H, W) float32 in metres, NaN for no reading.
@@ -95,55 +79,51 @@ class DepthSensor:
             Cosine of the angle of incidence.
         """
         h, w = depth.shape
-        edge = self._edges(depth)
+        edge = _depth_edges(depth)
         # The raster has 640 pixels per row; smaller images are scaled from it. The sideways shift frays edges; within
         # a surface it is part of the axial noise, which was measured on tilted tables.
         scale = w / 640.0
-        side = max(1, round(self.patch * scale))
+        side = max(1, round(_PATCH * scale))
         aside = self.lateral * scale * edge
         rows = np.arange(h)[:, None] + np.rint(_patches(rng.standard_normal, h, w, side) * aside).astype(np.int64)
         columns = np.arange(w)[None, :] + np.rint(_patches(rng.standard_normal, h, w, side) * aside).astype(np.int64)
         at = np.clip(rows, 0, h - 1), np.clip(columns, 0, w - 1)
         z, cosine = depth[at], slant[at]
-        eighths = 8.0 * self.focal * self.baseline
-        noise = rng.standard_normal((h, w)) * self.disparity_noise
+        noise = rng.standard_normal((h, w)) * _DISPARITY_NOISE
         with np.errstate(invalid="ignore", divide="ignore"):
-            units = np.rint(eighths / z + noise)
-            reading = eighths / np.maximum(units, 1.0)
+            reading = _EIGHTHS / np.maximum(np.rint(_EIGHTHS / z + noise), 1.0)
         wide = edge.copy()
         for axis in (0, 1):
             wide |= np.roll(edge, 1, axis) | np.roll(edge, -1, axis)
         lost = wide & (_patches(rng.uniform, h, w, side) < self.edge_dropout)
         lost |= self._unlit(depth)[at]
-        lost |= (cosine < np.cos(self.grazing)) | (reading < self.nearest) | (reading > self.farthest)
+        lost |= (cosine < np.cos(_GRAZING)) | (reading < _NEAREST) | (reading > _FARTHEST)
         return np.where(lost | ~np.isfinite(z), np.nan, reading).astype(np.float32)
 
     def _unlit(self, depth: np.ndarray) -> np.ndarray:
-        """Surfaces that the projector, `baseline` to the right of the camera, does not light: (H, W) bool.
+        """Surfaces that the projector, a baseline to the right of the camera, does not light: (H, W) bool.
 
         Seen by the projector, column u of depth z is at u - f b / z. A surface is in shadow if another one, farther
         right in the camera's image, is to its left there.
         """
         w = depth.shape[1]
-        disparity = self.focal * w / 640.0 * self.baseline / np.where(np.isfinite(depth), depth, np.inf)
+        disparity = _FOCAL * w / 640.0 * _BASELINE / np.where(np.isfinite(depth), depth, np.inf)
         there = np.arange(w) - disparity
         least = np.minimum.accumulate(there[:, ::-1], axis=1)[:, ::-1]
         return there > least + self.fill * w / 640.0
 
-    def _edges(self, depth: np.ndarray) -> np.ndarray:
-        """Whether a pixel or its neighbour is at a step in depth: (H, W) bool."""
-        edge = np.zeros(depth.shape, bool)
-        for axis in (0, 1):
-            a: list[slice] = [slice(None), slice(None)]
-            b: list[slice] = [slice(None), slice(None)]
-            a[axis], b[axis] = slice(1, None), slice(None, -1)
-            first, second = depth[tuple(a)], depth[tuple(b)]
-            with np.errstate(invalid="ignore"):
-                step = ~(np.abs(first - second) <= self.edge_step * np.minimum(first, second))
-            step &= np.isfinite(first) | np.isfinite(second)
-            edge[tuple(a)] |= step
-            edge[tuple(b)] |= step
-        return edge
+
+def _depth_edges(depth: np.ndarray) -> np.ndarray:
+    """Whether a pixel or its neighbour is at a step in depth: (H, W) bool."""
+    edge = np.zeros(depth.shape, bool)
+    for here, there in NEIGHBOURS:
+        first, second = depth[here], depth[there]
+        with np.errstate(invalid="ignore"):
+            step = ~(np.abs(first - second) <= _EDGE_STEP * np.minimum(first, second))
+        step &= np.isfinite(first) | np.isfinite(second)
+        edge[here] |= step
+        edge[there] |= step
+    return edge
 
 
 def _patches(draw: Callable[..., np.ndarray], h: int, w: int, side: int) -> np.ndarray:
@@ -152,35 +132,16 @@ def _patches(draw: Callable[..., np.ndarray], h: int, w: int, side: int) -> np.n
     return np.repeat(np.repeat(small, side, axis=0), side, axis=1)[:h, :w]
 
 
-@dataclass(frozen=True)
-class ColourSensor:
-    """A small colour camera.
+def colour_reading(rng: np.random.Generator, linear: np.ndarray) -> np.ndarray:
+    """sRGB image (H, W, 3) uint8 of a colour camera from exposed linear light (H, W, 3), 1 for white."""
+    import cv2
 
-    Parameters
-    ----------
-    blur : float
-        Standard deviation of the blur of the optics, pixels.
-    photons : float
-        Standard deviation of noise at white, as a share of white; proportional to the root of the light.
-    read_noise : float
-        Standard deviation of noise in the dark, as a share of white.
-    """
-
-    blur: float = 0.45
-    photons: float = 0.010
-    read_noise: float = 0.002
-
-    def read(self, rng: np.random.Generator, linear: np.ndarray) -> np.ndarray:
-        """sRGB image (H, W, 3) uint8 of exposed linear light (H, W, 3), 1 for white."""
-        import cv2
-
-        light = cv2.GaussianBlur(linear, (0, 0), self.blur) if self.blur > 0 else linear
-        light = np.maximum(light, 0.0)
-        # Compress highlights instead of clipping them, as cameras do.
-        light = np.where(light > 0.7, 0.7 + 0.3 * np.tanh((light - 0.7) / 0.3), light)
-        noise = rng.standard_normal(light.shape, dtype=np.float32)
-        light = light + noise * np.sqrt(self.photons**2 * light + self.read_noise**2)
-        return _DISPLAY[np.clip(light * 4095.0 + 0.5, 0, 4095).astype(np.int64)]
+    light = np.maximum(cv2.GaussianBlur(linear, (0, 0), _BLUR), 0.0)
+    # Compress highlights instead of clipping them, as cameras do.
+    light = np.where(light > 0.7, 0.7 + 0.3 * np.tanh((light - 0.7) / 0.3), light)
+    noise = rng.standard_normal(light.shape, dtype=np.float32)
+    light = light + noise * np.sqrt(_PHOTON_NOISE**2 * light + _READ_NOISE**2)
+    return _DISPLAY[np.clip(light * 4095.0 + 0.5, 0, 4095).astype(np.int64)]
 
 
 def _display_curve() -> np.ndarray:

@@ -29,7 +29,7 @@ True
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
 
@@ -106,10 +106,8 @@ class Shape:
         One of SHAPE_FAMILIES.
     name : str
         Member of the family.
-    pieces : tuple of Piece
-        Convex; their union is the object.
-    half : (3,) metres
-        Half edges of the bounding box, which is centred on the origin.
+    pieces : sequence of Piece
+        Convex; their union is the object. They are moved so that its bounding box is centred on the origin.
     mass : float
         Kilograms.
     print_as : {"box", "lathe"}
@@ -124,13 +122,23 @@ class Shape:
 
     family: str
     name: str
-    pieces: tuple[Piece, ...]
-    half: np.ndarray
+    pieces: Sequence[Piece]
     mass: float
     print_as: str
     rests: tuple[tuple[int, float], ...]
     finish: tuple[str, ...]
     rolling: float = 0.0005
+
+    half: np.ndarray = field(init=False)
+    """Half edges (3,) of the bounding box, metres."""
+
+    def __post_init__(self) -> None:
+        bounds = [piece.bounds() for piece in self.pieces]
+        lower, upper = np.min([b[0] for b in bounds], axis=0), np.max([b[1] for b in bounds], axis=0)
+        middle = (lower + upper) / 2
+        moved = tuple(replace(piece, centre=piece.centre - middle) for piece in self.pieces)
+        object.__setattr__(self, "pieces", moved)
+        object.__setattr__(self, "half", (upper - lower) / 2)
 
     @property
     def radius(self) -> float:
@@ -184,25 +192,6 @@ def label_voxels(shapes: Sequence[Shape], poses: np.ndarray, grid: VoxelGrid) ->
     return labels
 
 
-def _make(
-    family: str,
-    name: str,
-    pieces: list[Piece],
-    mass: float,
-    print_as: str,
-    rests: tuple[tuple[int, float], ...],
-    finish: tuple[str, ...],
-    rolling: float = 0.0005,
-) -> Shape:
-    """A shape whose bounding box is centred on the origin."""
-    bounds = [piece.bounds() for piece in pieces]
-    lower = np.min([b[0] for b in bounds], axis=0)
-    upper = np.max([b[1] for b in bounds], axis=0)
-    middle = (lower + upper) / 2
-    moved = tuple(replace(piece, centre=piece.centre - middle) for piece in pieces)
-    return Shape(family, name, moved, (upper - lower) / 2, mass, print_as, rests, finish, rolling)
-
-
 def _choose(rng: np.random.Generator, table: Mapping[str, tuple[float, ...]]) -> tuple[str, tuple[float, ...]]:
     name = list(table)[int(rng.integers(len(table)))]
     return name, table[name]
@@ -220,7 +209,7 @@ def _carton(rng: np.random.Generator, scale: Callable[[], float]) -> Shape:
     half = (x * scale() / 2, y * scale() / 2, z * scale() / 2)
     # On its broad side, on its long narrow side, upright.
     rests = ((_UP_X, 0.35), (_UP_Y, 0.25), (_UP_Z, 0.40))
-    return _make("carton", name, [box(half)], mass, "box", rests, ("carton",))
+    return Shape("carton", name, [box(half)], mass, "box", rests, ("carton",))
 
 
 def _brick(rng: np.random.Generator, scale: Callable[[], float]) -> Shape:
@@ -229,7 +218,7 @@ def _brick(rng: np.random.Generator, scale: Callable[[], float]) -> Shape:
     x, y, z = (edge * scale() / 2 for edge in edges)
     mass = 600.0 * 8.0 * x * y * z
     rests = ((_UP_X, 0.5), (_UP_Y, 0.3), (_UP_Z, 0.2))
-    return _make("brick", name, [box((x, y, z))], mass, "box", rests, ("wood", "cloth", "speckle"))
+    return Shape("brick", name, [box((x, y, z))], mass, "box", rests, ("wood", "cloth", "speckle"))
 
 
 def _can(rng: np.random.Generator, scale: Callable[[], float]) -> Shape:
@@ -242,7 +231,7 @@ def _can(rng: np.random.Generator, scale: Callable[[], float]) -> Shape:
     }
     name, (radius, height, mass) = _choose(rng, table)
     piece = cylinder(radius * scale(), height * scale() / 2)
-    return _make("can", name, [piece], mass, "lathe", ((_UP_Z, 1.0),), ("label",))
+    return Shape("can", name, [piece], mass, "lathe", ((_UP_Z, 1.0),), ("label",))
 
 
 def _bottle(rng: np.random.Generator, scale: Callable[[], float]) -> Shape:
@@ -255,7 +244,7 @@ def _bottle(rng: np.random.Generator, scale: Callable[[], float]) -> Shape:
         frustum(knee, (neck, body + shoulder)),
         cylinder(neck, cap / 2, (0, 0, body + shoulder + cap / 2)),
     ]
-    return _make("bottle", "bottle", pieces, 0.35, "lathe", ((_UP_Z, 1.0),), ("label",))
+    return Shape("bottle", "bottle", pieces, 0.35, "lathe", ((_UP_Z, 1.0),), ("label",))
 
 
 def _bowl(rng: np.random.Generator, scale: Callable[[], float]) -> Shape:
@@ -265,7 +254,7 @@ def _bowl(rng: np.random.Generator, scale: Callable[[], float]) -> Shape:
     # The floor's rim lies in the middle of the sloping wall.
     middle = foot - 0.5 * _WALL
     floor = frustum((middle, 0.0), (middle + (knee - foot) * _WALL / (0.45 * height), _WALL))
-    return _make("bowl", "bowl", [floor, *walls], 0.25, "lathe", ((_UP_Z, 0.8), (_DOWN_Z, 0.2)), ("ceramic",))
+    return Shape("bowl", "bowl", [floor, *walls], 0.25, "lathe", ((_UP_Z, 0.8), (_DOWN_Z, 0.2)), ("ceramic",))
 
 
 def _mug(rng: np.random.Generator, scale: Callable[[], float]) -> Shape:
@@ -277,13 +266,13 @@ def _mug(rng: np.random.Generator, scale: Callable[[], float]) -> Shape:
     reach, tall = 0.032, 0.32 * height
     path = [(radius - 0.003 + reach * np.cos(a), 0.0, height / 2 + tall * np.sin(a)) for a in turn]
     pieces += [capsule(a, b, 0.0075, plain=True) for a, b in pairwise(path)]
-    return _make("mug", "mug", pieces, 0.20, "lathe", ((_UP_Z, 0.85), (_DOWN_Z, 0.15)), ("ceramic",))
+    return Shape("mug", "mug", pieces, 0.20, "lathe", ((_UP_Z, 0.85), (_DOWN_Z, 0.15)), ("ceramic",))
 
 
 def _ball(rng: np.random.Generator, scale: Callable[[], float]) -> Shape:
     radius = 0.036 * scale()
     piece = ellipsoid((radius, radius, radius))
-    return _make("ball", "ball", [piece], 0.10, "lathe", ((_UP_Z, 1.0),), ("ceramic", "speckle"), rolling=0.003)
+    return Shape("ball", "ball", [piece], 0.10, "lathe", ((_UP_Z, 1.0),), ("ceramic", "speckle"), rolling=0.003)
 
 
 def _soap(rng: np.random.Generator, scale: Callable[[], float]) -> Shape:
@@ -299,7 +288,7 @@ def _soap(rng: np.random.Generator, scale: Callable[[], float]) -> Shape:
     # Cut flat where it would rock: real ones do not balance on a point.
     round_ = np.clip(round_, -0.94, 0.94) / 0.94
     mass = 800.0 * 6.0 * float(np.prod(half))
-    return _make("soap", name, [hull(round_ * half)], mass, "box", ((_UP_Y, 0.3), (_UP_Z, 0.7)), ("speckle", "cloth"))
+    return Shape("soap", name, [hull(round_ * half)], mass, "box", ((_UP_Y, 0.3), (_UP_Z, 0.7)), ("speckle", "cloth"))
 
 
 def _angle(rng: np.random.Generator, scale: Callable[[], float]) -> Shape:
@@ -309,7 +298,7 @@ def _angle(rng: np.random.Generator, scale: Callable[[], float]) -> Shape:
         box((thick / 2, (wide - thick) / 2, deep / 2), (thick / 2, (wide + thick) / 2, 0)),
     ]
     rests = ((_UP_Z, 0.6), (_UP_Y, 0.4))
-    return _make("angle", "angle", pieces, 0.22, "box", rests, ("wood", "speckle", "cloth"))
+    return Shape("angle", "angle", pieces, 0.22, "box", rests, ("wood", "speckle", "cloth"))
 
 
 def _banana(rng: np.random.Generator, scale: Callable[[], float]) -> Shape:
@@ -318,7 +307,7 @@ def _banana(rng: np.random.Generator, scale: Callable[[], float]) -> Shape:
     path = np.stack([bend * np.sin(turn), bend * (np.cos(turn) - 1.0), 0.0 * turn], axis=1)
     thick = 0.018 * np.array([0.62, 0.88, 1.0, 1.0, 1.0, 0.88, 0.62])
     pieces = [capsule(a, b, r) for a, b, r in zip(path, path[1:], thick, strict=False)]
-    return _make("banana", "banana", pieces, 0.12, "box", ((_UP_Z, 1.0),), ("peel",), rolling=0.002)
+    return Shape("banana", "banana", pieces, 0.12, "box", ((_UP_Z, 1.0),), ("peel",), rolling=0.002)
 
 
 _MAKERS: dict[str, Callable[[np.random.Generator, Callable[[], float]], Shape]] = {

@@ -45,7 +45,7 @@ class Piece:
     centre : (3,) metres
         Origin of the piece's frame in the body.
     rotation : (3, 3)
-        Columns are the axes of the piece's frame in the body.
+        Columns are the axes of the piece's frame in the body. Only capsules are turned.
     vertices : (n, 3) metres, optional
         Of a hull, in the piece's frame.
     plain : bool
@@ -99,17 +99,14 @@ class Piece:
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
         """Minimum and maximum corner of the bounding box in the body's frame."""
         if self.kind == "hull":
-            corners = self.vertices @ self.rotation.T + self.centre
+            corners = self.vertices + self.centre
             return corners.min(axis=0), corners.max(axis=0)
-        r = self.rotation
-        if self.kind == "box":
-            reach = np.abs(r) @ np.array(self.size)
-        elif self.kind == "ellipsoid":
-            reach = np.sqrt((r**2) @ np.array(self.size) ** 2)
-        elif self.kind == "capsule":
-            reach = self.size[0] + np.abs(r[:, 2]) * self.size[1]
+        if self.kind == "capsule":
+            reach = self.size[0] + np.abs(self.rotation[:, 2]) * self.size[1]
+        elif self.kind == "cylinder":
+            reach = np.array([self.size[0], *self.size])
         else:
-            reach = self.size[0] * np.sqrt(np.maximum(0.0, 1.0 - r[:, 2] ** 2)) + np.abs(r[:, 2]) * self.size[1]
+            reach = np.array(self.size)
         return self.centre - reach, self.centre + reach
 
 

@@ -58,15 +58,6 @@ _HIGH = _LOW + 0.26
 _DOWN, _PUSH, _UP = 0.17, 0.60, 0.15
 
 
-@dataclass(frozen=True)
-class Contact:
-    """Two objects (indices from 0) that touch, and how deep they overlap (metres; negative for a gap)."""
-
-    first: int
-    second: int
-    depth: float
-
-
 def _numbers(values: ArrayLike | None) -> str:
     return " ".join(repr(float(v)) for v in np.asarray(values).ravel())
 
@@ -233,31 +224,23 @@ class PhysicsWorld:
         self.forward()
         return False
 
-    def contacts(self) -> list[Contact]:
-        """Pairs of objects that touch, within half a millimetre; the deepest contact of each pair."""
-        deepest: dict[tuple[int, int], float] = {}
-        contact = self.data.contact
-        for (a, b), dist in zip(contact.geom, contact.dist, strict=True):
-            i, j = sorted((int(self.geom_object[a]), int(self.geom_object[b])))
-            if i >= 1 and j < FINGER_ID:
-                deepest[i - 1, j - 1] = max(deepest.get((i - 1, j - 1), -np.inf), -float(dist))
-        return [Contact(i, j, depth) for (i, j), depth in sorted(deepest.items())]
+    def contacts(self) -> list[tuple[int, int]]:
+        """Pairs (i, j), i < j, of objects that touch or are less than half a millimetre apart, after `forward`."""
+        pairs = np.sort(self.geom_object[self.data.contact.geom.reshape(-1, 2)], axis=1)
+        objects = (pairs[:, 0] >= 1) & (pairs[:, 1] < FINGER_ID)
+        return [(i - 1, j - 1) for i, j in np.unique(pairs[objects], axis=0).tolist()]
 
     def overlaps(self, k: int | None = None) -> bool:
         """Whether object k (None: the finger) overlaps an object, after `forward`."""
         own = FINGER_ID if k is None else k + 1
-        contact = self.data.contact
-        for (a, b), dist in zip(contact.geom, contact.dist, strict=True):
-            pair = (int(self.geom_object[a]), int(self.geom_object[b]))
-            if dist < 0 and own in pair and min(pair) >= 1:
-                return True
-        return False
+        pairs, distance = self.geom_object[self.data.contact.geom.reshape(-1, 2)], self.data.contact.dist
+        return bool(((distance < 0) & (pairs == own).any(axis=1) & (pairs >= 1).all(axis=1)).any())
 
     def deepest_overlap(self) -> float:
         """Greatest depth in metres at which objects overlap each other or the table, after `forward`."""
         contact = self.data.contact
-        objects = (self.geom_object[contact.geom] > 0).any(axis=1) if len(contact.dist) else np.zeros(0, bool)
-        return float(max(0.0, -contact.dist[objects].min())) if objects.any() else 0.0
+        objects = (self.geom_object[contact.geom.reshape(-1, 2)] > 0).any(axis=1)
+        return float(-contact.dist[objects].min(initial=0.0))
 
     def save(self) -> np.ndarray:
         """The full state of the integration; `restore` continues from it bit by bit."""

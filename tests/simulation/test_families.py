@@ -12,8 +12,8 @@ from mstfilter.simulation.shapes import ANY, REPORTED, TUNING
 
 def test_named_families():
     demo, table = scene_family("demo"), scene_family("table")
-    assert (demo.image_size, demo.frames_per_clip, demo.n_actions) == ((320, 240), 8, 2)
-    assert (table.image_size, table.frames_per_clip, table.n_actions) == ((640, 480), 15, 3)
+    assert (demo.width, demo.height, demo.frames_per_clip, demo.n_actions) == (320, 240, 8, 2)
+    assert (table.width, table.height, table.frames_per_clip, table.n_actions) == (640, 480, 15, 3)
     assert table.grid().shape == (100, 100, 50)
     assert table.n_frames == 1 + 3 * 14
     assert table.grid().origin[2] == 0.0
@@ -22,11 +22,9 @@ def test_named_families():
 def test_the_seed_decides_the_catalogue_of_the_studied_families():
     for name in ("s1", "s2", "s3"):
         family = scene_family(name)
-        assert {family.for_seed(seed).catalogue for seed in (0, 99, 999)} == {"tuning"}
-        assert {family.for_seed(seed).catalogue for seed in (1000, 5000)} == {"reported"}
-        assert family.for_seed(5).pool == TUNING and family.for_seed(5000).pool == REPORTED
-    table = scene_family("table")
-    assert table.for_seed(0) is table and table.pool == ANY
+        assert {family.pool(seed) for seed in (0, 99, 999)} == {TUNING}
+        assert {family.pool(seed) for seed in (1000, 5000)} == {REPORTED}
+    assert scene_family("table").pool(0) == ANY
 
 
 def test_studied_families_differ_only_in_their_objects():

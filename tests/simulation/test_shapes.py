@@ -139,8 +139,8 @@ def test_tuning_and_reported_scenes_share_no_size():
     def measures(seeds):
         found = set()
         for seed in seeds:
-            family = replace(scene_family("s3"), shapes="can").for_seed(seed)
-            for shape in draw_objects(np.random.default_rng(seed), family).shapes:
+            family = replace(scene_family("s3"), shapes="can")
+            for shape in draw_objects(np.random.default_rng(seed), family, family.pool(seed)).shapes:
                 nominal = {"soup": 0.033, "coffee": 0.051, "tuna": 0.0425, "crisps": 0.0375, "biscuits": 0.075}
                 found.add(int((shape.half[0] / nominal[shape.name] - 0.9) / 0.025))
         return found
