@@ -261,7 +261,7 @@ class _Step:
             if not self.filter.trigger.wants(population, self.state.t):
                 return self.state.population, False
             n = self.filter.n if self.filter.size is None else self.filter.size.choose(population)
-            selected = self._resample(population.labelled({}), n)
+            selected = self._resample(population.labelled({}), n, "resampler")
             if priority is not None:
                 ancestors = selected.parents["ancestor"]
                 if (ancestors < 0).any():
@@ -270,9 +270,9 @@ class _Step:
             self.slot.record(selected.notes)
         return selected, True
 
-    def _resample(self, population: Population, n: int) -> Population:
+    def _resample(self, population: Population, n: int, stream: str) -> Population:
         """Resampled particles; their ancestors are -1 if the resampler does not report them."""
-        selected = self.filter.resampler.resample(self.rng("resampler"), population, n)
+        selected = self.filter.resampler.resample(self.rng(stream), population, n)
         if "ancestor" in selected.parents:
             return selected
         return selected.with_ancestors(np.full(len(selected), -1))
@@ -343,7 +343,8 @@ class _Step:
                     n = size.choose(fused)
                     limit = n if after else limit
             if len(fused) > limit or (after and self.filter.trigger.wants(fused, self.state.t)):
-                selected = self._resample(fused, n)
+                # A step that resamples before the prediction may resample a second time, so it needs another stream.
+                selected = self._resample(fused, n, "resampler" if after else "second resampler")
                 if selected.notes is not fused.notes:
                     self.slot.record(selected.notes)
                 return selected, True
