@@ -97,7 +97,7 @@ class CrossVectors(Update):
     share : float
         Children per predicted particle.
     among : bool
-        Cross predicted particles with each other (Kwok et al.).
+        Cross predicted particles with each other (Kwok et al.); ``parents["mate"]`` is the second parent.
     """
 
     log_likelihood: Callable[[Any, Any], np.ndarray]
@@ -130,8 +130,8 @@ class CrossVectors(Update):
         children = np.where(rng.random((n, a.shape[1])) < 0.5, a[i], b[j])
         log_weights = np.logaddexp(predicted.log_weights[i], mates.log_weights[j]) - np.log(2)
         parents = {"previous": predicted.parents.get("previous", np.full(len(predicted), -1))[i]}
-        if mates is not predicted:
-            parents["proposed"] = mates.parents.get("proposed", np.full(len(mates), -1))[j]
+        name, source = ("mate", "previous") if mates is predicted else ("proposed", "proposed")
+        parents[name] = mates.parents.get(source, np.full(len(mates), -1))[j]
         return Population(children, log_weights, parents)
 
 

@@ -158,6 +158,25 @@ def _check_log_weights(lw: np.ndarray, n: int) -> None:
         )
 
 
+def _integers(what: str, index: Any) -> np.ndarray:
+    """An index array as int64; raises InputError if it holds other numbers than integers."""
+    index = np.asarray(index)
+    if index.dtype.kind not in "iu":
+        raise InputError(f"{what} are of type {index.dtype}, expected integers")
+    return index.astype(np.int64, copy=False)
+
+
+def _within(index: np.ndarray, n: int) -> np.ndarray:
+    """Indices of n particles; raises InputError if one is negative or too large."""
+    if len(index) and index.view(np.uint64).max() >= n:  # as unsigned integers, negative ones are too large
+        wrong = int(np.flatnonzero((index < 0) | (index >= n))[0])
+        raise InputError(
+            f"index {wrong} of the selected particles is {index[wrong]}, expected 0 to {n - 1}",
+            "indices are positions in the population that is selected from",
+        )
+    return index
+
+
 @dataclass(frozen=True, eq=False)
 class Population:
     """Weighted particles and their parents.
@@ -169,8 +188,9 @@ class Population:
     log_weights : (n,) float
         Natural log, unnormalised. -inf is a weight of 0; NaN and +inf raise InputError. Default: all 0.
     parents : mapping
-        ``"previous"`` and ``"proposed"``: (n,) index of the parent in the previous population or among the
-        proposed particles, -1 for none. A resampler adds ``"ancestor"``: the index before the resampling.
+        ``"previous"`` and ``"proposed"``: (n,) integer index of the parent in the previous population or among the
+        proposed particles, -1 for none. ``"mate"``: the second parent of a particle that two previous ones made.
+        A resampler adds ``"ancestor"``: the index before the resampling.
     notes : mapping
         Values that a component records: plain numbers, strings and lists.
     """
@@ -190,7 +210,7 @@ class Population:
         lw.flags.writeable = False
         parents = {}
         for name, index in self.parents.items():
-            index = np.asarray(index, dtype=np.int64).view()
+            index = _integers(f'parents "{name}"', index).view()
             index.flags.writeable = False
             if index.shape != (n,):
                 raise InputError(f'parents "{name}" have shape {index.shape}, expected ({n},)')
@@ -237,8 +257,14 @@ class Population:
         return self.particles[index]
 
     def take(self, indices: np.ndarray, log_weights: np.ndarray | None = None) -> Population:
-        """Select particles with their parents, and with their log weights unless new ones are given."""
-        indices = np.asarray(indices, dtype=np.int64)
+        """Select particles with their parents, and with their log weights unless new ones are given.
+
+        Raises
+        ------
+        InputError
+            If the indices are not integers from 0 to n - 1.
+        """
+        indices = _within(_integers("indices", indices), len(self))
         return Population(
             take(self.particles, indices),
             self.log_weights[indices] if log_weights is None else log_weights,
@@ -252,7 +278,7 @@ class Population:
 
     def with_ancestors(self, ancestors: np.ndarray, **notes: Any) -> Population:
         """The same particles with ``parents["ancestor"]`` set and further notes."""
-        parents = {**self.parents, "ancestor": np.asarray(ancestors, dtype=np.int64)}
+        parents = {**self.parents, "ancestor": _integers("ancestors", ancestors)}
         return self.labelled(parents, {**self.notes, **notes} if notes else self.notes)
 
     def labelled(self, parents: Mapping[str, np.ndarray], notes: Mapping[str, Any] | None = None) -> Population:
@@ -264,15 +290,16 @@ class Population:
     def traced_through(self, resampled: Population | None) -> Population:
         """The same particles, with parents traced through a resampling before the prediction.
 
-        ``parents["previous"]`` are indices into `resampled`; they become ``ancestor[previous]`` if `resampled` has
-        ancestors. ``parents["ancestor"]`` and the notes are dropped.
+        ``parents["previous"]`` and ``parents["mate"]`` are indices into `resampled`; they become indices into the
+        population that was resampled, if it is known. ``parents["ancestor"]`` and the notes are dropped.
         """
         parents = {name: index for name, index in self.parents.items() if name != "ancestor"}
         ancestors = None if resampled is None else resampled.parents.get("ancestor")
-        if ancestors is not None and "previous" in parents:
-            previous = parents["previous"]
-            stayed = previous is identity(len(ancestors))
-            parents["previous"] = ancestors if stayed else np.where(previous >= 0, ancestors[previous], -1)
+        for name in ("previous", "mate") if ancestors is not None else ():
+            if name in parents:
+                index = parents[name]
+                stayed = index is identity(len(ancestors))
+                parents[name] = ancestors if stayed else np.where(index >= 0, ancestors[index], -1)
         return self.labelled(parents)
 
     def moved(self, particles: Particles) -> Population:
@@ -319,6 +346,10 @@ def union(predicted: Population | None, proposed: Population | None) -> Populati
     none_a, none_b = np.full(len(predicted), -1), np.full(len(proposed), -1)
     parents = {
         name: np.concatenate([predicted.parents.get(name, none_a), proposed.parents.get(name, none_b)])
-        for name in ("previous", "proposed")
+        for name in (
+            "previous",
+            "proposed",
+            *(["mate"] if "mate" in {**predicted.parents, **proposed.parents} else []),
+        )
     }
     return Population(particles, np.concatenate([predicted.log_weights, proposed.log_weights]), parents)

@@ -2,11 +2,24 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import pytest
 
 from mstfilter.errors import InputError
-from mstfilter.smc import Candidates, Key, Population, child, key_of, log_mean_exp
+from mstfilter.smc import (
+    Always,
+    Candidates,
+    Key,
+    Population,
+    WeightResampler,
+    bootstrap,
+    child,
+    key_of,
+    log_mean_exp,
+)
+from tests.smc.models import AR1
 
 
 @pytest.mark.parametrize(
@@ -133,3 +146,33 @@ def test_streams_do_not_meet_spawned_or_foreign_ones():
 def test_bad_seeds(seed):
     with pytest.raises(InputError, match="seed"):
         Key(seed)
+
+
+@dataclass(frozen=True)
+class WrongAncestors(WeightResampler):
+    ancestors: tuple
+
+    def select(self, rng, log_weights, n):
+        return np.array(self.ancestors), None
+
+
+@pytest.mark.parametrize(
+    ("ancestors", "message"),
+    [
+        ((0, -1, 2), "index 1 of the selected particles is -1, expected 0 to 2"),
+        ((0, 1, 99), "index 2 of the selected particles is 99, expected 0 to 2"),
+        ((0.0, 1.0, 2.0), "indices are of type float64, expected integers"),
+    ],
+)
+def test_wrong_ancestors_are_a_named_error(ancestors, message):
+    with pytest.raises(InputError, match=message):
+        Population(np.zeros(3)).take(np.array(ancestors))
+    filter = bootstrap(AR1, 3, WrongAncestors(ancestors), Always())
+    with pytest.raises(InputError, match=f"step 1, resampler: {message}"):
+        filter.run([0.1, 0.2], 0)
+
+
+def test_parents_are_integers():
+    for name in ("previous", "ancestor"):
+        with pytest.raises(InputError, match=f'parents "{name}" are of type float64, expected integers'):
+            Population(np.zeros(2), parents={name: np.array([0.0, 1.7])})
