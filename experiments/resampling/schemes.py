@@ -16,6 +16,7 @@ from mstfilter.smc import (
     KDpp,
     KeepWeights,
     Killing,
+    LargestWeights,
     Multinomial,
     Resampler,
     Residual,
@@ -46,6 +47,7 @@ def schemes(similarity: Similarity, equivalence: Equivalence) -> dict[str, Resam
         "clusters": ClusterStratified(similarity),
         "kdpp": KDpp(similarity),
         "greedy_diverse": GreedyDiverse(similarity),
+        "largest_weights": LargestWeights(),
         "keep_weights": KeepWeights(),
     }
 

@@ -25,7 +25,6 @@ import time
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
-from itertools import islice
 from pathlib import Path
 from typing import Any, Literal
 
@@ -180,7 +179,8 @@ class ParticleFilter:
             The state to continue from, or a seed.
         checkpoint : path, optional
             A file to which the state is written after every step. If it exists, the run continues from its state: the
-            observations used before are skipped, and the result equals that of an uninterrupted run.
+            observations used before are skipped, and the result equals that of an uninterrupted run. InputError if
+            the file is of another seed, filter or model, or if those observations were others.
         codec : Codec, optional
             Stores particles that are not arrays, mappings of arrays or dataclasses of arrays.
         observer : callable, optional
@@ -218,11 +218,9 @@ class ParticleFilter:
             return observations, current, None
         from mstfilter.smc.checkpoint import Checkpoint
 
-        store = Checkpoint(Path(checkpoint), codec)
-        stored = store.load(self, current)
-        if stored is None:
-            return observations, current, store
-        return islice(observations, stored.t - current.t, None), stored, store
+        store = Checkpoint(Path(checkpoint), codec, self, current)
+        remaining = iter(observations)
+        return remaining, store.resume(remaining), store
 
     def _steps(
         self, observations: Iterable[Any], state: State, store: Any, observer: Observer | None
@@ -230,7 +228,7 @@ class ParticleFilter:
         for observation in observations:
             state, info = self.step(state, observation, observer)
             if store is not None:
-                store.save(self, state)
+                store.save(state, observation)
             yield state, info
 
 

@@ -295,8 +295,8 @@ class Population:
         """
         parents = {name: index for name, index in self.parents.items() if name != "ancestor"}
         ancestors = None if resampled is None else resampled.parents.get("ancestor")
-        for name in ("previous", "mate") if ancestors is not None else ():
-            if name in parents:
+        for name in ("previous", "mate"):
+            if ancestors is not None and name in parents:
                 index = parents[name]
                 stayed = index is identity(len(ancestors))
                 parents[name] = ancestors if stayed else np.where(index >= 0, ancestors[index], -1)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import copy
 import os
 import signal
 import subprocess
 import sys
 import time
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -19,9 +21,11 @@ from mstfilter.smc import (
     EssBelow,
     Key,
     Multinomial,
+    Normal,
     Population,
     Program,
     State,
+    StateSpaceModel,
     Tempered,
     Trace,
     bootstrap,
@@ -32,11 +36,12 @@ from mstfilter.smc import (
     run_many,
     sample,
 )
-from mstfilter.smc.checkpoint import load_state, save_state
+from mstfilter.smc.checkpoint import digest, load_state, save_state
 from tests.conftest import REPOSITORY
 from tests.smc.models import AR1, SYMBOLS, Box, ar1_observations, hmm
 
 YS = ar1_observations(10)
+FACTOR = 2.0
 
 
 # --- collectors ---------------------------------------------------------------------------------------------------
@@ -245,6 +250,53 @@ def test_a_run_goes_on_from_its_checkpoint(filter, ys, tmp_path):
             other.run(ys, 5, checkpoint=path)
     same = replace(filter, n=np.int64(filter.n))
     assert same.run(ys, 5, checkpoint=path)[1] == []
+    with pytest.raises(InputError, match=f"its first {len(ys)} observations differ"):
+        filter.run([*ys[:2], None, *ys[3:]], 5, checkpoint=path)
+    with pytest.raises(InputError, match="there are only 3 observations"):
+        filter.run(ys[:3], 5, checkpoint=path)
+    with pytest.raises(InputError, match="its first step is 0, expected 2"):
+        filter.run(ys[2:], filter.run(ys[:2], 5)[0], checkpoint=path)
+
+
+def with_noise(sd):
+    return StateSpaceModel.of(Normal(0.0, 1.0), lambda x: Normal(0.9 * x, sd), lambda x: Normal(x, 1.0))
+
+
+def test_a_checkpoint_of_another_model_is_refused(tmp_path):
+    """Also if the models differ only in a number that a function encloses, or in its code."""
+    path = tmp_path / "run.npz"
+    bootstrap(with_noise(0.5), 20).run(YS[:3], 0, checkpoint=path)
+    assert len(bootstrap(with_noise(0.5), 20).run(YS, 0, checkpoint=path)[1]) == len(YS) - 3
+    for other in (
+        with_noise(0.6),
+        replace(with_noise(0.5), log_likelihood=lambda x, y: -((x - y) ** 2)),
+        replace(with_noise(0.5), log_likelihood=partial(with_noise(0.5).log_likelihood)),
+    ):
+        with pytest.raises(InputError, match="is of another run: its filter"):
+            bootstrap(other, 20).run(YS, 0, checkpoint=path)
+
+
+def test_what_a_hash_depends_on():
+    """The same value gives the same hash, and every pair of different ones different hashes."""
+
+    def recursive(x):
+        return recursive(x) if x else FACTOR
+
+    values = [
+        None, 0, 0.0, False, "0", (), [], (1,), {"a": 1}, {"a": 2}, {"b": 1}, np.zeros(2), np.zeros((2, 1)),
+        np.zeros(2, np.float32), np.array([0.0, 1.0]), np.float64(0.0), {1, 2}, frozenset({1, 2}), recursive,
+        lambda x: x, lambda x: x + 1, lambda x, y=1: x, EssBelow(0.5), EssBelow(0.25), EssBelow, partial(len, "a"),
+        np.array([1, "a"], object), with_noise(1.0).density, with_noise(2.0).density,
+    ]  # fmt: skip
+    hashes = [digest(value) for value in values]
+    assert hashes == [digest(copy.deepcopy(value)) for value in values]
+    assert len(set(hashes)) == len(hashes)
+
+
+def test_a_hash_follows_the_constants_that_a_function_uses(monkeypatch):
+    before = digest(lambda x: FACTOR * x)
+    monkeypatch.setitem(globals(), "FACTOR", 3.0)
+    assert digest(lambda x: FACTOR * x) != before
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="kills a process by a signal")

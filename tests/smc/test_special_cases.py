@@ -147,7 +147,7 @@ def test_crossing_previous_particles_records_both_parents():
     )
     state, before = filter.start(1), None
     for y in YS[:4]:
-        state, info = filter.step(state, y)
+        state, _ = filter.step(state, y)
         particles, parents = state.population.particles, state.population.parents
         if before is not None:
             assert set(parents) >= {"previous", "mate"}
