@@ -20,7 +20,6 @@ from mstfilter.formats.pauses import (
 from mstfilter.formats.video import (
     KnownWorld as KnownWorld,
     RecordingFormat as RecordingFormat,
-    RgbdImages as RgbdImages,
     Video as Video,
     VideoFormat as VideoFormat,
 )

@@ -18,6 +18,7 @@ from __future__ import annotations
 import contextlib
 import struct
 import weakref
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,22 +27,8 @@ from typing import Any
 import numpy as np
 
 from mstfilter.errors import InputError, MissingLibraryError
-from mstfilter.formats.video import RgbdImages, Video, VideoFormat, pair_stamps
+from mstfilter.formats.video import Video, VideoFormat, pair_stamps
 from mstfilter.scene import Recording
-
-
-@dataclass(frozen=True)
-class Topic:
-    """A topic: its name, message type and number of messages."""
-
-    name: str
-    kind: str
-    count: int
-
-    @property
-    def compressed(self) -> bool:
-        """Whether its images are compressed."""
-        return self.kind.endswith("/CompressedImage")
 
 
 @dataclass(frozen=True)
@@ -82,12 +69,14 @@ class BagFile:
             self._reader.open()
         weakref.finalize(self, _close, self._reader)
         self.is_ros2: bool = self._reader.is2
-        self.topics: dict[str, Topic] = {
-            c.topic: Topic(
-                c.topic, str(c.msgtype), sum(x.msgcount for x in self._reader.connections if x.topic == c.topic)
-            )
-            for c in self._reader.connections
-        }
+
+    def topics(self, *kinds: str) -> dict[str, int]:
+        """Number of messages of each topic of some message types; topics without messages are left out."""
+        counts: Counter[str] = Counter()
+        for connection in self._reader.connections:
+            if connection.msgtype in kinds:
+                counts[connection.topic] += connection.msgcount
+        return {name: n for name, n in counts.items() if n}
 
     @contextlib.contextmanager
     def _reading(self) -> Iterator[None]:
@@ -229,24 +218,32 @@ def _compressed_depth(data: bytes, encoding: str, depth_scale: float, where: str
         return np.where(image > 0, a / (image.astype(np.float64) - b), np.nan).astype(np.float32)
 
 
-_IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
+_IMAGE, _COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 _INFO = "sensor_msgs/msg/CameraInfo"
 
 
 @dataclass(frozen=True)
 class _Stream:
-    """An image topic, with properties of its first message."""
+    """An image topic: name, number of messages, and properties of the first message."""
 
-    topic: Topic
+    name: str
+    count: int
+    compressed: bool
     encoding: str
     frame_id: str
     size: tuple[int, int]
 
     def __str__(self) -> str:
         width, height = self.size
-        return (
-            f"{self.topic.name} ({self.topic.count} x {self.encoding}, {width} x {height}, frame {self.frame_id!r})"
-        )
+        return f"{self.name} ({self.count} x {self.encoding}, {width} x {height}, frame {self.frame_id!r})"
+
+    @property
+    def info(self) -> str:
+        """Its CameraInfo topic, as image_transport names it."""
+        parts = self.name.split("/")
+        if parts[-1] in ("compressed", "compressedDepth"):
+            parts = parts[:-1]
+        return "/".join([*parts[:-1], "camera_info"])
 
 
 @dataclass(frozen=True)
@@ -283,40 +280,36 @@ class Bag(VideoFormat):
 
     def open(self, path: Path) -> Recording:
         bag = BagFile(path)
-        streams = [_stream(bag, t) for t in bag.topics.values() if t.kind in _IMAGES and t.count]
+        kinds = ((_IMAGE, False), (_COMPRESSED, True))
+        streams = [_stream(bag, name, n, packed) for kind, packed in kinds for name, n in bag.topics(kind).items()]
         pictures = [s for s in streams if s.encoding not in _DEPTH]
-        pictures = [
-            s for s in pictures if s.encoding not in _GREY
-        ] or pictures  # grey images may be those of an infrared camera
+        # Grey images may be those of an infrared camera.
+        pictures = [s for s in pictures if s.encoding not in _GREY] or pictures
         colour = _choose(path, "colour", self.colour, pictures, streams)
         depth = self._depth(path, colour, streams)
         K, distortion = self._intrinsics(bag, colour, depth)
-        entries = [bag.index(s.topic.name) for s in (colour, depth)]
+        entries = [bag.index(s.name) for s in (colour, depth)]
         stamps = [[e.stamp for e in listed] for listed in entries]
-        pairs = pair_stamps(stamps[0], stamps[1], self.tolerance_s, f"{path}: {colour.topic.name}")
+        pairs = pair_stamps(stamps[0], stamps[1], self.tolerance_s, f"{path}: {colour.name}")
 
         def read_rgb(index: int) -> np.ndarray:
-            k, topic = pairs[index][0], colour.topic
-            return colour_image(
-                bag.message(topic.name, entries[0][k]), topic.compressed, f"message {k} of {topic.name}"
-            )
+            k = pairs[index][0]
+            message = bag.message(colour.name, entries[0][k])
+            return colour_image(message, colour.compressed, f"message {k} of {colour.name}")
 
-        def read(index: int) -> RgbdImages:
-            k, topic = pairs[index][1], depth.topic
-            where = f"depth message {k} of {topic.name} in {path.name}"
-            metres = depth_image(bag.message(topic.name, entries[1][k]), topic.compressed, self.depth_scale, where)
-            return RgbdImages(
-                read_rgb(index), metres, f"colour message {pairs[index][0]} of {colour.topic.name}", where
-            )
+        def read_depth(index: int) -> np.ndarray:
+            k = pairs[index][1]
+            message, where = bag.message(depth.name, entries[1][k]), f"depth message {k} of {depth.name}"
+            return depth_image(message, depth.compressed, self.depth_scale, where)
 
         video = Video(
             path.resolve().stem,
             tuple(stamps[0][i] for i, _ in pairs),
-            read,
+            read_rgb,
+            read_depth,
             K,
             path,
             self.depth_scale if depth.encoding != "32FC1" else 0.00025,
-            read_rgb=read_rgb,
             distortion=distortion,
         )
         return self.recording_of(video)
@@ -344,8 +337,7 @@ class Bag(VideoFormat):
         """fx, fy, cx, cy and the distortion of the colour image."""
         if self.K:
             return self.K, ()
-        infos = [t.name for t in bag.topics.values() if t.kind == _INFO and t.count]
-        usual = _info_topic(colour.topic)
+        infos, usual = bag.topics(_INFO), colour.info
         if self.info and self.info not in infos:
             raise InputError(
                 f"{bag.path}: no CameraInfo topic {self.info!r}", f"there are: {', '.join(infos) or 'none'}"
@@ -353,18 +345,18 @@ class Bag(VideoFormat):
         name = self.info or (usual if usual in infos else "")
         if not name:
             raise InputError(
-                f"{bag.path}: intrinsics are missing, there is no {usual} for {colour.topic.name}",
+                f"{bag.path}: intrinsics are missing, there is no {usual} for {colour.name}",
                 f"choose one: info=TOPIC, of {', '.join(infos)}" if infos else "give them: K=fx,fy,cx,cy",
             )
-        info = _camera_info(bag, name, "rect" in colour.topic.name)
+        info = _camera_info(bag, name, "rect" in colour.name)
         if (info["width"], info["height"]) != colour.size and info["width"]:
             raise InputError(
                 f"{bag.path}: {name} is of images of {info['width']} x {info['height']}, {colour} is not",
                 "choose the CameraInfo of the colour camera: info=TOPIC",
             )
-        other = _info_topic(depth.topic)
+        other = depth.info
         if not self.registered and not self.info and other in infos and other != name:
-            of_depth = _camera_info(bag, other, "rect" in depth.topic.name)
+            of_depth = _camera_info(bag, other, "rect" in depth.name)
             if not np.allclose(of_depth["matrix"], info["matrix"], atol=1.0) and of_depth["width"]:
                 raise InputError(
                     f"{bag.path}: camera matrices of {name} and {other} differ: depth is not registered to colour",
@@ -374,23 +366,23 @@ class Bag(VideoFormat):
         return (matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]), info["distortion"]
 
 
-def _stream(bag: BagFile, topic: Topic) -> _Stream:
-    message = bag.first(topic.name)
-    encoding = image_encoding(message, topic.compressed)
-    where = f"first message of {topic.name} in {bag.path.name}"
-    if not topic.compressed:
+def _stream(bag: BagFile, name: str, count: int, compressed: bool) -> _Stream:
+    message = bag.first(name)
+    encoding = image_encoding(message, compressed)
+    where = f"first message of {name} in {bag.path.name}"
+    if not compressed:
         size = int(message.width), int(message.height)
     else:
         read = depth_image(message, True, 1.0, where) if encoding in _DEPTH else colour_image(message, True, where)
         size = read.shape[1], read.shape[0]
-    return _Stream(topic, encoding, str(message.header.frame_id).lstrip("/"), size)
+    return _Stream(name, count, compressed, encoding, str(message.header.frame_id).lstrip("/"), size)
 
 
 def _choose(path: Path, what: str, name: str, candidates: list[_Stream], streams: list[_Stream]) -> _Stream:
     """The stream of a name, or the only candidate."""
-    listed = [f"  {s}" for s in sorted(streams, key=lambda s: s.topic.name)]
+    listed = [f"  {s}" for s in sorted(streams, key=lambda s: s.name)]
     if name:
-        chosen = next((s for s in streams if s.topic.name == name), None)
+        chosen = next((s for s in streams if s.name == name), None)
         if chosen is None:
             raise InputError(f"{path}: no image topic {name!r} for {what}", "image topics are:", *listed)
         if (chosen.encoding in _DEPTH) != (what == "depth"):
@@ -400,19 +392,11 @@ def _choose(path: Path, what: str, name: str, candidates: list[_Stream], streams
         raise InputError(f"{path}: there is no {what} topic", *(["image topics are:", *listed] if listed else []))
     if len(candidates) > 1:
         raise InputError(
-            f"{path}: {len(candidates)} topics could be {what}: {', '.join(s.topic.name for s in candidates)}",
+            f"{path}: {len(candidates)} topics could be {what}: {', '.join(s.name for s in candidates)}",
             f"choose one: {what}=TOPIC, of",
             *listed,
         )
     return candidates[0]
-
-
-def _info_topic(topic: Topic) -> str:
-    """The CameraInfo topic of an image topic, as image_transport names it."""
-    parts = topic.name.split("/")
-    if parts[-1] in ("compressed", "compressedDepth"):
-        parts = parts[:-1]
-    return "/".join([*parts[:-1], "camera_info"])
 
 
 def _camera_info(bag: BagFile, name: str, rectified: bool) -> dict[str, Any]:

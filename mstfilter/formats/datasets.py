@@ -16,7 +16,7 @@ from scipy.spatial.transform import RigidTransform
 
 from mstfilter.errors import InputError, MissingLibraryError
 from mstfilter.formats.pauses import EveryNth, PauseRule
-from mstfilter.formats.video import KnownWorld, RecordingFormat, RgbdImages, Video
+from mstfilter.formats.video import KnownWorld, RecordingFormat, Video
 from mstfilter.scene import (
     Camera,
     Frame,
@@ -79,23 +79,18 @@ class Bop(RecordingFormat):
                     "choose images of one camera: images=0,1,2",
                 )
         K = first["cam_K"]
-        colour = {k: _image(path, ("rgb", "gray"), k) for k in chosen}
-        depth = {k: _image(path, ("depth",), k) for k in chosen}
-
-        def read(index: int) -> RgbdImages:
-            k = chosen[index]
-            scale = cameras[k]["depth_scale"] / 1000
-            names = f"colour image {colour[k]}", f"depth image {depth[k]}"
-            return RgbdImages(read_rgb(colour[k]), read_depth(depth[k], scale), *names)
+        colour = [_image(path, ("rgb", "gray"), k) for k in chosen]
+        depth = [_image(path, ("depth",), k) for k in chosen]
+        scales = [cameras[k]["depth_scale"] / 1000 for k in chosen]
 
         return Video(
             f"{path.resolve().parent.name}-{path.resolve().name}",
             tuple(i / self.fps for i in range(len(chosen))),
-            read,
+            lambda index: read_rgb(colour[index]),
+            lambda index: read_depth(depth[index], scales[index]),
             (K[0], K[4], K[2], K[5]),
             path,
-            first["depth_scale"] / 1000,
-            read_rgb=lambda index: read_rgb(colour[chosen[index]]),
+            scales[0],
             motion=_motion(cameras, chosen),
             read_instance=lambda index: _instances(path, chosen[index]),
         ).recording(self.pauses, self.world)

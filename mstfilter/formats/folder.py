@@ -200,27 +200,24 @@ class RecordingWriter:
             "T_world_camera": None if camera.T_world_camera is None else camera.T_world_camera.as_matrix().tolist(),
             "workspace": None if grid is None else _Workspace.of(grid).model_dump(),
         }
+        manifest = {**self._manifest, "frames": self._frames}
         with self._writing():
-            self._finish(described)
+            (self._folder / "camera.json").write_text(json.dumps(described, indent=1))
+            (self._folder / "manifest.json").write_text(json.dumps(manifest, indent=1))
+            if self._poses:
+                (self._folder / "poses.json").write_text(json.dumps(self._poses))
+            if grid is not None and self._voxels:
+                np.savez_compressed(
+                    self._folder / "voxels.npz",
+                    labels=np.stack(self._voxels),
+                    frame=np.array(self._voxel_frames),
+                    origin=grid.origin,
+                    voxel_size=grid.voxel_size,
+                )
+            if self.path.exists():
+                self.path.rmdir()
+            self._folder.rename(self.path)
         return self.path
-
-    def _finish(self, described: dict[str, Any]) -> None:
-        (self._folder / "camera.json").write_text(json.dumps(described, indent=1))
-        (self._folder / "manifest.json").write_text(json.dumps({**self._manifest, "frames": self._frames}, indent=1))
-        if self._poses:
-            (self._folder / "poses.json").write_text(json.dumps(self._poses))
-        if self._voxels:
-            assert self._grid is not None
-            np.savez_compressed(
-                self._folder / "voxels.npz",
-                labels=np.stack(self._voxels),
-                frame=np.array(self._voxel_frames),
-                origin=self._grid.origin,
-                voxel_size=self._grid.voxel_size,
-            )
-        if self.path.exists():
-            self.path.rmdir()
-        self._folder.rename(self.path)
 
     @contextlib.contextmanager
     def _writing(self) -> Iterator[None]:
@@ -270,16 +267,16 @@ def save_recording(
     **manifest
         Further entries of manifest.json: generator, ...
     """
-    home, total = recording.frames[recording.pauses[0]].camera, len(recording)
+    camera, total = recording.frames[recording.pauses[0]].camera, len(recording)
     manifest = {"name": recording.name, "depth_scale": recording.depth_scale, **manifest}
-    with RecordingWriter(path, home, recording.grid, **manifest) as writer:
+    with RecordingWriter(path, camera, recording.grid, **manifest) as writer:
         for index in range(total):
             frame = recording.frames[index]
             pause = index in recording.pauses
-            if not np.array_equal(frame.camera.K, home.K):
+            if not np.array_equal(frame.camera.K, camera.K):
                 raise InputError(
                     f"frame {index} of {recording.name} has camera matrix {frame.camera.K.tolist()}, frame "
-                    f"{recording.pauses[0]} has {home.K.tolist()}: a recording folder stores one",
+                    f"{recording.pauses[0]} has {camera.K.tolist()}: a recording folder stores one",
                     "convert frames of one camera only",
                 )
             if frame.views:
@@ -288,7 +285,9 @@ def save_recording(
                     "folder stores one",
                     "write one recording per camera, and join their frames by Frame(..., views=...)",
                 )
-            moved = {} if frame.camera.key == home.key else {"T_world_camera": frame.camera.pose.as_matrix().tolist()}
+            moved = (
+                {} if frame.camera.key == camera.key else {"T_world_camera": frame.camera.pose.as_matrix().tolist()}
+            )
             writer.add_frame(
                 frame.rgb,
                 frame.depth,
@@ -431,9 +430,8 @@ def open_recording(path: str | Path) -> Recording:
         return Frame(rgb, depth, view, robot)
 
     if camera.T_world_camera is None or grid is None:
-        camera, grid = find_world(
-            read(pauses[0], camera.at(poses[pauses[0]]) if pauses[0] in poses else camera), grid
-        )
+        first = pauses[0]
+        camera, grid = find_world(read(first, camera.at(poses[first]) if first in poses else camera), grid)
 
     def read_posed(index: int) -> Frame:
         return read(index, camera.at(poses[index]) if index in poses else camera)

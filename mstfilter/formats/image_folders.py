@@ -16,7 +16,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from mstfilter.errors import InputError
-from mstfilter.formats.video import RecordingFormat, RgbdImages, Video, VideoFormat, pair_stamps
+from mstfilter.formats.video import RecordingFormat, Video, VideoFormat, pair_stamps
 from mstfilter.scene import Recording, read_depth, read_rgb, rigid_from_matrix
 
 
@@ -115,10 +115,6 @@ class Redwood(VideoFormat):
                     "an image is missing, or the two are numbered differently; rename one side to match",
                 )
 
-        def read(index: int) -> RgbdImages:
-            names = f"colour image {colour[index]}", f"depth image {depth[index]}"
-            return RgbdImages(read_rgb(colour[index]), read_depth(depth[index], self.depth_scale), *names)
-
         logs = sorted(path.glob("*.log")) if self.moving else []
         if len(logs) > 1:
             raise InputError(
@@ -127,11 +123,11 @@ class Redwood(VideoFormat):
         video = Video(
             path.resolve().name,
             tuple(k / self.fps for k in range(len(colour))),
-            read,
+            lambda index: read_rgb(colour[index]),
+            lambda index: read_depth(depth[index], self.depth_scale),
             self.K or _intrinsics(path),
             path,
             self.depth_scale,
-            read_rgb=lambda index: read_rgb(colour[index]),
             motion=_trajectory(logs[0], len(colour)) if logs else None,
             distortion=self.distortion,
         )
@@ -145,7 +141,6 @@ def _numbered(folder: Path) -> list[Path]:
     files = [p for p in folder.iterdir() if p.suffix.lower() in _SUFFIXES and not p.name.startswith(".")]
     if not files:
         raise InputError(f"{folder} has no image", f"expected {', '.join(_SUFFIXES)}")
-
     return sorted(files, key=lambda file: (_number(file), file.name))
 
 
@@ -176,7 +171,7 @@ def _intrinsics(path: Path) -> tuple[float, ...]:
 
 
 def _trajectory(path: Path, n: int) -> list[RigidTransform]:
-    """Camera-to-world poses of a .log file, one a frame."""
+    """Camera-to-world poses of a .log file, one per frame."""
     try:
         rows = [[float(v) for v in line.split()] for line in path.read_text().splitlines() if line.strip()]
     except (OSError, ValueError) as error:
@@ -227,25 +222,16 @@ class Tum(VideoFormat):
         stamps = [[float(row[0]) for row in table] for table in (colour, depth)]
         pairs = pair_stamps(stamps[0], stamps[1], self.tolerance_s, str(path))
 
-        def read(index: int) -> RgbdImages:
-            names = [path / table[k][1] for table, k in zip((colour, depth), pairs[index], strict=True)]
-            return RgbdImages(
-                read_rgb(names[0]),
-                read_depth(names[1], self.depth_scale),
-                f"colour image {names[0]}",
-                f"depth image {names[1]}",
-            )
-
         times = tuple(stamps[0][i] for i, _ in pairs)
         truth = path / "groundtruth.txt"
         video = Video(
             path.resolve().name,
             times,
-            read,
+            lambda index: read_rgb(path / colour[pairs[index][0]][1]),
+            lambda index: read_depth(path / depth[pairs[index][1]][1], self.depth_scale),
             self.K,
             path,
             self.depth_scale,
-            read_rgb=lambda index: read_rgb(path / colour[pairs[index][0]][1]),
             motion=_motion(truth, times) if self.moving and truth.is_file() else None,
             distortion=self.distortion,
         )

@@ -10,12 +10,12 @@ To read another layout, define a subclass in a file: ``mstfilter convert IN OUT 
 are options of the command line. It is best built with `Video`, which checks every frame when it is read; for arrays
 in memory use `Recording.from_arrays`.
 
->>> video = Video("tum", times, read, K, path, depth_scale=0.0002)
+>>> video = Video("tum", times, read_rgb, read_depth, K, path, depth_scale=0.0002)
 >>> video.recording(pauses=Still(), world=KnownWorld())
 
 The camera pose is found from the support plane of the first pause unless it is given. If the layout stores the motion
 of the camera, only the motion relative to the first pause is used, because the world of a trajectory seldom has its
-table at z = 0. Cameras have no distortion: distorted images are undistorted when they are read (`Lens`).
+table at z = 0. Cameras have no distortion: distorted images are undistorted when they are read.
 """
 
 from __future__ import annotations
@@ -62,78 +62,36 @@ class RecordingFormat(ABC):
 _NEGLIGIBLE = 0.5  # pixels
 
 
-@dataclass(frozen=True, eq=False)
-class Lens:
-    """Source pixels of an undistorted image.
+def undistortion_map(camera: Camera, distortion: tuple[float, ...]) -> np.ndarray | None:
+    """Column and row in the distorted image of each pixel of the undistorted one, (H, W, 2) float32.
 
-    Parameters
-    ----------
-    source : (H, W, 2) float32, optional
-        Column and row in the distorted image; None if the lens has no distortion.
+    `distortion` has OpenCV's coefficients k1, k2, p1, p2, k3, ... Returns None if no pixel moves by half a pixel.
     """
-
-    source: np.ndarray | None = None
-
-    @classmethod
-    def of(cls, camera: Camera, distortion: tuple[float, ...]) -> Lens:
-        """The lens of OpenCV's coefficients k1, k2, p1, p2, k3, ...; distortion below half a pixel is ignored."""
-        if not any(distortion):
-            return cls()
-        if len(distortion) not in (4, 5, 8, 12, 14) or not np.isfinite(distortion).all():
-            raise InputError(
-                f"distortion has {len(distortion)} numbers {tuple(distortion)}, expected 4, 5, 8, 12 or 14",
-                "k1, k2, p1, p2, k3, ... in the order of OpenCV",
-            )
-        import cv2
-
-        size = (camera.width, camera.height)
-        x, y = cv2.initUndistortRectifyMap(
-            camera.K, np.array(distortion, dtype=float), None, camera.K, size, cv2.CV_32FC1
+    if not any(distortion):
+        return None
+    if len(distortion) not in (4, 5, 8, 12, 14) or not np.isfinite(distortion).all():
+        raise InputError(
+            f"distortion has {len(distortion)} numbers {tuple(distortion)}, expected 4, 5, 8, 12 or 14",
+            "k1, k2, p1, p2, k3, ... in the order of OpenCV",
         )
-        source = np.stack([x, y], axis=-1)
-        v, u = np.mgrid[: camera.height, : camera.width]
-        return cls() if np.abs(source - np.stack([u, v], axis=-1)).max() < _NEGLIGIBLE else cls(source)
+    import cv2
 
-    def undistort(self, image: np.ndarray) -> np.ndarray:
-        """Undistort a colour image."""
-        import cv2
-
-        return image if self.source is None else self._remap(image, cv2.INTER_LINEAR, 0)
-
-    def undistort_nearest(self, image: np.ndarray, outside: float) -> np.ndarray:
-        """Undistort an image of depth or labels, without interpolation."""
-        import cv2
-
-        return image if self.source is None else self._remap(image, cv2.INTER_NEAREST, outside)
-
-    def _remap(self, image: np.ndarray, how: int, outside: float) -> np.ndarray:
-        import cv2
-
-        fill: Any = outside
-        remapped: np.ndarray = cv2.remap(
-            image, self.source, None, how, borderMode=cv2.BORDER_CONSTANT, borderValue=fill
-        )
-        return remapped
+    size = (camera.width, camera.height)
+    x, y = cv2.initUndistortRectifyMap(camera.K, np.array(distortion, float), None, camera.K, size, cv2.CV_32FC1)
+    source = np.stack([x, y], axis=-1)
+    v, u = np.mgrid[: camera.height, : camera.width]
+    return source if np.abs(source - np.stack([u, v], axis=-1)).max() >= _NEGLIGIBLE else None
 
 
-@dataclass(frozen=True, eq=False)
-class RgbdImages:
-    """Images of one instant.
+def _undistort(image: np.ndarray, source: np.ndarray | None, outside: float = 0, smooth: bool = False) -> np.ndarray:
+    """The undistorted image; depth and labels must not be interpolated (`smooth`)."""
+    import cv2
 
-    Parameters
-    ----------
-    rgb : (H, W, 3) uint8
-        Colour.
-    depth : (H, W) float32
-        Metres, registered to the colour image; NaN = no reading.
-    rgb_name, depth_name : str
-        Names of the images, for messages.
-    """
-
-    rgb: np.ndarray
-    depth: np.ndarray
-    rgb_name: str
-    depth_name: str
+    if source is None:
+        return image
+    how = cv2.INTER_LINEAR if smooth else cv2.INTER_NEAREST
+    fill: Any = outside
+    return np.asarray(cv2.remap(image, source, None, how, borderMode=cv2.BORDER_CONSTANT, borderValue=fill))
 
 
 @dataclass(frozen=True)
@@ -175,20 +133,6 @@ class KnownWorld:
         return VoxelGrid.from_bounds(np.array(self.workspace[:3]), np.array(self.workspace[3:]), self.voxel_size)
 
 
-def _camera_from(K: Sequence[float], width: int, height: int, where: str) -> Camera:
-    """A camera from fx, fy, cx, cy. Raises InputError if they do not fit the image size."""
-    if len(K) != 4:
-        raise InputError(f"{where}: K has {len(K)} numbers, expected fx, fy, cx, cy in pixels")
-    fx, fy, cx, cy = (float(v) for v in K)
-    camera = Camera.from_intrinsics(fx, fy, cx, cy, width, height)
-    if not (0 < cx < width and 0 < cy < height):
-        raise InputError(
-            f"{where}: K has the principal point ({cx:g}, {cy:g}), outside images of {width} x {height}",
-            "K is fx, fy, cx, cy in pixels of these images; adapt it if they were resized or cropped",
-        )
-    return camera
-
-
 @dataclass(frozen=True, eq=False)
 class Video:
     """Frames on disk and their calibration.
@@ -199,16 +143,16 @@ class Video:
         For messages and reports.
     times : tuple of float
         Seconds, one per frame, ascending.
-    read : callable
-        Images of a frame, by index.
+    read_rgb : callable
+        Colour image (H, W, 3) uint8 of a frame, by index.
+    read_depth : callable
+        Depth image (H, W) float32 of a frame in metres, registered to the colour image; NaN = no reading.
     K : tuple of float
         fx, fy, cx, cy in pixels.
     path : Path
         File or folder.
     depth_scale : float
         Metres per unit of the stored depth.
-    read_rgb : callable, optional
-        The colour image of a frame, if reading it alone is faster.
     motion : sequence of RigidTransform, optional
         Camera poses in any world, one per frame.
     read_instance : callable, optional
@@ -219,11 +163,11 @@ class Video:
 
     name: str
     times: tuple[float, ...]
-    read: Callable[[int], RgbdImages]
+    read_rgb: Callable[[int], np.ndarray]
+    read_depth: Callable[[int], np.ndarray]
     K: tuple[float, ...]
     path: Path
     depth_scale: float
-    read_rgb: Callable[[int], np.ndarray] | None = None
     motion: Sequence[RigidTransform] | None = None
     read_instance: Callable[[int], np.ndarray | None] = field(default=lambda index: None)
     distortion: tuple[float, ...] = ()
@@ -238,12 +182,11 @@ class Video:
                 f"{self.path}: no frame is between start_s={start_s:g} and stop_s={stop_s:g}; the video lasts "
                 f"{self.times[-1] - self.times[0]:.1f} s"
             )
-        read_rgb = self.read_rgb
         return replace(
             self,
             times=tuple(self.times[k] for k in kept),
-            read=lambda index: self.read(kept[index]),
-            read_rgb=None if read_rgb is None else lambda index: read_rgb(kept[index]),
+            read_rgb=lambda index: self.read_rgb(kept[index]),
+            read_depth=lambda index: self.read_depth(kept[index]),
             motion=None if self.motion is None else [self.motion[k] for k in kept],
             read_instance=lambda index: self.read_instance(kept[index]),
         )
@@ -252,15 +195,22 @@ class Video:
         """The recording; pose and workspace are found now, images are read when they are used."""
         if not self.times:
             raise InputError(f"{self.path} has no pair of a colour and a depth image")
-        first = self.read(0)
-        height, width = first.rgb.shape[:2]
-        camera = _camera_from(self.K, width, height, str(self.path))
-        lens = Lens.of(camera, self.distortion)
-        self._frame(0, camera, lens)  # raises an error in the first frame before all frames are searched for pauses
-        found = pauses.find(self.times, self.read_rgb or (lambda index: self.read(index).rgb))
+        if len(self.K) != 4:
+            raise InputError(f"{self.path}: K has {len(self.K)} numbers, expected fx, fy, cx, cy in pixels")
+        height, width = self.read_rgb(0).shape[:2]
+        fx, fy, cx, cy = self.K
+        if not (0 < cx < width and 0 < cy < height):
+            raise InputError(
+                f"{self.path}: K has the principal point ({cx:g}, {cy:g}), outside images of {width} x {height}",
+                "K is fx, fy, cx, cy in pixels of these images; adapt it if they were resized or cropped",
+            )
+        camera = Camera.from_intrinsics(fx, fy, cx, cy, width, height)
+        source = undistortion_map(camera, self.distortion)
+        self._frame(0, camera, source)  # raises an error in the first frame before all frames are searched for pauses
+        found = pauses.find(self.times, self.read_rgb)
         first_pause = found[0]
         camera = camera if world.pose is None else camera.at(world.pose)
-        camera, grid = find_world(self._frame(first_pause, camera, lens), world.grid)
+        camera, grid = find_world(self._frame(first_pause, camera, source), world.grid)
         cameras: dict[int, Camera] = {}
 
         def camera_at(index: int) -> Camera:
@@ -274,10 +224,10 @@ class Video:
             image = self.read_instance(index)
             if image is not None and image.shape != (height, width):
                 raise InputError(f"instance image of frame {index} of {self.path} has shape {image.shape}")
-            return image if image is None else lens.undistort_nearest(image, 0)
+            return image if image is None else _undistort(image, source)
 
         return Recording(
-            LazyFrames(lambda index: self._frame(index, camera_at(index), lens), len(self.times)),
+            LazyFrames(lambda index: self._frame(index, camera_at(index), source), len(self.times)),
             grid,
             found,
             tuple(t - self.times[0] for t in self.times),
@@ -287,18 +237,19 @@ class Video:
             instance=instance,
         )
 
-    def _frame(self, index: int, camera: Camera, lens: Lens) -> Frame:
-        images = self.read(index)
-        (h, w), (dh, dw) = images.rgb.shape[:2], images.depth.shape[:2]
+    def _frame(self, index: int, camera: Camera, source: np.ndarray | None) -> Frame:
+        rgb, depth = self.read_rgb(index), self.read_depth(index)
+        where = f"frame {index} of {self.path}"
+        (h, w), (dh, dw) = rgb.shape[:2], depth.shape[:2]
         if (h, w) != (dh, dw):
             raise InputError(
-                f"{images.depth_name} is {dw} x {dh}, the colour image {w} x {h}: depth is not registered to colour",
+                f"{where} has a colour image of {w} x {h} and depth of {dw} x {dh}: depth is not registered to colour",
                 "align depth to colour when recording (each depth pixel must belong to the colour pixel above it)",
             )
         if (h, w) != (camera.height, camera.width):
-            raise InputError(f"{images.rgb_name} is {w} x {h}, the first is {camera.width} x {camera.height}")
-        check_depth(images.depth, f"{images.depth_name} with {self.depth_scale:g} m per unit")
-        return Frame(lens.undistort(images.rgb), lens.undistort_nearest(images.depth, np.nan), camera)
+            raise InputError(f"{where} is {w} x {h}, the first is {camera.width} x {camera.height}")
+        check_depth(depth, f"depth of {where} with {self.depth_scale:g} m per unit")
+        return Frame(_undistort(rgb, source, smooth=True), _undistort(depth, source, np.nan), camera)
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 import warnings
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from mstfilter.formats.datasets import Bop, Dsr
 from mstfilter.formats.folder import save_recording
 from mstfilter.formats.image_folders import Redwood, Tum
 from mstfilter.formats.pauses import Ends, EveryNth
-from mstfilter.formats.video import KnownWorld, Lens, pair_stamps
+from mstfilter.formats.video import KnownWorld, _undistort, pair_stamps, undistortion_map
 from mstfilter.scene import Recording, write_image
 from tests.formats.layouts import (
     FPS,
@@ -318,7 +319,7 @@ def test_pairs_of_stamps():
 def test_images_are_undistorted():
     """An image distorted by the lens model is recovered; depth is not interpolated."""
     bend = (0.2, -0.5, 0.001, -0.002, 0.1)
-    lens = Lens.of(CAMERA, bend)
+    source = undistortion_map(CAMERA, bend)
     k1, k2, p1, p2, k3 = bend
     x, y = CAMERA.rays()[..., 0], CAMERA.rays()[..., 1]
     r2 = x**2 + y**2
@@ -326,13 +327,13 @@ def test_images_are_undistorted():
     u = CAMERA.K[0, 0] * (x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x**2)) + CAMERA.K[0, 2]
     v = CAMERA.K[1, 1] * (y * radial + p1 * (r2 + 2 * y**2) + 2 * p2 * x * y) + CAMERA.K[1, 2]
     # The brown model: pixel (x, y) of the straight image is at (u, v) of the distorted one.
-    np.testing.assert_allclose(lens.source[..., 0], u, atol=1e-3)
-    np.testing.assert_allclose(lens.source[..., 1], v, atol=1e-3)
+    np.testing.assert_allclose(source[..., 0], u, atol=1e-3)
+    np.testing.assert_allclose(source[..., 1], v, atol=1e-3)
     depth = np.where(np.arange(160) % 2, 1.0, 2.0)[None].repeat(120, axis=0).astype(np.float32)
-    assert set(np.unique(lens.undistort_nearest(depth, np.nan)[20:100, 30:130])) == {1.0, 2.0}
-    assert Lens.of(CAMERA, (1e-4, 0, 0, 0)).source is None
+    assert set(np.unique(_undistort(depth, source, np.nan)[20:100, 30:130])) == {1.0, 2.0}
+    assert undistortion_map(CAMERA, (1e-4, 0, 0, 0)) is None
     with pytest.raises(InputError, match="3 numbers"):
-        Lens.of(CAMERA, (0.1, 0.1, 0.1))
+        undistortion_map(CAMERA, (0.1, 0.1, 0.1))
 
 
 def test_distorted_images_are_undistorted_when_read(tmp_path):
@@ -341,7 +342,7 @@ def test_distorted_images_are_undistorted_when_read(tmp_path):
     bent = Tum(K=K, pauses=Ends(), world=WORLD).open(path).frames[0]
     assert (straight.rgb != bent.rgb).mean() > 0.02
     np.testing.assert_allclose(straight.rgb[50:70, 70:90].astype(int), bent.rgb[50:70, 70:90], atol=4)
-    u, v = np.moveaxis(np.rint(Lens.of(CAMERA, (0.3, 0.0, 0.0, 0.0)).source).astype(int), -1, 0)
+    u, v = np.moveaxis(np.rint(undistortion_map(CAMERA, (0.3, 0.0, 0.0, 0.0))).astype(int), -1, 0)
     inside = (u >= 0) & (u < 160) & (v >= 0) & (v < 120)
     picked = bent.depth[v.clip(0, 119), u.clip(0, 159)]
     assert (straight.depth[inside] == picked[inside]).mean() > 0.99  # halves of a pixel may round the other way
@@ -365,10 +366,10 @@ def test_depth_out_of_the_range_of_the_file_is_no_reading(tmp_path):
 def test_a_disk_that_is_full_at_the_end_leaves_no_files(tmp_path, monkeypatch):
     from mstfilter.formats.folder import RecordingWriter
 
-    def full(self, described):
+    def full(self, target):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(RecordingWriter, "_finish", full)
+    monkeypatch.setattr(Path, "rename", full)
     rgb, depth, _ = video((0,))
     with pytest.raises(InputError, match="No space left"), RecordingWriter(tmp_path / "r", CAMERA) as writer:
         writer.add_frame(rgb[0], depth[0], 0.0, "static")
