@@ -243,7 +243,7 @@ class Video:
         (h, w), (dh, dw) = rgb.shape[:2], depth.shape[:2]
         if (h, w) != (dh, dw):
             raise InputError(
-                f"{where} has a colour image of {w} x {h} and depth of {dw} x {dh}: depth is not registered to colour",
+                f"{where} has depth of {dw} x {dh}, colour of {w} x {h}: depth is not registered to colour",
                 "align depth to colour when recording (each depth pixel must belong to the colour pixel above it)",
             )
         if (h, w) != (camera.height, camera.width):
