@@ -48,9 +48,10 @@ def states(scene: SimulatedScene, actions: int) -> Iterator[None]:
 def measure(name: str, seed: int, actions: int, small: dict[str, int]) -> list[str]:
     scene = SimulatedScene(replace(scene_family(name), **small), seed)
     arguments = (scene.world, scene.objects.skins, scene.room, scene.camera, scene.family.supersample, POSE_TOLERANCE)
-    renderers = Renderer(*arguments), Renderer(*arguments, reuse=False)
+    renderers = Renderer(*arguments), Renderer(*arguments)
     spent, cpu, sensor, frames = np.zeros(2), np.zeros(2), 0.0, 0
     for _ in states(scene, actions):
+        renderers[1].forget()
         views = []
         for k, renderer in enumerate(renderers):
             wall, busy = time.perf_counter(), time.process_time()

@@ -3,7 +3,7 @@
 `Stage` holds the poses that are rendered. `PixelRays` casts one ray through each pixel and keeps what it meets.
 `LightMap` holds light on the table. A ray's result holds until a body moves that the ray meets before or after; the
 light at a point holds, for each light source, until a body moves between them. Both are decided by conservative
-bounds (`solids.CapsuleBounds`), so the images equal those of casting every ray in every frame.
+bounds (`solids.may_meet`), so the images equal those of casting every ray in every frame.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mstfilter.simulation.shapes import Shape
-from mstfilter.simulation.solids import CapsuleBounds
+from mstfilter.simulation.solids import may_meet
 from mstfilter.simulation.textures import Atlas, Room, texture_coordinates
 from mstfilter.simulation.world import FINGER_GROUP, FINGER_ID, OBJECT_GROUP, PhysicsWorld
 
@@ -24,7 +24,8 @@ SHADOW_GROUPS = (OBJECT_GROUP, FINGER_GROUP)
 _LIFT = 0.0012  # metres off the surface, against shadows of a surface on itself
 _MAP_LOW, _MAP_HIGH = np.array([-0.62, -0.55]), np.array([0.62, 0.66])
 _FINGER_COLOUR = np.array([0.09, 0.095, 0.105], np.float32)
-_UNKNOWN = -2
+UNKNOWN = -2
+"""Geom of a ray that has not been cast."""
 
 
 class Stage:
@@ -87,22 +88,20 @@ class Stage:
         """T_world_object (n, 4, 4) as rendered."""
         return self._poses.copy()
 
-    def key(self) -> np.ndarray:
-        """Pose of every object, then of the finger: (n + 1, 12). Equal rows are equal poses."""
-        rows = self._poses[:, :3].reshape(len(self._poses), 12)
-        return np.concatenate([rows, np.resize(self._finger, (1, 12))])
+    def bodies(self) -> tuple[np.ndarray, np.ndarray]:
+        """Poses (k, 12) of all bodies that cast shadows, and capsules (k, 7) that contain them.
 
-    def bounds(self) -> tuple[CapsuleBounds, np.ndarray]:
-        """Capsules around all bodies that cast shadows, and the row of `key` that each belongs to."""
-        model, data = self.world.model, self._data
-        at, axis = self._poses[:, :3, 3], np.einsum("nij,nj->ni", self._poses[:, :3, :3], self._axis)
+        Equal rows of the first array are equal poses; see `solids.may_meet` for the second.
+        """
+        model, data, n = self.world.model, self._data, len(self._poses)
         limbs = np.flatnonzero(self.world.geom_object == FINGER_ID)
-        # Capsules and cylinders alike lie in the capsule of their radius and axis.
+        # Finger and arm are capsules and cylinders, which lie in the capsule of their radius and axis.
         limb_axis = data.geom_xmat[limbs].reshape(-1, 3, 3)[:, :, 2] * model.geom_size[limbs, 1:2]
-        at, axis = np.concatenate([at, data.geom_xpos[limbs]]), np.concatenate([axis, limb_axis])
+        axis = np.concatenate([np.einsum("nij,nj->ni", self._poses[:, :3, :3], self._axis), limb_axis])
+        at = np.concatenate([self._poses[:, :3, 3], data.geom_xpos[limbs]])
         radius = np.concatenate([self._thick, model.geom_size[limbs, 0]]) + 0.002
-        rows = np.minimum(np.arange(len(at)), len(self._poses))
-        return CapsuleBounds(at - axis, at + axis, radius), rows
+        rows = [self._poses[:, :3].reshape(n, 12), np.resize(self._finger, (len(limbs), 12))]
+        return np.concatenate(rows), np.column_stack([at - axis, at + axis, radius])
 
     def cast(
         self, origin: ArrayLike, directions: np.ndarray, groups: Sequence[int] = (0, 1, 2)
@@ -125,7 +124,7 @@ def cosine_to_light(stage: Stage, light: np.ndarray, points: np.ndarray, normal:
 
 
 class LightMap:
-    """Light on the table from some light sources, on a raster and interpolated at the table's pixels.
+    """Light on the table from some light sources: the mean of cosine times visibility, on a raster.
 
     A shadow on the table thus costs rays at the resolution of the raster, not of the image.
 
@@ -136,7 +135,7 @@ class LightMap:
     lights : (k, 3) metres
         Light sources.
     pixels : (n, 2) metres
-        Points of the table that the camera's pixels show.
+        Points of the table that the camera's pixels show; see `at_pixels`.
     """
 
     def __init__(self, spacing: float, lights: np.ndarray, pixels: np.ndarray) -> None:
@@ -144,55 +143,38 @@ class LightMap:
         nx, ny = (np.ceil((_MAP_HIGH - _MAP_LOW) / spacing).astype(int) + 1).tolist()
         x, y = _MAP_LOW[0] + spacing * np.arange(nx), _MAP_LOW[1] + spacing * np.arange(ny)
         grid = np.meshgrid(x, y, indexing="ij")
-        self.shape = (nx, ny)
+        self._shape = (nx, ny)
         self._rays = np.stack([grid[0].ravel(), grid[1].ravel(), np.full(nx * ny, _LIFT)], axis=1) - lights[:, None]
-        self._short = self._rays.astype(np.float32)
-        cosine = -self._rays[:, :, 2] / np.linalg.norm(self._rays, axis=2)
-        self._cosine = cosine.astype(np.float32)
+        self._cosine = (-self._rays[:, :, 2] / np.linalg.norm(self._rays, axis=2)).astype(np.float32)
         self._dark = np.zeros(self._cosine.shape, bool)
         self._values = np.zeros(nx * ny, np.float32)
-        self._corner, self._share = self._locate(pixels)
-        self.at_pixels: np.ndarray = np.zeros(len(pixels), np.float32)
-        """Mean over the light sources of cosine times visibility at the pixels (n,)."""
+        self._pixels = self._locate(pixels)
 
-    def update(self, stage: Stage, bounds: CapsuleBounds, fresh: bool) -> None:
-        """Cast shadow rays again where one of the bounds may be in the way; `fresh`: the map is new."""
-        maybe = np.zeros(len(self._values), bool)
-        for light, rays, short, dark in zip(self._lights, self._rays, self._short, self._dark, strict=True):
-            which = np.flatnonzero(bounds.seen_from(light).may_meet(short))
+    def update(self, stage: Stage, moved: np.ndarray) -> None:
+        """Cast shadow rays again where one of the capsules (k, 7) may be in the way."""
+        self._values[:] = 0
+        for light, rays, cosine, dark in zip(self._lights, self._rays, self._cosine, self._dark, strict=True):
+            which = np.flatnonzero(may_meet(moved, light, rays))
             _, distance, _ = stage.cast(light, rays[which], SHADOW_GROUPS)
             dark[which] = (distance >= 0) & (distance <= 1.0 - 1e-6)
-            maybe[which] = True
-        if fresh:
-            maybe[:] = True
-        nodes = np.flatnonzero(maybe)
-        total = np.zeros(len(nodes), np.float32)
-        for cosine, dark in zip(self._cosine, self._dark, strict=True):
-            total += np.where(dark[nodes], np.float32(0), cosine[nodes])
-        total /= np.float32(len(self._lights))
-        changed = np.zeros(len(maybe), bool)
-        changed[nodes] = fresh | (total != self._values[nodes])
-        self._values[nodes] = total
-        # A pixel changes with any of the four nodes around it; `corner` marks the lower one.
-        ny = self.shape[1]
-        corner = changed.copy()
-        corner[:-1] |= changed[1:]
-        corner[:-ny] |= changed[ny:]
-        corner[: -ny - 1] |= changed[ny + 1 :]
-        which = np.flatnonzero(corner[self._corner])
-        self.at_pixels[which] = self._between(self._corner[which], self._share[which])
+            self._values += np.where(dark, np.float32(0), cosine)
+        self._values /= np.float32(len(self._lights))
+
+    def at_pixels(self) -> np.ndarray:
+        """Values (n,) at the pixels of the table."""
+        return self._interpolate(*self._pixels)
 
     def sample(self, xy: np.ndarray) -> np.ndarray:
         """Bilinear values (n,) at points (n, 2) of the table; beyond the map the value at its border."""
-        return self._between(*self._locate(xy))
+        return self._interpolate(*self._locate(xy))
 
     def _locate(self, xy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        place = np.clip((xy - _MAP_LOW) / self._spacing, 0, np.array(self.shape) - 1.001)
+        place = np.clip((xy - _MAP_LOW) / self._spacing, 0, np.array(self._shape) - 1.001)
         at = place.astype(np.int64)
-        return at[:, 0] * self.shape[1] + at[:, 1], (place - at).astype(np.float32)
+        return at[:, 0] * self._shape[1] + at[:, 1], (place - at).astype(np.float32)
 
-    def _between(self, corner: np.ndarray, share: np.ndarray) -> np.ndarray:
-        values, ny = self._values, self.shape[1]
+    def _interpolate(self, corner: np.ndarray, share: np.ndarray) -> np.ndarray:
+        values, ny = self._values, self._shape[1]
         low = values[corner] * (1 - share[:, 1]) + values[corner + 1] * share[:, 1]
         high = values[corner + ny] * (1 - share[:, 1]) + values[corner + ny + 1] * share[:, 1]
         return low * (1 - share[:, 0]) + high * share[:, 0]
@@ -220,10 +202,9 @@ class PixelRays:
     ) -> None:
         self.stage, self.room, self.eye, self.directions = stage, room, eye, directions
         self._atlas, self._groups = atlas, tuple(groups)
-        self._short = directions.astype(np.float32)
         self._lights = np.concatenate([room.lamp, room.sky])
         n = len(directions)
-        self.geom = np.full(n, _UNKNOWN, np.int32)
+        self.geom = np.full(n, UNKNOWN, np.int32)
         self.depth = np.empty(n)
         self.normal = np.empty((n, 3))
         self._albedo = np.empty((n, 3), np.float32)
@@ -233,29 +214,21 @@ class PixelRays:
         self._bounce = np.empty(n, np.float32)
         self._cosine = np.empty((len(self._lights), n), np.float32)
 
-    def forget(self) -> None:
-        """Forget the results of all rays."""
-        self.geom[:] = _UNKNOWN
-
-    def update(self, pixels: np.ndarray, moved: CapsuleBounds, limit: np.ndarray | None = None) -> None:
+    def update(self, pixels: np.ndarray, moved: np.ndarray, limit: np.ndarray | None = None) -> None:
         """Bring some pixels up to date and forget all others.
 
         Parameters
         ----------
         pixels : (m,) int
-        moved : CapsuleBounds
-            Of bodies that moved since the last update, at their old and new poses.
+        moved : (k, 7) metres
+            Capsules of bodies that moved since the last update, at their old and new poses.
         limit : (n,) metres, optional
             Hits beyond this depth are ignored.
         """
-        known = self.geom[pixels] != _UNKNOWN
         other = np.ones(len(self.geom), bool)
         other[pixels] = False
-        self.geom[other] = _UNKNOWN
-        stale = ~known
-        if len(moved):
-            old = np.flatnonzero(known)
-            stale[old] |= moved.seen_from(self.eye).may_meet(self._short[pixels[old]])
+        self.geom[other] = UNKNOWN
+        stale = (self.geom[pixels] == UNKNOWN) | may_meet(moved, self.eye, self.directions[pixels])
         new, kept = pixels[stale], pixels[~stale]
         geom, z, normal = self.stage.cast(self.eye, self.directions[new], self._groups)
         if limit is not None:
@@ -265,8 +238,7 @@ class PixelRays:
         bodies = self.is_body(new)
         self._shade(new[bodies])
         self._light(new[bodies], None)
-        if len(moved):
-            self._light(kept[self.is_body(kept)], moved)
+        self._light(kept[self.is_body(kept)], moved)
 
     def instance(self, pixels: np.ndarray) -> np.ndarray:
         """Instance id (k,) of what the rays meet, 0 for the room or nothing."""
@@ -310,13 +282,13 @@ class PixelRays:
         # Light reflected by the table reaches surfaces that face down or sideways, less near the table.
         self._bounce[pixels] = (0.5 - 0.5 * smooth[:, 2]) * np.clip(points[:, 2] / 0.05, 0.35, 1)
 
-    def _light(self, pixels: np.ndarray, moved: CapsuleBounds | None) -> None:
+    def _light(self, pixels: np.ndarray, moved: np.ndarray | None) -> None:
         """Light of each source at pixels on bodies; with `moved`, only where these bodies may cast a shadow."""
         lifted, n_lamps = self._lifted[pixels], len(self.room.lamp)
         for k, light in enumerate(self._lights):
             which = pixels
             if moved is not None:
-                which = pixels[moved.seen_from(light).may_meet(lifted - light.astype(np.float32))]
+                which = pixels[may_meet(moved, light, lifted - light)]
             normal = self._smooth[which]
             if k >= n_lamps:
                 # Finger and arm are dark: shadows of the ceiling's light on them would be invisible.

@@ -13,9 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from mstfilter.scene import Camera
-from mstfilter.simulation.layers import SHADOW_GROUPS, LightMap, PixelRays, Stage
+from mstfilter.simulation.layers import SHADOW_GROUPS, UNKNOWN, LightMap, PixelRays, Stage
 from mstfilter.simulation.sensor import NEIGHBOURS
-from mstfilter.simulation.solids import CapsuleBounds
 from mstfilter.simulation.textures import Atlas, Room, Skin
 from mstfilter.simulation.world import FINGER_GROUP, OBJECT_GROUP, ROOM_GROUP, TABLE, PhysicsWorld
 
@@ -66,8 +65,6 @@ class Renderer:
         Whether pixels on edges get further rays.
     tolerance : float
         Metres by which the rendered poses may differ from the physics; see `Stage`.
-    reuse : bool
-        Keep results between frames. False casts all rays again, for the same images.
     """
 
     def __init__(
@@ -78,10 +75,9 @@ class Renderer:
         camera: Camera,
         supersample: bool = True,
         tolerance: float = 0.0,
-        reuse: bool = True,
     ) -> None:
         self.room, self.camera = room, camera
-        self.stage, self.reuse = Stage(world, tolerance), reuse
+        self.stage = Stage(world, tolerance)
         atlas = Atlas(list(skins), visible_texel(camera))
         turn = camera.pose.as_matrix()[:3, :3]
         self._eye = np.array(camera.position)
@@ -99,7 +95,16 @@ class Renderer:
         fine = max(0.004, 2.0 / float(K[0, 0]))
         self._lamp_map = LightMap(fine, room.lamp, self._table_xy)
         self._sky_map = LightMap(2 * fine, room.sky, self._table_xy)
-        self._rendered: tuple[np.ndarray, CapsuleBounds, np.ndarray] | None = None
+        self._poses, self._capsules = np.full((1, 12), np.nan), np.zeros((0, 7))
+        self.forget()
+
+    def forget(self) -> None:
+        """Cast all rays again at the next call of `render`, for the same images."""
+        # Bodies at their first poses count as moved, so a ray that cannot meet any of them meets no body.
+        self._poses = np.full_like(self._poses, np.nan)
+        self._main.geom[:] = -1
+        for rays in self._further:
+            rays.geom[:] = UNKNOWN
 
     def _render_background(self, rays: np.ndarray) -> None:
         """The room without objects. Between frames only the light on the table changes."""
@@ -149,34 +154,25 @@ class Renderer:
         room = self.room
         return lamp[:, None] * room.lamp_colour + sky[:, None] * room.sky_colour + room.ambient
 
-    def _moved_bounds(self) -> CapsuleBounds:
-        """Bounds of the bodies that moved since the last image, old and new; of all bodies before the first one."""
-        key, (bounds, rows) = self.stage.key(), self.stage.bounds()
-        before, self._rendered = self._rendered, (key, bounds, rows)
-        if before is None or not self.reuse:
-            for rays in (self._main, *self._further):
-                rays.forget()
-            return bounds if before is None else bounds.joined(before[1])
-        changed = (key != before[0]).any(axis=1)
-        return before[1][changed[before[2]]].joined(bounds[changed[rows]])
+    def _moved_capsules(self) -> np.ndarray:
+        """Capsules (k, 7) of the bodies that moved since the last image, at their old and new poses."""
+        poses, capsules = self.stage.bodies()
+        moved = (poses != self._poses).any(axis=1)
+        both = np.concatenate([self._capsules[moved[: len(self._capsules)]], capsules[moved]])
+        self._poses, self._capsules = poses, capsules
+        return both
 
     def render(self) -> View:
         """Images of the world as it is now."""
         h, w = self.camera.height, self.camera.width
-        first = self._rendered is None or not self.reuse
         self.stage.follow()
-        moved = self._moved_bounds()
-        if len(moved) or first:
-            self._lamp_map.update(self.stage, moved, first)
-            self._sky_map.update(self.stage, moved, first)
+        moved = self._moved_capsules()
+        self._lamp_map.update(self.stage, moved)
+        self._sky_map.update(self.stage, moved)
         light = self._room_light.copy()
-        light[self._on_table] = self._table_light(self._lamp_map.at_pixels, self._sky_map.at_pixels)
+        light[self._on_table] = self._table_light(self._lamp_map.at_pixels(), self._sky_map.at_pixels())
         colour = self._room_albedo * light
 
-        if first:
-            # A ray that cannot meet any bound meets no body.
-            bounds = self.stage.bounds()[0]
-            self._main.geom[~bounds.seen_from(self._eye).may_meet(self._unit)] = -1
         self._main.update(np.arange(h * w), moved, self._room_depth)
         hit = np.flatnonzero(self._main.geom >= 0)
         depth, slant, normal = self._room_depth.copy(), self._room_slant.copy(), self._room_normal.copy()

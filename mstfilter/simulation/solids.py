@@ -1,4 +1,4 @@
-"""Convex pieces of objects, and bounds that tell which rays can meet them.
+"""Convex pieces of objects, and a test which rays can meet the capsules around them.
 
 A rigid object is a union of convex pieces. MuJoCo collides and ray-casts these pieces, and `Piece.inside` answers
 for the same solids, so images and true volumes agree.
@@ -7,13 +7,12 @@ for the same solids, so images and true volumes agree.
 >>> box((0.02, 0.03, 0.04)).inside([[0.0, 0.0, 0.039], [0.0, 0.0, 0.041]]).tolist()
 [True, False]
 
-`CapsuleBounds` are capsules around moving bodies. Seen from a point, a capsule lies in a cone and, if it is long,
-between two planes. The test is conservative: a ray that fails it does not meet the capsule.
+`may_meet` tests rays against capsules around bodies.
 
 >>> import numpy as np
->>> from mstfilter.simulation.solids import CapsuleBounds
->>> ball = CapsuleBounds(np.array([[0.0, 0, 1]]), np.array([[0.0, 0, 1]]), np.array([0.1]))
->>> ball.seen_from(np.zeros(3)).may_meet(np.array([[0.0, 0.05, 1.0], [0.5, 0.0, 1.0]], np.float32)).tolist()
+>>> from mstfilter.simulation.solids import may_meet
+>>> ball = np.array([[0.0, 0, 1, 0, 0, 1, 0.1]])
+>>> may_meet(ball, np.zeros(3), np.array([[0.0, 0.05, 1.0], [0.5, 0.0, 1.0]])).tolist()
 [True, False]
 """
 
@@ -28,7 +27,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 _TOLERANCE = 1e-9  # so that a voxel centre on the face that two pieces share lies in one of them
-_ANGLE_SLACK = 1e-4  # of the bounds' angles, for single precision
+_ANGLE_SLACK = 1e-4  # of the angles in `may_meet`, for single precision
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,90 +180,48 @@ def ring(profile: list[tuple[float, float, float]], sides: int = 20) -> list[Pie
     return wedges
 
 
-@dataclass(frozen=True, eq=False)
-class BoundingCones:
-    """Capsules as seen from one point.
+def may_meet(capsules: np.ndarray, point: np.ndarray, rays: np.ndarray) -> np.ndarray:
+    """Whether rays from a point may meet one of some capsules: (n,) bool.
+
+    Seen from the point, a capsule lies in a cone and, if it is long, between two planes through the point. The test
+    is conservative: a ray that fails it does not meet the capsule.
 
     Parameters
     ----------
-    axis : (k, 3) float32
-        Unit vectors from the point along the axes of the cones.
-    cosine : (k,) float32
-        Least cosine between the axis and a ray that meets the capsule.
-    across : (k, 3) float32
-        Unit normals of the planes through the point and the axes of long capsules; 0 for balls.
-    slab : (k,) float32
-        Greatest sine between that plane and a ray that meets the capsule.
+    capsules : (k, 7) metres
+        Both ends of the axis and the radius; equal ends for a ball.
+    point : (3,) metres
+        Origin of the rays.
+    rays : (n, 3)
+        Directions, of any length.
     """
+    a, b, radius = capsules[:, :3] - point, capsules[:, 3:6] - point, capsules[:, 6]
+    along = b - a
+    square = np.maximum((along**2).sum(axis=1), 1e-30)
+    share = np.clip(-(a * along).sum(axis=1) / square, 0.0, 1.0)
+    nearest = np.linalg.norm(a + share[:, None] * along, axis=1)
+    within = nearest <= radius * 1.001  # the point is in the capsule
+    first, second = _unit(a), _unit(b)
+    spread = np.arccos(np.clip((first * second).sum(axis=1), -1.0, 1.0))
+    ratio = np.minimum(radius / np.where(within, 1.0, nearest), 1.0)
+    # Half the angle between the ends, and the angle of the radius at the nearest point of the axis.
+    angle = spread / 2 + np.arcsin(ratio) + _ANGLE_SLACK
+    cosine = np.where(within | (angle >= np.pi / 2), -2.0, np.cos(np.minimum(angle, np.pi)))
+    across = np.where((within | (spread < 1e-3))[:, None], 0.0, _unit(np.cross(a, b)))
 
-    axis: np.ndarray
-    cosine: np.ndarray
-    across: np.ndarray
-    slab: np.ndarray
-
-    def may_meet(self, rays: np.ndarray) -> np.ndarray:
-        """Whether rays (n, 3) float32 of any length, from the point, may meet one of the capsules: (n,) bool."""
-        met = np.zeros(len(rays), bool)
-        x, y, z = (np.ascontiguousarray(rays[:, i]) for i in range(3))
-        length = np.sqrt(x * x + y * y + z * z)
-        for a, cosine, n, slab in zip(self.axis, self.cosine, self.across, self.slab, strict=True):
-            inside = x * a[0] + y * a[1] + z * a[2] >= cosine * length
-            if n.any():
-                few = np.flatnonzero(inside)
-                off = np.abs(x[few] * n[0] + y[few] * n[1] + z[few] * n[2])
-                met[few] |= off <= slab * length[few]
-            else:
-                met |= inside
-        return met
-
-
-@dataclass(frozen=True, eq=False)
-class CapsuleBounds:
-    """Capsules around bodies.
-
-    Parameters
-    ----------
-    a, b : (k, 3) metres
-        Ends of the axes; equal for balls.
-    radius : (k,) metres
-    """
-
-    a: np.ndarray
-    b: np.ndarray
-    radius: np.ndarray
-
-    def __len__(self) -> int:
-        return len(self.radius)
-
-    def __getitem__(self, which: np.ndarray) -> CapsuleBounds:
-        return CapsuleBounds(self.a[which], self.b[which], self.radius[which])
-
-    def joined(self, other: CapsuleBounds) -> CapsuleBounds:
-        """The capsules of both."""
-        return CapsuleBounds(
-            np.concatenate([self.a, other.a]),
-            np.concatenate([self.b, other.b]),
-            np.concatenate([self.radius, other.radius]),
-        )
-
-    def seen_from(self, point: np.ndarray) -> BoundingCones:
-        """Cones around the capsules with their apex at a point."""
-        a, b = self.a - point, self.b - point
-        along = b - a
-        square = np.maximum((along**2).sum(axis=1), 1e-30)
-        share = np.clip(-(a * along).sum(axis=1) / square, 0.0, 1.0)
-        nearest = np.linalg.norm(a + share[:, None] * along, axis=1)
-        within = nearest <= self.radius * 1.001
-        safe = np.where(within, 1.0, nearest)
-        first, second = _unit(a), _unit(b)
-        spread = np.arccos(np.clip((first * second).sum(axis=1), -1.0, 1.0))
-        ratio = np.minimum(self.radius / safe, 1.0)
-        # Half the angle between the ends, and the angle of the radius at the nearest point of the axis.
-        angle = spread / 2 + np.arcsin(ratio) + _ANGLE_SLACK
-        cosine = np.where(within | (angle >= np.pi / 2), -2.0, np.cos(np.minimum(angle, np.pi)))
-        across = np.where((within | (spread < 1e-3))[:, None], 0.0, _unit(np.cross(a, b)))
-        single = [np.asarray(v, np.float32) for v in (_unit(first + second), cosine, across, ratio + _ANGLE_SLACK)]
-        return BoundingCones(*single)
+    met = np.zeros(len(rays), bool)
+    x, y, z = np.ascontiguousarray(rays.T, dtype=np.float32)
+    length = np.sqrt(x * x + y * y + z * z)
+    cones = (np.asarray(v, np.float32) for v in (_unit(first + second), cosine, across, ratio + _ANGLE_SLACK))
+    for axis, least, normal, slab in zip(*cones, strict=True):
+        inside = x * axis[0] + y * axis[1] + z * axis[2] >= least * length
+        if normal.any():
+            few = np.flatnonzero(inside)
+            off = np.abs(x[few] * normal[0] + y[few] * normal[1] + z[few] * normal[2])
+            met[few] |= off <= slab * length[few]
+        else:
+            met |= inside
+    return met
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:
