@@ -1,14 +1,17 @@
-"""What all contracts share: the base classes, and helpers that turn what goes wrong into words.
+"""What all contracts share: the base classes, and helpers that describe failures.
 
-A contract is a pytest class. Each ``test_`` method checks one property; the first line of its docstring states the
+A contract is a pytest class. It defines the arguments of a call (`inputs`), the call, and what every result must
+fulfil (`check_result`). Each ``test_`` method checks one more property; the first line of its docstring states the
 property, and the message of a failed assertion states how it is violated:
 
 >>> class TriggerContract(Contract):
-...     def test_returns_bool(self):
+...     def call(self, component, rng, inputs):
+...         return component.wants(inputs["population"], 0)
+...     def check_result(self, result, inputs):
+...         assert isinstance(result, bool), f"its answer is {result!r}, expected True or False"
+...     def test_answers_yes_or_no(self):
 ...         \"\"\"It returns True or False.\"\"\"
-...         population, _ = self.example(np.random.default_rng(0), 5)
-...         answer = self.make().wants(population, 0)
-...         assert isinstance(answer, bool), f"it returns {answer!r}, expected True or False"
+...         self.checked_call(self.make(), self.inputs(5))
 """
 
 from __future__ import annotations
@@ -52,7 +55,7 @@ def number_example(rng: np.random.Generator, n: int) -> tuple[Population, Any]:
 class Contract:
     """Base class of all contracts. Inherit one of its subclasses and define `make`; pytest does the rest.
 
-    A contract for another interface defines `inputs` and `call`, and adds tests.
+    A contract for another interface defines `inputs`, `call` and `check_result`, and adds tests.
     """
 
     def make(self) -> Any:
@@ -72,12 +75,20 @@ class Contract:
         """Use the component once."""
         raise NotImplementedError
 
+    def check_result(self, result: Any, inputs: dict[str, Any]) -> None:
+        """Assert what the result of every call must fulfil."""
+
+    def checked_call(self, component: Any, inputs: dict[str, Any], rng: np.random.Generator | None = None) -> Any:
+        """Use the component once; an exception or a wrong result is reported with a description of the inputs."""
+        with reports_errors(_description(inputs)):
+            result = self.call(component, np.random.default_rng(3) if rng is None else rng, inputs)
+        self.check_result(result, inputs)
+        return result
+
     def setup_method(self) -> None:
-        """Store the state of the global generators."""
         self._global_state = _global_state()
 
     def teardown_method(self) -> None:
-        """Restore the state of the global generators."""
         numpy_state, python_state = self._global_state
         np.random.set_state(numpy_state)  # noqa: NPY002
         random.setstate(python_state)
@@ -162,6 +173,17 @@ def skips_errors() -> Iterator[None]:
         yield
     except Exception as error:
         pytest.skip(f"a call raises {type(error).__name__}, see the other tests")
+
+
+def _description(inputs: dict[str, Any]) -> str:
+    """The sizes of populations, and arguments that are None or numbers: "6 particles, observation=None"."""
+    words = []
+    for name, value in inputs.items():
+        if isinstance(value, Population):
+            words.append(f"{len(value)} {'' if name == 'population' else f'{name} '}particles")
+        elif value is None or isinstance(value, int):
+            words.append(f"{name}={value}")
+    return ", ".join(words)
 
 
 def _writes_to_read_only(error: Exception) -> bool:

@@ -9,15 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mstfilter.smc import (
-    DensityTransition,
-    Population,
-    Proposal,
-    Rejuvenation,
-    Transition,
-    Update,
-    as_matrix,
-)
+from mstfilter.smc import DensityTransition, Population, as_matrix
 from mstfilter.testing.contract import (
     FALSE_ALARM,
     RandomContract,
@@ -34,36 +26,37 @@ def _rng(seed: int = 3) -> np.random.Generator:
     return np.random.default_rng(seed)
 
 
-def _check_population(found: Any, method: str) -> Population:
-    assert isinstance(found, Population), f"{method} returns {type(found).__name__}, expected a Population"
-    return found
+class _PopulationContract(RandomContract):
+    """What contracts share of components that return a population."""
+
+    def check_result(self, result: Any, inputs: dict[str, Any]) -> None:
+        assert isinstance(result, Population), f"it returns {type(result).__name__}, expected a Population"
+
+    def check_scale(self, inputs: dict[str, Any], name: str) -> None:
+        """Check that adding a number to the log weights of the population `name` adds it to those of the result."""
+        component = self.make()
+        skip_unless_properly_weighted(component)
+        unshifted = self.checked_call(component, inputs)
+        for shift in (50.0, -50.0):
+            population = inputs[name].reweighted(np.full(len(inputs[name]), shift))
+            shifted = self.checked_call(component, {**inputs, name: population})
+            equal = len(unshifted) == len(shifted) and np.allclose(
+                shifted.log_weights - shift, unshifted.log_weights, atol=1e-9, rtol=0
+            )
+            assert equal, f"log weights + {shift:g} in do not give log weights + {shift:g} out"
 
 
-def _check_shift(a: Population, b: Population, shift: float) -> None:
-    """`b` is the result for the same particles with `shift` added to their log weights."""
-    assert len(a) == len(b) and np.allclose(b.log_weights - shift, a.log_weights, atol=1e-9, rtol=0), (
-        f"log weights + {shift:g} in do not give log weights + {shift:g} out"
-    )
-
-
-class TransitionContract(RandomContract):
+class TransitionContract(_PopulationContract):
     """The contract of every `Transition`. Its one statistical test has a false-alarm rate of at most 1e-6."""
 
-    def call(self, component: Transition, rng: np.random.Generator, inputs: dict[str, Any]) -> Population:
-        """Predict."""
+    def call(self, component: Any, rng: np.random.Generator, inputs: dict[str, Any]) -> Population:
         return component.predict(rng, inputs["population"], inputs["observation"])
-
-    def predict(self, component: Transition, population: Population, observation: Any, seed: int = 3) -> Population:
-        """Predict, and check the type of the result."""
-        with reports_errors(f"{len(population)} particles, observation {'None' if observation is None else 'given'}"):
-            moved = component.predict(_rng(seed), population, observation)
-        return _check_population(moved, "predict")
 
     def test_says_where_particles_come_from(self) -> None:
         """It keeps the number of particles, or sets parents "previous" to indices of old particles."""
         component = self.make()
         for n in (1, 2, _N):
-            moved = self.predict(component, *self.example(_rng(0), n))
+            moved = self.checked_call(component, self.inputs(n))
             previous = moved.parents.get("previous")
             if previous is None:
                 assert len(moved) == n, f'{n} particles became {len(moved)}, and there are no parents "previous"'
@@ -74,35 +67,29 @@ class TransitionContract(RandomContract):
 
     def test_takes_a_missing_observation(self) -> None:
         """It moves particles if the observation is missing (None)."""
-        self.predict(self.make(), self.example(_rng(0), _N)[0], None)
+        self.checked_call(self.make(), {**self.inputs(_N), "observation": None})
 
     def test_scale_of_weights_is_irrelevant(self) -> None:
         """A common factor of the weights is kept and has no other effect."""
-        component = self.make()
-        skip_unless_properly_weighted(component)
-        population, observation = self.example(_rng(0), _N)
-        unshifted = self.predict(component, population, observation)
-        for shift in (50.0, -50.0):
-            shifted = self.predict(component, population.reweighted(np.full(_N, shift)), observation)
-            _check_shift(unshifted, shifted, shift)
+        self.check_scale(self.inputs(_N), "population")
 
     @statistical
     def test_order_of_particles_is_irrelevant(self) -> None:
         """The move of a particle does not depend on its position among the others."""
         from scipy.stats import ks_2samp
 
-        component = self.make()
-        population, observation = self.example(_rng(0), _N)
+        component, inputs = self.make(), self.inputs(_N)
+        population = inputs["population"]
         if not isinstance(population.particles, (np.ndarray, dict)):
             pytest.skip("the particles are objects, whose moves are not compared")
-        if len(self.predict(component, population, observation)) != _N:
+        if len(self.checked_call(component, inputs)) != _N:
             pytest.skip("the number of particles changes")
         orders = (np.arange(_N), np.arange(_N)[::-1])
         samples: list[list[np.ndarray]] = [[], []]
         for seed in range(300):
             for side, order in enumerate(orders):
                 given = population.take(order)
-                moved = self.predict(component, given, observation, seed + 1000 * side)
+                moved = self.checked_call(component, {**inputs, "population": given}, _rng(seed + 1000 * side))
                 rows = np.column_stack([as_matrix(moved.particles), moved.log_weights - given.log_weights])
                 samples[side].append(rows[np.argsort(order)])
         # Kolmogorov-Smirnov tests of each coordinate of each particle. Rounding: equal weights may differ in the last
@@ -121,83 +108,70 @@ class DensityTransitionContract(TransitionContract):
 
     def test_log_prob_of_own_moves_is_finite(self) -> None:
         """`log_prob` gives one finite number for each move that `predict` makes."""
-        component: DensityTransition = self.make()
+        component = self.make()
         for n in (1, _N):
-            population, observation = self.example(_rng(0), n)
-            moved = self.predict(component, population, observation)
-            found = self._log_prob(component, population.particles, moved.particles, observation)
+            inputs = self.inputs(n)
+            found = self._log_prob(component, inputs, self.checked_call(component, inputs))
             assert found.shape == (n,), f"log densities of {n} moves have shape {found.shape}, expected ({n},)"
             assert np.isfinite(found).all(), f"log density of a move is {found[~np.isfinite(found)][0]}"
 
     def test_log_prob_of_a_move_does_not_depend_on_others(self) -> None:
         """`log_prob` treats every pair of rows alone."""
-        component: DensityTransition = self.make()
-        population, observation = self.example(_rng(0), _N)
-        moved = self.predict(component, population, observation)
-        found = self._log_prob(component, population.particles, moved.particles, observation)
-        rows = np.array([4, 0, 3])
-        fewer = self._log_prob(component, population.take(rows).particles, moved.take(rows).particles, observation)
+        component, inputs = self.make(), self.inputs(_N)
+        moved, rows = self.checked_call(component, inputs), np.array([4, 0, 3])
+        found = self._log_prob(component, inputs, moved)
+        fewer_inputs = {**inputs, "population": inputs["population"].take(rows)}
+        fewer = self._log_prob(component, fewer_inputs, moved.take(rows))
         assert np.allclose(fewer, found[rows], atol=1e-9), "three of six moves have other log densities alone"
 
     @staticmethod
-    def _log_prob(component: DensityTransition, previous: Any, new: Any, observation: Any) -> np.ndarray:
+    def _log_prob(component: DensityTransition, inputs: dict[str, Any], moved: Population) -> np.ndarray:
         with reports_errors("log_prob"):
-            return np.asarray(component.log_prob(previous, new, observation))
+            old = inputs["population"].particles
+            return np.asarray(component.log_prob(old, moved.particles, inputs["observation"]))
 
 
-class ProposalContract(RandomContract):
+class ProposalContract(_PopulationContract):
     """The contract of every `Proposal`."""
 
     def inputs(self, n: int, seed: int = 0) -> dict[str, Any]:
-        """The observation of the example, and a number of particles."""
         return {"observation": self.example(_rng(0), 2)[1], "n": n}
 
-    def call(self, component: Proposal, rng: np.random.Generator, inputs: dict[str, Any]) -> Population:
-        """Sample."""
+    def call(self, component: Any, rng: np.random.Generator, inputs: dict[str, Any]) -> Population:
         return component.sample(rng, inputs["observation"], inputs["n"])
 
     def test_gives_n_particles(self) -> None:
         """It returns n particles for any n."""
-        component, observation = self.make(), self.example(_rng(0), 2)[1]
+        component = self.make()
         for n in (1, 2, 7, 20):
-            with reports_errors(f"{n} particles"):
-                found = _check_population(component.sample(_rng(), observation, n), "sample")
+            found = self.checked_call(component, self.inputs(n))
             assert len(found) == n, f"asked for {n} particles it returns {len(found)}: repeat some if needed"
 
 
-class UpdateContract(RandomContract):
+class UpdateContract(_PopulationContract):
     """The contract of every `Update`."""
 
     def inputs(self, n: int, seed: int = 0) -> dict[str, Any]:
-        """Predicted and proposed particles, and an observation."""
         predicted, observation = self.example(_rng(seed), n)
         proposed = replace(self.example(_rng(seed + 1), 4)[0], log_weights=np.zeros(4))
         return {"predicted": predicted, "proposed": proposed, "observation": observation}
 
-    def call(self, component: Update, rng: np.random.Generator, inputs: dict[str, Any]) -> Population:
-        """Update."""
+    def call(self, component: Any, rng: np.random.Generator, inputs: dict[str, Any]) -> Population:
         return component.update(rng, **inputs)
-
-    def update(self, component: Update, **inputs: Any) -> Population:
-        """Update, and check the type of the result."""
-        given = [name for name in ("predicted", "proposed") if inputs[name] is not None]
-        with reports_errors(f"{' and '.join(given)} particles"):
-            return _check_population(component.update(_rng(), **inputs), "update")
 
     def test_takes_any_of_its_inputs(self) -> None:
         """It accepts predicted particles, proposed ones, or both."""
         component, inputs = self.make(), self.inputs(_N)
-        self.update(component, **{**inputs, "proposed": None})
-        self.update(component, **{**inputs, "predicted": None})
-        self.update(component, **inputs)
+        for absent in ({"proposed": None}, {"predicted": None}, {}):
+            self.checked_call(component, {**inputs, **absent})
 
     def test_parents_exist(self) -> None:
         """Parents are indices of particles that exist, or -1."""
         inputs = self.inputs(_N)
         sizes = {"previous": len(inputs["predicted"]), "proposed": len(inputs["proposed"])}
-        for name, slot in (("previous", "predicted"), ("proposed", "proposed")):
-            inputs[slot] = replace(inputs[slot], parents={name: np.arange(sizes[name])})
-        out = self.update(self.make(), **inputs)
+        for name, population in (("previous", "predicted"), ("proposed", "proposed")):
+            inputs[population] = replace(inputs[population], parents={name: np.arange(sizes[name])})
+        out = self.checked_call(self.make(), inputs)
         for name, n in sizes.items():
             index = out.parents.get(name, np.array([-1]))
             assert ((index >= -1) & (index < n)).all(), (
@@ -206,15 +180,10 @@ class UpdateContract(RandomContract):
 
     def test_scale_of_weights_is_irrelevant(self) -> None:
         """A common factor of the weights is kept and has no other effect."""
-        component, inputs = self.make(), {**self.inputs(_N), "proposed": None}
-        skip_unless_properly_weighted(component)
-        unshifted = self.update(component, **inputs)
-        for shift in (50.0, -50.0):
-            predicted = inputs["predicted"].reweighted(np.full(_N, shift))
-            _check_shift(unshifted, self.update(component, **{**inputs, "predicted": predicted}), shift)
+        self.check_scale({**self.inputs(_N), "proposed": None}, "predicted")
 
 
-class RejuvenationContract(RandomContract):
+class RejuvenationContract(_PopulationContract):
     """The contract of every `Rejuvenation`. Its one statistical test has a false-alarm rate of at most 1e-6.
 
     That test needs exact draws of p(x_t | x_{t-1}, y_t). Define a method ``exact(self, rng, n)`` that returns a
@@ -224,27 +193,10 @@ class RejuvenationContract(RandomContract):
     exact: Callable[[np.random.Generator, int], tuple[Population | None, Population, Any]] | None = None
 
     def inputs(self, n: int, seed: int = 0) -> dict[str, Any]:
-        """Particles, the previous ones that they come from, and an observation."""
         return {**super().inputs(n, seed), "previous": self.example(_rng(seed + 1), n)[0]}
 
-    def call(self, component: Rejuvenation, rng: np.random.Generator, inputs: dict[str, Any]) -> Population:
-        """Move."""
+    def call(self, component: Any, rng: np.random.Generator, inputs: dict[str, Any]) -> Population:
         return component.move(rng, inputs["population"], inputs["previous"], inputs["observation"])
-
-    def move(
-        self,
-        component: Rejuvenation,
-        population: Population,
-        previous: Population | None,
-        observation: Any,
-        rng: np.random.Generator | None = None,
-    ) -> Population:
-        """Move, and check the type of the result."""
-        given = "no previous ones" if previous is None else "previous ones"
-        missing = ", observation None" if observation is None else ""
-        with reports_errors(f"{len(population)} particles, {given}{missing}"):
-            moved = component.move(_rng() if rng is None else rng, population, previous, observation)
-        return _check_population(moved, "move")
 
     def test_keeps_number_and_weights(self) -> None:
         """It returns as many particles, with unchanged log weights, also if the past or the observation is None."""
@@ -252,7 +204,7 @@ class RejuvenationContract(RandomContract):
         for n in (1, 2, _N):
             inputs = self.inputs(n)
             for absent in ({}, {"previous": None}, {"observation": None}):
-                moved = self.move(component, **{**inputs, **absent})
+                moved = self.checked_call(component, {**inputs, **absent})
                 assert len(moved) == n, f"{n} particles became {len(moved)}"
                 assert same(moved.log_weights, inputs["population"].log_weights), (
                     "it changes log weights: a kernel that keeps the distribution leaves them unchanged"
@@ -271,7 +223,8 @@ class RejuvenationContract(RandomContract):
         n, rng = 4000, _rng(2)
         previous, population, observation = self.exact(_rng(1), n)
         for _ in range(5):
-            population = self.move(component, population, previous, observation, rng)
+            inputs = {"population": population, "previous": previous, "observation": observation}
+            population = self.checked_call(component, inputs, rng)
         moved = _columns(previous, population)
         fresh_previous, fresh, _ = self.exact(_rng(3), n)
         expected = _columns(fresh_previous, fresh)

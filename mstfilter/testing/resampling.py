@@ -9,11 +9,9 @@ bias of 0.1 copies.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import pytest
 
 from mstfilter.smc import Population, Resampler, WeightResampler, log_mean_exp
 from mstfilter.testing.contract import (
@@ -38,9 +36,7 @@ _N_COMPARISONS = sum(len(weights) for weights, _ in _CASES)
 
 
 class ResamplerContract(RandomContract):
-    """The contract of every `Resampler`. Its three statistical tests have a false-alarm rate of at most 1e-6 each."""
-
-    _kept_samples: list[tuple[int, _Sample]]
+    """The contract of every `Resampler`. Its two statistical tests have a false-alarm rate of at most 1e-6 each."""
 
     def population(self, weights: Any) -> Population:
         """The particles of the example with given weights, and with parents that identify them."""
@@ -49,24 +45,22 @@ class ResamplerContract(RandomContract):
         return Population(particles, _log(weights), {"previous": np.arange(n)[::-1]})
 
     def inputs(self, n: int, seed: int = 0) -> dict[str, Any]:
-        """40 particles to select from; `seed` changes their weights."""
         return {"population": self.population(np.linspace(1, 2 + seed, 40)), "n": 25}
 
     def call(self, component: Resampler, rng: np.random.Generator, inputs: dict[str, Any]) -> Population:
-        """Resample."""
         return component.resample(rng, inputs["population"], inputs["n"])
 
-    def resample(self, component: Resampler, population: Population, n: int, rng: np.random.Generator) -> Population:
-        """Resample, and check what every result must fulfil."""
-        m = len(population)
-        with reports_errors(f"{m} particles to {n}"):
-            chosen = component.resample(rng, population, n)
-        assert isinstance(chosen, Population), f"resample returns {type(chosen).__name__}, expected a Population"
-        ancestors = chosen.parents.get("ancestor")
+    def check_result(self, result: Any, inputs: dict[str, Any]) -> None:
+        assert isinstance(result, Population), f"resample returns {type(result).__name__}, expected a Population"
+        ancestors = result.parents.get("ancestor")
         assert ancestors is not None, 'the result has no parents "ancestor"'
+        m = len(inputs["population"])
         wrong = ancestors[(ancestors < 0) | (ancestors >= m)]
         assert not len(wrong), f"ancestor {wrong[0]} is out of range: there are {m} particles; off by one?"
-        return chosen
+
+    def resample(self, component: Resampler, population: Population, n: int, rng: np.random.Generator) -> Population:
+        """A checked call."""
+        return self.checked_call(component, {"population": population, "n": n}, rng)
 
     @prerequisite
     def test_ancestors_in_range(self) -> None:
@@ -161,41 +155,30 @@ class ResamplerContract(RandomContract):
     # --- proper weighting ---
 
     @statistical
-    def test_mean_number_of_copies(self) -> None:
-        """A particle gets n W_i copies on average, if all copies have equal weights."""
+    def test_carried_weight(self) -> None:
+        """A particle gets n W_i copies on average, or copies that carry W_i if their weights differ."""
         component = self.make()
         skip_unless_properly_weighted(component)
-        cases = [(n, sample) for n, sample in self._samples(component) if sample.equal_weights]
-        if not cases:
-            pytest.skip("copies have different weights")
-        for n, sample in cases:
-            mean, expected = sample.copies.mean(axis=0), n * sample.expected
-            excess = np.abs(mean - expected) - _tolerance(sample.copies, 1.0, _N_COMPARISONS)
-            i = int(np.argmax(excess))
-            assert excess[i] <= 0, (
-                f"copies are biased: of {len(mean)} particles to {n}, particle {i} (W = {sample.expected[i]:.3g}) "
-                f"gets {mean[i]:.3f} copies on average, expected {expected[i]:.3f}{_shift_hint(mean, expected)}"
+        for seed, (weights, n) in enumerate(_CASES):
+            carried, equal_weights = self._carried(component, weights, n, seed)
+            mean, expected = carried.mean(axis=0), np.asarray(weights) / np.sum(weights)
+            total = carried.sum(axis=1)
+            assert not equal_weights or np.abs(total - 1).max() <= 1e-9, (
+                f"the mean weight after selection is {total[0]:.4g} of the one before, expected the same"
             )
-
-    @statistical
-    def test_output_weights(self) -> None:
-        """The mean of w f(x) over the result is unbiased; equal output weights keep the mean weight exactly."""
-        component = self.make()
-        skip_unless_properly_weighted(component)
-        for n, sample in self._samples(component):
-            total = sample.carried.sum(axis=1)
-            if sample.equal_weights:
-                assert np.abs(total - 1).max() <= 1e-9, (
-                    f"the mean weight after selection is {total[0]:.4g} of the one before, expected the same"
+            excess = np.abs(mean - expected) - _tolerance(carried, 1.0 / n, _N_COMPARISONS)
+            i = int(np.argmax(excess))
+            if equal_weights:
+                fault = (
+                    f"copies are biased: particle {i} (W = {expected[i]:.3g}) gets {n * mean[i]:.3f} copies on "
+                    f"average, expected {n * expected[i]:.3f}{_shift_hint(mean, expected)}"
                 )
-                continue
-            mean = sample.carried.mean(axis=0)
-            excess = np.abs(mean - sample.expected) - _tolerance(sample.carried, 1.0 / n, _N_COMPARISONS)
-            i = int(np.argmax(excess))
-            assert excess[i] <= 0, (
-                f"output weights are wrong: of {len(mean)} particles to {n}, particle {i} carries {mean[i]:.3f} of "
-                f"the weight on average, expected {sample.expected[i]:.3f}"
-            )
+            else:
+                fault = (
+                    f"output weights are wrong: particle {i} carries {mean[i]:.3f} of the weight on average, "
+                    f"expected {expected[i]:.3f}"
+                )
+            assert excess[i] <= 0, f"{len(mean)} particles to {n}: {fault}"
 
     @statistical
     def test_order_of_particles_is_irrelevant(self) -> None:
@@ -204,7 +187,7 @@ class ResamplerContract(RandomContract):
         skip_unless_properly_weighted(component)
         weights, n = _CASES[1][0], 4
         orders = (tuple(range(5)), _OTHER_ORDER)
-        samples = [self._sample(component, weights, n, seed, order).carried for seed, order in enumerate(orders)]
+        samples = [self._carried(component, weights, n, seed, order)[0] for seed, order in enumerate(orders)]
         a, b = (s.mean(axis=0) for s in samples)
         excess = np.abs(a - b) - sum(_tolerance(s, 1.0 / n, 2 * len(weights)) for s in samples)
         i = int(np.argmax(excess))
@@ -213,38 +196,35 @@ class ResamplerContract(RandomContract):
             f"of the weight as number {i}, and {b[i]:.3f} as number {_OTHER_ORDER.index(i)}"
         )
 
-    def _samples(self, component: Resampler) -> list[tuple[int, _Sample]]:
-        """(n, sample) of all cases; kept by the class, since two tests use them."""
-        cls = type(self)
-        if "_kept_samples" not in cls.__dict__:
-            cls._kept_samples = [
-                (n, self._sample(component, weights, n, seed)) for seed, (weights, n) in enumerate(_CASES)
-            ]
-        return cls._kept_samples
-
-    def _sample(
+    def _carried(
         self,
         component: Resampler,
         weights: tuple[float, ...],
         n: int,
         seed: int,
         order: tuple[int, ...] | None = None,
-    ) -> _Sample:
-        """Resample many times, with the particles in an order; results are in the order of `weights`."""
+    ) -> tuple[np.ndarray, bool]:
+        """What each particle carries in each of many runs, with the particles in an order.
+
+        Returns
+        -------
+        carried : (repeats, m) float64
+            Columns are in the order of `weights`.
+        equal_weights : bool
+            Whether all output weights were equal in every run.
+        """
         m = len(weights)
         positions = np.arange(m) if order is None else np.asarray(order)
         population = self.population(weights).reweighted(np.full(m, 3.0))
         given = population.take(positions)
         rng, mean = np.random.default_rng(seed), log_mean_exp(population.log_weights)
-        carried, copies, equal = np.zeros((_REPEATS, m)), np.zeros((_REPEATS, m), np.int64), True
+        carried, equal = np.zeros((_REPEATS, m)), True
         for r in range(_REPEATS):
             chosen = self.resample(component, given, n, rng)
-            original = positions[chosen.parents["ancestor"]]
             out = np.exp(chosen.log_weights - mean)
             equal = equal and bool(np.ptp(out) <= 1e-9 * out.max())
-            carried[r] = np.bincount(original, out, minlength=m) / len(out)
-            copies[r] = np.bincount(original, minlength=m)
-        return _Sample(carried, copies, equal, np.asarray(weights) / np.sum(weights))
+            carried[r] = np.bincount(positions[chosen.parents["ancestor"]], out, minlength=m) / len(out)
+        return carried, equal
 
 
 class WeightResamplerContract(ResamplerContract):
@@ -295,28 +275,6 @@ class WeightResamplerContract(ResamplerContract):
                 f"the particles of small weight get {light:.0f} copies in total, expected {expected:.0f}: "
                 "cumulated in single precision, or biased?"
             )
-
-
-@dataclass(frozen=True)
-class _Sample:
-    """What each particle carries over many runs.
-
-    Parameters
-    ----------
-    carried : (repeats, m) float64
-        Sum of the output weights of a particle's copies, divided by the number of copies and the mean input weight.
-    copies : (repeats, m) int
-        Number of copies.
-    equal_weights : bool
-        Whether all output weights were equal in every run.
-    expected : (m,) float64
-        Expectation of `carried` for a properly weighted resampler: W_i.
-    """
-
-    carried: np.ndarray
-    copies: np.ndarray
-    equal_weights: bool
-    expected: np.ndarray
 
 
 def _tolerance(samples: np.ndarray, unit: float, n_comparisons: int) -> np.ndarray:

@@ -1,6 +1,6 @@
 """The resampler contract: planted faults are reported, correct resamplers and those of the package pass.
 
-False alarms: each contract has three statistical properties at 1e-6, so below 1e-4 for this file.
+False alarms: each contract has two statistical properties at 1e-6, so below 1e-4 for this file.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ OURS = {
 def test_components_of_the_package_keep_their_contract(name):
     results = run_contract(OURS[name])
     assert [r for r in results if r.failure] == []
-    tested = {r.name: r.skipped is None for r in results}["output_weights"]
+    tested = {r.name: r.skipped is None for r in results}["carried_weight"]
     assert tested == OURS[name].properly_weighted
 
 
