@@ -38,7 +38,7 @@ import networkx as nx
 import numpy as np
 
 from mstfilter.errors import InputError
-from mstfilter.fusion.interfaces import Structure
+from mstfilter.fusion.interfaces import OrderAndEdges, Structure
 from mstfilter.scene import MAX_LABEL, Hypothesis, VoxelGrid, as_labels
 
 PROPOSED, PREDICTED = 0, 1
@@ -195,9 +195,7 @@ class RandomOrder(Structure):
     A uniformly random order of the vertices gives both. Every conflict may end in a merge.
     """
 
-    def draw(
-        self, rng: np.random.Generator, graph: nx.Graph, component: Sequence[int]
-    ) -> tuple[list[int], list[tuple[int, int]]]:
+    def draw(self, rng: np.random.Generator, graph: nx.Graph, component: Sequence[int]) -> OrderAndEdges:
         order = [component[k] for k in rng.permutation(len(component))]
         place = {v: k for k, v in enumerate(order)}
         return order, [(v, w) for v in order for w in graph[v] if place[v] < place[w]]
@@ -212,9 +210,7 @@ class OneSideLast(Structure):
     and an object that was cut stays cut. Every conflict may end in a merge.
     """
 
-    def draw(
-        self, rng: np.random.Generator, graph: nx.Graph, component: Sequence[int]
-    ) -> tuple[list[int], list[tuple[int, int]]]:
+    def draw(self, rng: np.random.Generator, graph: nx.Graph, component: Sequence[int]) -> OrderAndEdges:
         side = {v: graph.nodes[v]["side"] for v in component}
         first_is_last = bool(rng.random() < 0.5)
         last = {v: (side[v] == side[component[0]]) == first_is_last for v in component}
@@ -230,9 +226,7 @@ class SpanningTree(Structure):
     Only edges of the tree may end in a merge. Children are painted before their parent, the root last.
     """
 
-    def draw(
-        self, rng: np.random.Generator, graph: nx.Graph, component: Sequence[int]
-    ) -> tuple[list[int], list[tuple[int, int]]]:
+    def draw(self, rng: np.random.Generator, graph: nx.Graph, component: Sequence[int]) -> OrderAndEdges:
         root, parent = random_spanning_tree(rng, graph, component)
         children: dict[int, list[int]] = {v: [] for v in component}
         for v in component:

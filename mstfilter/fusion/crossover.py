@@ -17,7 +17,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from mstfilter.errors import InputError
+from mstfilter.errors import InputError, check_integer, check_number
 from mstfilter.fusion.conflicts import (
     PREDICTED,
     PROPOSED,
@@ -83,36 +83,32 @@ class ModeFilter:
     scope: Literal["everywhere", "disputed"] = "everywhere"
 
     def __post_init__(self) -> None:
-        for name in ("window", "margin", "isolation", "max_sweeps"):
-            if not isinstance(getattr(self, name), (int, np.integer)):
-                raise InputError(f"mode filter {name} is {getattr(self, name)!r}, expected a whole number")
-        if self.window < 1 or self.window % 2 == 0:
+        check_integer("mode filter window", self.window)
+        check_integer("mode filter isolation", self.isolation, at_least=0)
+        check_integer("mode filter max_sweeps", self.max_sweeps)
+        check_number("mode filter margin", self.margin)
+        if self.window % 2 == 0:
             raise InputError(f"mode filter window is {self.window}, expected an odd number of voxels")
-        if self.max_sweeps < 1:
-            raise InputError(f"mode filter has max_sweeps {self.max_sweeps}, expected at least 1")
         if self.scope not in ("everywhere", "disputed"):
             raise InputError(f'mode filter scope is {self.scope!r}, expected "everywhere" or "disputed"')
 
     def apply(self, labels: np.ndarray, disputed: np.ndarray | None = None) -> np.ndarray:
-        """Filtered labels (X, Y, Z) uint16.
+        """Filtered labels (X, Y, Z) uint16, 0 is free.
 
-        Parameters
-        ----------
-        labels : (X, Y, Z) integer
-            0 is free.
-        disputed : (X, Y, Z) bool, optional
-            The voxels that may change if `scope` is "disputed".
+        `disputed` (X, Y, Z) bool are the voxels that may change if `scope` is "disputed"; None is no voxel.
         """
         labels = as_labels(labels)
         if labels.ndim != 3:
             raise InputError(f"label grid has shape {labels.shape}, the mode filter expects three axes")
-        may_change = labels != 0
-        if disputed is not None and (disputed.shape != labels.shape or disputed.dtype != bool):
+        if disputed is None:
+            disputed = np.zeros(labels.shape, bool)
+        if disputed.shape != labels.shape or disputed.dtype != bool:
             raise InputError(
                 f"disputed is {disputed.dtype} of shape {disputed.shape}, expected bool of shape {labels.shape}"
             )
+        may_change = labels != 0
         if self.scope == "disputed":
-            may_change = may_change & disputed if disputed is not None else np.zeros_like(may_change)
+            may_change &= disputed
         if self.window == 1 or not may_change.any():
             return labels
         # Work inside the box that sweeps can reach, with a border of free cells so that every window is complete.
@@ -187,15 +183,7 @@ class Crossover:
     def resolve(
         self, rng: np.random.Generator, graph: ConflictGraph, apart: Mapping[int, set[int]] | None = None
     ) -> ConflictResolution:
-        """Draw a resolution of all conflicts of a graph.
-
-        Parameters
-        ----------
-        rng : Generator
-        graph : ConflictGraph
-        apart : mapping, optional
-            Vertices with which each vertex must not be merged.
-        """
+        """Draw a resolution of all conflicts. `apart` has the vertices with which each vertex must not be merged."""
         links = graph.networkx()
         components = components_in_conflict(links)
         conflicted = {v for component in components for v in component}
@@ -339,15 +327,8 @@ class _Votes:
     A voxel can change only if a cell in its window has changed since the last sweep. So the first sweep processes the
     voxels whose window contains another object or much free space, and each later sweep those near a changed cell.
 
-    Parameters
-    ----------
-    filter : ModeFilter
-    labels : (X, Y, Z) uint16
-        With a border of half a window, in C order. Written in place.
-    at : (n,) int
-        Flat indices of the voxels that may change.
-    cells : (n,) int
-        Cells in the window of each voxel that lie in the grid.
+    `labels` (X, Y, Z) uint16 have a border of half a window and are in C order. `at` (n,) are flat indices of the
+    voxels that may change, and `cells` (n,) the numbers of grid cells in their windows.
     """
 
     def __init__(self, filter: ModeFilter, labels: np.ndarray, at: np.ndarray, cells: np.ndarray) -> None:
@@ -361,9 +342,8 @@ class _Votes:
         """Positions in `at` of voxels that a sweep may change."""
         window, half = self.filter.window, self.filter.window // 2
         inner = self.labels[(slice(half, -half),) * 3]
-        below = self.labels - np.uint16(
-            1
-        )  # free wraps to the largest number, so the smallest is the label of an object
+        # Free wraps to the largest number, so the smallest one is the label of an object.
+        below = self.labels - np.uint16(1)
         mixed = _over_window(np.maximum, self.labels, window) != inner
         mixed |= _over_window(np.minimum, below, window) != below[(slice(half, -half),) * 3]
         taken = _over_window(np.add, (self.labels != 0).astype(self.count_type), window)
@@ -423,7 +403,6 @@ class _Votes:
         return out
 
     def _count(self, hit: np.ndarray) -> np.ndarray:
-        """Number (m,) of True cells in each window, from (cells, m)."""
         return hit.sum(axis=0, dtype=self.count_type).astype(np.int64)
 
 

@@ -20,6 +20,7 @@ from mstfilter.fusion.interfaces import Division
 from mstfilter.scene import MAX_LABEL, Clip, Hypothesis, ObjectRecord, frame_geometry, project
 from mstfilter.tracking import MotionSegmentation
 
+_PURE = 0.8  # share of an object's pixels of known motion that must have one motion for the object to have it
 _INSIDE = 0.5  # share of a predicted object that must lie in a proposed object to count as inside
 
 
@@ -28,7 +29,7 @@ class NoDivision(Division):
     """Divides no object."""
 
     def divide(self, clip: Clip) -> None:
-        """Return None."""
+        return None
 
 
 @dataclass(frozen=True)
@@ -44,7 +45,6 @@ class RigidMotions(Division):
     motions: MotionSegmentation = field(default_factory=MotionSegmentation)
 
     def divide(self, clip: Clip) -> np.ndarray | None:
-        """Number of the motion of each pixel: 0 at rest, 1, 2, ... moving, -1 unknown; None for a single frame."""
         return self.motions.labels(clip)
 
 
@@ -58,31 +58,19 @@ class PartRule:
         Least number of visible pixels of known motion of a part.
     min_share : float
         Least share of the object's pixels of known motion.
-    pure : float
-        Share of an object's pixels of known motion that must have the same motion for the object to have it.
     """
 
     min_pixels: int = 40
     min_share: float = 0.25
-    pure: float = 0.8
 
 
 def split_by_motion(
     hypothesis: Hypothesis, motions: np.ndarray, clip: Clip, rule: PartRule = PartRule(), proposed: bool = True
 ) -> Hypothesis:
-    """Split objects by motion, and record which objects moved apart.
+    """Split objects of a hypothesis about the end of a clip by motion, and record which objects moved apart.
 
-    Parameters
-    ----------
-    hypothesis : Hypothesis
-        About the end of the clip.
-    motions : (H, W) int
-        Number of the motion of each pixel of the last frame, -1 unknown (`Division.divide`).
-    clip : Clip
-    rule : PartRule
-    proposed : bool
-        Whether the hypothesis comes from the proposal. New parts of proposed and predicted hypotheses get
-        different ids.
+    `motions` (H, W) is the result of `Division.divide`. New parts of proposed and predicted hypotheses get different
+    ids.
     """
     image = project(hypothesis, clip.after.camera)
     known = (image > 0) & (motions >= 0)
@@ -97,15 +85,13 @@ def split_by_motion(
     for label in np.flatnonzero(parts.sum(axis=1) >= 2).tolist():
         labels, made = _split_by_pixels(hypothesis, labels, label, np.flatnonzero(parts[label]), image, motions, clip)
         origin.update(made)
-    went = {
-        k: int(count[k].argmax())
-        for k in range(size)
-        if count[k].max() >= max(rule.min_pixels, rule.pure * total[k, 0])
+    motion_of = {
+        k: int(count[k].argmax()) for k in range(size) if count[k].max() >= max(rule.min_pixels, _PURE * total[k, 0])
     }
     for label, (_, motion) in origin.items():
-        went[label] = motion
+        motion_of[label] = motion
     divided = _with_parts(hypothesis, labels, {k: parent for k, (parent, _) in origin.items()}, clip.index, proposed)
-    return _record_apart(divided, went)
+    return _record_apart(divided, motion_of)
 
 
 def _split_by_pixels(
@@ -117,7 +103,7 @@ def _split_by_pixels(
     motions: np.ndarray,
     clip: Clip,
 ) -> tuple[np.ndarray, dict[int, tuple[int, int]]]:
-    """Give each voxel the motion of the nearest visible voxel. Returns labels and new label -> (parent, motion)."""
+    """Give each voxel the motion of the nearest visible voxel; see `_split` for the result."""
     geometry = frame_geometry(clip.after, hypothesis.grid)
     at = np.nonzero(hypothesis.labels == label)
     pixel = geometry.pixel[at]
@@ -127,12 +113,16 @@ def _split_by_pixels(
     number = np.where(seen, motions.ravel()[pixel], -1)
     number[~np.isin(number, numbers)] = -1
     seeds = number >= 0
-    present = np.unique(number[seeds])
-    if len(present) < 2:
+    if len(np.unique(number[seeds])) < 2:
         return labels, {}
+    return _split(labels, at, _nearest(at, number, seeds), label)
+
+
+def _nearest(at: tuple[np.ndarray, ...], values: np.ndarray, seeds: np.ndarray) -> np.ndarray:
+    """The value (n,) of the nearest seed of each voxel `at`; `seeds` (n,) bool selects voxels."""
     voxels = np.stack(at, axis=1)
     _, nearest = cKDTree(voxels[seeds]).query(voxels)
-    return _split(labels, at, number[seeds][nearest], label)
+    return np.asarray(values[seeds][nearest])
 
 
 def _split(
@@ -159,39 +149,32 @@ def _with_parts(
     """The hypothesis after a split: the largest part keeps the record of its parent, the others get new records."""
     if labels is hypothesis.labels:
         return hypothesis
-    records = []
-    for record in hypothesis.objects:
-        records.append(record.changed() if record.label in parents else record)
+    records = [r.changed() if r.label in parents else r for r in hypothesis.objects]
     for label, parent in sorted(parents.items()):
         if label != parent:
-            own = label if proposed else MAX_LABEL - label
-            new = ObjectRecord.born(own, birth)
+            new = ObjectRecord.born(label if proposed else MAX_LABEL - label, birth)
             records.append(replace(new, label=label, apart=hypothesis.record(parent).apart))
     return Hypothesis(labels, hypothesis.grid, tuple(sorted(records, key=lambda r: r.label)))
 
 
-def _record_apart(hypothesis: Hypothesis, went: dict[int, int]) -> Hypothesis:
-    """Record objects with different motions as apart, on both sides. `went` maps labels to motions."""
-    movers = [(r.id, went[r.label]) for r in hypothesis.objects if r.label in went]
-    records = []
-    for record in hypothesis.objects:
-        apart = record.apart
-        if record.label in went:
-            apart = apart | {other for other, motion in movers if motion != went[record.label]}
-        records.append(replace(record, apart=apart))
-    by_id = {r.id: r for r in records}
-    for record in records:
-        for other in record.apart:
-            if other in by_id and record.id not in by_id[other].apart:
-                by_id[other] = replace(by_id[other], apart=by_id[other].apart | {record.id})
-    return Hypothesis(hypothesis.labels, hypothesis.grid, tuple(by_id[r.id] for r in records))
+def _record_apart(hypothesis: Hypothesis, motion_of: dict[int, int]) -> Hypothesis:
+    """Record objects with different motions as apart, in both records. `motion_of` maps labels to motions."""
+    moved = [(r.id, motion_of[r.label]) for r in hypothesis.objects if r.label in motion_of]
+    apart = {r.id: set(r.apart) for r in hypothesis.objects}
+    for k, motion in moved:
+        apart[k] |= {other for other, other_motion in moved if other_motion != motion}
+    for k in list(apart):
+        for other in apart[k] & apart.keys():
+            apart[other].add(k)
+    records = tuple(replace(r, apart=frozenset(apart[r.id])) for r in hypothesis.objects)
+    return Hypothesis(hypothesis.labels, hypothesis.grid, records)
 
 
 def split_like(proposed: Hypothesis, predicted: Hypothesis) -> Hypothesis:
     """Split every proposed object that contains predicted objects which moved apart earlier.
 
     Each voxel goes to the nearest of these objects. A proposed object contains a predicted one if it has at least
-    half of its voxels; a smaller overlap is an error of position at the border.
+    half of its voxels.
     """
     if not any(record.apart for record in predicted.objects):
         return proposed
@@ -208,20 +191,17 @@ def split_like(proposed: Hypothesis, predicted: Hypothesis) -> Hypothesis:
         if len(seeds) < 2:
             continue
         at = np.nonzero(proposed.labels == label)
-        there = predicted.labels[at]
-        seed = np.isin(there, seeds)
-        voxels = np.stack(at, axis=1)
-        _, nearest = cKDTree(voxels[seed]).query(voxels)
-        labels, made = _split(labels, at, there[seed][nearest].astype(np.int64), label)
+        there = predicted.labels[at].astype(np.int64)
+        labels, made = _split(labels, at, _nearest(at, there, np.isin(there, seeds)), label)
         parents.update({k: parent for k, (parent, _) in made.items()})
     birth = max((r.birth for r in proposed.objects), default=0)
     return _with_parts(proposed, labels, parents, birth, True)
 
 
-def inherit_apart(child: Hypothesis, parent: Hypothesis, own: Mapping[int, int]) -> Hypothesis:
+def inherit_apart(child: Hypothesis, parent: Hypothesis, merged_into: Mapping[int, int]) -> Hypothesis:
     """Copy the record of objects that moved apart from a parent of a crossover to its child.
 
-    The heirs of a parent's object are the object ``own[label]`` of the child that it was merged into, and the object
+    The heirs of a parent's object are the object ``merged_into[label]`` of the child, and the object of the child
     that has most of its voxels. So the record is kept if the object is painted over.
     """
     if not any(record.apart for record in parent.objects):
@@ -231,7 +211,7 @@ def inherit_apart(child: Hypothesis, parent: Hypothesis, own: Mapping[int, int])
     for record in parent.objects:
         if record.apart:
             now = np.bincount(child.labels[parent.labels == record.label])
-            heirs[record.id] = {own[record.label]} if record.label in own else set()
+            heirs[record.id] = {merged_into[record.label]} if record.label in merged_into else set()
             heirs[record.id] |= {int(now.argmax())} - {0}
     ids = {r.label: r.id for r in child.objects}
     apart = {r.label: set(r.apart) for r in child.objects}

@@ -17,7 +17,7 @@ observed free space.
 from __future__ import annotations
 
 from dataclasses import dataclass, is_dataclass, replace
-from typing import Any, ClassVar, Protocol, TypeVar
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -28,7 +28,7 @@ from mstfilter.scene import (
     Frame,
     Hypothesis,
     VoxelGrid,
-    content_key,
+    component_key,
     depth_sigma,
     frame_geometry,
     memo,
@@ -37,21 +37,6 @@ from mstfilter.scene import (
 from mstfilter.smc import Population, Update, union
 
 _SMALLEST_QUALITY = 1e-3
-
-
-class LabelledVoxels(Protocol):
-    """A particle that can be projected: a `Hypothesis`, or any frozen dataclass with these fields."""
-
-    @property
-    def labels(self) -> np.ndarray:
-        """Labels (X, Y, Z), 0 is free."""
-
-    @property
-    def grid(self) -> VoxelGrid:
-        """Grid of the labels."""
-
-
-P = TypeVar("P", bound=LabelledVoxels)
 
 
 @dataclass(frozen=True)
@@ -88,17 +73,14 @@ class FreeSpace(Projection):
     table_height: float = 0.0
 
     def __post_init__(self) -> None:
-        margins = (self.margin_voxels, self.margin_sigmas)
-        if not (np.isfinite([*margins, self.table_height]).all() and min(margins) >= 0):
-            raise InputError(
-                f"free space has margin_voxels {self.margin_voxels}, margin_sigmas {self.margin_sigmas} and "
-                f"table_height {self.table_height}, expected finite numbers, margins >= 0"
-            )
+        check_number("margin_voxels", self.margin_voxels, at_least=0)
+        check_number("margin_sigmas", self.margin_sigmas, at_least=0)
+        check_number("table_height", self.table_height)
 
     def known_free(self, frame: Frame, grid: VoxelGrid) -> np.ndarray:
-        """Voxels (X, Y, Z) bool that a frame observes as free. Memoised by content."""
-        key = content_key("free space", self.margin_voxels, self.margin_sigmas, self.table_height)
-        return memo("known_free", (frame.key, grid.key, key), lambda: read_only(self._known_free(frame, grid)))
+        """Voxels (X, Y, Z) bool that a frame observes as free. Cached by content."""
+        key = (frame.key, grid.key, component_key(self))
+        return memo("known_free", key, lambda: read_only(self._known_free(frame, grid)))
 
     def _known_free(self, frame: Frame, grid: VoxelGrid) -> np.ndarray:
         free, hit = np.zeros(grid.shape, bool), np.zeros(grid.shape, bool)
@@ -116,31 +98,26 @@ class FreeSpace(Projection):
         free[:, :, below] = True
         return free
 
-    def project(self, hypothesis: P, frame: Frame) -> tuple[P, float]:
-        """Clear voxels that the frame observes as free. A hypothesis without voxels has quality 1."""
-        return _cleared(hypothesis, self.known_free(frame, hypothesis.grid))
+    def project(self, hypothesis: Any, frame: Frame) -> tuple[Any, float]:
+        """Clear voxels that the frame observes as free. A hypothesis without voxels has quality 1.
 
-
-def _cleared(particle: P, free: np.ndarray) -> tuple[P, float]:
-    """The particle without the voxels `free`, and Q = 1 - cleared / occupied, the share of voxels that it keeps."""
-    occupied = particle.labels != 0
-    hit = occupied & free
-    n_hit = int(hit.sum())
-    if n_hit == 0:
-        return particle, 1.0
-    labels = np.where(hit, 0, particle.labels).astype(particle.labels.dtype)
-    quality = 1.0 - n_hit / int(occupied.sum())
-    cleared: Any
-    if isinstance(particle, Hypothesis):
-        cleared = particle.with_labels(labels)
-    elif is_dataclass(particle):
-        cleared = replace(particle, labels=labels)
-    else:
-        raise InputError(
-            f"a particle is a {type(particle).__name__}, and free space cannot clear it",
-            "it takes a Hypothesis, or a dataclass with fields labels and grid",
-        )
-    return cleared, quality
+        `hypothesis` is a `Hypothesis`, or any dataclass with ``labels`` (X, Y, Z), 0 is free, and their ``grid``.
+        """
+        occupied = hypothesis.labels != 0
+        hit = occupied & self.known_free(frame, hypothesis.grid)
+        n_hit = int(hit.sum())
+        if n_hit == 0:
+            return hypothesis, 1.0
+        labels = np.where(hit, 0, hypothesis.labels).astype(hypothesis.labels.dtype)
+        quality = 1.0 - n_hit / int(occupied.sum())
+        if isinstance(hypothesis, Hypothesis):
+            return hypothesis.with_labels(labels), quality
+        if not is_dataclass(hypothesis) or isinstance(hypothesis, type):
+            raise InputError(
+                f"a particle is a {type(hypothesis).__name__}, and free space cannot clear it",
+                "it takes a Hypothesis, or a dataclass with fields labels and grid",
+            )
+        return replace(hypothesis, labels=labels), quality
 
 
 def log_quality(quality: np.ndarray) -> np.ndarray:

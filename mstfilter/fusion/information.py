@@ -31,6 +31,7 @@ from collections.abc import Callable
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
+from scipy.special import entr
 
 from mstfilter.errors import check_number
 from mstfilter.fusion.similarity import canonical
@@ -39,27 +40,19 @@ from mstfilter.smc import first_seen
 
 def entropy(probabilities: np.ndarray) -> float:
     """``-sum p log p`` of probabilities (k,) that sum to one."""
-    p = probabilities[probabilities > 0]
-    return max(0.0, float(-(p * np.log(p)).sum()))
+    return max(0.0, float(entr(probabilities).sum()))
 
 
 def binary_entropy(p: np.ndarray) -> np.ndarray:
     """``-p log p - (1 - p) log(1 - p)`` of each probability; at most log 2."""
     p = np.clip(p, 0.0, 1.0)  # sums of weights may exceed 1 by rounding
-    with np.errstate(divide="ignore", invalid="ignore"):
-        terms = np.where(p > 0, p * np.log(p), 0.0) + np.where(p < 1, (1 - p) * np.log1p(-p), 0.0)
-    return np.maximum(-terms, 0.0)
+    return np.asarray(entr(p) + entr(1 - p))
 
 
 def noisy_information(weights: np.ndarray, channel: np.ndarray) -> float:
     """Mutual information with a noisy outcome.
 
-    Parameters
-    ----------
-    weights : (n,) float
-        Sum 1.
-    channel : (n, k) float
-        Probability of each of k outcomes under each hypothesis; rows sum to 1.
+    `weights` (n,) sum to 1; `channel` (n, k) has the probability of each of k outcomes under each hypothesis.
     """
     conditional = sum(w * entropy(row) for w, row in zip(weights, channel, strict=True))
     return max(0.0, entropy(weights @ channel) - conditional)
@@ -72,7 +65,7 @@ def outcome_information(
     sizes: np.ndarray,
     tolerance: float = 0.0,
 ) -> float:
-    """Information of an outcome that each hypothesis determines; the module explains the tolerance.
+    """Information of an outcome that each hypothesis determines.
 
     Parameters
     ----------
@@ -85,7 +78,7 @@ def outcome_information(
     sizes : (k,) int
         Cells in each group.
     tolerance : float
-        Cells.
+        tau in cells (see the module).
     """
     check_number("tolerance", tolerance, at_least=0, unit="number of voxels or pixels")
     which = first_seen(row.tobytes() for row in np.ascontiguousarray(outcomes))
@@ -112,13 +105,7 @@ def partition_distance(rows: np.ndarray, sizes: np.ndarray) -> np.ndarray:
 
     ``d_ij = sum_c size_c [c is occupied in i or j] - max sum_k |A_k cap B_m(k)|``, A and B the objects of i and j,
     the maximum over one-to-one matchings m (Gusfield 2002, *Partition-distance*, with free space as a part that
-    matches free space only).
-
-    Parameters
-    ----------
-    rows : (n, k) integer
-        Canonical partitions of k groups of cells.
-    sizes : (k,) int
+    matches free space only). `rows` (n, k) are `canonical_rows` of k groups of `sizes` cells.
     """
     n, width = len(rows), int(rows.max(initial=0)) + 1
     found = np.zeros((n, n))

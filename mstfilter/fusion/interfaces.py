@@ -23,6 +23,9 @@ import numpy as np
 
 from mstfilter.scene import Clip, Frame, Hypothesis
 
+#: Vertices in painting order, and edges (child, parent); see `Structure.draw`.
+OrderAndEdges = tuple[list[int], list[tuple[int, int]]]
+
 
 class Projection(ABC):
     """Projects a hypothesis onto the set of hypotheses that agree with a frame."""
@@ -62,9 +65,7 @@ class Structure(ABC):
     """Draws the order in which objects in conflict are painted, and the conflicts that may end in a merge."""
 
     @abstractmethod
-    def draw(
-        self, rng: np.random.Generator, graph: nx.Graph, component: Sequence[int]
-    ) -> tuple[list[int], list[tuple[int, int]]]:
+    def draw(self, rng: np.random.Generator, graph: nx.Graph, component: Sequence[int]) -> OrderAndEdges:
         """Draw an order and directed edges for one component of the conflict graph.
 
         Parameters

@@ -19,7 +19,7 @@ from typing import ClassVar, Literal
 
 import numpy as np
 
-from mstfilter.errors import InputError
+from mstfilter.errors import InputError, check_integer, check_number
 from mstfilter.fusion.conflicts import check_grid
 from mstfilter.fusion.crossover import Crossover
 from mstfilter.fusion.division import NoDivision, PartRule, split_by_motion
@@ -54,8 +54,7 @@ class Claims:
     def __post_init__(self) -> None:
         if self.surface not in ("both", "sample"):
             raise InputError(f'surface is {self.surface!r}, expected "both" or "sample"')
-        if not 0 <= self.max_cleared <= 1:
-            raise InputError(f"max_cleared is {self.max_cleared}, expected a share from 0 to 1")
+        check_number("max_cleared", self.max_cleared, at_least=0, at_most=1)
 
     def exposed(self, clip: Clip) -> np.ndarray | None:
         """Voxels (X, Y, Z) bool at or in front of the measured surface; None if `surface` is "both"."""
@@ -128,10 +127,9 @@ class FusionUpdate(Update):
     properly_weighted: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
-        if self.eta < 1 or self.n_scored < 0:
-            raise InputError(f"eta is {self.eta} and n_scored {self.n_scored}, expected at least 1 and 0 candidates")
-        if not (np.isfinite(self.quality_exponent) and self.quality_exponent >= 0):
-            raise InputError(f"quality_exponent is {self.quality_exponent}, expected a number >= 0")
+        check_integer("eta", self.eta)
+        check_integer("n_scored", self.n_scored, at_least=0)
+        check_number("quality_exponent", self.quality_exponent, at_least=0)
 
     def update(
         self,
