@@ -5,7 +5,9 @@ from mstfilter.tracking.registration import (
     ColouredIcp as ColouredIcp,
     PointToPlaneIcp as PointToPlaneIcp,
     Registration as Registration,
+    RegistrationResult as RegistrationResult,
     SmallGicp as SmallGicp,
+    Surface as Surface,
 )
 from mstfilter.tracking.residual import MotionResidual as MotionResidual, refine_motion as refine_motion
 from mstfilter.tracking.rigid import move_points as move_points, rigid_transform as rigid_transform

@@ -29,6 +29,7 @@ from mstfilter.scene import Clip, Frame, memo
 from mstfilter.tracking.features import matched_colour, same_depth, smooth_colour
 
 _PRESETS = ("ultrafast", "fast", "medium")
+_GRID = np.s_[::2, ::2]  # rows and columns of the followed points
 _N_VOTERS = 5
 #: Frames are skipped until the motion since the last used frame reaches this fraction of the image width: errors
 #: accumulate with the number of frames, but flow fails for long motions.
@@ -82,33 +83,28 @@ class DenseFlow:
     Parameters
     ----------
     preset : "ultrafast", "fast" or "medium"
-    grid_step : int
-        Spacing of the followed points in pixels.
     """
 
     preset: str = "medium"
-    grid_step: int = 2
 
     def __post_init__(self) -> None:
         if self.preset not in _PRESETS:
             raise InputError(f"flow preset {self.preset!r} is unknown", f"one of {', '.join(_PRESETS)}")
-        if self.grid_step < 1:
-            raise InputError(f"grid_step is {self.grid_step}, expected at least 1")
 
     def track(self, clip: Clip) -> ClipTracks:
         """Follow points and pixels through the clip. Cached by content."""
         frames = list(clip.frames)
         key = (tuple(f.key for f in frames), astuple(self))
-        return memo("clip tracks", key, lambda: _track(_thinned(frames), self.preset, self.grid_step), ClipTracks)
+        return memo("clip tracks", key, lambda: _track(_thinned(frames), self.preset), ClipTracks)
 
 
-def _track(frames: list[Frame], preset: str, step: int) -> ClipTracks:
+def _track(frames: list[Frame], preset: str) -> ClipTracks:
     first, last = frames[0], frames[-1]
     height, width = first.depth.shape
     columns, rows = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
-    start = np.stack([columns[::step, ::step].ravel(), rows[::step, ::step].ravel()], axis=1)
+    start = np.stack([columns[_GRID].ravel(), rows[_GRID].ravel()], axis=1)
     end = start.copy()
-    alive = ~_robot(first)[::step, ::step].ravel()
+    alive = ~_robot(first)[_GRID].ravel()
     grid = np.stack([columns.ravel(), rows.ravel()], axis=1)
     pull = grid.copy()  # position in the first frame of every pixel of the current frame
     known = ~_robot(first).ravel()

@@ -22,6 +22,9 @@ from mstfilter.scene import Clip, component_key, memo, read_only
 from mstfilter.tracking.flow import DenseFlow
 from mstfilter.tracking.rigid import fit_sums, move_points, pair_sums
 
+_CELL = 10  # pixels, edge of a cell
+_MOVED = 0.008  # metres; a cell whose points moved less on average is at rest
+_MIN_POINTS = 40  # smallest number of points of a motion
 _MAX_NOISE = 0.006  # metres; cells with a larger root mean square residual under one rigid motion are not used
 _RIVAL_REACH = 0.15  # metres; largest distance of cells whose motions are compared
 
@@ -67,10 +70,6 @@ class MotionSegmentation:
 
     Parameters
     ----------
-    cell : int
-        Edge of a cell in pixels.
-    moved : float
-        A cell whose points moved less than this (metres) on average is at rest.
     misfit : float
         Largest misfit of two joined neighbours, metres: root mean square residual of the points of the smaller one
         under the common motion, in addition to the residual under its own motion.
@@ -80,18 +79,13 @@ class MotionSegmentation:
         motions farther away coincide by chance.
     reach : float
         Largest distance in space (metres) of neighbouring cells.
-    min_points : int
-        Smallest number of points of a motion.
     flow : DenseFlow
         Follows the points. The flow is shared with a transition that uses the same settings.
     """
 
-    cell: int = 10
-    moved: float = 0.008
     misfit: float = 0.015
     rival: float = 0.006
     reach: float = 0.04
-    min_points: int = 40
     flow: DenseFlow = field(default_factory=DenseFlow)
 
     def labels(self, clip: Clip) -> np.ndarray | None:
@@ -106,11 +100,11 @@ class MotionSegmentation:
         out = np.full((height, width), -1, np.int32)
         if not len(points.p):
             return out
-        went = np.linalg.norm(points.q - points.p, axis=1) >= self.moved
+        moved = np.linalg.norm(points.q - points.p, axis=1) >= _MOVED
         # Cells hold either points at rest (even number) or moved points (odd number).
-        across, down = (-(-n // self.cell) for n in (width, height))
-        place = (points.row // self.cell) * across + points.column // self.cell
-        cells, cell = np.unique(2 * place + went, return_inverse=True)
+        across, down = (-(-n // _CELL) for n in (width, height))
+        place = (points.row // _CELL) * across + points.column // _CELL
+        cells, cell = np.unique(2 * place + moved, return_inverse=True)
         origin = points.q.mean(axis=0)
         sums = pair_sums(points.p - origin, points.q - origin, cell, len(cells))
         _, error = fit_sums(sums)
@@ -141,9 +135,9 @@ class MotionSegmentation:
             total = sums[own].sum(axis=0)
             T, _ = fit_sums(total)
             trace = total[7] + total[11] + total[15]
-            if total[16] + total[17] - 2 * trace < total[0] * self.moved**2:
+            if total[16] + total[17] - 2 * trace < total[0] * _MOVED**2:
                 number[own] = 0
-            elif total[0] >= self.min_points:
+            elif total[0] >= _MIN_POINTS:
                 number[own] = len(motions)
                 motions.append(T)
         return np.array(motions), number

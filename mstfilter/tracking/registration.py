@@ -12,13 +12,14 @@ digits of the result.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
-from mstfilter.errors import InputError
+from mstfilter.errors import InputError, check_number
 from mstfilter.open3d_import import import_open3d
 from mstfilter.tracking.rigid import move_points
 
@@ -110,17 +111,9 @@ class Registration(ABC):
 
     @abstractmethod
     def register(self, source: Surface, target: Surface, init: np.ndarray, reach: float) -> RegistrationResult | None:
-        """Align source to target.
+        """Align source to target; None if the result is not finite.
 
-        Parameters
-        ----------
-        source, target : Surface
-        init : (4, 4) initial motion.
-        reach : largest correspondence distance, metres.
-
-        Returns
-        -------
-        RegistrationResult, or None if the result is not a finite rigid motion.
+        `init` (4, 4) is the initial motion, `reach` the largest distance of a correspondence in metres.
         """
 
 
@@ -144,7 +137,6 @@ class SmallGicp(Registration):
             raise InputError(f"registration method {self.method!r} is unknown", "one of GICP, PLANE_ICP, ICP")
 
     def register(self, source: Surface, target: Surface, init: np.ndarray, reach: float) -> RegistrationResult | None:
-        """Align source to target."""
         import small_gicp
 
         found = small_gicp.align(
@@ -174,17 +166,9 @@ class PointToPlaneIcp(Registration):
     iterations: int = 30
 
     def register(self, source: Surface, target: Surface, init: np.ndarray, reach: float) -> RegistrationResult | None:
-        """Align source to target."""
         icp = import_open3d().pipelines.registration
-        found = icp.registration_icp(
-            source.open3d_cloud,
-            target.open3d_cloud,
-            reach,
-            init,
-            icp.TransformationEstimationPointToPlane(),
-            icp.ICPConvergenceCriteria(max_iteration=self.iterations),
-        )
-        return _open3d_result(found, source, target, reach)
+        estimation = icp.TransformationEstimationPointToPlane()
+        return _by_open3d(icp.registration_icp, estimation, self.iterations, source, target, init, reach)
 
 
 @dataclass(frozen=True)
@@ -192,7 +176,8 @@ class ColouredIcp(Registration):
     """open3d's coloured ICP (Park et al., ICCV 2017). Colour determines motions along a surface; depth does not.
 
     Minimises the sum of ``w d^2 + (1 - w) c^2`` over the correspondences, with d the point-to-plane distance in
-    metres, c the difference of grey values 0 .. 1, and w such that the two scales below have equal cost.
+    metres, c the difference of grey values 0 .. 1, and w such that the two scales below have equal cost. Both
+    surfaces need colours.
 
     Parameters
     ----------
@@ -209,29 +194,29 @@ class ColouredIcp(Registration):
     iterations: int = 30
 
     def __post_init__(self) -> None:
-        if not (self.distance_scale > 0 and self.colour_scale > 0):
-            raise InputError(
-                f"coloured ICP has scales {self.distance_scale!r} m and {self.colour_scale!r}, expected numbers > 0"
-            )
+        check_number("distance_scale", self.distance_scale, above=0)
+        check_number("colour_scale", self.colour_scale, above=0)
 
     def register(self, source: Surface, target: Surface, init: np.ndarray, reach: float) -> RegistrationResult | None:
-        """Align source to target. Both need colours."""
         if source.raw_colours is None or target.raw_colours is None:
             raise InputError("coloured ICP needs the colours of both surfaces", "prepare(points, colours)")
         c, d = self.colour_scale / 255, self.distance_scale
         icp = import_open3d().pipelines.registration
-        found = icp.registration_colored_icp(
-            source.open3d_cloud,
-            target.open3d_cloud,
-            reach,
-            init,
-            icp.TransformationEstimationForColoredICP(c**2 / (c**2 + d**2)),
-            icp.ICPConvergenceCriteria(max_iteration=self.iterations),
-        )
-        return _open3d_result(found, source, target, reach)
+        estimation = icp.TransformationEstimationForColoredICP(c**2 / (c**2 + d**2))
+        return _by_open3d(icp.registration_colored_icp, estimation, self.iterations, source, target, init, reach)
 
 
-def _open3d_result(found: Any, source: Surface, target: Surface, reach: float) -> RegistrationResult | None:
+def _by_open3d(
+    method: Callable,
+    estimation: Any,
+    iterations: int,
+    source: Surface,
+    target: Surface,
+    init: np.ndarray,
+    reach: float,
+) -> RegistrationResult | None:
+    criteria = import_open3d().pipelines.registration.ICPConvergenceCriteria(max_iteration=iterations)
+    found = method(source.open3d_cloud, target.open3d_cloud, reach, init, estimation, criteria)
     inliers = len(np.asarray(found.correspondence_set))
     return _result(found.transformation, source, target, reach, float(found.inlier_rmse), inliers)
 

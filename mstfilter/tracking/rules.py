@@ -18,8 +18,8 @@ rotations of symmetric objects, SIFT without texture.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
@@ -36,6 +36,7 @@ from mstfilter.tracking.segments import Track
 _MIN_OVERLAP = 0.3  # fraction of the moved surface that has a correspondence after registration
 _MIN_PAIRS = 6  # flow tracks or SIFT matches of a motion
 _MAX_SIFT = 3  # SIFT motions of a segment
+_REST_BONUS = 0.15  # in S; a motion must be better than rest by this much
 _SEARCH_RADIUS, _SEARCH_STEP = 0.14, 0.01  # metres
 
 
@@ -61,6 +62,9 @@ class Candidate:
     registration: RegistrationResult | None = None
 
 
+#: Kind, motion (4, 4), support and registration of a motion that is not scored yet.
+_Estimate = tuple[str, np.ndarray, int, RegistrationResult | None]
+
 #: Rest, the motion of objects that are not tracked.
 IDENTITY = Candidate("identity", RigidTransform.identity())
 
@@ -80,7 +84,7 @@ class MotionRule(ABC):
 def _sift_motions(
     rng: np.random.Generator, track: Track, sift: SiftMatching, in_target: bool, min_size: int, n_models: int
 ) -> list[MotionCluster]:
-    """Rigid motions among the SIFT matches of a segment, best supported first."""
+    """Rigid motions among the SIFT matches of a segment, most inliers first."""
     p, q = track.sift_pairs(sift, in_target)
     return jlinkage(rng, p, q, min_size=min_size, n_models=n_models)
 
@@ -126,7 +130,6 @@ class PaperRule(MotionRule):
             raise InputError(f"order {self.order!r} is unknown", "one of first, best")
 
     def candidates(self, rng: np.random.Generator, track: Track) -> tuple[Candidate, ...]:
-        """The motions that passed their test, in the order SIFT, ICP, identity."""
         passed = []
         motions = _sift_motions(rng, track, self.sift, True, 3, 500)
         if motions and len(motions[0].inliers) > self.min_inliers:
@@ -139,7 +142,6 @@ class PaperRule(MotionRule):
         return (*passed, IDENTITY)
 
     def choose(self, rng: np.random.Generator, candidates: tuple[Candidate, ...]) -> Candidate:
-        """The first motion, or with ``order="best"`` the one with the smallest error."""
         moving = [c for c in candidates if c.kind != "identity"]
         if self.order == "best" and moving:
             return min(moving, key=lambda c: c.score)
@@ -175,18 +177,14 @@ class AuthorsRule(MotionRule):
     sift: SiftMatching = field(default_factory=_one_to_many)
 
     def candidates(self, rng: np.random.Generator, track: Track) -> tuple[Candidate, ...]:
-        """All SIFT clusters, ICP if accepted, identity."""
-        found = [
-            Candidate("sift", rigid_transform(m.T), len(m.inliers), m.rms)
-            for m in _sift_motions(rng, track, self.sift, True, 3, 1000)
-        ]
+        clusters = _sift_motions(rng, track, self.sift, True, 3, 1000)
+        candidates = [Candidate("sift", rigid_transform(m.T), len(m.inliers), m.rms) for m in clusters]
         fit = _registered(track, False, 10.0, self.registration)  # the authors' program has no limit of distance
         if fit is not None and fit.error**2 <= self.max_mean_square:
-            found.append(fit)
-        return (*found, IDENTITY)
+            candidates.append(fit)
+        return (*candidates, IDENTITY)
 
     def choose(self, rng: np.random.Generator, candidates: tuple[Candidate, ...]) -> Candidate:
-        """Draw a cluster and whether to use it; else ICP; else identity."""
         sift = [c for c in candidates if c.kind == "sift"]
         if sift:
             sizes = np.array([c.support for c in sift], dtype=np.float64)
@@ -197,15 +195,6 @@ class AuthorsRule(MotionRule):
         return next(c for c in candidates if c.kind != "sift")
 
 
-class _Proposal(NamedTuple):
-    """A motion (4, 4) that is not scored yet."""
-
-    kind: str
-    T: np.ndarray
-    support: int
-    registration: RegistrationResult | None = None
-
-
 @dataclass(frozen=True)
 class MstRule(MotionRule):
     """Candidates from flow, registration and SIFT, ranked by `MotionResidual`; rest is preferred.
@@ -214,8 +203,6 @@ class MstRule(MotionRule):
     ----------
     select : "map" or "sample"
         Take the candidate with the best score, or draw one with probability ~ exp(-n_eff S / 2) for each particle.
-    static_margin : float
-        Bonus in S for rest: a motion must be better by this much.
     n_eff : float
         Effective number of independent observations per segment, for ``select="sample"``. Residuals of neighbouring
         pixels are correlated, so it is much smaller than the number of pixels.
@@ -236,7 +223,6 @@ class MstRule(MotionRule):
     """
 
     select: str = "map"
-    static_margin: float = 0.15
     n_eff: float = 20.0
     use_flow: bool = True
     use_icp: bool = True
@@ -255,27 +241,25 @@ class MstRule(MotionRule):
 
     def candidates(self, rng: np.random.Generator, track: Track) -> tuple[Candidate, ...]:
         """Scored motions, the identity first."""
-        rest = Candidate("identity", IDENTITY.T, score=self.residual.score(track, np.eye(4)) - self.static_margin)
+        rest = Candidate("identity", IDENTITY.T, score=self.residual.score(track, np.eye(4)) - _REST_BONUS)
         if not len(track.segment.support):
             return (rest,)
         centre = track.points.mean(axis=0)
-        distinct: list[_Proposal] = []
-        for proposal in self._proposals(rng, track):
-            same = any(_nearly_equal(proposal.T, other.T, centre) for other in distinct)
-            if self._admissible(proposal.T, centre) and not same:
-                distinct.append(proposal)
-        found = [self._scored(track, proposal) for proposal in distinct]
-        best = sorted(range(len(found)), key=lambda i: found[i].score)[: self.n_refine]
-        for i in best:
-            refined = distinct[i]._replace(T=refine_motion(track, distinct[i].T), registration=None)
-            if self._admissible(refined.T, centre):
-                found.append(self._scored(track, refined))
-        if self.search_above >= 0 and min(c.score for c in [rest, *found]) > self.search_above:
-            found.extend(self._search(track, centre))
-        return (rest, *(c for c in found if np.isfinite(c.score)))
+        distinct: list[np.ndarray] = []
+        moving: list[Candidate] = []
+        for kind, T, support, registration in self._estimates(rng, track):
+            if self._admissible(T, centre) and not any(_nearly_equal(T, other, centre) for other in distinct):
+                distinct.append(T)
+                moving.append(self._scored(track, kind, T, support, registration))
+        for best in sorted(moving, key=lambda c: c.score)[: self.n_refine]:
+            T = refine_motion(track, best.T.as_matrix())
+            if self._admissible(T, centre):
+                moving.append(self._scored(track, best.kind, T, best.support))
+        if self.search_above >= 0 and min(c.score for c in [rest, *moving]) > self.search_above:
+            moving.extend(self._search(track, centre))
+        return (rest, *(c for c in moving if np.isfinite(c.score)))
 
     def choose(self, rng: np.random.Generator, candidates: tuple[Candidate, ...]) -> Candidate:
-        """The candidate with the best score, or one drawn by score."""
         scores = np.array([c.score for c in candidates])
         if not np.isfinite(scores).any():
             return IDENTITY
@@ -284,37 +268,35 @@ class MstRule(MotionRule):
         weights = np.exp(-0.5 * self.n_eff * (scores - scores.min()))
         return candidates[int(rng.choice(len(candidates), p=weights / weights.sum()))]
 
-    def _proposals(self, rng: np.random.Generator, track: Track) -> list[_Proposal]:
-        """Motions from every estimator, and each of them refined by registration."""
-        proposals: list[_Proposal] = []
-        starts: list[tuple[_Proposal, float]] = []  # initial motion of a registration, and its reach in metres
+    def _estimates(self, rng: np.random.Generator, track: Track) -> Iterator[_Estimate]:
+        """Motions from every estimator, then each of them refined by registration."""
+        starts: list[tuple[str, np.ndarray, int, float]] = []  # kind, initial motion, support, reach in metres
         if self.use_flow:
             p, q = track.flow_pairs
             fit = rigid.ransac(rng, p, q, 0.008) if len(p) >= _MIN_PAIRS else None
             if fit is not None and len(fit.inliers) >= _MIN_PAIRS:
                 T = rigid.refine_robust(fit.T, p, q, 0.004)
-                proposals.append(_Proposal("flow", T, len(fit.inliers)))
-                starts.append((_Proposal("icp", T, len(fit.inliers)), 0.020))
+                yield "flow", T, len(fit.inliers), None
+                starts.append(("icp", T, len(fit.inliers), 0.020))
         if self.use_sift:
             for m in _sift_motions(rng, track, self.sift, False, _MIN_PAIRS, 500)[:_MAX_SIFT]:
-                proposals.append(_Proposal("sift", m.T, len(m.inliers)))
-                starts.append((proposals[-1], 0.015))
+                yield "sift", m.T, len(m.inliers), None
+                starts.append(("sift", m.T, len(m.inliers), 0.015))
         source, target = track.surface, track.target_surface
         if self.use_icp and source is not None and target is not None:
             shift = centroid_shift(source.points, target.points)
-            starts.append((_Proposal("icp", shift, len(source.points)), 0.030))
-            for start, reach in starts:
-                result = self.registration.register(source, target, start.T, reach)
+            starts.append(("icp", shift, len(source.points), 0.030))
+            for kind, init, support, reach in starts:
+                result = self.registration.register(source, target, init, reach)
                 if result is not None and result.overlap >= _MIN_OVERLAP:
-                    proposals.append(start._replace(T=result.T, registration=result))
-        return proposals
+                    yield kind, result.T, support, result
 
     def _search(self, track: Track, centre: np.ndarray) -> list[Candidate]:
         """Search a grid of shifts on the table and three rotations; refine the two best shifts of each rotation."""
         n = round(_SEARCH_RADIUS / _SEARCH_STEP)
         shifts = _SEARCH_STEP * np.stack(np.meshgrid(*[np.arange(-n, n + 1)] * 2), axis=-1).reshape(-1, 2)
         shifts = shifts[np.hypot(*shifts.T) <= _SEARCH_RADIUS]
-        found = []
+        candidates = []
         for yaw in (-0.35, 0.0, 0.35):
             motions = np.tile(np.eye(4), (len(shifts), 1, 1))
             c, s = np.cos(yaw), np.sin(yaw)
@@ -325,11 +307,12 @@ class MstRule(MotionRule):
             for k in np.argsort(scores, kind="stable")[:2]:
                 T = refine_motion(track, motions[k])
                 if np.isfinite(scores[k]) and self._admissible(T, centre):
-                    found.append(self._scored(track, _Proposal("search", T, 0)))
-        return found
+                    candidates.append(self._scored(track, "search", T))
+        return candidates
 
-    def _scored(self, track: Track, proposal: _Proposal) -> Candidate:
-        kind, T, support, result = proposal
+    def _scored(
+        self, track: Track, kind: str, T: np.ndarray, support: int = 0, result: RegistrationResult | None = None
+    ) -> Candidate:
         error = 0.0 if result is None else result.rms
         return Candidate(kind, rigid_transform(T), support, error, self.residual.score(track, T), result)
 

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from scipy.ndimage import value_indices
 
 from mstfilter.scene import Clip, Frame, Hypothesis, content_key, render_hypothesis
 from mstfilter.tracking.features import SiftMatching, matched_colour, smooth_colour
@@ -69,23 +70,16 @@ def segments_of(hypothesis: Hypothesis, frame: Frame) -> dict[int, Segment]:
 
 def _interior(labels: np.ndarray) -> np.ndarray:
     """Pixels with the same label as their four neighbours."""
+    import cv2
+
+    cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
     padded = np.pad(labels, 1)
-    centre = padded[1:-1, 1:-1]
-    return (
-        (padded[:-2, 1:-1] == centre)
-        & (padded[2:, 1:-1] == centre)
-        & (padded[1:-1, :-2] == centre)
-        & (padded[1:-1, 2:] == centre)
-    )
+    return (cv2.erode(padded, cross) == cv2.dilate(padded, cross))[1:-1, 1:-1]
 
 
 def _indices_by_label(labels: np.ndarray) -> dict[int, np.ndarray]:
     """Ascending flat indices of each non-zero label of an array."""
-    flat = labels.ravel()
-    labelled = np.flatnonzero(flat)
-    order = labelled[np.argsort(flat[labelled], kind="stable")]
-    values, starts = np.unique(flat[order], return_index=True)
-    return dict(zip(values.tolist(), np.split(order, starts)[1:], strict=True))
+    return {int(k): index for k, (index,) in value_indices(labels.ravel(), ignore_value=0).items()}
 
 
 @dataclass(frozen=True, eq=False)

@@ -117,7 +117,7 @@ def test_too_few_points_cannot_be_registered(n):
 def test_invalid_fields_are_reported():
     with pytest.raises(InputError, match="method 'icp'"):
         SmallGicp("icp")
-    with pytest.raises(InputError, match="expected numbers > 0"):
+    with pytest.raises(InputError, match="colour_scale is 0"):
         ColouredIcp(colour_scale=0)
     p = corner(np.random.default_rng(0))
     with pytest.raises(InputError, match="needs the colours"):
