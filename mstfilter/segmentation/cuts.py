@@ -34,6 +34,15 @@ from mstfilter.segmentation.tree import Tree
 
 _MAX_TRIES = 100000  # Gibbs draws of `ExactCuts` for each cut
 
+# Constants of `SceneCutObjectness`.
+_START_SCALE = 0.3  # tolerance for boundaries inside the region, in P(boundary)
+_END_SCALE = 0.7  # tolerance for a weak outer boundary, in P(boundary)
+_POWER = 0.95  # exponent of the area; below 1 favours larger regions
+_FLOOR = 1e-3  # objectness of a region outside the area limits
+_MIN_AREA, _MAX_AREA = 1000 / 307200, 150000 / 307200  # fractions of the image
+
+_CLIP = 1e-3  # `MergeLogOdds` clips probabilities to _CLIP .. 1 - _CLIP
+
 _Value = TypeVar("_Value", float, np.ndarray)
 
 
@@ -49,43 +58,21 @@ class CutValue(ABC):
 class SceneCutObjectness(CutValue):
     """SceneCut's objectness: regions that form early and end late (Pham et al. 2018, eq. 4-5).
 
-    ``s = 0.5 exp(-(start / start_scale)^2) exp(-((1 - end) / end_scale)^2)``, ``w = ln(s) area^power``; a region
-    outside the area limits gets ``s = floor``. SceneCut's second term, a model of planes the size of furniture, is
-    omitted: on a tabletop the support plane is found directly and removed as background.
+    ``s = 0.5 exp(-(start / 0.3)^2) exp(-((1 - end) / 0.7)^2)``, ``w = ln(s) area^0.95``; a region smaller than 1000
+    or larger than 150,000 pixels of a 640 x 480 image gets ``s = 0.001``. SceneCut's second term, a model of planes
+    the size of furniture, is omitted: on a tabletop the support plane is found directly and removed as background.
 
     Parameters
     ----------
-    start_scale : float
-        Tolerance for boundaries inside the region, in P(boundary).
-    end_scale : float
-        Tolerance for a weak outer boundary, in P(boundary).
-    power : float
-        Exponent of the area; below 1 favours larger regions.
-    floor : float
-        Objectness of a region outside the area limits.
-    min_area, max_area : float
-        Area limits as fractions of the image. SceneCut's 1000 and 150,000 px at 640 x 480.
     background_weight : float
         Area of a pixel that is not above the table; 1 in SceneCut. With 1 the table contributes most of v*. The width
         of the sampled law is relative to v*, so a larger table gives more random samples. With 0 cuts of the
         table have no cost, and chains spend their steps on them.
     """
 
-    start_scale: float = 0.3
-    end_scale: float = 0.7
-    power: float = 0.95
-    floor: float = 1e-3
-    min_area: float = 1000 / 307200
-    max_area: float = 150000 / 307200
     background_weight: float = 0.003
 
-    def __post_init__(self) -> None:
-        for name in ("start_scale", "end_scale", "power", "floor"):
-            if not getattr(self, name) > 0:
-                raise InputError(f"objectness {name} is {getattr(self, name)!r}, expected a number > 0")
-
     def values(self, tree: Tree, frame: Frame) -> np.ndarray:
-        """``ln(s) area^power`` of every node."""
         area = tree.area.astype(np.float64)
         if self.background_weight < 1:
             foreground = tree.accumulate_pixels(pixels_above_table(frame)).astype(np.float64)
@@ -95,9 +82,9 @@ class SceneCutObjectness(CutValue):
         else:
             limited = np.ones(len(area), dtype=bool)
         fraction = area / tree.leaves.size
-        log_s = np.log(0.5) - (tree.start / self.start_scale) ** 2 - ((1 - tree.end) / self.end_scale) ** 2
-        outside = limited & ((fraction < self.min_area) | (fraction > self.max_area))
-        return np.where(outside, np.log(self.floor), log_s) * area**self.power
+        log_s = np.log(0.5) - (tree.start / _START_SCALE) ** 2 - ((1 - tree.end) / _END_SCALE) ** 2
+        outside = limited & ((fraction < _MIN_AREA) | (fraction > _MAX_AREA))
+        return np.where(outside, np.log(_FLOOR), log_s) * area**_POWER
 
 
 @dataclass(frozen=True)
@@ -107,23 +94,15 @@ class MergeLogOdds(CutValue):
     ``w(n) = -sum of logit P(boundary) over the merges inside n``: exp(v(c)) is, up to a constant, the
     probability that exactly the merges above the cut join different objects. The values are log probabilities, so
     cuts are sampled at a temperature, without a scale sigma. The odds of the tree are used if it has any
-    (`LearnedTree`); else `start` is the probability.
-
-    Parameters
-    ----------
-    clip : float
-        Probabilities are clipped to clip .. 1 - clip.
+    (`LearnedTree`); else `start` is the probability. Probabilities are clipped to 0.001 .. 0.999.
     """
 
-    clip: float = 1e-3
-
     def values(self, tree: Tree, frame: Frame) -> np.ndarray:
-        """Minus the log odds of all merges inside each node, summed."""
         if tree.odds is None:
-            p = np.clip(tree.start, self.clip, 1 - self.clip)
+            p = np.clip(tree.start, _CLIP, 1 - _CLIP)
             merge = -(np.log(p) - np.log1p(-p))
         else:
-            bound = np.log1p(-self.clip) - np.log(self.clip)
+            bound = np.log1p(-_CLIP) - np.log(_CLIP)
             merge = -np.clip(tree.odds, -bound, bound)
         merge[: tree.n_leaves] = 0.0
         return tree.accumulate_nodes(merge)
@@ -210,10 +189,9 @@ def optimal_cut(tree: Tree, w: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class OptimalCut(CutSampler):
-    """The optimal cut, without randomness. The single-frame baseline (SceneCut)."""
+    """The optimal cut, `n` times, without randomness. The single-frame baseline (SceneCut)."""
 
     def sample(self, rng: np.random.Generator, tree: Tree, w: np.ndarray, n: int) -> CutSample:
-        """Return the optimal cut `n` times."""
         cut = optimal_cut(tree, w)
         value = float(np.asarray(w, dtype=np.float64)[cut].sum())
         return CutSample((cut,) * n, np.full(n, value), np.zeros(n), {"size_of_best": len(cut)})
@@ -264,8 +242,7 @@ class Gibbs:
 
 def gibbs(tree: Tree, w: np.ndarray, b: float) -> Gibbs:
     """The Gibbs law with inverse temperature `b` under node values `w` (N,)."""
-    values = check_values(tree, w).tolist()
-    n = tree.n_nodes
+    values, n = w.tolist(), tree.n_nodes
     log_z, stop, mean = [0.0] * n, [1.0] * n, [0.0] * n
     for node, children in enumerate(tree.children):
         own = b * values[node]
@@ -336,7 +313,6 @@ class ExactCuts(CutSampler):
         check_target_law(self.sigma2, self.temperature)
 
     def sample(self, rng: np.random.Generator, tree: Tree, w: np.ndarray, n: int) -> CutSample:
-        """Draw `n` independent cuts."""
         best = float(check_values(tree, w)[optimal_cut(tree, w)].sum())
         s2 = max(self.sigma2 * best**2, 1e-300)
         law = proposal_law(tree, w, best, s2, self.temperature)

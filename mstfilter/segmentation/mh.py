@@ -143,7 +143,6 @@ class NodeMoves(MoveRule):
         return state.nodes[int(draw) >> 1], bool(int(draw) & 1)
 
     def outcome(self, state: CutState, choice: tuple[int, bool]) -> Move | None:
-        """The move with its exact ratio."""
         node, upward = choice
         n = len(state.nodes)
         if upward:
@@ -186,7 +185,6 @@ class AuthorsMoves(MoveRule):
         return moves
 
     def outcome(self, state: CutState, choice: tuple[int, bool] | None) -> Move | None:
-        """The move with the authors' ratio."""
         if choice is None:
             return None
         node, upward = choice
@@ -239,14 +237,13 @@ class SubtreeRedraw(MoveRule):
         return node, self.law.draw(random, node)
 
     def outcome(self, state: CutState, choice: tuple[int, list[int]]) -> Move | None:
-        """The move; its ratio is exp(b v(old)) / exp(b v(new)) of the Gibbs law."""
         node, added = choice
         if not added or state.covered_from_above(node):
             return None
         removed = state.below(node)
         w = self.law.w
         old, new = sum(w[x] for x in removed), sum(w[x] for x in added)
-        return Move(removed, added, self.law.b * (old - new))
+        return Move(removed, added, self.law.b * (old - new))  # log of exp(b v(old)) / exp(b v(new))
 
 
 LOCAL_MOVES: dict[str, type[MoveRule]] = {"node": NodeMoves, "authors": AuthorsMoves}
@@ -283,10 +280,6 @@ class CutChain:
         self.state = CutState(self.tree, cut.tolist())
         self.value = sum(self.w[x] for x in self.state.nodes)
 
-    def log_target(self, value: float) -> float:
-        """Unnormalised log p of a cut of this value."""
-        return log_target(value, self.best, self.s2, self.temperature)
-
     def judge(self, rule: MoveRule, choice: Any) -> tuple[Move | None, float, float]:
         """Move of a choice (None: stay), value after it, and log of its acceptance ratio."""
         move = rule.outcome(self.state, choice)
@@ -297,7 +290,8 @@ class CutChain:
             value -= self.w[x]
         for x in move.added:
             value += self.w[x]
-        return move, value, self.log_target(value) - self.log_target(self.value) + move.log_ratio
+        law = self.best, self.s2, self.temperature
+        return move, value, log_target(value, *law) - log_target(self.value, *law) + move.log_ratio
 
     def step(self, random: Callable[[], float], rule: MoveRule) -> None:
         """One step under a rule."""
@@ -359,7 +353,6 @@ class MetropolisHastingsCuts(CutSampler):
             raise InputError(f"redraw_share is {self.redraw_share!r}, expected a share 0 .. 1")
 
     def sample(self, rng: np.random.Generator, tree: Tree, w: np.ndarray, n: int) -> CutSample:
-        """Draw `n` cuts from the chain."""
         w = check_values(tree, w)
         optimal = optimal_cut(tree, w)
         best = float(w[optimal].sum())
@@ -368,7 +361,7 @@ class MetropolisHastingsCuts(CutSampler):
         redraw = None
         if self.redraw_share > 0:
             redraw = SubtreeRedraw(proposal_law(tree, w, best, s2, self.temperature))
-        random = _uniforms(rng)
+        random = _uniforms(rng).__next__
 
         chain = CutChain(tree, w, best, s2, optimal, self.temperature)
         trace: list[float] = []
@@ -410,14 +403,10 @@ class MetropolisHastingsCuts(CutSampler):
         return CutSample(tuple(cuts), v, log_target(v, best, s2, self.temperature), diagnostics)
 
 
-def _uniforms(rng: np.random.Generator, block: int = 1024) -> Callable[[], float]:
-    """A function that returns uniform numbers, drawn in blocks: ten times faster than single draws."""
-
-    def numbers() -> Iterator[float]:
-        while True:
-            yield from rng.random(block).tolist()
-
-    return numbers().__next__
+def _uniforms(rng: np.random.Generator) -> Iterator[float]:
+    """Uniform numbers, drawn in blocks: ten times faster than single draws."""
+    while True:
+        yield from rng.random(1024).tolist()
 
 
 def _autocorrelation(trace: np.ndarray) -> float | None:

@@ -139,8 +139,6 @@ class TreeCutProposal(Proposal):
     weight_rule : {"equal", "p"}
         "equal": equal weights, which is correct for cuts drawn from p. "p": log weight ``log p(c) - log p(c*)`` as in
         the paper and the authors' program; p then counts twice, in the draw and in the weight.
-    include_optimal : bool
-        Replace the first sample by the optimal cut.
     threshold : float
         Smallest probability of an occupied voxel.
     """
@@ -152,7 +150,6 @@ class TreeCutProposal(Proposal):
     objects: ObjectRule = field(default_factory=ObjectRule)
     completer: Completer = field(default_factory=Extrude)
     weight_rule: str = "equal"
-    include_optimal: bool = False
     threshold: float = 0.5
 
     properly_weighted: ClassVar[bool] = False
@@ -177,19 +174,15 @@ class TreeCutProposal(Proposal):
         return self.objects.label_image(tree, optimal_cut(tree, w) if cut is None else cut, frame)
 
     def sample(self, rng: np.random.Generator, observation: Clip, n: int) -> Population:
-        """Draw `n` hypotheses of the scene at the end of the clip."""
         frame, grid = observation.after, observation.grid
         tree, w = self.tree_of(frame)
         drawn = self.sampler.sample(rng, tree, w, n)
-        cuts, log_p = list(drawn.cuts), drawn.log_p.copy()
-        if self.include_optimal and n > 0:
-            cuts[0], log_p[0] = optimal_cut(tree, w), 0.0
         found = memo(
             "segments",
             (frame.key, grid.key, tree.key, component_key(self.objects)),
             lambda: self.objects.segments(tree, frame, grid),
         )
-        kept = [cut[found.is_object[cut]] for cut in cuts]
+        kept = [cut[found.is_object[cut]] for cut in drawn.cuts]
         completed: dict[int, Completion] = {}
         for node in np.unique(np.concatenate([np.zeros(0, np.int64), *kept])).tolist():
             mask = tree.mask(node) & found.object_pixels
@@ -205,12 +198,12 @@ class TreeCutProposal(Proposal):
         notes = {
             "sampler": drawn.diagnostics,
             "tree_nodes": tree.n_nodes,
-            "cut_sizes": [len(cut) for cut in cuts],
+            "cut_sizes": [len(cut) for cut in drawn.cuts],
             "objects": [h.n_objects for h in particles],
             "distinct_segments": len(completed),
             "distinct_hypotheses": len(built),
         }
-        log_weights = log_p if self.weight_rule == "p" else np.zeros(n)
+        log_weights = drawn.log_p if self.weight_rule == "p" else np.zeros(n)
         return Population(particles, log_weights, notes=notes)
 
 

@@ -24,6 +24,7 @@ from mstfilter.segmentation.boundary import (
     filled_disparity,
     pixels_above_table,
 )
+from mstfilter.segmentation.join_weights import JOIN_WEIGHTS
 
 #: Bin width of the height histogram in metres; the last bin has no upper limit.
 _HEIGHT_BIN = 0.01
@@ -219,44 +220,8 @@ def _shifted(image: np.ndarray, at: tuple[np.ndarray, ...], axis: int, shift: in
     return image[tuple(index)]
 
 
-PAIR_FEATURES = (
-    "bias",
-    "strength",
-    "strength^2",
-    "hollow",
-    "convex",
-    "step",
-    "clear step share",
-    "lightness",
-    "chroma",
-    "texture",
-    "misfit",
-    "residual",
-    "border share",
-    "free border share",
-    "log pixels",
-    "log ratio",
-    "front higher",
-    "back higher",
-    "front bottom",
-    "back bottom",
-    "front bend",
-    "back bend",
-    "ground distance",
-    "front on table",
-    "back on table",
-    "front drop",
-    "back drop",
-    "rim",
-    "rim * back bend",
-    "rim * step",
-    "rim * inside",
-    "step * misfit",
-    "hollow * misfit",
-    "strength * log pixels",
-    "hollow * log pixels",
-    "convex * strength",
-)
+PAIR_FEATURES = tuple(JOIN_WEIGHTS)
+"""Names of the columns of `pair_features`."""
 
 
 def quadric_residual(sums: np.ndarray) -> np.ndarray:
@@ -313,45 +278,45 @@ def pair_features(
     log_small = np.log(small / scale**2)
     on_front, drop_front = _table(table_front, front)
     on_back, drop_back = _table(table_back, back)
-    columns = [
-        np.ones(len(small)),
-        strength,
-        strength**2,
-        hollow,
-        convex,
-        step,
-        mean[:, BORDER["clear"]],
-        np.minimum(np.abs(lab[:, 0]) / 20, 3),
-        np.minimum(np.hypot(lab[:, 1], lab[:, 2]) / 10, 4),
-        _texture(front, back, n_front, n_back),
-        misfit,
-        np.log1p(joint / (n_front + n_back)),
-        np.minimum(length / np.minimum(_get(front, "perimeter"), _get(back, "perimeter")), 1),
-        np.minimum(length / np.maximum(free, 1), 1),
-        log_small,
-        np.abs(np.log(n_front / n_back)),
-        np.maximum(higher, 0),
-        np.maximum(-higher, 0),
-        np.minimum(bottom_front * 10, 2),
-        np.minimum(bottom_back * 10, 2),
-        bend_front,
-        bend_back,
-        distance,
-        on_front,
-        on_back,
-        drop_front,
-        drop_back,
-        rim,
-        rim * bend_back,
-        rim * step,
-        rim * np.exp(-(distance**2)) * step,
-        step * misfit,
-        hollow * misfit,
-        strength * log_small,
-        hollow * log_small,
-        convex * strength,
-    ]
-    return np.stack(columns, axis=1)
+    columns = {
+        "bias": np.ones(len(small)),
+        "strength": strength,
+        "strength^2": strength**2,
+        "hollow": hollow,
+        "convex": convex,
+        "step": step,
+        "clear step share": mean[:, BORDER["clear"]],
+        "lightness": np.minimum(np.abs(lab[:, 0]) / 20, 3),
+        "chroma": np.minimum(np.hypot(lab[:, 1], lab[:, 2]) / 10, 4),
+        "texture": _texture(front, back, n_front, n_back),
+        "misfit": misfit,
+        "residual": np.log1p(joint / (n_front + n_back)),
+        "border share": np.minimum(length / np.minimum(_get(front, "perimeter"), _get(back, "perimeter")), 1),
+        "free border share": np.minimum(length / np.maximum(free, 1), 1),
+        "log pixels": log_small,
+        "log ratio": np.abs(np.log(n_front / n_back)),
+        "front higher": np.maximum(higher, 0),
+        "back higher": np.maximum(-higher, 0),
+        "front bottom": np.minimum(bottom_front * 10, 2),
+        "back bottom": np.minimum(bottom_back * 10, 2),
+        "front bend": bend_front,
+        "back bend": bend_back,
+        "ground distance": distance,
+        "front on table": on_front,
+        "back on table": on_back,
+        "front drop": drop_front,
+        "back drop": drop_back,
+        "rim": rim,
+        "rim * back bend": rim * bend_back,
+        "rim * step": rim * step,
+        "rim * inside": rim * np.exp(-(distance**2)) * step,
+        "step * misfit": step * misfit,
+        "hollow * misfit": hollow * misfit,
+        "strength * log pixels": strength * log_small,
+        "hollow * log pixels": hollow * log_small,
+        "convex * strength": convex * strength,
+    }
+    return np.stack([columns[name] for name in PAIR_FEATURES], axis=1)
 
 
 def _texture(a: np.ndarray, b: np.ndarray, n_a: np.ndarray, n_b: np.ndarray) -> np.ndarray:

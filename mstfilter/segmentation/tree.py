@@ -55,15 +55,12 @@ class Tree:
     def __post_init__(self) -> None:
         parent = np.array(self.parent, dtype=np.int64)
         leaves = np.array(self.leaves, dtype=np.int32)
-        start = np.array(self.start, dtype=np.float64)
         n = len(parent)
         if parent.ndim != 1 or n == 0 or parent[-1] != n - 1 or (parent[:-1] <= np.arange(n - 1)).any():
             raise InputError(
                 "tree parents are not ordered: every parent must have a larger index than its children",
                 "the root is the last node and its own parent",
             )
-        if start.shape != (n,) or not np.isfinite(start).all():
-            raise InputError(f"tree start heights have shape {start.shape}, expected {(n,)} finite numbers")
         inner = np.zeros(n, dtype=bool)
         inner[parent[:-1]] = True
         n_leaves = n - int(inner.sum())
@@ -71,14 +68,14 @@ class Tree:
             raise InputError("tree nodes are not ordered: leaves must come before all inner nodes")
         if leaves.ndim != 2 or leaves.size == 0 or leaves.min() < 0 or leaves.max() >= n_leaves:
             raise InputError(f"leaf image must be 2-D with values 0 .. {n_leaves - 1}")
-        if self.odds is not None:
-            odds = np.array(self.odds, dtype=np.float64)
-            if odds.shape != (n,) or not np.isfinite(odds).all():
-                raise InputError(f"tree log odds have shape {odds.shape}, expected {(n,)} finite numbers")
-            object.__setattr__(self, "odds", read_only(odds))
+        for name, values in (("start", self.start), ("odds", self.odds)):
+            if values is not None:
+                values = np.array(values, dtype=np.float64)
+                if values.shape != (n,) or not np.isfinite(values).all():
+                    raise InputError(f"tree {name} has shape {values.shape}, expected {(n,)} finite numbers")
+                object.__setattr__(self, name, read_only(values))
         object.__setattr__(self, "parent", read_only(parent))
         object.__setattr__(self, "leaves", read_only(leaves))
-        object.__setattr__(self, "start", read_only(start))
 
     @property
     def n_nodes(self) -> int:
@@ -114,12 +111,8 @@ class Tree:
         return tuple(map(tuple, found))
 
     def accumulate(self, leaf_values: np.ndarray) -> np.ndarray:
-        """Sum of leaf values (n_leaves, ...) over the leaves of every node, (N, ...)."""
-        leaf_values = np.asarray(leaf_values)
-        order, first, last = self._leaf_ranges
-        sums = np.zeros((self.n_leaves + 1, *leaf_values.shape[1:]), dtype=np.result_type(leaf_values, np.int64))
-        np.cumsum(leaf_values[order], axis=0, out=sums[1:])
-        return sums[last] - sums[first]
+        """Sum of leaf values (n_leaves,) over the leaves of every node, (N,)."""
+        return self.accumulate_nodes(np.append(leaf_values, np.zeros(self.n_nodes - self.n_leaves, np.int64)))
 
     def accumulate_nodes(self, values: np.ndarray) -> np.ndarray:
         """Sum of node values (N,) over every node and its descendants, (N,)."""
@@ -135,7 +128,7 @@ class Tree:
     @cached_property
     def area(self) -> np.ndarray:
         """(N,) number of pixels of every node."""
-        return read_only(self.accumulate(np.bincount(self.leaves.ravel(), minlength=self.n_leaves)))
+        return read_only(self.accumulate_pixels(np.ones(self.leaves.shape, bool)))
 
     @cached_property
     def _leaf_ranges(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -225,7 +218,6 @@ class UcmTree(TreeBuilder):
             raise InputError(f"max_leaves is {self.max_leaves!r}, expected at least 1")
 
     def build(self, boundary: np.ndarray, frame: Frame | None = None) -> Tree:
-        """Build the tree of a boundary map (H, W) with values 0 .. 1; the frame is not used."""
         boundary = np.asarray(boundary)
         if boundary.ndim != 2 or boundary.size == 0:
             raise InputError(f"boundary map has shape {boundary.shape}, expected (H, W)")

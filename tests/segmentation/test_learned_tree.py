@@ -9,7 +9,6 @@ from mstfilter.errors import InputError
 from mstfilter.scene import Camera, Frame
 from mstfilter.segmentation.boundary import ColourDepthBoundary
 from mstfilter.segmentation.cuts import MergeLogOdds
-from mstfilter.segmentation.join_weights import JOIN_WEIGHTS
 from mstfilter.segmentation.learned_tree import Agglomeration, LearnedTree, tree_of_merges
 from mstfilter.segmentation.regions import (
     BORDER,
@@ -81,11 +80,6 @@ def test_the_residual_of_a_quadric_matches_least_squares():
     assert quadric_residual(row)[0] == pytest.approx(
         np.linalg.lstsq(design, d, rcond=None)[1][0], rel=1e-4
     )  # the ridge
-
-
-def test_every_feature_has_a_weight():
-    assert set(JOIN_WEIGHTS) == set(PAIR_FEATURES)
-    assert len(PAIR_FEATURES) == len(set(PAIR_FEATURES))
 
 
 @pytest.mark.parametrize("width", [160, 320, 640])

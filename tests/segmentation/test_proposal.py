@@ -88,7 +88,8 @@ def test_sample():
         assert (a.labels == b.labels).all()
         assert a.grid == clip.grid
         assert all(o.birth == 0 and o.id == o.label and o.completion_key for o in a.objects)
-    best = replace(proposal, include_optimal=True).sample(np.random.default_rng(0), clip, 3).particles[0]
+    optimal = replace(proposal, sampler=replace(proposal.sampler, include_optimal=True))
+    best = optimal.sample(np.random.default_rng(0), clip, 3).particles[0]
     shown = render(best.labels, GRID, clip.after.camera).labels
     assert weighted_coverage(shown, seen(TOUCHING, clip.after)) > 0.75
 

@@ -54,7 +54,7 @@ def test_malformed_trees_raise_an_error():
         Tree([1, 4, 4, 4, 4], [[0]], np.zeros(5))
     with pytest.raises(InputError, match="leaf image"):
         Tree([2, 2, 2], [[0, 2]], np.zeros(3))
-    with pytest.raises(InputError, match="start heights"):
+    with pytest.raises(InputError, match="tree start"):
         Tree([2, 2, 2], [[0, 1]], np.zeros(2))
 
 
