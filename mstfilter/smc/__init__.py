@@ -22,7 +22,7 @@
 `state_space`         state-space models; bootstrap, guided, auxiliary and resample-move filters
 `kalman`              linear-Gaussian models, Rao-Blackwellised filters
 `programs`            filters for probabilistic programs
-`distributions`       distributions for models; `adapters` for those of scipy and torch
+`distributions`       distributions for models; adapters for those of scipy and torch
 `smoothing`           states given all observations
 `diagnostics`         quantities of a run, comparison of filters
 ====================  ===================================================================================

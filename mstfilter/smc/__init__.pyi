@@ -1,4 +1,3 @@
-from mstfilter.smc.adapters import as_distribution as as_distribution
 from mstfilter.smc.checkpoint import ArrayCodec as ArrayCodec, load_state as load_state, save_state as save_state
 from mstfilter.smc.components import (
     Branching as Branching,
@@ -21,13 +20,13 @@ from mstfilter.smc.diagnostics import (
 from mstfilter.smc.distributions import (
     Bernoulli as Bernoulli,
     Categorical as Categorical,
-    Distribution as Distribution,
     Gamma as Gamma,
     MultivariateNormal as MultivariateNormal,
     Normal as Normal,
     Poisson as Poisson,
     Student as Student,
     Uniform as Uniform,
+    as_distribution as as_distribution,
 )
 from mstfilter.smc.diverse_resampling import (
     ClusterStratified as ClusterStratified,
@@ -39,6 +38,7 @@ from mstfilter.smc.interfaces import (
     Codec as Codec,
     Component as Component,
     DensityTransition as DensityTransition,
+    Distribution as Distribution,
     Info as Info,
     Lookahead as Lookahead,
     Observer as Observer,

@@ -6,56 +6,65 @@
 >>> Normal(x, 1.0).log_prob(0.3).shape
 (5,)
 
-The first axis is that of the particles. Parameters of shape () or (n,) give values (n,); parameters (1, d) or (n, d)
-give values (n, d), whose entries are independent and whose log densities are summed. `log_prob` is always (n,), or a
-number if nothing has rows. Frozen distributions of scipy.stats and objects of torch.distributions can be used in
-place of these (`as_distribution`); these take a third to a sixth of their time.
+The first axis is that of the particles. Parameters of shape () or (n,) give values (n,): the event shape is ().
+Parameters (1, d) or (n, d) give values (n, d): the event shape is (d,), the entries of an event are independent, and
+their log densities are summed. `log_prob` is always (n,), or a number if nothing has rows.
+
+Frozen distributions of scipy.stats and objects of torch.distributions can be used in place of these
+(`as_distribution`); they take three to six times as long. Neither library is imported before it is used. torch draws
+from a global generator, so its distributions are drawn by their inverse distribution function at uniforms of our
+generator, or, without an inverse, from their probabilities.
 """
 
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 
 from mstfilter.errors import InputError
+from mstfilter.smc.interfaces import Distribution
 
 _HALF_LOG_2PI = 0.5 * math.log(2 * math.pi)
 
 
-class Distribution(ABC):
-    """A distribution over the values of particles."""
+class _Independent(Distribution):
+    """Independent entries. The fields are the parameters: (), (n,), (1, d) or (n, d)."""
+
+    @cached_property
+    def _shape(self) -> tuple[int, ...]:
+        return _broadcast_shape(*vars(self).values())
+
+    @abstractmethod
+    def _moments(self) -> tuple[Any, Any]:
+        """Mean and standard deviation of an entry."""
 
     @property
-    def discrete(self) -> bool:
-        """Whether the values are integers: a lookahead then uses the mode, a move draws new values."""
-        return False
-
-    @abstractmethod
-    def sample(self, rng: np.random.Generator, size: int) -> np.ndarray:
-        """Values of `size` particles: (size,) or (size, d)."""
-
-    @abstractmethod
-    def log_prob(self, value: Any) -> np.ndarray:
-        """(n,) log density or probability of each row; -inf outside the support."""
-
-    @property
-    @abstractmethod
     def mean(self) -> np.ndarray:
-        """Expected value, of the shape of the parameters."""
+        return np.broadcast_to(np.asarray(self._moments()[0], np.float64), self._shape)
 
     @property
-    @abstractmethod
     def sd(self) -> np.ndarray:
-        """Standard deviation of each entry, of the shape of the parameters."""
+        return np.broadcast_to(np.asarray(self._moments()[1], np.float64), self._shape)
 
-    @property
-    def centre(self) -> np.ndarray:
-        """The mean, or the mode of a discrete distribution; a lookahead uses it instead of a draw."""
-        return self.mean
+
+def _broadcast_shape(*parameters: Any) -> tuple[int, ...]:
+    shape: tuple[int, ...] = ()
+    for parameter in parameters:
+        other = () if isinstance(parameter, float) else np.shape(parameter)
+        if other and other != shape:
+            try:
+                shape = np.broadcast_shapes(shape, other)
+            except ValueError:
+                raise InputError(
+                    f"parameters of shapes {' and '.join(str(np.shape(p)) for p in parameters)} do not fit together",
+                    "with one row per particle they are all (n,), or all (n, d) or (n, 1)",
+                ) from None
+    return shape
 
 
 def _check_positive(what: str, value: Any) -> None:
@@ -64,26 +73,7 @@ def _check_positive(what: str, value: Any) -> None:
         raise InputError(f"{what} is {value}, expected a positive number")
 
 
-def _value_shape(size: int, *parameters: Any) -> tuple[int, ...]:
-    """Shape of `size` rows of values with these parameters."""
-    plain = (size,)
-    if all(np.shape(p) in ((), plain) for p in parameters):  # the usual case
-        return plain
-    inner: tuple[int, ...] = np.broadcast_shapes(*(np.shape(p) for p in parameters))
-    rows = (size,) + (1,) * (len(inner) - 1)
-    try:
-        shape = np.broadcast_shapes(rows, inner)
-    except ValueError:
-        shape = (-1,)
-    if shape[0] != size:
-        raise InputError(
-            f"parameters of shape {inner} do not fit {size} particles",
-            f"give one row per particle, ({size}, ...), or write a vector shared by all as (1, d)",
-        )
-    return shape
-
-
-def sum_rows(log_prob: Any) -> np.ndarray:
+def _sum_rows(log_prob: Any) -> np.ndarray:
     """Sum over all axes but the first: the entries of a row are independent."""
     out = np.asarray(log_prob)
     return out if out.ndim <= 1 else out.reshape(len(out), -1).sum(axis=1)
@@ -92,17 +82,12 @@ def sum_rows(log_prob: Any) -> np.ndarray:
 def _standardised(value: Any, loc: Any, scale: Any) -> np.ndarray:
     """(value - loc) / scale with one temporary array."""
     z = np.asarray(np.subtract(value, loc), dtype=np.float64)
-    if z.ndim and isinstance(scale, float):
-        z /= scale
-        return z
-    if z.ndim and np.ndim(scale) <= z.ndim and np.broadcast_shapes(z.shape, np.shape(scale)) == z.shape:
-        np.divide(z, scale, out=z)
-        return z
-    return z / scale
+    fits = isinstance(scale, float) or np.broadcast_shapes(z.shape, np.shape(scale)) == z.shape
+    return np.divide(z, scale, out=z if z.ndim and fits else None)
 
 
 @dataclass(frozen=True, eq=False)
-class Normal(Distribution):
+class Normal(_Independent):
     """Gaussian with mean `loc` and standard deviation `scale` > 0."""
 
     loc: Any = 0.0
@@ -112,7 +97,7 @@ class Normal(Distribution):
         _check_positive("scale of a Normal", self.scale)
 
     def sample(self, rng: np.random.Generator, size: int) -> np.ndarray:
-        z = rng.standard_normal(_value_shape(size, self.loc, self.scale))
+        z = rng.standard_normal(self.value_shape(size))
         z *= self.scale
         z += self.loc
         return z
@@ -123,23 +108,18 @@ class Normal(Distribution):
             z *= z
             z *= -0.5
             z -= math.log(self.scale) + _HALF_LOG_2PI
-            return sum_rows(z)
-        return sum_rows(-0.5 * (z * z) - (np.log(self.scale) + _HALF_LOG_2PI))
+            return _sum_rows(z)
+        return _sum_rows(-0.5 * (z * z) - (np.log(self.scale) + _HALF_LOG_2PI))
 
-    @property
-    def mean(self) -> np.ndarray:
-        return np.broadcast_arrays(np.asarray(self.loc, np.float64), self.scale)[0]
-
-    @property
-    def sd(self) -> np.ndarray:
-        return np.broadcast_arrays(np.asarray(self.scale, np.float64), self.loc)[0]
+    def _moments(self) -> tuple[Any, Any]:
+        return self.loc, self.scale
 
 
 @dataclass(frozen=True, eq=False)
-class Student(Distribution):
+class Student(_Independent):
     """Student's t with `df` > 0 degrees of freedom, centre `loc` and scale `scale` > 0.
 
-    The standard deviation is larger than the scale, and infinite for df <= 2.
+    `sd` is the scale: the standard deviation is larger, and infinite for df <= 2.
     """
 
     df: Any
@@ -151,27 +131,21 @@ class Student(Distribution):
         _check_positive("scale of a Student", self.scale)
 
     def sample(self, rng: np.random.Generator, size: int) -> np.ndarray:
-        return self.loc + self.scale * rng.standard_t(self.df, _value_shape(size, self.df, self.loc, self.scale))
+        return self.loc + self.scale * rng.standard_t(self.df, self.value_shape(size))
 
     def log_prob(self, value: Any) -> np.ndarray:
         from scipy.special import gammaln
 
         z, df = _standardised(value, self.loc, self.scale), np.asarray(self.df, dtype=np.float64)
         constant = gammaln((df + 1) / 2) - gammaln(df / 2) - 0.5 * np.log(df * np.pi) - np.log(self.scale)
-        return sum_rows(constant - (df + 1) / 2 * np.log1p(z * z / df))
+        return _sum_rows(constant - (df + 1) / 2 * np.log1p(z * z / df))
 
-    @property
-    def mean(self) -> np.ndarray:
-        return np.broadcast_arrays(np.asarray(self.loc, np.float64), self.scale, self.df)[0]
-
-    @property
-    def sd(self) -> np.ndarray:
-        """Scale, as unit of the steps of moves (the standard deviation may be infinite)."""
-        return np.broadcast_arrays(np.asarray(self.scale, np.float64), self.loc, self.df)[0]
+    def _moments(self) -> tuple[Any, Any]:
+        return self.loc, self.scale
 
 
 @dataclass(frozen=True, eq=False)
-class Uniform(Distribution):
+class Uniform(_Independent):
     """Uniform on [low, high)."""
 
     low: Any = 0.0
@@ -182,25 +156,20 @@ class Uniform(Distribution):
             _check_positive(f"width of a Uniform from {self.low} to {self.high}", self.high - self.low)
 
     def sample(self, rng: np.random.Generator, size: int) -> np.ndarray:
-        u = rng.random(_value_shape(size, self.low, self.high))
+        u = rng.random(self.value_shape(size))
         return self.low + (np.asarray(self.high) - self.low) * u
 
     def log_prob(self, value: Any) -> np.ndarray:
         x = np.asarray(value)
         inside = (x >= self.low) & (x < self.high)
-        return sum_rows(np.where(inside, -np.log(np.asarray(self.high) - self.low), -np.inf))
+        return _sum_rows(np.where(inside, -np.log(np.asarray(self.high) - self.low), -np.inf))
 
-    @property
-    def mean(self) -> np.ndarray:
-        return (np.asarray(self.low, np.float64) + self.high) / 2
-
-    @property
-    def sd(self) -> np.ndarray:
-        return (np.asarray(self.high, np.float64) - self.low) / math.sqrt(12)
+    def _moments(self) -> tuple[Any, Any]:
+        return (np.asarray(self.low) + self.high) / 2, (np.asarray(self.high) - self.low) / math.sqrt(12)
 
 
 @dataclass(frozen=True, eq=False)
-class Gamma(Distribution):
+class Gamma(_Independent):
     """Gamma with `shape` > 0 and `rate` > 0; the mean is shape / rate."""
 
     shape: Any
@@ -211,7 +180,7 @@ class Gamma(Distribution):
         _check_positive("rate of a Gamma", self.rate)
 
     def sample(self, rng: np.random.Generator, size: int) -> np.ndarray:
-        return rng.standard_gamma(self.shape, _value_shape(size, self.shape, self.rate)) / self.rate
+        return rng.standard_gamma(self.shape, self.value_shape(size)) / self.rate
 
     def log_prob(self, value: Any) -> np.ndarray:
         from scipy.special import gammaln, xlogy
@@ -219,15 +188,10 @@ class Gamma(Distribution):
         x, a = np.asarray(value, dtype=np.float64), np.asarray(self.shape, dtype=np.float64)
         safe = np.where(x >= 0, x, 1.0)
         inside = xlogy(a, self.rate) + xlogy(a - 1, safe) - self.rate * safe - gammaln(a)
-        return sum_rows(np.where(x >= 0, inside, -np.inf))
+        return _sum_rows(np.where(x >= 0, inside, -np.inf))
 
-    @property
-    def mean(self) -> np.ndarray:
-        return np.asarray(self.shape, np.float64) / self.rate
-
-    @property
-    def sd(self) -> np.ndarray:
-        return np.sqrt(np.asarray(self.shape, np.float64)) / self.rate
+    def _moments(self) -> tuple[Any, Any]:
+        return np.asarray(self.shape) / self.rate, np.sqrt(self.shape) / self.rate
 
 
 @dataclass(frozen=True, eq=False)
@@ -250,11 +214,18 @@ class MultivariateNormal(Distribution):
             root = np.linalg.cholesky(np.asarray(self.cov, dtype=np.float64))
         except np.linalg.LinAlgError:
             raise InputError(f"covariance is not positive definite: {np.asarray(self.cov).tolist()}"[:300]) from None
+        shape = _broadcast_shape(self.loc, root[..., 0])
+        if shape[-1:] != root.shape[-1:]:
+            raise InputError(
+                f"mean of shape {np.shape(self.loc)} does not fit a covariance of shape {root.shape}",
+                "the mean is (d,), or (n, d) with one row per particle; x[:, None] makes (n, 1) of (n,)",
+            )
         object.__setattr__(self, "_root", root)
+        object.__setattr__(self, "_shape", shape if len(shape) > 1 else (1, *shape))
 
     def sample(self, rng: np.random.Generator, size: int) -> np.ndarray:
         root = self.__dict__["_root"]
-        z = rng.standard_normal((size, root.shape[-1]))
+        z = rng.standard_normal(self.value_shape(size))
         return self.loc + (z @ root.T if root.ndim == 2 else np.einsum("nij,nj->ni", root, z))
 
     def log_prob(self, value: Any) -> np.ndarray:
@@ -267,7 +238,7 @@ class MultivariateNormal(Distribution):
 
             z = solve_triangular(root, r.T if r.ndim == 2 else r, lower=True, check_finite=False)
             return -0.5 * (z * z).sum(axis=0) - log_det - d * _HALF_LOG_2PI
-        z = np.linalg.solve(root, np.broadcast_to(r, root.shape[:-1])[..., None])[..., 0]
+        z = np.linalg.solve(root, np.atleast_2d(r)[..., None])[..., 0]
         return -0.5 * (z * z).sum(axis=-1) - log_det - d * _HALF_LOG_2PI
 
     @property
@@ -281,14 +252,14 @@ class MultivariateNormal(Distribution):
 
 
 @dataclass(frozen=True, eq=False)
-class Poisson(Distribution):
+class Poisson(_Independent):
     """Poisson counts with mean `rate` >= 0."""
 
     rate: Any
-    discrete: ClassVar[bool] = True
+    discrete = True
 
     def sample(self, rng: np.random.Generator, size: int) -> np.ndarray:
-        return rng.poisson(self.rate, _value_shape(size, self.rate))
+        return rng.poisson(self.rate, self.value_shape(size))
 
     def log_prob(self, value: Any) -> np.ndarray:
         from scipy.special import gammaln, xlogy
@@ -296,15 +267,10 @@ class Poisson(Distribution):
         k = np.asarray(value, dtype=np.float64)
         valid = (k >= 0) & (k == np.floor(k))
         safe = np.where(valid, k, 0.0)
-        return sum_rows(np.where(valid, xlogy(safe, self.rate) - gammaln(safe + 1) - self.rate, -np.inf))
+        return _sum_rows(np.where(valid, xlogy(safe, self.rate) - gammaln(safe + 1) - self.rate, -np.inf))
 
-    @property
-    def mean(self) -> np.ndarray:
-        return np.asarray(self.rate, np.float64)
-
-    @property
-    def sd(self) -> np.ndarray:
-        return np.sqrt(self.mean)
+    def _moments(self) -> tuple[Any, Any]:
+        return self.rate, np.sqrt(self.rate)
 
     @property
     def centre(self) -> np.ndarray:
@@ -312,28 +278,23 @@ class Poisson(Distribution):
 
 
 @dataclass(frozen=True, eq=False)
-class Bernoulli(Distribution):
+class Bernoulli(_Independent):
     """Booleans, True with probability `p`."""
 
     p: Any
-    discrete: ClassVar[bool] = True
+    discrete = True
 
     def sample(self, rng: np.random.Generator, size: int) -> np.ndarray:
-        return rng.random(_value_shape(size, self.p)) < self.p
+        return rng.random(self.value_shape(size)) < self.p
 
     def log_prob(self, value: Any) -> np.ndarray:
         x = np.asarray(value)
         with np.errstate(divide="ignore"):
             log_p = np.where(x.astype(bool), np.log(self.p), np.log1p(-np.asarray(self.p)))
-        return sum_rows(np.where((x == 0) | (x == 1), log_p, -np.inf))
+        return _sum_rows(np.where((x == 0) | (x == 1), log_p, -np.inf))
 
-    @property
-    def mean(self) -> np.ndarray:
-        return np.asarray(self.p, np.float64)
-
-    @property
-    def sd(self) -> np.ndarray:
-        return np.sqrt(self.mean * (1 - self.mean))
+    def _moments(self) -> tuple[Any, Any]:
+        return self.p, np.sqrt(np.asarray(self.p) * (1 - np.asarray(self.p)))
 
     @property
     def centre(self) -> np.ndarray:
@@ -351,7 +312,7 @@ class Categorical(Distribution):
     """
 
     probs: Any
-    discrete: ClassVar[bool] = True
+    discrete = True
 
     def __post_init__(self) -> None:
         p = np.asarray(self.probs, dtype=np.float64)
@@ -363,16 +324,18 @@ class Categorical(Distribution):
             )
         object.__setattr__(self, "probs", p / total)
 
+    @cached_property
+    def _shape(self) -> tuple[int, ...]:
+        return self.probs.shape[:-1]
+
     def sample(self, rng: np.random.Generator, size: int) -> np.ndarray:
         """Draw; a category of probability zero is never drawn."""
-        u = rng.random(size)
+        u = rng.random(self.value_shape(size))
         cumulative = np.cumsum(self.probs, axis=-1)
         if self.probs.ndim == 1:
             index = np.searchsorted(cumulative, u * cumulative[-1], side="right")
             last = np.flatnonzero(self.probs)[-1]
             return np.minimum(index, last)
-        if len(self.probs) not in (1, size):
-            raise InputError(f"{len(self.probs)} rows of probabilities do not fit {size} particles")
         index = (cumulative <= (u * cumulative[:, -1])[:, None]).sum(axis=1)
         last = self.probs.shape[1] - 1 - np.argmax(self.probs[:, ::-1] > 0, axis=1)
         return np.minimum(index, last)
@@ -385,7 +348,7 @@ class Categorical(Distribution):
         if self.probs.ndim == 1:
             picked = log_p[index]
         else:
-            picked = log_p[np.arange(len(log_p)) if len(log_p) > 1 or index.ndim == 0 else 0, index]
+            picked = log_p[0 if len(log_p) == 1 and index.ndim else np.arange(len(log_p)), index]
         return np.where(index == k, picked, -np.inf)
 
     @property
@@ -400,3 +363,137 @@ class Categorical(Distribution):
     @property
     def centre(self) -> np.ndarray:
         return np.argmax(self.probs, axis=-1)
+
+
+def as_distribution(value: Any) -> Distribution:
+    """Convert a distribution of this package, of scipy.stats (frozen or new style) or of torch.
+
+    Raises
+    ------
+    InputError
+        If `value` is not a distribution.
+    """
+    if isinstance(value, Distribution):
+        return value
+    module = type(value).__module__
+    if module.startswith("scipy.stats"):
+        return FromScipy(value)
+    if module.startswith("torch.distributions"):
+        ours, parameter = _OURS_FOR_TORCH.get(type(value).__name__, (FromTorch, None))
+        return ours(value if parameter is None else getattr(value, parameter).detach().numpy())
+    raise InputError(
+        f"expected a distribution, found a {type(value).__module__}.{type(value).__qualname__}",
+        "use one of mstfilter.smc, a frozen one of scipy.stats, or one of torch.distributions",
+        "or subclass mstfilter.smc.Distribution",
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class FromScipy(Distribution):
+    """A frozen distribution of scipy.stats, uni- or multivariate, or one of its new style (``stats.Normal``).
+
+    Parameters
+    ----------
+    wrapped : object
+        The distribution; array parameters have one row per particle.
+    """
+
+    wrapped: Any
+
+    def __post_init__(self) -> None:
+        kind = type(self.wrapped)
+        discrete = any("discrete" in base.__name__.lower() for base in kind.__mro__)
+        object.__setattr__(self, "discrete", discrete or not hasattr(kind, "logpdf"))
+        object.__setattr__(self, "_vector", kind.__module__.endswith("_multivariate"))
+
+    @cached_property
+    def _shape(self) -> tuple[int, ...]:
+        wrapped = self.wrapped
+        if self.__dict__["_vector"]:
+            return (1, *np.shape(self.mean))
+        if hasattr(wrapped, "args"):  # the mean would be slow
+            return _broadcast_shape(*wrapped.args, *wrapped.kwds.values())
+        return np.shape(wrapped.mean())
+
+    def sample(self, rng: np.random.Generator, size: int) -> np.ndarray:
+        wrapped, shape = self.wrapped, self.value_shape(size)
+        if self.__dict__["_vector"]:
+            return np.reshape(wrapped.rvs(size=size, random_state=rng), shape)
+        if hasattr(wrapped, "rvs"):
+            return np.asarray(wrapped.rvs(size=shape, random_state=rng))
+        rows = self.batch_shape not in ((), (1,))  # the new style adds a shape to that of the parameters
+        return np.reshape(wrapped.sample(() if rows else (size,), rng=rng), shape)
+
+    def log_prob(self, value: Any) -> np.ndarray:
+        if "dirichlet_frozen" in type(self.wrapped).__name__ and np.ndim(value) == 2:
+            value = np.transpose(value)  # one column per particle
+        log_prob = self.wrapped.logpmf(value) if self.discrete else self.wrapped.logpdf(value)
+        return np.asarray(log_prob) if self.__dict__["_vector"] else _sum_rows(log_prob)
+
+    @property
+    def mean(self) -> np.ndarray:
+        mean = self.wrapped.mean
+        return np.asarray(mean() if callable(mean) else mean)
+
+    @property
+    def sd(self) -> np.ndarray:
+        wrapped = self.wrapped
+        if self.__dict__["_vector"]:
+            return np.sqrt(np.diagonal(wrapped.cov))
+        return np.asarray(wrapped.std() if hasattr(wrapped, "std") else wrapped.standard_deviation())
+
+    @property
+    def centre(self) -> np.ndarray:
+        """Mean, or the median of a discrete number."""
+        return self.mean if self.__dict__["_vector"] or not self.discrete else np.asarray(self.wrapped.median())
+
+
+_OURS_FOR_TORCH: dict[str, tuple[Any, str | None]] = {
+    "Categorical": (Categorical, "probs"),
+    "Bernoulli": (Bernoulli, "probs"),
+    "Poisson": (Poisson, "rate"),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class FromTorch(Distribution):
+    """A continuous distribution of torch, drawn as ``icdf(u)`` in double precision.
+
+    Parameters
+    ----------
+    wrapped : torch.distributions.Distribution
+        Parameters have one row per particle, or no rows.
+    """
+
+    wrapped: Any
+
+    @cached_property
+    def _shape(self) -> tuple[int, ...]:
+        return (*(self.wrapped.batch_shape or (self.wrapped.event_shape and (1,))), *self.wrapped.event_shape)
+
+    def sample(self, rng: np.random.Generator, size: int) -> np.ndarray:
+        import torch
+
+        u = rng.random(self.value_shape(size))
+        np.clip(u, 2.0**-54, None, out=u)  # 0 would be -inf
+        try:
+            return self.wrapped.icdf(torch.from_numpy(u)).numpy()
+        except NotImplementedError:
+            raise InputError(
+                f"torch's {type(self.wrapped).__name__} has no icdf, so it cannot be drawn reproducibly",
+                "use the one of mstfilter.smc or of scipy.stats",
+            ) from None
+
+    def log_prob(self, value: Any) -> np.ndarray:
+        import torch
+
+        found = self.wrapped.log_prob(torch.tensor(np.asarray(value)))
+        return _sum_rows(found.detach().numpy().astype(np.float64))
+
+    @property
+    def mean(self) -> np.ndarray:
+        return np.asarray(self.wrapped.mean)
+
+    @property
+    def sd(self) -> np.ndarray:
+        return np.asarray(self.wrapped.stddev)

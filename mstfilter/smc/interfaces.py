@@ -21,7 +21,7 @@ to the log weights (`mstfilter.smc.GuidedTransition` does so for any model with 
 Every filter needs a `Proposal` for its first particles, a `Resampler` and a `Trigger`; most have a `Transition` and
 an `Update`. Optional are `Size` (number of particles), `Lookahead` (auxiliary filter), `Rejuvenation`
 (resample-move) and `Codec` (checkpoints of your own particle type). An interface for an additional ability extends
-another one: `DensityTransition`, `WeightResampler`.
+another one: `DensityTransition`, `WeightResampler`. Models and programs are made of `Distribution`.
 """
 
 from __future__ import annotations
@@ -29,10 +29,12 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
+from mstfilter.errors import InputError
 from mstfilter.smc.population import Population
 from mstfilter.smc.streams import Key
 
@@ -218,6 +220,66 @@ class Rejuvenation(Component):
             As many particles in the same order, moved by a kernel that leaves p(x_t | x_{t-1}, y_t) invariant; log
             weights unchanged.
         """
+
+
+class Distribution(ABC):
+    """A distribution over the values of particles.
+
+    Attributes
+    ----------
+    discrete : bool
+        Whether the values are integers: a lookahead then uses the mode, a move draws new values.
+    """
+
+    discrete = False
+
+    @cached_property
+    def _shape(self) -> tuple[int, ...]:
+        """(n, *event_shape), (1, *event_shape), or () for a number that all particles share."""
+        return np.shape(self.mean)
+
+    @property
+    def batch_shape(self) -> tuple[int, ...]:
+        """(n,) if the parameters have one row per particle; () or (1,) if all particles share them."""
+        return self._shape[:1]
+
+    @property
+    def event_shape(self) -> tuple[int, ...]:
+        """Shape of the value of one particle. Default: that of `mean` without its first axis."""
+        return self._shape[1:]
+
+    def value_shape(self, size: int) -> tuple[int, ...]:
+        """Shape ``(size, *event_shape)`` of the values of `size` particles; InputError if the rows do not fit."""
+        batch, event = self.batch_shape, self.event_shape
+        if batch not in ((), (1,), (size,)):
+            raise InputError(
+                f"parameters of shape {(*batch, *event)} do not fit {size} particles",
+                f"give one row per particle, ({size}, ...), or write a vector shared by all as (1, d)",
+            )
+        return (size, *event)
+
+    @abstractmethod
+    def sample(self, rng: np.random.Generator, size: int) -> np.ndarray:
+        """Values (size, *event_shape) of `size` particles."""
+
+    @abstractmethod
+    def log_prob(self, value: Any) -> np.ndarray:
+        """(n,) log density or probability of each row; -inf outside the support."""
+
+    @property
+    @abstractmethod
+    def mean(self) -> np.ndarray:
+        """Expected value, of shape ``(*batch_shape, *event_shape)``."""
+
+    @property
+    @abstractmethod
+    def sd(self) -> np.ndarray:
+        """Standard deviation of each entry, of the shape of the mean."""
+
+    @property
+    def centre(self) -> np.ndarray:
+        """The mean, or the mode of a discrete distribution; a lookahead uses it instead of a draw."""
+        return self.mean
 
 
 class Codec(ABC):

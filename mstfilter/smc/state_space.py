@@ -23,8 +23,8 @@ from typing import Any
 import numpy as np
 
 from mstfilter.errors import InputError, check_component, check_integer
-from mstfilter.smc.adapters import as_distribution
 from mstfilter.smc.components import Reweight
+from mstfilter.smc.distributions import as_distribution
 from mstfilter.smc.filter import ParticleFilter
 from mstfilter.smc.interfaces import DensityTransition, Lookahead, Proposal, Rejuvenation, Resampler, Trigger
 from mstfilter.smc.population import Particles, Population, count_particles

@@ -100,6 +100,50 @@ def test_rows():
         Categorical([0.0, 0.0])
 
 
+@pytest.mark.parametrize(
+    ("distribution", "batch", "event"),
+    [
+        (Normal(0.0, 1.0), (), ()),
+        (Normal(np.zeros(5), 1.0), (5,), ()),
+        (Normal(np.zeros((1, 3)), np.ones(3)), (1,), (3,)),
+        (Gamma(np.ones((5, 1)), np.ones((5, 2))), (5,), (2,)),
+        (Uniform(np.zeros((5, 2, 2)), 1.0), (5,), (2, 2)),
+        (Categorical([0.5, 0.5]), (), ()),
+        (Categorical(np.ones((5, 3))), (5,), ()),
+        (MultivariateNormal([0.0, 0.0], COV), (1,), (2,)),
+        (MultivariateNormal(0.0, COV), (1,), (2,)),
+        (MultivariateNormal(np.zeros((5, 2)), COV), (5,), (2,)),
+        (MultivariateNormal([0.0, 0.0], np.tile(COV, (5, 1, 1))), (5,), (2,)),
+        (as_distribution(stats.norm(np.zeros((5, 2)), 1.0)), (5,), (2,)),
+        (as_distribution(stats.Normal(mu=np.zeros(5), sigma=1.0)), (5,), ()),
+        (as_distribution(stats.rv_discrete(values=([0, 1], [0.5, 0.5]))), (), ()),
+        (as_distribution(stats.multivariate_normal([0.0, 1.0], COV)), (1,), (2,)),
+        (as_distribution(stats.multivariate_normal(0.0, 1.0)), (1,), (1,)),
+        (as_distribution(stats.multinomial(4, [0.5, 0.2, 0.3])), (1,), (3,)),
+        (as_distribution(stats.dirichlet([1.0, 2.0])), (1,), (2,)),
+    ],
+    ids=lambda value: type(value).__name__ if not isinstance(value, tuple) else str(value),
+)
+def test_shapes_of_batch_and_event(distribution, batch, event):
+    assert (distribution.batch_shape, distribution.event_shape) == (batch, event)
+    values = distribution.sample(np.random.default_rng(0), 5)
+    assert values.shape == distribution.value_shape(5) == (5, *event)
+    assert distribution.log_prob(values).shape == (5,)
+    for row in (0, 3):  # the log density of a row is that of the same value alone
+        alone = np.broadcast_to(distribution.log_prob(values[row]), 5)
+        np.testing.assert_allclose(distribution.log_prob(values)[row], alone[row])
+    if batch == (5,):
+        with pytest.raises(InputError, match=r"do not fit 4 particles"):
+            distribution.value_shape(4)
+
+
+def test_parameters_that_do_not_fit_together():
+    with pytest.raises(InputError, match=r"shapes \(4, 2\) and \(4,\) do not fit together"):
+        Normal(np.zeros((4, 2)), np.ones(4)).sample(np.random.default_rng(0), 4)
+    with pytest.raises(InputError, match=r"mean of shape \(4,\) does not fit a covariance of shape \(1, 1\)"):
+        MultivariateNormal(np.zeros(4), [[1.0]])
+
+
 def test_log_prob_does_not_write_to_its_argument():
     x = np.linspace(-1, 1, 5)
     kept = x.copy()
@@ -109,19 +153,23 @@ def test_log_prob_does_not_write_to_its_argument():
 
 
 @pytest.mark.parametrize(
-    "frozen",
-    [stats.norm(1.0, 2.0), stats.poisson(3.0), stats.Normal(mu=1.0, sigma=2.0)],
-    ids=["old", "discrete", "new"],
+    ("frozen", "log_prob"),
+    [
+        (stats.norm(1.0, 2.0), Normal(1.0, 2.0).log_prob),
+        (stats.poisson(3.0), Poisson(3.0).log_prob),
+        (stats.Normal(mu=1.0, sigma=2.0), Normal(1.0, 2.0).log_prob),
+        (stats.Binomial(n=5, p=0.4), stats.binom(5, 0.4).logpmf),
+    ],
+    ids=["old", "discrete", "new", "new discrete"],
 )
-def test_scipy_distributions(frozen):
+def test_scipy_distributions(frozen, log_prob):
     d = as_distribution(frozen)
     a, b = (d.sample(np.random.default_rng(3), 3000) for _ in range(2))
     np.testing.assert_array_equal(a, b)
     assert a.shape == (3000,)
     mean, sd = float(d.mean), float(d.sd)
     assert abs(a.mean() - mean) < 5 * sd / np.sqrt(3000)
-    expected = Poisson(3.0) if d.discrete else Normal(1.0, 2.0)
-    np.testing.assert_allclose(d.log_prob(a[:20]), expected.log_prob(a[:20]))
+    np.testing.assert_allclose(d.log_prob(a[:20]), log_prob(a[:20]))
 
 
 def test_scipy_rows_and_vectors():

@@ -15,8 +15,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mstfilter.errors import InputError
-from mstfilter.smc.adapters import as_distribution
-from mstfilter.smc.distributions import Categorical, Distribution
+from mstfilter.smc.distributions import Categorical, as_distribution
+from mstfilter.smc.interfaces import Distribution
 from mstfilter.smc.population import take
 from mstfilter.smc.streams import child
 
