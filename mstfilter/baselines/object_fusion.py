@@ -12,7 +12,7 @@ Dynamic SLAM") within the interfaces of this package, not of their program. At e
 4. masks without a match that do not show known objects become new objects, with the usual completion.
 
 There is one hypothesis: wrong masks are never revised, and two objects are never merged. Between pauses the map is
-stored as voxels, like every hypothesis; a volume starts with the signed distance of its voxels at `prior_weight`.
+stored as voxels, like every hypothesis; a volume starts with the signed distance of its voxels.
 
 >>> volume = ObjectVolume.of(hypothesis.mask(3), grid, truncation=0.03, weight=2.0)
 >>> volume = volume.integrate(frame, grid, np.eye(4), mine, others)
@@ -28,12 +28,28 @@ import cv2
 import numpy as np
 from scipy.ndimage import distance_transform_edt
 
-from mstfilter.errors import InputError
 from mstfilter.fusion import FreeSpace, Projection
 from mstfilter.scene import Camera, Clip, Frame, Hypothesis, ObjectRecord, VoxelGrid, depth_sigma, project
 from mstfilter.scoring import overlap
 from mstfilter.smc import Population, Update, union
 from mstfilter.tracking import DenseFlow, Segment, Track, move_points, refine_motion, segments_of
+
+#: Truncation of the signed distances in metres. Two voxels are better than three by .01 to .02 of quality on tuning
+#: scenes.
+_TRUNCATION = 0.02
+#: Weight of the map before the clip, in images.
+_PRIOR_WEIGHT = 2.0
+#: Least intersection over union, in pixels, of a mask and the rendered object that it shows.
+_MATCH_IOU = 0.3
+#: A mask without a match is a new object if less than this share of it shows known objects.
+_NEW_SHARE = 0.5
+#: Smallest mask of a new object, in pixels of a 640 x 480 image; scales with the area of the image.
+_MIN_PIXELS = 60
+#: Least share of an object's visible points that lie on the measured surface (3 sigma + 5 mm) in an image between
+#: pauses that is integrated. The first image that fails ends the integration of a moving object.
+_MIN_AGREEMENT = 0.6
+#: Objects with fewer voxels are removed.
+_MIN_VOXELS = 8
 
 
 class _Match(NamedTuple):
@@ -51,44 +67,12 @@ class ObjectFusion(Update):
     ----------
     free_space : Projection
         Clears the tracked map first.
-    truncation : float
-        Truncation of the signed distances in metres. Two voxels are better than three by .01 to .02 of quality on
-        tuning scenes.
-    prior_weight : float
-        Weight of the map before the clip, in images.
-    match_iou : float
-        Least intersection over union, in pixels, of a mask and the rendered object that it shows.
-    new_share : float
-        A mask without a match is a new object if less than this share of it shows known objects.
-    min_pixels : int
-        Smallest mask of a new object, in pixels of a 640 x 480 image; scales with the area of the image.
-    min_agreement : float
-        Least share of an object's visible points that lie on the measured surface (3 sigma + 5 mm) in an image
-        between pauses that is integrated. The first image that fails ends the integration of a moving object.
-    min_voxels : int
-        Objects with fewer voxels are removed.
-    between : bool
-        Whether the images between the pauses are integrated.
     """
 
     free_space: Projection = field(default_factory=FreeSpace)
-    truncation: float = 0.02
-    prior_weight: float = 2.0
-    match_iou: float = 0.3
-    new_share: float = 0.5
-    min_pixels: int = 60
-    min_agreement: float = 0.6
-    min_voxels: int = 8
-    between: bool = True
 
     properly_weighted: ClassVar[bool] = False
     draws: ClassVar[bool] = False
-
-    def __post_init__(self) -> None:
-        if not self.truncation > 0 or not self.prior_weight > 0:
-            raise InputError(
-                f"object fusion has truncation {self.truncation} m and prior_weight {self.prior_weight}, expected > 0"
-            )
 
     def update(
         self,
@@ -115,9 +99,9 @@ class ObjectFusion(Update):
         moved = {r.label for r in old.objects if not np.array_equal(r.motion.as_matrix(), np.eye(4))}
         old = self.free_space.refine((old,), clip)[0][0]
         match = self._match(old, sample, frame)
-        volumes = {r.label: self._begin(old, r.label) for r in old.objects}
+        volumes = {r.label: ObjectVolume.of(old.mask(r.label), grid, _TRUNCATION, _PRIOR_WEIGHT) for r in old.objects}
         taken = 0
-        if self.between and len(clip) > 2 and old.objects:
+        if len(clip) > 2 and old.objects:
             volumes, taken = self._integrate_between(volumes, old, moved, clip)
         everything = np.zeros(frame.depth.shape, np.int32)
         for label, mask in match.masks.items():
@@ -129,14 +113,11 @@ class ObjectFusion(Update):
         for k in match.new:
             assert sample is not None
             label = max(volumes, default=0) + 1
-            volumes[label] = ObjectVolume.of(sample.mask(k), grid, self.truncation, 1.0)
+            volumes[label] = ObjectVolume.of(sample.mask(k), grid, _TRUNCATION, 1.0)
             records[label] = ObjectRecord.born(k, clip.index, sample.record(k).completion_key)
         fused = self._assemble(volumes, records, grid)
         note = {"matched": len(match.masks) - len(match.new), "new": len(match.new), "images": taken}
         return fused, note | {"forgotten": known + len(match.new) - fused.n_objects}
-
-    def _begin(self, old: Hypothesis, label: int) -> ObjectVolume:
-        return ObjectVolume.of(old.mask(label), old.grid, self.truncation, self.prior_weight)
 
     def _match(self, old: Hypothesis, sample: Hypothesis | None, frame: Frame) -> _Match:
         """Match masks with objects of the map. New objects get the next labels."""
@@ -148,18 +129,18 @@ class ObjectFusion(Update):
         iou = np.where((table.labels_a > 0)[:, None] & (table.labels_b > 0)[None, :], table.jaccard(), 0.0)
         masks: dict[int, np.ndarray] = {}
         left = {int(k) for k in table.labels_a if k > 0}
-        while iou.size and iou.max() >= self.match_iou:  # best pairs first, one to one
+        while iou.size and iou.max() >= _MATCH_IOU:  # best pairs first, one to one
             a, b = np.unravel_index(int(iou.argmax()), iou.shape)
             masks[int(table.labels_b[b])] = seen == table.labels_a[a]
             left.discard(int(table.labels_a[a]))
             iou[a], iou[:, b] = 0, 0
         new, free = [], max((r.label for r in old.objects), default=0)
-        smallest = max(1.0, self.min_pixels * frame.depth.size / 307200)
+        smallest = max(1.0, _MIN_PIXELS * frame.depth.size / 307200)
         for k in sorted(left):
             row = int(np.searchsorted(table.labels_a, k))
             size = int(table.sizes_a[row])
             known = int(table.counts[row][table.labels_b > 0].sum())
-            if size >= smallest and known < self.new_share * size:
+            if size >= smallest and known < _NEW_SHARE * size:
                 new.append(k)
                 masks[free + len(new)] = seen == k
         return _Match(masks, new)
@@ -204,7 +185,7 @@ class ObjectFusion(Update):
         if visible.sum() < max(12, 0.3 * len(points)):
             return False
         near = np.abs(behind[visible]) <= 0.005 + 3 * depth_sigma(z[known][visible])
-        return bool(near.mean() >= self.min_agreement)
+        return bool(near.mean() >= _MIN_AGREEMENT)
 
     def _assemble(
         self, volumes: dict[int, ObjectVolume], records: dict[int, ObjectRecord], grid: VoxelGrid
@@ -214,7 +195,7 @@ class ObjectFusion(Update):
         share, depth = np.zeros(grid.shape), np.zeros(grid.shape)
         for label, volume in volumes.items():
             inside = volume.occupied
-            if inside.sum() < self.min_voxels:
+            if inside.sum() < _MIN_VOXELS:
                 continue
             mine = volume.own / np.maximum(volume.own + volume.other, 1e-9)
             box = volume.box

@@ -7,7 +7,7 @@ named ``true_...`` use them in place of an estimate, which shows how much each s
 >>> filter = bind_truth(filter, recording)                  # a clip holds no truth; the recording does
 >>> state, infos = filter.run(recording.clips(), seed=0)
 
-`STAGES` lists the overrides by stage, `budget_arms` the arms of an error budget.
+`STAGES` lists the overrides by stage.
 """
 
 from mstfilter.lazy import attach

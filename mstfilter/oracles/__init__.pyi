@@ -10,7 +10,6 @@ from mstfilter.oracles.stages import (
     TrueFusion as TrueFusion,
     TrueMotions as TrueMotions,
     TrueQuality as TrueQuality,
-    budget_arms as budget_arms,
     overrides_of as overrides_of,
 )
 from mstfilter.oracles.truth import UsesTruth as UsesTruth, bind_truth as bind_truth, uses_truth as uses_truth

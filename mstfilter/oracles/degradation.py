@@ -16,7 +16,7 @@ same generator makes similar errors in similar images, and errors can persist wh
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cache
+from functools import cache, partial
 
 import numpy as np
 
@@ -24,6 +24,7 @@ from mstfilter.scoring import weighted_coverage
 from mstfilter.smc import child
 
 _TRIES = 30
+_TOLERANCE = 0.01  # distance from the quality at which the search ends
 _REACH = 120.0  # largest displacement in pixels of a 640 px wide image
 _SMOOTH = 15.0  # of the displacement, pixels of a 640 px wide image
 
@@ -36,7 +37,6 @@ def degrade(
     quality: float,
     over: float = 0.35,
     under: float = 0.35,
-    tolerance: float = 0.01,
 ) -> np.ndarray:
     """Degrade a label image.
 
@@ -50,8 +50,6 @@ def degrade(
         Weighted coverage (form ``objects``) of the result against `labels`.
     over, under : float
         Shares of the loss due to splits and merges.
-    tolerance : float
-        Distance from `quality` at which the search ends.
 
     Returns
     -------
@@ -65,29 +63,30 @@ def degrade(
     margin = 8
     box = tuple(slice(max(int(k.min()) - margin, 0), int(k.max()) + margin + 1) for k in inside)
     true = labels[box]
-    worse, names = _split(rng, true, 1 - over * (1 - quality), tolerance)
-    worse = _merge(rng, true, worse, names, 1 - (over + under) * (1 - quality), tolerance)
-    if over + under < 1 or weighted_coverage(worse, true) > quality + tolerance:
-        worse = _displace(rng, true, worse, quality, tolerance, labels.shape, box)
+    worse, names = _split(rng, true, 1 - over * (1 - quality))
+    worse = _merge(rng, true, worse, names, 1 - (over + under) * (1 - quality))
+    if over + under < 1 or weighted_coverage(worse, true) > quality + _TOLERANCE:
+        worse = _displace(rng, true, worse, quality, labels.shape, box)
     out = np.zeros_like(labels)
     out[box] = worse
     return out
 
 
-def _split(rng: np.random.Generator, true: np.ndarray, target: float, tol: float) -> tuple[np.ndarray, _Names]:
+def _split(rng: np.random.Generator, true: np.ndarray, target: float) -> tuple[np.ndarray, _Names]:
     """Cut objects in two until the quality is `target`; the last cut is as small as needed.
 
     Returns the labels and the name of each: the true object, then the side of each cut.
     """
 
     def draw(name: tuple[int, ...]) -> np.ndarray:
+        """For choosing an object, and for the angle of its cut."""
         return child(rng, "split", *name).random(2)
 
     labels = true
     names: _Names = {int(k): (int(k),) for k in np.unique(true) if k > 0}
     draws = {k: draw(name) for k, name in names.items()}
     for _ in range(_TRIES):
-        if weighted_coverage(labels, true) <= target + tol / 2:
+        if weighted_coverage(labels, true) <= target + _TOLERANCE / 2:
             break
         sizes = np.bincount(labels.ravel())
         # Exponential race: the piece with least -log(1 - u) / size, so a piece is chosen in proportion to its size.
@@ -98,23 +97,10 @@ def _split(rng: np.random.Generator, true: np.ndarray, target: float, tol: float
         rank = np.argsort(np.argsort(along, kind="stable"), kind="stable") / max(len(along), 1)
         fresh = max(names) + 1
 
-        def cut(
-            share: float,
-            at: tuple[np.ndarray, ...] = where,
-            rank: np.ndarray = rank,
-            old: np.ndarray = labels,
-            fresh: int = fresh,
-        ) -> np.ndarray:
-            new = old.copy()
-            new[at[0][rank < share], at[1][rank < share]] = fresh
-            return new
-
-        def left(share: float, cut: Callable[[float], np.ndarray] = cut) -> float:
-            return weighted_coverage(cut(share), true)
-
+        cut = partial(_cut, labels, where, rank, fresh)
         share = 0.5
-        if left(share) < target - tol / 2:
-            share = _bisect(left, 0.0, 0.5, target, tol / 2)
+        if weighted_coverage(cut(share), true) < target - _TOLERANCE / 2:
+            share = _bisect(cut, true, 0.0, 0.5, target)
         labels = cut(share)
         if (labels == fresh).any():
             names[fresh], names[chosen] = (*names[chosen], 1), (*names[chosen], 0)
@@ -124,8 +110,15 @@ def _split(rng: np.random.Generator, true: np.ndarray, target: float, tol: float
     return labels, names
 
 
+def _cut(labels: np.ndarray, where: tuple[np.ndarray, ...], rank: np.ndarray, fresh: int, share: float) -> np.ndarray:
+    """Give the label `fresh` to the pixels `where` whose rank, 0 to 1, is below `share`."""
+    new = labels.copy()
+    new[where[0][rank < share], where[1][rank < share]] = fresh
+    return new
+
+
 def _merge(
-    rng: np.random.Generator, true: np.ndarray, labels: np.ndarray, names: _Names, target: float, tol: float
+    rng: np.random.Generator, true: np.ndarray, labels: np.ndarray, names: _Names, target: float
 ) -> np.ndarray:
     """Join touching objects while the quality stays at `target` or above."""
 
@@ -138,7 +131,7 @@ def _merge(
     refused: set[tuple[int, int]] = set()
     roots = {k: {name[0]} for k, name in names.items()}
     for _ in range(_TRIES):
-        if weighted_coverage(labels, true) <= target + tol / 2:
+        if weighted_coverage(labels, true) <= target + _TOLERANCE / 2:
             break
         # Merging two pieces of one object would undo a split.
         pairs = {(a, b) for a, b in _touching(labels) - refused if not roots[a] & roots[b]}
@@ -146,7 +139,7 @@ def _merge(
             break
         a, b = min(pairs, key=lambda pair: (turn(pair), pair))
         new = np.where(labels == b, a, labels)
-        if weighted_coverage(new, true) < target - tol / 2:
+        if weighted_coverage(new, true) < target - _TOLERANCE / 2:
             refused.add((a, b))
         else:
             labels = new
@@ -170,7 +163,6 @@ def _displace(
     true: np.ndarray,
     labels: np.ndarray,
     target: float,
-    tol: float,
     image: tuple[int, ...],
     box: tuple[slice, ...],
 ) -> np.ndarray:
@@ -189,18 +181,20 @@ def _displace(
         c = np.clip(np.rint(columns + reach * field[1]), 0, true.shape[1] - 1).astype(int)
         return np.where(seen, labels[r, c], 0)  # only these pixels can belong to an object
 
-    return moved(_bisect(lambda reach: weighted_coverage(moved(reach), true), 0.0, _REACH * resize, target, tol / 2))
+    return moved(_bisect(moved, true, 0.0, _REACH * resize, target))
 
 
-def _bisect(quality: Callable[[float], float], low: float, high: float, target: float, tol: float) -> float:
-    """The argument at which a decreasing quality reaches the target: the closest one of all that were tried."""
+def _bisect(
+    degraded: Callable[[float], np.ndarray], true: np.ndarray, low: float, high: float, target: float
+) -> float:
+    """The argument at which the decreasing quality of `degraded` is closest to the target, of all that were tried."""
     best, closest = low, np.inf
     for k in range(24):
         at = high if k == 0 else (low + high) / 2
-        value = quality(at)
+        value = weighted_coverage(degraded(at), true)
         if abs(value - target) < closest:
             best, closest = at, abs(value - target)
-        if closest <= tol:
+        if closest <= _TOLERANCE / 2:
             break
         if k == 0:
             if value > target:

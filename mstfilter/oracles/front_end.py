@@ -28,6 +28,8 @@ from mstfilter.scoring import MIN_PIXELS, weighted_coverage
 from mstfilter.segmentation import BoundaryModel, ColourDepthBoundary, ObjectRule, hypothesis_of
 from mstfilter.smc import Key, Population, Proposal, child
 
+_REACH = 4.0  # distance to a true border up to which strength is kept, in pixels of an image of 640 px width
+
 
 @dataclass(frozen=True)
 class TrueMasks(UsesTruth, Proposal):
@@ -45,10 +47,6 @@ class TrueMasks(UsesTruth, Proposal):
     over, under : float
         Shares of the lost quality that come from splitting and from merging objects; their sum is at most 1. The
         rest comes from displaced borders, as does any loss that splitting and merging could not reach.
-    tolerance : float
-        Largest deviation from `quality`.
-    min_pixels : float
-        Objects with fewer pixels are ignored; for a 640 x 480 image, scaled with the area of the image.
     objects : ObjectRule
         Which pixels can belong to an object (only its `object_pixels` is used).
     threshold : float
@@ -60,8 +58,6 @@ class TrueMasks(UsesTruth, Proposal):
     errors: Literal["independent", "lasting"] = "independent"
     over: float = 0.35
     under: float = 0.35
-    tolerance: float = 0.01
-    min_pixels: float = MIN_PIXELS
     objects: ObjectRule = field(default_factory=ObjectRule)
     threshold: float = 0.5
 
@@ -75,14 +71,12 @@ class TrueMasks(UsesTruth, Proposal):
             raise InputError(f"errors of masks are {self.errors!r}", "there are: independent, lasting")
         if min(self.over, self.under) < 0 or self.over + self.under > 1:
             raise InputError(f"over is {self.over} and under {self.under}, expected shares that sum to at most 1")
-        if not self.tolerance > 0:
-            raise InputError(f"tolerance of masks is {self.tolerance}, expected > 0")
 
     def masks(self, frame: Frame, clip: Clip) -> np.ndarray:
-        """(H, W) int32 true objects of the clip's last frame where they are seen, 0 elsewhere."""
+        """(H, W) int32 true objects of the clip's last frame with enough pixels, 0 elsewhere."""
         image = self.truth.instance(clip.index)
         counts = np.bincount(image.ravel())
-        enough = counts >= max(1.0, self.min_pixels * image.size / 307200)
+        enough = counts >= max(1.0, MIN_PIXELS * image.size / 307200)
         enough[0] = False
         return np.where(enough[image] & self.objects.object_pixels(frame, clip.grid), image, 0).astype(np.int32)
 
@@ -98,7 +92,7 @@ class TrueMasks(UsesTruth, Proposal):
                 particles.append(particles[0])
                 reached.append(reached[0])
                 continue
-            masks = degrade(self._errors(rng, i), true, self.quality, self.over, self.under, self.tolerance)
+            masks = degrade(self._errors(rng, i), true, self.quality, self.over, self.under)
             reached.append(round(weighted_coverage(masks, true), 4))
             numbers = [int(k) for k in np.unique(masks) if k > 0]
             completed = [
@@ -128,13 +122,10 @@ class TrueBoundary(UsesTruth, BoundaryModel):
         tree; .868, .998, .901 for `UcmTree`.
     measured : BoundaryModel
         Model of the measured strength.
-    reach : float
-        Distance to a true border up to which strength is kept, in pixels of an image of 640 px width.
     """
 
     form: Literal["crisp", "cleaned"] = "crisp"
     measured: BoundaryModel = field(default_factory=ColourDepthBoundary)
-    reach: float = 4.0
 
     needs: ClassVar[tuple[Need, ...]] = ("voxels", "instance")
 
@@ -155,7 +146,7 @@ class TrueBoundary(UsesTruth, BoundaryModel):
             return edge
         import cv2
 
-        size = 2 * max(1, round(self.reach * frame.camera.width / 640)) + 1
+        size = 2 * max(1, round(_REACH * frame.camera.width / 640)) + 1
         near = cv2.dilate(edge, np.ones((size, size), np.uint8)) > 0
         return np.where(near, self.measured.boundary(frame), 0).astype(np.float32)
 
@@ -175,7 +166,7 @@ class TrueCompletion(UsesTruth, Completer):
     needs: ClassVar[tuple[Need, ...]] = ("voxels", "instance")
 
     def fill(self, rng: np.random.Generator, seen: ObservedBox) -> np.ndarray:
-        """1 on the visible surface: what is left to do where the mask shows no true object."""
+        """1 on the visible surface, for masks that show no true object."""
         return seen.own.astype(np.float32)
 
     def complete(

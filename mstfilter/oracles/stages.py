@@ -1,4 +1,4 @@
-"""Tracking, free space, fusion and selection replaced by the truth, and the arms of an error budget.
+"""Tracking, free space, fusion and selection replaced by the truth, and the overrides of all stages.
 
 >>> transition = TrueMotions()                                     # the rigid motion of each object
 >>> FusionUpdate(free_space=TrueFreeSpace())                       # exactly the free space that is visible
@@ -24,9 +24,12 @@ import numpy as np
 from mstfilter.fusion import Evidence, FreeSpace, Projection
 from mstfilter.oracles.truth import Need, UsesTruth
 from mstfilter.scene import Clip, Frame, Hypothesis, ObjectRecord, frame_geometry, render
-from mstfilter.scoring import Form, overlap, weighted_coverage
+from mstfilter.scoring import overlap, weighted_coverage
 from mstfilter.smc import Candidates, Population, Transition, Update, union
 from mstfilter.tracking import Warp, move_points, rigid_transform
+
+_REST = 0.0005  # metres; objects that move less are not moved, since simulated objects settle a little
+_NATS = 1e4  # log score of a true quality of 1
 
 
 @dataclass(frozen=True)
@@ -40,12 +43,9 @@ class TrueMotions(UsesTruth, Transition):
     ----------
     warp : Warp
         Moves the voxels.
-    rest : float
-        Objects whose voxels all move less than this (metres) are not moved, since simulated objects settle a little.
     """
 
     warp: Warp = field(default_factory=lambda: Warp("smooth"))
-    rest: float = 0.0005
 
     properly_weighted: ClassVar[bool] = False
     needs: ClassVar[tuple[Need, ...]] = ("voxels", "poses")
@@ -75,7 +75,7 @@ class TrueMotions(UsesTruth, Transition):
                 T = motions.get(int(table.labels_b[shared[row].argmax()]), np.eye(4))
                 centres = hypothesis.grid.centre_of(np.argwhere(hypothesis.mask(label)))
                 went = np.linalg.norm(move_points(T, centres) - centres, axis=1).max()
-                fate = "true" if went > self.rest else "rest"
+                fate = "true" if went > _REST else "rest"
                 if fate == "true":
                     chosen[label] = rigid_transform(T)
             counts[fate] += 1
@@ -113,23 +113,11 @@ class TrueFreeSpace(UsesTruth, Projection):
 
 @dataclass(frozen=True)
 class TrueQuality(UsesTruth, Evidence):
-    """Scores hypotheses by their true quality.
-
-    Parameters
-    ----------
-    strength : float
-        Nats for a quality of 1. With the default practically all weight is on the best candidate.
-    form : {"objects", "paper", "authors"}
-        Form of the quality.
-    """
-
-    strength: float = 1e4
-    form: Form = "objects"
+    """Scores hypotheses by their true quality, so strongly that practically all weight is on the best candidate."""
 
     def log_score(self, hypotheses: Sequence[Hypothesis], clip: Clip) -> np.ndarray:
-        """(n,) strength x quality."""
         labels = self.truth.labels(clip.index)
-        return self.strength * np.array([weighted_coverage(h.labels, labels, self.form) for h in hypotheses])
+        return _NATS * np.array([weighted_coverage(h.labels, labels) for h in hypotheses])
 
 
 @dataclass(frozen=True)
@@ -238,19 +226,7 @@ STAGES: dict[str, tuple[str, ...]] = {
     "selection": ('update.evidence=["true_quality"]', "resampler=largest_weights"),
 }
 
-#: Stages to replace for a filter without any estimate: true masks need no boundary, true fusion no choice.
-PERFECT_STAGES: tuple[str, ...] = ("masks", "completion", "motions", "fusion", "free space", "selection")
-
 
 def overrides_of(*stages: str) -> tuple[str, ...]:
     """Overrides of ``mst`` that replace several stages, in an order in which no override undoes another."""
     return tuple(change for stage in STAGES if stage in stages for change in STAGES[stage])
-
-
-def budget_arms() -> dict[str, tuple[str, ...]]:
-    """Arms of the error budget: ``mst``, each stage replaced alone, all stages, all stages but one."""
-    arms: dict[str, tuple[str, ...]] = {"mst": ()}
-    arms |= {f"true {stage}": overrides_of(stage) for stage in STAGES}
-    arms["all true"] = overrides_of(*PERFECT_STAGES)
-    arms |= {f"all but {left}": overrides_of(*(s for s in PERFECT_STAGES if s != left)) for left in PERFECT_STAGES}
-    return arms

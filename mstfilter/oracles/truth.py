@@ -29,7 +29,7 @@ T = TypeVar("T")
 
 
 class RecordingTruth:
-    """The ground truth at the pauses of a recording.
+    """The ground truth at the pauses of a recording; `check` what a component needs first.
 
     Parameters
     ----------
@@ -62,16 +62,14 @@ class RecordingTruth:
     def labels(self, t: int) -> np.ndarray:
         """(X, Y, Z) uint16 true labels at pause `t`."""
         labels = self.recording.truth(t)
-        if labels is None:
-            raise InputError(f"recording {self.recording.name} has no true voxels at pause {t}")
+        assert labels is not None
         return labels
 
     def instance(self, t: int) -> np.ndarray:
         """(H, W) int32 true object of each pixel at pause `t`; 0 if it has no true voxels."""
         if t not in self._instance:
             image = self.recording.instance(self.recording.pauses[t])
-            if image is None:
-                raise InputError(f"recording {self.recording.name} has no instance image at pause {t}")
+            assert image is not None
             if self._objects is None:
                 pauses = range(len(self.recording.pauses))
                 self._objects = np.unique(np.concatenate([np.unique(self.labels(k)) for k in pauses]))
@@ -82,8 +80,7 @@ class RecordingTruth:
         """(4, 4) motion in world metres of each object from pause `t` - 1 to pause `t`, by label."""
         pauses = self.recording.pauses
         before, after = (self.recording.poses(pauses[k]) for k in (t - 1, t))
-        if before is None or after is None:
-            raise InputError(f"recording {self.recording.name} has no true poses at pause {t - (before is None)}")
+        assert before is not None and after is not None
         return {k: after[k] @ np.linalg.inv(before[k]) for k in before.keys() & after.keys()}
 
     def pause_of(self, frame: Frame) -> int:

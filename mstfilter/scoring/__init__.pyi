@@ -10,6 +10,5 @@ from mstfilter.scoring.quality import (
     one_blob as one_blob,
     overlap as overlap,
     quality_of as quality_of,
-    split_truth as split_truth,
     weighted_coverage as weighted_coverage,
 )

@@ -28,7 +28,6 @@ has found occupied space, but not objects.
 
 >>> object_status(recording, 2)  # doctest: +SKIP
 {1: 'visible', 2: 'hidden', 3: 'unseen'}
->>> split_truth(recording, 2)["hidden"]  # doctest: +SKIP
 
 Figures of quality are split by the status of objects: no method can know an object that it never saw, and hidden
 objects show what tracking contributes.
@@ -190,17 +189,6 @@ def object_status(recording: Recording, t: int, min_pixels: float = MIN_PIXELS) 
             break
         seen |= _shown(recording, earlier, min_pixels)
     return {k: "visible" if k in visible else "hidden" if k in seen else "unseen" for k in present}
-
-
-def split_truth(recording: Recording, t: int, min_pixels: float = MIN_PIXELS) -> dict[Status, np.ndarray]:
-    """True labels (X, Y, Z) uint16 at pause `t`, by status of the objects; parameters of `object_status`."""
-    status = object_status(recording, t, min_pixels)
-    labels = recording.truth(t)
-    assert labels is not None
-    return {
-        wanted: np.where(np.isin(labels, [k for k, s in status.items() if s == wanted]), labels, 0).astype(np.uint16)
-        for wanted in STATUSES
-    }
 
 
 def _shown(recording: Recording, t: int, min_pixels: float) -> set[int]:

@@ -120,24 +120,17 @@ def run_contract(
     """
     cls = type(component)
     contract = contract_of(cls)
-    example = example or _function_beside(cls, "example") or (scene_example if _uses_images(cls) else None)
-    exact = exact or _function_beside(cls, "exact")
-    body: dict[str, Any] = {"make": lambda self: component}
-    if example is not None:
-        body["example"] = lambda self, rng, n: example(rng, n)
-    if exact is not None:
-        body["exact"] = lambda self, rng, n: exact(rng, n)
-    plugin = _Plugin(type(f"Test{cls.__name__}", (contract,), body))
+    functions = {
+        "make": lambda: component,
+        "example": example or _function_beside(cls, "example") or (scene_example if _uses_images(cls) else None),
+        "exact": exact or _function_beside(cls, "exact"),
+    }
+    methods = {name: staticmethod(function) for name, function in functions.items() if function is not None}
+    plugin = _Plugin(type(f"Test{cls.__name__}", (contract,), methods))
     with tempfile.TemporaryDirectory() as folder, _quiet_pytest():
         path = Path(folder, "test_component.py")
         path.touch()  # pytest needs a file to collect; the plugin replaces its content
-        options = [
-            "--capture=no",
-            "--assert=plain",
-            "--noconftest",
-            f"--rootdir={folder}",
-            f"-c{os.devnull}",
-        ]
+        options = ["--capture=no", "--assert=plain", "--noconftest", f"--rootdir={folder}", f"-c{os.devnull}"]
         disabled = [f"-pno:{name}" for name in ("cacheprovider", "faulthandler", "terminal", "warnings")]
         status = pytest.main([*options, *disabled, str(path)], plugins=[plugin])
     if status not in (pytest.ExitCode.OK, pytest.ExitCode.TESTS_FAILED):

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from mstfilter.baselines.object_fusion import ObjectFusion, ObjectVolume
-from mstfilter.errors import InputError
 from mstfilter.presets import build_filter, load_config
 from mstfilter.scene import Clip, Frame, Hypothesis, render
 from mstfilter.scoring import weighted_coverage
@@ -161,13 +160,6 @@ def test_images_between_the_pauses_are_taken_in():
     clip = Clip((frame,) * 4, GRID, 1)
     fused = ObjectFusion().update(RNG, predicted, None, clip)
     assert fused.notes["maps"][0]["images"] == 4  # two objects, two frames
-    alone = ObjectFusion(between=False).update(RNG, predicted, None, clip)
-    assert alone.notes["maps"][0]["images"] == 0
-
-
-def test_useless_fields_are_one_clear_error():
-    with pytest.raises(InputError, match="truncation 0"):
-        ObjectFusion(truncation=0.0)
 
 
 class TestObjectFusion(UpdateContract):

@@ -8,11 +8,13 @@ import pytest
 
 from mstfilter import oracles
 from mstfilter.oracles import uses_truth
-from mstfilter.oracles.stages import PERFECT_STAGES, STAGES, budget_arms, overrides_of
+from mstfilter.oracles.stages import STAGES, overrides_of
 from mstfilter.presets import REGISTRY, build_filter, describe_filter, load_config
 from tests.baselines.test_presets import differences
 from tests.conftest import REPOSITORY
 
+#: A filter without any estimate: true masks need no boundary, true fusion no choice.
+PERFECT_STAGES = ("masks", "completion", "motions", "fusion", "free space", "selection")
 MST = describe_filter(build_filter(load_config("mst")))
 
 WHERE = {
@@ -62,9 +64,12 @@ def test_with_all_stages_replaced_nothing_is_estimated():
 
 
 def test_the_experiment_has_all_arms():
-    """If they differ, write the arms of study.toml again from `budget_arms`."""
+    """`mst`, each stage replaced alone, all stages, all stages but one."""
+    arms = {"mst": (), "all true": overrides_of(*PERFECT_STAGES)}
+    arms |= {f"true {stage}": overrides_of(stage) for stage in STAGES}
+    arms |= {f"all but {stage}": overrides_of(*(s for s in PERFECT_STAGES if s != stage)) for stage in PERFECT_STAGES}
     data = tomllib.loads((REPOSITORY / "experiments/error_budget/study.toml").read_text())
-    assert {arm["name"]: tuple(arm.get("set", ())) for arm in data["arms"]} == budget_arms()
+    assert {arm["name"]: tuple(arm.get("set", ())) for arm in data["arms"]} == arms
     assert data["reference"] == "mst"
 
 

@@ -21,6 +21,7 @@ from mstfilter.oracles import (
     TrueQuality,
     UsesTruth,
     bind_truth,
+    front_end,
     uses_truth,
 )
 from mstfilter.oracles.stages import best_of_both
@@ -189,7 +190,7 @@ def test_a_hidden_object_follows_its_true_motion(tmp_path):
 # Masks, boundary, completion
 
 
-def test_true_masks_are_the_instance_image_where_the_sensor_sees(recording):
+def test_true_masks_are_the_instance_image_where_the_sensor_sees(recording, monkeypatch):
     proposal, clip = bound(TrueMasks(), recording), recording.clips()[0]
     masks = proposal.masks(clip.after, clip)
     instance = recording.instance(0)
@@ -200,8 +201,8 @@ def test_true_masks_are_the_instance_image_where_the_sensor_sees(recording):
     assert len({h.key for h in population.particles}) == 1
     assert population.particles[0].n_objects == 2
     assert proposal.masks(clip.after, clip) is not None
-    few = bound(TrueMasks(min_pixels=1e9), recording)
-    assert few.sample(RNG, clip, 1).particles[0].n_objects == 0
+    monkeypatch.setattr(front_end, "MIN_PIXELS", 1e9)
+    assert proposal.sample(RNG, clip, 1).particles[0].n_objects == 0
 
 
 def test_the_robot_is_not_an_object(recording):

@@ -9,7 +9,7 @@ import pytest
 
 from mstfilter.errors import InputError
 from mstfilter.scene import Recording
-from mstfilter.scoring.quality import STATUSES, object_status, split_truth
+from mstfilter.scoring.quality import object_status
 from tests.scene.scenes import CAMERA, GRID, table_scene
 
 SHAPE = (120, 160)  # 1/16 of 640 x 480: 100 pixels there are 6.25 here
@@ -47,10 +47,6 @@ def test_status_of_visible_hidden_and_unseen_objects():
     assert object_status(recording, 1) == {1: "visible", 2: "hidden", 3: "unseen", 4: "unseen"}
     assert object_status(recording, 2) == {1: "hidden", 2: "visible", 3: "unseen", 4: "unseen"}
     assert object_status(recording, 1, min_pixels=96)[2] == "visible"  # 6 of the small image
-    parts = split_truth(recording, 1)
-    assert list(parts) == list(STATUSES)
-    assert np.array_equal(sum(parts.values()), labels)
-    assert set(np.unique(parts["unseen"])) == {0, 3, 4}
 
 
 def test_missing_ground_truth_raises_an_error():
