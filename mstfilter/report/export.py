@@ -180,7 +180,11 @@ def export_run(
     paths: list[Path] = []
     rows: list[dict[str, object]] = []
     for t in range(run.n_pauses):
-        folder, camera, weights = _pause_folder(out, t), run.camera(t), run.info(t)["weights"]
+        folder, camera, weights = Path(out) / f"pause_{t:03d}", run.camera(t), run.info(t)["weights"]
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise InputError(f"cannot write exports to {out}: {error.strerror}", "choose another folder") from error
         for k, hypothesis in enumerate(run.hypotheses(t)):
             colours, volumes = identities.colours(t, k), hypothesis.volumes()
             image = folder / f"hypothesis_{k:03d}.png"
@@ -204,12 +208,3 @@ def export_run(
     columns = ("pause", "hypothesis", "weight", "label", "id", "birth", "voxels", "colour")
     write_csv(Path(out) / "objects.csv", rows, columns)
     return [*paths, Path(out) / "objects.csv"]
-
-
-def _pause_folder(out: str | Path, t: int) -> Path:
-    folder = Path(out) / f"pause_{t:03d}"
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"cannot write exports to {out}: {error.strerror}", "choose another folder") from error
-    return folder

@@ -225,9 +225,11 @@ def genealogy_figure(
         for t, parents in enumerate(previous):
             for k, parent in enumerate(parents or ()):
                 if t and 0 <= parent < len(weights[t - 1]):
-                    own = line.get(t) == k
+                    in_lineage = line.get(t) == k
+                    style: dict[str, Any]
+                    style = {"color": _ACCENT, "lw": 2.2} if in_lineage else {"color": _MUTED, "lw": 1, "alpha": 0.45}
                     x, y = _curve(t - 1, parent, t, k)
-                    axes.plot(x, y, color=_ACCENT if own else _MUTED, lw=2.2 if own else 1, alpha=1 if own else 0.45)
+                    axes.plot(x, y, **style)
         for t, indices in enumerate(proposed):
             for k, index in enumerate(indices or ()):
                 if index >= 0:
@@ -309,8 +311,10 @@ def time_figure(values: Mapping[str, Mapping[str, Mapping[int, Sequence[float]]]
     values = {family: {a: v for a, v in of_arms.items() if a in arms} for family, of_arms in values.items()}
     colours, n = _arm_colours(arms), len(values)
     shown = [arm for arm in arms if any(arm in of_arms for of_arms in values.values())]
+    most_pauses = max(len({t for by_pause in of_arms.values() for t in by_pause}) for of_arms in values.values())
+    most_boxes = most_pauses * len(shown)
     with _style("study over time"):
-        figure, panels = _new_figure(max(6.6, 1.1 + 0.42 * _slots(values, len(shown))), 3.4 * n, n, below=True)
+        figure, panels = _new_figure(max(6.6, 1.1 + 0.42 * most_boxes), 3.4 * n, n, below=True)
         for axes, (family, of_arms) in zip(panels, values.items(), strict=True):
             pauses = sorted({t for by_pause in of_arms.values() for t in by_pause})
             width = 0.84 / max(len(shown), 1)
@@ -341,11 +345,6 @@ def time_figure(values: Mapping[str, Mapping[str, Mapping[int, Sequence[float]]]
             fontsize=8.5,
         )
         return _svg_text(figure, "Quality of the hypotheses over time by family and method")
-
-
-def _slots(values: Mapping[str, Mapping[str, Mapping[int, Sequence[float]]]], n_arms: int) -> int:
-    """Number of boxes in the widest panel."""
-    return max(len({t for by_pause in of_arms.values() for t in by_pause}) for of_arms in values.values()) * n_arms
 
 
 def _boxes(

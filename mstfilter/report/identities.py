@@ -20,14 +20,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from mstfilter.report.pictures import (
-    Colour,
-    colour,
-    data_uri,
-    overlay_layer,
-    png_bytes,
-    voxel_picture,
-)
+from mstfilter.report.pictures import Colour, colour, data_uri, overlay_layer, png_bytes, voxel_picture
 from mstfilter.runs import RunFolder
 from mstfilter.scene import Camera, Hypothesis, project
 from mstfilter.scoring import overlap
@@ -69,8 +62,7 @@ def assign_identities(run: RunFolder) -> Identities:
     assignment = _Assignment()
     for t in range(run.n_pauses):
         info = run.info(t)
-        parents = dict(info.get("parents") or {}).get("previous")
-        assignment.add(t, run.hypotheses(t), info["weights"], parents, run.truth(t))
+        assignment.add(t, run.hypotheses(t), info["weights"], info["parents"].get("previous"), run.truth(t))
     return Identities(assignment.table)
 
 
@@ -122,26 +114,26 @@ class _Assignment:
     ) -> None:
         from scipy.optimize import linear_sum_assignment
 
-        own = list(ids)
-        score = np.zeros((len(own), self._n))
-        if own and self._n:
-            for images, worth in ((self._now, 1.0), (self._before, _EARLIER_SCORE)):
-                overlaps = [_overlaps(labels, image, own, self._n) for image in images]
+        present = list(ids)
+        score = np.zeros((len(present), self._n))
+        if present and self._n:
+            for images, factor in ((self._now, 1.0), (self._before, _EARLIER_SCORE)):
+                overlaps = [_overlaps(labels, image, present, self._n) for image in images]
                 if overlaps:
-                    score += worth * np.max(overlaps, axis=0)
-        for row, label in enumerate(own):
+                    score += factor * np.max(overlaps, axis=0)
+        for row, label in enumerate(present):
             identity = inherited.get(ids[label])
             if identity is not None:
                 score[row, identity] += descent_score
         rows, columns = linear_sum_assignment(-score)
         pairs = zip(rows.tolist(), columns.tolist(), strict=True)
-        found = {own[r]: int(c) for r, c in pairs if score[r, c] >= _LEAST_SCORE}
-        for label in own:
+        found = {present[r]: int(c) for r, c in pairs if score[r, c] >= _LEAST_SCORE}
+        for label in present:
             if label not in found:
                 found[label] = self._n
                 self._n += 1
-        self.table[t, k] = {label: found[label] for label in own}
-        self._ids[t, k] = {ids[label]: found[label] for label in own}
+        self.table[t, k] = {label: found[label] for label in present}
+        self._ids[t, k] = {ids[label]: found[label] for label in present}
         if len(self._now) < _REFERENCES:
             lookup = np.zeros(int(labels.max()) + 1, np.int64)
             for label, identity in found.items():
@@ -149,16 +141,16 @@ class _Assignment:
             self._now.append(lookup[labels])
 
 
-def _overlaps(labels: np.ndarray, image: np.ndarray, own: list[int], n: int) -> np.ndarray:
-    """Jaccard indices (len(own), n) of objects and identities."""
+def _overlaps(labels: np.ndarray, image: np.ndarray, objects: list[int], n: int) -> np.ndarray:
+    """Jaccard indices (len(objects), n) of objects and identities."""
     table = overlap(labels, image)
     jaccard = table.jaccard()
-    out = np.zeros((len(own), n))
-    where = {int(label): row for row, label in enumerate(table.labels_a)}
+    out = np.zeros((len(objects), n))
+    row_of = {int(label): row for row, label in enumerate(table.labels_a)}
     present = table.labels_b > 0
-    for row, label in enumerate(own):
-        if label in where:
-            out[row, table.labels_b[present] - 1] = jaccard[where[label], present]
+    for row, label in enumerate(objects):
+        if label in row_of:
+            out[row, table.labels_b[present] - 1] = jaccard[row_of[label], present]
     return out
 
 
@@ -208,7 +200,7 @@ def cards_of_pause(run: RunFolder, t: int, identities: Identities, view: Camera)
     weight = [sum(info["weights"][k] for k in members) for members in groups.values()]
     order = order_by_weight(weight)
     members = list(groups.values())
-    quality = info.get("quality")
+    quality = info["quality"]
     cards = []
     for g in order[:_MOST_CARDS]:
         k = members[g][0]
@@ -256,7 +248,7 @@ def _place_tags(image: np.ndarray, identity: Mapping[int, int]) -> list[Tag]:
     """Numbers at the widest place of each object that is large enough in the image; larger objects come first."""
     from scipy.ndimage import distance_transform_edt, find_objects
 
-    least, apart = 0.009 * image.shape[1], 0.03 * image.shape[1]
+    min_radius, min_distance = 0.009 * image.shape[1], 0.03 * image.shape[1]
     places = []
     for label, box in enumerate(find_objects(image.astype(np.int32)), 1):
         if box is None or label not in identity:
@@ -266,6 +258,6 @@ def _place_tags(image: np.ndarray, identity: Mapping[int, int]) -> list[Tag]:
         places.append((float(inside[row, column]), label, float(column + box[1].start), float(row + box[0].start)))
     tags: list[Tag] = []
     for radius, label, x, y in sorted(places, reverse=True):
-        if radius >= least and all(np.hypot(tag.x - x, tag.y - y) > apart for tag in tags):
+        if radius >= min_radius and all(np.hypot(tag.x - x, tag.y - y) > min_distance for tag in tags):
             tags.append(Tag(str(identity[label] + 1), x + 0.5, y + 0.5))
     return tags

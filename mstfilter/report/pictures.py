@@ -39,6 +39,7 @@ UNASSIGNED_COLOUR: Colour = (140, 143, 148)
 _Volume = Hypothesis | tuple[np.ndarray, VoxelGrid]
 _LIGHT = np.array([-0.35, -0.45, 0.82])  # direction to the light in axes of the view: right, towards the eye, up
 _TABLE_GREY = 128.0
+_RAYS = 2  # per pixel and axis of a voxel picture
 
 
 def colour(identity: int) -> Colour:
@@ -59,11 +60,11 @@ def png_bytes(image: np.ndarray) -> bytes:
     return bytes(cv2.imencode(".png", np.ascontiguousarray(image[..., order]), [cv2.IMWRITE_PNG_COMPRESSION, 6])[1])
 
 
-def jpeg_bytes(image: np.ndarray, quality: int = 92) -> bytes:
+def jpeg_bytes(image: np.ndarray) -> bytes:
     """JPEG file of an RGB (H, W, 3) uint8 image."""
     import cv2
 
-    return bytes(cv2.imencode(".jpg", np.ascontiguousarray(image[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, quality])[1])
+    return bytes(cv2.imencode(".jpg", np.ascontiguousarray(image[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, 92])[1])
 
 
 def data_uri(data: bytes, kind: str = "png") -> str:
@@ -103,19 +104,14 @@ def overlay_layer(
     (scale H, scale W, 4) uint8
         RGBA, not premultiplied.
     """
+    from scipy.ndimage import maximum_filter1d, minimum_filter1d
+
     labels = labels.repeat(scale, axis=0).repeat(scale, axis=1)
     inside = labels > 0
     edge = np.zeros(labels.shape, bool)
     for axis in (0, 1):
-        for step in range(1, line + 1):
-            for sign in (step, -step):
-                other = np.roll(labels, sign, axis=axis)
-                differs = other != labels
-                # np.roll wraps around: pixels of the opposite border are no neighbours.
-                ends = [slice(None)] * 2
-                ends[axis] = slice(0, sign) if sign > 0 else slice(sign, None)
-                differs[tuple(ends)] = False
-                edge |= differs
+        for extreme in (maximum_filter1d, minimum_filter1d):
+            edge |= extreme(labels, 2 * line + 1, axis, mode="nearest") != labels
     edge &= inside
     out = np.zeros((*labels.shape, 4), np.uint8)
     out[..., :3] = np.rint(_label_colours(labels, colours))
@@ -203,9 +199,7 @@ def viewpoint(
     )
 
 
-def voxel_picture(
-    labels: np.ndarray, grid: VoxelGrid, view: Camera, colours: Mapping[int, Colour], supersample: int = 2
-) -> np.ndarray:
+def voxel_picture(labels: np.ndarray, grid: VoxelGrid, view: Camera, colours: Mapping[int, Colour]) -> np.ndarray:
     """Render voxels on the table plane as RGBA (view.height, view.width, 4) uint8.
 
     Parameters
@@ -218,10 +212,8 @@ def voxel_picture(
         See `viewpoint`.
     colours : mapping
         ``{label: (r, g, b)}``.
-    supersample : int
-        Rays per pixel and axis.
     """
-    camera = view.scaled(supersample)
+    camera = view.scaled(_RAYS)
     seen = render(labels, grid, camera)
     hit = seen.labels > 0
     light = _LIGHT @ _view_axes(camera)
@@ -250,7 +242,7 @@ def voxel_picture(
         side[hit] = normal + 8 * np.floor(np.abs(p[np.arange(len(p)), np.abs(normal) - 1]) / grid.voxel_size + 0.5)
         crease, border = _lines(seen.labels, side, hit)
         colour *= np.where(border, 0.42, np.where(crease, 0.86, 1.0))[..., None]
-    return _over(_reduced(colour, alpha, supersample), _table(view, grid, shade))
+    return _over(_reduced(colour, alpha, _RAYS), _table(view, grid, shade))
 
 
 def _view_axes(camera: Camera) -> np.ndarray:

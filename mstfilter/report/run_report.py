@@ -15,6 +15,7 @@ except for the times of the steps.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -65,8 +66,8 @@ class PauseNumbers:
         Weighted mean quality of trivial baselines; None without ground truth.
     true_objects : int or None
         Number of objects in the ground truth.
-    time, clip_seconds : float or None
-        Time of the pause in the recording, and time since the last pause.
+    time, clip_seconds : float
+        Time of the pause in the recording, and time since the last pause; None for the first pause.
     """
 
     info: Mapping[str, Any]
@@ -75,7 +76,7 @@ class PauseNumbers:
     n_distinct: int
     baselines: Mapping[str, float] | None
     true_objects: int | None
-    time: float | None
+    time: float
     clip_seconds: float | None
 
     @property
@@ -86,11 +87,10 @@ class PauseNumbers:
     @property
     def quality(self) -> Mapping[str, Sequence[float]] | None:
         """Quality of each hypothesis, by form; None without ground truth."""
-        return self.info.get("quality")
+        return self.info["quality"]
 
     @property
     def step_seconds(self) -> float:
-        """Seconds of the step."""
         return float(sum(self.seconds.values()))
 
     @property
@@ -116,19 +116,14 @@ class PauseNumbers:
 
     def parents(self, kind: str) -> list[int] | None:
         """``"previous"`` or ``"proposed"`` parents; None if they were not recorded."""
-        found = (self.info.get("parents") or {}).get(kind)
-        return None if found is None else list(found)
+        return self.info["parents"].get(kind)
 
     def notes(self, slot: str) -> Mapping[str, Any]:
         """Notes of a component, without those that it only passed on from an earlier one."""
-        notes = self.info.get("notes") or {}
-        own = notes.get(slot) or {}
-        for earlier in notes:
-            if earlier == slot:
-                break
-            if notes[earlier] == own:
-                return {}
-        return own if isinstance(own, Mapping) else {"notes": own}
+        notes: Mapping[str, Mapping[str, Any]] = self.info["notes"]
+        earlier = itertools.takewhile(lambda name: name != slot, notes)
+        chosen = notes.get(slot, {})
+        return {} if chosen in [notes[name] for name in earlier] else chosen
 
 
 @dataclass(frozen=True)
@@ -141,33 +136,27 @@ class RunNumbers:
     @property
     def title(self) -> str:
         """Name of the recording."""
-        return str(self._recording.get("name") or "A run")
+        return str(self.description["recording"]["name"])
 
     @property
     def status(self) -> str:
         """Status of the run: running, interrupted, failed, done."""
-        return str(self.description.get("status", "unknown"))
+        return str(self.description["status"])
 
     @property
     def truth_users(self) -> list[str]:
         """Classes of the components that use the ground truth."""
-        return list(self.description.get("uses_truth") or ())
-
-    @property
-    def _recording(self) -> Mapping[str, Any]:
-        found = self.description.get("recording")
-        return found if isinstance(found, Mapping) else {}
+        return list(self.description["uses_truth"])
 
     @cached_property
     def slots(self) -> list[str]:
         """Slots with times or notes, in the order of a step."""
-        used = {s for step in self.steps for s in (*step.seconds, *(step.info.get("notes") or {}))}
+        used = {s for step in self.steps for s in (*step.seconds, *step.info["notes"])}
         return [s for s in _TITLES if s in used] + sorted(used - set(_TITLES))
 
     def component(self, slot: str) -> str:
         """Name of the component of a slot; empty if unknown."""
-        config = self.description.get("config")
-        part = config.get(slot) if isinstance(config, Mapping) else None
+        part = self.description["config"].get(slot)
         name = part.get("component", "") if isinstance(part, Mapping) else part
         return str(name).rsplit(":", 1)[-1] if name else ""
 
@@ -179,13 +168,12 @@ class RunNumbers:
     @property
     def summary(self) -> list[str]:
         """The run in one to four sentences."""
-        planned = len(self._recording.get("pauses") or ())
+        planned = len(self.description["recording"]["pauses"])
         done = len(self.steps)
         sentences = []
         if self.status != "done":
             verbs = {"running": "has not ended", "interrupted": "was interrupted", "failed": "failed"}
-            verb = verbs.get(self.status, self.status)
-            sentences.append(f"The run {verb}: {done} of {planned or '?'} pauses are complete.")
+            sentences.append(f"The run {verbs[self.status]}: {done} of {planned} pauses are complete.")
         if not done:
             return sentences or ["The run has no pauses."]
         last = self.steps[-1]
@@ -238,7 +226,7 @@ def _count(n: int, one: str, several: str = "") -> str:
 def read_numbers(run: RunFolder) -> RunNumbers:
     """Numbers of a run folder."""
     description = run.description
-    times = list((description.get("recording") or {}).get("times") or ())
+    times = description["recording"]["times"]
     steps = []
     for t in range(run.n_pauses):
         info, hypotheses, truth = run.info(t), run.hypotheses(t), run.truth(t)
@@ -252,7 +240,6 @@ def read_numbers(run: RunFolder) -> RunNumbers:
                 name: sum(w * weighted_coverage(baseline(distinct[key]), truth) for key, w in weight.items())
                 for name, baseline in _BASELINES.items()
             }
-        time = float(times[t]) if t < len(times) else None
         steps.append(
             PauseNumbers(
                 info=info,
@@ -261,8 +248,8 @@ def read_numbers(run: RunFolder) -> RunNumbers:
                 n_distinct=len({h.key for h in hypotheses}),
                 baselines=baselines,
                 true_objects=None if truth is None else len(set(np.unique(truth).tolist()) - {0}),
-                time=time,
-                clip_seconds=None if time is None or t == 0 else time - float(times[t - 1]),
+                time=float(times[t]),
+                clip_seconds=None if t == 0 else float(times[t]) - float(times[t - 1]),
             )
         )
     return RunNumbers(description, tuple(steps))
@@ -290,9 +277,11 @@ def write_report(run: RunFolder | str | Path, out: str | Path | None = None) -> 
     """
     run = RunFolder.open(run.path if isinstance(run, RunFolder) else run)
     numbers = read_numbers(run)
-    filters: dict[str, Callable[..., Any]] = dict(
-        short_text=short_text, seconds=seconds_text, percent=lambda x: f"{100 * x:.3g} %"
-    )
+    filters: dict[str, Callable[..., Any]] = {
+        "short_text": short_text,
+        "seconds": seconds_text,
+        "percent": lambda x: f"{100 * x:.3g} %",
+    }
     page = fill_template(
         "report.html",
         filters,
@@ -300,7 +289,7 @@ def write_report(run: RunFolder | str | Path, out: str | Path | None = None) -> 
         pauses=_pauses(run, numbers),
         figures=_figures(numbers),
         parts=[_part(numbers, slot) for slot in numbers.slots],
-        config=_config_rows(numbers.description.get("config") or {}),
+        config=_config_rows(numbers.description["config"]),
         facts=_facts(numbers.description),
     )
     return write_page(run.path / "report.html" if out is None else Path(out), page)
@@ -398,14 +387,14 @@ def _config_rows(config: Mapping[str, Any]) -> list[tuple[str, list[tuple[str, s
 
 def _facts(description: Mapping[str, Any]) -> list[tuple[str, str]]:
     """Preset, seed, recording and versions."""
-    recording = description.get("recording") or {}
+    recording = description["recording"]
     facts = [
-        ("preset", str(description.get("description") or "–")),
-        ("seed", short_text(description.get("seed"))),
-        ("status", str(description.get("status", "–"))),
-        ("recording", str(recording.get("name", "–"))),
-        ("recording key", str(recording.get("key", "–"))),
-        ("generator", short_text(recording.get("generator"))),
+        ("preset", str(description["description"])),
+        ("seed", short_text(description["seed"])),
+        ("status", str(description["status"])),
+        ("recording", str(recording["name"])),
+        ("recording key", str(recording["key"])),
+        ("generator", short_text(recording["generator"])),
     ]
-    facts += [(name, str(version)) for name, version in (description.get("versions") or {}).items()]
+    facts += [(name, str(version)) for name, version in description["versions"].items()]
     return [fact for fact in facts if fact[1] not in ("", "–")]

@@ -64,15 +64,17 @@ def write_study_report(study: StudyFolder | str | Path, out: str | Path | None =
 def _page(study: StudyFolder) -> str:
     filters = dict(seconds=seconds_text, number=_number, signed=lambda x: _number(x, "+"), range=_range)
     records, summary, failures = study.records(), study.summary(), study.failures()
-    sources: list[dict[str, Any]] = [scene["source"] for scene in study.description["scenes"]]
+    scenes: dict[str, list[str]] = defaultdict(list)
+    for scene in study.description["scenes"]:
+        scenes[scene["group"]].append(scene["name"])
     return fill_template(
         "study.html",
         filters,
         study=study.description,
         n_done=len({(r["scene"], r["arm"], r["seed"]) for r in records}),
         summary=summary,
-        simulated=bool([source for source in sources if "family" in source]),
-        scenes={group: _scenes(study, group) for group in _groups(study)},
+        simulated=any("family" in scene["source"] for scene in study.description["scenes"]),
+        scenes=scenes,
         claim=CLAIM,
         compared=[one for one in summary.compared() if one.difference.n],
         columns=[(name, heading) for name, heading in _FIGURES if name in summary.names],
@@ -92,14 +94,6 @@ def _number(value: float | None, sign: str = "") -> str:
 def _range(ends: tuple[float, float], sign: str = "") -> str:
     """An interval; a dash for an unknown one."""
     return "–" if ends[0] != ends[0] else f"{ends[0]:{sign}.3f} to {ends[1]:{sign}.3f}"
-
-
-def _groups(study: StudyFolder) -> list[str]:
-    return list(dict.fromkeys(scene["group"] for scene in study.description["scenes"]))
-
-
-def _scenes(study: StudyFolder, group: str) -> list[str]:
-    return [scene["name"] for scene in study.description["scenes"] if scene["group"] == group]
 
 
 def _drawn(records: Sequence[Mapping[str, Any]], summary: Summary, reported_only: Sequence[str]) -> dict[str, Any]:

@@ -102,7 +102,14 @@ def make_run(path: Path, pauses: int = 3, truth: bool = True, empty: bool = Fals
         "seed": 7,
         "description": "boxes & tests",
         "config": {"n": 3, "transition": {"component": "./own.py:Stay"}, "proposal": {"component": "boxes"}},
-        "recording": {"name": film.name, "key": "00", "pauses": list(film.pauses), "times": list(film.times)},
+        "recording": {
+            "name": film.name,
+            "key": "00",
+            "pauses": list(film.pauses),
+            "times": list(film.times),
+            "generator": None,
+        },
+        "uses_truth": [],
         "versions": {"mstfilter": "0", "numpy": np.__version__},
     }
     run = RunFolder.create(path, description)
