@@ -31,7 +31,7 @@ import importlib
 import importlib.util
 import sys
 import typing
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from importlib.metadata import entry_points
 from pathlib import Path
 from types import ModuleType
@@ -236,6 +236,17 @@ class Registry:
                 if where == location:
                     return name
         return f"{cls.__module__}:{cls.__qualname__}"
+
+
+def nested_components(component: Any) -> Iterator[Any]:
+    """A component and all components in its fields."""
+    if isinstance(component, tuple):
+        for part in component:
+            yield from nested_components(part)
+    elif dataclasses.is_dataclass(component):
+        yield component
+        for field in dataclasses.fields(component):
+            yield from nested_components(getattr(component, field.name))
 
 
 def default_of(field: dataclasses.Field[Any]) -> Any:

@@ -8,7 +8,6 @@ configuration, seed and recording; its result equals that of an uninterrupted ru
 
 from __future__ import annotations
 
-import dataclasses
 import hashlib
 import json
 import platform
@@ -22,6 +21,7 @@ import mstfilter
 from mstfilter.errors import InputError
 from mstfilter.oracles import bind_truth, uses_truth
 from mstfilter.presets import build_filter, describe_filter
+from mstfilter.registry import nested_components
 from mstfilter.runs.run_folder import RunFolder, as_json
 from mstfilter.scene import Recording
 from mstfilter.smc import Observer
@@ -145,17 +145,8 @@ def _first_difference(found: Any, wanted: Any, where: str = "") -> str:
 
 def component_files(component: Any) -> dict[str, str]:
     """Files of the user that a component and its parts come from -> hash of their content."""
-    if isinstance(component, tuple):
-        return {path: content for part in component for path, content in component_files(part).items()}
-    if not dataclasses.is_dataclass(component):
-        return {}
-    found = {}
-    cls = type(component)
-    if "__mst_source__" in cls.__dict__:
-        found[cls.__dict__["__mst_file__"]] = cls.__dict__["__mst_source__"]
-    for field in dataclasses.fields(component):
-        found.update(component_files(getattr(component, field.name)))
-    return found
+    sources = [type(part).__dict__ for part in nested_components(component)]
+    return {source["__mst_file__"]: source["__mst_source__"] for source in sources if "__mst_file__" in source}
 
 
 def library_versions() -> dict[str, str]:

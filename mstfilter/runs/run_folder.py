@@ -18,11 +18,11 @@ bytes in all files except seconds.json.
 
 from __future__ import annotations
 
+import itertools
 import json
 import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -80,11 +80,9 @@ class HypothesisCodec(Codec):
     """Hypotheses on one grid as arrays, bit for bit."""
 
     def encode(self, particles: Any) -> Mapping[str, np.ndarray]:
-        """Named arrays of a sequence of hypotheses."""
         return encode_hypotheses(particles)
 
     def decode(self, arrays: Mapping[str, np.ndarray]) -> Any:
-        """The hypotheses."""
         return decode_hypotheses(arrays)
 
 
@@ -118,7 +116,7 @@ class RunFolder:
         write_json(path / "run.json", {"format": _FORMAT, "status": "running", **description})
         return cls(path)
 
-    @cached_property
+    @property
     def description(self) -> dict[str, Any]:
         """The content of run.json."""
         return dict(_read_json(self.path / "run.json"))
@@ -126,10 +124,7 @@ class RunFolder:
     @property
     def n_pauses(self) -> int:
         """Number of complete pauses."""
-        t = 0
-        while (self.path / "pauses" / f"{t:03d}").is_dir():
-            t += 1
-        return t
+        return next(t for t in itertools.count() if not self.pause(t).is_dir())
 
     def pause(self, t: int) -> Path:
         """Folder of a pause."""
@@ -137,7 +132,7 @@ class RunFolder:
 
     def set_status(self, status: str) -> None:
         """Set the status of the run: running, interrupted, failed or done."""
-        write_json(self.path / "run.json", {**_read_json(self.path / "run.json"), "status": status})
+        write_json(self.path / "run.json", {**self.description, "status": status})
 
     def write_pause(self, clip: Clip, state: State, info: Info, truth: np.ndarray | None) -> None:
         """Write the results of a step; an interrupted call writes nothing."""
@@ -157,8 +152,10 @@ class RunFolder:
                 },
             )
             save_state(folder / "state.npz", state, HypothesisCodec(), compress=True)
+            quality: dict[str, list[float]] | None = None
             if truth is not None:
                 np.savez_compressed(folder / "truth.npz", labels=truth)
+                quality = {form: [weighted_coverage(h.labels, truth, form) for h in hypotheses] for form in FORMS}
             record = {
                 "t": info.t,
                 "n": info.n,
@@ -171,7 +168,7 @@ class RunFolder:
                 "parents": info.parents,
                 "log_weights": info.log_weights,
                 "weights": state.population.weights,
-                "quality": None if truth is None else _qualities(hypotheses, truth),
+                "quality": quality,
                 "notes": info.notes,
             }
             write_json(folder / "info.json", record)
@@ -179,8 +176,8 @@ class RunFolder:
 
     def remove_partial_pauses(self) -> None:
         """Remove the incomplete folder of a pause that a killed run left."""
-        for left in (self.path / "pauses").glob(".*.partial"):
-            shutil.rmtree(left, ignore_errors=True)
+        for partial in (self.path / "pauses").glob(".*.partial"):
+            shutil.rmtree(partial, ignore_errors=True)
 
     def info(self, t: int) -> dict[str, Any]:
         """Record of the step that ended at pause `t`."""
@@ -235,8 +232,3 @@ class RunFolder:
                     row[f"quality_{form}"] = "" if info["quality"] is None else f"{info['quality'][form][k]:.6f}"
                 rows.append(row)
         write_csv(self.path / "metrics.csv", rows)
-
-
-def _qualities(hypotheses: tuple[Hypothesis, ...], truth: np.ndarray) -> dict[str, list[float]]:
-    """Quality of each hypothesis against the ground truth, in all forms."""
-    return {form: [weighted_coverage(h.labels, truth, form) for h in hypotheses] for form in FORMS}

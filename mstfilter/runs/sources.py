@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from mstfilter.errors import InputError
-from mstfilter.formats import RecordingFormat
+from mstfilter.formats import RecordingFormat, pauses_from_text
 from mstfilter.presets import REGISTRY, settings
 from mstfilter.scene import Recording
 
@@ -39,8 +39,6 @@ def open_source(
     """
     fields = format_settings(options)
     if pauses:
-        from mstfilter.formats import pauses_from_text
-
         rule = pauses_from_text(pauses)
         more = fields.get("pauses")
         fields["pauses"] = {**rule, **more} if isinstance(more, dict) else rule
@@ -48,9 +46,8 @@ def open_source(
     cls = _reader(name, allow_files)
     if not path.exists():
         raise InputError(f"recording does not exist: {path}")
-    reader = REGISTRY.make(cls, fields, "", allow_files)
-    opened: Recording = reader.open(path)
-    return opened
+    reader: RecordingFormat = REGISTRY.make(cls, fields, "", allow_files)
+    return reader.open(path)
 
 
 def _reader(name: str, allow_files: bool = False) -> type[RecordingFormat]:

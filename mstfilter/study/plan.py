@@ -16,13 +16,14 @@ import json
 import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, fields, is_dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from mstfilter.errors import InputError
 from mstfilter.oracles import uses_truth
 from mstfilter.presets import REGISTRY, build_filter, describe_filter
+from mstfilter.registry import nested_components
 from mstfilter.runs import as_json, code_version, component_files, library_versions, open_source
 from mstfilter.scene import content_key
 from mstfilter.study.config import ArmRequest, SceneEntry, StudyConfig, expand_arms
@@ -156,7 +157,7 @@ def _arm(request: ArmRequest, code: str, allow_files: bool) -> Arm:
     with request.name_in_errors():
         filter = build_filter(request.config(allow_files), allow_files=allow_files)
     config = as_json(describe_filter(filter))
-    known_code = all(module.split(".")[0].startswith("mstfilter") for module in _modules(filter))
+    known_code = all(type(part).__module__.startswith("mstfilter") for part in nested_components(filter))
     key = _hash([config, component_files(filter), library_versions(), code])
     return Arm(request.name, config, key, known_code, tuple(uses_truth(filter)), request.reported_only)
 
@@ -194,27 +195,16 @@ def _unique_names(scenes: list[StudyScene]) -> tuple[StudyScene, ...]:
 
 def _check_unique(what: str, named: list[tuple[str, str]]) -> None:
     """Raise InputError if a name or a key occurs twice."""
-    seen: dict[str, str] = {}
+    name_of: dict[str, str] = {}
     for name, key in named:
-        if key in seen:
+        if key in name_of:
             raise InputError(
-                f"two {what} are the same: {seen[key]!r} and {name!r}", "leave one out, or change what it sets"
+                f"two {what} are the same: {name_of[key]!r} and {name!r}", "remove one, or change its settings"
             )
-        if name in seen.values():
-            raise InputError(
-                f"two {what} are called {name!r}",
-                "give each a name" if what == "arms" else "give each a different group",
-            )
-        seen[key] = name
-
-
-def _modules(component: Any) -> set[str]:
-    """Modules of a component's class and of those of its parts."""
-    if isinstance(component, tuple):
-        return set().union(*(_modules(part) for part in component))
-    if not is_dataclass(component):
-        return set()
-    return {type(component).__module__}.union(*(_modules(getattr(component, f.name)) for f in fields(component)))
+        if name in name_of.values():
+            hint = "give each a name" if what == "arms" else "give each a different group"
+            raise InputError(f"two {what} are called {name!r}", hint)
+        name_of[key] = name
 
 
 def _hash(value: Any) -> str:

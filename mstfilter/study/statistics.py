@@ -69,18 +69,18 @@ def compare(first: Mapping[str, float], second: Mapping[str, float]) -> Differen
     return Difference(float(d.mean()), *interval(d), *studentised(d), p, len(d), p)
 
 
-def interval(values: np.ndarray, level: float = LEVEL) -> tuple[float, float]:
+def interval(values: np.ndarray) -> tuple[float, float]:
     """t interval of the mean; NaN for fewer than two values."""
     from scipy.stats import t
 
     n = len(values)
     if n < 2:
         return float("nan"), float("nan")
-    half = float(t.ppf(0.5 + level / 2, n - 1)) * values.std(ddof=1) / np.sqrt(n)
+    half = float(t.ppf(0.5 + LEVEL / 2, n - 1)) * values.std(ddof=1) / np.sqrt(n)
     return float(values.mean() - half), float(values.mean() + half)
 
 
-def studentised(values: np.ndarray, level: float = LEVEL, n_resamples: int = N_BOOTSTRAP) -> tuple[float, float]:
+def studentised(values: np.ndarray, n_resamples: int = N_BOOTSTRAP) -> tuple[float, float]:
     """Studentised bootstrap interval of the mean (Efron, Tibshirani 1993, section 12.5); NaN for fewer
     than five values.
 
@@ -98,7 +98,7 @@ def studentised(values: np.ndarray, level: float = LEVEL, n_resamples: int = N_B
     scale = drawn.std(axis=1, ddof=1)
     good = scale > 1e-9 * spread
     ratio = (drawn.mean(axis=1)[good] - values.mean()) / scale[good]
-    low, high = np.quantile(ratio, [0.5 - level / 2, 0.5 + level / 2])
+    low, high = np.quantile(ratio, [0.5 - LEVEL / 2, 0.5 + LEVEL / 2])
     return float(values.mean() - high * spread), float(values.mean() - low * spread)
 
 

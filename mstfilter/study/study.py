@@ -12,14 +12,14 @@ from __future__ import annotations
 import contextlib
 import shutil
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from mstfilter.errors import InputError
 from mstfilter.runs import library_versions, write_json
 from mstfilter.study.config import StudyConfig
-from mstfilter.study.executors import Event, Executor, Local
+from mstfilter.study.executors import Event, Executor, Local, Tell
 from mstfilter.study.plan import Plan, StudyRun, make_plan
 from mstfilter.study.results import STUDY_FORMAT, Job, JobOutcome, StudyFolder, read_result
 
@@ -112,7 +112,7 @@ def run_study(
             _check_free_space(target)
         executor = executor or Local(logs=path / "logs")
         write_json(path / "study.json", _description(plan))
-        _adopt_renamed_runs(plan, folder)
+        _rename_done_runs(plan, folder)
         waiting = [run for run in plan.runs if not _is_done(run, folder)]
         n_before = len(plan.runs) - len(waiting)
         failed_scenes = _record_scenes(waiting, cache, plan.config, executor, progress)
@@ -121,7 +121,8 @@ def run_study(
             if run.name in failed:
                 _write_failure(folder, run, failed[run.name])
         waiting = [run for run in waiting if run.name not in failed]
-        counted = _Counter(progress, "runs", [run.name for run in waiting], n_before, len(plan.runs), len(failed))
+        names = [run.name for run in waiting]
+        count = _counter(progress, "runs", names, n_before, len(plan.runs), len(failed))
 
         def tell(event: Event) -> None:
             run = waiting[event.job]
@@ -129,13 +130,13 @@ def run_study(
                 _remove_partial_runs(path, run.folder)
             if event.outcome is not None and event.outcome.status != "done":
                 _write_failure(folder, run, event.outcome)
-            counted(event)
+            count(event)
 
         outcomes = executor.run(_run_jobs(plan, waiting, folder, cache, allow_files), tell)
         for run, outcome in zip(waiting, outcomes, strict=True):
             if outcome.status != "done":
                 failed[run.name] = outcome
-                _write_failure(folder, run, outcome)  # again: the disk may have been full before
+                _write_failure(folder, run, outcome)  # repeated, because the disk may have been full before
         folder = StudyFolder.open(path)
         try:
             folder.write_tables()
@@ -185,8 +186,8 @@ def _is_empty(path: Path) -> bool:
 
 
 def _remove_partial_runs(path: Path, folder: str) -> None:
-    for left in (path / "runs").glob(f".{folder}.*.partial"):
-        shutil.rmtree(left, ignore_errors=True)
+    for partial in (path / "runs").glob(f".{folder}.*.partial"):
+        shutil.rmtree(partial, ignore_errors=True)
 
 
 def _check_free_space(folder: Path) -> None:
@@ -211,15 +212,10 @@ def _description(plan: Plan) -> dict[str, Any]:
         "description": study.description,
         "reference": plan.reference,
         "arms": [
-            {
-                "name": arm.name,
-                "reported_only": arm.reported_only,
-                "uses_truth": arm.uses_truth,
-                "config": arm.config,
-            }
+            {name: getattr(arm, name) for name in ("name", "reported_only", "uses_truth", "config")}
             for arm in plan.arms
         ],
-        "scenes": [{"name": s.name, "group": s.group, "source": s.source, "key": s.key} for s in plan.scenes],
+        "scenes": [asdict(scene) for scene in plan.scenes],
         "seeds": study.seeds,
         "runs": [
             {
@@ -236,12 +232,12 @@ def _description(plan: Plan) -> dict[str, Any]:
     }
 
 
-def _adopt_renamed_runs(plan: Plan, folder: StudyFolder) -> None:
+def _rename_done_runs(plan: Plan, folder: StudyFolder) -> None:
     """Rename the folders of runs that are done and whose arm or scene has a new name."""
-    wanted = {run.identity: folder.run(run.folder) for run in plan.runs}
+    named = {run.identity: folder.run(run.folder) for run in plan.runs}
     for path in (folder.path / "runs").glob("*"):
         result = read_result(path)
-        target = wanted.get(result.get("identity", ""))
+        target = named.get(result.get("identity", ""))
         if target is not None and target != path and result.get("status") == "done" and not target.exists():
             path.rename(target)
 
@@ -282,8 +278,7 @@ def _record_scenes(
     ]
     if not jobs:
         return {}
-    counted = _Counter(progress, "recordings", [scene.name for scene in missing], 0, len(jobs), 0)
-    outcomes = executor.run(jobs, counted)
+    outcomes = executor.run(jobs, _counter(progress, "recordings", [s.name for s in missing], 0, len(jobs), 0))
     return {scene.key: outcome for scene, outcome in zip(missing, outcomes, strict=True) if outcome.status != "done"}
 
 
@@ -325,25 +320,17 @@ def _run_jobs(plan: Plan, runs: Sequence[StudyRun], folder: StudyFolder, cache: 
     ]
 
 
-class _Counter:
-    """Turns events into progress."""
+def _counter(
+    progress: Callable[[StudyProgress], None], what: str, names: Sequence[str], done: int, total: int, failed: int
+) -> Tell:
+    """A function that turns the events of jobs into progress."""
 
-    def __init__(
-        self,
-        progress: Callable[[StudyProgress], None],
-        what: str,
-        names: list[str],
-        done: int,
-        total: int,
-        failed: int,
-    ) -> None:
-        self._progress, self._what, self._names, self._total = progress, what, names, total
-        self._done, self._failed = done, failed
-        progress(StudyProgress(what, None, "", done, failed, total))
-
-    def __call__(self, event: Event) -> None:
+    def count(event: Event) -> None:
+        nonlocal done, failed
         if event.outcome is not None:
-            good = event.outcome.status == "done"
-            self._done, self._failed = self._done + good, self._failed + (not good)
-        name = self._names[event.job]
-        self._progress(StudyProgress(self._what, event, name, self._done, self._failed, self._total))
+            done += event.outcome.status == "done"
+            failed += event.outcome.status != "done"
+        progress(StudyProgress(what, event, names[event.job], done, failed, total))
+
+    progress(StudyProgress(what, None, "", done, failed, total))
+    return count

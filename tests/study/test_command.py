@@ -69,7 +69,7 @@ def test_ctrl_c_ends_workers_and_keeps_results(config, tmp_path):
         text=True,
         preexec_fn=default_interrupts,
     )
-    wait_for(marker)
+    wait_for(marker, process)
     os.kill(process.pid, signal.SIGINT)
     _, error = process.communicate(timeout=300)
     assert process.returncode == 130

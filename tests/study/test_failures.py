@@ -55,18 +55,19 @@ def metrics(path):
 
 def test_failures_are_isolated_listed_and_explained(folder, tmp_path):
     out = tmp_path / "out"
-    result = run_study(study(folder, "good", "raise", "full", "die", "print"), out, Local(2), cache=tmp_path)
-    assert result.done == 4
+    result = run_study(
+        study(folder, "good", "raise", "full", "die", "print", seeds=[0]), out, Local(2), cache=tmp_path
+    )
+    assert result.done == 2
     errors = {(r["run"], r["tries"]): r["error"] for r in table(out, "failures.csv")}
-    for seed in (0, 1):
-        assert "RuntimeError: the component broke" in errors[f"raise on slide, seed {seed}", "1"]
-        assert "no space left" in errors[f"full on slide, seed {seed}", "1"]
-        assert errors[f"die on slide, seed {seed}", "3"] == "its worker died 3 times, the last time by signal 9"
-    assert len(errors) == 6
-    assert {r["arm"] for r in table(out)} == {"good", "print"}  # what a component prints confuses nobody
+    assert "RuntimeError: the component broke" in errors["raise on slide, seed 0", "1"]
+    assert "no space left" in errors["full on slide, seed 0", "1"]
+    assert errors["die on slide, seed 0", "3"] == "its worker died 3 times, the last time by signal 9"
+    assert len(errors) == 3
+    assert {r["arm"] for r in table(out)} == {"good", "print"}  # the output of a component has no effect
     trace = next(f["trace"] for f in result.folder.failures() if f["arm"] == "raise")
     assert "broken.py" in trace
-    assert not list((out / "runs").glob(".*"))  # nothing half done is left
+    assert not list((out / "runs").glob(".*"))  # no unfinished run remains
     for log in (out / "logs").glob("*"):
         assert log.name.startswith("worker-")
 
@@ -119,11 +120,11 @@ class LimitHanging(Executor):
 
 def test_a_run_that_takes_too_long_is_named(folder, tmp_path):
     """The run hangs until it is killed, so the test does not depend on the speed of the machine."""
-    executor = LimitHanging(Local(1), timeout_s=2)
+    executor = LimitHanging(Local(1), timeout_s=1)
     wanted = study(folder, "hang", "good", seeds=[0], tries=2)
     result = run_study(wanted, tmp_path / "out", executor, cache=tmp_path)
     assert [(n, o.error, o.tries) for n, o in result.failed] == [
-        ("hang on slide, seed 0", "its worker died 2 times, the last time because it took longer than 2 s", 2)
+        ("hang on slide, seed 0", "its worker died 2 times, the last time because it took longer than 1 s", 2)
     ]
     assert result.done == 1
 
@@ -138,11 +139,10 @@ def test_a_recording_that_cannot_be_made_fails_its_runs_only(folder, tmp_path):
     assert table(tmp_path / "out", "failures.csv")[0]["run"] == name
 
 
-def wait_for(path):
-    """Return when a file exists; the process that makes it then waits to be stopped."""
-    deadline = time.monotonic() + 600
+def wait_for(path, process):
+    """Return when a process has made a file; the process then waits to be stopped."""
     while not path.exists():
-        assert time.monotonic() < deadline, f"{path} was not made"
+        assert process.poll() is None, f"the process ended and did not make {path}"
         time.sleep(0.05)
 
 
@@ -163,7 +163,7 @@ def test_killing_the_study_and_resuming_ends_with_the_same_table(folder, tmp_pat
     command = [sys.executable, "-m", "mstfilter", "study", config, "--workers", "1", "--out", out]
     environment = {**os.environ, "MSTFILTER_CACHE": str(tmp_path / "cache")}
     process = subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    wait_for(marker)
+    wait_for(marker, process)
     process.send_signal(signal.SIGKILL)
     process.wait()
     done = {p: p.stat().st_mtime_ns for p in out.glob("runs/*/result.json")}
