@@ -82,7 +82,7 @@ class RecordedGenerator:
 def agree(crossover: Crossover, proposed: Hypothesis, predicted: Hypothesis, seed: int) -> bool:
     """Whether both programs make the same labels, up to renaming, from the same random decisions."""
     tape, structure = RecordedGenerator(seed), RecordedOrder()
-    child = replace(crossover, structure=structure).mix(tape, proposed, predicted)
+    child = replace(crossover, structure=structure).cross(tape, proposed, predicted)
     graph = conflict_graph(proposed.labels, predicted.labels)
     vertex = list(zip(graph.side.tolist(), graph.label.tolist(), strict=True))
     decisions = plain.Decisions({}, {}, {v: k + 1 for k, v in enumerate(vertex)})
@@ -114,7 +114,7 @@ def one_round(seed: int, n: int, order: np.random.Generator) -> dict[str, float]
 
     def ours(crossover: Crossover) -> None:
         for i, j in pairs:
-            crossover.mix(np.random.default_rng([seed, i, j]), proposed.particles[i], predicted.particles[j])
+            crossover.cross(np.random.default_rng([seed, i, j]), proposed.particles[i], predicted.particles[j])
 
     def step(update: FusionUpdate, lazy: bool) -> None:
         fused = update.update(np.random.default_rng(seed), predicted, proposed, clip)

@@ -63,7 +63,7 @@ def fused(particles: Particles, preset: str, eta: int) -> Iterator[np.ndarray]:
     for sample in particles.samples:
         for prediction in particles.predictions:
             for _ in range(eta):
-                yield crossover.mix(rng, sample, prediction).labels
+                yield crossover.cross(rng, sample, prediction).labels
 
 
 def weights(particles: Particles, eta: int) -> np.ndarray:

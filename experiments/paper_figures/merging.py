@@ -87,7 +87,7 @@ def picture(particles: Particles, path: Path, smoke: bool) -> Path:
     directed = [edge for _, edges in drawn.values() for edge in edges]
     for row, draw in enumerate((first, second), start=1):
         own = {v + 1: colours[v] for v in range(len(graph))}
-        labels, disputed = fixed.paint(graph, draw, sample.labels, prediction.labels)
+        labels, disputed = fixed.assign_labels(graph, draw, sample.labels, prediction.labels)
         smooth = fixed.mode_filter.apply(labels, disputed)
         draw_graph(axes[row, 0], graph, places, [colours[g] for g in draw.group], directed, draw)
         axes[row, 0].set_title(("A random order; bold: merged", "The same order, other merges")[row - 1])

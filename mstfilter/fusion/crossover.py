@@ -1,11 +1,11 @@
 """Crossover of two hypotheses by their conflict graph (paper, section IV-D, figure 5).
 
->>> child = Crossover().mix(rng, proposed, predicted)
+>>> child = Crossover().cross(rng, proposed, predicted)
 
 1. `graph_of` builds the conflict graph: objects of the two hypotheses that overlap are in conflict.
 2. `Crossover.resolve` draws, for each connected component, the conflicts along which objects are merged, and the
    order in which the merged objects are painted, later over earlier.
-3. `Crossover.paint` writes the labels. Objects without conflict are copied.
+3. `Crossover.assign_labels` writes the labels. Objects without conflict are copied.
 4. `ModeFilter` removes the speckle that painting leaves.
 """
 
@@ -72,7 +72,7 @@ class ModeFilter:
     max_sweeps : int
         Largest number of sweeps.
     scope : {"everywhere", "disputed"}
-        Voxels that may change: all, or only disputed ones (see `Crossover.paint`). "everywhere" removes objects
+        Voxels that may change: all, or disputed ones (see `Crossover.assign_labels`). "everywhere" removes objects
         that are thinner than half a window, for example a 2 cm book or a rod.
     """
 
@@ -153,7 +153,7 @@ class Crossover:
     mode_filter: ModeFilter = ModeFilter(scope="disputed")
     drop_rule: bool = False
 
-    def mix(self, rng: np.random.Generator, proposed: Hypothesis, predicted: Hypothesis) -> Hypothesis:
+    def cross(self, rng: np.random.Generator, proposed: Hypothesis, predicted: Hypothesis) -> Hypothesis:
         """A hypothesis made of the objects of both parents.
 
         If one parent has no objects, the result is the other one. An object keeps the identity of the largest
@@ -205,7 +205,7 @@ class Crossover:
             _unite(group, [e for e, yes in zip(edges, merged, strict=True) if yes], painted, apart or {})
         return ConflictResolution(order, group)
 
-    def paint(
+    def assign_labels(
         self, graph: ConflictGraph, resolution: ConflictResolution, proposed: np.ndarray, predicted: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """Labels (X, Y, Z) uint16, with k + 1 for group k, and the disputed voxels (X, Y, Z) bool.

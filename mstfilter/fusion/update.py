@@ -165,7 +165,7 @@ class FusionUpdate(Update):
             stream = key.child("candidate", candidate).generator()
             sample, prediction = samples[i[candidate]], refined[j[candidate]]
             prediction = claims.limited(sample, prediction, exposed, doubtful[j[candidate]])
-            return crossover.mix(stream, sample, prediction)
+            return crossover.cross(stream, sample, prediction)
 
         none_j, none_i = np.full(len(predicted), -1), np.full(len(proposed), -1)
         parents = {

@@ -16,7 +16,7 @@ from dataclasses import astuple, dataclass
 
 import numpy as np
 
-from mstfilter.errors import InputError
+from mstfilter.errors import check_number
 from mstfilter.scene import Frame, depth_sigma, memo
 
 _N_EXPOSURE_PIXELS = 20000
@@ -126,11 +126,8 @@ class SiftMatching:
     search_distance: float = 0.40
 
     def __post_init__(self) -> None:
-        if self.descriptor_radius <= 0 or self.search_share <= 0 or self.search_distance <= 0:
-            raise InputError(
-                f"SIFT radii must be positive: descriptor {self.descriptor_radius}, "
-                f"image {self.search_share}, space {self.search_distance}"
-            )
+        for name in ("descriptor_radius", "search_share", "search_distance"):
+            check_number(name, getattr(self, name), above=0)
 
     def match(self, before: Frame, after: Frame) -> Matches:
         """Matches of two frames. Cached by content."""

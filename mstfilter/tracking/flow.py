@@ -122,9 +122,9 @@ def _track(frames: list[Frame], preset: str) -> ClipTracks:
         pull[same] = grid[same]
         ok |= same
         robot = _robot(current).ravel()
-        voted = np.flatnonzero(~ok & ~robot)
+        uncertain = np.flatnonzero(~ok & ~robot)
         known = ~robot
-        pull[voted] = _vote(current, pull, ok, voted)
+        pull[uncertain] = _vote(current, pull, ok, uncertain)
     unchanged = _unchanged_pixels(first, last)
     u, v = _pixel(pull, width, height)
     source = np.where(known, v * width + u, -1).astype(np.int32).reshape(height, width)
@@ -210,9 +210,9 @@ def _advance(
     """Move points from frame a to b. Returns their positions (N, 2) and whether they are valid (N,)."""
     height, width = a.depth.shape
     moved = at + _sample(there, at)
-    home = moved + _sample(back, moved)
+    returned = moved + _sample(back, moved)
     inside = (moved >= 0).all(axis=1) & (moved[:, 0] <= width - 1) & (moved[:, 1] <= height - 1)
-    ok = inside & (((home - at) ** 2).sum(axis=1) < _ROUND_TRIP**2)
+    ok = inside & (((returned - at) ** 2).sum(axis=1) < _ROUND_TRIP**2)
     ua, va = _pixel(at, width, height)
     ub, vb = _pixel(moved, width, height)
     jump = np.abs(b.depth[vb, ub] - a.depth[va, ua])
@@ -238,7 +238,7 @@ def _unchanged_pixels(first: Frame, last: Frame) -> np.ndarray:
     return same_depth(first, last) & (change <= 12.0)
 
 
-def _vote(frame: Frame, pull: np.ndarray, known: np.ndarray, doubtful: np.ndarray) -> np.ndarray:
+def _vote(frame: Frame, pull: np.ndarray, known: np.ndarray, uncertain: np.ndarray) -> np.ndarray:
     """Positions in the first frame (D, 2) of pixels without valid flow.
 
     Each takes the position of one of its five nearest valid pixels, by position in space and colour together (12 mm
@@ -249,8 +249,8 @@ def _vote(frame: Frame, pull: np.ndarray, known: np.ndarray, doubtful: np.ndarra
     from scipy.spatial import cKDTree
 
     height, width = frame.depth.shape
-    if not len(doubtful) or not known.any():
-        return pull[doubtful]
+    if not len(uncertain) or not known.any():
+        return pull[uncertain]
     finite = np.isfinite(frame.depth)
     rows, columns = np.divmod(np.arange(height * width), width)
     if finite.any():
@@ -260,9 +260,9 @@ def _vote(frame: Frame, pull: np.ndarray, known: np.ndarray, doubtful: np.ndarra
         place = np.stack([columns, rows], axis=1) / 6.0
     colour = smooth_colour(frame).reshape(-1, 3) / 20.0
     features = np.hstack([place, colour])
-    # Only valid pixels within 12 pixels of a doubtful one are voters.
+    # Only valid pixels within 12 pixels of a uncertain one are voters.
     image = np.zeros((height, width), np.uint8)
-    image.ravel()[doubtful] = 1
+    image.ravel()[uncertain] = 1
     nearby = (cv2.dilate(image, np.ones((25, 25), np.uint8)).ravel() > 0) & known
     candidates = np.flatnonzero(nearby)
     if len(candidates) > 20000:  # every other row and column is sufficient
@@ -270,12 +270,12 @@ def _vote(frame: Frame, pull: np.ndarray, known: np.ndarray, doubtful: np.ndarra
     if len(candidates) < _N_VOTERS:
         candidates = np.flatnonzero(known)
     tree = cKDTree(features[candidates], balanced_tree=False, compact_nodes=False)
-    _, found = tree.query(features[doubtful], k=min(_N_VOTERS, len(candidates)), eps=0.5)
-    voters = candidates[np.asarray(found).reshape(len(doubtful), -1)]
+    _, found = tree.query(features[uncertain], k=min(_N_VOTERS, len(candidates)), eps=0.5)
+    voters = candidates[np.asarray(found).reshape(len(uncertain), -1)]
     # The voter whose motion is closest to the others (distances capped at 4 pixels). The pixel takes the position of
     # that voter in the first frame, not the motion: at an uncovered pixel of the resting table the first frame shows
     # the object.
     offset = pull[voters] - np.stack([columns[voters], rows[voters]], axis=-1)
     distance = np.abs(offset[:, :, None] - offset[:, None, :]).sum(axis=-1)
     choice = np.minimum(distance, 4.0).sum(axis=-1).argmin(axis=1)
-    return pull[voters[np.arange(len(doubtful)), choice]]
+    return pull[voters[np.arange(len(uncertain)), choice]]

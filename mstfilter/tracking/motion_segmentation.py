@@ -7,7 +7,6 @@ cells are joined while one rigid motion explains both, the pair with the smalles
 `rigid.pair_sums` each trial is one 3 x 3 SVD). This separates touching objects of equal look when one has moved
 relative to the other.
 
-Data used: the optical flow of the clip, and the depth of its first and last frame.
 """
 
 from __future__ import annotations

@@ -87,10 +87,11 @@ class MotionResidual:
         total = np.where(counted, cost, 0.0).sum(axis=-1) + self.outside_cost * n_outside
         # Fraction of the visible points that land on pixels of another object according to the flow.
         source = track.flow.source[v, u]
-        traced = counted & ~hidden & (source >= 0)
-        foreign = (traced & ~track.mask.ravel()[source]).sum(axis=-1) / np.maximum(traced.sum(axis=-1), 1)
+        with_source = counted & ~hidden & (source >= 0)
+        foreign = (with_source & ~track.mask.ravel()[source]).sum(axis=-1)
+        share_foreign = foreign / np.maximum(with_source.sum(axis=-1), 1)
         mean = total / np.maximum(n, 1)
-        return np.where(n >= max(_MIN_COUNTED * len(points), 1), mean + self.track_weight * foreign, np.inf)
+        return np.where(n >= max(_MIN_COUNTED * len(points), 1), mean + self.track_weight * share_foreign, np.inf)
 
 
 def normals(frame: Frame) -> np.ndarray:

@@ -66,17 +66,9 @@ def displacement(T: np.ndarray, centre: np.ndarray) -> np.ndarray:
 
 
 def kabsch(p: np.ndarray, q: np.ndarray, weights: np.ndarray | None = None) -> np.ndarray:
-    """Least-squares rigid motions of corresponding points.
+    """Least-squares rigid motions (..., 4, 4) of points p to points q, both (..., N, 3), with det R = +1.
 
-    Parameters
-    ----------
-    p, q : (..., N, 3) points before and after, metres.
-    weights : (..., N) or None
-        Non-negative weights, not all zero.
-
-    Returns
-    -------
-    (..., 4, 4) motions with det R = +1 (Kabsch 1976; the sign correction excludes reflections).
+    `weights` (..., N) are not negative and not all zero (Kabsch 1976; the sign correction excludes reflections).
     """
     p = np.asarray(p, dtype=np.float64)
     q = np.asarray(q, dtype=np.float64)
@@ -103,16 +95,10 @@ def _from_covariance(covariance: np.ndarray, mean_p: np.ndarray, mean_q: np.ndar
 
 
 def pair_sums(p: np.ndarray, q: np.ndarray, group: np.ndarray, n_groups: int) -> np.ndarray:
-    """The 18 additive sums of each group of point pairs.
+    """The 18 additive sums (n_groups, 18) of each group of point pairs.
 
-    Parameters
-    ----------
-    p, q : (N, 3) points, metres, relative to one common origin near them, against cancellation.
-    group : (N,) int, the group of each pair in 0..n_groups-1.
-
-    Returns
-    -------
-    (n_groups, 18) float64. The sums of a union of groups are the sum of their rows.
+    `p` and `q` (N, 3) are relative to one common origin near them, against cancellation; `group` (N,) is the number
+    of the group of each pair.
     """
     columns = np.empty((len(p), _N_SUMS))
     columns[:, 0] = 1.0
@@ -149,14 +135,10 @@ def fit_sums(sums: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def minimal_models(rng: np.random.Generator, p: np.ndarray, q: np.ndarray, eps: float, n_models: int) -> np.ndarray:
-    """Motions of random triples of point pairs that are consistent with a rigid motion.
+    """Motions (M, 4, 4) of random triples of point pairs that are consistent with a rigid motion, M <= n_models.
 
     A triple is rejected without a fit if it is nearly collinear, or if the length of a side changes by more than
     ``2 eps``, because a rigid motion preserves lengths.
-
-    Returns
-    -------
-    (M, 4, 4) with M <= n_models; (0, 4, 4) for fewer than three pairs.
     """
     n = len(p)
     if n < 3:
@@ -254,7 +236,8 @@ def jlinkage(
 
     Returns
     -------
-    list of MotionCluster, most inliers first (ties: smaller rms). Near-equal motions are merged.
+    list of MotionCluster, most inliers first (ties: smaller rms). A motion is left out if one with more inliers
+    explains more than half of its inliers.
     """
     p = np.ascontiguousarray(p, dtype=np.float64)
     q = np.ascontiguousarray(q, dtype=np.float64)
@@ -266,24 +249,25 @@ def jlinkage(
     models = minimal_models(rng, p[chosen], q[chosen], eps, n_models)
     if not len(models):
         return []
-    preference = residuals(models, p[chosen], q[chosen]) < eps
     motions: list[MotionCluster] = []
-    for members in cluster(preference):
+    for members in cluster(residuals(models, p[chosen], q[chosen]) < eps):
         if len(members) >= min_size:
             rows = chosen[members]
             motion = _refit(p, q, kabsch(p[rows], q[rows]), eps)
             if motion is not None and len(motion.inliers) >= min_size:
                 motions.append(motion)
     motions.sort(key=lambda m: (-len(m.inliers), m.rms))
-    return _without_repeats(motions)
+    kept: list[MotionCluster] = []
+    for motion in motions:
+        if all(np.isin(motion.inliers, other.inliers).mean() <= 0.5 for other in kept):
+            kept.append(motion)
+    return kept
 
 
 def cluster(preference: np.ndarray) -> list[np.ndarray]:
     """Merge rows of a preference matrix (N, M) until all preference sets are disjoint.
 
-    Returns
-    -------
-    list of index arrays, largest first. Rows with an empty set are in no cluster.
+    Returns the rows of each cluster, largest cluster first. Rows with an empty set are in no cluster.
     """
     rows = np.flatnonzero(preference.any(axis=1))
     if not len(rows):
@@ -319,15 +303,5 @@ def cluster(preference: np.ndarray) -> list[np.ndarray]:
         for i in {*stale.tolist(), a, b}:
             best_at[i] = similarity[i].argmax()
             best[i] = similarity[i, best_at[i]]
-    found = [np.array(sorted(m), dtype=np.int64) for m in members if m]
-    return sorted(found, key=lambda m: (-len(m), int(m[0])))
-
-
-def _without_repeats(motions: list[MotionCluster]) -> list[MotionCluster]:
-    """Drop motions of which a motion with more inliers explains more than half of the inliers."""
-    kept: list[MotionCluster] = []
-    for motion in motions:
-        shares = [np.isin(motion.inliers, other.inliers).mean() for other in kept]
-        if not shares or max(shares) <= 0.5:
-            kept.append(motion)
-    return kept
+    clusters = [np.array(sorted(m), dtype=np.int64) for m in members if m]
+    return sorted(clusters, key=lambda m: (-len(m), int(m[0])))

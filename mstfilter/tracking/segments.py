@@ -115,25 +115,17 @@ class Track:
         return self.clip.before.points.reshape(-1, 3)[self.segment.support]
 
     @cached_property
-    def target_points(self) -> np.ndarray:
-        """World points of the target mask in the last frame, above the table, (R, 3) metres."""
-        return self.clip.after.points[self._target_pixels]
-
-    @cached_property
-    def _target_pixels(self) -> np.ndarray:
-        after = self.clip.after
-        with np.errstate(invalid="ignore"):
-            return self.target_mask & after.valid & (after.points[..., 2] > _TABLE_HEIGHT)
-
-    @cached_property
     def surface(self) -> Surface | None:
         """The visible surface in the first frame; None if it has too few points."""
         return prepare(self.points, smooth_colour(self.clip.before, 5).reshape(-1, 3)[self.segment.support])
 
     @cached_property
     def target_surface(self) -> Surface | None:
-        """The surface of the target mask in the last frame; None if it has too few points."""
-        return prepare(self.target_points, self.colour_after[self._target_pixels])
+        """The surface of the target mask in the last frame, above the table; None if it has too few points."""
+        after = self.clip.after
+        with np.errstate(invalid="ignore"):
+            pixels = self.target_mask & after.valid & (after.points[..., 2] > _TABLE_HEIGHT)
+        return prepare(after.points[pixels], self.colour_after[pixels])
 
     @cached_property
     def flow_pairs(self) -> tuple[np.ndarray, np.ndarray]:

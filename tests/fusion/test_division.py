@@ -101,7 +101,7 @@ def test_crossover_never_makes_one_of_strangers(merge):
     for seed in range(50):
         rng = np.random.default_rng(seed)
         labels = rng.integers(0, 3, 4)
-        child = Crossover(merge=merge).mix(rng, Hypothesis.from_labels(bars(*labels), GRID, 1), predicted)
+        child = Crossover(merge=merge).cross(rng, Hypothesis.from_labels(bars(*labels), GRID, 1), predicted)
         for a, b in (((2, 4, 1), (7, 4, 1)), ((12, 4, 1), (17, 4, 1))):
             assert child.labels[a] != child.labels[b]
             one, other = child.record(int(child.labels[a])), child.record(int(child.labels[b]))
@@ -111,7 +111,7 @@ def test_crossover_never_makes_one_of_strangers(merge):
 
 def test_without_memory_always_merging_does_make_one():
     """The check above can fail: the same crossover without memory."""
-    child = Crossover(merge="always").mix(
+    child = Crossover(merge="always").cross(
         np.random.default_rng(0),
         Hypothesis.from_labels(bars(1, 1, 2, 2), GRID, 1),
         Hypothesis.from_labels(bars(1, 2, 3, 4), GRID),

@@ -29,7 +29,7 @@ def on(labels, grid=SMALL, birth=0):
 
 
 def mixed(proposed, predicted, seed=0, **fields):
-    return Crossover(**{"mode_filter": FILTERS[0], **fields}).mix(np.random.default_rng(seed), proposed, predicted)
+    return Crossover(**{"mode_filter": FILTERS[0], **fields}).cross(np.random.default_rng(seed), proposed, predicted)
 
 
 @pytest.mark.parametrize(

@@ -39,7 +39,7 @@ crossovers = st.builds(
 def test_crossover_invariants(a, b, crossover, seed):
     """Occupied is the union; no object is invented; every child object is made of whole parents' pieces."""
     proposed, predicted = Hypothesis.from_labels(a, SMALL, birth=1), Hypothesis.from_labels(b, SMALL, birth=0)
-    child = crossover.mix(np.random.default_rng(seed), proposed, predicted)
+    child = crossover.cross(np.random.default_rng(seed), proposed, predicted)
     np.testing.assert_array_equal(child.labels > 0, (a > 0) | (b > 0))
     ids = {o.id for h in (proposed, predicted) for o in h.objects}
     assert {o.id for o in child.objects} <= ids
@@ -50,12 +50,12 @@ def test_crossover_invariants(a, b, crossover, seed):
             mask = hypothesis.labels == record.label
             if not other[mask].any():
                 assert len(np.unique(child.labels[mask])) == 1
-    again = crossover.mix(np.random.default_rng(seed), proposed, predicted)
+    again = crossover.cross(np.random.default_rng(seed), proposed, predicted)
     np.testing.assert_array_equal(child.labels, again.labels)
     if crossover.merge == "never":
         assert child.n_objects <= proposed.n_objects + predicted.n_objects
     if crossover.merge == "always" and isinstance(crossover.structure, RandomOrder):
-        _, disputed = crossover.paint(*_graph_and_draw(crossover, a, b, seed), a, b)
+        _, disputed = crossover.assign_labels(*_graph_and_draw(crossover, a, b, seed), a, b)
         assert not disputed.any()
 
 
@@ -73,18 +73,18 @@ def test_equal_parents_and_empty_parents(a, seed):
     rng = np.random.default_rng(seed)
     crossover = Crossover(merge="share", mode_filter=ModeFilter(scope="disputed"))
     one, two = Hypothesis.from_labels(a, SMALL, birth=3), Hypothesis.from_labels(a, SMALL)
-    child = crossover.mix(rng, one, two)
+    child = crossover.cross(rng, one, two)
     assert weighted_coverage(child.labels, a) == 1.0
     nothing = Hypothesis.from_labels(np.zeros(SMALL.shape, np.uint16), SMALL)
-    assert crossover.mix(rng, one, nothing) is one
-    assert crossover.mix(rng, nothing, two) is (two if two.objects else nothing)
+    assert crossover.cross(rng, one, nothing) is one
+    assert crossover.cross(rng, nothing, two) is (two if two.objects else nothing)
 
 
 def test_thin_objects_survive_agreement():
     labels = book_and_rod()
     grid = VoxelGrid((0, 0, 0), 0.01, labels.shape)
     both = Hypothesis.from_labels(labels, grid), Hypothesis.from_labels(labels, grid)
-    child = Crossover(mode_filter=ModeFilter(scope="disputed")).mix(np.random.default_rng(0), *both)
+    child = Crossover(mode_filter=ModeFilter(scope="disputed")).cross(np.random.default_rng(0), *both)
     assert weighted_coverage(child.labels, labels) == 1.0
 
 
@@ -98,7 +98,7 @@ def test_identity_and_motion_history():
     records = tuple(replace(o, source=Crop.of(b == o.label), motion=moved) for o in predicted.objects)
     predicted = Hypothesis(b, SMALL, records)
     proposed = Hypothesis.from_labels(a, SMALL, birth=2)
-    child = Crossover(merge="always", mode_filter=NO_FILTER).mix(np.random.default_rng(0), proposed, predicted)
+    child = Crossover(merge="always", mode_filter=NO_FILTER).cross(np.random.default_rng(0), proposed, predicted)
     assert sorted(o.id for o in child.objects) == [1, 2, 2 * 65536 + 6]
     by_id = {o.id: o for o in child.objects}
     assert by_id[1].source is not None  # swallowed a part of itself: unchanged
@@ -111,7 +111,7 @@ def test_grids_must_agree():
     a = Hypothesis.from_labels(np.ones(SMALL.shape, np.uint16), SMALL)
     other = VoxelGrid((1, 0, 0), 0.01, SMALL.shape)
     with pytest.raises(InputError, match="grid of the proposed hypothesis"):
-        Crossover().mix(np.random.default_rng(0), a, Hypothesis.from_labels(a.labels, other))
+        Crossover().cross(np.random.default_rng(0), a, Hypothesis.from_labels(a.labels, other))
 
 
 def clip(t=1):
@@ -264,11 +264,11 @@ def test_the_drop_rule_loses_late_loose_objects_and_only_on_request():
     proposed, predicted = Hypothesis.from_labels(a, SMALL, 1), Hypothesis.from_labels(b, SMALL)
     for drop, left in ((False, True), (True, False)):
         crossover = Crossover(mode_filter=NO_FILTER, drop_rule=drop)
-        child = crossover.mix(np.random.default_rng(0), proposed, predicted)
+        child = crossover.cross(np.random.default_rng(0), proposed, predicted)
         assert bool(child.labels[4, 3, 2]) == left
     b[4, 3, 2], b[0, 3, 2] = 0, 0
     a[4, 0, 0] = 1  # the conflict now reaches beyond nothing loose: nothing to drop
-    same = Crossover(mode_filter=NO_FILTER, drop_rule=True).mix(
+    same = Crossover(mode_filter=NO_FILTER, drop_rule=True).cross(
         np.random.default_rng(0), Hypothesis.from_labels(a, SMALL, 1), Hypothesis.from_labels(b, SMALL)
     )
     assert ((same.labels > 0) == ((a > 0) | (b > 0))).all()
@@ -284,7 +284,7 @@ def test_history_ends_where_fusion_changes_voxels():
     predicted = Hypothesis(b, SMALL, (record,))
     a = np.zeros(SMALL.shape, np.uint16)
     a[1:3, :2] = 1
-    child = Crossover(merge="always", mode_filter=NO_FILTER).mix(
+    child = Crossover(merge="always", mode_filter=NO_FILTER).cross(
         np.random.default_rng(0), Hypothesis.from_labels(a, SMALL, 1), predicted
     )
     assert child.objects[0].id == record.id

@@ -85,7 +85,7 @@ def test_the_residual_is_infinite_without_depth(textured):
     scene, clip = textured
     blank = Frame(clip.after.rgb, np.full_like(clip.after.depth, np.nan), clip.after.camera)
     blind = Clip((clip.before, blank), clip.grid)
-    assert tracks_of(scene, blind)[1].target_points.shape == (0, 3)
+    assert tracks_of(scene, blind)[1].target_surface is None
     assert MotionResidual().score(tracks_of(scene, blind)[1], np.eye(4)) == np.inf
 
 
