@@ -30,19 +30,12 @@ _HIGHEST = 0.30  # top of a stack, metres: still in view
 
 @dataclass(frozen=True)
 class SceneObjects:
-    """The objects of a scene.
-
-    Parameters
-    ----------
-    shapes : tuple of Shape
-    skins : tuple of Skin
-    twin_of : tuple of int
-        Index of the object that this one repeats, -1 for none.
-    """
+    """The objects of a scene."""
 
     shapes: tuple[Shape, ...]
     skins: tuple[Skin, ...]
     twin_of: tuple[int, ...]
+    """Index of the object that each one repeats, -1 for none."""
 
 
 def draw_objects(rng: np.random.Generator, family: SceneFamily, pool: Pool) -> SceneObjects:
@@ -129,7 +122,7 @@ def _put_beside(
     `towards` (2,) is the approximate direction from the neighbour; None for any direction.
     """
     table_radius = min(0.32, 0.20 + 0.012 * world.n_objects)
-    start = world.positions()[k].copy()
+    start = world.positions()[k]
     for _ in range(attempts):
         near = neighbours[int(rng.integers(len(neighbours)))]
         goal = world.positions()[near, :2]
@@ -150,7 +143,7 @@ def _put_beside(
 
 def _put_on_top(rng: np.random.Generator, world: PhysicsWorld, k: int, placed: list[int]) -> bool:
     """Put object k on a flat object, if it fits on one."""
-    start = world.positions()[k].copy()
+    start = world.positions()[k]
     flat = [j for j in placed if world.shapes[j].family in ("carton", "brick", "can", "angle")]
     for j in rng.permutation(flat) if flat else []:
         below, top = world.positions()[j], _top(world, j)
@@ -181,7 +174,7 @@ def _visible_pixels(world: PhysicsWorld, camera: Camera) -> np.ndarray:
 
 def _put_behind(rng: np.random.Generator, world: PhysicsWorld, k: int, placed: list[int], camera: Camera) -> bool:
     """Put object k behind one of the tallest objects where it is least visible, if there is room."""
-    start, best = world.positions()[k].copy(), None
+    start, best = world.positions()[k], None
     tallest = sorted(placed, key=lambda j: -_top(world, j))[:5]
     for _ in range(_HIDING_PLACES):
         near = tallest[int(rng.integers(len(tallest)))]
@@ -190,7 +183,7 @@ def _put_behind(rng: np.random.Generator, world: PhysicsWorld, k: int, placed: l
             continue
         seen = int(_visible_pixels(world, camera)[k])
         if best is None or seen < best[0]:
-            best = (seen, world.positions()[k].copy(), world.rotations()[k])
+            best = (seen, world.positions()[k], world.rotations()[k])
         if seen == 0:
             break
     world.place(k, *(best[1:] if best else (start, np.eye(3))))
@@ -214,7 +207,8 @@ def _try_arrangement(
     lone = [k for k in originals if k not in stacked and k not in twin_of]
     hidden = sorted(lone, key=lambda k: world.shapes[k].radius)[: min(family.n_hidden, len(lone) - 1)]
     standing = [k for k in originals if k not in stacked and k not in hidden]
-    tall = sorted(standing, key=lambda k: -_greatest_height(world.shapes[k]))[: len(hidden)]
+    heights = [max(shape.half[abs(axis) - 1] for axis, _ in shape.rests) for shape in world.shapes]
+    tall = sorted(standing, key=lambda k: -heights[k])[: len(hidden)]
     camera = family.camera().scaled(160 / family.width)
     order = [j for k in standing + stacked for j in (k, *(t for t in twins if twin_of[t] == k))] + hidden
     placed: list[int] = []
@@ -245,11 +239,6 @@ def _try_arrangement(
             return False
     touching = set(world.contacts())
     return sum((min(k, t), max(k, t)) in touching for k, t in enumerate(twin_of) if t >= 0) >= n_touching
-
-
-def _greatest_height(shape: Shape) -> float:
-    """Height of a shape in its tallest rest pose, metres."""
-    return 2 * max(float(shape.half[abs(axis) - 1]) for axis, _ in shape.rests)
 
 
 def arrange_objects(

@@ -51,19 +51,15 @@ class Stage:
         self._radius = np.array([shape.radius for shape in world.shapes])
         # Every object lies in a capsule along its longest edge.
         half = np.array([shape.half for shape in world.shapes])
-        longest = half.argmax(axis=1)
         long = half.max(axis=1)
         across = np.sqrt((half**2).sum(axis=1) - long**2)
         inward = np.minimum(0.35 * across, long)
-        self._axis = np.eye(3)[longest] * (long - inward)[:, None]
+        self._axis = np.eye(3)[half.argmax(axis=1)] * (long - inward)[:, None]
         self._thick = np.hypot(across, inward)
         self._poses = world.poses()
         self._finger = world.finger_position()
-        self._set_coordinates(world.data.qpos)
-
-    def _set_coordinates(self, qpos: np.ndarray) -> None:
-        self._data.qpos[:] = qpos
-        self._mj.mj_kinematics(self.world.model, self._data)
+        self._data.qpos[:] = world.data.qpos
+        mujoco.mj_kinematics(world.model, self._data)
 
     def follow(self) -> None:
         """Update the rendered poses to those of the world, within the tolerance."""
@@ -76,12 +72,10 @@ class Stage:
             return
         self._poses = np.where(moved[:, None, None], now, self._poses)
         self._finger = finger
-        qpos = self._data.qpos.copy()
-        qpos[:3] = finger
-        for k in np.flatnonzero(moved):
-            at = world.qpos_of(int(k))
-            qpos[at] = world.data.qpos[at]
-        self._set_coordinates(qpos)
+        index = world.pose_index[moved]
+        self._data.qpos[:3] = finger
+        self._data.qpos[index] = world.data.qpos[index]
+        self._mj.mj_kinematics(world.model, self._data)
 
     @property
     def poses(self) -> np.ndarray:
@@ -110,7 +104,7 @@ class Stage:
         return self.world.cast(origin, directions, groups, self._data)
 
 
-def cosine_to_light(stage: Stage, light: np.ndarray, points: np.ndarray, normal: np.ndarray) -> np.ndarray:
+def _cosine_to_light(stage: Stage, light: np.ndarray, points: np.ndarray, normal: np.ndarray) -> np.ndarray:
     """Cosine (n,) float32 between the normals (n, 3) of points (n, 3) and a light source, 0 in its shadow."""
     ray = points - light
     length = np.sqrt(ray[:, 0] ** 2 + ray[:, 1] ** 2 + ray[:, 2] ** 2)
@@ -297,7 +291,7 @@ class PixelRays:
                 self._cosine[k, which[finger]] = np.maximum(_dot(towards, normal[finger]), 0.0)
                 which, normal = which[~finger], normal[~finger]
             points = self._lifted[which].astype(float)
-            self._cosine[k, which] = cosine_to_light(self.stage, light, points, normal)
+            self._cosine[k, which] = _cosine_to_light(self.stage, light, points, normal)
 
     def colour(self, pixels: np.ndarray) -> np.ndarray:
         """Linear colours (k, 3) float32 of pixels on bodies."""

@@ -60,10 +60,8 @@ def noise(
 
     total = np.zeros(shape, np.float32)
     for k in range(octaves):
-        rows = max(2, int(np.ceil(shape[0] * 2**k / cell[0])) + 1)
-        cols = max(2, int(np.ceil(shape[1] * 2**k / cell[1])) + 1)
-        rows, cols = min(rows, shape[0]), min(cols, shape[1])
-        values = rng.standard_normal((max(rows, 1), max(cols, 1)), dtype=np.float32)
+        rows, cols = (min(max(2, int(np.ceil(n * 2**k / c)) + 1), n) for n, c in zip(shape, cell, strict=True))
+        values = rng.standard_normal((rows, cols), dtype=np.float32)
         total += cv2.resize(values, shape[::-1], interpolation=cv2.INTER_CUBIC) * 0.6**k
     return total
 

@@ -91,9 +91,8 @@ class SimulatedScene:
         self.world = PhysicsWorld(self.objects.shapes, family.arm)
         arrange_objects(_stream(self.seed, "arrangement"), self.world, family, self.objects.twin_of)
         self.room: Room = draw_room(_stream(self.seed, "room"), visible_texel(self.camera))
-        self._renderer = Renderer(
-            self.world, self.objects.skins, self.room, self.camera, family.supersample, POSE_TOLERANCE
-        )
+        appearance = self.objects.skins, self.room
+        self._renderer = Renderer(self.world, *appearance, self.camera, family.supersample, POSE_TOLERANCE)
 
     def choose_push(self, action: int) -> FingerPush:
         """Choose the push of action number `action` from the current state."""
@@ -122,13 +121,13 @@ class SimulatedScene:
         """Description of the scene for the manifest."""
         objects = [
             {
-                "id": k + 1,
+                "id": k,
                 "family": s.family,
                 "name": s.name,
                 "half_m": s.half.tolist(),
                 "twin_of": t + 1 if t >= 0 else None,
             }
-            for k, (s, t) in enumerate(zip(self.objects.shapes, self.objects.twin_of, strict=True))
+            for k, (s, t) in enumerate(zip(self.objects.shapes, self.objects.twin_of, strict=True), start=1)
         ]
         return {
             "name": f"{self.family.name}-{self.seed}",
@@ -143,7 +142,7 @@ class SimulatedScene:
 def simulate_recording(
     family: SceneFamily, seed: int, path: str | Path, progress: _Progress | None = None
 ) -> Recording:
-    """Simulate a scene and write its recording.
+    """Simulate a scene and write its recording; see `record_scene`.
 
     Parameters
     ----------
@@ -151,63 +150,47 @@ def simulate_recording(
         See `scene_family`.
     seed : int
         Determines everything else. Not negative.
+    """
+    return record_scene(SimulatedScene(family, seed), path, progress)
+
+
+def record_scene(scene: SimulatedScene, path: str | Path, progress: _Progress | None = None) -> Recording:
+    """Simulate the actions of a scene, write the recording and open it.
+
+    Parameters
+    ----------
+    scene : SimulatedScene
+        At its first pause. A subclass can change the arrangement and the choice of pushes.
     path : path
         Folder of the recording; it must not exist or be empty. Nothing is left behind on failure.
     progress : callable, optional
         Called after each frame with frames done, frames in all, and a description.
-
-    Returns
-    -------
-    Recording
-        Opened from the folder.
 
     Raises
     ------
     InputError
         If the folder cannot be written, or the objects cannot be arranged or pushed.
     """
-    return record_scene(SimulatedScene(family, seed), path, progress)
-
-
-def record_scene(scene: SimulatedScene, path: str | Path, progress: _Progress | None = None) -> Recording:
-    """Simulate the actions of a scene and write the recording.
-
-    Parameters
-    ----------
-    scene : SimulatedScene
-        At its first pause. A subclass can change the arrangement and the choice of pushes.
-    path, progress
-        See `simulate_recording`.
-
-    Raises
-    ------
-    InputError
-        If the folder cannot be written, or the objects cannot be pushed.
-    """
-    with RecordingWriter(path, scene.camera, scene.grid, **scene.describe()) as writer:
-        _record_actions(scene, writer, progress or (lambda done, total, description: None))
-    return open_recording(path)
-
-
-def _record_actions(scene: SimulatedScene, writer: RecordingWriter, progress: _Progress) -> None:
     family, world = scene.family, scene.world
-    start, index = world.time, 0
-    _record_pause(scene, writer, index, 0.0)
-    progress(1, family.n_frames, "pause 0")
-    for action in range(family.n_actions):
-        push = scene.choose_push(action)
-        before, began = world.poses(), world.time
-        for step in range(1, family.frames_per_clip - 1):
+    report = progress or (lambda done, total, description: None)
+    with RecordingWriter(path, scene.camera, scene.grid, **scene.describe()) as writer:
+        start, index = world.time, 0
+        _record_pause(scene, writer, index, 0.0)
+        report(1, family.n_frames, "pause 0")
+        for action in range(family.n_actions):
+            push = scene.choose_push(action)
+            before, began = world.poses(), world.time
+            for step in range(1, family.frames_per_clip - 1):
+                index += 1
+                advance_push(world, push, (step - 1) / family.fps, step / family.fps)
+                _record_frame(scene, writer, index, began + step / family.fps - start, "action", action=action)
+                report(index + 1, family.n_frames, f"action {action}")
             index += 1
-            advance_push(world, push, (step - 1) / family.fps, step / family.fps)
-            _record_frame(scene, writer, index, began + step / family.fps - start, "action", action=action)
-            progress(index + 1, family.n_frames, f"action {action}")
-        index += 1
-        advance_push(world, push, (family.frames_per_clip - 2) / family.fps, push.seconds)
-        result = push_effect(world, before, finish_push(world), family)
-        description = _describe_push(push, result)
-        _record_pause(scene, writer, index, world.time - start, action=action, push=description)
-        progress(index + 1, family.n_frames, f"pause {action + 1}")
+            advance_push(world, push, (family.frames_per_clip - 2) / family.fps, push.seconds)
+            description = _describe_push(push, push_effect(world, before, finish_push(world), family))
+            _record_pause(scene, writer, index, world.time - start, action=action, push=description)
+            report(index + 1, family.n_frames, f"pause {action + 1}")
+    return open_recording(path)
 
 
 def _record_frame(
@@ -305,10 +288,9 @@ def _simulate_into_cache(family: SceneFamily, seed: int, target: Path) -> None:
             "set MSTFILTER_CACHE to a folder that can be written",
         ) from error
     try:
-        made = simulate_recording(family, seed, work / "recording").path
-        assert made is not None
+        simulate_recording(family, seed, work / "recording")
         try:
-            made.rename(target)
+            (work / "recording").rename(target)
         except OSError:
             if not (target / "manifest.json").is_file():
                 raise

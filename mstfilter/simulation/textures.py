@@ -124,13 +124,11 @@ def draw_skin(rng: np.random.Generator, shape: Shape, pool: Pool = ANY) -> Skin:
             charts.append(printing.carton_face(rng, w, h, pair, words, role, pool))
     elif style == "label":
         metal = (176, 176, 180)
-        ends = [
-            printing.lid(rng, w, metal if k == 0 else pair[1], k == 0, pool)
-            for k, (w, _) in enumerate([sizes[_TOP]] * 2)
-        ]
-        top = ends[int(rng.integers(2))]
-        charts = [printing.label_side(rng, *sizes[_SIDE], pair, words, pool), top, ends[0]]
-        charts.append(printing.glaze(rng, *sizes[_INSIDE], pair, 0))
+        bottom = printing.lid(rng, sizes[_TOP][0], metal, True, pool)
+        printed = printing.lid(rng, sizes[_TOP][0], pair[1], False, pool)
+        top = (bottom, printed)[int(rng.integers(2))]
+        side = printing.label_side(rng, *sizes[_SIDE], pair, words, pool)
+        charts = [side, top, bottom, printing.glaze(rng, *sizes[_INSIDE], pair, 0)]
     elif style == "ceramic":
         pale = printing.shade(rng, (0.7, 0.95), 0.45, pool)
         motif = int(rng.integers(3))
@@ -153,9 +151,8 @@ def draw_skin(rng: np.random.Generator, shape: Shape, pool: Pool = ANY) -> Skin:
         # Stone and foam have tones of one colour.
         r, g, b = (int(0.65 * first + 0.35 * second) for first, second in zip(*pair, strict=True))
         charts = [printing.speckle(rng, w, h, (pair[0], (r, g, b))) for w, h in sizes]
-    plain = np.ascontiguousarray(np.broadcast_to(charts[0].reshape(-1, 3).mean(axis=0).astype(np.uint8), (2, 2, 3)))
-    if style == "ceramic":
-        plain = np.ascontiguousarray(np.broadcast_to(charts[_INSIDE][0, 0], (2, 2, 3)))
+    colour = charts[_INSIDE][0, 0] if style == "ceramic" else charts[0].reshape(-1, 3).mean(axis=0)
+    plain = np.broadcast_to(colour.astype(np.uint8), (2, 2, 3))
     return Skin((*charts, plain), gloss)
 
 
@@ -174,30 +171,22 @@ class Atlas:
         import cv2
 
         shrink = printing.DOT / texel
-        first: list[int] = []
-        width: list[int] = []
-        height: list[int] = []
         texels: list[np.ndarray] = []
-        start = 0
-        self.base: list[int] = []
+        self._base = np.cumsum([0, *(len(skin.charts) for skin in skins)])
         self.gloss = [skin.gloss for skin in skins]
-        for skin in skins:
-            self.base.append(len(width))
-            for chart in skin.charts:
-                size = (max(2, round(chart.shape[1] * shrink)), max(2, round(chart.shape[0] * shrink)))
-                if shrink < 1 and size[0] <= chart.shape[1] and size[1] <= chart.shape[0]:
-                    chart = cv2.resize(chart, size, interpolation=cv2.INTER_AREA)
-                first.append(start)
-                height.append(chart.shape[0])
-                width.append(chart.shape[1])
-                texels.append(chart.reshape(-1, 3))
-                start += chart.shape[0] * chart.shape[1]
-        self._first, self._width, self._height = np.array(first), np.array(width), np.array(height)
-        self._texels = _srgb_to_linear(np.concatenate(texels).astype(np.float32) / 255.0)
+        for chart in (chart for skin in skins for chart in skin.charts):
+            size = (max(2, round(chart.shape[1] * shrink)), max(2, round(chart.shape[0] * shrink)))
+            if shrink < 1 and size[0] <= chart.shape[1] and size[1] <= chart.shape[0]:
+                chart = cv2.resize(chart, size, interpolation=cv2.INTER_AREA)
+            texels.append(chart)
+        self._height, self._width = np.array([chart.shape[:2] for chart in texels]).T
+        self._first = np.cumsum([0, *(self._height * self._width)[:-1]])
+        colours = np.concatenate([chart.reshape(-1, 3) for chart in texels])
+        self._texels = _srgb_to_linear(colours.astype(np.float32) / 255.0)
 
     def colour(self, skin: int, chart: np.ndarray, place: np.ndarray) -> np.ndarray:
         """Linear albedo (n, 3) float32 at places (n, 2) of charts (n,) of a skin, interpolated bilinearly."""
-        chart = chart + self.base[skin]
+        chart = chart + self._base[skin]
         w, h = self._width[chart], self._height[chart]
         x = np.clip(place[:, 0] * w - 0.5, 0, w - 1.001)
         y = np.clip(place[:, 1] * h - 0.5, 0, h - 1.001)

@@ -65,12 +65,12 @@ def _numbers(values: ArrayLike | None) -> str:
 def _geom_xml(piece: Piece, mesh: str, density: float, rolling: float) -> str:
     from scipy.spatial.transform import Rotation
 
-    x, y, z, w = Rotation.from_matrix(piece.rotation).as_quat()
+    quaternion = Rotation.from_matrix(piece.rotation).as_quat(scalar_first=True)
     solid = (
         f'type="mesh" mesh="{mesh}"' if piece.kind == "hull" else f'type="{piece.kind}" size="{_numbers(piece.size)}"'
     )
     return (
-        f'<geom {solid} pos="{_numbers(piece.centre)}" quat="{_numbers((w, x, y, z))}" density="{density!r}" '
+        f'<geom {solid} pos="{_numbers(piece.centre)}" quat="{_numbers(quaternion)}" density="{density!r}" '
         f'group="{OBJECT_GROUP}" gap="{_CONTACT_GAP}" condim="{6 if rolling > 0.0005 else 4}" '
         f'friction="0.55 0.01 {rolling!r}"/>'
     )
@@ -147,8 +147,10 @@ class PhysicsWorld:
         """Instance id of each geom: 0 for the room, 1 .. n for objects, 255 for finger and arm."""
         self.geom_piece: np.ndarray = np.arange(self.model.ngeom) - self.model.body_geomadr[self.model.geom_bodyid]
         """Index of each geom among the pieces of its body."""
-        self._qpos = self.model.jnt_qposadr[self.model.body_jntadr[bodies]]
-        self._dof = self.model.jnt_dofadr[self.model.body_jntadr[bodies]]
+        joints = self.model.body_jntadr[bodies]
+        self.pose_index: np.ndarray = self.model.jnt_qposadr[joints][:, None] + np.arange(7)
+        """Indices (n, 7) of position and quaternion (w, x, y, z) of each object in `data.qpos`."""
+        self._velocity_index = self.model.jnt_dofadr[joints][:, None] + np.arange(6)
         self.move_finger(_PARKED)
 
     @property
@@ -165,22 +167,19 @@ class PhysicsWorld:
         """Set the pose of object k, at rest."""
         from scipy.spatial.transform import Rotation
 
-        x, y, z, w = Rotation.from_matrix(np.asarray(rotation)).as_quat()
-        at = self._qpos[k]
-        self.data.qpos[at : at + 3] = position
-        self.data.qpos[at + 3 : at + 7] = (w, x, y, z)
-        self.data.qvel[self._dof[k] : self._dof[k] + 6] = 0.0
+        quaternion = Rotation.from_matrix(np.asarray(rotation)).as_quat(scalar_first=True)
+        self.data.qpos[self.pose_index[k]] = np.concatenate([position, quaternion])
+        self.data.qvel[self._velocity_index[k]] = 0.0
 
     def positions(self) -> np.ndarray:
         """Origins of the objects (n, 3), metres."""
-        return np.stack([self.data.qpos[a : a + 3] for a in self._qpos])
+        return self.data.qpos[self.pose_index[:, :3]]
 
     def rotations(self) -> np.ndarray:
         """Orientations of the objects (n, 3, 3)."""
         from scipy.spatial.transform import Rotation
 
-        quaternions = np.stack([self.data.qpos[a + 3 : a + 7] for a in self._qpos])
-        return Rotation.from_quat(quaternions[:, [1, 2, 3, 0]]).as_matrix()
+        return Rotation.from_quat(self.data.qpos[self.pose_index[:, 3:]], scalar_first=True).as_matrix()
 
     def poses(self) -> np.ndarray:
         """T_world_object (n, 4, 4)."""
@@ -199,10 +198,6 @@ class PhysicsWorld:
         self.data.qvel[:3] = 0.0
         self.data.ctrl[:] = position
 
-    def steer_finger(self, target: ArrayLike) -> None:
-        """Set the target of the finger's motors."""
-        self.data.ctrl[:] = target
-
     def forward(self) -> None:
         """Bring contacts and positions of all geoms up to date."""
         self._mj.mj_forward(self.model, self.data)
@@ -211,18 +206,16 @@ class PhysicsWorld:
         """Advance by n time steps of 2 ms."""
         self._mj.mj_step(self.model, self.data, n)
 
-    def settle(self, limit: float = 4.0, speed: float = 0.01) -> bool:
-        """Run until no object moves faster than `speed` (m/s, rad/s) for 0.1 s; False at the time limit (s)."""
+    def settle(self) -> bool:
+        """Run until no object moves faster than 0.01 m/s or rad/s for 0.1 s; False if that takes more than 4 s."""
         calm = 0
-        for _ in range(int(limit / (10 * _TIME_STEP))):
+        for _ in range(200):
             self.step(10)
-            fastest = max(np.abs(self.data.qvel[d : d + 6]).max() for d in self._dof)
-            calm = calm + 1 if fastest < speed else 0
+            calm = calm + 1 if np.abs(self.data.qvel[self._velocity_index]).max() < 0.01 else 0
             if calm >= 5:
-                self.forward()
-                return True
+                break
         self.forward()
-        return False
+        return calm >= 5
 
     def contacts(self) -> list[tuple[int, int]]:
         """Pairs (i, j), i < j, of objects that touch or are less than half a millimetre apart, after `forward`."""
@@ -290,10 +283,6 @@ class PhysicsWorld:
             self._mj.mj_multiRay(self.model, state, start, rays, visible, True, -1, geom, distance, flat, n, 1e6)
         return geom, distance, normal
 
-    def qpos_of(self, k: int) -> slice:
-        """Indices of the pose of object k in MuJoCo's coordinates."""
-        return slice(int(self._qpos[k]), int(self._qpos[k]) + 7)
-
 
 @dataclass(frozen=True)
 class FingerPush:
@@ -360,7 +349,7 @@ def advance_push(world: PhysicsWorld, push: FingerPush, start: float, stop: floa
         elif k == parked:
             world.move_finger(_PARKED)
         if k < parked:
-            world.steer_finger(push.target(k * _TIME_STEP))
+            world.data.ctrl[:] = push.target(k * _TIME_STEP)
         world.step()
     world.forward()
 
@@ -391,15 +380,14 @@ def push_effect(world: PhysicsWorld, before: np.ndarray, settled: bool, family: 
 def _is_clear(world: PhysicsWorld, at: tuple[float, float]) -> bool:
     """Whether the finger can come down at a place without touching an object."""
     saved = world.save()
-    clear = True
     for height in np.linspace(_HIGH, _LOW, 5):
         world.move_finger((*at, height))
         world.forward()
-        if world.overlaps():
-            clear = False
+        overlaps = world.overlaps()
+        if overlaps:
             break
     world.restore(saved)
-    return clear
+    return not overlaps
 
 
 def _draw_push(rng: np.random.Generator, world: PhysicsWorld, family: SceneFamily) -> FingerPush:

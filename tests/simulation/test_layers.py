@@ -34,7 +34,7 @@ def test_no_ray_is_cast_if_nothing_moved(monkeypatch):
     scene = SimulatedScene(SMALL, 2)
     first = scene._renderer.render()
     monkeypatch.setattr(Stage, "cast", lambda self, eye, rays, groups=(): pytest.fail("a ray") if len(rays) else CAST)
-    scene.world.data.qpos[scene.world.qpos_of(0).start] += 0.4 * POSE_TOLERANCE
+    scene.world.data.qpos[scene.world.pose_index[0, 0]] += 0.4 * POSE_TOLERANCE
     scene.world.forward()
     np.testing.assert_array_equal(scene._renderer.render().colour, first.colour)
 
