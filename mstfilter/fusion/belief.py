@@ -148,8 +148,8 @@ class Belief:
         if region is not None:
             inside = self._refined.cells.ravel()[_flat_region(self.grid, region)]
             counts = np.bincount(inside, minlength=len(counts))
-        met = np.flatnonzero(counts)
-        return met, counts[met]
+        cells = np.flatnonzero(counts)
+        return cells, counts[cells]
 
     # Probabilities --------------------------------------------------------------------------------------------
 
@@ -162,19 +162,12 @@ class Belief:
         return binary_entropy(self._mass @ (self._refined.objects > 0))[self._refined.cells]
 
     def same_object(self, a: Any, b: Any) -> np.ndarray:
-        """Probability that two voxels belong to the same object: ``sum_i w_i [L_i(a) = L_i(b) > 0]``.
+        """Probability (...) that two voxels belong to the same object: ``sum_i w_i [L_i(a) = L_i(b) > 0]``.
 
-        Parameters
-        ----------
-        a, b : (..., 3) int
-            Voxels, broadcast against each other. For a = b the result is the occupancy.
-
-        Returns
-        -------
-        (...) float
+        `a` and `b` (..., 3) are broadcast against each other. For a = b the result is the occupancy.
         """
-        one, other = self._refined.objects[:, self._cells(a)], self._refined.objects[:, self._cells(b)]
-        return np.tensordot(self._mass, (one == other) & (one > 0), axes=1)
+        at_a, at_b = self._refined.objects[:, self._cells(a)], self._refined.objects[:, self._cells(b)]
+        return np.tensordot(self._mass, (at_a == at_b) & (at_a > 0), axes=1)
 
     def object_at(self, voxel: Any) -> np.ndarray:
         """Extent (X, Y, Z) of the object at a voxel (3,): ``same_object(voxel, v)`` for every voxel v."""
@@ -183,17 +176,9 @@ class Belief:
         return (self._mass @ same)[self._refined.cells]
 
     def same_object_at_pixels(self, camera: Camera, a: Any, b: Any) -> np.ndarray:
-        """Probability that two pixels show the same object: ``sum_i w_i [R_i(a) = R_i(b) > 0]``, R_i = Project(h_i).
+        """Probability (...) that two pixels show the same object: ``sum_i w_i [R_i(a) = R_i(b) > 0]``.
 
-        Parameters
-        ----------
-        camera : Camera
-        a, b : (..., 2) int
-            Pixels (column, row), broadcast against each other.
-
-        Returns
-        -------
-        (...) float
+        R_i = Project(h_i). `a` and `b` (..., 2) are pixels (column, row), broadcast against each other.
         """
         images = self._images(camera)
         a, b = _rows_and_columns(camera, a), _rows_and_columns(camera, b)
@@ -231,9 +216,8 @@ class Belief:
         lower, upper = cells[:-1][where[:-1]], cells[1:][where[:-1]]
         both, same = np.zeros(len(lower)), np.zeros(len(lower))
         for w, row in zip(self._mass, self._refined.objects, strict=True):
-            one, other = row[lower], row[upper]
-            both += w * ((one > 0) & (other > 0))
-            same += w * ((one > 0) & (one == other))
+            both += w * ((row[lower] > 0) & (row[upper] > 0))
+            same += w * ((row[lower] > 0) & (row[lower] == row[upper]))
         return where, both, same
 
     def boundary(self) -> np.ndarray:
@@ -242,11 +226,11 @@ class Belief:
         ``[a, v] = sum_i w_i [L_i(v) > 0, L_i(v') > 0, L_i(v) != L_i(v')]``, v' the next voxel along axis a; 0 at
         the end of the grid.
         """
-        found = np.zeros((3, *self.grid.shape))
+        probability = np.zeros((3, *self.grid.shape))
         for axis in range(3):
             where, both, same = self._faces(axis)
-            np.moveaxis(found[axis], axis, 0)[where] = np.maximum(both - same, 0.0)
-        return found
+            np.moveaxis(probability[axis], axis, 0)[where] = np.maximum(both - same, 0.0)
+        return probability
 
     def boundary_entropy(self) -> np.ndarray:
         """Entropy (X, Y, Z) of the segmentation at a voxel: the largest of its six faces, at most log 2.
@@ -255,15 +239,15 @@ class Belief:
         object, ``h(p) = -p log p - (1 - p) log(1 - p)``. The entropy of occupancy, H(B), is not included
         (`occupancy_entropy`): H(B, S) = H(B) + H(S | B).
         """
-        found = np.zeros(self.grid.shape)
+        largest = np.zeros(self.grid.shape)
         for axis in range(3):
             where, both, same = self._faces(axis)
             face = np.zeros(where.shape)
             face[where] = both * binary_entropy(np.divide(same, both, out=np.zeros_like(same), where=both > 0))
-            out = np.moveaxis(found, axis, 0)
+            out = np.moveaxis(largest, axis, 0)
             np.maximum(out, face, out=out)
             np.maximum(out[1:], face[:-1], out=out[1:])
-        return found
+        return largest
 
     def partition_entropy(self, region: Any = None, tolerance: float = 0.0) -> float:
         """Entropy of the segmentation of a region (default: the whole grid).
@@ -289,17 +273,10 @@ class Belief:
     def view_information(
         self, camera: Camera, tolerance: float = 0.0, sees: Literal["depth", "objects"] = "depth"
     ) -> float:
-        """Information of an image from a camera.
+        """Information of an image from a camera; `tolerance` in pixels. ``camera.scaled(0.25)`` is faster.
 
-        Parameters
-        ----------
-        camera : Camera
-            Any camera; ``camera.scaled(0.25)`` is faster.
-        tolerance : float
-            Pixels.
-        sees : {"depth", "objects"}
-            Outcome: the depth image of the objects (rounded to a hundredth of a voxel, without the table), or the
-            true segmentation of the image.
+        The outcome is the depth image of the objects (rounded to a hundredth of a voxel, without the table), or the
+        true segmentation of the image.
         """
         if sees == "objects":
             image = common_refinement(self._images(camera))

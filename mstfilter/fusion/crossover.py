@@ -173,12 +173,12 @@ class Crossover:
         if len(groups) > MAX_LABEL:
             raise InputError(
                 f"crossover of {len(proposed.objects)} proposed and {len(predicted.objects)} predicted objects gives "
-                f"{len(groups)}, at most {MAX_LABEL} can be told apart",
-                "objects of a voxel or two are noise: drop them before fusion",
+                f"{len(groups)}, at most {MAX_LABEL} have a label",
+                "remove objects of one or two voxels before fusion",
             )
         labels = self.mode_filter.apply(voxels.spread(numbers.astype(np.uint16)), voxels.spread(disputed))
-        left, numbers = _numbered(labels.reshape(-1)[voxels.at])
-        return _with_records(voxels, numbers, groups[left - 1] - 1, graph, resolution, proposed, predicted)
+        remaining, numbers = _numbered(labels.reshape(-1)[voxels.at])
+        return _with_records(voxels, numbers, groups[remaining - 1] - 1, graph, resolution, proposed, predicted)
 
     def resolve(
         self, rng: np.random.Generator, graph: ConflictGraph, apart: Mapping[int, set[int]] | None = None
@@ -226,11 +226,11 @@ def _painted(
     rank[resolution.order] = np.arange(len(resolution.order))
     group_of, rank_of = [], []
     for side, labels in ((PROPOSED, voxels.proposed), (PREDICTED, voxels.predicted)):
-        mine = graph.side == side
+        on_side = graph.side == side
         table = np.zeros(int(labels.max(initial=0)) + 1, np.int64)
         ranks = np.full(len(table), -1)
-        table[graph.label[mine]] = resolution.group[mine] + 1
-        kept = mine & (resolution.group >= 0)
+        table[graph.label[on_side]] = resolution.group[on_side] + 1
+        kept = on_side & (resolution.group >= 0)
         ranks[graph.label[kept]] = rank[kept]
         group_of.append(table[labels])
         rank_of.append(ranks[labels])
@@ -300,8 +300,8 @@ def _with_records(
     best_of = dict(zip(resolution.group[order[last]].tolist(), order[last].tolist(), strict=True))
     best = np.array([-1, *(best_of[g] for g in groups.tolist())], np.int64)  # of each number, 0 free
     side, label = graph.side[best], graph.label[best]
-    own = np.where(side[numbers] == PREDICTED, voxels.predicted, voxels.proposed) == label[numbers]
-    sizes, kept = (np.bincount(n, minlength=len(best)) for n in (numbers, numbers[own]))
+    same = np.where(side[numbers] == PREDICTED, voxels.predicted, voxels.proposed) == label[numbers]
+    sizes, kept = (np.bincount(n, minlength=len(best)) for n in (numbers, numbers[same]))
     unchanged = (sizes == graph.size[best]) & (kept == sizes)
     parents = (proposed, predicted)
     record_of = [{r.label: r for r in parent.objects} for parent in parents]
@@ -312,8 +312,8 @@ def _with_records(
     child = Hypothesis(voxels.spread(numbers.astype(np.uint16)), predicted.grid, tuple(records))
     number_of = {g: number for number, g in enumerate(groups.tolist(), start=1)}
     for which, parent in enumerate(parents):
-        mine = np.flatnonzero(graph.side == which)
-        heirs = zip(graph.label[mine].tolist(), resolution.group[mine].tolist(), strict=True)
+        on_side = graph.side == which
+        heirs = zip(graph.label[on_side].tolist(), resolution.group[on_side].tolist(), strict=True)
         child = inherit_apart(child, parent, {k: number_of[g] for k, g in heirs if g in number_of})
     return child
 

@@ -108,11 +108,11 @@ def partition_distance(rows: np.ndarray, sizes: np.ndarray) -> np.ndarray:
     matches free space only). `rows` (n, k) are `canonical_rows` of k groups of `sizes` cells.
     """
     n, width = len(rows), int(rows.max(initial=0)) + 1
-    found = np.zeros((n, n))
+    distance = np.zeros((n, n))
     for i in range(n):
         for j in range(i):
             table = np.bincount(rows[i].astype(np.int64) * width + rows[j], sizes, width * width)
             counts = table.reshape(width, width)
             kept = counts[1:, 1:][linear_sum_assignment(counts[1:, 1:], maximize=True)].sum()
-            found[i, j] = found[j, i] = counts.sum() - counts[0, 0] - kept
-    return found
+            distance[i, j] = distance[j, i] = counts.sum() - counts[0, 0] - kept
+    return distance

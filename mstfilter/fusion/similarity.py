@@ -77,13 +77,13 @@ class CommonRefinement:
     def overlaps(self) -> np.ndarray:
         """Positions (n_objects + 1, n_objects + 1) that two objects share; row and column 0 (free) are 0."""
         total = self.n_objects + 1
-        found = np.zeros((total, total))
+        shared = np.zeros((total, total))
         sizes = np.broadcast_to(self.sizes, self.objects.shape).ravel()
         for row, below, above in zip(self.objects, self.first, self.first[1:], strict=False):
             codes = np.where(row > 0, row - below, 0) * total + self.objects
             counts = np.bincount(codes.ravel(), sizes, (above - below + 1) * total).reshape(-1, total)
-            found[below + 1 : above + 1, 1:] = counts[1:, 1:]
-        return found
+            shared[below + 1 : above + 1, 1:] = counts[1:, 1:]
+        return shared
 
 
 def common_refinement(segmentations: Sequence[np.ndarray]) -> CommonRefinement:

@@ -35,17 +35,14 @@ _SURFACE_VOXELS = 1.5  # a voxel up to this far behind the reading counts as sur
 class Claims:
     """Voxels that the predicted parent of a candidate may add to the sample.
 
-    The sample has seen the surface that the frame measures; the prediction may have seen the space behind it. If free
-    space had to clear much of a predicted object, its motion was wrong, and so are its hidden voxels.
-
     Parameters
     ----------
     surface : {"both", "sample"}
-        Whose objects may fill voxels at the surface that the last frame measures: those of both parents, or of the
-        sample alone. Voxels that only a prediction has there are mostly one or two voxels of misplacement.
+        Parents whose objects may fill voxels at the surface that the last frame measures. Voxels that only the
+        prediction has there are mostly errors of position.
     max_cleared : float
-        A predicted object that lost more than this share of its voxels to free space adds no voxels to those of the
-        sample. 1 sets no limit.
+        A predicted object of which free space clears more than this share adds no voxels: its motion was wrong, and
+        so are its hidden voxels. 1 sets no limit.
     """
 
     surface: Literal["both", "sample"] = "both"
@@ -68,9 +65,9 @@ class Claims:
         """Voxels (X, Y, Z) bool of objects of which free space cleared too much; None if there are none."""
         if self.max_cleared >= 1:
             return None
-        left = refined.volumes()
-        lost = [k for k, n in predicted.volumes().items() if left.get(k, 0) < (1 - self.max_cleared) * n]
-        return np.isin(refined.labels, lost) if any(k in left for k in lost) else None
+        kept = refined.volumes()
+        wrong = [k for k, n in predicted.volumes().items() if kept.get(k, 0) < (1 - self.max_cleared) * n]
+        return np.isin(refined.labels, wrong) if any(k in kept for k in wrong) else None
 
     def limited(
         self, sample: Hypothesis, prediction: Hypothesis, exposed: np.ndarray | None, doubtful: np.ndarray | None
@@ -78,14 +75,14 @@ class Claims:
         """The prediction without the voxels that it must not add to a sample. An empty sample limits nothing."""
         if not sample.n_objects:
             return prediction
-        barred = np.zeros(prediction.labels.shape, bool)
+        excluded = np.zeros(prediction.labels.shape, bool)
         for voxels in (exposed, doubtful):
             if voxels is not None:
-                barred |= voxels
-        barred &= (sample.labels == 0) & (prediction.labels != 0)
-        if not barred.any():
+                excluded |= voxels
+        excluded &= (sample.labels == 0) & (prediction.labels != 0)
+        if not excluded.any():
             return prediction
-        return prediction.with_labels(np.where(barred, 0, prediction.labels).astype(np.uint16))
+        return prediction.with_labels(np.where(excluded, 0, prediction.labels).astype(np.uint16))
 
 
 @dataclass(frozen=True)

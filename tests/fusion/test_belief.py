@@ -222,7 +222,7 @@ def test_tolerance_bounds_the_information_of_wrong_readings(error):
     assert positive > 5
 
 
-def test_own_outcomes():
+def test_outcomes_of_the_user():
     grids, lw = scenes(1)
     belief = belief_of(grids, lw)
     w = belief.weights
@@ -334,7 +334,7 @@ def test_no_information_exceeds_that_of_the_whole_segmentation(seed, tolerance):
         assert all(b <= a + 1e-9 for a, b in zip(soft, informations(belief, more * tolerance), strict=True))
 
 
-def test_one_hypothesis_is_sure_and_nothing_is_something():
+def test_one_hypothesis_has_no_entropy_and_empty_hypotheses_count():
     for grid in (scenes(0)[0][0], np.zeros(SHAPE, int)):
         belief = belief_of([grid, grid], [0.0, 1.0])
         assert informations(belief, 0.0) == informations(belief, 2.0) == [0.0] * 8

@@ -1,4 +1,4 @@
-"""Who may claim what: the sample at the surface, no hidden voxels of a prediction that went wrong."""
+"""Claims: voxels at the surface belong to the sample; wrong predictions add no hidden voxels."""
 
 import numpy as np
 import pytest
@@ -29,7 +29,7 @@ def children(clip, sample, prediction, claims, seeds=range(4), **fields):
     return [update.update(np.random.default_rng(k), predicted, proposed, clip).particles[0].labels for k in seeds]
 
 
-def test_the_parents_are_limited_as_said(scene):
+def test_the_prediction_is_limited_by_surface_and_doubtful_voxels(scene):
     clip, truth = scene
     empty = np.zeros_like(truth)
     exposed = Claims(surface="sample").exposed(clip)

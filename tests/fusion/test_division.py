@@ -1,4 +1,4 @@
-"""Objects that were seen to move apart become two, and stay two."""
+"""Objects that move apart in a clip are split, and are not merged again."""
 
 from dataclasses import replace
 
@@ -33,7 +33,7 @@ def record_at(hypothesis, where):
     return hypothesis.record(int(np.bincount(hypothesis.labels[where])[1:].argmax()) + 1)
 
 
-def test_what_moved_apart_is_taken_apart_and_remembered(pushed):
+def test_objects_that_moved_apart_are_split_and_recorded(pushed):
     clip, truth = pushed
     motions = RigidMotions().divide(clip)
     one = Hypothesis.from_labels(merged(truth, (4, 5)), clip.grid)
@@ -48,7 +48,7 @@ def test_what_moved_apart_is_taken_apart_and_remembered(pushed):
     assert b.id in resting.apart  # 5 moved, 3 did not
 
 
-def test_what_moved_as_one_stays_as_it_is(pushed):
+def test_objects_of_one_motion_are_not_split(pushed):
     clip, truth = pushed
     motions = RigidMotions().divide(clip)
     right = split_by_motion(Hypothesis.from_labels(truth, clip.grid), motions, clip)
@@ -59,7 +59,7 @@ def test_what_moved_as_one_stays_as_it_is(pushed):
     assert split_by_motion(nothing, motions, clip) is nothing
 
 
-def test_small_parts_are_left(pushed):
+def test_small_parts_are_not_split(pushed):
     clip, truth = pushed
     one = Hypothesis.from_labels(merged(truth, (4, 5)), clip.grid)
     kept = split_by_motion(one, RigidMotions().divide(clip), clip, PartRule(min_pixels=10**6))
@@ -74,8 +74,8 @@ def bars(*labels):
     return grid
 
 
-def strangers(labels, *pairs):
-    """A predicted hypothesis in which pairs of labels came apart."""
+def moved_apart(labels, *pairs):
+    """A predicted hypothesis in which pairs of labels have moved apart."""
     h = Hypothesis.from_labels(labels, GRID)
     ids = {r.label: r.id for r in h.objects}
     apart = {r.label: set() for r in h.objects}
@@ -85,19 +85,21 @@ def strangers(labels, *pairs):
     return Hypothesis(h.labels, GRID, tuple(replace(r, apart=frozenset(apart[r.label])) for r in h.objects))
 
 
-def test_a_sample_that_has_them_as_one_is_parted():
+def test_a_sample_is_split_like_the_prediction():
     sample = Hypothesis.from_labels(bars(1, 1, 2, 2), GRID, birth=1)
-    parted = split_like(sample, strangers(bars(1, 2, 3, 4), (1, 2)))
+    parted = split_like(sample, moved_apart(bars(1, 2, 3, 4), (1, 2)))
     assert parted.n_objects == 3
     assert weighted_coverage(parted.labels, bars(1, 2, 3, 3)) == 1.0
-    assert split_like(sample, strangers(bars(1, 2, 3, 4))) is sample
-    three = split_like(Hypothesis.from_labels(bars(1, 1, 1, 1), GRID, 1), strangers(bars(1, 2, 3, 0), (1, 2), (2, 3)))
+    assert split_like(sample, moved_apart(bars(1, 2, 3, 4))) is sample
+    three = split_like(
+        Hypothesis.from_labels(bars(1, 1, 1, 1), GRID, 1), moved_apart(bars(1, 2, 3, 0), (1, 2), (2, 3))
+    )
     assert weighted_coverage(three.labels, bars(1, 2, 3, 3)) == 1.0  # the rest goes to the nearest
 
 
 @pytest.mark.parametrize("merge", ["always", "share", "match", "never"])
-def test_crossover_never_makes_one_of_strangers(merge):
-    predicted = strangers(bars(1, 2, 3, 4), (1, 2), (3, 4))
+def test_crossover_never_merges_objects_that_moved_apart(merge):
+    predicted = moved_apart(bars(1, 2, 3, 4), (1, 2), (3, 4))
     for seed in range(50):
         rng = np.random.default_rng(seed)
         labels = rng.integers(0, 3, 4)
@@ -109,8 +111,8 @@ def test_crossover_never_makes_one_of_strangers(merge):
         assert len({r.id for r in child.objects}) == child.n_objects
 
 
-def test_without_memory_always_merging_does_make_one():
-    """The check above can fail: the same crossover without memory."""
+def test_without_the_record_the_same_objects_are_merged():
+    """The test above can fail: without records of motion the crossover merges the objects."""
     child = Crossover(merge="always").cross(
         np.random.default_rng(0),
         Hypothesis.from_labels(bars(1, 1, 2, 2), GRID, 1),
@@ -119,14 +121,14 @@ def test_without_memory_always_merging_does_make_one():
     assert child.labels[2, 4, 1] == child.labels[7, 4, 1]
 
 
-def test_memory_survives_files():
-    h = strangers(bars(1, 2, 3, 4), (1, 2), (1, 4))
+def test_the_record_is_stored_in_files():
+    h = moved_apart(bars(1, 2, 3, 4), (1, 2), (1, 4))
     (back,) = decode_hypotheses(encode_hypotheses([h]))
     assert [r.apart for r in back.objects] == [r.apart for r in h.objects]
     assert ObjectRecord.born(1, 0).apart == frozenset()
 
 
-def test_in_the_update_twins_come_apart_whatever_the_parents_say(pushed):
+def test_the_update_splits_twins_that_both_parents_merge(pushed):
     clip, truth = pushed
     one = Hypothesis.from_labels(merged(truth, (4, 5)), clip.grid)
     predicted = Population((one,), np.zeros(1), {"previous": np.zeros(1, int)})
@@ -142,5 +144,5 @@ def test_in_the_update_twins_come_apart_whatever_the_parents_say(pushed):
         assert weighted_coverage(child.labels, truth) > 0.95
 
 
-def test_no_division_says_nothing(pushed):
+def test_no_division_returns_none(pushed):
     assert NoDivision().divide(pushed[0]) is None

@@ -13,7 +13,7 @@ from mstfilter.fusion.free_space import FreeSpace, NoFreeSpace
 from mstfilter.scene import Camera, Clip, Frame, Hypothesis, Recording, look_at, render
 from mstfilter.scoring import weighted_coverage
 from mstfilter.smc import Population
-from tests.fusion.looks import CAMERAS, SMALL, frame_of, look, shelf, views
+from tests.fusion.reference import CAMERAS, SMALL, frame_of, observe, shelf, views
 from tests.scene.scenes import CAMERA, GRID, table_scene
 
 RGB, DEPTH, LABELS = table_scene()
@@ -21,7 +21,7 @@ FRAME = Frame(RGB, DEPTH, CAMERA)
 TRUTH = Hypothesis.from_labels(LABELS, GRID)
 
 
-def test_the_truth_is_left_alone():
+def test_the_truth_is_unchanged():
     refined, quality = FreeSpace().project(TRUTH, FRAME)
     assert quality == 1.0
     assert refined is TRUTH
@@ -29,7 +29,7 @@ def test_the_truth_is_left_alone():
     assert FreeSpace().project(TRUTH, noisy)[1] > 0.998
 
 
-def test_an_invented_object_in_view_is_cleared_and_costs():
+def test_a_false_object_in_free_space_is_cleared_and_lowers_the_quality():
     labels = LABELS.copy()
     labels[20:26, 8:14, :8] = 3  # stands free in front of everything
     labels[16:24, 40:46, :6] = 4  # behind box 1: partly hidden
@@ -51,7 +51,7 @@ def test_no_known_free_voxel_survives_and_measured_ones_do():
     assert (refined.labels[tuple(seen.T)] > 0).all()
 
 
-def test_unknown_stays_unknown():
+def test_unobserved_voxels_are_not_free():
     robot = Frame(RGB, DEPTH, CAMERA, np.ones(DEPTH.shape, bool))
     holes = Frame(RGB, np.full_like(DEPTH, np.nan), CAMERA)
     everything = Hypothesis.from_labels(np.ones(GRID.shape, np.uint16), GRID)
@@ -104,9 +104,9 @@ def cleared_of(frame, voxels=0.5, sigmas=3.0, table=0.0):
 
 @settings(max_examples=40, deadline=None)
 @given(st.integers(1, 3).flatmap(views), margins, tables)
-def test_what_is_cleared_is_what_the_definition_says(frame, margin, table):
+def test_known_free_voxels_match_the_reference(frame, margin, table):
     found = cleared_of(frame, *margin, table)
-    expected = look(frame, SMALL, *margin, table)
+    expected = observe(frame, SMALL, *margin, table)
     sure = ~expected.unsure
     assert sure.mean() > 0.9
     np.testing.assert_array_equal(found[sure], expected.free[sure])
@@ -127,7 +127,7 @@ def test_more_margin_clears_no_more(frame, a, b):
 def test_two_cameras_clear_what_either_does_and_support_of_either_protects(frame):
     other = frame.views[0]
     alone = [frame_of(v.depth, v.camera, v.robot_mask) for v in (frame, other)]
-    looks = [look(v, SMALL, 0.5, 3.0, -1.0) for v in alone]
+    looks = [observe(v, SMALL, 0.5, 3.0, -1.0) for v in alone]
     sure = ~(looks[0].unsure | looks[1].unsure)
     either = cleared_of(alone[0], table=-1.0) | cleared_of(alone[1], table=-1.0)
     both = cleared_of(frame, table=-1.0)

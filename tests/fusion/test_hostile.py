@@ -1,4 +1,4 @@
-"""Hostile input to fusion: each is fused correctly, or answered by one clear error."""
+"""Unusual input to fusion: it is fused correctly or raises one clear error."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def test_grids_that_differ(grid, found):
         (((0, 0, "low"), 0.01, (9, 8, 7)), "origin is .*low"),
     ],
 )
-def test_grids_that_cannot_be(arguments, message):
+def test_invalid_grids_raise_an_error(arguments, message):
     with pytest.raises(InputError, match=message):
         VoxelGrid(*arguments)
 
@@ -77,7 +77,7 @@ def test_grids_that_cannot_be(arguments, message):
     ],
     ids=["negative", "float", "nan", "object", "too large"],
 )
-def test_labels_that_cannot_be(wrong, message):
+def test_invalid_labels_raise_an_error(wrong, message):
     good = on(A)
     for call in (
         lambda: on(wrong),
@@ -109,7 +109,7 @@ def test_shapes_that_differ():
         )
 
 
-def test_masks_that_are_none():
+def test_disputed_must_be_boolean():
     with pytest.raises(InputError, match="disputed is float64"):
         ModeFilter(scope="disputed").apply(A, np.ones(A.shape))
 
@@ -191,7 +191,7 @@ def full(grid):
     return labels
 
 
-def test_as_many_labels_as_there_can_be():
+def test_the_largest_number_of_labels():
     """A table of all pairs of labels would take 34 GB; more objects than labels are refused, not wrapped around."""
     grid = VoxelGrid((0, 0, 0), 0.01, (41, 40, 40))
     labels = full(grid)
@@ -207,7 +207,7 @@ def test_as_many_labels_as_there_can_be():
         mixed(many, shifted, merge="never", mode_filter=off, structure=RandomOrder())
 
 
-def test_the_mode_filter_with_as_many_labels_as_there_can_be():
+def test_the_mode_filter_with_the_largest_number_of_labels():
     labels = full(VoxelGrid((0, 0, 0), 0.01, (41, 40, 40)))
     np.testing.assert_array_equal(ModeFilter(3, 3, 27).apply(labels), labels)  # none leads by three
     doubled = np.where(np.arange(labels.shape[2]) < 20, labels, MAX_LABEL)
@@ -224,8 +224,8 @@ def test_fields_of_the_mode_filter(fields):
         ModeFilter(**fields)
 
 
-def test_free_space_of_odd_hypotheses():
-    """Free space asks the hypothesis where it lies, so any grid is right; nothing, and nothing but noise, pass."""
+def test_free_space_of_unusual_grids():
+    """Free space uses the grid of the hypothesis. Empty hypotheses and hypotheses of single voxels are allowed."""
     project = FreeSpace().project
     frame = CLIP.after
     whole = np.ones(GRID.shape, np.uint16)
@@ -250,7 +250,7 @@ def test_free_space_of_odd_hypotheses():
 @pytest.mark.parametrize("claims", [Claims(), Claims("sample", 0.03)])
 @pytest.mark.parametrize("evidence", [(), (Agreement(),)])
 def test_an_update_of_parents_without_objects(claims, evidence):
-    """Whichever side is empty, all candidates can be built, weighted and scored."""
+    """If a parent is empty, all candidates can be built, weighted and scored."""
     nothing, something = on(0 * LABELS, GRID), on(LABELS, GRID, 1)
     update = FusionUpdate(eta=2, claims=claims, evidence=evidence)
     for predicted, proposed in ((nothing, something), (something, nothing), (nothing, nothing)):
@@ -263,7 +263,7 @@ def test_an_update_of_parents_without_objects(claims, evidence):
             np.testing.assert_array_equal(child.labels, wanted.labels)
 
 
-SURFACE = Claims("sample", 0.03)  # asks the frame about voxels of the clip's grid
+SURFACE = Claims("sample", 0.03)  # uses the grid of the clip
 
 
 @pytest.mark.parametrize(
@@ -277,7 +277,7 @@ SURFACE = Claims("sample", 0.03)  # asks the frame about voxels of the clip's gr
     ],
 )
 def test_an_update_of_hypotheses_on_another_grid(claims, wrong, found):
-    """Of the same shape, too: what the frame shows of a voxel would be taken for what it shows of another."""
+    """Grids of the same shape with another origin raise an error as well."""
     good, moved = on(LABELS, GRID), on(LABELS, replace(GRID, origin=GRID.origin + 0.05))
     first = moved if "all" in wrong else good
     sides = {name: Population((first, moved if name in wrong else good)) for name in ("predicted", "proposed")}

@@ -1,4 +1,4 @@
-"""The mode filter against plain loops, and what it does to thin objects."""
+"""The mode filter against plain loops, and its effect on thin objects."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def test_one_sweep_against_loops(labels, window, margin, isolation, where):
 
 @pytest.mark.parametrize("seed", range(12))
 def test_sweep_after_sweep_against_loops(seed):
-    """Later sweeps look only at what lies beside a change; the plain one looks at everything every time."""
+    """Later sweeps process voxels near a change; the loops process all voxels in every sweep."""
     rng = np.random.default_rng(seed)
     window, margin, isolation = int(rng.choice([3, 5])), int(rng.integers(-1, 4)), int(rng.integers(5, 125))
     labels = rng.choice([0, 1, 2, 5], (4, 3, 3), p=[0.1, 0.3, 0.3, 0.3]).repeat(2, 0).repeat(2, 1).repeat(2, 2)
@@ -93,7 +93,7 @@ def book_and_rod():
     return labels
 
 
-def test_everywhere_eats_the_book_and_the_rod_disputed_does_not():
+def test_everywhere_removes_the_book_and_the_rod_disputed_does_not():
     labels = book_and_rod()
     eaten = ModeFilter(scope="everywhere").apply(labels)
     assert 3 not in eaten

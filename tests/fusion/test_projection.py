@@ -1,4 +1,4 @@
-"""Free space as an update of its own, for any particle with labels on a grid."""
+"""Free space as a separate update, for any particle with labels on a grid."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ CLIP = Clip((Frame(RGB, DEPTH, CAMERA),), GRID, 0)
 
 @dataclass(frozen=True)
 class Occupancy:
-    """A particle of someone else's: occupied or not, and something of its own."""
+    """A particle of another class: occupancy and a name."""
 
     labels: np.ndarray
     grid: VoxelGrid
@@ -56,8 +56,8 @@ def test_the_manifold_update_for_vectors_takes_the_same_projection():
     assert [h.key for h in found.particles] == [h.key for h in mine.particles]
 
 
-def test_particles_of_ones_own_in_a_filter_without_a_proposal():
-    """Clouds of voxels that jitter: what is in free space goes, and the best guess of where the boxes stand wins."""
+def test_other_particles_in_a_filter_without_a_proposal():
+    """Shifted copies of the scene: voxels in free space are cleared, and the best shift gets the largest weight."""
 
     @dataclass(frozen=True)
     class Guesses(Proposal):
@@ -106,7 +106,7 @@ def test_a_particle_that_loses_all_keeps_a_weight():
     assert found.log_weights[0] == pytest.approx(2 * np.log(1e-3))
 
 
-def test_it_is_found_by_name_and_says_what_is_wrong():
+def test_it_is_built_by_name_and_checks_its_fields():
     built = REGISTRY.build("update", {"component": "projection", "free_space": "none", "quality_exponent": 1.0})
     assert built == ProjectionUpdate(NoFreeSpace(), 1.0)
     with pytest.raises(InputError, match="quality_exponent"):

@@ -48,7 +48,7 @@ def test_hypotheses_without_any_object():
         WeightedCoverage().matrix([empty, Hypothesis.from_labels(np.zeros((2, 2, 2), int), other)])
 
 
-def test_labels_are_only_names():
+def test_renamed_labels_are_equal():
     a = np.array([[[0, 5, 5, 2]]])
     b = np.array([[[0, 1, 1, 9]]])
     c = np.array([[[3, 1, 1, 9]]])

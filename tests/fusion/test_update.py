@@ -37,14 +37,14 @@ crossovers = st.builds(
 @settings(max_examples=150, deadline=None)
 @given(labels, labels, crossovers, st.integers(0, 1000))
 def test_crossover_invariants(a, b, crossover, seed):
-    """Occupied is the union; no object is invented; every child object is made of whole parents' pieces."""
+    """The child occupies the union of its parents, and its objects are objects of its parents."""
     proposed, predicted = Hypothesis.from_labels(a, SMALL, birth=1), Hypothesis.from_labels(b, SMALL, birth=0)
     child = crossover.cross(np.random.default_rng(seed), proposed, predicted)
     np.testing.assert_array_equal(child.labels > 0, (a > 0) | (b > 0))
     ids = {o.id for h in (proposed, predicted) for o in h.objects}
     assert {o.id for o in child.objects} <= ids
     assert len({o.id for o in child.objects}) == len(child.objects)
-    # Voxels that no conflict touches keep their company.
+    # An object without conflict keeps one label.
     for hypothesis, other in ((proposed, b), (predicted, a)):
         for record in hypothesis.objects:
             mask = hypothesis.labels == record.label
@@ -69,7 +69,7 @@ def _graph_and_draw(crossover, a, b, seed):
 @settings(max_examples=60, deadline=None)
 @given(labels, st.integers(0, 1000))
 def test_equal_parents_and_empty_parents(a, seed):
-    """A perfect prediction and a perfect measurement leave the scene unchanged; an empty side returns the other."""
+    """Equal parents give the same scene; with an empty parent the result is the other one."""
     rng = np.random.default_rng(seed)
     crossover = Crossover(merge="share", mode_filter=ModeFilter(scope="disputed"))
     one, two = Hypothesis.from_labels(a, SMALL, birth=3), Hypothesis.from_labels(a, SMALL)
@@ -89,7 +89,7 @@ def test_thin_objects_survive_agreement():
 
 
 def test_identity_and_motion_history():
-    """The largest predicted object gives the id; history is kept only where the voxels are exactly its own."""
+    """The largest predicted object gives the id. The history is kept if the voxels are exactly those predicted."""
     a, b = np.zeros(SMALL.shape, np.uint16), np.zeros(SMALL.shape, np.uint16)
     b[0, :3], b[4, 0] = 1, 2
     a[0, :3, 0], a[2, 2, 2] = 5, 6
@@ -190,7 +190,7 @@ def test_the_authors_real_particles(shared_data):
     config = load_config("authors", ["update.free_space=none"])
     update = REGISTRY.build("update", config["update"])
     assert isinstance(update.free_space, NoFreeSpace)
-    # There is no depth: the projection is off and hands out the Q that came with the data.
+    # The data contain no depth: the projection returns the Q of the data.
     update = replace(update, free_space=ShippedQuality({h.key: q for h, q in zip(predictions, quality, strict=True)}))
     predicted = Population(predictions, measured["weight"][0, :5], {"previous": np.arange(5)})
     rgb, depth, _ = table_scene()
@@ -249,7 +249,7 @@ def test_systematic_resampling_reaches_many_parents(n, n_proposed):
 
 @dataclass(frozen=True)
 class ShippedQuality(Projection):
-    """Hands out the quality that came with the data, by the particle's own voxels."""
+    """Returns the quality of the data, by the key of the hypothesis."""
 
     by_key: dict
 
@@ -257,8 +257,8 @@ class ShippedQuality(Projection):
         return hypothesis, self.by_key[hypothesis.key]
 
 
-def test_the_drop_rule_loses_late_loose_objects_and_only_on_request():
-    """An unconflicted object whose first voxel comes after those of all conflicting ones."""
+def test_the_drop_rule_drops_late_objects_without_conflict():
+    """An object without conflict whose first voxel follows those of all objects in conflict."""
     a, b = np.zeros(SMALL.shape, np.uint16), np.zeros(SMALL.shape, np.uint16)
     a[0, 0, 0], b[:2, 0, 0], b[4, 3, 2] = 1, 1, 2  # label 2 stands alone, at the end of the scan
     proposed, predicted = Hypothesis.from_labels(a, SMALL, 1), Hypothesis.from_labels(b, SMALL)
@@ -275,7 +275,7 @@ def test_the_drop_rule_loses_late_loose_objects_and_only_on_request():
 
 
 def test_history_ends_where_fusion_changes_voxels():
-    """A predicted object that gains or loses a voxel starts anew."""
+    """The history of a predicted object that gains or loses a voxel is removed."""
     b = np.zeros(SMALL.shape, np.uint16)
     b[:2, :2] = 1
     moved = RigidTransform.from_translation([0.01, 0, 0])

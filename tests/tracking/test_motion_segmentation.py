@@ -18,7 +18,7 @@ def pushed():
     return clip, project(truth, clip.after.camera)
 
 
-def test_every_motion_has_a_number_of_its_own(pushed):
+def test_every_motion_has_a_different_number(pushed):
     clip, objects = pushed
     motions = MotionSegmentation().labels(clip)
     main = {}
@@ -41,8 +41,8 @@ def test_nothing_moved_or_a_single_frame(pushed):
 
 
 @pytest.mark.parametrize("change", ["frames", "grid"])
-def test_what_is_remembered_belongs_to_one_clip(pushed, change):
-    """Clips of the same first and last frame are told apart by what lies between, and by the workspace."""
+def test_cached_motions_belong_to_one_clip(pushed, change):
+    """Clips with equal first and last frames have different keys if other frames or the workspace differ."""
     clip, _ = pushed
     frames, grid = list(clip.frames), clip.grid
     if change == "frames":
@@ -72,8 +72,8 @@ def test_the_limit_of_misfit_decides(pushed):
     assert len(np.unique(coarse[inside])) < len(np.unique(fine[inside]))
 
 
-def test_an_object_that_turned_is_not_broken():
-    """A long bar turns about its end: what lies near the axis went with it, and may as well have rested."""
+def test_an_object_that_turned_is_not_split():
+    """A long bar turns about its end: points near the axis also agree with rest."""
     length, turns = 0.24, np.linspace(0, 24, 5)
     poses = []
     for degrees in turns:

@@ -100,7 +100,7 @@ def test_refinement_reduces_the_error_of_a_motion(textured, plain):
             mm, deg = errors(refined, truth, centre)
             assert deg < 1.2
             assert MotionResidual().score(track, refined) < 0.6 * MotionResidual().score(track, truth @ off)
-            if kind == "textured":  # along a plain face neither depth nor colour says anything
+            if kind == "textured":  # along a plain face neither depth nor colour determines the motion
                 assert mm < 2.0
 
 

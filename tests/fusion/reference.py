@@ -1,4 +1,4 @@
-"""What depth images say of voxels, one voxel and one camera at a time: an oracle for free space, and small scenes."""
+"""A reference for free space, which checks one voxel and one camera at a time, and small scenes."""
 
 from __future__ import annotations
 
@@ -56,8 +56,8 @@ def views(n: int):
 
 
 @dataclass
-class Looked:
-    """What an instant says of every voxel; where a rounding decides, `unsure`."""
+class ObservedVoxels:
+    """State of every voxel; `unsure` where the result depends on rounding."""
 
     free: np.ndarray
     hit: np.ndarray
@@ -65,9 +65,9 @@ class Looked:
     unsure: np.ndarray
 
 
-def look(frame: Frame, grid: VoxelGrid, voxels: float, sigmas: float, table: float) -> Looked:
-    """By the definition: explicit pinhole, one voxel after the other."""
-    found = Looked(*(np.zeros(grid.shape, bool) for _ in range(4)))
+def observe(frame: Frame, grid: VoxelGrid, voxels: float, sigmas: float, table: float) -> ObservedVoxels:
+    """Evaluates the definition with a pinhole camera, voxel by voxel."""
+    found = ObservedVoxels(*(np.zeros(grid.shape, bool) for _ in range(4)))
     for view in (frame, *frame.views):
         _mark_hits(view, grid, found)
     for index in np.ndindex(*grid.shape):
@@ -82,7 +82,7 @@ def look(frame: Frame, grid: VoxelGrid, voxels: float, sigmas: float, table: flo
     return found
 
 
-def _mark_hits(view: Frame, grid: VoxelGrid, found: Looked) -> None:
+def _mark_hits(view: Frame, grid: VoxelGrid, found: ObservedVoxels) -> None:
     K, T = view.camera.K, view.camera.T_world_camera.as_matrix()
     for v, u in np.ndindex(view.camera.height, view.camera.width):
         d = float(view.depth[v, u])
