@@ -17,7 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
@@ -70,15 +70,15 @@ class TrueMotions(UsesTruth, Transition):
         for row, label in enumerate(table.labels_a.tolist()):
             if label == 0:
                 continue
-            fate = "no object"
+            outcome = "no object"
             if shared[row].any():
                 T = motions.get(int(table.labels_b[shared[row].argmax()]), np.eye(4))
                 centres = hypothesis.grid.centre_of(np.argwhere(hypothesis.mask(label)))
-                went = np.linalg.norm(move_points(T, centres) - centres, axis=1).max()
-                fate = "true" if went > _REST else "rest"
-                if fate == "true":
+                distance = np.linalg.norm(move_points(T, centres) - centres, axis=1).max()
+                outcome = "true" if distance > _REST else "rest"
+                if outcome == "true":
                     chosen[label] = rigid_transform(T)
-            counts[fate] += 1
+            counts[outcome] += 1
         return self.warp.move(hypothesis, chosen).hypothesis
 
 
@@ -170,48 +170,62 @@ class TrueFusion(UsesTruth, Update):
         return Population(built.particles, np.sum(scores, axis=0), parents)
 
 
+class _Part(NamedTuple):
+    """An object of a parent."""
+
+    number: int  # among the objects of both parents, the predicted ones first
+    record: ObjectRecord
+    mask: np.ndarray
+    jaccard: dict[int, float]  # with each true object that it overlaps
+
+    @property
+    def target(self) -> int:
+        """The true object that it overlaps best."""
+        return max(self.jaccard, key=lambda label: (self.jaccard[label], -label))
+
+
 def best_of_both(proposed: Hypothesis, predicted: Hypothesis, true: np.ndarray) -> Hypothesis:
     """The candidate that `TrueFusion` builds from two hypotheses."""
-    masks: list[np.ndarray] = []
-    records: list[ObjectRecord] = []
-    claims: list[dict[int, float]] = []  # Jaccard index with each true object that an object meets
+    parts: list[_Part] = []
     for parent in (predicted, proposed):
         table = overlap(parent.labels, true)
         jaccard = table.jaccard()
         for record in parent.objects:
             row = int(np.searchsorted(table.labels_a, record.label))
-            masks.append(parent.mask(record.label))
-            records.append(record)
-            met = np.flatnonzero((table.counts[row] > 0) & (table.labels_b > 0))
-            claims.append({int(table.labels_b[c]): float(jaccard[row, c]) for c in met})
-    n_predicted = predicted.n_objects
-    chosen: list[tuple[float, int, np.ndarray, bool]] = []
-    for k in sorted({k for claim in claims for k in claim}):
-        able = [m for m in range(len(masks)) if claims[m] and max(claims[m], key=lambda o: (claims[m][o], -o)) == k]
-        able.sort(key=lambda m: -claims[m][k])
-        if not able:
+            columns = np.flatnonzero((table.counts[row] > 0) & (table.labels_b > 0))
+            overlaps = {int(table.labels_b[c]): float(jaccard[row, c]) for c in columns}
+            mask = parent.mask(record.label)
+            parts.append(_Part(len(parts), record, mask, overlaps))
+
+    chosen: list[tuple[float, int, ObjectRecord, np.ndarray, bool]] = []
+    for label in {k for part in parts for k in part.jaccard}:
+        candidates = [part for part in parts if part.jaccard and part.target == label]
+        if not candidates:
             continue
-        target, mask, best, merged = true == k, masks[able[0]], claims[able[0]][k], False
-        for m in able[1:]:
-            joined = mask | masks[m]
-            jaccard_joined = float((joined & target).sum() / (joined | target).sum())
-            if jaccard_joined > best + 1e-9:
-                mask, best, merged = joined, jaccard_joined, True
-        known = [m for m in able if m < n_predicted]
-        if known:  # an object that was there before keeps its name
-            old = records[known[0]]
-            records[able[0]] = replace(records[able[0]], id=old.id, birth=old.birth)
-        chosen.append((best, able[0], mask, merged))
-    labels, kept = np.zeros(true.shape, np.uint16), {}
-    for number, (_, m, mask, merged) in enumerate(sorted(chosen, key=lambda c: (c[0], -c[1])), start=1):
+        candidates.sort(key=lambda part: -part.jaccard[label])
+        first = candidates[0]
+        record, mask, best, merged = first.record, first.mask, first.jaccard[label], False
+        for part in candidates[1:]:
+            joined = mask | part.mask
+            score = float((joined & (true == label)).sum() / (joined | (true == label)).sum())
+            if score > best + 1e-9:
+                mask, best, merged = joined, score, True
+        known = [part.record for part in candidates if part.number < predicted.n_objects]
+        if known:  # the object keeps its identity
+            record = replace(record, id=known[0].id, birth=known[0].birth)
+        chosen.append((best, -first.number, record, mask, merged))
+
+    chosen.sort(key=lambda entry: entry[:2])
+    labels = np.zeros(true.shape, np.uint16)
+    for number, (_, _, _, mask, _) in enumerate(chosen, start=1):
         labels[mask] = number
-        kept[number] = (records[m], mask, merged)
-    out = []
-    for number in [int(k) for k in np.unique(labels) if k > 0]:
-        record, mask, merged = kept[number]
-        record = replace(record, label=number)
-        out.append(record if not merged and np.array_equal(labels == number, mask) else record.changed())
-    return Hypothesis(labels, predicted.grid, tuple(out))
+    records = []
+    for number, (_, _, record, mask, merged) in enumerate(chosen, start=1):
+        visible = labels == number
+        if visible.any():
+            record = replace(record, label=number)
+            records.append(record if not merged and np.array_equal(visible, mask) else record.changed())
+    return Hypothesis(labels, predicted.grid, tuple(records))
 
 
 #: Overrides of the preset ``mst`` by stage. A new component keeps the fields of ``mst`` that it has too.

@@ -52,7 +52,7 @@ class TransitionContract(_PopulationContract):
     def call(self, component: Any, rng: np.random.Generator, inputs: dict[str, Any]) -> Population:
         return component.predict(rng, inputs["population"], inputs["observation"])
 
-    def test_says_where_particles_come_from(self) -> None:
+    def test_parents_are_valid(self) -> None:
         """It keeps the number of particles, or sets parents "previous" to indices of old particles."""
         component = self.make()
         for n in (1, 2, _N):

@@ -1,4 +1,4 @@
-"""Contracts of resamplers, with the law of proper weighting.
+"""Contracts of resamplers, with tests of proper weighting.
 
 A resampler is properly weighted if the mean over its output of w f(x) has, for every f, the expectation of the mean
 over its input. Particle i of m *carries* the sum of the output weights of its copies, divided by the number n of
@@ -24,7 +24,7 @@ from mstfilter.testing.contract import (
 )
 
 _REPEATS = 3000
-#: Weights and numbers of particles for the law. No weight is so small that a particle is hardly ever selected.
+#: Weights and numbers of particles of the statistical tests. Every particle is selected now and then.
 _CASES: tuple[tuple[tuple[float, ...], int], ...] = (
     ((0.11, 0.36, 0.15, 0.38), 3),
     ((0.41, 0.24, 0.2, 0.1, 0.05), 7),
@@ -59,7 +59,6 @@ class ResamplerContract(RandomContract):
         assert not len(wrong), f"ancestor {wrong[0]} is out of range: there are {m} particles; off by one?"
 
     def resample(self, component: Resampler, population: Population, n: int, rng: np.random.Generator) -> Population:
-        """A checked call."""
         return self.checked_call(component, {"population": population, "n": n}, rng)
 
     @prerequisite
@@ -100,7 +99,7 @@ class ResamplerContract(RandomContract):
                 wrong = _without_weight(chosen, weights)
                 assert not len(wrong), f"of weights {weights} it selects particle {wrong[0]}, weight 0"
 
-    def test_copes_with_extreme_uniforms(self) -> None:
+    def test_handles_extreme_uniforms(self) -> None:
         """It handles the smallest and the largest uniform number, 0 and 1 - 2^-53."""
         component = self.make()
         for value in (0.0, 1 - 2.0**-53):
@@ -113,7 +112,7 @@ class ResamplerContract(RandomContract):
                         'weight 0: use np.searchsorted with side="right", and end at a particle with weight'
                     )
 
-    def test_parents_come_along(self) -> None:
+    def test_keeps_parents(self) -> None:
         """Selected particles keep their parents."""
         population = self.population((1.0, 2.0, 1.5, 0.5, 2.0))
         chosen = self.resample(self.make(), population, 4, np.random.default_rng(1))
@@ -122,7 +121,7 @@ class ResamplerContract(RandomContract):
             'parents "previous" of the result are not those of the ancestors'
         )
 
-    def test_listens_to_the_generator(self) -> None:
+    def test_depends_on_the_generator(self) -> None:
         """Different generators give different results, if n W_i are not integers."""
         component = self.make()
         skip_unless_properly_weighted(component)
@@ -229,17 +228,6 @@ class ResamplerContract(RandomContract):
 
 class WeightResamplerContract(ResamplerContract):
     """The contract of every `WeightResampler`: that of a `Resampler`, and properties of `select`."""
-
-    @prerequisite
-    def test_select_leaves_its_input_alone(self) -> None:
-        """It leaves an array of log weights unchanged."""
-        log_weights = _log((1.0, 2.0, 3.0, 4.0))
-        given = log_weights.copy()
-        try:
-            self.make().select(np.random.default_rng(0), given, 3)
-        except Exception:  # other tests report errors
-            return
-        assert np.array_equal(given, log_weights), "it changes its input in place (log_weights): make a copy first"
 
     @prerequisite
     def test_select_returns_integers(self) -> None:

@@ -270,7 +270,7 @@ class CodecContract(_ParticlesContract):
         for n in _SIZES:
             self.checked_call(component, self.inputs(n))
 
-    def test_particles_come_back(self) -> None:
+    def test_decoded_particles_are_equal(self) -> None:
         """Particles read from a file equal the stored ones bit by bit."""
         component = self.make()
         for n in _SIZES:

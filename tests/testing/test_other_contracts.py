@@ -26,14 +26,9 @@ from mstfilter.smc import (
 from mstfilter.testing import (
     CodecContract,
     DensityTransitionContract,
-    EquivalenceContract,
-    EvidenceContract,
     LookaheadContract,
     ProposalContract,
     RejuvenationContract,
-    SimilarityContract,
-    SizeContract,
-    TriggerContract,
     UpdateContract,
     run_contract,
     scene_example,
@@ -67,16 +62,6 @@ class TestReweight(UpdateContract):
 
     def example(self, rng, n):
         return vectors(rng, n)
-
-
-class TestEss(TriggerContract):
-    def make(self):
-        return REGISTRY.build("trigger", "ess")
-
-
-class TestKld(SizeContract):
-    def make(self):
-        return REGISTRY.build("size", "kld")
 
 
 def boxes(rng, n):
@@ -158,21 +143,6 @@ class TestHypotheses(CodecContract):
 
     def example(self, rng, n):
         return scene_example(rng, n)
-
-
-class TestGaussian(SimilarityContract):
-    def make(self):
-        return REGISTRY.build("similarity", "gaussian")
-
-
-class TestBins(EquivalenceContract):
-    def make(self):
-        return REGISTRY.build("equivalence", "bins")
-
-
-class TestAgreement(EvidenceContract):
-    def make(self):
-        return REGISTRY.build("evidence", "agreement")
 
 
 @pytest.mark.parametrize(
