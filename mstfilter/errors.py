@@ -37,6 +37,10 @@ class MissingLibraryError(InputError):
     """A library or a system package that a chosen component needs is not there."""
 
 
+class LostRunError(InputError):
+    """No particle explains an observation: the estimate of the evidence is 0, and the run cannot continue."""
+
+
 class InputWarning(UserWarning):
     """Input that can be used but is probably not what was meant. The command line shows it as one ``warning:`` line.
 

@@ -18,6 +18,7 @@
 `triggers`            when to resample, and to how many particles
 `components`          updates by a likelihood or a projection, transitions with several branches
 `streams`             random streams named by seed, step, slot and index
+`batching`            many runs of a filter at once
 `checkpoint`          storage of the state of a run in a file
 `state_space`         state-space models; bootstrap, guided, auxiliary and resample-move filters
 `kalman`              linear-Gaussian models, Rao-Blackwellised filters

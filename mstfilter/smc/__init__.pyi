@@ -1,3 +1,8 @@
+from mstfilter.smc.batching import (
+    Batch as Batch,
+    batch as batch,
+    batched_slots as batched_slots,
+)
 from mstfilter.smc.checkpoint import ArrayCodec as ArrayCodec, load_state as load_state, save_state as save_state
 from mstfilter.smc.components import (
     Branching as Branching,
@@ -122,7 +127,7 @@ from mstfilter.smc.state_space import (
     guided as guided,
     resample_move as resample_move,
 )
-from mstfilter.smc.streams import Key as Key, child as child, key_of as key_of
+from mstfilter.smc.streams import Key as Key, RunGenerators as RunGenerators, child as child, key_of as key_of
 from mstfilter.smc.triggers import (
     Always as Always,
     EssBelow as EssBelow,

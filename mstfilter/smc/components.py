@@ -33,9 +33,12 @@ class Reweight(Update):
     ----------
     log_likelihood : callable
         ``(particles, observation) -> (n,)`` log p(y | x).
+    batched : bool
+        Whether the function also takes particles (R, n, ...) and returns (R, n).
     """
 
     log_likelihood: Callable[[Any, Any], np.ndarray]
+    batched: bool = False
 
     draws: ClassVar[bool] = False
 
@@ -44,9 +47,10 @@ class Reweight(Update):
     ) -> Population:
         population = union(predicted, proposed)
         found = np.asarray(self.log_likelihood(population.particles, observation))
-        if found.shape != (len(population),):
+        if found.shape != population.log_weights.shape:
             raise InputError(
-                f"log likelihood has shape {found.shape}, expected ({len(population)},): one number a particle"
+                f"log likelihood has shape {found.shape}, expected {population.log_weights.shape}: one number per "
+                "particle"
             )
         return population.reweighted(found)
 

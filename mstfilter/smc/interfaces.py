@@ -63,6 +63,14 @@ class Component(ABC):
         """Whether the component uses the generator that it is given. If False, it must not use it."""
         return True
 
+    @property
+    def batched(self) -> bool:
+        """Whether the component also works on R runs at once, with arrays (R, n, ...) instead of (n, ...).
+
+        See `mstfilter.smc.batching`. Default: False, then it is called once for each run.
+        """
+        return False
+
 
 class Proposal(Component):
     """Draws particles from the observation alone."""

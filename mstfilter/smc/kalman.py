@@ -51,12 +51,13 @@ def linear_gaussian(F: Any, Q: Any, H: Any, R: Any, m0: Any, P0: Any) -> StateSp
 
         def of(residual: np.ndarray) -> np.ndarray:
             z = residual @ whiten.T
-            return constant - 0.5 * np.einsum("ij,ij->i", z, z)
+            return constant - 0.5 * np.einsum("...j,...j->...", z, z)
 
         return of
 
-    def initial(rng: np.random.Generator, n: int) -> np.ndarray:
-        return m0 + rng.standard_normal((n, len(m0))) @ root_P.T
+    def initial(rng: np.random.Generator, n: int | tuple[int, int]) -> np.ndarray:
+        shape = (n,) if isinstance(n, int) else n
+        return m0 + rng.standard_normal((*shape, len(m0))) @ root_P.T
 
     def transition(rng: np.random.Generator, x: np.ndarray) -> np.ndarray:
         return x @ F.T + rng.standard_normal(x.shape) @ root_Q.T
@@ -68,6 +69,7 @@ def linear_gaussian(F: Any, Q: Any, H: Any, R: Any, m0: Any, P0: Any) -> StateSp
         lambda x, y: of_R(np.atleast_1d(y) - x @ H.T),
         lambda x: of_P(x - m0),
         lambda old, new: of_Q(new - old @ F.T),
+        batched=True,
     )
 
 

@@ -26,7 +26,7 @@ from typing import Any, Generic, TypeVar
 
 import numpy as np
 
-from mstfilter.errors import InputError
+from mstfilter.errors import InputError, LostRunError
 
 _T = TypeVar("_T")
 _U = TypeVar("_U")
@@ -152,7 +152,7 @@ def _check_log_weights(lw: np.ndarray, n: int) -> None:
             *(["is the observation NaN? one that is missing is None"] if np.isnan(lw).all() else []),
         )
     if top == -np.inf:
-        raise InputError(
+        raise LostRunError(
             f"all {n} log weights are -inf: no particle explains the observation",
             "more particles, a wider proposal, or a likelihood with heavier tails",
         )
@@ -244,7 +244,7 @@ class Population:
             weights = self.log_weights - top
             np.exp(weights, out=weights)
             total = float(weights.sum())
-            both = (total**2 / float(weights @ weights), float(top) + math.log(total / len(weights)))
+            both = (total * total / float(weights @ weights), float(top) + math.log(total / len(weights)))
             object.__setattr__(self, "_both", both)
         return self.__dict__["_both"]
 

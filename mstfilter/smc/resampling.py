@@ -143,9 +143,30 @@ class Stratified(WeightResampler):
 class Systematic(WeightResampler):
     """One uniform for all strata (Carpenter, Clifford, Fearnhead 1999); N_i is floor or ceil of n W_i."""
 
+    batched: ClassVar[bool] = True
+
     def select(self, rng: np.random.Generator, log_weights: np.ndarray, n: int) -> tuple[np.ndarray, None]:
+        if log_weights.ndim == 2:  # one row per run of a batch
+            return _systematic_rows(log_weights, n, rng.random((len(log_weights), 1))), None
         cumulative = _cumulative(log_weights, n)
         return systematic_ancestors(cumulative, n, rng.random()), None
+
+
+def _systematic_rows(log_weights: np.ndarray, n: int, shifts: np.ndarray) -> np.ndarray:
+    """(R, n) ancestors for (R, m) log weights and (R, 1) shifts: `systematic_ancestors` of every row."""
+    rows = len(log_weights)
+    weights = log_weights - log_weights.max(axis=1, keepdims=True)
+    np.exp(weights, out=weights)
+    cumulative = np.cumsum(weights, axis=1, out=weights)
+    total = cumulative[:, -1:]
+    points = cumulative * (n / total)
+    points -= shifts
+    np.ceil(points, out=points)
+    np.minimum(points, n, out=points)
+    points[cumulative == total] = n
+    ends = points[:, :-1].astype(np.int64) + (n + 1) * np.arange(rows)[:, None]
+    counts = np.bincount(ends.ravel(), minlength=rows * (n + 1)).reshape(rows, n + 1)
+    return counts[:, :n].cumsum(axis=1)
 
 
 @dataclass(frozen=True)

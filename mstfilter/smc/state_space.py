@@ -48,6 +48,9 @@ class StateSpaceModel:
         ``(particles) -> (n,)`` log p(x_0). Guided filters and moves need it.
     log_transition : callable, optional
         ``(previous, new) -> (n,)`` log f(x_t | x_{t-1}) of paired rows. Guided filters and moves need it.
+    batched : bool
+        Whether `sample_initial` also takes n = (R, n), and `sample_transition` and `log_likelihood` particles
+        (R, n, ...), the particles of R runs (see `mstfilter.smc.batching`).
     """
 
     sample_initial: Callable[[np.random.Generator, int], Any]
@@ -55,6 +58,7 @@ class StateSpaceModel:
     log_likelihood: Callable[[Any, Any], np.ndarray]
     log_initial: Callable[[Any], np.ndarray] | None = None
     log_transition: Callable[[Any, Any], np.ndarray] | None = None
+    batched: bool = False
 
     @classmethod
     def of(cls, initial: Any, transition: Callable[[Any], Any], observation: Callable[[Any], Any]) -> StateSpaceModel:
@@ -103,6 +107,10 @@ class Prior(Proposal):
 
     model: StateSpaceModel
 
+    @property
+    def batched(self) -> bool:
+        return self.model.batched
+
     def sample(self, rng: np.random.Generator, observation: Any, n: int) -> Population:
         return Population(self.model.sample_initial(rng, n))
 
@@ -112,6 +120,10 @@ class Dynamics(DensityTransition):
     """Moves by the transition of the model."""
 
     model: StateSpaceModel
+
+    @property
+    def batched(self) -> bool:
+        return self.model.batched
 
     def predict(self, rng: np.random.Generator, population: Population, observation: Any) -> Population:
         return population.moved(self.model.sample_transition(rng, population.particles))
@@ -263,7 +275,7 @@ def bootstrap(
     return ParticleFilter(
         initial=Prior(model),
         transition=Dynamics(model),
-        update=Reweight(model.log_likelihood),
+        update=Reweight(model.log_likelihood, model.batched),
         resampler=resampler,
         trigger=trigger,
         n=n,

@@ -18,6 +18,7 @@ share a stream (probability one in a million for a hundred names).
 
 from __future__ import annotations
 
+import ctypes
 import zlib
 from dataclasses import dataclass
 from functools import lru_cache
@@ -27,6 +28,8 @@ import numpy as np
 
 from mstfilter.errors import InputError
 
+#: Streams whose states are computed together.
+_BLOCK = 1 << 16
 _PREFIX = 0x6D7374  # "mst"; spawn() numbers its children from 0
 
 
@@ -109,6 +112,84 @@ def key_of(rng: np.random.Generator) -> Key:
     return Key(int(sequence.entropy), (_PREFIX, len(path), *path))  # the length makes children and siblings differ
 
 
+def pcg64_states(words: np.ndarray) -> np.ndarray:
+    """States of the generators that numpy's SeedSequence and PCG64 make from given words.
+
+    Parameters
+    ----------
+    words : (m, k) uint32
+        The assembled entropy of m sequences, k >= 4, as `Key.generator` makes it.
+
+    Returns
+    -------
+    (m, 4) uint64
+        Low and high word of the state, low and high word of the increment.
+
+    References
+    ----------
+    O'Neill (2015), "Developing a seed_seq alternative", the hash of SeedSequence; O'Neill (2014), PCG, section 4.
+    """
+    constant = 0x43B0D7E5
+
+    def hashed(value: np.ndarray) -> np.ndarray:
+        nonlocal constant
+        value = value ^ np.uint32(constant)
+        constant = constant * 0x931E8875 & 0xFFFFFFFF
+        value = value * np.uint32(constant)
+        return value ^ value >> np.uint32(16)
+
+    def mixed(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        z: Any = x * np.uint32(0xCA01F9DD) - y * np.uint32(0x4973F715)
+        return z ^ z >> np.uint32(16)
+
+    pool = [hashed(words[:, i]) for i in range(4)]
+    for source in range(4):
+        for target in range(4):
+            if source != target:
+                pool[target] = mixed(pool[target], hashed(pool[source]))
+    for source in range(4, words.shape[1]):
+        for target in range(4):
+            pool[target] = mixed(pool[target], hashed(words[:, source]))
+    state, out = 0x8B51F9DD, []
+    for i in range(8):
+        value = pool[i % 4] ^ np.uint32(state)
+        state = state * 0x58F38DED & 0xFFFFFFFF
+        value = value * np.uint32(state)
+        out.append((value ^ value >> np.uint32(16)).astype(np.uint64))
+    seed_high, seed_low, inc_high, inc_low = (out[2 * i] | out[2 * i + 1] << np.uint64(32) for i in range(4))
+    # inc = 2 * sequence + 1; state = (inc + seed) * multiplier + inc, modulo 2^128.
+    inc_high, inc_low = inc_high << np.uint64(1) | inc_low >> np.uint64(63), inc_low << np.uint64(1) | np.uint64(1)
+    low, high = _add(inc_low, inc_high, seed_low, seed_high)
+    low, high = _add(*_times_multiplier(low, high), inc_low, inc_high)
+    return np.stack([low, high, inc_low, inc_high], axis=1)
+
+
+def _add(a_low: np.ndarray, a_high: np.ndarray, b_low: np.ndarray, b_high: np.ndarray) -> tuple[Any, Any]:
+    """Sums modulo 2^128."""
+    low = a_low + b_low
+    return low, a_high + b_high + (low < a_low)
+
+
+def _times_multiplier(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Products with the multiplier of PCG64, modulo 2^128."""
+    m_high, m_low = np.uint64(0x2360ED051FC65DA4), np.uint64(0x4385DF649FCCF645)
+    half, mask = np.uint64(32), np.uint64(0xFFFFFFFF)
+    a, b, c, d = low & mask, low >> half, m_low & mask, m_low >> half
+    middle = (a * c >> half) + (b * c & mask) + (a * d & mask)
+    carry = b * d + (b * c >> half) + (a * d >> half) + (middle >> half)
+    return low * m_low, high * m_low + low * m_high + carry
+
+
+def entropy(seeds: list[int], *parts: int | str) -> np.ndarray:
+    """(R, k) uint32 words of the keys ``Key(seed).child(*parts)``, for `pcg64_states`; seeds below 2^128."""
+    path = [word for number in (_PREFIX, *map(_number, parts)) for word in _words(number)]
+    words = np.zeros((len(seeds), 4 + len(path)), np.uint32)
+    for row, seed in zip(words, seeds, strict=True):
+        row[: len(_words(seed))] = _words(seed)
+    words[:, 4:] = path
+    return words
+
+
 def _words(number: int) -> list[int]:
     """A number as 32-bit words, lowest first."""
     words = [number & 0xFFFFFFFF]
@@ -128,3 +209,152 @@ def _number(part: int | str) -> int:
 @lru_cache(maxsize=256)
 def _named(name: str) -> int:
     return zlib.crc32(name.encode()) | 1 << 32  # two words, so different from any single index below 2^32
+
+
+class SlotStreams:
+    """States of the streams of many runs in one slot, for all steps.
+
+    Parameters
+    ----------
+    seeds : list of int
+        One per run, below 2^128.
+    slot : str
+    n_steps : int
+    """
+
+    def __init__(self, seeds: list[int], slot: str, n_steps: int) -> None:
+        self.seeds, self.slot, self.n_steps = seeds, slot, n_steps
+        self.block, self.known = max(1, _BLOCK // len(seeds)), -1
+        self.found = np.zeros((0, len(seeds), 4), np.uint64)
+
+    def states(self, t: int, runs: np.ndarray) -> np.ndarray:
+        """(len(runs), 4) uint64 at step t."""
+        block, position = divmod(t, self.block)
+        if block != self.known:
+            steps = range(block * self.block, min((block + 1) * self.block, self.n_steps))
+            words = entropy(self.seeds, "step", 0, self.slot)
+            all_words = np.tile(words, (len(steps), 1, 1))
+            at = entropy([0], "step").shape[1]  # the word of the number of the step
+            all_words[:, :, at] = np.array(steps, np.uint32)[:, None]
+            found = pcg64_states(all_words.reshape(-1, words.shape[1]))
+            self.found, self.known = found.reshape(len(steps), len(self.seeds), 4), block
+        return self.found[position][runs]
+
+
+class RunGenerators:
+    """The generators of R runs, for batched components: row r of every array is drawn by the generator of run r.
+
+    ``standard_normal``, ``random`` and ``standard_exponential`` are fast. Any other method of
+    `numpy.random.Generator` works if its size, or one of its arguments, has a first axis of length R.
+
+    Parameters
+    ----------
+    states : (R, 4) uint64
+        As `pcg64_states` returns them.
+    """
+
+    def __init__(self, states: np.ndarray) -> None:
+        self._states = states
+        self._own: list[np.random.Generator] | None = None  # made when another method is called
+
+    def __len__(self) -> int:
+        return len(self._states)
+
+    def standard_normal(self, size: Any) -> np.ndarray:
+        """Independent standard normal numbers, of shape `size` = (R, ...)."""
+        return self._filled("standard_normal", size)
+
+    def random(self, size: Any) -> np.ndarray:
+        """Independent uniform numbers on [0, 1), of shape `size` = (R, ...)."""
+        return self._filled("random", size)
+
+    def standard_exponential(self, size: Any) -> np.ndarray:
+        """Independent exponential numbers, of shape `size` = (R, ...)."""
+        return self._filled("standard_exponential", size)
+
+    def __getattr__(self, method: str) -> Any:
+        if method.startswith("_") or not hasattr(np.random.Generator, method):
+            raise AttributeError(method)
+
+        def draw(*args: Any, size: Any = None, **options: Any) -> np.ndarray:
+            rows = [a for a in args if np.ndim(a) and len(a) == len(self)]
+            inner = None if rows and size is None else self._inner(size)
+            drawn = []
+            for r, rng in enumerate(self._generators()):
+                row = [a[r] if np.ndim(a) and len(a) == len(self) else a for a in args]
+                drawn.append(getattr(rng, method)(*row, size=inner, **options))
+            return np.stack(drawn)
+
+        return draw
+
+    def _generators(self) -> list[np.random.Generator]:
+        if self._own is None:
+            self._own = []
+            for low, high, inc_low, inc_high in self._states.tolist():
+                rng = np.random.Generator(np.random.PCG64(0))
+                state = {"state": low + (high << 64), "inc": inc_low + (inc_high << 64)}
+                rng.bit_generator.state = {"bit_generator": "PCG64", "state": state, "has_uint32": 0, "uinteger": 0}
+                self._own.append(rng)
+        return self._own
+
+    def _inner(self, size: Any) -> tuple[int, ...]:
+        """Shape of the numbers of one run."""
+        if not isinstance(size, tuple) or size[:1] != (len(self),):
+            raise InputError(
+                f"a batched component drew numbers of size {size} for {len(self)} runs",
+                "give size=, the shape of the particles, (R, n, ...); or set batched to False",
+            )
+        return size[1:]
+
+    def _filled(self, method: str, size: Any) -> np.ndarray:
+        out = np.empty((len(self), *self._inner(size)))
+        rows = out.reshape(len(self), -1)
+        shared = _shared_generator()
+        if self._own is not None or shared is None:
+            for row, rng in zip(rows, self._generators(), strict=True):
+                getattr(rng, method)(out=row)
+            return out
+        rng, memory = shared
+        draw = getattr(rng, method)
+        if method == "random" and rows.shape[1] == 1:
+            rows[:, 0] = _next_uniforms(self._states)
+            return out
+        for state, row in zip(self._states, rows, strict=True):
+            memory[:] = state
+            draw(out=row)
+            state[:] = memory
+        return out
+
+
+def _next_uniforms(states: np.ndarray) -> np.ndarray:
+    """(R,) uniform numbers on [0, 1), one from each PCG64 state (R, 4); the states advance.
+
+    The output is the exclusive or of the halves, rotated by the six highest bits (XSL RR); its 53 highest bits are
+    the number.
+    """
+    low, high, inc_low, inc_high = states.T
+    low, high = _add(*_times_multiplier(low, high), inc_low, inc_high)
+    states[:, 0], states[:, 1] = low, high
+    rotation, word = high >> np.uint64(58), high ^ low
+    word = word >> rotation | word << (np.uint64(64) - rotation & np.uint64(63))
+    return (word >> np.uint64(11)) * 2.0**-53
+
+
+@lru_cache(maxsize=1)
+def _shared_generator() -> tuple[np.random.Generator, np.ndarray] | None:
+    """A generator, and its state as an array of 4 words; None if its memory is not as expected.
+
+    Writing the state takes a tenth of the time of setting ``bit_generator.state``.
+    """
+    rng = np.random.Generator(np.random.PCG64(np.random.SeedSequence(1)))
+    address = ctypes.cast(rng.bit_generator.ctypes.state_address, ctypes.POINTER(ctypes.c_void_p))[0]
+    if address is None:
+        return None
+    memory = np.ctypeslib.as_array(ctypes.cast(address, ctypes.POINTER(ctypes.c_uint64)), (4,))
+    for _ in range(2):
+        state = rng.bit_generator.state["state"]
+        expected = [state["state"] & 2**64 - 1, state["state"] >> 64, state["inc"] & 2**64 - 1, state["inc"] >> 64]
+        if memory.tolist() != expected:
+            return None
+        rng.random()
+    return rng, memory
