@@ -180,7 +180,7 @@ def _times_multiplier(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np
     return low * m_low, high * m_low + low * m_high + carry
 
 
-def entropy(seeds: list[int], *parts: int | str) -> np.ndarray:
+def key_words(seeds: list[int], *parts: int | str) -> np.ndarray:
     """(R, k) uint32 words of the keys ``Key(seed).child(*parts)``, for `pcg64_states`; seeds below 2^128."""
     path = [word for number in (_PREFIX, *map(_number, parts)) for word in _words(number)]
     words = np.zeros((len(seeds), 4 + len(path)), np.uint32)
@@ -232,9 +232,9 @@ class SlotStreams:
         block, position = divmod(t, self.block)
         if block != self.known:
             steps = range(block * self.block, min((block + 1) * self.block, self.n_steps))
-            words = entropy(self.seeds, "step", 0, self.slot)
+            words = key_words(self.seeds, "step", 0, self.slot)
             all_words = np.tile(words, (len(steps), 1, 1))
-            at = entropy([0], "step").shape[1]  # the word of the number of the step
+            at = key_words([0], "step").shape[1]  # the word of the number of the step
             all_words[:, :, at] = np.array(steps, np.uint32)[:, None]
             found = pcg64_states(all_words.reshape(-1, words.shape[1]))
             self.found, self.known = found.reshape(len(steps), len(self.seeds), 4), block

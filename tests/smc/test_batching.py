@@ -35,7 +35,7 @@ from mstfilter.smc import (
 )
 from mstfilter.smc.batching import summaries
 from mstfilter.smc.population import Population
-from mstfilter.smc.streams import Key, entropy, pcg64_states
+from mstfilter.smc.streams import Key, key_words, pcg64_states
 from tests.smc.models import AR1, RHO, SD0, SIGMA, TAU, ar1_observations, hmm, optimal
 from tests.smc.test_particle_filter import MODEL, observations
 
@@ -145,7 +145,7 @@ def test_lost_runs_are_recorded_and_the_others_continue(model):
 
 def test_generators_of_runs_draw_what_their_streams_draw():
     seeds = list(range(6))
-    ours = RunGenerators(pcg64_states(entropy(seeds, "a")))
+    ours = RunGenerators(pcg64_states(key_words(seeds, "a")))
     singles = [Key(seed).child("a").generator() for seed in seeds]
     means = np.arange(12.0).reshape(6, 2)
     for draw in (
