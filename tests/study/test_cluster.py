@@ -25,7 +25,7 @@ def test_a_cluster_gives_the_same_bytes(cluster, tmp_path):
     from mstfilter.study.cluster import Cluster
 
     slide(tmp_path / "slide", pauses=2)
-    wanted = study(tmp_path, "good", "raise", "die", seeds=[0], tries=1)
+    wanted = study(tmp_path, "mst", "raise", "die", seeds=[0], tries=1)
     here = run_study(wanted, tmp_path / "here", Local(1), cache=tmp_path / "cache-1")
     seen = []
     there = run_study(
@@ -50,10 +50,10 @@ def test_a_cluster_gives_the_same_bytes(cluster, tmp_path):
     died = next(outcome for name, outcome in there.failed if name.startswith("die"))
     assert "its worker died 2 times" in died.error  # allowed_failures of the scheduler, not tries
     assert not list((tmp_path / "there" / "runs").glob(".*"))
-    for one in (tmp_path / "here" / "runs").glob("good*/pauses/*/state.npz"):
+    for one in (tmp_path / "here" / "runs").glob("mst*/pauses/*/state.npz"):
         assert one.read_bytes() == (tmp_path / "there" / one.relative_to(tmp_path / "here")).read_bytes()
     again = run_study(
-        study(tmp_path, "good", seeds=[0]), tmp_path / "there", Cluster(cluster), cache=tmp_path / "cache-2"
+        study(tmp_path, "mst", seeds=[0]), tmp_path / "there", Cluster(cluster), cache=tmp_path / "cache-2"
     )
     assert again.repeated == 1
 

@@ -22,6 +22,7 @@ from mstfilter.study.study import run_study
 from tests.study.scenes import slide
 
 BROKEN = Path(__file__).parent / "broken.py"
+FAST = "floor_components"  # a preset that needs no large library
 
 
 @pytest.fixture(scope="module")
@@ -32,12 +33,13 @@ def folder(tmp_path_factory):
 
 
 def study(folder, *arms, **more):
-    """Arms of one recording: ``good`` ones, and ones whose transition breaks in a way."""
+    """Arms of one recording: ``good`` and ``mst`` succeed, others have a transition that breaks in a way."""
+    succeed = {"good": {"preset": FAST}, "mst": {"set": ["transition=identity"]}}
     entries = []
     for arm in arms:
         how, _, marker = arm.partition("@")
         rule = [f"transition={BROKEN}:Breaks", f"transition.how={how}", f'transition.marker="{marker}"']
-        entries.append({"name": how, "set": ["transition=identity"] if how == "good" else rule})
+        entries.append({"name": how, **succeed.get(how, {"preset": FAST, "set": rule})})
     data = {"name": "test", "folder": folder, "scenes": [{"recordings": "slide"}], "seeds": [0, 1], "arms": entries}
     return study_of({**data, **more})
 
@@ -151,7 +153,7 @@ def hanging_study(path, recording, marker):
     hangs = [f"transition={BROKEN}:Breaks", "transition.how=hang", f'transition.marker="{marker}"']
     path.write_text(
         f"seeds = [0, 1]\nscenes = [{{recordings = '{recording}'}}]\n"
-        f"arms = [{{name = 'good', set = 'transition=identity'}}, {{name = 'hangs', set = {hangs!r}}}]\n"
+        f"arms = [{{name = 'good', preset = '{FAST}'}}, {{name = 'hangs', preset = '{FAST}', set = {hangs!r}}}]\n"
     )
     return path
 
