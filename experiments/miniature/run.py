@@ -64,14 +64,14 @@ def arm(name: str, world: Miniature, n: int) -> ParticleFilter:
         return replace(mst, resampler=KeepWeights(Multinomial()))
     if name == "mst, no Q":
         return replace(mst, update=replace(mst.update, quality_exponent=0.0))
-    if name == "mst, no score":  # what is built is not judged
+    if name == "mst, no score":  # candidates are not scored
         return replace(mst, update=replace(mst.update, evidence=()))
     if name == "mst, systematic":
         return replace(mst, resampler=Systematic())
     if name in UNIONS:
         filter = arm(UNIONS[name], world, n)
         return replace(filter, update=replace(filter.update, built_per_particle=0))
-    rung = LADDER.index(name)  # each rung keeps what those below it brought
+    rung = LADDER.index(name)  # each rung includes the changes of those below
     rule = ScoredFusion(world, mst.update, distinct=rung >= 1, predictive=rung >= 2, include_parents=rung >= 3)
     filter = replace(mst, update=rule)
     if rung >= 4:
@@ -83,13 +83,13 @@ Plan = list[tuple[tuple[str, ...], int, int]]  # arms, n, number of worlds
 
 
 def distances(plan: Plan) -> list[dict[str, object]]:
-    """One row a world, arm, size and step; a process for each shape of world."""
+    """One row per world, arm, size and step; one process per shape of world."""
     with ProcessPoolExecutor(len(WORLDS)) as pool:
-        return [row for rows in pool.map(of_shape, WORLDS, [plan] * len(WORLDS)) for row in rows]
+        return [row for rows in pool.map(distances_of_shape, WORLDS, [plan] * len(WORLDS)) for row in rows]
 
 
-def of_shape(shape: str, plan: Plan) -> list[dict[str, object]]:
-    """The rows of one shape of world."""
+def distances_of_shape(shape: str, plan: Plan) -> list[dict[str, object]]:
+    """Rows of one shape of world."""
     rows, world = [], WORLDS[shape]
     for arms, n, n_worlds in plan:
         for seed in range(n_worlds):
@@ -111,14 +111,14 @@ def of_shape(shape: str, plan: Plan) -> list[dict[str, object]]:
 
 
 def interval(values: np.ndarray) -> tuple[float, float]:
-    """Mean and half width of its 95 % t interval; one value a world."""
+    """Mean and half width of its 95 % t interval, of one value per world."""
     if len(values) < 2:
         return float(values.mean()), float("nan")
     return float(values.mean()), float(stats.sem(values) * stats.t.ppf(0.975, len(values) - 1))
 
 
 def by_world(rows: list[dict], key: Callable[[dict], tuple], measure: str) -> dict[tuple, np.ndarray]:
-    """Means over steps, one a world, by key."""
+    """Means over steps, one per world, by key."""
     groups: dict[tuple, dict[int, list[float]]] = {}
     for row in rows:
         groups.setdefault(key(row), {}).setdefault(row["seed"], []).append(row[measure])
@@ -186,7 +186,7 @@ def calibrate(arms: dict[str, int], n_worlds: int, steps: int, out: Path) -> Non
 
 
 def main() -> None:
-    """Run what is asked for."""
+    """The command line."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--smoke", action="store_true", help="two worlds, few particles: a minute; needs --out")
     parser.add_argument(

@@ -15,7 +15,7 @@ There is one hypothesis: wrong masks are never revised, and two objects are neve
 stored as voxels, like every hypothesis; a volume starts with the signed distance of its voxels.
 
 >>> volume = ObjectVolume.of(hypothesis.mask(3), grid, truncation=0.03, weight=2.0)
->>> volume = volume.integrate(frame, grid, np.eye(4), mine, others)
+>>> volume = volume.integrate(frame, grid, np.eye(4), mask, others)
 >>> volume.occupied                     # (a, b, c) bool, at volume.box of the grid
 """
 
@@ -100,15 +100,15 @@ class ObjectFusion(Update):
         old = self.free_space.refine((old,), clip)[0][0]
         match = self._match(old, sample, frame)
         volumes = {r.label: ObjectVolume.of(old.mask(r.label), grid, _TRUNCATION, _PRIOR_WEIGHT) for r in old.objects}
-        taken = 0
+        n_images = 0
         if len(clip) > 2 and old.objects:
-            volumes, taken = self._integrate_between(volumes, old, moved, clip)
-        everything = np.zeros(frame.depth.shape, np.int32)
+            volumes, n_images = self._integrate_between(volumes, old, moved, clip)
+        shown = np.zeros(frame.depth.shape, np.int32)
         for label, mask in match.masks.items():
-            everything[mask] = label
+            shown[mask] = label
         for label, volume in volumes.items():
-            mine, others = everything == label, (everything > 0) & (everything != label)
-            volumes[label] = volume.integrate(frame, grid, np.eye(4), mine, others)
+            mask, others = shown == label, (shown > 0) & (shown != label)
+            volumes[label] = volume.integrate(frame, grid, np.eye(4), mask, others)
         records = {r.label: r for r in old.objects}
         for k in match.new:
             assert sample is not None
@@ -116,7 +116,7 @@ class ObjectFusion(Update):
             volumes[label] = ObjectVolume.of(sample.mask(k), grid, _TRUNCATION, 1.0)
             records[label] = ObjectRecord.born(k, clip.index, sample.record(k).completion_key)
         fused = self._assemble(volumes, records, grid)
-        note = {"matched": len(match.masks) - len(match.new), "new": len(match.new), "images": taken}
+        note = {"matched": len(match.masks) - len(match.new), "new": len(match.new), "images": n_images}
         return fused, note | {"forgotten": known + len(match.new) - fused.n_objects}
 
     def _match(self, old: Hypothesis, sample: Hypothesis | None, frame: Frame) -> _Match:
@@ -128,15 +128,15 @@ class ObjectFusion(Update):
         table = overlap(seen, rendered)
         iou = np.where((table.labels_a > 0)[:, None] & (table.labels_b > 0)[None, :], table.jaccard(), 0.0)
         masks: dict[int, np.ndarray] = {}
-        left = {int(k) for k in table.labels_a if k > 0}
+        unmatched = {int(k) for k in table.labels_a if k > 0}
         while iou.size and iou.max() >= _MATCH_IOU:  # best pairs first, one to one
             a, b = np.unravel_index(int(iou.argmax()), iou.shape)
             masks[int(table.labels_b[b])] = seen == table.labels_a[a]
-            left.discard(int(table.labels_a[a]))
+            unmatched.discard(int(table.labels_a[a]))
             iou[a], iou[:, b] = 0, 0
         new, free = [], max((r.label for r in old.objects), default=0)
         smallest = max(1.0, _MIN_PIXELS * frame.depth.size / 307200)
-        for k in sorted(left):
+        for k in sorted(unmatched):
             row = int(np.searchsorted(table.labels_a, k))
             size = int(table.sizes_a[row])
             known = int(table.counts[row][table.labels_b > 0].sum())
@@ -156,7 +156,7 @@ class ObjectFusion(Update):
         segments = segments_of(old, clip.after)
         poses: dict[int, np.ndarray] = {label: np.eye(4) for label in volumes if label in segments}
         rested = {label for label in poses if label not in moved}
-        taken = 0
+        n_images = 0
         for position in range(len(clip) - 2, 0, -1):
             frame = clip.frames[position]
             pair = Clip((clip.after, frame), clip.grid)
@@ -169,10 +169,10 @@ class ObjectFusion(Update):
                         del poses[label]
                     continue
                 poses[label] = T
-                mine = _shown(segments[label], clip.after, T, frame)
-                volumes[label] = volumes[label].integrate(frame, clip.grid, T, mine, np.zeros_like(mine))
-                taken += 1
-        return volumes, taken
+                mask = _shown(segments[label], clip.after, T, frame)
+                volumes[label] = volumes[label].integrate(frame, clip.grid, T, mask, np.zeros_like(mask))
+                n_images += 1
+        return volumes, n_images
 
     def _agrees(self, track: Track, T: np.ndarray, frame: Frame) -> bool:
         """Whether a moved object's visible points lie on the surface that a frame measures."""
@@ -197,11 +197,11 @@ class ObjectFusion(Update):
             inside = volume.occupied
             if inside.sum() < _MIN_VOXELS:
                 continue
-            mine = volume.own / np.maximum(volume.own + volume.other, 1e-9)
+            ratio = volume.hits / np.maximum(volume.hits + volume.other_hits, 1e-9)
             box = volume.box
-            better = inside & ((mine > share[box]) | ((mine == share[box]) & (-volume.distance > depth[box])))
+            better = inside & ((ratio > share[box]) | ((ratio == share[box]) & (-volume.distance > depth[box])))
             labels[box][better] = label
-            share[box][better] = mine[better]
+            share[box][better] = ratio[better]
             depth[box][better] = -volume.distance[better]
         present = [int(k) for k in np.unique(labels) if k > 0]
         kept = tuple(replace(records[k], label=k).changed() for k in present)
@@ -237,7 +237,7 @@ class ObjectVolume:
         Metres to the surface, negative inside, clipped to +-`truncation`.
     weight : (a, b, c) float
         Number of images averaged in each distance.
-    own, other : (a, b, c) float
+    hits, other_hits : (a, b, c) float
         Number of images with the voxel at the surface and in the mask of the object, or of another object.
     truncation : float
         Metres.
@@ -246,8 +246,8 @@ class ObjectVolume:
     offset: np.ndarray
     distance: np.ndarray
     weight: np.ndarray
-    own: np.ndarray
-    other: np.ndarray
+    hits: np.ndarray
+    other_hits: np.ndarray
     truncation: float
 
     @classmethod
@@ -274,10 +274,10 @@ class ObjectVolume:
     @property
     def occupied(self) -> np.ndarray:
         """Voxels (a, b, c) bool inside the surface that more masks of this object than of others have shown."""
-        return (self.distance < 0) & (self.own > self.other)
+        return (self.distance < 0) & (self.hits > self.other_hits)
 
     def integrate(
-        self, frame: Frame, grid: VoxelGrid, T: np.ndarray, mine: np.ndarray, others: np.ndarray
+        self, frame: Frame, grid: VoxelGrid, T: np.ndarray, mask: np.ndarray, others: np.ndarray
     ) -> ObjectVolume:
         """The volume averaged with another image.
 
@@ -287,8 +287,8 @@ class ObjectVolume:
         grid : VoxelGrid
         T : (4, 4) array
             Motion in world metres from the pose of the volume to the pose in the frame.
-        mine, others : (H, W) bool
-            Pixels that show this object, and another object. Surface is integrated in `mine` only, free space
+        mask, others : (H, W) bool
+            Pixels that show this object, and another object. Surface is integrated in `mask` only, free space
             everywhere.
         """
         index = np.stack(np.meshgrid(*(np.arange(n) for n in self.distance.shape), indexing="ij"), axis=-1)
@@ -296,7 +296,7 @@ class ObjectVolume:
         inside &= (z > 1e-6) & frame.valid[v, u]
         sdf = np.where(inside, frame.depth[v, u] - z, -np.inf)
         near = np.abs(sdf) <= self.truncation
-        taken = (sdf > self.truncation) | (near & mine[v, u])
+        taken = (sdf > self.truncation) | (near & mask[v, u])
         shape = self.distance.shape
         w = taken.reshape(shape).astype(float)
         step = np.where(taken, np.clip(sdf, -self.truncation, self.truncation), 0).reshape(shape)
@@ -305,6 +305,6 @@ class ObjectVolume:
             self,
             distance=(self.distance * self.weight + step * w) / weight,
             weight=weight,
-            own=self.own + (near & mine[v, u]).reshape(shape),
-            other=self.other + (near & others[v, u]).reshape(shape),
+            hits=self.hits + (near & mask[v, u]).reshape(shape),
+            other_hits=self.other_hits + (near & others[v, u]).reshape(shape),
         )

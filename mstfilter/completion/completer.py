@@ -70,10 +70,10 @@ class ObservedBox:
     ----------
     points : (a, b, c) int32
         Readings of the mask in each voxel.
-    own : (a, b, c) bool
+    surface : (a, b, c) bool
         Visible surface of the mask: the pixel of the voxel's centre is in the mask, and the centre is at the measured
         surface or just behind it. If no centre falls into a small mask, the voxel with most readings.
-    other : (a, b, c) bool
+    other_surface : (a, b, c) bool
         Visible surface outside the mask, by the same rule.
     free : (a, b, c) bool
         Observed as free.
@@ -84,8 +84,8 @@ class ObservedBox:
     """
 
     points: np.ndarray
-    own: np.ndarray
-    other: np.ndarray
+    surface: np.ndarray
+    other_surface: np.ndarray
     free: np.ndarray
     behind: np.ndarray
     height: np.ndarray
@@ -156,7 +156,7 @@ class Completer(ABC):
             p = np.array(self.fill(rng, seen), dtype=np.float32)
             p[seen.free] = 0
             if p.size and not (p == 1).any():
-                p[seen.own] = 1
+                p[seen.surface] = 1
             return Completion(read_only(offset), read_only(p), read_only(seen.points), name.hex()[:16])
 
         return compute() if self.stochastic else memo("completion", name, compute, Completion)
@@ -190,13 +190,13 @@ def observed_box(frame: Frame, mask: np.ndarray, grid: VoxelGrid, rule: Complete
     with np.errstate(invalid="ignore"):
         surface = (signed >= -rule.in_front * grid.voxel_size) & (signed < rule.depth * grid.voxel_size)
         behind = inside & (signed > 0)
-    own = surface & inside
+    in_mask = surface & inside
     free = _free(frame, grid, rule.free_margin, rule.free_sigmas)[box]
-    if not own.any():
-        own[np.unravel_index(points.argmax(), shape)] = True
-        free = free & ~own
+    if not in_mask.any():
+        in_mask[np.unravel_index(points.argmax(), shape)] = True
+        free = free & ~in_mask
     height = grid.origin[2] + (np.arange(shape[2]) + 0.5) * grid.voxel_size
-    return low, ObservedBox(points, own, surface & ~inside & ~own, free, behind, height)
+    return low, ObservedBox(points, in_mask, surface & ~inside & ~in_mask, free, behind, height)
 
 
 def _frame_points(frame: Frame, grid: VoxelGrid) -> tuple[np.ndarray, np.ndarray]:

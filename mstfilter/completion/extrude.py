@@ -17,7 +17,7 @@ class SurfaceOnly(Completer):
     """No completion: the visible surface alone."""
 
     def fill(self, rng: np.random.Generator, seen: ObservedBox) -> np.ndarray:
-        return seen.own.astype(np.float32)
+        return seen.surface.astype(np.float32)
 
 
 @dataclass(frozen=True)
@@ -39,11 +39,11 @@ class Extrude(Completer):
 
     def fill(self, rng: np.random.Generator, seen: ObservedBox) -> np.ndarray:
         """Probability 1 on the visible surface and `below` under it."""
-        state = np.zeros(seen.own.shape[:2], dtype=bool)
-        p = np.zeros(seen.own.shape, dtype=np.float32)
-        for k in range(seen.own.shape[2] - 1, -1, -1):
+        state = np.zeros(seen.surface.shape[:2], dtype=bool)
+        p = np.zeros(seen.surface.shape, dtype=np.float32)
+        for k in range(seen.surface.shape[2] - 1, -1, -1):
             # From the top down: the surface of another object ends a column, the own surface starts it (again).
-            state = (state & ~seen.other[:, :, k]) | seen.own[:, :, k]
-            p[:, :, k] = np.where(seen.own[:, :, k], 1.0, np.where(state, self.below, 0.0))
+            state = (state & ~seen.other_surface[:, :, k]) | seen.surface[:, :, k]
+            p[:, :, k] = np.where(seen.surface[:, :, k], 1.0, np.where(state, self.below, 0.0))
         p[:, :, seen.height < self.floor] = 0
         return p

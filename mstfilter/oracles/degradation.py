@@ -174,12 +174,12 @@ def _displace(
     field = np.stack([gaussian_filter(one, max(1.0, _SMOOTH * resize))[box] for one in noise])
     field /= field.std()
     rows, columns = np.indices(true.shape)
-    seen = true > 0
+    objects = true > 0
 
     def moved(reach: float) -> np.ndarray:
         r = np.clip(np.rint(rows + reach * field[0]), 0, true.shape[0] - 1).astype(int)
         c = np.clip(np.rint(columns + reach * field[1]), 0, true.shape[1] - 1).astype(int)
-        return np.where(seen, labels[r, c], 0)  # only these pixels can belong to an object
+        return np.where(objects, labels[r, c], 0)  # only these pixels can belong to an object
 
     return moved(_bisect(moved, true, 0.0, _REACH * resize, target))
 

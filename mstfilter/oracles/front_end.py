@@ -84,22 +84,22 @@ class TrueMasks(UsesTruth, Proposal):
         """`n` hypotheses about the scene at the end of the clip; equal ones where their masks are."""
         frame, grid = observation.after, observation.grid
         true = self.masks(frame, observation)
-        alike = self.quality == 1 or self.errors == "lasting"
+        same_masks = self.quality == 1 or self.errors == "lasting"
         particles: list[Hypothesis] = []
-        reached: list[float] = []
+        qualities: list[float] = []
         for i in range(n):
-            if alike and particles:
+            if same_masks and particles:
                 particles.append(particles[0])
-                reached.append(reached[0])
+                qualities.append(qualities[0])
                 continue
             masks = degrade(self._errors(rng, i), true, self.quality, self.over, self.under)
-            reached.append(round(weighted_coverage(masks, true), 4))
+            qualities.append(round(weighted_coverage(masks, true), 4))
             numbers = [int(k) for k in np.unique(masks) if k > 0]
             completed = [
                 self.completer.complete(child(rng, "completion", i, k), frame, [masks == k], grid)[0] for k in numbers
             ]
             particles.append(hypothesis_of(completed, grid, observation.index, self.threshold))
-        notes = {"mask_quality": reached, "objects": [h.n_objects for h in particles]}
+        notes = {"mask_quality": qualities, "objects": [h.n_objects for h in particles]}
         return Population(tuple(particles), notes=notes)
 
     def _errors(self, rng: np.random.Generator, i: int) -> np.random.Generator:
@@ -167,7 +167,7 @@ class TrueCompletion(UsesTruth, Completer):
 
     def fill(self, rng: np.random.Generator, seen: ObservedBox) -> np.ndarray:
         """1 on the visible surface, for masks that show no true object."""
-        return seen.own.astype(np.float32)
+        return seen.surface.astype(np.float32)
 
     def complete(
         self, rng: np.random.Generator, frame: Frame, masks: Sequence[np.ndarray], grid: VoxelGrid
@@ -190,16 +190,16 @@ class TrueCompletion(UsesTruth, Completer):
         voxels: np.ndarray,
         pixel: np.ndarray,
     ) -> Completion:
-        mine = voxels[mask.ravel()[pixel]]
-        if not len(mine):
+        filled = voxels[mask.ravel()[pixel]]
+        if not len(filled):
             return super().complete(rng, frame, [mask], grid)[0]
         offset, seen = observed_box(frame, mask, grid, self)
-        low, high = mine.min(axis=0), mine.max(axis=0) + 1
+        low, high = filled.min(axis=0), filled.max(axis=0) + 1
         if seen.points.size:
             low, high = np.minimum(low, offset), np.maximum(high, offset + seen.points.shape)
         shape = tuple((high - low).tolist())
         probability, points = np.zeros(shape, np.float32), np.zeros(shape, np.int32)
-        probability[tuple((mine - low).T)] = 1
+        probability[tuple((filled - low).T)] = 1
         if seen.points.size:
             box = tuple(slice(a, a + n) for a, n in zip((offset - low).tolist(), seen.points.shape, strict=True))
             points[box] = seen.points
@@ -211,13 +211,13 @@ class TrueCompletion(UsesTruth, Completer):
         from scipy.spatial import cKDTree
 
         labels, image = self.truth.labels(t), self.truth.instance(t)
-        own = self.objects.object_pixels(frame, grid)
+        object_pixels = self.objects.object_pixels(frame, grid)
         found, pixels = [np.zeros((0, 3), np.int64)], [np.zeros(0, np.int64)]
         for k in np.unique(labels):
             shown = image == k
             if k == 0 or not shown.any():
                 continue
-            usable = shown & own
+            usable = shown & object_pixels
             v, u = np.nonzero(usable if usable.any() else shown)
             index = np.argwhere(labels == k)
             uv, _ = frame.camera.project(grid.centre_of(index))

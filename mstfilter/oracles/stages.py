@@ -100,8 +100,8 @@ class TrueFreeSpace(UsesTruth, Projection):
         free = labels == 0
         if not self.hidden:
             geometry = frame_geometry(frame, hypothesis.grid)
-            seen = render(labels, hypothesis.grid, frame.camera).depth
-            surface = np.where(np.isnan(seen), np.inf, seen).ravel()[np.maximum(geometry.pixel, 0)]
+            depth = render(labels, hypothesis.grid, frame.camera).depth
+            surface = np.where(np.isnan(depth), np.inf, depth).ravel()[np.maximum(geometry.pixel, 0)]
             free = free & (geometry.pixel >= 0) & (geometry.z < surface)
         occupied = hypothesis.labels != 0
         hit = occupied & free

@@ -43,19 +43,20 @@ class RecordingTruth:
         self._pauses: dict[bytes, int] | None = None
         self._objects: np.ndarray | None = None
 
-    def check(self, needs: tuple[Need, ...], who: str) -> None:
-        """Raise InputError if something that the component `who` needs is missing at any pause."""
+    def check(self, needs: tuple[Need, ...], component: str) -> None:
+        """Raise InputError if something that a component needs is missing at any pause."""
         recording = self.recording
-        look = {
+        get = {
             "voxels": recording.truth,
             "instance": lambda t: recording.instance(recording.pauses[t]),
             "poses": lambda t: recording.poses(recording.pauses[t]),
         }
         for need in needs:
             for t in range(len(recording.pauses)):
-                if look[need](t) is None:
+                if get[need](t) is None:
+                    missing = f"recording {recording.name} has no {_WORDS[need]} at pause {t}"
                     raise InputError(
-                        f"{who} uses the truth, and recording {recording.name} has no {_WORDS[need]} at pause {t}",
+                        f"{component} uses the truth, and {missing}",
                         "simulated recordings have all of it: `mstfilter simulate`",
                     )
 

@@ -21,7 +21,7 @@ ids = pytest.mark.parametrize("world", WORLDS, ids=lambda w: f"{w.shape[0]}x{w.s
 
 
 def state_of(world, rows):
-    """The state of a picture: one row of digits a column of cells, seen from the left."""
+    """The state of a picture: each string holds the digits of one column of cells."""
     return world.states.index_of_labels(np.array([[int(k) for k in row] for row in rows], np.uint16))
 
 
@@ -79,7 +79,7 @@ def test_pushes_of_known_states():
         assert world.pushed[action, state_of(world, before)] == state_of(world, after)
 
 
-def test_hidden_cells_are_not_seen():
+def test_hidden_cells_do_not_change_the_observation():
     world = Miniature((3, 2))
     a, b = state_of(world, ["10", "02", "00"]), state_of(world, ["13", "02", "00"])
     assert world.surface[a].tolist() == world.surface[b].tolist() == [0, 1, 2]
@@ -172,7 +172,7 @@ def test_the_exact_filter_is_the_sum_over_all_paths():
             f[s, s] += (1 - world.rearranged) * world.slip
             f[s, number[naive_name(naive_push(grid, cell, step))]] += (1 - world.rearranged) * (1 - world.slip)
         g = np.array([naive_likelihood(world, grid, y) for grid in grids])
-        joint = joint[..., :, None] * f * g  # one axis a step: every path has its entry
+        joint = joint[..., :, None] * f * g  # one axis per step: one entry per path
     exact = exact_filter(world, observations)
     assert joint.shape == (S, S, S)
     assert exact.log_evidence[-1] == pytest.approx(np.log(joint.sum()), abs=1e-12)
