@@ -250,34 +250,23 @@ def pair_features(
     scale : float
         Image width / 640.
     """
-    flip = border[:, BORDER["step"]] < 0
-    front, back = np.where(flip[:, None], b, a), np.where(flip[:, None], a, b)
-    table_front = np.where(flip[:, None], table_b, table_a)
-    table_back = np.where(flip[:, None], table_a, table_b)
+    flip = (border[:, BORDER["step"]] < 0)[:, None]
+    sums_front, sums_back = np.where(flip, b, a), np.where(flip, a, b)
+    front = _RegionMeans(sums_front, np.where(flip, table_b, table_a))
+    back = _RegionMeans(sums_back, np.where(flip, table_a, table_b))
+    small = np.minimum(front.n, back.n)
+    log_small = np.log(small / scale**2)
+    lab, gap = front.lab - back.lab, front.ground - back.ground
+    joint = quadric_residual(sums_front + sums_back)
+    excess = joint - quadric_residual(sums_front) - quadric_residual(sums_back)
+    misfit = np.log1p(np.maximum(excess, 0) / small)
+    higher = np.clip((front.top - back.top) * 10, -1, 1)
+    rim = np.exp(-(((front.top - back.top) / 0.015) ** 2))
+    distance = np.minimum(np.hypot(gap[:, 0], gap[:, 1]) / (front.extent + back.extent + 1e-3), 4)
     length = np.maximum(border[:, BORDER["length"]], 1)
     mean = border / length[:, None]
-    n_front, n_back = _get(front, "pixels"), _get(back, "pixels")
-    small = np.minimum(n_front, n_back)
-
-    lab = front[:, REGION["lab"]] / n_front[:, None] - back[:, REGION["lab"]] / n_back[:, None]
-    joint = quadric_residual(front + back)
-    excess = np.maximum(joint - quadric_residual(front) - quadric_residual(back), 0) / small
-    misfit = np.log1p(excess)
-    free = np.minimum(_get(front, "perimeter") - table_front[:, 0], _get(back, "perimeter") - table_back[:, 0])
-    bottom_front, top_front = _range(front)
-    bottom_back, top_back = _range(back)
-    higher = np.clip((top_front - top_back) * 10, -1, 1)
-    rim = np.exp(-(((top_front - top_back) / 0.015) ** 2))
-    bend_front, bend_back = _get(front, "bend") / n_front, _get(back, "bend") / n_back
-    strength = mean[:, BORDER["strength"]]
+    strength, hollow, convex = (mean[:, BORDER[name]] for name in ("strength", "hollow", "convex"))
     step = np.log1p(np.abs(mean[:, BORDER["step"]]))
-    gap = front[:, REGION["ground"]] / n_front[:, None] - back[:, REGION["ground"]] / n_back[:, None]
-    extent = np.sqrt(_variance(front, n_front)) + np.sqrt(_variance(back, n_back)) + 1e-3
-    distance = np.minimum(np.hypot(gap[:, 0], gap[:, 1]) / extent, 4)
-    hollow, convex = mean[:, BORDER["hollow"]], mean[:, BORDER["convex"]]
-    log_small = np.log(small / scale**2)
-    on_front, drop_front = _table(table_front, front)
-    on_back, drop_back = _table(table_back, back)
     columns = {
         "bias": np.ones(len(small)),
         "strength": strength,
@@ -288,26 +277,26 @@ def pair_features(
         "clear step share": mean[:, BORDER["clear"]],
         "lightness": np.minimum(np.abs(lab[:, 0]) / 20, 3),
         "chroma": np.minimum(np.hypot(lab[:, 1], lab[:, 2]) / 10, 4),
-        "texture": _texture(front, back, n_front, n_back),
+        "texture": _texture(front, back),
         "misfit": misfit,
-        "residual": np.log1p(joint / (n_front + n_back)),
-        "border share": np.minimum(length / np.minimum(_get(front, "perimeter"), _get(back, "perimeter")), 1),
-        "free border share": np.minimum(length / np.maximum(free, 1), 1),
+        "residual": np.log1p(joint / (front.n + back.n)),
+        "border share": np.minimum(length / np.minimum(front.outline, back.outline), 1),
+        "free border share": np.minimum(length / np.maximum(np.minimum(front.free, back.free), 1), 1),
         "log pixels": log_small,
-        "log ratio": np.abs(np.log(n_front / n_back)),
+        "log ratio": np.abs(np.log(front.n / back.n)),
         "front higher": np.maximum(higher, 0),
         "back higher": np.maximum(-higher, 0),
-        "front bottom": np.minimum(bottom_front * 10, 2),
-        "back bottom": np.minimum(bottom_back * 10, 2),
-        "front bend": bend_front,
-        "back bend": bend_back,
+        "front bottom": np.minimum(front.bottom * 10, 2),
+        "back bottom": np.minimum(back.bottom * 10, 2),
+        "front bend": front.bend,
+        "back bend": back.bend,
         "ground distance": distance,
-        "front on table": on_front,
-        "back on table": on_back,
-        "front drop": drop_front,
-        "back drop": drop_back,
+        "front on table": front.on_table,
+        "back on table": back.on_table,
+        "front drop": front.drop,
+        "back drop": back.drop,
         "rim": rim,
-        "rim * back bend": rim * bend_back,
+        "rim * back bend": rim * back.bend,
         "rim * step": rim * step,
         "rim * inside": rim * np.exp(-(distance**2)) * step,
         "step * misfit": step * misfit,
@@ -319,36 +308,31 @@ def pair_features(
     return np.stack([columns[name] for name in PAIR_FEATURES], axis=1)
 
 
-def _texture(a: np.ndarray, b: np.ndarray, n_a: np.ndarray, n_b: np.ndarray) -> np.ndarray:
+class _RegionMeans:
+    """Measurements of k regions from rows of `Regions.sums` (k, C) and their borders with the table (k, B)."""
+
+    def __init__(self, sums: np.ndarray, table: np.ndarray) -> None:
+        self.n = np.maximum(sums[:, REGION["pixels"].start], 1)
+        lab, lab2, self.ground = (sums[:, REGION[name]] / self.n[:, None] for name in ("lab", "lab2", "ground"))
+        self.lab, self.lab_variance = lab, np.maximum(lab2 - lab**2, 0) + 4
+        # Standard deviation of the ground coordinates, metres.
+        spread = sums[:, REGION["spread"].start] / self.n
+        self.extent = np.sqrt(np.maximum(spread - (self.ground**2).sum(axis=1), 0))
+        self.bend = sums[:, REGION["bend"].start] / self.n
+        # 3rd and 97th percentile of the heights, metres.
+        share = np.cumsum(sums[:, REGION["heights"]], axis=1) / self.n[:, None]
+        self.bottom = (share < 0.03).sum(axis=1) * _HEIGHT_BIN
+        self.top = ((share < 0.97).sum(axis=1) + 1) * _HEIGHT_BIN
+        # Shares of the outline that touch the table, and that border on it with a clear step.
+        clear = table[:, BORDER["clear"]]
+        self.outline = np.maximum(sums[:, REGION["perimeter"].start], 1)
+        self.on_table, self.drop = (table[:, 0] - clear) / self.outline, clear / self.outline
+        self.free = self.outline - table[:, 0]
+
+
+def _texture(a: _RegionMeans, b: _RegionMeans) -> np.ndarray:
     """Bhattacharyya distance of normal distributions of Lab colour, summed over the channels, at most 4."""
-    mean_a, mean_b = a[:, REGION["lab"]] / n_a[:, None], b[:, REGION["lab"]] / n_b[:, None]
-    var_a = np.maximum(a[:, REGION["lab2"]] / n_a[:, None] - mean_a**2, 0) + 4
-    var_b = np.maximum(b[:, REGION["lab2"]] / n_b[:, None] - mean_b**2, 0) + 4
-    total = var_a + var_b
-    distance = (mean_a - mean_b) ** 2 / (4 * total) + 0.5 * np.log(total / (2 * np.sqrt(var_a * var_b)))
+    total = a.lab_variance + b.lab_variance
+    distance = (a.lab - b.lab) ** 2 / (4 * total)
+    distance += 0.5 * np.log(total / (2 * np.sqrt(a.lab_variance * b.lab_variance)))
     return np.minimum(distance.sum(axis=1), 4)
-
-
-def _get(sums: np.ndarray, name: str) -> np.ndarray:
-    """A column of region sums; at least 1 if it is a divisor."""
-    column: np.ndarray = sums[:, REGION[name].start]
-    return np.maximum(column, 1) if name in ("pixels", "perimeter") else column
-
-
-def _variance(sums: np.ndarray, n: np.ndarray) -> np.ndarray:
-    """Variance of the ground coordinates, square metres."""
-    mean = sums[:, REGION["ground"]] / n[:, None]
-    return np.maximum(_get(sums, "spread") / n - (mean**2).sum(axis=1), 0)
-
-
-def _range(sums: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """3rd and 97th percentile of the heights of a region, metres."""
-    share = np.cumsum(sums[:, REGION["heights"]], axis=1) / _get(sums, "pixels")[:, None]
-    return (share < 0.03).sum(axis=1) * _HEIGHT_BIN, ((share < 0.97).sum(axis=1) + 1) * _HEIGHT_BIN
-
-
-def _table(border: np.ndarray, sums: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Shares of the outline that touch the table, and that border on it with a clear step."""
-    clear = border[:, BORDER["clear"]]
-    outline = _get(sums, "perimeter")
-    return (border[:, 0] - clear) / outline, clear / outline
