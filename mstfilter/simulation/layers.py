@@ -43,7 +43,7 @@ class Stage:
         Greatest distance in metres between the rendered and the physical body.
     """
 
-    def __init__(self, world: PhysicsWorld, tolerance: float = 0.0) -> None:
+    def __init__(self, world: PhysicsWorld, tolerance: float) -> None:
         import mujoco
 
         self.world, self.tolerance = world, tolerance
@@ -56,7 +56,8 @@ class Stage:
         inward = np.minimum(0.35 * across, long)
         self._axis = np.eye(3)[half.argmax(axis=1)] * (long - inward)[:, None]
         self._thick = np.hypot(across, inward)
-        self._poses = world.poses()
+        self.poses: np.ndarray = world.poses()
+        """T_world_object (n, 4, 4) as rendered."""
         self._finger = world.finger_position()
         self._data.qpos[:] = world.data.qpos
         mujoco.mj_kinematics(world.model, self._data)
@@ -65,42 +66,37 @@ class Stage:
         """Update the rendered poses to those of the world, within the tolerance."""
         world = self.world
         now, finger = world.poses(), world.finger_position()
-        shift = np.linalg.norm(now[:, :3, 3] - self._poses[:, :3, 3], axis=1)
-        turn = np.linalg.norm(now[:, :3, :3] - self._poses[:, :3, :3], axis=(1, 2))
+        shift = np.linalg.norm(now[:, :3, 3] - self.poses[:, :3, 3], axis=1)
+        turn = np.linalg.norm(now[:, :3, :3] - self.poses[:, :3, :3], axis=(1, 2))
         moved = shift + turn * self._radius > self.tolerance
         if not moved.any() and (finger == self._finger).all():
             return
-        self._poses = np.where(moved[:, None, None], now, self._poses)
+        self.poses = np.where(moved[:, None, None], now, self.poses)
         self._finger = finger
         index = world.pose_index[moved]
         self._data.qpos[:3] = finger
         self._data.qpos[index] = world.data.qpos[index]
         self._mj.mj_kinematics(world.model, self._data)
 
-    @property
-    def poses(self) -> np.ndarray:
-        """T_world_object (n, 4, 4) as rendered."""
-        return self._poses.copy()
-
     def bodies(self) -> tuple[np.ndarray, np.ndarray]:
         """Poses (k, 12) of all bodies that cast shadows, and capsules (k, 7) that contain them.
 
         Equal rows of the first array are equal poses; see `solids.may_meet` for the second.
         """
-        model, data, n = self.world.model, self._data, len(self._poses)
+        model, data, n = self.world.model, self._data, len(self.poses)
         limbs = np.flatnonzero(self.world.geom_object == FINGER_ID)
         # Finger and arm are capsules and cylinders, which lie in the capsule of their radius and axis.
         limb_axis = data.geom_xmat[limbs].reshape(-1, 3, 3)[:, :, 2] * model.geom_size[limbs, 1:2]
-        axis = np.concatenate([np.einsum("nij,nj->ni", self._poses[:, :3, :3], self._axis), limb_axis])
-        at = np.concatenate([self._poses[:, :3, 3], data.geom_xpos[limbs]])
+        axis = np.concatenate([np.einsum("nij,nj->ni", self.poses[:, :3, :3], self._axis), limb_axis])
+        at = np.concatenate([self.poses[:, :3, 3], data.geom_xpos[limbs]])
         radius = np.concatenate([self._thick, model.geom_size[limbs, 0]]) + 0.002
-        rows = [self._poses[:, :3].reshape(n, 12), np.resize(self._finger, (len(limbs), 12))]
+        rows = [self.poses[:, :3].reshape(n, 12), np.resize(self._finger, (len(limbs), 12))]
         return np.concatenate(rows), np.column_stack([at - axis, at + axis, radius])
 
     def cast(
         self, origin: ArrayLike, directions: np.ndarray, groups: Sequence[int] = (0, 1, 2)
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Cast rays through the rendered poses; see `PhysicsWorld.cast`."""
+        """`PhysicsWorld.cast` with the rendered poses."""
         return self.world.cast(origin, directions, groups, self._data)
 
 
@@ -118,18 +114,10 @@ def _cosine_to_light(stage: Stage, light: np.ndarray, points: np.ndarray, normal
 
 
 class LightMap:
-    """Light on the table from some light sources: the mean of cosine times visibility, on a raster.
+    """Mean of cosine times visibility of light sources (k, 3) on the table, on a raster with some spacing in metres.
 
-    A shadow on the table thus costs rays at the resolution of the raster, not of the image.
-
-    Parameters
-    ----------
-    spacing : float
-        Of the raster, metres.
-    lights : (k, 3) metres
-        Light sources.
-    pixels : (n, 2) metres
-        Points of the table that the camera's pixels show; see `at_pixels`.
+    A shadow on the table thus costs rays at the resolution of the raster, not of the image. `pixels` (n, 2) are the
+    points of the table that the camera shows.
     """
 
     def __init__(self, spacing: float, lights: np.ndarray, pixels: np.ndarray) -> None:
@@ -175,20 +163,9 @@ class LightMap:
 
 
 class PixelRays:
-    """Rays of one camera, one per pixel.
+    """Rays from the camera at `eye` (3,), one per pixel, with what they meet among the geoms of some groups.
 
-    Parameters
-    ----------
-    stage : Stage
-    atlas : Atlas
-        Textures of the objects.
-    room : Room
-        Light.
-    eye : (3,) metres
-    directions : (n, 3)
-        Of each pixel's ray, with length 1 along the optical axis.
-    groups : sequence of int
-        Visible geoms.
+    `directions` (n, 3) have length 1 along the optical axis.
     """
 
     def __init__(
@@ -240,7 +217,6 @@ class PixelRays:
         return np.where(geom >= 0, self.stage.world.geom_object[np.maximum(geom, 0)], 0)
 
     def is_body(self, pixels: np.ndarray) -> np.ndarray:
-        """Whether the rays meet an object, the finger or the arm: (k,) bool."""
         return self.instance(pixels) > 0
 
     def points(self, pixels: np.ndarray) -> np.ndarray:

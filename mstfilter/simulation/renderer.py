@@ -23,24 +23,12 @@ _OFFSETS = ((-0.34, 0.14), (0.34, -0.14))  # of further rays within a pixel on a
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """Images without noise.
+    """Images without noise."""
 
-    Parameters
-    ----------
-    colour : (H, W, 3) float32
-        Linear intensity before exposure.
-    depth : (H, W) float32 metres
-        z-depth of the first surface; NaN for none.
-    instance : (H, W) uint8
-        0 for the room, 1 .. n for objects, 255 for finger and arm.
-    slant : (H, W) float32
-        Cosine between the surface's normal and the ray.
-    """
-
-    colour: np.ndarray
-    depth: np.ndarray
-    instance: np.ndarray
-    slant: np.ndarray
+    colour: np.ndarray  #: (H, W, 3) float32, linear intensity before exposure
+    depth: np.ndarray  #: (H, W) float32 metres, z-depth of the first surface; NaN for none
+    instance: np.ndarray  #: (H, W) uint8, 0 for the room, 1 .. n for objects, 255 for finger and arm
+    slant: np.ndarray  #: (H, W) float32, cosine between the surface's normal and the ray
 
 
 def visible_texel(camera: Camera) -> float:
@@ -73,7 +61,7 @@ class Renderer:
         skins: Sequence[Skin],
         room: Room,
         camera: Camera,
-        supersample: bool = True,
+        supersample: bool,
         tolerance: float = 0.0,
     ) -> None:
         self.room, self.camera = room, camera

@@ -123,9 +123,9 @@ def cylinder(radius: float, half_height: float, at: ArrayLike = (0, 0, 0)) -> Pi
     return _upright("cylinder", (radius, half_height), at)
 
 
-def ellipsoid(half: tuple[float, float, float], at: ArrayLike = (0, 0, 0)) -> Piece:
+def ellipsoid(half: tuple[float, float, float]) -> Piece:
     """An ellipsoid from its half axes."""
-    return _upright("ellipsoid", half, at)
+    return _upright("ellipsoid", half, (0, 0, 0))
 
 
 def capsule(start: ArrayLike, end: ArrayLike, radius: float, plain: bool = False) -> Piece:
@@ -148,15 +148,15 @@ def hull(vertices: ArrayLike) -> Piece:
     return Piece("hull", (), centre, np.eye(3), vertices - centre)
 
 
-def _circle(n: int, sides: int) -> np.ndarray:
-    """Points (n, 2) of the unit circle, 1 / `sides` of a turn apart."""
-    angle = np.arange(n) * (2.0 * np.pi / sides)
+def _circle(sides: int) -> np.ndarray:
+    """Points (sides + 1, 2) of the unit circle; the last one repeats the first."""
+    angle = np.arange(sides + 1) * (2.0 * np.pi / sides)
     return np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
 
 def frustum(lower: tuple[float, float], upper: tuple[float, float], sides: int = 32) -> Piece:
     """A frustum of a cone between two circles (radius, z), as a hull with `sides` side faces."""
-    circle = _circle(sides, sides)
+    circle = _circle(sides)[:-1]
     rings = [np.column_stack([r * circle, np.full(sides, z)]) for r, z in (lower, upper)]
     return hull(np.concatenate(rings))
 
@@ -171,7 +171,7 @@ def ring(profile: list[tuple[float, float, float]], sides: int = 20) -> list[Pie
     sides : int
         Wedges in each layer.
     """
-    circle = _circle(sides + 1, sides)
+    circle = _circle(sides)
     wedges = []
     for low, high in pairwise(profile):
         for a, b in pairwise(circle):

@@ -34,23 +34,18 @@ _SIDE, _TOP, _BOTTOM, _INSIDE = range(4)
 
 @dataclass(frozen=True, eq=False)
 class Skin:
-    """Texture of a body.
+    """Texture of a body: uint8 charts (h, w, 3), and the strength of the highlight, 0 .. 1.
 
-    Parameters
-    ----------
-    charts : tuple of (h, w, 3) uint8
-        Six faces (-x, +x, -y, +y, -z, +z) or side, top, bottom, inside; then the plain colour.
-    gloss : float
-        Strength of the highlight, 0 .. 1.
+    The charts are six faces (-x, +x, -y, +y, -z, +z) or side, top, bottom and inside, and then the plain colour.
     """
 
     charts: tuple[np.ndarray, ...]
     gloss: float
 
 
-def _srgb_to_linear(value: np.ndarray) -> np.ndarray:
-    """Linear intensity of sRGB values, both in 0 .. 1."""
-    value = np.asarray(value, dtype=np.float32)
+def _linear(image: np.ndarray) -> np.ndarray:
+    """Linear intensity 0 .. 1, float32, of an sRGB image."""
+    value = image.astype(np.float32) / 255.0
     return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4).astype(np.float32)
 
 
@@ -181,8 +176,7 @@ class Atlas:
             texels.append(chart)
         self._height, self._width = np.array([chart.shape[:2] for chart in texels]).T
         self._first = np.cumsum([0, *(self._height * self._width)[:-1]])
-        colours = np.concatenate([chart.reshape(-1, 3) for chart in texels])
-        self._texels = _srgb_to_linear(colours.astype(np.float32) / 255.0)
+        self._texels = _linear(np.concatenate([chart.reshape(-1, 3) for chart in texels]))
 
     def colour(self, skin: int, chart: np.ndarray, place: np.ndarray) -> np.ndarray:
         """Linear albedo (n, 3) float32 at places (n, 2) of charts (n,) of a skin, interpolated bilinearly."""
@@ -201,41 +195,19 @@ class Atlas:
 
 @dataclass(frozen=True, eq=False)
 class Room:
-    """Surroundings of a scene. Colours are linear.
+    """Surroundings of a scene. Colours are linear, float32."""
 
-    Parameters
-    ----------
-    table : (h, w, 3) float32
-        Albedo of the table top, row 0 at its far edge.
-    rim, floor, wall : (3,) float32
-        Albedo of the table's edge, the floor and the wall.
-    carpet : (n, n) float32
-        Relative brightness of a tile of the floor, which is repeated.
-    lamp : (k, 3) metres
-        Point sources of the lamp; several make soft shadows.
-    lamp_colour : (3,) float32
-        Irradiance of all of them on a surface that faces the lamp.
-    sky : (m, 3) metres
-        Point sources of the ceiling, for diffuse light from above.
-    sky_colour : (3,) float32
-        Irradiance of all of them.
-    ambient : (3,) float32
-        Irradiance without direction.
-    exposure : (3,) float32
-        Gain of each channel: exposure and white balance.
-    """
-
-    table: np.ndarray
-    rim: np.ndarray
-    floor: np.ndarray
-    wall: np.ndarray
-    carpet: np.ndarray
-    lamp: np.ndarray
-    lamp_colour: np.ndarray
-    sky: np.ndarray
-    sky_colour: np.ndarray
-    ambient: np.ndarray
-    exposure: np.ndarray
+    table: np.ndarray  #: (h, w, 3) albedo of the table top, row 0 at its far edge
+    rim: np.ndarray  #: (3,) albedo of the table's edge
+    floor: np.ndarray  #: (3,) albedo of the floor
+    wall: np.ndarray  #: (3,) albedo of the wall
+    carpet: np.ndarray  #: (n, n) relative brightness of a tile of the floor, which is repeated
+    lamp: np.ndarray  #: (k, 3) metres, point sources of the lamp; several make soft shadows
+    lamp_colour: np.ndarray  #: (3,) irradiance of all of them on a surface that faces the lamp
+    sky: np.ndarray  #: (m, 3) metres, point sources of the ceiling, for diffuse light from above
+    sky_colour: np.ndarray  #: (3,) irradiance of all of them
+    ambient: np.ndarray  #: (3,) irradiance without direction
+    exposure: np.ndarray  #: (3,) gain of each channel: exposure and white balance
 
 
 def _table_top(rng: np.random.Generator, texel: float) -> np.ndarray:
@@ -254,7 +226,7 @@ def _table_top(rng: np.random.Generator, texel: float) -> np.ndarray:
 
 def draw_room(rng: np.random.Generator, texel: float) -> Room:
     """Draw the surroundings of a scene; `texel` is the resolution of the table top in metres."""
-    table = _srgb_to_linear(_table_top(rng, texel).astype(np.float32) / 255.0)
+    table = _linear(_table_top(rng, texel))
     side = -1.0 if rng.uniform() < 0.5 else 1.0
     centre = np.array([side * rng.uniform(0.35, 0.8), rng.uniform(-0.7, 0.1), rng.uniform(1.3, 1.7)])
     spread = rng.uniform(0.08, 0.14)

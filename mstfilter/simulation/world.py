@@ -286,19 +286,11 @@ class PhysicsWorld:
 
 @dataclass(frozen=True)
 class FingerPush:
-    """A straight push along the table.
+    """A straight push along the table."""
 
-    Parameters
-    ----------
-    start, end : (x, y) metres
-        Path of the finger while it is down.
-    seconds : float
-        From one pause to the next, without the time to settle.
-    """
-
-    start: tuple[float, float]
-    end: tuple[float, float]
-    seconds: float
+    start: tuple[float, float]  #: (x, y) metres, where the finger comes down
+    end: tuple[float, float]  #: (x, y) metres, where it goes up
+    seconds: float  #: from one pause to the next, without the time to settle
 
     def target(self, t: float) -> np.ndarray:
         """Target (3,) of the finger t seconds after the pause."""
@@ -315,24 +307,12 @@ class FingerPush:
 
 @dataclass(frozen=True)
 class PushEffect:
-    """The effect of a push.
+    """The effect of a push."""
 
-    Parameters
-    ----------
-    displacement : (n,) metres
-        Distance that each object's origin moved.
-    turned : (n,) radians
-        Angle by which each object turned.
-    settled : bool
-        Whether all objects came to rest.
-    kept : bool
-        Whether all objects are still on the table, in the workspace and in view.
-    """
-
-    displacement: np.ndarray
-    turned: np.ndarray
-    settled: bool
-    kept: bool
+    displacement: np.ndarray  #: (n,) metres, distance that each object's origin moved
+    turned: np.ndarray  #: (n,) radians, angle by which each object turned
+    settled: bool  #: whether all objects came to rest
+    kept: bool  #: whether all objects are still on the table, in the workspace and in view
 
     def moved(self, threshold: float) -> int:
         """Number of objects that moved farther than `threshold` metres."""
