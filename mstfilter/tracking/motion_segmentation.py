@@ -116,7 +116,7 @@ class MotionSegmentation:
         group = _join(sums, pairs[used[pairs].all(axis=1)], self.misfit)
         group[~used] = -1
         group[(cells % 2 == 0) & ~near] = -2  # at rest
-        motions, group = self._motions(sums, group)
+        motions, group = _motions(sums, group)
         centre = sums[:, 4:7] / sums[:, :1]
         rivals = [cdist(centre, centre[group == k]).min(axis=1, initial=np.inf) for k in range(len(motions))]
         close = np.array(rivals) < _RIVAL_REACH
@@ -125,21 +125,22 @@ class MotionSegmentation:
         out[points.row, points.column] = number
         return out
 
-    def _motions(self, sums: np.ndarray, group: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Motions (k, 4, 4), the identity first, and the number of each cell's motion; -1 for too few points."""
-        motions, number = [np.eye(4)], np.full(len(group), -1)
-        number[group == -2] = 0
-        for g in np.unique(group[group >= 0]):
-            own = group == g
-            total = sums[own].sum(axis=0)
-            T, _ = fit_sums(total)
-            trace = total[7] + total[11] + total[15]
-            if total[16] + total[17] - 2 * trace < total[0] * _MOVED**2:
-                number[own] = 0
-            elif total[0] >= _MIN_POINTS:
-                number[own] = len(motions)
-                motions.append(T)
-        return np.array(motions), number
+
+def _motions(sums: np.ndarray, group: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Motions (k, 4, 4), the identity first, and the number of each cell's motion; -1 for too few points."""
+    motions, number = [np.eye(4)], np.full(len(group), -1)
+    number[group == -2] = 0
+    for g in np.unique(group[group >= 0]):
+        members = group == g
+        total = sums[members].sum(axis=0)
+        T, _ = fit_sums(total)
+        trace = total[7] + total[11] + total[15]
+        if total[16] + total[17] - 2 * trace < total[0] * _MOVED**2:
+            number[members] = 0
+        elif total[0] >= _MIN_POINTS:
+            number[members] = len(motions)
+            motions.append(T)
+    return np.array(motions), number
 
 
 def _neighbours(cells: np.ndarray, across: int, down: int, sums: np.ndarray, reach: float) -> np.ndarray:
@@ -148,15 +149,15 @@ def _neighbours(cells: np.ndarray, across: int, down: int, sums: np.ndarray, rea
     index = np.full((2, (down + 2) * (across + 2)), -1)
     padded = (place // across + 1) * (across + 2) + place % across + 1
     index[cells % 2, padded] = np.arange(len(cells))
-    found = []
+    pairs_of_step = []
     for step in (0, 1, across + 1, across + 2, across + 3):
         for kind in (0, 1):
             other = index[kind, padded + step]
             here = np.flatnonzero(other >= 0)
             if step == 0:
                 here = here[other[here] > here]
-            found.append(np.stack([here, other[here]], axis=1))
-    pairs = np.concatenate(found)
+            pairs_of_step.append(np.stack([here, other[here]], axis=1))
+    pairs = np.concatenate(pairs_of_step)
     close = np.linalg.norm(centre[pairs[:, 0]] - centre[pairs[:, 1]], axis=1) < reach
     return np.asarray(pairs[close], dtype=np.int64)
 
@@ -226,7 +227,7 @@ def _best(
     rival: float,
     rivals: np.ndarray,
 ) -> np.ndarray:
-    """For each point the motion, among those of its cell and of adjacent cells, with the smallest residual.
+    """Motion (n,) of each point with the smallest residual, among those of its cell and of adjacent cells.
 
     -1 if the residual exceeds `limit`, or if the residual of another of the `rivals` (motions, cells) is larger by
     less than `rival`.
@@ -242,5 +243,5 @@ def _best(
     least = np.where(near[cell, best], distance[every, best], np.inf)
     distance[every, best] = np.inf
     distance[~rivals.T[cell]] = np.inf
-    rivalled = distance.min(axis=1) < least + rival
-    return np.where((least < limit) & ~rivalled, best, -1).astype(np.int32)
+    ambiguous = distance.min(axis=1) < least + rival
+    return np.where((least < limit) & ~ambiguous, best, -1).astype(np.int32)

@@ -5,7 +5,7 @@ A rule works in two stages. `candidates` computes motions once per distinct segm
 
 ================  ===========================================================================
 `PaperRule`       paper, Algorithm 2: SIFT if it has more than 5 inliers, else ICP if its error
-                  is below 1 mm, else identity; ``order="best"``: the better of the two (text)
+                  is below 1 mm, else identity
 `AuthorsRule`     authors' program: a SIFT cluster drawn by size and used with a probability
                   that grows with it, else ICP with mean squared distance <= 0.002 m^2
 `MstRule`         candidates from flow, registration and SIFT, ranked by one robust residual
@@ -49,15 +49,13 @@ class Candidate:
     kind : "identity", "flow", "icp", "sift" or "search".
     T : RigidTransform, world metres.
     support : number of matches or points that determine it.
-    error : residual of these, metres (root mean square).
-    score : criterion of the rule; lower is better.
+    score : criterion of the rule, for SIFT and ICP the root mean square residual in metres; lower is better.
     registration : result of the registration that computed it, if any.
     """
 
     kind: str
     T: RigidTransform
     support: int = 0
-    error: float = 0.0
     score: float = 0.0
     registration: RegistrationResult | None = None
 
@@ -98,7 +96,7 @@ def _registered(track: Track, from_centroid: bool, reach: float, registration: R
     fit = registration.register(source, target, init, reach)
     if fit is None:
         return None
-    return Candidate("icp", rigid_transform(fit.T), len(track.points), fit.rms, fit.rms, fit)
+    return Candidate("icp", rigid_transform(fit.T), len(track.points), fit.rms, fit)
 
 
 @dataclass(frozen=True)
@@ -107,8 +105,6 @@ class PaperRule(MotionRule):
 
     Parameters
     ----------
-    order : "first" or "best"
-        The first of SIFT and ICP that passes its test (Algorithm 2), or the one with the smaller error (text).
     min_inliers : int
         SIFT is accepted with more inliers than this.
     max_error : float
@@ -119,32 +115,20 @@ class PaperRule(MotionRule):
     sift : SiftMatching
     """
 
-    order: str = "first"
     min_inliers: int = 5
     max_error: float = 0.001
     registration: Registration = field(default_factory=lambda: SmallGicp("ICP", 30))
     sift: SiftMatching = field(default_factory=SiftMatching)
 
-    def __post_init__(self) -> None:
-        if self.order not in ("first", "best"):
-            raise InputError(f"order {self.order!r} is unknown", "one of first, best")
-
     def candidates(self, rng: np.random.Generator, track: Track) -> tuple[Candidate, ...]:
-        passed = []
         motions = _sift_motions(rng, track, self.sift, True, 3, 500)
         if motions and len(motions[0].inliers) > self.min_inliers:
-            m = motions[0]
-            passed.append(Candidate("sift", rigid_transform(m.T), len(m.inliers), m.rms, m.rms))
-        if self.order == "best" or not passed:
-            fit = _registered(track, True, 0.03, self.registration)
-            if fit is not None and fit.error < self.max_error:
-                passed.append(fit)
-        return (*passed, IDENTITY)
+            best = motions[0]
+            return (Candidate("sift", rigid_transform(best.T), len(best.inliers), best.rms),)
+        fit = _registered(track, True, 0.03, self.registration)
+        return (fit if fit is not None and fit.score < self.max_error else IDENTITY,)
 
     def choose(self, rng: np.random.Generator, candidates: tuple[Candidate, ...]) -> Candidate:
-        moving = [c for c in candidates if c.kind != "identity"]
-        if self.order == "best" and moving:
-            return min(moving, key=lambda c: c.score)
         return candidates[0]
 
 
@@ -178,9 +162,9 @@ class AuthorsRule(MotionRule):
 
     def candidates(self, rng: np.random.Generator, track: Track) -> tuple[Candidate, ...]:
         clusters = _sift_motions(rng, track, self.sift, True, 3, 1000)
-        candidates = [Candidate("sift", rigid_transform(m.T), len(m.inliers), m.rms) for m in clusters]
+        candidates = [Candidate("sift", rigid_transform(m.T), len(m.inliers)) for m in clusters]
         fit = _registered(track, False, 10.0, self.registration)  # the authors' program has no limit of distance
-        if fit is not None and fit.error**2 <= self.max_mean_square:
+        if fit is not None and fit.score**2 <= self.max_mean_square:
             candidates.append(fit)
         return (*candidates, IDENTITY)
 
@@ -313,8 +297,7 @@ class MstRule(MotionRule):
     def _scored(
         self, track: Track, kind: str, T: np.ndarray, support: int = 0, result: RegistrationResult | None = None
     ) -> Candidate:
-        error = 0.0 if result is None else result.rms
-        return Candidate(kind, rigid_transform(T), support, error, self.residual.score(track, T), result)
+        return Candidate(kind, rigid_transform(T), support, self.residual.score(track, T), result)
 
     def _admissible(self, T: np.ndarray, centre: np.ndarray) -> bool:
         """Whether a motion is finite and within the limits of displacement and angle."""

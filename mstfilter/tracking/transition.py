@@ -6,7 +6,6 @@
 
 Optical flow follows the visible part of each object, a rule decides on a rigid motion, and a `Warp` moves the voxels.
 Flow and features are computed once per clip. A segment that several hypotheses share is tracked once.
-
 """
 
 from __future__ import annotations

@@ -43,14 +43,6 @@ def test_the_published_limit_of_1_mm_is_below_the_noise(printed_box, plain):
         assert loose.candidates(rng, track_of(scene, clip, label))[0].kind == "icp"
 
 
-def test_the_two_orders_of_the_paper_rule():
-    sift, icp = Candidate("sift", IDENTITY.T, 9, 0.004, 0.004), Candidate("icp", IDENTITY.T, 100, 0.0008, 0.0008)
-    rng = np.random.default_rng(0)
-    assert PaperRule().choose(rng, (sift, icp, IDENTITY)) is sift
-    assert PaperRule(order="best").choose(rng, (sift, icp, IDENTITY)) is icp
-    assert PaperRule(order="best").choose(rng, (IDENTITY,)) is IDENTITY
-
-
 def test_authors_rule_uses_clusters_with_the_stated_probability():
     """Binomial checks; each bound is 4.4 standard deviations, false alarm below 1e-4 in all."""
     n = 4000
@@ -107,18 +99,16 @@ def test_mst_rule_is_not_worse_than_registration_from_the_centroid(textured, pla
 
 
 def test_mst_rule_prefers_rest_by_the_margin():
-    rest, better, best = (
-        Candidate(k, IDENTITY.T, 0, 0.0, s) for k, s in (("identity", 0.85), ("icp", 0.9), ("icp", 0.8))
-    )
+    rest, better, best = (Candidate(k, IDENTITY.T, 0, s) for k, s in (("identity", 0.85), ("icp", 0.9), ("icp", 0.8)))
     rng = np.random.default_rng(0)
     assert MstRule().choose(rng, (rest, better)) is rest
     assert MstRule().choose(rng, (rest, best)) is best
-    nothing = Candidate("identity", IDENTITY.T, 0, 0.0, np.inf)
+    nothing = Candidate("identity", IDENTITY.T, 0, np.inf)
     assert MstRule().choose(rng, (nothing,)).kind == "identity"
 
 
 def test_sampling_follows_the_scores():
-    a, b = Candidate("identity", IDENTITY.T, 0, 0.0, 1.0), Candidate("icp", IDENTITY.T, 0, 0.0, 1.2)
+    a, b = Candidate("identity", IDENTITY.T, 0, 1.0), Candidate("icp", IDENTITY.T, 0, 1.2)
     rule, rng, n = MstRule(select="sample", n_eff=10.0), np.random.default_rng(3), 4000
     p = 1 / (1 + np.exp(-0.5 * 10 * 0.2))
     drawn = sum(rule.choose(rng, (a, b)) is a for _ in range(n))
@@ -149,6 +139,5 @@ def test_an_object_that_flow_lost_is_searched_for():
 
 
 def test_unknown_options_raise_an_error():
-    for make in (lambda: PaperRule(order="last"), lambda: MstRule(select="all")):
-        with pytest.raises(InputError):
-            make()
+    with pytest.raises(InputError):
+        MstRule(select="all")
