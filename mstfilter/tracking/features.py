@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from dataclasses import astuple, dataclass
 
+import cv2
 import numpy as np
 
 from mstfilter.errors import check_number
@@ -33,8 +34,6 @@ def same_depth(first: Frame, other: Frame, sigmas: float = 4.0) -> np.ndarray:
 
 def smooth_colour(frame: Frame, width: int = 3) -> np.ndarray:
     """Colour (H, W, 3) blurred over ``width`` pixels, to reduce the effect of shifts below a pixel."""
-    import cv2
-
     return memo(
         "smooth colour", (frame.key, width), lambda: cv2.GaussianBlur(frame.rgb, (width, width), 0).astype(np.float32)
     )
@@ -139,8 +138,6 @@ def _features(frame: Frame) -> tuple[np.ndarray, np.ndarray]:
     """Pixels (N, 2) and descriptors (N, 128) of features with a depth reading, off the robot."""
 
     def compute() -> tuple[np.ndarray, np.ndarray]:
-        import cv2
-
         grey = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
         keypoints, descriptors = cv2.SIFT_create().detectAndCompute(grey, None)  # type: ignore[attr-defined]
         if descriptors is None:

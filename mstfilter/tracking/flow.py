@@ -22,7 +22,10 @@ from dataclasses import astuple, dataclass
 from functools import cached_property
 from itertools import pairwise
 
+import cv2
 import numpy as np
+from scipy.ndimage import distance_transform_edt
+from scipy.spatial import cKDTree
 
 from mstfilter.errors import InputError
 from mstfilter.scene import Clip, Frame, memo
@@ -66,8 +69,6 @@ class ClipTracks:
     @cached_property
     def coherently_unchanged(self) -> np.ndarray:
         """As `unchanged`, but isolated changed pixels are treated as noise, (H, W) bool."""
-        import cv2
-
         changed = (~self.unchanged).astype(np.uint8)
         return cv2.morphologyEx(changed, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)) == 0
 
@@ -133,8 +134,6 @@ def _track(frames: list[Frame], preset: str) -> ClipTracks:
 
 def _thinned(frames: list[Frame]) -> list[Frame]:
     """Remove frames with little motion since the last kept frame."""
-    import cv2
-
     if len(frames) < 3:
         return frames
     factor = 160.0 / frames[0].depth.shape[1]
@@ -158,8 +157,6 @@ def _thinned(frames: list[Frame]) -> list[Frame]:
 
 def _speed(flow: np.ndarray, frame: Frame) -> float:
     """99.5th percentile of the flow length of pixels off the robot."""
-    import cv2
-
     length = np.hypot(flow[..., 0], flow[..., 1])
     robot = cv2.resize(_robot(frame).astype(np.uint8), length.shape[::-1], interpolation=cv2.INTER_AREA)
     seen = length[cv2.dilate(robot, np.ones((5, 5), np.uint8)) == 0]
@@ -169,8 +166,6 @@ def _speed(flow: np.ndarray, frame: Frame) -> float:
 @contextmanager
 def _one_thread() -> Iterator[None]:
     """Limit OpenCV to one thread: it splits the flow's search by thread, and the result depends on the split."""
-    import cv2
-
     threads = cv2.getNumThreads()
     cv2.setNumThreads(1)
     try:
@@ -185,8 +180,6 @@ def _robot(frame: Frame) -> np.ndarray:
 
 def _flow(a: Frame, b: Frame, preset: str) -> tuple[np.ndarray, np.ndarray]:
     """Flow a -> b and b -> a, (H, W, 2) pixels."""
-    import cv2
-
     grey = [cv2.cvtColor(f.rgb, cv2.COLOR_RGB2GRAY) for f in (a, b)]
     dis = cv2.DISOpticalFlow_create(_PRESETS.index(preset))  # type: ignore[attr-defined]
     with _one_thread():
@@ -195,8 +188,6 @@ def _flow(a: Frame, b: Frame, preset: str) -> tuple[np.ndarray, np.ndarray]:
 
 def _sample(field: np.ndarray, at: np.ndarray) -> np.ndarray:
     """Bilinear samples (N, 2) of a field (H, W, 2) at points (N, 2); the border is repeated."""
-    import cv2
-
     # OpenCV's images have at most 32767 rows: reshape the list of points to an image.
     folded = np.zeros((-(-len(at) // 1024), 1024, 2), np.float32)
     folded.reshape(-1, 2)[: len(at)] = at
@@ -244,10 +235,6 @@ def _vote(frame: Frame, pull: np.ndarray, known: np.ndarray, uncertain: np.ndarr
     Each takes the position of one of its five nearest valid pixels, by position in space and colour together (12 mm
     and 20 grey levels have equal weight; without depth 6 pixels): the one closest to the others.
     """
-    import cv2
-    from scipy.ndimage import distance_transform_edt
-    from scipy.spatial import cKDTree
-
     height, width = frame.depth.shape
     if not len(uncertain) or not known.any():
         return pull[uncertain]

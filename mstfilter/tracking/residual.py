@@ -24,6 +24,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -95,8 +96,6 @@ def normals(frame: Frame) -> np.ndarray:
     """World unit normals (H, W, 3) that face the camera, NaN if unknown. Cached by content."""
 
     def compute() -> np.ndarray:
-        import cv2
-
         valid = np.isfinite(frame.depth)
         points = np.where(valid[..., None], frame.points, 0.0).astype(np.float32)
         weight = cv2.blur(valid.astype(np.float32), (5, 5))

@@ -15,6 +15,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 
+import cv2
 import numpy as np
 from scipy.ndimage import value_indices
 
@@ -70,8 +71,6 @@ def segments_of(hypothesis: Hypothesis, frame: Frame) -> dict[int, Segment]:
 
 def _interior(labels: np.ndarray) -> np.ndarray:
     """Pixels with the same label as their four neighbours."""
-    import cv2
-
     cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
     padded = np.pad(labels, 1)
     return (cv2.erode(padded, cross) == cv2.dilate(padded, cross))[1:-1, 1:-1]
@@ -140,8 +139,6 @@ class Track:
 
     def sift_pairs(self, sift: SiftMatching, in_target: bool) -> tuple[np.ndarray, np.ndarray]:
         """World points of SIFT matches that start in the mask and, if `in_target`, end near the target mask."""
-        import cv2
-
         last = None
         if in_target:
             last = cv2.dilate(self.target_mask.astype(np.uint8), np.ones((11, 11), np.uint8)) > 0

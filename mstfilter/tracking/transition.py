@@ -16,6 +16,7 @@ from dataclasses import dataclass, field, replace
 from typing import ClassVar, NamedTuple
 
 import numpy as np
+from scipy.ndimage import distance_transform_edt, gaussian_filter, map_coordinates
 from scipy.spatial.transform import RigidTransform
 
 from mstfilter.errors import InputError
@@ -178,15 +179,11 @@ def _resting_claims(hypothesis: Hypothesis, labels: np.ndarray, claims: list[_Cl
 
 def _depth_inside(crop: Crop) -> np.ndarray:
     """Distance of each voxel of a crop to the nearest free voxel centre, in voxels. Free outside the crop."""
-    from scipy.ndimage import distance_transform_edt
-
     return distance_transform_edt(np.pad(crop.occupied, 1))[1:-1, 1:-1, 1:-1]
 
 
 def _pull(crop: Crop, T: np.ndarray, grid: VoxelGrid) -> tuple[np.ndarray, np.ndarray]:
     """Voxels (N, 3), also outside the grid, whose centre is in the source moved by T, and their depth inside."""
-    from scipy.ndimage import map_coordinates
-
     shape = np.array(crop.occupied.shape)
     index, at_source = _moved_box(crop, T, grid)
     # The tolerance makes motions by whole voxels independent of rounding errors.
@@ -212,8 +209,6 @@ def _moved_box(crop: Crop, T: np.ndarray, grid: VoxelGrid, margin: int = 0) -> t
 
 def _pull_smooth(crop: Crop, T: np.ndarray, grid: VoxelGrid) -> tuple[np.ndarray, np.ndarray]:
     """As `_pull`, with the smoothed signed distance; keeps the deepest voxels, as many as the source has."""
-    from scipy.ndimage import distance_transform_edt, gaussian_filter, map_coordinates
-
     index, at_source = _moved_box(crop, T, grid, 1)
     step = at_source[0] - np.rint(at_source[0] - 0.5) - 0.5
     turned = np.abs(T[:3, :3] - np.rint(T[:3, :3])).max()
