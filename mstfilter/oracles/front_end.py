@@ -87,11 +87,7 @@ class TrueMasks(UsesTruth, Proposal):
         same_masks = self.quality == 1 or self.errors == "lasting"
         particles: list[Hypothesis] = []
         qualities: list[float] = []
-        for i in range(n):
-            if same_masks and particles:
-                particles.append(particles[0])
-                qualities.append(qualities[0])
-                continue
+        for i in range(1 if same_masks else n):
             masks = degrade(self._errors(rng, i), true, self.quality, self.over, self.under)
             qualities.append(round(weighted_coverage(masks, true), 4))
             numbers = [int(k) for k in np.unique(masks) if k > 0]
@@ -99,6 +95,8 @@ class TrueMasks(UsesTruth, Proposal):
                 self.completer.complete(child(rng, "completion", i, k), frame, [masks == k], grid)[0] for k in numbers
             ]
             particles.append(hypothesis_of(completed, grid, observation.index, self.threshold))
+        if same_masks:
+            particles, qualities = particles * n, qualities * n
         notes = {"mask_quality": qualities, "objects": [h.n_objects for h in particles]}
         return Population(tuple(particles), notes=notes)
 

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+from functools import cached_property
 from typing import Any, ClassVar, Literal, TypeVar
 
 import numpy as np
@@ -40,8 +41,6 @@ class RecordingTruth:
     def __init__(self, recording: Recording) -> None:
         self.recording = recording
         self._instance: dict[int, np.ndarray] = {}
-        self._pauses: dict[bytes, int] | None = None
-        self._objects: np.ndarray | None = None
 
     def check(self, needs: tuple[Need, ...], component: str) -> None:
         """Raise InputError if something that a component needs is missing at any pause."""
@@ -71,11 +70,13 @@ class RecordingTruth:
         if t not in self._instance:
             image = self.recording.instance(self.recording.pauses[t])
             assert image is not None
-            if self._objects is None:
-                pauses = range(len(self.recording.pauses))
-                self._objects = np.unique(np.concatenate([np.unique(self.labels(k)) for k in pauses]))
             self._instance[t] = np.where(np.isin(image, self._objects), image, 0).astype(np.int32)
         return self._instance[t]
+
+    @cached_property
+    def _objects(self) -> np.ndarray:
+        """Labels with true voxels at any pause."""
+        return np.unique([k for t in range(len(self.recording.pauses)) for k in np.unique(self.labels(t))])
 
     def motions(self, t: int) -> dict[int, np.ndarray]:
         """(4, 4) motion in world metres of each object from pause `t` - 1 to pause `t`, by label."""
@@ -84,12 +85,14 @@ class RecordingTruth:
         assert before is not None and after is not None
         return {k: after[k] @ np.linalg.inv(before[k]) for k in before.keys() & after.keys()}
 
+    @cached_property
+    def _pauses(self) -> dict[bytes, int]:
+        """The first pause with each frame, by the key of the frame."""
+        frames = self.recording.frames
+        return {frames[index].key: t for t, index in reversed(list(enumerate(self.recording.pauses)))}
+
     def pause_of(self, frame: Frame) -> int:
         """The pause at which a frame was taken, found by its content."""
-        if self._pauses is None:
-            self._pauses = {}
-            for t, index in enumerate(self.recording.pauses):
-                self._pauses.setdefault(self.recording.frames[index].key, t)
         if frame.key not in self._pauses:
             raise InputError(
                 f"a frame is none of the {len(self.recording.pauses)} pauses of recording {self.recording.name}",
