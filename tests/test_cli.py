@@ -154,7 +154,7 @@ def test_a_run_that_was_killed_is_resumed(recording, tmp_path):
     command = [sys.executable, "-m", "mstfilter", "run", recording, *hangs, "--no-report"]
     part = tmp_path / "part"
     process = subprocess.Popen([*command, "--out", part], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    wait_for(marker)
+    wait_for(marker, process)
     process.kill()
     process.wait()
     assert RunFolder.open(part).n_pauses == 1

@@ -111,11 +111,8 @@ def _lines(kind: str) -> Iterator[str]:
     for name in REGISTRY.known(kind):
         cls = REGISTRY.find_class(kind, name)
         truth = " (uses the ground truth)" if issubclass(cls, UsesTruth) else ""
-        yield f"{name:<20}{_first_line(cls)}{truth}  [{_fields(cls)}]"
-
-
-def _first_line(cls: type) -> str:
-    return (cls.__doc__ or "").strip().split("\n")[0].rstrip(".")
+        summary = (cls.__doc__ or "").strip().split("\n")[0].rstrip(".")
+        yield f"{name:<20}{summary}{truth}  [{_fields(cls)}]"
 
 
 def _fields(cls: type) -> str:

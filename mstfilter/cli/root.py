@@ -127,7 +127,7 @@ def progress_bar(what: str) -> Iterator[Callable[[int, int], None]]:
 
 
 def print_summary(run: Path) -> None:
-    """Print one line a pause: hypotheses, their objects, effective sample size, quality."""
+    """Print one line per pause: hypotheses, their objects, effective sample size, quality."""
     from mstfilter.runs import RunFolder
 
     folder = RunFolder.open(run)

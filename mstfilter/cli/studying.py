@@ -21,7 +21,7 @@ def study(
         typer.Argument(metavar="[PATH=VALUE]...", help="Changes to every arm; a comma makes a grid: update.eta=3,5"),
     ] = None,
     out: Annotated[Path | None, typer.Option(help="Study folder. Default: studies/NAME.")] = None,
-    workers: Annotated[int, typer.Option(min=0, help="Processes; 0 is one a core.")] = 0,
+    workers: Annotated[int, typer.Option(min=0, help="Processes; 0 is one per core.")] = 0,
     scheduler: Annotated[
         str, typer.Option(help="Address of a Dask scheduler, tcp://HOST:PORT. Default: processes of this machine.")
     ] = "",

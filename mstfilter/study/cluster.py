@@ -42,7 +42,6 @@ class Cluster(Executor):
     connect_s: float = 10.0
 
     def run(self, jobs: Sequence[Job], tell: Tell) -> list[JobOutcome]:
-        """Run all jobs; the scheduler chooses the worker of each."""
         if not jobs:
             return []
         with self._client() as client:

@@ -27,16 +27,10 @@ from mstfilter.study.jobs import perform
 from mstfilter.study.results import Job, JobOutcome
 
 _POLL_S = 0.01
-_ONE_THREAD = {
-    name: "1"
-    for name in (
-        "OMP_NUM_THREADS",
-        "OPENBLAS_NUM_THREADS",
-        "MKL_NUM_THREADS",
-        "NUMEXPR_NUM_THREADS",
-        "VECLIB_MAXIMUM_THREADS",
-    )
-}
+_ONE_THREAD = dict.fromkeys(
+    ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS", "VECLIB_MAXIMUM_THREADS"),
+    "1",
+)
 
 
 @dataclass(frozen=True)
@@ -105,7 +99,6 @@ class Local(Executor):
             raise InputError(f"workers is {self.workers}, expected 0 or more")
 
     def run(self, jobs: Sequence[Job], tell: Tell) -> list[JobOutcome]:
-        """Run all jobs."""
         if not jobs:
             return []
         jobs_left = _JobQueue(jobs)
@@ -204,9 +197,7 @@ class _Worker(threading.Thread):
                 reason = f", the last time because it took longer than {job['timeout_s']:g} s"
             except ProcessExpired as error:
                 code = error.exitcode
-                reason = (
-                    f", the last time by signal {-code}" if code < 0 else f", the last time with exit code {code}"
-                )
+                reason = f", the last time {f'by signal {-code}' if code < 0 else f'with exit code {code}'}"
             except BrokenProcessPool:
                 reason = ", the last time before it began"
             else:
@@ -286,7 +277,7 @@ _step_pipe: Connection | None = None
 
 
 def _initialise(steps: Connection, log: str | None) -> None:
-    """Prepare a worker process: output goes to the log, one thread, an end if the study ends."""
+    """Prepare a worker process: output goes to the log, one thread, exit when the study ends."""
     global _step_pipe
     import cv2
 
@@ -301,7 +292,7 @@ def _initialise(steps: Connection, log: str | None) -> None:
 
 
 def _exit_with_parent() -> None:
-    """End this process, also in the middle of a job, when the process of the study has ended."""
+    """Exit as soon as the process of the study has ended, also during a job."""
     parent = multiprocessing.parent_process()
     assert parent is not None
     parent.join()

@@ -1,11 +1,11 @@
-"""The runs of a study: every combination of an arm, a scene and a seed, each named by everything that it depends on.
+"""The runs of a study: every combination of an arm, a scene and a seed, with an identity.
 
 >>> plan = make_plan(load_study("study.toml"))
 >>> [run.name for run in plan.runs]
 
-The identity of a run is a hash of its configuration, its recording (the recipe of a simulated one, the content of any
-other, ground truth included), its seed, the files of mstfilter and of the user, and the versions of the libraries. A
-run whose identity is unchanged is not repeated; two studies that share a run share its identity.
+The identity of a run is a hash of its configuration, its recording (the recipe if it is simulated, otherwise the
+content with the ground truth), its seed, the files of mstfilter and of the user, and the versions of the libraries. A
+run whose identity is unchanged is not repeated. Equal runs of two studies have equal identities.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ class StudyScene:
     group : str
         Name of its family in the tables.
     source : dict
-        ``{"family", "seed", "set"}`` of a simulated recording; path, format, options and pauses of any other.
+        ``{"family", "seed", "set"}`` of a simulated recording; path, format, options and pauses of other recordings.
     key : str
         Hash of the recipe or the content.
     """

@@ -6,9 +6,9 @@
 Layout::
 
     study.json       description, arms with their configuration, scenes, seeds, the folder of every run
-    runs/NAME/       one `RunFolder` a run; result.json holds its metrics, or why it failed
-    runs.csv         one row a pause and run: metrics first, time and memory last
-    summary.csv      one row a family, arm and metric: mean over scenes and its interval
+    runs/NAME/       one `RunFolder` per run; result.json holds its metrics, or why it failed
+    runs.csv         one row per pause and run: metrics first, time and memory last
+    summary.csv      one row per family, arm and metric: mean over scenes and its interval
     differences.csv  the reference against every other arm: paired differences, intervals, p values, conclusions
     failures.csv     runs that failed, and why
     logs/            output of the workers
@@ -126,7 +126,7 @@ class StudyFolder:
         return self.path / "runs" / folder
 
     def write_failure(self, folder: str, identity: str, outcome: JobOutcome) -> None:
-        """Write down why a run failed."""
+        """Record why a run failed."""
         record = {"identity": identity, "status": "failed", "error": outcome.error, "hints": outcome.hints}
         self.run(folder).mkdir(parents=True, exist_ok=True)
         write_result(self.run(folder), {**record, "tries": outcome.tries, "trace": outcome.trace})
@@ -141,7 +141,7 @@ class StudyFolder:
         return found
 
     def records(self) -> list[dict[str, Any]]:
-        """As `rows`, with lists too: ``qualities``, one value a hypothesis."""
+        """As `rows`, including lists: ``qualities`` has one value per hypothesis."""
         rows = []
         for run in self.description["runs"]:
             result = read_result(self.run(run["folder"]))
@@ -153,7 +153,7 @@ class StudyFolder:
         return rows
 
     def rows(self) -> list[dict[str, Any]]:
-        """One row a pause and run, of all runs that are done, in the order of the study: metrics, time and memory."""
+        """One row per pause and finished run, in the order of the study: metrics, time and memory."""
         return [{k: v for k, v in row.items() if not isinstance(v, list)} for row in self.records()]
 
     def summary(self) -> Summary:

@@ -3,8 +3,8 @@
 >>> result = run_study(load_study("study.toml"), Path("studies/first"), Local(workers=2))
 >>> result.done, result.failed
 
-The same call resumes a study that was stopped, and repeats what failed. Runs whose identity is unchanged are not
-repeated, and the tables come out the same.
+The same call resumes a study that was stopped and repeats the runs that failed. Runs whose identity is unchanged are
+not repeated; the tables are the same as those of an uninterrupted study.
 """
 
 from __future__ import annotations
@@ -150,7 +150,9 @@ def run_study(
 @contextlib.contextmanager
 def _locked(path: Path) -> Iterator[StudyFolder]:
     """The study folder, made if it is missing and locked for this process."""
-    if path.exists() and not (path / "study.json").exists() and not _is_empty(path):
+    made_first = {".lock", "logs", "runs"}  # what a study makes before study.json
+    is_study = path.is_dir() and ((path / "study.json").exists() or {p.name for p in path.iterdir()} <= made_first)
+    if path.exists() and not is_study:
         raise InputError(
             f"cannot run a study in {path}: it exists and is not a study folder", "choose another with --out"
         )
@@ -178,11 +180,6 @@ def _locked(path: Path) -> Iterator[StudyFolder]:
             yield StudyFolder(path)
         finally:
             _remove_partial_runs(path, "*")
-
-
-def _is_empty(path: Path) -> bool:
-    """Whether a folder holds nothing but what a study makes before its first run."""
-    return path.is_dir() and all(p.name in (".lock", "logs", "runs") for p in path.iterdir())
 
 
 def _remove_partial_runs(path: Path, folder: str) -> None:
@@ -248,7 +245,7 @@ def _is_done(run: StudyRun, folder: StudyFolder) -> bool:
 
 
 def _write_failure(folder: StudyFolder, run: StudyRun, outcome: JobOutcome) -> None:
-    """Write down why a run failed; if the disk is full, nothing is written."""
+    """Record why a run failed; if the disk is full, nothing is written."""
     with contextlib.suppress(OSError):
         folder.write_failure(run.folder, run.identity, outcome)
 
@@ -291,7 +288,7 @@ def _is_recorded(source: dict[str, Any], recordings: Path) -> bool:
 
 
 def _run_jobs(plan: Plan, runs: Sequence[StudyRun], folder: StudyFolder, cache: Path, allow_files: bool) -> list[Job]:
-    """Jobs as plain values, as `mstfilter.study.jobs` does them."""
+    """Jobs for `mstfilter.study.jobs`, as plain values."""
     libraries = "".join(f" {name}={version}" for name, version in library_versions().items())
     work = {
         "folder": str(cache / "work"),
