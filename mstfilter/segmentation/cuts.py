@@ -110,24 +110,12 @@ class MergeLogOdds(CutValue):
 
 @dataclass(frozen=True, eq=False)
 class CutSample:
-    """Cuts drawn from a tree.
+    """Cuts drawn from a tree."""
 
-    Parameters
-    ----------
-    cuts : tuple of int arrays
-        Ascending nodes of each cut.
-    values : (n,) float
-        v(c) of each cut.
-    log_p : (n,) float
-        Log of the sampler's target law relative to the optimal cut.
-    diagnostics : dict
-        Statistics of the draw; JSON types only.
-    """
-
-    cuts: tuple[np.ndarray, ...]
-    values: np.ndarray
-    log_p: np.ndarray
-    diagnostics: dict[str, Any] = field(default_factory=dict)
+    cuts: tuple[np.ndarray, ...]  #: ascending nodes of each cut
+    values: np.ndarray  #: (n,) v(c) of each cut
+    log_p: np.ndarray  #: (n,) log of the sampler's target law relative to the optimal cut
+    diagnostics: dict[str, Any] = field(default_factory=dict)  #: statistics of the draw; JSON types only
 
 
 class CutSampler(ABC):
@@ -199,29 +187,14 @@ class OptimalCut(CutSampler):
 
 @dataclass(frozen=True, eq=False)
 class Gibbs:
-    """A Gibbs law over the cuts of a tree and of its subtrees.
-
-    Parameters
-    ----------
-    tree : Tree
-    b : float
-        Inverse temperature, per unit of value.
-    w : list of float
-        Node values.
-    log_z : list of float
-        Log normaliser of every subtree.
-    stop : list of float
-        Probability that a cut which reaches the node contains the node itself.
-    mean : list of float
-        Expected value of the part of a cut inside the subtree.
-    """
+    """A Gibbs law over the cuts of a tree and of its subtrees; lists have one entry per node."""
 
     tree: Tree
-    b: float
-    w: list[float]
-    log_z: list[float]
-    stop: list[float]
-    mean: list[float]
+    b: float  #: inverse temperature, per unit of value
+    w: list[float]  #: node values
+    log_z: list[float]  #: log normaliser of the subtree
+    stop: list[float]  #: probability that a cut which reaches the node contains the node itself
+    mean: list[float]  #: expected value of the part of a cut inside the subtree
 
     def draw(self, random: Callable[[], float], node: int) -> list[int]:
         """Draw a cut of the subtree of `node`, unordered; `random` returns uniform numbers in [0, 1)."""
@@ -245,20 +218,20 @@ def gibbs(tree: Tree, w: np.ndarray, b: float) -> Gibbs:
     values, n = w.tolist(), tree.n_nodes
     log_z, stop, mean = [0.0] * n, [1.0] * n, [0.0] * n
     for node, children in enumerate(tree.children):
-        own = b * values[node]
+        keep = b * values[node]
         if not children:
-            log_z[node], mean[node] = own, values[node]
+            log_z[node], mean[node] = keep, values[node]
             continue
         split = inner = 0.0
         for child in children:
             split += log_z[child]
             inner += mean[child]
-        # log Z = log(exp(own) + exp(split)), stable for either order of magnitude.
-        if own >= split:
-            log_z[node] = own + log1p(exp(split - own))
+        # log Z = log(exp(keep) + exp(split)), stable for either order of magnitude.
+        if keep >= split:
+            log_z[node] = keep + log1p(exp(split - keep))
         else:
-            log_z[node] = split + log1p(exp(own - split))
-        stop[node] = p = exp(own - log_z[node])
+            log_z[node] = split + log1p(exp(keep - split))
+        stop[node] = p = exp(keep - log_z[node])
         mean[node] = p * values[node] + (1 - p) * inner
     return Gibbs(tree, b, values, log_z, stop, mean)
 

@@ -250,21 +250,10 @@ LOCAL_MOVES: dict[str, type[MoveRule]] = {"node": NodeMoves, "authors": AuthorsM
 
 
 class CutChain:
-    """A Metropolis-Hastings chain over cuts, one step at a time.
+    """A Metropolis-Hastings chain over cuts from an initial cut, one step at a time.
 
-    Parameters
-    ----------
-    tree : Tree
-    w : (N,) array
-        Node values.
-    best : float
-        v(c*).
-    s2 : float
-        Scale of the target law, in squared units of value.
-    cut : array of int
-        Initial cut.
-    temperature : float
-        If > 0, the target is the Gibbs law at this temperature, in units of value, and s2 is not used.
+    `best` is v(c*). The target is the law of the paper with scale `s2`, in squared units of value, or with a
+    `temperature` the Gibbs law.
     """
 
     def __init__(

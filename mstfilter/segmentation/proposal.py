@@ -41,18 +41,13 @@ _MIN_READINGS = 0.004  # fraction of a region's pixels with a depth reading (the
 
 @dataclass(frozen=True, eq=False)
 class Segments:
-    """Object pixels of an image, and the nodes of its tree that are objects.
-
-    Parameters
-    ----------
-    object_pixels : (H, W) bool
-        Pixels that can belong to an object: a depth reading above the table and in the workspace, not the robot.
-    is_object : (N,) bool
-        Whether the node is an object if it is part of a cut.
-    """
+    """Object pixels of an image, and the nodes of its tree that are objects."""
 
     object_pixels: np.ndarray
+    """(H, W) bool, pixels that can belong to an object: a depth reading above the table and in the workspace, not the
+    robot."""
     is_object: np.ndarray
+    """(N,) bool, whether the node is an object if it is part of a cut."""
 
 
 @dataclass(frozen=True)
@@ -73,36 +68,36 @@ class ObjectRule:
 
     def object_pixels(self, frame: Frame, grid: VoxelGrid | None = None) -> np.ndarray:
         """Pixels that can belong to an object, (H, W) bool, as `Segments.object_pixels`."""
-        found = pixels_above_table(frame)
+        pixels = pixels_above_table(frame)
         if grid is not None:
-            found &= grid.contains(grid.index_of(frame.points))
-        return found
+            pixels &= grid.contains(grid.index_of(frame.points))
+        return pixels
 
     def segments(self, tree: Tree, frame: Frame, grid: VoxelGrid | None = None) -> Segments:
         """Test every node of a tree. Without a grid the workspace is everything above the table."""
-        own = self.object_pixels(frame, grid)
+        pixels = self.object_pixels(frame, grid)
         readings = tree.accumulate_pixels(frame.valid)
-        points = tree.accumulate_pixels(own)
-        core = _core(tree, own, max(1, round(_CORE_RADIUS * frame.camera.width / 640)))
-        resize = own.size / 307200
+        points = tree.accumulate_pixels(pixels)
+        core = _core(tree, pixels, max(1, round(_CORE_RADIUS * frame.camera.width / 640)))
+        resize = pixels.size / 307200
         is_object = (
             (points >= max(1.0, self.min_points * resize))
             & (core >= _MIN_CORE * resize)
             & (points >= _MIN_RAISED * readings)
             & (readings >= _MIN_READINGS * tree.area)
         )
-        return Segments(own, is_object)
+        return Segments(pixels, is_object)
 
     def label_image(self, tree: Tree, cut: np.ndarray, frame: Frame, grid: VoxelGrid | None = None) -> np.ndarray:
         """(H, W) int32 segments of a cut: 0 is background, k + 1 the k-th node of the cut."""
-        found = self.segments(tree, frame, grid)
+        segments = self.segments(tree, frame, grid)
         cut = np.asarray(cut)
-        numbers = np.where(found.is_object[cut], np.arange(1, len(cut) + 1), 0)
-        return np.where(found.object_pixels, numbers[tree.label_image(cut)], 0).astype(np.int32)
+        numbers = np.where(segments.is_object[cut], np.arange(1, len(cut) + 1), 0)
+        return np.where(segments.object_pixels, numbers[tree.label_image(cut)], 0).astype(np.int32)
 
 
-def _core(tree: Tree, own: np.ndarray, radius: int) -> np.ndarray:
-    """Number of pixels (N,) of each node whose square neighbourhood lies in the node and in `own`.
+def _core(tree: Tree, pixels: np.ndarray, radius: int) -> np.ndarray:
+    """Number of pixels (N,) of each node whose square neighbourhood lies in the node and in `pixels`.
 
     A neighbourhood lies in the lowest node that contains all of it and in the ancestors of that node, so one pass
     over the pixels is sufficient. The lowest node is the one that contains the first and the last leaf of the
@@ -112,8 +107,8 @@ def _core(tree: Tree, own: np.ndarray, radius: int) -> np.ndarray:
 
     square = np.ones((2 * radius + 1, 2 * radius + 1), np.uint8)
     # First fill single missing readings inside an object.
-    closed = cv2.morphologyEx(own.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
-    inside = (cv2.erode(closed, square, borderValue=0) > 0) & own
+    closed = cv2.morphologyEx(pixels.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
+    inside = (cv2.erode(closed, square, borderValue=0) > 0) & pixels
     position = tree.leaf_position[tree.leaves].astype(np.float32)
     first = cv2.erode(position, square)[inside].astype(np.int64)
     last = cv2.dilate(position, square)[inside].astype(np.int64)
@@ -177,15 +172,15 @@ class TreeCutProposal(Proposal):
         frame, grid = observation.after, observation.grid
         tree, w = self.tree_of(frame)
         drawn = self.sampler.sample(rng, tree, w, n)
-        found = memo(
+        segments = memo(
             "segments",
             (frame.key, grid.key, tree.key, component_key(self.objects)),
             lambda: self.objects.segments(tree, frame, grid),
         )
-        kept = [cut[found.is_object[cut]] for cut in drawn.cuts]
+        kept = [cut[segments.is_object[cut]] for cut in drawn.cuts]
         completed: dict[int, Completion] = {}
         for node in np.unique(np.concatenate([np.zeros(0, np.int64), *kept])).tolist():
-            mask = tree.mask(node) & found.object_pixels
+            mask = tree.mask(node) & segments.object_pixels
             # One stream per segment, so the result does not depend on the other segments.
             stream = child(rng, "completion", node)
             completed[node] = self.completer.complete(stream, frame, [mask], grid)[0]

@@ -96,12 +96,12 @@ def measure_regions(leaves: np.ndarray, frame: Frame, boundary: np.ndarray) -> R
     n_leaves = int(leaves.max()) + 1
     flat = leaves.ravel()
     above = above_table(frame)
-    own = pixels_above_table(frame)
+    raised = pixels_above_table(frame)
     areas = np.bincount(flat, minlength=n_leaves)
     # A leaf that contains object and table pixels is an object. Rays above the horizon of the table (infinite
     # disparity above it) make a leaf an object only if they are the majority.
-    meets = own & (above < np.inf)
-    of_leaf = np.where(_raised(flat, above, meets, areas, _MIXED) | _raised(flat, above, own, areas, 0.5), 1, 0)
+    meets = raised & (above < np.inf)
+    of_leaf = np.where(_raised(flat, above, meets, areas, _MIXED) | _raised(flat, above, raised, areas, 0.5), 1, 0)
     of_leaf[of_leaf > 0] = 1 + np.arange(int(of_leaf.sum()))
     region = of_leaf[leaves]
     n = int(of_leaf.max()) + 1
@@ -109,7 +109,7 @@ def measure_regions(leaves: np.ndarray, frame: Frame, boundary: np.ndarray) -> R
     D = filled_disparity(frame)
     hollow, convex = curvature(D, width / 640)
     sums = np.zeros((n, sum(_WIDTHS.values())))
-    at = np.nonzero(own & (region > 0))
+    at = np.nonzero(raised & (region > 0))
     which = region[at]
 
     def put(name: str, *values: np.ndarray) -> None:

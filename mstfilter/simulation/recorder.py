@@ -224,9 +224,8 @@ def _describe_push(push: FingerPush, result: PushEffect) -> dict[str, Any]:
 
 def cache_folder() -> Path:
     """Folder of cached files: MSTFILTER_CACHE, else `mstfilter` in the user's cache folder."""
-    own = os.environ.get("MSTFILTER_CACHE")
-    if own:
-        return Path(own)
+    if folder := os.environ.get("MSTFILTER_CACHE"):
+        return Path(folder)
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "mstfilter"
 
 
@@ -250,7 +249,7 @@ def cached_recording(family: str | SceneFamily, seed: int, folder: Path | None =
         The name of a family, or a family.
     seed : int
         Not negative.
-    folder : path, optional
+    folder : Path, optional
         Where recordings are kept. Default: `recordings` in `cache_folder()`.
     **overrides
         Fields of the family to change: image size, frames per clip, number of actions, ...
@@ -269,8 +268,7 @@ def cached_recording(family: str | SceneFamily, seed: int, folder: Path | None =
         )
     chosen = replace(chosen, **overrides)
     _check_seed(seed)
-    home = Path(folder) if folder is not None else cache_folder() / "recordings"
-    target = home / f"{chosen.name}-{seed}-{recipe_key(chosen, seed)}"
+    target = (folder or cache_folder() / "recordings") / f"{chosen.name}-{seed}-{recipe_key(chosen, seed)}"
     if not (target / "manifest.json").is_file():
         _simulate_into_cache(chosen, seed, target)
     return target

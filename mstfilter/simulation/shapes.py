@@ -85,8 +85,8 @@ class Pool:
 
     def name(self, rng: np.random.Generator, names: Sequence[str]) -> str:
         """One of the names that belong to the pool."""
-        own = names if self.half is None else names[self.half :: 2]
-        return own[int(rng.integers(len(own)))]
+        available = names if self.half is None else names[self.half :: 2]
+        return available[int(rng.integers(len(available)))]
 
 
 def _within_band(share: float) -> float:

@@ -225,9 +225,9 @@ class PhysicsWorld:
 
     def overlaps(self, k: int | None = None) -> bool:
         """Whether object k (None: the finger) overlaps an object, after `forward`."""
-        own = FINGER_ID if k is None else k + 1
+        body = FINGER_ID if k is None else k + 1
         pairs, distance = self.geom_object[self.data.contact.geom.reshape(-1, 2)], self.data.contact.dist
-        return bool(((distance < 0) & (pairs == own).any(axis=1) & (pairs >= 1).all(axis=1)).any())
+        return bool(((distance < 0) & (pairs == body).any(axis=1) & (pairs >= 1).all(axis=1)).any())
 
     def deepest_overlap(self) -> float:
         """Greatest depth in metres at which objects overlap each other or the table, after `forward`."""
@@ -260,7 +260,7 @@ class PhysicsWorld:
         groups : sequence of int
             Visible geoms: 0 the room, 1 objects, 2 finger and arm.
         data : mujoco.MjData, optional
-            Another state of the same model. Default: the world's own, as it is after `forward`.
+            Another state of the same model. Default: the state of the world after `forward`.
 
         Returns
         -------
