@@ -120,7 +120,10 @@ class ModeFilter:
         )
         padded = np.pad(np.ascontiguousarray(labels[box]), half)
         at = np.ravel_multi_index([w - b.start + half for w, b in zip(where, box, strict=True)], padded.shape)
-        votes = _Votes(self, padded, at, _window_cells(where, labels.shape, half))
+        sides = [
+            np.minimum(w + half + 1, n) - np.maximum(w - half, 0) for w, n in zip(where, labels.shape, strict=True)
+        ]
+        votes = _Votes(self, padded, at, np.prod(sides, axis=0))
         changed = votes.sweep(votes.unsettled())
         for _ in range(self.max_sweeps - 1):
             if not len(changed):
@@ -416,9 +419,3 @@ def _over_window(function: np.ufunc, cells: np.ndarray, window: int) -> np.ndarr
             function(out, along[k : k + n], out=out)
         cells = np.moveaxis(out, 0, axis)
     return cells
-
-
-def _window_cells(at: tuple[np.ndarray, ...], shape: tuple[int, ...], half: int) -> np.ndarray:
-    """Number of grid cells in the window of every voxel `at`."""
-    sides = [np.minimum(w + half + 1, n) - np.maximum(w - half, 0) for w, n in zip(at, shape, strict=True)]
-    return np.asarray(sides[0] * sides[1] * sides[2])

@@ -35,13 +35,7 @@ class Projection(ABC):
         """The nearest hypothesis that agrees with a frame, and the share of voxels that it keeps, in [0, 1]."""
 
     def refine(self, hypotheses: Sequence[Any], clip: Clip) -> tuple[tuple[Any, ...], np.ndarray]:
-        """Project hypotheses about the end of a clip onto its last frame.
-
-        Returns
-        -------
-        tuple of hypotheses, (n,) float
-            Projected hypotheses and the share of voxels that each keeps.
-        """
+        """Project hypotheses about the end of a clip onto its last frame; also returns the shares of voxels (n,)."""
         pairs = [self.project(hypothesis, clip.after) for hypothesis in hypotheses]
         return tuple(h for h, _ in pairs), np.array([q for _, q in pairs])
 
@@ -51,13 +45,10 @@ class Division(ABC):
 
     @abstractmethod
     def divide(self, clip: Clip) -> np.ndarray | None:
-        """Group the pixels of the last frame of a clip.
+        """Numbers (H, W) int32 of the pixels of the last frame; None if the clip gives no information.
 
-        Returns
-        -------
-        (H, W) int32 or None
-            Pixels with different numbers >= 0 belong to different objects; -1 is unknown. None if the clip
-            shows nothing, for example a single frame.
+        Pixels with different numbers >= 0 belong to different objects; -1 is unknown. A clip of a single frame, for
+        example, gives no information.
         """
 
 

@@ -10,8 +10,7 @@ Two results are accumulated over the frames of the clip:
 >>> labels_after = tracks.warp(project(hypothesis, clip.before.camera))   # doctest: +SKIP
 
 A point or pixel is valid while the backward flow returns it to its start, its depth and colour do not jump, and it is
-not on the robot. The intermediate frames are needed because the flow from
-first to last frame fails for long motions.
+not on the robot. The flow from the first to the last frame alone fails for long motions.
 """
 
 from __future__ import annotations

@@ -6,7 +6,6 @@ Points that the optical flow followed through the clip are binned into small cel
 cells are joined while one rigid motion explains both, the pair with the smallest misfit first (Ward's rule; with
 `rigid.pair_sums` each trial is one 3 x 3 SVD). This separates touching objects of equal look when one has moved
 relative to the other.
-
 """
 
 from __future__ import annotations

@@ -132,9 +132,8 @@ class PaperRule(MotionRule):
         return candidates[0]
 
 
-def _one_to_many() -> SiftMatching:
-    """All pairs within the radii of the authors' program: descriptor distance 200, 1000 pixels, 1 m."""
-    return SiftMatching(mutual=False, descriptor_radius=200.0, search_share=10.0, search_distance=1.0)
+#: All pairs within the radii of the authors' program: descriptor distance 200, 1000 pixels, 1 m.
+_ALL_PAIRS = SiftMatching(mutual=False, descriptor_radius=200.0, search_share=10.0, search_distance=1.0)
 
 
 @dataclass(frozen=True)
@@ -158,7 +157,7 @@ class AuthorsRule(MotionRule):
     highest: float = 0.9
     max_mean_square: float = 0.002
     registration: Registration = field(default_factory=lambda: SmallGicp("ICP", 20))
-    sift: SiftMatching = field(default_factory=_one_to_many)
+    sift: SiftMatching = _ALL_PAIRS
 
     def candidates(self, rng: np.random.Generator, track: Track) -> tuple[Candidate, ...]:
         clusters = _sift_motions(rng, track, self.sift, True, 3, 1000)
