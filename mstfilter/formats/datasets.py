@@ -120,7 +120,6 @@ def _cameras(path: Path) -> dict[int, dict[str, Any]]:
 
 
 def _image(path: Path, parts: tuple[str, ...], k: int) -> Path:
-    """The file of an image number."""
     for part in parts:
         for suffix in (".png", ".jpg", ".tif"):
             file = path / part / f"{k:06d}{suffix}"
@@ -231,7 +230,6 @@ class Dsr(RecordingFormat):
         )
 
     def _steps(self, path: Path) -> list[Path]:
-        """Files of the chosen sequence in order."""
         names = sorted({p.stem.rpartition("_")[0] for p in path.glob("*_*.hdf5")}, key=lambda s: (len(s), s))
         if not names:
             raise InputError(f"not a DSR-Net folder: {path} holds no ID_k.hdf5")
@@ -251,7 +249,6 @@ class Dsr(RecordingFormat):
 
 
 def _read(path: Path) -> dict[str, np.ndarray]:
-    """The volumes of a step."""
     try:
         import h5py
     except ImportError as error:

@@ -131,7 +131,6 @@ class Listed(PauseRule):
 
 
 def _numbers(words: list[str]) -> dict[str, Any]:
-    """Fields of `At`."""
     try:
         return {
             "frames": tuple(int(w) for w in words if not w.endswith("s")),
@@ -237,7 +236,6 @@ class Still(PauseRule):
         return tuple((a, b) for a, b in runs if b > a and times[b] - times[a] >= self.hold_s - 1e-9)
 
     def _part(self, blocks: np.ndarray) -> np.ndarray:
-        """The blocks of the region."""
         h, w = blocks.shape
         left, top, right, bottom = self.region
         part = blocks[int(top * h) : int(np.ceil(bottom * h)), int(left * w) : int(np.ceil(right * w))]

@@ -296,7 +296,6 @@ def write_report(run: RunFolder | str | Path, out: str | Path | None = None) -> 
 
 
 def _pauses(run: RunFolder, numbers: RunNumbers) -> list[dict[str, Any]]:
-    """Pictures of all pauses."""
     if not numbers.steps:
         return []
     identities = assign_identities(run)

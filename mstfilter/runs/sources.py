@@ -51,7 +51,6 @@ def open_source(
 
 
 def _reader(name: str, allow_files: bool = False) -> type[RecordingFormat]:
-    """The class of a format."""
     cls = REGISTRY.find_class("format", name, "format", allow_files)
     if not issubclass(cls, RecordingFormat):
         raise InputError(f"{name} is not a reader of recordings", "subclass mstfilter.formats.RecordingFormat")
