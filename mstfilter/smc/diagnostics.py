@@ -17,19 +17,26 @@ A collector is a function ``(state, info) -> number or array``, called after eve
 
 Run k of every arm has the same seed and so the same random streams, which makes differences between arms less noisy
 than those of independent runs. A run depends on its filter, its seed and the observations only, not on the number of
-workers or on other arms. Each worker limits the numerical libraries to one thread.
+workers or on other arms. Each worker limits the numerical libraries to one thread. With ``folder="runs"``, finished
+runs are stored, and the same call continues after an interruption.
 """
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from itertools import product
+from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 import numpy as np
 
-from mstfilter.errors import InputError, MissingLibraryError
+from mstfilter.errors import InputError, LostRunError, MissingLibraryError
+from mstfilter.files import atomic_path
+from mstfilter.smc.batching import batch, batched_slots
+from mstfilter.smc.checkpoint import digest
 from mstfilter.smc.filter import ParticleFilter
 from mstfilter.smc.interfaces import Info, State
 
@@ -95,12 +102,15 @@ class History(Mapping[str, np.ndarray]):
         Labels along the axes.
     state : State or None
         The last state of a single run.
+    lost : mapping
+        (arm, seed) -> reason, of runs that are lost.
     """
 
     values_: Mapping[str, np.ndarray]
     dims: tuple[str, ...] = ("time",)
     coords: Mapping[str, Any] = None  # type: ignore[assignment]
     state: State | None = None
+    lost: Mapping[tuple[str, int], str] = field(default_factory=dict)
 
     def __getitem__(self, name: str) -> np.ndarray:
         if name not in self.values_:
@@ -161,8 +171,10 @@ def _stack(name: str, rows: list[np.ndarray]) -> np.ndarray:
 def run_many(
     arms: Mapping[str, ParticleFilter],
     observations: Iterable[Any],
-    seeds: Sequence[int] = range(10),
+    seeds: Iterable[int] = range(10),
     workers: int = 1,
+    folder: str | Path | None = None,
+    progress: Callable[[int, int], None] | None = None,
     **collectors: Collector,
 ) -> History:
     """Run each filter with each seed.
@@ -173,64 +185,164 @@ def run_many(
         Name -> filter.
     observations : iterable
         The same for all filters.
-    seeds : sequence of int
+    seeds : iterable of int
         One per run; the same for all filters.
     workers : int
-        Number of processes; 1 uses the calling process.
+        Number of processes. 1 uses the calling process; more are started by joblib's loky, as new interpreters that
+        get the filters by cloudpickle.
+    folder : path, optional
+        Every finished run is stored there. The same call runs only those that are missing. InputError if a stored run
+        was made by another filter, other observations or other collectors.
+    progress : callable, optional
+        ``progress(done, total)``, called as runs finish.
     **collectors
-        As for `collect`; default `log_evidence`.
+        As for `collect`; default `log_evidence`. If they are `log_evidence` and `ess` only, `batch` runs many seeds
+        at once where the filter allows it.
 
     Returns
     -------
     History
-        Arrays (arm, seed, time, ...).
+        Arrays (arm, seed, time, ...). A run is lost if no particle explains an observation (`LostRunError`). From
+        that step on, its log evidence is -inf and other results are NaN; `History.lost` has the reasons.
     """
     if not arms:
         raise InputError("there are no filters to run")
     if workers < 1:
         raise InputError(f"workers is {workers}, expected at least 1")
-    wanted = collectors or {"log_evidence": log_evidence}
-    job = {"arms": dict(arms), "observations": list(observations), "collectors": wanted}
-    tasks = [(name, int(seed)) for name in arms for seed in seeds]
-    if workers == 1:
-        results = [_one(job, *task) for task in tasks]
-    else:
-        results = _in_pool(job, tasks, workers)
-    shape = (len(arms), len(seeds))
-    values = {}
-    for name in wanted:
-        stacked = np.stack([r[name] for r in results])
-        values[name] = stacked.reshape(*shape, *stacked.shape[1:])
-    coords = {"arm": list(arms), "seed": np.asarray(list(seeds)), "time": np.arange(len(job["observations"]))}
-    return History(values, ("arm", "seed", "time"), coords)
+    observations, collectors = list(observations), collectors or {"log_evidence": log_evidence}
+    hashes = {} if folder is None else {arm: digest((arms[arm], observations, collectors)) for arm in arms}
+    job = _Job(dict(arms), observations, collectors, folder, hashes)
+    seeds = [int(seed) for seed in seeds]
+    found = {task: run for task in product(arms, seeds) if (run := job.load(*task)) is not None}
+    total, chunks = len(arms) * len(seeds), []
+    for arm in arms:
+        missing = [seed for seed in seeds if (arm, seed) not in found]
+        size = 1 if job.batched(arm) is False else -(-len(missing) // (4 * workers if workers > 1 else 1)) or 1
+        chunks += [(arm, missing[k : k + size]) for k in range(0, len(missing), size)]
+    for done in _finished_chunks(job, chunks, workers):
+        found.update(done)
+        if progress is not None:
+            progress(len(found), total)
+    lost = {task: run.lost for task, run in found.items() if run.lost}
+    shape = (len(arms), len(seeds), len(job.observations))
+    values = {
+        name: job.joined(name, [found[task] for task in product(arms, seeds)], shape) for name in job.collectors
+    }
+    coords = {"arm": list(arms), "seed": np.asarray(seeds), "time": np.arange(shape[2])}
+    return History(values, ("arm", "seed", "time"), coords, lost=lost)
 
 
-def _one(job: Mapping[str, Any], arm: str, seed: int) -> dict[str, np.ndarray]:
-    try:
-        history = collect(job["arms"][arm].iterate(job["observations"], seed), **job["collectors"])
-    except InputError as error:
-        raise InputError(f"arm {arm!r}, seed {seed}: {error.message}", *error.hints) from error
-    return dict(history)
+@dataclass(frozen=True)
+class _Run:
+    """Collected rows of a run by name, and why it was lost ("" if it was not)."""
+
+    rows: dict[str, np.ndarray]
+    lost: str = ""
 
 
-def _in_pool(job: dict[str, Any], tasks: list[tuple[str, int]], workers: int) -> list[dict[str, np.ndarray]]:
-    """Results in order, from new processes: a fork of a process with threads can deadlock.
+@dataclass(frozen=True)
+class _Job:
+    """What `run_many` runs."""
 
-    The job is sent once per batch, by cloudpickle, so closures and classes of a notebook can be sent.
+    arms: dict[str, ParticleFilter]
+    observations: list[Any]
+    collectors: dict[str, Collector]
+    folder: str | Path | None
+    hashes: dict[str, str]  # of all that the runs of an arm depend on, apart from the seed
+
+    def batched(self, arm: str) -> bool:
+        """Whether many seeds of an arm run at once."""
+        return set(self.collectors.values()) <= {log_evidence, ess} and bool(batched_slots(self.arms[arm]))
+
+    def run(self, arm: str, seeds: list[int]) -> dict[tuple[str, int], _Run]:
+        """Run some seeds of an arm, and store the results."""
+        found = {}
+        try:
+            if self.batched(arm):
+                runs = batch(self.arms[arm], self.observations, seeds)
+                tables: dict[Collector, np.ndarray] = {log_evidence: runs.log_evidence, ess: runs.ess}
+                for r, seed in enumerate(seeds):
+                    rows = {name: tables[collector][r] for name, collector in self.collectors.items()}
+                    found[arm, seed] = _Run(rows, runs.lost.get(r, ""))
+            else:
+                found = {(arm, seed): self.single(arm, seed) for seed in seeds}
+        except InputError as error:
+            raise InputError(f"arm {arm!r}, seed {seeds[0]}: {error.message}", *error.hints) from error
+        for (_, seed), run in found.items():
+            self.save(arm, seed, run)
+        return found
+
+    def single(self, arm: str, seed: int) -> _Run:
+        """One run, up to the step at which it is lost."""
+        rows: dict[str, list[Any]] = {name: [] for name in self.collectors}
+        lost = ""
+        try:
+            for state, info in self.arms[arm].iterate(self.observations, seed):
+                for name, collector in self.collectors.items():
+                    rows[name].append(np.asarray(collector(state, info)))
+        except LostRunError as error:
+            lost = error.message
+        return _Run({name: _stack(name, row) for name, row in rows.items()}, lost)
+
+    def joined(self, name: str, runs: list[_Run], shape: tuple[int, ...]) -> np.ndarray:
+        """(arm, seed, time, ...) values of a collector."""
+        rows = [run.rows[name] for run in runs]
+        longest = max(rows, key=len)
+        complete = all(len(row) == shape[2] for row in rows)
+        empty = -np.inf if self.collectors[name] is log_evidence else np.nan
+        kind = longest.dtype if complete else np.result_type(longest.dtype, np.float64)
+        values = np.full((len(rows), shape[2], *longest.shape[1:]), 0 if complete else empty, kind)
+        for value, row in zip(values, rows, strict=True):
+            if len(row):
+                value[: len(row)] = row
+        return values.reshape(*shape, *values.shape[2:])
+
+    def path(self, arm: str, seed: int) -> Path:
+        return Path(self.folder or ".") / quote(arm, safe="") / f"{seed}.npz"
+
+    def save(self, arm: str, seed: int, run: _Run) -> None:
+        if self.folder is None:
+            return
+        path = self.path(arm, seed)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        arrays: dict[str, Any] = {f"rows/{name}": row for name, row in run.rows.items()}
+        with atomic_path(path) as partial, partial.open("wb") as file:
+            np.savez(file, head=np.array([self.hashes[arm], run.lost]), **arrays)
+
+    def load(self, arm: str, seed: int) -> _Run | None:
+        """A stored run; None if there is none."""
+        path = self.path(arm, seed)
+        if self.folder is None or not path.exists():
+            return None
+        with np.load(path, allow_pickle=False) as data:
+            identity, lost = (str(text) for text in data["head"])
+            rows = {name: data[f"rows/{name}"] for name in self.collectors if f"rows/{name}" in data.files}
+        if identity != self.hashes[arm]:
+            raise InputError(
+                f"run {path} was made by another filter, other observations or other collectors",
+                "choose another folder, or remove this one",
+            )
+        return _Run(rows, lost)
+
+
+def _finished_chunks(job: _Job, chunks: list[tuple[str, list[int]]], workers: int) -> Iterable[Any]:
+    """Results of chunks of runs in the order in which they finish.
+
+    Workers are new processes: a fork of a process with threads can deadlock.
     """
+    if workers == 1:
+        return (job.run(arm, seeds) for arm, seeds in chunks)
     from joblib import Parallel, delayed, parallel_config
 
-    batches = [tasks[k :: 4 * workers] for k in range(min(4 * workers, len(tasks)))]
-    with parallel_config("loky", n_jobs=min(workers, len(batches)), inner_max_num_threads=1):
-        done = Parallel(batch_size=1)(delayed(_batch)(job, batch) for batch in batches)
-    found = dict(pair for results in done for pair in results)
-    return [found[task] for task in tasks]
+    with parallel_config("loky", n_jobs=workers, inner_max_num_threads=1):
+        parallel = Parallel(batch_size=1, return_as="generator_unordered")
+        return parallel(delayed(_in_worker)(job, *chunk) for chunk in chunks)
 
 
-def _batch(job: dict[str, Any], tasks: list[tuple[str, int]]) -> list[tuple[tuple[str, int], dict[str, np.ndarray]]]:
-    """Run a batch in a worker, with one thread in libraries that ignore the environment variables."""
+def _in_worker(job: _Job, arm: str, seeds: list[int]) -> dict[tuple[str, int], _Run]:
+    """Run a chunk with one thread in libraries that ignore the environment variables."""
     if "torch" in sys.modules:
         sys.modules["torch"].set_num_threads(1)
     if "cv2" in sys.modules:
         sys.modules["cv2"].setNumThreads(1)
-    return [(task, _one(job, *task)) for task in tasks]
+    return job.run(arm, seeds)

@@ -196,16 +196,19 @@ class ParticleFilter:
         checkpoint: str | Path | None = None,
         codec: Codec | None = None,
         observer: Observer | None = None,
+        keep_arrays: bool = True,
     ) -> tuple[State, list[Info]]:
         """Run all steps; returns the last state and the infos. Parameters as in `iterate`.
 
-        If the run continues from a checkpoint, it returns the infos of the later steps only.
+        If the run continues from a checkpoint, it returns the infos of the later steps only. The infos hold some (n,)
+        arrays of each step, so memory grows with n times the number of steps; with ``keep_arrays=False``, they do not
+        (see `Info.without_arrays`). `collect` keeps only what it is asked for.
         """
         observations, state, store = self._begin(observations, seed, checkpoint, codec)
         infos = []
         for current, info in self._steps(observations, state, store, observer):
             state = current
-            infos.append(info)
+            infos.append(info if keep_arrays else info.without_arrays())
         return state, infos
 
     def _begin(

@@ -28,7 +28,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -370,8 +370,15 @@ class Info:
     notes: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     seconds: Mapping[str, float] = field(default_factory=dict)
 
-    @property
+    @cached_property
     def unique_ancestors(self) -> int:
         """Number of particles of the previous population that have descendants."""
         previous = self.parents.get("previous")
         return 0 if previous is None else len(np.unique(previous[previous >= 0]))
+
+    def without_arrays(self) -> Info:
+        """The same record with empty `ancestors`, `parents` and `log_weights`: its size does not depend on n."""
+        none = np.zeros(0, np.int64)
+        light = replace(self, ancestors=none, parents={}, log_weights=np.zeros(0))
+        light.__dict__["unique_ancestors"] = self.unique_ancestors
+        return light

@@ -31,6 +31,7 @@ from mstfilter.smc import (
     bootstrap,
     collect,
     diagnostics,
+    linear_gaussian,
     observe,
     per_particle,
     run_many,
@@ -83,6 +84,20 @@ def test_to_xarray(monkeypatch):
         history.to_xarray()
 
 
+def test_a_run_without_arrays():
+    full, light = (bootstrap(AR1, 16).run(YS, 3, keep_arrays=keep)[1] for keep in (True, False))
+    for a, b in zip(full, light, strict=True):
+        assert (a.t, a.n, a.ess, a.resampled, a.unique_ancestors) == (
+            b.t,
+            b.n,
+            b.ess,
+            b.resampled,
+            b.unique_ancestors,
+        )
+        assert len(a.log_weights) == 16
+        assert len(b.log_weights) == len(b.ancestors) == len(b.parents) == 0
+
+
 # --- many runs ----------------------------------------------------------------------------------------------------
 def test_results_do_not_depend_on_workers_or_on_other_arms():
     arms = {"systematic": bootstrap(AR1, 50), "multinomial": bootstrap(AR1, 50, Multinomial())}
@@ -108,6 +123,69 @@ def test_errors_in_workers_name_the_run():
             run_many({"a": bootstrap(AR1, 4)}, YS, [5], workers=workers, x=broken)
     with pytest.raises(InputError, match="workers is 0"):
         run_many({"a": bootstrap(AR1, 4)}, YS, [5], workers=0)
+
+
+FRAGILE = replace(AR1, log_likelihood=lambda x, y: np.where(x < -0.2, AR1.log_likelihood(x, y), -np.inf))
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_lost_runs_are_counted_and_the_others_are_kept(workers):
+    arms = {"few": bootstrap(FRAGILE, 3), "many": bootstrap(FRAGILE, 60)}
+    kept = {"log_evidence": diagnostics.log_evidence, "mean": diagnostics.mean, "resampled": diagnostics.resampled}
+    runs = run_many(arms, YS[:5], range(12), workers=workers, **kept)
+    lost = {arm: [seed for name, seed in runs.lost if name == arm] for arm in arms}
+    assert 0 < len(lost["few"]) < 12 and not lost["many"]
+    for seed in range(12):
+        history = runs["log_evidence"][0, seed]
+        if seed not in lost["few"]:
+            assert history[-1] == arms["few"].run(YS[:5], seed)[0].log_evidence
+            continue
+        reason = runs.lost["few", seed]
+        assert reason.startswith("step ") and "all 3 log weights are -inf" in reason
+        t = int(reason.split(",")[0].split()[1])
+        assert np.isneginf(history[t:]).all() and np.isfinite(history[:t]).all()
+        assert np.isnan(runs["mean"][0, seed, t:]).all() and np.isnan(runs["resampled"][0, seed, t:]).all()
+
+
+CALLS: list[int] = []
+
+
+def counted(state, info):
+    CALLS.append(info.t)
+    return info.ess
+
+
+def test_stored_runs_are_not_run_again(tmp_path):
+    def run(seeds, n=2, **options):
+        return run_many({"a/b": bootstrap(FRAGILE, n)}, YS[:5], seeds, folder=tmp_path / "runs", x=counted, **options)
+
+    steps: list[tuple[int, int]] = []
+    first = run(range(4), progress=lambda done, total: steps.append((done, total)))
+    assert steps == [(1, 4), (2, 4), (3, 4), (4, 4)]
+    before = len(CALLS)
+    (tmp_path / "runs" / "a%2Fb" / "2.npz").unlink()
+    again = run(range(4))
+    # Only run 2 was repeated.
+    assert len(CALLS) - before == np.isfinite(first["x"][0, 2]).sum()
+    np.testing.assert_array_equal(first["x"], again["x"])
+    assert first.lost == again.lost and len(again.lost) > 0
+    for other in (
+        lambda: run(range(4), n=6),
+        lambda: run_many({"a/b": bootstrap(FRAGILE, 2)}, YS[:4], [0], folder=tmp_path / "runs", x=counted),
+    ):
+        with pytest.raises(InputError, match="was made by another filter, other observations or other collectors"):
+            other()
+
+
+def test_a_batched_arm_gives_the_numbers_of_single_runs(tmp_path):
+    model = linear_gaussian(*np.array([[[0.9]], [[0.4]], [[1.0]], [[0.2]]]), [0.0], [[1.0]])
+    arms = {"batched": bootstrap(model, 20), "single": bootstrap(replace(model, batched=False), 20)}
+    kept = {"z": diagnostics.log_evidence, "ess": diagnostics.ess}
+    runs = run_many(arms, YS, range(5), **kept, folder=tmp_path)
+    for name in kept:
+        np.testing.assert_array_equal(runs[name][0], runs[name][1])
+    two = run_many(arms, YS, range(5), workers=2, **kept)
+    np.testing.assert_array_equal(two["z"], runs["z"])
 
 
 # --- codecs -------------------------------------------------------------------------------------------------------
