@@ -1,7 +1,7 @@
 """Measure `particles` 0.4 in a separate environment; run by speed.py, one command per line on standard input.
 
-Commands: ``filter SEED`` (bootstrap AR(1)) and ``systematic SEED N``; the answer is JSON. The first calls
-include compilation.
+Commands: ``filter SEED N`` (bootstrap AR(1)), and ``SCHEME SEED N`` or ``log:SCHEME SEED N`` (resampling N even
+weights, given normalised or as log weights); the answer is JSON. The first calls include compilation.
 """
 
 from __future__ import annotations
@@ -47,9 +47,10 @@ for line in sys.stdin:
         answer = {"seconds": seconds, "log_evidence": log_evidence}
     else:
         np.random.seed(int(seed))  # noqa: NPY002
-        w = np.random.exponential(size=int(n))  # noqa: NPY002
-        w /= w.sum()
+        w = np.random.uniform(0.5, 1.5, int(n))  # noqa: NPY002
+        lw, w = np.log(w), w / w.sum()
+        scheme = resampling.rs_funcs[what.removeprefix("log:")]
         start = clock()
-        resampling.systematic(w, M=int(n))
+        scheme(resampling.Weights(lw).W if what.startswith("log:") else w, M=int(n))
         answer = {"seconds": clock() - start}
     print(json.dumps(answer), flush=True)

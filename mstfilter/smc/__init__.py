@@ -7,26 +7,27 @@
 >>> state, infos = filter.run(observations, seed=0)
 >>> state.population.particles, state.population.weights, state.log_evidence
 
-====================  ===================================================================================
-`filter`              `ParticleFilter`; `ParticleFilter.step` is one step of the filter
-`interfaces`          base classes of components (`Transition`, `Proposal`, `Update`, `Resampler`, ...),
-                      `State` and `Info`
-`population`          `Population`: particles, log weights, parents; `Candidates`, built when accessed
-`resampling`          schemes that need only weights, and wrappers of schemes
-`diverse_resampling`  schemes that compare particles
-`similarity`          similarity and equality of particles, for these schemes
-`triggers`            when to resample, and to how many particles
-`components`          updates by a likelihood or a projection, transitions with several branches
-`streams`             random streams named by seed, step, slot and index
-`batching`            many runs of a filter at once
-`checkpoint`          storage of the state of a run in a file
-`state_space`         state-space models; bootstrap, guided, auxiliary and resample-move filters
-`kalman`              linear-Gaussian models, Rao-Blackwellised filters
-`programs`            filters for probabilistic programs
-`distributions`       distributions for models; adapters for those of scipy and torch
-`smoothing`           states given all observations
-`diagnostics`         quantities of a run, comparison of filters
-====================  ===================================================================================
+======================  ===================================================================================
+`filter`                `ParticleFilter`; `ParticleFilter.step` is one step of the filter
+`interfaces`            base classes of components (`Transition`, `Proposal`, `Update`, `Resampler`, ...),
+                        `State` and `Info`
+`population`            `Population`: particles, log weights, parents; `Candidates`, built when accessed
+`resampling`            schemes that need only weights, and wrappers of schemes
+`diverse_resampling`    schemes that keep different particles, with unequal weights
+`transport_resampling`  schemes that merge, sort or move particles
+`similarity`            similarity and equality of particles, for these schemes
+`triggers`              when to resample, and to how many particles
+`components`            updates by a likelihood or a projection, transitions with several branches
+`streams`               random streams named by seed, step, slot and index
+`batching`              many runs of a filter at once
+`checkpoint`            storage of the state of a run in a file
+`state_space`           state-space models; bootstrap, guided, auxiliary and resample-move filters
+`kalman`                linear-Gaussian models, Rao-Blackwellised filters
+`programs`              filters for probabilistic programs
+`distributions`         distributions for models; adapters for those of scipy and torch
+`smoothing`             states given all observations
+`diagnostics`           quantities of a run, comparison of filters
+======================  ===================================================================================
 """
 
 from mstfilter.lazy import attach

@@ -35,6 +35,7 @@ from mstfilter.smc.distributions import (
 )
 from mstfilter.smc.diverse_resampling import (
     ClusterStratified as ClusterStratified,
+    FearnheadClifford as FearnheadClifford,
     GreedyDiverse as GreedyDiverse,
     KDpp as KDpp,
 )
@@ -83,8 +84,6 @@ from mstfilter.smc.programs.sites import (
     switch as switch,
 )
 from mstfilter.smc.resampling import (
-    Coalesced as Coalesced,
-    FearnheadClifford as FearnheadClifford,
     KeepWeights as KeepWeights,
     Killing as Killing,
     LargestWeights as LargestWeights,
@@ -96,7 +95,6 @@ from mstfilter.smc.resampling import (
     Stratified as Stratified,
     Systematic as Systematic,
     Tempered as Tempered,
-    coalesce as coalesce,
 )
 from mstfilter.smc.similarity import (
     Bins as Bins,
@@ -128,6 +126,7 @@ from mstfilter.smc.state_space import (
     resample_move as resample_move,
 )
 from mstfilter.smc.streams import Key as Key, RunGenerators as RunGenerators, child as child, key_of as key_of
+from mstfilter.smc.transport_resampling import Coalesced as Coalesced, coalesce as coalesce
 from mstfilter.smc.triggers import (
     Always as Always,
     EssBelow as EssBelow,

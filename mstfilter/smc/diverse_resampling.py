@@ -1,6 +1,7 @@
-"""Resampling that keeps different particles: by clusters, by a k-determinantal point process, greedily.
+"""Resampling that keeps different particles, with unequal output weights.
 
-These schemes compare the particles by a `Similarity`. They need more candidates than particles to select.
+`FearnheadClifford` needs only the weights. The other schemes compare the particles by a `Similarity`. All need more
+candidates than particles to select.
 
 >>> import numpy as np
 >>> from mstfilter.smc import ClusterStratified, Gaussian, GreedyDiverse, KDpp, Population
@@ -20,7 +21,7 @@ similarity: heavy particles that differ from each other. Equal particles are nev
 particle gets the weight w_i / pi_i, pi_i its probability of being selected, which makes the selection unbiased.
 
 >>> twins = Population(np.array([0.0, 0.01, 5.0]), np.log([4.0, 4.0, 1.0]))
->>> KDpp(similarity=Gaussian(1.0)).resample(rng, twins, 2).particles
+>>> KDpp(similarity=Gaussian(1.0)).resample(rng, twins, 2).particles.round()
 array([0., 5.])
 
 `GreedyDiverse` maximises det L_A greedily and draws nothing. It is not properly weighted: the weight of a particle
@@ -39,10 +40,73 @@ from typing import ClassVar
 import numpy as np
 
 from mstfilter.errors import InputError, check_component, check_number
-from mstfilter.smc.interfaces import Resampler
+from mstfilter.smc.interfaces import Resampler, WeightResampler
 from mstfilter.smc.population import Population, log_mean_exp
-from mstfilter.smc.resampling import FearnheadClifford, Systematic, checked_weights
+from mstfilter.smc.resampling import Systematic, checked_weights, systematic_ancestors
 from mstfilter.smc.similarity import Gaussian, Similarity
+
+
+@dataclass(frozen=True)
+class FearnheadClifford(WeightResampler):
+    """Optimal resampling: keeps particles with w_i >= c, and others with probability w_i / c and weight c.
+
+    c solves sum min(1, w_i / c) = n. The light particles are selected systematically, so there are no duplicates. The
+    total weight is kept exactly. Of all unbiased random weights with at most n positive ones, these have the least
+    expected squared error. If n or fewer particles have positive weight, all of these are kept, so fewer than n may
+    be returned. A filter that selects n of n particles therefore degenerates: use more candidates than particles
+    (`Branching`).
+
+    >>> log_weights = np.log([4.0, 3.0, 1.0, 1.0, 1.0])
+    >>> ancestors, log_weights = FearnheadClifford().select(np.random.default_rng(1), log_weights, 4)
+    >>> ancestors
+    array([0, 1, 2, 4])
+
+    Reference: Fearnhead and Clifford (2003), "On-line inference for hidden Markov models via particle filters",
+    Journal of the Royal Statistical Society B 65.
+    """
+
+    exact_size: ClassVar[bool] = False
+
+    def select(self, rng: np.random.Generator, log_weights: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
+        weights = checked_weights(log_weights, n)
+        lw = np.asarray(log_weights, dtype=np.float64)
+        positive = np.flatnonzero(weights > 0)
+        if len(positive) <= n:
+            return positive, lw[positive] + np.log(len(positive) / len(lw))
+        w = weights[positive]
+        c, heavy = optimal_threshold(w, n)
+        light = np.flatnonzero(~heavy)
+        log_out = np.where(heavy, lw[positive], lw.max() + np.log(c))
+        chosen = heavy
+        scaled = w[light] / w[light].max()  # avoids underflow
+        chosen[light[systematic_ancestors(np.cumsum(scaled), n - int(heavy.sum()), rng.random())]] = True
+        # Adding log(n / m) keeps the log mean of the weights.
+        return positive[chosen], log_out[chosen] + np.log(n / len(lw))
+
+
+def optimal_threshold(weights: np.ndarray, n: int) -> tuple[float, np.ndarray]:
+    """c with sum min(1, w_i / c) = n, and the (m,) bool mask of the fewer than n weights with w_i >= c.
+
+    Parameters
+    ----------
+    weights : (m,) float64
+        Positive, m > n.
+    n : int
+        Number of particles to select.
+    """
+    heavy, kept, c = np.zeros(len(weights), bool), 0, float(weights.sum()) / n
+    while True:  # c decreases until all light weights are below c; takes a few rounds
+        # Light weights are below c by more than rounding errors, so no light interval contains two points.
+        heavy |= weights >= c * (1 - 1e-9)
+        if int(heavy.sum()) == kept:
+            return c, heavy
+        kept = int(heavy.sum())
+        if kept >= n:  # only by rounding: the sum of the light weights is negligible
+            heavy = np.zeros(len(weights), bool)
+            heavy[np.argsort(-weights, kind="stable")[: n - 1]] = True
+            return float(weights[~heavy].sum()), heavy
+        c = float(weights[~heavy].sum()) / (n - kept)
+
 
 #: Similarities of more particles than this are not computed: the matrix alone would take gigabytes.
 MAX_PARTICLES = 10_000
@@ -188,7 +252,7 @@ class KDpp(Resampler):
     """
 
     similarity: Similarity = Gaussian()  # noqa: RUF009 (frozen)
-    scheme: Resampler = FearnheadClifford()  # noqa: RUF009 (frozen)
+    scheme: Resampler = FearnheadClifford()
 
     exact_size: ClassVar[bool] = False
 

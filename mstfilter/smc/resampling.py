@@ -1,8 +1,7 @@
-"""Resampling by weight: the classical schemes, and wrappers around a scheme.
+"""Resampling by weight: schemes with equal output weights, and wrappers around a scheme.
 
 W_i is the normalised weight of particle i, N_i its number of copies among the n selected particles, f = frac(n W_i).
-The schemes with equal output weights are unbiased: E[N_i] = n W_i. `FearnheadClifford` is unbiased due to its output
-weights. The schemes differ in the variance of N_i.
+The schemes are unbiased: E[N_i] = n W_i. They differ in the variance of N_i.
 
 ==================  =================================================  ====================================
 scheme              N_i                                                variance of N_i
@@ -13,7 +12,6 @@ Stratified          one draw in each of n equal strata of [0, 1)       sum over 
 Systematic          one draw, shifted to each stratum                  f (1 - f)
 Ssp                 floor or ceil, fractions decided pair by pair      f (1 - f)
 Killing             survive with w_i / max w, else multinomial         see `Killing`
-FearnheadClifford   at most 1, with unequal weights                    least expected squared error
 ==================  =================================================  ====================================
 
 >>> import numpy as np
@@ -28,11 +26,8 @@ selected. `InputError` is raised if a log weight is NaN or +inf, or if all weigh
 Ties: the random schemes do not compare weights. Of particles with equal weights, `LargestWeights.select` (a stable
 sort), `coalesce`, and the diverse schemes of `mstfilter.smc.diverse_resampling` take the first.
 
-`Coalesced`, `Tempered`, `Shuffled` and `KeepWeights` wrap another resampler:
-
->>> doubled = Population(np.array([1.0, 2.0, 1.0, 3.0]), np.log([1.0, 1.0, 2.0, 4.0]))
->>> Coalesced(FearnheadClifford()).resample(rng, doubled, 3).particles
-array([2., 1., 3.])
+`Tempered`, `Shuffled` and `KeepWeights` wrap another resampler; so does `Coalesced` of
+`mstfilter.smc.transport_resampling`.
 
 Residual-systematic resampling (Bolic, Djuric, Hong 2004) has no class: in exact arithmetic it selects the same
 particles as `Systematic` and as ``Residual("systematic")`` if all use the same uniform number.
@@ -51,7 +46,6 @@ import numpy as np
 from mstfilter.errors import InputError, check_component, check_number
 from mstfilter.smc.interfaces import Resampler, WeightResampler
 from mstfilter.smc.population import Population
-from mstfilter.smc.similarity import Equivalence, ExactEquality
 
 
 def checked_weights(log_weights: np.ndarray, n: int) -> np.ndarray:
@@ -75,49 +69,117 @@ def checked_weights(log_weights: np.ndarray, n: int) -> np.ndarray:
     return np.exp(weights, out=weights)
 
 
-def _cumulative(log_weights: np.ndarray, n: int) -> np.ndarray:
-    """(m,) cumulative sums of the checked weights."""
-    weights = checked_weights(log_weights, n)
-    return np.cumsum(weights, out=weights)
-
-
 def _certain_copies(weights: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray, int]:
     """floor(n W_i) (m,) int64, the fractions frac(n W_i) (m,), and the sum of the fractions: the copies to draw."""
-    expected = weights * (n / weights.sum())
-    copies = np.floor(expected * (1 + 1e-13))  # an integer up to rounding counts as that integer
-    return copies.astype(np.int64), np.clip(expected - copies, 0.0, None), n - int(copies.sum())
+    fractions = weights * (n / weights.sum())
+    floors = fractions * (1 + 1e-13)  # an integer up to rounding counts as that integer
+    np.floor(floors, out=floors)
+    fractions -= floors
+    np.maximum(fractions, 0.0, out=fractions)
+    copies = floors.astype(np.int64)
+    return copies, fractions, n - int(copies.sum())
 
 
 def ordered_uniforms(rng: np.random.Generator, n: int) -> np.ndarray:
     """(n,) uniforms on [0, 1] in ascending order, in O(n): normalised exponential spacings."""
-    spacings = np.cumsum(rng.standard_exponential(n + 1))
-    return spacings[:-1] / spacings[-1]
+    points = rng.standard_exponential(n + 1)
+    np.cumsum(points, out=points)
+    points /= points[-1]
+    return points[:-1]
 
 
-def _from_points(cumulative: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """For each point of [0, total), the index of the interval of the cumulative weights that contains it."""
-    index = np.searchsorted(cumulative, points, side="right")  # "right" skips weights of zero
-    # A point rounded up to the total belongs to the last particle of positive weight.
-    last = int(np.searchsorted(cumulative, cumulative[-1], side="left"))
-    return np.minimum(index, last)
+def _fixed_point(weights: np.ndarray, total: int) -> np.ndarray:
+    """(m,) int64 cumulative weights that end at `total`, at most 2^62; overwrites `weights`.
+
+    Integers are added exactly, and four times as fast as floats.
+    """
+    weights *= total / weights.sum()
+    cumulative = weights.astype(np.int64)
+    np.cumsum(cumulative, out=cumulative)
+    if cumulative[-1] > total:
+        np.minimum(cumulative, total, out=cumulative)
+    cumulative[cumulative.searchsorted(cumulative[-1]) :] = total  # ends at the last particle of positive weight
+    return cumulative
+
+
+_BLOCK = 1 << 13  # arrays of so many numbers stay in cache
+
+
+def independent_draws(rng: np.random.Generator, weights: np.ndarray, n: int) -> np.ndarray:
+    """(n,) indices drawn independently by weight, in O(m + n); overwrites `weights`.
+
+    Few draws search the cumulative weights for ordered uniforms. Many draws are distributed to strata of equal weight
+    and ascend from one stratum to the next only. Inside a stratum, the number of cumulative weights in lower bins is
+    a lower bound of the index of a point, which is increased where it is too small.
+    """
+    total = 1 << 62
+    cumulative = _fixed_point(weights, total)
+    if n < 1000:
+        points = np.minimum(ordered_uniforms(rng, n) * total, total - 1024).astype(np.int64)
+        return cumulative.searchsorted(points, side="right")  # "right" skips weights of zero
+    n_strata = -(-n // _BLOCK)
+    limits = [total * k // n_strata for k in range(n_strata + 1)]
+    stops = cumulative.searchsorted(limits, side="right").tolist()
+    stops[-1] = int(cumulative.searchsorted(total))
+    index, begin = np.empty(n, np.int64), 0
+    for k, size in enumerate(rng.multinomial(n, np.full(n_strata, 1 / n_strata)).tolist()):
+        width = limits[k + 1] - limits[k]
+        points = (rng.random(size) * width).astype(np.int64)
+        edges = cumulative[stops[k] : stops[k + 1]] - limits[k]
+        bin_width = max(width.bit_length() - size.bit_length() - 1, 0)  # log2; one to four bins for each point
+        below = np.bincount((edges >> bin_width) + 1, minlength=(width >> bin_width) + 2)
+        found = np.cumsum(below, out=below).take(points >> bin_width)
+        _increase(found, np.append(edges, total), points)
+        found += stops[k]
+        index[begin : begin + size] = found
+        begin += size
+    return index
+
+
+def _increase(index: np.ndarray, edges: np.ndarray, points: np.ndarray) -> None:
+    """Increase lower bounds of ``searchsorted(edges, points, side="right")`` to these, in place."""
+    low = np.flatnonzero(edges.take(index) <= points)
+    at, points = index.take(low), points.take(low)
+    for _ in range(6):
+        at += 1
+        index[low] = at
+        more = np.flatnonzero(edges.take(at) <= points)
+        if not len(more):
+            return
+        low, at, points = low.take(more), at.take(more), points.take(more)
+    index[low] = edges.searchsorted(points, side="right")
+
+
+def stratified_ancestors(weights: np.ndarray, uniforms: np.ndarray) -> np.ndarray:
+    """(n,) ancestors at the points (k + u_k) / n of the cumulative weights; overwrites `weights`."""
+    n = len(uniforms)
+    bits = 62 - n.bit_length()
+    cumulative = _fixed_point(weights, n << bits)  # a stratum has width 2^bits
+    for begin in range(0, len(weights), _BLOCK):
+        edges = cumulative[begin : begin + _BLOCK]
+        strata = edges >> bits
+        edges &= (1 << bits) - 1
+        below = uniforms.take(strata, mode="clip") < edges * 2.0**-bits  # the last edge lies at 0 of stratum n
+        np.add(strata, below, out=edges)
+    return _expanded(cumulative, n)
 
 
 def systematic_ancestors(cumulative: np.ndarray, n: int, shift: float) -> np.ndarray:
-    """Systematic selection: ancestors at the points (k + shift) / n, in O(m + n) without a search."""
+    """(n,) ancestors at the points (k + shift) / n of the cumulative weights."""
     total = cumulative[-1]
     # Number of points below each cumulative weight; n at the total, whatever the rounding.
     points = cumulative * (n / total)
     points -= shift
     np.ceil(points, out=points)  # greater than -1 before, so not negative now
     np.minimum(points, n, out=points)
-    points[cumulative.searchsorted(total, side="left") :] = n
-    # The ancestor of position k is the number of particles that end at or before point k.
-    ends = points[:-1].astype(np.int64)
-    return np.bincount(ends, minlength=n)[:n].cumsum()
+    points[cumulative.searchsorted(total) :] = n
+    return _expanded(points.astype(np.int64), n)
 
 
-def _repeated(copies: np.ndarray) -> np.ndarray:
-    return np.repeat(np.arange(len(copies)), copies)
+def _expanded(ends: np.ndarray, n: int) -> np.ndarray:
+    """(n,) ancestors if particle i gets the positions from ends[i - 1] to ends[i]: position k that many ends <= k."""
+    counts = np.bincount(ends[: ends.searchsorted(n)], minlength=n)
+    return np.cumsum(counts, out=counts)
 
 
 @dataclass(frozen=True)
@@ -125,8 +187,7 @@ class Multinomial(WeightResampler):
     """Independent draws by weight (Gordon, Salmond, Smith 1993). It has the largest variance; used as a reference."""
 
     def select(self, rng: np.random.Generator, log_weights: np.ndarray, n: int) -> tuple[np.ndarray, None]:
-        cumulative = _cumulative(log_weights, n)
-        return _from_points(cumulative, ordered_uniforms(rng, n) * cumulative[-1]), None
+        return independent_draws(rng, checked_weights(log_weights, n), n), None
 
 
 @dataclass(frozen=True)
@@ -134,9 +195,7 @@ class Stratified(WeightResampler):
     """One uniform in each of n equal strata (Kitagawa 1996)."""
 
     def select(self, rng: np.random.Generator, log_weights: np.ndarray, n: int) -> tuple[np.ndarray, None]:
-        cumulative = _cumulative(log_weights, n)
-        points = (np.arange(n) + rng.random(n)) * (cumulative[-1] / n)
-        return _from_points(cumulative, points), None
+        return stratified_ancestors(checked_weights(log_weights, n), rng.random(n)), None
 
 
 @dataclass(frozen=True)
@@ -148,8 +207,8 @@ class Systematic(WeightResampler):
     def select(self, rng: np.random.Generator, log_weights: np.ndarray, n: int) -> tuple[np.ndarray, None]:
         if log_weights.ndim == 2:  # one row per run of a batch
             return _systematic_rows(log_weights, n, rng.random((len(log_weights), 1))), None
-        cumulative = _cumulative(log_weights, n)
-        return systematic_ancestors(cumulative, n, rng.random()), None
+        weights = checked_weights(log_weights, n)
+        return systematic_ancestors(np.cumsum(weights, out=weights), n, rng.random()), None
 
 
 def _systematic_rows(log_weights: np.ndarray, n: int, shifts: np.ndarray) -> np.ndarray:
@@ -188,15 +247,14 @@ class Residual(WeightResampler):
     def select(self, rng: np.random.Generator, log_weights: np.ndarray, n: int) -> tuple[np.ndarray, None]:
         copies, fractions, rest = _certain_copies(checked_weights(log_weights, n), n)
         if rest > 0:
-            cumulative = np.cumsum(fractions)
             if self.remainder == "systematic":
-                drawn = systematic_ancestors(cumulative, rest, rng.random())
+                drawn = systematic_ancestors(np.cumsum(fractions), rest, rng.random())
             elif self.remainder == "stratified":
-                drawn = _from_points(cumulative, (np.arange(rest) + rng.random(rest)) * (cumulative[-1] / rest))
+                drawn = stratified_ancestors(fractions, rng.random(rest))
             else:
-                drawn = _from_points(cumulative, ordered_uniforms(rng, rest) * cumulative[-1])
+                drawn = independent_draws(rng, fractions, rest)
             copies += np.bincount(drawn, minlength=len(copies))
-        return _repeated(copies), None
+        return _expanded(np.cumsum(copies), n), None
 
 
 _SETTLED = 1e-12  # a fraction this close to 0 or 1 is 0 or 1 up to rounding
@@ -215,27 +273,35 @@ class Ssp(WeightResampler):
 
     def select(self, rng: np.random.Generator, log_weights: np.ndarray, n: int) -> tuple[np.ndarray, None]:
         weights = checked_weights(log_weights, n)
-        copies, fractions, rest = _certain_copies(weights, n)
-        index = np.flatnonzero(fractions > _SETTLED)
-        value = fractions[index]
+        copies, value, _ = _certain_copies(weights, n)
+        index = np.flatnonzero(value > _SETTLED)
+        value = value[index]
         while len(index) > 1:
-            pairs = len(index) // 2
-            a, b = value[: 2 * pairs : 2], value[1 : 2 * pairs : 2]
-            up, down = np.minimum(1 - a, b), np.minimum(a, 1 - b)
-            lift = rng.random(pairs) * (up + down) < down
-            value[: 2 * pairs : 2] = np.where(lift, a + up, a - down)
-            value[1 : 2 * pairs : 2] = np.where(lift, b - up, b + down)
-            full = value >= 1 - _SETTLED
-            copies[index[full]] += 1
-            rest -= int(full.sum())
-            alive = ~full & (value > _SETTLED)
-            index, value = index[alive], value[alive]
-        if rest > 0 and len(index):  # the fractions sum to an integer, so the last one is 0 or 1 up to rounding
+            a, b = value[:-1:2], value[1::2]
+            total = a + b
+            exceeds = total >= 1
+            # One fraction of a pair becomes 0 and the other a + b, or one becomes 1 and the other a + b - 1.
+            grows = rng.random(len(a)) * np.minimum(total, 2 - total) < np.minimum(a, 1 - b)
+            left, right = index[:-1:2], index[1::2]
+            open_one = np.where(grows != exceeds, left, right)
+            full = np.flatnonzero(exceeds)
+            copies[left[full] + right[full] - open_one[full]] += 1
+            total -= exceeds
+            if len(index) % 2:
+                open_one, total = np.append(open_one, index[-1]), np.append(total, value[-1])
+            index, value = open_one, total
+            if value.min() <= _SETTLED or value.max() >= 1 - _SETTLED:
+                copies[index[value >= 1 - _SETTLED]] += 1
+                alive = np.abs(value - 0.5) < 0.5 - _SETTLED
+                index, value = index[alive], value[alive]
+        # The fractions sum to an integer, so the last one is 0 or 1 up to rounding.
+        rest = n - int(copies.sum())
+        if rest > 0 and len(index):
             copies[index[0]] += 1
             rest -= 1
         if rest > 0:  # a copy lost by rounding, probability of order 1e-12
             copies[np.argmax(weights)] += rest
-        return _repeated(copies), None
+        return _expanded(np.cumsum(copies), n), None
 
 
 @dataclass(frozen=True)
@@ -254,73 +320,10 @@ class Killing(WeightResampler):
         ancestors = np.tile(np.arange(m), n // m)
         if n % m:
             ancestors = np.concatenate([ancestors, np.sort(rng.choice(m, n % m, replace=False, shuffle=False))])
-        killed = np.flatnonzero(rng.random(n) >= weights[ancestors])
-        cumulative = np.cumsum(weights)
+        killed = np.flatnonzero(rng.random(n) >= (weights if n == m else weights[ancestors]))
         if len(killed):
-            ancestors[killed] = _from_points(cumulative, ordered_uniforms(rng, len(killed)) * cumulative[-1])
+            ancestors[killed] = independent_draws(rng, weights, len(killed))
         return ancestors, None
-
-
-@dataclass(frozen=True)
-class FearnheadClifford(WeightResampler):
-    """Optimal resampling: keeps particles with w_i >= c, and others with probability w_i / c and weight c.
-
-    c solves sum min(1, w_i / c) = n. The light particles are selected systematically, so there are no duplicates. The
-    total weight is kept exactly. Of all unbiased random weights with at most n positive ones, these have the least
-    expected squared error. If n or fewer particles have positive weight, all of these are kept, so fewer than n may
-    be returned. A filter that selects n of n particles therefore degenerates: use more candidates than particles
-    (`Branching`).
-
-    >>> log_weights = np.log([4.0, 3.0, 1.0, 1.0, 1.0])
-    >>> ancestors, log_weights = FearnheadClifford().select(np.random.default_rng(1), log_weights, 4)
-    >>> ancestors
-    array([0, 1, 2, 4])
-
-    Reference: Fearnhead and Clifford (2003), "On-line inference for hidden Markov models via particle filters",
-    Journal of the Royal Statistical Society B 65.
-    """
-
-    exact_size: ClassVar[bool] = False
-
-    def select(self, rng: np.random.Generator, log_weights: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
-        weights = checked_weights(log_weights, n)
-        lw = np.asarray(log_weights, dtype=np.float64)
-        positive = np.flatnonzero(weights > 0)
-        if len(positive) <= n:
-            return positive, lw[positive] + np.log(len(positive) / len(lw))
-        w = weights[positive]
-        c, heavy = optimal_threshold(w, n)
-        light = np.flatnonzero(~heavy)
-        log_out = np.where(heavy, lw[positive], lw.max() + np.log(c))
-        chosen = heavy
-        scaled = w[light] / w[light].max()  # avoids underflow
-        chosen[light[systematic_ancestors(np.cumsum(scaled), n - int(heavy.sum()), rng.random())]] = True
-        # Adding log(n / m) keeps the log mean of the weights.
-        return positive[chosen], log_out[chosen] + np.log(n / len(lw))
-
-
-def optimal_threshold(weights: np.ndarray, n: int) -> tuple[float, np.ndarray]:
-    """c with sum min(1, w_i / c) = n, and the (m,) bool mask of the fewer than n weights with w_i >= c.
-
-    Parameters
-    ----------
-    weights : (m,) float64
-        Positive, m > n.
-    n : int
-        Number of particles to select.
-    """
-    heavy, kept, c = np.zeros(len(weights), bool), 0, float(weights.sum()) / n
-    while True:  # c decreases until all light weights are below c; takes a few rounds
-        # Light weights are below c by more than rounding errors, so no light interval contains two points.
-        heavy |= weights >= c * (1 - 1e-9)
-        if int(heavy.sum()) == kept:
-            return c, heavy
-        kept = int(heavy.sum())
-        if kept >= n:  # only by rounding: the sum of the light weights is negligible
-            heavy = np.zeros(len(weights), bool)
-            heavy[np.argsort(-weights, kind="stable")[: n - 1]] = True
-            return float(weights[~heavy].sum()), heavy
-        c = float(weights[~heavy].sum()) / (n - kept)
 
 
 @dataclass(frozen=True)
@@ -364,57 +367,6 @@ class ResamplerWrapper(Resampler):
     @property
     def exact_size(self) -> bool:
         return self.scheme.exact_size
-
-
-@dataclass(frozen=True)
-class Coalesced(ResamplerWrapper):
-    """Merges equal particles, with the sum of their weights, before the selection.
-
-    The result represents the same distribution with fewer particles. The population grows again only if a transition
-    or update makes more candidates. ``notes["distinct"]`` is the number of different particles of positive weight.
-
-    Parameters
-    ----------
-    equivalence : Equivalence
-        Decides which particles are equal. The heaviest particle of a class is kept, the first of several.
-    """
-
-    scheme: Resampler = FearnheadClifford()
-    equivalence: Equivalence = ExactEquality()  # noqa: RUF009 (frozen)
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_component("equivalence", self.equivalence, Equivalence)
-
-    def resample(self, rng: np.random.Generator, population: Population, n: int) -> Population:
-        population = population.realised()
-        classes = self.equivalence.classes(population.particles)
-        representatives, log_weights = coalesce(population.log_weights, classes)
-        chosen = self.scheme.resample(rng, population.take(representatives, log_weights), n)
-        ancestors = representatives[chosen.parents["ancestor"]]
-        return chosen.with_ancestors(ancestors, distinct=len(representatives))
-
-
-def coalesce(log_weights: np.ndarray, classes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Select one particle for each class: the heaviest, with the weight of the class.
-
-    Returns
-    -------
-    representatives : (k,) int
-        The heaviest particle of each class (the first, if several have equal weights), ascending. Classes of weight
-        zero are left out.
-    log_weights : (k,) float64
-        Log of the summed weights times k / m, which keeps the log mean of the weights.
-    """
-    lw = np.asarray(log_weights, dtype=np.float64)
-    classes = np.asarray(classes)
-    mass = np.bincount(classes, np.exp(lw - lw.max()))
-    heaviest = np.lexsort((np.arange(len(lw)), -lw, classes))
-    first = np.concatenate([[True], np.diff(classes[heaviest]) > 0])
-    representatives = heaviest[first]
-    representatives = np.sort(representatives[mass[classes[representatives]] > 0])
-    total = np.log(mass[classes[representatives]]) + lw.max()
-    return representatives, total + np.log(len(representatives) / len(lw))
 
 
 @dataclass(frozen=True)

@@ -25,6 +25,7 @@ from mstfilter.smc import (
     Systematic,
     log_mean_exp,
 )
+from mstfilter.smc.resampling import independent_draws, stratified_ancestors, systematic_ancestors
 
 SCHEMES = [
     Multinomial(),
@@ -107,18 +108,60 @@ def test_mean_and_variance_of_copies(scheme, name, n):
 
 def test_systematic_by_exact_quadrature():
     """Integrating the copies over the one uniform gives n W exactly."""
-    from mstfilter.smc.resampling import _cumulative, systematic_ancestors
-
     W = np.array([0.12, 0.0, 0.43, 0.05, 0.4])
     for n in (1, 2, 5, 7):
-        cumulative = _cumulative(np.log(np.maximum(W, 1e-300)), n)
         edges = np.unique(np.concatenate([[0, 1], np.mod(n * np.cumsum(W), 1.0)]))
         mean = np.zeros(len(W))
         for a, b in pairwise(edges):
-            copies = np.bincount(systematic_ancestors(cumulative, n, (a + b) / 2), minlength=len(W))
+            copies = np.bincount(systematic_ancestors(np.cumsum(W), n, (a + b) / 2), minlength=len(W))
             assert ((copies == np.floor(n * W + 1e-9)) | (copies == np.ceil(n * W - 1e-9))).all()
             mean += (b - a) * copies
         np.testing.assert_allclose(mean, n * W, atol=1e-9)
+
+
+def hostile_weights(kind, m):
+    rng = np.random.default_rng(7)
+    weights = rng.uniform(0.5, 1.5, m)
+    if kind == "zeros":
+        weights[rng.random(m) < 0.9] = 0.0
+        weights[m // 2] = 1.0
+    elif kind == "ends":
+        weights[: m // 3] = weights[m - m // 3 :] = 0.0
+    elif kind == "heavy":
+        weights = np.exp(6 * rng.standard_normal(m))
+    elif kind == "one":
+        weights[m // 2] = 1e6
+    return weights
+
+
+@pytest.mark.parametrize("kind", ["even", "zeros", "ends", "heavy", "one"])
+@pytest.mark.parametrize(("m", "n"), [(5_000, 30_000), (30_000, 30_000), (200_000, 2_000), (7, 20_000)])
+def test_many_independent_draws(kind, m, n):
+    """Chi-square of 50 groups of particles, 20 cases: false alarm below 2e-5 for all. No draw has weight zero."""
+    weights = hostile_weights(kind, m)
+    drawn = independent_draws(np.random.default_rng(m + n), weights.copy(), n)
+    assert drawn.shape == (n,) and (weights[drawn] > 0).all()
+    # Consecutive particles whose weights add up to about a fiftieth of the total.
+    group = np.minimum(50 * np.cumsum(weights) / weights.sum(), 49).astype(int)
+    expected = n * np.bincount(group, weights, minlength=50) / weights.sum()
+    found = np.bincount(group[drawn], minlength=50)
+    some = expected > 5
+    chi2 = ((found - expected)[some] ** 2 / expected[some]).sum()
+    assert stats.chi2.sf(chi2, max(some.sum() - 1, 1)) > 1e-7
+    # The neighbours of a particle are not taken for it: the share of odd indices, at 5 standard errors.
+    odd = (weights[1::2].sum() / weights.sum(), (drawn % 2).mean())
+    assert abs(odd[1] - odd[0]) <= 5 * np.sqrt(odd[0] * (1 - odd[0]) / n) + 1e-9
+
+
+@pytest.mark.parametrize("kind", ["even", "zeros", "ends", "heavy", "one"])
+@pytest.mark.parametrize(("m", "n"), [(5_000, 30_000), (30_000, 30_000), (200_000, 100), (7, 2_000), (1, 3)])
+def test_stratified_equals_a_search(kind, m, n):
+    weights = hostile_weights(kind, m) if m > 1 else np.ones(1)
+    uniforms = np.random.default_rng(m + n).random(n)
+    cumulative = np.cumsum(weights)
+    points = (np.arange(n) + uniforms) * (cumulative[-1] / n)
+    expected = np.searchsorted(cumulative, points, side="right")
+    np.testing.assert_array_equal(stratified_ancestors(weights, uniforms), expected)
 
 
 @each_scheme

@@ -34,8 +34,7 @@ from mstfilter.smc import (
     coalesce,
     log_mean_exp,
 )
-from mstfilter.smc.diverse_resampling import Spectrum, inclusion, leader_clusters, sample_kdpp
-from mstfilter.smc.resampling import optimal_threshold
+from mstfilter.smc.diverse_resampling import Spectrum, inclusion, leader_clusters, optimal_threshold, sample_kdpp
 
 positive_weights = st.lists(st.floats(0.01, 10.0), min_size=1, max_size=12)
 
