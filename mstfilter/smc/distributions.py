@@ -21,7 +21,6 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -35,7 +34,7 @@ _HALF_LOG_2PI = 0.5 * math.log(2 * math.pi)
 class _Independent(Distribution):
     """Independent entries. The fields are the parameters: (), (n,), (1, d) or (n, d)."""
 
-    @cached_property
+    @property
     def _shape(self) -> tuple[int, ...]:
         return _broadcast_shape(*vars(self).values())
 
@@ -56,14 +55,16 @@ def _broadcast_shape(*parameters: Any) -> tuple[int, ...]:
     shape: tuple[int, ...] = ()
     for parameter in parameters:
         other = () if isinstance(parameter, float) else np.shape(parameter)
-        if other and other != shape:
-            try:
-                shape = np.broadcast_shapes(shape, other)
-            except ValueError:
-                raise InputError(
-                    f"parameters of shapes {' and '.join(str(np.shape(p)) for p in parameters)} do not fit together",
-                    "with one row per particle they are all (n,), or all (n, d) or (n, 1)",
-                ) from None
+        if not shape or other in ((), shape):  # the usual case
+            shape = shape or other
+            continue
+        try:
+            shape = np.broadcast_shapes(shape, other)
+        except ValueError:
+            raise InputError(
+                f"parameters of shapes {' and '.join(str(np.shape(p)) for p in parameters)} do not fit together",
+                "with one row per particle they are all (n,), or all (n, d) or (n, 1)",
+            ) from None
     return shape
 
 
@@ -214,14 +215,16 @@ class MultivariateNormal(Distribution):
             root = np.linalg.cholesky(np.asarray(self.cov, dtype=np.float64))
         except np.linalg.LinAlgError:
             raise InputError(f"covariance is not positive definite: {np.asarray(self.cov).tolist()}"[:300]) from None
-        shape = _broadcast_shape(self.loc, root[..., 0])
-        if shape[-1:] != root.shape[-1:]:
+        if _broadcast_shape(self.loc, root[..., 0])[-1:] != root.shape[-1:]:
             raise InputError(
                 f"mean of shape {np.shape(self.loc)} does not fit a covariance of shape {root.shape}",
                 "the mean is (d,), or (n, d) with one row per particle; x[:, None] makes (n, 1) of (n,)",
             )
         object.__setattr__(self, "_root", root)
-        object.__setattr__(self, "_shape", shape if len(shape) > 1 else (1, *shape))
+
+    @property
+    def _shape(self) -> tuple[int, ...]:
+        return _broadcast_shape(np.zeros((1, 1)), self.loc, self.__dict__["_root"][..., 0])
 
     def sample(self, rng: np.random.Generator, size: int) -> np.ndarray:
         root = self.__dict__["_root"]
@@ -243,12 +246,12 @@ class MultivariateNormal(Distribution):
 
     @property
     def mean(self) -> np.ndarray:
-        return np.asarray(self.loc, np.float64)
+        return np.broadcast_to(np.asarray(self.loc, np.float64), self._shape)
 
     @property
     def sd(self) -> np.ndarray:
         root = self.__dict__["_root"]
-        return np.broadcast_arrays(np.sqrt((root * root).sum(axis=-1)), self.mean)[0]
+        return np.broadcast_to(np.sqrt((root * root).sum(axis=-1)), self._shape)
 
 
 @dataclass(frozen=True, eq=False)
@@ -324,7 +327,7 @@ class Categorical(Distribution):
             )
         object.__setattr__(self, "probs", p / total)
 
-    @cached_property
+    @property
     def _shape(self) -> tuple[int, ...]:
         return self.probs.shape[:-1]
 
@@ -406,14 +409,11 @@ class FromScipy(Distribution):
         object.__setattr__(self, "discrete", discrete or not hasattr(kind, "logpdf"))
         object.__setattr__(self, "_vector", kind.__module__.endswith("_multivariate"))
 
-    @cached_property
+    @property
     def _shape(self) -> tuple[int, ...]:
-        wrapped = self.wrapped
-        if self.__dict__["_vector"]:
-            return (1, *np.shape(self.mean))
-        if hasattr(wrapped, "args"):  # the mean would be slow
-            return _broadcast_shape(*wrapped.args, *wrapped.kwds.values())
-        return np.shape(wrapped.mean())
+        if hasattr(self.wrapped, "args"):  # the mean would be slow
+            return _broadcast_shape(*self.wrapped.args, *self.wrapped.kwds.values())
+        return np.shape(self.mean)
 
     def sample(self, rng: np.random.Generator, size: int) -> np.ndarray:
         wrapped, shape = self.wrapped, self.value_shape(size)
@@ -433,13 +433,14 @@ class FromScipy(Distribution):
     @property
     def mean(self) -> np.ndarray:
         mean = self.wrapped.mean
-        return np.asarray(mean() if callable(mean) else mean)
+        mean = np.asarray(mean() if callable(mean) else mean)
+        return mean[None] if self.__dict__["_vector"] else mean
 
     @property
     def sd(self) -> np.ndarray:
         wrapped = self.wrapped
         if self.__dict__["_vector"]:
-            return np.sqrt(np.diagonal(wrapped.cov))
+            return np.sqrt(np.diagonal(wrapped.cov))[None]
         return np.asarray(wrapped.std() if hasattr(wrapped, "std") else wrapped.standard_deviation())
 
     @property
@@ -467,7 +468,7 @@ class FromTorch(Distribution):
 
     wrapped: Any
 
-    @cached_property
+    @property
     def _shape(self) -> tuple[int, ...]:
         return (*(self.wrapped.batch_shape or (self.wrapped.event_shape and (1,))), *self.wrapped.event_shape)
 
@@ -492,8 +493,8 @@ class FromTorch(Distribution):
 
     @property
     def mean(self) -> np.ndarray:
-        return np.asarray(self.wrapped.mean)
+        return np.reshape(self.wrapped.mean, self._shape)
 
     @property
     def sd(self) -> np.ndarray:
-        return np.asarray(self.wrapped.stddev)
+        return np.reshape(self.wrapped.stddev, self._shape)

@@ -241,9 +241,8 @@ class Distribution(ABC):
 
     discrete = False
 
-    @cached_property
+    @property
     def _shape(self) -> tuple[int, ...]:
-        """(n, *event_shape), (1, *event_shape), or () for a number that all particles share."""
         return np.shape(self.mean)
 
     @property
@@ -253,18 +252,18 @@ class Distribution(ABC):
 
     @property
     def event_shape(self) -> tuple[int, ...]:
-        """Shape of the value of one particle. Default: that of `mean` without its first axis."""
+        """Shape of the value of one particle."""
         return self._shape[1:]
 
     def value_shape(self, size: int) -> tuple[int, ...]:
         """Shape ``(size, *event_shape)`` of the values of `size` particles; InputError if the rows do not fit."""
-        batch, event = self.batch_shape, self.event_shape
-        if batch not in ((), (1,), (size,)):
+        shape = self._shape
+        if shape and shape[0] not in (1, size):
             raise InputError(
-                f"parameters of shape {(*batch, *event)} do not fit {size} particles",
+                f"parameters of shape {shape} do not fit {size} particles",
                 f"give one row per particle, ({size}, ...), or write a vector shared by all as (1, d)",
             )
-        return (size, *event)
+        return (size, *shape[1:])
 
     @abstractmethod
     def sample(self, rng: np.random.Generator, size: int) -> np.ndarray:
@@ -277,7 +276,7 @@ class Distribution(ABC):
     @property
     @abstractmethod
     def mean(self) -> np.ndarray:
-        """Expected value, of shape ``(*batch_shape, *event_shape)``."""
+        """Expected value. Its shape is that of the batch and of the event: (), (n,), (1, d) or (n, d)."""
 
     @property
     @abstractmethod

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import re
 from itertools import product
 
 import numpy as np
@@ -13,7 +15,10 @@ from mstfilter.smc import (
     Always,
     Bernoulli,
     Categorical,
+    Distribution,
     EssBelow,
+    Gamma,
+    MultivariateNormal,
     Normal,
     Poisson,
     Program,
@@ -270,49 +275,405 @@ def test_distributions_of_other_libraries_in_programs():
     assert state.log_evidence == pytest.approx(EXACT, abs=0.5)
 
 
-def test_errors_name_the_site():
-    def run(model, guide=None):
-        program = Program(model)
-        (program.bootstrap(4) if guide is None else program.guided(guide, 4)).run([0.5, 0.5], 0)
+def errors_of(model, guide=None, y=0.5, n=4, kind="bootstrap"):
+    """The text of the error of a program, with its hints."""
+    program = Program(model)
+    filter = program.guided(guide, n) if guide is not None else getattr(program, kind)(n, trigger=Always())
+    with pytest.raises(InputError) as caught:
+        filter.run([y] * 3, 0)
+    return "\n".join([caught.value.message, *caught.value.hints])
 
-    def nothing(previous, y):
-        pass
 
-    def other(previous, y):
-        sample("x", Normal(0.0, 1.0))
-        sample("z", Normal(0.0, 1.0))
+def x_and(statement):
+    """A program that samples x and z (both scalar), v (a vector of one entry) and k, and then does something."""
 
-    def twice(previous, y):
-        sample("x", Normal(0.0, 1.0))
-        sample("x", Normal(0.0, 1.0))
+    def model(previous, y):
+        x = sample("x", Normal(np.zeros(1), 1.0))
+        z = sample("z", Gamma(2.0))
+        v = sample("v", MultivariateNormal([0.0], [[1.0]]))
+        k = sample("k", Categorical([0.5, 0.5]))
+        return statement(x, z, v, k, y)
 
-    def shape(previous, y):
-        observe("y", Normal(sample("x", Normal(0.0, 1.0)), 1.0), np.zeros(3))
+    return model
 
-    def matrix(previous, y):
-        sample("x", Normal(0.0, 1.0))
-        observe("y", Normal(np.zeros(3), 1.0), y)
 
-    def text(previous, y):
-        sample("x", 3.0)
+def changed(x):
+    x += 1.0
 
-    with pytest.raises(InputError, match="the guide has no site 'x', which the model samples"):
-        run(ar1, nothing_but_w)
-    with pytest.raises(InputError, match="the model has no site 'z', which the guide samples"):
-        run(ar1, other)
-    with pytest.raises(InputError, match="sampled nothing"):
-        run(nothing)
-    with pytest.raises(InputError, match="'x' is sampled twice"):
-        run(twice)
-    with pytest.raises(InputError, match=r"observation 'y' has shape \(3,\), expected one number per particle"):
-        run(matrix)
-    with pytest.raises(InputError, match="step 0, initial: expected a distribution, found a builtins.float"):
-        run(text)
+
+@pytest.mark.parametrize(
+    ("statement", "y", "expected"),
+    [
+        # events and observations whose shapes differ
+        (
+            lambda x, z, v, k, y: observe("o", Normal(v + x, 1), y),
+            0.5,
+            r"'o': the value has shape \(\), expected \(4,\)",
+        ),
+        (
+            lambda x, z, v, k, y: {"t": sample("s", Normal(v + x, 1))[:, 0]},
+            0.5,
+            r"site 's': an event has shape \(4,\), which changes",
+        ),
+        (lambda x, z, v, k, y: {"s": v + x}, 0.5, r"returned 's': an event has shape \(4,\), which changes"),
+        (lambda x, z, v, k, y: observe("o", Normal(x, 1), y), np.zeros((4, 1)), r"shape \(4, 1\), expected \(\)"),
+        (
+            lambda x, z, v, k, y: observe("o", Normal(x, 1), y),
+            np.zeros(4),
+            r"'o': the value has shape \(4,\), expected \(\)",
+        ),
+        (
+            lambda x, z, v, k, y: observe("o", Normal(x, 1), y),
+            [0.1, 0.2, 0.3, 0.4],
+            r"has shape \(4,\), expected \(\)",
+        ),
+        (lambda x, z, v, k, y: observe("o", Normal(0.0, 1), y - x), np.zeros(4), r"has shape \(4,\), expected \(\)"),
+        (lambda x, z, v, k, y: observe("o", Normal(x, 1), y), np.zeros(3), r"has shape \(3,\), expected \(\)"),
+        (lambda x, z, v, k, y: observe("o", Normal(np.zeros((1, 2)), 1), y), 0.5, r"shape \(\), expected \(2,\)"),
+        (lambda x, z, v, k, y: observe("o", Normal(v, 1), y), np.zeros(4), r"shape \(4,\), expected \(1,\)"),
+        (lambda x, z, v, k, y: observe("o", MultivariateNormal([0, 0], np.eye(2)), y), 0.5, r"expected \(2,\)"),
+        (
+            lambda x, z, v, k, y: observe("o", stats.multivariate_normal([0, 0], np.eye(2)), y),
+            0.5,
+            r"expected \(2,\)",
+        ),
+        (
+            lambda x, z, v, k, y: observe("o", Normal(np.zeros(3), 1), y),
+            0.5,
+            r"'o': parameters of shape \(3,\) do not fit 4",
+        ),
+        (
+            lambda x, z, v, k, y: observe("o", MultivariateNormal(x, [[1]]), y),
+            0.5,
+            r"mean of shape \(4,\) does not fit",
+        ),
+        (
+            lambda x, z, v, k, y: sample("s", Normal(np.zeros((4, 2)), z)),
+            0.5,
+            r"'s': parameters of shapes \(4, 2\) and \(4,\)",
+        ),
+        (
+            lambda x, z, v, k, y: {"s": np.zeros(3)},
+            0.5,
+            r"returned 's' of shape \(3,\), expected one row per particle",
+        ),
+        # names
+        (lambda x, z, v, k, y: {"x": x + 3}, 0.5, "returned 'x' with other values than site 'x'.*under another name"),
+        (lambda x, z, v, k, y: sample("x", Normal()), 0.5, "site 'x': sampled twice"),
+        (lambda x, z, v, k, y: sample(Normal(), "s"), 0.5, "expected a distribution"),
+        (lambda x, z, v, k, y: sample(3, Normal()), 0.5, "the name of a site is a int"),
+        # arrays of all particles used as one number
+        (
+            lambda x, z, v, k, y: float(x),
+            0.5,
+            r"as one number .*after site 'k', line \d+ `.*float\(x\).*TypeError.*numpy",
+        ),
+        (lambda x, z, v, k, y: math.exp(x), 0.5, "as one number .*after site 'k'.*numpy.exp"),
+        (lambda x, z, v, k, y: list(range(k)), 0.5, "as one number .*after site 'k'.*per_particle"),
+        (lambda x, z, v, k, y: ["a", "b"][k], 0.5, "as one number .*after site 'k'.*an array as table"),
+        (lambda x, z, v, k, y: {0: 1.0, 1: 2.0}[k], 0.5, "as a key .*table"),
+        (lambda x, z, v, k, y: 1 if x > 0 else 2, 0.5, "decides by an array .*after site 'k'.*use switch"),
+        (
+            lambda x, z, v, k, y: changed(x),
+            0.5,
+            "changes an array of particles in place .*after site 'k'.*x = x \\+ 1",
+        ),
+        (lambda x, z, v, k, y: changed(v[:, 0]), 0.5, "changes an array of particles in place"),
+        (lambda x, z, v, k, y: y + 1, None, "the program uses None .*missing observation is None"),
+        (lambda x, z, v, k, y: x + np.zeros(3), 0.5, "arrays that do not fit together .*after site 'k'"),
+        # parameters out of range
+        (
+            lambda x, z, v, k, y: sample("s", Poisson(-z)),
+            0.5,
+            "the program fails .site 's', line .* ValueError: lam < 0",
+        ),
+        (lambda x, z, v, k, y: observe("o", Normal(0, -z), y), 0.5, "observation 'o': log density is nan for 4 of 4"),
+        (lambda x, z, v, k, y: observe("o", Normal(x, 1), y), np.nan, "'o': log density is nan.*missing is None"),
+        (lambda x, z, v, k, y: observe("o", Normal(x, 1), y), "a", "the program fails .observation 'o'"),
+    ],
+)
+def test_a_wrong_statement_is_a_named_error(statement, y, expected):
+    text = errors_of(x_and(statement), y=y)
+    assert text.startswith("step 0, initial: ")
+    assert re.search(expected, text, re.DOTALL), text
+
+
+def test_previous_names():
+    def model(previous, y):
+        x = sample("x", Normal())
+        return {"w": x if previous is None else previous["z"]}
+
+    text = errors_of(model)
+    assert text.startswith("step 1, transition: previous has no 'z' (after site 'x', line")
+    assert "it has ['w', 'x']" in text
+    assert "previous is None at the first step" in errors_of(lambda previous, y: {"x": previous["x"]})
+    text = errors_of(per_particle(model))
+    assert "previous has no 'z'" in text and "previous.get(name)" in text
+
+
+def in_branches(first, second=lambda x, y: None, probs=(0.5, 0.5), arguments=None):
+    """A program that samples x and calls one of two functions of x and y in branches."""
+
+    def model(previous, y):
+        x = sample("x", Normal(np.zeros(1), 1.0))
+        rows = (x,) if arguments is None else arguments(x)
+        returned = switch("s", np.asarray(probs), [lambda *a: first(*a, y), lambda *a: second(*a, y)], *rows)
+        return None if returned is None else {"returned": returned}
+
+    return model
+
+
+def draw(name, *shape):
+    def branch(x, y):
+        sample(name, Normal(np.zeros((len(x), *shape)), 1.0))
+
+    return branch
+
+
+@pytest.mark.parametrize(
+    ("model", "expected"),
+    [
+        (in_branches(lambda x, y: draw("a")(x, y) or draw("a")(x, y)), "site 'a' in branch 0 of 's': sampled twice"),
+        (in_branches(draw("x")), "site 'x' in branch 0 of 's': sampled twice"),
+        (in_branches(draw("a"), draw("a", 2)), r"event shape \(2,\) here, \(\) in another branch"),
+        (
+            in_branches(lambda x, y: np.zeros(len(x) + 1), lambda x, y: x),
+            r"switch 's': branch 0 returns .*one row for each",
+        ),
+        (in_branches(lambda x, y: x, lambda x, y: np.stack([x, x], axis=1)), "branch 0 returns an array of shape"),
+        (in_branches(lambda x, y: x), "switch 's': branches return different kinds"),
+        (in_branches(lambda x, y: {"a": x}, lambda x, y: {"b": x}), "switch 's': branches return different names"),
+        (
+            in_branches(lambda x, y: {"a": x[0].max()}, lambda x, y: {"a": x.max()}, probs=[1.0, 0.0]),
+            "when no particle",
+        ),
+        (in_branches(draw("a"), arguments=lambda x: (np.zeros(9),)), r"argument 0 of the branches has shape \(9,\)"),
+        (in_branches(draw("a"), arguments=lambda x: (np.zeros(3),)), "expected one row for each of 4 particles"),
+        (in_branches(draw("a"), arguments=lambda x: ({"x": x, "y": 2.0},)), r"argument 0 .* shape \(\)"),
+        (in_branches(draw("a"), arguments=lambda x: (0.5,)), "switch 's': argument 0 .*such as the observation"),
+        (in_branches(draw("a"), probs=[0.2, 0.2, 0.6]), "switch 's': 3 probabilities for 2 branches"),
+        (in_branches(draw("a"), probs=np.ones((3, 2))), r"site 's': parameters of shape \(3,\) do not fit 4"),
+        (
+            in_branches(lambda x, y: observe("o", Normal(x, 1.0), np.zeros(len(x) + 1))),
+            "'o' in branch 0 of 's': the value has shape",
+        ),
+    ],
+)
+def test_a_wrong_branch_is_a_named_error(model, expected):
+    text = errors_of(model)
+    assert text.startswith("step 0, initial: ")
+    assert re.search(expected, text, re.DOTALL), text
+
+
+def test_branches_use_rows_of_their_own():
+    """An array of all particles does not fit the particles of a branch."""
+
+    def model(previous, y):
+        x = sample("x", Normal(np.zeros(1), 1.0))
+
+        def outer():
+            sample("a", Normal(x, 1.0))
+
+        switch("s", [0.5, 0.5], [outer, lambda: None])
+
+    assert re.search(
+        r"site 'a' in branch 0 of 's': parameters of shape \(4,\) do not fit \d particles", errors_of(model)
+    )
+
+
+def test_a_site_in_branches_of_two_switches():
+    """A particle may reach both; in branches of one switch, also nested, it reaches one of them."""
+
+    def model(previous, y):
+        x = sample("x", Normal(np.zeros(1), 1.0))
+        for name in ("s", "t"):
+            switch(name, [0.5, 0.5], [lambda x: draw("a")(x, y), lambda x: None], x)
+
+    assert "site 'a' in branch 0 of 't': sampled in branches of two switches, 's' and 't'" in errors_of(model)
+
+    def nested(previous, y):
+        x = sample("x", Normal(np.zeros(1), 1.0))
+
+        def inner(x):
+            switch("t", [0.5, 0.5], [lambda x: draw("a")(x, y), lambda x: draw("a")(x, y)], x)
+
+        switch("s", [0.5, 0.5], [inner, lambda x: draw("a")(x, y)], x)
+
+    state, _ = Program(nested).bootstrap(50).run([0.1, 0.2], 0)
+    assert np.isfinite(state.population.particles["a"]).all()
+
+
+@pytest.mark.parametrize(
+    ("guide", "expected"),
+    [
+        (lambda previous, y: sample("x", Normal()) and None, "site 'k': the guide has no such site.*'k'"),
+        (lambda previous, y: guide_of("z"), "the model has no site 'z', which the guide samples"),
+        (lambda previous, y: guide_of(observes=True), "observation 'y': a guide does not observe"),
+        (
+            lambda previous, y: guide_of(k=Normal()),
+            "site 'k': the guide draws a continuous Normal .* a discrete Categorical",
+        ),
+        (lambda previous, y: guide_of(x=Poisson(2.0)), "site 'x': the guide draws a discrete Poisson"),
+        (
+            lambda previous, y: guide_of(x=Normal(np.zeros((1, 2)))),
+            r"site 'x': the guide draws .* event shape \(2,\)",
+        ),
+        (
+            lambda previous, y: guide_of(k=Categorical([0.5, 0.5])),
+            "'k': the guide chooses from 2 categories, the model from 3",
+        ),
+        (
+            lambda previous, y: guide_of(branches=[True, False]),
+            "'a' in branch 1 of 's': the guide does not draw it for",
+        ),
+        (lambda previous, y: guide_of(branches=[True]), "site 's': the guide chooses from 1 branches"),
+    ],
+)
+def test_a_guide_that_does_not_fit_the_model(guide, expected):
+    def model(previous, y):
+        guide_of()
+        observe("y", Normal(), y)
+
+    text = errors_of(model, guide, n=30)
+    assert text.startswith("step 0, initial: ")
+    assert re.search(expected, text, re.DOTALL), text
+
+
+def guide_of(extra=None, x=Normal(), k=Categorical([0.2, 0.2, 0.6]), branches=(False, True), observes=False):  # noqa: B008
+    """Sample x, k and in some branches a."""
+    rows = sample("x", x)
+    sample("k", k)
+    if extra:
+        sample(extra, Normal())
+    names = [lambda x, reached=reached: draw("a")(x, 0.0) if reached else None for reached in branches]
+    switch("s", np.ones(len(branches)), names, rows)
+    if observes:
+        observe("y", Normal(), 0.5)
+
+
+def test_a_guide_may_draw_outside_of_branches_or_in_more():
+    """The model uses the draws of the particles that reach the site; the others integrate to one."""
+
+    def model(previous, y):
+        x = sample("x", Normal(np.zeros(1), 1.0))
+        jump = switch("s", [0.7, 0.3], [lambda x: 0.0 * x, lambda x: sample("a", Normal(2.0, 1.0))], x)
+        observe("y", Normal(x + jump, 1.0), y)
+
+    def outside(previous, y):
+        x = sample("x", Normal(0.5 * y * np.ones(1), 1.0))
+        sample("a", Normal(1.0 + 0.0 * x, 1.5))
+        switch("s", [0.5, 0.5], [lambda: None, lambda: None])
+
+    def everywhere(previous, y):
+        sample("x", Normal(0.5 * y, 1.0))
+        switch("s", [0.5, 0.5], [lambda: sample("a", Normal(1.0, 1.5))] * 2)
+
+    exact = np.log(0.7 * stats.norm(0, np.sqrt(2)).pdf(1.3) + 0.3 * stats.norm(2, np.sqrt(3)).pdf(1.3))
+    for guide in (outside, everywhere):
+        mean, standard, _ = mean_ratio(Program(model).guided(guide, 400), [1.3], exact, range(100))
+        assert abs(mean - 1) < 4 * standard  # false alarm 6e-5
+        assert standard < 0.01
+
+
+def test_a_move_keeps_returned_values_and_sites_apart():
+    """E[x_2 | y] of an AR(1) model by resample-move, with a value that the program returns beside the site."""
+
+    def model(previous, y):
+        x = sample("x", Normal(0.0, SD0) if previous is None else Normal(RHO * (previous["above"] - 3.0), SIGMA))
+        observe("y", Normal(x, TAU), y)
+        return {"above": x + 3.0, "x": x}
+
+    means = []
+    for seed in range(60):
+        population = Program(model).resample_move(400, trigger=Always()).run(YS, seed)[0].population
+        np.testing.assert_array_equal(population.particles["above"], population.particles["x"] + 3.0)
+        means.append(population.weights @ population.particles["x"])
+    standard = np.std(means, ddof=1) / np.sqrt(60)
+    assert abs(np.mean(means) - kalman_ar1(YS)[0][-1, 0]) < 4 * standard  # false alarm 6e-5
+    assert standard < 0.02
+
+
+def test_values_of_particles_that_look_like_a_shared_vector():
+    """One number for each particle is an observation, also if an event has as many entries as there are particles."""
+    sizes = []
+
+    def model(previous, y):
+        k = sample("k", Categorical([0.5, 0.5]))
+        x = sample("x", Normal(np.zeros((1, 4)), 1.0))
+        observe("of k", Normal(0.0, 1.0), np.array([y, y + 1])[k])
+        observe("residual", Normal(0.0, 1.0), y - x)
+        observe("one row", Normal(x[:, 0], 1.0), [y])
+        observe("number", MultivariateNormal([[0.0]], [[1.0]]), y)
+        sizes.append(len(k))
+
+    Program(model).bootstrap(4).run([0.3, 0.2, 0.1], 0)
+    assert sizes == [4, 1, 4, 1, 4]  # the first and the second step are checked by a run with one particle
+    a, _ = Program(model).bootstrap(4).run([0.1], 0)
+    p = a.population.particles
+    expected = (
+        stats.norm.logpdf(np.array([0.1, 1.1])[p["k"]])
+        + stats.norm.logpdf(0.1 - p["x"]).sum(axis=1)
+        + stats.norm.logpdf(0.1 - p["x"][:, 0])
+        + stats.norm.logpdf(0.1)
+    )
+    np.testing.assert_allclose(np.diff(a.population.log_weights), np.diff(expected))
+
+
+def test_arrays_of_a_trace_are_read_only():
+    @per_particle
+    def model(previous, y):
+        x = sample("x", Normal(np.zeros((1, 2)), 1.0))
+        if previous is not None:
+            previous["kept"][0] = 5.0
+        return {"kept": np.array(x)}
+
+    assert re.search("step 1, transition: the program fails .after site 'x', line .*read-only", errors_of(model))
+
+
+def test_an_observation_of_one_particle_compares_shapes():
+    def of(distribution):
+        @per_particle
+        def model(previous, y):
+            x = sample("x", Normal(np.zeros((1, 2)), 1.0))
+            observe("y", distribution(x), y)
+
+        return model
+
+    assert r"observation 'y': the value has shape (), expected (2,)" in errors_of(of(lambda x: Normal(x, 1.0)))
+    assert "expected (2,)" in errors_of(of(lambda x: Normal(x[None], 1.0)))
+    state, _ = Program(of(lambda x: Normal(x, 1.0))).bootstrap(3).run([[0.1, 0.2]], 0)
+    particles = state.population.particles
+    expected = [stats.norm(p["x"], 1.0).logpdf([0.1, 0.2]).sum() for p in particles]
+    np.testing.assert_allclose(state.population.log_weights, expected)
+
+
+def test_the_mean_states_the_event_shape():
+    class Pair(Distribution):
+        mean = sd = np.ones((1, 2))
+
+        def sample(self, rng, size):
+            return rng.standard_normal((size, 2))
+
+        def log_prob(self, value):
+            return stats.norm.logpdf(value).sum(axis=-1)
+
+    class Wrong(Pair):
+        mean = np.ones(2)
+
+    class Number(Pair):
+        mean = 1.0
+
+    state, _ = Program(lambda previous, y: {"x": sample("x", Pair())}).bootstrap(4).run([0.1], 0)
+    assert state.population.particles["x"].shape == (4, 2)
+    text = errors_of(lambda previous, y: {"x": sample("x", Wrong())})
+    assert "site 'x': parameters of shape (2,) do not fit 4 particles" in text and "(1, d)" in text
+    text = errors_of(lambda previous, y: {"x": sample("x", Number())})
+    assert "site 'x': values have shape (4, 2), expected (4,) by the Number" in text
+
+
+def test_errors_outside_of_steps():
     with pytest.raises(InputError, match="outside of a program"):
         sample("x", Normal(0.0, 1.0))
-    with pytest.raises((InputError, ValueError)):
-        run(shape)
-
-
-def nothing_but_w(previous, y):
-    sample("w", Normal(0.0, 1.0))
+    assert "sampled nothing" in errors_of(lambda previous, y: None)
+    assert "returned a ndarray" in errors_of(lambda previous, y: sample("x", Normal()))
+    assert "site 'x': expected a distribution, found a builtins.float" in errors_of(lambda p, y: sample("x", 3.0))

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import traceback
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -12,24 +16,22 @@ from mstfilter.errors import InputError, check_integer, check_number
 from mstfilter.smc.distributions import Normal
 from mstfilter.smc.filter import ParticleFilter
 from mstfilter.smc.interfaces import Lookahead, Proposal, Rejuvenation, Transition
-from mstfilter.smc.population import Particles, Population
-from mstfilter.smc.programs.sites import (
+from mstfilter.smc.population import Particles, Population, take
+from mstfilter.smc.programs.handlers import (
     CentreHandler,
     GuideHandler,
-    PerParticle,
-    ProgramRun,
     ReplayHandler,
     SampleHandler,
     ScoreHandler,
     Site,
     SiteHandler,
-    Trace,
-    active_run,
 )
+from mstfilter.smc.programs.sites import PerParticle, ProgramRun, Trace, active_run
 from mstfilter.smc.state_space import accept_moves, choose_rows
 from mstfilter.smc.streams import child
 
 Model = Callable[[Any, Any], Any]
+_HERE = str(Path(__file__).parent)
 
 
 @dataclass(frozen=True)
@@ -86,16 +88,26 @@ class Program:
 
 
 def _advance(
-    rng: np.random.Generator, model: Model, guide: Model | None, previous: Any, observation: Any, n: int
-) -> tuple[Any, np.ndarray]:
-    """Particles after a step and the gain of their log weights."""
+    rng: np.random.Generator, model: Model, guide: Model | None, past: Population | None, observation: Any, n: int
+) -> Population:
+    """The population after a step."""
+    previous = None if past is None else past.particles
     if guide is None or observation is None:
-        return run_program(model, SampleHandler(rng), previous, observation, n)
-    if isinstance(guide, PerParticle) != isinstance(model, PerParticle):
-        raise InputError("model and guide must both be per_particle, or neither")
-    proposed = GuideHandler(rng, n)
-    run_program(guide, proposed, previous, observation, n)
-    return run_program(model, ReplayHandler(proposed), previous, observation, n)
+        particles, gain = run_program(model, SampleHandler(rng), previous, observation, n)
+    else:
+        if isinstance(guide, PerParticle) != isinstance(model, PerParticle):
+            raise InputError("model and guide must both be per_particle, or neither")
+        proposed = GuideHandler(rng, n)
+        run_program(guide, proposed, previous, observation, n)
+        particles, gain = run_program(model, ReplayHandler(proposed), previous, observation, n)
+    try:
+        if past is None:
+            return Population(particles, gain)
+        return Population(particles, past.log_weights + gain, past.parents)
+    except InputError:
+        if np.isnan(gain).any() and not isinstance(model, PerParticle):  # name the site
+            run_program(model, ScoreHandler(particles, strict=True), previous, observation, n)
+        raise
 
 
 @dataclass(frozen=True)
@@ -106,7 +118,7 @@ class ProgramInitial(Proposal):
     guide: Model | None = None
 
     def sample(self, rng: np.random.Generator, observation: Any, n: int) -> Population:
-        return Population(*_advance(rng, self.model, self.guide, None, observation, n))
+        return _advance(rng, self.model, self.guide, None, observation, n)
 
 
 @dataclass(frozen=True)
@@ -117,9 +129,7 @@ class ProgramTransition(Transition):
     guide: Model | None = None
 
     def predict(self, rng: np.random.Generator, population: Population, observation: Any) -> Population:
-        n = len(population)
-        particles, gain = _advance(rng, self.model, self.guide, population.particles, observation, n)
-        return Population(particles, population.log_weights + gain, population.parents)
+        return _advance(rng, self.model, self.guide, population, observation, len(population))
 
 
 @dataclass(frozen=True)
@@ -208,8 +218,8 @@ class ProgramMove(Rejuvenation):
             values = self._propose(rng, now.values, sites)
             try:
                 new, new_sites = score(values)
-            except InputError:
-                if not single:
+            except InputError as error:
+                if not single or not isinstance(error.__cause__, InputError | None):
                     raise
                 continue  # other sites are reached, which have no values: rejected in both directions
             if [s.name for s in new_sites] != [s.name for s in sites]:
@@ -297,18 +307,12 @@ def _run_once(
 ) -> ProgramRun:
     """One pass of a function, `single` without the particle axis."""
     run = ProgramRun(handler, n, single)
-    token = active_run.set(run)
     try:
-        returned = function(previous, observation)
-    except ValueError as error:
-        if single or "truth value of an array" not in str(error):
+        _call(function, run, previous, observation)
+    except (TypeError, ValueError, LookupError, AttributeError, ArithmeticError) as error:
+        if isinstance(error, InputError) and not run.inside:
             raise
-        raise InputError(
-            "the program decides by an array that holds all particles (if, and, or, while)",
-            "use switch(name, probs, branches), numpy.where, or mark the program with @per_particle",
-        ) from error
-    finally:
-        active_run.reset(token)
+        raise _explained(error, run, previous) from error
     if isinstance(handler, GuideHandler):
         handler.values = dict(run.values)
     if isinstance(handler, ReplayHandler):
@@ -317,11 +321,103 @@ def _run_once(
             raise InputError(
                 f"the model has no site {unused[0]!r}, which the guide samples", f"it has {sorted(run.values)}"
             )
-    run.returned = _returned(returned, n, single)
+    if run.shapes and handler.draws:
+        _check_shapes(function, run, previous, observation)
     return run
 
 
-def _returned(returned: Any, n: int, single: bool) -> dict[str, Any]:
+def _call(function: Callable[[Any, Any], Any], run: ProgramRun, previous: Any, observation: Any) -> None:
+    token = active_run.set(run)
+    try:
+        returned = function(previous, observation)
+    finally:
+        active_run.reset(token)
+    run.returned = _returned(returned, run)
+
+
+def _check_shapes(function: Callable[[Any, Any], Any], run: ProgramRun, previous: Any, observation: Any) -> None:
+    """Raise if the shape of an event depends on the number of particles, by a second run with one particle.
+
+    A vector with as many entries as there are particles looks like one number for each of them, and an array (n, n)
+    made from (n, 1) and (n,) looks like n vectors. Shapes that passed are not checked again.
+    """
+    ambiguous = {k: shapes for k, shapes in run.shapes.items() if shapes.ambiguous}
+    if not ambiguous:
+        return
+    try:
+        passed = _PASSED.setdefault(function, set())
+        key = (previous is None, np.shape(observation), *(shapes.pattern for shapes in ambiguous.values()))
+    except (TypeError, ValueError):  # no weak references to the function, or an observation without shape
+        passed, key = set(), ()
+    if key in passed:
+        return
+    alone = ProgramRun(SampleHandler(np.random.default_rng(0)), 1)
+    with suppress(Exception):  # calls that it does not reach are not compared
+        _call(function, alone, None if previous is None else take(previous, np.zeros(1, dtype=int)), observation)
+    for k, found in ambiguous.items():
+        one = alone.shapes.get(k, found._replace(event=(), value=found.value and ()))
+        if k <= alone.n_calls and not (found.event == one.event and (one.value is None or one.fits)):
+            raise found.error(f"{found.what}: ")
+    passed.add(key)
+
+
+_PASSED: WeakKeyDictionary[Callable[[Any, Any], Any], set[tuple[Any, ...]]] = WeakKeyDictionary()
+
+#: Parts of messages of numpy and Python, what the program did, and what to write instead.
+_RAW_ERRORS = {
+    "truth value of an array": (
+        "the program decides by an array that holds all particles (if, and, or, while)",
+        "use switch(name, probs, branches), numpy.where, or mark the program with @per_particle",
+    ),
+    "scalar": (
+        "the program uses an array that holds all particles as one number (float, int, range, math, list index)",
+        "use numpy (numpy.exp, x.astype(int), an array as table), or mark the program with @per_particle",
+    ),
+    "unhashable": (
+        "the program uses an array that holds all particles as a key",
+        "use an array as table, table[x], or mark the program with @per_particle",
+    ),
+    "read-only": (
+        "the program changes an array of particles in place",
+        "write x = x + 1 for x += 1 and numpy.where for x[i] = ..., and return the result under another name",
+    ),
+    "NoneType": (
+        "the program uses None",
+        "previous is None at the first step, and a missing observation is None: test `is None`",
+    ),
+    "zero-size array": (
+        "the program reduces an array without entries",
+        "a branch of switch is also called when no particle reaches it",
+    ),
+    "broadcast": (
+        "the program combines arrays that do not fit together",
+        "the first axis is that of the particles: write x[:, None] to combine (n,) with (n, d)",
+    ),
+}
+
+
+def _explained(error: Exception, run: ProgramRun, previous: Any) -> InputError:
+    """The error of a program, with its place and a hint."""
+    if isinstance(error, InputError):
+        return type(error)(f"{run.what}: {error.message}", *error.hints)
+    frames = [f for f in traceback.extract_tb(error.__traceback__) if not f.filename.startswith(_HERE)]
+    place = run.what if run.inside else f"after {run.what}" if run.what else "before its first site"
+    if frames:
+        own = [frame for frame in frames if frame.filename == frames[0].filename][-1]
+        place += f", line {own.lineno}" + f" `{own.line}`" * bool(own.line)
+    if isinstance(error, KeyError) and isinstance(previous, Mapping) and error.args and error.args[0] not in previous:
+        return InputError(
+            f"previous has no {error.args[0]!r} ({place})",
+            f"it has {sorted(previous)}, the sites and returned values of the step before",
+            *(["previous.get(name) is for sites that not all particles reach"] if run.single else []),
+        )
+    fact, *hints = next((_RAW_ERRORS[part] for part in _RAW_ERRORS if part in str(error)), ("the program fails",))
+    if run.single:
+        fact, hints = "the program fails", []
+    return InputError(f"{fact} ({place}): {type(error).__name__}: {error}".replace("\n", " "), *hints)
+
+
+def _returned(returned: Any, run: ProgramRun) -> dict[str, Any]:
     """Check the values that a program returned: one row per particle, or any value of a single particle."""
     if returned is None:
         return {}
@@ -329,17 +425,29 @@ def _returned(returned: Any, n: int, single: bool) -> dict[str, Any]:
         raise InputError(
             f"a program returned a {type(returned).__qualname__}, expected None or a mapping of values to keep"
         )
-    if single:
-        return {str(name): value for name, value in returned.items()}
     out = {}
     for name, value in returned.items():
-        array = np.asarray(value)
-        if array.ndim == 0 or len(array) != n:
+        if not run.single:
+            value = np.asarray(value)
+            if value.ndim == 0 or len(value) != run.n:
+                raise InputError(
+                    f"a program returned {name!r} of shape {value.shape}, expected one row per particle ({run.n})"
+                )
+            run.what = f"returned {name!r}"
+            run.record(value.shape[1:], None, run.n)
+        if name in run.values and not _equal(value, run.values[name][0] if run.single else run.values[name]):
             raise InputError(
-                f"a program returned {name!r} of shape {array.shape}, expected one row per particle ({n})"
+                f"a program returned {name!r} with other values than site {name!r}",
+                "return them under another name: densities and moves need the values of the site",
             )
-        out[str(name)] = array
+        out[str(name)] = value
     return out
+
+
+def _equal(a: Any, b: Any) -> bool:
+    """Whether two arrays are equal, NaN to NaN."""
+    a, b = np.asarray(a), np.asarray(b)
+    return a is b or (a.shape == b.shape and bool(np.all((a == b) | ((a != a) & (b != b)))))
 
 
 def _values_of(run: ProgramRun) -> dict[str, Any]:

@@ -1,12 +1,7 @@
-"""The functions that a program calls (`sample`, `observe`, `switch`), and the handlers that give sites their values.
-
-A `ProgramRun` is one pass of a program over n particles. Its handler decides the value of each site: a draw, a
-replayed draw of a guide, the mean of the distribution, or a given value.
-"""
+"""The functions that a program calls (`sample`, `observe`, `switch`), and `ProgramRun`, one pass of a program."""
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextvars import ContextVar
 from dataclasses import dataclass
@@ -18,7 +13,7 @@ from mstfilter.errors import InputError
 from mstfilter.smc.distributions import Categorical, as_distribution
 from mstfilter.smc.interfaces import Distribution
 from mstfilter.smc.population import take
-from mstfilter.smc.streams import child
+from mstfilter.smc.programs.handlers import Site, SiteHandler
 
 active_run: ContextVar[ProgramRun | None] = ContextVar("run of a program", default=None)
 
@@ -29,14 +24,14 @@ def sample(name: str, distribution: Any) -> Any:
     Parameters
     ----------
     name : str
-        Unique within a step.
+        Unique within a step, except for sites in different branches of a `switch`.
     distribution : Distribution
         Of this package, frozen of scipy.stats, or of torch; parameters have one row per particle.
 
     Returns
     -------
-    ndarray (n, ...)
-        One row per particle; a number or array without that axis in a `per_particle` program.
+    ndarray (n, *event_shape)
+        One row per particle, read-only; a number or array without that axis in a `per_particle` program.
     """
     return _current().sample(name, distribution)
 
@@ -51,7 +46,8 @@ def observe(name: str, distribution: Any, value: Any) -> None:
     distribution : Distribution
         Of the observation given the particle.
     value : array_like or None
-        The observation.
+        The observation, of the event shape of the distribution. Or a value for each particle, (n, *event_shape), that
+        depends on the particle, such as the reading that it assigns to an object.
     """
     _current().observe(name, distribution, value)
 
@@ -68,7 +64,7 @@ def switch(name: str, probs: Any, branches: Sequence[Callable[..., Any]], *args:
     branches : sequence of callables
         Each is called once with the rows of `args` that belong to its particles, and may `sample`, `observe` and
         `switch`. A site with the same name in several branches is one array; the value is NaN (0 for integers) for
-        particles that did not reach the site.
+        particles that did not reach the site. A branch is also called if it has no particles.
     *args : array (n, ...), mapping of such, or None
         Split by rows. Values shared by all particles, such as the observation, come by closure.
 
@@ -123,7 +119,7 @@ class Trace(Mapping[str, Any]):
     __slots__ = ("_values",)
 
     def __init__(self, values: Mapping[str, Any]) -> None:
-        self._values = dict(values)
+        self._values = {name: _read_only(v) if isinstance(v, np.ndarray) else v for name, v in values.items()}
 
     def __getitem__(self, name: str) -> Any:
         return self._values[name]
@@ -138,141 +134,62 @@ class Trace(Mapping[str, Any]):
         return f"Trace({self._values!r})"
 
 
-class Site(NamedTuple):
-    """A call of `sample` in a run.
+def _read_only(array: np.ndarray) -> np.ndarray:
+    view = array.view()
+    view.setflags(write=False)
+    return view
+
+
+class Shapes(NamedTuple):
+    """Shapes at a site, an observation or a returned value.
 
     Parameters
     ----------
-    name : str
-    distribution : Distribution
+    what : str
+        Description, for messages.
+    event : tuple
+        Event shape.
+    value : tuple or None
+        Shape of the observed value.
     size : int
-        Number of particles that reach the site.
-    rows : (size,) int array or None
-        Their indices; None stands for all particles.
-    branch : bool
-        Whether the value chooses a branch of `switch`.
+        Number of particles.
     """
 
-    name: str
-    distribution: Distribution
+    what: str
+    event: tuple[int, ...]
+    value: tuple[int, ...] | None
     size: int
-    rows: np.ndarray | None
-    branch: bool
 
     @property
-    def index(self) -> Any:
-        """Index of the rows in arrays of all particles."""
-        return slice(None) if self.rows is None else self.rows
+    def fits(self) -> bool:
+        """Whether the value is an event, or one for each particle; a number is an event of shape (1,)."""
+        event, value = self.event, self.value
+        return value in (event, (1, *event), (self.size, *event)) or (value == () and event == (1,))
 
+    @property
+    def ambiguous(self) -> bool:
+        """Whether the axis of the particles may be an axis of the event, or the reverse."""
+        return self.size > 1 and (self.size in self.event or self.value == (self.size, *self.event))
 
-class SiteHandler(ABC):
-    """Decides the values of sites."""
+    @property
+    def pattern(self) -> tuple[Any, ...]:
+        """The shapes with the size replaced by a letter."""
+        return self.what, *(k if k != self.size else "n" for k in (*self.event, -1, *(self.value or ())))
 
-    @abstractmethod
-    def value(self, site: Site) -> tuple[np.ndarray, np.ndarray | None]:
-        """Values (size, ...) of a site and what they add to the log weights (None: nothing)."""
-
-    @abstractmethod
-    def row(self, index: int) -> SiteHandler:
-        """The handler of one particle of a `per_particle` program."""
-
-
-class SampleHandler(SiteHandler):
-    """Draws every site."""
-
-    def __init__(self, rng: np.random.Generator) -> None:
-        self.rng = rng
-
-    def value(self, site: Site) -> tuple[np.ndarray, np.ndarray | None]:
-        return site.distribution.sample(self.rng, site.size), None
-
-    def row(self, index: int) -> SampleHandler:
-        return SampleHandler(child(self.rng, "particle", index))
-
-
-class GuideHandler(SiteHandler):
-    """Draws every site, and keeps values and log densities for a `ReplayHandler`.
-
-    Parameters
-    ----------
-    rng : Generator
-    n : int
-        Particles.
-    """
-
-    def __init__(self, rng: np.random.Generator, n: int) -> None:
-        self.rng, self.n = rng, n
-        self.values: dict[str, np.ndarray] = {}
-        self.log_q: dict[str, np.ndarray] = {}
-        self.rows: list[GuideHandler] = []
-
-    def value(self, site: Site) -> tuple[np.ndarray, np.ndarray | None]:
-        value = site.distribution.sample(self.rng, site.size)
-        log_q = self.log_q.setdefault(site.name, np.zeros(self.n))
-        log_q[site.index] = site.distribution.log_prob(value)
-        return value, None
-
-    def row(self, index: int) -> GuideHandler:
-        self.rows.append(GuideHandler(child(self.rng, "particle", index), 1))
-        return self.rows[-1]
-
-
-class ReplayHandler(SiteHandler):
-    """Takes the values of a guide and weights them by f / q."""
-
-    def __init__(self, guide: GuideHandler) -> None:
-        self.guide = guide
-
-    def value(self, site: Site) -> tuple[np.ndarray, np.ndarray | None]:
-        if site.name not in self.guide.values:
-            raise InputError(
-                f"the guide has no site {site.name!r}, which the model samples",
-                f'add sample("{site.name}", ...) to the guide; it has {sorted(self.guide.values)}',
+    def error(self, prefix: str = "") -> InputError:
+        """The error of a wrong shape."""
+        hints = []
+        if self.size > 1 and self.size in self.event:
+            hints += ["arrays (n, 1) and (n,) combine to (n, n): use x[:, 0], or z[:, None]"]
+        if self.value is None:
+            return InputError(
+                f"{prefix}an event has shape {self.event}, which changes with the number of particles", *hints
             )
-        value = self.guide.values[site.name][site.index]
-        return value, site.distribution.log_prob(value) - self.guide.log_q[site.name][site.index]
-
-    def row(self, index: int) -> ReplayHandler:
-        return ReplayHandler(self.guide.rows[index])
-
-
-class CentreHandler(SiteHandler):
-    """Sets every site to the mean of its distribution (mode if discrete)."""
-
-    def value(self, site: Site) -> tuple[np.ndarray, np.ndarray | None]:
-        centre = np.asarray(site.distribution.centre)
-        inner = centre.shape[1:] if centre.ndim and len(centre) in (1, site.size) else centre.shape
-        return np.broadcast_to(centre, (site.size, *inner)), None
-
-    def row(self, index: int) -> CentreHandler:
-        return self
-
-
-class ScoreHandler(SiteHandler):
-    """Takes given values, weights them by their density, and keeps the sites.
-
-    Parameters
-    ----------
-    values : mapping
-        Value of each site.
-    single : bool
-        Whether they are the values of one particle, without the particle axis.
-    """
-
-    def __init__(self, values: Mapping[str, Any], single: bool = False) -> None:
-        self.values, self.single = values, single
-        self.sites: list[Site] = []
-
-    def value(self, site: Site) -> tuple[np.ndarray, np.ndarray | None]:
-        if site.name not in self.values:
-            raise InputError(f"there is no value for site {site.name!r}")
-        self.sites.append(site)
-        value = np.asarray(self.values[site.name])[None] if self.single else self.values[site.name]
-        value = value[site.index]
-        return value, site.distribution.log_prob(value)
-
-    def row(self, index: int) -> ScoreHandler:
-        return ScoreHandler(self.values, self.single)
+        if len(self.value) < len(self.event):
+            hints += ["give all entries of the vector, or observe one entry by its parameters, such as x[:, 0]"]
+        else:
+            hints += ["a vector of k entries needs parameters (n, k) or (1, k), such as Normal(x[:, None], 1.0)"]
+        return InputError(f"{prefix}the value has shape {self.value}, expected {self.event}", *hints)
 
 
 class ProgramRun:
@@ -293,74 +210,162 @@ class ProgramRun:
         self.values: dict[str, np.ndarray] = {}
         self.returned: dict[str, Any] = {}
         self.gain = np.zeros(n)
+        self.shapes: dict[int, Shapes] = {}  # of the calls that do not have a number for each particle, in order
+        self.n_calls = 0
+        self.what, self.inside = "", False  # the last site or observation, and whether it is being processed
         self._rows: np.ndarray | None = None
-        self._split: set[str] = set()  # sites inside a branch
+        self._path: tuple[tuple[str, int], ...] = ()
+        self._where = ""  # the branch, for messages
+        self._paths: dict[str, list[tuple[tuple[str, int], ...]]] = {}
 
     def sample(self, name: str, distribution: Any, branch: bool = False) -> Any:
-        rows = self._rows
+        self.what, self.inside = f"site {name!r}{self._where}", True
+        rows, distribution = self._rows, as_distribution(distribution)
         size = self.n if rows is None else len(rows)
-        value, gain = self.handler.value(Site(name, as_distribution(distribution), size, rows, branch))
+        shape = self._value_shape(distribution, size)
+        self._check_name(name)
+        value, gain = self.handler.value(Site(name, distribution, size, rows, branch))
+        value = _read_only(np.asarray(value))
+        if value.shape != shape:
+            raise InputError(
+                f"values have shape {value.shape}, expected {shape} by the {type(distribution).__name__}",
+                "the shape of its mean states the event shape: (), (n,), (1, d) or (n, d)",
+            )
+        if not self.single:
+            self.record(shape[1:], None, size)
         self._store(name, value, rows)
         if gain is not None:
-            self._add(gain, f"site {name!r}")
+            self._add(gain, size)
+        self.inside = False
         return value[0] if self.single else value
 
     def observe(self, name: str, distribution: Any, value: Any) -> None:
+        self.what, self.inside = f"observation {name!r}{self._where}", True
+        if not self.handler.observes:
+            raise InputError("a guide does not observe, the model weights the particles", "remove it from the guide")
         if value is not None:
-            self._add(as_distribution(distribution).log_prob(value), f"observation {name!r}")
+            distribution = as_distribution(distribution)
+            size = self.n if self._rows is None else len(self._rows)
+            found: tuple[int, ...] = () if isinstance(value, float) else np.shape(value)
+            if self.single:
+                event = distribution.event_shape
+                if distribution.batch_shape != (1,):
+                    event = (*distribution.batch_shape, *event)
+            else:
+                event = self._value_shape(distribution, size)[1:]
+                if len(found) > 1 and found[0] == size and not event and not distribution.batch_shape:
+                    event = found[1:]  # independent entries with the same parameters
+            self.record(event, found, size)
+            self._add(distribution.log_prob(value), size)
+        self.inside = False
 
     def switch(self, name: str, probs: Any, branches: Sequence[Callable[..., Any]], args: tuple[Any, ...]) -> Any:
+        self.what, self.inside = f"switch {name!r}", True
         distribution = Categorical(probs)
         if distribution.probs.shape[-1] != len(branches):
-            raise InputError(
-                f"switch {name!r} has {distribution.probs.shape[-1]} probabilities for {len(branches)} branches"
-            )
+            raise InputError(f"{distribution.probs.shape[-1]} probabilities for {len(branches)} branches")
+        if not self.single:
+            for k, argument in enumerate(args):
+                _check_rows(argument, self.n if self._rows is None else len(self._rows), k)
         index = self.sample(name, distribution, branch=True)
         if self.single:
             return branches[int(index)](*args)
-        outer, results, groups = self._rows, [], []
+        outer, path, where, results, groups = self._rows, self._path, self._where, [], []
         for k, branch in enumerate(branches):  # also empty groups: the sites of all branches exist at every step
             group = np.flatnonzero(index == k)
-            self._rows = group if outer is None else outer[group]
+            self._rows, self._path = group if outer is None else outer[group], (*path, (name, k))
+            self._where = f" in branch {k} of {name!r}"
             groups.append(group)
             try:
                 results.append(branch(*(None if a is None else take(a, group) for a in args)))
             finally:
-                self._rows = outer
-        return _merge(results, groups, len(index), name)
+                self._rows, self._path, self._where = outer, path, where
+        self.what, self.inside = f"switch {name!r}", True
+        merged = _merge(results, groups, len(index))
+        self.inside = False
+        return merged
+
+    def record(self, event: tuple[int, ...], value: tuple[int, ...] | None, size: int) -> None:
+        """Keep the shapes of an event and of an observed value; raise if they differ."""
+        self.n_calls += 1
+        if event or value:
+            shapes = self.shapes[self.n_calls] = Shapes(self.what, event, value, size)
+            if value is not None and not shapes.fits:
+                raise shapes.error()
+
+    def _value_shape(self, distribution: Distribution, size: int) -> tuple[int, ...]:
+        try:
+            return distribution.value_shape(size)
+        except InputError as error:
+            if self._rows is None:
+                raise
+            raise InputError(
+                error.message, "give the branch the rows of its particles, as arguments of switch"
+            ) from None
+
+    def _check_name(self, name: str) -> None:
+        """Raise if a particle may reach two sites of this name."""
+        if not isinstance(name, str):
+            raise InputError(f"the name of a site is a {type(name).__name__}", 'write sample("x", distribution)')
+        if name not in self._paths:
+            self._paths[name] = [self._path]
+            return
+        for other in self._paths[name]:
+            apart = [(mine, theirs) for mine, theirs in zip(self._path, other, strict=False) if mine != theirs]
+            if not apart:
+                raise InputError("sampled twice in one step", "give every site its own name")
+            (mine, _), (theirs, _) = apart[0]
+            if mine != theirs:
+                raise InputError(
+                    f"sampled in branches of two switches, {theirs!r} and {mine!r}, and a particle may reach both",
+                    "give every site its own name",
+                )
+        self._paths[name].append(self._path)
 
     def _store(self, name: str, value: np.ndarray, rows: np.ndarray | None) -> None:
         if rows is None:
-            if name in self.values:
-                raise InputError(f"site {name!r} is sampled twice in one step", "give every site its own name")
             self.values[name] = value
             return
-        if name not in self.values:
-            self.values[name] = _blank(value, self.n)
-            self._split.add(name)
-        if name not in self._split:
-            raise InputError(f"site {name!r} is sampled inside and outside of a branch", "give them two names")
-        values = self.values[name]
+        values = self.values.get(name)
+        if values is None:
+            values = _blank(value, self.n)
+        if values.shape[1:] != value.shape[1:]:
+            raise InputError(
+                f"values have event shape {value.shape[1:]} here, {values.shape[1:]} in another branch",
+                "give the sites two names",
+            )
         values = values.astype(np.result_type(values, value), copy=False)
         values[rows] = value
         self.values[name] = values
 
-    def _add(self, log_prob: Any, what: str) -> None:
+    def _add(self, log_prob: Any, size: int) -> None:
         log_prob = np.asarray(log_prob)
         if self.single:
-            self.gain += log_prob.sum()
-            return
-        target = self.gain if self._rows is None else self.gain[self._rows]
-        if log_prob.ndim > 1 or (log_prob.ndim == 1 and len(log_prob) not in (1, len(target))):
+            log_prob = log_prob.sum()
+        elif log_prob.shape not in ((size,), (), (1,)):
+            raise InputError(f"log_prob has shape {log_prob.shape}, expected one number per particle, ({size},)")
+        if self.handler.strict and size and not log_prob.max() < np.inf:
+            wrong = np.flatnonzero(~(np.atleast_1d(log_prob) < np.inf))
             raise InputError(
-                f"log probability of {what} has shape {log_prob.shape}, expected one number per particle, "
-                f"({len(target)},)",
-                "give the distribution one row per particle: parameters (n,) or (n, d)",
+                f"log density is {np.atleast_1d(log_prob)[wrong[0]]} for {len(wrong)} of {size} particles",
+                "is a parameter out of range, such as a negative scale, or is the observation NaN?",
+                "one that is missing is None",
             )
         if self._rows is None:
             self.gain += log_prob
         else:
             self.gain[self._rows] += log_prob
+
+
+def _check_rows(argument: Any, size: int, k: int) -> None:
+    """Raise unless the argument of a switch has one row per particle."""
+    for value in argument.values() if isinstance(argument, Mapping) else (argument,):
+        if value is not None and (np.ndim(value) == 0 or len(value) != size):
+            raise InputError(
+                f"argument {k} of the branches has shape {np.shape(value)}, expected one row for each of {size} "
+                "particles",
+                "a branch can use values that all particles share, such as the observation, without an argument",
+            )
 
 
 def _blank(value: np.ndarray, n: int) -> np.ndarray:
@@ -369,19 +374,25 @@ def _blank(value: np.ndarray, n: int) -> np.ndarray:
     return np.full((n, *value.shape[1:]), fill, dtype=value.dtype)
 
 
-def _merge(results: list[Any], groups: list[np.ndarray], n: int, name: str) -> Any:
+def _merge(results: list[Any], groups: list[np.ndarray], n: int) -> Any:
     """Values returned by the branches, each in its rows."""
     if all(r is None for r in results):
         return None
     if all(isinstance(r, Mapping) for r in results):
         if any(set(r) != set(results[0]) for r in results):
-            raise InputError(f"branches of switch {name!r} return different names: {[sorted(r) for r in results]}")
-        return {key: _merge([r[key] for r in results], groups, n, name) for key in results[0]}
+            raise InputError(f"branches return different names: {[sorted(r) for r in results]}")
+        return {key: _merge([r[key] for r in results], groups, n) for key in results[0]}
     if any(r is None or isinstance(r, Mapping) for r in results):
-        raise InputError(f"branches of switch {name!r} return different kinds of values")
+        raise InputError("branches return different kinds of values: None, arrays or mappings")
     arrays = [np.asarray(r) for r in results]
-    inner = next((a.shape[1:] for a in arrays if a.ndim), ())
+    inner = max(arrays, key=np.ndim).shape[1:]
     merged = np.zeros((n, *inner), dtype=np.result_type(*arrays))
-    for group, array in zip(groups, arrays, strict=True):
+    for k, (group, array) in enumerate(zip(groups, arrays, strict=True)):
+        if array.shape not in ((), inner, (1, *inner), (len(group), *inner)):
+            raise InputError(
+                f"branch {k} returns an array of shape {array.shape}, expected one row for each of its particles, "
+                f"{(len(group), *inner)}",
+                "a branch takes arrays of particles as arguments, which hold its particles only",
+            )
         merged[group] = array
     return merged

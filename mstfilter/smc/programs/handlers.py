@@ -1,0 +1,211 @@
+"""Handlers decide the values of the sites of a program.
+
+A value is a draw, a replayed draw of a guide, the mean of the distribution, or given.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from mstfilter.errors import InputError
+from mstfilter.smc.distributions import Categorical
+from mstfilter.smc.interfaces import Distribution
+from mstfilter.smc.streams import child
+
+
+class Site(NamedTuple):
+    """A call of `sample` in a run.
+
+    Parameters
+    ----------
+    name : str
+    distribution : Distribution
+    size : int
+        Number of particles that reach the site.
+    rows : (size,) int array or None
+        Their indices; None stands for all particles.
+    branch : bool
+        Whether the value chooses a branch of `switch`.
+    """
+
+    name: str
+    distribution: Distribution
+    size: int
+    rows: np.ndarray | None
+    branch: bool
+
+    @property
+    def index(self) -> Any:
+        """Index of the rows in arrays of all particles."""
+        return slice(None) if self.rows is None else self.rows
+
+
+class SiteHandler(ABC):
+    """Decides the values of sites.
+
+    Attributes
+    ----------
+    observes : bool
+        Whether the program may observe.
+    draws : bool
+        Whether the values are new, and not given.
+    strict : bool
+        Whether a log density of NaN or +inf is an error.
+    """
+
+    observes = True
+    draws = True
+    strict = False
+
+    @abstractmethod
+    def value(self, site: Site) -> tuple[np.ndarray, np.ndarray | None]:
+        """Values (size, ...) of a site and what they add to the log weights (None: nothing)."""
+
+    @abstractmethod
+    def row(self, index: int) -> SiteHandler:
+        """The handler of one particle of a `per_particle` program."""
+
+
+class SampleHandler(SiteHandler):
+    """Draws every site."""
+
+    def __init__(self, rng: np.random.Generator) -> None:
+        self.rng = rng
+
+    def value(self, site: Site) -> tuple[np.ndarray, np.ndarray | None]:
+        return site.distribution.sample(self.rng, site.size), None
+
+    def row(self, index: int) -> SampleHandler:
+        return SampleHandler(child(self.rng, "particle", index))
+
+
+class GuideHandler(SiteHandler):
+    """Draws every site, and keeps values and log densities for a `ReplayHandler`.
+
+    Parameters
+    ----------
+    rng : Generator
+    n : int
+        Particles.
+    """
+
+    observes = False
+
+    def __init__(self, rng: np.random.Generator, n: int) -> None:
+        self.rng, self.n = rng, n
+        self.values: dict[str, np.ndarray] = {}
+        self.log_q: dict[str, np.ndarray] = {}
+        self.sites: dict[str, list[Site]] = {}
+        self.rows: list[GuideHandler] = []
+
+    def value(self, site: Site) -> tuple[np.ndarray, np.ndarray | None]:
+        value = site.distribution.sample(self.rng, site.size)
+        log_q = self.log_q.setdefault(site.name, np.zeros(self.n))
+        log_q[site.index] = site.distribution.log_prob(value)
+        self.sites.setdefault(site.name, []).append(site)
+        return value, None
+
+    def row(self, index: int) -> GuideHandler:
+        self.rows.append(GuideHandler(child(self.rng, "particle", index), 1))
+        return self.rows[-1]
+
+
+class ReplayHandler(SiteHandler):
+    """Takes the values of a guide and weights them by f / q."""
+
+    def __init__(self, guide: GuideHandler) -> None:
+        self.guide = guide
+
+    def value(self, site: Site) -> tuple[np.ndarray, np.ndarray | None]:
+        if site.name not in self.guide.values:
+            raise InputError(
+                "the guide has no such site",
+                f'add sample("{site.name}", ...) to the guide; it has {sorted(self.guide.values)}',
+            )
+        self._compare(site, self.guide.sites[site.name])
+        value = self.guide.values[site.name][site.index]
+        return value, site.distribution.log_prob(value) - self.guide.log_q[site.name][site.index]
+
+    def _compare(self, site: Site, drawn: list[Site]) -> None:
+        """Raise unless the guide draws the values that the model needs."""
+        model = site.distribution
+        for guide in (other.distribution for other in drawn):
+            if (guide.discrete, guide.event_shape) != (model.discrete, model.event_shape):
+                raise InputError(
+                    f"the guide draws a {_described(guide)}, the model a {_described(model)}",
+                    "give both distributions the same kind and event shape",
+                )
+            if isinstance(guide, Categorical) and isinstance(model, Categorical):
+                k, needed = guide.probs.shape[-1], model.probs.shape[-1]
+                if k < needed or (site.branch and k != needed):
+                    raise InputError(
+                        f"the guide chooses from {k} {'branches' if site.branch else 'categories'}, the model from "
+                        f"{needed}",
+                        "give the guide as many; it may give those that the observation excludes a probability of 0",
+                    )
+        if any(other.rows is None for other in drawn):
+            return
+        reached = np.zeros(self.guide.n, dtype=bool)
+        for other in drawn:
+            reached[other.rows] = True
+        missing = site.size - int(reached[site.index].sum())
+        if missing:
+            raise InputError(
+                f"the guide does not draw it for {missing} of {site.size} particles",
+                "sample it in the same branches as in the model, or outside of the branches",
+            )
+
+    def row(self, index: int) -> ReplayHandler:
+        return ReplayHandler(self.guide.rows[index])
+
+
+def _described(distribution: Distribution) -> str:
+    kind = "discrete" if distribution.discrete else "continuous"
+    return f"{kind} {type(distribution).__name__} with event shape {distribution.event_shape}"
+
+
+class CentreHandler(SiteHandler):
+    """Sets every site to the mean of its distribution (mode if discrete)."""
+
+    draws = False
+
+    def value(self, site: Site) -> tuple[np.ndarray, np.ndarray | None]:
+        return np.broadcast_to(site.distribution.centre, site.distribution.value_shape(site.size)), None
+
+    def row(self, index: int) -> CentreHandler:
+        return self
+
+
+class ScoreHandler(SiteHandler):
+    """Takes given values, weights them by their density, and keeps the sites.
+
+    Parameters
+    ----------
+    values : mapping
+        Value of each site.
+    single : bool
+        Whether they are the values of one particle, without the particle axis.
+    strict : bool
+        Whether a log density of NaN or +inf is an error.
+    """
+
+    draws = False
+
+    def __init__(self, values: Mapping[str, Any], single: bool = False, strict: bool = False) -> None:
+        self.values, self.single, self.strict = values, single, strict
+        self.sites: list[Site] = []
+
+    def value(self, site: Site) -> tuple[np.ndarray, np.ndarray | None]:
+        if site.name not in self.values:
+            raise InputError("there is no value for it")
+        self.sites.append(site)
+        value = np.asarray(self.values[site.name])[None] if self.single else self.values[site.name]
+        value = value[site.index]
+        return value, site.distribution.log_prob(value)
+
+    def row(self, index: int) -> ScoreHandler:
+        return ScoreHandler(self.values, self.single)
