@@ -48,7 +48,7 @@ from mstfilter.smc.interfaces import (
 )
 from mstfilter.smc.population import Population, identity
 from mstfilter.smc.resampling import Systematic
-from mstfilter.smc.streams import Key
+from mstfilter.smc.streams import Key, step_generator
 from mstfilter.smc.triggers import EssBelow
 
 _INTERFACES: dict[str, type] = {
@@ -242,12 +242,11 @@ class _Step:
         self, filter: ParticleFilter, state: State, observation: Any, observer: Observer | None = None
     ) -> None:
         self.filter, self.state, self.observation = filter, state, observation
-        self.streams = state.key.child("step", state.t)
         self.slot = _Slot(state.t, observer)
 
     def rng(self, slot: str) -> np.random.Generator:
         """The random stream of a component in this step."""
-        return self.streams.child(slot).generator()
+        return step_generator(self.state.key, self.state.t, slot)
 
     def select_before(self) -> tuple[Population | None, bool]:
         """Select: the particles x_{t-1} to move, and whether they were resampled."""

@@ -25,6 +25,7 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
+from numpy.random.bit_generator import ISpawnableSeedSequence
 
 from mstfilter.errors import InputError
 
@@ -73,14 +74,23 @@ class Key:
 
     def generator(self) -> np.random.Generator:
         """A new generator at the start of the stream."""
-        words = _words(self.seed)
-        words += [0] * (4 - len(words))  # as numpy does before a spawn key
-        words.append(_PREFIX)
-        for number in self.path:
-            words += _words(number)
-        sequence = _KeyedSequence(np.array(words, dtype=np.uint32))
-        sequence.key = self
-        return np.random.Generator(np.random.PCG64(sequence))
+        return np.random.Generator(np.random.PCG64(_sequence(self)))
+
+
+def _sequence(key: Key) -> _KeyedSequence:
+    sequence = _KeyedSequence(np.array(_key_words(key), dtype=np.uint32))
+    sequence.key = key
+    return sequence
+
+
+def _key_words(key: Key) -> list[int]:
+    """The entropy of a key: words of the seed, at least 4 as numpy has it before a spawn key, prefix, and path."""
+    words = _words(key.seed)
+    words += [0] * (4 - len(words))
+    words.append(_PREFIX)
+    for number in key.path:
+        words += _words(number)
+    return words
 
 
 def child(rng: np.random.Generator, *parts: int | str) -> np.random.Generator:
@@ -99,7 +109,7 @@ def child(rng: np.random.Generator, *parts: int | str) -> np.random.Generator:
 def key_of(rng: np.random.Generator) -> Key:
     """The key of the stream of a generator, whatever its current position in the stream."""
     sequence = rng.bit_generator.seed_seq
-    if isinstance(sequence, _KeyedSequence):
+    if isinstance(sequence, (_KeyedSequence, _KnownSequence)):
         return sequence.key
     if not isinstance(sequence, np.random.SeedSequence) or not isinstance(sequence.entropy, (int, np.integer)):
         raise InputError(
@@ -112,8 +122,46 @@ def key_of(rng: np.random.Generator) -> Key:
     return Key(int(sequence.entropy), (_PREFIX, len(path), *path))  # the length makes children and siblings differ
 
 
-def pcg64_states(words: np.ndarray) -> np.ndarray:
-    """States of the generators that numpy's SeedSequence and PCG64 make from given words.
+def step_generator(key: Key, t: int, slot: str) -> np.random.Generator:
+    """``key.child("step", t).child(slot).generator()``; the seeds of 64 steps are computed together."""
+    block, position = divmod(t, 64)
+    sequence = _KnownSequence(key, t, slot, _seeds_of_steps(key, slot, block)[position])
+    return np.random.Generator(np.random.PCG64(sequence))  # type: ignore[arg-type]
+
+
+@lru_cache(maxsize=32)
+def _seeds_of_steps(key: Key, slot: str, block: int) -> np.ndarray:
+    """(64, 4) uint64 seeds of the generators of a slot."""
+    steps = range(64 * block, 64 * block + 64)
+    return pcg64_seeds(np.array([_key_words(key.child("step", t, slot)) for t in steps], np.uint32))
+
+
+class _KnownSequence(ISpawnableSeedSequence):
+    """The SeedSequence of a step and a slot, of which the seed of a PCG64 is known."""
+
+    def __init__(self, key: Key, t: int, slot: str, seed: np.ndarray) -> None:
+        self._place, self._seed = (key, t, slot), seed
+
+    @property
+    def key(self) -> Key:
+        key, t, slot = self._place
+        return key.child("step", t, slot)
+
+    def generate_state(self, n_words: int, dtype: Any = np.uint32) -> np.ndarray:
+        """As the sequence that it stands for."""
+        if n_words == 4 and dtype is np.uint64:
+            return self._seed
+        return _sequence(self.key).generate_state(n_words, dtype)
+
+    def spawn(self, n_children: int) -> list[Any]:
+        """As the sequence that it stands for; repeated calls give new children."""
+        if "_real" not in self.__dict__:
+            self._real = _sequence(self.key)
+        return self._real.spawn(n_children)
+
+
+def pcg64_seeds(words: np.ndarray) -> np.ndarray:
+    """Seeds of the PCG64 generators that numpy's SeedSequence makes from given words.
 
     Parameters
     ----------
@@ -123,11 +171,11 @@ def pcg64_states(words: np.ndarray) -> np.ndarray:
     Returns
     -------
     (m, 4) uint64
-        Low and high word of the state, low and high word of the increment.
+        High and low word of the initial state, high and low word of the sequence number.
 
     References
     ----------
-    O'Neill (2015), "Developing a seed_seq alternative", the hash of SeedSequence; O'Neill (2014), PCG, section 4.
+    O'Neill (2015), "Developing a seed_seq alternative", the hash of SeedSequence.
     """
     constant = 0x43B0D7E5
 
@@ -156,7 +204,18 @@ def pcg64_states(words: np.ndarray) -> np.ndarray:
         state = state * 0x58F38DED & 0xFFFFFFFF
         value = value * np.uint32(state)
         out.append((value ^ value >> np.uint32(16)).astype(np.uint64))
-    seed_high, seed_low, inc_high, inc_low = (out[2 * i] | out[2 * i + 1] << np.uint64(32) for i in range(4))
+    return np.stack([out[2 * i] | out[2 * i + 1] << np.uint64(32) for i in range(4)], axis=1)
+
+
+def pcg64_states(words: np.ndarray) -> np.ndarray:
+    """States of the generators of `pcg64_seeds`.
+
+    Returns
+    -------
+    (m, 4) uint64
+        Low and high word of the state, low and high word of the increment (O'Neill 2014, PCG, section 4).
+    """
+    seed_high, seed_low, inc_high, inc_low = pcg64_seeds(words).T
     # inc = 2 * sequence + 1; state = (inc + seed) * multiplier + inc, modulo 2^128.
     inc_high, inc_low = inc_high << np.uint64(1) | inc_low >> np.uint64(63), inc_low << np.uint64(1) | np.uint64(1)
     low, high = _add(inc_low, inc_high, seed_low, seed_high)
@@ -182,12 +241,7 @@ def _times_multiplier(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np
 
 def key_words(seeds: list[int], *parts: int | str) -> np.ndarray:
     """(R, k) uint32 words of the keys ``Key(seed).child(*parts)``, for `pcg64_states`; seeds below 2^128."""
-    path = [word for number in (_PREFIX, *map(_number, parts)) for word in _words(number)]
-    words = np.zeros((len(seeds), 4 + len(path)), np.uint32)
-    for row, seed in zip(words, seeds, strict=True):
-        row[: len(_words(seed))] = _words(seed)
-    words[:, 4:] = path
-    return words
+    return np.array([_key_words(Key(seed).child(*parts)) for seed in seeds], np.uint32)
 
 
 def _words(number: int) -> list[int]:

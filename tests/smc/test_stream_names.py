@@ -26,7 +26,9 @@ from mstfilter.smc import (
     Systematic,
     auxiliary,
     bootstrap,
+    filter as filter_module,
     guided,
+    key_of,
     observe,
     per_particle,
     resample_move,
@@ -91,13 +93,17 @@ ASSEMBLIES = {
 def used_twice(monkeypatch, filter, observations) -> list[Key]:
     """Keys from which a run makes more than one generator."""
     made: Counter[Key] = Counter()
-    make = Key.generator
 
-    def spy(key):
-        made[key] += 1
-        return make(key)
+    def recorded(make):
+        def spy(*args):
+            rng = make(*args)
+            made[key_of(rng)] += 1
+            return rng
 
-    monkeypatch.setattr(Key, "generator", spy)
+        return spy
+
+    monkeypatch.setattr(Key, "generator", recorded(Key.generator))
+    monkeypatch.setattr(filter_module, "step_generator", recorded(filter_module.step_generator))
     filter.run(observations, 3)
     assert len(made) >= len(observations)
     return [key for key, times in made.items() if times > 1]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import pickle
 import zlib
 
 import numpy as np
@@ -10,7 +11,7 @@ import pytest
 
 from mstfilter.errors import InputError
 from mstfilter.smc import Key, Population, child, key_of
-from mstfilter.smc.streams import _PREFIX, key_words, pcg64_states
+from mstfilter.smc.streams import _PREFIX, key_words, pcg64_states, step_generator
 
 
 @pytest.mark.parametrize("seed", [0, 3, 2**31, 2**32, 2**40 + 5, 2**130 + 7])
@@ -24,6 +25,18 @@ def test_the_stream_of_a_key_is_that_of_its_seed_sequence(seed, path):
     for a, b in zip(ours.spawn(2) + ours.spawn(1), numpys.spawn(2) + numpys.spawn(1), strict=True):
         np.testing.assert_array_equal(a.random(3), b.random(3))
     np.testing.assert_array_equal(ours.random(5), numpys.random(5))
+
+
+@pytest.mark.parametrize("key", [Key(0), Key(2**130 + 7, (5, 2**40))])
+@pytest.mark.parametrize("t", [0, 63, 64, 1000])
+def test_the_stream_of_a_step_is_that_of_its_key(key, t):
+    rng, expected = step_generator(key, t, "update"), key.child("step", t, "update").generator()
+    assert key_of(rng) == key_of(expected) == key_of(copy.deepcopy(rng)) == key_of(pickle.loads(pickle.dumps(rng)))
+    for a, b in zip(rng.spawn(2) + rng.spawn(1), expected.spawn(2) + expected.spawn(1), strict=True):
+        np.testing.assert_array_equal(a.random(3), b.random(3))
+    np.testing.assert_array_equal(rng.random(5), expected.random(5))
+    a, b = (np.random.MT19937(r.bit_generator.seed_seq).random_raw(3) for r in (rng, expected))
+    np.testing.assert_array_equal(a, b)
 
 
 def test_moved_particles_keep_weights_and_parents():
