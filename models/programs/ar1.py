@@ -1,4 +1,4 @@
-"""AR(1) observed in noise: the smallest program, with every filter that comes from it.
+"""A linear Gaussian AR(1) process observed in noise, with all filters of a program.
 
     python models/programs/ar1.py
 
@@ -25,7 +25,7 @@ def model(previous, y):
 
 
 def guide(previous, y):
-    """The best proposal there is: p(x_t | x_{t-1}, y_t). Its sites have the names of the model's."""
+    """The optimal proposal p(x_t | x_{t-1}, y_t). A guide has the same sites as the model."""
     if previous is None:
         v = S**2 / (1 - R**2)
         sample("x", Normal(v / (v + Q**2) * y, np.sqrt(v * Q**2 / (v + Q**2))))
@@ -35,7 +35,7 @@ def guide(previous, y):
 
 
 def simulate(T: int, seed: int = 0) -> tuple[np.ndarray, list[float]]:
-    """States (T,) and observations."""
+    """Simulate T steps; returns the states (T,) and the observations."""
     rng = np.random.default_rng(seed)
     x = [rng.normal(0, S / np.sqrt(1 - R**2))]
     for _ in range(T - 1):
@@ -44,7 +44,7 @@ def simulate(T: int, seed: int = 0) -> tuple[np.ndarray, list[float]]:
 
 
 def filters(n: int) -> dict:
-    """All from the one program."""
+    """The filters of the program with `n` particles, by name."""
     program = Program(model)
     return {
         "bootstrap": program.bootstrap(n),

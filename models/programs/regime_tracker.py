@@ -1,9 +1,9 @@
-"""A target that drifts or manoeuvres: two regimes with different sites, and readings that are sometimes missing.
+"""A target with two regimes of motion, which have different sites, and observations that are sometimes missing.
 
     python models/programs/regime_tracker.py
 
-The state is a position and a velocity in the plane. Drifting, the velocity hardly changes; manoeuvring, it gets a
-thrust in a direction of its own, a site that exists in that regime alone.
+The state is a position and a velocity in the plane. In the regime "drift" the velocity changes slowly. In the regime
+"manoeuvre" it changes by a thrust; its direction is a site of this regime only, and NaN in the other.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import numpy as np
 from mstfilter.smc import Normal, Program, Uniform, observe, sample, switch
 
 STEP, NOISE = 1.0, 0.5
-TO_MANOEUVRE = np.array([0.1, 0.6])  # from drifting, from manoeuvring
+TO_MANOEUVRE = np.array([0.1, 0.6])  # probability of a manoeuvre after a drift, after a manoeuvre
 
 
 def model(previous, y):
@@ -41,7 +41,7 @@ def model(previous, y):
 
 
 def simulate(T: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray, list]:
-    """Positions (T, 2), regimes (T,) and readings, one in ten missing."""
+    """Simulate T steps; returns positions (T, 2), regimes (T,) and readings, of which a tenth are missing (None)."""
     rng = np.random.default_rng(seed)
     position, velocity, regime = rng.normal(0, 5, 2), rng.normal(0, 1, 2), 0
     positions, regimes, readings = [], [], []
@@ -61,7 +61,7 @@ def simulate(T: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray, list]:
 
 
 def filters(n: int) -> dict:
-    """From the one program."""
+    """The filters of the program with `n` particles, by name."""
     return {"bootstrap": Program(model).bootstrap(n), "resample-move": Program(model).resample_move(n, scale=0.3)}
 
 
@@ -74,4 +74,4 @@ if __name__ == "__main__":
             errors.append(np.linalg.norm(w @ p["position"] - truth[info.t]))
             right.append((w @ (p["regime"] == 1) > 0.5) == regimes[info.t])
         print(f"{name:14s} position error {np.mean(errors):.3f}  regime right {np.mean(right):.2f}")
-    print(f"{'readings':14s} position error {NOISE * np.sqrt(np.pi / 2):.3f} (where there is one)")
+    print(f"{'readings':14s} position error {NOISE * np.sqrt(np.pi / 2):.3f} (if not missing)")

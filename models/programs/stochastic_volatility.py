@@ -1,8 +1,8 @@
-"""Stochastic volatility: returns whose log variance is a slow AR(1), with heavy tails.
+"""Stochastic volatility: heavy-tailed returns whose log variance is an AR(1) process.
 
     python models/programs/stochastic_volatility.py
 
-h_t = m + r (h_{t-1} - m) + N(0, s^2),  y_t = exp(h_t / 2) e_t,  e_t Student with 8 degrees of freedom.
+h_t = m + r (h_{t-1} - m) + N(0, s^2),  y_t = exp(h_t / 2) e_t,  e_t is Student's t with 8 degrees of freedom.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ def model(previous, y):
     else:
         h = sample("h", Normal(M + R * (previous["h"] - M), S))
     observe("y", Student(DF, 0.0, np.exp(h / 2)), y)
-    return {"volatility": np.exp(h / 2)}  # kept beside the sites
+    return {"volatility": np.exp(h / 2)}  # stored in the particles beside the sites
 
 
 def simulate(T: int, seed: int = 0) -> tuple[np.ndarray, list[float]]:
-    """Volatilities (T,) and returns."""
+    """Simulate T steps; returns the volatilities (T,) and the returns."""
     rng = np.random.default_rng(seed)
     h = [rng.normal(M, S / np.sqrt(1 - R**2))]
     for _ in range(T - 1):
@@ -35,7 +35,7 @@ def simulate(T: int, seed: int = 0) -> tuple[np.ndarray, list[float]]:
 
 
 def filters(n: int) -> dict:
-    """From the one program."""
+    """The filters of the program with `n` particles, by name."""
     program = Program(model)
     return {
         "bootstrap": program.bootstrap(n),
@@ -53,4 +53,4 @@ if __name__ == "__main__":
             errors.append(population.weights @ population.particles["volatility"] - truth[info.t])
         rmse = np.sqrt(np.mean(np.square(errors)))
         print(f"{name:14s} log evidence {state.log_evidence:9.3f}  volatility RMSE {rmse:.3f}")
-    print(f"{'always the mean':14s} RMSE {truth.std():.3f}")
+    print(f"{'constant mean':14s} RMSE {truth.std():.3f}")

@@ -77,12 +77,12 @@ def _check_positive(what: str, value: Any) -> None:
 def _sum_rows(log_prob: Any) -> np.ndarray:
     """Sum over all axes but the first: the entries of a row are independent."""
     out = np.asarray(log_prob)
-    return out if out.ndim <= 1 else out.reshape(len(out), -1).sum(axis=1)
+    return out if out.ndim <= 1 else out.reshape(len(out), math.prod(out.shape[1:])).sum(axis=1)
 
 
 def _standardised(value: Any, loc: Any, scale: Any) -> np.ndarray:
     """(value - loc) / scale with one temporary array."""
-    z = np.asarray(np.subtract(value, loc), dtype=np.float64)
+    z = np.asarray(np.subtract(np.asarray(value), loc), dtype=np.float64)
     fits = isinstance(scale, float) or np.broadcast_shapes(z.shape, np.shape(scale)) == z.shape
     return np.divide(z, scale, out=z if z.ndim and fits else None)
 
@@ -215,9 +215,10 @@ class MultivariateNormal(Distribution):
             root = np.linalg.cholesky(np.asarray(self.cov, dtype=np.float64))
         except np.linalg.LinAlgError:
             raise InputError(f"covariance is not positive definite: {np.asarray(self.cov).tolist()}"[:300]) from None
-        if _broadcast_shape(self.loc, root[..., 0])[-1:] != root.shape[-1:]:
+        loc = np.shape(self.loc)
+        if loc and loc[-1] != root.shape[-1] and (len(loc), loc[-1]) != (2, 1):
             raise InputError(
-                f"mean of shape {np.shape(self.loc)} does not fit a covariance of shape {root.shape}",
+                f"mean of shape {loc} does not fit a covariance of shape {root.shape}",
                 "the mean is (d,), or (n, d) with one row per particle; x[:, None] makes (n, 1) of (n,)",
             )
         object.__setattr__(self, "_root", root)
@@ -286,6 +287,10 @@ class Bernoulli(_Independent):
 
     p: Any
     discrete = True
+
+    def __post_init__(self) -> None:
+        if isinstance(self.p, (int, float)) and not 0 <= self.p <= 1:
+            raise InputError(f"probability of a Bernoulli is {self.p}, expected a number from 0 to 1")
 
     def sample(self, rng: np.random.Generator, size: int) -> np.ndarray:
         return rng.random(self.value_shape(size)) < self.p
@@ -393,13 +398,7 @@ def as_distribution(value: Any) -> Distribution:
 
 @dataclass(frozen=True, eq=False)
 class FromScipy(Distribution):
-    """A frozen distribution of scipy.stats, uni- or multivariate, or one of its new style (``stats.Normal``).
-
-    Parameters
-    ----------
-    wrapped : object
-        The distribution; array parameters have one row per particle.
-    """
+    """A frozen distribution of scipy.stats, uni- or multivariate, or one of its new style (``stats.Normal``)."""
 
     wrapped: Any
 
@@ -413,6 +412,8 @@ class FromScipy(Distribution):
     def _shape(self) -> tuple[int, ...]:
         if hasattr(self.wrapped, "args"):  # the mean would be slow
             return _broadcast_shape(*self.wrapped.args, *self.wrapped.kwds.values())
+        if self.__dict__["_vector"] and not hasattr(self.wrapped, "mean"):
+            return (1, *(np.shape(self.wrapped.rvs(2, random_state=0))[1:] or (1,)))
         return np.shape(self.mean)
 
     def sample(self, rng: np.random.Generator, size: int) -> np.ndarray:
@@ -425,8 +426,8 @@ class FromScipy(Distribution):
         return np.reshape(wrapped.sample(() if rows else (size,), rng=rng), shape)
 
     def log_prob(self, value: Any) -> np.ndarray:
-        if "dirichlet_frozen" in type(self.wrapped).__name__ and np.ndim(value) == 2:
-            value = np.transpose(value)  # one column per particle
+        if type(self.wrapped).__name__ in _PARTICLES_LAST and np.ndim(value) == len(self._shape):
+            value = np.moveaxis(value, 0, -1)
         log_prob = self.wrapped.logpmf(value) if self.discrete else self.wrapped.logpdf(value)
         return np.asarray(log_prob) if self.__dict__["_vector"] else _sum_rows(log_prob)
 
@@ -449,6 +450,7 @@ class FromScipy(Distribution):
         return self.mean if self.__dict__["_vector"] or not self.discrete else np.asarray(self.wrapped.median())
 
 
+_PARTICLES_LAST = ("dirichlet_frozen", "wishart_frozen", "invwishart_frozen")
 _OURS_FOR_TORCH: dict[str, tuple[Any, str | None]] = {
     "Categorical": (Categorical, "probs"),
     "Bernoulli": (Bernoulli, "probs"),
@@ -458,13 +460,7 @@ _OURS_FOR_TORCH: dict[str, tuple[Any, str | None]] = {
 
 @dataclass(frozen=True, eq=False)
 class FromTorch(Distribution):
-    """A continuous distribution of torch, drawn as ``icdf(u)`` in double precision.
-
-    Parameters
-    ----------
-    wrapped : torch.distributions.Distribution
-        Parameters have one row per particle, or no rows.
-    """
+    """A continuous distribution of torch, drawn as ``icdf(u)`` in double precision."""
 
     wrapped: Any
 

@@ -121,6 +121,8 @@ def test_rows():
         (as_distribution(stats.multivariate_normal(0.0, 1.0)), (1,), (1,)),
         (as_distribution(stats.multinomial(4, [0.5, 0.2, 0.3])), (1,), (3,)),
         (as_distribution(stats.dirichlet([1.0, 2.0])), (1,), (2,)),
+        (as_distribution(stats.wishart(4, COV)), (1,), (2, 2)),
+        (as_distribution(stats.multivariate_t([0.0, 1.0], COV, df=5)), (1,), (2,)),
     ],
     ids=lambda value: type(value).__name__ if not isinstance(value, tuple) else str(value),
 )
@@ -140,6 +142,10 @@ def test_shapes_of_batch_and_event(distribution, batch, event):
 def test_parameters_that_do_not_fit_together():
     with pytest.raises(InputError, match=r"shapes \(4, 2\) and \(4,\) do not fit together"):
         Normal(np.zeros((4, 2)), np.ones(4)).sample(np.random.default_rng(0), 4)
+    with pytest.raises(InputError, match="probability of a Bernoulli is 1.5"):
+        Bernoulli(1.5)
+    with pytest.raises(InputError, match=r"mean of shape \(1,\) does not fit a covariance of shape \(2, 2\)"):
+        MultivariateNormal([0.0], COV)
     with pytest.raises(InputError, match=r"mean of shape \(4,\) does not fit a covariance of shape \(1, 1\)"):
         MultivariateNormal(np.zeros(4), [[1.0]])
 

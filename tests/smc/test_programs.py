@@ -301,6 +301,7 @@ def changed(x):
     x += 1.0
 
 
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
 @pytest.mark.parametrize(
     ("statement", "y", "expected"),
     [
@@ -357,6 +358,11 @@ def changed(x):
             0.5,
             r"returned 's' of shape \(3,\), expected one row per particle",
         ),
+        (
+            lambda x, z, v, k, y: observe("o", MultivariateNormal(x, np.eye(4)), np.zeros(4)),
+            0.5,
+            r"'o': an error with one particle, and none with 4: mean of shape \(1,\) does not fit .* \(4, 4\)",
+        ),
         # names
         (lambda x, z, v, k, y: {"x": x + 3}, 0.5, "returned 'x' with other values than site 'x'.*under another name"),
         (lambda x, z, v, k, y: sample("x", Normal()), 0.5, "site 'x': sampled twice"),
@@ -388,6 +394,11 @@ def changed(x):
             "the program fails .site 's', line .* ValueError: lam < 0",
         ),
         (lambda x, z, v, k, y: observe("o", Normal(0, -z), y), 0.5, "observation 'o': log density is nan for 4 of 4"),
+        (
+            lambda x, z, v, k, y: observe("o", Normal(x, -1), y),
+            0.5,
+            r"scale of a Normal is -1,.*after site 'k', line \d+",
+        ),
         (lambda x, z, v, k, y: observe("o", Normal(x, 1), y), np.nan, "'o': log density is nan.*missing is None"),
         (lambda x, z, v, k, y: observe("o", Normal(x, 1), y), "a", "the program fails .observation 'o'"),
     ],
@@ -551,6 +562,49 @@ def guide_of(extra=None, x=Normal(), k=Categorical([0.2, 0.2, 0.6]), branches=(F
         observe("y", Normal(), 0.5)
 
 
+def test_all_distributions_in_a_branch_without_particles():
+    """By every filter; the branch does not change the evidence."""
+
+    def model(previous, y):
+        x = sample("x", Normal(np.zeros(1), 1.0))
+
+        def empty(x):
+            sample("a", Categorical(np.ones((len(x), 3))))
+            sample("b", Poisson(np.exp(x)))
+            sample("c", Bernoulli(0.5))
+            sample("d", MultivariateNormal(np.stack([x, x], axis=1), np.eye(2)))
+            sample("e", stats.multivariate_normal([0.0, 0.0], np.eye(2)))
+            sample("f", stats.norm(x, 1.0))
+            sample("g", Normal(np.zeros((1, 3)), 1.0))
+            observe("y", Categorical(np.ones((len(x), 3))), 1)
+            observe("z", MultivariateNormal(np.stack([x, x], axis=1), np.eye(2)), [0.1, 0.2])
+
+        switch("s", [0.0, 1.0], [empty, lambda x: observe("y", Normal(x, 1.0), y)], x)
+
+    def guide(previous, y):
+        x = sample("x", Normal(np.full(1, y), 1.0))
+        sample("d", Normal(np.zeros((1, 2)), 1.0))
+
+        def rest():
+            for name, distribution in zip("abcefg", others, strict=True):
+                sample(name, distribution)
+
+        pair, triple = Normal(np.zeros((1, 2)), 1.0), Normal(np.zeros((1, 3)), 1.0)
+        others = [Categorical(np.ones(3)), Poisson(1.0), Bernoulli(0.5), pair, Normal(), triple]
+        switch("s", [0.5, 0.5], [rest, lambda: None])
+        assert len(x)
+
+    for make in (
+        lambda p: p.bootstrap(30),
+        lambda p: p.guided(guide, 30),
+        lambda p: p.auxiliary(30),
+        lambda p: p.resample_move(30, trigger=Always()),
+    ):
+        state, _ = make(Program(model)).run([0.3, -0.2], 0)
+        assert state.log_evidence == pytest.approx(stats.norm(0, np.sqrt(2)).logpdf([0.3, -0.2]).sum(), abs=0.8)
+        assert np.isnan(state.population.particles["d"][state.population.weights > 0]).all()
+
+
 def test_a_guide_may_draw_outside_of_branches_or_in_more():
     """The model uses the draws of the particles that reach the site; the others integrate to one."""
 
@@ -641,6 +695,7 @@ def test_an_observation_of_one_particle_compares_shapes():
 
     assert r"observation 'y': the value has shape (), expected (2,)" in errors_of(of(lambda x: Normal(x, 1.0)))
     assert "expected (2,)" in errors_of(of(lambda x: Normal(x[None], 1.0)))
+    assert "observation 'y': log density is nan" in errors_of(of(lambda x: Normal(x, 1.0)), y=[np.nan, 0.0])
     state, _ = Program(of(lambda x: Normal(x, 1.0))).bootstrap(3).run([[0.1, 0.2]], 0)
     particles = state.population.particles
     expected = [stats.norm(p["x"], 1.0).logpdf([0.1, 0.2]).sum() for p in particles]
@@ -669,6 +724,18 @@ def test_the_mean_states_the_event_shape():
     assert "site 'x': parameters of shape (2,) do not fit 4 particles" in text and "(1, d)" in text
     text = errors_of(lambda previous, y: {"x": sample("x", Number())})
     assert "site 'x': values have shape (4, 2), expected (4,) by the Number" in text
+
+
+def test_errors_of_the_user_keep_their_type():
+    class Stop(ValueError):
+        pass
+
+    def model(previous, y):
+        sample("x", Normal())
+        raise Stop
+
+    with pytest.raises(Stop):
+        Program(model).bootstrap(4).run([0.1], 0)
 
 
 def test_errors_outside_of_steps():

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import traceback
 from collections.abc import Callable, Mapping
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -310,9 +309,10 @@ def _run_once(
     try:
         _call(function, run, previous, observation)
     except (TypeError, ValueError, LookupError, AttributeError, ArithmeticError) as error:
-        if isinstance(error, InputError) and not run.inside:
+        explained = _explained(error, run, previous)
+        if explained is error:
             raise
-        raise _explained(error, run, previous) from error
+        raise explained from error
     if isinstance(handler, GuideHandler):
         handler.values = dict(run.values)
     if isinstance(handler, ReplayHandler):
@@ -352,9 +352,16 @@ def _check_shapes(function: Callable[[Any, Any], Any], run: ProgramRun, previous
     if key in passed:
         return
     alone = ProgramRun(SampleHandler(np.random.default_rng(0)), 1)
-    with suppress(Exception):  # calls that it does not reach are not compared
+    raised = ""
+    try:
         _call(function, alone, None if previous is None else take(previous, np.zeros(1, dtype=int)), observation)
+    except InputError as error:
+        raised = error.message
+    except Exception:
+        pass
     for k, found in ambiguous.items():
+        if raised and k == alone.n_calls + 1:
+            raise InputError(f"{found.what}: an error with one particle, and none with {found.size}: {raised}")
         one = alone.shapes.get(k, found._replace(event=(), value=found.value and ()))
         if k <= alone.n_calls and not (found.event == one.event and (one.value is None or one.fits)):
             raise found.error(f"{found.what}: ")
@@ -396,15 +403,19 @@ _RAW_ERRORS = {
 }
 
 
-def _explained(error: Exception, run: ProgramRun, previous: Any) -> InputError:
-    """The error of a program, with its place and a hint."""
-    if isinstance(error, InputError):
-        return type(error)(f"{run.what}: {error.message}", *error.hints)
+def _explained(error: Exception, run: ProgramRun, previous: Any) -> Exception:
+    """The error of a program with its place and a hint; the same error if it is not one of Python, numpy or scipy."""
     frames = [f for f in traceback.extract_tb(error.__traceback__) if not f.filename.startswith(_HERE)]
     place = run.what if run.inside else f"after {run.what}" if run.what else "before its first site"
     if frames:
         own = [frame for frame in frames if frame.filename == frames[0].filename][-1]
         place += f", line {own.lineno}" + f" `{own.line}`" * bool(own.line)
+    if isinstance(error, InputError):
+        if run.inside:
+            return type(error)(f"{run.what}: {error.message}", *error.hints)
+        return type(error)(f"{error.message} ({place})", *error.hints) if frames else error
+    if type(error).__module__.split(".")[0] not in ("builtins", "numpy", "scipy"):
+        return error
     if isinstance(error, KeyError) and isinstance(previous, Mapping) and error.args and error.args[0] not in previous:
         return InputError(
             f"previous has no {error.args[0]!r} ({place})",

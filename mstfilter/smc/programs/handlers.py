@@ -54,7 +54,7 @@ class SiteHandler(ABC):
     draws : bool
         Whether the values are new, and not given.
     strict : bool
-        Whether a log density of NaN or +inf is an error.
+        Whether a log density of NaN or +inf is an error. It is for single particles that are drawn.
     """
 
     observes = True

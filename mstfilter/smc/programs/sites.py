@@ -344,7 +344,8 @@ class ProgramRun:
             log_prob = log_prob.sum()
         elif log_prob.shape not in ((size,), (), (1,)):
             raise InputError(f"log_prob has shape {log_prob.shape}, expected one number per particle, ({size},)")
-        if self.handler.strict and size and not log_prob.max() < np.inf:
+        strict = self.handler.draws if self.single else self.handler.strict
+        if strict and size and not log_prob.max() < np.inf:
             wrong = np.flatnonzero(~(np.atleast_1d(log_prob) < np.inf))
             raise InputError(
                 f"log density is {np.atleast_1d(log_prob)[wrong[0]]} for {len(wrong)} of {size} particles",
