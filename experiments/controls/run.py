@@ -35,7 +35,7 @@ from mstfilter.scene import Clip, Hypothesis, Recording
 from mstfilter.scoring import overlap, weighted_coverage
 from mstfilter.simulation import cached_recording
 from mstfilter.smc import ParticleFilter, Population, State, Transition
-from mstfilter.study import interval
+from mstfilter.statistics import interval
 
 SCENES = [(family, k) for family in ("s1", "s2") for k in range(6)]
 SMALL = {"width": 160, "height": 120, "n_actions": 1, "frames_per_clip": 8, "voxel_size": 0.02}

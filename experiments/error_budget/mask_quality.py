@@ -28,7 +28,8 @@ from mstfilter.scene import Recording
 from mstfilter.scoring import weighted_coverage
 from mstfilter.segmentation import TreeCutProposal
 from mstfilter.simulation import cached_recording
-from mstfilter.study import StudyFolder, Summary, compare
+from mstfilter.statistics import compare
+from mstfilter.study import StudyFolder, Summary
 
 FIGURES = {"quality": "", "quality_weighted": "_weighted"}  # of a study, and what its columns end in
 COLUMNS = (

@@ -28,7 +28,7 @@ from mstfilter.presets import preset
 from mstfilter.scene import Recording, project, read_labels
 from mstfilter.scoring import weighted_coverage
 from mstfilter.smc import ParticleFilter, State
-from mstfilter.study import Difference, adjusted, compare
+from mstfilter.statistics import Difference, adjusted, compare
 
 HERE = Path(__file__).resolve().parent
 SHARED = Path(os.environ.get("MSTFILTER_SHARED", HERE.parents[2] / "shared"))

@@ -15,7 +15,8 @@ from typing import Any
 
 from mstfilter.report.figures import differences_figure, figure_groups, time_figure
 from mstfilter.report.page import fill_template, flatten, seconds_text, short_text, write_page
-from mstfilter.study import CLAIM, ENDPOINT, SLOPE, StudyFolder, Summary
+from mstfilter.statistics import CLAIM
+from mstfilter.study import ENDPOINT, SLOPE, StudyFolder, Summary
 
 # Columns of the table of results: name in the study, heading.
 _FIGURES = (

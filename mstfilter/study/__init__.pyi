@@ -15,14 +15,6 @@ from mstfilter.study.results import (
     StudyFolder as StudyFolder,
     cost_columns as cost_columns,
 )
-from mstfilter.study.statistics import (
-    CLAIM as CLAIM,
-    Difference as Difference,
-    adjusted as adjusted,
-    compare as compare,
-    conclusion as conclusion,
-    interval as interval,
-)
 from mstfilter.study.study import StudyProgress as StudyProgress, run_study as run_study
 from mstfilter.study.summary import (
     ENDPOINT as ENDPOINT,

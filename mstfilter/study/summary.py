@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from mstfilter.study.statistics import Difference, compare, conclusion, holm, interval, slope
+from mstfilter.statistics import Difference, compare, conclusion, holm, interval, slope
 
 ENDPOINT = "quality"
 SLOPE = "quality_slope"  # change of quality from pause to pause, t = 0 included

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mstfilter.study.statistics import compare
+from mstfilter.statistics import compare
 from mstfilter.study.summary import summarise
 
 

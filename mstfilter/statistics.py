@@ -1,24 +1,31 @@
-"""Differences between arms, paired by scene, and the conclusions that they allow.
+"""Paired differences between arms, and the conclusions that they allow.
 
->>> difference = compare({"a": 0.9, "b": 0.8, "c": 0.8}, {"a": 0.7, "b": 0.7, "c": 0.6})
+>>> difference = compare([0.9, 0.8, 0.8], [0.7, 0.7, 0.6])
 >>> round(difference.mean, 3), difference.n
 (0.167, 3)
+>>> table = {"ours": [0.9, 0.8, 0.8], "theirs": [0.7, 0.7, 0.6], "floor": [0.1, 0.2, 0.1]}
+>>> [(arm, round(d.p_holm, 2)) for arm, d in compare_arms(table, reference="ours").items()]
+[('theirs', 0.5), ('floor', 0.5)]
 
-The unit is the scene: values of filter seeds on one scene are averaged first. A difference has a t interval, a
-studentised bootstrap interval, and the p value of a sign-flip test, which assumes that the differences are symmetric
-about zero under the null hypothesis. p values of one table are adjusted by Holm's method.
+Values are paired by unit: a scene, a data set, or a seed that all arms share. Units must be independent, so values of
+several filter seeds on one scene are averaged first. A difference has a t interval, a studentised bootstrap interval,
+and the p value of a sign-flip test, which assumes that the differences are symmetric about zero under the null
+hypothesis. p values of one table are adjusted by Holm's method.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
+from mstfilter.errors import InputError
+
 LEVEL = 0.95
-CLAIM = 20  # fewest scenes for a claim
-EXACT = 12  # most scenes for which all sign flips are enumerated
+CLAIM = 20  # fewest units for a claim
+EXACT = 12  # most units for which all sign flips are enumerated
 N_FLIPS = 9999
 N_BOOTSTRAP = 4999
 
@@ -31,13 +38,13 @@ class Difference:
     ----------
     mean : float
     low, high : float
-        t interval; NaN for one scene.
+        t interval; NaN for one unit.
     low_bootstrap, high_bootstrap : float
-        Studentised bootstrap interval; NaN for fewer than five scenes.
+        Studentised bootstrap interval; NaN for fewer than five units.
     p : float
-        Two-sided p value of the sign-flip test; NaN for one scene.
+        Two-sided p value of the sign-flip test; NaN for one unit.
     n : int
-        Number of scenes that both arms have.
+        Number of units that both arms have.
     p_holm : float
         p value adjusted for all comparisons of the table; equals `p` for a single comparison.
     """
@@ -52,16 +59,35 @@ class Difference:
     p_holm: float = float("nan")
 
 
-def compare(first: Mapping[str, float], second: Mapping[str, float]) -> Difference:
-    """First minus second over the scenes that both have.
+#: Unit -> value, or one value per unit in the order that all arms share.
+Values = Mapping[Any, float] | Sequence[float] | np.ndarray
+
+
+def compare(first: Values, second: Values) -> Difference:
+    """First minus second over the units that both have.
 
     Parameters
     ----------
-    first, second : mapping
-        Scene -> value. Scenes without a finite value are left out.
+    first, second : mapping, or (n,) array_like
+        Unit -> value, or values in the same order of units. Units without a finite value are left out, such as the
+        seeds of lost runs.
+
+    Raises
+    ------
+    InputError
+        If two arrays have different shapes, or are not one-dimensional.
     """
-    scenes = [s for s in first if s in second and np.isfinite(first[s]) and np.isfinite(second[s])]
-    d = np.array([first[s] - second[s] for s in scenes])
+    if isinstance(first, Mapping) and isinstance(second, Mapping):
+        d = np.array([first[unit] - second[unit] for unit in first if unit in second], dtype=np.float64)
+    elif isinstance(first, Mapping) or isinstance(second, Mapping):
+        raise InputError("one arm is a mapping of units to values and the other is not, so they cannot be paired")
+    else:
+        a, b = np.asarray(first, dtype=np.float64), np.asarray(second, dtype=np.float64)
+        if a.ndim != 1 or a.shape != b.shape:
+            raise InputError(f"values have shapes {a.shape} and {b.shape}, expected one number per unit: (n,) twice")
+        with np.errstate(invalid="ignore"):
+            d = a - b
+    d = d[np.isfinite(d)]
     if len(d) == 0:
         nan = float("nan")
         return Difference(nan, nan, nan, nan, nan, nan, 0)
@@ -141,6 +167,27 @@ def adjusted(differences: Sequence[Difference]) -> list[Difference]:
     return [replace(d, p_holm=float(p)) for d, p in zip(differences, holm([d.p for d in differences]), strict=True)]
 
 
+def compare_arms(table: Mapping[str, Values], reference: str) -> dict[str, Difference]:
+    """Every arm minus the reference, with p values adjusted together.
+
+    Parameters
+    ----------
+    table : mapping
+        Arm -> values, as for `compare`.
+    reference : str
+        The arm that the others are compared with.
+
+    Returns
+    -------
+    dict
+        Arm -> Difference; the reference is left out.
+    """
+    if reference not in table:
+        raise InputError(f"there is no arm {reference!r}", f"there are: {', '.join(table) or 'no arms'}")
+    others = [arm for arm in table if arm != reference]
+    return dict(zip(others, adjusted([compare(table[arm], table[reference]) for arm in others]), strict=True))
+
+
 def slope(times: np.ndarray, values: np.ndarray) -> float:
     """Least-squares slope of values over times; NaN for fewer than two."""
     times, values = np.asarray(times, dtype=float), np.asarray(values, dtype=float)
@@ -150,11 +197,11 @@ def slope(times: np.ndarray, values: np.ndarray) -> float:
     return float(centred @ values / (centred @ centred))
 
 
-def conclusion(difference: Difference, first: str, second: str, where: str = "") -> str:
-    """The conclusion that a difference allows, as a sentence."""
+def conclusion(difference: Difference, first: str, second: str, where: str = "", unit: str = "scene") -> str:
+    """The conclusion that a difference allows, as a sentence; `unit` names what the values are paired by."""
     d, at = difference, f" on {where}" if where else ""
     if d.n == 0:
-        return f"{first} and {second}{at}: no scene has both."
+        return f"{first} and {second}{at}: no {unit} has both."
     if d.n < 2:
         return f"{first} and {second}{at}: no difference can be claimed at n = 1."
     found = f"{d.mean:+.3f}, 95 % interval {d.low:+.3f} to {d.high:+.3f}, p {d.p_holm:.2g} after Holm, n = {d.n}"
@@ -162,7 +209,7 @@ def conclusion(difference: Difference, first: str, second: str, where: str = "")
         return f"{first} and {second}{at}: no difference can be claimed at n = {d.n} ({found})."
     word = "above" if d.mean > 0 else "below"
     if d.n < CLAIM:
-        return f"{first} is {word} {second}{at} ({found}): a first look, no claim below {CLAIM} scenes."
+        return f"{first} is {word} {second}{at} ({found}): a first look, no claim below {CLAIM} {unit}s."
     if not d.p_holm < 1 - LEVEL:
         return f"{first} is {word} {second}{at} by its interval, but not after adjustment ({found}): no claim."
     return f"{first} is {word} {second}{at} ({found})."

@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from mstfilter.study.statistics import (
+from mstfilter.errors import InputError
+from mstfilter.statistics import (
     Difference,
     adjusted,
     compare,
+    compare_arms,
     conclusion,
     holm,
     interval,
@@ -126,3 +128,29 @@ def test_words_claim_no_more_than_they_may():
     assert conclusion(d, "a", "b").startswith("a is below b (") and "claim" not in conclusion(d, "a", "b")
     assert "n = 1" in conclusion(compare({"x": 1.0}, {"x": 2.0}), "a", "b")
     assert adjusted([d, d])[0].p_holm == pytest.approx(0.002)
+
+
+def test_a_table_of_any_units_is_compared_with_a_reference():
+    """Arrays in one order of units, or mappings; lost units are left out; p values are adjusted over the table."""
+    rng = np.random.default_rng(2)
+    table = {arm: rng.normal(shift, 1.0, 9) for arm, shift in (("base", 0.0), ("same", 0.0), ("better", 3.0))}
+    table["same"][4] = -np.inf
+    found = compare_arms(table, "base")
+    named = {arm: dict(zip("abcdefghi", values, strict=True)) for arm, values in table.items()}
+    assert found == compare_arms(named, "base")
+    d = np.delete(table["same"] - table["base"], 4)
+    expected = scipy.stats.ttest_1samp(d, 0).confidence_interval(0.95)
+    assert (found["same"].n, found["same"].mean) == (8, pytest.approx(d.mean()))
+    assert (found["same"].low, found["same"].high) == pytest.approx(tuple(expected))
+    assert [found[arm].p_holm for arm in ("same", "better")] == pytest.approx(
+        holm([sign_flip(d), sign_flip(table["better"] - table["base"])])
+    )
+    assert "no claim below 20 seeds" in conclusion(found["better"], "better", "base", unit="seed")
+    for wrong, message in (
+        ({"base": [1.0], "b": [1.0, 2.0]}, r"shapes \(2,\) and \(1,\)"),
+        ({"base": [[1.0]], "b": [[1.0]]}, "one number per unit"),
+        ({"base": [1.0], "b": {"x": 1.0}}, "cannot be paired"),
+        ({"b": [1.0]}, "no arm 'base'"),
+    ):
+        with pytest.raises(InputError, match=message):
+            compare_arms(wrong, "base")
