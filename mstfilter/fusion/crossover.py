@@ -39,15 +39,11 @@ _CHUNK = 2**19  # number of window cells processed together, so that they fit in
 
 
 class ConflictResolution(NamedTuple):
-    """One resolution of all conflicts of a conflict graph.
+    """One resolution of all conflicts of a conflict graph."""
 
-    Attributes
-    ----------
-    order : vertices in painting order, first to last.
-    group : for each vertex, the vertex of its merge group that is painted last; -1 if the object is dropped.
-    """
-
+    #: Vertices in painting order, first to last.
     order: list[int]
+    #: For each vertex, the vertex of its merge group that is painted last; -1 if the object is dropped.
     group: np.ndarray
 
 

@@ -4,14 +4,15 @@
 >>> state, infos = filter.run(observations, seed=0)
 >>> state.population.weights, state.log_evidence
 
-A step selects, predicts, proposes, fuses and selects (y is the observation):
+A step selects, predicts, proposes, fuses and selects (y is the observation)::
 
     past      = resampler.resample(previous, n)          only with resample="before", the textbook order
     predicted = transition.predict(past, y)
     proposed  = proposal.sample(y, n_proposed)
     fused     = update.update(predicted, proposed, y)
-    next      = resampler.resample(fused, n)             with resample="after", the order of MST; with "before"
-                                                         only if there are more than n particles
+    next      = resampler.resample(fused, n)             with resample="after", the order of MST
+
+With "before", a step that ends with more than n particles resamples them too.
 
 `ParticleFilter.step` has one line for each of these; `_Step` has one method for each. Textbook filters have no
 `proposal`; MST (Price, Huang, Berenson 2021) has all four components. Guided filters have a transition that weights

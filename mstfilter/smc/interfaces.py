@@ -267,7 +267,7 @@ class Distribution(ABC):
 
     @abstractmethod
     def sample(self, rng: np.random.Generator, size: int) -> np.ndarray:
-        """Values (size, *event_shape) of `size` particles."""
+        """Values ``(size, *event_shape)`` of `size` particles."""
 
     @abstractmethod
     def log_prob(self, value: Any) -> np.ndarray:

@@ -30,7 +30,7 @@ def sample(name: str, distribution: Any) -> Any:
 
     Returns
     -------
-    ndarray (n, *event_shape)
+    ndarray ``(n, *event_shape)``
         One row per particle, read-only; a number or array without that axis in a `per_particle` program.
     """
     return _current().sample(name, distribution)
@@ -46,7 +46,8 @@ def observe(name: str, distribution: Any, value: Any) -> None:
     distribution : Distribution
         Of the observation given the particle.
     value : array_like or None
-        The observation, of the event shape of the distribution. Or a value for each particle, (n, *event_shape), that
+        The observation, of the event shape of the distribution. Or a value for each particle, ``(n, *event_shape)``,
+        that
         depends on the particle, such as the reading that it assigns to an object.
     """
     _current().observe(name, distribution, value)
