@@ -39,6 +39,17 @@ from mstfilter.smc.diverse_resampling import (
     GreedyDiverse as GreedyDiverse,
     KDpp as KDpp,
 )
+from mstfilter.smc.exact import (
+    ConditionallyLinear as ConditionallyLinear,
+    Kalman as Kalman,
+    Linear as Linear,
+    Marginals as Marginals,
+    forward_backward as forward_backward,
+    hidden_markov as hidden_markov,
+    kalman_filter as kalman_filter,
+    linear_gaussian as linear_gaussian,
+    rao_blackwellised as rao_blackwellised,
+)
 from mstfilter.smc.filter import ParticleFilter as ParticleFilter
 from mstfilter.smc.interfaces import (
     Codec as Codec,
@@ -57,12 +68,6 @@ from mstfilter.smc.interfaces import (
     Trigger as Trigger,
     Update as Update,
     WeightResampler as WeightResampler,
-)
-from mstfilter.smc.kalman import (
-    ConditionallyLinear as ConditionallyLinear,
-    Linear as Linear,
-    linear_gaussian as linear_gaussian,
-    rao_blackwellised as rao_blackwellised,
 )
 from mstfilter.smc.population import (
     Candidates as Candidates,
