@@ -35,7 +35,7 @@ class _Independent(Distribution):
     """Independent entries. The fields are the parameters: (), (n,), (1, d) or (n, d)."""
 
     @property
-    def _shape(self) -> tuple[int, ...]:
+    def parameter_shape(self) -> tuple[int, ...]:
         return _broadcast_shape(*vars(self).values())
 
     @abstractmethod
@@ -44,18 +44,18 @@ class _Independent(Distribution):
 
     @property
     def mean(self) -> np.ndarray:
-        return np.broadcast_to(np.asarray(self._moments()[0], np.float64), self._shape)
+        return np.broadcast_to(np.asarray(self._moments()[0], np.float64), self.parameter_shape)
 
     @property
     def sd(self) -> np.ndarray:
-        return np.broadcast_to(np.asarray(self._moments()[1], np.float64), self._shape)
+        return np.broadcast_to(np.asarray(self._moments()[1], np.float64), self.parameter_shape)
 
 
 def _broadcast_shape(*parameters: Any) -> tuple[int, ...]:
     shape: tuple[int, ...] = ()
     for parameter in parameters:
         other = () if isinstance(parameter, float) else np.shape(parameter)
-        if not shape or other in ((), shape):  # the usual case
+        if not shape or not other or other == shape:  # the usual case
             shape = shape or other
             continue
         try:
@@ -224,7 +224,7 @@ class MultivariateNormal(Distribution):
         object.__setattr__(self, "_root", root)
 
     @property
-    def _shape(self) -> tuple[int, ...]:
+    def parameter_shape(self) -> tuple[int, ...]:
         return _broadcast_shape(np.zeros((1, 1)), self.loc, self.__dict__["_root"][..., 0])
 
     def sample(self, rng: np.random.Generator, size: int) -> np.ndarray:
@@ -247,12 +247,12 @@ class MultivariateNormal(Distribution):
 
     @property
     def mean(self) -> np.ndarray:
-        return np.broadcast_to(np.asarray(self.loc, np.float64), self._shape)
+        return np.broadcast_to(np.asarray(self.loc, np.float64), self.parameter_shape)
 
     @property
     def sd(self) -> np.ndarray:
         root = self.__dict__["_root"]
-        return np.broadcast_to(np.sqrt((root * root).sum(axis=-1)), self._shape)
+        return np.broadcast_to(np.sqrt((root * root).sum(axis=-1)), self.parameter_shape)
 
 
 @dataclass(frozen=True, eq=False)
@@ -333,7 +333,7 @@ class Categorical(Distribution):
         object.__setattr__(self, "probs", p / total)
 
     @property
-    def _shape(self) -> tuple[int, ...]:
+    def parameter_shape(self) -> tuple[int, ...]:
         return self.probs.shape[:-1]
 
     def sample(self, rng: np.random.Generator, size: int) -> np.ndarray:
@@ -409,7 +409,7 @@ class FromScipy(Distribution):
         object.__setattr__(self, "_vector", kind.__module__.endswith("_multivariate"))
 
     @property
-    def _shape(self) -> tuple[int, ...]:
+    def parameter_shape(self) -> tuple[int, ...]:
         if hasattr(self.wrapped, "args"):  # the mean would be slow
             return _broadcast_shape(*self.wrapped.args, *self.wrapped.kwds.values())
         if self.__dict__["_vector"] and not hasattr(self.wrapped, "mean"):
@@ -426,7 +426,7 @@ class FromScipy(Distribution):
         return np.reshape(wrapped.sample(() if rows else (size,), rng=rng), shape)
 
     def log_prob(self, value: Any) -> np.ndarray:
-        if type(self.wrapped).__name__ in _PARTICLES_LAST and np.ndim(value) == len(self._shape):
+        if type(self.wrapped).__name__ in _PARTICLES_LAST and np.ndim(value) == len(self.parameter_shape):
             value = np.moveaxis(value, 0, -1)
         log_prob = self.wrapped.logpmf(value) if self.discrete else self.wrapped.logpdf(value)
         return np.asarray(log_prob) if self.__dict__["_vector"] else _sum_rows(log_prob)
@@ -465,7 +465,7 @@ class FromTorch(Distribution):
     wrapped: Any
 
     @property
-    def _shape(self) -> tuple[int, ...]:
+    def parameter_shape(self) -> tuple[int, ...]:
         return (*(self.wrapped.batch_shape or (self.wrapped.event_shape and (1,))), *self.wrapped.event_shape)
 
     def sample(self, rng: np.random.Generator, size: int) -> np.ndarray:
@@ -489,8 +489,8 @@ class FromTorch(Distribution):
 
     @property
     def mean(self) -> np.ndarray:
-        return np.reshape(self.wrapped.mean, self._shape)
+        return np.reshape(self.wrapped.mean, self.parameter_shape)
 
     @property
     def sd(self) -> np.ndarray:
-        return np.reshape(self.wrapped.stddev, self._shape)
+        return np.reshape(self.wrapped.stddev, self.parameter_shape)

@@ -242,26 +242,28 @@ class Distribution(ABC):
     discrete = False
 
     @property
-    def _shape(self) -> tuple[int, ...]:
+    def parameter_shape(self) -> tuple[int, ...]:
+        """(n, *event_shape), (1, *event_shape), or () for a number whose parameters all particles share."""
         return np.shape(self.mean)
 
     @property
     def batch_shape(self) -> tuple[int, ...]:
         """(n,) if the parameters have one row per particle; () or (1,) if all particles share them."""
-        return self._shape[:1]
+        return self.parameter_shape[:1]
 
     @property
     def event_shape(self) -> tuple[int, ...]:
         """Shape of the value of one particle."""
-        return self._shape[1:]
+        return self.parameter_shape[1:]
 
     def value_shape(self, size: int) -> tuple[int, ...]:
         """Shape ``(size, *event_shape)`` of the values of `size` particles; InputError if the rows do not fit."""
-        shape = self._shape
+        shape = self.parameter_shape
         if shape and shape[0] not in (1, size):
             raise InputError(
                 f"parameters of shape {shape} do not fit {size} particles",
                 f"give one row per particle, ({size}, ...), or write a vector shared by all as (1, d)",
+                "a branch of a program has the particles whose rows it receives as arguments of switch",
             )
         return (size, *shape[1:])
 
@@ -276,7 +278,7 @@ class Distribution(ABC):
     @property
     @abstractmethod
     def mean(self) -> np.ndarray:
-        """Expected value. Its shape is that of the batch and of the event: (), (n,), (1, d) or (n, d)."""
+        """Expected value, of the shape of the parameters: (), (n,), (1, d) or (n, d)."""
 
     @property
     @abstractmethod

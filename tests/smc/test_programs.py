@@ -522,12 +522,12 @@ def test_a_site_in_branches_of_two_switches():
         (lambda previous, y: guide_of(observes=True), "observation 'y': a guide does not observe"),
         (
             lambda previous, y: guide_of(k=Normal()),
-            "site 'k': the guide draws a continuous Normal .* a discrete Categorical",
+            "site 'k': the guide draws from a continuous Normal, the model from a discrete Cat",
         ),
-        (lambda previous, y: guide_of(x=Poisson(2.0)), "site 'x': the guide draws a discrete Poisson"),
+        (lambda previous, y: guide_of(x=Poisson(2.0)), "site 'x': the guide draws from a discrete Poisson"),
         (
             lambda previous, y: guide_of(x=Normal(np.zeros((1, 2)))),
-            r"site 'x': the guide draws .* event shape \(2,\)",
+            r"site 'x': the values of the guide have shape \(30, 2\), expected \(30,\)",
         ),
         (
             lambda previous, y: guide_of(k=Categorical([0.5, 0.5])),
@@ -723,7 +723,7 @@ def test_the_mean_states_the_event_shape():
     text = errors_of(lambda previous, y: {"x": sample("x", Wrong())})
     assert "site 'x': parameters of shape (2,) do not fit 4 particles" in text and "(1, d)" in text
     text = errors_of(lambda previous, y: {"x": sample("x", Number())})
-    assert "site 'x': values have shape (4, 2), expected (4,) by the Number" in text
+    assert "site 'x': its draws have shape (4, 2), expected (4,) by the Number" in text
 
 
 def test_errors_of_the_user_keep_their_type():

@@ -321,7 +321,7 @@ def _run_once(
             raise InputError(
                 f"the model has no site {unused[0]!r}, which the guide samples", f"it has {sorted(run.values)}"
             )
-    if run.shapes and handler.draws:
+    if run.ambiguous and handler.draws:
         _check_shapes(function, run, previous, observation)
     return run
 
@@ -342,8 +342,6 @@ def _check_shapes(function: Callable[[Any, Any], Any], run: ProgramRun, previous
     made from (n, 1) and (n,) looks like n vectors. Shapes that passed are not checked again.
     """
     ambiguous = {k: shapes for k, shapes in run.shapes.items() if shapes.ambiguous}
-    if not ambiguous:
-        return
     try:
         passed = _PASSED.setdefault(function, set())
         key = (previous is None, np.shape(observation), *(shapes.pattern for shapes in ambiguous.values()))

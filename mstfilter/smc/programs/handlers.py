@@ -126,19 +126,19 @@ class ReplayHandler(SiteHandler):
                 "the guide has no such site",
                 f'add sample("{site.name}", ...) to the guide; it has {sorted(self.guide.values)}',
             )
-        self._compare(site, self.guide.sites[site.name])
         value = self.guide.values[site.name][site.index]
+        self._compare(site, self.guide.sites[site.name])
+        check_shape("the values of the guide", value, site.distribution, site.size)
         return value, site.distribution.log_prob(value) - self.guide.log_q[site.name][site.index]
 
     def _compare(self, site: Site, drawn: list[Site]) -> None:
         """Raise unless the guide draws the values that the model needs."""
-        model = site.distribution
-        for guide in (other.distribution for other in drawn):
-            if (guide.discrete, guide.event_shape) != (model.discrete, model.event_shape):
-                raise InputError(
-                    f"the guide draws a {_described(guide)}, the model a {_described(model)}",
-                    "give both distributions the same kind and event shape",
-                )
+        model, everywhere = site.distribution, False
+        for other in drawn:
+            guide, everywhere = other.distribution, everywhere or other.rows is None
+            if guide.discrete != model.discrete:
+                kinds = [f"{'discrete' if d.discrete else 'continuous'} {type(d).__name__}" for d in (guide, model)]
+                raise InputError(f"the guide draws from a {kinds[0]}, the model from a {kinds[1]}")
             if isinstance(guide, Categorical) and isinstance(model, Categorical):
                 k, needed = guide.probs.shape[-1], model.probs.shape[-1]
                 if k < needed or (site.branch and k != needed):
@@ -147,7 +147,7 @@ class ReplayHandler(SiteHandler):
                         f"{needed}",
                         "give the guide as many; it may give those that the observation excludes a probability of 0",
                     )
-        if any(other.rows is None for other in drawn):
+        if everywhere:
             return
         reached = np.zeros(self.guide.n, dtype=bool)
         for other in drawn:
@@ -163,9 +163,14 @@ class ReplayHandler(SiteHandler):
         return ReplayHandler(self.guide.rows[index])
 
 
-def _described(distribution: Distribution) -> str:
-    kind = "discrete" if distribution.discrete else "continuous"
-    return f"{kind} {type(distribution).__name__} with event shape {distribution.event_shape}"
+def check_shape(what: str, value: np.ndarray, distribution: Distribution, size: int) -> None:
+    """Raise InputError if a value does not have the event shape of a distribution."""
+    shape = distribution.value_shape(size)
+    if value.shape != shape:
+        raise InputError(
+            f"{what} have shape {value.shape}, expected {shape} by the {type(distribution).__name__}",
+            "the mean of a distribution states the event shape: it is (), (n,), (1, d) or (n, d)",
+        )
 
 
 class CentreHandler(SiteHandler):
@@ -205,6 +210,7 @@ class ScoreHandler(SiteHandler):
         self.sites.append(site)
         value = np.asarray(self.values[site.name])[None] if self.single else self.values[site.name]
         value = value[site.index]
+        check_shape("the values", value, site.distribution, site.size)
         return value, site.distribution.log_prob(value)
 
     def row(self, index: int) -> ScoreHandler:

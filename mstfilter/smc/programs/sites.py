@@ -11,9 +11,8 @@ import numpy as np
 
 from mstfilter.errors import InputError
 from mstfilter.smc.distributions import Categorical, as_distribution
-from mstfilter.smc.interfaces import Distribution
 from mstfilter.smc.population import take
-from mstfilter.smc.programs.handlers import Site, SiteHandler
+from mstfilter.smc.programs.handlers import Site, SiteHandler, check_shape
 
 active_run: ContextVar[ProgramRun | None] = ContextVar("run of a program", default=None)
 
@@ -212,7 +211,7 @@ class ProgramRun:
         self.returned: dict[str, Any] = {}
         self.gain = np.zeros(n)
         self.shapes: dict[int, Shapes] = {}  # of the calls that do not have a number for each particle, in order
-        self.n_calls = 0
+        self.n_calls, self.ambiguous = 0, False
         self.what, self.inside = "", False  # the last site or observation, and whether it is being processed
         self._rows: np.ndarray | None = None
         self._path: tuple[tuple[str, int], ...] = ()
@@ -223,17 +222,12 @@ class ProgramRun:
         self.what, self.inside = f"site {name!r}{self._where}", True
         rows, distribution = self._rows, as_distribution(distribution)
         size = self.n if rows is None else len(rows)
-        shape = self._value_shape(distribution, size)
         self._check_name(name)
         value, gain = self.handler.value(Site(name, distribution, size, rows, branch))
         value = _read_only(np.asarray(value))
-        if value.shape != shape:
-            raise InputError(
-                f"values have shape {value.shape}, expected {shape} by the {type(distribution).__name__}",
-                "the shape of its mean states the event shape: (), (n,), (1, d) or (n, d)",
-            )
-        if not self.single:
-            self.record(shape[1:], None, size)
+        if gain is None and value.shape != (size,):
+            check_shape("its draws", value, distribution, size)
+        self.record(value.shape[1:], None, size)
         self._store(name, value, rows)
         if gain is not None:
             self._add(gain, size)
@@ -249,12 +243,11 @@ class ProgramRun:
             size = self.n if self._rows is None else len(self._rows)
             found: tuple[int, ...] = () if isinstance(value, float) else np.shape(value)
             if self.single:
-                event = distribution.event_shape
-                if distribution.batch_shape != (1,):
-                    event = (*distribution.batch_shape, *event)
+                shape = distribution.parameter_shape
+                event = shape[1:] if shape[:1] == (1,) else shape
             else:
-                event = self._value_shape(distribution, size)[1:]
-                if len(found) > 1 and found[0] == size and not event and not distribution.batch_shape:
+                event = distribution.value_shape(size)[1:]
+                if len(found) > 1 and found[0] == size and not distribution.parameter_shape:
                     event = found[1:]  # independent entries with the same parameters
             self.record(event, found, size)
             self._add(distribution.log_prob(value), size)
@@ -291,18 +284,9 @@ class ProgramRun:
         self.n_calls += 1
         if event or value:
             shapes = self.shapes[self.n_calls] = Shapes(self.what, event, value, size)
+            self.ambiguous = self.ambiguous or shapes.ambiguous
             if value is not None and not shapes.fits:
                 raise shapes.error()
-
-    def _value_shape(self, distribution: Distribution, size: int) -> tuple[int, ...]:
-        try:
-            return distribution.value_shape(size)
-        except InputError as error:
-            if self._rows is None:
-                raise
-            raise InputError(
-                error.message, "give the branch the rows of its particles, as arguments of switch"
-            ) from None
 
     def _check_name(self, name: str) -> None:
         """Raise if a particle may reach two sites of this name."""
