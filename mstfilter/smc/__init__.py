@@ -12,9 +12,9 @@
 `interfaces`            base classes of components (`Transition`, `Proposal`, `Update`, `Resampler`, ...),
                         `State` and `Info`
 `population`            `Population`: particles, log weights, parents; `Candidates`, built when accessed
-`resampling`            schemes that need only weights, and wrappers of schemes
+`resampling`            schemes that need only weights, with equal output weights
 `diverse_resampling`    schemes that keep different particles, with unequal weights
-`transport_resampling`  schemes that merge, sort or move particles
+`transport_resampling`  wrappers of schemes, sorted particles, transport
 `similarity`            similarity and equality of particles, for these schemes
 `triggers`              when to resample, and to how many particles
 `components`            updates by a likelihood or a projection, transitions with several branches
@@ -52,14 +52,19 @@ __components__ = {
         "systematic": "Systematic",
         "ssp": "Ssp",
         "killing": "Killing",
+        "rejection": "Rejection",
+        "metropolis": "Metropolis",
         "largest_weights": "LargestWeights",
         "fearnhead_clifford": "FearnheadClifford",
+        "chopthin": "Chopthin",
         "clusters": "ClusterStratified",
         "kdpp": "KDpp",
         "greedy_diverse": "GreedyDiverse",
+        "ensemble_transform": "EnsembleTransform",
         "coalesced": "Coalesced",
         "tempered": "Tempered",
         "shuffled": "Shuffled",
+        "sorted": "Sorted",
         "keep_weights": "KeepWeights",
     },
     "trigger": {"always": "Always", "ess": "EssBelow", "every": "EveryKth", "never": "Never"},

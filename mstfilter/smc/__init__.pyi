@@ -34,6 +34,7 @@ from mstfilter.smc.distributions import (
     as_distribution as as_distribution,
 )
 from mstfilter.smc.diverse_resampling import (
+    Chopthin as Chopthin,
     ClusterStratified as ClusterStratified,
     FearnheadClifford as FearnheadClifford,
     GreedyDiverse as GreedyDiverse,
@@ -64,6 +65,7 @@ from mstfilter.smc.interfaces import (
     Resampler as Resampler,
     Size as Size,
     State as State,
+    TransformResampler as TransformResampler,
     Transition as Transition,
     Trigger as Trigger,
     Update as Update,
@@ -89,17 +91,15 @@ from mstfilter.smc.programs.sites import (
     switch as switch,
 )
 from mstfilter.smc.resampling import (
-    KeepWeights as KeepWeights,
     Killing as Killing,
     LargestWeights as LargestWeights,
+    Metropolis as Metropolis,
     Multinomial as Multinomial,
-    ResamplerWrapper as ResamplerWrapper,
+    Rejection as Rejection,
     Residual as Residual,
-    Shuffled as Shuffled,
     Ssp as Ssp,
     Stratified as Stratified,
     Systematic as Systematic,
-    Tempered as Tempered,
 )
 from mstfilter.smc.similarity import (
     Bins as Bins,
@@ -131,7 +131,16 @@ from mstfilter.smc.state_space import (
     resample_move as resample_move,
 )
 from mstfilter.smc.streams import Key as Key, RunGenerators as RunGenerators, child as child, key_of as key_of
-from mstfilter.smc.transport_resampling import Coalesced as Coalesced, coalesce as coalesce
+from mstfilter.smc.transport_resampling import (
+    Coalesced as Coalesced,
+    EnsembleTransform as EnsembleTransform,
+    KeepWeights as KeepWeights,
+    ResamplerWrapper as ResamplerWrapper,
+    Shuffled as Shuffled,
+    Sorted as Sorted,
+    Tempered as Tempered,
+    coalesce as coalesce,
+)
 from mstfilter.smc.triggers import (
     Always as Always,
     EssBelow as EssBelow,

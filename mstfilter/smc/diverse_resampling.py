@@ -1,7 +1,7 @@
 """Resampling that keeps different particles, with unequal output weights.
 
-`FearnheadClifford` needs only the weights. The other schemes compare the particles by a `Similarity`. All need more
-candidates than particles to select.
+`FearnheadClifford` and `Chopthin` need only the weights. The other schemes compare the particles by a `Similarity`.
+All but `Chopthin` need more candidates than particles to select.
 
 >>> import numpy as np
 >>> from mstfilter.smc import ClusterStratified, Gaussian, GreedyDiverse, KDpp, Population
@@ -42,7 +42,7 @@ import numpy as np
 from mstfilter.errors import InputError, check_component, check_number
 from mstfilter.smc.interfaces import Resampler, WeightResampler
 from mstfilter.smc.population import Population, log_mean_exp
-from mstfilter.smc.resampling import Systematic, checked_weights, systematic_ancestors
+from mstfilter.smc.resampling import Systematic, certain_copies, check_scheme, checked_weights, systematic_ancestors
 from mstfilter.smc.similarity import Gaussian, Similarity
 
 
@@ -108,6 +108,66 @@ def optimal_threshold(weights: np.ndarray, n: int) -> tuple[float, np.ndarray]:
         c = float(weights[~heavy].sum()) / (n - kept)
 
 
+@dataclass(frozen=True)
+class Chopthin(WeightResampler):
+    """Bounds the ratio of the output weights: light particles are thinned, heavy ones chopped into copies.
+
+    With a threshold a, a particle of weight w gets on average h(w) copies: w / a if w < a (then the copy has weight
+    a), 1 if w is between a and ratio a / 2, and 2 w / (ratio a) if w is larger (each copy then has an equal share of
+    w). a solves sum h(w_i) = n; the numbers are floor or ceil of h, rounded systematically. Exactly n particles are
+    returned, and all weights lie in [a, ratio a]. If the ratio of the given weights is at most ratio / 2 and n of n
+    are selected, nothing changes.
+
+    Parameters
+    ----------
+    ratio : float
+        Bound of the largest output weight over the smallest, at least 4. The effective sample size is then at least
+        4 ratio / (1 + ratio)^2 of n: one half for the default, 3 + sqrt(8).
+
+    Reference: Gandy and Lau (2016), "The chopthin algorithm for resampling", IEEE Transactions on Signal Processing
+    64.
+    """
+
+    ratio: float = 3 + 8**0.5
+
+    def __post_init__(self) -> None:
+        check_number("ratio", self.ratio, at_least=4)
+
+    def select(self, rng: np.random.Generator, log_weights: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
+        weights = checked_weights(log_weights, n)
+        lw = np.asarray(log_weights, dtype=np.float64)
+        positive = np.flatnonzero(weights > 0)
+        a = chopthin_threshold(weights[positive], n, self.ratio)
+        # Light particles first: the number of those that are kept is then floor or ceil of its mean.
+        light = weights[positive] < a
+        order = positive[np.argsort(~light, kind="stable")]
+        light, w = np.sort(light)[::-1], weights[order]
+        expected = np.where(light, w / a, np.maximum(1.0, w * (2 / (self.ratio * a))))
+        copies, fractions, rest = certain_copies(expected, n)
+        if rest > 0:
+            copies += np.bincount(systematic_ancestors(np.cumsum(fractions), rest, rng.random()), minlength=len(w))
+        log_out = np.where(light, lw.max() + np.log(a), lw[order] - np.log(np.maximum(copies, 1)))
+        # Adding log(n / m) keeps the log mean of the weights.
+        return np.repeat(order, copies), np.repeat(log_out, copies) + np.log(n / len(lw))
+
+
+def chopthin_threshold(weights: np.ndarray, n: int, ratio: float) -> float:
+    """a with sum h(w_i) = n, see `Chopthin`, for (m,) positive weights; any such a if there are several."""
+    w = np.sort(weights)
+    # For a between neighbours among all w and 2 w / ratio, sum h = share / a + middle: particles below the index
+    # `thinned` have w < a, those from `unchopped` on have w > ratio a / 2.
+    limits = np.concatenate([w, w * (2 / ratio), [np.inf]])
+    by_limit = np.argsort(limits, kind="stable")
+    is_w = by_limit < len(w)
+    thinned = np.append(0, np.cumsum(is_w)[:-1])
+    unchopped = np.arange(len(limits)) - thinned
+    total = np.append(0.0, np.cumsum(w))
+    share = total[thinned] + (total[-1] - total[unchopped]) * (2 / ratio)
+    middle = unchopped - thinned
+    k = int(np.argmax(share / limits[by_limit] + middle <= n))  # sum h decreases: the first interval that reaches n
+    return float(share[k] / (n - middle[k])) if share[k] > 0 else float(limits[by_limit[k]])
+
+
 #: Similarities of more particles than this are not computed: the matrix alone would take gigabytes.
 MAX_PARTICLES = 10_000
 
@@ -159,7 +219,7 @@ class ClusterStratified(Resampler):
 
     def __post_init__(self) -> None:
         check_component("similarity", self.similarity, Similarity)
-        check_component("scheme", self.scheme, Resampler)
+        check_scheme(self.scheme)
         check_number("at_least", self.at_least, above=0, at_most=1, unit="similarity")
         check_number("least_mass", self.least_mass, at_least=0, below=1, unit="share of the weight")
 
@@ -258,7 +318,7 @@ class KDpp(Resampler):
 
     def __post_init__(self) -> None:
         check_component("similarity", self.similarity, Similarity)
-        check_component("scheme", self.scheme, Resampler)
+        check_scheme(self.scheme)
 
     @property
     def properly_weighted(self) -> bool:

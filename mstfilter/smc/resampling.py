@@ -1,7 +1,8 @@
-"""Resampling by weight: schemes with equal output weights, and wrappers around a scheme.
+"""Resampling by weight: schemes with equal output weights.
 
 W_i is the normalised weight of particle i, N_i its number of copies among the n selected particles, f = frac(n W_i).
-The schemes are unbiased: E[N_i] = n W_i. They differ in the variance of N_i.
+The schemes are unbiased, E[N_i] = n W_i, except `Metropolis` and `LargestWeights`. They differ in the variance of
+N_i.
 
 ==================  =================================================  ====================================
 scheme              N_i                                                variance of N_i
@@ -11,7 +12,7 @@ Residual            floor(n W_i), the rest by another scheme           f (1 - f 
 Stratified          one draw in each of n equal strata of [0, 1)       sum over strata of p (1 - p)
 Systematic          one draw, shifted to each stratum                  f (1 - f)
 Ssp                 floor or ceil, fractions decided pair by pair      f (1 - f)
-Killing             survive with w_i / max w, else multinomial         see `Killing`
+Killing, Rejection  survive with w_i / max w, else multinomial         see `Killing`
 ==================  =================================================  ====================================
 
 >>> import numpy as np
@@ -26,9 +27,6 @@ selected. `InputError` is raised if a log weight is NaN or +inf, or if all weigh
 Ties: the random schemes do not compare weights. Of particles with equal weights, `LargestWeights.select` (a stable
 sort), `coalesce`, and the diverse schemes of `mstfilter.smc.diverse_resampling` take the first.
 
-`Tempered`, `Shuffled` and `KeepWeights` wrap another resampler; so does `Coalesced` of
-`mstfilter.smc.transport_resampling`.
-
 Residual-systematic resampling (Bolic, Djuric, Hong 2004) has no class: in exact arithmetic it selects the same
 particles as `Systematic` and as ``Residual("systematic")`` if all use the same uniform number.
 
@@ -38,14 +36,13 @@ Liu and Chen (1998).
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import ClassVar, Literal
 
 import numpy as np
 
-from mstfilter.errors import InputError, check_component, check_number
-from mstfilter.smc.interfaces import Resampler, WeightResampler
-from mstfilter.smc.population import Population
+from mstfilter.errors import InputError, check_component, check_integer, check_number
+from mstfilter.smc.interfaces import Resampler, TransformResampler, WeightResampler
 
 
 def checked_weights(log_weights: np.ndarray, n: int) -> np.ndarray:
@@ -69,7 +66,7 @@ def checked_weights(log_weights: np.ndarray, n: int) -> np.ndarray:
     return np.exp(weights, out=weights)
 
 
-def _certain_copies(weights: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray, int]:
+def certain_copies(weights: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray, int]:
     """floor(n W_i) (m,) int64, the fractions frac(n W_i) (m,), and the sum of the fractions: the copies to draw."""
     fractions = weights * (n / weights.sum())
     floors = fractions * (1 + 1e-13)  # an integer up to rounding counts as that integer
@@ -245,7 +242,7 @@ class Residual(WeightResampler):
             raise InputError(f"remainder is {self.remainder!r}, expected multinomial, stratified or systematic")
 
     def select(self, rng: np.random.Generator, log_weights: np.ndarray, n: int) -> tuple[np.ndarray, None]:
-        copies, fractions, rest = _certain_copies(checked_weights(log_weights, n), n)
+        copies, fractions, rest = certain_copies(checked_weights(log_weights, n), n)
         if rest > 0:
             if self.remainder == "systematic":
                 drawn = systematic_ancestors(np.cumsum(fractions), rest, rng.random())
@@ -273,7 +270,7 @@ class Ssp(WeightResampler):
 
     def select(self, rng: np.random.Generator, log_weights: np.ndarray, n: int) -> tuple[np.ndarray, None]:
         weights = checked_weights(log_weights, n)
-        copies, value, _ = _certain_copies(weights, n)
+        copies, value, _ = certain_copies(weights, n)
         index = np.flatnonzero(value > _SETTLED)
         value = value[index]
         while len(index) > 1:
@@ -304,6 +301,14 @@ class Ssp(WeightResampler):
         return _expanded(np.cumsum(copies), n), None
 
 
+def _one_particle_per_position(rng: np.random.Generator, m: int, n: int) -> np.ndarray:
+    """(n,) particle that each position belongs to: floor(n / m) positions for each, one more for a random subset."""
+    particles = np.tile(np.arange(m), n // m)
+    if n % m:
+        particles = np.concatenate([particles, np.sort(rng.choice(m, n % m, replace=False, shuffle=False))])
+    return particles
+
+
 @dataclass(frozen=True)
 class Killing(WeightResampler):
     """A particle keeps its position with probability w_i / max w; the others are replaced by draws by weight.
@@ -316,14 +321,84 @@ class Killing(WeightResampler):
 
     def select(self, rng: np.random.Generator, log_weights: np.ndarray, n: int) -> tuple[np.ndarray, None]:
         weights = checked_weights(log_weights, n)
-        m = len(weights)
-        ancestors = np.tile(np.arange(m), n // m)
-        if n % m:
-            ancestors = np.concatenate([ancestors, np.sort(rng.choice(m, n % m, replace=False, shuffle=False))])
-        killed = np.flatnonzero(rng.random(n) >= (weights if n == m else weights[ancestors]))
+        ancestors = _one_particle_per_position(rng, len(weights), n)
+        killed = np.flatnonzero(rng.random(n) >= (weights if n == len(weights) else weights[ancestors]))
         if len(killed):
             ancestors[killed] = independent_draws(rng, weights, len(killed))
         return ancestors, None
+
+
+@dataclass(frozen=True)
+class Rejection(WeightResampler):
+    """`Killing` without cumulative weights: a killed position tries particles until it accepts one.
+
+    A position first tries its own particle, then particles drawn uniformly; it accepts with probability w / max w.
+    The mean number of trials is max w / mean w. Murray, Lee, Jacob (2016), "Parallel resampling in the particle
+    filter", code 3.
+
+    Parameters
+    ----------
+    max_trials : int
+        Positions that have accepted nothing after so many trials are drawn by weight. This does not change the law.
+    """
+
+    max_trials: int = 100
+
+    def __post_init__(self) -> None:
+        check_integer("max_trials", self.max_trials)
+
+    def select(self, rng: np.random.Generator, log_weights: np.ndarray, n: int) -> tuple[np.ndarray, None]:
+        weights = checked_weights(log_weights, n)
+        ancestors = _one_particle_per_position(rng, len(weights), n)
+        left = np.flatnonzero(rng.random(n) >= weights[ancestors])
+        for _ in range(self.max_trials - 1):
+            if not len(left):
+                break
+            ancestors[left] = rng.integers(0, len(weights), len(left))
+            left = left[rng.random(len(left)) >= weights[ancestors[left]]]
+        if len(left):
+            ancestors[left] = independent_draws(rng, weights, len(left))
+        return ancestors, None
+
+
+@dataclass(frozen=True)
+class Metropolis(WeightResampler):
+    """Each position follows a Metropolis chain over the particles, with uniform proposals. Not properly weighted.
+
+    The law of a position differs from W by at most (1 - mean w / max w)^steps in total variation. Murray, Lee, Jacob
+    (2016), "Parallel resampling in the particle filter", code 2 and section 3.2.
+
+    Parameters
+    ----------
+    tolerance : float
+        The number of steps is the least for which this bound is at most `tolerance`, in (0, 1).
+    max_steps : int
+        At most so many steps, even if the bound is larger then.
+    """
+
+    tolerance: float = 0.01
+    max_steps: int = 500
+
+    properly_weighted: ClassVar[bool] = False
+
+    def __post_init__(self) -> None:
+        check_number("tolerance", self.tolerance, above=0, below=1, unit="total variation")
+        check_integer("max_steps", self.max_steps)
+
+    def select(self, rng: np.random.Generator, log_weights: np.ndarray, n: int) -> tuple[np.ndarray, None]:
+        weights = checked_weights(log_weights, n)
+        ancestors = _one_particle_per_position(rng, len(weights), n)
+        ancestors[weights[ancestors] == 0] = np.argmax(weights)  # a chain from weight zero could end there
+        for _ in range(self.steps(weights)):
+            tried = rng.integers(0, len(weights), n)
+            accepted = rng.random(n) * weights[ancestors] < weights[tried]
+            ancestors = np.where(accepted, tried, ancestors)
+        return ancestors, None
+
+    def steps(self, weights: np.ndarray) -> int:
+        """Number of steps for weights with maximum 1."""
+        acceptance = min(float(weights.mean()), 1 - 1e-9)
+        return min(int(np.ceil(np.log(self.tolerance) / np.log1p(-acceptance))), self.max_steps)
 
 
 @dataclass(frozen=True)
@@ -343,83 +418,11 @@ class LargestWeights(WeightResampler):
         return largest[np.arange(n) % len(largest)], None
 
 
-@dataclass(frozen=True)
-class ResamplerWrapper(Resampler):
-    """Base class of resamplers that change the input or the result of another resampler.
-
-    It is properly weighted if the wrapped resampler is.
-
-    Parameters
-    ----------
-    scheme : Resampler
-        The wrapped resampler.
-    """
-
-    scheme: Resampler = Systematic()
-
-    def __post_init__(self) -> None:
-        check_component("scheme", self.scheme, Resampler)
-
-    @property
-    def properly_weighted(self) -> bool:
-        return self.scheme.properly_weighted
-
-    @property
-    def exact_size(self) -> bool:
-        return self.scheme.exact_size
-
-
-@dataclass(frozen=True)
-class Tempered(ResamplerWrapper):
-    """Selects by w^power and multiplies the selected weights by w^(1 - power): light particles survive longer.
-
-    Parameters
-    ----------
-    power : float
-        In [0, 1]. 1: same as the wrapped scheme. 0: all particles of positive weight are equally likely.
-    """
-
-    power: float = 0.5
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_number("power", self.power, at_least=0, at_most=1)
-
-    def resample(self, rng: np.random.Generator, population: Population, n: int) -> Population:
-        lw = population.log_weights
-        positive = checked_weights(lw, n) > 0
-        tempered = np.full(len(lw), -np.inf)
-        tempered[positive] = self.power * lw[positive]
-        rest = np.zeros(len(lw))
-        rest[positive] = (1 - self.power) * lw[positive]
-        chosen = self.scheme.resample(rng, replace(population, log_weights=tempered), n)
-        return chosen.reweighted(rest[chosen.parents["ancestor"]])
-
-
-@dataclass(frozen=True)
-class Shuffled(ResamplerWrapper):
-    """Permutes the particles at random before the selection.
-
-    Systematic and stratified schemes then do not depend on the order of the particles.
-    """
-
-    def resample(self, rng: np.random.Generator, population: Population, n: int) -> Population:
-        order = rng.permutation(len(population))
-        chosen = self.scheme.resample(rng, population.take(order), n)
-        return chosen.with_ancestors(order[chosen.parents["ancestor"]])
-
-
-@dataclass(frozen=True)
-class KeepWeights(ResamplerWrapper):
-    """Selected particles keep their weights, as in the program of the MST authors.
-
-    Selecting by weight and keeping the weight counts the same evidence twice, so this is not properly weighted.
-    """
-
-    scheme: Resampler = Multinomial()
-
-    properly_weighted: ClassVar[bool] = False
-
-    def resample(self, rng: np.random.Generator, population: Population, n: int) -> Population:
-        chosen = self.scheme.resample(rng, population, n)
-        return replace(chosen, log_weights=population.log_weights[chosen.parents["ancestor"]])
+def check_scheme(scheme: Resampler) -> None:
+    """Raise InputError unless the scheme is a resampler that selects particles."""
+    check_component("scheme", scheme, Resampler)
+    if isinstance(scheme, TransformResampler):
+        raise InputError(
+            f"{type(scheme).__name__} makes new particles without ancestors",
+            "use a scheme that selects",
+        )

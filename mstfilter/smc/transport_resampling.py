@@ -1,24 +1,153 @@
-"""Resampling by position: equal particles are merged.
+"""Resampling around another scheme, and by transport.
+
+`Sorted`, `Shuffled`, `Coalesced`, `Tempered` and `KeepWeights` wrap a scheme: they change the order of the particles,
+merge equal ones, or change the weights.
 
 >>> import numpy as np
->>> from mstfilter.smc import Coalesced, FearnheadClifford, Population
+>>> from mstfilter.smc import Coalesced, EnsembleTransform, FearnheadClifford, Population
+>>> rng = np.random.default_rng(0)
 >>> doubled = Population(np.array([1.0, 2.0, 1.0, 3.0]), np.log([1.0, 1.0, 2.0, 4.0]))
->>> Coalesced(FearnheadClifford()).resample(np.random.default_rng(0), doubled, 3).particles
+>>> Coalesced(FearnheadClifford()).resample(rng, doubled, 3).particles
 array([2., 1., 3.])
+
+`EnsembleTransform` makes new particles of equal weight whose mean is the weighted mean of the old ones.
+
+>>> EnsembleTransform().resample(rng, doubled, 4).particles
+array([1. , 3. , 1.5, 3. ])
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from mstfilter.errors import check_component
+from mstfilter.errors import InputError, check_component, check_number
 from mstfilter.smc.diverse_resampling import FearnheadClifford
-from mstfilter.smc.interfaces import Resampler
+from mstfilter.smc.interfaces import Resampler, TransformResampler
 from mstfilter.smc.population import Population
-from mstfilter.smc.resampling import ResamplerWrapper
-from mstfilter.smc.similarity import Equivalence, ExactEquality
+from mstfilter.smc.resampling import Multinomial, Stratified, Systematic, check_scheme, checked_weights
+from mstfilter.smc.similarity import Equivalence, ExactEquality, as_matrix
+
+#: Linear programs of more variables than this are not solved: they take longer than some seconds.
+MAX_TRANSPORT = 100_000
+
+
+@dataclass(frozen=True)
+class ResamplerWrapper(Resampler):
+    """Base class of resamplers that change the input or the result of another resampler.
+
+    It is properly weighted if the wrapped resampler is.
+
+    Parameters
+    ----------
+    scheme : Resampler
+        The wrapped resampler.
+    """
+
+    scheme: Resampler = Systematic()  # noqa: RUF009 (frozen)
+
+    def __post_init__(self) -> None:
+        check_scheme(self.scheme)
+
+    @property
+    def properly_weighted(self) -> bool:
+        return self.scheme.properly_weighted
+
+    @property
+    def exact_size(self) -> bool:
+        return self.scheme.exact_size
+
+
+@dataclass(frozen=True)
+class Sorted(ResamplerWrapper):
+    """Orders the particles before the selection, for schemes whose result depends on the order.
+
+    Parameters
+    ----------
+    order : {"position", "mean_partition"}
+        "position": by value; particles that are vectors, along a Hilbert curve. In one dimension, the distribution
+        function of the particles that `Systematic` or `Stratified` select differs from the weighted one by at most
+        1 / n. Gerber, Chopin, Whiteley (2019), "Negative association, ordering and convergence of resampling
+        methods"; Li, Wang, Deng, Liu (2022), "Stratification and optimal resampling for sequential Monte Carlo".
+        "mean_partition": particles of at most the mean weight, then the others, each group in its order. `Systematic`
+        then keeps as many of the light particles as on average, rounded up or down. Chopin, Singh, Soto, Vihola
+        (2022), "On resampling schemes for particle filters with weakly informative observations".
+    """
+
+    scheme: Resampler = Stratified()  # noqa: RUF009 (frozen)
+    order: Literal["position", "mean_partition"] = "position"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.order not in ("position", "mean_partition"):
+            raise InputError(f"order is {self.order!r}, expected position or mean_partition")
+
+    def resample(self, rng: np.random.Generator, population: Population, n: int) -> Population:
+        if self.order == "mean_partition":
+            weights = checked_weights(population.log_weights, n)
+            order = np.argsort(weights > weights.mean(), kind="stable")
+        else:
+            order = np.argsort(_line(as_matrix(population.particles)), kind="stable")
+        chosen = self.scheme.resample(rng, population.take(order), n)
+        return chosen.with_ancestors(order[chosen.parents["ancestor"]])
+
+
+def _line(x: np.ndarray) -> np.ndarray:
+    """(n,) numbers that order (n, d) rows: the value if d = 1, else the position along a Hilbert curve."""
+    d = x.shape[1]
+    if d == 1:
+        return x[:, 0]
+    bits = 62 // d
+    if bits < 1:
+        raise InputError(f"particles have {d} dimensions, at most 62 are ordered along a Hilbert curve")
+    # The logistic function maps all values into (0, 1): Gerber and Chopin (2015), section 3.
+    spread = x.std(axis=0)
+    z = (x - x.mean(axis=0)) / np.where(spread > 0, spread, 1.0)
+    cells = (2.0 ** (bits - 1) * (1 + np.tanh(z / 2))).astype(np.int64)
+    return hilbert_position(np.minimum(cells, (1 << bits) - 1), bits)
+
+
+def hilbert_position(cells: np.ndarray, bits: int) -> np.ndarray:
+    """(n,) int64 position along the Hilbert curve of (n, d) cells with coordinates 0 .. 2^bits - 1, d bits < 63.
+
+    Neighbours on the curve are neighbours in space. Skilling (2004), "Programming the Hilbert curve".
+    """
+    x = np.array(cells.T, np.int64)
+    d = len(x)
+    for bit in range(bits - 1, 0, -1):  # undo the reflections and exchanges of axes, from the largest cubes
+        lower = (1 << bit) - 1
+        for i in range(d):
+            upper = (x[i] >> bit & 1).astype(bool)
+            exchange = np.where(upper, 0, (x[0] ^ x[i]) & lower)
+            x[0] ^= np.where(upper, lower, exchange)
+            x[i] ^= exchange
+    for i in range(1, d):  # Gray code
+        x[i] ^= x[i - 1]
+    flips = np.zeros_like(x[0])
+    for bit in range(bits - 1, 0, -1):
+        flips ^= np.where(x[d - 1] >> bit & 1, (1 << bit) - 1, 0)
+    x ^= flips
+    position = np.zeros_like(flips)
+    for bit in range(bits - 1, -1, -1):
+        for i in range(d):
+            position = position << 1 | x[i] >> bit & 1
+    return position
+
+
+@dataclass(frozen=True)
+class Shuffled(ResamplerWrapper):
+    """Permutes the particles at random before the selection.
+
+    Systematic and stratified schemes then do not depend on the order of the particles.
+    """
+
+    def resample(self, rng: np.random.Generator, population: Population, n: int) -> Population:
+        order = rng.permutation(len(population))
+        chosen = self.scheme.resample(rng, population.take(order), n)
+        return chosen.with_ancestors(order[chosen.parents["ancestor"]])
 
 
 @dataclass(frozen=True)
@@ -70,3 +199,128 @@ def coalesce(log_weights: np.ndarray, classes: np.ndarray) -> tuple[np.ndarray, 
     representatives = np.sort(representatives[mass[classes[representatives]] > 0])
     total = np.log(mass[classes[representatives]]) + lw.max()
     return representatives, total + np.log(len(representatives) / len(lw))
+
+
+@dataclass(frozen=True)
+class Tempered(ResamplerWrapper):
+    """Selects by w^power and multiplies the selected weights by w^(1 - power): light particles survive longer.
+
+    Parameters
+    ----------
+    power : float
+        In [0, 1]. 1: same as the wrapped scheme. 0: all particles of positive weight are equally likely.
+    """
+
+    power: float = 0.5
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_number("power", self.power, at_least=0, at_most=1)
+
+    def resample(self, rng: np.random.Generator, population: Population, n: int) -> Population:
+        lw = population.log_weights
+        positive = checked_weights(lw, n) > 0
+        tempered = np.full(len(lw), -np.inf)
+        tempered[positive] = self.power * lw[positive]
+        rest = np.zeros(len(lw))
+        rest[positive] = (1 - self.power) * lw[positive]
+        chosen = self.scheme.resample(rng, replace(population, log_weights=tempered), n)
+        return chosen.reweighted(rest[chosen.parents["ancestor"]])
+
+
+@dataclass(frozen=True)
+class KeepWeights(ResamplerWrapper):
+    """Selected particles keep their weights, as in the program of the MST authors.
+
+    Selecting by weight and keeping the weight counts the same evidence twice, so this is not properly weighted.
+    """
+
+    scheme: Resampler = Multinomial()  # noqa: RUF009 (frozen)
+
+    properly_weighted: ClassVar[bool] = False
+
+    def resample(self, rng: np.random.Generator, population: Population, n: int) -> Population:
+        chosen = self.scheme.resample(rng, population, n)
+        return replace(chosen, log_weights=population.log_weights[chosen.parents["ancestor"]])
+
+
+@dataclass(frozen=True)
+class EnsembleTransform(TransformResampler):
+    """Moves the particles to equal weights by optimal transport: new particles are mixtures of old ones.
+
+    T_ij minimises the sum of T_ij |x_i - y_j|^2 with row sums W_i and column sums 1 / n; the new particles are
+    n sum_i T_ij x_i. The targets y_j are the old particles; for n different from m, equally spaced ones in their
+    order. In one dimension T is the monotone transport, found by sorting in O(m log m); otherwise a linear program of
+    m n variables, so use a few hundred particles. Draws nothing. Mixtures have less variance than the weighted
+    particles. Particles are arrays of floats, or mappings of such arrays.
+
+    Reference: Reich (2013), "A nonparametric ensemble transform method for Bayesian inference", SIAM Journal on
+    Scientific Computing 35.
+    """
+
+    @property
+    def draws(self) -> bool:
+        return False
+
+    def resample(self, rng: np.random.Generator, population: Population, n: int) -> Population:
+        weights = checked_weights(population.log_weights, n)
+        particles, x = population.particles, as_matrix(population.particles)
+        weights /= weights.sum()
+        i, j, mass = _monotone_transport(x[:, 0], weights, n) if x.shape[1] == 1 else _transport(x, weights, n)
+        mass /= np.bincount(j, mass, minlength=n)[j]
+
+        def mixed(name: str, old: np.ndarray) -> np.ndarray:
+            if not np.issubdtype(old.dtype, np.floating):
+                raise InputError(f"{name} of type {old.dtype} cannot be mixed, expected floats")
+            rows = old.reshape(len(old), -1)
+            new = np.stack([np.bincount(j, mass * column[i], minlength=n) for column in rows.T], axis=1)
+            new += weights @ rows - new.mean(axis=0)  # rounding, or the tolerance of the linear program
+            return new.reshape(n, *old.shape[1:])
+
+        if isinstance(particles, Mapping):
+            made: Any = {name: mixed(f"array {name!r}", np.asarray(old)) for name, old in particles.items()}
+        else:
+            made = mixed("an array", particles)
+        return Population(made, np.full(n, population.log_mean_weight))
+
+
+def _monotone_transport(x: np.ndarray, weights: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Rows, columns and masses of the transport of weighted numbers to n of equal weight that keeps their order."""
+    order = np.argsort(x, kind="stable")
+    ends = np.cumsum(weights[order])
+    ends /= ends[-1]
+    cuts = np.sort(np.concatenate([[0.0], ends, np.arange(1, n) / n]))
+    mass, middle = np.diff(cuts), (cuts[1:] + cuts[:-1]) / 2
+    some = mass > 0
+    mass, middle = mass[some], middle[some]
+    columns = np.minimum((middle * n).astype(np.int64), n - 1)
+    # The new particle of a rank takes the position of the old one of this rank.
+    return order[ends.searchsorted(middle)], order[columns] if n == len(x) else columns, mass
+
+
+def _transport(x: np.ndarray, weights: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Rows, columns and masses of the optimal transport of weighted (m, d) rows to n of equal weight."""
+    from scipy import optimize, sparse
+
+    rows = np.flatnonzero(weights)
+    if len(rows) * n > MAX_TRANSPORT:
+        raise InputError(
+            f"transport of {len(rows)} particles to {n} is a linear program of {len(rows) * n} variables, at most "
+            f"{MAX_TRANSPORT} are solved",
+            "use fewer particles, or Sorted(Stratified()), which selects particles",
+        )
+    targets = x[((np.arange(n) + 0.5) * (len(x) / n)).astype(np.int64)]
+    cost = ((x[rows, None, :] - targets[None, :, :]) ** 2).sum(axis=2)
+    by_row = sparse.kron(sparse.eye_array(len(rows)), np.ones((1, n)))
+    by_column = sparse.kron(np.ones((1, len(rows))), sparse.eye_array(n))
+    found = optimize.linprog(
+        cost.ravel() / max(cost.max(), np.finfo(float).tiny),
+        A_eq=sparse.vstack([by_row, by_column]).tocsr(),
+        b_eq=np.concatenate([weights[rows] * n, np.ones(n)]),
+        method="highs-ds",
+        options={"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10},
+    )
+    if found.x is None:
+        raise InputError(f"the transport was not found: {found.message}")
+    i, j = np.nonzero(found.x.reshape(len(rows), n) > 0)
+    return rows[i], j, found.x.reshape(len(rows), n)[i, j]

@@ -18,6 +18,7 @@ from mstfilter.testing.moves import (
 )
 from mstfilter.testing.resampling import (
     ResamplerContract as ResamplerContract,
+    TransformResamplerContract as TransformResamplerContract,
     WeightResamplerContract as WeightResamplerContract,
 )
 from mstfilter.testing.scenes import scene_example as scene_example

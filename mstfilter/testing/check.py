@@ -34,6 +34,7 @@ from mstfilter.smc import (
     Resampler,
     Similarity,
     Size,
+    TransformResampler,
     Transition,
     Trigger,
     Update,
@@ -46,6 +47,7 @@ from mstfilter.testing.scenes import scene_example
 #: Contract of each interface, the more special interface first.
 _CONTRACTS: dict[type, type[Contract]] = {
     WeightResampler: resampling.WeightResamplerContract,
+    TransformResampler: resampling.TransformResamplerContract,
     Resampler: resampling.ResamplerContract,
     DensityTransition: moves.DensityTransitionContract,
     Transition: moves.TransitionContract,

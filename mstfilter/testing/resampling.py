@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from mstfilter.smc import Population, Resampler, WeightResampler, log_mean_exp
+from mstfilter.smc import Population, Resampler, TransformResampler, WeightResampler, as_matrix, log_mean_exp
 from mstfilter.testing.contract import (
     FALSE_ALARM,
     RandomContract,
@@ -263,6 +263,67 @@ class WeightResamplerContract(ResamplerContract):
                 f"the particles of small weight get {light:.0f} copies in total, expected {expected:.0f}: "
                 "cumulated in single precision, or biased?"
             )
+
+
+class TransformResamplerContract(RandomContract):
+    """The contract of every `TransformResampler`: n new particles of equal weight whose mean is the weighted mean.
+
+    The example has particles that are arrays of numbers, or mappings of such arrays.
+    """
+
+    def inputs(self, n: int, seed: int = 0) -> dict[str, Any]:
+        particles = self.example(np.random.default_rng(seed), 20)[0].realised().particles
+        return {"population": Population(particles, _log(np.linspace(1, 2 + seed, 20))), "n": 12}
+
+    def call(self, component: TransformResampler, rng: np.random.Generator, inputs: dict[str, Any]) -> Population:
+        return component.resample(rng, inputs["population"], inputs["n"])
+
+    def check_result(self, result: Any, inputs: dict[str, Any]) -> None:
+        assert isinstance(result, Population), f"resample returns {type(result).__name__}, expected a Population"
+        assert not result.parents, f"new particles have parents {sorted(result.parents)}, expected none"
+        before = inputs["population"].log_mean_weight
+        assert np.allclose(result.log_weights, before, rtol=0, atol=1e-9), (
+            f"log weights of the result lie in {result.log_weights.min():.6g} .. {result.log_weights.max():.6g}, "
+            f"expected the log mean of the old weights, {before:.6g}"
+        )
+
+    @prerequisite
+    def test_gives_n_particles(self) -> None:
+        """It returns n particles for any n; at most n if ``exact_size`` is False."""
+        component = self.make()
+        for m in (1, 4, 7):
+            for n in (1, 2, m, 2 * m + 3):
+                found = len(self._resample(component, np.linspace(1, 3, m), n)[1])
+                enough = found == n if component.exact_size else 1 <= found <= n
+                assert enough, f"asked to make {n} particles of {m} it returns {found}"
+
+    def test_keeps_the_weighted_mean(self) -> None:
+        """The mean of the new particles is the weighted mean of the old ones, also with weights of zero."""
+        for weights in ((1, 2, 1.5, 0.5, 2), *_ZEROS, (1, 1e-6, 1e-12, 1, 1)):
+            for n in (1, 3, 5, 9):
+                old, new = self._resample(self.make(), weights, n)
+                x = as_matrix(old.particles)
+                found, expected = as_matrix(new.particles).mean(axis=0), old.weights @ x
+                i = int(np.argmax(np.abs(found - expected)))
+                assert np.allclose(found, expected, rtol=0, atol=1e-6 * max(np.abs(x).max(), 1e-300)), (
+                    f"of weights {weights} to {n} particles, coordinate {i} has mean {found[i]:.6g}, expected "
+                    f"{expected[i]:.6g}"
+                )
+
+    def test_common_factor_of_weights(self) -> None:
+        """A common factor of the weights does not change the new particles."""
+        weights = np.array([0.11, 0.36, 0.15, 0.38])
+        a = self._resample(self.make(), weights, 6)[1]
+        for shift in (100.0, -100.0, 1e4, -1e4):
+            b = self._resample(self.make(), weights, 6, shift)[1]
+            assert np.allclose(as_matrix(a.particles), as_matrix(b.particles)), (
+                f"adding {shift:g} to all log weights changes the new particles (overflow or underflow?)"
+            )
+
+    def _resample(self, component: Any, weights: Any, n: int, shift: float = 0.0) -> tuple[Population, Population]:
+        particles = self.example(np.random.default_rng(0), len(weights))[0].realised().particles
+        old = Population(particles, _log(weights) + shift)
+        return old, self.checked_call(component, {"population": old, "n": n})
 
 
 def _tolerance(samples: np.ndarray, unit: float, n_comparisons: int) -> np.ndarray:

@@ -38,6 +38,9 @@ class Scripted(np.random.Generator):
         drawn = [(self.digit(np.ones(self.cells)) + 0.5) / self.cells for _ in range(1 if size is None else size)]
         return drawn[0] if size is None else np.array(drawn)
 
+    def integers(self, low, high, size):
+        return np.array([low + self.digit(np.ones(high - low)) for _ in range(size)], dtype=np.int64)
+
     def permutation(self, n):
         orders = list(permutations(range(n)))
         return np.array(orders[self.digit(np.ones(len(orders)))])

@@ -5,22 +5,26 @@ Weights are small whole numbers, so that what the single uniforms decide changes
 
 from __future__ import annotations
 
-from itertools import combinations, product
+from itertools import combinations, pairwise, product
 
 import numpy as np
 import pytest
 
 from mstfilter.smc import (
+    Chopthin,
     ClusterStratified,
     Coalesced,
     FearnheadClifford,
     Gaussian,
     KDpp,
     Killing,
+    Metropolis,
     Multinomial,
     Population,
+    Rejection,
     Residual,
     Shuffled,
+    Sorted,
     Ssp,
     Stratified,
     Systematic,
@@ -28,6 +32,7 @@ from mstfilter.smc import (
     diverse_resampling,
     resampling,
 )
+from mstfilter.smc.resampling import systematic_ancestors
 from tests.smc.enumeration import outcomes
 
 
@@ -188,6 +193,78 @@ def test_shuffled_and_coalesced(n):
     np.testing.assert_allclose(found, np.exp(population.log_weights) / 4, atol=1e-12)
     found = carried(Coalesced(Systematic()), population, n, cells=8)
     np.testing.assert_allclose(found, np.array([0.0, 2.0, 4.0, 2.0]) / 4, atol=1e-12)
+
+
+@pytest.mark.parametrize(("weights", "n"), [((1, 3, 2), 3), ((1, 3, 2), 2), ((3, 1), 3), ((2, 0, 1), 2)])
+def test_rejection(weights, n, enumerated_uniforms):
+    """Mean n W and the covariance of killing, also with the draws by weight after the second trial."""
+    enumerated_uniforms(weights)
+    mean, cov, _ = copies_law(Rejection(max_trials=2), weights, n, coins=True)
+    np.testing.assert_allclose(mean, expected_of(weights, n)[1], atol=1e-12)
+    np.testing.assert_allclose(cov, copies_law(Killing(), weights, n, coins=True)[1], atol=1e-12)
+
+
+@pytest.mark.parametrize("weights", [(1, 3, 2), (2, 0, 1)])
+def test_metropolis(weights):
+    """Two steps of the chain, by powers of its transition matrix; its bound of the total variation holds."""
+    mean, _, _ = copies_law(Metropolis(max_steps=2), weights, 2, coins=True)
+    w = np.array(weights, float)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        P = np.where(w[:, None] > 0, np.minimum(1, w[None, :] / w[:, None]), 1.0) / 3
+    P += np.diag(1 - P.sum(axis=1))
+    start = np.where(w > 0, np.arange(3), np.argmax(w))  # weight zero starts at the heaviest
+    start_law = np.bincount(start, minlength=3) / 3  # two positions belong to a random pair of particles
+    np.testing.assert_allclose(mean / 2, start_law @ P @ P, atol=1e-12)
+    steps = Metropolis(tolerance=0.05).steps(w / w.max())
+    assert 0.5 * np.abs(np.linalg.matrix_power(P, steps)[w > 0] - w / w.sum()).sum(axis=1).max() <= 0.05
+    assert steps > 1
+
+
+CHOPPED = [(1.0, 4.0, 1.0, 2.0), (40.0, 1.0, 1.0, 2.0), (3.0, 3.0), (1.0,), (0.0, 1.0, 12.0)]
+
+
+@pytest.mark.parametrize("weights", CHOPPED)
+@pytest.mark.parametrize("n", [1, 2, 3, 4, 7])
+@pytest.mark.parametrize("ratio", [4.0, 3 + 8**0.5, 25.0])
+def test_chopthin(weights, n, ratio):
+    """The mean over the uniform, exactly: the result changes where cumulative fractions end."""
+    population = of(np.arange(float(len(weights))), weights)
+    uniforms: list[float] = []
+    fractions: list[np.ndarray] = []
+
+    class One(np.random.Generator):
+        def random(self):
+            return uniforms[0]
+
+    def spy(cumulative, rest, shift):
+        fractions.append(cumulative * (rest / cumulative[-1]))
+        return systematic_ancestors(cumulative, rest, shift)
+
+    uniforms[:] = [0.5]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(diverse_resampling, "systematic_ancestors", spy)
+        Chopthin(ratio).resample(One(np.random.PCG64(0)), population, n)
+    jumps = np.unique([0.0, 1.0, *np.mod(np.concatenate([[], *fractions]), 1.0)])
+    total = np.zeros(len(weights))
+    for a, b in pairwise(jumps):
+        uniforms[:] = [(a + b) / 2]
+        chosen = Chopthin(ratio).resample(One(np.random.PCG64(0)), population, n)
+        assert len(chosen) == n
+        assert np.ptp(chosen.log_weights) <= np.log(ratio) + 1e-9
+        carried = np.bincount(chosen.parents["ancestor"], np.exp(chosen.log_weights), minlength=len(weights)) / n
+        total += (b - a) * carried
+    np.testing.assert_allclose(total, np.array(weights) / len(weights), rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("order", ["position", "mean_partition"])
+@pytest.mark.parametrize("n", [1, 2, 4, 5])
+def test_sorted(order, n):
+    """The law of copies of the scheme in the sorted order; chosen particles keep their ancestors."""
+    population = of([2.0, -1.0, 0.5, 1.0], [1.0, 3.0, 2.0, 2.0])
+    found = carried(Sorted(Systematic(), order), population, n, cells=8)
+    np.testing.assert_allclose(found, np.exp(population.log_weights) / 4, atol=1e-12)
+    chosen = Sorted(Stratified(), order).resample(np.random.default_rng(0), population, n)
+    np.testing.assert_array_equal(chosen.particles, population.particles[chosen.parents["ancestor"]])
 
 
 @pytest.mark.parametrize("k", [1, 2, 3, 4])

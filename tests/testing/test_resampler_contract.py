@@ -5,6 +5,8 @@ False alarms: each contract has two statistical properties at 1e-6, so below 1e-
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import pytest
 
@@ -13,13 +15,16 @@ from mstfilter.presets import REGISTRY
 from mstfilter.smc import (
     ClusterStratified,
     Coalesced,
+    EnsembleTransform,
     FearnheadClifford,
     Gaussian,
     KDpp,
     Population,
     Residual,
     Shuffled,
+    Sorted,
     Tempered,
+    TransformResampler,
 )
 from mstfilter.testing import WeightResamplerContract, run_contract
 from tests.testing.faults import FAULTS, Correct, CorrectWeighted
@@ -53,6 +58,7 @@ def test_the_global_generators_are_restored():
 
 OURS = {
     **{name: REGISTRY.build("resampler", name) for name in smc.__components__["resampler"]},
+    "mean partition": Sorted(order="mean_partition"),
     "residual, stratified": Residual("stratified"),
     "residual, systematic": Residual("systematic"),
     "kdpp, wide": KDpp(Gaussian(5.0)),
@@ -69,8 +75,11 @@ OURS = {
 def test_components_of_the_package_keep_their_contract(name):
     results = run_contract(OURS[name])
     assert [r for r in results if r.failure] == []
-    tested = {r.name: r.skipped is None for r in results}["carried_weight"]
-    assert tested == OURS[name].properly_weighted
+    outcomes = {r.name: r.skipped is None for r in results}
+    if isinstance(OURS[name], TransformResampler):
+        assert outcomes["keeps_the_weighted_mean"]
+    else:
+        assert outcomes["carried_weight"] == OURS[name].properly_weighted
 
 
 def test_resamplers_work_on_other_particles():
@@ -87,3 +96,39 @@ def test_resamplers_work_on_other_particles():
 
     for scheme, example in ((KDpp(), vectors), (Coalesced(), mapping), (Coalesced(), objects)):
         assert [r for r in run_contract(scheme, example) if r.failure] == []
+
+
+@dataclass(frozen=True)
+class Mixture(TransformResampler):
+    """New particles by optimal transport, with planted faults."""
+
+    fault: str = ""
+
+    def resample(self, rng, population, n):
+        made = EnsembleTransform().resample(rng, population, n)
+        if self.fault == "ignores weights":
+            flat = population.reweighted(population.log_mean_weight - population.log_weights)
+            made = EnsembleTransform().resample(rng, flat, n)
+        if self.fault == "sum of weights":
+            return made.reweighted(np.full(n, np.log(len(population) / n)))
+        if self.fault == "jitter":
+            return made.moved(made.particles + 0.01 * rng.standard_normal(n))
+        if self.fault == "ancestors":
+            return made.with_ancestors(np.zeros(n, int))
+        return made.take(np.arange(max(n - 1, 1))) if self.fault == "one less" else made
+
+
+@pytest.mark.parametrize(
+    ("fault", "words"),
+    [
+        ("", None),
+        ("ignores weights", "has mean"),
+        ("sum of weights", "log mean of the old weights"),
+        ("jitter", "has mean"),
+        ("ancestors", "parents ['ancestor']"),
+        ("one less", "it returns"),
+    ],
+)
+def test_contract_of_resamplers_that_make_particles(fault, words):
+    failures = [r.failure for r in run_contract(Mixture(fault)) if r.failure]
+    assert not failures if words is None else any(words in failure for failure in failures), failures
