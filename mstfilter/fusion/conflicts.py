@@ -7,9 +7,9 @@
 A vertex is an object of one of the two hypotheses; an edge joins a proposed and a predicted object that overlap. The
 graph is bipartite, because objects of one hypothesis never overlap.
 
-For each connected component a `Structure` draws a painting order and directed edges child -> parent.
-`merge_probability` is the probability that a child with n1 voxels is merged into its parent with n2 voxels, if they
-have I voxels in common:
+For each connected component a `Structure` draws a painting order, and directed edges from a child to its parent,
+which is painted later. `merge_probability` is the probability that a child with n1 voxels is merged into its parent
+with n2 voxels, if they have I voxels in common:
 
 =============  =============================  ========================================================
 rule           probability                    source

@@ -2,9 +2,9 @@
 
 >>> child = Crossover().cross(rng, proposed, predicted)
 
-1. `graph_of` builds the conflict graph: objects of the two hypotheses that overlap are in conflict.
-2. `Crossover.resolve` draws, for each connected component, the conflicts along which objects are merged, and the
-   order in which the merged objects are painted, later over earlier.
+1. `graph_of` builds the conflict graph: two objects that share voxels are in conflict.
+2. `Crossover.resolve` draws, for each connected component of the graph, which objects are merged, and the order in
+   which all of them are painted. A later object covers an earlier one.
 3. `Crossover.assign_labels` writes the labels. Objects without conflict are copied.
 4. `ModeFilter` removes the speckle that painting leaves.
 """
@@ -51,10 +51,10 @@ class ConflictResolution(NamedTuple):
 class ModeFilter:
     """Majority filter over label grids.
 
-    The label of an occupied voxel is replaced by the most frequent other label in its window, if this label occurs
-    at least `margin` times more often than its own. Of equally frequent labels the larger one is used. Free cells are
-    not counted as a label, but an occupied voxel with more than `isolation` free cells in its window becomes free.
-    All voxels of a sweep change at the same time. Sweeps are repeated until no voxel changes.
+    The label of an occupied voxel is replaced by the most frequent other label in its window, if the count of this
+    label exceeds that of its own by at least `margin`. Of equally frequent labels the larger one is used. Free cells
+    are not counted as a label, but an occupied voxel with more than `isolation` free cells in its window becomes
+    free. All voxels of a sweep change at the same time. Sweeps are repeated until no voxel changes.
 
     Parameters
     ----------

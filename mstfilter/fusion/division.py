@@ -1,10 +1,11 @@
-"""Split objects of which a clip shows that their parts move apart, and remember the split.
+"""Splits objects whose parts move apart in a clip, and remembers the split.
 
 >>> hypothesis = split_by_motion(hypothesis, motions, clip)         # by the motions of this clip
 >>> proposed = split_like(proposed, predicted)                      # by the motions of earlier clips
 
-After two touching objects have moved apart, a later image may show them as one object again. `ObjectRecord.apart`
-has the ids of the objects from which an object has moved apart, and crossover never merges such objects.
+After two touching objects have moved apart, a segmentation of a later image may show them as one object again.
+`ObjectRecord.apart` lists the ids of the objects from which an object has moved apart. Crossover never merges two
+objects that moved apart.
 """
 
 from __future__ import annotations

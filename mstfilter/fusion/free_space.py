@@ -3,13 +3,14 @@
 >>> refined, quality = FreeSpace().project(hypothesis, frame)           # one hypothesis, one frame
 >>> refined, quality = FreeSpace().refine(hypotheses, clip)             # several, at the end of a clip
 
-The quality of a hypothesis is Q = 1 - (occupied voxels that are cleared) / (occupied voxels). The update adds
-lambda log Q to the log weight, so a prediction with objects in free space loses voxels and weight.
+The quality of a prediction is Q = 1 - (occupied voxels that are cleared) / (occupied voxels). The update adds
+lambda log Q to its log weight; lambda is `quality_exponent`. So a prediction with objects in free space loses voxels
+and weight.
 
-`ProjectionUpdate` is an update that consists of this projection alone. If an observation is compatible only with a
-thin set of states, predictions hardly ever lie in this set; a projection moves every particle into it (Koval,
-Pollard, Srinivasa 2015; for vectors `mstfilter.smc.ProjectOnto`). Here it is the set of scenes without voxels in
-observed free space.
+`ProjectionUpdate` is an update that consists of this projection alone. If only a thin set of states agrees with an
+observation, hardly any prediction lies in it. So a projection moves every particle into it (the manifold filter of
+Koval, Pollard and Srinivasa 2015; for vectors `mstfilter.smc.ProjectOnto`). Here it is the set of scenes without
+voxels in observed free space.
 
 >>> filter = ParticleFilter(proposal=None, initial=..., transition=..., update=ProjectionUpdate(), ...)
 """

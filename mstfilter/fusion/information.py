@@ -11,15 +11,16 @@ entropy of the weights summed over equal outcomes.
 >>> import numpy as np
 >>> rows = np.array([[1, 1, 0], [1, 1, 0], [0, 0, 0]])    # outcomes of three hypotheses in three groups of cells
 >>> weights, sizes = np.array([0.25, 0.25, 0.5]), np.array([10, 5, 70])
->>> float(outcome_information(weights, rows, hamming, sizes)) == np.log(2)
+>>> bool(np.isclose(outcome_information(weights, rows, hamming, sizes), np.log(2)))
 True
 
-**Tolerance.** Without noise, two outcomes that differ in one cell of 10,000 are different. With `tolerance` tau
+**Tolerance.** Without noise, two outcomes that differ in one cell of 10,000 are different. With a
+`tolerance` tau, the information is
 
-    I_tau = - sum_i w_i log sum_j w_j exp(-d_ij / tau),      d_ij = number of cells in which outcomes i and j differ,
+    I_tau = - sum_i w_i log sum_j w_j exp(-d_ij / tau),      d_ij = number of cells in which outcomes i and j differ.
 
-decreases from the information without noise (tau = 0, exact) to 0: outcomes that differ in far fewer than tau cells
-count as one, those that differ in far more count as two. If every cell is read with an independent error of
+Outcomes that differ in far fewer than tau cells count as one, and those that differ in far more count as two. I_0 is
+the information without noise; I_tau decreases to 0 as tau grows. If every cell is read with an independent error of
 probability e, then I_tau with tau = -1 / log(2 sqrt(e (1 - e))) is a lower bound of the mutual information with the
 reading (Kolchinsky, Tracey 2017, *Estimating mixture entropy with pairwise distances*, with the Bhattacharyya
 distance).

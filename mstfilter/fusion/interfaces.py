@@ -3,10 +3,10 @@
 ==============  =====================================================================  ===========================
 interface       task                                                                   field of a preset
 ==============  =====================================================================  ===========================
-`Projection`    clears what a frame observes as free from predicted hypotheses         ``update.free_space``
-`Division`      groups the pixels of a frame by what a clip shows to be different      ``update.division``
-`Structure`     orders the objects of a component of the conflict graph                ``update.crossover.structure``
-`Evidence`      scores built candidates against one part of the data                   ``update.evidence``
+`Projection`    clears voxels of a prediction that a frame observes as free            ``update.free_space``
+`Division`      groups the pixels of a frame by object, as far as a clip shows it      ``update.division``
+`Structure`     draws which conflicts may merge, and the painting order                ``update.crossover.structure``
+`Evidence`      scores built candidates by one part of the data                        ``update.evidence``
 ==============  =====================================================================  ===========================
 
 >>> log_score = evidence.log_score(hypotheses, clip)       # (n,) nats, larger is better

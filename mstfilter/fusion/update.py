@@ -2,13 +2,16 @@
 
 >>> fused = FusionUpdate().update(rng, predicted, proposed, clip)
 
-1. Every predicted hypothesis j is projected onto the observed free space and keeps a share Q_j of its voxels.
-2. Every pair of a proposed sample i and a predicted hypothesis j is crossed `eta` times. The weight of a candidate,
+1. The projection onto free space clears voxels of every predicted hypothesis j, which keeps a share Q_j of them.
+2. Objects whose parts moved apart in the clip are split (`division`).
+3. Every sample i and every predicted hypothesis j make `eta` candidates by crossover. With weights w_i and w_j of the
+   parents and lambda = `quality_exponent`, the weight of a candidate,
 
-       log w = log w_j + log w_i + lambda log Q_j,
+       log w = log w_i + log w_j + lambda log Q_j,
 
-   depends on its pair only. So candidates are resampled first, and only those that are chosen are built.
-3. With `evidence`, some candidates are drawn by this weight, built and scored. The weight of the first stage is
+   depends on its parents only. So candidates are resampled first, and only those that are chosen are built. `claims`
+   says which voxels a prediction may add to a sample when they are built.
+4. With `evidence`, some candidates are drawn by this weight, built and scored. The weight of the first draw is
    divided out, so the weight of a drawn candidate is its score.
 """
 

@@ -10,7 +10,8 @@ truth.
 ``quality_paper``, ``quality_authors``: the other forms (see `mstfilter.scoring`).
 ``quality_top``, ``quality_weighted``, ``quality_best``: quality of the hypothesis of largest weight, weighted mean,
 and maximum. The maximum can only be compared at equal numbers of hypotheses.
-``quality_visible``, ``quality_hidden``, ``quality_unseen``: coverage of the true objects of that status only.
+``quality_visible``, ``quality_hidden``, ``quality_unseen``: coverage of the true objects that are visible at this
+pause, were visible at an earlier one only, or never were (`mstfilter.scoring.object_status`).
 ``quality_one_blob``, ``quality_components``: trivial baselines: the occupied voxels as one object, or as their
 connected components.
 ``occupancy``: intersection over union of the occupied voxels. ``object_f``: F score of objects at IoU 0.5.

@@ -1,4 +1,4 @@
-"""Filter a recording into a run folder.
+"""Filters a recording, and writes the run folder.
 
 >>> run = filter_recording(recording, load_config("mst"), Path("runs/mine"), seed=0)
 

@@ -3,10 +3,10 @@
 >>> rows = score_pauses(read_estimate(Path("runs/mine")), read_truth(Path("recordings/mine/voxels.npz")))
 >>> rows[0].form, rows[0].mean, rows[0].best, rows[0].one_blob
 
-There is one row for each pause and form of weighted coverage (`mstfilter.scoring`): the mean over the hypotheses, the
-weighted mean, the maximum, the value of the hypothesis of largest weight, and two trivial baselines: the occupied
-voxels of the same hypotheses as one blob and as connected components. If the ground truth has instance images but no
-volumes, hypotheses are rendered and compared in the image; pixels of the robot (255) are ignored.
+There is one row for each pause and form of weighted coverage (`mstfilter.scoring`). It has the mean over the
+hypotheses, the weighted mean, the maximum, and the value of the hypothesis of largest weight. It also has two floors:
+the occupied voxels of the same hypotheses as one blob, and as connected components. If the ground truth has instance
+images but no volumes, hypotheses are rendered and compared in the image; pixels of the robot (255) are ignored.
 """
 
 from __future__ import annotations

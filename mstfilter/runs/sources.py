@@ -1,10 +1,11 @@
-"""Open recordings of any format.
+"""Opens recordings of any format.
 
 >>> open_source(Path("session.mcap"))
 >>> open_source(Path("rgbd_dataset"), options=["K=525,525,319.5,239.5"], pauses="0s,4.2s")
 
-Options are fields of the format (``mstfilter list format`` shows them) in the syntax of overrides; a comma makes a
-list. The format ``./file.py:Class`` is a reader that the user wrote.
+Options are fields of the format (``mstfilter list format`` shows them), as ``FIELD=VALUE``; commas make a list. The
+format ``./file.py:Class`` is a reader that the user wrote. Each format is a class of `mstfilter.formats`; a ROS bag
+is read by ``formats/bag.py``, and a rule of ``formats/pauses.py`` decides where the pauses are.
 """
 
 from __future__ import annotations

@@ -3,8 +3,9 @@
 >>> with scene_cache.on_disk(folder, limit_bytes=10**9, version="1"):  # doctest: +SKIP
 ...     run()                                    # values with `stored_as` are stored, and found again
 
-diskcache keeps the entries and removes the least recently used ones beyond the limit. An entry holds the bytes of an
-.npz file. Nothing is pickled, and nothing that the folder holds is unpickled.
+`stored_as` is an argument of `mstfilter.scene.memo`. diskcache keeps the entries and removes the least recently used
+ones beyond the limit. An entry holds the bytes of an .npz file. Nothing is pickled, and nothing that the folder holds
+is unpickled.
 """
 
 from __future__ import annotations

@@ -5,8 +5,8 @@
 >>> clip = Clip([frame, frame_2], grid)        # the frames from one pause to the next
 >>> clip.before, clip.after                    # its first and its last frame
 
-If several cameras observe the scene, one of them is segmented and tracked. The frames of the others at the same
-instant are its `views`; free space is computed from all of them:
+If several cameras observe the scene, the images of one are segmented and tracked. The frames of the others at the
+same time are its `views`. Free space is computed from all of them:
 
 >>> frame = Frame(rgb, depth, camera, views=(Frame(rgb_2, depth_2, camera_2),))
 """

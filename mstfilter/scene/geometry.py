@@ -6,9 +6,10 @@
 >>> grid = workspace(frame_with_that_camera)              # voxels around the objects on the table
 >>> warn_if_workspace_is_empty(frames, grid, "recording table-7")
 
-Disparity D = 8 f b / z is affine in pixel coordinates on a plane, and its noise is the same everywhere. The support
-plane is therefore a least-squares fit of D = a u + b v + c. Disparity is given in the units of a Kinect (f = 525
-pixels, b = 0.075 m, 1/8 pixel) for every image size, so that thresholds correspond to the same noise.
+Disparity D = 8 f b / z (f focal length, b baseline, z depth) is affine in pixel coordinates on a plane, and its noise
+is the same everywhere. So the support plane is a least-squares fit of D by an affine function of the pixel (u, v).
+Disparity has the units of a Kinect (f = 525 pixels, b = 0.075 m, 1/8 pixel) for every image size, so that thresholds
+correspond to the same noise.
 """
 
 from __future__ import annotations

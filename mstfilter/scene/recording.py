@@ -5,8 +5,8 @@
 >>> for clip in recording.clips():
 ...     clip.before, clip.after                              # Frames, read when they are used
 
-Without a camera pose the world is found from the support plane of the first pause; without a workspace a grid is
-placed around the objects on the table.
+If the camera pose is not given, the world axes are those of the support plane at the first pause. If the workspace is
+not given, it is placed around the objects on the table.
 """
 
 from __future__ import annotations

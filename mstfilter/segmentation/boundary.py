@@ -3,10 +3,11 @@
 >>> boundary = ColourDepthBoundary().boundary(frame)       # (H, W) float32 in 0 .. 1
 >>> height = above_table(frame)                            # (H, W), > 0 above the table, NaN without reading
 
-Objects are mostly convex, so depth has a concave crease or a step where two objects meet and where an object meets
-the table. The convex creases of a box lie inside one object. Disparity D = 8 f b / z is affine on every plane and its
-noise does not depend on the range, so the largest eigenvalue of its Hessian responds to creases and steps only.
-Colour adds boundaries that depth does not show. Its weight is lower because print on a box is not a boundary.
+Objects are mostly convex. So depth has a concave crease or a step where two objects meet and where an object meets
+the table. A convex crease, such as the edge of a box, lies inside one object. Disparity D = 8 f b / z (f focal
+length, b baseline, z depth) is affine on every plane, and its noise does not depend on the range. So the largest
+eigenvalue of its Hessian responds to creases and steps only. Colour adds boundaries that depth does not show. Its
+weight is lower, because print on a box is not a boundary.
 """
 
 from __future__ import annotations

@@ -7,14 +7,15 @@ maximises it, a `CutSampler` draws cuts at random.
 >>> best = optimal_cut(tree, w)                                # ascending nodes
 >>> sample = ExactCuts().sample(np.random.default_rng(0), tree, w, 10)
 
-Under a Gibbs law a cut has probability proportional to exp(b v(c)). One pass up the tree gives the probability
-``stop[n]`` that a cut which reaches node n contains n itself. A walk down from the root with these probabilities
-draws a cut exactly.
+Under a Gibbs law with inverse temperature b, a cut has probability proportional to exp(b v(c)). One pass up the tree
+gives the probability ``stop[n]`` that a cut which reaches node n contains n itself. A walk down from the root with
+these probabilities draws a cut exactly.
 
-The law of the paper, exp(-(v* - v)^2 / s2), is bounded by a scaled Gibbs law for any b: with d = v* - v,
-``exp(-d^2 / s2) <= exp(-b d + b^2 s2 / 4)``. Gibbs draws that are accepted with probability
-``exp(-(d - b s2 / 2)^2 / s2)`` are therefore exact and independent draws from it (`ExactCuts`). The acceptance rate
-is highest for the b that solves ``b = 2 E_b[d] / s2``.
+The law of the paper is exp(-d^2 / s2), where d = v* - v(c) is the difference to the value v* of the optimal cut.
+`ExactCuts` draws from it by rejection, because a scaled Gibbs law bounds it for any b:
+``exp(-d^2 / s2) <= exp(-b d + b^2 s2 / 4)``. A Gibbs draw is accepted with probability
+``exp(-(d - b s2 / 2)^2 / s2)``; accepted draws are exact and independent. The acceptance rate is highest for the b
+that solves ``b = 2 E_b[d] / s2``, with E_b the mean under the Gibbs law.
 """
 
 from __future__ import annotations

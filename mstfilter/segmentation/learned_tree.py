@@ -1,8 +1,8 @@
 """A segmentation tree whose merges are decided by learned log odds: same object or not.
 
-Watershed regions of a boundary map are merged best first. The log odds that two regions are different objects are
-linear in features of their border and of their union (`PAIR_FEATURES`), which are recomputed when a region grows. The
-weights were fitted on simulated scenes only.
+Watershed regions of a boundary map are merged, the pair with the lowest log odds first. The log odds that two regions
+are different objects are linear in features of their border and of their union (`PAIR_FEATURES`), which are
+recomputed when a region grows. The weights were fitted on simulated scenes only.
 
 >>> tree = LearnedTree().build(boundary, frame)
 >>> w = MergeLogOdds().values(tree, frame)

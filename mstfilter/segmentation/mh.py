@@ -12,10 +12,10 @@ for values that are log odds (`MergeLogOdds`), which need no scale.
 >>> sample = MetropolisHastingsCuts().sample(np.random.default_rng(0), tree, w, 5)
 >>> sample.diagnostics["acceptance"], sample.diagnostics["autocorrelation_steps"]
 
-A `MoveRule` proposes the next cut. MoveNode goes *up* or *down* at a node of the cut: up replaces the node and all
-its siblings, which must be in the cut, by their parent; down replaces the node by its children. Any of the m siblings
-can propose the same move up, so with a node drawn uniformly from n and a fair coin for the direction the proposal
-probability is ``g(up) = m / (2 n)``, and ``1 / (2 n')`` for the reverse move. A rule draws a choice, which determines
+A `MoveRule` proposes the next cut. MoveNode (`NodeMoves`) draws one of the n nodes of the cut, and *up* or *down* by
+a fair coin. Up replaces the node and all its siblings, which must be in the cut, by their parent. Down replaces the
+node by its children. Each of m siblings proposes the same move up, so its probability is ``g(up) = m / (2 n)``. The
+reverse move has ``1 / (2 n')``, with n' nodes in the cut after the move up. A rule draws a choice, which determines
 the move:
 
 >>> state = CutState(tree, cut)

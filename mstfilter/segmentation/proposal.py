@@ -4,8 +4,8 @@
 >>> population = proposal.sample(np.random.default_rng(0), clip, 10)
 >>> population.particles[0].n_objects, population.notes["distinct_segments"]
 
-There is one boundary map and one tree per frame. Each distinct segment of the sampled cuts is completed once. Voxels
-that several objects of a hypothesis claim are assigned per hypothesis.
+There is one boundary map and one tree per frame. Each distinct segment of the sampled cuts is completed once. If
+several objects of a hypothesis claim a voxel, one of them gets it, in every hypothesis separately.
 
 `ObjectRule` decides which regions of a cut are objects:
 

@@ -7,7 +7,8 @@ Regions and borders are measured as sums over pixels, so the row of a merged reg
 >>> x = pair_features(sums[a], sums[b], border, table_a, table_b, scale)       # (k, len(PAIR_FEATURES))
 
 The features are inputs of the log odds that two regions are different objects. Sizes are in pixels of a 640 px wide
-image, disparity in sensor units, lengths in metres. "Front" is the region that is nearer to the camera at the border.
+image, disparity in sensor units (1/8 px at f = 525 px), lengths in metres. "Front" is the region that is nearer to
+the camera at the border.
 """
 
 from __future__ import annotations

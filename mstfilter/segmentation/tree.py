@@ -14,8 +14,9 @@ array([[1, 1],
        [1, 0]])
 
 `UcmTree` builds the ultrametric contour map (Arbelaez et al. 2011): watershed regions of the boundary map are merged
-in order of the mean strength of their common border. A logistic curve maps merge heights to P(boundary): a region
-inside one object starts near 0, a region bordered by other objects ends near 1.
+in order of the mean strength of their common border. A logistic curve maps the height of a merge, which is this mean,
+to P(boundary), the probability that it joins different objects. `start` is P(boundary) of the merge that makes a
+node: near 0 if the node lies inside one object, near 1 if it contains several.
 """
 
 from __future__ import annotations

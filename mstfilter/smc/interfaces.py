@@ -54,7 +54,7 @@ class Component(ABC):
 
         The author of a component states this: True is the default, ``properly_weighted = False`` in the class changes
         it. `mstfilter check` tests it for resamplers. A filter reports the log evidence only if all its components
-        are properly weighted.
+        are properly weighted and it has no `proposal`.
         """
         return True
 

@@ -45,9 +45,8 @@ def observe(name: str, distribution: Any, value: Any) -> None:
     distribution : Distribution
         Of the observation given the particle.
     value : array_like or None
-        The observation, of the event shape of the distribution. Or a value for each particle, ``(n, *event_shape)``,
-        that
-        depends on the particle, such as the reading that it assigns to an object.
+        The observation, of the event shape of the distribution. Or a value for each particle, of shape
+        ``(n, *event_shape)``, such as the reading that the particle assigns to an object.
     """
     _current().observe(name, distribution, value)
 
