@@ -26,7 +26,15 @@ from mstfilter.errors import InputError, check_component, check_integer
 from mstfilter.smc.components import Reweight
 from mstfilter.smc.distributions import as_distribution
 from mstfilter.smc.filter import ParticleFilter
-from mstfilter.smc.interfaces import DensityTransition, Lookahead, Proposal, Rejuvenation, Resampler, Trigger
+from mstfilter.smc.interfaces import (
+    DensityTransition,
+    Distribution,
+    Lookahead,
+    Proposal,
+    Rejuvenation,
+    Resampler,
+    Trigger,
+)
 from mstfilter.smc.population import Particles, Population, count_particles
 from mstfilter.smc.resampling import Systematic
 from mstfilter.smc.triggers import EssBelow
@@ -82,7 +90,7 @@ class StateSpaceModel:
         return cls(
             first.sample,
             lambda rng, x: as_distribution(transition(x)).sample(rng, count_particles(x)),
-            lambda x, y: as_distribution(observation(x)).log_prob(y),
+            lambda x, y: _log_likelihood(as_distribution(observation(x)), y),
             first.log_prob,
             lambda previous, new: as_distribution(transition(previous)).log_prob(new),
         )
@@ -99,6 +107,17 @@ class StateSpaceModel:
         if found is None:
             raise InputError(f"the model has no {which}", "give StateSpaceModel its log densities, or use .of()")
         return found
+
+
+def _log_likelihood(distribution: Distribution, y: Any) -> np.ndarray:
+    """(n,) log p(y | x). Without the check, entries of a vector would be compared with the particles one by one."""
+    found, event = () if isinstance(y, float) else np.shape(y), distribution.event_shape
+    if found not in (event, (1, *event)) and (found, event) != ((), (1,)):
+        raise InputError(
+            f"the observation has shape {found}, expected the event shape {event}",
+            "a vector of d entries needs parameters (n, d) or (1, d), such as Normal(x[:, None], 1.0)",
+        )
+    return distribution.log_prob(y)
 
 
 @dataclass(frozen=True)

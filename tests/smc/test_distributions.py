@@ -14,9 +14,11 @@ from mstfilter.smc import (
     MultivariateNormal,
     Normal,
     Poisson,
+    StateSpaceModel,
     Student,
     Uniform,
     as_distribution,
+    bootstrap,
 )
 
 COV = np.array([[2.0, 0.6], [0.6, 0.5]])
@@ -148,6 +150,21 @@ def test_parameters_that_do_not_fit_together():
         MultivariateNormal([0.0], COV)
     with pytest.raises(InputError, match=r"mean of shape \(4,\) does not fit a covariance of shape \(1, 1\)"):
         MultivariateNormal(np.zeros(4), [[1.0]])
+
+
+@pytest.mark.parametrize(
+    ("loc", "y", "expected"),
+    [
+        (lambda x: x, np.zeros(5), r"shape \(5,\), expected the event shape \(\)"),
+        (lambda x: x, np.zeros((5, 1)), r"shape \(5, 1\), expected the event shape \(\)"),
+        (lambda x: np.stack([x, x], axis=1), 0.5, r"shape \(\), expected the event shape \(2,\)"),
+        (lambda x: x + x[:, None], 0.5, r"shape \(\), expected the event shape \(5,\)"),
+    ],
+)
+def test_a_state_space_model_compares_an_observation_with_the_event(loc, y, expected):
+    model = StateSpaceModel.of(Normal(0.0, 1.0), lambda x: Normal(x, 1.0), lambda x: Normal(loc(x), 1.0))
+    with pytest.raises(InputError, match="step 0, update: the observation has " + expected):
+        bootstrap(model, 5).run([y], 0)
 
 
 def test_log_prob_does_not_write_to_its_argument():
