@@ -102,18 +102,25 @@ def _fixed_point(weights: np.ndarray, total: int) -> np.ndarray:
 _BLOCK = 1 << 13  # arrays of so many numbers stay in cache
 
 
-def independent_draws(rng: np.random.Generator, weights: np.ndarray, n: int) -> np.ndarray:
-    """(n,) indices drawn independently by weight, in O(m + n); overwrites `weights`.
+def _searched(weights: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """The index of the interval of the cumulative weights, scaled to [0, 1), that contains each of a few points."""
+    cumulative = weights.cumsum()
+    index = cumulative.searchsorted(points * cumulative[-1], side="right")  # "right" skips weights of zero
+    # A point rounded up to the total belongs to the last particle of positive weight.
+    return np.minimum(index, cumulative.searchsorted(cumulative[-1]))
 
-    Few draws search the cumulative weights for ordered uniforms. Many draws are distributed to strata of equal weight
-    and ascend from one stratum to the next only. Inside a stratum, the number of cumulative weights in lower bins is
-    a lower bound of the index of a point, which is increased where it is too small.
+
+def independent_draws(rng: np.random.Generator, weights: np.ndarray, n: int) -> np.ndarray:
+    """(n,) indices drawn independently by weight, in O(m + n); may overwrite `weights`.
+
+    Many draws are distributed to strata of equal weight, and ascend from one stratum to the next only. Inside a
+    stratum, the number of cumulative weights in lower bins is a lower bound of the index of a point, which is
+    increased where it is too small.
     """
+    if n < 2000:
+        return _searched(weights, ordered_uniforms(rng, n))
     total = 1 << 62
     cumulative = _fixed_point(weights, total)
-    if n < 1000:
-        points = np.minimum(ordered_uniforms(rng, n) * total, total - 1024).astype(np.int64)
-        return cumulative.searchsorted(points, side="right")  # "right" skips weights of zero
     n_strata = -(-n // _BLOCK)
     limits = [total * k // n_strata for k in range(n_strata + 1)]
     stops = cumulative.searchsorted(limits, side="right").tolist()
@@ -148,8 +155,10 @@ def _increase(index: np.ndarray, edges: np.ndarray, points: np.ndarray) -> None:
 
 
 def stratified_ancestors(weights: np.ndarray, uniforms: np.ndarray) -> np.ndarray:
-    """(n,) ancestors at the points (k + u_k) / n of the cumulative weights; overwrites `weights`."""
+    """(n,) ancestors at the points (k + u_k) / n of the cumulative weights; may overwrite `weights`."""
     n = len(uniforms)
+    if n < 1000:
+        return _searched(weights, (np.arange(n) + uniforms) / n)
     bits = 62 - n.bit_length()
     cumulative = _fixed_point(weights, n << bits)  # a stratum has width 2^bits
     for begin in range(0, len(weights), _BLOCK):
@@ -175,8 +184,8 @@ def systematic_ancestors(cumulative: np.ndarray, n: int, shift: float) -> np.nda
 
 def _expanded(ends: np.ndarray, n: int) -> np.ndarray:
     """(n,) ancestors if particle i gets the positions from ends[i - 1] to ends[i]: position k that many ends <= k."""
-    counts = np.bincount(ends[: ends.searchsorted(n)], minlength=n)
-    return np.cumsum(counts, out=counts)
+    counts = np.bincount(ends[:-1], minlength=n)[:n]
+    return counts.cumsum(out=counts)
 
 
 @dataclass(frozen=True)
@@ -205,7 +214,7 @@ class Systematic(WeightResampler):
         if log_weights.ndim == 2:  # one row per run of a batch
             return _systematic_rows(log_weights, n, rng.random((len(log_weights), 1))), None
         weights = checked_weights(log_weights, n)
-        return systematic_ancestors(np.cumsum(weights, out=weights), n, rng.random()), None
+        return systematic_ancestors(weights.cumsum(out=weights), n, rng.random()), None
 
 
 def _systematic_rows(log_weights: np.ndarray, n: int, shifts: np.ndarray) -> np.ndarray:
@@ -281,11 +290,10 @@ class Ssp(WeightResampler):
             grows = rng.random(len(a)) * np.minimum(total, 2 - total) < np.minimum(a, 1 - b)
             left, right = index[:-1:2], index[1::2]
             open_one = np.where(grows != exceeds, left, right)
-            full = np.flatnonzero(exceeds)
-            copies[left[full] + right[full] - open_one[full]] += 1
+            copies[left + right - open_one] += exceeds
             total -= exceeds
             if len(index) % 2:
-                open_one, total = np.append(open_one, index[-1]), np.append(total, value[-1])
+                open_one, total = np.concatenate((open_one, index[-1:])), np.concatenate((total, value[-1:]))
             index, value = open_one, total
             if value.min() <= _SETTLED or value.max() >= 1 - _SETTLED:
                 copies[index[value >= 1 - _SETTLED]] += 1
