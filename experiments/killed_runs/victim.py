@@ -1,16 +1,44 @@
-"""The run that trials.py kills: ``victim.py CHECKPOINT``. It resumes from the checkpoint if there is one."""
+"""The run that trials.py kills: ``victim.py KIND PATH``. It continues from what PATH holds.
+
+`checkpoint` is one run with a checkpoint file; `run_many` stores finished runs of two filters in a folder; `batch` is
+`run_many` where it runs many seeds at once.
+"""
 
 from __future__ import annotations
 
 import sys
+from pathlib import Path
 
 import numpy as np
 
-from mstfilter.smc import Normal, StateSpaceModel, bootstrap
+from mstfilter.smc import (
+    Multinomial,
+    Normal,
+    StateSpaceModel,
+    bootstrap,
+    ess,
+    linear_gaussian,
+    log_evidence,
+    mean,
+    run_many,
+)
 
 MODEL = StateSpaceModel.of(Normal(0.0, 1.0), lambda x: Normal(0.9 * x, 0.6), lambda x: Normal(x, 0.4))
+LINEAR = linear_gaussian(*np.array([[[0.9]], [[0.36]], [[1.0]], [[0.16]]]), [0.0], [[1.0]])
+OBSERVATIONS = np.random.default_rng(0).normal(size=60).tolist()
+
+
+def run(kind: str, path: Path) -> None:
+    """Run, or continue; the results of the folders are also written as history.npz."""
+    if kind == "checkpoint":
+        bootstrap(MODEL, 2000).run(OBSERVATIONS, 3, checkpoint=path)
+        return
+    arms = {"systematic": bootstrap(LINEAR, 500), "multinomial": bootstrap(LINEAR, 500, Multinomial())}
+    collectors = {"log_evidence": log_evidence, **({"ess": ess} if kind == "batch" else {"mean": mean})}
+    history = run_many(arms, OBSERVATIONS, range(8), folder=path, **collectors)
+    np.savez(path / "history.npz", **history)
+
 
 if __name__ == "__main__":
-    observations = np.random.default_rng(0).normal(size=60).tolist()
     print("begun", flush=True)
-    bootstrap(MODEL, 2000).run(observations, 3, checkpoint=sys.argv[1])
+    run(sys.argv[1], Path(sys.argv[2]))

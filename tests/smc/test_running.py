@@ -377,23 +377,33 @@ def test_a_hash_follows_the_constants_that_a_function_uses(monkeypatch):
     assert digest(lambda x: FACTOR * x) != before
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="kills a process by a signal")
-def test_a_killed_run_ends_as_one_that_was_not(tmp_path):
-    """Eight kills at random moments; experiments/killed_runs has a hundred."""
+def killed(kind, path, delays):
+    """Run the script that experiments/killed_runs kills, and kill it after each delay."""
     script = REPOSITORY / "experiments" / "killed_runs" / "victim.py"
     environment = {**os.environ, "PYTHONPATH": str(REPOSITORY), "OMP_NUM_THREADS": "1"}
-    reference = tmp_path / "whole.npz"
-    subprocess.run([sys.executable, script, reference], check=True, env=environment)
-    rng, path = np.random.default_rng(1), tmp_path / "run.npz"
-    for _ in range(8):
-        process = subprocess.Popen([sys.executable, script, path], env=environment, stdout=subprocess.PIPE)
+    for delay in delays:
+        process = subprocess.Popen([sys.executable, script, kind, path], env=environment, stdout=subprocess.PIPE)
         process.stdout.readline()  # the run has begun
-        time.sleep(rng.uniform(0, 0.12))
+        time.sleep(delay)
         process.send_signal(signal.SIGKILL)
         process.wait()
         process.stdout.close()
-    subprocess.run([sys.executable, script, path], check=True, env=environment)
-    with np.load(reference) as a, np.load(path) as b:
-        assert a.files == b.files
-        for name in a.files:
-            np.testing.assert_array_equal(a[name], b[name])
+    subprocess.run([sys.executable, script, kind, path], check=True, env=environment)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="kills a process by a signal")
+@pytest.mark.parametrize(("kind", "n_kills"), [("checkpoint", 8), ("run_many", 3), ("batch", 2)])
+def test_a_killed_run_ends_as_one_that_was_not(kind, n_kills, tmp_path):
+    """Some kills at random moments; experiments/killed_runs has a hundred."""
+    whole, path = tmp_path / "whole.npz", tmp_path / "run.npz"
+    killed(kind, whole, [])
+    killed(kind, path, np.random.default_rng(1).uniform(0, 0.12, n_kills))
+    pairs = (
+        [(whole, path)] if kind == "checkpoint" else [(f, path / f.relative_to(whole)) for f in whole.rglob("*.npz")]
+    )
+    assert len(pairs) == (1 if kind == "checkpoint" else 2 * 8 + 1)
+    for files in pairs:
+        with np.load(files[0]) as a, np.load(files[1]) as b:
+            assert a.files == b.files
+            for name in a.files:
+                np.testing.assert_array_equal(a[name], b[name])
