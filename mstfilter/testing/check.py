@@ -41,7 +41,7 @@ from mstfilter.smc import (
     WeightResampler,
 )
 from mstfilter.testing import moves, resampling, values
-from mstfilter.testing.contract import Contract
+from mstfilter.testing.contract import Contract, number_example
 from mstfilter.testing.scenes import scene_example
 
 #: Contract of each interface, the more special interface first.
@@ -122,9 +122,12 @@ def run_contract(
     """
     cls = type(component)
     contract = contract_of(cls)
+    example = example or _function_beside(cls, "example") or (scene_example if _uses_images(cls) else None)
+    if isinstance(component, Resampler) and resampling.makes_particles(component, example or number_example):
+        contract = resampling.TransformResamplerContract
     functions = {
         "make": lambda: component,
-        "example": example or _function_beside(cls, "example") or (scene_example if _uses_images(cls) else None),
+        "example": example,
         "exact": exact or _function_beside(cls, "exact"),
     }
     methods = {name: staticmethod(function) for name, function in functions.items() if function is not None}

@@ -80,7 +80,7 @@ class Contract:
 
     def checked_call(self, component: Any, inputs: dict[str, Any], rng: np.random.Generator | None = None) -> Any:
         """Use the component once; an exception or a wrong result is reported with a description of the inputs."""
-        with reports_errors(_description(inputs)):
+        with reports_errors(inputs):
             result = self.call(component, np.random.default_rng(3) if rng is None else rng, inputs)
         self.check_result(result, inputs)
         return result
@@ -151,8 +151,8 @@ def skip_unless_properly_weighted(component: Any) -> None:
 
 
 @contextmanager
-def reports_errors(what: str) -> Iterator[None]:
-    """Turn any exception of a component into an AssertionError that describes the call."""
+def reports_errors(what: str | dict[str, Any]) -> Iterator[None]:
+    """Turn any exception of a component into an AssertionError that describes the call, or its inputs."""
     try:
         yield
     except AssertionError:
@@ -161,6 +161,7 @@ def reports_errors(what: str) -> Iterator[None]:
         if _writes_to_read_only(error):
             raise AssertionError("it changes its input in place: make a copy first") from error
         message = str(error) if isinstance(error, InputError) else f"{type(error).__name__}: {error}"
+        what = what if isinstance(what, str) else _description(what)
         raise AssertionError(f"{what}: it raises {message}") from error
 
 

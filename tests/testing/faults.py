@@ -1,12 +1,13 @@
-"""Resamplers with one fault each, and two correct ones."""
+"""Resamplers with one fault each, and correct ones."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.optimize import brentq
 
-from mstfilter.smc import WeightResampler, log_mean_exp, normalise
+from mstfilter.smc import Population, Resampler, WeightResampler, log_mean_exp, normalise
 
 
 def systematic(rng, weights, n):
@@ -31,6 +32,86 @@ class CorrectWeighted(WeightResampler):
         even = (log_weights > -np.inf) / 1.0
         ancestors = systematic(rng, even, n)
         return ancestors, log_weights[ancestors] + np.log(even.mean())
+
+
+def multinomial(rng, weights, n):
+    """Another correct scheme, with the largest variance."""
+    return np.searchsorted(np.cumsum(weights)[:-1], rng.random(n) * weights.sum(), side="right")
+
+
+@dataclass(frozen=True)
+class Rejection(WeightResampler):
+    """Draws evenly and accepts with probability w / max w; the cost grows with max w / mean w."""
+
+    def select(self, rng, log_weights, n):
+        weights = np.exp(log_weights - log_weights.max())
+        ancestors, waiting = np.empty(n, int), np.arange(n)
+        while len(waiting):
+            ancestors[waiting] = rng.integers(len(weights), size=len(waiting))
+            waiting = waiting[rng.random(len(waiting)) >= weights[ancestors[waiting]]]
+        return ancestors, None
+
+
+@dataclass(frozen=True)
+class Metropolis(WeightResampler):
+    """Chains of so many steps that their total variation distance from the weights is at most `tolerance`."""
+
+    tolerance: float = 0.01
+
+    def select(self, rng, log_weights, n):
+        weights = np.exp(log_weights - log_weights.max())
+        chains = np.resize(np.flatnonzero(weights), n)
+        # Tierney (1994): each step keeps at most 1 - mean w / max w of the distance.
+        steps = int(np.ceil(np.log(self.tolerance) / np.log1p(-min(weights.mean(), 1 - 1e-9))))
+        for _ in range(steps):
+            proposed = rng.integers(len(weights), size=n)
+            chains = np.where(rng.random(n) * weights[chains] < weights[proposed], proposed, chains)
+        return chains, None
+
+
+@dataclass(frozen=True)
+class Chopthin(WeightResampler):
+    """Light particles are thinned, heavy ones chopped: the output weights differ by a factor of at most `ratio`."""
+
+    ratio: float = 6.0
+
+    def select(self, rng, log_weights, n):
+        weights = normalise(log_weights)
+
+        def copies(a):
+            return np.where(weights < a, weights / a, np.maximum(1.0, 2 * weights / (self.ratio * a)))
+
+        a = brentq(lambda a: copies(a).sum() - n, 0.01 / n, 1.0, xtol=1e-15, rtol=1e-12)
+        expected = copies(a)
+        ancestors = systematic(rng, expected, n)
+        out = np.maximum(a, weights / np.maximum(np.bincount(ancestors, minlength=len(weights)), 1))
+        lw = np.where(weights < a, np.log(a), np.log(out))[ancestors]
+        return ancestors, lw + log_mean_exp(log_weights) + np.log(n)
+
+
+@dataclass(frozen=True)
+class MeansByOrder(Resampler):
+    """New particles are means of the old ones by optimal transport, in one dimension: by order (Reich 2013)."""
+
+    def resample(self, rng, population, n):
+        x, W = population.particles, population.weights
+        order = np.argsort(x)
+        # Cumulative integral of the quantile function; new particle k is its mean over [k/n, (k+1)/n].
+        ends = np.concatenate([[0.0], np.cumsum(W[order])])
+        integral = np.concatenate([[0.0], np.cumsum(W[order] * x[order])])
+        made = np.diff(np.interp(np.linspace(0, ends[-1], n + 1), ends, integral)) * n
+        return Population(made, np.full(n, population.log_mean_weight))
+
+
+CORRECT = (Metropolis(), Chopthin(), MeansByOrder())
+
+
+class ForgetsAncestors(Resampler):
+    """A selection that sets no ancestors."""
+
+    def resample(self, rng, population, n):
+        ancestors = systematic(rng, population.weights, n)
+        return Population(population.particles[ancestors], np.full(n, population.log_mean_weight))
 
 
 @dataclass(frozen=True)
@@ -187,6 +268,90 @@ class OwnGenerator(WeightResampler):
         return systematic(np.random.default_rng(), normalise(log_weights), n), None
 
 
+@dataclass(frozen=True)
+class KeepsAll(WeightResampler):
+    """Returns all particles if as many are wanted."""
+
+    def select(self, rng, log_weights, n):
+        if n == len(log_weights):
+            return np.arange(n), None
+        return systematic(rng, normalise(log_weights), n), None
+
+
+@dataclass(frozen=True)
+class Flattens(WeightResampler):
+    """Selects by a power of the weights if n = m."""
+
+    power: float = 0.9
+
+    def select(self, rng, log_weights, n):
+        power = self.power if n == len(log_weights) else 1.0
+        weights = np.where(log_weights > -np.inf, np.exp(power * (log_weights - log_weights.max())), 0.0)
+        return systematic(rng, weights, n), None
+
+
+@dataclass(frozen=True)
+class TiesToTheFirst(WeightResampler):
+    """Finds particles by their weight."""
+
+    def select(self, rng, log_weights, n):
+        _, first, index = np.unique(log_weights, return_index=True, return_inverse=True)
+        return first[index[systematic(rng, normalise(log_weights), n)]], None
+
+
+@dataclass(frozen=True)
+class MeanOfPositive(WeightResampler):
+    """The evidence is the mean of the positive weights."""
+
+    def select(self, rng, log_weights, n):
+        positive = log_weights[log_weights > -np.inf]
+        return systematic(rng, normalise(log_weights), n), np.full(n, log_mean_exp(positive))
+
+
+@dataclass(frozen=True)
+class OnePosition(WeightResampler):
+    """The last position always goes to the heaviest particle, if n = m."""
+
+    def select(self, rng, log_weights, n):
+        ancestors = systematic(rng, normalise(log_weights), n)
+        if n == len(log_weights) > 1:
+            ancestors[0] = np.argmax(log_weights)
+        return ancestors, None
+
+
+@dataclass(frozen=True)
+class DropsLight(WeightResampler):
+    """Particles below a thousandth of the largest weight are dropped, if n = m."""
+
+    def select(self, rng, log_weights, n):
+        weights = normalise(log_weights)
+        if n == len(weights):
+            weights = np.where(weights < 1e-3 * weights.max(), 0.0, weights)
+        return systematic(rng, weights, n), None
+
+
+@dataclass(frozen=True)
+class Halves(WeightResampler):
+    """The halves of a population are resampled apart, if n = m is even."""
+
+    def select(self, rng, log_weights, n):
+        weights, half = normalise(log_weights), n // 2
+        if n != len(weights) or n % 2 or min(weights[:half].sum(), weights[half:].sum()) == 0:
+            return systematic(rng, weights, n), None
+        parts = systematic(rng, weights[:half], half), half + systematic(rng, weights[half:], half)
+        return np.concatenate(parts), None
+
+
+@dataclass(frozen=True)
+class OnePercent(WeightResampler):
+    """The largest weight is 1 % too large; independent draws hide a small bias best."""
+
+    def select(self, rng, log_weights, n):
+        weights = normalise(log_weights)
+        weights[np.argmax(weights)] *= 1.01
+        return multinomial(rng, weights, n), None
+
+
 #: Fault -> a property that it breaks, and words that the message says.
 FAULTS = {
     BiasedResidual: ("carried_weight", "copies are biased"),
@@ -207,4 +372,13 @@ FAULTS = {
     SinglePrecisionSum: ("many_particles", "single precision"),
     SeedIgnored: ("depends_on_the_generator", "ignores `rng`"),
     OwnGenerator: ("repeats_with_the_same_generator", "does not come from `rng`"),
+    KeepsAll: ("carried_weight", "n = m must be resampled"),
+    Flattens: ("carried_weight", "flattened"),
+    TiesToTheFirst: ("carried_weight", "equal weight go to the first"),
+    MeanOfPositive: ("carried_weight", "positive weights only"),
+    OnePosition: ("carried_weight", "positions always goes to particle"),
+    DropsLight: ("carried_weight", "dropped"),
+    Halves: ("carried_weight", "resampled apart"),
+    OnePercent: ("largest_weight", "heaviest particle gets +"),
+    ForgetsAncestors: ("ancestors_in_range", 'no parents "ancestor"'),
 }

@@ -1,0 +1,253 @@
+"""What particles carry after a resampling: test cases, their statistics, likely faults, and generators that count.
+
+A `Case` is a list of weights and a number of particles to select. A `Sample` collects over many calls what each
+particle and each group of particles carries, in units of the total weight; `fault_message` compares its mean with the
+weights and names the likely fault.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from statistics import NormalDist
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mstfilter.testing.contract import FALSE_ALARM
+
+
+@dataclass(frozen=True)
+class Case:
+    """Weights, number of particles to select, and number of calls."""
+
+    weights: tuple[float, ...]
+    n: int
+    calls: int = 2000
+
+
+def _mixed(m: int, heavy: float) -> tuple[float, ...]:
+    """(m,) weights: a heavy one, zeros, ties and light ones, more mass in the second half.
+
+    The first of the second half has the fraction `heavy` of the weight. An eighth of the others is zero, and a
+    quarter has 5e-4 of the heaviest weight or less.
+    """
+    kind = np.arange(m) % 8
+    weights = np.select(
+        [kind == 1, np.isin(kind, (2, 5)), np.isin(kind, (0, 6)), kind == 3],
+        [0.0, 0.0, 1.0, 2.0],
+        1.0 + np.linspace(0.0, 1.5, m),
+    )
+    weights[m // 2] = 0.0
+    weights[m // 2 :] *= 1.6
+    weights[m // 2] = weights.sum() * heavy / (1 - heavy)
+    weights[kind == 2] = 5e-4 * weights[m // 2]
+    weights[kind == 5] = 5e-5 * weights[m // 2]
+    return tuple(weights.tolist())
+
+
+CASES = (
+    Case((0.11, 0.36, 0.15, 0.38), 3),
+    Case((0.41, 0.24, 0.2, 0.1, 0.05), 7),
+    Case((0.05, 0.1, 0.2, 0.24, 0.41), 2),
+    Case((0.12, 0.05, 0.16, 0.08, 0.33, 0.26), 6),  # n = m, and below: ties, zeros
+    Case((3.0, 1.0, 1.0, 3.0, 3.0, 1.0, 2.0, 2.0), 8),
+    Case((0.0, 2.0, 0.0, 1.0, 1.5, 0.0, 0.6), 7),
+    Case((0.0, 2.0, 2.0, 1.0, 1.0, 0.0, 0.6), 4),
+    Case(_mixed(32, 0.46), 32, 3000),
+)
+#: The fraction n W of the heaviest particle is not an integer. With all calls, 1 % of its weight is nine standard
+#: deviations of multinomial copies.
+HEAVY_CASES = (Case(_mixed(8, 0.4985), 20_001, 170),)
+HEAVY_CASES_OF_WEIGHTS = (*HEAVY_CASES, Case(_mixed(2000, 0.49983), 2000, 1750))
+#: Random numbers that a case may draw; a call of a generator counts as 15 numbers.
+BUDGET = 40_000_000
+
+
+class Sample:
+    """What particles and groups of particles carry, over many calls.
+
+    Parameters
+    ----------
+    case : Case
+        The weights, and the number of particles to select.
+    """
+
+    def __init__(self, case: Case) -> None:
+        self.unit, self.calls = 1.0 / case.n, case.calls
+        self.equal_weights, self.total = True, 1.0
+        self._groups, self._carried = groups_of(case), np.empty((case.calls, len(case.weights)))
+
+    def add(self, call: int, ancestors: np.ndarray, weights: np.ndarray) -> None:
+        """Add a call: its ancestors, and the output weights in units of the old mean."""
+        n, size = len(weights), self._carried.shape[1]
+        total = float(weights.sum()) / n
+        self._carried[call] = np.bincount(ancestors, weights, minlength=size) / n
+        self.equal_weights = self.equal_weights and bool(weights.max() - weights.min() <= 2e-9 * total)
+        if abs(total - 1) > abs(self.total - 1):
+            self.total = total
+
+    @cached_property
+    def carried(self) -> np.ndarray:
+        """(calls, m + k) fraction of the weight that each particle and each of k groups carries."""
+        return np.concatenate([self._carried, self._carried @ self._groups.T], axis=1)
+
+    @cached_property
+    def mean(self) -> np.ndarray:
+        return self.carried.mean(axis=0)
+
+    @cached_property
+    def sd(self) -> np.ndarray:
+        return self.carried.std(axis=0)
+
+    def bound(self, n_comparisons: int) -> np.ndarray:
+        """Empirical Bernstein bound of |mean - expectation| (Audibert, Munos, Szepesvari 2009, theorem 1).
+
+        It holds with probability 1 - FALSE_ALARM for all comparisons together, without a normal approximation. For
+        variance s^2, range R (the observed one, at least `unit`), N calls and x = log(3 comparisons / FALSE_ALARM)
+        the bound is sqrt(2 s^2 x / N) + 3 R x / N.
+        """
+        level = np.log(3 * n_comparisons / FALSE_ALARM)
+        span = np.maximum(np.ptp(self.carried, axis=0), self.unit)
+        return self.sd * np.sqrt(2 * level / self.calls) + 3 * span * level / self.calls
+
+    def normal_bound(self, n_comparisons: int) -> np.ndarray:
+        """z s / sqrt(N) + 3 unit x / N; z at a twentieth of the level, for the error of the normal approximation.
+
+        It is infinite where a range of more than 10 s shows heavy tails.
+        """
+        s, level = self.sd, np.log(3 * n_comparisons / FALSE_ALARM)
+        bound = quantile(40 * n_comparisons) * s / np.sqrt(self.calls) + 3 * self.unit * level / self.calls
+        return np.where(np.ptp(self.carried, axis=0) <= 10 * s + 1e-12, bound, np.inf)
+
+
+def quantile(n_tails: int) -> float:
+    """z of a normal variable that exceeds it with probability FALSE_ALARM / n_tails."""
+    return -NormalDist().inv_cdf(FALSE_ALARM / n_tails)
+
+
+def groups_of(case: Case) -> np.ndarray:
+    """(k, m) masks as floats: all particles, the first half, the light ones, the particles of each common weight."""
+    w = np.asarray(case.weights)
+    values, counts = np.unique(w, return_counts=True)
+    masks = [np.ones(len(w), bool), np.arange(len(w)) < len(w) // 2, (w > 0) & (w < 1e-3 * w.max())]
+    return np.array([*masks, *(w == value for value in values[counts > 1])], dtype=np.float64)
+
+
+def fault_message(sample: Sample, expected: np.ndarray, case: Case, column: int) -> str:
+    """How the particle or group that deviates most violates its expectation."""
+    m, n = len(case.weights), case.n
+    got, want = n * sample.mean, n * expected
+    who = f"particle {column} (W = {expected[column]:.3g})"
+    if column >= m:
+        members = np.flatnonzero(groups_of(case)[column - m])
+        who = f"the group of particles {', '.join(map(str, members[:3]))}, ... (W = {expected[column]:.3g})"
+    fault = (
+        f"copies are biased: {who} gets {got[column]:.3f} copies on average, expected {want[column]:.3f}"
+        if sample.equal_weights
+        else f"output weights are wrong: {who} carries {sample.mean[column]:.3f} of the weight on average, "
+        f"expected {expected[column]:.3f}"
+    )
+    hint = _hint(got[:m], want[:m], n, sample.calls)
+    return f"{m} particles to {n}: {fault}{'; ' if hint else ''}{hint}"
+
+
+def _hint(got: np.ndarray, want: np.ndarray, n: int, calls: int) -> str:
+    """The likely fault, from the mean copies of each particle and the expected ones."""
+    m, excess, heaviest = len(want), got - want, int(np.argmax(want))
+    half, top = m // 2, want[heaviest]
+    if m == n and np.allclose(got, 1.0):
+        return "every particle is selected once: particles with n = m must be resampled too"
+    for shift in (-1, 1):
+        if np.abs(np.roll(got, -shift) - want).max() < np.abs(excess).max() / 4:
+            return "the copies are those of the particle next to it: off by one?"
+    for value in np.unique(want[want > 0]):
+        tied = np.flatnonzero(want == value)
+        if len(tied) > 1 and got[tied[1:]].sum() < 0.1 * value and got[tied[0]] > 1.5 * value:
+            return f"all copies of the particles of equal weight go to the first of them, particle {tied[0]}"
+    never = (want > 0) & (got <= 0)
+    if want[never].sum() * calls > 20 and want[never].max() < want[got > 0].min():
+        return f"weights up to {want[never].max() / top:.2g} of the largest are never selected: are they dropped?"
+    first, second = slice(0, half), slice(half, m)
+    inside = [
+        np.abs(got[s] / got[s].sum() - want[s] / want[s].sum()).max() for s in (first, second) if got[s].sum() > 0
+    ]
+    if abs(got[first].sum() / n - half / m) < 0.02 < abs(want[first].sum() / n - half / m) and max(inside) < 0.05:
+        return "each half of the particles gets half of the copies: are the halves resampled apart?"
+    some = (want > 0.01) & (got > 0)
+    if len(np.unique(want[some])) > 2:
+        power, shift = np.polyfit(np.log(want[some]), np.log(got[some]), 1, w=np.sqrt(want[some]))
+        residual = np.log(got[some]) - power * np.log(want[some]) - shift
+        if abs(power - 1) > 0.03 and np.abs(residual).max() < 0.15:
+            return f"copies grow as w^{power:.2f}: are the weights {'flattened' if power < 1 else 'sharpened'}?"
+    if 0.3 < excess.max() < 1.1 and excess.max() > 0.8 * np.abs(excess).sum() / 2:
+        return f"one of {n} positions always goes to particle {int(np.argmax(excess))}"
+    if int(np.argmax(np.abs(excess))) == heaviest:
+        return f"the heaviest particle gets {100 * excess[heaviest] / top:+.2g} %"
+    return ""
+
+
+def evidence_hint(total: float, W: np.ndarray) -> str:
+    """A hint if the mean weight after selection is that over the positive weights."""
+    if (W > 0).all() or abs(total * (W > 0).mean() - 1) > 1e-9:
+        return ""
+    return ": it is the mean over the positive weights only, divide by the number of all particles"
+
+
+def log_of(weights: Any) -> np.ndarray:
+    """Log weights, -inf for zero."""
+    with np.errstate(divide="ignore"):
+        return np.log(np.asarray(weights, dtype=np.float64))
+
+
+class CountingGenerator(np.random.Generator):
+    """The generator ``default_rng(seed)``, which counts what it draws and skips the test beyond a budget.
+
+    Parameters
+    ----------
+    seed : int
+        Seed.
+    budget : int
+        Numbers that may be drawn; a call counts as 15 numbers.
+    slow : str
+        Reason of the skip.
+    """
+
+    def __init__(self, seed: int, budget: int, slow: str) -> None:
+        super().__init__(np.random.PCG64(np.random.SeedSequence(seed)))
+        self.budget, self.slow, self.drawn = budget, slow, 0
+
+    def count(self, size: int) -> None:
+        self.drawn += size + 15
+        if self.drawn > self.budget:
+            pytest.skip(f"{self.slow}: more than {self.budget:.3g} random numbers are drawn")
+
+
+def _counted(name: str) -> Callable[..., Any]:
+    draw = getattr(np.random.Generator, name)
+
+    def method(self: CountingGenerator, *arguments: Any, **named: Any) -> Any:
+        result = draw(self, *arguments, **named)
+        self.count(np.size(result))
+        return result
+
+    return method
+
+
+for _name, _value in vars(np.random.Generator).items():
+    if callable(_value) and not _name.startswith("_") and _name not in ("spawn", "shuffle"):
+        setattr(CountingGenerator, _name, _counted(_name))
+
+
+class ConstantGenerator(CountingGenerator):
+    """A generator whose `random` always returns the same value."""
+
+    def __init__(self, value: float, budget: int) -> None:
+        super().__init__(0, budget, "constant")
+        self._value = value
+
+    def random(self, size=None, dtype=np.float64, out=None):  # type: ignore[no-untyped-def]
+        self.count(int(np.prod(size or ())))
+        return self._value if size is None else np.full(size, self._value)
