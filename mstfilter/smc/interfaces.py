@@ -268,7 +268,7 @@ class Distribution(ABC):
 
     @property
     def parameter_shape(self) -> tuple[int, ...]:
-        """(n, *event_shape), (1, *event_shape), or () for a number whose parameters all particles share."""
+        """``(n, *event_shape)``, ``(1, *event_shape)``, or () for a number whose parameters all particles share."""
         return np.shape(self.mean)
 
     @property
