@@ -25,7 +25,8 @@
 `exact`                 linear-Gaussian and finite models with exact answers, Rao-Blackwellised filters
 `programs`              filters for probabilistic programs
 `distributions`         distributions for models; adapters for those of scipy and torch
-`smoothing`             states given all observations
+`smoothing`             states given all observations, paths of states by conditional SMC
+`inference`             parameters of a model: PMMH, particle Gibbs, emcee, SMC samplers
 `diagnostics`           quantities of a run, comparison of filters
 ======================  ===================================================================================
 """

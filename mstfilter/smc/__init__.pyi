@@ -52,6 +52,14 @@ from mstfilter.smc.exact import (
     rao_blackwellised as rao_blackwellised,
 )
 from mstfilter.smc.filter import ParticleFilter as ParticleFilter
+from mstfilter.smc.inference import (
+    Chains as Chains,
+    TemperedSample as TemperedSample,
+    ensemble as ensemble,
+    particle_gibbs as particle_gibbs,
+    pmmh as pmmh,
+    smc_sampler as smc_sampler,
+)
 from mstfilter.smc.interfaces import (
     Codec as Codec,
     Component as Component,
@@ -113,9 +121,11 @@ from mstfilter.smc.similarity import (
 from mstfilter.smc.smoothing import (
     Record as Record,
     backward_paths as backward_paths,
+    conditional_path as conditional_path,
     fixed_lag as fixed_lag,
     genealogy as genealogy,
     keep as keep,
+    path_log_prob as path_log_prob,
 )
 from mstfilter.smc.state_space import (
     Dynamics as Dynamics,

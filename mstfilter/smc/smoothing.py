@@ -18,16 +18,22 @@ They are valid for any filter with proper weights: guided, auxiliary, with moves
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from mstfilter.errors import InputError, check_component, check_integer
+from mstfilter.smc.distributions import as_distribution
 from mstfilter.smc.filter import ParticleFilter
-from mstfilter.smc.interfaces import DensityTransition, State
-from mstfilter.smc.population import Population, take
+from mstfilter.smc.interfaces import DensityTransition, State, Transition
+from mstfilter.smc.population import Particles, Population, count_particles, take
+from mstfilter.smc.programs.filters import ProgramInitial, ProgramTransition, run_program
+from mstfilter.smc.programs.sites import GuideHandler, PerParticle, ReplayHandler, SampleHandler, ScoreHandler, Site
+from mstfilter.smc.resampling import Multinomial
+from mstfilter.smc.state_space import Dynamics, GuidedInitial, GuidedTransition, Prior
+from mstfilter.smc.streams import Key, child
 
 #: Pairs of particles per call of `log_prob`.
 _PAIRS = 1_000_000
@@ -156,3 +162,243 @@ def _drawn(rng: np.random.Generator, log_weights: np.ndarray, t: int | None = No
     # The index is the number of entries at or below the point; "at" skips weights of zero.
     index = (cumulative <= points).sum(axis=1)
     return np.minimum(index, (cumulative < cumulative[:, -1:]).sum(axis=1))
+
+
+def conditional_path(
+    filter: ParticleFilter, observations: Sequence[Any], seed: int | Key = 0, path: Particles | None = None
+) -> Particles:
+    """A path of states drawn by conditional SMC, a kernel that leaves p(x_0 .. x_T | y_0 .. y_T) invariant.
+
+    One particle follows `path`, the others are drawn as usual, and one of the final particles is traced back.
+    Ancestors are multinomial at every step: `resampler` and `trigger` of the filter are not used. The particle that
+    follows the path draws its ancestors, too, if the density of the transition is known; a program must then keep
+    nothing but its sites.
+
+    Parameters
+    ----------
+    filter : ParticleFilter
+        Bootstrap or guided filter of a model or a program, with at least two particles.
+    observations : sequence
+    seed : int or Key
+    path : T particles, optional
+        The present path: row t is the particle at time t. Without it the path is drawn by an ordinary filter.
+
+    Returns
+    -------
+    array (T, ...), mapping of such, or tuple of T objects
+    """
+    _check_conditional(filter)
+    ys = list(observations)
+    if not ys or (path is not None and count_particles(path) != len(ys)):
+        states = "" if path is None else f" for a path of {count_particles(path)} states"
+        raise InputError(f"there are {len(ys)} observations{states}")
+    key = seed if isinstance(seed, Key) else Key(seed)
+    rng = key.child("ancestors").generator()
+    populations: list[Population] = []
+    parents: list[np.ndarray] = []
+    past: Population | None = None
+    for t, y in enumerate(ys):
+        given = None if path is None else take(path, np.array([t]))
+        if past is not None:
+            others, _ = Multinomial().select(rng, past.log_weights, filter.n - 1)
+            index = np.append(_ancestor(rng, filter.transition, past, given, y), others)
+            parents.append(index)
+            past = Population(take(past.particles, index))
+        past = _moved(filter, key.child("step", t), past, given, y)
+        if filter.update is not None and y is not None:
+            update_rng = key.child("step", t, "update").generator() if filter.update.draws else rng
+            past = filter.update.update(update_rng, past, None, y)
+        populations.append(past)
+    rows = [int(_drawn(rng, populations[-1].log_weights[None])[0])]
+    for index in reversed(parents):
+        rows.append(int(index[rows[-1]]))
+    chosen = zip(populations, reversed(rows), strict=True)
+    return _joined([take(p.realised().particles, np.array([row])) for p, row in chosen])
+
+
+def _check_conditional(filter: ParticleFilter) -> None:
+    for slot in ("proposal", "lookahead", "rejuvenation", "size"):
+        if getattr(filter, slot) is not None:
+            raise InputError(
+                f"conditional SMC does not know a filter with `{slot}`", "use a bootstrap or guided filter"
+            )
+    if not filter.properly_weighted:
+        raise InputError("a component of the filter is not properly weighted: its paths have another law")
+    check_integer("n", filter.n, "one particle follows the present path", at_least=2)
+
+
+def _ancestor(
+    rng: np.random.Generator, transition: Transition | None, past: Population, given: Particles | None, y: Any
+) -> int:
+    """Index of the parent of particle 0, which follows the given path."""
+    if given is None:
+        return int(_drawn(rng, past.log_weights[None])[0])
+    density = _log_density(transition, past.particles, take(given, np.zeros(len(past), np.int64)), y)
+    if density is None:
+        return 0
+    # Lindsten, Jordan, Schön (2014), equation 16.
+    return int(_drawn(rng, (past.log_weights + density)[None])[0])
+
+
+def _log_density(transition: Transition | None, old: Particles, new: Particles, y: Any) -> np.ndarray | None:
+    """(n,) log f(new | old), for programs with log p(y | new, old); None if it is not known."""
+    if isinstance(transition, ProgramTransition):
+        if isinstance(transition.model, PerParticle):
+            return None
+        handler = ScoreHandler(dict(new))
+        particles, density = run_program(transition.model, handler, old, y, count_particles(old))
+        # A value that the program returns is a function of the previous particle, and has no density.
+        return density if {site.name for site in handler.sites} == set(particles) else None
+    if isinstance(transition, Dynamics | GuidedTransition):
+        found = transition.model.log_transition
+        return None if found is None else np.asarray(found(old, new), np.float64)
+    if isinstance(transition, DensityTransition):
+        return np.asarray(transition.log_prob(old, new, y), np.float64)
+    return None
+
+
+def _moved(
+    filter: ParticleFilter, streams: Key, past: Population | None, given: Particles | None, y: Any
+) -> Population:
+    """The particles of a step before the update; particle 0 is the given one, with its weight."""
+    component: Any
+    slot, component = ("initial", filter.initial) if past is None else ("transition", filter.transition)
+    rng = streams.child(slot).generator()
+    if given is not None and isinstance(component, ProgramInitial | ProgramTransition):
+        return Population(*_program_step(rng, component, past, given, y, filter.n))
+    if past is None:
+        moved = component.sample(rng, y, filter.n)
+    else:
+        moved = past if component is None else component.predict(rng, past, y)
+    if len(moved) != filter.n:
+        raise InputError(f"{slot} made {len(moved)} particles of {filter.n}: conditional SMC needs one for each")
+    if given is None:
+        return moved
+    log_weights = np.array(moved.log_weights)
+    if isinstance(component, GuidedTransition) and past is not None:
+        old = take(past.particles, np.array([0]))
+        log_weights[0] = (
+            component.model.density("log_transition")(old, given)[0] - component.log_prob(old, given, y)[0]
+        )
+    elif isinstance(component, GuidedInitial):
+        if y is not None:
+            q = as_distribution(component.proposal(y))
+            log_weights[0] = component.model.density("log_initial")(given)[0] - q.log_prob(given)[0]
+    elif log_weights.any():
+        raise InputError(
+            f"{slot} is a {type(component).__name__} that weights its particles, so the weight of a given "
+            "particle is not known",
+            "use Prior, Dynamics, GuidedInitial, GuidedTransition or a Program",
+        )
+    return Population(_with_first(moved.particles, given), log_weights)
+
+
+def _with_first(particles: Particles, first: Particles) -> Particles:
+    """The particles with another one at index 0."""
+    if isinstance(particles, Mapping):
+        return {name: _with_first(a, first[name]) for name, a in particles.items()}
+    if not isinstance(particles, np.ndarray):
+        return (first[0], *tuple(particles)[1:])
+    particles = np.array(particles)
+    particles[0] = first[0]
+    return particles
+
+
+def _joined(rows: list[Particles]) -> Particles:
+    """Particles of all times, from one particle each; values that a program does not have at a time are NaN or 0."""
+    if isinstance(rows[0], np.ndarray):
+        return np.concatenate(rows)
+    if not isinstance(rows[0], Mapping):
+        return tuple(row[0] for row in rows)
+    examples = {name: a for row in rows for name, a in row.items()}
+    blank = {name: np.full_like(a, np.nan if a.dtype.kind == "f" else 0) for name, a in examples.items()}
+    return {name: np.concatenate([row.get(name, blank[name]) for row in rows]) for name in examples}
+
+
+class _GivenSamples(SampleHandler):
+    """Draws every site, except that particle 0 has given values."""
+
+    def __init__(self, rng: np.random.Generator, given: Particles) -> None:
+        super().__init__(rng)
+        self.given = given
+
+    def value(self, site: Site) -> tuple[np.ndarray, np.ndarray | None]:
+        value, gain = super().value(site)
+        return _given_value(site, value, self.given), gain
+
+    def row(self, index: int) -> SampleHandler:
+        inner = super().row(index)
+        return inner if index else _GivenSamples(inner.rng, self.given)
+
+
+class _GivenGuide(GuideHandler):
+    """As `_GivenSamples`, for a guide."""
+
+    def __init__(self, rng: np.random.Generator, n: int, given: Particles) -> None:
+        super().__init__(rng, n)
+        self.given = given
+
+    def value(self, site: Site) -> tuple[np.ndarray, np.ndarray | None]:
+        value, gain = super().value(site)
+        value = _given_value(site, value, self.given)
+        self.log_q[site.name][site.index] = site.distribution.log_prob(value)
+        return value, gain
+
+    def row(self, index: int) -> GuideHandler:
+        if index == 0:
+            self.rows.append(_GivenGuide(child(self.rng, "particle", index), 1, self.given))
+            return self.rows[-1]
+        return super().row(index)
+
+
+def _given_value(site: Site, value: np.ndarray, given: Particles) -> np.ndarray:
+    """The values of a site, with the given one in the row of particle 0, if that reaches the site."""
+    if site.rows is not None and (not len(site.rows) or site.rows[0] != 0):
+        return value
+    value = np.array(value)
+    value[0] = given[site.name][0] if isinstance(given, Mapping) else given[0][site.name]
+    return value
+
+
+def _program_step(
+    rng: np.random.Generator, component: Any, past: Population | None, given: Particles, y: Any, n: int
+) -> tuple[Particles, np.ndarray]:
+    """Particles and log weights of a step of a program; particle 0 has given values."""
+    previous = None if past is None else past.particles
+    if component.guide is None or y is None:
+        return run_program(component.model, _GivenSamples(rng, given), previous, y, n)
+    guide = _GivenGuide(rng, n, given)
+    run_program(component.guide, guide, previous, y, n)
+    return run_program(component.model, ReplayHandler(guide), previous, y, n)
+
+
+def path_log_prob(filter: ParticleFilter, observations: Sequence[Any], path: Particles) -> float:
+    """log p(x_0 .. x_T, y_0 .. y_T) of a path, by the model or the program of a filter.
+
+    Parameters
+    ----------
+    filter : ParticleFilter
+        Made from a `StateSpaceModel` with its log densities or from a `Program`.
+    observations : sequence
+    path : T particles
+        As `conditional_path` returns it.
+    """
+    ys, initial = list(observations), filter.initial
+    rows = [take(path, np.array([t])) for t in range(len(ys))]
+    if isinstance(initial, ProgramInitial):
+        total, previous = 0.0, None
+        for row, y in zip(rows, ys, strict=True):
+            values = row if isinstance(row, Mapping) else row[0]
+            if isinstance(initial.model, PerParticle):
+                raise InputError("the density of a path of a per_particle program is not available")
+            _, gain = run_program(initial.model, ScoreHandler(values), previous, y, 1)
+            total, previous = total + float(gain[0]), row
+        return total
+    if not isinstance(initial, Prior | GuidedInitial):
+        raise InputError("the filter is not made from a StateSpaceModel or a Program: its densities are not known")
+    model = initial.model
+    total = float(model.density("log_initial")(rows[0])[0])
+    if len(ys) > 1:
+        later = np.arange(1, len(ys))
+        total += float(model.density("log_transition")(take(path, later - 1), take(path, later)).sum())
+    return total + sum(float(model.log_likelihood(x, y)[0]) for x, y in zip(rows, ys, strict=True) if y is not None)

@@ -1,0 +1,435 @@
+"""Parameters of a model, inferred by particle Markov chain Monte Carlo or by a sequential sampler.
+
+A model with parameters is a function that returns a filter:
+
+>>> def filter_of(theta):
+...     rho, sigma = theta
+...     return bootstrap(StateSpaceModel.of(Normal(0.0, 1.0), lambda x: Normal(rho * x, sigma), observation), n=200)
+>>> chains = pmmh(filter_of, observations, log_prior, start=[0.5, 1.0], scale=[0.1, 0.1], n_iterations=5000)
+>>> chains.theta[1000:].mean(axis=(0, 1)), chains.autocorrelation_times()
+
+- `pmmh` is a Metropolis chain whose likelihood is the filter's unbiased estimate. The estimate of the current
+  parameters is kept until a proposal is accepted; so the chain has the exact posterior, for any number of particles
+  (Andrieu, Doucet, Holenstein 2010).
+- `ensemble` does the same with the walkers of emcee, without a scale to choose.
+- `particle_gibbs` alternates draws of parameters given the path of states, and of the path given the parameters by
+  `conditional_path`: a filter in which one particle follows the present path (conditional SMC). If the transition has
+  a density, that particle also draws its ancestors (Lindsten, Jordan, Schön 2014), without which the early states
+  hardly change.
+- `smc_sampler` moves particles from the prior to the posterior of a likelihood that can be computed, by tempering
+  (Del Moral, Doucet, Jasra 2006). It estimates the evidence, and finds several modes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from mstfilter.errors import InputError, LostRunError, check_integer, check_number
+from mstfilter.smc.batching import batch, batched_slots
+from mstfilter.smc.distributions import as_distribution
+from mstfilter.smc.filter import ParticleFilter
+from mstfilter.smc.interfaces import Resampler
+from mstfilter.smc.population import Particles, Population
+from mstfilter.smc.resampling import Systematic
+from mstfilter.smc.smoothing import conditional_path
+from mstfilter.smc.state_space import accept_moves, choose_rows
+from mstfilter.smc.streams import Key
+
+FilterOf = Callable[[np.ndarray], ParticleFilter]
+
+
+@dataclass(frozen=True, eq=False)
+class Chains:
+    """Markov chains of parameters.
+
+    Parameters
+    ----------
+    theta : (n_iterations, n_chains, d) float64
+        Parameters after each iteration.
+    log_evidence : (n_iterations, n_chains) float64
+        The estimate that belongs to these parameters; NaN in a chain of `particle_gibbs`.
+    log_density : (n_iterations, n_chains) float64
+        Log prior plus `log_evidence`.
+    accepted : (n_chains,) float64
+        Share of accepted proposals.
+    paths : tuple
+        Of `particle_gibbs`: the path of states after each iteration.
+    """
+
+    theta: np.ndarray
+    log_evidence: np.ndarray
+    log_density: np.ndarray
+    accepted: np.ndarray
+    paths: tuple[Particles, ...] = ()
+
+    def autocorrelation_times(self, discard: int = 0) -> np.ndarray:
+        """(d,) integrated autocorrelation times in iterations, by emcee.
+
+        emcee logs a warning if the chains are shorter than 50 times the result, which is then too low.
+
+        Parameters
+        ----------
+        discard : int
+            Iterations at the start to leave out.
+        """
+        from emcee.autocorr import integrated_time
+
+        return integrated_time(self.theta[discard:], quiet=True)
+
+    def effective_sizes(self, discard: int = 0) -> np.ndarray:
+        """(d,) numbers of independent draws that estimate a mean equally well; parameters as above."""
+        n_iterations, n_chains, _ = self.theta[discard:].shape
+        return n_iterations * n_chains / self.autocorrelation_times(discard)
+
+
+@dataclass(frozen=True)
+class _Posterior:
+    """Log prior and estimated log evidence of rows of parameters."""
+
+    filter_of: FilterOf
+    observations: Sequence[Any]
+    log_prior: Callable[[np.ndarray], float]
+    batched: bool = False
+    paired: bool = False
+
+    def __call__(self, rng: np.random.Generator, thetas: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """(R,) log densities and (R,) log evidences of (R, d) parameters."""
+        seeds = rng.integers(2**63, size=len(thetas)).tolist()
+        log_prior = np.array([float(self.log_prior(theta)) for theta in thetas])
+        if np.isnan(log_prior).any():
+            raise InputError(f"the log prior of {thetas[np.isnan(log_prior)][0].tolist()} is NaN")
+        evidence = np.full(len(thetas), -np.inf)
+        rows = np.flatnonzero(log_prior > -np.inf).tolist()
+        if rows:
+            ys = [self.observations[r] for r in rows] if self.paired else self.observations
+            evidence[rows] = self._estimates(thetas[rows], ys, [seeds[r] for r in rows])
+        return log_prior + evidence, evidence
+
+    def _estimates(self, thetas: np.ndarray, ys: Sequence[Any], seeds: list[int]) -> np.ndarray:
+        if self.batched:
+            filter = self.filter_of(thetas.T[:, :, None])
+            if not {"initial", "transition", "update"} <= set(batched_slots(filter) or ()):
+                raise InputError(
+                    "with batched=True the initial, transition and update of the filter must be batched",
+                    "see mstfilter.smc.batching; StateSpaceModel(..., batched=True) makes them so",
+                )
+            try:
+                runs = batch(filter, ys, seeds, paired=self.paired)
+                if not runs.lost:
+                    return runs.log_evidence[:, -1]
+            except ValueError:  # the arrays of parameters no longer fit after a run is lost
+                pass
+        found = []
+        for r, (theta, seed) in enumerate(zip(thetas, seeds, strict=True)):
+            filter = self.filter_of(theta)
+            if not filter.properly_weighted:
+                raise InputError("a component of the filter is not properly weighted: it has no unbiased evidence")
+            try:
+                state, _ = filter.run(ys[r] if self.paired else ys, seed)
+                found.append(state.log_evidence)
+            except LostRunError:
+                found.append(-np.inf)
+        return np.array(found, np.float64)
+
+
+def pmmh(
+    filter_of: FilterOf,
+    observations: Sequence[Any],
+    log_prior: Callable[[np.ndarray], float],
+    start: Any,
+    scale: Any,
+    n_iterations: int,
+    seed: int = 0,
+    *,
+    batched: bool = False,
+    paired: bool = False,
+) -> Chains:
+    """Particle marginal Metropolis-Hastings: a random walk on the parameters.
+
+    The number of particles decides how well the chain mixes: the log evidence should have a standard deviation of
+    about 1 at the posterior mean (Doucet, Pitt, Deligiannidis, Kohn 2015).
+
+    Parameters
+    ----------
+    filter_of : callable
+        ``(theta) -> ParticleFilter`` for parameters (d,). Its components must be properly weighted.
+    observations : sequence
+    log_prior : callable
+        ``(theta) -> float``; -inf outside of the support.
+    start : (d,) or (R, d) array_like
+        First parameters of one chain or of R chains.
+    scale : (d,) or (d, d) array_like
+        Standard deviations, or covariance, of a step. 2.4 / sqrt(d) posterior standard deviations are a good choice.
+    n_iterations : int
+    seed : int
+    batched : bool
+        Whether ``filter_of`` also takes an array (d, R, 1) and returns a filter of R runs (see
+        `mstfilter.smc.batching`), the parameters broadcast against particles (R, n). All chains then move in one
+        sweep of filters.
+    paired : bool
+        Chain r gets ``observations[r]``, a data set of its own.
+    """
+    theta = np.array(start, np.float64, ndmin=2)
+    root = _step_root(scale, theta.shape[1])
+    check_integer("n_iterations", n_iterations)
+    if paired and len(observations) != len(theta):
+        raise InputError(f"there are {len(observations)} data sets for {len(theta)} chains")
+    posterior = _Posterior(filter_of, observations, log_prior, batched, paired)
+    key = Key(seed).child("pmmh")
+    density, evidence = posterior(key.child("start").generator(), theta)
+    if not np.isfinite(density).all():
+        raise InputError(
+            f"the start {theta[~np.isfinite(density)][0].tolist()} has log density {density.min()}",
+            "start where the prior and the likelihood are positive",
+        )
+    shape = (n_iterations, len(theta))
+    thetas, evidences, densities = np.empty((*shape, theta.shape[1])), np.empty(shape), np.empty(shape)
+    accepted = np.zeros(len(theta))
+    for i in range(n_iterations):
+        rng = key.child(i).generator()
+        proposed = theta + rng.standard_normal(theta.shape) @ root.T
+        new_density, new_evidence = posterior(rng, proposed)
+        yes = accept_moves(rng, new_density - density)
+        theta, density = choose_rows(yes, proposed, theta), np.where(yes, new_density, density)
+        evidence = np.where(yes, new_evidence, evidence)
+        thetas[i], evidences[i], densities[i] = theta, evidence, density
+        accepted += yes
+    return Chains(thetas, evidences, densities, accepted / n_iterations)
+
+
+def _step_root(scale: Any, d: int) -> np.ndarray:
+    """(d, d) square root of the covariance of a step, from standard deviations or a covariance."""
+    scale = np.asarray(scale, np.float64)
+    if scale.ndim < 2 and scale.shape in ((), (1,), (d,)) and np.isfinite(scale).all() and (scale > 0).all():
+        return np.diag(np.broadcast_to(scale, d))
+    try:
+        if scale.shape == (d, d):
+            return np.linalg.cholesky(scale)
+    except np.linalg.LinAlgError:
+        pass
+    raise InputError(
+        f"scale is {scale.tolist()}, expected {d} positive standard deviations or a ({d}, {d}) covariance"
+    )
+
+
+def ensemble(
+    filter_of: FilterOf,
+    observations: Sequence[Any],
+    log_prior: Callable[[np.ndarray], float],
+    start: Any,
+    n_iterations: int,
+    seed: int = 0,
+    *,
+    moves: Any = None,
+    batched: bool = False,
+) -> Chains:
+    """Ensemble MCMC by emcee over the estimated evidence (Goodman and Weare 2010).
+
+    emcee keeps the log density of a walker until the walker moves, and the estimated evidence beside it (as a blob).
+    No estimate is drawn again for parameters that stay, so the chain has the exact posterior.
+
+    Parameters
+    ----------
+    filter_of, observations, log_prior, batched
+        As in `pmmh`; with `batched`, half of the walkers are evaluated in one sweep.
+    start : (n_walkers, d) array_like
+        First parameters: different ones, at least 2 d.
+    n_iterations : int
+    seed : int
+    moves : optional
+        Of emcee; default its stretch move.
+    """
+    import emcee
+
+    theta = np.array(start, np.float64)
+    if theta.ndim != 2 or len(theta) < 2 * theta.shape[1]:
+        raise InputError(f"start has shape {theta.shape}, expected (walkers, d) with at least 2 d walkers")
+    check_integer("n_iterations", n_iterations)
+    posterior = _Posterior(filter_of, observations, log_prior, batched)
+    rng = Key(seed).child("ensemble").generator()
+
+    def log_density(thetas: np.ndarray) -> np.ndarray:
+        return np.stack(posterior(rng, thetas), axis=1)
+
+    sampler = emcee.EnsembleSampler(*theta.shape, log_density, moves=moves, vectorize=True)
+    own = np.random.RandomState(np.random.MT19937(rng.integers(2**63)))  # emcee draws from the legacy generator
+    sampler.run_mcmc(emcee.State(theta, random_state=own.get_state()), n_iterations)
+    evidence = sampler.get_blobs().reshape(n_iterations, len(theta))
+    return Chains(sampler.get_chain(), evidence, sampler.get_log_prob(), sampler.acceptance_fraction)
+
+
+def particle_gibbs(
+    filter_of: FilterOf,
+    observations: Sequence[Any],
+    draw: Callable[[np.random.Generator, np.ndarray, Particles], Any],
+    start: Any,
+    n_iterations: int,
+    seed: int = 0,
+) -> Chains:
+    """Particle Gibbs: draws the parameters given a path of states, then the path given the parameters.
+
+    Parameters
+    ----------
+    filter_of : callable
+        ``(theta) -> ParticleFilter`` that `conditional_path` accepts.
+    observations : sequence
+    draw : callable
+        ``(rng, theta, path) -> theta`` (d,), by a kernel that leaves p(theta | path, y) invariant: an exact draw
+        where the prior is conjugate, or a Metropolis step with `path_log_prob`.
+    start : (d,) array_like
+        First parameters.
+    n_iterations : int
+    seed : int
+    """
+    check_integer("n_iterations", n_iterations)
+    key = Key(seed).child("particle gibbs")
+    theta = np.array(start, np.float64)
+    path = conditional_path(filter_of(theta), observations, key.child("start"))
+    thetas, paths, moved = np.empty((n_iterations, 1, len(theta))), [], 0
+    for i in range(n_iterations):
+        streams, old = key.child(i), theta
+        theta = np.asarray(draw(streams.child("theta").generator(), theta, path), np.float64)
+        if theta.shape != old.shape:
+            raise InputError(f"draw returned parameters of shape {theta.shape}, expected {old.shape}")
+        path = conditional_path(filter_of(theta), observations, streams, path)
+        moved += not np.array_equal(theta, old)
+        thetas[i] = theta
+        paths.append(path)
+    unknown = np.full((n_iterations, 1), np.nan)
+    return Chains(thetas, unknown, unknown, np.array([moved / n_iterations]), tuple(paths))
+
+
+@dataclass(frozen=True, eq=False)
+class TemperedSample:
+    """Result of `smc_sampler`.
+
+    Parameters
+    ----------
+    population : Population
+        Weighted draws of the posterior, particles (n,) or (n, d).
+    temperatures : (k,) float64
+        Powers of the likelihood, from 0 to 1.
+    accepted : (k - 1,) float64
+        Share of accepted moves at each temperature above 0.
+    """
+
+    population: Population
+    temperatures: np.ndarray
+    accepted: np.ndarray
+
+    @property
+    def log_evidence(self) -> float:
+        """Log of the estimated integral of prior times likelihood."""
+        return self.population.log_mean_weight
+
+
+def smc_sampler(
+    prior: Any,
+    log_likelihood: Callable[[np.ndarray], np.ndarray],
+    n: int,
+    seed: int = 0,
+    *,
+    share: float = 0.5,
+    steps: int = 5,
+    temperatures: Sequence[float] | None = None,
+    scale: Any = None,
+    resampler: Resampler = Systematic(),  # noqa: B008 (frozen)
+) -> TemperedSample:
+    """Sequential Monte Carlo from the prior to the posterior, by powers of the likelihood.
+
+    At each temperature the particles are weighted, resampled, and moved by Metropolis steps that leave
+    prior * likelihood^temperature invariant. With fixed `temperatures` and `scale` the estimate of the evidence is
+    unbiased; chosen from the particles, they add a bias of order 1 / n (Beskos, Jasra, Kantas, Thiery 2016).
+
+    Parameters
+    ----------
+    prior : Distribution
+        Of floating-point parameters.
+    log_likelihood : callable
+        ``(theta) -> (n,)`` of parameters (n,) or (n, d).
+    n : int
+        Particles.
+    seed : int
+    share : float
+        The next temperature is the one at which the effective sample size falls to this share of `n`.
+    steps : int
+        Metropolis steps per temperature.
+    temperatures : sequence of float, optional
+        Increasing numbers above 0 that end with 1.
+    scale : float, (d,) or (d, d) array_like, optional
+        Standard deviations or covariance of a step. Default: 2.38 / sqrt(d) times the root of the particles'
+        covariance.
+    resampler : Resampler
+    """
+    check_integer("n", n, at_least=2)
+    check_integer("steps", steps)
+    check_number("share", share, above=0, below=1)
+    planned = None if temperatures is None else [float(v) for v in temperatures]
+    if planned is not None and (not planned or planned[-1] != 1 or (np.diff([0.0, *planned]) <= 0).any()):
+        raise InputError(f"temperatures are {planned}, expected increasing numbers above 0 that end with 1")
+    prior, key = as_distribution(prior), Key(seed).child("tempering")
+    theta = prior.sample(key.child("initial").generator(), n)
+    population, log_l = Population(theta), _log_values(log_likelihood, theta)
+    reached, accepted = [0.0], []
+    while reached[-1] < 1:
+        streams = key.child(len(reached))
+        now = planned[len(reached) - 1] if planned else _next_temperature(population, log_l, reached[-1], share * n)
+        population = population.reweighted((now - reached[-1]) * log_l)
+        root = _spread(population) if scale is None else _step_root(scale, theta[0].size)
+        population = resampler.resample(streams.child("resampler").generator(), population, n)
+        rng = streams.child("move").generator()
+        theta, log_l = population.particles, log_l[population.parents["ancestor"]]
+        log_prior, taken = prior.log_prob(theta), 0.0
+        for _ in range(steps):
+            step = rng.standard_normal((len(theta), len(root))) @ root.T
+            new = theta + step.reshape(theta.shape)
+            new_prior = np.asarray(prior.log_prob(new), np.float64)
+            new_l = np.full(len(new), -np.inf)
+            inside = new_prior > -np.inf
+            if inside.any():
+                new_l[inside] = _log_values(log_likelihood, new[inside])
+            yes = accept_moves(rng, new_prior - log_prior + now * (new_l - log_l))
+            theta, log_l = choose_rows(yes, new, theta), np.where(yes, new_l, log_l)
+            log_prior = np.where(yes, new_prior, log_prior)
+            taken += yes.mean() / steps
+        population = Population(theta, population.log_weights)
+        reached.append(now)
+        accepted.append(taken)
+    return TemperedSample(population, np.array(reached), np.array(accepted))
+
+
+def _log_values(log_likelihood: Callable[[np.ndarray], np.ndarray], theta: np.ndarray) -> np.ndarray:
+    found = np.asarray(log_likelihood(theta), np.float64)
+    if found.shape != (len(theta),) or not (found < np.inf).all():
+        raise InputError(
+            f"log likelihood has shape {found.shape} and maximum {found.max()}, expected ({len(theta)},) numbers "
+            "below infinity"
+        )
+    return found
+
+
+def _next_temperature(population: Population, log_l: np.ndarray, now: float, target: float) -> float:
+    """The temperature at which the effective sample size is `target`; 1 if it stays above."""
+    from scipy.optimize import brentq
+
+    def excess(temperature: float) -> float:
+        return population.reweighted((temperature - now) * log_l).ess - target
+
+    if excess(1.0) >= 0:
+        return 1.0
+    smallest = now + 1e-9 * (1 - now)
+    return smallest if excess(smallest) <= 0 else float(brentq(excess, smallest, 1.0, xtol=1e-12))
+
+
+def _spread(population: Population) -> np.ndarray:
+    """Square root of 2.38^2 / d times the covariance of the particles (Roberts, Gelman, Gilks 1997)."""
+    theta = population.particles.reshape(len(population), -1)
+    d = theta.shape[1]
+    covariance = np.atleast_2d(np.cov(theta, rowvar=False, aweights=population.weights))
+    # A small multiple of the identity, for a covariance of fewer distinct particles than dimensions.
+    covariance += 1e-10 * (np.trace(covariance) + 1e-300) * np.eye(d)
+    return 2.38 / np.sqrt(d) * np.linalg.cholesky(covariance)

@@ -1,0 +1,457 @@
+"""Inference against exact posteriors: Kalman evidence on a grid, all paths of a hidden chain, conjugate normals.
+
+Chi-square tests at 1e-4, means at 5 standard errors: false alarm below 2e-3 for the file.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from itertools import product
+
+import numpy as np
+import pytest
+from filterpy.kalman import KalmanFilter
+from scipy import stats
+
+from mstfilter.errors import InputError
+from mstfilter.smc import (
+    Branching,
+    Categorical,
+    CrossVectors,
+    Dynamics,
+    LargestWeights,
+    MultivariateNormal,
+    Normal,
+    Population,
+    Program,
+    Proposal,
+    Reweight,
+    StateSpaceModel,
+    Transition,
+    Uniform,
+    auxiliary,
+    bootstrap,
+    conditional_path,
+    ensemble,
+    guided,
+    observe,
+    particle_gibbs,
+    path_log_prob,
+    per_particle,
+    pmmh,
+    sample,
+    smc_sampler,
+    switch,
+)
+from tests.smc.models import (
+    AR1,
+    BOXES,
+    EMIT,
+    MOVES,
+    RHO,
+    SD0,
+    SIGMA,
+    START,
+    TAU,
+    ar1_observations,
+    hmm,
+    predictive,
+    states_of,
+)
+
+# --- conditional SMC: sweeps from an exact path give an exact path -------------------------------------------------
+
+SYMBOLS = [1, 3, None]
+PATHS = np.array(list(product(range(3), repeat=len(SYMBOLS))))
+_P = START[PATHS[:, 0]] * np.prod([MOVES[PATHS[:, t], PATHS[:, t + 1]] for t in range(len(SYMBOLS) - 1)], axis=0)
+JOINT = _P * np.prod([EMIT[PATHS[:, t], y] for t, y in enumerate(SYMBOLS) if y is not None], axis=0)
+LOOK = np.array([[0.5, 0.2, 0.3], [0.3, 0.3, 0.4], [0.2, 0.2, 0.6]])  # a guide that is neither prior nor posterior
+
+
+def chain(previous, y):
+    k = sample("k", Categorical(START if previous is None else MOVES[previous["k"]]))
+    observe("y", Categorical(EMIT[k]), y)
+
+
+def keeping(previous, y):
+    chain(previous, y)
+    return None if previous is None else {"age": np.full(len(previous["k"]), 1.0)}
+
+
+def branching(previous, y):
+    """The same chain: the switch chooses the state, and each branch observes."""
+
+    def branch(k):
+        return lambda: observe("y", Categorical(EMIT[k]), y)
+
+    switch("k", START if previous is None else MOVES[previous["k"]], [branch(k) for k in range(3)])
+
+
+def guide(previous, y):
+    sample("k", Categorical(LOOK[0] if previous is None else LOOK[previous["k"]]))
+
+
+def look(x, y):
+    return Categorical(LOOK[x])
+
+
+VECTOR = hmm("vector")
+CONDITIONAL = {  # two particles: an error of the weights shows
+    "vector": bootstrap(VECTOR, 2),
+    "mapping": bootstrap(hmm("mapping"), 2),
+    "objects": bootstrap(hmm("objects"), 2),
+    "no density": bootstrap(replace(VECTOR, log_transition=None), 2),
+    "guided": guided(VECTOR, look, 2, lambda y: Categorical(LOOK[1])),
+    "program": Program(chain).bootstrap(2),
+    "guided program": Program(chain).guided(guide, 2),
+    "switch": Program(branching).bootstrap(2),
+    "returned values": Program(keeping).bootstrap(2),
+    "per particle": Program(per_particle(chain)).bootstrap(2),
+    "guided per particle": Program(per_particle(chain)).guided(per_particle(guide), 2),
+}
+
+
+def as_path(name, states):
+    """The states (T,) as a path of particles of a filter."""
+    if "per particle" in name:
+        return tuple({"k": int(k)} for k in states)
+    if name == "objects":
+        return tuple(BOXES[k] for k in states)
+    if name == "mapping":
+        return {"k": states, "twice": np.stack([states] * 2, 1)}
+    if name == "returned values":
+        return {"k": states, "age": np.arange(len(states))}
+    return {"k": states} if name in ("program", "guided program", "switch") else states
+
+
+def states_in(path):
+    traces = isinstance(path, tuple) and isinstance(path[0], Mapping)
+    return np.array([trace["k"] for trace in path]) if traces else states_of(path)
+
+
+@pytest.mark.parametrize("name", CONDITIONAL)
+def test_conditional_smc_keeps_the_law_of_paths(name):
+    """Chi-square of the paths after three sweeps from paths that are drawn from the exact posterior."""
+    n = 120 if "per particle" in name else 300
+    starts = np.random.default_rng(1).choice(len(PATHS), n, p=JOINT / JOINT.sum())
+    counts, moved = np.zeros(len(PATHS)), 0
+    for seed, k in enumerate(starts):
+        path = as_path(name, PATHS[k])
+        for sweep in range(3):
+            path = conditional_path(CONDITIONAL[name], SYMBOLS, 3 * seed + sweep, path)
+        end = states_in(path)
+        counts[int(end @ [9, 3, 1])] += 1
+        moved += not np.array_equal(end, PATHS[k])
+    expected = n * JOINT / JOINT.sum()
+    often = expected > 4
+    found = np.append(counts[often], counts[~often].sum())
+    assert stats.chisquare(found, np.append(expected[often], expected[~often].sum())).pvalue > 1e-4
+    # Without its own ancestors the given particle keeps the beginning of the path more often.
+    blind = name in ("no density", "returned values") or "per particle" in name
+    assert moved > (0.3 if blind else 0.5) * n
+
+
+def test_conditional_smc_of_a_continuous_state():
+    """A guided filter with two particles: means and variances of the path against the joint Gaussian."""
+    ys = ar1_observations(3)
+    cov = SD0**2 * RHO ** np.abs(np.subtract.outer(np.arange(3), np.arange(3)))
+    gain = cov @ np.linalg.inv(cov + TAU**2 * np.eye(3))
+    mean, posterior = gain @ ys, cov - gain @ cov
+    starts = np.random.default_rng(1).multivariate_normal(mean, posterior, 500)
+    wide = guided(AR1, lambda x, y: Normal(0.5 * (RHO * x + y), 0.7), 2, lambda y: Normal(0.7 * y, 0.8))
+    ends = np.array([conditional_path(wide, ys, seed, path) for seed, path in enumerate(starts)])
+    z = (ends - mean) / np.sqrt(np.diag(posterior))
+    assert np.abs(z.mean(axis=0)).max() < 5 / np.sqrt(500)
+    assert np.abs((z**2).mean(axis=0) - 1).max() < 5 * np.sqrt(2 / 500)
+    assert np.abs((z[:, 1:] * z[:, :-1]).mean(axis=0) - np.diag(np.corrcoef(starts.T), 1)).max() < 0.25
+    assert (ends != starts).any(axis=1).mean() > 0.4
+
+
+def test_path_log_prob_is_the_joint_density():
+    for name in ("vector", "mapping", "objects", "guided", "program", "switch"):
+        for k in (4, 13, 24):
+            path = as_path(name, PATHS[k])
+            with np.errstate(divide="ignore"):
+                assert path_log_prob(CONDITIONAL[name], SYMBOLS, path) == pytest.approx(np.log(JOINT[k]), abs=1e-12)
+
+
+def test_what_has_no_conditional_form():
+    ys = ar1_observations(3)
+    for filter, message in (
+        (auxiliary(AR1, predictive, 5), "a filter with `lookahead`"),
+        (replace(bootstrap(AR1, 5), update=CrossVectors(AR1.log_likelihood)), "not properly weighted"),
+        (bootstrap(AR1, 1), "n is 1"),
+        (replace(bootstrap(AR1, 5), transition=Branching(Dynamics(AR1))), "transition made 20 particles of 5"),
+        (replace(bootstrap(AR1, 5), transition=Drift()), "Drift that weights its particles"),
+    ):
+        with pytest.raises(InputError, match=message):
+            conditional_path(filter, ys, 0, np.zeros(3))
+    with pytest.raises(InputError, match="3 observations for a path of 2 states"):
+        conditional_path(bootstrap(AR1, 5), ys, 0, np.zeros(2))
+    with pytest.raises(InputError, match="there are 0 observations"):
+        conditional_path(bootstrap(AR1, 5), [])
+    with pytest.raises(InputError, match="densities are not known"):
+        path_log_prob(replace(bootstrap(AR1, 5), initial=Drawn()), ys, np.zeros(3))
+    with pytest.raises(InputError, match="per_particle"):
+        path_log_prob(CONDITIONAL["per particle"], [0], ({"k": 0},))
+
+
+@dataclass(frozen=True)
+class Drift(Transition):
+    def predict(self, rng, population, observation):
+        return population.reweighted(np.ones(len(population)))
+
+
+@dataclass(frozen=True)
+class Drawn(Proposal):
+    def sample(self, rng, observation, n):
+        return Population(rng.standard_normal(n))
+
+
+# --- the coefficient of an AR(1) process, against Kalman evidence on a grid ---------------------------------------
+
+YS = ar1_observations(6, seed=9)
+
+
+def log_prior(theta):
+    """Of N(0.4, 0.4^2), without its constant."""
+    return -0.5 * ((theta[0] - 0.4) / 0.4) ** 2
+
+
+def filter_of(theta, n=30):
+    """Works for one coefficient and, with arrays (1, R, 1), for R runs at once."""
+    (rho,) = theta
+    model = StateSpaceModel(
+        lambda rng, n: SD0 * rng.standard_normal(n),
+        lambda rng, x: rho * x + SIGMA * rng.standard_normal(x.shape),
+        lambda x, y: -0.5 * ((y - x) / TAU) ** 2 - np.log(TAU * np.sqrt(2 * np.pi)),
+        lambda x: stats.norm(0, SD0).logpdf(x),
+        lambda old, new: -0.5 * ((new - rho * old) / SIGMA) ** 2,
+        batched=True,
+    )
+    return bootstrap(model, n)
+
+
+def kalman(rho):
+    kf = KalmanFilter(dim_x=1, dim_z=1)
+    kf.F, kf.Q, kf.H, kf.R = (np.array([[v]]) for v in (rho, SIGMA**2, 1.0, TAU**2))
+    kf.x, kf.P = np.zeros(1), np.array([[SD0**2]])
+    total = 0.0
+    for t, y in enumerate(YS):
+        if t:
+            kf.predict()
+        total += stats.norm(kf.x[0], np.sqrt(kf.P[0, 0] + TAU**2)).logpdf(y)
+        kf.update(y)
+    return total
+
+
+GRID = np.linspace(-1.5, 2.2, 150)
+POSTERIOR = np.exp([kalman(rho) for rho in GRID]) * np.exp(log_prior([GRID]))
+MEAN = POSTERIOR @ GRID / POSTERIOR.sum()
+SQUARE = POSTERIOR @ (GRID - MEAN) ** 2 / POSTERIOR.sum()
+
+
+def agrees(means, squares):
+    """Whether independent estimates of the mean and of the mean square around it agree with the grid."""
+    found = np.stack([means, squares], axis=1)
+    error = found.std(axis=0, ddof=1) / np.sqrt(len(found))
+    return (np.abs(found.mean(axis=0) - [MEAN, SQUARE]) < 6 * error).all() and (error < [0.05, 0.03]).all()
+
+
+STARTS = np.random.default_rng(0).normal(MEAN, np.sqrt(SQUARE), (40, 1))
+
+
+def test_pmmh_has_the_exact_posterior():
+    """With only ten particles: the noise of the evidence slows the chain and does not bias it."""
+    chains = pmmh(lambda theta: filter_of(theta, 10), YS, log_prior, STARTS, 0.5, 120, batched=True)
+    rho = chains.theta[:, :, 0]
+    assert agrees(rho.mean(axis=0), ((rho - MEAN) ** 2).mean(axis=0))
+    assert 0.2 < chains.accepted.mean() < 0.8
+    # An estimate changes exactly when the parameters do.
+    same = (chains.theta[1:] == chains.theta[:-1])[:, :, 0]
+    assert (same == (chains.log_evidence[1:] == chains.log_evidence[:-1])).all()
+    density = log_prior([rho]) + chains.log_evidence
+    np.testing.assert_allclose(chains.log_density, density)
+    assert 1 < chains.autocorrelation_times()[0] < 30 and chains.effective_sizes(20)[0] > 100
+
+
+def test_pmmh_is_the_same_in_one_sweep_and_run_by_run():
+    """Also where a run is lost, and with a data set for each chain."""
+    arguments = (log_prior, STARTS[:3], 0.5, 5)
+    for ys, paired in ((YS, False), ([YS[:4], YS[1:5], YS[2:]], True)):
+        one = pmmh(filter_of, ys, *arguments, paired=paired)
+        many = pmmh(filter_of, ys, *arguments, paired=paired, batched=True)
+        np.testing.assert_array_equal(one.theta, many.theta)
+        np.testing.assert_array_equal(one.log_evidence, many.log_evidence)
+
+    def fragile(theta):
+        """Particles far from the observation are impossible, so some proposed coefficients lose their run."""
+
+        def near(x, y):
+            return np.where(np.abs(x - y) < 1.6, 0.0, -np.inf)
+
+        return replace(filter_of(theta, 8), update=Reweight(near, batched=True))
+
+    one, many = (pmmh(fragile, YS[:3], log_prior, STARTS[:6] * 0 + 0.4, 0.5, 10, 3, batched=b) for b in (False, True))
+    np.testing.assert_array_equal(one.theta, many.theta)
+
+
+def test_emcee_over_the_evidence_has_the_exact_posterior():
+    evaluated = []
+
+    def counted(theta):
+        evaluated.append(theta.shape[1])
+        return filter_of(theta)
+
+    means, squares = [], []
+    for seed in range(4):
+        chains = ensemble(counted, YS, log_prior, STARTS[:20], 50, seed, batched=True)
+        rho = chains.theta[10:, :, 0]
+        means.append(rho.mean())
+        squares.append(((rho - MEAN) ** 2).mean())
+    assert agrees(np.array(means), np.array(squares))
+    # Each walker is evaluated at the start and at each proposal, never again where it stays.
+    assert sum(evaluated) == 4 * 20 * (50 + 1)
+    same = (chains.theta[1:] == chains.theta[:-1])[:, :, 0]
+    assert same.any() and (same == (chains.log_evidence[1:] == chains.log_evidence[:-1])).all()
+    again = ensemble(counted, YS, log_prior, STARTS[:20], 50, 3, batched=True)
+    np.testing.assert_array_equal(again.theta, chains.theta)
+
+
+def conjugate(rng, theta, path):
+    """p(rho | x_0 .. x_T), a normal distribution."""
+    old, new = path[:-1], path[1:]
+    precision = 1 / 0.4**2 + old @ old / SIGMA**2
+    return [rng.normal((0.4 / 0.4**2 + old @ new / SIGMA**2) / precision, precision**-0.5)]
+
+
+def metropolis(rng, theta, path):
+    """A Metropolis step on rho that knows only the density of the path."""
+    new = theta + 0.5 * rng.standard_normal(1)
+    gain = path_log_prob(filter_of(new), YS, path) - path_log_prob(filter_of(theta), YS, path)
+    return new if np.log(rng.random()) < gain + log_prior(new) - log_prior(theta) else theta
+
+
+@pytest.mark.parametrize(("draw", "n_iterations"), [(conjugate, 60), (metropolis, 40)])
+def test_particle_gibbs_has_the_exact_posterior(draw, n_iterations):
+    means, squares = [], []
+    for seed in range(10):
+        chains = particle_gibbs(lambda theta: filter_of(theta, 5), YS, draw, STARTS[seed], n_iterations, seed)
+        rho = chains.theta[:, 0, 0]
+        means.append(rho.mean())
+        squares.append(((rho - MEAN) ** 2).mean())
+    assert agrees(np.array(means), np.array(squares))
+    assert len(chains.paths) == n_iterations and chains.paths[0].shape == (6,)
+    assert chains.accepted == 1 or draw is metropolis
+
+
+def test_particle_gibbs_of_a_program():
+    """The probability to stay in a state, with a beta prior: against the forward algorithm on a grid."""
+
+    def program_of(theta):
+        p = float(theta[0])
+        moves = np.array([[p, 1 - p], [1 - p, p]])
+
+        def program(previous, y):
+            k = sample("k", Categorical([0.5, 0.5] if previous is None else moves[previous["k"]]))
+            observe("y", Normal(k.astype(float), 0.6), y)
+
+        return Program(program).bootstrap(4)
+
+    ys = [0.1, 0.2, 1.1, 0.9, None, 1.2]
+    grid = (np.arange(200) + 0.5) / 200
+    evidence = []
+    for p in grid:
+        alpha, total = np.array([0.5, 0.5]), 1.0
+        for t, y in enumerate(ys):
+            alpha = alpha @ [[p, 1 - p], [1 - p, p]] if t else alpha
+            alpha = alpha if y is None else alpha * stats.norm(np.arange(2), 0.6).pdf(y)
+        evidence.append(total * alpha.sum())
+    posterior = np.array(evidence) * stats.beta(2, 2).pdf(grid)
+    exact = posterior @ grid / posterior.sum()
+
+    def draw(rng, theta, path):
+        stays = (path["k"][1:] == path["k"][:-1]).sum()
+        return [rng.beta(2 + stays, 2 + len(ys) - 1 - stays)]
+
+    means = [particle_gibbs(program_of, ys, draw, [0.5], 40, seed).theta[3:].mean() for seed in range(9)]
+    assert abs(np.mean(means) - exact) < 5 * np.std(means, ddof=1) / 3 < 0.15
+
+
+def test_what_chains_reject():
+    with pytest.raises(InputError, match="start .* has log density -inf"):
+        pmmh(filter_of, YS, lambda theta: -np.inf, [0.1], 0.5, 5)
+    with pytest.raises(InputError, match="log prior of .* is NaN"):
+        pmmh(filter_of, YS, lambda theta: np.nan, [0.1], 0.5, 5)
+    for scale in (0.0, [0.1, 0.2], [[-1.0]]):
+        with pytest.raises(InputError, match="scale is"):
+            pmmh(filter_of, YS, log_prior, [0.1], scale, 5)
+    with pytest.raises(InputError, match="1 data sets for 2 chains"):
+        pmmh(filter_of, [YS], log_prior, [[0.1], [0.2]], 0.5, 5, paired=True)
+    with pytest.raises(InputError, match="must be batched"):
+        pmmh(lambda theta: bootstrap(AR1, 5), YS, log_prior, [0.1], 0.5, 5, batched=True)
+    with pytest.raises(InputError, match="not properly weighted"):
+        pmmh(lambda theta: bootstrap(AR1, 5, LargestWeights()), YS, log_prior, [0.1], 0.5, 5)
+    with pytest.raises(InputError, match=r"start has shape \(1, 1\)"):
+        ensemble(filter_of, YS, log_prior, [[0.1]], 5)
+    with pytest.raises(InputError, match=r"draw returned parameters of shape \(2,\)"):
+        particle_gibbs(filter_of, YS, lambda rng, theta, path: [1.0, 2.0], [0.1], 5)
+
+
+# --- SMC samplers, against a conjugate normal model ---------------------------------------------------------------
+
+POINTS = np.random.default_rng(3).normal([1.0, -2.0], 1.0, (6, 2))
+NORMAL_PRIOR = MultivariateNormal(np.zeros(2), 4 * np.eye(2))
+EVIDENCE = sum(stats.multivariate_normal(np.zeros(6), 4 + np.eye(6)).logpdf(column) for column in POINTS.T)
+
+
+def log_likelihood(theta):
+    return -0.5 * ((POINTS - theta[:, None]) ** 2).sum(axis=(1, 2)) - 6 * np.log(2 * np.pi)
+
+
+def test_a_tempered_sampler_finds_posterior_and_evidence():
+    runs = [smc_sampler(NORMAL_PRIOR, log_likelihood, 400, seed) for seed in range(20)]
+    means = np.array([r.population.weights @ r.population.particles for r in runs])
+    spread = np.array([np.cov(r.population.particles.T, aweights=r.population.weights) for r in runs])
+    np.testing.assert_allclose(means.mean(axis=0), POINTS.sum(axis=0) / 6.25, atol=5 * 0.4 / np.sqrt(400 * 20 / 4))
+    np.testing.assert_allclose(spread.mean(axis=0), np.eye(2) / 6.25, atol=0.02)
+    assert abs(np.mean([r.log_evidence for r in runs]) - EVIDENCE) < 0.1
+    for run in runs:
+        assert run.temperatures[0] == 0 and run.temperatures[-1] == 1 and (np.diff(run.temperatures) > 0).all()
+        assert len(run.accepted) == len(run.temperatures) - 1 and (run.accepted > 0.1).all()
+
+
+def test_the_evidence_of_a_fixed_schedule_is_unbiased():
+    settings = {"temperatures": [0.05, 0.25, 1.0], "scale": 0.6, "steps": 2}
+    logs = [smc_sampler(NORMAL_PRIOR, log_likelihood, 50, seed, **settings).log_evidence for seed in range(200)]
+    ratio = np.exp(np.array(logs) - EVIDENCE)
+    assert abs(ratio.mean() - 1) < 5 * ratio.std(ddof=1) / np.sqrt(200)
+    assert ratio.std() < 0.6
+
+
+def test_a_tempered_sampler_finds_both_modes():
+    """Two separate modes of a scalar, on a bounded prior and with parts of likelihood zero."""
+
+    def log_l(theta):
+        with np.errstate(divide="ignore"):
+            two = 0.3 * stats.norm(-4, 0.3).pdf(theta) + 0.7 * stats.norm(4, 0.3).pdf(theta)
+            return np.where(np.abs(theta) < 1, -np.inf, np.log(two))
+
+    run = smc_sampler(Uniform(-6.0, 6.0), log_l, 2000, seed=1)
+    assert run.population.particles.shape == (2000,)
+    assert abs(run.population.weights @ (run.population.particles > 0) - 0.7) < 0.06
+    assert abs(run.log_evidence + np.log(12)) < 0.15
+
+
+def test_what_a_tempered_sampler_rejects():
+    for changed, message in (
+        ({"temperatures": [0.5]}, "temperatures are"),
+        ({"temperatures": [0.5, 0.5, 1.0]}, "temperatures are"),
+        ({"share": 1.5}, "share is 1.5"),
+        ({"n": 1}, "n is 1"),
+        ({"log_likelihood": lambda theta: np.zeros(3)}, r"log likelihood has shape \(3,\)"),
+        ({"log_likelihood": lambda theta: np.full(len(theta), np.nan)}, "maximum nan"),
+    ):
+        with pytest.raises(InputError, match=message):
+            smc_sampler(**{"prior": NORMAL_PRIOR, "log_likelihood": log_likelihood, "n": 20, **changed})
