@@ -4,7 +4,7 @@
 >>> paths = backward_paths(np.random.default_rng(1), record, Dynamics(model), n=200)
 >>> [population.weights @ population.particles for population in paths]        # E[x_t | y_0 .. y_T], t = 0 .. T
 
-Three smoothers return a tuple with one population per time:
+Three smoothers of a record return a tuple with one population per time:
 
 - `genealogy` follows the ancestors of the last particles (Kitagawa 1996). It needs only the record; after many
   resamplings all paths share their beginning.
@@ -14,6 +14,10 @@ Three smoothers return a tuple with one population per time:
   degeneracy, at the cost of n densities per path and step.
 
 They are valid for any filter with proper weights: guided, auxiliary, with moves, resampled before or after.
+
+`conditional_path` draws one path by a Markov kernel that leaves the smoothing distribution invariant (conditional SMC,
+Andrieu, Doucet, Holenstein 2010): exact for any number of particles, also for programs. `path_log_prob` is the joint
+log density of a path and the observations.
 """
 
 from __future__ import annotations
@@ -30,7 +34,8 @@ from mstfilter.smc.filter import ParticleFilter
 from mstfilter.smc.interfaces import DensityTransition, State, Transition
 from mstfilter.smc.population import Particles, Population, count_particles, take
 from mstfilter.smc.programs.filters import ProgramInitial, ProgramTransition, run_program
-from mstfilter.smc.programs.sites import GuideHandler, PerParticle, ReplayHandler, SampleHandler, ScoreHandler, Site
+from mstfilter.smc.programs.handlers import GuideHandler, ReplayHandler, SampleHandler, ScoreHandler, Site
+from mstfilter.smc.programs.sites import PerParticle
 from mstfilter.smc.resampling import Multinomial
 from mstfilter.smc.state_space import Dynamics, GuidedInitial, GuidedTransition, Prior
 from mstfilter.smc.streams import Key, child

@@ -66,7 +66,7 @@ SYMBOLS = [1, 3, None]
 PATHS = np.array(list(product(range(3), repeat=len(SYMBOLS))))
 _P = START[PATHS[:, 0]] * np.prod([MOVES[PATHS[:, t], PATHS[:, t + 1]] for t in range(len(SYMBOLS) - 1)], axis=0)
 JOINT = _P * np.prod([EMIT[PATHS[:, t], y] for t, y in enumerate(SYMBOLS) if y is not None], axis=0)
-LOOK = np.array([[0.5, 0.2, 0.3], [0.3, 0.3, 0.4], [0.2, 0.2, 0.6]])  # a guide that is neither prior nor posterior
+LOOK = np.array([[0.15, 0.25, 0.6], [0.6, 0.2, 0.2], [0.1, 0.8, 0.1]])  # a poor guide
 
 
 def chain(previous, y):
@@ -102,7 +102,7 @@ CONDITIONAL = {  # two particles: an error of the weights shows
     "mapping": bootstrap(hmm("mapping"), 2),
     "objects": bootstrap(hmm("objects"), 2),
     "no density": bootstrap(replace(VECTOR, log_transition=None), 2),
-    "guided": guided(VECTOR, look, 2, lambda y: Categorical(LOOK[1])),
+    "guided": guided(VECTOR, look, 2, lambda y: Categorical(LOOK[0])),
     "program": Program(chain).bootstrap(2),
     "guided program": Program(chain).guided(guide, 2),
     "switch": Program(branching).bootstrap(2),
@@ -130,10 +130,10 @@ def states_in(path):
     return np.array([trace["k"] for trace in path]) if traces else states_of(path)
 
 
-@pytest.mark.parametrize("name", CONDITIONAL)
+@pytest.mark.parametrize("name", ["vector", "no density", "guided", "per particle", "guided per particle"])
 def test_conditional_smc_keeps_the_law_of_paths(name):
     """Chi-square of the paths after three sweeps from paths that are drawn from the exact posterior."""
-    n = 120 if "per particle" in name else 300
+    n = 100 if "per particle" in name else 300
     starts = np.random.default_rng(1).choice(len(PATHS), n, p=JOINT / JOINT.sum())
     counts, moved = np.zeros(len(PATHS)), 0
     for seed, k in enumerate(starts):
@@ -147,9 +147,30 @@ def test_conditional_smc_keeps_the_law_of_paths(name):
     often = expected > 4
     found = np.append(counts[often], counts[~often].sum())
     assert stats.chisquare(found, np.append(expected[often], expected[~often].sum())).pvalue > 1e-4
-    # Without its own ancestors the given particle keeps the beginning of the path more often.
-    blind = name in ("no density", "returned values") or "per particle" in name
-    assert moved > (0.3 if blind else 0.5) * n
+    assert moved > 0.2 * n
+
+
+@pytest.mark.parametrize(
+    ("name", "same"),
+    [
+        ("mapping", "vector"),
+        ("objects", "vector"),
+        ("program", "vector"),
+        ("switch", "vector"),
+        ("returned values", "no density"),
+        ("guided program", "guided"),
+    ],
+)
+def test_conditional_smc_is_the_same_for_every_form_of_a_model(name, same):
+    """The same paths from the same streams, in chains of 60 sweeps; values that a program returns have no density."""
+    one, other = (conditional_path(CONDITIONAL[form], SYMBOLS) for form in (name, same))
+    distinct = set()
+    for seed in range(60):
+        one = conditional_path(CONDITIONAL[name], SYMBOLS, seed, one)
+        other = conditional_path(CONDITIONAL[same], SYMBOLS, seed, other)
+        np.testing.assert_array_equal(states_in(one), other)
+        distinct.add(tuple(other))
+    assert len(distinct) > 3
 
 
 def test_conditional_smc_of_a_continuous_state():
@@ -158,12 +179,14 @@ def test_conditional_smc_of_a_continuous_state():
     cov = SD0**2 * RHO ** np.abs(np.subtract.outer(np.arange(3), np.arange(3)))
     gain = cov @ np.linalg.inv(cov + TAU**2 * np.eye(3))
     mean, posterior = gain @ ys, cov - gain @ cov
-    starts = np.random.default_rng(1).multivariate_normal(mean, posterior, 500)
-    wide = guided(AR1, lambda x, y: Normal(0.5 * (RHO * x + y), 0.7), 2, lambda y: Normal(0.7 * y, 0.8))
-    ends = np.array([conditional_path(wide, ys, seed, path) for seed, path in enumerate(starts)])
+    starts = np.random.default_rng(1).multivariate_normal(mean, posterior, 200)
+    poor = guided(AR1, lambda x, y: Normal(RHO * x - 0.7, 0.9), 2, lambda y: Normal(0.7 * y + 0.5, 1.2))
+    ends = starts
+    for sweep in range(3):
+        ends = np.array([conditional_path(poor, ys, 3 * seed + sweep, path) for seed, path in enumerate(ends)])
     z = (ends - mean) / np.sqrt(np.diag(posterior))
-    assert np.abs(z.mean(axis=0)).max() < 5 / np.sqrt(500)
-    assert np.abs((z**2).mean(axis=0) - 1).max() < 5 * np.sqrt(2 / 500)
+    assert np.abs(z.mean(axis=0)).max() < 5 / np.sqrt(200)
+    assert np.abs((z**2).mean(axis=0) - 1).max() < 5 * np.sqrt(2 / 200)
     assert np.abs((z[:, 1:] * z[:, :-1]).mean(axis=0) - np.diag(np.corrcoef(starts.T), 1)).max() < 0.25
     assert (ends != starts).any(axis=1).mean() > 0.4
 
@@ -306,17 +329,17 @@ def test_emcee_over_the_evidence_has_the_exact_posterior():
 
     means, squares = [], []
     for seed in range(4):
-        chains = ensemble(counted, YS, log_prior, STARTS[:20], 50, seed, batched=True)
+        chains = ensemble(counted, YS, log_prior, STARTS[:16], 40, seed, batched=True)
         rho = chains.theta[10:, :, 0]
         means.append(rho.mean())
         squares.append(((rho - MEAN) ** 2).mean())
     assert agrees(np.array(means), np.array(squares))
     # Each walker is evaluated at the start and at each proposal, never again where it stays.
-    assert sum(evaluated) == 4 * 20 * (50 + 1)
+    assert sum(evaluated) == 4 * 16 * (40 + 1)
     same = (chains.theta[1:] == chains.theta[:-1])[:, :, 0]
     assert same.any() and (same == (chains.log_evidence[1:] == chains.log_evidence[:-1])).all()
-    again = ensemble(counted, YS, log_prior, STARTS[:20], 50, 3, batched=True)
-    np.testing.assert_array_equal(again.theta, chains.theta)
+    again = ensemble(counted, YS, log_prior, STARTS[:16], 3, 3, batched=True)
+    np.testing.assert_array_equal(again.theta, chains.theta[:3])
 
 
 def conjugate(rng, theta, path):
@@ -333,7 +356,7 @@ def metropolis(rng, theta, path):
     return new if np.log(rng.random()) < gain + log_prior(new) - log_prior(theta) else theta
 
 
-@pytest.mark.parametrize(("draw", "n_iterations"), [(conjugate, 60), (metropolis, 40)])
+@pytest.mark.parametrize(("draw", "n_iterations"), [(conjugate, 50), (metropolis, 30)])
 def test_particle_gibbs_has_the_exact_posterior(draw, n_iterations):
     means, squares = [], []
     for seed in range(10):
@@ -375,8 +398,8 @@ def test_particle_gibbs_of_a_program():
         stays = (path["k"][1:] == path["k"][:-1]).sum()
         return [rng.beta(2 + stays, 2 + len(ys) - 1 - stays)]
 
-    means = [particle_gibbs(program_of, ys, draw, [0.5], 40, seed).theta[3:].mean() for seed in range(9)]
-    assert abs(np.mean(means) - exact) < 5 * np.std(means, ddof=1) / 3 < 0.15
+    means = [particle_gibbs(program_of, ys, draw, [0.5], 30, seed).theta[3:].mean() for seed in range(7)]
+    assert abs(np.mean(means) - exact) < 5 * np.std(means, ddof=1) / np.sqrt(7) < 0.2
 
 
 def test_what_chains_reject():
@@ -424,9 +447,9 @@ def test_a_tempered_sampler_finds_posterior_and_evidence():
 
 def test_the_evidence_of_a_fixed_schedule_is_unbiased():
     settings = {"temperatures": [0.05, 0.25, 1.0], "scale": 0.6, "steps": 2}
-    logs = [smc_sampler(NORMAL_PRIOR, log_likelihood, 50, seed, **settings).log_evidence for seed in range(200)]
+    logs = [smc_sampler(NORMAL_PRIOR, log_likelihood, 50, seed, **settings).log_evidence for seed in range(150)]
     ratio = np.exp(np.array(logs) - EVIDENCE)
-    assert abs(ratio.mean() - 1) < 5 * ratio.std(ddof=1) / np.sqrt(200)
+    assert abs(ratio.mean() - 1) < 5 * ratio.std(ddof=1) / np.sqrt(150)
     assert ratio.std() < 0.6
 
 
