@@ -15,8 +15,8 @@ Three smoothers of a record return a tuple with one population per time:
 
 They are valid for any filter with proper weights: guided, auxiliary, with moves, resampled before or after.
 
-`conditional_path` draws one path by a Markov kernel that leaves the smoothing distribution invariant (conditional SMC,
-Andrieu, Doucet, Holenstein 2010): exact for any number of particles, also for programs. `path_log_prob` is the joint
+`conditional_path` draws one path by a Markov kernel that leaves the smoothing distribution invariant, for any number
+of particles and also for programs (conditional SMC; Andrieu, Doucet, Holenstein 2010). `path_log_prob` is the joint
 log density of a path and the observations.
 """
 
