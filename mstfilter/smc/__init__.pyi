@@ -125,6 +125,7 @@ from mstfilter.smc.smoothing import (
     fixed_lag as fixed_lag,
     genealogy as genealogy,
     keep as keep,
+    paris as paris,
     path_log_prob as path_log_prob,
 )
 from mstfilter.smc.state_space import (
@@ -137,8 +138,11 @@ from mstfilter.smc.state_space import (
     StateSpaceModel as StateSpaceModel,
     auxiliary as auxiliary,
     bootstrap as bootstrap,
+    ekf_proposal as ekf_proposal,
     guided as guided,
+    nonlinear_gaussian as nonlinear_gaussian,
     resample_move as resample_move,
+    ukf_proposal as ukf_proposal,
 )
 from mstfilter.smc.streams import Key as Key, RunGenerators as RunGenerators, child as child, key_of as key_of
 from mstfilter.smc.transport_resampling import (

@@ -37,7 +37,7 @@ from mstfilter.errors import InputError
 from mstfilter.smc.filter import ParticleFilter
 from mstfilter.smc.interfaces import Proposal, Transition, Update
 from mstfilter.smc.population import Population, union
-from mstfilter.smc.state_space import StateSpaceModel
+from mstfilter.smc.state_space import StateSpaceModel, nonlinear_gaussian
 
 
 def linear_gaussian(F: Any, Q: Any, H: Any, R: Any, m0: Any, P0: Any) -> StateSpaceModel:
@@ -49,41 +49,10 @@ def linear_gaussian(F: Any, Q: Any, H: Any, R: Any, m0: Any, P0: Any) -> StateSp
     if m0.ndim != 1:
         raise InputError(f"m0 has shape {m0.shape}, expected one number per entry of the state: (d,)")
     d, k = m0.shape, H.shape[:1]
-    shapes = {"F": (F, d * 2), "Q": (Q, d * 2), "H": (H, k + d), "R": (R, k * 2), "m0": (m0, d), "P0": (P0, d * 2)}
-    for name, (array, shape) in shapes.items():
+    for name, array, shape in (("F", F, d * 2), ("H", H, k + d), ("R", R, k * 2)):
         if array.shape != shape:
             raise InputError(f"{name} has shape {array.shape}, expected {shape} as m0 has {d[0]} entries")
-    for name, cov in (("Q", Q), ("R", R), ("P0", P0)):
-        if not np.allclose(cov, cov.T) or not (np.linalg.eigvalsh(cov) > 0).all():
-            raise InputError(f"{name} is {cov.tolist()}, expected a covariance: symmetric and positive definite")
-    root_Q, root_P = np.linalg.cholesky(Q), np.linalg.cholesky(P0)
-
-    def log_normal(cov: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
-        whiten = np.linalg.inv(np.linalg.cholesky(cov))
-        constant = np.log(np.diag(whiten)).sum() - 0.5 * len(cov) * np.log(2 * np.pi)
-
-        def of(residual: np.ndarray) -> np.ndarray:
-            z = residual @ whiten.T
-            return constant - 0.5 * np.einsum("...j,...j->...", z, z)
-
-        return of
-
-    def initial(rng: np.random.Generator, n: int | tuple[int, int]) -> np.ndarray:
-        shape = (n,) if isinstance(n, int) else n
-        return m0 + rng.standard_normal((*shape, len(m0))) @ root_P.T
-
-    def transition(rng: np.random.Generator, x: np.ndarray) -> np.ndarray:
-        return x @ F.T + rng.standard_normal(x.shape) @ root_Q.T
-
-    of_R, of_P, of_Q = log_normal(R), log_normal(P0), log_normal(Q)
-    return StateSpaceModel(
-        initial,
-        transition,
-        lambda x, y: of_R(np.atleast_1d(y) - x @ H.T),
-        lambda x: of_P(x - m0),
-        lambda old, new: of_Q(new - old @ F.T),
-        batched=True,
-    )
+    return nonlinear_gaussian(lambda x: x @ F.T, Q, lambda x: x @ H.T, R, m0, P0)
 
 
 class Kalman(NamedTuple):

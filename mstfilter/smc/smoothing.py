@@ -15,6 +15,8 @@ Three smoothers of a record return a tuple with one population per time:
 
 They are valid for any filter with proper weights: guided, auxiliary, with moves, resampled before or after.
 
+`paris` yields smoothed means of sums over the path while observations arrive, in constant memory.
+
 `conditional_path` draws one path by a Markov kernel that leaves the smoothing distribution invariant, for any number
 of particles and also for programs (conditional SMC; Andrieu, Doucet, Holenstein 2010). `path_log_prob` is the joint
 log density of a path and the observations.
@@ -22,7 +24,7 @@ log density of a path and the observations.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -139,18 +141,88 @@ def backward_paths(
     path = [Population(take(last.particles, index))]
     for t in range(len(record) - 2, -1, -1):
         population, y = record.populations[t].realised(), record.observations[t + 1]
-        later, m = path[-1].particles, len(population)
-        index = np.empty(n, np.int64)
-        block = max(1, _PAIRS // m)
-        for begin in range(0, n, block):
-            rows = np.arange(begin, min(begin + block, n))
-            old = take(population.particles, np.tile(np.arange(m), len(rows)))
-            density = np.asarray(transition.log_prob(old, take(later, np.repeat(rows, m)), y), dtype=np.float64)
-            if density.shape != (len(rows) * m,):
-                raise InputError(f"log_prob returned shape {density.shape}, expected ({len(rows) * m},)")
-            index[rows] = _drawn(rng, population.log_weights + density.reshape(len(rows), m), t)
-        path.append(Population(take(population.particles, index)))
+        index = _predecessors(rng, population, path[-1].particles, transition, y, t)
+        path.append(Population(take(population.particles, index[:, 0])))
     return tuple(reversed(path))
+
+
+def _predecessors(
+    rng: np.random.Generator,
+    population: Population,
+    later: Particles,
+    transition: DensityTransition,
+    y: Any,
+    t: int,
+    n_draws: int = 1,
+) -> np.ndarray:
+    """(n, n_draws) indices in the population at time t, by weight times density of the move to n later particles."""
+    n, m = count_particles(later), len(population)
+    index = np.empty((n, n_draws), np.int64)
+    block = max(1, _PAIRS // m)
+    for begin in range(0, n, block):
+        rows = np.arange(begin, min(begin + block, n))
+        old = take(population.particles, np.tile(np.arange(m), len(rows)))
+        density = np.asarray(transition.log_prob(old, take(later, np.repeat(rows, m)), y), dtype=np.float64)
+        if density.shape != (len(rows) * m,):
+            raise InputError(f"log_prob returned shape {density.shape}, expected ({len(rows) * m},)")
+        log_weights = population.log_weights + density.reshape(len(rows), m)
+        for k in range(n_draws):
+            index[rows, k] = _drawn(rng, log_weights, t)
+    return index
+
+
+def paris(
+    filter: ParticleFilter,
+    observations: Iterable[Any],
+    functional: Callable[[int, Particles | None, Particles], np.ndarray],
+    transition: DensityTransition,
+    seed: int = 0,
+    n_draws: int = 2,
+) -> Iterator[np.ndarray]:
+    """Smoothed means of an additive functional, online (PaRIS; Olsson and Westerborn 2017, algorithm 2).
+
+    After each observation it yields E[h_0(x_0) + h_1(x_0, x_1) + .. + h_t(x_{t-1}, x_t) | y_0 .. y_t]. Only the last
+    population is kept, with one statistic per particle: the mean over `n_draws` predecessors drawn backwards. A step
+    takes n^2 densities.
+
+    Parameters
+    ----------
+    filter : ParticleFilter
+        With proper weights.
+    observations : iterable
+    functional : callable
+        ``(t, previous, particles) -> (n,) or (n, k)`` is h_t of paired rows; `previous` is None at t = 0.
+    transition : DensityTransition
+        The transition of the model, ``Dynamics(model)``.
+    seed : int
+    n_draws : int
+        At least 2: with one the variance grows as that of the genealogy.
+
+    Yields
+    ------
+    float64 scalar or (k,)
+    """
+    check_component("transition", transition, DensityTransition)
+    check_integer("n_draws", n_draws)
+    if not filter.properly_weighted:
+        raise InputError("a component of the filter is not properly weighted: its smoothed means have another limit")
+    past: Population | None = None
+    statistic = np.zeros(0)
+    state = filter.start(seed)
+    for t, y in enumerate(observations):
+        state, _ = filter.step(state, y)
+        assert state.population is not None
+        now = state.population.realised()
+        if past is None:
+            statistic = np.asarray(functional(t, None, now.particles), np.float64)
+        else:
+            rng = Key(seed).child("paris", t).generator()
+            index = _predecessors(rng, past, now.particles, transition, y, t - 1, n_draws).ravel()
+            later = take(now.particles, np.repeat(np.arange(len(now)), n_draws))
+            statistic = statistic[index] + functional(t, take(past.particles, index), later)
+            statistic = statistic.reshape(len(now), n_draws, *statistic.shape[1:]).mean(axis=1)
+        past = now
+        yield np.tensordot(now.weights, statistic, axes=1)
 
 
 def _drawn(rng: np.random.Generator, log_weights: np.ndarray, t: int | None = None) -> np.ndarray:
