@@ -45,11 +45,14 @@ from mstfilter.smc.exact import (
     Kalman as Kalman,
     Linear as Linear,
     Marginals as Marginals,
+    ekf_proposal as ekf_proposal,
     forward_backward as forward_backward,
     hidden_markov as hidden_markov,
     kalman_filter as kalman_filter,
     linear_gaussian as linear_gaussian,
+    nonlinear_gaussian as nonlinear_gaussian,
     rao_blackwellised as rao_blackwellised,
+    ukf_proposal as ukf_proposal,
 )
 from mstfilter.smc.filter import ParticleFilter as ParticleFilter
 from mstfilter.smc.inference import (
@@ -138,11 +141,8 @@ from mstfilter.smc.state_space import (
     StateSpaceModel as StateSpaceModel,
     auxiliary as auxiliary,
     bootstrap as bootstrap,
-    ekf_proposal as ekf_proposal,
     guided as guided,
-    nonlinear_gaussian as nonlinear_gaussian,
     resample_move as resample_move,
-    ukf_proposal as ukf_proposal,
 )
 from mstfilter.smc.streams import Key as Key, RunGenerators as RunGenerators, child as child, key_of as key_of
 from mstfilter.smc.transport_resampling import (

@@ -1,4 +1,4 @@
-"""Models with exact answers, and the Rao-Blackwellised filter, which integrates part of the state exactly.
+"""Gaussian and finite models, their exact answers, and filters that use them: Rao-Blackwellised, EKF- and UKF-guided.
 
 >>> filter = bootstrap(linear_gaussian(F, Q, H, R, m0, P0), n=1000)
 >>> exact = kalman_filter(F, Q, H, R, m0, P0, observations)
@@ -10,6 +10,11 @@
 
 The first observation updates the initial state before any prediction, as in all filters of this package. An
 observation that is missing is None.
+
+>>> filter = guided(nonlinear_gaussian(f, Q, h, R, m0, P0), ukf_proposal(f, Q, h, R), n=100)
+
+A model with Gaussian noise and nonlinear functions has no exact answers, but good proposals: the updates of the
+extended and the unscented Kalman filter.
 
 >>> filter = rao_blackwellised(model, n=100)
 >>> state, infos = filter.run(observations, seed=0)
@@ -34,10 +39,11 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from mstfilter.errors import InputError
+from mstfilter.smc.distributions import MultivariateNormal
 from mstfilter.smc.filter import ParticleFilter
 from mstfilter.smc.interfaces import Proposal, Transition, Update
 from mstfilter.smc.population import Population, union
-from mstfilter.smc.state_space import StateSpaceModel, nonlinear_gaussian
+from mstfilter.smc.state_space import StateSpaceModel
 
 
 def linear_gaussian(F: Any, Q: Any, H: Any, R: Any, m0: Any, P0: Any) -> StateSpaceModel:
@@ -53,6 +59,66 @@ def linear_gaussian(F: Any, Q: Any, H: Any, R: Any, m0: Any, P0: Any) -> StateSp
         if array.shape != shape:
             raise InputError(f"{name} has shape {array.shape}, expected {shape} as m0 has {d[0]} entries")
     return nonlinear_gaussian(lambda x: x @ F.T, Q, lambda x: x @ H.T, R, m0, P0)
+
+
+def nonlinear_gaussian(
+    f: Callable[[np.ndarray], np.ndarray],
+    Q: Any,
+    h: Callable[[np.ndarray], np.ndarray],
+    R: Any,
+    m0: Any,
+    P0: Any,
+) -> StateSpaceModel:
+    """x_0 ~ N(m0, P0), x_t = f(x_{t-1}) + N(0, Q), y_t = h(x_t) + N(0, R).
+
+    Parameters
+    ----------
+    f, h : callable
+        Of particles (n, d): the next states (n, d), and the observations (n, k) without noise. If they also take
+        particles (R, n, d), the model can be run in a batch.
+    Q, R : (d, d) and (k, k) array_like
+    m0, P0 : (d,) and (d, d) array_like
+    """
+    m0 = np.asarray(m0, np.float64)
+    Q, R, P0 = _covariance("Q", Q, len(m0)), _covariance("R", R), _covariance("P0", P0, len(m0))
+    root_Q, root_P = np.linalg.cholesky(Q), np.linalg.cholesky(P0)
+
+    def log_normal(cov: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
+        whiten = np.linalg.inv(np.linalg.cholesky(cov))
+        constant = np.log(np.diag(whiten)).sum() - 0.5 * len(cov) * np.log(2 * np.pi)
+
+        def of(residual: np.ndarray) -> np.ndarray:
+            z = residual @ whiten.T
+            return constant - 0.5 * np.einsum("...j,...j->...", z, z)
+
+        return of
+
+    def initial(rng: np.random.Generator, n: int | tuple[int, int]) -> np.ndarray:
+        shape = (n,) if isinstance(n, int) else n
+        return m0 + rng.standard_normal((*shape, len(m0))) @ root_P.T
+
+    def transition(rng: np.random.Generator, x: np.ndarray) -> np.ndarray:
+        return f(x) + rng.standard_normal(x.shape) @ root_Q.T
+
+    of_R, of_P, of_Q = log_normal(R), log_normal(P0), log_normal(Q)
+    return StateSpaceModel(
+        initial,
+        transition,
+        lambda x, y: of_R(np.atleast_1d(y) - h(x)),
+        lambda x: of_P(x - m0),
+        lambda old, new: of_Q(new - f(old)),
+        batched=True,
+    )
+
+
+def _covariance(name: str, given: Any, d: int | None = None) -> np.ndarray:
+    cov = np.asarray(given, dtype=np.float64)
+    if cov.ndim != 2 or cov.shape != (d or len(cov), d or len(cov)):
+        expected = "(k, k)" if d is None else f"({d}, {d}) as m0 has {d} entries"
+        raise InputError(f"{name} has shape {cov.shape}, expected {expected}")
+    if not np.allclose(cov, cov.T) or not (np.linalg.eigvalsh(cov) > 0).all():
+        raise InputError(f"{name} is {cov.tolist()}, expected a covariance: symmetric and positive definite")
+    return cov
 
 
 class Kalman(NamedTuple):
@@ -345,3 +411,81 @@ def rao_blackwellised(model: ConditionallyLinear, n: int, **components: Any) -> 
     return ParticleFilter(
         initial=_Initial(model), transition=_Predict(model), update=_Correct(model), n=n, **components
     )
+
+
+def ekf_proposal(
+    f: Callable[[np.ndarray], np.ndarray],
+    Q: Any,
+    h: Callable[[np.ndarray], np.ndarray],
+    R: Any,
+    jacobian: Callable[[np.ndarray], np.ndarray],
+) -> Callable[[np.ndarray, Any], MultivariateNormal]:
+    """A proposal for `guided`: the update of the extended Kalman filter from each particle.
+
+    Given x_{t-1} the state is N(f(x_{t-1}), Q); `h` is linearised at its mean (Doucet, Godsill, Andrieu 2000, section
+    II D). It is computed for all particles at once; filterpy's ExtendedKalmanFilter holds a single state.
+
+    Parameters
+    ----------
+    f, Q, h, R
+        As in `nonlinear_gaussian`.
+    jacobian : callable
+        Of particles (n, d): the derivatives of `h`, (n, k, d) or (k, d).
+    """
+    Q, R = _covariance("Q", Q), _covariance("R", R)
+
+    def proposal(x: np.ndarray, y: Any) -> MultivariateNormal:
+        mean = f(x)
+        H = np.asarray(jacobian(mean), np.float64)
+        cross = Q @ np.swapaxes(H, -1, -2)
+        return _conditional(mean, Q, h(mean), H @ cross + R, cross, y)
+
+    return proposal
+
+
+def ukf_proposal(
+    f: Callable[[np.ndarray], np.ndarray],
+    Q: Any,
+    h: Callable[[np.ndarray], np.ndarray],
+    R: Any,
+    alpha: float = 1.0,
+    beta: float = 2.0,
+    kappa: float = 0.0,
+) -> Callable[[np.ndarray, Any], MultivariateNormal]:
+    """A proposal for `guided`: the update of the unscented Kalman filter from each particle.
+
+    Needs no derivatives (van der Merwe, Doucet, de Freitas, Wan 2000). Sigma points and their weights are those of
+    filterpy.
+
+    Parameters
+    ----------
+    f, Q, h, R
+        As in `nonlinear_gaussian`.
+    alpha, beta, kappa : float
+        Of filterpy's MerweScaledSigmaPoints: spread of the points, weight of the central one, secondary spread.
+    """
+    from filterpy.kalman import MerweScaledSigmaPoints
+
+    Q, R = _covariance("Q", Q), _covariance("R", R)
+    points = MerweScaledSigmaPoints(len(Q), alpha, beta, kappa)
+    offsets = points.sigma_points(np.zeros(len(Q)), Q)
+
+    def proposal(x: np.ndarray, y: Any) -> MultivariateNormal:
+        mean = f(x)
+        sigma = mean[:, None] + offsets
+        z = np.reshape(h(sigma.reshape(-1, len(Q))), (*sigma.shape[:2], len(R)))
+        centre = np.einsum("s,nsk->nk", points.Wm, z)
+        z = z - centre[:, None]
+        S = np.einsum("s,nsi,nsj->nij", points.Wc, z, z) + R
+        return _conditional(mean, Q, centre, S, np.einsum("s,si,nsj->nij", points.Wc, offsets, z), y)
+
+    return proposal
+
+
+def _conditional(
+    mean: np.ndarray, cov: np.ndarray, predicted: np.ndarray, S: np.ndarray, cross: np.ndarray, y: Any
+) -> MultivariateNormal:
+    """The normal distribution of x given y, from their joint moments."""
+    gain = np.swapaxes(np.linalg.solve(S, np.swapaxes(cross, -1, -2)), -1, -2)
+    residual = np.atleast_1d(np.asarray(y, np.float64)) - predicted
+    return MultivariateNormal(mean + (gain @ residual[..., None])[..., 0], cov - gain @ S @ np.swapaxes(gain, -1, -2))
