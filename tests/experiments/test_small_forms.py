@@ -177,6 +177,20 @@ def test_resampling(tmp_path):
     assert " s\n" not in run_script(*arguments), "finished parts are not run again"
 
 
+def test_inference(tmp_path):
+    arguments = ("inference/run.py", "--smoke", "--out", tmp_path)
+    assert "particle_gibbs: 4 data sets" in run_script(*arguments)
+    ranks = read_csv(tmp_path / "ranks.csv")
+    assert [row["method"] for row in ranks] == ["pmmh"] * 4 + ["particle_gibbs"] * 4 + ["control"] * 4
+    assert all(0 <= int(row[name]) <= 9 for row in ranks for name in ("rho", "sigma"))
+    assert {(row["method"], row["data sets"]) for row in read_csv(tmp_path / "summary.csv")} == {
+        ("pmmh", "4"),
+        ("particle_gibbs", "4"),
+        ("control", "4"),
+    }
+    assert "4 data sets" not in run_script(*arguments).split("chi-square")[0], "finished data sets are not run again"
+
+
 @pytest.mark.parametrize(("script", "table"), [("trials", "results"), ("sharing", "sharing")])
 def test_study_runner(tmp_path, cache, script, table):
     run_script(f"study_runner/{script}.py", "--smoke", "--out", tmp_path, MSTFILTER_CACHE=cache)
