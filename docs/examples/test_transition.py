@@ -1,6 +1,6 @@
 """MyTransition keeps the contract of its interface."""
 
-from transition import MyTransition, example
+from transition import MyTransition, exact, example
 
 from mstfilter.testing import TransitionContract
 
@@ -11,3 +11,6 @@ class TestMyTransition(TransitionContract):
 
     def example(self, rng, n):
         return example(rng, n)
+
+    def exact(self, rng, n):
+        return exact(rng, n)

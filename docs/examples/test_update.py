@@ -1,6 +1,6 @@
 """MyUpdate keeps the contract of its interface."""
 
-from update import MyUpdate, example
+from update import MyUpdate, exact, example
 
 from mstfilter.testing import UpdateContract
 
@@ -11,3 +11,6 @@ class TestMyUpdate(UpdateContract):
 
     def example(self, rng, n):
         return example(rng, n)
+
+    def exact(self, rng, n):
+        return exact(rng, n)

@@ -45,3 +45,9 @@ class MyTransition(Transition):
 def example(rng: np.random.Generator, n: int) -> tuple[Population, Any]:
     """Input for the contract: n particles of the kind it moves, and an observation."""
     return Population(rng.standard_normal((n, 2)), rng.standard_normal(n)), np.array([0.3, -0.1])
+
+
+def exact(rng: np.random.Generator, n: int) -> tuple[Population, Population, Any]:
+    """x_{t-1}, draws of x_t by the model given them, and y_t: the contract tests the distribution with them."""
+    previous = rng.standard_normal((n, 2))
+    return Population(previous), Population(rng.normal(previous, 1.0)), np.array([0.3, -0.1])

@@ -45,3 +45,11 @@ class MyUpdate(Update):
 def example(rng: np.random.Generator, n: int) -> tuple[Population, Any]:
     """Input for the contract: n particles, and an observation."""
     return Population(rng.standard_normal((n, 2)), rng.standard_normal(n)), np.array([0.3, -0.1])
+
+
+def exact(rng: np.random.Generator, n: int) -> tuple[Population, Population, Any]:
+    """Draws of p(x), exact draws of p(x | y), and y: the contract tests the weights with them."""
+    y = np.array([0.3, -0.1])
+    # x ~ N(0, 1) and y ~ N(x, 0.5^2) give x | y ~ N(0.8 y, 0.2).
+    posterior = rng.normal(0.8 * y, np.sqrt(0.2), (n, 2))
+    return Population(rng.standard_normal((n, 2))), Population(posterior), y

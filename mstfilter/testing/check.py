@@ -117,8 +117,9 @@ def run_contract(
         ``(rng, n) -> (population, observation)`` that the component can handle. Default: the function ``example`` in
         the module of its class; without one, a scene for components of images and numbers for others.
     exact : callable, optional
-        For a `Rejuvenation`: ``(rng, n) -> (previous, population, observation)``, rows of x_{t-1} and exact draws of
-        x_t given them and the observation. Default: the function ``exact`` in the module of its class, if any.
+        For a `Transition`, `Update` or `Rejuvenation`: ``(rng, n) -> (before, after, observation)``, `n` particles
+        and exact draws of what they become; see the contract. Default: the function ``exact`` in the module of its
+        class, if any.
     """
     cls = type(component)
     contract = contract_of(cls)

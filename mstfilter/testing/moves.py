@@ -18,6 +18,7 @@ from mstfilter.testing.contract import (
     skip_unless_properly_weighted,
     statistical,
 )
+from mstfilter.testing.copies import quantile
 
 _N = 6
 
@@ -46,8 +47,74 @@ class _PopulationContract(RandomContract):
             assert equal, f"log weights + {shift:g} in do not give log weights + {shift:g} out"
 
 
-class TransitionContract(_PopulationContract):
-    """The contract of every `Transition`. Its one statistical test has a false-alarm rate of at most 1e-6."""
+class _ExactContract(_PopulationContract):
+    """Properties of components with exact draws to compare with.
+
+    Define a method ``exact(self, rng, n)`` (or a function ``exact(rng, n)`` beside the component). It returns a
+    population of `n` particles before the call, a population of exact draws, or with exact weights, after it, and the
+    observation. A fourth item ``log_likelihood(particles) -> (n,)`` multiplies the weights on both sides: it makes
+    the weights f / q of a guided move even. The test is skipped if one of 10,000 weights exceeds 1 % of the total.
+    """
+
+    exact: Callable[[np.random.Generator, int], tuple[Any, ...]] | None = None
+
+    def exact_case(self, seed: int, n: int = 10_000) -> tuple[Any, ...]:
+        """Exact draws; skips the test if there are none."""
+        if self.exact is None:
+            pytest.skip("there are no exact draws to compare with: write exact(rng, n)")
+        return self.exact(_rng(seed), n)
+
+    def compare_weighted(self, found: np.ndarray, lw: np.ndarray, exact: np.ndarray, exact_lw: np.ndarray) -> None:
+        """Compare the weighted distributions of rows, by the probabilities of 19 intervals of each column.
+
+        The difference of two weighted means is normal up to errors that a twentieth of the level allows for.
+        """
+        samples = []
+        for log_weights in (lw, exact_lw):
+            w = np.exp(log_weights - log_weights.max())
+            w /= w.sum()
+            if w.max() > 0.01:
+                pytest.skip(
+                    f"the weights of the exact case are too uneven (effective sample size {1 / (w @ w):.3g}): "
+                    "return log p(y | x_t) as a fourth item of exact"
+                )
+            samples.append(w)
+        for j in range(found.shape[1]):
+            order = np.argsort(exact[:, j])
+            cumulative = np.cumsum(samples[1][order])[:-1]
+            limits = exact[order[cumulative.searchsorted(np.arange(0.05, 1, 0.05))], j]
+            (p, s), (q, r) = (
+                _weighted_fractions(x[:, j], w, limits) for x, w in zip((found, exact), samples, strict=True)
+            )
+            what = self.columns(j, found.shape[1])
+            excess = np.abs(p - q) - quantile(40 * found.shape[1] * len(limits)) * np.hypot(s, r) - 1e-9
+            k = int(np.argmax(excess))
+            assert excess[k] <= 0, (
+                f"the weighted distribution is wrong: {what} is below {limits[k]:.3g} with probability {p[k]:.3f}, "
+                f"expected {q[k]:.3f}"
+            )
+
+    def columns(self, j: int, n_columns: int) -> str:
+        """What column `j` is."""
+        return (
+            f"coordinate {j} of x_t" if 2 * j < n_columns else f"coordinate {j - n_columns // 2} of x_t - x_{{t-1}}"
+        )
+
+
+def _weighted_fractions(x: np.ndarray, w: np.ndarray, limits: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Probabilities that x is at most each limit, and their standard errors, for weights that sum to one."""
+    below = x[:, None] <= limits
+    p = w @ below
+    return p, np.sqrt((w * w) @ (below - p) ** 2)
+
+
+class TransitionContract(_ExactContract):
+    """The contract of every `Transition`. Its two statistical tests have a false-alarm rate of at most 1e-6 each.
+
+    One needs a method ``exact(self, rng, n)`` that returns n rows x_{t-1}, draws of x_t from f(x_t | x_{t-1}) given
+    them, and the observation; for a guided move also log p(y_t | x_t), a function of x_t. If the transition weights
+    by the observation, the population of x_t has these weights.
+    """
 
     def call(self, component: Any, rng: np.random.Generator, inputs: dict[str, Any]) -> Population:
         return component.predict(rng, inputs["population"], inputs["observation"])
@@ -73,6 +140,47 @@ class TransitionContract(_PopulationContract):
         """A common factor of the weights is kept and has no other effect."""
         self.check_scale(self.inputs(_N), "population")
 
+    def test_weights_stay_with_their_particles(self) -> None:
+        """It keeps the order of the particles, or sets parents "previous"."""
+        component, inputs = self.make(), self.inputs(_N)
+        skip_unless_properly_weighted(component)
+        old = 0.1 * np.arange(_N) ** 2
+        given = replace(inputs["population"], log_weights=old, parents={})
+        moved = self.checked_call(component, {**inputs, "population": given})
+        parents = moved.parents.get("previous", np.arange(len(moved)))
+        permuted = len(moved) == _N and same(np.sort(moved.log_weights), old) and (parents >= 0).all()
+        assert not permuted or np.array_equal(moved.log_weights, old[parents]), (
+            'the particles have another order than before, and parents "previous" do not state it'
+        )
+
+    @statistical
+    def test_weighted_moves_are_those_of_the_model(self) -> None:
+        """Weighted moves have the distribution of the model, also jointly with x_{t-1}, and keep the total weight."""
+        component = self.make()
+        skip_unless_properly_weighted(component)
+        population, _, observation, *likelihood = self.exact_case(1)
+        moved = self.checked_call(component, {"population": population, "observation": observation}, _rng(2))
+        other, fresh, *_ = self.exact_case(3)
+        before = population.take(moved.parents.get("previous", np.arange(len(moved))))
+        change, exact_lw = moved.log_weights - before.log_weights, fresh.log_weights - other.log_weights
+        log_g = sum(log_likelihood(moved.particles) for log_likelihood in likelihood)
+        exact_lw = exact_lw + sum(log_likelihood(fresh.particles) for log_likelihood in likelihood)
+        found, exact, lw = _columns(before, moved), _columns(other, fresh), log_g + change
+        try:
+            self.compare_weighted(found, lw, exact, exact_lw)
+        except (AssertionError, pytest.skip.Exception) as error:
+            try:
+                self.compare_weighted(found, log_g - change, exact, exact_lw)
+            except (AssertionError, pytest.skip.Exception):
+                raise error from None
+            raise AssertionError(
+                "the weighted distribution is right if the change of the log weights has the opposite sign: "
+                "is it log q - log f?"
+            ) from error
+        w, v = np.exp(lw), np.exp(exact_lw)
+        bound = quantile(40) * np.hypot(w.std() / len(w) ** 0.5, v.std() / len(v) ** 0.5) + 1e-9
+        assert abs(w.mean() - v.mean()) <= bound, f"the mean weight is {w.mean():.4g}, expected {v.mean():.4g}"
+
     @statistical
     def test_order_of_particles_is_irrelevant(self) -> None:
         """The move of a particle does not depend on its position among the others."""
@@ -95,6 +203,12 @@ class TransitionContract(_PopulationContract):
         # Kolmogorov-Smirnov tests of each coordinate of each particle. Rounding: equal weights may differ in the last
         # bits, since the order of a sum differs.
         a, b = (np.round(np.array(s), 9) for s in samples)
+        noise = a - a.mean(axis=0)
+        spread = np.abs(noise).max(axis=(0, 1))
+        for c in np.flatnonzero(spread > 1e-6):
+            assert np.abs(noise[:, :, c] - noise[:, :1, c]).max() > 1e-6 * spread[c], (
+                "all particles get the same noise: draw one random number for each, size=len(population)"
+            )
         for i in range(_N):
             for j in range(a.shape[2]):
                 x, y = a[:, i, j], b[:, i, j]
@@ -148,8 +262,12 @@ class ProposalContract(_PopulationContract):
             assert len(found) == n, f"asked for {n} particles it returns {len(found)}: repeat some if needed"
 
 
-class UpdateContract(_PopulationContract):
-    """The contract of every `Update`."""
+class UpdateContract(_ExactContract):
+    """The contract of every `Update`. Its one statistical test has a false-alarm rate of at most 1e-6.
+
+    That test needs a method ``exact(self, rng, n)`` that returns n predicted particles x ~ p(x), exact draws of
+    p(x | y) or the predicted particles with exact weights p(y | x), and y. A constant factor of the weights is free.
+    """
 
     def inputs(self, n: int, seed: int = 0) -> dict[str, Any]:
         predicted, observation = self.example(_rng(seed), n)
@@ -178,19 +296,46 @@ class UpdateContract(_PopulationContract):
                 f'parents "{name}" contain {int(np.max(index))}, and there were {n} particles'
             )
 
+    def test_parents_belong_to_their_particles(self) -> None:
+        """A predicted particle that it keeps has that particle as parent "previous"."""
+        inputs = {**self.inputs(_N), "proposed": None}
+        inputs["predicted"] = replace(inputs["predicted"], parents={"previous": np.arange(_N)})
+        out = self.checked_call(self.make(), inputs).realised()
+        index = out.parents.get("previous", np.arange(len(out)))
+        old = [inputs["predicted"].take(np.array([i])).particles for i in range(_N)]
+        for k in range(len(out)):
+            copies = [i for i in range(_N) if same(out.take(np.array([k])).particles, old[i])]
+            assert not copies or index[k] in copies or index[k] < 0, (
+                f'particle {k} is predicted particle {copies[0]}, and its parent "previous" is {int(index[k])}'
+            )
+
+    @statistical
+    def test_weights_are_those_of_the_posterior(self) -> None:
+        """Weighted predicted particles have the distribution p(x | y)."""
+        component = self.make()
+        skip_unless_properly_weighted(component)
+        predicted, _, observation, *_ = self.exact_case(1)
+        inputs = {"predicted": predicted, "proposed": None, "observation": observation}
+        out = self.checked_call(component, inputs, _rng(2))
+        _, exact, *_ = self.exact_case(3)
+        self.compare_weighted(
+            as_matrix(out.particles), out.log_weights, as_matrix(exact.particles), exact.log_weights
+        )
+
+    def columns(self, j: int, n_columns: int) -> str:
+        return f"coordinate {j} of x"
+
     def test_scale_of_weights_is_irrelevant(self) -> None:
         """A common factor of the weights is kept and has no other effect."""
         self.check_scale({**self.inputs(_N), "proposed": None}, "predicted")
 
 
-class RejuvenationContract(_PopulationContract):
+class RejuvenationContract(_ExactContract):
     """The contract of every `Rejuvenation`. Its one statistical test has a false-alarm rate of at most 1e-6.
 
     That test needs exact draws of p(x_t | x_{t-1}, y_t). Define a method ``exact(self, rng, n)`` that returns a
     population of `n` rows x_{t-1} (None: the first step), a population of draws x_t given them and y_t, and y_t.
     """
-
-    exact: Callable[[np.random.Generator, int], tuple[Population | None, Population, Any]] | None = None
 
     def inputs(self, n: int, seed: int = 0) -> dict[str, Any]:
         return {**super().inputs(n, seed), "previous": self.example(_rng(seed + 1), n)[0]}
@@ -217,16 +362,14 @@ class RejuvenationContract(_PopulationContract):
 
         component = self.make()
         skip_unless_properly_weighted(component)
-        if self.exact is None:
-            pytest.skip("there are no exact draws to compare with: write exact(rng, n)")
         # Exact draws after five moves against other exact draws: x_t, and x_t - x_{t-1}.
         n, rng = 4000, _rng(2)
-        previous, population, observation = self.exact(_rng(1), n)
+        previous, population, observation = self.exact_case(1, n)
         for _ in range(5):
             inputs = {"population": population, "previous": previous, "observation": observation}
             population = self.checked_call(component, inputs, rng)
         moved = _columns(previous, population)
-        fresh_previous, fresh, _ = self.exact(_rng(3), n)
+        fresh_previous, fresh, _ = self.exact_case(3, n)
         expected = _columns(fresh_previous, fresh)
         for j in range(moved.shape[1]):
             what = f"x_t ({j})" if j < moved.shape[1] / 2 or previous is None else "x_t - x_{t-1}"

@@ -12,6 +12,7 @@ from mstfilter.smc import (
     DensityTransition,
     Equivalence,
     Lookahead,
+    Normal,
     Population,
     Proposal,
     Rejuvenation,
@@ -20,8 +21,9 @@ from mstfilter.smc import (
     Transition,
     Trigger,
     Update,
+    union,
 )
-from tests.smc.models import optimal
+from tests.smc.models import RHO, SD0, SIGMA, TAU, optimal, optimal_initial
 
 
 @dataclass(frozen=True)
@@ -63,6 +65,100 @@ class NormalisesWeights(Transition):
 class GlobalMove(Transition):
     def predict(self, rng, population, observation):
         return replace(population, particles=population.particles + np.random.randn())  # noqa: NPY002
+
+
+@dataclass(frozen=True)
+class Guided(Transition):
+    """Draws from p(x_t | x_{t-1}, y_t) of the AR(1) model; the weights have a sign."""
+
+    sign: float = 1.0
+
+    def predict(self, rng, population, observation):
+        x = population.particles
+        if observation is None:
+            return population.moved(Normal(RHO * x, SIGMA).sample(rng, len(x)))
+        q = optimal(x, observation)
+        new = q.sample(rng, len(x))
+        change = Normal(RHO * x, SIGMA).log_prob(new) - q.log_prob(new)
+        return population.moved(new).reweighted(self.sign * change)
+
+
+@dataclass(frozen=True)
+class WrongSign(Guided):
+    sign: float = -1.0
+
+
+@dataclass(frozen=True)
+class OneNoise(Transition):
+    def predict(self, rng, population, observation):
+        return population.moved(RHO * population.particles + SIGMA * rng.standard_normal())
+
+
+@dataclass(frozen=True)
+class Permutes(Transition):
+    """Returns the moved particles in another order, without their weights."""
+
+    def predict(self, rng, population, observation):
+        moved = RHO * population.particles + SIGMA * rng.standard_normal(len(population))
+        return population.moved(rng.permutation(moved))
+
+
+@dataclass(frozen=True)
+class PermutesAll(Transition):
+    """Returns the moved particles with their weights in another order."""
+
+    def predict(self, rng, population, observation):
+        moved = RHO * population.particles + SIGMA * rng.standard_normal(len(population))
+        order = rng.permutation(len(population))
+        return Population(moved[order], population.log_weights[order])
+
+
+@dataclass(frozen=True)
+class Posterior(Update):
+    """Weights by a power of the likelihood."""
+
+    power: float = 1.0
+
+    def update(self, rng, predicted, proposed, observation):
+        population = union(predicted, proposed)
+        return population.reweighted(self.power * Normal(population.particles, TAU).log_prob(observation))
+
+
+@dataclass(frozen=True)
+class Squared(Posterior):
+    power: float = 2.0
+
+
+@dataclass(frozen=True)
+class PermutesUpdate(Posterior):
+    def update(self, rng, predicted, proposed, observation):
+        out = super().update(rng, predicted, proposed, observation)
+        return Population(out.particles[::-1], out.log_weights[::-1], out.parents)
+
+
+def exact_moves(rng, n):
+    """x_{t-1}, draws of x_t given them, y_t, log p(y_t | x_t)."""
+    previous = rng.normal(0.2, 1.0, n)
+    moved = rng.normal(RHO * previous, SIGMA)
+    return Population(previous), Population(moved), 0.7, lambda x: Normal(x, TAU).log_prob(0.7)
+
+
+def exact_posterior(rng, n):
+    """Draws of p(x), of p(x | y), y."""
+    prior, posterior = rng.normal(0.0, SD0, n), optimal_initial(0.7).sample(rng, n)
+    return Population(prior), Population(posterior), 0.7
+
+
+#: Fault of weighted distributions, property that must be broken, words of its message, exact draws.
+WEIGHTED_FAULTS = [
+    (WrongSign, "weighted_moves_are_those_of_the_model", "opposite sign", exact_moves),
+    (OneNoise, "weighted_moves_are_those_of_the_model", "is below", exact_moves),
+    (OneNoise, "order_of_particles_is_irrelevant", "the same noise", None),
+    (Permutes, "weighted_moves_are_those_of_the_model", "x_t - x_{t-1}", exact_moves),
+    (PermutesAll, "weights_stay_with_their_particles", "another order", None),
+    (Squared, "weights_are_those_of_the_posterior", "is below", exact_posterior),
+    (PermutesUpdate, "parents_belong_to_their_particles", "parent", None),
+]
 
 
 @dataclass(frozen=True)
