@@ -1,4 +1,7 @@
-"""The schemes that are compared: every registered resampler, with similarities and classes of the particles."""
+"""The schemes that are compared: every registered resampler that selects particles.
+
+`ensemble_transform` makes new particles, which objects and discrete states do not allow.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from mstfilter.smc import (
+    Chopthin,
     ClusterStratified,
     Coalesced,
     Equivalence,
@@ -17,11 +21,14 @@ from mstfilter.smc import (
     KeepWeights,
     Killing,
     LargestWeights,
+    Metropolis,
     Multinomial,
+    Rejection,
     Resampler,
     Residual,
     Shuffled,
     Similarity,
+    Sorted,
     Ssp,
     Stratified,
     Systematic,
@@ -41,6 +48,10 @@ def schemes(similarity: Similarity, equivalence: Equivalence) -> dict[str, Resam
         "stratified": Stratified(),
         "killing": Killing(),
         "multinomial": Multinomial(),
+        "rejection": Rejection(),
+        "metropolis": Metropolis(),
+        "chopthin": Chopthin(),
+        "sorted": Sorted(),
         "tempered": Tempered(),
         "fearnhead_clifford": FearnheadClifford(),
         "coalesced": Coalesced(equivalence=equivalence),

@@ -56,6 +56,10 @@ def walk(previous, y):
     observe("y", Normal(x, 1.0), y)
 
 
+def guide(previous, y):
+    sample("x", Normal(0.0 if previous is None else previous["x"], 2.0))
+
+
 @pytest.mark.parametrize(
     "filter",
     [
@@ -85,7 +89,7 @@ ASSEMBLIES = {
     "clusters": branching(bootstrap(AR1, 8, ClusterStratified(), Always())),
     "k-dpp": branching(bootstrap(AR1, 8, KDpp(), Always())),
     "KLD size": branching(replace(bootstrap(AR1, 8, trigger=Always()), size=Kld(n_min=2, n_max=9))),
-    "program": branching(Program(walk).resample_move(8, guide=walk, trigger=Always())),
+    "program": branching(Program(walk).resample_move(8, guide=guide, trigger=Always())),
     "per particle": branching(Program(per_particle(walk)).resample_move(8, trigger=Always())),
 }
 
