@@ -145,6 +145,19 @@ def test_killed_runs(tmp_path):
     assert [r["identical"] for r in read_csv(tmp_path / "trials.csv")] == ["1"]
 
 
+def test_resamplers_of_other_libraries(tmp_path):
+    """The table names the faults of filterpy: residual resampling that drops light particles, and n to n only."""
+    run_script("peer_resamplers/run.py", "--smoke", "--only", "filterpy", "--out", tmp_path)
+    rows = {(r["kind"], r["test"]): r for r in read_csv(tmp_path / "table.csv")}
+    assert {r["scheme"] for r in rows.values()} == {"residual"}
+    fault = rows["contract", "carried_weight"]
+    assert fault["outcome"] == "wrong" and "copies are biased" in fault["why"] and "gets 0.000 copies" in fault["why"]
+    assert rows["direct call", "any_size"]["outcome"] == "error"
+    assert rows["contract", "ancestors_in_range"]["outcome"] == "holds"
+    filters = {(r["library"], r["scheme"]) for r in read_csv(tmp_path / "filters.csv")}
+    assert filters >= {("mstfilter", "systematic"), ("filterpy", "residual")}
+
+
 def test_miniature(tmp_path):
     run_script("miniature/run.py", "--smoke", "--out", tmp_path)
     rows = {(r["world"], r["n"], r["arm"]): float(r["tv"]) for r in read_csv(tmp_path / "distances.csv")}
