@@ -5,11 +5,15 @@
 The scheduler and its workers are neither started nor stopped here. All machines must see the study folder and the
 cache under the same paths and have the same version of mstfilter. If a worker dies, the scheduler gives its job to
 another worker; after its ``allowed-failures`` (3) the job has failed. If a job exceeds its time limit, the process of
-its worker is restarted by the worker's nanny.
+its worker is restarted by the worker's nanny. If no worker is left for a while, an error ends the wait.
+
+A worker sends the outcome of a job as an event, not as the value of the task. The outcome therefore remains when the
+worker dies later, and no value has to be fetched from a worker that may be gone.
 """
 
 from __future__ import annotations
 
+import collections
 import contextlib
 import queue
 import time
@@ -23,7 +27,7 @@ from mstfilter.study.executors import Event, Executor, Tell, times
 from mstfilter.study.jobs import perform
 from mstfilter.study.results import Job, JobOutcome
 
-_CHECK_INTERVAL_S = 0.5  # of time limits
+_CHECK_INTERVAL_S = 0.5  # of workers and time limits
 
 
 @dataclass(frozen=True)
@@ -36,17 +40,26 @@ class Cluster(Executor):
         For example ``tcp://head:8786``.
     connect_s : float
         Time limit in seconds for the first answer of the scheduler.
+    without_workers_s : float
+        Time in seconds for which the scheduler may have no workers, for instance while they restart.
+
+    Raises
+    ------
+    InputError
+        By `run`, if the scheduler does not answer, has no workers at the beginning or for longer than
+        `without_workers_s`, or if its workers have several threads or another version of mstfilter.
     """
 
     address: str
     connect_s: float = 10.0
+    without_workers_s: float = 300.0
 
     def run(self, jobs: Sequence[Job], tell: Tell) -> list[JobOutcome]:
         if not jobs:
             return []
         with self._client() as client:
             _check_workers(client)
-            return _ClusterRun(client, jobs, tell).run()
+            return _ClusterRun(client, jobs, tell, self.without_workers_s).run()
 
     @contextlib.contextmanager
     def _client(self) -> Iterator[Any]:
@@ -70,39 +83,53 @@ class Cluster(Executor):
 class _ClusterRun:
     """The jobs of one call, and the messages of their workers."""
 
-    def __init__(self, client: Any, jobs: Sequence[Job], tell: Tell) -> None:
+    def __init__(self, client: Any, jobs: Sequence[Job], tell: Tell, without_workers_s: float) -> None:
         self._client, self._jobs, self._tell = client, jobs, tell
+        self._without_workers_s = without_workers_s
+        self._topic = f"mstfilter-{uuid.uuid4().hex}"
         self._messages: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
         self._futures: dict[int, Any] = {}
         self._outcomes: dict[int, JobOutcome] = {}
         self._running: dict[int, tuple[str, float]] = {}  # job -> its worker, and when the current try began
         self._tries: dict[int, int] = {}
+        self._resubmitted: collections.Counter[int] = collections.Counter()
+        self._checked = self._had_workers = time.monotonic()
 
     def run(self) -> list[JobOutcome]:
-        topic = f"mstfilter-{uuid.uuid4().hex}"
-        self._client.subscribe_topic(topic, lambda event: self._messages.put(event[1]))
+        self._client.subscribe_topic(self._topic, lambda event: self._messages.put(event[1]))
         try:
-            for k, job in enumerate(self._jobs):
-                future = self._client.submit(
-                    _perform, dict(job), k, topic, pure=False, key=f"{topic}-{k}", priority=-k
-                )
-                self._futures[k] = future
-                future.add_done_callback(lambda future, k=k: self._messages.put({"job": k, "ended": True}))
+            for k in range(len(self._jobs)):
+                self._submit(k)
             while len(self._outcomes) < len(self._jobs):
                 with contextlib.suppress(queue.Empty):
                     self._receive(self._messages.get(timeout=_CHECK_INTERVAL_S))
-                self._check_time_limits()
+                if time.monotonic() - self._checked >= _CHECK_INTERVAL_S:
+                    self._check_workers_left()
+                    self._check_time_limits()
+                    self._checked = time.monotonic()
         finally:
-            self._client.cancel([f for k, f in self._futures.items() if k not in self._outcomes], force=True)
-            self._client.unsubscribe_topic(topic)
+            self._client.cancel(list(self._futures.values()), force=True)
+            self._client.unsubscribe_topic(self._topic)
         return [self._outcomes[k] for k in range(len(self._jobs))]
+
+    def _submit(self, k: int) -> None:
+        key = f"{self._topic}-{k}-{self._resubmitted[k]}"
+        job = dict(self._jobs[k])
+        future = self._client.submit(_perform, job, k, self._topic, pure=False, key=key, priority=-k)
+        self._futures[k] = future
+        future.add_done_callback(lambda future: self._messages.put({"job": k, "future": future}))
 
     def _receive(self, message: dict[str, Any]) -> None:
         k = message["job"]
+        if "future" in message:
+            self._futures.pop(k)  # the scheduler forgets the task and does not repeat it if its worker dies
         if k in self._outcomes:
             return
-        if "ended" in message:
-            self._end(k, _outcome(self._futures[k], self._tries.get(k, 1)))
+        if "future" in message:
+            self._end_without_outcome(k, message["future"])
+        elif "outcome" in message:
+            outcome = message["outcome"]
+            self._end(k, JobOutcome(**{**outcome, "hints": tuple(outcome["hints"])}))
         elif "started" in message:
             if k not in self._tries:
                 self._tell(Event("started", k))
@@ -111,10 +138,51 @@ class _ClusterRun:
         else:
             self._tell(Event("step", k, message["done"], message["total"]))
 
+    def _end_without_outcome(self, k: int, future: Any) -> None:
+        """End or repeat a job whose task is done and which has sent no outcome."""
+        from distributed import KilledWorker
+
+        if future.status in ("cancelled", "lost"):
+            self._fail(k, f"the scheduler has dropped it: {future.status}", "repeat the command")
+            return
+        error = future.exception()
+        if not isinstance(error, KilledWorker):
+            self._fail(k, f"{type(error).__name__}: {error}", "look at the logs of the cluster")
+        elif k not in self._tries and self._resubmitted[k] < len(self._jobs):
+            # It only waited for the workers that died. This happens at most once for every other job.
+            self._resubmitted[k] += 1
+            self._submit(k)
+        else:
+            self._tries[k] = error.allowed_failures + 1
+            hint = "if memory ran out: give each worker more memory"
+            self._fail(k, f"its worker died {times(self._tries[k])}", hint)
+
+    def _fail(self, k: int, error: str, *hints: str) -> None:
+        self._end(k, JobOutcome("failed", error, hints, tries=self._tries.get(k, 1)))
+
     def _end(self, k: int, outcome: JobOutcome) -> None:
         self._running.pop(k, None)
         self._outcomes[k] = outcome
         self._tell(Event("ended", k, outcome=outcome))
+
+    def _check_workers_left(self) -> None:
+        """Forget what ran on workers that are gone; raise InputError if there have been no workers for too long."""
+        try:
+            workers = self._client.nthreads()
+        except OSError:  # the connection is lost, and distributed cancels all futures
+            return
+        self._running = {k: run for k, run in self._running.items() if run[0] in workers}
+        now = time.monotonic()
+        if workers:
+            self._had_workers = now
+        elif now - self._had_workers > self._without_workers_s and self._messages.empty():
+            n, total = len(self._jobs) - len(self._outcomes), len(self._jobs)
+            raise InputError(
+                f"the Dask scheduler at {self._client.scheduler.address} has had no workers for "
+                f"{self._without_workers_s:g} s, and {n} of {total} jobs {'is' if n == 1 else 'are'} not done",
+                "start workers and repeat the command: it resumes",
+                "if workers die: look at their logs, give them more memory",
+            )
 
     def _check_time_limits(self) -> None:
         now = time.monotonic()
@@ -134,28 +202,7 @@ class _ClusterRun:
                 hints.append(f"{worker} could not be restarted ({failure}): start workers with their nanny")
                 last = True
             if last:
-                n = self._tries[k]
-                self._end(
-                    k, JobOutcome("failed", f"it took longer than {limit:g} s, {times(n)}", tuple(hints), tries=n)
-                )
-
-
-def _outcome(future: Any, tries: int) -> JobOutcome:
-    """The outcome of a job whose future is done."""
-    from distributed import KilledWorker
-
-    if future.status in ("cancelled", "lost"):
-        hints = ("repeat the command",)
-        return JobOutcome("failed", f"the scheduler has dropped it: {future.status}", hints, tries=tries)
-    error = future.exception()
-    if error is None:
-        result = future.result()
-        return JobOutcome(**{**result, "hints": tuple(result["hints"])})
-    if isinstance(error, KilledWorker):
-        n = error.allowed_failures + 1
-        hints = ("if memory ran out: give each worker more memory",)
-        return JobOutcome("failed", f"its worker died {times(n)}", hints, tries=n)
-    return JobOutcome("failed", f"{type(error).__name__}: {error}", ("look at the logs of the cluster",), tries=tries)
+                self._fail(k, f"it took longer than {limit:g} s, {times(self._tries[k])}", *hints)
 
 
 def _check_workers(client: Any) -> None:
@@ -183,8 +230,8 @@ def _worker_version() -> str:
     return __version__
 
 
-def _perform(job: Job, k: int, topic: str) -> dict[str, Any]:
-    """In a worker: do a job and log its steps as events of the scheduler."""
+def _perform(job: Job, k: int, topic: str) -> None:
+    """In a worker: do a job and log its steps and its outcome as events of the scheduler."""
     import cv2
     from distributed import get_worker
 
@@ -194,5 +241,6 @@ def _perform(job: Job, k: int, topic: str) -> dict[str, Any]:
         worker.log_event(topic, {"job": k, **message})
 
     cv2.setNumThreads(1)
-    send(started=worker.address)
-    return asdict(perform(job, lambda done, total: send(done=done, total=total)))
+    send(started=worker.contact_address)
+    outcome = perform(job, lambda done, total: send(done=done, total=total))
+    send(outcome=asdict(outcome))

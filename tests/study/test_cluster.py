@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+
 import pytest
 
 from mstfilter.errors import InputError
@@ -10,15 +12,36 @@ from mstfilter.study.study import run_study
 from tests.study.scenes import slide
 from tests.study.test_failures import LimitHanging, metrics, study, table
 
+dask = pytest.importorskip("dask", reason="dask absent: pip install -e '.[dask]'")
 distributed = pytest.importorskip("distributed", reason="dask absent: pip install -e '.[dask]'")
+
+
+@contextlib.contextmanager
+def local_cluster(n_workers, *, allowed_failures=1, lost_worker_timeout="1h"):
+    """A Dask cluster in processes of this machine.
+
+    Dask closes the nanny of a worker that is not back after `lost_worker_timeout`. Its default of 15 s is exceeded on
+    a busy machine, and the cluster then loses its workers one by one.
+    """
+    with (
+        dask.config.set({"distributed.deploy.lost-worker-timeout": lost_worker_timeout}),
+        distributed.LocalCluster(
+            n_workers=n_workers,
+            threads_per_worker=1,
+            processes=True,
+            dashboard_address="127.0.0.1:0",
+            host="127.0.0.1",
+            silence_logs=50,
+            scheduler_kwargs={"allowed_failures": allowed_failures},
+        ) as made,
+    ):
+        yield made.scheduler_address
 
 
 @pytest.fixture(scope="module")
 def cluster():
-    options = {"processes": True, "dashboard_address": None, "host": "127.0.0.1", "silence_logs": 50}
-    options["scheduler_kwargs"] = {"allowed_failures": 1}
-    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, **options) as made:
-        yield made.scheduler_address
+    with local_cluster(2) as address:
+        yield address
 
 
 def test_a_cluster_gives_the_same_bytes(cluster, tmp_path):
@@ -72,6 +95,34 @@ def test_a_run_that_takes_too_long_is_named(cluster, tmp_path):
     assert result.done == 1
     again = run_study(study(tmp_path, "good"), tmp_path / "out", executor, cache=tmp_path)
     assert (again.done, again.repeated) == (2, 1)
+
+
+def test_a_dying_worker_fails_only_the_job_that_it_ran(tmp_path):
+    """The other jobs of the worker waited; they are submitted again."""
+    from mstfilter.study.cluster import Cluster
+
+    slide(tmp_path / "slide", pauses=2)
+    with local_cluster(1, allowed_failures=0) as address:
+        result = run_study(
+            study(tmp_path, "die", "good", seeds=[0]), tmp_path / "out", Cluster(address), cache=tmp_path
+        )
+    assert [(n, o.error) for n, o in result.failed] == [("die on slide, seed 0", "its worker died 1 time")]
+    assert result.done == 1
+
+
+def test_a_cluster_without_workers_ends_the_study(tmp_path):
+    """The worker dies and is not restarted; the runs that are done remain."""
+    from mstfilter.study.cluster import Cluster
+
+    slide(tmp_path / "slide", pauses=2)
+    wanted = study(tmp_path, "good", "die", seeds=[0])
+    with local_cluster(1, lost_worker_timeout="0s") as address:
+        executor = Cluster(address, without_workers_s=0.1)
+        with pytest.raises(InputError, match=r"has had no workers for 0\.1 s, and 1 of 2 jobs is not done"):
+            run_study(wanted, tmp_path / "out", executor, cache=tmp_path)
+        with pytest.raises(InputError, match="has no workers"):
+            run_study(wanted, tmp_path / "out", executor, cache=tmp_path)
+    assert len(list((tmp_path / "out" / "runs").glob("good*/result.json"))) == 1
 
 
 def test_no_scheduler_is_one_clear_error(tmp_path):

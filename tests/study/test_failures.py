@@ -142,8 +142,13 @@ def test_a_recording_that_cannot_be_made_fails_its_runs_only(folder, tmp_path):
 
 
 def wait_for(path, process):
-    """Return when a process has made a file; the process then waits to be stopped."""
+    """Return when a process has made a file; the process then waits to be stopped.
+
+    The deadline ends the test of a broken program; a slow machine does not reach it.
+    """
+    deadline = time.monotonic() + 600
     while not path.exists():
+        assert time.monotonic() < deadline, f"the process has not made {path} after 600 s"
         assert process.poll() is None, f"the process ended and did not make {path}"
         time.sleep(0.05)
 
