@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 from scipy import stats
 
 from mstfilter.errors import InputError
+from mstfilter.segmentation import mh
 from mstfilter.segmentation.cuts import ExactCuts, OptimalCut, best_envelope, gibbs, optimal_cut
 from mstfilter.segmentation.mh import AuthorsMoves, MetropolisHastingsCuts, NodeMoves, SubtreeRedraw
 from mstfilter.segmentation.tree import Tree
@@ -176,6 +179,21 @@ def test_diagnostics():
     assert 0 < d["acceptance"] <= 1
     assert 0 < d["distinct"] <= 1
     assert 1 <= d["autocorrelation_steps"] < 100
+
+
+@pytest.mark.parametrize("n", [100, 128, 1001])
+@pytest.mark.parametrize("memory", [0.0, 0.5, 0.99])
+def test_autocorrelation_time_equals_that_of_emcee(n, memory):
+    from emcee.autocorr import integrated_time
+
+    steps = np.random.default_rng(n).standard_normal(n)
+    trace = np.array(list(itertools.accumulate(steps, lambda last, step: memory * last + step)))
+    assert mh._autocorrelation(trace) == integrated_time(trace, tol=0, quiet=True)[0]
+
+
+def test_autocorrelation_time_needs_a_long_trace_that_varies():
+    assert mh._autocorrelation(np.arange(99.0)) is None
+    assert mh._autocorrelation(np.ones(200)) is None
 
 
 def test_invalid_fields_are_reported():
