@@ -109,7 +109,7 @@ def test_a_demo_folder_with_foreign_files_is_left_alone(tmp_path, capsys):
 
 def python(code, *arguments):
     return subprocess.run(
-        [sys.executable, "-c", code, *map(str, arguments)], capture_output=True, text=True, timeout=300
+        [sys.executable, "-c", code, *map(str, arguments)], capture_output=True, text=True, timeout=600
     )
 
 
@@ -140,6 +140,7 @@ def test_the_default_path_needs_neither_open3d_nor_torch(recording, tmp_path):
         "main(sys.argv[1:])",
         "run",
         recording,
+        "n=3",
         "--out",
         tmp_path / "run",
     )
@@ -151,7 +152,7 @@ def test_a_run_that_was_killed_is_resumed(recording, tmp_path):
     """The process is killed in its second step; the same command ends with the bytes of an undisturbed run."""
     marker = tmp_path / "marker"
     hangs = [f"transition={BROKEN}:Breaks", "transition.how=hang", f'transition.marker="{marker}"']
-    command = [sys.executable, "-m", "mstfilter", "run", recording, *hangs, "--no-report"]
+    command = [sys.executable, "-m", "mstfilter", "run", recording, "n=3", *hangs, "--no-report"]
     part = tmp_path / "part"
     process = subprocess.Popen([*command, "--out", part], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     wait_for(marker, process)
@@ -159,8 +160,8 @@ def test_a_run_that_was_killed_is_resumed(recording, tmp_path):
     process.wait()
     assert RunFolder.open(part).n_pauses == 1
     assert not (part / "metrics.csv").exists()
-    subprocess.run([*command, "--out", part], check=True, capture_output=True, timeout=300)
-    subprocess.run([*command, "--out", tmp_path / "whole"], check=True, capture_output=True, timeout=300)
+    subprocess.run([*command, "--out", part], check=True, capture_output=True, timeout=600)
+    subprocess.run([*command, "--out", tmp_path / "whole"], check=True, capture_output=True, timeout=600)
     whole, resumed = content(tmp_path / "whole"), content(part)
     assert whole.keys() == resumed.keys()
     assert [k for k in whole if whole[k] != resumed[k]] == []

@@ -27,7 +27,7 @@ def ask(tmp_path, *flags, **environment):
         env={**clean, **environment},
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=600,
     )
     assert done.returncode == 0, done.stderr
     package, folder, *names = done.stdout.split("\n")[:-1]
@@ -41,7 +41,7 @@ def wheel(tmp_path_factory):
     pytest.importorskip("hatchling", reason="hatchling absent: pip install -e '.[dev]'")
     out = tmp_path_factory.mktemp("wheel")
     command = [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(out)]
-    done = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, timeout=300)
+    done = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, timeout=600)
     assert done.returncode == 0, done.stderr
     return next(out.glob("*.whl"))
 

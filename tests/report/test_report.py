@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import re
 import shutil
@@ -12,6 +13,7 @@ import numpy as np
 import pytest
 
 from mstfilter.errors import InputError
+from mstfilter.report import run_report, viewpoint
 from mstfilter.report.run_report import read_numbers, write_report
 from mstfilter.runs import HypothesisCodec, RunFolder
 from mstfilter.scoring import weighted_coverage
@@ -60,6 +62,14 @@ class Page(HTMLParser):
 def read(path):
     text = path.read_text(encoding="utf-8")
     return text, Page(text)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def small_pictures():
+    """Voxel pictures of 120 x 90 pixels; nothing here depends on their size, and large ones take most of the time."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(run_report, "viewpoint", functools.partial(viewpoint, width=120, height=90))
+        yield
 
 
 @pytest.fixture(scope="module")

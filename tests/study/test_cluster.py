@@ -48,7 +48,7 @@ def test_a_cluster_gives_the_same_bytes(cluster, tmp_path):
     from mstfilter.study.cluster import Cluster
 
     slide(tmp_path / "slide", pauses=2)
-    wanted = study(tmp_path, "mst", "raise", "die", seeds=[0], tries=1)
+    wanted = study(tmp_path, "mst", "good", "raise", "die", seeds=[0], tries=1)
     here = run_study(wanted, tmp_path / "here", Local(1), cache=tmp_path / "cache-1")
     seen = []
     there = run_study(
@@ -59,7 +59,7 @@ def test_a_cluster_gives_the_same_bytes(cluster, tmp_path):
         progress=lambda p: seen.append(p.event),
     )
     events = [(e.kind, e.job) for e in seen if e is not None]
-    for job in range(3):  # each job starts once and before it ends; steps are reported
+    for job in range(4):  # each job starts once and before it ends; steps are reported
         assert events.count(("started", job)) == events.count(("ended", job)) == 1
         assert events.index(("started", job)) < events.index(("ended", job))
     assert max(e.done for e in seen if e is not None and e.kind == "step") == 2
@@ -67,7 +67,7 @@ def test_a_cluster_gives_the_same_bytes(cluster, tmp_path):
     assert (tmp_path / "there" / "differences.csv").read_bytes() == (
         tmp_path / "here" / "differences.csv"
     ).read_bytes()
-    assert there.done == here.done == 1
+    assert there.done == here.done == 2
     names = [r["run"] for r in table(tmp_path / "here", "failures.csv")]
     assert [r["run"] for r in table(tmp_path / "there", "failures.csv")] == names and len(names) == 2
     died = next(outcome for name, outcome in there.failed if name.startswith("die"))
@@ -93,8 +93,8 @@ def test_a_run_that_takes_too_long_is_named(cluster, tmp_path):
         ("hang on slide, seed 0", "it took longer than 1 s, 1 time", 1)
     ]
     assert result.done == 1
-    again = run_study(study(tmp_path, "good"), tmp_path / "out", executor, cache=tmp_path)
-    assert (again.done, again.repeated) == (2, 1)
+    again = run_study(study(tmp_path, "good", seeds=[0, 1, 2]), tmp_path / "out", executor, cache=tmp_path)
+    assert (again.done, again.repeated) == (3, 1)
 
 
 def test_a_dying_worker_fails_only_the_job_that_it_ran(tmp_path):

@@ -71,7 +71,7 @@ def test_ctrl_c_ends_workers_and_keeps_results(config, tmp_path):
     )
     wait_for(marker, process)
     os.kill(process.pid, signal.SIGINT)
-    _, error = process.communicate(timeout=300)
+    _, error = process.communicate(timeout=600)
     assert process.returncode == 130
     assert "interrupted: repeat the command to resume" in error
     assert "Traceback" not in error

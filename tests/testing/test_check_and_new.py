@@ -32,7 +32,7 @@ def test_starting_files_pass_their_tests(tmp_path):
     for kind in starter_kinds():
         write_starter(kind, tmp_path / f"my_{kind}.py")
     command = [sys.executable, "-m", "pytest", "-q", "-rs", "-p", "no:cacheprovider", str(tmp_path)]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=300)
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=600)
     assert done.returncode == 0, done.stdout + done.stderr
     assert "passed" in done.stdout
     assert "exact draws" not in done.stdout
@@ -89,7 +89,7 @@ def test_check_of_registered_components_with_fields(capsys):
 def test_a_missing_pytest_is_one_line():
     program = "import sys; sys.modules['pytest'] = None; from mstfilter.cli import main; main()"
     command = [sys.executable, "-c", program, "check", "resampler.systematic"]
-    done = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, timeout=120)
+    done = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, timeout=600)
     assert done.returncode == 2
     assert "check needs pytest, which is not installed" in done.stderr
     assert "mstfilter[check]" in done.stderr

@@ -35,7 +35,7 @@ def test_components_of_an_installed_package_have_a_name(tmp_path):
             [sys.executable, "-m", *arguments],
             capture_output=True,
             text=True,
-            timeout=300,
+            timeout=600,
             env=environment,
             cwd=tmp_path,
         )
