@@ -41,13 +41,7 @@ class Cluster(Executor):
     connect_s : float
         Time limit in seconds for the first answer of the scheduler.
     without_workers_s : float
-        Time in seconds for which the scheduler may have no workers, for instance while they restart.
-
-    Raises
-    ------
-    InputError
-        By `run`, if the scheduler does not answer, has no workers at the beginning or for longer than
-        `without_workers_s`, or if its workers have several threads or another version of mstfilter.
+        `run` raises InputError if the scheduler has no workers at the beginning, or later for this time in seconds.
     """
 
     address: str
@@ -153,9 +147,8 @@ class _ClusterRun:
             self._resubmitted[k] += 1
             self._submit(k)
         else:
-            self._tries[k] = error.allowed_failures + 1
-            hint = "if memory ran out: give each worker more memory"
-            self._fail(k, f"its worker died {times(self._tries[k])}", hint)
+            n = self._tries[k] = error.allowed_failures + 1
+            self._fail(k, f"its worker died {times(n)}", "if memory ran out: give each worker more memory")
 
     def _fail(self, k: int, error: str, *hints: str) -> None:
         self._end(k, JobOutcome("failed", error, hints, tries=self._tries.get(k, 1)))
@@ -176,12 +169,10 @@ class _ClusterRun:
         if workers:
             self._had_workers = now
         elif now - self._had_workers > self._without_workers_s and self._messages.empty():
-            n, total = len(self._jobs) - len(self._outcomes), len(self._jobs)
             raise InputError(
                 f"the Dask scheduler at {self._client.scheduler.address} has had no workers for "
-                f"{self._without_workers_s:g} s, and {n} of {total} jobs {'is' if n == 1 else 'are'} not done",
+                f"{self._without_workers_s:g} s; {len(self._outcomes)} of {len(self._jobs)} jobs have ended",
                 "start workers and repeat the command: it resumes",
-                "if workers die: look at their logs, give them more memory",
             )
 
     def _check_time_limits(self) -> None:

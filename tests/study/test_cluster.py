@@ -118,7 +118,7 @@ def test_a_cluster_without_workers_ends_the_study(tmp_path):
     wanted = study(tmp_path, "good", "die", seeds=[0])
     with local_cluster(1, lost_worker_timeout="0s") as address:
         executor = Cluster(address, without_workers_s=0.1)
-        with pytest.raises(InputError, match=r"has had no workers for 0\.1 s, and 1 of 2 jobs is not done"):
+        with pytest.raises(InputError, match=r"has had no workers for 0\.1 s; 1 of 2 jobs have ended"):
             run_study(wanted, tmp_path / "out", executor, cache=tmp_path)
         with pytest.raises(InputError, match="has no workers"):
             run_study(wanted, tmp_path / "out", executor, cache=tmp_path)
