@@ -77,8 +77,8 @@ def test_the_package_does_not_grow():
     assert n_lines(FILES) <= 32_500
     assert len(FILES) <= 145
     smc = [path for path in FILES if path.is_relative_to(PACKAGE / "smc") and path.name != "__init__.py"]
-    assert n_lines(smc) <= 8_000
-    assert len({path if path.parent.name == "smc" else path.parent for path in smc}) <= 19  # programs/ is one
+    assert n_lines(smc) <= 8_300
+    assert len({path if path.parent.name == "smc" else path.parent for path in smc}) <= 20  # programs/ is one
     assert max(n_lines([path]) for path in FILES) <= 500
 
 

@@ -27,7 +27,8 @@
 `distributions`         distributions for models; adapters for those of scipy and torch
 `smoothing`             states given all observations, paths of states by conditional SMC
 `inference`             parameters of a model: PMMH, particle Gibbs, emcee, SMC samplers
-`diagnostics`           quantities of a run, comparison of filters
+`diagnostics`           quantities of a run, energy distances, comparison of filters
+`evaluation`            coalescence and variance of a run
 ======================  ===================================================================================
 """
 

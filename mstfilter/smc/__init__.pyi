@@ -12,13 +12,16 @@ from mstfilter.smc.components import (
 )
 from mstfilter.smc.diagnostics import (
     History as History,
+    Measured as Measured,
     collect as collect,
+    energy_distance as energy_distance,
     ess as ess,
     log_evidence as log_evidence,
     mean as mean,
     n_particles as n_particles,
     resampled as resampled,
     run_many as run_many,
+    selection_distance as selection_distance,
     unique_ancestors as unique_ancestors,
     weight_entropy as weight_entropy,
 )
@@ -39,6 +42,12 @@ from mstfilter.smc.diverse_resampling import (
     FearnheadClifford as FearnheadClifford,
     GreedyDiverse as GreedyDiverse,
     KDpp as KDpp,
+)
+from mstfilter.smc.evaluation import (
+    Coalescence as Coalescence,
+    RunVariance as RunVariance,
+    coalescence as coalescence,
+    run_variance as run_variance,
 )
 from mstfilter.smc.exact import (
     ConditionallyLinear as ConditionallyLinear,

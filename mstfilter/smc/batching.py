@@ -94,16 +94,20 @@ def batch(
         raise InputError(
             f"sequences of observations have lengths {sorted({len(y) for y in ys})}, expected one length"
         )
-    if batched_slots(filter) is None:
-        return _one_by_one(filter, ys, seeds)
-    return _Sweep(filter, ys, seeds).run()
+    if batched_slots(filter) is not None:
+        try:
+            return _Sweep(filter, ys, seeds).run()
+        except _SizeChanged:
+            pass
+    return _one_by_one(filter, ys, seeds)
 
 
 def batched_slots(filter: ParticleFilter) -> tuple[str, ...] | None:
     """Slots whose components process all runs at once; None if the runs of the filter are made one by one.
 
     The latter are filters with other components than the four below, with a resampler that compares particles, or
-    with one that may return fewer particles.
+    with one that may return fewer particles. Filters whose components change the number of particles are found when
+    they do so, and their runs are made one by one too.
     """
     others = (filter.proposal, filter.lookahead, filter.rejuvenation, filter.size)
     resampler = filter.resampler
@@ -140,6 +144,10 @@ def _finished(result: Batch, states: list[State | None], filter: ParticleFilter)
     for r in result.lost if filter.properly_weighted else ():
         result.log_evidence[r, np.isnan(result.log_evidence[r])] = -np.inf
     return Batch(result.log_evidence, result.ess, result.resampled, tuple(states), result.lost)
+
+
+class _SizeChanged(Exception):
+    """A component returned another number of particles than it got."""
 
 
 class _AllLost(Exception):
@@ -260,7 +268,7 @@ class _Sweep:
                 found.append(None)
                 continue
             if len(population) != self.filter.n:
-                raise InputError(f"run {r}, step {t}, {slot}: {len(population)} particles, expected {self.filter.n}")
+                raise _SizeChanged
             found.append(population.realised())
         alive = np.array([p is not None for p in found])
         self.keep(alive)

@@ -68,6 +68,7 @@ FILTERS = {
     "guided": guided(AR1, optimal, 20),
     "program": Program(walk).bootstrap(20),
     "objects": bootstrap(hmm("objects"), 20),
+    "more candidates": branching(bootstrap(AR1, 20)),
     "without duplicates": branching(bootstrap(AR1, 20, FearnheadClifford())),
     "one by one": resample_move(AR1, RandomWalkMove(AR1, 0.5), 20),
 }

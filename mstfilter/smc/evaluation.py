@@ -1,0 +1,272 @@
+"""How good the estimates of a run are, from the run itself: coalescence of its paths, Monte Carlo variances.
+
+>>> found = run_variance(bootstrap(model, n=1000), observations, seed=0, lag=20)
+>>> found.log_evidence[-1], found.log_evidence_variance[-1] ** 0.5    # an estimate and its standard error
+>>> coalescence(keep(bootstrap(model, n=1000), observations)).ancestors     # (T,) of the last particles
+
+Both follow ancestors, so they need a filter whose particles all have known parents.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from mstfilter.errors import InputError, check_integer
+from mstfilter.smc.filter import ParticleFilter
+from mstfilter.smc.interfaces import State
+from mstfilter.smc.population import Population
+from mstfilter.smc.smoothing import Record
+from mstfilter.smc.transport_resampling import ResamplerWrapper
+
+
+@dataclass(frozen=True, eq=False)
+class Coalescence:
+    """The ancestors of the last particles of a run.
+
+    Parameters
+    ----------
+    ancestors : (T,) int64
+        Number of distinct ancestors at time t of the last particles of positive weight.
+    shared : (T,) float64
+        Probability that two particles, drawn by weight from the last population, have the same ancestor at time t.
+    """
+
+    ancestors: np.ndarray
+    shared: np.ndarray
+
+    @property
+    def time(self) -> int | None:
+        """Steps from the last time back to the latest common ancestor of all particles; None if there is none."""
+        common = np.flatnonzero(self.ancestors == 1)
+        return len(self.ancestors) - 1 - int(common[-1]) if len(common) else None
+
+    @property
+    def pair_time(self) -> float:
+        """Mean number of steps back to the latest common ancestor of two particles drawn by weight.
+
+        Pairs without one count as T steps, so the mean is a lower bound unless ``shared[0]`` is 1.
+        """
+        return float((1.0 - self.shared).sum())
+
+
+def coalescence(record: Record) -> Coalescence:
+    """How fast the paths of the last particles coalesce (Jacob, Murray, Rubenthaler 2015).
+
+    For equal weights and independent selections at every step, the genealogy is that of Wright and Fisher: two
+    particles share their ancestor s steps before with probability 1 - (1 - 1/n)^s.
+    """
+    last = record.populations[-1]
+    index, weights = np.flatnonzero(last.weights > 0), last.weights[last.weights > 0]
+    ancestors, shared = [], []
+    for t in range(len(record) - 1, -1, -1):
+        masses = np.bincount(index, weights)
+        ancestors.append(len(np.unique(index)))
+        shared.append(min(float(masses @ masses), 1.0))
+        if t:
+            index = record.parents(t)[index]
+    return Coalescence(np.array(ancestors[::-1]), np.array(shared[::-1]))
+
+
+@dataclass(frozen=True, eq=False)
+class RunVariance:
+    """Estimates of a run and their Monte Carlo variances, estimated from the same run.
+
+    Parameters
+    ----------
+    log_evidence : (T,) float64
+    log_evidence_variance : (T,) float64
+        Variance of the log evidence over seeds. May be negative where it is small compared with its own error.
+    mean : (T, ...) float64
+        Weighted means of the function.
+    mean_variance : (T, ...) float64
+        Variances of these means over seeds, entry by entry.
+    state : State
+        The last state of the run.
+    """
+
+    log_evidence: np.ndarray
+    log_evidence_variance: np.ndarray
+    mean: np.ndarray
+    mean_variance: np.ndarray
+    state: State
+
+
+def run_variance(
+    filter: ParticleFilter,
+    observations: Iterable[Any],
+    seed: int = 0,
+    lag: int | None = None,
+    function: Callable[[Any], np.ndarray] | None = None,
+) -> RunVariance:
+    """Run a filter and estimate the variance of its estimates from their ancestors.
+
+    Let A_e be the weight of the particles at time t whose ancestor at time 0 is e; all weights sum to 1. The relative
+    variance of the evidence, and so the variance of its log, is estimated by
+
+        V = 1 - f (1 - sum_e A_e^2),    f = N / (N - 1) * product of f_s over the selections s,
+
+    and the variance of a weighted mean by ``f sum_e B_e^2``, where B_e is the sum of w (x - mean) over the particles
+    of A_e (Lee and Whiteley 2018). For independent selections (`Multinomial`), f_s = N / (N - 1) makes V
+    unbiased. Other schemes make fewer duplicates, so f_s is measured here:
+
+        f_s = (1 - sum_e W_e^2) / (1 - sum_e V_e^2)
+
+    W_e and V_e are the weights of the descendants of e before and after the selection. This is the ratio of the
+    probabilities that two draws have different ancestors; it is N / (N - 1) on average for independent selections of
+    particles with different ancestors. For other schemes than `Multinomial` it is an approximation: it takes pairs of
+    particles with different ancestors as equally likely to be selected together, in proportion to their weights.
+
+    With a lag L (Olsson and Douc 2019), ancestors L steps earlier take the place of those at time 0 for the mean. For
+    the evidence, the part of V that arises at time s is evaluated at time s + L instead of t, and the parts are
+    added. This reduces the noise of the estimates and keeps them valid when all particles share one ancestor. The
+    bias is small if the model forgets its state in L steps.
+
+    Parameters
+    ----------
+    filter : ParticleFilter
+        Properly weighted, with n of at least 2.
+    observations : iterable
+    seed : int
+    lag : int, optional
+        Steps, at least 1. Default: all. Time and memory grow with n times the lag.
+    function : callable, optional
+        ``(particles) -> (n, ...)``, whose weighted mean is estimated. Default: the particles, if they are an array;
+        else means are of shape (T, 0).
+
+    Returns
+    -------
+    RunVariance
+        The estimates equal those of ``filter.run(observations, seed)``.
+    """
+    if lag is not None:
+        check_integer("lag", lag)
+    if not filter.properly_weighted:
+        raise InputError("a filter that is not properly weighted reports no evidence, and so has no variance of it")
+    if filter.n < 2:
+        raise InputError(f"n is {filter.n}, expected at least 2 particles to estimate a variance")
+    watched = _Watched(filter.resampler)
+    ancestry = _Ancestry(lag)
+    rows: list[tuple[Any, ...]] = []
+    state = filter.start(seed)
+    for state, info in replace(filter, resampler=watched).iterate(observations, seed):
+        population, total = state.population, state.log_evidence
+        assert population is not None and total is not None
+        if info.t == 0:
+            ancestry.begin(info.n_candidates)
+        parents = _parents(population, info.t) if info.t else info.ancestors
+        ancestry.descend(watched.selections, parents, population.weights)
+        watched.selections.clear()
+        if info.t > 0 and lag is not None:
+            ancestry.begin(len(population))
+        values = _values(population, function)
+        mean = np.tensordot(population.weights, values, axes=1)
+        rows.append((total, ancestry.evidence(), mean, ancestry.mean(values - mean)))
+    columns = [np.array(column) for column in zip(*rows, strict=True)] or [np.zeros(0)] * 4
+    return RunVariance(columns[0], columns[1], columns[2], columns[3], state)
+
+
+def _values(population: Population, function: Callable[[Any], np.ndarray] | None) -> np.ndarray:
+    particles, n = population.particles, len(population)
+    if function is None:
+        plain = isinstance(particles, np.ndarray) and particles.dtype != object
+        return np.asarray(particles, dtype=np.float64) if plain else np.zeros((n, 0))
+    values = np.asarray(function(particles), dtype=np.float64)
+    if values.shape[:1] != (n,):
+        raise InputError(f"the function returned shape {values.shape}, expected one row per particle: ({n}, ...)")
+    return values
+
+
+class _Selection(NamedTuple):
+    """A selection from m particles.
+
+    Parameters
+    ----------
+    parents : (m,) int
+        Their parents in the population after the previous step.
+    before, after : (m,) float
+        Their weights; the shares of their copies in the weight after the selection.
+    ancestors : (n,) int
+    """
+
+    parents: np.ndarray
+    before: np.ndarray
+    after: np.ndarray
+    ancestors: np.ndarray
+
+
+@dataclass(frozen=True)
+class _Watched(ResamplerWrapper):
+    """Records the selections of a step."""
+
+    selections: list[_Selection] = field(default_factory=list)
+
+    def resample(self, rng: np.random.Generator, population: Population, n: int) -> Population:
+        chosen = self.scheme.resample(rng, population, n)
+        ancestors = chosen.parents.get("ancestor")
+        if ancestors is None or (ancestors < 0).any():
+            raise InputError("the variance of a run needs a resampler that reports ancestors")
+        parents = population.parents.get("previous", np.arange(len(population)))
+        if self.selections:
+            parents = self.selections[-1].ancestors[parents]
+        shares = np.bincount(ancestors, chosen.weights, len(population))
+        self.selections.append(_Selection(parents, population.weights, shares, ancestors))
+        return chosen
+
+
+class _Ancestry:
+    """Ancestors of the particles at the times t - lag .. t, with the factor f of the selections since."""
+
+    def __init__(self, lag: int | None) -> None:
+        self.lag = lag
+        #: For each time: ancestors of the present particles, and f.
+        self.window: deque[tuple[np.ndarray, float]] = deque()
+        self.past = 0.0  # parts of the variance of the evidence that arose before the window
+        self.weights = np.zeros(0)
+
+    def begin(self, n: int) -> None:
+        """Take the present particles as n independent draws."""
+        self.window.append((np.arange(n), n / (n - 1) if n > 1 else 1.0))
+
+    def descend(self, selections: list[_Selection], parents: np.ndarray, weights: np.ndarray) -> None:
+        """Go to the next population."""
+        if self.lag is not None and len(self.window) > self.lag:
+            self.past += self._relative(0) - self._relative(1)
+            self.window.popleft()
+        for k, (index, f) in enumerate(self.window):
+            for selection in selections:
+                of = index[selection.parents]
+                after = _differ(of, selection.after)
+                # If all descend from one ancestor, V is 1 for any f.
+                f *= _differ(of, selection.before) / after if after > 1e-12 else 1.0
+            self.window[k] = index[parents], f
+        self.weights = weights
+
+    def _relative(self, place: int) -> float:
+        """Relative variance of the evidence that arises from the time of `place` to now."""
+        index, f = self.window[place]
+        return 1.0 - f * _differ(index, self.weights)
+
+    def evidence(self) -> float:
+        return self.past + self._relative(0)
+
+    def mean(self, centred: np.ndarray) -> np.ndarray:
+        """(...) variance of the weighted mean of (n, ...) values minus that mean."""
+        index, f = self.window[0]
+        columns = (self.weights[:, None] * centred.reshape(len(centred), -1)).T
+        squares = [float(np.square(np.bincount(index, column)).sum()) for column in columns]
+        return f * np.array(squares).reshape(centred.shape[1:])
+
+
+def _differ(groups: np.ndarray, weights: np.ndarray) -> float:
+    """Probability that two draws by weight are of different groups."""
+    masses = np.bincount(groups, weights)
+    return 1.0 - float(masses @ masses)
+
+
+def _parents(population: Population, t: int) -> np.ndarray:
+    return Record((population,) * (t + 1), ()).parents(t)
