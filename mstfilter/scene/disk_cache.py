@@ -23,7 +23,8 @@ import numpy as np
 
 from mstfilter.scene.arrays import content_key
 
-_UNREADABLE = (OSError, ValueError, TypeError, KeyError, EOFError, zipfile.BadZipFile, sqlite3.Error)
+# CPython 3.11 raises SystemError if two threads parse the headers of arrays at once (python/cpython#106905).
+_UNREADABLE = (OSError, ValueError, TypeError, KeyError, EOFError, SystemError, zipfile.BadZipFile, sqlite3.Error)
 
 
 class _BytesDisk(diskcache.Disk):

@@ -116,8 +116,10 @@ def test_cameras_anywhere_also_inside_the_grid(seed, x, y, z):
     point = camera.position + (got.depth[..., None] + 1e-6) * directions
     index = GRID.index_of(point[hit])
     inside = GRID.contains(index)
-    assert inside.mean() > 0.98 if hit.any() else True
-    assert (labels[tuple(index[inside].T)] == got.labels[hit][inside]).mean() > 0.97 if hit.any() else True
+    # A ray that touches an edge leaves the voxel within the added micrometre: at most one, or 2 %.
+    assert (~inside).sum() <= max(1, 0.02 * len(inside))
+    wrong = labels[tuple(index[inside].T)] != got.labels[hit][inside]
+    assert wrong.sum() <= max(1, 0.03 * len(wrong))
 
 
 def test_an_empty_grid_gives_an_empty_image_and_a_wrong_shape_an_error():
