@@ -132,8 +132,9 @@ def step_generator(key: Key, t: int, slot: str) -> np.random.Generator:
 @lru_cache(maxsize=32)
 def _seeds_of_steps(key: Key, slot: str, block: int) -> np.ndarray:
     """(64, 4) uint64 seeds of the generators of a slot."""
-    steps = range(64 * block, 64 * block + 64)
-    return pcg64_seeds(np.array([_key_words(key.child("step", t, slot)) for t in steps], np.uint32))
+    words = np.tile(np.array(_key_words(key.child("step", 0, slot)), np.uint32), (64, 1))
+    words[:, len(_key_words(key.child("step")))] = np.arange(64 * block, 64 * block + 64)
+    return pcg64_seeds(words)
 
 
 class _KnownSequence(ISpawnableSeedSequence):
