@@ -103,7 +103,7 @@ class Sample:
         return self.carried.std(axis=0)
 
     def bound(self, n_comparisons: int) -> np.ndarray:
-        """Empirical Bernstein bound of |mean - expectation| (Audibert, Munos, Szepesvari 2009, theorem 1).
+        """Empirical Bernstein bound of ``|mean - expectation|`` (Audibert, Munos, Szepesvari 2009, theorem 1).
 
         It holds with probability 1 - FALSE_ALARM for all comparisons together, without a normal approximation. For
         variance s^2, range R (the observed one, at least `unit`), N calls and x = log(3 comparisons / FALSE_ALARM)
