@@ -86,7 +86,7 @@ class Contract:
         return result
 
     def setup_method(self) -> None:
-        self._global_state = _global_state()
+        self._global_state = global_state()
 
     def teardown_method(self) -> None:
         numpy_state, python_state = self._global_state
@@ -136,10 +136,10 @@ class RandomContract(Contract):
     @prerequisite
     def test_does_not_use_global_generators(self) -> None:
         """It does not use the global generators of numpy and Python."""
-        before = _global_state()
+        before = global_state()
         with skips_errors():
             self.call(self.make(), np.random.default_rng(7), self.inputs(6))
-        after = _global_state()
+        after = global_state()
         assert same(before[0], after[0]), "it draws from numpy's global generator (np.random.*): draw from `rng`"
         assert before[1] == after[1], "it draws from Python's global generator (random.*): draw from `rng`"
 
@@ -221,5 +221,6 @@ def _plain(value: Any) -> Any:
     return value
 
 
-def _global_state() -> tuple[Any, Any]:
+def global_state() -> tuple[Any, Any]:
+    """States of the global generators of numpy and Python."""
     return np.random.get_state(), random.getstate()  # noqa: NPY002

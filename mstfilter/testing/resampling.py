@@ -14,6 +14,7 @@ not used, so the outcome of a check does not depend on the machine.
 
 from __future__ import annotations
 
+import random
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -25,6 +26,7 @@ from mstfilter.errors import InputError
 from mstfilter.smc import Population, Resampler, TransformResampler, WeightResampler, as_matrix, log_mean_exp
 from mstfilter.testing.contract import (
     RandomContract,
+    global_state,
     prerequisite,
     reports_errors,
     same,
@@ -392,6 +394,7 @@ def makes_particles(component: Resampler, example: Callable[..., Any]) -> bool:
     """Whether a resampler makes new particles: its result has no ancestors and is no selection from its input."""
     given = example(np.random.default_rng(0), 7)[0].realised()
     population = Population(given.particles, np.log(np.linspace(1.0, 3.0, 7)))
+    numpy_state, python_state = global_state()
     try:
         made = component.resample(np.random.default_rng(0), population, 7).realised()
         if "ancestor" in made.parents:
@@ -402,6 +405,9 @@ def makes_particles(component: Resampler, example: Callable[..., Any]) -> bool:
         )
     except Exception:  # the contract reports it
         return False
+    finally:
+        np.random.set_state(numpy_state)  # noqa: NPY002
+        random.setstate(python_state)
     return not all(any(same(a, b) for b in old) for a in new)
 
 
