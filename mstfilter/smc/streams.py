@@ -19,6 +19,7 @@ share a stream (probability one in a million for a hundred names).
 from __future__ import annotations
 
 import ctypes
+import threading
 import zlib
 from dataclasses import dataclass
 from functools import lru_cache
@@ -78,12 +79,12 @@ class Key:
 
 
 def _sequence(key: Key) -> _KeyedSequence:
-    sequence = _KeyedSequence(np.array(_key_words(key), dtype=np.uint32))
+    sequence = _KeyedSequence(np.array(key_words(key), dtype=np.uint32))
     sequence.key = key
     return sequence
 
 
-def _key_words(key: Key) -> list[int]:
+def key_words(key: Key) -> list[int]:
     """The entropy of a key: words of the seed, at least 4 as numpy has it before a spawn key, prefix, and path."""
     words = _words(key.seed)
     words += [0] * (4 - len(words))
@@ -132,9 +133,16 @@ def step_generator(key: Key, t: int, slot: str) -> np.random.Generator:
 @lru_cache(maxsize=32)
 def _seeds_of_steps(key: Key, slot: str, block: int) -> np.ndarray:
     """(64, 4) uint64 seeds of the generators of a slot."""
-    words = np.tile(np.array(_key_words(key.child("step", 0, slot)), np.uint32), (64, 1))
-    words[:, len(_key_words(key.child("step")))] = np.arange(64 * block, 64 * block + 64)
-    return pcg64_seeds(words)
+    return pcg64_seeds(_step_words([key], slot, range(64 * block, 64 * block + 64)))
+
+
+def _step_words(keys: list[Key], slot: str, steps: range) -> np.ndarray:
+    """(len(steps) * len(keys), k) uint32 words of ``key.child("step", t, slot)`` for each step and key."""
+    words = np.array([key_words(key.child("step", 0, slot)) for key in keys], np.uint32)
+    repeated = np.tile(words, (len(steps), 1, 1))
+    number_of_step = len(key_words(keys[0].child("step")))
+    repeated[:, :, number_of_step] = np.array(steps, np.uint32)[:, None]
+    return repeated.reshape(-1, words.shape[1])
 
 
 class _KnownSequence(ISpawnableSeedSequence):
@@ -240,11 +248,6 @@ def _times_multiplier(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np
     return low * m_low, high * m_low + low * m_high + carry
 
 
-def key_words(seeds: list[int], *parts: int | str) -> np.ndarray:
-    """(R, k) uint32 words of the keys ``Key(seed).child(*parts)``, for `pcg64_states`; seeds below 2^128."""
-    return np.array([_key_words(Key(seed).child(*parts)) for seed in seeds], np.uint32)
-
-
 def _words(number: int) -> list[int]:
     """A number as 32-bit words, lowest first."""
     words = [number & 0xFFFFFFFF]
@@ -287,11 +290,7 @@ class SlotStreams:
         block, position = divmod(t, self.block)
         if block != self.known:
             steps = range(block * self.block, min((block + 1) * self.block, self.n_steps))
-            words = key_words(self.seeds, "step", 0, self.slot)
-            all_words = np.tile(words, (len(steps), 1, 1))
-            at = key_words([0], "step").shape[1]  # the word of the number of the step
-            all_words[:, :, at] = np.array(steps, np.uint32)[:, None]
-            found = pcg64_states(all_words.reshape(-1, words.shape[1]))
+            found = pcg64_states(_step_words([Key(seed) for seed in self.seeds], self.slot, steps))
             self.found, self.known = found.reshape(len(steps), len(self.seeds), 4), block
         return self.found[position][runs]
 
@@ -364,7 +363,7 @@ class RunGenerators:
     def _filled(self, method: str, size: Any) -> np.ndarray:
         out = np.empty((len(self), *self._inner(size)))
         rows = out.reshape(len(self), -1)
-        shared = _shared_generator()
+        shared = _reused_generator(threading.get_ident())
         if self._own is not None or shared is None:
             for row, rng in zip(rows, self._generators(), strict=True):
                 getattr(rng, method)(out=row)
@@ -395,9 +394,9 @@ def _next_uniforms(states: np.ndarray) -> np.ndarray:
     return (word >> np.uint64(11)) * 2.0**-53
 
 
-@lru_cache(maxsize=1)
-def _shared_generator() -> tuple[np.random.Generator, np.ndarray] | None:
-    """A generator, and its state as an array of 4 words; None if its memory is not as expected.
+@lru_cache(maxsize=16)
+def _reused_generator(thread: int) -> tuple[np.random.Generator, np.ndarray] | None:
+    """A generator of a thread, and its state as an array of 4 words; None if its memory is not as expected.
 
     Writing the state takes a tenth of the time of setting ``bit_generator.state``.
     """

@@ -89,9 +89,7 @@ class Contract:
         self._global_state = global_state()
 
     def teardown_method(self) -> None:
-        numpy_state, python_state = self._global_state
-        np.random.set_state(numpy_state)  # noqa: NPY002
-        random.setstate(python_state)
+        restore_global_state(self._global_state)
 
     @prerequisite
     def test_does_not_change_input(self) -> None:
@@ -224,3 +222,9 @@ def _plain(value: Any) -> Any:
 def global_state() -> tuple[Any, Any]:
     """States of the global generators of numpy and Python."""
     return np.random.get_state(), random.getstate()  # noqa: NPY002
+
+
+def restore_global_state(state: tuple[Any, Any]) -> None:
+    """Set the global generators to states that `global_state` returned."""
+    np.random.set_state(state[0])  # noqa: NPY002
+    random.setstate(state[1])

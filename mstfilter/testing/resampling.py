@@ -14,7 +14,6 @@ not used, so the outcome of a check does not depend on the machine.
 
 from __future__ import annotations
 
-import random
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -29,6 +28,7 @@ from mstfilter.testing.contract import (
     global_state,
     prerequisite,
     reports_errors,
+    restore_global_state,
     same,
     skip_unless_properly_weighted,
     statistical,
@@ -394,7 +394,7 @@ def makes_particles(component: Resampler, example: Callable[..., Any]) -> bool:
     """Whether a resampler makes new particles: its result has no ancestors and is no selection from its input."""
     given = example(np.random.default_rng(0), 7)[0].realised()
     population = Population(given.particles, np.log(np.linspace(1.0, 3.0, 7)))
-    numpy_state, python_state = global_state()
+    before = global_state()
     try:
         made = component.resample(np.random.default_rng(0), population, 7).realised()
         if "ancestor" in made.parents:
@@ -406,8 +406,7 @@ def makes_particles(component: Resampler, example: Callable[..., Any]) -> bool:
     except Exception:  # the contract reports it
         return False
     finally:
-        np.random.set_state(numpy_state)  # noqa: NPY002
-        random.setstate(python_state)
+        restore_global_state(before)
     return not all(any(same(a, b) for b in old) for a in new)
 
 

@@ -83,9 +83,9 @@ def test_a_moved_object_is_integrated_where_it_was():
 def test_anothers_mask_takes_the_surface_away():
     frame, labels = seen(box())
     volume = ObjectVolume.of(box() == 1, GRID, 0.02, 1.0)
-    nobody = np.zeros(labels.shape, bool)
+    no_robot = np.zeros(labels.shape, bool)
     for _ in range(2):
-        volume = volume.integrate(frame, GRID, np.eye(4), nobody, labels == 1)
+        volume = volume.integrate(frame, GRID, np.eye(4), no_robot, labels == 1)
     assert not volume.occupied[tuple(np.array([25, 20, 9]) - volume.offset)]
 
 

@@ -58,7 +58,7 @@ def test_objects_that_free_space_cleared_too_much_of_are_doubtful(scene):
 
 
 def test_a_perfect_prediction_and_measurement_leave_the_scene_as_it_is(scene):
-    """A book of 2 cm and a thin rod too, whatever is merged and whoever wins."""
+    """A book of 2 cm and a thin rod too, for every merge and every order of painting."""
     clip, truth = scene
     for claims in (MST, Claims("sample", 0.0), Claims()):
         for merge in ("covered", "never", "always", "share"):

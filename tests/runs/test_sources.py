@@ -79,7 +79,7 @@ def test_options_reach_the_reader(tmp_path):
 
 
 def test_a_reader_of_ones_own(tmp_path):
-    """A layout that nobody else has: one class in a file, named like any component."""
+    """A layout of the user's own: one class in a file, named like any component."""
     rgb, depth, _ = layouts.video((0, 2))
     np.savez(tmp_path / "mine.npz", rgb=rgb, depth=depth.astype(np.float32))
     (tmp_path / "mine.py").write_text(

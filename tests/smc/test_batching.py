@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -35,9 +36,10 @@ from mstfilter.smc import (
 )
 from mstfilter.smc.batching import summaries
 from mstfilter.smc.population import Population
-from mstfilter.smc.streams import Key, key_words, pcg64_states
+from mstfilter.smc.streams import Key, pcg64_states
 from tests.smc.models import AR1, RHO, SD0, SIGMA, TAU, ar1_observations, hmm, optimal
 from tests.smc.test_particle_filter import MODEL, observations
+from tests.smc.test_streams import words_of
 
 YS = ar1_observations(8)
 SEEDS = [3, 1, 4, 1_000_003, 2**40 + 1]
@@ -146,7 +148,7 @@ def test_lost_runs_are_recorded_and_the_others_continue(model):
 
 def test_generators_of_runs_draw_what_their_streams_draw():
     seeds = list(range(6))
-    ours = RunGenerators(pcg64_states(key_words(seeds, "a")))
+    ours = RunGenerators(pcg64_states(words_of(seeds, "a")))
     singles = [Key(seed).child("a").generator() for seed in seeds]
     means = np.arange(12.0).reshape(6, 2)
     for draw in (
@@ -185,3 +187,17 @@ def test_wrong_calls_are_named():
         batch(bootstrap(AR1, 5), YS, [])
     with pytest.raises(InputError, match=r"run 0, step 0, update: log likelihood has shape \(\)"):
         batch(bootstrap(replace(AR1, log_likelihood=lambda x, y: 0.0), 5), YS, range(2))
+
+
+def test_threads_do_not_mix_their_streams():
+    """Threads that draw at the same time draw what each of them draws alone."""
+
+    def drawn(first):
+        rng = RunGenerators(pcg64_states(words_of(range(first, first + 50), "a")))
+        return np.stack([rng.standard_normal((50, 40)) for _ in range(40)])
+
+    alone = [drawn(first) for first in (0, 100, 200, 300)]
+    with ThreadPoolExecutor(4) as pool:
+        together = list(pool.map(drawn, (0, 100, 200, 300)))
+    for a, b in zip(alone, together, strict=True):
+        np.testing.assert_array_equal(a, b)
