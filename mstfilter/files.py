@@ -60,18 +60,10 @@ def write_csv(
     columns: Iterable[str] | None = None,
     float_format: str = "",
 ) -> None:
-    """Write rows as CSV in one step.
+    """Write rows as CSV in one step; None and NaN are written as an empty cell.
 
-    Parameters
-    ----------
-    path : path
-        The file.
-    rows : iterable of mappings
-        Column name -> value; None and NaN are written as an empty cell.
-    columns : iterable of str, optional
-        The columns that are written, in this order; by default all in the order of first appearance.
-    float_format : str
-        Format of floating-point numbers, for example ``.6g``. Default: all digits.
+    `columns` are written in this order; by default all in the order of first appearance. `float_format` is for
+    example ``.6g``; the default writes all digits.
     """
     rows = [{name: _cell(value, float_format) for name, value in row.items()} for row in rows]
     names = list(columns) if columns is not None else list(dict.fromkeys(name for row in rows for name in row))

@@ -43,13 +43,7 @@ _ENTRY_POINTS = "mstfilter.components"
 
 
 class Registry:
-    """The components that packages declare.
-
-    Parameters
-    ----------
-    *packages : module
-        Packages with ``__components__``, ``__interfaces__`` or both.
-    """
+    """The components that packages declare by ``__components__``, ``__interfaces__`` or both."""
 
     def __init__(self, *packages: ModuleType) -> None:
         self._interfaces: dict[str, str] = {}  # location of the class -> kind
@@ -138,18 +132,8 @@ class Registry:
     ) -> Any:
         """A component from its name, or from a mapping with ``component`` and fields.
 
-        Parameters
-        ----------
-        kind : str
-            One of `kinds`.
-        spec : str or mapping
-            What to build. A mapping without ``component`` changes fields of `default`.
-        where : str, optional
-            Path in the configuration, for messages.
-        allow_files : bool
-            Whether ``./file.py:Class`` is loaded.
-        default : component, optional
-            The component that a mapping without ``component`` changes.
+        A mapping without ``component`` changes fields of `default`. `where` is the path in the configuration, for
+        messages. With `allow_files`, ``./file.py:Class`` is loaded.
         """
         where = where or kind
         if isinstance(spec, str):

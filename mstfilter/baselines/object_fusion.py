@@ -61,13 +61,7 @@ class _Match(NamedTuple):
 
 @dataclass(frozen=True)
 class ObjectFusion(Update):
-    """Object-level volumetric fusion in the manner of MID-Fusion.
-
-    Parameters
-    ----------
-    free_space : Projection
-        Clears the tracked map first.
-    """
+    """Object-level volumetric fusion in the manner of MID-Fusion; `free_space` clears the tracked map first."""
 
     free_space: Projection = field(default_factory=FreeSpace)
 
@@ -227,28 +221,14 @@ def _project(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 @dataclass(frozen=True, eq=False)
 class ObjectVolume:
-    """Truncated signed distances of one object in a box of the grid (Curless and Levoy 1996).
+    """Truncated signed distances of one object in a box of the grid (Curless and Levoy 1996)."""
 
-    Parameters
-    ----------
-    offset : (3,) int
-        Index of the box's first voxel in the grid.
-    distance : (a, b, c) float
-        Metres to the surface, negative inside, clipped to +-`truncation`.
-    weight : (a, b, c) float
-        Number of images averaged in each distance.
-    hits, other_hits : (a, b, c) float
-        Number of images with the voxel at the surface and in the mask of the object, or of another object.
-    truncation : float
-        Metres.
-    """
-
-    offset: np.ndarray
-    distance: np.ndarray
-    weight: np.ndarray
-    hits: np.ndarray
-    other_hits: np.ndarray
-    truncation: float
+    offset: np.ndarray  #: (3,) int index of the box's first voxel in the grid
+    distance: np.ndarray  #: (a, b, c) metres to the surface, negative inside, clipped to +-`truncation`
+    weight: np.ndarray  #: (a, b, c) number of images averaged in each distance
+    hits: np.ndarray  #: (a, b, c) number of images with the voxel at the surface and in the mask of the object
+    other_hits: np.ndarray  #: (a, b, c) the same for the masks of other objects
+    truncation: float  #: metres
 
     @classmethod
     def of(cls, mask: np.ndarray, grid: VoxelGrid, truncation: float, weight: float) -> ObjectVolume:
@@ -281,15 +261,9 @@ class ObjectVolume:
     ) -> ObjectVolume:
         """The volume averaged with another image.
 
-        Parameters
-        ----------
-        frame : Frame
-        grid : VoxelGrid
-        T : (4, 4) array
-            Motion in world metres from the pose of the volume to the pose in the frame.
-        mask, others : (H, W) bool
-            Pixels that show this object, and another object. Surface is integrated in `mask` only, free space
-            everywhere.
+        `T` (4, 4) is the motion in world metres from the pose of the volume to the pose in the frame. `mask` and
+        `others` (H, W) bool are the pixels of this object and of others. Surface is integrated in `mask` only, free
+        space everywhere.
         """
         index = np.stack(np.meshgrid(*(np.arange(n) for n in self.distance.shape), indexing="ij"), axis=-1)
         u, v, z, inside = _project(frame.camera, move_points(T, grid.centre_of(index.reshape(-1, 3) + self.offset)))

@@ -27,10 +27,7 @@ from mstfilter.smc import Population, Proposal, child
 class FirstPause(Proposal):
     """The samples of another proposal at the first pause; afterwards hypotheses without objects.
 
-    Parameters
-    ----------
-    proposal : Proposal
-        Used at the first pause, with the random stream that it would have without this wrapper.
+    The inner proposal has the random stream that it would have without this wrapper.
     """
 
     proposal: Proposal = field(default_factory=TreeCutProposal)

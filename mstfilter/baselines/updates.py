@@ -42,10 +42,7 @@ class SamplesOnly(Update):
 class TrackingOnly(Update):
     """The predicted hypotheses alone.
 
-    Parameters
-    ----------
-    free_space : Projection
-        Clears voxels that the latest image observes as free; ``none`` leaves predictions unchanged.
+    `free_space` clears voxels that the latest image observes as free; ``none`` leaves predictions unchanged.
     """
 
     free_space: Projection = field(default_factory=FreeSpace)
@@ -72,12 +69,8 @@ class Union(Update):
     """Predicted and proposed hypotheses together, with the weights of fusion but without crossover.
 
     A prediction has log weight ``log w + lambda log Q``, a sample ``log w``; both populations are first scaled to
-    mean weight 1. The evidence of the fusion scores all hypotheses.
-
-    Parameters
-    ----------
-    fusion : FusionUpdate
-        The fusion whose free space, division, weights and evidence are used.
+    mean weight 1. Free space, division, weights and evidence are those of `fusion`; the evidence scores all
+    hypotheses.
     """
 
     fusion: FusionUpdate = field(default_factory=FusionUpdate)

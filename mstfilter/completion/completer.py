@@ -36,24 +36,13 @@ from mstfilter.scene import Frame, VoxelGrid, component_key, content_key, depth_
 
 @dataclass(frozen=True, eq=False)
 class Completion:
-    """The completed object of one segment, in a box of the grid.
+    """The completed object of one segment, in a box of the grid."""
 
-    Parameters
-    ----------
-    offset : (3,) int
-        Index of the box's first voxel in the grid.
-    probability : (a, b, c) float32
-        Probability of being occupied by the object; empty if the mask has no reading in the grid.
-    points : (a, b, c) int32
-        Depth readings of the mask in each voxel: the visible surface.
-    key : str
-        Key of the contents of frame, mask, grid and completer.
-    """
-
-    offset: np.ndarray
+    offset: np.ndarray  #: (3,) int index of the box's first voxel in the grid
+    #: (a, b, c) float32, probability of being occupied by the object; empty if the mask has no reading in the grid.
     probability: np.ndarray
-    points: np.ndarray
-    key: str
+    points: np.ndarray  #: (a, b, c) int32: depth readings of the mask in each voxel: the visible surface
+    key: str  #: key of the contents of frame, mask, grid and completer
 
     @property
     def box(self) -> tuple[slice, slice, slice]:
@@ -64,31 +53,18 @@ class Completion:
 
 @dataclass(frozen=True, eq=False)
 class ObservedBox:
-    """What a frame shows of a box of the grid around one mask.
+    """What a frame shows of a box of the grid around one mask."""
 
-    Parameters
-    ----------
-    points : (a, b, c) int32
-        Readings of the mask in each voxel.
-    surface : (a, b, c) bool
-        Visible surface of the mask: the pixel of the voxel's centre is in the mask, and the centre is at the measured
-        surface or just behind it. If no centre falls into a small mask, the voxel with most readings.
-    other_surface : (a, b, c) bool
-        Visible surface outside the mask, by the same rule.
-    free : (a, b, c) bool
-        Observed as free.
-    behind : (a, b, c) bool
-        The pixel of the centre is in the mask and the centre is behind the measured surface.
-    height : (c,) float
-        Height of the voxel centres above the table in metres.
-    """
-
-    points: np.ndarray
+    points: np.ndarray  #: (a, b, c) int32: readings of the mask in each voxel
+    #: (a, b, c) bool visible surface of the mask: the pixel of the voxel's centre is in the mask, and the centre
+    #: is at the measured surface or just behind it. If no centre falls into a small mask, the voxel with most
+    #: readings.
     surface: np.ndarray
-    other_surface: np.ndarray
-    free: np.ndarray
+    other_surface: np.ndarray  #: (a, b, c) bool visible surface outside the mask, by the same rule
+    free: np.ndarray  #: (a, b, c) bool observed as free
+    #: (a, b, c) bool the pixel of the centre is in the mask and the centre is behind the measured surface.
     behind: np.ndarray
-    height: np.ndarray
+    height: np.ndarray  #: (c,) height of the voxel centres above the table in metres
 
 
 @dataclass(frozen=True)
@@ -125,18 +101,14 @@ class Completer(ABC):
     def complete(
         self, rng: np.random.Generator, frame: Frame, masks: Sequence[np.ndarray], grid: VoxelGrid
     ) -> list[Completion]:
-        """Complete several masks of a frame.
+        """Complete several masks of a frame; the pose of the frame places it in the grid.
 
         Parameters
         ----------
         rng : Generator
             Only stochastic completers draw from it.
-        frame : Frame
-            With the pose that places it in the grid.
         masks : sequence of (H, W) bool
             Each one segment. Pixels without a reading, of the robot, or outside the grid are ignored.
-        grid : VoxelGrid
-            The grid of the result.
 
         Returns
         -------
@@ -222,21 +194,9 @@ def _free(frame: Frame, grid: VoxelGrid, margin: float, sigmas: float) -> np.nda
 
 
 def arbitrate(completions: Sequence[Completion], grid: VoxelGrid, threshold: float = 0.5) -> np.ndarray:
-    """Label grid of several completions.
+    """Label grid (X, Y, Z) uint16 of the completions of one hypothesis: 0 free, k + 1 the k-th completion.
 
-    Parameters
-    ----------
-    completions : sequence of Completion
-        The completions of one hypothesis, with disjoint masks.
-    grid : VoxelGrid
-        The grid of the completions.
-    threshold : float
-        Least probability of an occupied voxel.
-
-    Returns
-    -------
-    (X, Y, Z) uint16
-        0 free, k + 1 the k-th completion.
+    `threshold` is the least probability of an occupied voxel.
     """
     labels = np.zeros(grid.shape, dtype=np.uint16)
     most = np.zeros(grid.shape, dtype=np.int32)

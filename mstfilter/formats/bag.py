@@ -41,16 +41,11 @@ class Entry:
 
 
 class BagFile:
-    """An open bag, closed when it is garbage collected.
+    """An open bag (.bag, .mcap or .db3 file, or the folder of a ROS 2 bag), closed when it is garbage collected.
 
     >>> bag = BagFile(Path("session.mcap"))
     >>> entries = bag.index("/camera/color/image_raw")
     >>> message = bag.message("/camera/color/image_raw", entries[3])
-
-    Parameters
-    ----------
-    path : Path
-        A .bag, .mcap or .db3 file, or the folder of a ROS 2 bag.
     """
 
     def __init__(self, path: Path) -> None:

@@ -138,11 +138,8 @@ class RecordingWriter:
         Parameters
         ----------
         rgb : (H, W, 3) uint8
-            Colour.
         depth : (H, W) float
             Metres, NaN = no reading.
-        time_s : float
-            Seconds.
         role : {"static", "action"}
             At a pause, or between pauses.
         instance : (H, W) uint8 or uint16, optional
@@ -254,18 +251,10 @@ def save_recording(
     progress: Callable[[int, int], None] = lambda done, total: None,
     **manifest: Any,
 ) -> Path:
-    """Write a recording as a recording folder; if the camera moves, every frame stores its pose.
+    """Write a recording as a new recording folder; if the camera moves, every frame stores its pose.
 
-    Parameters
-    ----------
-    recording : Recording
-        The recording. Depth is stored in units of its `depth_scale`.
-    path : path
-        The new folder. It must not exist, or be empty.
-    progress : callable
-        Called with the number of frames written and the number of all frames.
-    **manifest
-        Further entries of manifest.json: generator, ...
+    Depth is stored in units of the recording's `depth_scale`. `progress` is called with the number of frames written
+    and the number of all frames. Further entries of manifest.json, such as the generator, are given by name.
     """
     camera, total = recording.frames[recording.pauses[0]].camera, len(recording)
     manifest = {"name": recording.name, "depth_scale": recording.depth_scale, **manifest}

@@ -25,12 +25,8 @@ class PairedImages(RecordingFormat):
     """A folder of pairs NAME_rgb.png, NAME_depth.png with an info.json; every frame is a pause.
 
     ``info.json`` holds ``K`` (fx, fy, cx, cy, or a 3x3 matrix) and ``depth_scale_m``, metres per unit of the 16-bit
-    depth images. There is no pose: the world is found from the support plane.
-
-    Parameters
-    ----------
-    frames : tuple of str or int
-        Names of frames in order. Default: all, sorted by name.
+    depth images. There is no pose: the world is found from the support plane. `frames` are the names of frames in
+    order; by default all, sorted by name.
     """
 
     frames: tuple[str | int, ...] = ()

@@ -3,19 +3,8 @@
 >>> pauses_from_text("still"), pauses_from_text("0,40,85"), pauses_from_text("0s,4.2s")
 
 A clip goes from one pause to the next. At a pause nothing moves, and neither the robot nor a hand should be in the
-image. Only the recording folder of mstfilter stores the pauses. For other layouts they are found by one of these
-rules:
-
-``still``
-    By image motion.
-``at``
-    Given frames or seconds.
-``listed``
-    A text file of frames or seconds.
-``ends``
-    The first and the last frame.
-``every``
-    Every n-th frame: single images of a scene that was changed in between.
+image. Only the recording folder of mstfilter stores the pauses. For other layouts they are found by one of the rules
+below.
 """
 
 from __future__ import annotations
@@ -39,12 +28,7 @@ class PauseRule(ABC):
     def find(self, times: tuple[float, ...], read_rgb: Callable[[int], np.ndarray]) -> tuple[int, ...]:
         """Ascending frame indices of the pauses.
 
-        Parameters
-        ----------
-        times : tuple of float
-            Seconds, one per frame.
-        read_rgb : callable
-            Colour image (H, W, 3) uint8 of a frame index.
+        `times` are seconds, one per frame; ``read_rgb(index)`` is the colour image (H, W, 3) uint8 of a frame.
         """
 
 
@@ -58,13 +42,7 @@ class Ends(PauseRule):
 
 @dataclass(frozen=True)
 class EveryNth(PauseRule):
-    """Every n-th frame is a pause: single images of a scene that was changed in between.
-
-    Parameters
-    ----------
-    n : int
-        Distance of the pauses in frames.
-    """
+    """Every n-th frame is a pause: single images of a scene that was changed in between."""
 
     n: int = 1
 
@@ -107,13 +85,7 @@ class At(PauseRule):
 
 @dataclass(frozen=True)
 class Listed(PauseRule):
-    """A text file of frame indices, or of seconds that end in ``s``; ``#`` starts a comment.
-
-    Parameters
-    ----------
-    file : str
-        Path of the file.
-    """
+    """A text file of frame indices, or of seconds that end in ``s``; ``#`` starts a comment."""
 
     file: str = "pauses.txt"
 

@@ -96,21 +96,12 @@ def _undistort(image: np.ndarray, source: np.ndarray | None, outside: float = 0,
 
 @dataclass(frozen=True)
 class KnownWorld:
-    """Camera pose and workspace, if they are known; what is empty is found from the first pause.
+    """Camera pose and workspace, if they are known; what is empty is found from the first pause."""
 
-    Parameters
-    ----------
-    T_world_camera : tuple of 16 float
-        Pose of the camera at the first pause, row by row: z up, table at z = 0, metres.
-    workspace : tuple of 6 float
-        x, y, z of the lower, then of the upper corner, metres.
-    voxel_size : float
-        Metres; used with `workspace`.
-    """
-
+    #: tuple of 16 float: pose of the camera at the first pause, row by row: z up, table at z = 0, metres.
     T_world_camera: tuple[float, ...] = ()
-    workspace: tuple[float, ...] = ()
-    voxel_size: float = 0.01
+    workspace: tuple[float, ...] = ()  #: tuple of 6 float: x, y, z of the lower, then of the upper corner, metres
+    voxel_size: float = 0.01  #: metres; used with `workspace`
 
     @cached_property
     def pose(self) -> RigidTransform | None:
@@ -135,42 +126,20 @@ class KnownWorld:
 
 @dataclass(frozen=True, eq=False)
 class Video:
-    """Frames on disk and their calibration.
+    """Frames on disk and their calibration."""
 
-    Parameters
-    ----------
-    name : str
-        For messages and reports.
-    times : tuple of float
-        Seconds, one per frame, ascending.
-    read_rgb : callable
-        Colour image (H, W, 3) uint8 of a frame, by index.
-    read_depth : callable
-        Depth image (H, W) float32 of a frame in metres, registered to the colour image; NaN = no reading.
-    K : tuple of float
-        fx, fy, cx, cy in pixels.
-    path : Path
-        File or folder.
-    depth_scale : float
-        Metres per unit of the stored depth.
-    motion : sequence of RigidTransform, optional
-        Camera poses in any world, one per frame.
-    read_instance : callable, optional
-        True label image of a frame, by index.
-    distortion : tuple of float
-        OpenCV's k1, k2, p1, p2, k3, ... of both images; they are undistorted.
-    """
-
-    name: str
-    times: tuple[float, ...]
-    read_rgb: Callable[[int], np.ndarray]
+    name: str  #: for messages and reports
+    times: tuple[float, ...]  #: seconds, one per frame, ascending
+    read_rgb: Callable[[int], np.ndarray]  #: colour image (H, W, 3) uint8 of a frame, by index
+    #: Depth image (H, W) float32 of a frame in metres, registered to the colour image; NaN = no reading.
     read_depth: Callable[[int], np.ndarray]
-    K: tuple[float, ...]
-    path: Path
-    depth_scale: float
-    motion: Sequence[RigidTransform] | None = None
+    K: tuple[float, ...]  #: fx, fy, cx, cy in pixels
+    path: Path  #: file or folder
+    depth_scale: float  #: metres per unit of the stored depth
+    motion: Sequence[RigidTransform] | None = None  #: camera poses in any world, one per frame
+    #: True label image of a frame, by index.
     read_instance: Callable[[int], np.ndarray | None] = field(default=lambda index: None)
-    distortion: tuple[float, ...] = ()
+    distortion: tuple[float, ...] = ()  #: OpenCV's k1, k2, p1, p2, k3, ... of both images; they are undistorted
 
     def between(self, start_s: float, stop_s: float) -> Video:
         """The frames from `start_s` to `stop_s` seconds after the first."""

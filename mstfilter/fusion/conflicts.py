@@ -50,30 +50,17 @@ MERGE_RULES: tuple[MergeRule, ...] = get_args(MergeRule)
 class ConflictGraph:
     """Objects of a proposed and a predicted hypothesis and their overlaps.
 
-    Parameters
-    ----------
-    side : (n,) int
-        0 proposed, 1 predicted.
-    label : (n,) int
-        Label of the object in its hypothesis.
-    size : (n,) int
-        Voxels of the object.
-    edges : (m, 2) int
-        Vertex numbers of overlapping pairs.
-    intersection : (m,) int
-        Voxels that both objects claim.
-
     Notes
     -----
     Vertices are numbered by their first voxel in a scan with x fastest, the proposed object first if two objects
     begin at the same voxel: the authors' numbering.
     """
 
-    side: np.ndarray
-    label: np.ndarray
-    size: np.ndarray
-    edges: np.ndarray
-    intersection: np.ndarray
+    side: np.ndarray  #: (n,) int 0 proposed, 1 predicted
+    label: np.ndarray  #: (n,) int label of the object in its hypothesis
+    size: np.ndarray  #: (n,) int voxels of the object
+    edges: np.ndarray  #: (m, 2) int vertex numbers of overlapping pairs
+    intersection: np.ndarray  #: (m,) int voxels that both objects claim
 
     def __len__(self) -> int:
         return len(self.label)
@@ -278,12 +265,8 @@ def merge_probability(
 ) -> np.ndarray:
     """Probability that a child object is merged into its parent, elementwise.
 
-    Parameters
-    ----------
-    rule : str
-        One of `MERGE_RULES`; the table of the module has the formulas.
-    intersection, child, parent : int or arrays of the same shape
-        Voxels in common, of the child, of the parent.
+    The table of the module has the formulas. `intersection`, `child` and `parent` are the voxels in common, of the
+    child, and of the parent.
     """
     common, n1, n2 = (np.asarray(a, dtype=np.float64) for a in (intersection, child, parent))
     iou = common / (n1 + n2 - common)

@@ -35,13 +35,7 @@ class NoDivision(Division):
 
 @dataclass(frozen=True)
 class RigidMotions(Division):
-    """Pixels that followed different rigid motions in the clip belong to different objects.
-
-    Parameters
-    ----------
-    motions : MotionSegmentation
-        Groups the pixels of the last frame by rigid motion.
-    """
+    """Pixels that `motions` groups by different rigid motions in the clip belong to different objects."""
 
     motions: MotionSegmentation = field(default_factory=MotionSegmentation)
 

@@ -128,15 +128,9 @@ def log_quality(quality: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class ProjectionUpdate(Update):
-    """Projects every particle, and adds lambda log Q to its log weight.
+    """Projects every particle, and adds lambda log Q to its log weight, lambda the `quality_exponent`.
 
-    Proposed particles join the predicted ones.
-
-    Parameters
-    ----------
-    free_space : Projection
-    quality_exponent : float
-        lambda: power of Q, the share of voxels that a particle keeps, in the weight.
+    Q is the share of voxels that a particle keeps. Proposed particles join the predicted ones.
     """
 
     free_space: Projection = FreeSpace()

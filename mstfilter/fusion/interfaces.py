@@ -61,7 +61,6 @@ class Structure(ABC):
 
         Parameters
         ----------
-        rng : Generator
         graph : networkx.Graph
             The conflict graph (`ConflictGraph.networkx`). The neighbours of a vertex, ``graph[v]``, ascend.
         component : sequence of int
@@ -72,8 +71,7 @@ class Structure(ABC):
         order : list of int
             All vertices of the component, first to last painted; later ones paint over earlier ones.
         edges : list of (child, parent)
-            Edges of the graph along which the child may be merged into the parent. A parent is painted after its
-            child.
+            Edges of the graph along which the child may be merged into the parent, which is painted after it.
         """
 
 

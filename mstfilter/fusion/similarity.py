@@ -43,25 +43,16 @@ def canonical(labels: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class CommonRefinement:
-    """Cells of several segmentations, and the objects that they belong to.
+    """Cells of several segmentations, and the objects that they belong to."""
 
-    Parameters
-    ----------
-    cells : int array of the segmentations' shape
-        The cell of every position. Cell 0 is free in all segmentations and may be empty.
-    objects : (n, k) int
-        Object of each of k cells in each of n segmentations; 0 is free. Objects are numbered from 1 over all
-        segmentations, so different segmentations have different objects.
-    sizes : (k,) int
-        Positions in each cell.
-    first : (n + 1,) int
-        Segmentation i has the objects first[i] + 1 .. first[i + 1].
-    """
-
+    #: int array of the segmentations' shape: the cell of every position. Cell 0 is free in all segmentations and
+    #: may be empty.
     cells: np.ndarray
+    #: (n, k) int object of each of k cells in each of n segmentations; 0 is free. Objects are numbered from 1 over
+    #: all segmentations, so different segmentations have different objects.
     objects: np.ndarray
-    sizes: np.ndarray
-    first: np.ndarray
+    sizes: np.ndarray  #: (k,) int positions in each cell
+    first: np.ndarray  #: (n + 1,) int segmentation i has the objects first[i] + 1 .. first[i + 1]
 
     @property
     def n_objects(self) -> int:
@@ -129,10 +120,7 @@ class SameSegmentation(Equivalence):
 class WeightedCoverage(Similarity):
     """Weighted coverage (form ``objects`` of `mstfilter.scoring.quality`) of all pairs of hypotheses.
 
-    Parameters
-    ----------
-    stride : int
-        Step between the voxels that are used, along each axis. The time falls with stride^3.
+    `stride` is the step between the voxels that are used, along each axis. The time falls with stride^3.
     """
 
     stride: int = 1

@@ -36,19 +36,13 @@ _SURFACE_VOXELS = 1.5  # a voxel up to this far behind the reading counts as sur
 
 @dataclass(frozen=True)
 class Claims:
-    """Voxels that the predicted parent of a candidate may add to the sample.
+    """Voxels that the predicted parent of a candidate may add to the sample."""
 
-    Parameters
-    ----------
-    surface : {"both", "sample"}
-        Parents whose objects may fill voxels at the surface that the last frame measures. Voxels that only the
-        prediction has there are mostly errors of position.
-    max_cleared : float
-        A predicted object of which free space clears more than this share adds no voxels: its motion was wrong, and
-        so are its hidden voxels. 1 sets no limit.
-    """
-
+    #: {"both", "sample"}: parents whose objects may fill voxels at the surface that the last frame measures.
+    #: Voxels that only the prediction has there are mostly errors of position.
     surface: Literal["both", "sample"] = "both"
+    #: A predicted object of which free space clears more than this share adds no voxels: its motion was wrong, and
+    #: so are its hidden voxels. 1 sets no limit.
     max_cleared: float = 1.0
 
     def __post_init__(self) -> None:

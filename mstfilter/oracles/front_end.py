@@ -153,10 +153,7 @@ class TrueBoundary(UsesTruth, BoundaryModel):
 class TrueCompletion(UsesTruth, Completer):
     """The true voxels of what a mask shows. A mask that shows no true object keeps its visible surface.
 
-    Parameters
-    ----------
-    objects : ObjectRule
-        Which pixels can belong to an object; true voxels are assigned to these pixels.
+    `objects` says which pixels can belong to an object; true voxels are assigned to these pixels.
     """
 
     objects: ObjectRule = ObjectRule()  # noqa: RUF009 (frozen)

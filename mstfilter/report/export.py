@@ -45,19 +45,10 @@ _TAUBIN_ITERATIONS = 10
 
 
 def voxel_faces(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Triangles of the faces between the voxels of a mask and all other voxels.
+    """Triangles of the faces between the voxels of a mask (X, Y, Z) bool, not empty, and all other voxels.
 
-    Parameters
-    ----------
-    mask : (X, Y, Z) bool
-        Not empty.
-
-    Returns
-    -------
-    vertices : (v, 3) int
-        Corners in voxels from the lower corner of the grid.
-    triangles : (f, 3) int
-        Counter-clockwise seen from outside.
+    Returns corners (v, 3) int in voxels from the lower corner of the grid, and triangles (f, 3) int,
+    counter-clockwise seen from outside.
     """
     padded = np.pad(mask, 1)
     quads = []
@@ -80,8 +71,6 @@ def hypothesis_mesh(
 
     Parameters
     ----------
-    hypothesis : Hypothesis
-        Its objects.
     colours : mapping, optional
         ``{label: (r, g, b)}``. Default: the palette in order of labels.
     style : {"blocky", "smooth"}
@@ -148,28 +137,10 @@ def export_mesh(
 def export_run(
     run: RunFolder | str | Path, out: str | Path, mesh_format: str = "ply", mesh_style: str = "blocky"
 ) -> list[Path]:
-    """Write meshes and label images of all hypotheses of all pauses, and a table of all objects.
+    """Write meshes and label images of all hypotheses of all pauses, and a table of all objects, as laid out above.
 
-    Parameters
-    ----------
-    run : RunFolder or path
-        The run.
-    out : path
-        The folder; see the layout above.
-    mesh_format : {"ply", "obj", "glb"}
-        Format of the meshes.
-    mesh_style : {"blocky", "smooth"}
-        See `hypothesis_mesh`.
-
-    Returns
-    -------
-    list of Path
-        The files that were written.
-
-    Raises
-    ------
-    InputError
-        If an option is unknown, the folder cannot be written, or open3d cannot be imported.
+    Returns the files. Raises InputError if an option is unknown, the folder cannot be written, or open3d cannot be
+    imported. `mesh_format` is "ply", "obj" or "glb"; `mesh_style` as for `hypothesis_mesh`.
     """
     for option, value, known in (("format", mesh_format, MESH_FORMATS), ("style", mesh_style, MESH_STYLES)):
         if value not in known:

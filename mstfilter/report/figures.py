@@ -140,14 +140,8 @@ def quality_figure(
 ) -> str:
     """Quality of every hypothesis (points, area by weight), their weighted mean (line) and baselines (dashed).
 
-    Parameters
-    ----------
-    times : sequence of int
-        Pauses with ground truth.
-    qualities, weights : sequence of sequences
-        One value per hypothesis, for each of these pauses.
-    baselines : mapping
-        Name -> one value per pause.
+    `times` are the pauses with ground truth. `qualities` and `weights` have one value per hypothesis for each of
+    them, `baselines` one value per pause for each name.
     """
     with _style("quality"):
         figure, (axes,) = _new_figure(6.6, 3.3)
@@ -173,12 +167,7 @@ def health_figure(
 ) -> str:
     """Effective sample size before resampling, and how many previous particles have descendants.
 
-    Parameters
-    ----------
-    times : sequence of int
-        Pauses.
-    ess, ancestors : sequence of (value, most) or None
-        Drawn as a share of the most possible value; None for no bar.
+    `ess` and `ancestors` have (value, most possible value) for each pause, drawn as a share; None for no bar.
     """
     with _style("health"):
         figure, axes = _new_figure(6.6, 2.3, 2)
@@ -207,14 +196,9 @@ def genealogy_figure(
 ) -> str:
     """Genealogy of the particles: those of a pause in a column, disc area by weight.
 
-    Parameters
-    ----------
-    weights : sequence of sequences
-        For each pause, one value per particle.
-    previous, proposed : sequence of sequences or None
-        For each pause, the previous particle and the proposed sample of each particle; -1 for none.
-
-    The lineage of the heaviest particle of the last pause is drawn in colour.
+    For each pause, `weights` has one value per particle, `previous` and `proposed` the previous particle and the
+    proposed sample of each particle; -1 for none. The lineage of the heaviest particle of the last pause is drawn in
+    colour.
     """
     n = max(len(w) for w in weights)
     named = n <= _MOST_NAMED
@@ -298,15 +282,10 @@ def figure_groups(arms: Sequence[str], reference: str) -> list[list[str]]:
 def time_figure(values: Mapping[str, Mapping[str, Mapping[int, Sequence[float]]]], arms: Sequence[str]) -> str:
     """Quality of all hypotheses over time, one panel per family.
 
-    Parameters
-    ----------
-    values : mapping
-        Family -> arm -> pause -> quality of every hypothesis of every scene and seed.
-    arms : sequence of str
-        In the order of their boxes; see `figure_groups` for many arms.
-
-    Arms without values are left out. Boxes contain the middle half of the hypotheses, the bar is their median,
-    whiskers reach the 5th and 95th percentile; points are hypotheses, lines join the means.
+    `values` is family -> arm -> pause -> quality of every hypothesis of every scene and seed. `arms` gives the order
+    of the boxes (see `figure_groups` for many arms); arms without values are left out. Boxes contain the middle half
+    of the hypotheses, the bar is their median, whiskers reach the 5th and 95th percentile; points are hypotheses,
+    lines join the means.
     """
     values = {family: {a: v for a, v in of_arms.items() if a in arms} for family, of_arms in values.items()}
     colours, n = _arm_colours(arms), len(values)

@@ -38,14 +38,9 @@ _MOST_CARDS = 12
 
 @dataclass(frozen=True)
 class Identities:
-    """Identity of every object of every hypothesis.
+    """Identity of every object of every hypothesis."""
 
-    Parameters
-    ----------
-    table : mapping
-        ``(pause, hypothesis) -> {label: identity}``; hypothesis -1 is the ground truth.
-    """
-
+    #: ``(pause, hypothesis) -> {label: identity}``; hypothesis -1 is the ground truth.
     table: Mapping[tuple[int, int], Mapping[int, int]] = field(default_factory=dict)
 
     def of(self, t: int, k: int) -> Mapping[int, int]:

@@ -86,23 +86,8 @@ def overlay_layer(
 ) -> np.ndarray:
     """The overlay of a label image without the image below: translucent fill, opaque contours.
 
-    Parameters
-    ----------
-    labels : (H, W) integer
-        0 is transparent.
-    colours : mapping
-        ``{label: (r, g, b)}``.
-    scale : int
-        Pixels of the result per pixel of the label image and axis.
-    fill : float
-        Opacity inside.
-    line : int
-        Width of the contour in pixels of the result.
-
-    Returns
-    -------
-    (scale H, scale W, 4) uint8
-        RGBA, not premultiplied.
+    `fill` is the opacity inside, `line` the width of the contour in pixels of the result: (scale H, scale W, 4)
+    uint8, RGBA, not premultiplied. Label 0 is transparent.
     """
     from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
@@ -164,14 +149,8 @@ def viewpoint(
 ) -> Camera:
     """A camera that looks down obliquely at the occupied voxels of all volumes and shows all of them.
 
-    Parameters
-    ----------
-    volumes : iterable of Hypothesis or (labels, grid)
-        If no voxel is occupied, the view shows the middle of the workspace.
-    camera : Camera, optional
-        The real camera. The view is from its side, turned by 35 degrees.
-    width, height : int
-        Size of the picture in pixels.
+    A volume is a hypothesis or (labels, grid). If no voxel is occupied, the view shows the middle of the workspace.
+    The view is from the side of `camera`, if given, turned by 35 degrees.
     """
     points, grid = _occupied_points(volumes)
     if len(points) == 0:
@@ -200,19 +179,7 @@ def viewpoint(
 
 
 def voxel_picture(labels: np.ndarray, grid: VoxelGrid, view: Camera, colours: Mapping[int, Colour]) -> np.ndarray:
-    """Render voxels on the table plane as RGBA (view.height, view.width, 4) uint8.
-
-    Parameters
-    ----------
-    labels : (X, Y, Z) integer
-        0 is free.
-    grid : VoxelGrid
-        Of the labels.
-    view : Camera
-        See `viewpoint`.
-    colours : mapping
-        ``{label: (r, g, b)}``.
-    """
+    """Render voxels on the table plane as RGBA (view.height, view.width, 4) uint8; `view` as from `viewpoint`."""
     camera = view.scaled(_RAYS)
     seen = render(labels, grid, camera)
     hit = seen.labels > 0

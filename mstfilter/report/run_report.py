@@ -52,32 +52,16 @@ _BASELINES = {"one blob": one_blob, "connected components": connected_components
 
 @dataclass(frozen=True)
 class PauseNumbers:
-    """Numbers of one pause.
+    """Numbers of one pause."""
 
-    Parameters
-    ----------
-    info, seconds : mapping
-        Contents of info.json and seconds.json.
-    objects : sequence of int
-        Number of objects of each hypothesis.
-    n_distinct : int
-        Number of distinct hypotheses.
-    baselines : mapping or None
-        Weighted mean quality of trivial baselines; None without ground truth.
-    true_objects : int or None
-        Number of objects in the ground truth.
-    time, clip_seconds : float
-        Time of the pause in the recording, and time since the last pause; None for the first pause.
-    """
-
-    info: Mapping[str, Any]
-    seconds: Mapping[str, float]
-    objects: Sequence[int]
-    n_distinct: int
-    baselines: Mapping[str, float] | None
-    true_objects: int | None
-    time: float
-    clip_seconds: float | None
+    info: Mapping[str, Any]  #: contents of info.json
+    seconds: Mapping[str, float]  #: contents of seconds.json
+    objects: Sequence[int]  #: number of objects of each hypothesis
+    n_distinct: int  #: number of distinct hypotheses
+    baselines: Mapping[str, float] | None  #: weighted mean quality of trivial baselines; None without ground truth
+    true_objects: int | None  #: number of objects in the ground truth
+    time: float  #: time of the pause in the recording
+    clip_seconds: float | None  #: time since the last pause; None for the first pause
 
     @property
     def weights(self) -> list[float]:
@@ -256,24 +240,9 @@ def read_numbers(run: RunFolder) -> RunNumbers:
 
 
 def write_report(run: RunFolder | str | Path, out: str | Path | None = None) -> Path:
-    """Write the report of a run.
+    """Write the report of a run, finished or not, as HTML. Default: ``report.html`` in the run folder.
 
-    Parameters
-    ----------
-    run : RunFolder or path
-        The run, finished or not.
-    out : path, optional
-        The HTML file. Default: ``report.html`` in the run folder.
-
-    Returns
-    -------
-    Path
-        The file.
-
-    Raises
-    ------
-    InputError
-        If the folder is no run folder, or the file cannot be written.
+    Returns the file. Raises InputError if the folder is no run folder, or the file cannot be written.
     """
     run = RunFolder.open(run.path if isinstance(run, RunFolder) else run)
     numbers = read_numbers(run)

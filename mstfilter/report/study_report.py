@@ -43,19 +43,9 @@ _FIGURES = (
 
 
 def write_study_report(study: StudyFolder | str | Path, out: str | Path | None = None) -> Path:
-    """Write the report of a study folder.
+    """Write the report of a study folder, finished or not, as HTML. Default: ``report.html`` in the study folder.
 
-    Parameters
-    ----------
-    study : StudyFolder or path
-        Finished or not.
-    out : path, optional
-        The HTML file. Default: ``report.html`` in the study folder.
-
-    Raises
-    ------
-    InputError
-        If the folder is no study folder, or the file cannot be written.
+    Returns the file. Raises InputError if the folder is no study folder, or the file cannot be written.
     """
     study = StudyFolder.open(study.path if isinstance(study, StudyFolder) else study)
     path = study.path / "report.html" if out is None else Path(out)

@@ -35,15 +35,8 @@ _Value = TypeVar("_Value")
 class Cache:
     """Values in memory, found by name and key; safe to use from several threads.
 
-    Parameters
-    ----------
-    limit_bytes : int
-        Largest total size. Beyond it, the least recently used values are dropped.
-
-    Attributes
-    ----------
-    hits : Counter
-        How often values of each name were found, in memory or on disk.
+    Beyond `limit_bytes` in total, the least recently used values are dropped. The counter `hits` has for each name
+    how often values were found, in memory or on disk.
     """
 
     def __init__(self, limit_bytes: int = 768 * 2**20) -> None:
@@ -108,16 +101,9 @@ class Cache:
 
     @contextlib.contextmanager
     def on_disk(self, folder: str | Path, limit_bytes: int, version: str) -> Iterator[DiskCache]:
-        """Also store values with `stored_as` in a folder that several processes share.
+        """Also store values with `stored_as` in a folder that several processes share (see `DiskCache`).
 
-        Parameters
-        ----------
-        folder : path
-            See `DiskCache`.
-        limit_bytes : int
-            Largest size of the folder.
-        version : str
-            Version of the code that computes the values. Values of other versions are not found.
+        `limit_bytes` is the largest size of the folder. Values of another `version` of the code are not found.
         """
         from mstfilter.scene.disk_cache import DiskCache
 

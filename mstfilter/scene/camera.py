@@ -128,12 +128,7 @@ class Camera:
         return directions * depth[..., None].astype(np.float64) + matrix[:3, 3]
 
     def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Project world points into the image.
-
-        Parameters
-        ----------
-        points : (..., 3) array
-            World points in metres.
+        """Project world points (..., 3) in metres into the image.
 
         Returns
         -------

@@ -43,19 +43,10 @@ class _BytesDisk(diskcache.Disk):
 
 
 class DiskCache:
-    """Values in a folder.
+    """Values in a folder, which is made if it does not exist. `version` is part of the key of every entry.
 
     Several processes may use the folder at the same time. An entry that cannot be read counts as missing. If the
     folder cannot be written or the disk is full, nothing is stored and no error is raised.
-
-    Parameters
-    ----------
-    folder : path
-        Made if it does not exist.
-    limit_bytes : int
-        Largest total size of the entries.
-    version : str
-        Version of the code that computes the values; part of the key of every entry.
     """
 
     def __init__(self, folder: str | Path, limit_bytes: int, version: str) -> None:

@@ -31,21 +31,13 @@ from mstfilter.scene.voxels import VoxelGrid
 
 @dataclass(frozen=True, eq=False)
 class FrameGeometry:
-    """Voxel centres of a grid in the image of a frame.
+    """Voxel centres of a grid in the image of a frame."""
 
-    Parameters
-    ----------
-    pixel : (X, Y, Z) int32
-        Flat index of the pixel that contains the centre; -1 outside the image or behind the camera.
-    z : (X, Y, Z) float32
-        z-depth of the centre in metres.
-    signed : (X, Y, Z) float32
-        `z` minus the measured depth of the pixel: negative in front of the surface, positive behind; NaN if it is
-        unknown (outside the image, no reading, robot).
-    """
-
+    #: (X, Y, Z) int32: flat index of the pixel of the centre; -1 outside the image or behind the camera.
     pixel: np.ndarray
-    z: np.ndarray
+    z: np.ndarray  #: (X, Y, Z) float32, z-depth of the centre in metres
+    #: (X, Y, Z) float32, `z` minus the measured depth of the pixel: negative in front of the surface, positive
+    #: behind; NaN if it is unknown (outside the image, no reading, robot).
     signed: np.ndarray
 
     def known_free(self, margin: float | np.ndarray) -> np.ndarray:
@@ -92,21 +84,14 @@ _FOCAL = 525.0  # focal length of a Kinect v1 in pixels; sets the unit of dispar
 
 @dataclass(frozen=True, eq=False)
 class SupportPlane:
-    """The plane on which the objects stand.
+    """The plane on which the objects stand."""
 
-    Parameters
-    ----------
-    T_world_camera : RigidTransform
-        Camera pose in the world of the plane: z is the normal of the plane, which is at z = 0; the origin is at the
-        median of its pixels, y points away from the camera.
-    on_or_behind : (H, W) bool
-        Readings on the plane or behind it.
-    residual : (H, W) float32
-        Measured minus plane disparity, in 1/8 pixels; positive is in front of the plane (above it), NaN is unknown.
-    """
-
+    #: Camera pose in the world of the plane: z is the normal of the plane, which is at z = 0; the origin is at the
+    #: median of its pixels, y points away from the camera.
     T_world_camera: RigidTransform
-    on_or_behind: np.ndarray
+    on_or_behind: np.ndarray  #: (H, W) bool readings on the plane or behind it
+    #: (H, W) float32, measured minus plane disparity, in 1/8 pixels; positive is in front of the plane (above it),
+    #: NaN is unknown.
     residual: np.ndarray
 
 
@@ -218,14 +203,9 @@ _MIN_HEIGHT = 0.01  # metres above the table beyond which a reading may show an 
 
 
 def workspace(frame: Frame) -> VoxelGrid:
-    """A grid of 1 x 1 x 0.5 m in voxels of 1 cm around the objects on the table.
+    """A grid of 1 x 1 x 0.5 m in voxels of 1 cm around the objects on the table, which is at z = 0.
 
     The grid is centred on the readings more than 1 cm above the table, or on the table if there are fewer than 200.
-
-    Parameters
-    ----------
-    frame : Frame
-        With a pose whose world has the table at z = 0.
     """
     voxel_size, shape = 0.01, (100, 100, 50)
     points = frame.points[frame.valid]
@@ -248,16 +228,8 @@ def warn_if_workspace_is_empty(frames: Iterable[Frame], grid: VoxelGrid, where: 
     """Warn if no frame has readings inside the grid and above the table.
 
     Objects are searched inside the voxel grid only. A grid in other units, at another place, or below a pose that is
-    upside down gives hypotheses without objects and no error.
-
-    Parameters
-    ----------
-    frames : iterable of Frame
-        With poses, at the pauses; read until one has such readings.
-    grid : VoxelGrid
-        Workspace.
-    where : str
-        Name of the recording, for the message.
+    upside down gives hypotheses without objects and no error. The frames are those at the pauses; they are read until
+    one has such readings. `where` names the recording in the message.
     """
     spans = []
     for frame in frames:

@@ -30,15 +30,7 @@ from mstfilter.scene.voxels import VoxelGrid, as_labels
 
 
 class LazyFrames(Sequence[Frame]):
-    """Frames that are read when they are used; the last 40 are kept in memory.
-
-    Parameters
-    ----------
-    read : callable
-        Frame of an index.
-    n : int
-        Number of frames.
-    """
+    """Frames ``read(index)``, read when they are used; the last 40 are kept in memory."""
 
     def __init__(self, read: Callable[[int], Frame], n: int) -> None:
         self._read = lru_cache(maxsize=40)(read)

@@ -147,18 +147,10 @@ def occupied_box(mask: np.ndarray) -> tuple[slice, ...] | None:
 
 @dataclass(frozen=True, eq=False)
 class Crop:
-    """Occupied voxels of one object inside a small box of the grid.
+    """Occupied voxels of one object inside a small box of the grid."""
 
-    Parameters
-    ----------
-    occupied : (a, b, c) bool
-        The box.
-    offset : (3,) int
-        Index of its first voxel in the grid.
-    """
-
-    occupied: np.ndarray
-    offset: np.ndarray
+    occupied: np.ndarray  #: (a, b, c) bool the box
+    offset: np.ndarray  #: (3,) int index of its first voxel in the grid
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "occupied", frozen(np.asarray(self.occupied, dtype=bool)))
@@ -181,33 +173,18 @@ class Crop:
 
 @dataclass(frozen=True, eq=False)
 class ObjectRecord:
-    """What a hypothesis stores about an object.
+    """What a hypothesis stores about an object."""
 
-    Parameters
-    ----------
-    label : int
-        Its value in the voxel grid, 1 .. 65535.
-    id : int
-        Identity of the object over time, within one lineage of hypotheses.
-    birth : int
-        Index of the pause at which it was first proposed.
-    source : Crop, optional
-        Occupancy of the object after its last change other than a rigid motion. None: its current voxels.
-    motion : RigidTransform
-        Rigid motion in world metres since `source`; the identity if `source` is None.
-    completion_key : str, optional
-        Key of the segment that it was completed from.
-    apart : frozenset of int
-        Ids of objects of the same hypothesis that were observed to move apart from it, so that they are not the same
-        object.
-    """
-
-    label: int
-    id: int
-    birth: int = 0
+    label: int  #: its value in the voxel grid, 1 .. 65535
+    id: int  #: identity of the object over time, within one lineage of hypotheses
+    birth: int = 0  #: index of the pause at which it was first proposed
+    #: Occupancy of the object after its last change other than a rigid motion. None: its current voxels.
     source: Crop | None = None
+    #: Rigid motion in world metres since `source`; the identity if `source` is None.
     motion: RigidTransform = field(default_factory=lambda: _NO_MOTION)
-    completion_key: str | None = None
+    completion_key: str | None = None  #: key of the segment that it was completed from
+    #: frozenset of int ids of objects of the same hypothesis that were observed to move apart from it, so that
+    #: they are not the same object.
     apart: frozenset[int] = frozenset()
 
     @classmethod

@@ -146,18 +146,9 @@ def check_target_law(sigma2: float, temperature: float) -> None:
 
 
 def optimal_cut(tree: Tree, w: np.ndarray) -> np.ndarray:
-    """The cut of largest value, by one pass up the tree. If parent and children tie, the parent is kept.
+    """Ascending nodes (n,) of the cut of largest value, for node values `w` (N,), by one pass up the tree.
 
-    Parameters
-    ----------
-    tree : Tree
-    w : (N,) array
-        Node values.
-
-    Returns
-    -------
-    (n,) int array
-        Ascending nodes of the cut.
+    If parent and children tie, the parent is kept.
     """
     best = check_values(tree, w).tolist()
     keep = [True] * tree.n_nodes

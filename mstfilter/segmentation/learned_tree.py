@@ -31,15 +31,7 @@ _ROOT_ODDS = 30.0  # the root joins the table and regions that never touched
 
 
 class Agglomeration:
-    """Best-first merging of regions.
-
-    Parameters
-    ----------
-    regions : Regions
-        Region 0, the table, is never merged.
-    log_odds : callable
-        Log odds that pairs belong to different objects.
-    """
+    """Best-first merging of regions by the log odds that they are different objects; region 0, the table, stays."""
 
     def __init__(self, regions: Regions, log_odds: PairLogOdds) -> None:
         n = len(regions.sums)
@@ -100,14 +92,9 @@ class Agglomeration:
 
 @dataclass(frozen=True)
 class LearnedTree(TreeBuilder):
-    """Best-first merging of watershed regions by learned log odds.
+    """Best-first merging of watershed regions, the leaves of the tree of `leaves`, by learned log odds.
 
     The table is one leaf. Only the root merges it with other regions.
-
-    Parameters
-    ----------
-    leaves : TreeBuilder
-        The leaves of its tree are the initial regions.
     """
 
     leaves: TreeBuilder = field(default_factory=UcmTree)
@@ -134,14 +121,8 @@ class LearnedTree(TreeBuilder):
 def tree_of_merges(image: np.ndarray, n_regions: int, merges: list[tuple[int, int, float]]) -> Tree:
     """The tree of a list of merges. Merge k creates node n_regions + k; a root joins the remaining regions.
 
-    Parameters
-    ----------
-    image : (H, W) int
-        Region of every pixel.
-    n_regions : int
-        Number of regions. Region 0 is the table.
-    merges : list of (int, int, float)
-        The two nodes and the log odds of each merge.
+    `image` (H, W) int has the region of every pixel; region 0 is the table. A merge is its two nodes and its log
+    odds.
     """
     if n_regions == 1:
         return Tree(np.zeros(1, np.int64), image, np.zeros(1), np.zeros(1))

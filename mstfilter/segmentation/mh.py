@@ -212,15 +212,10 @@ class AuthorsMoves(MoveRule):
 
 @dataclass(frozen=True, eq=False)
 class SubtreeRedraw(MoveRule):
-    """Redraw the part of the cut inside a random subtree from a Gibbs law.
+    """Redraw the part of the cut inside a random subtree from the Gibbs law `law`.
 
     The subtree's node is uniform over the inner nodes, for any state; if an ancestor of it is in the cut, the chain
     stays. A choice is (inner node, new nodes).
-
-    Parameters
-    ----------
-    law : Gibbs
-        Law that the new nodes are drawn from.
     """
 
     law: Gibbs

@@ -70,21 +70,12 @@ _SIGN = np.array([1, 1, 1, 1, -1, 1, 1], dtype=np.float64)
 
 @dataclass(frozen=True, eq=False)
 class Regions:
-    """Measured leaves of a tree. All leaves of the table form one region.
+    """Measured leaves of a tree. All leaves of the table form one region."""
 
-    Parameters
-    ----------
-    of_leaf : (n_leaves,) int
-        Region of every leaf; 0 is the table.
-    sums : (R, C) float64
-        Columns `REGION`.
-    borders : list of dict
-        For each region a mapping from neighbour to the row (columns `BORDER`) of the common border, with the region
-        as the first of the two.
-    """
-
-    of_leaf: np.ndarray
-    sums: np.ndarray
+    of_leaf: np.ndarray  #: (n_leaves,) int region of every leaf; 0 is the table
+    sums: np.ndarray  #: (R, C) columns `REGION`
+    #: list of dict: for each region a mapping from neighbour to the row (columns `BORDER`) of the common border,
+    #: with the region as the first of the two.
     borders: list[dict[int, np.ndarray]]
 
 

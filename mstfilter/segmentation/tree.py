@@ -33,24 +33,16 @@ from mstfilter.scene import Frame, content_key, read_only
 
 @dataclass(frozen=True, eq=False)
 class Tree:
-    """A hierarchy of image regions.
+    """A hierarchy of image regions."""
 
-    Parameters
-    ----------
-    parent : (N,) int
-        Parent of every node; the root (last) is its own parent. ``parent[i] > i`` elsewhere.
-    leaves : (H, W) int
-        Leaf of every pixel.
-    start : (N,) float
-        P(boundary) of the merge that creates the node, 0 .. 1. Zero for leaves, non-decreasing towards the root.
-    odds : (N,) float, optional
-        Log odds that the merge that creates the node joins different objects, if the builder estimates them.
-        Zero for leaves; not necessarily monotone.
-    """
-
+    #: (N,) int parent of every node; the root (last) is its own parent. ``parent[i] > i`` elsewhere.
     parent: np.ndarray
-    leaves: np.ndarray
+    leaves: np.ndarray  #: (H, W) int leaf of every pixel
+    #: (N,) P(boundary) of the merge that creates the node, 0 .. 1. Zero for leaves, non-decreasing towards the
+    #: root.
     start: np.ndarray
+    #: (N,) log odds that the merge that creates the node joins different objects, if the builder estimates them.
+    #: Zero for leaves; not necessarily monotone.
     odds: np.ndarray | None = None
 
     def __post_init__(self) -> None:

@@ -52,81 +52,39 @@ _LIMITS: dict[str, tuple[float, float]] = {
 
 @dataclass(frozen=True)
 class SceneFamily:
-    """How scenes are drawn, moved and imaged.
+    """How scenes are drawn, moved and imaged."""
 
-    Parameters
-    ----------
-    name : str
-        Name of the family.
-    n_objects_min, n_objects_max : int
-        Range of the number of objects on the table, twins included; uniform.
-    n_twins : int
-        Objects that repeat the shape and texture of another object and touch it.
-    n_stacked : int
-        Objects that are put on top of another object, if there is room.
-    n_hidden : int
-        Small objects that are put behind a tall one, seen from the camera. If there are any, at most a third of all
-        objects is hidden at the first pause.
-    contact : float
-        Probability that an object without a twin touches another one; otherwise the gap is 1 - 4 cm.
-    shapes : str
-        Families of objects, separated by commas; "all" for every family.
-    catalogue : {"tuning", "reported", "any", "by seed"}
-        Pool of sizes and textures: one of two disjoint pools, or all. "by seed": the tuning pool for seeds below
-        1000, the reported pool from 1000 on.
-    n_actions : int
-        Number of pushes.
-    frames_per_clip : int
-        Frames from one pause to the next, both included.
-    fps : float
-        Frames per second.
-    push_speed : float
-        Speed of the finger, m/s.
-    min_moved : int
-        Objects that an action should move; fewer if no candidate push moves as many.
-    move_threshold : float
-        Displacement from which an object counts as moved, metres.
-    n_candidates : int
-        A push is chosen from at most 4 `n_candidates` simulated ones.
-    arm : bool
-        Whether the finger has a visible arm.
-    width, height : int
-        Size of the images, pixels. The camera is a Kinect's (focal length 525 pixels at 640 x 480), scaled.
-    supersample : bool
-        Smooth the edges of objects with three rays per pixel.
-    camera_distance : float
-        From the camera to the middle of the table, metres.
-    workspace_x, workspace_y, workspace_z : float
-        Edges of the voxel grid, metres; it is centred on the table and stands on it.
-    voxel_size : float
-        Edge of a voxel, metres.
-    """
-
-    name: str = "table"
-    n_objects_min: int = 5
-    n_objects_max: int = 6
-    n_twins: int = 1
-    n_stacked: int = 0
+    name: str = "table"  #: name of the family
+    n_objects_min: int = 5  #: range of the number of objects on the table, twins included; uniform
+    n_objects_max: int = 6  #: see `n_objects_min`
+    n_twins: int = 1  #: objects that repeat the shape and texture of another object and touch it
+    n_stacked: int = 0  #: objects that are put on top of another object, if there is room
+    #: Small objects that are put behind a tall one, seen from the camera. If there are any, at most a third of all
+    #: objects is hidden at the first pause.
     n_hidden: int = 0
+    #: Probability that an object without a twin touches another one; otherwise the gap is 1 - 4 cm.
     contact: float = 0.6
-    shapes: str = "all"
+    shapes: str = "all"  #: families of objects, separated by commas; "all" for every family
+    #: {"tuning", "reported", "any", "by seed"}: pool of sizes and textures: one of two disjoint pools, or all. "by
+    #: seed": the tuning pool for seeds below 1000, the reported pool from 1000 on.
     catalogue: str = "any"
-    n_actions: int = 3
-    frames_per_clip: int = 15
-    fps: float = 5.0
-    push_speed: float = 0.10
-    min_moved: int = 2
-    move_threshold: float = 0.02
-    n_candidates: int = 24
-    arm: bool = True
+    n_actions: int = 3  #: number of pushes
+    frames_per_clip: int = 15  #: frames from one pause to the next, both included
+    fps: float = 5.0  #: frames per second
+    push_speed: float = 0.10  #: speed of the finger, m/s
+    min_moved: int = 2  #: objects that an action should move; fewer if no candidate push moves as many
+    move_threshold: float = 0.02  #: displacement from which an object counts as moved, metres
+    n_candidates: int = 24  #: a push is chosen from at most 4 `n_candidates` simulated ones
+    arm: bool = True  #: whether the finger has a visible arm
+    #: Size of the images, pixels. The camera is a Kinect's (focal length 525 pixels at 640 x 480), scaled.
     width: int = 640
     height: int = 480
-    supersample: bool = True
-    camera_distance: float = 0.8
-    workspace_x: float = 1.0
+    supersample: bool = True  #: smooth the edges of objects with three rays per pixel
+    camera_distance: float = 0.8  #: from the camera to the middle of the table, metres
+    workspace_x: float = 1.0  #: edges of the voxel grid, metres, which is centred on the table and stands on it
     workspace_y: float = 1.0
     workspace_z: float = 0.5
-    voxel_size: float = 0.01
+    voxel_size: float = 0.01  #: edge of a voxel, metres
 
     def __post_init__(self) -> None:
         limits = dict(_LIMITS)

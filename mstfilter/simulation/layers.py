@@ -32,15 +32,8 @@ class Stage:
     """The poses that are rendered: those of the physics without tremor.
 
     Soft contacts make bodies at rest move by micrometres between frames. A rendered pose is kept until a point of
-    the body is farther than a tolerance from it. Images, poses and volumes all use the rendered poses, so they agree
-    exactly, and a body that has not moved need not be rendered again.
-
-    Parameters
-    ----------
-    world : PhysicsWorld
-        Not changed.
-    tolerance : float
-        Greatest distance in metres between the rendered and the physical body.
+    the body is farther than `tolerance` metres from it. Images, poses and volumes all use the rendered poses, so they
+    agree exactly, and a body that has not moved need not be rendered again. The world is not changed.
     """
 
     def __init__(self, world: PhysicsWorld, tolerance: float) -> None:
@@ -186,15 +179,10 @@ class PixelRays:
         self._cosine = np.empty((len(self._lights), n), np.float32)
 
     def update(self, pixels: np.ndarray, moved: np.ndarray, limit: np.ndarray | None = None) -> None:
-        """Bring some pixels up to date and forget all others.
+        """Bring some pixels (m,) up to date and forget all others.
 
-        Parameters
-        ----------
-        pixels : (m,) int
-        moved : (k, 7) metres
-            Capsules of bodies that moved since the last update, at their old and new poses.
-        limit : (n,) metres, optional
-            Hits beyond this depth are ignored.
+        `moved` (k, 7) are capsules of bodies that moved since the last update, at their old and new poses, in metres.
+        Hits beyond the depth `limit` (n,) are ignored.
         """
         other = np.ones(len(self.geom), bool)
         other[pixels] = False

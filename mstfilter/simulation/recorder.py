@@ -74,14 +74,7 @@ def _check_seed(seed: int) -> None:
 
 
 class SimulatedScene:
-    """A world with its textures and sensors, for use step by step; `record_scene` records it.
-
-    Parameters
-    ----------
-    family : SceneFamily
-    seed : int
-        Not negative.
-    """
+    """A world with its textures and sensors, for use step by step; `record_scene` records it."""
 
     def __init__(self, family: SceneFamily, seed: int) -> None:
         _check_seed(seed)
@@ -142,15 +135,7 @@ class SimulatedScene:
 def simulate_recording(
     family: SceneFamily, seed: int, path: str | Path, progress: _Progress | None = None
 ) -> Recording:
-    """Simulate a scene and write its recording; see `record_scene`.
-
-    Parameters
-    ----------
-    family : SceneFamily
-        See `scene_family`.
-    seed : int
-        Determines everything else. Not negative.
-    """
+    """Simulate a scene, which family and seed determine, and write its recording; see `record_scene`."""
     return record_scene(SimulatedScene(family, seed), path, progress)
 
 
@@ -247,8 +232,6 @@ def cached_recording(family: str | SceneFamily, seed: int, folder: Path | None =
     ----------
     family : str or SceneFamily
         The name of a family, or a family.
-    seed : int
-        Not negative.
     folder : Path, optional
         Where recordings are kept. Default: `recordings` in `cache_folder()`.
     **overrides

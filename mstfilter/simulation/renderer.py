@@ -39,20 +39,8 @@ def visible_texel(camera: Camera) -> float:
 class Renderer:
     """Renders the current state of a world.
 
-    Parameters
-    ----------
-    world : PhysicsWorld
-        Read by each call of `render`.
-    skins : sequence of Skin
-        One per object.
-    room : Room
-        Surroundings and light.
-    camera : Camera
-        With a pose.
-    supersample : bool
-        Whether pixels on edges get further rays.
-    tolerance : float
-        Metres by which the rendered poses may differ from the physics; see `Stage`.
+    There is one skin for each object. `supersample` gives pixels on edges further rays. The rendered poses may differ
+    from the physics by `tolerance` metres; see `Stage`.
     """
 
     def __init__(

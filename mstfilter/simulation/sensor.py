@@ -70,13 +70,8 @@ class DepthSensor:
     def read(self, rng: np.random.Generator, depth: np.ndarray, slant: np.ndarray) -> np.ndarray:
         """Depth image (H, W) float32 in metres, NaN for no reading.
 
-        Parameters
-        ----------
-        rng : numpy.random.Generator
-        depth : (H, W) metres
-            True z-depth, NaN for no surface.
-        slant : (H, W)
-            Cosine of the angle of incidence.
+        `depth` (H, W) is the true z-depth in metres, NaN for no surface; `slant` (H, W) the cosine of the angle of
+        incidence.
         """
         h, w = depth.shape
         edge = _depth_edges(depth)

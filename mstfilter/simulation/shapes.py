@@ -57,14 +57,9 @@ class Pool:
 
     Scenes for tuning and scenes for reporting use disjoint pools. Both pools cover the same range in alternate bands,
     so neither is harder than the other.
-
-    Parameters
-    ----------
-    half : {0, 1, None}
-        Which of the two disjoint pools; None for all sizes, hues and names.
     """
 
-    half: int | None = None
+    half: int | None = None  #: {0, 1, None}: which of the two disjoint pools; None for all sizes, hues and names
 
     def factor(self, rng: np.random.Generator) -> float:
         """Factor that scales a measure, 0.9 .. 1.1."""
@@ -98,36 +93,19 @@ ANY, TUNING, REPORTED = Pool(), Pool(0), Pool(1)
 
 @dataclass(frozen=True, eq=False)
 class Shape:
-    """A rigid object.
+    """A rigid object."""
 
-    Parameters
-    ----------
-    family : str
-        One of SHAPE_FAMILIES.
-    name : str
-        Member of the family.
-    pieces : sequence of Piece
-        Convex; their union is the object. They are moved so that its bounding box is centred on the origin.
-    mass : float
-        Kilograms.
-    print_as : {"box", "lathe"}
-        Layout of the texture: six faces, or side, top, bottom and inside of a turned solid.
-    rests : tuple of (axis, weight)
-        Body axes that can point up at rest, with relative frequencies.
-    finish : tuple of str
-        Styles of texture that suit the object.
-    rolling : float
-        Rolling friction, metres.
-    """
-
-    family: str
-    name: str
+    family: str  #: one of SHAPE_FAMILIES
+    name: str  #: member of the family
+    #: Convex; their union is the object. They are moved so that its bounding box is centred on the origin.
     pieces: Sequence[Piece]
-    mass: float
+    mass: float  #: kilograms
+    #: {"box", "lathe"}: layout of the texture: six faces, or side, top, bottom and inside of a turned solid.
     print_as: str
+    #: tuple of (axis, weight) body axes that can point up at rest, with relative frequencies.
     rests: tuple[tuple[int, float], ...]
-    finish: tuple[str, ...]
-    rolling: float = 0.0005
+    finish: tuple[str, ...]  #: styles of texture that suit the object
+    rolling: float = 0.0005  #: rolling friction, metres
 
     half: np.ndarray = field(init=False)
     """Half edges (3,) of the bounding box, metres."""
@@ -164,18 +142,8 @@ class Shape:
 def label_voxels(shapes: Sequence[Shape], poses: np.ndarray, grid: VoxelGrid) -> np.ndarray:
     """Labels (X, Y, Z) uint16: k + 1 if the centre of the voxel lies in shape k, 0 if it lies in none.
 
-    Parameters
-    ----------
-    shapes : sequence of Shape
-        The objects.
-    poses : (n, 4, 4)
-        T_world_object of each.
-    grid : VoxelGrid
-        The workspace.
-
-    Notes
-    -----
-    Objects at rest overlap by less than a millimetre; a centre that lies in two objects belongs to the first.
+    `poses` (n, 4, 4) are T_world_object. Objects at rest overlap by less than a millimetre; a centre that lies in two
+    objects belongs to the first.
     """
     labels = np.zeros(grid.shape, np.uint16)
     for k, (shape, pose) in enumerate(zip(shapes, poses, strict=True)):
@@ -328,21 +296,7 @@ SHAPE_FAMILIES: tuple[str, ...] = tuple(_MAKERS)
 
 
 def draw_shape(rng: np.random.Generator, family: str, pool: Pool = ANY) -> Shape:
-    """Draw a member of a family and its measures.
-
-    Parameters
-    ----------
-    rng : numpy.random.Generator
-    family : str
-        One of SHAPE_FAMILIES.
-    pool : Pool
-        Each measure is scaled by a factor drawn from it.
-
-    Raises
-    ------
-    InputError
-        If the family is unknown.
-    """
+    """Draw a member of one of `SHAPE_FAMILIES`; each measure is scaled by a factor drawn from the pool."""
     if family not in _MAKERS:
         raise InputError(f"unknown family of shapes {family!r}", f"known: {', '.join(SHAPE_FAMILIES)}")
     return _MAKERS[family](rng, lambda: pool.factor(rng))

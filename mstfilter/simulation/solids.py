@@ -32,31 +32,16 @@ _ANGLE_SLACK = 1e-4  # of the angles in `may_meet`, for single precision
 
 @dataclass(frozen=True, eq=False)
 class Piece:
-    """A convex solid in the frame of its body.
+    """A convex solid in the frame of its body."""
 
-    Parameters
-    ----------
-    kind : {"box", "cylinder", "ellipsoid", "capsule", "hull"}
-        Type of solid.
-    size : tuple of float
-        Metres, in MuJoCo's convention: half edges; radius and half height; half axes; radius and half length of the
-        axis. Empty for a hull.
-    centre : (3,) metres
-        Origin of the piece's frame in the body.
-    rotation : (3, 3)
-        Columns are the axes of the piece's frame in the body. Only capsules are turned.
-    vertices : (n, 3) metres, optional
-        Of a hull, in the piece's frame.
-    plain : bool
-        Whether the piece has one colour (a handle) instead of the body's texture.
-    """
-
-    kind: str
+    kind: str  #: {"box", "cylinder", "ellipsoid", "capsule", "hull"}: type of solid
+    #: Metres, in MuJoCo's convention: half edges; radius and half height; half axes; radius and half length of the
+    #: axis. Empty for a hull.
     size: tuple[float, ...]
-    centre: np.ndarray
-    rotation: np.ndarray
-    vertices: np.ndarray | None = None
-    plain: bool = False
+    centre: np.ndarray  #: (3,) metres: origin of the piece's frame in the body
+    rotation: np.ndarray  #: (3, 3) columns are the axes of the piece's frame in the body. Only capsules are turned
+    vertices: np.ndarray | None = None  #: (n, 3) metres: of a hull, in the piece's frame
+    plain: bool = False  #: whether the piece has one colour (a handle) instead of the body's texture
 
     @cached_property
     def _hull(self) -> Any:
@@ -162,14 +147,9 @@ def frustum(lower: tuple[float, float], upper: tuple[float, float], sides: int =
 
 
 def ring(profile: list[tuple[float, float, float]], sides: int = 20) -> list[Piece]:
-    """The wall of a turned solid as convex wedges.
+    """The wall of a turned solid as convex wedges, `sides` in each layer.
 
-    Parameters
-    ----------
-    profile : list of (inner radius, outer radius, z)
-        From bottom to top; neighbouring entries bound one layer.
-    sides : int
-        Wedges in each layer.
+    The profile has (inner radius, outer radius, z) from bottom to top; neighbouring entries bound one layer.
     """
     circle = _circle(sides)
     wedges = []
@@ -181,19 +161,11 @@ def ring(profile: list[tuple[float, float, float]], sides: int = 20) -> list[Pie
 
 
 def may_meet(capsules: np.ndarray, point: np.ndarray, rays: np.ndarray) -> np.ndarray:
-    """Whether rays from a point may meet one of some capsules: (n,) bool.
+    """Whether rays (n, 3) of any length from a point may meet one of some capsules: (n,) bool.
 
-    Seen from the point, a capsule lies in a cone and, if it is long, between two planes through the point. The test
-    is conservative: a ray that fails it does not meet the capsule.
-
-    Parameters
-    ----------
-    capsules : (k, 7) metres
-        Both ends of the axis and the radius; equal ends for a ball.
-    point : (3,) metres
-        Origin of the rays.
-    rays : (n, 3)
-        Directions, of any length.
+    Capsules (k, 7) are both ends of the axis and the radius, in metres; equal ends make a ball. Seen from the point,
+    a capsule lies in a cone and, if it is long, between two planes through the point. The test is conservative: a ray
+    that fails it does not meet the capsule.
     """
     a, b, radius = capsules[:, :3] - point, capsules[:, 3:6] - point, capsules[:, 6]
     along = b - a

@@ -71,13 +71,8 @@ def texture_coordinates(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Chart number (n,) of surface points and place (n, 2) in it, 0 .. 1 from its upper left corner.
 
-    Parameters
-    ----------
-    shape : Shape
-    points, normals : (n, 3)
-        In the body's frame, metres; outward unit normals.
-    plain : (n,) bool
-        Points of pieces that have one colour.
+    `points` and outward unit `normals` (n, 3) are in the body's frame, metres; `plain` (n,) bool are points of pieces
+    that have one colour.
     """
     place = np.zeros((len(points), 2), np.float32)
     if shape.print_as == "box":
@@ -152,15 +147,7 @@ def draw_skin(rng: np.random.Generator, shape: Shape, pool: Pool = ANY) -> Skin:
 
 
 class Atlas:
-    """The charts of many skins in one array, at the resolution of a camera.
-
-    Parameters
-    ----------
-    skins : sequence of Skin
-        Charts are numbered in their order.
-    texel : float
-        Size of a texel in metres; charts are averaged down to it.
-    """
+    """The charts of many skins in one array, averaged down to the resolution of a camera: `texel` metres."""
 
     def __init__(self, skins: list[Skin], texel: float) -> None:
         import cv2

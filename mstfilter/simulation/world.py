@@ -121,13 +121,8 @@ def _model_xml(shapes: Sequence[Shape], arm: bool) -> str:
 class PhysicsWorld:
     """Objects on a table, and a finger.
 
-    Parameters
-    ----------
-    shapes : sequence of Shape
-        Object k of the world is shapes[k]; its id in images, voxels and poses is k + 1. Objects start far away:
-        `place` puts one on the table.
-    arm : bool
-        Whether the finger has an arm, which is visible and casts shadows but touches nothing.
+    Object k of the world is shapes[k]; its id in images, voxels and poses is k + 1. Objects start far away: `place`
+    puts one on the table. The arm of the finger is visible and casts shadows but touches nothing.
     """
 
     def __init__(self, shapes: Sequence[Shape], arm: bool = True) -> None:
@@ -264,12 +259,9 @@ class PhysicsWorld:
 
         Returns
         -------
-        geom : (n,) int32
-            First geom that each ray meets, -1 for none.
-        distance : (n,)
-            In units of the length of each direction.
-        normal : (n, 3)
-            Of the surface.
+        geom, distance, normal : (n,) int32, (n,), (n, 3)
+            First geom that each ray meets, -1 for none; distance in units of the length of the direction; surface
+            normal.
         """
         n = len(directions)
         geom, distance = np.full(n, -1, np.int32), np.full(n, -1.0)

@@ -15,9 +15,7 @@
 `resampling`            schemes that need only weights, with equal output weights
 `diverse_resampling`    schemes that keep different particles, with unequal weights
 `transport_resampling`  wrappers of schemes, sorted particles, transport
-`similarity`            similarity and equality of particles, for these schemes
-`triggers`              when to resample, and to how many particles
-`components`            updates by a likelihood or a projection, transitions with several branches
+`components`            updates by a likelihood or a projection, branching, triggers, sizes, equality
 `streams`               random streams named by seed, step, slot and index
 `batching`              many runs of a filter at once
 `checkpoint`            storage of the state of a run in a file

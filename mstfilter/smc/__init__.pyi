@@ -5,10 +5,19 @@ from mstfilter.smc.batching import (
 )
 from mstfilter.smc.checkpoint import ArrayCodec as ArrayCodec, load_state as load_state, save_state as save_state
 from mstfilter.smc.components import (
+    Always as Always,
+    Bins as Bins,
     Branching as Branching,
     CrossVectors as CrossVectors,
+    EssBelow as EssBelow,
+    EveryKth as EveryKth,
+    ExactEquality as ExactEquality,
+    Fixed as Fixed,
+    Kld as Kld,
+    Never as Never,
     ProjectOnto as ProjectOnto,
     Reweight as Reweight,
+    first_seen as first_seen,
 )
 from mstfilter.smc.diagnostics import (
     History as History,
@@ -40,6 +49,7 @@ from mstfilter.smc.diverse_resampling import (
     Chopthin as Chopthin,
     ClusterStratified as ClusterStratified,
     FearnheadClifford as FearnheadClifford,
+    Gaussian as Gaussian,
     GreedyDiverse as GreedyDiverse,
     KDpp as KDpp,
 )
@@ -77,12 +87,14 @@ from mstfilter.smc.interfaces import (
     Component as Component,
     DensityTransition as DensityTransition,
     Distribution as Distribution,
+    Equivalence as Equivalence,
     Info as Info,
     Lookahead as Lookahead,
     Observer as Observer,
     Proposal as Proposal,
     Rejuvenation as Rejuvenation,
     Resampler as Resampler,
+    Similarity as Similarity,
     Size as Size,
     State as State,
     TransformResampler as TransformResampler,
@@ -94,6 +106,7 @@ from mstfilter.smc.interfaces import (
 from mstfilter.smc.population import (
     Candidates as Candidates,
     Population as Population,
+    as_matrix as as_matrix,
     log_mean_exp as log_mean_exp,
     normalise as normalise,
     union as union,
@@ -120,15 +133,6 @@ from mstfilter.smc.resampling import (
     Ssp as Ssp,
     Stratified as Stratified,
     Systematic as Systematic,
-)
-from mstfilter.smc.similarity import (
-    Bins as Bins,
-    Equivalence as Equivalence,
-    ExactEquality as ExactEquality,
-    Gaussian as Gaussian,
-    Similarity as Similarity,
-    as_matrix as as_matrix,
-    first_seen as first_seen,
 )
 from mstfilter.smc.smoothing import (
     Record as Record,
@@ -163,12 +167,4 @@ from mstfilter.smc.transport_resampling import (
     Sorted as Sorted,
     Tempered as Tempered,
     coalesce as coalesce,
-)
-from mstfilter.smc.triggers import (
-    Always as Always,
-    EssBelow as EssBelow,
-    EveryKth as EveryKth,
-    Fixed as Fixed,
-    Kld as Kld,
-    Never as Never,
 )

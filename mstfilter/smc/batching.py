@@ -25,36 +25,24 @@ from typing import Any
 import numpy as np
 
 from mstfilter.errors import InputError, LostRunError
+from mstfilter.smc.components import Always, EssBelow, EveryKth, Never
 from mstfilter.smc.filter import ParticleFilter
 from mstfilter.smc.interfaces import State, WeightResampler
 from mstfilter.smc.population import Population, identity
 from mstfilter.smc.streams import Key, RunGenerators, SlotStreams
-from mstfilter.smc.triggers import Always, EssBelow, EveryKth, Never
 
 
 @dataclass(frozen=True, eq=False)
 class Batch:
-    """The results of R runs of T steps.
+    """The results of R runs of T steps."""
 
-    Parameters
-    ----------
-    log_evidence : (R, T) float64
-        Log evidence after each step; NaN if the filter does not report it, -inf from the step at which a run is lost.
-    ess : (R, T) float64
-        Effective sample size after each update; NaN after a run is lost.
-    resampled : (R, T) bool
-        Whether the step resampled.
-    states : tuple of R State or None
-        The last states; None for a run that is lost.
-    lost : mapping
-        Run -> reason.
-    """
-
+    #: (R, T) log evidence after each step; NaN if the filter does not report it, -inf from the step at which a run
+    #: is lost.
     log_evidence: np.ndarray
-    ess: np.ndarray
-    resampled: np.ndarray
-    states: tuple[State | None, ...]
-    lost: dict[int, str] = field(default_factory=dict)
+    ess: np.ndarray  #: (R, T) effective sample size after each update; NaN after a run is lost
+    resampled: np.ndarray  #: (R, T) bool whether the step resampled
+    states: tuple[State | None, ...]  #: the last states; None for a run that is lost
+    lost: dict[int, str] = field(default_factory=dict)  #: run -> reason
 
     def state(self, run: int) -> State:
         """The last state of a run; InputError if the run is lost."""
@@ -71,18 +59,11 @@ def batch(
 
     Parameters
     ----------
-    filter : ParticleFilter
     observations : iterable
         T observations, the same for all runs; None if missing.
-    seeds : sequence of int
-        One per run.
     paired : bool
         If True, `observations` are R sequences of T observations, one for each seed. Batched components get the
         observations of a step as an array (R, 1, ...).
-
-    Returns
-    -------
-    Batch
     """
     seeds = [int(seed) for seed in seeds]
     ys = [list(y) for y in observations] if paired else [list(observations)]

@@ -50,7 +50,7 @@ def save_state(
     state : State
         After at least one step.
     codec : Codec, optional
-        For particles other than arrays, mappings of arrays and dataclasses of arrays.
+        Default: `ArrayCodec`.
     compress : bool
         Compress the arrays: smaller, but slower.
     **description
@@ -110,18 +110,9 @@ def _below(arrays: dict[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:
 
 
 class Checkpoint:
-    """The file that holds the state of a run, with a description of the filter and a hash of the observations.
+    """The .npz file that holds the state of a run, with a description of the filter and a hash of the observations.
 
-    Parameters
-    ----------
-    path : Path
-        The .npz file.
-    codec : Codec or None
-        For other particles than those of `ArrayCodec`.
-    filter : ParticleFilter
-        Its components, their fields, functions and arrays are compared with those of the stored run.
-    start : State
-        Where the run begins.
+    The components of the filter, their fields, functions and arrays are compared with those of the stored run.
     """
 
     def __init__(self, path: Path, codec: Codec | None, filter: Any, start: State) -> None:
@@ -325,7 +316,6 @@ class ArrayCodec(Codec):
         return {_FORM: _json({**form, "rows": described}), **arrays}
 
     def decode(self, arrays: Mapping[str, np.ndarray]) -> Any:
-        """The particles."""
         form = json.loads(str(arrays[_FORM]))
         if form["kind"] == "array":
             return arrays["x"]

@@ -39,8 +39,7 @@ from mstfilter.smc.batching import batch, batched_slots
 from mstfilter.smc.checkpoint import digest
 from mstfilter.smc.filter import ParticleFilter
 from mstfilter.smc.interfaces import Info, State
-from mstfilter.smc.population import Population, union
-from mstfilter.smc.similarity import as_matrix
+from mstfilter.smc.population import Population, as_matrix, union
 from mstfilter.smc.transport_resampling import ResamplerWrapper
 
 Collector = Callable[[State, Info], Any]
@@ -173,27 +172,14 @@ def selection_distance(state: State, info: Info) -> float:
 
 @dataclass(frozen=True, eq=False)
 class History(Mapping[str, np.ndarray]):
-    """Collected arrays by name.
+    """Collected arrays by name."""
 
-    Parameters
-    ----------
-    values_ : mapping
-        Name -> array whose first axes are `dims`.
-    dims : tuple of str
-        ``("time",)`` for one run, ``("arm", "seed", "time")`` for many.
-    coords : mapping
-        Labels along the axes.
-    state : State or None
-        The last state of a single run.
-    lost : mapping
-        (arm, seed) -> reason, of runs that are lost.
-    """
-
-    values_: Mapping[str, np.ndarray]
-    dims: tuple[str, ...] = ("time",)
+    values_: Mapping[str, np.ndarray]  #: name -> array whose first axes are `dims`
+    dims: tuple[str, ...] = ("time",)  #: ``("time",)`` for one run, ``("arm", "seed", "time")`` for many
+    #: Labels along the axes.
     coords: Mapping[str, Any] = None  # type: ignore[assignment]
-    state: State | None = None
-    lost: Mapping[tuple[str, int], str] = field(default_factory=dict)
+    state: State | None = None  #: the last state of a single run
+    lost: Mapping[tuple[str, int], str] = field(default_factory=dict)  #: (arm, seed) -> reason, of runs that are lost
 
     def __getitem__(self, name: str) -> np.ndarray:
         if name not in self.values_:
@@ -222,14 +208,9 @@ class History(Mapping[str, np.ndarray]):
 
 
 def collect(steps: Iterable[tuple[State, Info]], /, **collectors: Collector) -> History:
-    """Iterate over a run and keep the results of the collectors.
+    """Iterate over a run, ``filter.iterate(observations, seed)``, and keep the results of the collectors.
 
-    Parameters
-    ----------
-    steps : iterable of (State, Info)
-        ``filter.iterate(observations, seed)``.
-    **collectors
-        Name -> function of (state, info); its result has the same shape at every step.
+    Each collector is a function of (state, info), whose result has the same shape at every step.
     """
     rows: dict[str, list[Any]] = {name: [] for name in collectors}
     state, times = None, []
@@ -265,11 +246,7 @@ def run_many(
     Parameters
     ----------
     arms : mapping
-        Name -> filter.
-    observations : iterable
-        The same for all filters.
-    seeds : iterable of int
-        One per run; the same for all filters.
+        Name -> filter. All filters get the same observations and seeds.
     workers : int
         Number of processes. 1 uses the calling process; more are started by joblib's loky, as new interpreters that
         get the filters by cloudpickle.

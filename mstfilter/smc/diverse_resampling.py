@@ -10,7 +10,7 @@ All but `Chopthin` need more candidates than particles to select.
 
 `ClusterStratified` gives every group of similar particles a share of the selection by its weight, at least one
 particle if possible, and selects inside each group. A light group that differs from all others keeps a particle where
-weight- based schemes lose it most of the time. Exact in expectation.
+weight-based schemes lose it most of the time. Exact in expectation.
 
 >>> chosen = ClusterStratified(Gaussian(1.0)).resample(rng, population, 2)
 >>> float(chosen.particles[1]), chosen.weights
@@ -35,15 +35,14 @@ determinantal point process".
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
 from mstfilter.errors import InputError, check_component, check_number
-from mstfilter.smc.interfaces import Resampler, WeightResampler
-from mstfilter.smc.population import Population, log_mean_exp
+from mstfilter.smc.interfaces import Resampler, Similarity, WeightResampler
+from mstfilter.smc.population import Population, as_matrix, log_mean_exp
 from mstfilter.smc.resampling import Systematic, certain_copies, check_scheme, checked_weights, systematic_ancestors
-from mstfilter.smc.similarity import Gaussian, Similarity
 
 
 @dataclass(frozen=True)
@@ -87,12 +86,7 @@ class FearnheadClifford(WeightResampler):
 def optimal_threshold(weights: np.ndarray, n: int) -> tuple[float, np.ndarray]:
     """c with sum min(1, w_i / c) = n, and the (m,) bool mask of the fewer than n weights with w_i >= c.
 
-    Parameters
-    ----------
-    weights : (m,) float64
-        Positive, m > n.
-    n : int
-        Number of particles to select.
+    The (m,) weights are positive, m > n.
     """
     heavy, kept, c = np.zeros(len(weights), bool), 0, float(weights.sum()) / n
     while True:  # c decreases until all light weights are below c; takes a few rounds
@@ -168,6 +162,37 @@ def chopthin_threshold(weights: np.ndarray, n: int, ratio: float) -> float:
     return float(share[k] / (n - middle[k])) if share[k] > 0 else float(limits[by_limit[k]])
 
 
+@dataclass(frozen=True)
+class Gaussian(Similarity):
+    """exp(-d^2 / (2 scale^2)) with the Euclidean distance d of array particles; positive semidefinite.
+
+    Parameters
+    ----------
+    scale : float
+        Standard deviation of the kernel, in the units of the particles.
+    """
+
+    scale: float = 1.0
+
+    def __post_init__(self) -> None:
+        check_number("scale", self.scale, above=0, unit="distance")
+
+    def matrix(self, particles: Any) -> np.ndarray:
+        x = as_matrix(particles) / self.scale
+        small = len(x) ** 2 * x.shape[1] < 1e7
+        squares = ((x[:, None, :] - x[None, :, :]) ** 2).sum(axis=2) if small else _squared_distances(x)
+        return np.exp(-0.5 * squares)
+
+
+def _squared_distances(x: np.ndarray) -> np.ndarray:
+    """(n, n) |x_i|^2 + |x_j|^2 - 2 x_i x_j, without an (n, n, d) array; centred to keep rounding errors small."""
+    x = x - x.mean(axis=0)
+    norms = (x * x).sum(axis=1)
+    squares = np.maximum(norms[:, None] + norms[None, :] - 2 * (x @ x.T), 0.0)
+    np.fill_diagonal(squares, 0.0)
+    return (squares + squares.T) / 2
+
+
 #: Similarities of more particles than this are not computed: the matrix alone would take gigabytes.
 MAX_PARTICLES = 10_000
 
@@ -200,8 +225,6 @@ class ClusterStratified(Resampler):
 
     Parameters
     ----------
-    similarity : Similarity
-        Compares particles.
     at_least : float
         Similarity to the leader from which a particle belongs to its cluster, in (0, 1].
     scheme : Resampler
@@ -210,7 +233,7 @@ class ClusterStratified(Resampler):
         Share of the total weight from which a cluster is sure of a particle, in [0, 1).
     """
 
-    similarity: Similarity = Gaussian()  # noqa: RUF009 (frozen)
+    similarity: Similarity = Gaussian()
     at_least: float = 0.5
     scheme: Resampler = Systematic()  # noqa: RUF009 (frozen)
     least_mass: float = 0.0
@@ -311,7 +334,7 @@ class KDpp(Resampler):
         Selects instead if fewer than n particles differ from each other (rank of L below n).
     """
 
-    similarity: Similarity = Gaussian()  # noqa: RUF009 (frozen)
+    similarity: Similarity = Gaussian()
     scheme: Resampler = FearnheadClifford()
 
     exact_size: ClassVar[bool] = False
@@ -354,21 +377,11 @@ class KDpp(Resampler):
 
 @dataclass(frozen=True)
 class Spectrum:
-    """Eigenvalues and eigenvectors of a likelihood matrix L, and its elementary symmetric polynomials.
+    """Eigenvalues and eigenvectors of a likelihood matrix L, and its elementary symmetric polynomials."""
 
-    Parameters
-    ----------
-    values : (r,) float64
-        Positive eigenvalues, scaled to maximum 1.
-    vectors : (m, r) float64
-        Orthonormal columns.
-    log_e : (r + 1, k + 1) float64
-        Row j, column l: log e_l of the first j values.
-    """
-
-    values: np.ndarray
-    vectors: np.ndarray
-    log_e: np.ndarray
+    values: np.ndarray  #: (r,) positive eigenvalues, scaled to maximum 1
+    vectors: np.ndarray  #: (m, r) orthonormal columns
+    log_e: np.ndarray  #: (r + 1, k + 1) row j, column l: log e_l of the first j values
 
     @classmethod
     def of(cls, L: np.ndarray, k: int) -> Spectrum:
@@ -448,7 +461,7 @@ class GreedyDiverse(Resampler):
     is not selected moves to the most similar selected one, so the total stays.
     """
 
-    similarity: Similarity = Gaussian()  # noqa: RUF009 (frozen)
+    similarity: Similarity = Gaussian()
 
     properly_weighted: ClassVar[bool] = False
     exact_size: ClassVar[bool] = False

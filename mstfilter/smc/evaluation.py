@@ -20,23 +20,18 @@ from mstfilter.errors import InputError, check_integer
 from mstfilter.smc.filter import ParticleFilter
 from mstfilter.smc.interfaces import State
 from mstfilter.smc.population import Population
-from mstfilter.smc.smoothing import Record
+from mstfilter.smc.smoothing import Record, known_parents
 from mstfilter.smc.transport_resampling import ResamplerWrapper
 
 
 @dataclass(frozen=True, eq=False)
 class Coalescence:
-    """The ancestors of the last particles of a run.
+    """The ancestors of the last particles of a run."""
 
-    Parameters
-    ----------
-    ancestors : (T,) int64
-        Number of distinct ancestors at time t of the last particles of positive weight.
-    shared : (T,) float64
-        Probability that two particles, drawn by weight from the last population, have the same ancestor at time t.
-    """
-
+    #: (T,) int64: number of distinct ancestors at time t of the last particles of positive weight.
     ancestors: np.ndarray
+    #: (T,) probability that two particles, drawn by weight from the last population, have the same ancestor at
+    #: time t.
     shared: np.ndarray
 
     @property
@@ -74,26 +69,14 @@ def coalescence(record: Record) -> Coalescence:
 
 @dataclass(frozen=True, eq=False)
 class RunVariance:
-    """Estimates of a run and their Monte Carlo variances, estimated from the same run.
+    """Estimates of a run and their Monte Carlo variances, estimated from the same run."""
 
-    Parameters
-    ----------
-    log_evidence : (T,) float64
-    log_evidence_variance : (T,) float64
-        Variance of the log evidence over seeds. May be negative where it is small compared with its own error.
-    mean : (T, ...) float64
-        Weighted means of the function.
-    mean_variance : (T, ...) float64
-        Variances of these means over seeds, entry by entry.
-    state : State
-        The last state of the run.
-    """
-
-    log_evidence: np.ndarray
+    log_evidence: np.ndarray  #: (T,)
+    #: (T,) variance of the log evidence over seeds. May be negative where it is small compared with its own error.
     log_evidence_variance: np.ndarray
-    mean: np.ndarray
-    mean_variance: np.ndarray
-    state: State
+    mean: np.ndarray  #: (T, ...) weighted means of the function
+    mean_variance: np.ndarray  #: (T, ...) variances of these means over seeds, entry by entry
+    state: State  #: the last state of the run
 
 
 def run_variance(
@@ -158,7 +141,7 @@ def run_variance(
         assert population is not None and total is not None
         if info.t == 0:
             ancestry.begin(info.n_candidates)
-        parents = _parents(population, info.t) if info.t else info.ancestors
+        parents = known_parents(population, info.t) if info.t else info.ancestors
         ancestry.descend(watched.selections, parents, population.weights)
         watched.selections.clear()
         if info.t > 0 and lag is not None:
@@ -182,21 +165,12 @@ def _values(population: Population, function: Callable[[Any], np.ndarray] | None
 
 
 class _Selection(NamedTuple):
-    """A selection from m particles.
+    """A selection from m particles."""
 
-    Parameters
-    ----------
-    parents : (m,) int
-        Their parents in the population after the previous step.
-    before, after : (m,) float
-        Their weights; the shares of their copies in the weight after the selection.
-    ancestors : (n,) int
-    """
-
-    parents: np.ndarray
-    before: np.ndarray
-    after: np.ndarray
-    ancestors: np.ndarray
+    parents: np.ndarray  #: (m,) int their parents in the population after the previous step
+    before: np.ndarray  #: (m,) their weights
+    after: np.ndarray  #: (m,) shares of their copies in the weight after the selection
+    ancestors: np.ndarray  #: (n,) int
 
 
 @dataclass(frozen=True)
@@ -266,7 +240,3 @@ def _differ(groups: np.ndarray, weights: np.ndarray) -> float:
     """Probability that two draws by weight are of different groups."""
     masses = np.bincount(groups, weights)
     return 1.0 - float(masses @ masses)
-
-
-def _parents(population: Population, t: int) -> np.ndarray:
-    return Record((population,) * (t + 1), ()).parents(t)

@@ -122,27 +122,13 @@ def _covariance(name: str, given: Any, d: int | None = None) -> np.ndarray:
 
 
 class Kalman(NamedTuple):
-    """Exact answers of a linear-Gaussian model.
+    """Exact answers of a linear-Gaussian model."""
 
-    Parameters
-    ----------
-    means : (T, d) float64
-        E[x_t | y_0 .. y_t].
-    covariances : (T, d, d) float64
-        Cov[x_t | y_0 .. y_t].
-    smoothed_means : (T, d) float64
-        E[x_t | y_0 .. y_{T-1}].
-    smoothed_covariances : (T, d, d) float64
-        Cov[x_t | y_0 .. y_{T-1}].
-    log_evidence : (T,) float64
-        log p(y_0 .. y_t).
-    """
-
-    means: np.ndarray
-    covariances: np.ndarray
-    smoothed_means: np.ndarray
-    smoothed_covariances: np.ndarray
-    log_evidence: np.ndarray
+    means: np.ndarray  #: (T, d) E[x_t | y_0 .. y_t]
+    covariances: np.ndarray  #: (T, d, d) Cov[x_t | y_0 .. y_t]
+    smoothed_means: np.ndarray  #: (T, d) E[x_t | y_0 .. y_{T-1}]
+    smoothed_covariances: np.ndarray  #: (T, d, d) Cov[x_t | y_0 .. y_{T-1}]
+    log_evidence: np.ndarray  #: (T,) log p(y_0 .. y_t)
 
 
 def kalman_filter(F: Any, Q: Any, H: Any, R: Any, m0: Any, P0: Any, observations: Iterable[Any]) -> Kalman:
@@ -244,21 +230,11 @@ def _probabilities(name: str, given: Any, ndim: int) -> np.ndarray:
 
 
 class Marginals(NamedTuple):
-    """Exact answers of a model with K states.
+    """Exact answers of a model with K states."""
 
-    Parameters
-    ----------
-    filtered : (T, K) float64
-        p(x_t | y_0 .. y_t).
-    smoothed : (T, K) float64
-        p(x_t | y_0 .. y_{T-1}).
-    log_evidence : (T,) float64
-        log p(y_0 .. y_t).
-    """
-
-    filtered: np.ndarray
-    smoothed: np.ndarray
-    log_evidence: np.ndarray
+    filtered: np.ndarray  #: (T, K) p(x_t | y_0 .. y_t)
+    smoothed: np.ndarray  #: (T, K) p(x_t | y_0 .. y_{T-1})
+    log_evidence: np.ndarray  #: (T,) log p(y_0 .. y_t)
 
 
 def forward_backward(
@@ -302,22 +278,13 @@ def forward_backward(
 
 
 class Linear(NamedTuple):
-    """Matrices of the linear part for each particle, or without the particle axis if shared by all.
+    """Matrices of the linear part for each particle, or without the particle axis if shared by all."""
 
-    Parameters
-    ----------
-    F : (n, d, d) array
-    Q : (n, d, d) array
-    H : (n, k, d) array
-    R : (n, k, k) array
-    b : (n, d) array
-    """
-
-    F: Any
+    F: Any  #: (n, d, d)
     Q: Any
-    H: Any
-    R: Any
-    b: Any = 0.0
+    H: Any  #: (n, k, d)
+    R: Any  #: (n, k, k)
+    b: Any = 0.0  #: (n, d)
 
 
 @dataclass(frozen=True)
@@ -398,15 +365,9 @@ class _Correct(Update):
 
 
 def rao_blackwellised(model: ConditionallyLinear, n: int, **components: Any) -> ParticleFilter:
-    """The Rao-Blackwellised filter of a model.
+    """The Rao-Blackwellised filter of a model with `n` particles.
 
-    Parameters
-    ----------
-    model : ConditionallyLinear
-    n : int
-        Particles.
-    **components
-        Further fields of `ParticleFilter`, such as ``resampler``.
+    `components` are further fields of `ParticleFilter`, such as ``resampler``.
     """
     return ParticleFilter(
         initial=_Initial(model), transition=_Predict(model), update=_Correct(model), n=n, **components

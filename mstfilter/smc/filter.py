@@ -32,6 +32,7 @@ from typing import Any, Literal
 import numpy as np
 
 from mstfilter.errors import InputError, check_component, check_integer
+from mstfilter.smc.components import EssBelow
 from mstfilter.smc.interfaces import (
     Codec,
     Component,
@@ -50,7 +51,6 @@ from mstfilter.smc.interfaces import (
 from mstfilter.smc.population import Population, identity
 from mstfilter.smc.resampling import Systematic
 from mstfilter.smc.streams import Key, step_generator
-from mstfilter.smc.triggers import EssBelow
 
 _INTERFACES: dict[str, type] = {
     "initial": Proposal,

@@ -44,37 +44,19 @@ FilterOf = Callable[[np.ndarray], ParticleFilter]
 
 @dataclass(frozen=True, eq=False)
 class Chains:
-    """Markov chains of parameters.
+    """Markov chains of parameters."""
 
-    Parameters
-    ----------
-    theta : (n_iterations, n_chains, d) float64
-        Parameters after each iteration.
-    log_evidence : (n_iterations, n_chains) float64
-        The estimate that belongs to these parameters; NaN in a chain of `particle_gibbs`.
-    log_density : (n_iterations, n_chains) float64
-        Log prior plus `log_evidence`.
-    accepted : (n_chains,) float64
-        Share of accepted proposals.
-    paths : tuple
-        Of `particle_gibbs`: the path of states after each iteration.
-    """
-
-    theta: np.ndarray
+    theta: np.ndarray  #: (n_iterations, n_chains, d) parameters after each iteration
+    #: (n_iterations, n_chains) the estimate that belongs to these parameters; NaN in a chain of `particle_gibbs`.
     log_evidence: np.ndarray
-    log_density: np.ndarray
-    accepted: np.ndarray
-    paths: tuple[Particles, ...] = ()
+    log_density: np.ndarray  #: (n_iterations, n_chains) log prior plus `log_evidence`
+    accepted: np.ndarray  #: (n_chains,) share of accepted proposals
+    paths: tuple[Particles, ...] = ()  #: of `particle_gibbs`: the path of states after each iteration
 
     def autocorrelation_times(self, discard: int = 0) -> np.ndarray:
-        """(d,) integrated autocorrelation times in iterations, by emcee.
+        """(d,) integrated autocorrelation times in iterations, by emcee, without the first `discard` iterations.
 
         emcee logs a warning if the chains are shorter than 50 times the result, which is then too low.
-
-        Parameters
-        ----------
-        discard : int
-            Iterations at the start to leave out.
         """
         from emcee.autocorr import integrated_time
 
@@ -157,15 +139,12 @@ def pmmh(
     ----------
     filter_of : callable
         ``(theta) -> ParticleFilter`` for parameters (d,). Its components must be properly weighted.
-    observations : sequence
     log_prior : callable
         ``(theta) -> float``; -inf outside of the support.
     start : (d,) or (R, d) array_like
         First parameters of one chain or of R chains.
     scale : (d,) or (d, d) array_like
         Standard deviations, or covariance, of a step. 2.4 / sqrt(d) posterior standard deviations are a good choice.
-    n_iterations : int
-    seed : int
     batched : bool
         Whether ``filter_of`` also takes an array (d, R, 1) and returns a filter of R runs (see
         `mstfilter.smc.batching`), the parameters broadcast against particles (R, n). All chains then move in one
@@ -238,8 +217,6 @@ def ensemble(
         As in `pmmh`; with `batched`, half of the walkers are evaluated in one sweep.
     start : (n_walkers, d) array_like
         First parameters: different ones, at least 2 d.
-    n_iterations : int
-    seed : int
     moves : optional
         Of emcee; default its stretch move.
     """
@@ -276,14 +253,11 @@ def particle_gibbs(
     ----------
     filter_of : callable
         ``(theta) -> ParticleFilter`` that `conditional_path` accepts.
-    observations : sequence
     draw : callable
         ``(rng, theta, path) -> theta`` (d,), by a kernel that leaves p(theta | path, y) invariant: an exact draw
         where the prior is conjugate, or a Metropolis step with `path_log_prob`.
     start : (d,) array_like
         First parameters.
-    n_iterations : int
-    seed : int
     """
     check_integer("n_iterations", n_iterations)
     key = Key(seed).child("particle gibbs")
@@ -305,21 +279,11 @@ def particle_gibbs(
 
 @dataclass(frozen=True, eq=False)
 class TemperedSample:
-    """Result of `smc_sampler`.
+    """Result of `smc_sampler`."""
 
-    Parameters
-    ----------
-    population : Population
-        Weighted draws of the posterior, particles (n,) or (n, d).
-    temperatures : (k,) float64
-        Powers of the likelihood, from 0 to 1.
-    accepted : (k - 1,) float64
-        Share of accepted moves at each temperature above 0.
-    """
-
-    population: Population
-    temperatures: np.ndarray
-    accepted: np.ndarray
+    population: Population  #: weighted draws of the posterior, particles (n,) or (n, d)
+    temperatures: np.ndarray  #: (k,) powers of the likelihood, from 0 to 1
+    accepted: np.ndarray  #: (k - 1,) share of accepted moves at each temperature above 0
 
     @property
     def log_evidence(self) -> float:
@@ -351,9 +315,6 @@ def smc_sampler(
         Of floating-point parameters.
     log_likelihood : callable
         ``(theta) -> (n,)`` of parameters (n,) or (n, d).
-    n : int
-        Particles.
-    seed : int
     share : float
         The next temperature is the one at which the effective sample size falls to this share of `n`.
     steps : int
@@ -363,7 +324,6 @@ def smc_sampler(
     scale : float, (d,) or (d, d) array_like, optional
         Standard deviations or covariance of a step. Default: 2.38 / sqrt(d) times the root of the particles'
         covariance.
-    resampler : Resampler
     """
     check_integer("n", n, at_least=2)
     check_integer("steps", steps)

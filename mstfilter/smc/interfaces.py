@@ -217,6 +217,22 @@ class Size(ABC):
         """Number of particles (at least 1), from the weighted particles that are about to be resampled."""
 
 
+class Similarity(ABC):
+    """Similarity of particles."""
+
+    @abstractmethod
+    def matrix(self, particles: Any) -> np.ndarray:
+        """(n, n) symmetric similarities in [0, 1], 1 on the diagonal. It need not be positive semidefinite."""
+
+
+class Equivalence(ABC):
+    """Classes of particles that count as equal."""
+
+    @abstractmethod
+    def classes(self, particles: Any) -> np.ndarray:
+        """(n,) int: the class of each particle, numbered from 0 in the order of first occurrence."""
+
+
 class Lookahead(Component):
     """Evaluates the next observation before particles are selected (auxiliary filter).
 
@@ -330,24 +346,12 @@ class Codec(ABC):
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """Everything that a filter needs to continue.
+    """Everything that a filter needs to continue."""
 
-    Parameters
-    ----------
-    t : int
-        Number of observations so far.
-    population : Population or None
-        The particles after the last observation; None before the first.
-    key : Key
-        Names the random streams of the run.
-    properly_weighted : bool
-        Whether the weights are those of an exact filter.
-    """
-
-    t: int
-    population: Population | None
-    key: Key
-    properly_weighted: bool = True
+    t: int  #: number of observations so far
+    population: Population | None  #: the particles after the last observation; None before the first
+    key: Key  #: names the random streams of the run
+    properly_weighted: bool = True  #: whether the weights are those of an exact filter
 
     @property
     def log_evidence(self) -> float | None:
@@ -359,42 +363,20 @@ class State:
 
 @dataclass(frozen=True, eq=False)
 class Info:
-    """Record of a step.
+    """Record of a step."""
 
-    Parameters
-    ----------
-    t : int
-        Index of the observation, from 0.
-    n : int
-        Particles after the step.
-    n_candidates : int
-        Particles after the update, before the resampling that follows it.
-    ess : float
-        Effective sample size after the update, before the resampling that follows it.
-    resampled : bool
-        Whether the step resampled.
-    ancestors : (n,) int
-        Index among the candidates of each particle, if the step resampled after the update; else 0 .. n-1.
-    parents : mapping
-        ``"previous"`` and ``"proposed"`` parents of the particles after the step, if known.
-    log_weights : (n,) float
-        After the step.
-    notes : mapping
-        Notes of the components, by slot.
-    seconds : mapping
-        Wall time by slot. Not reproducible.
-    """
-
-    t: int
-    n: int
-    n_candidates: int
-    ess: float
-    resampled: bool
+    t: int  #: index of the observation, from 0
+    n: int  #: particles after the step
+    n_candidates: int  #: particles after the update, before the resampling that follows it
+    ess: float  #: effective sample size after the update, before the resampling that follows it
+    resampled: bool  #: whether the step resampled
+    #: (n,) int index among the candidates of each particle, if the step resampled after the update; else 0 .. n-1.
     ancestors: np.ndarray
+    #: ``"previous"`` and ``"proposed"`` parents of the particles after the step, if known.
     parents: Mapping[str, np.ndarray]
-    log_weights: np.ndarray
-    notes: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
-    seconds: Mapping[str, float] = field(default_factory=dict)
+    log_weights: np.ndarray  #: (n,) after the step
+    notes: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)  #: notes of the components, by slot
+    seconds: Mapping[str, float] = field(default_factory=dict)  #: wall time by slot. Not reproducible
 
     @cached_property
     def unique_ancestors(self) -> int:

@@ -128,6 +128,18 @@ def take(particles: Particles, indices: np.ndarray) -> Particles:
     return tuple(particles[int(i)] for i in indices)
 
 
+def as_matrix(particles: Any) -> np.ndarray:
+    """(n, d) float64 rows of particles that are an array or a mapping of arrays; InputError for objects."""
+    if isinstance(particles, np.ndarray) and particles.dtype != object:
+        return np.asarray(particles, dtype=np.float64).reshape(len(particles), -1)
+    if isinstance(particles, Mapping):
+        return np.concatenate([as_matrix(np.asarray(a)) for _, a in sorted(particles.items())], axis=1)
+    raise InputError(
+        f"particles are {type(particles[0]).__name__} objects, expected an array or a mapping of arrays",
+        "choose a similarity or equivalence for these objects, or write your own",
+    )
+
+
 def _freeze(particles: Particles) -> Particles:
     """Read-only views of arrays, a tuple of objects."""
     if isinstance(particles, np.ndarray):

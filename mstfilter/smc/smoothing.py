@@ -48,31 +48,29 @@ _PAIRS = 1_000_000
 
 @dataclass(frozen=True, eq=False)
 class Record:
-    """The populations of a run, with the observations.
+    """The populations of a run, with the observations."""
 
-    Parameters
-    ----------
-    populations : tuple of Population
-        After each observation; ``parents["previous"]`` are indices into the one before.
-    observations : tuple
-        None if missing.
-    """
-
+    #: After each observation; ``parents["previous"]`` are indices into the one before.
     populations: tuple[Population, ...]
-    observations: tuple[Any, ...]
+    observations: tuple[Any, ...]  #: none if missing
 
     def __len__(self) -> int:
         return len(self.populations)
 
     def parents(self, t: int) -> np.ndarray:
         """(n,) indices into population t - 1 of the particles at time t."""
-        index = self.populations[t].parents.get("previous")
-        if index is None or (index < 0).any():
-            raise InputError(
-                f"step {t}: {'no' if index is None else 'not every'} particle has a known parent",
-                "a filter with a proposal of new particles has no paths",
-            )
-        return index
+        return known_parents(self.populations[t], t)
+
+
+def known_parents(population: Population, t: int) -> np.ndarray:
+    """(n,) indices into the population before; InputError if a particle has no known parent."""
+    index = population.parents.get("previous")
+    if index is None or (index < 0).any():
+        raise InputError(
+            f"step {t}: {'no' if index is None else 'not every'} particle has a known parent",
+            "a filter with a proposal of new particles has no paths",
+        )
+    return index
 
 
 def keep(filter: ParticleFilter, observations: Iterable[Any], seed: int | State = 0) -> Record:
@@ -95,11 +93,7 @@ def genealogy(record: Record) -> tuple[Population, ...]:
 def fixed_lag(record: Record, lag: int) -> tuple[Population, ...]:
     """At each time t the ancestors of the particles at t + `lag` (or the end), with their weights.
 
-    Parameters
-    ----------
-    record : Record
-    lag : int
-        Steps; 0 returns the filter's populations.
+    A lag of 0 steps returns the filter's populations.
     """
     check_integer("lag", lag, at_least=0)
     last = len(record) - 1
@@ -123,16 +117,8 @@ def backward_paths(
 ) -> tuple[Population, ...]:
     """Draw `n` equally weighted paths from the smoothing distribution: row k of all populations is a path.
 
-    Parameters
-    ----------
-    rng : Generator
-    record : Record
-        Its parents are not needed.
-    transition : DensityTransition
-        The transition of the model, ``Dynamics(model)``. The density of a guided transition is that of its proposal,
-        so it cannot be used.
-    n : int
-        Paths.
+    `transition` is that of the model, ``Dynamics(model)``. A guided transition cannot be used: its density is that of
+    its proposal. The parents of the record are not needed.
     """
     check_component("transition", transition, DensityTransition)
     check_integer("n", n)
@@ -189,12 +175,10 @@ def paris(
     ----------
     filter : ParticleFilter
         With proper weights.
-    observations : iterable
     functional : callable
         ``(t, previous, particles) -> (n,) or (n, k)`` is h_t of paired rows; `previous` is None at t = 0.
     transition : DensityTransition
         The transition of the model, ``Dynamics(model)``.
-    seed : int
     n_draws : int
         At least 2: with one the variance grows as that of the genealogy.
 
@@ -255,8 +239,6 @@ def conditional_path(
     ----------
     filter : ParticleFilter
         Bootstrap or guided filter of a model or a program, with at least two particles.
-    observations : sequence
-    seed : int or Key
     path : T particles, optional
         The present path: row t is the particle at time t. Without it the path is drawn by an ordinary filter.
 
@@ -450,15 +432,9 @@ def _program_step(
 
 
 def path_log_prob(filter: ParticleFilter, observations: Sequence[Any], path: Particles) -> float:
-    """log p(x_0 .. x_T, y_0 .. y_T) of a path, by the model or the program of a filter.
+    """log p(x_0 .. x_T, y_0 .. y_T) of a path of `conditional_path`, by the model or the program of a filter.
 
-    Parameters
-    ----------
-    filter : ParticleFilter
-        Made from a `StateSpaceModel` with its log densities or from a `Program`.
-    observations : sequence
-    path : T particles
-        As `conditional_path` returns it.
+    The filter is made from a `StateSpaceModel` with its log densities or from a `Program`.
     """
     ys, initial = list(observations), filter.initial
     rows = [take(path, np.array([t])) for t in range(len(ys))]

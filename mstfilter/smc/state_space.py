@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from mstfilter.errors import InputError, check_component, check_integer
-from mstfilter.smc.components import Reweight
+from mstfilter.smc.components import EssBelow, Reweight
 from mstfilter.smc.distributions import as_distribution
 from mstfilter.smc.filter import ParticleFilter
 from mstfilter.smc.interfaces import (
@@ -37,7 +37,6 @@ from mstfilter.smc.interfaces import (
 )
 from mstfilter.smc.population import Particles, Population, count_particles
 from mstfilter.smc.resampling import Systematic
-from mstfilter.smc.triggers import EssBelow
 
 
 @dataclass(frozen=True)
@@ -316,8 +315,6 @@ def guided(
         With its log densities.
     proposal : callable
         ``(particles, y) -> distribution`` of x_t.
-    n : int
-        Particles.
     initial : callable, optional
         ``(y) -> distribution`` of x_0; default the prior of the model.
     **components
@@ -347,13 +344,11 @@ def auxiliary(
         With its log densities if `proposal` is given.
     log_priority : callable
         ``(particles, y) -> (n,)``, close to log p(y_t | x_{t-1}); the filter is exact for any finite priority.
-    n : int
-        Particles.
     proposal, initial : callable, optional
         As in `guided`. With p(y_t | x_{t-1}) as priority and p(x_t | x_{t-1}, y_t) as proposal the filter is fully
         adapted.
     **components
-        Further fields of `ParticleFilter`, such as ``resampler`` or ``trigger``.
+        As in `guided`.
     """
     return replace(
         bootstrap(model, n),

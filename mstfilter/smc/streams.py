@@ -49,18 +49,10 @@ class _KeyedSequence(np.random.SeedSequence):
 
 @dataclass(frozen=True)
 class Key:
-    """The name of a random stream.
+    """The name of a random stream."""
 
-    Parameters
-    ----------
-    seed : int
-        Non-negative.
-    path : tuple of int
-        Position in the run where the stream is used.
-    """
-
-    seed: int
-    path: tuple[int, ...] = ()
+    seed: int  #: non-negative
+    path: tuple[int, ...] = ()  #: position in the run where the stream is used
 
     def __post_init__(self) -> None:
         if isinstance(self.seed, bool) or not isinstance(self.seed, (int, np.integer)) or self.seed < 0:
@@ -95,14 +87,9 @@ def key_words(key: Key) -> list[int]:
 
 
 def child(rng: np.random.Generator, *parts: int | str) -> np.random.Generator:
-    """A stream derived from the stream of `rng`; `rng` itself is not advanced.
+    """A stream derived from the stream of `rng` and named by `parts`, for example ``"object", 7``.
 
-    Parameters
-    ----------
-    rng : Generator
-        Made from a seed, for example by numpy.random.default_rng or `Key`.
-    *parts : int or str
-        Name of the child, for example ``"object", 7``.
+    `rng` is made from a seed, for example by numpy.random.default_rng or `Key`. It is not advanced.
     """
     return key_of(rng).child(*parts).generator()
 
@@ -170,21 +157,11 @@ class _KnownSequence(ISpawnableSeedSequence):
 
 
 def pcg64_seeds(words: np.ndarray) -> np.ndarray:
-    """Seeds of the PCG64 generators that numpy's SeedSequence makes from given words.
+    """Seeds (m, 4) uint64 of the PCG64 generators that numpy's SeedSequence makes from given words.
 
-    Parameters
-    ----------
-    words : (m, k) uint32
-        The assembled entropy of m sequences, k >= 4, as `Key.generator` makes it.
-
-    Returns
-    -------
-    (m, 4) uint64
-        High and low word of the initial state, high and low word of the sequence number.
-
-    References
-    ----------
-    O'Neill (2015), "Developing a seed_seq alternative", the hash of SeedSequence.
+    The words (m, k) uint32 are the assembled entropy of m sequences, k >= 4, as `Key.generator` makes it. The result
+    holds high and low word of the initial state, then of the sequence number. O'Neill (2015), "Developing a seed_seq
+    alternative", has the hash of SeedSequence.
     """
     constant = 0x43B0D7E5
 
@@ -217,12 +194,9 @@ def pcg64_seeds(words: np.ndarray) -> np.ndarray:
 
 
 def pcg64_states(words: np.ndarray) -> np.ndarray:
-    """States of the generators of `pcg64_seeds`.
+    """States (m, 4) uint64 of the generators of `pcg64_seeds` (O'Neill 2014, PCG, section 4).
 
-    Returns
-    -------
-    (m, 4) uint64
-        Low and high word of the state, low and high word of the increment (O'Neill 2014, PCG, section 4).
+    Low and high word of the state, low and high word of the increment.
     """
     seed_high, seed_low, inc_high, inc_low = pcg64_seeds(words).T
     # inc = 2 * sequence + 1; state = (inc + seed) * multiplier + inc, modulo 2^128.
@@ -270,15 +244,7 @@ def _named(name: str) -> int:
 
 
 class SlotStreams:
-    """States of the streams of many runs in one slot, for all steps.
-
-    Parameters
-    ----------
-    seeds : list of int
-        One per run, below 2^128.
-    slot : str
-    n_steps : int
-    """
+    """States of the streams of many runs in one slot, for all steps; `seeds` are one per run, below 2^128."""
 
     def __init__(self, seeds: list[int], slot: str, n_steps: int) -> None:
         self.seeds, self.slot, self.n_steps = seeds, slot, n_steps

@@ -25,11 +25,11 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 
 from mstfilter.errors import InputError, check_component, check_number
+from mstfilter.smc.components import ExactEquality
 from mstfilter.smc.diverse_resampling import FearnheadClifford
-from mstfilter.smc.interfaces import Resampler, TransformResampler
-from mstfilter.smc.population import Population
+from mstfilter.smc.interfaces import Equivalence, Resampler, TransformResampler
+from mstfilter.smc.population import Population, as_matrix
 from mstfilter.smc.resampling import Multinomial, Stratified, Systematic, check_scheme, checked_weights
-from mstfilter.smc.similarity import Equivalence, ExactEquality, as_matrix
 
 #: Linear programs of more variables than this are not solved: they take longer than some seconds.
 MAX_TRANSPORT = 100_000
@@ -37,14 +37,9 @@ MAX_TRANSPORT = 100_000
 
 @dataclass(frozen=True)
 class ResamplerWrapper(Resampler):
-    """Base class of resamplers that change the input or the result of another resampler.
+    """Base class of resamplers that change the input or the result of another resampler, `scheme`.
 
     It is properly weighted if the wrapped resampler is.
-
-    Parameters
-    ----------
-    scheme : Resampler
-        The wrapped resampler.
     """
 
     scheme: Resampler = Systematic()  # noqa: RUF009 (frozen)

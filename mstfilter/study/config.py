@@ -71,32 +71,16 @@ class _Entry(BaseModel):
 
 
 class SceneEntry(_Entry):
-    """Scenes: a family with seeds, or recordings of any format that `mstfilter run` reads.
+    """Scenes: a family with seeds, or recordings of any format that `mstfilter run` reads."""
 
-    Parameters
-    ----------
-    family : str
-        A simulated family; `set` changes its fields.
-    seeds : numbers
-        One scene for each.
-    set : table
-        Fields of the family.
-    recordings : list of str
-        Files or folders; a ``*`` stands for any text.
-    format, options, pauses
-        How they are read, as for `mstfilter run`. Default: detected.
-    group : str
-        Name of the family in the tables. Default: the family's name, ``recordings`` for folders.
-    """
-
-    family: str = ""
-    seeds: Seeds = ()
-    set: dict[str, Any] = Field(default_factory=dict)
-    recordings: Texts = ()
-    format: str = ""
+    family: str = ""  #: a simulated family; `set` changes its fields
+    seeds: Seeds = ()  #: one scene for each
+    set: dict[str, Any] = Field(default_factory=dict)  #: fields of the family
+    recordings: Texts = ()  #: files or folders; a ``*`` stands for any text
+    format: str = ""  #: how they are read, as for `mstfilter run`. Default: detected
     options: Texts = ()
     pauses: str = ""
-    group: str = ""
+    group: str = ""  #: name of the family in the tables. Default: the family's name, ``recordings`` for folders
 
     @model_validator(mode="after")
     def _one_kind(self) -> SceneEntry:
@@ -110,78 +94,41 @@ class SceneEntry(_Entry):
 
 
 class ArmEntry(_Entry):
-    """A filter to compare: a preset and changes to it; commas make a grid.
+    """A filter to compare: a preset and changes to it; commas make a grid."""
 
-    Parameters
-    ----------
-    preset : str or list of str
-        Names, or paths of TOML files.
-    set : list of str
-        ``path=value`` each, as `mstfilter run` takes them; ``path=a,b`` is two arms.
-    name : str
-        Name in the tables. Default: the preset and the values that the grid varies.
-    reported_only : bool
-        Reported, but not part of the comparisons whose p values are adjusted together: a lower or an upper bound.
-    """
-
-    preset: Texts = ("mst",)
-    set: Texts = ()
-    name: str = ""
+    preset: Texts = ("mst",)  #: names, or paths of TOML files
+    set: Texts = ()  #: ``path=value`` each, as `mstfilter run` takes them; ``path=a,b`` is two arms
+    name: str = ""  #: name in the tables. Default: the preset and the values that the grid varies
+    #: Reported, but not part of the comparisons whose p values are adjusted together: a lower or an upper bound.
     reported_only: bool = False
 
 
 class StudyConfig(_Entry):
-    """A study.
+    """A study."""
 
-    Parameters
-    ----------
-    name : str
-        Default: the name of the file.
-    description : str
-    arms, scenes : lists of tables
-    seeds : numbers
-        Seeds of the filter. They are nested in scenes: averaged before arms are compared.
-    reference : str
-        The arm that the others are compared with. Default: the first.
-    keep : {"all", "tables"}
-        What is kept of a run: its folder, from which a report can be made, or its metrics only.
-    tries : int
-        How many times a run is started if its worker dies.
-    timeout_s : float
-        Time limit of a run in seconds; it is then started again, up to `tries` times. 0: no limit.
-    cache_gb : float
-        Maximum size in GB of intermediate results that are kept on disk for other arms and later runs; 0 keeps none.
-    smoke : table
-        Replaces fields of the study under ``--smoke``.
-    """
-
-    name: str
+    name: str  #: default: the name of the file
     description: str = ""
-    arms: tuple[ArmEntry, ...] = ()
+    arms: tuple[ArmEntry, ...] = ()  #: the arms to run
     scenes: tuple[SceneEntry, ...] = ()
+    #: Seeds of the filter. They are nested in scenes: averaged before arms are compared.
     seeds: Seeds = (0, 1, 2)
-    reference: str = ""
+    reference: str = ""  #: the arm that the others are compared with. Default: the first
+    #: {"all", "tables"}: what is kept of a run: its folder, from which a report can be made, or its metrics only.
     keep: Annotated[str, Field(pattern="^(all|tables)$")] = "all"
-    tries: Annotated[int, Field(ge=1)] = 3
+    tries: Annotated[int, Field(ge=1)] = 3  #: how many times a run is started if its worker dies
+    #: Time limit of a run in seconds; it is then started again, up to `tries` times. 0: no limit.
     timeout_s: Annotated[float, Field(ge=0)] = 0.0
+    #: Maximum size in GB of intermediate results that are kept on disk for other arms and later runs; 0 keeps none.
     cache_gb: Annotated[float, Field(ge=0)] = 4.0
-    smoke: dict[str, Any] = Field(default_factory=dict)
+    smoke: dict[str, Any] = Field(default_factory=dict)  #: replaces fields of the study under ``--smoke``
     folder: Path = Path()  # relative paths start here
 
 
 def load_study(path: str | Path, *, smoke: bool = False) -> StudyConfig:
     """Read a study from a TOML file.
 
-    Parameters
-    ----------
-    path : path
-    smoke : bool
-        Apply the table ``[smoke]``: a small study that shows that everything works.
-
-    Raises
-    ------
-    InputError
-        If the file is missing, is not valid TOML, or has an unknown or invalid entry.
+    `smoke` applies the table ``[smoke]``: a small study that shows that everything works. Raises InputError if the
+    file is missing, is not valid TOML, or has an unknown or invalid entry.
     """
     path = Path(path)
     try:
@@ -217,22 +164,12 @@ def study_of(data: dict[str, Any], where: str = "study") -> StudyConfig:
 
 @dataclass(frozen=True)
 class ArmRequest:
-    """An arm before its filter is built.
-
-    Parameters
-    ----------
-    name : str
-    preset : str
-        Name or path.
-    overrides : tuple of str
-    reported_only : bool
-        Reported, but not part of the comparisons.
-    """
+    """An arm before its filter is built."""
 
     name: str
-    preset: str
+    preset: str  #: name or path
     overrides: tuple[str, ...]
-    reported_only: bool
+    reported_only: bool  #: reported, but not part of the comparisons
 
     def config(self, allow_files: bool) -> dict[str, Any]:
         """The configuration of the arm; unknown names of components raise InputError."""

@@ -35,25 +35,15 @@ _ONE_THREAD = dict.fromkeys(
 
 @dataclass(frozen=True)
 class Event:
-    """Something that happened to a job.
+    """Something that happened to a job."""
 
-    Parameters
-    ----------
-    kind : {"started", "step", "lost", "ended"}
-        "lost": its worker died or the time limit was exceeded; it is started again if tries are left.
-    job : int
-        Its index in the list of jobs.
-    done, total : int
-        Steps of the job, if known.
-    outcome : JobOutcome, optional
-        Of a job that has ended.
-    """
-
+    #: {"started", "step", "lost", "ended"}: "lost": its worker died or the time limit was exceeded; it is started
+    #: again if tries are left.
     kind: str
-    job: int
-    done: int = 0
+    job: int  #: its index in the list of jobs
+    done: int = 0  #: steps of the job, if known
     total: int = 0
-    outcome: JobOutcome | None = None
+    outcome: JobOutcome | None = None  #: of a job that has ended
 
 
 Tell = Callable[[Event], None]
@@ -66,12 +56,8 @@ class Executor(ABC):
     def run(self, jobs: Sequence[Job], tell: Tell) -> list[JobOutcome]:
         """Run all jobs and return their outcomes, in the order of `jobs`.
 
-        Parameters
-        ----------
-        jobs : sequence of mapping
-            Started in this order when workers are free. Jobs of one ``share`` go to the same worker if possible.
-        tell : callable
-            Called with every `Event`, in the calling thread. An exception that it raises stops all jobs.
+        Jobs are started in this order when workers are free. Jobs of one ``share`` go to the same worker if possible.
+        `tell` is called with every `Event`, in the calling thread. An exception that it raises stops all jobs.
         """
 
 

@@ -35,12 +35,8 @@ _StepCallback = Callable[[int, int], None]
 def perform(job: Job, step: _StepCallback = lambda done, total: None) -> JobOutcome:
     """Do a job; an error in it becomes its outcome.
 
-    Parameters
-    ----------
-    job : mapping
-        ``kind`` is "record" or "run"; the other keys are those that `mstfilter.study.study` makes.
-    step : callable
-        Called with the number of steps done and of all steps.
+    ``job["kind"]`` is "record" or "run"; the other keys are those that `mstfilter.study.study` makes. `step` is
+    called with the number of steps done and of all steps.
     """
     try:
         if job["kind"] == "record":

@@ -31,50 +31,27 @@ from mstfilter.study.config import ArmRequest, SceneEntry, StudyConfig, expand_a
 
 @dataclass(frozen=True)
 class Arm:
-    """A filter to compare.
-
-    Parameters
-    ----------
-    name : str
-    config : dict
-        Every field of every component.
-    key : str
-        Hash of the configuration, the code and the files of the user.
-    known_code : bool
-        Whether all components belong to mstfilter or to a file of the user, whose code is part of `key`.
-    uses_truth : tuple of str
-        Classes of its components that use the ground truth.
-    reported_only : bool
-        Not part of the comparisons whose p values are adjusted together.
-    """
+    """A filter to compare."""
 
     name: str
-    config: dict[str, Any]
-    key: str
+    config: dict[str, Any]  #: every field of every component
+    key: str  #: hash of the configuration, the code and the files of the user
+    #: Whether all components belong to mstfilter or to a file of the user, whose code is part of `key`.
     known_code: bool
-    uses_truth: tuple[str, ...]
-    reported_only: bool = False
+    uses_truth: tuple[str, ...]  #: classes of its components that use the ground truth
+    reported_only: bool = False  #: not part of the comparisons whose p values are adjusted together
 
 
 @dataclass(frozen=True)
 class StudyScene:
-    """A recording to filter.
-
-    Parameters
-    ----------
-    name : str
-    group : str
-        Name of its family in the tables.
-    source : dict
-        ``{"family", "seed", "set"}`` of a simulated recording; path, format, options and pauses of other recordings.
-    key : str
-        Hash of the recipe or the content.
-    """
+    """A recording to filter."""
 
     name: str
-    group: str
+    group: str  #: name of its family in the tables
+    #: ``{"family", "seed", "set"}`` of a simulated recording; path, format, options and pauses of other
+    #: recordings.
     source: dict[str, Any]
-    key: str
+    key: str  #: hash of the recipe or the content
 
 
 @dataclass(frozen=True)
@@ -119,7 +96,6 @@ def make_plan(study: StudyConfig, overrides: Sequence[str] = (), *, allow_files:
 
     Parameters
     ----------
-    study : StudyConfig
     overrides : sequence of str
         Applied to every arm after those of the arm; a comma makes a grid.
     allow_files : bool

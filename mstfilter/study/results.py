@@ -45,26 +45,13 @@ Job = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class JobOutcome:
-    """How a job ended.
+    """How a job ended."""
 
-    Parameters
-    ----------
-    status : {"done", "failed"}
-    error : str
-        What went wrong, in one line.
-    hints : tuple of str
-        What the user can do about it.
-    trace : str
-        Traceback of the error.
-    tries : int
-        How many times the job was started.
-    """
-
-    status: str
-    error: str = ""
-    hints: tuple[str, ...] = ()
-    trace: str = ""
-    tries: int = 1
+    status: str  #: {"done", "failed"}
+    error: str = ""  #: what went wrong, in one line
+    hints: tuple[str, ...] = ()  #: what the user can do about it
+    trace: str = ""  #: traceback of the error
+    tries: int = 1  #: how many times the job was started
 
 
 def read_result(folder: Path) -> dict[str, Any]:
@@ -82,12 +69,7 @@ def write_result(folder: Path, result: Mapping[str, Any]) -> None:
 
 @dataclass(frozen=True)
 class StudyFolder:
-    """A study on disk.
-
-    Parameters
-    ----------
-    path : Path
-    """
+    """A study on disk."""
 
     path: Path
 

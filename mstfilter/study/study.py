@@ -28,46 +28,24 @@ _LEAST_FREE_GB = 0.5
 
 @dataclass(frozen=True)
 class StudyProgress:
-    """Progress of a study.
+    """Progress of a study."""
 
-    Parameters
-    ----------
-    what : {"recordings", "runs"}
-    event : Event, optional
-        The last event; None at the beginning of a part.
-    name : str
-        Of the job that the event belongs to.
-    done, failed, total : int
-        Jobs of this part; `done` includes those of earlier calls.
-    """
-
-    what: str
-    event: Event | None
-    name: str
-    done: int
+    what: str  #: {"recordings", "runs"}
+    event: Event | None  #: the last event; None at the beginning of a part
+    name: str  #: of the job that the event belongs to
+    done: int  #: jobs of this part; `done` includes those of earlier calls
     failed: int
     total: int
 
 
 @dataclass(frozen=True)
 class StudyResult:
-    """Result of `run_study`.
-
-    Parameters
-    ----------
-    folder : StudyFolder
-    done : int
-        Runs that are done, earlier ones included.
-    repeated : int
-        Runs that were done before this call.
-    failed : tuple of (str, JobOutcome)
-        Names of the runs that failed, and why.
-    """
+    """Result of `run_study`."""
 
     folder: StudyFolder
-    done: int
-    repeated: int
-    failed: tuple[tuple[str, JobOutcome], ...]
+    done: int  #: runs that are done, earlier ones included
+    repeated: int  #: runs that were done before this call
+    failed: tuple[tuple[str, JobOutcome], ...]  #: names of the runs that failed, and why
 
 
 def run_study(
@@ -84,7 +62,6 @@ def run_study(
 
     Parameters
     ----------
-    study : StudyConfig
     path : Path
         The study folder: new, empty, or of an earlier call.
     executor : Executor, optional

@@ -66,27 +66,15 @@ _CONTRACTS: dict[type, type[Contract]] = {
 
 @dataclass(frozen=True)
 class CheckResult:
-    """The outcome of one property.
+    """The outcome of one property."""
 
-    Parameters
-    ----------
-    name : str
-        Name of the test without ``test_``.
-    statement : str
-        The property: the first line of the docstring of the test.
-    statistical : bool
-        Whether the test looks at random samples, and so fails for a correct component with probability `FALSE_ALARM`.
-    failure : str or None
-        How the property is violated; None if it holds or was not tested.
-    skipped : str or None
-        Why it was not tested.
-    """
-
-    name: str
-    statement: str
+    name: str  #: name of the test without ``test_``
+    statement: str  #: the property: the first line of the docstring of the test
+    #: Whether the test looks at random samples, and so fails for a correct component with probability
+    #: `FALSE_ALARM`.
     statistical: bool
-    failure: str | None = None
-    skipped: str | None = None
+    failure: str | None = None  #: how the property is violated; None if it holds or was not tested
+    skipped: str | None = None  #: why it was not tested
 
 
 def contract_of(cls: type) -> type[Contract]:

@@ -78,17 +78,11 @@ def _exposure(frame: Frame, reference: Frame) -> tuple[np.ndarray, np.ndarray]:
 
 @dataclass(frozen=True, eq=False)
 class Matches:
-    """Pairs of matching features.
+    """Pairs of matching features."""
 
-    Attributes
-    ----------
-    before, after : (N, 2) int32 pixels (column, row) in the first and last frame.
-    p, q : (N, 3) float64 world points of these pixels, metres.
-    """
-
-    before: np.ndarray
+    before: np.ndarray  #: (N, 2) int32 pixels (column, row) in the first and last frame
     after: np.ndarray
-    p: np.ndarray
+    p: np.ndarray  #: (N, 3) float64 world points of these pixels, metres
     q: np.ndarray
 
     def within(self, first: np.ndarray, last: np.ndarray | None = None) -> np.ndarray:

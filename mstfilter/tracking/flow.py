@@ -43,22 +43,14 @@ _COLOUR_JUMP = 30.0  # grey levels per channel, largest change of colour of a tr
 
 @dataclass(frozen=True, eq=False)
 class ClipTracks:
-    """Points and pixels followed through a clip.
+    """Points and pixels followed through a clip."""
 
-    Attributes
-    ----------
-    start : (N, 2) int32, pixel (column, row) of each point in the first frame.
-    end : (N, 2) float32, its position in the last frame; undefined for lost points.
-    alive : (N,) bool, whether the point was followed to the end and is not on the robot there.
-    source : (H, W) int32, flat pixel of the first frame for each pixel of the last frame; -1 for robot pixels.
-    unchanged : (H, W) bool, whether depth and colour agree between first and last frame.
-    """
-
-    start: np.ndarray
-    end: np.ndarray
-    alive: np.ndarray
+    start: np.ndarray  #: (N, 2) int32, pixel (column, row) of each point in the first frame
+    end: np.ndarray  #: (N, 2) float32, its position in the last frame; undefined for lost points
+    alive: np.ndarray  #: (N,) bool, whether the point was followed to the end and is not on the robot there
+    #: (H, W) int32, flat pixel of the first frame for each pixel of the last frame; -1 for robot pixels.
     source: np.ndarray
-    unchanged: np.ndarray
+    unchanged: np.ndarray  #: (H, W) bool, whether depth and colour agree between first and last frame
 
     def warp(self, labels: np.ndarray) -> np.ndarray:
         """A label image (H, W) of the first frame, moved to the last; 0 for robot pixels."""
@@ -80,9 +72,7 @@ class ClipTracks:
 class DenseFlow:
     """Dense inverse search flow (Kroeger et al., ECCV 2016; OpenCV's DIS), forward and backward.
 
-    Parameters
-    ----------
-    preset : "ultrafast", "fast" or "medium"
+    `preset` is "ultrafast", "fast" or "medium".
     """
 
     preset: str = "medium"

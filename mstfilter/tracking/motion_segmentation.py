@@ -29,17 +29,11 @@ _RIVAL_REACH = 0.15  # metres; largest distance of cells whose motions are compa
 
 @dataclass(frozen=True, eq=False)
 class FollowedPoints:
-    """Points that were followed through a clip and have depth in the first and last frame.
+    """Points that were followed through a clip and have depth in the first and last frame."""
 
-    Attributes
-    ----------
-    p, q : (n, 3) world metres, before and after.
-    column, row : (n,) pixel of each point in the last frame.
-    """
-
-    p: np.ndarray
+    p: np.ndarray  #: (n, 3) world metres, before and after
     q: np.ndarray
-    column: np.ndarray
+    column: np.ndarray  #: (n,) pixel of each point in the last frame
     row: np.ndarray
 
 

@@ -30,21 +30,13 @@ _N_NEIGHBOURS = 12  # for normals and covariances
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """A point cloud prepared for registration; make one with `prepare`.
+    """A point cloud prepared for registration; make one with `prepare`."""
 
-    Attributes
-    ----------
-    points : (N, 3) downsampled points, metres.
-    cloud, tree : small_gicp's cloud (with normals and covariances) and search tree.
-    raw_points : (M, 3) points before downsampling, metres.
-    raw_colours : (M, 3) their colours, grey levels 0 .. 255, or None.
-    """
-
-    points: np.ndarray
-    cloud: Any
+    points: np.ndarray  #: (N, 3) downsampled points, metres
+    cloud: Any  #: small_gicp's cloud (with normals and covariances) and search tree
     tree: Any
-    raw_points: np.ndarray
-    raw_colours: np.ndarray | None
+    raw_points: np.ndarray  #: (M, 3) points before downsampling, metres
+    raw_colours: np.ndarray | None  #: (M, 3) their colours, grey levels 0 .. 255, or None
 
     @cached_property
     def open3d_cloud(self) -> Any:
@@ -66,27 +58,17 @@ class Surface:
 
 @dataclass(frozen=True, eq=False)
 class RegistrationResult:
-    """Result of a registration.
+    """Result of a registration."""
 
-    Attributes
-    ----------
-    T : (4, 4) motion.
-    rms : root mean square distance from each moved source point to its nearest target point, metres.
-    overlap : fraction of the moved source points with a target point within the reach.
-    error : objective of the method (small_gicp), or root mean square distance of the inliers in metres (open3d).
-    inliers : number of correspondences within the reach.
-    converged, iterations : whether the method converged, and the index of its last iteration; None for open3d.
-    H : (6, 6) Gauss-Newton matrix of the objective, rotation first; None for open3d.
-    """
-
-    T: np.ndarray
-    rms: float
-    overlap: float
+    T: np.ndarray  #: (4, 4) motion
+    rms: float  #: root mean square distance from each moved source point to its nearest target point, metres
+    overlap: float  #: fraction of the moved source points with a target point within the reach
+    #: Objective of the method (small_gicp), or root mean square distance of the inliers in metres (open3d).
     error: float
-    inliers: int
-    converged: bool | None = None
-    iterations: int | None = None
-    H: np.ndarray | None = None
+    inliers: int  #: number of correspondences within the reach
+    converged: bool | None = None  #: whether the method converged; None for open3d
+    iterations: int | None = None  #: index of the last iteration; None for open3d
+    H: np.ndarray | None = None  #: (6, 6) Gauss-Newton matrix of the objective, rotation first; None for open3d
 
 
 def prepare(points: np.ndarray, colours: np.ndarray | None = None) -> Surface | None:
@@ -155,13 +137,7 @@ class SmallGicp(Registration):
 
 @dataclass(frozen=True)
 class PointToPlaneIcp(Registration):
-    """open3d's point-to-plane ICP (Chen and Medioni 1991).
-
-    Parameters
-    ----------
-    iterations : int
-        Largest number of iterations.
-    """
+    """open3d's point-to-plane ICP (Chen and Medioni 1991), at most `iterations` iterations."""
 
     iterations: int = 30
 

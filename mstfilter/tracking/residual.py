@@ -47,10 +47,7 @@ _DAMPING = 1e-3  # of the largest eigenvalue; keeps directions that the data do 
 class MotionResidual:
     """Robust residual of a motion.
 
-    Parameters
-    ----------
-    track_weight : float
-        Added to S if all visible points land on pixels that the flow traces back to another object.
+    `track_weight` is added to S if all visible points land on pixels that the flow traces back to another object.
     """
 
     track_weight: float = 1.0

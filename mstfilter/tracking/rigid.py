@@ -167,18 +167,11 @@ def residuals(models: np.ndarray, p: np.ndarray, q: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class MotionCluster:
-    """A rigid motion and the matches that it explains.
+    """A rigid motion and the matches that it explains."""
 
-    Attributes
-    ----------
-    T : (4, 4) motion, world metres.
-    inliers : (K,) int64, indices of the matches within eps of it.
-    rms : root mean square residual of the inliers, metres.
-    """
-
-    T: np.ndarray
-    inliers: np.ndarray
-    rms: float
+    T: np.ndarray  #: (4, 4) motion, world metres
+    inliers: np.ndarray  #: (K,) int64, indices of the matches within eps of it
+    rms: float  #: root mean square residual of the inliers, metres
 
 
 def ransac(rng: np.random.Generator, p: np.ndarray, q: np.ndarray, eps: float) -> MotionCluster | None:

@@ -42,22 +42,14 @@ _SEARCH_RADIUS, _SEARCH_STEP = 0.14, 0.01  # metres
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """A possible motion of an object.
+    """A possible motion of an object."""
 
-    Attributes
-    ----------
-    kind : "identity", "flow", "icp", "sift" or "search".
-    T : RigidTransform, world metres.
-    support : number of matches or points that determine it.
-    score : criterion of the rule, for SIFT and ICP the root mean square residual in metres; lower is better.
-    registration : result of the registration that computed it, if any.
-    """
-
-    kind: str
-    T: RigidTransform
-    support: int = 0
+    kind: str  #: "identity", "flow", "icp", "sift" or "search"
+    T: RigidTransform  #: world metres
+    support: int = 0  #: number of matches or points that determine it
+    #: Criterion of the rule, for SIFT and ICP the root mean square residual in metres; lower is better.
     score: float = 0.0
-    registration: RegistrationResult | None = None
+    registration: RegistrationResult | None = None  #: result of the registration that computed it, if any
 
 
 #: Kind, motion (4, 4), support and registration of a motion that is not scored yet.

@@ -32,18 +32,12 @@ _OCCLUDED_MARGIN = 0.015  # metres; a pixel whose depth decreased by more is occ
 
 @dataclass(frozen=True, eq=False)
 class Segment:
-    """The visible part of one object.
+    """The visible part of one object."""
 
-    Attributes
-    ----------
-    key : hash of the content; equal keys are the same tracking problem.
-    pixels : (M,) int64 sorted flat pixels of the projected mask.
-    support : (S,) int64 sorted flat pixels of the mask whose measured depth agrees with the object. The mask of a
-        voxel object extends slightly beyond the object itself.
-    """
-
-    key: bytes
-    pixels: np.ndarray
+    key: bytes  #: hash of the content; equal keys are the same tracking problem
+    pixels: np.ndarray  #: (M,) int64 sorted flat pixels of the projected mask
+    #: (S,) int64 sorted flat pixels of the mask whose measured depth agrees with the object. The mask of a voxel
+    #: object extends slightly beyond the object itself.
     support: np.ndarray
 
 
@@ -83,18 +77,11 @@ def _indices_by_label(labels: np.ndarray) -> dict[int, np.ndarray]:
 
 @dataclass(frozen=True, eq=False)
 class Track:
-    """A segment in a clip.
-
-    Attributes
-    ----------
-    segment : Segment
-    clip : Clip
-    flow : ClipTracks, the dense flow of the clip.
-    """
+    """A segment in a clip."""
 
     segment: Segment
     clip: Clip
-    flow: ClipTracks
+    flow: ClipTracks  #: the dense flow of the clip
 
     @cached_property
     def mask(self) -> np.ndarray:
@@ -164,12 +151,8 @@ class StaticTest:
     """Tests whether an object rested. Objects that pass keep the identity exactly.
 
     Tracking damages objects at rest: labels leak between touching objects of equal look, and the registration of
-    symmetric objects drifts. Objects whose pixels are unchanged are therefore not tracked.
-
-    Parameters
-    ----------
-    enabled : bool
-        If False, every object is tracked (the published algorithms).
+    symmetric objects drifts. Objects whose pixels are unchanged are therefore not tracked. If `enabled` is False,
+    every object is tracked (the published algorithms).
     """
 
     enabled: bool = True

@@ -32,20 +32,12 @@ _SMOOTHING = 0.5  # voxels, standard deviation; .3 to .6 differ little
 
 @dataclass(frozen=True)
 class WarpResult:
-    """A moved hypothesis.
-
-    Attributes
-    ----------
-    hypothesis : Hypothesis
-    voxels_left : number of voxels that left the grid.
-    contested : number of voxels that more than one object claimed.
-    dropped : ids of objects without voxels.
-    """
+    """A moved hypothesis."""
 
     hypothesis: Hypothesis
-    voxels_left: int = 0
-    contested: int = 0
-    dropped: tuple[int, ...] = ()
+    voxels_left: int = 0  #: number of voxels that left the grid
+    contested: int = 0  #: number of voxels that more than one object claimed
+    dropped: tuple[int, ...] = ()  #: ids of objects without voxels
 
 
 class _Claim(NamedTuple):
@@ -91,11 +83,8 @@ class Warp:
     ) -> WarpResult:
         """Move objects; if all motions are the identity, the result contains the same hypothesis object.
 
-        Parameters
-        ----------
-        hypothesis : Hypothesis
-        motions : label -> RigidTransform, world metres. Objects without a motion do not move.
-        residuals : label -> residual of the motion, for ties.
+        `motions` maps labels to motions in world metres; objects without one do not move. `residuals` of the motions
+        decide ties.
         """
         matrices = {k: T.as_matrix() for k, T in motions.items()}
         moving = {k: T for k, T in matrices.items() if not np.array_equal(T, np.eye(4))}

@@ -35,7 +35,9 @@ _HERE = str(Path(__file__).parent)
 
 @dataclass(frozen=True)
 class Program:
-    """A model given as a function, and its filters.
+    """A model given as a function, and its filters with `n` particles.
+
+    The methods take further fields of `ParticleFilter` by name, such as ``resampler`` or ``trigger``.
 
     Parameters
     ----------
@@ -64,10 +66,6 @@ class Program:
         guide : callable
             Program that draws every site of the model, by name, given the observation. If the observation is missing,
             the model draws.
-        n : int
-            Particles.
-        **components
-            Further fields of `ParticleFilter`, such as ``resampler`` or ``trigger``.
         """
         return self._filter(guide, n, components)
 
@@ -137,8 +135,6 @@ class ProgramLookahead(Lookahead):
 
     Parameters
     ----------
-    model : callable
-        The program.
     power : float
         Power of the priority; below 1 if the lookahead at the mean is too confident.
     """
@@ -169,8 +165,6 @@ class ProgramMove(Rejuvenation):
 
     Parameters
     ----------
-    model : callable
-        The program.
     scale : float
         Standard deviation of a step relative to that of the site.
     steps : int
@@ -269,20 +263,7 @@ class ProgramMove(Rejuvenation):
 def run_program(
     model: Callable[[Any, Any], Any], handler: SiteHandler, previous: Particles | None, observation: Any, n: int
 ) -> tuple[Particles, np.ndarray]:
-    """Run a program over n particles.
-
-    Parameters
-    ----------
-    model : callable
-        The program, or its guide.
-    handler : SiteHandler
-        Decides the values of the sites.
-    previous : particles or None
-        x_{t-1}.
-    observation : Any
-        y_t.
-    n : int
-        Number of particles.
+    """Run a program, or its guide, over n particles; the handler decides the values of the sites.
 
     Returns
     -------

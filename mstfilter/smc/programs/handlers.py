@@ -18,25 +18,13 @@ from mstfilter.smc.streams import child
 
 
 class Site(NamedTuple):
-    """A call of `sample` in a run.
-
-    Parameters
-    ----------
-    name : str
-    distribution : Distribution
-    size : int
-        Number of particles that reach the site.
-    rows : (size,) int array or None
-        Their indices; None stands for all particles.
-    branch : bool
-        Whether the value chooses a branch of `switch`.
-    """
+    """A call of `sample` in a run."""
 
     name: str
     distribution: Distribution
-    size: int
-    rows: np.ndarray | None
-    branch: bool
+    size: int  #: number of particles that reach the site
+    rows: np.ndarray | None  #: (size,) int indices; None stands for all particles
+    branch: bool  #: whether the value chooses a branch of `switch`
 
     @property
     def index(self) -> Any:
@@ -84,14 +72,7 @@ class SampleHandler(SiteHandler):
 
 
 class GuideHandler(SiteHandler):
-    """Draws every site, and keeps values and log densities for a `ReplayHandler`.
-
-    Parameters
-    ----------
-    rng : Generator
-    n : int
-        Particles.
-    """
+    """Draws every site for n particles, and keeps values and log densities for a `ReplayHandler`."""
 
     observes = False
 

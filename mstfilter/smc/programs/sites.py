@@ -89,10 +89,7 @@ def _current() -> ProgramRun:
 class PerParticle:
     """A program that runs once for every particle; made by `per_particle`.
 
-    Parameters
-    ----------
-    function : callable
-        ``(previous, observation)``; `previous` is the particle's `Trace`.
+    ``function(previous, observation)`` gets the particle's `Trace` as `previous`.
     """
 
     function: Callable[[Any, Any], Any]
@@ -107,13 +104,7 @@ def per_particle(function: Callable[[Any, Any], Any]) -> PerParticle:
 
 
 class Trace(Mapping[str, Any]):
-    """An immutable mapping from names to values: a particle of a `per_particle` program.
-
-    Parameters
-    ----------
-    values : mapping
-        Numbers, strings or arrays.
-    """
+    """An immutable mapping from names to numbers, strings or arrays: a particle of a `per_particle` program."""
 
     __slots__ = ("_values",)
 
@@ -140,24 +131,12 @@ def _read_only(array: np.ndarray) -> np.ndarray:
 
 
 class Shapes(NamedTuple):
-    """Shapes at a site, an observation or a returned value.
+    """Shapes at a site, an observation or a returned value."""
 
-    Parameters
-    ----------
-    what : str
-        Description, for messages.
-    event : tuple
-        Event shape.
-    value : tuple or None
-        Shape of the observed value.
-    size : int
-        Number of particles.
-    """
-
-    what: str
-    event: tuple[int, ...]
-    value: tuple[int, ...] | None
-    size: int
+    what: str  #: description, for messages
+    event: tuple[int, ...]  #: event shape
+    value: tuple[int, ...] | None  #: shape of the observed value
+    size: int  #: number of particles
 
     @property
     def fits(self) -> bool:
@@ -192,16 +171,9 @@ class Shapes(NamedTuple):
 
 
 class ProgramRun:
-    """One pass of a program.
+    """One pass of a program over n particles; the handler decides the values.
 
-    Parameters
-    ----------
-    handler : SiteHandler
-        Decides the values.
-    n : int
-        Particles.
-    single : bool
-        Whether the program sees one particle's values without the particle axis.
+    With `single` the program sees the values of one particle, without the particle axis.
     """
 
     def __init__(self, handler: SiteHandler, n: int, single: bool = False) -> None:
