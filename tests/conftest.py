@@ -1,4 +1,4 @@
-"""Shared fixtures: where the real data lie."""
+"""Shared fixtures: where the real data lie, and recordings that are simulated once per session."""
 
 from __future__ import annotations
 
@@ -33,3 +33,16 @@ def find_shared(name: str) -> Path:
 def shared_data():
     """``shared_data("r1/quality.npz")`` is the path, or the test is skipped."""
     return find_shared
+
+
+@pytest.fixture(scope="session", autouse=True)
+def recordings(tmp_path_factory):
+    """The folder of `cached_recording` in this session: all tests and workers share what one of them has simulated.
+
+    The user's cache is not used: the key of a recording does not depend on the code that makes it.
+    """
+    base = tmp_path_factory.getbasetemp()
+    cache = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "cache"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("MSTFILTER_CACHE", str(cache))
+        yield cache / "recordings"

@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
 import numpy as np
+from joblib import Parallel, delayed
 from miniature_filters import (
     N_RANK_DRAWS,
     POSTERIOR_ERRORS,
@@ -82,18 +82,18 @@ def arm(name: str, world: Miniature, n: int) -> ParticleFilter:
 Plan = list[tuple[tuple[str, ...], int, int]]  # arms, n, number of worlds
 
 
-def distances(plan: Plan) -> list[dict[str, object]]:
-    """One row per world, arm, size and step; one process per shape of world."""
-    with ProcessPoolExecutor(len(WORLDS)) as pool:
-        return [row for rows in pool.map(distances_of_shape, WORLDS, [plan] * len(WORLDS)) for row in rows]
+def distances(plan: Plan, steps: int = T, processes: int = len(WORLDS)) -> list[dict[str, object]]:
+    """One row per world, arm, size and step; by default one process per shape of world."""
+    parts = Parallel(processes)(delayed(distances_of_shape)(shape, plan, steps) for shape in WORLDS)
+    return [row for rows in parts for row in rows]
 
 
-def distances_of_shape(shape: str, plan: Plan) -> list[dict[str, object]]:
+def distances_of_shape(shape: str, plan: Plan, n_steps: int) -> list[dict[str, object]]:
     """Rows of one shape of world."""
     rows, world = [], WORLDS[shape]
     for arms, n, n_worlds in plan:
         for seed in range(n_worlds):
-            truth, observations = world.simulate(np.random.default_rng([seed, 11]), T)
+            truth, observations = world.simulate(np.random.default_rng([seed, 11]), n_steps)
             exact = exact_filter(world, observations).posterior
             answers: dict[str, list[np.ndarray]] = {
                 "exact": list(exact),
@@ -188,7 +188,7 @@ def calibrate(arms: dict[str, int], n_worlds: int, steps: int, out: Path) -> Non
 def main() -> None:
     """The command line."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--smoke", action="store_true", help="two worlds, few particles: a minute; needs --out")
+    parser.add_argument("--smoke", action="store_true", help="two worlds, few particles: seconds; needs --out")
     parser.add_argument(
         "--presets", action="store_true", help="the presets alone, distances alone: 4 minutes on two cores"
     )
@@ -206,14 +206,16 @@ def main() -> None:
         )
         return
     if options.smoke:
-        plan, ranked, n_worlds = [(every, 5, 2), (every, 20, 2)], {"exact": 0, "guided": 50, "mst": 5}, 20
+        plan, ranked, n_worlds = [(every, 5, 2), (tuple(PROPER), 20, 2)], {"exact": 0, "guided": 50, "mst": 5}, 10
+        found = distances(plan, 2, processes=1)
     else:
         few = (*PROPER, *PRESETS, "+ parents", "+ cover", "union, cover")
         plan = [(every, 5, 100), (every, 20, 100), (every, 100, 50), (few, 500, 24)]
         ranked = {"exact": 0, "bootstrap": 1000, "guided": 500, "balanced": 500, "paper": 20, "authors": 20}
         ranked |= {"mst": 20, "+ cover": 20}
         n_worlds = 400
-    summarise(distances(plan), options.out)
+        found = distances(plan)
+    summarise(found, options.out)
     calibrate(ranked, n_worlds, 3, options.out)
     from figure import draw
 

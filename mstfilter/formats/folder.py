@@ -55,8 +55,7 @@ from mstfilter.scene import (
     write_image,
 )
 
-VERSION = 1
-"""Version of the layout."""
+VERSION = 1  #: Version of the layout
 
 
 class _Workspace(BaseModel):

@@ -28,8 +28,8 @@ if TYPE_CHECKING:
 
 # Placeholders, which are replaced by the colours of the page.
 _INK, _MUTED, _LINE, _ACCENT, _BASELINE = "#010203", "#020304", "#030405", "#040506", "#050607"
+#: Placeholders of the colours of arms.
 SERIES = tuple(f"#06{k:02x}08" for k in range(12))
-"""Placeholders of the colours of arms."""
 _PAGE = {
     _INK: "currentColor",
     _MUTED: "var(--muted)",

@@ -25,8 +25,7 @@ from mstfilter.runs import RunFolder
 from mstfilter.scene import Camera, Hypothesis, project
 from mstfilter.scoring import overlap
 
-TRUTH = -1
-"""Index of the ground truth in place of a hypothesis."""
+TRUTH = -1  #: Index of the ground truth in place of a hypothesis
 
 _DESCENT_SCORE = 0.5  # score of descent; an overlap (Jaccard index) of 1 at this pause scores 1
 _EARLIER_SCORE = 0.4  # score of an overlap of 1 with the last pause

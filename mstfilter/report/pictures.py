@@ -30,11 +30,10 @@ _HEX = (
     "a95317 876888 eba9b2 968727 52a9fe e66d71 577251 075c70 9dbe7c 6892ac"
 )
 
+#: Twenty colours, 8-bit sRGB.
 PALETTE: tuple[Colour, ...] = tuple((int(h[:2], 16), int(h[2:4], 16), int(h[4:], 16)) for h in _HEX.split())
-"""Twenty colours, 8-bit sRGB."""
 
-UNASSIGNED_COLOUR: Colour = (140, 143, 148)
-"""Colour of objects without an identity."""
+UNASSIGNED_COLOUR: Colour = (140, 143, 148)  #: Colour of objects without an identity
 
 _Volume = Hypothesis | tuple[np.ndarray, VoxelGrid]
 _LIGHT = np.array([-0.35, -0.45, 0.82])  # direction to the light in axes of the view: right, towards the eye, up

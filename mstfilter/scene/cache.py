@@ -115,8 +115,7 @@ class Cache:
             self._disk = before
 
 
-scene_cache = Cache()
-"""The cache of this process."""
+scene_cache = Cache()  #: The cache of this process
 
 
 def memo(name: str, key: Hashable, compute: Callable[[], _Value], stored_as: Any = None) -> _Value:

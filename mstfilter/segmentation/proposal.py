@@ -43,11 +43,10 @@ _MIN_READINGS = 0.004  # fraction of a region's pixels with a depth reading (the
 class Segments:
     """Object pixels of an image, and the nodes of its tree that are objects."""
 
+    #: (H, W) bool, pixels that can belong to an object: a depth reading above the table and in the workspace, not the
+    #: robot.
     object_pixels: np.ndarray
-    """(H, W) bool, pixels that can belong to an object: a depth reading above the table and in the workspace, not the
-    robot."""
-    is_object: np.ndarray
-    """(N,) bool, whether the node is an object if it is part of a cut."""
+    is_object: np.ndarray  #: (N,) bool, whether the node is an object if it is part of a cut
 
 
 @dataclass(frozen=True)

@@ -212,8 +212,7 @@ def _shifted(image: np.ndarray, at: tuple[np.ndarray, ...], axis: int, shift: in
     return image[tuple(index)]
 
 
-PAIR_FEATURES = tuple(JOIN_WEIGHTS)
-"""Names of the columns of `pair_features`."""
+PAIR_FEATURES = tuple(JOIN_WEIGHTS)  #: Names of the columns of `pair_features`
 
 
 def quadric_residual(sums: np.ndarray) -> np.ndarray:

@@ -34,8 +34,7 @@ class SceneObjects:
 
     shapes: tuple[Shape, ...]
     skins: tuple[Skin, ...]
-    twin_of: tuple[int, ...]
-    """Index of the object that each one repeats, -1 for none."""
+    twin_of: tuple[int, ...]  #: Index of the object that each one repeats, -1 for none
 
 
 def draw_objects(rng: np.random.Generator, family: SceneFamily, pool: Pool) -> SceneObjects:

@@ -22,11 +22,9 @@ from mstfilter.simulation.shapes import ANY, REPORTED, SHAPE_FAMILIES, TUNING, P
 _LOOKS_AT = np.array([0.02, 0.05, 0.04])
 _TOWARDS_CAMERA = np.array([0.03, -0.77, 0.54]) / np.linalg.norm([0.03, -0.77, 0.54])
 
-GENERATOR_VERSION = 7
-"""Raised whenever the bytes of the recording of a seed change."""
+GENERATOR_VERSION = 7  #: Raised whenever the bytes of the recording of a seed change
 
-FIRST_REPORTED_SEED = 1000
-"""With the catalogue "by seed", seeds from this one on draw from the reported pool."""
+FIRST_REPORTED_SEED = 1000  #: With the catalogue "by seed", seeds from this one on draw from the reported pool
 
 _POOLS = {"tuning": TUNING, "reported": REPORTED, "any": ANY}
 
@@ -171,6 +169,7 @@ _STUDIED = SceneFamily(
     n_actions=4,
 )
 
+#: The named families.
 SCENE_FAMILIES: dict[str, SceneFamily] = {
     "demo": SceneFamily(
         name="demo",
@@ -195,7 +194,6 @@ SCENE_FAMILIES: dict[str, SceneFamily] = {
         _STUDIED, name="s3", n_objects_min=15, n_objects_max=20, n_twins=4, n_stacked=4, n_hidden=3, min_moved=3
     ),
 }
-"""The named families."""
 
 
 def scene_family(name: str) -> SceneFamily:

@@ -18,14 +18,12 @@ from mstfilter.simulation.solids import may_meet
 from mstfilter.simulation.textures import Atlas, Room, texture_coordinates
 from mstfilter.simulation.world import FINGER_GROUP, FINGER_ID, OBJECT_GROUP, PhysicsWorld
 
-SHADOW_GROUPS = (OBJECT_GROUP, FINGER_GROUP)
-"""Geoms that cast shadows."""
+SHADOW_GROUPS = (OBJECT_GROUP, FINGER_GROUP)  #: Geoms that cast shadows
 
 _LIFT = 0.0012  # metres off the surface, against shadows of a surface on itself
 _MAP_LOW, _MAP_HIGH = np.array([-0.62, -0.55]), np.array([0.62, 0.66])
 _FINGER_COLOUR = np.array([0.09, 0.095, 0.105], np.float32)
-UNKNOWN = -2
-"""Geom of a ray that has not been cast."""
+UNKNOWN = -2  #: Geom of a ray that has not been cast
 
 
 class Stage:
@@ -49,8 +47,7 @@ class Stage:
         inward = np.minimum(0.35 * across, long)
         self._axis = np.eye(3)[half.argmax(axis=1)] * (long - inward)[:, None]
         self._thick = np.hypot(across, inward)
-        self.poses: np.ndarray = world.poses()
-        """T_world_object (n, 4, 4) as rendered."""
+        self.poses: np.ndarray = world.poses()  #: T_world_object (n, 4, 4) as rendered
         self._finger = world.finger_position()
         self._data.qpos[:] = world.data.qpos
         mujoco.mj_kinematics(world.model, self._data)

@@ -18,8 +18,7 @@ import numpy as np
 
 from mstfilter.simulation.shapes import ANY, Pool
 
-DOT = 0.0004
-"""Size of a drawn pixel in metres."""
+DOT = 0.0004  #: Size of a drawn pixel in metres
 
 _Rgb = tuple[int, int, int]
 _Box = tuple[int, int, int, int]  # x, y, width, height in pixels

@@ -56,8 +56,8 @@ from mstfilter.simulation.world import (
     push_effect,
 )
 
+#: Metres by which recorded poses (in images, poses and volumes alike) may differ from the physics; see `Stage`.
 POSE_TOLERANCE = 0.0002
-"""Metres by which recorded poses (in images, poses and volumes alike) may differ from the physics; see `Stage`."""
 
 _Progress = Callable[[int, int, str], None]  # called with frames done, frames in all, and a description
 

@@ -35,8 +35,8 @@ _BLUR = 0.45  # standard deviation of the blur of the colour camera's optics, pi
 _PHOTON_NOISE = 0.010  # standard deviation at white, as a share of white; proportional to the root of the light
 _READ_NOISE = 0.002  # standard deviation in the dark, as a share of white
 
+#: Pairs of views of an image that hold vertical and horizontal neighbours.
 NEIGHBOURS = ((np.s_[1:], np.s_[:-1]), (np.s_[:, 1:], np.s_[:, :-1]))
-"""Pairs of views of an image that hold vertical and horizontal neighbours."""
 
 
 @dataclass(frozen=True)

@@ -107,8 +107,7 @@ class Shape:
     finish: tuple[str, ...]  #: styles of texture that suit the object
     rolling: float = 0.0005  #: rolling friction, metres
 
-    half: np.ndarray = field(init=False)
-    """Half edges (3,) of the bounding box, metres."""
+    half: np.ndarray = field(init=False)  #: Half edges (3,) of the bounding box, metres
 
     def __post_init__(self) -> None:
         bounds = [piece.bounds() for piece in self.pieces]
@@ -291,8 +290,7 @@ _MAKERS: dict[str, Callable[[np.random.Generator, Callable[[], float]], Shape]] 
     "banana": _banana,
 }
 
-SHAPE_FAMILIES: tuple[str, ...] = tuple(_MAKERS)
-"""Names of the families of objects."""
+SHAPE_FAMILIES: tuple[str, ...] = tuple(_MAKERS)  #: Names of the families of objects
 
 
 def draw_shape(rng: np.random.Generator, family: str, pool: Pool = ANY) -> Shape:

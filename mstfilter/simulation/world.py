@@ -31,16 +31,13 @@ from mstfilter.simulation.families import SceneFamily
 from mstfilter.simulation.shapes import Shape
 from mstfilter.simulation.solids import Piece
 
-FINGER_ID = 255
-"""Instance id of finger and arm."""
+FINGER_ID = 255  #: Instance id of finger and arm
 
-TABLE = ((0.85, 0.66, 0.02), (0.0, 0.04, -0.02))
-"""Half edges and centre of the table top; its upper face is z = 0."""
+TABLE = ((0.85, 0.66, 0.02), (0.0, 0.04, -0.02))  #: Half edges and centre of the table top; its upper face is z = 0
 
 FLOOR_HEIGHT = -0.72
 
-ROOM_GROUP, OBJECT_GROUP, FINGER_GROUP = 0, 1, 2
-"""Groups of geoms that rays can be limited to."""
+ROOM_GROUP, OBJECT_GROUP, FINGER_GROUP = 0, 1, 2  #: Groups of geoms that rays can be limited to
 
 _TIME_STEP = 0.002
 _WALL_DISTANCE = 1.9
@@ -138,13 +135,13 @@ class PhysicsWorld:
         ids = np.zeros(self.model.nbody, np.int32)
         ids[bodies] = np.arange(1, len(shapes) + 1)
         ids[self.model.body("finger").id] = FINGER_ID
+        #: Instance id of each geom: 0 for the room, 1 .. n for objects, 255 for finger and arm.
         self.geom_object: np.ndarray = ids[self.model.geom_bodyid]
-        """Instance id of each geom: 0 for the room, 1 .. n for objects, 255 for finger and arm."""
+        #: Index of each geom among the pieces of its body.
         self.geom_piece: np.ndarray = np.arange(self.model.ngeom) - self.model.body_geomadr[self.model.geom_bodyid]
-        """Index of each geom among the pieces of its body."""
         joints = self.model.body_jntadr[bodies]
+        #: Indices (n, 7) of position and quaternion (w, x, y, z) of each object in `data.qpos`.
         self.pose_index: np.ndarray = self.model.jnt_qposadr[joints][:, None] + np.arange(7)
-        """Indices (n, 7) of position and quaternion (w, x, y, z) of each object in `data.qpos`."""
         self._velocity_index = self.model.jnt_dofadr[joints][:, None] + np.arange(6)
         self.move_finger(_PARKED)
 

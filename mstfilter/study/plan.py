@@ -107,7 +107,8 @@ def make_plan(study: StudyConfig, overrides: Sequence[str] = (), *, allow_files:
         If an arm is invalid, two arms are the same, there are no runs, or a recording cannot be read.
     """
     code = code_version()
-    arms = tuple(_arm(request, code, allow_files) for request in expand_arms(study, overrides))
+    versions = library_versions()
+    arms = tuple(_arm(request, versions, code, allow_files) for request in expand_arms(study, overrides))
     for what, found in (("arm", arms), ("scene", study.scenes), ("seed", study.seeds)):
         if not found:
             raise InputError(f"study {study.name} has no {what}, so there is nothing to run")
@@ -129,12 +130,12 @@ def make_plan(study: StudyConfig, overrides: Sequence[str] = (), *, allow_files:
     return Plan(study, code, arms, scenes, runs)
 
 
-def _arm(request: ArmRequest, code: str, allow_files: bool) -> Arm:
+def _arm(request: ArmRequest, versions: dict[str, str], code: str, allow_files: bool) -> Arm:
     with request.name_in_errors():
         filter = build_filter(request.config(allow_files), allow_files=allow_files)
     config = as_json(describe_filter(filter))
     known_code = all(type(part).__module__.startswith("mstfilter") for part in nested_components(filter))
-    key = _hash([config, component_files(filter), library_versions(), code])
+    key = _hash([config, component_files(filter), versions, code])
     return Arm(request.name, config, key, known_code, tuple(uses_truth(filter)), request.reported_only)
 
 

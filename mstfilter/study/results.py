@@ -38,9 +38,9 @@ _DIFFERENCE_COLUMNS = (
 _FAILURE_COLUMNS = ("run", "error", "hints", "tries", "folder")
 
 
+#: Plain values: ``kind`` (record or run), ``name``, ``share`` (jobs of one share use the same intermediate results),
+#: ``tries``, ``timeout_s`` and what `mstfilter.study.jobs` needs.
 Job = Mapping[str, Any]
-"""Plain values: ``kind`` (record or run), ``name``, ``share`` (jobs of one share use the same intermediate results),
-``tries``, ``timeout_s`` and what `mstfilter.study.jobs` needs."""
 
 
 @dataclass(frozen=True)

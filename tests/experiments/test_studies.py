@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from unittest import mock
+
 import pytest
 
 from mstfilter.cli import main
@@ -9,24 +11,20 @@ from mstfilter.files import read_csv
 from mstfilter.simulation import FIRST_REPORTED_SEED
 from mstfilter.study import load_study, make_plan
 from tests.experiments.scripts import EXPERIMENTS, run_script
+from tests.study.scenes import InProcess
 
 MAIN = EXPERIMENTS / "main/study.toml"
 FUSION = EXPERIMENTS / "fusion"
 
 
-@pytest.fixture(autouse=True)
-def cache(tmp_path, monkeypatch):
-    """Recordings and shared work are kept in a folder of the test."""
-    monkeypatch.setenv("MSTFILTER_CACHE", str(tmp_path / "cache"))
-
-
-def run_small(tmp_path, config, workers=2):
+def run_small(tmp_path, config):
     """The folder of a study in its small form."""
     out = tmp_path / config.stem
-    try:
-        main(["study", str(config), "--smoke", "--out", str(out), "--workers", str(workers)])
-    except SystemExit as end:
-        assert not end.code
+    with mock.patch("mstfilter.study.Local", lambda workers, logs: InProcess()):
+        try:
+            main(["study", str(config), "--smoke", "--out", str(out)])
+        except SystemExit as end:
+            assert not end.code
     return out
 
 
@@ -88,14 +86,14 @@ def test_fusion_study_reports_the_arms_that_were_tuned():
 
 
 def test_error_budget(tmp_path):
-    folder = run_small(tmp_path, EXPERIMENTS / "error_budget/study.toml", workers=1)
+    folder = run_small(tmp_path, EXPERIMENTS / "error_budget/study.toml")
     quality = {row["arm"]: float(row["quality"]) for row in read_csv(folder / "runs.csv")}
     assert len(quality) == 3
     assert quality["all true"] >= 0.97 > quality["mst"]
 
 
 def test_mask_quality(tmp_path):
-    folder = run_small(tmp_path, EXPERIMENTS / "error_budget/mask_quality.toml", workers=1)
+    folder = run_small(tmp_path, EXPERIMENTS / "error_budget/mask_quality.toml")
     quality = {row["arm"]: float(row["quality"]) for row in read_csv(folder / "runs.csv")}
     assert len(quality) == 10
     best = [q for arm, q in quality.items() if "=1.0" in arm]

@@ -1,10 +1,13 @@
-"""Small recordings for studies."""
+"""Small recordings for studies, and an executor without processes."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from mstfilter.formats import RecordingWriter
+from mstfilter.study import Executor
+from mstfilter.study.executors import Event
+from mstfilter.study.jobs import perform
 from tests.scene.scenes import CAMERA, GRID, table_scene
 
 
@@ -18,3 +21,19 @@ def slide(path, seed=0, pauses=3):
             if index % 2 == 0:
                 writer.add_voxels(labels)
     return path
+
+
+class InProcess(Executor):
+    """Runs jobs one after another in this process.
+
+    For tests of plans, resuming and tables: starting a worker takes longer than a small run. `Local` and `Cluster`
+    have their own tests.
+    """
+
+    def run(self, jobs, tell):
+        outcomes = []
+        for k, job in enumerate(jobs):
+            tell(Event("started", k))
+            outcomes.append(perform(job, lambda done, total, k=k: tell(Event("step", k, done, total))))
+            tell(Event("ended", k, outcome=outcomes[-1]))
+        return outcomes

@@ -19,7 +19,7 @@ from mstfilter.study.config import load_study, study_of
 from mstfilter.study.executors import Executor, Local
 from mstfilter.study.results import StudyFolder
 from mstfilter.study.study import run_study
-from tests.study.scenes import slide
+from tests.study.scenes import InProcess, slide
 
 BROKEN = Path(__file__).parent / "broken.py"
 FAST = "floor_components"  # a preset that needs no large library
@@ -77,9 +77,9 @@ def test_failures_are_isolated_listed_and_explained(folder, tmp_path):
 def test_only_failed_runs_are_repeated(folder, tmp_path):
     marker = tmp_path / "once"
     wanted, out = study(folder, "good", f"raise@{marker}", seeds=[0]), tmp_path / "out"
-    first = run_study(wanted, out, Local(1), cache=tmp_path)
+    first = run_study(wanted, out, InProcess(), cache=tmp_path)
     assert (first.done, len(first.failed)) == (1, 1)
-    again = run_study(wanted, out, Local(1), cache=tmp_path)
+    again = run_study(wanted, out, InProcess(), cache=tmp_path)
     assert (again.done, again.repeated, again.failed) == (2, 1, ())
     assert table(out, "failures.csv") == []
 
@@ -94,7 +94,7 @@ def test_a_failure_that_could_not_be_written_down_is_written_later(folder, tmp_p
         write(self, folder, identity, outcome)
 
     monkeypatch.setattr(StudyFolder, "write_failure", full_at_first)
-    run_study(study(folder, "full", seeds=[0]), tmp_path / "out", Local(1), cache=tmp_path)
+    run_study(study(folder, "full", seeds=[0]), tmp_path / "out", InProcess(), cache=tmp_path)
     assert "no space left" in table(tmp_path / "out", "failures.csv")[0]["error"]
 
 
@@ -134,7 +134,7 @@ def test_a_run_that_takes_too_long_is_named(folder, tmp_path):
 def test_a_recording_that_cannot_be_made_fails_its_runs_only(folder, tmp_path):
     impossible = {"family": "demo", "seeds": 0, "group": "no", "set": {"workspace_x": 0.1, "workspace_y": 0.1}}
     wanted = study(folder, "good", scenes=[{"recordings": "slide"}, impossible], seeds=[0])
-    result = run_study(wanted, tmp_path / "out", Local(1), cache=tmp_path)
+    result = run_study(wanted, tmp_path / "out", InProcess(), cache=tmp_path)
     assert result.done == 1
     ((name, outcome),) = result.failed
     assert name == "good on no-0, seed 0" and outcome.error
@@ -176,10 +176,10 @@ def test_killing_the_study_and_resuming_ends_with_the_same_table(folder, tmp_pat
     done = {p: p.stat().st_mtime_ns for p in out.glob("runs/*/result.json")}
     assert len(done) == 1
     assert not (out / "runs.csv").exists()
-    resumed = run_study(load_study(config), out, Local(2), cache=tmp_path / "cache")
+    resumed = run_study(load_study(config), out, InProcess(), cache=tmp_path / "cache")
     assert resumed.repeated == 1 and resumed.done == 4
     assert {p: p.stat().st_mtime_ns for p in done} == done
-    whole = run_study(load_study(config), tmp_path / "whole", Local(1), cache=tmp_path / "cache")
+    whole = run_study(load_study(config), tmp_path / "whole", InProcess(), cache=tmp_path / "cache")
     assert whole.repeated == 0
     assert metrics(out) == metrics(tmp_path / "whole")
     assert not list((out / "runs").glob(".*"))
@@ -188,11 +188,11 @@ def test_killing_the_study_and_resuming_ends_with_the_same_table(folder, tmp_pat
 def test_one_process_a_study(folder, tmp_path):
     fcntl = pytest.importorskip("fcntl")
     out = tmp_path / "out"
-    run_study(study(folder, "good", seeds=[0]), out, Local(1), cache=tmp_path)
+    run_study(study(folder, "good", seeds=[0]), out, InProcess(), cache=tmp_path)
     with (out / ".lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         with pytest.raises(InputError, match="another process"):
-            run_study(study(folder, "good", seeds=[0]), out, Local(1), cache=tmp_path)
+            run_study(study(folder, "good", seeds=[0]), out, InProcess(), cache=tmp_path)
 
 
 WRONG = {

@@ -20,7 +20,7 @@ from mstfilter.study.executors import Local
 from mstfilter.study.jobs import perform
 from mstfilter.study.plan import make_plan
 from mstfilter.study.study import run_study
-from tests.study.scenes import slide
+from tests.study.scenes import InProcess, slide
 
 BASE = """
 description = "test"
@@ -126,8 +126,8 @@ def test_recordings_of_one_name_in_two_groups(tmp_path):
 
 def test_a_larger_study_runs_new_runs_only(folder, tmp_path):
     study = load_study(folder / "base.toml", smoke=True)
-    assert run_study(study, tmp_path / "out", Local(1), cache=tmp_path / "cache").done == 4
-    more = run_study(study, tmp_path / "out", Local(1), ["n=5,4"], cache=tmp_path / "cache")
+    assert run_study(study, tmp_path / "out", InProcess(), cache=tmp_path / "cache").done == 4
+    more = run_study(study, tmp_path / "out", InProcess(), ["n=5,4"], cache=tmp_path / "cache")
     assert (more.done, more.repeated) == (8, 4)  # n = 5 is the default, so these runs are done already
     assert len({r["arm"] for r in table(tmp_path / "out" / "runs.csv")}) == 4
 
@@ -137,7 +137,7 @@ def test_keep_tables_removes_the_hypotheses(folder, tmp_path):
     scenes = (SceneEntry(recordings=("slide-0",)),)
     for keep in ("all", "tables"):
         chosen = study.model_copy(update={"keep": keep, "scenes": scenes})
-        run_study(chosen, tmp_path / keep, Local(1), cache=tmp_path / "cache")
+        run_study(chosen, tmp_path / keep, InProcess(), cache=tmp_path / "cache")
         runs = list((tmp_path / keep / "runs").iterdir())
         assert runs and all((path / "pauses").exists() == (keep == "all") for path in runs)
     assert table(tmp_path / "all" / "runs.csv") == table(tmp_path / "tables" / "runs.csv")
@@ -152,7 +152,7 @@ def test_arms_that_use_the_ground_truth_are_marked(folder, tmp_path):
     data = {"name": "s", "folder": folder, "scenes": [{"recordings": "slide-0"}], "seeds": [0]}
     arms = [{"preset": "mst"}]
     arms.append({"name": "oracle", "preset": "mst", "set": ['update.evidence=["true_quality"]']})
-    result = run_study(study_of({**data, "arms": arms}), tmp_path / "out", Local(1), cache=tmp_path / "cache")
+    result = run_study(study_of({**data, "arms": arms}), tmp_path / "out", InProcess(), cache=tmp_path / "cache")
     assert result.failed == ()
     assert result.folder.truth_users == {"oracle": ["TrueQuality"]}
     for run in result.folder.description["runs"]:
