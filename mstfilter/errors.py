@@ -16,21 +16,19 @@ from numbers import Integral, Real
 from typing import Any
 
 
-class InputError(ValueError):
-    """Input that cannot be used.
-
-    Parameters
-    ----------
-    message : str
-        One line: what is wrong, where, and the value found.
-    *hints : str
-        One line each: what the user can do about it.
-    """
-
+class _WithHints(Exception):
     def __init__(self, message: str, *hints: str) -> None:
         super().__init__(message)
         self.message = message
         self.hints = hints
+
+
+class InputError(_WithHints, ValueError):
+    """Input that cannot be used.
+
+    `message` is one line: what is wrong, where, and the value found. Each hint is one line: what the user can do
+    about it.
+    """
 
 
 class MissingLibraryError(InputError):
@@ -41,21 +39,11 @@ class LostRunError(InputError):
     """No particle explains an observation: the estimate of the evidence is 0, and the run cannot continue."""
 
 
-class InputWarning(UserWarning):
-    """Input that can be used but is probably not what was meant. The command line shows it as one ``warning:`` line.
+class InputWarning(_WithHints, UserWarning):
+    """Input that can be used but is probably not what was meant; message and hints as for `InputError`.
 
-    Parameters
-    ----------
-    message : str
-        One line: what is strange, where, and the value found.
-    *hints : str
-        One line each: what the user can do about it.
+    The command line shows it as one ``warning:`` line.
     """
-
-    def __init__(self, message: str, *hints: str) -> None:
-        super().__init__(message)
-        self.message = message
-        self.hints = hints
 
 
 def check_number(

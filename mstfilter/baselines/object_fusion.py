@@ -69,11 +69,7 @@ class ObjectFusion(Update):
     draws: ClassVar[bool] = False
 
     def update(
-        self,
-        rng: np.random.Generator,
-        predicted: Population | None,
-        proposed: Population | None,
-        observation: Clip,
+        self, rng: np.random.Generator, predicted: Population | None, proposed: Population | None, observation: Clip
     ) -> Population:
         """The map after the clip; at the first pause the proposed segmentation."""
         if predicted is None:

@@ -43,16 +43,7 @@ class FirstPause(Proposal):
 
 @dataclass(frozen=True)
 class OneBlob(Proposal):
-    """One object: everything above the table, completed.
-
-    Parameters
-    ----------
-    completer : Completer
-    objects : ObjectRule
-        Selects the pixels above the table.
-    threshold : float
-        Least probability of an occupied voxel.
-    """
+    """One object: everything above the table, completed; voxels of probability `threshold` or more are occupied."""
 
     completer: Completer = field(default_factory=Extrude)
     objects: ObjectRule = field(default_factory=ObjectRule)
@@ -67,15 +58,7 @@ class OneBlob(Proposal):
 
 @dataclass(frozen=True)
 class OccupiedComponents(Proposal):
-    """Connected components of the occupied space.
-
-    Parameters
-    ----------
-    completer, objects, threshold
-        As in `OneBlob`.
-    min_voxels : int
-        Smaller components are dropped.
-    """
+    """Connected components of at least `min_voxels` voxels of the occupied space; other fields as in `OneBlob`."""
 
     completer: Completer = field(default_factory=Extrude)
     objects: ObjectRule = field(default_factory=ObjectRule)
@@ -98,12 +81,8 @@ class OccupiedComponents(Proposal):
 class ImageComponents(Proposal):
     """Connected components of the image above the support plane, each completed.
 
-    Parameters
-    ----------
-    completer, objects, threshold
-        As in `OneBlob`; ``objects.min_points`` is the size of the smallest component.
-    max_step : float
-        Neighbouring pixels with depths that differ by more (metres) are not connected.
+    ``objects.min_points`` is the size of the smallest component. Neighbouring pixels with depths that differ by more
+    than `max_step` metres are not connected. Other fields are as in `OneBlob`.
     """
 
     completer: Completer = field(default_factory=Extrude)

@@ -28,11 +28,7 @@ class SamplesOnly(Update):
     draws: ClassVar[bool] = False
 
     def update(
-        self,
-        rng: np.random.Generator,
-        predicted: Population | None,
-        proposed: Population | None,
-        observation: Clip,
+        self, rng: np.random.Generator, predicted: Population | None, proposed: Population | None, observation: Clip
     ) -> Population:
         """The proposed population; without a proposal, the predicted one."""
         return union(predicted if proposed is None else None, proposed)
@@ -51,11 +47,7 @@ class TrackingOnly(Update):
     draws: ClassVar[bool] = False
 
     def update(
-        self,
-        rng: np.random.Generator,
-        predicted: Population | None,
-        proposed: Population | None,
-        observation: Clip,
+        self, rng: np.random.Generator, predicted: Population | None, proposed: Population | None, observation: Clip
     ) -> Population:
         """The projected predictions with their weights; the proposed samples at the first pause."""
         if predicted is None:
@@ -83,11 +75,7 @@ class Union(Update):
             raise InputError(f"union.fusion is a {type(self.fusion).__name__}, expected a FusionUpdate")
 
     def update(
-        self,
-        rng: np.random.Generator,
-        predicted: Population | None,
-        proposed: Population | None,
-        observation: Clip,
+        self, rng: np.random.Generator, predicted: Population | None, proposed: Population | None, observation: Clip
     ) -> Population:
         if predicted is None or proposed is None:
             return self.fusion.update(rng, predicted, proposed, observation)

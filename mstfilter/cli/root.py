@@ -8,7 +8,7 @@ import sys
 import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Annotated, Any, TextIO
+from typing import Annotated, Any
 
 import typer
 
@@ -87,16 +87,9 @@ def warnings_as_lines() -> Iterator[None]:
         show_other = warnings.showwarning
         warnings.simplefilter("always", InputWarning)
 
-        def show(
-            message: Warning | str,
-            category: type[Warning],
-            filename: str,
-            lineno: int,
-            file: TextIO | None = None,
-            line: str | None = None,
-        ) -> None:
+        def show(message: Warning | str, *place: Any, **named: Any) -> None:
             if not isinstance(message, InputWarning):
-                show_other(message, category, filename, lineno, file, line)
+                show_other(message, *place, **named)
                 return
             print(f"warning: {message.message}", file=sys.stderr)
             for hint in message.hints:

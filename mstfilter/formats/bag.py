@@ -343,22 +343,21 @@ class Bag(VideoFormat):
                 f"{bag.path}: intrinsics are missing, there is no {usual} for {colour.name}",
                 f"choose one: info=TOPIC, of {', '.join(infos)}" if infos else "give them: K=fx,fy,cx,cy",
             )
-        info = _camera_info(bag, name, "rect" in colour.name)
-        if (info["width"], info["height"]) != colour.size and info["width"]:
+        matrix, distortion, size = _camera_info(bag, name, "rect" in colour.name)
+        if size[0] and size != colour.size:
             raise InputError(
-                f"{bag.path}: {name} is of images of {info['width']} x {info['height']}, {colour} is not",
+                f"{bag.path}: {name} is of images of {size[0]} x {size[1]}, {colour} is not",
                 "choose the CameraInfo of the colour camera: info=TOPIC",
             )
         other = depth.info
         if not self.registered and not self.info and other in infos and other != name:
-            of_depth = _camera_info(bag, other, "rect" in depth.name)
-            if not np.allclose(of_depth["matrix"], info["matrix"], atol=1.0) and of_depth["width"]:
+            of_depth, _, size = _camera_info(bag, other, "rect" in depth.name)
+            if size[0] and not np.allclose(of_depth, matrix, atol=1.0):
                 raise InputError(
                     f"{bag.path}: camera matrices of {name} and {other} differ: depth is not registered to colour",
                     "record the aligned depth; or, if it is registered: registered=true",
                 )
-        matrix = info["matrix"]
-        return (matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]), info["distortion"]
+        return (matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]), distortion
 
 
 def _stream(bag: BagFile, name: str, count: int, compressed: bool) -> _Stream:
@@ -394,8 +393,8 @@ def _choose(path: Path, what: str, name: str, candidates: list[_Stream], streams
     return candidates[0]
 
 
-def _camera_info(bag: BagFile, name: str, rectified: bool) -> dict[str, Any]:
-    """Camera matrix, distortion and size of the images."""
+def _camera_info(bag: BagFile, name: str, rectified: bool) -> tuple[np.ndarray, tuple[float, ...], tuple[int, int]]:
+    """Camera matrix (3, 3), distortion, and width and height of the images."""
     message = bag.first(name)
     D, K, P = (message.d, message.k, message.p) if bag.is_ros2 else (message.D, message.K, message.P)
     raw, projection = np.reshape(np.asarray(K, float), (3, 3)), np.reshape(np.asarray(P, float), (3, 4))[:, :3]
@@ -411,9 +410,4 @@ def _camera_info(bag: BagFile, name: str, rectified: bool) -> dict[str, Any]:
             f"{bag.path}: {name} has distortion model {model!r}, which is not supported",
             "rectify the images (image_proc), or give K=fx,fy,cx,cy to ignore the distortion",
         )
-    return {
-        "matrix": raw,
-        "distortion": distortion,
-        "width": int(message.width),
-        "height": int(message.height),
-    }
+    return raw, distortion, (int(message.width), int(message.height))

@@ -56,15 +56,7 @@ class EveryNth(PauseRule):
 
 @dataclass(frozen=True)
 class At(PauseRule):
-    """Given frames or given times.
-
-    Parameters
-    ----------
-    frames : tuple of int
-        Indices from 0; negative ones count from the end.
-    seconds : tuple of float
-        Times since the first frame; the nearest frame is the pause.
-    """
+    """Frames by index from 0, negative ones from the end, or the frames nearest to seconds since the first."""
 
     frames: tuple[int, ...] = ()
     seconds: tuple[float, ...] = ()

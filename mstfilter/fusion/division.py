@@ -47,12 +47,7 @@ class RigidMotions(Division):
 class PartRule:
     """When a part of an object becomes a separate object.
 
-    Parameters
-    ----------
-    min_pixels : int
-        Least number of visible pixels of known motion of a part.
-    min_share : float
-        Least share of the object's pixels of known motion.
+    It needs at least `min_pixels` visible pixels of known motion, and the share `min_share` of those of the object.
     """
 
     min_pixels: int = 40

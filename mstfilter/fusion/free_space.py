@@ -144,11 +144,7 @@ class ProjectionUpdate(Update):
         check_number("quality_exponent", self.quality_exponent, at_least=0)
 
     def update(
-        self,
-        rng: np.random.Generator,
-        predicted: Population | None,
-        proposed: Population | None,
-        observation: Clip,
+        self, rng: np.random.Generator, predicted: Population | None, proposed: Population | None, observation: Clip
     ) -> Population:
         population = union(predicted, proposed)
         refined, quality = self.free_space.refine(population.particles, observation)

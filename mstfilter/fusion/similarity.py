@@ -45,7 +45,7 @@ def canonical(labels: np.ndarray) -> np.ndarray:
 class CommonRefinement:
     """Cells of several segmentations, and the objects that they belong to."""
 
-    #: int array of the segmentations' shape: the cell of every position. Cell 0 is free in all segmentations and
+    #: Int array of the segmentations' shape: the cell of every position. Cell 0 is free in all segmentations and
     #: may be empty.
     cells: np.ndarray
     #: (n, k) int object of each of k cells in each of n segmentations; 0 is free. Objects are numbered from 1 over

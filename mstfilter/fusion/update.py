@@ -126,11 +126,7 @@ class FusionUpdate(Update):
         check_number("quality_exponent", self.quality_exponent, at_least=0)
 
     def update(
-        self,
-        rng: np.random.Generator,
-        predicted: Population | None,
-        proposed: Population | None,
-        observation: Clip,
+        self, rng: np.random.Generator, predicted: Population | None, proposed: Population | None, observation: Clip
     ) -> Population:
         """Candidates of all pairs, not built.
 
@@ -161,12 +157,8 @@ class FusionUpdate(Update):
             prediction = claims.limited(sample, prediction, exposed, doubtful[j[candidate]])
             return crossover.cross(stream, sample, prediction)
 
-        none_j, none_i = np.full(len(predicted), -1), np.full(len(proposed), -1)
-        parents = {
-            "previous": predicted.parents.get("previous", none_j)[j],
-            "proposed": proposed.parents.get("proposed", none_i)[i],
-        }
         log_weights = proposed.log_weights[i] + (predicted.log_weights + log_q)[j]
+        parents = parents_of_pairs(proposed, i, predicted, j)
         fused = Population(Candidates(build, len(i)), log_weights, parents, notes)
         if not self.evidence:
             return fused
@@ -197,6 +189,16 @@ class FusionUpdate(Update):
         distinct = {id(h): h for h in hypotheses}
         split = {name: split_by_motion(h, motions, clip, self.parts, proposed) for name, h in distinct.items()}
         return tuple(split[id(h)] for h in hypotheses)
+
+
+def parents_of_pairs(
+    proposed: Population, i: np.ndarray, predicted: Population, j: np.ndarray
+) -> dict[str, np.ndarray]:
+    """Parents of candidates made of the samples `i` and the predictions `j`; -1 if unknown."""
+    return {
+        "previous": predicted.parents.get("previous", np.full(len(predicted), -1))[j],
+        "proposed": proposed.parents.get("proposed", np.full(len(proposed), -1))[i],
+    }
 
 
 def _pairs(rng: np.random.Generator, n_proposed: int, n_predicted: int, eta: int) -> tuple[np.ndarray, np.ndarray]:

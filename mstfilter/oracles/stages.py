@@ -22,6 +22,7 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 
 from mstfilter.fusion import Evidence, FreeSpace, Projection
+from mstfilter.fusion.update import parents_of_pairs
 from mstfilter.oracles.truth import Need, UsesTruth
 from mstfilter.scene import Clip, Frame, Hypothesis, ObjectRecord, frame_geometry, render
 from mstfilter.scoring import overlap, weighted_coverage
@@ -38,11 +39,6 @@ class TrueMotions(UsesTruth, Transition):
 
     Only the motion is true: the object of the hypothesis is moved by the ordinary warp. An object that covers two
     true objects moves as the one that it shares more voxels with.
-
-    Parameters
-    ----------
-    warp : Warp
-        Moves the voxels.
     """
 
     warp: Warp = field(default_factory=lambda: Warp("smooth"))
@@ -84,13 +80,7 @@ class TrueMotions(UsesTruth, Transition):
 
 @dataclass(frozen=True)
 class TrueFreeSpace(UsesTruth, Projection):
-    """Clears voxels that are truly free.
-
-    Parameters
-    ----------
-    hidden : bool
-        Also clear voxels that the camera does not see, which no sensor could observe.
-    """
+    """Clears voxels that are truly free; with `hidden`, also those that the camera does not see."""
 
     hidden: bool = False
 
@@ -124,15 +114,10 @@ class TrueQuality(UsesTruth, Evidence):
 class TrueFusion(UsesTruth, Update):
     """The best hypothesis that the objects of two parents allow, without random draws.
 
-    For every true object: the best object of either parent (by Jaccard index), merged with all objects that improve
-    it. Better objects are painted over worse ones; other objects are dropped. Each pair makes one candidate.
-
-    Parameters
-    ----------
-    free_space : Projection
-        Projects the predicted hypotheses first.
-    evidence : tuple of Evidence
-        Terms that weight the candidates, which are then all built. Default: the weights of the pairs.
+    `free_space` projects the predicted hypotheses first. For every true object: the best object of either parent (by
+    Jaccard index), merged with all objects that improve it. Better objects are painted over worse ones; other objects
+    are dropped. Each pair makes one candidate. If there are terms of `evidence`, all candidates are built and
+    weighted by them, else by the weights of the pairs.
     """
 
     free_space: Projection = FreeSpace()  # noqa: RUF009 (frozen)
@@ -142,11 +127,7 @@ class TrueFusion(UsesTruth, Update):
     draws: ClassVar[bool] = False
 
     def update(
-        self,
-        rng: np.random.Generator,
-        predicted: Population | None,
-        proposed: Population | None,
-        observation: Clip,
+        self, rng: np.random.Generator, predicted: Population | None, proposed: Population | None, observation: Clip
     ) -> Population:
         """One candidate per pair; a single parent passes unchanged."""
         if predicted is None:
@@ -156,11 +137,7 @@ class TrueFusion(UsesTruth, Update):
             return Population(refined, predicted.log_weights, predicted.parents)
         labels, samples = self.truth.labels(observation.index), tuple(proposed.particles)
         i, j = np.divmod(np.arange(len(proposed) * len(predicted)), len(predicted))
-        none_j, none_i = np.full(len(predicted), -1), np.full(len(proposed), -1)
-        parents = {
-            "previous": predicted.parents.get("previous", none_j)[j],
-            "proposed": proposed.parents.get("proposed", none_i)[i],
-        }
+        parents = parents_of_pairs(proposed, i, predicted, j)
         candidates = Candidates(lambda c: best_of_both(samples[i[c]], refined[j[c]], labels), len(i))
         fused = Population(candidates, proposed.log_weights[i] + predicted.log_weights[j], parents)
         if not self.evidence:

@@ -30,13 +30,7 @@ T = TypeVar("T")
 
 
 class RecordingTruth:
-    """The ground truth at the pauses of a recording; `check` what a component needs first.
-
-    Parameters
-    ----------
-    recording : Recording
-        Usually a simulated one.
-    """
+    """The ground truth at the pauses of a recording; `check` what a component needs first."""
 
     def __init__(self, recording: Recording) -> None:
         self.recording = recording

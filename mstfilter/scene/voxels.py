@@ -183,8 +183,8 @@ class ObjectRecord:
     #: Rigid motion in world metres since `source`; the identity if `source` is None.
     motion: RigidTransform = field(default_factory=lambda: _NO_MOTION)
     completion_key: str | None = None  #: key of the segment that it was completed from
-    #: frozenset of int ids of objects of the same hypothesis that were observed to move apart from it, so that
-    #: they are not the same object.
+    #: Ids of objects of the same hypothesis that were observed to move apart from it, so that they are not the
+    #: same object.
     apart: frozenset[int] = frozenset()
 
     @classmethod

@@ -53,14 +53,9 @@ class Segments:
 class ObjectRule:
     """Decides which regions are objects.
 
-    A region is background if most of its readings are on the table, behind it or outside the workspace, or if too few
-    readings remain.
-
-    Parameters
-    ----------
-    min_points : int
-        Smallest number of readings above the table and in the workspace, for an image of 640 x 480 pixels; scaled by
-        the area of the image.
+    A region is background if most of its readings are on the table, behind it or outside the workspace, or if fewer
+    than `min_points` readings remain. These are for an image of 640 x 480 pixels, and scaled by the area of the
+    image.
     """
 
     min_points: int = 60
@@ -204,17 +199,10 @@ class TreeCutProposal(Proposal):
 def hypothesis_of(
     completions: Sequence[Completion], grid: VoxelGrid, birth: int = 0, threshold: float = 0.5
 ) -> Hypothesis:
-    """One hypothesis from completed segments. Labels are 1, 2, ... in order; segments without voxels get no record.
+    """One hypothesis from completed segments of a frame, at the pause `birth`.
 
-    Parameters
-    ----------
-    completions : sequence of Completion
-        Completed segments of one frame. `mstfilter.completion.arbitrate` assigns voxels that several of them claim.
-    grid : VoxelGrid
-    birth : int
-        Index of the pause.
-    threshold : float
-        Smallest probability of an occupied voxel.
+    Labels are 1, 2, ... in order; segments without voxels get no record. `threshold` is the smallest probability of
+    an occupied voxel. `mstfilter.completion.arbitrate` assigns voxels that several segments claim.
     """
     labels = arbitrate(completions, grid, threshold)
     present = np.bincount(labels.ravel(), minlength=len(completions) + 1)

@@ -74,8 +74,8 @@ class Regions:
 
     of_leaf: np.ndarray  #: (n_leaves,) int region of every leaf; 0 is the table
     sums: np.ndarray  #: (R, C) columns `REGION`
-    #: list of dict: for each region a mapping from neighbour to the row (columns `BORDER`) of the common border,
-    #: with the region as the first of the two.
+    #: For each region a mapping from neighbour to the row (columns `BORDER`) of the common border, with the region
+    #: as the first of the two.
     borders: list[dict[int, np.ndarray]]
 
 
@@ -228,18 +228,10 @@ def quadric_residual(sums: np.ndarray) -> np.ndarray:
 def pair_features(
     a: np.ndarray, b: np.ndarray, border: np.ndarray, table_a: np.ndarray, table_b: np.ndarray, scale: float
 ) -> np.ndarray:
-    """Features of k pairs of regions.
+    """Features of k pairs of regions, from their rows `a` and `b` (k, C) of `Regions.sums`.
 
-    Parameters
-    ----------
-    a, b : (k, C) float64
-        Rows of `Regions.sums`.
-    border : (k, B) float64
-        Their common borders, seen from `a`.
-    table_a, table_b : (k, B) float64
-        Their borders with the table; zeros if there is none.
-    scale : float
-        Image width / 640.
+    `border` (k, B) are their common borders, seen from `a`; `table_a` and `table_b` (k, B) their borders with the
+    table, zeros if there is none. `scale` is the image width / 640.
     """
     flip = (border[:, BORDER["step"]] < 0)[:, None]
     sums_front, sums_back = np.where(flip, b, a), np.where(flip, a, b)

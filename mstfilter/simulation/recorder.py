@@ -142,19 +142,10 @@ def simulate_recording(
 def record_scene(scene: SimulatedScene, path: str | Path, progress: _Progress | None = None) -> Recording:
     """Simulate the actions of a scene, write the recording and open it.
 
-    Parameters
-    ----------
-    scene : SimulatedScene
-        At its first pause. A subclass can change the arrangement and the choice of pushes.
-    path : path
-        Folder of the recording; it must not exist or be empty. Nothing is left behind on failure.
-    progress : callable, optional
-        Called after each frame with frames done, frames in all, and a description.
-
-    Raises
-    ------
-    InputError
-        If the folder cannot be written, or the objects cannot be arranged or pushed.
+    The scene is at its first pause; a subclass of `SimulatedScene` can change the arrangement and the choice of
+    pushes. The folder `path` must not exist or be empty. Nothing is left behind on failure. `progress` is called
+    after each frame with frames done, frames in all, and a description. Raises InputError if the folder cannot be
+    written, or the objects cannot be arranged or pushed.
     """
     family, world = scene.family, scene.world
     report = progress or (lambda done, total, description: None)
@@ -228,19 +219,9 @@ def recipe_key(family: SceneFamily, seed: int) -> str:
 def cached_recording(family: str | SceneFamily, seed: int, folder: Path | None = None, **overrides: Any) -> Path:
     """The folder of a simulated recording, which is simulated if it does not exist.
 
-    Parameters
-    ----------
-    family : str or SceneFamily
-        The name of a family, or a family.
-    folder : Path, optional
-        Where recordings are kept. Default: `recordings` in `cache_folder()`.
-    **overrides
-        Fields of the family to change: image size, frames per clip, number of actions, ...
-
-    Raises
-    ------
-    InputError
-        If the family, a field or the seed is invalid, or the folder cannot be written.
+    `overrides` are fields of the family to change. Recordings are kept in `folder`; by default `recordings` in
+    `cache_folder()`. Raises InputError if the family, a field or the seed is invalid, or the folder cannot be
+    written.
     """
     chosen = scene_family(family) if isinstance(family, str) else family
     known = {f.name for f in fields(SceneFamily)}

@@ -40,16 +40,10 @@ from mstfilter.smc.population import Population, as_matrix, union
 
 @dataclass(frozen=True)
 class Reweight(Update):
-    """Adds a log likelihood to the log weights: the update of the bootstrap filter.
+    """Adds ``log_likelihood(particles, observation)`` (n,) to the log weights: the update of the bootstrap filter.
 
-    Proposed particles, if any, join the predicted ones.
-
-    Parameters
-    ----------
-    log_likelihood : callable
-        ``(particles, observation) -> (n,)`` log p(y | x).
-    batched : bool
-        Whether the function also takes particles (R, n, ...) and returns (R, n).
+    Proposed particles, if any, join the predicted ones. `batched` says whether the function also takes particles
+    (R, n, ...) and returns (R, n).
     """
 
     log_likelihood: Callable[[Any, Any], np.ndarray]
@@ -75,13 +69,8 @@ class ProjectOnto(Update):
     """Moves every particle onto the set of states that the observation allows, then weights it.
 
     If that set has no volume (a contact), no draw of the dynamics lies in it and every weight would be zero.
-
-    Parameters
-    ----------
-    project : callable
-        ``(particles, y) -> particles``, row by row.
-    log_likelihood : callable, optional
-        ``(particles, y) -> (n,)`` of the projected particles: the information that the projection does not use.
+    ``project(particles, y)`` moves row by row; ``log_likelihood(particles, y)`` (n,) of the projected particles is
+    the information that the projection does not use.
     """
 
     project: Callable[[Any, Any], Any]
@@ -200,13 +189,7 @@ class Branching(Transition):
 
 @dataclass(frozen=True)
 class EssBelow(Trigger):
-    """Resample if the effective sample size is below a share of the number of particles.
-
-    Parameters
-    ----------
-    share : float
-        In (0, 1].
-    """
+    """Resample if the effective sample size is below a `share`, in (0, 1], of the number of particles."""
 
     share: float = 0.5
 
@@ -281,13 +264,7 @@ class ExactEquality(Equivalence):
 
 @dataclass(frozen=True)
 class Bins(Equivalence):
-    """Array particles in the same cell of a regular grid.
-
-    Parameters
-    ----------
-    width : float
-        Side of a cell, in the units of the particles.
-    """
+    """Array particles in the same cell of a regular grid; `width` is the side of a cell, in their units."""
 
     width: float = 1.0
 

@@ -93,23 +93,13 @@ def mean(state: State, info: Info) -> Any:
 def energy_distance(
     first: Population, second: Population, distance: Callable[[Any], np.ndarray] | None = None
 ) -> float:
-    """Energy distance between two weighted populations (Szekely and Rizzo 2013).
+    """Energy distance between two weighted populations (Szekely and Rizzo 2013), in the units of the distance.
 
     2 E d(X, Y) - E d(X, X') - E d(Y, Y') for draws X, X' of the first and Y, Y' of the second; the square of
-    `scipy.stats.energy_distance` for numbers. It is 0 if both represent the same distribution.
+    `scipy.stats.energy_distance` for numbers. It is 0 if both represent the same distribution, else positive.
 
-    Parameters
-    ----------
-    first, second : Population
-        Of the same type of particles.
-    distance : callable, optional
-        ``(particles) -> (n, n)`` distances of particles, such as ``lambda p: 1 - similarity.matrix(p)``. They must be
-        of negative type. Default: Euclidean, for arrays and mappings of arrays.
-
-    Returns
-    -------
-    float
-        In the units of the distance, at least 0.
+    ``distance(particles)`` is (n, n), such as ``lambda p: 1 - similarity.matrix(p)``, and must be of negative type.
+    Default: Euclidean, for arrays and mappings of arrays.
     """
     both = union(first.realised().labelled({}), second.realised().labelled({}))
     return _energy(both.particles, np.concatenate([first.weights, -second.weights]), distance)
@@ -142,12 +132,7 @@ class Measured(ResamplerWrapper):
 
     The selection itself does not change. ``notes["energy_distance"]`` is the distance, which `selection_distance`
     collects. Its mean over seeds is the squared error that the selection adds: for numbers, twice the integral over z
-    of the variance of the share of particles below z.
-
-    Parameters
-    ----------
-    distance : callable, optional
-        As for `energy_distance`.
+    of the variance of the share of particles below z. `distance` is as for `energy_distance`.
     """
 
     distance: Callable[[Any], np.ndarray] | None = None

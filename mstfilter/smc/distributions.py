@@ -311,13 +311,7 @@ class Bernoulli(_Independent):
 
 @dataclass(frozen=True, eq=False)
 class Categorical(Distribution):
-    """One of k categories, numbered from 0.
-
-    Parameters
-    ----------
-    probs : (k,) or (n, k) array_like
-        Non-negative; rows are scaled to sum to one.
-    """
+    """One of k categories, numbered from 0; the rows of `probs` (k,) or (n, k) are scaled to sum to one."""
 
     probs: Any
     discrete = True

@@ -164,13 +164,7 @@ def chopthin_threshold(weights: np.ndarray, n: int, ratio: float) -> float:
 
 @dataclass(frozen=True)
 class Gaussian(Similarity):
-    """exp(-d^2 / (2 scale^2)) with the Euclidean distance d of array particles; positive semidefinite.
-
-    Parameters
-    ----------
-    scale : float
-        Standard deviation of the kernel, in the units of the particles.
-    """
+    """exp(-d^2 / (2 scale^2)), d the Euclidean distance of array particles in their units; positive semidefinite."""
 
     scale: float = 1.0
 
@@ -454,11 +448,10 @@ def sample_kdpp(rng: np.random.Generator, spectrum: Spectrum, k: int) -> np.ndar
 
 @dataclass(frozen=True)
 class GreedyDiverse(Resampler):
-    """Adds one by one the particle that increases det L of the selected set most; draws nothing.
+    """Adds one by one the particle that increases det L of the selected set most.
 
     The first is the heaviest; each next one maximises w_i times the squared norm of its component orthogonal to the
-    selected ones. If no different particle is left, the heaviest of the others follow. The weight of a particle that
-    is not selected moves to the most similar selected one, so the total stays.
+    selected ones. If no different particle is left, the heaviest of the others follow. The total weight stays.
     """
 
     similarity: Similarity = Gaussian()

@@ -71,13 +71,8 @@ def nonlinear_gaussian(
 ) -> StateSpaceModel:
     """x_0 ~ N(m0, P0), x_t = f(x_{t-1}) + N(0, Q), y_t = h(x_t) + N(0, R).
 
-    Parameters
-    ----------
-    f, h : callable
-        Of particles (n, d): the next states (n, d), and the observations (n, k) without noise. If they also take
-        particles (R, n, d), the model can be run in a batch.
-    Q, R : (d, d) and (k, k) array_like
-    m0, P0 : (d,) and (d, d) array_like
+    `f` and `h` give the next states (n, d), and the observations (n, k) without noise, of particles (n, d). If they
+    also take particles (R, n, d), the model can be run in a batch.
     """
     m0 = np.asarray(m0, np.float64)
     Q, R, P0 = _covariance("Q", Q, len(m0)), _covariance("R", R), _covariance("P0", P0, len(m0))
@@ -184,9 +179,7 @@ def kalman_filter(F: Any, Q: Any, H: Any, R: Any, m0: Any, P0: Any, observations
 
 
 def hidden_markov(initial: Any, transition: Any, log_likelihood: Callable[[Any], Any]) -> StateSpaceModel:
-    """A model with K states 0 .. K-1; particles are (n,) int.
-
-    `forward_backward` has the exact answers.
+    """A model with K states 0 .. K-1; particles are (n,) int. `forward_backward` has the exact answers.
 
     Parameters
     ----------
@@ -197,9 +190,7 @@ def hidden_markov(initial: Any, transition: Any, log_likelihood: Callable[[Any],
     log_likelihood : callable
         ``(y) -> (K,)`` log p(y_t | x_t = 0 .. K-1); -inf if impossible.
     """
-    start, moves = _probabilities("initial", initial, 1), _probabilities("transition", transition, 2)
-    if moves.shape != (len(start),) * 2:
-        raise InputError(f"transition has shape {moves.shape}, expected {(len(start),) * 2} as initial")
+    start, moves = _chain(initial, transition)
     # The last positive entry is 1 exactly, so that u < 1 never selects a state of probability 0.
     below_start, below = (np.cumsum(p, axis=-1) / p.sum(axis=-1, keepdims=True) for p in (start, moves))
     for cumulative in (below_start, below):
@@ -217,6 +208,14 @@ def hidden_markov(initial: Any, transition: Any, log_likelihood: Callable[[Any],
         lambda x: log_start[x],
         lambda old, new: log_moves[old, new],
     )
+
+
+def _chain(initial: Any, transition: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Checked probabilities (K,) of the first state and (K, K) of the moves."""
+    start, moves = _probabilities("initial", initial, 1), _probabilities("transition", transition, 2)
+    if moves.shape != (len(start),) * 2:
+        raise InputError(f"transition has shape {moves.shape}, expected {(len(start),) * 2} as initial")
+    return start, moves
 
 
 def _probabilities(name: str, given: Any, ndim: int) -> np.ndarray:
@@ -247,11 +246,9 @@ def forward_backward(
     InputError
         If a shape does not fit, or no state explains an observation.
     """
-    start, moves = _probabilities("initial", initial, 1), _probabilities("transition", transition, 2)
+    start, moves = _chain(initial, transition)
     ys = list(observations)
     T, K = len(ys), len(start)
-    if moves.shape != (K, K):
-        raise InputError(f"transition has shape {moves.shape}, expected {(K, K)} as initial")
     filtered, likelihood, total = np.empty((T, K)), np.ones((T, K)), np.zeros(T)
     for t, y in enumerate(ys):
         predicted = filtered[t - 1] @ moves if t else start
@@ -384,14 +381,8 @@ def ekf_proposal(
     """A proposal for `guided`: the update of the extended Kalman filter from each particle.
 
     Given x_{t-1} the state is N(f(x_{t-1}), Q); `h` is linearised at its mean (Doucet, Godsill, Andrieu 2000, section
-    II D). It is computed for all particles at once; filterpy's ExtendedKalmanFilter holds a single state.
-
-    Parameters
-    ----------
-    f, Q, h, R
-        As in `nonlinear_gaussian`.
-    jacobian : callable
-        Of particles (n, d): the derivatives of `h`, (n, k, d) or (k, d).
+    II D). The arguments are as in `nonlinear_gaussian`; `jacobian` gives the derivatives of `h`, (n, k, d) or (k, d).
+    It is computed for all particles at once; filterpy's ExtendedKalmanFilter holds a single state.
     """
     Q, R = _covariance("Q", Q), _covariance("R", R)
 
@@ -415,15 +406,9 @@ def ukf_proposal(
 ) -> Callable[[np.ndarray, Any], MultivariateNormal]:
     """A proposal for `guided`: the update of the unscented Kalman filter from each particle.
 
-    Needs no derivatives (van der Merwe, Doucet, de Freitas, Wan 2000). Sigma points and their weights are those of
-    filterpy.
-
-    Parameters
-    ----------
-    f, Q, h, R
-        As in `nonlinear_gaussian`.
-    alpha, beta, kappa : float
-        Of filterpy's MerweScaledSigmaPoints: spread of the points, weight of the central one, secondary spread.
+    Needs no derivatives (van der Merwe, Doucet, de Freitas, Wan 2000). `alpha`, `beta` and `kappa` are those of
+    filterpy's MerweScaledSigmaPoints: spread of the points, weight of the central one, secondary spread. The other
+    arguments are as in `nonlinear_gaussian`.
     """
     from filterpy.kalman import MerweScaledSigmaPoints
 

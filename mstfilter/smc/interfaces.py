@@ -93,19 +93,9 @@ class DensityTransition(Transition):
 
     @abstractmethod
     def log_prob(self, previous: Any, new: Any, observation: Any) -> np.ndarray:
-        """Log density of each move.
+        """Log density (n,) float64 of each move from row i of `previous` to row i of `new`; -inf if it is impossible.
 
-        Parameters
-        ----------
-        previous, new : n particles each
-            Row i of `new` was reached from row i of `previous`.
-        observation : Any
-            The observation given to `predict`; None if it is missing.
-
-        Returns
-        -------
-        (n,) float64
-            log f(new_i | previous_i); -inf if the move is impossible.
+        `observation` is that given to `predict`; None if it is missing.
         """
 
 
@@ -116,14 +106,10 @@ class Update(Component):
     def update(
         self, rng: np.random.Generator, predicted: Population | None, proposed: Population | None, observation: Any
     ) -> Population:
-        """Any number of particles, from the predicted and the proposed ones.
+        """Any number of particles, from the predicted and the proposed ones; at least one of the two is given.
 
-        Parameters
-        ----------
-        predicted : Population or None
-            The moved particles; None at the first step of a filter that starts from its proposal.
-        proposed : Population or None
-            New particles; None if the filter has no proposal. At least one of the two is given.
+        `predicted` are the moved particles, None at the first step of a filter that starts from its proposal.
+        `proposed` are new particles, None if the filter has no proposal.
         """
 
 
@@ -254,20 +240,9 @@ class Rejuvenation(Component):
     ) -> Population:
         """Move x_t without changing its distribution.
 
-        Parameters
-        ----------
-        population : Population
-            Weighted particles x_t after the observation.
-        previous : Population or None
-            Their x_{t-1}, row by row; None at the first step.
-        observation : Any
-            y_t; None if it is missing.
-
-        Returns
-        -------
-        Population
-            As many particles in the same order, moved by a kernel that leaves p(x_t | x_{t-1}, y_t) invariant; log
-            weights unchanged.
+        `population` holds the weighted particles x_t after the observation, `previous` their x_{t-1} row by row; None
+        at the first step. The result has as many particles in the same order, moved by a kernel that leaves p(x_t |
+        x_{t-1}, y_t) invariant, and unchanged log weights. `observation` is y_t; None if it is missing.
         """
 
 

@@ -53,23 +53,15 @@ def normalise(log_weights: np.ndarray) -> np.ndarray:
 @lru_cache(maxsize=8)
 def identity(n: int) -> np.ndarray:
     """0 .. n-1, read-only and shared: the parents of particles that kept their positions."""
-    index = np.arange(n)
-    index.flags.writeable = False
-    return index
+    return frozen_view(np.arange(n))
 
 
 class Candidates(Sequence[_T], Generic[_T]):
-    """Particles that are built when they are accessed.
+    """Particles ``build(index)`` that are built when they are accessed, and then stored.
 
     In MST the weight of a candidate depends only on the pair that it is made from, so candidates can be resampled
-    before they are built. Candidates that have been built are stored.
-
-    Parameters
-    ----------
-    build : callable
-        ``build(index) -> particle``. It must return the same particle at every call with the same index.
-    indices : (n,) int array, or int
-        The candidates, in order; an index may occur more than once. An integer n stands for 0 .. n-1.
+    before they are built. `build` must return the same particle at every call with the same index. `indices` (n,) are
+    the candidates, in order; an index may occur more than once. An integer n stands for 0 .. n-1.
     """
 
     def __init__(
@@ -140,12 +132,17 @@ def as_matrix(particles: Any) -> np.ndarray:
     )
 
 
+def frozen_view(array: np.ndarray) -> np.ndarray:
+    """A read-only view of an array."""
+    view = array.view()
+    view.flags.writeable = False
+    return view
+
+
 def _freeze(particles: Particles) -> Particles:
     """Read-only views of arrays, a tuple of objects."""
     if isinstance(particles, np.ndarray):
-        view = particles.view()
-        view.flags.writeable = False
-        return view
+        return frozen_view(particles)
     if isinstance(particles, Mapping):
         return {name: _freeze(np.asarray(a)) for name, a in particles.items()}
     if isinstance(particles, Candidates):
@@ -222,8 +219,7 @@ class Population:
         lw.flags.writeable = False
         parents = {}
         for name, index in self.parents.items():
-            index = _integers(f'parents "{name}"', index).view()
-            index.flags.writeable = False
+            index = frozen_view(_integers(f'parents "{name}"', index))
             if index.shape != (n,):
                 raise InputError(f'parents "{name}" have shape {index.shape}, expected ({n},)')
             parents[name] = index

@@ -238,10 +238,7 @@ def _systematic_rows(log_weights: np.ndarray, n: int, shifts: np.ndarray) -> np.
 class Residual(WeightResampler):
     """floor(n W_i) copies of each particle; the rest is drawn by another scheme (Liu and Chen 1998).
 
-    Parameters
-    ----------
-    remainder : {"multinomial", "stratified", "systematic"}
-        Scheme for the fractions frac(n W_i). Systematic has the least variance, f (1 - f).
+    `remainder` is the scheme for the fractions frac(n W_i). Systematic has the least variance, f (1 - f).
     """
 
     remainder: Literal["multinomial", "stratified", "systematic"] = "multinomial"
@@ -341,13 +338,9 @@ class Rejection(WeightResampler):
     """`Killing` without cumulative weights: a killed position tries particles until it accepts one.
 
     A position first tries its own particle, then particles drawn uniformly; it accepts with probability w / max w.
-    The mean number of trials is max w / mean w. Murray, Lee, Jacob (2016), "Parallel resampling in the particle
-    filter", code 3.
-
-    Parameters
-    ----------
-    max_trials : int
-        Positions that have accepted nothing after so many trials are drawn by weight. This does not change the law.
+    The mean number of trials is max w / mean w. Positions that have accepted nothing after `max_trials` are drawn by
+    weight, which does not change the law. Murray, Lee, Jacob (2016), "Parallel resampling in the particle filter",
+    code 3.
     """
 
     max_trials: int = 100
@@ -373,15 +366,9 @@ class Rejection(WeightResampler):
 class Metropolis(WeightResampler):
     """Each position follows a Metropolis chain over the particles, with uniform proposals. Not properly weighted.
 
-    The law of a position differs from W by at most (1 - mean w / max w)^steps in total variation. Murray, Lee, Jacob
-    (2016), "Parallel resampling in the particle filter", code 2 and section 3.2.
-
-    Parameters
-    ----------
-    tolerance : float
-        The number of steps is the least for which this bound is at most `tolerance`, in (0, 1).
-    max_steps : int
-        At most so many steps, even if the bound is larger then.
+    The law of a position differs from W by at most (1 - mean w / max w)^steps in total variation. The number of steps
+    is the least for which this bound is at most `tolerance`, but at most `max_steps`. Murray, Lee, Jacob (2016),
+    "Parallel resampling in the particle filter", code 2 and section 3.2.
     """
 
     tolerance: float = 0.01

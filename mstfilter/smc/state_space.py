@@ -71,14 +71,8 @@ class StateSpaceModel:
     def of(cls, initial: Any, transition: Callable[[Any], Any], observation: Callable[[Any], Any]) -> StateSpaceModel:
         """A model from distributions of this package, frozen ones of scipy.stats, or those of torch.
 
-        Parameters
-        ----------
-        initial : distribution
-            Of x_0.
-        transition : callable
-            ``(particles) -> distribution`` of x_t, one row per particle.
-        observation : callable
-            ``(particles) -> distribution`` of y_t.
+        `initial` is the distribution of x_0, ``transition(particles)`` that of x_t, and ``observation(particles)``
+        that of y_t, one row per particle.
         """
         first = as_distribution(initial)
         for name, function in (("transition", transition), ("observation", observation)):
@@ -154,12 +148,7 @@ class Dynamics(DensityTransition):
 class GuidedInitial(Proposal):
     """First particles from q(x_0 | y_0), weighted by p(x_0) / q; from the prior if y_0 is missing.
 
-    Parameters
-    ----------
-    model : StateSpaceModel
-        With `log_initial`.
-    proposal : callable
-        ``(y) -> distribution`` of x_0.
+    ``proposal(y)`` is the distribution q; the model needs its `log_initial`.
     """
 
     model: StateSpaceModel

@@ -265,12 +265,8 @@ class RunGenerators:
     """The generators of R runs, for batched components: row r of every array is drawn by the generator of run r.
 
     ``standard_normal``, ``random`` and ``standard_exponential`` are fast. Any other method of
-    `numpy.random.Generator` works if its size, or one of its arguments, has a first axis of length R.
-
-    Parameters
-    ----------
-    states : (R, 4) uint64
-        As `pcg64_states` returns them.
+    `numpy.random.Generator` works if its size, or one of its arguments, has a first axis of length R. `states` (R, 4)
+    are those of `pcg64_states`.
     """
 
     def __init__(self, states: np.ndarray) -> None:

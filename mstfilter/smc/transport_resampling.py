@@ -151,15 +151,11 @@ class Shuffled(ResamplerWrapper):
 
 @dataclass(frozen=True)
 class Coalesced(ResamplerWrapper):
-    """Merges equal particles, with the sum of their weights, before the selection.
+    """Merges particles that `equivalence` takes as equal, with the sum of their weights, before the selection.
 
-    The result represents the same distribution with fewer particles. The population grows again only if a transition
-    or update makes more candidates. ``notes["distinct"]`` is the number of different particles of positive weight.
-
-    Parameters
-    ----------
-    equivalence : Equivalence
-        Decides which particles are equal. The heaviest particle of a class is kept, the first of several.
+    The heaviest particle of a class is kept, the first of several. The result represents the same distribution with
+    fewer particles. The population grows again only if a transition or update makes more candidates.
+    ``notes["distinct"]`` is the number of different particles of positive weight.
     """
 
     scheme: Resampler = FearnheadClifford()  # noqa: RUF009 (frozen)
@@ -181,13 +177,8 @@ class Coalesced(ResamplerWrapper):
 def coalesce(log_weights: np.ndarray, classes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Select one particle for each class: the heaviest, with the weight of the class.
 
-    Returns
-    -------
-    representatives : (k,) int
-        The heaviest particle of each class (the first, if several have equal weights), ascending. Classes of weight
-        zero are left out.
-    log_weights : (k,) float64
-        Log of the summed weights times k / m, which keeps the log mean of the weights.
+    Returns the representatives (k,), ascending, the first if several have equal weights, and their log weights (k,):
+    the log of the summed weights times k / m, which keeps the log mean. Classes of weight zero are left out.
     """
     lw = np.asarray(log_weights, dtype=np.float64)
     classes = np.asarray(classes)
@@ -204,10 +195,8 @@ def coalesce(log_weights: np.ndarray, classes: np.ndarray) -> tuple[np.ndarray, 
 class Tempered(ResamplerWrapper):
     """Selects by w^power and multiplies the selected weights by w^(1 - power): light particles survive longer.
 
-    Parameters
-    ----------
-    power : float
-        In [0, 1]. 1: same as the wrapped scheme. 0: all particles of positive weight are equally likely.
+    `power` is in [0, 1]. With 1 this is the wrapped scheme; with 0 all particles of positive weight are equally
+    likely.
     """
 
     power: float = 0.5

@@ -94,17 +94,9 @@ class Plan:
 def make_plan(study: StudyConfig, overrides: Sequence[str] = (), *, allow_files: bool = True) -> Plan:
     """The runs of a study.
 
-    Parameters
-    ----------
-    overrides : sequence of str
-        Applied to every arm after those of the arm; a comma makes a grid.
-    allow_files : bool
-        Whether components may come from ``./file.py:Class``.
-
-    Raises
-    ------
-    InputError
-        If an arm is invalid, two arms are the same, there are no runs, or a recording cannot be read.
+    `overrides` are applied to every arm after those of the arm; a comma makes a grid. `allow_files` says whether
+    components may come from ``./file.py:Class``. Raises InputError if an arm is invalid, two arms are the same, there
+    are no runs, or a recording cannot be read.
     """
     code = code_version()
     versions = library_versions()

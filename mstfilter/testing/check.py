@@ -78,13 +78,7 @@ class CheckResult:
 
 
 def contract_of(cls: type) -> type[Contract]:
-    """The contract of a class of components.
-
-    Raises
-    ------
-    InputError
-        If no interface of the class has a contract.
-    """
+    """The contract of a class of components; InputError if no interface of the class has a contract."""
     for interface, contract in _CONTRACTS.items():
         if issubclass(cls, interface):
             return contract

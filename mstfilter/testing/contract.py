@@ -142,10 +142,11 @@ class RandomContract(Contract):
         assert before[1] == after[1], "it draws from Python's global generator (random.*): draw from `rng`"
 
 
-def skip_unless_properly_weighted(component: Any) -> None:
-    """Skip a test of the weights if the component declares ``properly_weighted = False``."""
+def skip_unless_properly_weighted(component: Any) -> Any:
+    """The component; skips a test of the weights if it declares ``properly_weighted = False``."""
     if not component.properly_weighted:
         pytest.skip("the component declares properly_weighted = False")
+    return component
 
 
 @contextmanager

@@ -67,13 +67,7 @@ BUDGET = 40_000_000
 
 
 class Sample:
-    """What particles and groups of particles carry, over many calls.
-
-    Parameters
-    ----------
-    case : Case
-        The weights, and the number of particles to select.
-    """
+    """What particles and groups of particles of a case carry, over many calls."""
 
     def __init__(self, case: Case) -> None:
         self.unit, self.calls = 1.0 / case.n, case.calls
@@ -205,14 +199,7 @@ def log_of(weights: Any) -> np.ndarray:
 class CountingGenerator(np.random.Generator):
     """The generator ``default_rng(seed)``, which counts what it draws and skips the test beyond a budget.
 
-    Parameters
-    ----------
-    seed : int
-        Seed.
-    budget : int
-        Numbers that may be drawn; a call counts as 15 numbers.
-    slow : str
-        Reason of the skip.
+    `budget` is in numbers; a call counts as 15 numbers. `slow` is the reason of the skip.
     """
 
     def __init__(self, seed: int, budget: int, slow: str) -> None:

@@ -35,8 +35,7 @@ class _PopulationContract(RandomContract):
 
     def check_scale(self, inputs: dict[str, Any], name: str) -> None:
         """Check that adding a number to the log weights of the population `name` adds it to those of the result."""
-        component = self.make()
-        skip_unless_properly_weighted(component)
+        component = skip_unless_properly_weighted(self.make())
         unshifted = self.checked_call(component, inputs)
         for shift in (50.0, -50.0):
             population = inputs[name].reweighted(np.full(len(inputs[name]), shift))
@@ -142,8 +141,7 @@ class TransitionContract(_ExactContract):
 
     def test_weights_stay_with_their_particles(self) -> None:
         """It keeps the order of the particles, or sets parents "previous"."""
-        component, inputs = self.make(), self.inputs(_N)
-        skip_unless_properly_weighted(component)
+        component, inputs = skip_unless_properly_weighted(self.make()), self.inputs(_N)
         old = 0.1 * np.arange(_N) ** 2
         given = replace(inputs["population"], log_weights=old, parents={})
         moved = self.checked_call(component, {**inputs, "population": given})
@@ -156,8 +154,7 @@ class TransitionContract(_ExactContract):
     @statistical
     def test_weighted_moves_are_those_of_the_model(self) -> None:
         """Weighted moves have the distribution of the model, also jointly with x_{t-1}, and keep the total weight."""
-        component = self.make()
-        skip_unless_properly_weighted(component)
+        component = skip_unless_properly_weighted(self.make())
         population, _, observation, *likelihood = self.exact_case(1)
         moved = self.checked_call(component, {"population": population, "observation": observation}, _rng(2))
         other, fresh, *_ = self.exact_case(3)
@@ -312,8 +309,7 @@ class UpdateContract(_ExactContract):
     @statistical
     def test_weights_are_those_of_the_posterior(self) -> None:
         """Weighted predicted particles have the distribution p(x | y)."""
-        component = self.make()
-        skip_unless_properly_weighted(component)
+        component = skip_unless_properly_weighted(self.make())
         predicted, _, observation, *_ = self.exact_case(1)
         inputs = {"predicted": predicted, "proposed": None, "observation": observation}
         out = self.checked_call(component, inputs, _rng(2))
@@ -360,8 +356,7 @@ class RejuvenationContract(_ExactContract):
         """It leaves p(x_t | x_{t-1}, y_t) unchanged."""
         from scipy.stats import ks_2samp
 
-        component = self.make()
-        skip_unless_properly_weighted(component)
+        component = skip_unless_properly_weighted(self.make())
         # Exact draws after five moves against other exact draws: x_t, and x_t - x_{t-1}.
         n, rng = 4000, _rng(2)
         previous, population, observation = self.exact_case(1, n)

@@ -159,8 +159,7 @@ class ResamplerContract(RandomContract):
 
     def test_depends_on_the_generator(self) -> None:
         """Different generators give different results, if n W_i are not integers."""
-        component = self.make()
-        skip_unless_properly_weighted(component)
+        component = skip_unless_properly_weighted(self.make())
         population = self.population((0.41, 0.24, 0.2, 0.1, 0.05))
         chosen = [self.resample(component, population, 2, np.random.default_rng(seed)) for seed in range(40)]
         assert len({tuple(c.parents["ancestor"].tolist()) for c in chosen}) > 1, (
@@ -203,8 +202,7 @@ class ResamplerContract(RandomContract):
     @statistical
     def test_order_of_particles_is_irrelevant(self) -> None:
         """The order of the particles does not change what each carries on average."""
-        component = self.make()
-        skip_unless_properly_weighted(component)
+        component = skip_unless_properly_weighted(self.make())
         for n in (4, 5):
             case = Case(CASES[1].weights, n, 1000)
             orders = (np.arange(5), np.array(_OTHER_ORDER))
@@ -219,8 +217,7 @@ class ResamplerContract(RandomContract):
 
     def _check_cases(self, cases: tuple[Case, ...]) -> None:
         """Compare what each particle and each group of particles carries on average with its weight."""
-        component = self.make()
-        skip_unless_properly_weighted(component)
+        component = skip_unless_properly_weighted(self.make())
         n_comparisons = sum(len(case.weights) + len(groups_of(case)) for case in cases)
         slow = []
         for seed, case in enumerate(cases):

@@ -18,24 +18,10 @@ def starter_kinds() -> list[str]:
 
 
 def write_starter(kind: str, path: Path) -> tuple[Path, Path]:
-    """Write a commented component that works, and its test.
+    """Write a commented component of one of `starter_kinds` that works, and its test beside it as ``test_NAME.py``.
 
-    Parameters
-    ----------
-    kind : str
-        One of `starter_kinds`.
-    path : Path
-        Python file to write; the test is written beside it as ``test_NAME.py``.
-
-    Returns
-    -------
-    (Path, Path)
-        Component and test.
-
-    Raises
-    ------
-    InputError
-        If there is no such kind, the name cannot be imported, or a file exists already.
+    Returns both paths. Raises InputError if there is no such kind, the name cannot be imported, or a file exists
+    already.
     """
     if kind not in starter_kinds():
         raise InputError(f"there is no starting file for {kind!r}", f"there are: {', '.join(starter_kinds())}")

@@ -101,14 +101,9 @@ class Registration(ABC):
 
 @dataclass(frozen=True)
 class SmallGicp(Registration):
-    """small_gicp (Koide 2024), one thread.
+    """small_gicp (Koide 2024), one thread, at most `iterations` iterations.
 
-    Parameters
-    ----------
-    method : "GICP", "PLANE_ICP" or "ICP"
-        Generalised, point-to-plane or point-to-point ICP.
-    iterations : int
-        Largest number of iterations.
+    `method` is "GICP", "PLANE_ICP" or "ICP": generalised, point-to-plane or point-to-point ICP.
     """
 
     method: str = "GICP"

@@ -114,12 +114,10 @@ def pair_sums(p: np.ndarray, q: np.ndarray, group: np.ndarray, n_groups: int) ->
 
 
 def fit_sums(sums: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Least-squares motions and squared residuals from the sums (..., 18) of `pair_sums`.
+    """Least-squares motions T (..., 4, 4) and squared residuals (...) from the sums (..., 18) of `pair_sums`.
 
-    Returns
-    -------
-    T : (..., 4, 4) motions; identity if the weight is zero.
-    residual : (...,) sum of weighted squared distances |R p + t - q|^2, clipped at 0.
+    T is the identity if the weight is zero. A residual is the sum of weighted squared distances
+    ``|R p + t - q|^2``, clipped at 0.
     """
     sums = np.asarray(sums, dtype=np.float64)
     n = sums[..., 0]

@@ -37,13 +37,8 @@ _HERE = str(Path(__file__).parent)
 class Program:
     """A model given as a function, and its filters with `n` particles.
 
-    The methods take further fields of `ParticleFilter` by name, such as ``resampler`` or ``trigger``.
-
-    Parameters
-    ----------
-    model : callable
-        ``model(previous, observation)`` with calls of `sample` and `observe`; returns None, or a mapping of further
-        values to keep.
+    ``model(previous, observation)`` calls `sample` and `observe`, and returns None or a mapping of further values to
+    keep. The methods take further fields of `ParticleFilter` by name, such as ``resampler`` or ``trigger``.
     """
 
     model: Model
@@ -61,11 +56,8 @@ class Program:
     def guided(self, guide: Model, n: int, **components: Any) -> ParticleFilter:
         """Guided filter.
 
-        Parameters
-        ----------
-        guide : callable
-            Program that draws every site of the model, by name, given the observation. If the observation is missing,
-            the model draws.
+        The guide is a program that draws every site of the model, by name, given the observation. If the observation
+        is missing, the model draws.
         """
         return self._filter(guide, n, components)
 
@@ -133,10 +125,7 @@ class ProgramTransition(Transition):
 class ProgramLookahead(Lookahead):
     """Priority from a run with the mean (mode of a discrete site) instead of each draw.
 
-    Parameters
-    ----------
-    power : float
-        Power of the priority; below 1 if the lookahead at the mean is too confident.
+    It is raised to `power`; below 1 if the lookahead at the mean is too confident.
     """
 
     model: Model

@@ -167,16 +167,10 @@ class CentreHandler(SiteHandler):
 
 
 class ScoreHandler(SiteHandler):
-    """Takes given values, weights them by their density, and keeps the sites.
+    """Takes given values of each site, weights them by their density, and keeps the sites.
 
-    Parameters
-    ----------
-    values : mapping
-        Value of each site.
-    single : bool
-        Whether they are the values of one particle, without the particle axis.
-    strict : bool
-        Whether a log density of NaN or +inf is an error.
+    With `single` they are the values of one particle, without the particle axis. With `strict`, a log density of NaN
+    or +inf is an error.
     """
 
     draws = False

@@ -11,7 +11,7 @@ import numpy as np
 
 from mstfilter.errors import InputError
 from mstfilter.smc.distributions import Categorical, as_distribution
-from mstfilter.smc.population import take
+from mstfilter.smc.population import frozen_view, take
 from mstfilter.smc.programs.handlers import Site, SiteHandler, check_shape
 
 active_run: ContextVar[ProgramRun | None] = ContextVar("run of a program", default=None)
@@ -109,7 +109,7 @@ class Trace(Mapping[str, Any]):
     __slots__ = ("_values",)
 
     def __init__(self, values: Mapping[str, Any]) -> None:
-        self._values = {name: _read_only(v) if isinstance(v, np.ndarray) else v for name, v in values.items()}
+        self._values = {name: frozen_view(v) if isinstance(v, np.ndarray) else v for name, v in values.items()}
 
     def __getitem__(self, name: str) -> Any:
         return self._values[name]
@@ -122,12 +122,6 @@ class Trace(Mapping[str, Any]):
 
     def __repr__(self) -> str:
         return f"Trace({self._values!r})"
-
-
-def _read_only(array: np.ndarray) -> np.ndarray:
-    view = array.view()
-    view.setflags(write=False)
-    return view
 
 
 class Shapes(NamedTuple):
@@ -195,7 +189,7 @@ class ProgramRun:
         size = self.n if rows is None else len(rows)
         self._check_name(name)
         value, gain = self.handler.value(Site(name, distribution, size, rows, branch))
-        value = _read_only(np.asarray(value))
+        value = frozen_view(np.asarray(value))
         if gain is None and value.shape != (size,):
             check_shape("its draws", value, distribution, size)
         self.record(value.shape[1:], None, size)
