@@ -20,12 +20,8 @@ SYSTEM_PACKAGES = ("libusb-1.0-0", "libgl1", "libegl1", "libgomp1")
 def import_open3d() -> ModuleType:
     """Import open3d, limited to one thread.
 
-    With several threads the order of a parallel sum varies, and results differ in their last digits.
-
-    Raises
-    ------
-    MissingLibraryError
-        If the package or a system library that it needs is missing.
+    With several threads the order of a parallel sum varies, and results differ in their last digits. Raises
+    MissingLibraryError if the package or a system library that it needs is missing.
     """
     try:
         open3d = import_module("open3d")

@@ -161,10 +161,7 @@ class Registry:
     ) -> Any:
         """Build a dataclass from plain values and nested components. Other fields have the values of `base`.
 
-        Raises
-        ------
-        InputError
-            If a field or a component is unknown, or a value does not fit its field.
+        Raises InputError if a field or a component is unknown, or a value does not fit its field.
         """
         if not dataclasses.is_dataclass(cls):
             raise InputError(f"{where}: {cls.__name__} is not a dataclass, so its fields cannot be configured")

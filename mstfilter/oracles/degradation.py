@@ -38,23 +38,11 @@ def degrade(
     over: float = 0.35,
     under: float = 0.35,
 ) -> np.ndarray:
-    """Degrade a label image.
+    """Degrade a label image (H, W) of true objects, 0 elsewhere. It is unchanged if there are no objects.
 
-    Parameters
-    ----------
-    rng : Generator
-        Source of the streams (`mstfilter.smc.child`); its state does not change.
-    labels : (H, W) int
-        True objects, 0 elsewhere.
-    quality : float
-        Weighted coverage (form ``objects``) of the result against `labels`.
-    over, under : float
-        Shares of the loss due to splits and merges.
-
-    Returns
-    -------
-    (H, W) int32
-        Unchanged if there are no objects.
+    `quality` is the weighted coverage (form ``objects``) of the result against `labels`; `over` and `under` are the
+    shares of the loss due to splits and merges. `rng` is the source of the streams (`mstfilter.smc.child`); its state
+    does not change.
     """
     labels = np.asarray(labels, dtype=np.int32)
     if quality >= 1 or not labels.any():

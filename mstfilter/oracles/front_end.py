@@ -37,7 +37,6 @@ class TrueMasks(UsesTruth, Proposal):
 
     Parameters
     ----------
-    completer : Completer
     quality : float
         2-D quality (form ``objects``) of the masks of each sample, 0.3 to 1.
     errors : {"independent", "lasting"}

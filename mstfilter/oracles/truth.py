@@ -137,10 +137,7 @@ def uses_truth(component: Any) -> list[str]:
 def bind_truth(component: T, recording: Recording) -> T:
     """The same filter (or component) with all components that use the truth bound to a recording.
 
-    Raises
-    ------
-    InputError
-        If the recording lacks something that a component needs, at any pause.
+    Raises InputError if the recording lacks something that a component needs, at any pause.
     """
     return _bind(component, RecordingTruth(recording)) if uses_truth(component) else component
 

@@ -69,19 +69,10 @@ def hypothesis_mesh(
 ) -> Any:
     """Meshes of all objects of a hypothesis as one ``open3d.geometry.TriangleMesh``, in world metres.
 
-    Parameters
-    ----------
-    colours : mapping, optional
-        ``{label: (r, g, b)}``. Default: the palette in order of labels.
-    style : {"blocky", "smooth"}
-        "blocky": the faces of the voxels, which enclose exactly the volume of the voxels. "smooth": the isosurface
-        of the occupancy at 0.5 (open3d's dual contouring), smoothed by Taubin's filter, which shrinks it little
-        (G. Taubin, "Curve and surface smoothing without shrinkage", ICCV 1995).
-
-    Raises
-    ------
-    MissingLibraryError
-        If open3d cannot be imported.
+    `colours` is ``{label: (r, g, b)}``; by default the palette in order of labels. The style "blocky" has the faces
+    of the voxels, which enclose exactly the volume of the voxels. "smooth" is the isosurface of the occupancy at 0.5
+    (open3d's dual contouring), smoothed by Taubin's filter, which shrinks it little (G. Taubin, "Curve and surface
+    smoothing without shrinkage", ICCV 1995). Raises MissingLibraryError if open3d cannot be imported.
     """
     o3d = import_open3d()
     if colours is None:

@@ -110,12 +110,7 @@ def fit_support_plane(frame: Frame) -> SupportPlane:
     """Find the plane with the most readings (RANSAC, then least squares). Cached by content.
 
     The pose of the frame is not used. The minimal sets are drawn with a constant seed, so the same frame gives the
-    same plane.
-
-    Raises
-    ------
-    InputError
-        If there are too few readings or too few inliers.
+    same plane. Raises InputError if there are too few readings or too few inliers.
     """
     return memo("support_plane", frame.key, lambda: _fit(frame))
 

@@ -233,11 +233,7 @@ class Hypothesis:
     grid : VoxelGrid
         Where the voxels are.
     objects : tuple of ObjectRecord
-        One for each label that occurs, in ascending order of labels.
-
-    See Also
-    --------
-    Hypothesis.from_labels : makes the records.
+        One for each label that occurs, in ascending order of labels. `Hypothesis.from_labels` makes them.
     """
 
     labels: np.ndarray

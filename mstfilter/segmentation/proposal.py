@@ -117,14 +117,10 @@ class TreeCutProposal(Proposal):
 
     Parameters
     ----------
-    boundary : BoundaryModel
-    tree : TreeBuilder
-    value : CutValue
     sampler : CutSampler
         Must match the value: a `temperature` for log odds, `sigma2` for `SceneCutObjectness`.
     objects : ObjectRule
         Decides which regions of a cut are objects.
-    completer : Completer
     weight_rule : {"equal", "p"}
         "equal": equal weights, which is correct for cuts drawn from p. "p": log weight ``log p(c) - log p(c*)`` as in
         the paper and the authors' program; p then counts twice, in the draw and in the weight.

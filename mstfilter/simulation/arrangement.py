@@ -246,11 +246,7 @@ def arrange_objects(
     """Place all objects and let them settle, with twins in contact and some objects hidden.
 
     In a dense heap, settling may separate some twins or reveal hidden objects; after some attempts fewer suffice.
-
-    Raises
-    ------
-    InputError
-        If the objects do not fit on the table.
+    Raises InputError if the objects do not fit on the table.
     """
     empty = world.save()
     twins = sum(t >= 0 for t in twin_of)

@@ -242,23 +242,12 @@ class PhysicsWorld:
     def cast(
         self, origin: ArrayLike, directions: np.ndarray, groups: Sequence[int] = (0, 1, 2), data: Any = None
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Cast rays from one point.
+        """Cast rays (n, 3) of any length from one point (3,), metres.
 
-        Parameters
-        ----------
-        origin : (3,) metres
-        directions : (n, 3)
-            Of any length.
-        groups : sequence of int
-            Visible geoms: 0 the room, 1 objects, 2 finger and arm.
-        data : mujoco.MjData, optional
-            Another state of the same model. Default: the state of the world after `forward`.
-
-        Returns
-        -------
-        geom, distance, normal : (n,) int32, (n,), (n, 3)
-            First geom that each ray meets, -1 for none; distance in units of the length of the direction; surface
-            normal.
+        `groups` are the visible geoms: 0 the room, 1 objects, 2 finger and arm. `data` is another state of the same
+        model; by default the state of the world after `forward`. Returns the first geom (n,) int32 that each ray
+        meets, -1 for none; the distance (n,) in units of the length of the direction; and the normal (n, 3) of the
+        surface.
         """
         n = len(directions)
         geom, distance = np.full(n, -1, np.int32), np.full(n, -1.0)
@@ -382,12 +371,8 @@ def choose_push(rng: np.random.Generator, world: PhysicsWorld, family: SceneFami
     """Choose a push that moves objects by simulating candidates; the world is left unchanged.
 
     The first candidate that moves `family.min_moved` objects and topples none is taken, otherwise the one that moves
-    most and topples fewest. Candidates that drop an object or leave one in motion are discarded.
-
-    Raises
-    ------
-    InputError
-        If no candidate moves any object.
+    most and topples fewest. Candidates that drop an object or leave one in motion are discarded. Raises InputError if
+    no candidate moves any object.
     """
     saved = world.save()
     best: tuple[float, FingerPush] | None = None

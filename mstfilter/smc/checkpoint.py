@@ -41,25 +41,11 @@ _FORMAT = 1
 def save_state(
     path: Path, state: State, codec: Codec | None = None, *, compress: bool = False, **description: Any
 ) -> None:
-    """Write a state atomically.
+    """Write a state after at least one step to an .npz file, atomically. The folder exists.
 
-    Parameters
-    ----------
-    path : Path
-        The .npz file; its folder exists.
-    state : State
-        After at least one step.
-    codec : Codec, optional
-        Default: `ArrayCodec`.
-    compress : bool
-        Compress the arrays: smaller, but slower.
-    **description
-        Further values to store, of types that JSON represents.
-
-    Raises
-    ------
-    InputError
-        If the particles cannot be stored or the file cannot be written.
+    `codec` is for particles other than those of `ArrayCodec`. With `compress` the file is smaller, and slower to
+    write. Further values, of types that JSON represents, are stored by name. Raises InputError if the particles
+    cannot be stored or the file cannot be written.
     """
     population = state.population
     if population is None:
@@ -129,10 +115,7 @@ class Checkpoint:
     def resume(self, observations: Iterator[Any]) -> State:
         """The stored state, after removing the observations that it contains; `start` if there is no file.
 
-        Raises
-        ------
-        InputError
-            If the file is of another run: another seed, first step, filter or observation.
+        Raises InputError if the file is of another run: another seed, first step, filter or observation.
         """
         if not self.path.exists():
             if not self.path.parent.is_dir():
@@ -264,10 +247,8 @@ _FORM = "form"
 class ArrayCodec(Codec):
     """Arrays, mappings of arrays, and sequences of dataclasses or traces of arrays.
 
-    Parameters
-    ----------
-    particle : type, optional
-        The dataclass of the particles, if it cannot be found by name because it is defined inside a function.
+    `particle` is the dataclass of the particles, if it cannot be found by name because it is defined inside a
+    function.
     """
 
     particle: type | None = None

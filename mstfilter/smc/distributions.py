@@ -199,12 +199,8 @@ class Gamma(_Independent):
 class MultivariateNormal(Distribution):
     """Gaussian vectors.
 
-    Parameters
-    ----------
-    loc : (d,) or (n, d) array_like
-        Mean, one for all particles or one for each.
-    cov : (d, d) or (n, d, d) array_like
-        Covariance, positive definite.
+    The mean `loc` is (d,) or (n, d), one for all particles or one for each; the covariance `cov` is (d, d) or (n, d,
+    d), positive definite.
     """
 
     loc: Any
@@ -370,10 +366,7 @@ class Categorical(Distribution):
 def as_distribution(value: Any) -> Distribution:
     """Convert a distribution of this package, of scipy.stats (frozen or new style) or of torch.
 
-    Raises
-    ------
-    InputError
-        If `value` is not a distribution.
+    Raises InputError if `value` is not a distribution.
     """
     if isinstance(value, Distribution):
         return value

@@ -179,7 +179,7 @@ class Gaussian(Similarity):
 
 
 def _squared_distances(x: np.ndarray) -> np.ndarray:
-    """(n, n) |x_i|^2 + |x_j|^2 - 2 x_i x_j, without an (n, n, d) array; centred to keep rounding errors small."""
+    """(n, n) ``|x_i|^2 + |x_j|^2 - 2 x_i x_j``, without an (n, n, d) array; centred to keep rounding errors small."""
     x = x - x.mean(axis=0)
     norms = (x * x).sum(axis=1)
     squares = np.maximum(norms[:, None] + norms[None, :] - 2 * (x @ x.T), 0.0)

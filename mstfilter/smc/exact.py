@@ -127,23 +127,11 @@ class Kalman(NamedTuple):
 
 
 def kalman_filter(F: Any, Q: Any, H: Any, R: Any, m0: Any, P0: Any, observations: Iterable[Any]) -> Kalman:
-    """The Kalman filter and the Rauch-Tung-Striebel smoother of filterpy.
+    """The Kalman filter and the Rauch-Tung-Striebel smoother of filterpy, of (k,) observations; None if missing.
 
-    Parameters
-    ----------
-    F, Q : (d, d) or (T, d, d) array_like
-        As in `linear_gaussian`. With a first axis, entry t moves x_{t-1} to x_t; entry 0 is not used.
-    H, R : (k, d) and (k, k), or (T, k, d) and (T, k, k), array_like
-        Entry t belongs to y_t.
-    m0, P0 : (d,) and (d, d) array_like
-        Mean and covariance of x_0.
-    observations : iterable of (k,) array_like, float or None
-        T observations; None if missing.
-
-    Raises
-    ------
-    InputError
-        If a shape does not fit.
+    The arguments are as in `linear_gaussian`. The matrices may have a first axis of T entries: entry t of `F` and `Q`
+    moves x_{t-1} to x_t, entry 0 is not used; entry t of `H` and `R` belongs to y_t. Raises InputError if a shape
+    does not fit.
     """
     from filterpy.kalman import KalmanFilter
 
@@ -241,10 +229,7 @@ def forward_backward(
 ) -> Marginals:
     """The forward-backward algorithm of a model with K states (Rabiner 1989); arguments as in `hidden_markov`.
 
-    Raises
-    ------
-    InputError
-        If a shape does not fit, or no state explains an observation.
+    Raises InputError if a shape does not fit, or no state explains an observation.
     """
     start, moves = _chain(initial, transition)
     ys = list(observations)

@@ -146,10 +146,7 @@ class ParticleFilter:
     def step(self, state: State, observation: Any, observer: Observer | None = None) -> tuple[State, Info]:
         """Process one observation; None if it is missing, then the particles are only moved.
 
-        Raises
-        ------
-        InputError
-            If a component raises it. The message starts with the step and the slot of the component.
+        Raises InputError if a component raises it. The message starts with the step and the slot of the component.
         """
         step = _Step(self, state, observation, observer)
         past, resampled_before = step.select_before()

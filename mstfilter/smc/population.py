@@ -267,10 +267,7 @@ class Population:
     def take(self, indices: np.ndarray, log_weights: np.ndarray | None = None) -> Population:
         """Select particles with their parents, and with their log weights unless new ones are given.
 
-        Raises
-        ------
-        InputError
-            If the indices are not integers from 0 to n - 1.
+        Raises InputError if the indices are not integers from 0 to n - 1.
         """
         indices = _within(_integers("indices", indices), len(self))
         return Population(

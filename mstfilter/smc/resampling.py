@@ -48,10 +48,7 @@ from mstfilter.smc.interfaces import Resampler, TransformResampler, WeightResamp
 def checked_weights(log_weights: np.ndarray, n: int) -> np.ndarray:
     """(m,) float64 weights with maximum 1, from log weights of any float type.
 
-    Raises
-    ------
-    InputError
-        If the log weights are not one-dimensional, hold NaN or +inf, or are all -inf, or if n < 1.
+    Raises InputError if the log weights are not one-dimensional, hold NaN or +inf, or are all -inf, or if n < 1.
     """
     lw = np.asarray(log_weights, dtype=np.float64)
     if lw.ndim != 1 or len(lw) == 0:

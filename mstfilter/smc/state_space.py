@@ -91,10 +91,7 @@ class StateSpaceModel:
     def density(self, which: str) -> Callable[..., np.ndarray]:
         """``log_initial`` or ``log_transition``.
 
-        Raises
-        ------
-        InputError
-            If the model was made without it.
+        Raises InputError if the model was made without it.
         """
         found = self.log_initial if which == "log_initial" else self.log_transition
         if found is None:

@@ -236,7 +236,7 @@ class KeepWeights(ResamplerWrapper):
 class EnsembleTransform(TransformResampler):
     """Moves the particles to equal weights by optimal transport: new particles are mixtures of old ones.
 
-    T_ij minimises the sum of T_ij |x_i - y_j|^2 with row sums W_i and column sums 1 / n; the new particles are
+    T_ij minimises the sum of ``T_ij |x_i - y_j|^2`` with row sums W_i and column sums 1 / n; the new particles are
     n sum_i T_ij x_i. The targets y_j are the old particles; for n different from m, equally spaced ones in their
     order. In one dimension T is the monotone transport, found by sorting in O(m log m); otherwise a linear program of
     m n variables, so use a few hundred particles. Draws nothing. Mixtures have less variance than the weighted

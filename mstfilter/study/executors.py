@@ -197,10 +197,7 @@ class _Worker(threading.Thread):
     def _try(self, k: int, job: Job) -> JobOutcome | None:
         """Run a job once; None if the worker is stopped.
 
-        Raises
-        ------
-        TimeoutError, ProcessExpired, BrokenProcessPool
-            If the process took too long or died.
+        Raises TimeoutError, ProcessExpired or BrokenProcessPool if the process took too long or died.
         """
         if self._pool is None:
             self._open_pool()

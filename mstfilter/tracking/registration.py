@@ -147,17 +147,8 @@ class ColouredIcp(Registration):
     """open3d's coloured ICP (Park et al., ICCV 2017). Colour determines motions along a surface; depth does not.
 
     Minimises the sum of ``w d^2 + (1 - w) c^2`` over the correspondences, with d the point-to-plane distance in
-    metres, c the difference of grey values 0 .. 1, and w such that the two scales below have equal cost. Both
-    surfaces need colours.
-
-    Parameters
-    ----------
-    distance_scale : float
-        Metres.
-    colour_scale : float
-        Grey levels, 0 .. 255.
-    iterations : int
-        Largest number of iterations.
+    metres, c the difference of grey values 0 .. 1, and w such that `distance_scale` metres and `colour_scale` grey
+    levels (0 .. 255) have equal cost. Both surfaces need colours. It takes at most `iterations` iterations.
     """
 
     distance_scale: float = 0.002

@@ -104,7 +104,6 @@ class PaperRule(MotionRule):
         depth camera at 0.7 m, so ICP is almost never accepted.
     registration : Registration
         Performs the ICP. The paper does not state its initial motion; here it aligns the centroids.
-    sift : SiftMatching
     """
 
     min_inliers: int = 5
@@ -140,7 +139,6 @@ class AuthorsRule(MotionRule):
         Square metres; ICP is accepted up to this mean squared distance (0.002 is 4.5 cm rms).
     registration : Registration
         Performs the ICP, from the identity.
-    sift : SiftMatching
     """
 
     slope: float = 0.1
@@ -191,8 +189,6 @@ class MstRule(MotionRule):
         Number of best candidates that are refined against the whole last frame and added as further candidates.
     search_above : float
         If every score is larger, the object is searched for around its last position. Negative values disable it.
-    sift : SiftMatching
-    residual : MotionResidual
     registration : Registration
         Aligns the surfaces of the segment before and after.
     """
