@@ -204,7 +204,8 @@ def conclusion(difference: Difference, first: str, second: str, where: str = "",
         return f"{first} and {second}{at}: no {unit} has both."
     if d.n < 2:
         return f"{first} and {second}{at}: no difference can be claimed at n = 1."
-    found = f"{d.mean:+.3f}, 95 % interval {d.low:+.3f} to {d.high:+.3f}, p {d.p_holm:.2g} after Holm, n = {d.n}"
+    numbers = f"{d.mean:+#.3g}, 95 % interval {d.low:+#.3g} to {d.high:+#.3g}"
+    found = f"{numbers}, p {d.p_holm:.2g} after Holm, n = {d.n}"
     if not (d.low > 0 or d.high < 0):
         return f"{first} and {second}{at}: no difference can be claimed at n = {d.n} ({found})."
     word = "above" if d.mean > 0 else "below"

@@ -4,6 +4,7 @@
 >>> runs.log_evidence.shape, runs.ess.shape                       # (200, T) each
 >>> runs.state(7).population.particles                            # of the run with the eighth seed
 >>> batch(bootstrap(model, n=100), data_sets, seeds=range(200), paired=True)    # run r gets data_sets[r]
+>>> batch(filter, observations, mean=lambda p: p.weights @ p.particles).values["mean"]                # (R, T)
 
 Run r equals ``filter.run(observations, seeds[r])`` bit for bit: it draws from the same streams. Components that are
 `batched` are called once per step, with arrays (R, n, ...) of R runs; others are called once per run and step.
@@ -18,18 +19,19 @@ whose functions do so. `RunGenerators` stands for the generator.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 from mstfilter.errors import InputError, LostRunError
-from mstfilter.smc.components import Always, EssBelow, EveryKth, Never
 from mstfilter.smc.filter import ParticleFilter
 from mstfilter.smc.interfaces import State, WeightResampler
 from mstfilter.smc.population import Population, identity
 from mstfilter.smc.streams import Key, RunGenerators, SlotStreams
+
+Function = Callable[[Population], Any]
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,6 +45,8 @@ class Batch:
     resampled: np.ndarray  #: (R, T) bool whether the step resampled
     states: tuple[State | None, ...]  #: the last states; None for a run that is lost
     lost: dict[int, str] = field(default_factory=dict)  #: run -> reason
+    #: name -> (R, T, ...) float64, results of the functions given to `batch`; NaN after a run is lost
+    values: dict[str, np.ndarray] = field(default_factory=dict)
 
     def state(self, run: int) -> State:
         """The last state of a run; InputError if the run is lost."""
@@ -51,9 +55,21 @@ class Batch:
             raise InputError(f"run {run} is lost: {self.lost[run]}")
         return state
 
+    def record(self, run: int, t: int, population: Population, functions: Mapping[str, Function]) -> None:
+        """Keep what the functions return."""
+        for name, function in functions.items():
+            found = np.asarray(function(population))
+            if name not in self.values:
+                self.values[name] = np.full((*self.ess.shape, *found.shape), np.nan)
+            self.values[name][run, t] = found
+
 
 def batch(
-    filter: ParticleFilter, observations: Iterable[Any], seeds: Sequence[int] = range(100), paired: bool = False
+    filter: ParticleFilter,
+    observations: Iterable[Any],
+    seeds: Sequence[int] = range(100),
+    paired: bool = False,
+    **functions: Function,
 ) -> Batch:
     """Run a filter with many seeds.
 
@@ -64,6 +80,9 @@ def batch(
     paired : bool
         If True, `observations` are R sequences of T observations, one for each seed. Batched components get the
         observations of a step as an array (R, 1, ...).
+    **functions
+        Name -> function of the population after a step, called for each run and step. It gets particles and weights
+        only; its result has the same shape at every step.
     """
     seeds = [int(seed) for seed in seeds]
     ys = [list(y) for y in observations] if paired else [list(observations)]
@@ -77,10 +96,10 @@ def batch(
         )
     if batched_slots(filter) is not None:
         try:
-            return _Sweep(filter, ys, seeds).run()
+            return _Sweep(filter, ys, seeds, functions).run()
         except _SizeChanged:
             pass
-    return _one_by_one(filter, ys, seeds)
+    return _one_by_one(filter, ys, seeds, functions)
 
 
 def batched_slots(filter: ParticleFilter) -> tuple[str, ...] | None:
@@ -100,7 +119,9 @@ def batched_slots(filter: ParticleFilter) -> tuple[str, ...] | None:
     return tuple(slot for slot, component in components.items() if component is not None and component.batched)
 
 
-def _one_by_one(filter: ParticleFilter, ys: list[list[Any]], seeds: list[int]) -> Batch:
+def _one_by_one(
+    filter: ParticleFilter, ys: list[list[Any]], seeds: list[int], functions: Mapping[str, Function]
+) -> Batch:
     result = _empty(len(seeds), len(ys[0]))
     states: list[State | None] = []
     for r, seed in enumerate(seeds):
@@ -110,6 +131,8 @@ def _one_by_one(filter: ParticleFilter, ys: list[list[Any]], seeds: list[int]) -
                 found = state.log_evidence
                 result.log_evidence[r, info.t] = np.nan if found is None else found
                 result.ess[r, info.t], result.resampled[r, info.t] = info.ess, info.resampled
+                assert state.population is not None
+                result.record(r, info.t, state.population, functions)
         except LostRunError as error:
             state, result.lost[r] = None, error.message
         states.append(state)
@@ -124,7 +147,7 @@ def _empty(n_runs: int, n_steps: int) -> Batch:
 def _finished(result: Batch, states: list[State | None], filter: ParticleFilter) -> Batch:
     for r in result.lost if filter.properly_weighted else ():
         result.log_evidence[r, np.isnan(result.log_evidence[r])] = -np.inf
-    return Batch(result.log_evidence, result.ess, result.resampled, tuple(states), result.lost)
+    return replace(result, states=tuple(states))
 
 
 class _SizeChanged(Exception):
@@ -139,9 +162,9 @@ class _Runs(Population):
     """The populations of R runs: log weights (R, n), particles (R, n, ...)."""
 
     @classmethod
-    def of(cls, particles: Any, log_weights: np.ndarray) -> _Runs:
+    def of(cls, particles: Any, log_weights: np.ndarray, **known: Any) -> _Runs:
         new = object.__new__(cls)  # not checked: the shapes of a population do not apply
-        new.__dict__.update(particles=particles, log_weights=log_weights, parents={}, notes={})
+        new.__dict__.update(particles=particles, log_weights=log_weights, parents={}, notes={}, **known)
         return new
 
     def labelled(self, parents: Any, notes: Any = None) -> Population:
@@ -154,8 +177,10 @@ class _Runs(Population):
 class _Sweep:
     """The steps of R runs; rows are runs that are not lost."""
 
-    def __init__(self, filter: ParticleFilter, ys: list[list[Any]], seeds: list[int]) -> None:
-        self.filter, self.ys, self.seeds = filter, ys, seeds
+    def __init__(
+        self, filter: ParticleFilter, ys: list[list[Any]], seeds: list[int], functions: Mapping[str, Function]
+    ) -> None:
+        self.filter, self.ys, self.seeds, self.functions = filter, ys, seeds, functions
         self.result = _empty(len(seeds), len(ys[0]))
         self.runs = np.arange(len(seeds))  # the run of each row
         self.streams: dict[str, SlotStreams] = {}
@@ -168,6 +193,8 @@ class _Sweep:
         try:
             for t in range(len(self.ys[0])):
                 particles, log_weights, ancestors = self.step(t, particles, log_weights)
+                for row, run in enumerate(self.runs.tolist() if self.functions else ()):
+                    self.result.record(run, t, Population(_row(particles, row), log_weights[row]), self.functions)
         except _AllLost:
             pass
         proper = self.filter.properly_weighted
@@ -303,13 +330,10 @@ class _Sweep:
 
     def wanted(self, t: int, particles: Any, log_weights: np.ndarray, ess: np.ndarray) -> np.ndarray:
         """(R,) bool: the runs to resample."""
-        trigger = self.filter.trigger
-        if isinstance(trigger, EssBelow):
-            return ess < trigger.share * self.filter.n
-        if isinstance(trigger, (Always, Never, EveryKth)):
-            any_population = Population(np.zeros(1))
-            return np.full(len(ess), trigger.wants(any_population, t))
-        rows = range(len(ess))
+        trigger, rows = self.filter.trigger, range(len(ess))
+        if trigger.batched:
+            runs = _Runs.of(particles, log_weights, _both=self.summary)
+            return np.broadcast_to(trigger.wants(runs, t), len(ess))
         return np.array([trigger.wants(Population(_row(particles, k), log_weights[k]), t) for k in rows])
 
     def observation(self, t: int) -> Any:

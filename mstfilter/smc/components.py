@@ -192,18 +192,21 @@ class EssBelow(Trigger):
     """Resample if the effective sample size is below a `share`, in (0, 1], of the number of particles."""
 
     share: float = 0.5
+    batched: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         hint = "share is relative to the number of particles: 0.5 resamples below half of them"
         check_number("share", self.share, f"{hint}; see also the triggers Always and Never", above=0, at_most=1)
 
     def wants(self, population: Population, t: int) -> bool:
-        return population.ess < self.share * len(population)
+        return population.ess < self.share * population.log_weights.shape[-1]
 
 
 @dataclass(frozen=True)
 class Always(Trigger):
     """Resample at every step."""
+
+    batched: ClassVar[bool] = True
 
     def wants(self, population: Population, t: int) -> bool:
         return True
@@ -212,6 +215,8 @@ class Always(Trigger):
 @dataclass(frozen=True)
 class Never(Trigger):
     """Resample only if there are more particles than the filter keeps."""
+
+    batched: ClassVar[bool] = True
 
     def wants(self, population: Population, t: int) -> bool:
         return False
@@ -222,6 +227,7 @@ class EveryKth(Trigger):
     """Resample at every k-th step."""
 
     k: int = 2
+    batched: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         check_integer("resampling at every k-th step: k", self.k)

@@ -82,12 +82,16 @@ def n_particles(state: State, info: Info) -> int:
 def mean(state: State, info: Info) -> Any:
     """Weighted mean of array particles."""
     assert state.population is not None
-    if not isinstance(state.population.particles, np.ndarray):
+    return _mean(state.population)
+
+
+def _mean(population: Population) -> Any:
+    if not isinstance(population.particles, np.ndarray):
         raise InputError(
-            f"the mean of particles of type {type(state.population.particles).__name__} is not defined",
+            f"the mean of particles of type {type(population.particles).__name__} is not defined",
             "write a collector: lambda state, info: state.population.weights @ state.population.particles['x']",
         )
-    return np.tensordot(state.population.weights, state.population.particles, axes=1)
+    return np.tensordot(population.weights, population.particles, axes=1)
 
 
 def energy_distance(
@@ -241,8 +245,8 @@ def run_many(
     progress : callable, optional
         ``progress(done, total)``, called as runs finish.
     **collectors
-        As for `collect`; default `log_evidence`. If they are `log_evidence` and `ess` only, `batch` runs many seeds
-        at once where the filter allows it.
+        As for `collect`; default `log_evidence`. If they are `log_evidence`, `ess` and `mean` only, `batch` runs many
+        seeds at once where the filter allows it.
 
     Returns
     -------
@@ -297,15 +301,17 @@ class _Job:
 
     def batched(self, arm: str) -> bool:
         """Whether many seeds of an arm run at once."""
-        return set(self.collectors.values()) <= {log_evidence, ess} and bool(batched_slots(self.arms[arm]))
+        return set(self.collectors.values()) <= {log_evidence, ess, mean} and bool(batched_slots(self.arms[arm]))
 
     def run(self, arm: str, seeds: list[int]) -> dict[tuple[str, int], _Run]:
         """Run some seeds of an arm, and store the results."""
         found = {}
         try:
             if self.batched(arm):
-                runs = batch(self.arms[arm], self.observations, seeds)
+                means: dict[str, Any] = {"mean": _mean} if mean in self.collectors.values() else {}
+                runs = batch(self.arms[arm], self.observations, seeds, **means)
                 tables: dict[Collector, np.ndarray] = {log_evidence: runs.log_evidence, ess: runs.ess}
+                tables[mean] = runs.values.get("mean", np.zeros((len(seeds), 0)))  # all runs lost at the first step
                 for r, seed in enumerate(seeds):
                     rows = {name: tables[collector][r] for name, collector in self.collectors.items()}
                     found[arm, seed] = _Run(rows, runs.lost.get(r, ""))
@@ -319,15 +325,9 @@ class _Job:
 
     def single(self, arm: str, seed: int) -> _Run:
         """One run, up to the step at which it is lost."""
-        rows: dict[str, list[Any]] = {name: [] for name in self.collectors}
-        lost = ""
-        try:
-            for state, info in self.arms[arm].iterate(self.observations, seed):
-                for name, collector in self.collectors.items():
-                    rows[name].append(np.asarray(collector(state, info)))
-        except LostRunError as error:
-            lost = error.message
-        return _Run({name: _stack(name, row) for name, row in rows.items()}, lost)
+        lost: list[str] = []
+        steps = _until_lost(self.arms[arm].iterate(self.observations, seed), lost)
+        return _Run(dict(collect(steps, **self.collectors)), "".join(lost))
 
     def joined(self, name: str, runs: list[_Run], shape: tuple[int, ...]) -> np.ndarray:
         """(arm, seed, time, ...) values of a collector."""
@@ -368,6 +368,14 @@ class _Job:
                 "choose another folder, or remove this one",
             )
         return _Run(rows, lost)
+
+
+def _until_lost(steps: Iterable[tuple[State, Info]], lost: list[str]) -> Iterable[tuple[State, Info]]:
+    """The steps of a run; if it is lost, the reason is appended."""
+    try:
+        yield from steps
+    except LostRunError as error:
+        lost.append(error.message)
 
 
 def _finished_chunks(job: _Job, chunks: list[tuple[str, list[int]]], workers: int) -> Iterable[Any]:

@@ -34,6 +34,7 @@ determinantal point process".
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -253,11 +254,17 @@ class ClusterStratified(Resampler):
         ancestors, log_weights = [], []
         for g in np.flatnonzero(counts):
             members = np.flatnonzero(cluster == g)
-            inner = self.scheme.resample(rng, population.take(members, np.log(weights[members])), int(counts[g]))
+            inside, k = np.log(weights[members]), int(counts[g])
+            if isinstance(self.scheme, WeightResampler):  # saves the time to make populations
+                index, out = self.scheme.select(rng, inside, k)
+                out = np.full(len(index), log_mean_exp(inside)) if out is None else out
+            else:
+                inner = self.scheme.resample(rng, population.take(members, inside), k)
+                index, out = inner.parents["ancestor"], inner.log_weights
             # The scheme keeps the mean of the weights; here their sum is needed, scaled to the mass of the cluster.
-            scale = np.log(len(members) / len(inner)) + np.log(masses[g] / mass[g])
-            ancestors.append(members[inner.parents["ancestor"]])
-            log_weights.append(inner.log_weights + scale)
+            scale = np.log(len(members) / len(index)) + np.log(masses[g] / mass[g])
+            ancestors.append(members[index])
+            log_weights.append(out + scale)
         selected = np.concatenate(ancestors)
         out = np.concatenate(log_weights) + population.log_weights.max()
         out += np.log(len(selected) / len(weights))
@@ -347,8 +354,10 @@ class KDpp(Resampler):
         positive = weights > 0
         root = np.sqrt(weights[positive])
         S = checked_similarity(self.similarity, population)[np.ix_(positive, positive)]
-        values, vectors = np.linalg.eigh(S)
-        if values[0] < 0:
+        try:
+            np.linalg.cholesky(S + 1e-12 * np.eye(len(S)))  # a fraction of the time of eigenvalues
+        except np.linalg.LinAlgError:
+            values, vectors = np.linalg.eigh(S)
             S = (vectors * np.maximum(values, 0.0)) @ vectors.T
         return root[:, None] * S * root[None, :]
 
@@ -422,23 +431,22 @@ def inclusion(spectrum: Spectrum, k: int) -> np.ndarray:
 
 def sample_kdpp(rng: np.random.Generator, spectrum: Spectrum, k: int) -> np.ndarray:
     """(k,) ascending items: k eigenvectors drawn by the polynomials, then items one by one by projection."""
-    log_values, left, used = np.log(spectrum.values), k, []
-    uniforms = rng.random(spectrum.rank)
+    log_values, log_e, left, used = np.log(spectrum.values).tolist(), spectrum.log_e.tolist(), k, []
+    uniforms = rng.random(spectrum.rank).tolist()
     for j in range(spectrum.rank, 0, -1):
         if left == 0:
             break
-        log_take = log_values[j - 1] + spectrum.log_e[j - 1, left - 1] - spectrum.log_e[j, left]
-        if left == j or uniforms[j - 1] < np.exp(log_take):
+        log_take = log_values[j - 1] + log_e[j - 1][left - 1] - log_e[j][left]
+        if left == j or uniforms[j - 1] < math.exp(min(log_take, 0.0)):
             used.append(j - 1)
             left -= 1
     V = spectrum.vectors[:, used]
     norms = (V * V).sum(axis=1)
     rows, items = np.zeros((len(V), k)), np.empty(k, np.int64)
     for step in range(k):
-        cumulative = np.cumsum(norms)
-        i = int(np.searchsorted(cumulative, rng.random() * cumulative[-1], side="right"))
-        i = min(i, int(np.searchsorted(cumulative, cumulative[-1], side="left")))
-        items[step] = i
+        cumulative = norms.cumsum()
+        i = int(cumulative.searchsorted(rng.random() * cumulative[-1], side="right"))
+        items[step] = i = min(i, int(cumulative.searchsorted(cumulative[-1])))
         # Gram-Schmidt: subtract from all items their component along item i.
         rows[:, step] = (V @ V[i] - rows[:, :step] @ rows[i, :step]) / np.sqrt(norms[i])
         norms = np.maximum(norms - rows[:, step] ** 2, 0.0)

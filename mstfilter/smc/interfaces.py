@@ -190,6 +190,11 @@ class TransformResampler(Resampler):
 class Trigger(ABC):
     """Decides whether a step resamples."""
 
+    @property
+    def batched(self) -> bool:
+        """Whether `wants` also takes the populations of R runs, whose `ess` is (R,), and returns (R,) bool or one."""
+        return False
+
     @abstractmethod
     def wants(self, population: Population, t: int) -> bool:
         """True to resample at step `t`."""

@@ -86,6 +86,7 @@ def assert_equal_to_single_runs(filter, data, seeds, runs):
     for r, seed in enumerate(seeds):
         state = None
         for state, info in filter.iterate(data[r], seed):
+            np.testing.assert_array_equal(runs.values["weights"][r, info.t], state.population.weights)
             assert runs.ess[r, info.t] == info.ess
             assert runs.log_evidence[r, info.t] == state.log_evidence
             assert runs.resampled[r, info.t] == info.resampled
@@ -100,17 +101,18 @@ def assert_equal_to_single_runs(filter, data, seeds, runs):
 def test_every_run_equals_its_single_run(name):
     filter = FILTERS[name]
     ys = [0, 2, 1, 3, 0] if name == "objects" else [*YS[:4], None, *YS[5:]]
-    assert_equal_to_single_runs(filter, [ys] * len(SEEDS), SEEDS, batch(filter, ys, SEEDS))
+    runs = batch(filter, ys, SEEDS, weights=lambda p: p.weights)
+    assert_equal_to_single_runs(filter, [ys] * len(SEEDS), SEEDS, runs)
 
 
 def test_a_model_of_vectors_with_its_own_data_for_each_run():
     data = [observations(6, seed) for seed in range(5)]
     for filter in (bootstrap(MODEL, 50, Systematic(), Always()), guided(AR1, optimal, 10)):
         ys = data if filter.n == 50 else [[float(y[0]) for y in run] for run in data]
-        assert_equal_to_single_runs(filter, ys, SEEDS, batch(filter, ys, SEEDS, paired=True))
+        assert_equal_to_single_runs(filter, ys, SEEDS, batch(filter, ys, SEEDS, True, weights=lambda p: p.weights))
     data[2][3] = None
     filter = bootstrap(MODEL, 50)
-    assert_equal_to_single_runs(filter, data, SEEDS, batch(filter, data, SEEDS, paired=True))
+    assert_equal_to_single_runs(filter, data, SEEDS, batch(filter, data, SEEDS, True, weights=lambda p: p.weights))
 
 
 def test_which_components_are_called_once_per_step():

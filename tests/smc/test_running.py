@@ -180,7 +180,7 @@ def test_stored_runs_are_not_run_again(tmp_path):
 def test_a_batched_arm_gives_the_numbers_of_single_runs(tmp_path):
     model = linear_gaussian(*np.array([[[0.9]], [[0.4]], [[1.0]], [[0.2]]]), [0.0], [[1.0]])
     arms = {"batched": bootstrap(model, 20), "single": bootstrap(replace(model, batched=False), 20)}
-    kept = {"z": diagnostics.log_evidence, "ess": diagnostics.ess}
+    kept = {"z": diagnostics.log_evidence, "ess": diagnostics.ess, "x": diagnostics.mean}
     runs = run_many(arms, YS, range(5), **kept, folder=tmp_path)
     for name in kept:
         np.testing.assert_array_equal(runs[name][0], runs[name][1])
