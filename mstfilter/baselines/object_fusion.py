@@ -29,7 +29,7 @@ import numpy as np
 from scipy.ndimage import distance_transform_edt
 
 from mstfilter.fusion import FreeSpace, Projection
-from mstfilter.scene import Camera, Clip, Frame, Hypothesis, ObjectRecord, VoxelGrid, depth_sigma, project
+from mstfilter.scene import Clip, Frame, Hypothesis, ObjectRecord, VoxelGrid, depth_sigma, project
 from mstfilter.scoring import overlap
 from mstfilter.smc import Population, Update, union
 from mstfilter.tracking import DenseFlow, Segment, Track, move_points, refine_motion, segments_of
@@ -167,7 +167,7 @@ class ObjectFusion(Update):
     def _agrees(self, track: Track, T: np.ndarray, frame: Frame) -> bool:
         """Whether a moved object's visible points lie on the surface that a frame measures."""
         points = track.points[:: max(1, len(track.points) // 400)]
-        u, v, z, inside = _project(frame.camera, move_points(T, points))
+        u, v, z, inside = frame.camera.pixels_of(move_points(T, points))
         u, v, z = u[inside], v[inside], z[inside]
         known = frame.valid[v, u]
         behind = (z - frame.depth[v, u])[known]
@@ -200,19 +200,10 @@ class ObjectFusion(Update):
 
 def _shown(segment: Segment, after: Frame, T: np.ndarray, frame: Frame) -> np.ndarray:
     """Pixels (H, W) bool of an earlier frame that show a segment of the last frame."""
-    u, v, _, inside = _project(frame.camera, move_points(T, after.points.reshape(-1, 3)[segment.support]))
+    u, v, _, inside = frame.camera.pixels_of(move_points(T, after.points.reshape(-1, 3)[segment.support]))
     image = np.zeros(frame.depth.shape, np.uint8)
     image[v[inside], u[inside]] = 1
     return cv2.morphologyEx(image, cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8)) > 0
-
-
-def _project(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Column and row (n,) of the pixel of each point, its depth z, and whether it lies in the image (else 0, 0)."""
-    uv, z = camera.project(points)
-    pixel = np.rint(np.where(np.isfinite(uv), uv, -1))
-    inside = np.all((pixel >= 0) & (pixel < [camera.width, camera.height]), axis=1)
-    u, v = np.where(inside[:, None], pixel, 0).astype(np.int64).T
-    return u, v, z, inside
 
 
 @dataclass(frozen=True, eq=False)
@@ -262,7 +253,7 @@ class ObjectVolume:
         space everywhere.
         """
         index = np.stack(np.meshgrid(*(np.arange(n) for n in self.distance.shape), indexing="ij"), axis=-1)
-        u, v, z, inside = _project(frame.camera, move_points(T, grid.centre_of(index.reshape(-1, 3) + self.offset)))
+        u, v, z, inside = frame.camera.pixels_of(move_points(T, grid.centre_of(index.reshape(-1, 3) + self.offset)))
         inside &= (z > 1e-6) & frame.valid[v, u]
         sdf = np.where(inside, frame.depth[v, u] - z, -np.inf)
         near = np.abs(sdf) <= self.truncation

@@ -148,6 +148,17 @@ class Camera:
         v = self.K[1, 1] * y + self.K[1, 2]
         return np.stack([u, v], axis=-1), z
 
+    def pixels_of(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Column, row and z-depth (...) of world points (..., 3), and whether their pixels are in the image.
+
+        Column and row are int64, 0 outside the image.
+        """
+        uv, z = self.project(points)
+        pixel = np.rint(np.where(np.isfinite(uv), uv, -1.0))
+        inside: np.ndarray = np.all((pixel >= 0) & (pixel < [self.width, self.height]), axis=-1)
+        u, v = np.moveaxis(np.where(inside[..., None], pixel, 0.0).astype(np.int64), -1, 0)
+        return u, v, z, inside
+
     def scaled(self, factor: float) -> Camera:
         """The camera of the same image resized by `factor` (pixel centres stay where they are)."""
         width, height = round(self.width * factor), round(self.height * factor)

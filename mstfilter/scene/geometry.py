@@ -69,12 +69,8 @@ def _frame_geometry(frame: Frame, grid: VoxelGrid) -> FrameGeometry:
 
 def _projected(camera: Camera, grid: VoxelGrid) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Pixel and z-depth (single and double precision) of every voxel centre: the same for all frames of a camera."""
-    uv, z = camera.project(grid.centres())
-    with np.errstate(invalid="ignore"):
-        u, v = np.rint(uv[..., 0]), np.rint(uv[..., 1])
-        inside = (z > 1e-6) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
-    pixel = np.full(grid.shape, -1, np.int32)
-    pixel[inside] = (v[inside] * camera.width + u[inside]).astype(np.int32)
+    u, v, z, inside = camera.pixels_of(grid.centres())
+    pixel = np.where(inside & (z > 1e-6), v * camera.width + u, -1).astype(np.int32)
     return read_only(pixel), read_only(z.astype(np.float32)), read_only(z)
 
 

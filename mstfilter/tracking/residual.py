@@ -62,11 +62,7 @@ class MotionResidual:
         if not len(points):
             return np.full(len(motions), np.inf)
         after = track.clip.after
-        height, width = after.depth.shape
-        uv, z = after.camera.project(move_points(motions, points))
-        pixel = np.rint(np.where(np.isfinite(uv), uv, -1.0))
-        inside = (pixel >= 0).all(axis=-1) & (pixel[..., 0] < width) & (pixel[..., 1] < height)
-        u, v = np.moveaxis(np.where(inside[..., None], pixel, 0.0).astype(np.int64), -1, 0)
+        u, v, z, inside = after.camera.pixels_of(move_points(motions, points))
         measured = after.depth[v, u].astype(np.float64)
         counted = inside & after.valid[v, u]
         behind = z - measured

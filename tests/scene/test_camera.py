@@ -102,3 +102,13 @@ def test_frames_are_checked_and_read_only():
     ):
         with pytest.raises(InputError, match=message):
             Frame(*wrong, *([CAMERA] if len(wrong) == 2 else []))
+
+
+def test_pixels_of_points_inside_and_outside_the_image():
+    camera = Camera(np.array([[100, 0, 9.5], [0, 100, 4.5], [0, 0, 1.0]]), 20, 10)
+    # Pixel (12, 3) at 2 m; one row above the image; behind the camera.
+    points = np.array([[(12 - 9.5) * 0.02, (3 - 4.5) * 0.02, 2.0], [0.0, (-1 - 4.5) * 0.01, 1.0], [0.0, 0.0, -1.0]])
+    u, v, z, inside = camera.pixels_of(points)
+    assert inside.tolist() == [True, False, False]
+    assert (u.tolist(), v.tolist()) == ([12, 0, 0], [3, 0, 0])
+    assert z.tolist() == [2.0, 1.0, -1.0]
