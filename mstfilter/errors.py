@@ -6,12 +6,13 @@ Traceback (most recent call last):
 ...
 mstfilter.errors.InputError: depth image 000003.png is empty
 
-`check_number`, `check_integer` and `check_component` check the fields of components with one wording.
+`check_number`, `check_integer`, `check_choice` and `check_component` check the fields of components with one wording.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from numbers import Integral, Real
 from typing import Any
 
@@ -75,6 +76,12 @@ def check_integer(name: str, value: Any, *hints: str, at_least: int = 1) -> None
     if isinstance(value, Integral) and not isinstance(value, bool) and int(value) >= at_least:
         return
     raise InputError(f"{name} is {value!r}, expected an integer of at least {at_least}", *hints)
+
+
+def check_choice(name: str, value: Any, choices: Sequence[str]) -> None:
+    """Raise InputError unless `value` is one of `choices`."""
+    if value not in choices:
+        raise InputError(f"{name} is {value!r}, expected {', '.join(choices[:-1])} or {choices[-1]}")
 
 
 def check_component(name: str, value: Any, interface: type, optional: bool = False) -> None:

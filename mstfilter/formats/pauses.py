@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from mstfilter.errors import InputError
+from mstfilter.errors import InputError, check_integer
 
 
 class PauseRule(ABC):
@@ -47,8 +47,7 @@ class EveryNth(PauseRule):
     n: int = 1
 
     def __post_init__(self) -> None:
-        if self.n < 1:
-            raise InputError(f"n is {self.n}, expected at least 1")
+        check_integer("n", self.n)
 
     def find(self, times: tuple[float, ...], read_rgb: Callable[[int], np.ndarray]) -> tuple[int, ...]:
         return tuple(range(0, len(times), self.n))

@@ -17,7 +17,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from mstfilter.errors import InputError, check_integer, check_number
+from mstfilter.errors import InputError, check_choice, check_integer, check_number
 from mstfilter.fusion.conflicts import (
     PREDICTED,
     PROPOSED,
@@ -85,8 +85,7 @@ class ModeFilter:
         check_number("mode filter margin", self.margin)
         if self.window % 2 == 0:
             raise InputError(f"mode filter window is {self.window}, expected an odd number of voxels")
-        if self.scope not in ("everywhere", "disputed"):
-            raise InputError(f'mode filter scope is {self.scope!r}, expected "everywhere" or "disputed"')
+        check_choice("mode filter scope", self.scope, ("everywhere", "disputed"))
 
     def apply(self, labels: np.ndarray, disputed: np.ndarray | None = None) -> np.ndarray:
         """Filtered labels (X, Y, Z) uint16, 0 is free.

@@ -25,7 +25,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from mstfilter.errors import InputError
+from mstfilter.errors import InputError, check_integer
 from mstfilter.fusion.interfaces import Evidence
 from mstfilter.scene import Clip, Hypothesis
 from mstfilter.smc import Equivalence, Similarity, first_seen
@@ -126,8 +126,7 @@ class WeightedCoverage(Similarity):
     stride: int = 1
 
     def __post_init__(self) -> None:
-        if self.stride < 1:
-            raise InputError(f"stride is {self.stride} voxels, expected at least 1")
+        check_integer("stride in voxels", self.stride)
 
     def matrix(self, particles: Sequence[Hypothesis]) -> np.ndarray:
         step = slice(None, None, self.stride)

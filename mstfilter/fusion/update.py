@@ -22,7 +22,7 @@ from typing import ClassVar, Literal
 
 import numpy as np
 
-from mstfilter.errors import InputError, check_integer, check_number
+from mstfilter.errors import check_choice, check_integer, check_number
 from mstfilter.fusion.conflicts import check_grid
 from mstfilter.fusion.crossover import Crossover
 from mstfilter.fusion.division import NoDivision, PartRule, split_by_motion
@@ -46,8 +46,7 @@ class Claims:
     max_cleared: float = 1.0
 
     def __post_init__(self) -> None:
-        if self.surface not in ("both", "sample"):
-            raise InputError(f'surface is {self.surface!r}, expected "both" or "sample"')
+        check_choice("surface", self.surface, ("both", "sample"))
         check_number("max_cleared", self.max_cleared, at_least=0, at_most=1)
 
     def exposed(self, clip: Clip) -> np.ndarray | None:

@@ -20,7 +20,7 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from mstfilter.completion import Completer, Completion, Extrude, ObservedBox, observed_box
-from mstfilter.errors import InputError
+from mstfilter.errors import InputError, check_choice, check_number
 from mstfilter.oracles.degradation import degrade
 from mstfilter.oracles.truth import Need, UsesTruth
 from mstfilter.scene import Clip, Frame, Hypothesis, VoxelGrid, content_key, memo, read_only
@@ -64,10 +64,8 @@ class TrueMasks(UsesTruth, Proposal):
     needs: ClassVar[tuple[Need, ...]] = ("voxels", "instance")
 
     def __post_init__(self) -> None:
-        if not 0.3 <= self.quality <= 1:
-            raise InputError(f"quality of masks is {self.quality}, expected 0.3 .. 1")
-        if self.errors not in ("independent", "lasting"):
-            raise InputError(f"errors of masks are {self.errors!r}", "there are: independent, lasting")
+        check_number("quality of masks", self.quality, at_least=0.3, at_most=1)
+        check_choice("errors", self.errors, ("independent", "lasting"))
         if min(self.over, self.under) < 0 or self.over + self.under > 1:
             raise InputError(f"over is {self.over} and under {self.under}, expected shares that sum to at most 1")
 
@@ -127,8 +125,7 @@ class TrueBoundary(UsesTruth, BoundaryModel):
     needs: ClassVar[tuple[Need, ...]] = ("voxels", "instance")
 
     def __post_init__(self) -> None:
-        if self.form not in ("crisp", "cleaned"):
-            raise InputError(f"true boundary has form {self.form!r}", "there are: crisp, cleaned")
+        check_choice("form", self.form, ("crisp", "cleaned"))
 
     def boundary(self, frame: Frame) -> np.ndarray:
         """(H, W) float32; the frame must be at a pause."""

@@ -24,7 +24,7 @@ from typing import Any
 
 import numpy as np
 
-from mstfilter.errors import InputError
+from mstfilter.errors import InputError, check_choice
 from mstfilter.files import atomic_path, write_csv
 from mstfilter.open3d_import import import_open3d
 from mstfilter.report.identities import assign_identities
@@ -133,9 +133,8 @@ def export_run(
     Returns the files. Raises InputError if an option is unknown, the folder cannot be written, or open3d cannot be
     imported. `mesh_format` is "ply", "obj" or "glb"; `mesh_style` as for `hypothesis_mesh`.
     """
-    for option, value, known in (("format", mesh_format, MESH_FORMATS), ("style", mesh_style, MESH_STYLES)):
-        if value not in known:
-            raise InputError(f"unknown mesh {option} {value!r}", f"known: {', '.join(known)}")
+    check_choice("mesh_format", mesh_format, MESH_FORMATS)
+    check_choice("mesh_style", mesh_style, MESH_STYLES)
     import_open3d()  # a missing library is reported before anything is written
     run = run if isinstance(run, RunFolder) else RunFolder.open(run)
     identities = assign_identities(run)

@@ -28,7 +28,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from mstfilter.errors import InputError
+from mstfilter.errors import InputError, check_number
 from mstfilter.scene import Frame
 from mstfilter.segmentation.boundary import pixels_above_table
 from mstfilter.segmentation.tree import Tree
@@ -139,10 +139,8 @@ def check_values(tree: Tree, w: np.ndarray) -> np.ndarray:
 
 def check_target_law(sigma2: float, temperature: float) -> None:
     """Raise InputError unless sigma2 > 0 and temperature >= 0."""
-    if not sigma2 > 0:
-        raise InputError(f"sigma2 is {sigma2!r}, expected a number > 0")
-    if temperature < 0:
-        raise InputError(f"temperature is {temperature!r}, expected a number >= 0")
+    check_number("sigma2", sigma2, above=0)
+    check_number("temperature", temperature, at_least=0)
 
 
 def optimal_cut(tree: Tree, w: np.ndarray) -> np.ndarray:

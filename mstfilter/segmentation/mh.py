@@ -34,7 +34,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from mstfilter.errors import InputError
+from mstfilter.errors import check_choice, check_integer, check_number
 from mstfilter.segmentation.cuts import (
     CutSample,
     CutSampler,
@@ -328,13 +328,11 @@ class MetropolisHastingsCuts(CutSampler):
     temperature: float = 0.0
 
     def __post_init__(self) -> None:
-        if self.moves not in LOCAL_MOVES:
-            raise InputError(f"move rule {self.moves!r} is not known", f"known rules: {', '.join(LOCAL_MOVES)}")
+        check_choice("moves", self.moves, tuple(LOCAL_MOVES))
         check_target_law(self.sigma2, self.temperature)
-        if self.burn_in < 0 or self.thinning < 1:
-            raise InputError(f"burn_in {self.burn_in!r} must be >= 0 and thinning {self.thinning!r} >= 1")
-        if not 0 <= self.redraw_share <= 1:
-            raise InputError(f"redraw_share is {self.redraw_share!r}, expected a share 0 .. 1")
+        check_integer("burn_in", self.burn_in, at_least=0)
+        check_integer("thinning", self.thinning)
+        check_number("redraw_share", self.redraw_share, at_least=0, at_most=1)
 
     def sample(self, rng: np.random.Generator, tree: Tree, w: np.ndarray, n: int) -> CutSample:
         w = check_values(tree, w)

@@ -21,7 +21,7 @@ from typing import ClassVar
 import numpy as np
 
 from mstfilter.completion import Completer, Completion, Extrude, arbitrate
-from mstfilter.errors import InputError
+from mstfilter.errors import check_choice
 from mstfilter.scene import Clip, Frame, Hypothesis, ObjectRecord, VoxelGrid, component_key, memo
 from mstfilter.segmentation.boundary import BoundaryModel, ColourDepthBoundary, pixels_above_table
 from mstfilter.segmentation.cuts import CutSampler, CutValue, MergeLogOdds, optimal_cut
@@ -140,8 +140,7 @@ class TreeCutProposal(Proposal):
     properly_weighted: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
-        if self.weight_rule not in ("equal", "p"):
-            raise InputError(f"weight rule {self.weight_rule!r} is not known", "known rules: equal, p")
+        check_choice("weight_rule", self.weight_rule, ("equal", "p"))
 
     def tree_of(self, frame: Frame) -> tuple[Tree, np.ndarray]:
         """The tree of a frame and its node values (N,). Cached by content."""

@@ -27,7 +27,7 @@ from functools import cached_property
 
 import numpy as np
 
-from mstfilter.errors import InputError
+from mstfilter.errors import InputError, check_integer
 from mstfilter.scene import Frame, content_key, read_only
 
 
@@ -207,8 +207,7 @@ class UcmTree(TreeBuilder):
     calibrate: bool = True
 
     def __post_init__(self) -> None:
-        if self.max_leaves < 1:
-            raise InputError(f"max_leaves is {self.max_leaves!r}, expected at least 1")
+        check_integer("max_leaves", self.max_leaves)
 
     def build(self, boundary: np.ndarray, frame: Frame | None = None) -> Tree:
         boundary = np.asarray(boundary)

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mstfilter.errors import InputError
+from mstfilter.errors import InputError, check_choice
 from mstfilter.scene import Camera, VoxelGrid, look_at
 from mstfilter.simulation.shapes import ANY, REPORTED, SHAPE_FAMILIES, TUNING, Pool
 
@@ -93,11 +93,7 @@ class SceneFamily:
             if not low <= value <= high:
                 expected = f"at least {low}" if high == np.inf else f"{low} .. {high}"
                 raise InputError(f"scene family {self.name!r}: {field} is {value!r}, expected {expected}")
-        if self.catalogue not in (*_POOLS, "by seed"):
-            raise InputError(
-                f"scene family {self.name!r}: unknown catalogue {self.catalogue!r}",
-                f"known: {', '.join(_POOLS)}, by seed",
-            )
+        check_choice(f"scene family {self.name!r}: catalogue", self.catalogue, (*_POOLS, "by seed"))
         self.shape_families()
         if self.n_actions and self.action_seconds < 1.0:
             raise InputError(

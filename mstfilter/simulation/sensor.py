@@ -21,7 +21,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mstfilter.errors import InputError
+from mstfilter.errors import check_number
 
 _FOCAL, _BASELINE = 525.0, 0.075  # pixels of the sensor's raster of 640 pixels per row, metres
 _EIGHTHS = 8.0 * _FOCAL * _BASELINE  # disparity at one metre, eighths of a pixel
@@ -59,8 +59,7 @@ class DepthSensor:
     fill: float = 2.5
 
     def __post_init__(self) -> None:
-        if not 0.0 <= self.edge_dropout <= 1.0:
-            raise InputError(f"edge_dropout is {self.edge_dropout!r}, expected a probability")
+        check_number("edge_dropout", self.edge_dropout, at_least=0, at_most=1, unit="probability")
 
     @property
     def axial_sigma(self) -> float:

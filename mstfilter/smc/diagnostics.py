@@ -33,7 +33,7 @@ from urllib.parse import quote
 
 import numpy as np
 
-from mstfilter.errors import InputError, LostRunError, MissingLibraryError
+from mstfilter.errors import InputError, LostRunError, MissingLibraryError, check_integer
 from mstfilter.files import atomic_path
 from mstfilter.smc.batching import batch, batched_slots
 from mstfilter.smc.checkpoint import digest
@@ -256,8 +256,7 @@ def run_many(
     """
     if not arms:
         raise InputError("there are no filters to run")
-    if workers < 1:
-        raise InputError(f"workers is {workers}, expected at least 1")
+    check_integer("workers", workers)
     observations, collectors = list(observations), collectors or {"log_evidence": log_evidence}
     hashes = {} if folder is None else {arm: digest((arms[arm], observations, collectors)) for arm in arms}
     job = _Job(dict(arms), observations, collectors, folder, hashes)

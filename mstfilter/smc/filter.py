@@ -31,7 +31,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from mstfilter.errors import InputError, check_component, check_integer
+from mstfilter.errors import InputError, check_choice, check_component, check_integer
 from mstfilter.smc.components import EssBelow
 from mstfilter.smc.interfaces import (
     Codec,
@@ -120,8 +120,7 @@ class ParticleFilter:
             check_component(name, getattr(self, name), interface, optional=name not in ("resampler", "trigger"))
         if self.initial is None and self.proposal is None:
             raise InputError("the filter has neither `initial` nor `proposal`: no particles to start from")
-        if self.resample not in ("after", "before"):
-            raise InputError(f'resample is {self.resample!r}, expected "after" or "before"')
+        check_choice("resample", self.resample, ("after", "before"))
         if self.lookahead is not None and self.resample == "after":
             raise InputError(
                 'a lookahead needs the next observation, which is not known yet if resample="after"',

@@ -41,7 +41,7 @@ from typing import ClassVar, Literal
 
 import numpy as np
 
-from mstfilter.errors import InputError, check_component, check_integer, check_number
+from mstfilter.errors import InputError, check_choice, check_component, check_integer, check_number
 from mstfilter.smc.interfaces import Resampler, TransformResampler, WeightResampler
 
 
@@ -241,8 +241,7 @@ class Residual(WeightResampler):
     remainder: Literal["multinomial", "stratified", "systematic"] = "multinomial"
 
     def __post_init__(self) -> None:
-        if self.remainder not in ("multinomial", "stratified", "systematic"):
-            raise InputError(f"remainder is {self.remainder!r}, expected multinomial, stratified or systematic")
+        check_choice("remainder", self.remainder, ("multinomial", "stratified", "systematic"))
 
     def select(self, rng: np.random.Generator, log_weights: np.ndarray, n: int) -> tuple[np.ndarray, None]:
         copies, fractions, rest = certain_copies(checked_weights(log_weights, n), n)

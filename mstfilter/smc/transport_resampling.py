@@ -24,7 +24,7 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from mstfilter.errors import InputError, check_component, check_number
+from mstfilter.errors import InputError, check_choice, check_component, check_number
 from mstfilter.smc.components import ExactEquality
 from mstfilter.smc.diverse_resampling import FearnheadClifford
 from mstfilter.smc.interfaces import Equivalence, Resampler, TransformResampler
@@ -81,8 +81,7 @@ class Sorted(ResamplerWrapper):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.order not in ("position", "mean_partition"):
-            raise InputError(f"order is {self.order!r}, expected position or mean_partition")
+        check_choice("order", self.order, ("position", "mean_partition"))
 
     def resample(self, rng: np.random.Generator, population: Population, n: int) -> Population:
         if self.order == "mean_partition":

@@ -22,7 +22,7 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
-from mstfilter.errors import InputError
+from mstfilter.errors import check_integer
 from mstfilter.study.jobs import perform
 from mstfilter.study.results import Job, JobOutcome
 
@@ -81,8 +81,7 @@ class Local(Executor):
     logs: Path | None = None
 
     def __post_init__(self) -> None:
-        if self.workers < 0:
-            raise InputError(f"workers is {self.workers}, expected 0 or more")
+        check_integer("workers", self.workers, at_least=0)
 
     def run(self, jobs: Sequence[Job], tell: Tell) -> list[JobOutcome]:
         if not jobs:

@@ -26,7 +26,7 @@ import numpy as np
 from scipy.ndimage import distance_transform_edt
 from scipy.spatial import cKDTree
 
-from mstfilter.errors import InputError
+from mstfilter.errors import check_choice
 from mstfilter.scene import Clip, Frame, memo
 from mstfilter.tracking.features import matched_colour, same_depth, smooth_colour
 
@@ -78,8 +78,7 @@ class DenseFlow:
     preset: str = "medium"
 
     def __post_init__(self) -> None:
-        if self.preset not in _PRESETS:
-            raise InputError(f"flow preset {self.preset!r} is unknown", f"one of {', '.join(_PRESETS)}")
+        check_choice("preset", self.preset, _PRESETS)
 
     def track(self, clip: Clip) -> ClipTracks:
         """Follow points and pixels through the clip. Cached by content."""

@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from mstfilter.errors import InputError, check_number
+from mstfilter.errors import InputError, check_choice, check_number
 from mstfilter.open3d_import import import_open3d
 from mstfilter.tracking.rigid import move_points
 
@@ -110,8 +110,7 @@ class SmallGicp(Registration):
     iterations: int = 30
 
     def __post_init__(self) -> None:
-        if self.method not in ("GICP", "PLANE_ICP", "ICP"):
-            raise InputError(f"registration method {self.method!r} is unknown", "one of GICP, PLANE_ICP, ICP")
+        check_choice("method", self.method, ("GICP", "PLANE_ICP", "ICP"))
 
     def register(self, source: Surface, target: Surface, init: np.ndarray, reach: float) -> RegistrationResult | None:
         import small_gicp

@@ -24,7 +24,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from mstfilter.errors import InputError
+from mstfilter.errors import check_choice
 from mstfilter.tracking import rigid
 from mstfilter.tracking.features import SiftMatching
 from mstfilter.tracking.registration import Registration, RegistrationResult, SmallGicp, centroid_shift
@@ -207,8 +207,7 @@ class MstRule(MotionRule):
     registration: Registration = field(default_factory=SmallGicp)
 
     def __post_init__(self) -> None:
-        if self.select not in ("map", "sample"):
-            raise InputError(f"select {self.select!r} is unknown", "one of map, sample")
+        check_choice("select", self.select, ("map", "sample"))
 
     def candidates(self, rng: np.random.Generator, track: Track) -> tuple[Candidate, ...]:
         """Scored motions, the identity first."""

@@ -19,7 +19,7 @@ import numpy as np
 from scipy.ndimage import distance_transform_edt, gaussian_filter, map_coordinates
 from scipy.spatial.transform import RigidTransform
 
-from mstfilter.errors import InputError
+from mstfilter.errors import check_choice
 from mstfilter.scene import Clip, Crop, Hypothesis, ObjectRecord, VoxelGrid
 from mstfilter.smc import Population, Transition, child
 from mstfilter.tracking.flow import DenseFlow
@@ -70,10 +70,8 @@ class Warp:
     collisions: str = "deepest"
 
     def __post_init__(self) -> None:
-        if self.method not in ("pull", "smooth", "splat"):
-            raise InputError(f"warp method {self.method!r} is unknown", "one of pull, smooth, splat")
-        if self.collisions not in ("deepest", "label"):
-            raise InputError(f"collision rule {self.collisions!r} is unknown", "one of deepest, label")
+        check_choice("method", self.method, ("pull", "smooth", "splat"))
+        check_choice("collisions", self.collisions, ("deepest", "label"))
 
     def move(
         self,

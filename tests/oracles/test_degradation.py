@@ -135,7 +135,7 @@ def test_component_key_depends_on_the_truth(tmp_path):
     [
         ({"quality": 1.2}, "quality of masks is 1.2"),
         ({"over": 0.7, "under": 0.5}, "shares"),
-        ({"errors": "often"}, "errors of masks are 'often'"),
+        ({"errors": "often"}, "errors is 'often'"),
     ],
 )
 def test_invalid_fields_are_an_error(fields, says):

@@ -143,9 +143,9 @@ def test_errors(o3d, tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match="cannot write exports"):
         export_run(tmp_path / "run", tmp_path / "file")
-    with pytest.raises(InputError, match="unknown mesh format 'stl'"):
+    with pytest.raises(InputError, match="mesh_format is 'stl'"):
         export_run(tmp_path / "run", tmp_path / "out", mesh_format="stl")
-    with pytest.raises(InputError, match="unknown mesh style 'round'"):
+    with pytest.raises(InputError, match="mesh_style is 'round'"):
         export_run(tmp_path / "run", tmp_path / "out", mesh_style="round")
     assert not (tmp_path / "out").exists()
 

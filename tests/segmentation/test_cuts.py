@@ -197,7 +197,7 @@ def test_autocorrelation_time_needs_a_long_trace_that_varies():
 
 
 def test_invalid_fields_are_reported():
-    with pytest.raises(InputError, match="move rule 'x'"):
+    with pytest.raises(InputError, match="moves is 'x'"):
         MetropolisHastingsCuts(moves="x")
     with pytest.raises(InputError, match="sigma2"):
         ExactCuts(sigma2=0)

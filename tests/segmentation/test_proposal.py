@@ -135,7 +135,7 @@ def test_more_samples_than_cuts():
 
 
 def test_bad_weight_rule():
-    with pytest.raises(InputError, match="weight rule 'x'"):
+    with pytest.raises(InputError, match="weight_rule is 'x'"):
         TreeCutProposal(weight_rule="x")
 
 

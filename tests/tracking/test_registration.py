@@ -115,7 +115,7 @@ def test_too_few_points_cannot_be_registered(n):
 
 
 def test_invalid_fields_are_reported():
-    with pytest.raises(InputError, match="method 'icp'"):
+    with pytest.raises(InputError, match="method is 'icp', expected GICP, PLANE_ICP or ICP"):
         SmallGicp("icp")
     with pytest.raises(InputError, match="colour_scale is 0"):
         ColouredIcp(colour_scale=0)
