@@ -210,7 +210,7 @@ def _shown(segment: Segment, after: Frame, T: np.ndarray, frame: Frame) -> np.nd
 class ObjectVolume:
     """Truncated signed distances of one object in a box of the grid (Curless and Levoy 1996)."""
 
-    offset: np.ndarray  #: (3,) int index of the box's first voxel in the grid
+    offset: np.ndarray  #: (3,) int, index of the box's first voxel in the grid
     distance: np.ndarray  #: (a, b, c) metres to the surface, negative inside, clipped to +-`truncation`
     weight: np.ndarray  #: (a, b, c) number of images averaged in each distance
     hits: np.ndarray  #: (a, b, c) number of images with the voxel at the surface and in the mask of the object

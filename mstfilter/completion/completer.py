@@ -38,7 +38,7 @@ from mstfilter.scene import Frame, VoxelGrid, component_key, content_key, depth_
 class Completion:
     """The completed object of one segment, in a box of the grid."""
 
-    offset: np.ndarray  #: (3,) int index of the box's first voxel in the grid
+    offset: np.ndarray  #: (3,) int, index of the box's first voxel in the grid
     #: (a, b, c) float32, probability of being occupied by the object; empty if the mask has no reading in the grid.
     probability: np.ndarray
     points: np.ndarray  #: (a, b, c) int32: depth readings of the mask in each voxel: the visible surface
@@ -56,13 +56,13 @@ class ObservedBox:
     """What a frame shows of a box of the grid around one mask."""
 
     points: np.ndarray  #: (a, b, c) int32: readings of the mask in each voxel
-    #: (a, b, c) bool visible surface of the mask: the pixel of the voxel's centre is in the mask, and the centre
+    #: (a, b, c) bool, visible surface of the mask: the pixel of the voxel's centre is in the mask, and the centre
     #: is at the measured surface or just behind it. If no centre falls into a small mask, the voxel with most
     #: readings.
     surface: np.ndarray
-    other_surface: np.ndarray  #: (a, b, c) bool visible surface outside the mask, by the same rule
-    free: np.ndarray  #: (a, b, c) bool observed as free
-    #: (a, b, c) bool the pixel of the centre is in the mask and the centre is behind the measured surface.
+    other_surface: np.ndarray  #: (a, b, c) bool, visible surface outside the mask, by the same rule
+    free: np.ndarray  #: (a, b, c) bool, observed as free
+    #: (a, b, c) bool, the pixel of the centre is in the mask and the centre is behind the measured surface.
     behind: np.ndarray
     height: np.ndarray  #: (c,) height of the voxel centres above the table in metres
 

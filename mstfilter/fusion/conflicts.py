@@ -57,10 +57,10 @@ class ConflictGraph:
     """
 
     side: np.ndarray  #: (n,) int 0 proposed, 1 predicted
-    label: np.ndarray  #: (n,) int label of the object in its hypothesis
-    size: np.ndarray  #: (n,) int voxels of the object
-    edges: np.ndarray  #: (m, 2) int vertex numbers of overlapping pairs
-    intersection: np.ndarray  #: (m,) int voxels that both objects claim
+    label: np.ndarray  #: (n,) int, label of the object in its hypothesis
+    size: np.ndarray  #: (n,) int, voxels of the object
+    edges: np.ndarray  #: (m, 2) int, vertex numbers of overlapping pairs
+    intersection: np.ndarray  #: (m,) int, voxels that both objects claim
 
     def __len__(self) -> int:
         return len(self.label)

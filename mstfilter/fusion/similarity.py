@@ -48,11 +48,11 @@ class CommonRefinement:
     #: Int array of the segmentations' shape: the cell of every position. Cell 0 is free in all segmentations and
     #: may be empty.
     cells: np.ndarray
-    #: (n, k) int object of each of k cells in each of n segmentations; 0 is free. Objects are numbered from 1 over
+    #: (n, k) int, object of each of k cells in each of n segmentations; 0 is free. Objects are numbered from 1 over
     #: all segmentations, so different segmentations have different objects.
     objects: np.ndarray
-    sizes: np.ndarray  #: (k,) int positions in each cell
-    first: np.ndarray  #: (n + 1,) int segmentation i has the objects first[i] + 1 .. first[i + 1]
+    sizes: np.ndarray  #: (k,) int, positions in each cell
+    first: np.ndarray  #: (n + 1,) int, segmentation i has the objects first[i] + 1 .. first[i + 1]
 
     @property
     def n_objects(self) -> int:

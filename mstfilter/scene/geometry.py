@@ -85,7 +85,7 @@ class SupportPlane:
     #: Camera pose in the world of the plane: z is the normal of the plane, which is at z = 0; the origin is at the
     #: median of its pixels, y points away from the camera.
     T_world_camera: RigidTransform
-    on_or_behind: np.ndarray  #: (H, W) bool readings on the plane or behind it
+    on_or_behind: np.ndarray  #: (H, W) bool, readings on the plane or behind it
     #: (H, W) float32, measured minus plane disparity, in 1/8 pixels; positive is in front of the plane (above it),
     #: NaN is unknown.
     residual: np.ndarray

@@ -149,8 +149,8 @@ def occupied_box(mask: np.ndarray) -> tuple[slice, ...] | None:
 class Crop:
     """Occupied voxels of one object inside a small box of the grid."""
 
-    occupied: np.ndarray  #: (a, b, c) bool the box
-    offset: np.ndarray  #: (3,) int index of its first voxel in the grid
+    occupied: np.ndarray  #: (a, b, c) bool, the box
+    offset: np.ndarray  #: (3,) int, index of its first voxel in the grid
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "occupied", frozen(np.asarray(self.occupied, dtype=bool)))

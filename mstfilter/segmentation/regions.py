@@ -72,7 +72,7 @@ _SIGN = np.array([1, 1, 1, 1, -1, 1, 1], dtype=np.float64)
 class Regions:
     """Measured leaves of a tree. All leaves of the table form one region."""
 
-    of_leaf: np.ndarray  #: (n_leaves,) int region of every leaf; 0 is the table
+    of_leaf: np.ndarray  #: (n_leaves,) int, region of every leaf; 0 is the table
     sums: np.ndarray  #: (R, C) columns `REGION`
     #: For each region a mapping from neighbour to the row (columns `BORDER`) of the common border, with the region
     #: as the first of the two.

@@ -35,9 +35,9 @@ from mstfilter.scene import Frame, content_key, read_only
 class Tree:
     """A hierarchy of image regions."""
 
-    #: (N,) int parent of every node; the root (last) is its own parent. ``parent[i] > i`` elsewhere.
+    #: (N,) int, parent of every node; the root (last) is its own parent. ``parent[i] > i`` elsewhere.
     parent: np.ndarray
-    leaves: np.ndarray  #: (H, W) int leaf of every pixel
+    leaves: np.ndarray  #: (H, W) int, leaf of every pixel
     #: (N,) P(boundary) of the merge that creates the node, 0 .. 1. Zero for leaves, non-decreasing towards the
     #: root.
     start: np.ndarray

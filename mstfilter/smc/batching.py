@@ -42,7 +42,7 @@ class Batch:
     #: is lost.
     log_evidence: np.ndarray
     ess: np.ndarray  #: (R, T) effective sample size after each update; NaN after a run is lost
-    resampled: np.ndarray  #: (R, T) bool whether the step resampled
+    resampled: np.ndarray  #: (R, T) bool, whether the step resampled
     states: tuple[State | None, ...]  #: the last states; None for a run that is lost
     lost: dict[int, str] = field(default_factory=dict)  #: run -> reason
     #: name -> (R, T, ...) float64, results of the functions given to `batch`; NaN after a run is lost

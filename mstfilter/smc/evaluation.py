@@ -167,7 +167,7 @@ def _values(population: Population, function: Callable[[Any], np.ndarray] | None
 class _Selection(NamedTuple):
     """A selection from m particles."""
 
-    parents: np.ndarray  #: (m,) int their parents in the population after the previous step
+    parents: np.ndarray  #: (m,) int, their parents in the population after the previous step
     before: np.ndarray  #: (m,) their weights
     after: np.ndarray  #: (m,) shares of their copies in the weight after the selection
     ancestors: np.ndarray  #: (n,) int

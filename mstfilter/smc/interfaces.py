@@ -350,7 +350,7 @@ class Info:
     n_candidates: int  #: particles after the update, before the resampling that follows it
     ess: float  #: effective sample size after the update, before the resampling that follows it
     resampled: bool  #: whether the step resampled
-    #: (n,) int index among the candidates of each particle, if the step resampled after the update; else 0 .. n-1.
+    #: (n,) int, index among the candidates of each particle, if the step resampled after the update; else 0 .. n-1.
     ancestors: np.ndarray
     #: ``"previous"`` and ``"proposed"`` parents of the particles after the step, if known.
     parents: Mapping[str, np.ndarray]

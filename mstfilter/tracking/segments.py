@@ -35,8 +35,8 @@ class Segment:
     """The visible part of one object."""
 
     key: bytes  #: hash of the content; equal keys are the same tracking problem
-    pixels: np.ndarray  #: (M,) int64 sorted flat pixels of the projected mask
-    #: (S,) int64 sorted flat pixels of the mask whose measured depth agrees with the object. The mask of a voxel
+    pixels: np.ndarray  #: (M,) int64, sorted flat pixels of the projected mask
+    #: (S,) int64, sorted flat pixels of the mask whose measured depth agrees with the object. The mask of a voxel
     #: object extends slightly beyond the object itself.
     support: np.ndarray
 

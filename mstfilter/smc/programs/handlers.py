@@ -23,7 +23,7 @@ class Site(NamedTuple):
     name: str
     distribution: Distribution
     size: int  #: number of particles that reach the site
-    rows: np.ndarray | None  #: (size,) int indices; None stands for all particles
+    rows: np.ndarray | None  #: (size,) int, indices; None stands for all particles
     branch: bool  #: whether the value chooses a branch of `switch`
 
     @property
