@@ -55,7 +55,7 @@ class Batch:
             raise InputError(f"run {run} is lost: {self.lost[run]}")
         return state
 
-    def record(self, run: int, t: int, population: Population, functions: Mapping[str, Function]) -> None:
+    def record(self, run: int, t: int, population: Any, functions: Mapping[str, Function]) -> None:
         """Keep what the functions return."""
         for name, function in functions.items():
             found = np.asarray(function(population))
@@ -119,9 +119,7 @@ def batched_slots(filter: ParticleFilter) -> tuple[str, ...] | None:
     return tuple(slot for slot, component in components.items() if component is not None and component.batched)
 
 
-def _one_by_one(
-    filter: ParticleFilter, ys: list[list[Any]], seeds: list[int], functions: Mapping[str, Function]
-) -> Batch:
+def _one_by_one(filter: ParticleFilter, ys: list[list[Any]], seeds: list[int], functions: Any) -> Batch:
     result = _empty(len(seeds), len(ys[0]))
     states: list[State | None] = []
     for r, seed in enumerate(seeds):
@@ -131,7 +129,6 @@ def _one_by_one(
                 found = state.log_evidence
                 result.log_evidence[r, info.t] = np.nan if found is None else found
                 result.ess[r, info.t], result.resampled[r, info.t] = info.ess, info.resampled
-                assert state.population is not None
                 result.record(r, info.t, state.population, functions)
         except LostRunError as error:
             state, result.lost[r] = None, error.message
@@ -177,9 +174,7 @@ class _Runs(Population):
 class _Sweep:
     """The steps of R runs; rows are runs that are not lost."""
 
-    def __init__(
-        self, filter: ParticleFilter, ys: list[list[Any]], seeds: list[int], functions: Mapping[str, Function]
-    ) -> None:
+    def __init__(self, filter: ParticleFilter, ys: list[list[Any]], seeds: list[int], functions: Any) -> None:
         self.filter, self.ys, self.seeds, self.functions = filter, ys, seeds, functions
         self.result = _empty(len(seeds), len(ys[0]))
         self.runs = np.arange(len(seeds))  # the run of each row

@@ -30,7 +30,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -190,10 +190,8 @@ class TransformResampler(Resampler):
 class Trigger(ABC):
     """Decides whether a step resamples."""
 
-    @property
-    def batched(self) -> bool:
-        """Whether `wants` also takes the populations of R runs, whose `ess` is (R,), and returns (R,) bool or one."""
-        return False
+    #: Whether `wants` also takes the populations of R runs, whose `ess` is (R,), and returns (R,) bool or one.
+    batched: ClassVar[bool] = False
 
     @abstractmethod
     def wants(self, population: Population, t: int) -> bool:

@@ -37,7 +37,7 @@ Liu and Chen (1998).
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 
@@ -63,6 +63,14 @@ def checked_weights(log_weights: np.ndarray, n: int) -> np.ndarray:
     return np.exp(weights, out=weights)
 
 
+def _weights(log_weights: np.ndarray, n: int) -> np.ndarray:
+    """`checked_weights`; those of a batch, (R, m), are not checked."""
+    if np.ndim(log_weights) != 2:
+        return checked_weights(log_weights, n)
+    weights = log_weights - log_weights.max(axis=1, keepdims=True)
+    return np.exp(weights, out=weights)
+
+
 def certain_copies(weights: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray, int]:
     """floor(n W_i) (m,) int64, the fractions frac(n W_i) (m,), and the sum of the fractions: the copies to draw."""
     fractions = weights * (n / weights.sum())
@@ -74,12 +82,12 @@ def certain_copies(weights: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray,
     return copies, fractions, n - int(copies.sum())
 
 
-def ordered_uniforms(rng: np.random.Generator, n: int) -> np.ndarray:
-    """(n,) uniforms on [0, 1] in ascending order, in O(n): normalised exponential spacings."""
-    points = rng.standard_exponential(n + 1)
-    np.cumsum(points, out=points)
-    points /= points[-1]
-    return points[:-1]
+def ordered_uniforms(rng: np.random.Generator, n: int, rows: tuple[int, ...] = ()) -> np.ndarray:
+    """(*rows, n) uniforms on [0, 1], ascending in each row, in O(n): normalised exponential spacings."""
+    points = rng.standard_exponential((*rows, n + 1))
+    np.cumsum(points, axis=-1, out=points)
+    points /= points[..., -1:]
+    return points[..., :-1]
 
 
 def _fixed_point(weights: np.ndarray, total: int) -> np.ndarray:
@@ -101,13 +109,15 @@ _BLOCK = 1 << 13  # arrays of so many numbers stay in cache
 
 def _searched(weights: np.ndarray, points: np.ndarray) -> np.ndarray:
     """The index of the interval of the cumulative weights, scaled to [0, 1), that contains each of a few points."""
+    if weights.ndim == 2:
+        return np.stack([_searched(*row) for row in zip(weights, points, strict=True)])
     cumulative = weights.cumsum()
     index = cumulative.searchsorted(points * cumulative[-1], side="right")  # "right" skips weights of zero
     # A point rounded up to the total belongs to the last particle of positive weight.
     return np.minimum(index, cumulative.searchsorted(cumulative[-1]))
 
 
-def independent_draws(rng: np.random.Generator, weights: np.ndarray, n: int) -> np.ndarray:
+def independent_draws(rng: Any, weights: np.ndarray, n: int) -> np.ndarray:
     """(n,) indices drawn independently by weight, in O(m + n); may overwrite `weights`.
 
     Many draws are distributed to strata of equal weight, and ascend from one stratum to the next only. Inside a
@@ -115,7 +125,9 @@ def independent_draws(rng: np.random.Generator, weights: np.ndarray, n: int) -> 
     increased where it is too small.
     """
     if n < 2000:
-        return _searched(weights, ordered_uniforms(rng, n))
+        return _searched(weights, ordered_uniforms(rng, n, weights.shape[:-1]))
+    if weights.ndim == 2:
+        return np.stack([independent_draws(g, w, n) for g, w in zip(rng.generators(), weights, strict=True)])
     total = 1 << 62
     cumulative = _fixed_point(weights, total)
     n_strata = -(-n // _BLOCK)
@@ -153,9 +165,11 @@ def _increase(index: np.ndarray, edges: np.ndarray, points: np.ndarray) -> None:
 
 def stratified_ancestors(weights: np.ndarray, uniforms: np.ndarray) -> np.ndarray:
     """(n,) ancestors at the points (k + u_k) / n of the cumulative weights; may overwrite `weights`."""
-    n = len(uniforms)
+    n = uniforms.shape[-1]
     if n < 1000:
         return _searched(weights, (np.arange(n) + uniforms) / n)
+    if weights.ndim == 2:
+        return np.stack([stratified_ancestors(*row) for row in zip(weights, uniforms, strict=True)])
     bits = 62 - n.bit_length()
     cumulative = _fixed_point(weights, n << bits)  # a stratum has width 2^bits
     for begin in range(0, len(weights), _BLOCK):
@@ -189,16 +203,21 @@ def _expanded(ends: np.ndarray, n: int) -> np.ndarray:
 class Multinomial(WeightResampler):
     """Independent draws by weight (Gordon, Salmond, Smith 1993). It has the largest variance; used as a reference."""
 
+    batched: ClassVar[bool] = True
+
     def select(self, rng: np.random.Generator, log_weights: np.ndarray, n: int) -> tuple[np.ndarray, None]:
-        return independent_draws(rng, checked_weights(log_weights, n), n), None
+        return independent_draws(rng, _weights(log_weights, n), n), None
 
 
 @dataclass(frozen=True)
 class Stratified(WeightResampler):
     """One uniform in each of n equal strata (Kitagawa 1996)."""
 
+    batched: ClassVar[bool] = True
+
     def select(self, rng: np.random.Generator, log_weights: np.ndarray, n: int) -> tuple[np.ndarray, None]:
-        return stratified_ancestors(checked_weights(log_weights, n), rng.random(n)), None
+        weights = _weights(log_weights, n)
+        return stratified_ancestors(weights, rng.random((*weights.shape[:-1], n))), None
 
 
 @dataclass(frozen=True)
@@ -216,9 +235,7 @@ class Systematic(WeightResampler):
 
 def _systematic_rows(log_weights: np.ndarray, n: int, shifts: np.ndarray) -> np.ndarray:
     """(R, n) ancestors for (R, m) log weights and (R, 1) shifts: `systematic_ancestors` of every row."""
-    rows = len(log_weights)
-    weights = log_weights - log_weights.max(axis=1, keepdims=True)
-    np.exp(weights, out=weights)
+    rows, weights = len(log_weights), _weights(log_weights, n)
     cumulative = np.cumsum(weights, axis=1, out=weights)
     total = cumulative[:, -1:]
     points = cumulative * (n / total)

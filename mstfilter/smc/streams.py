@@ -296,14 +296,15 @@ class RunGenerators:
             rows = [a for a in args if np.ndim(a) and len(a) == len(self)]
             inner = None if rows and size is None else self._inner(size)
             drawn = []
-            for r, rng in enumerate(self._generators()):
+            for r, rng in enumerate(self.generators()):
                 row = [a[r] if np.ndim(a) and len(a) == len(self) else a for a in args]
                 drawn.append(getattr(rng, method)(*row, size=inner, **options))
             return np.stack(drawn)
 
         return draw
 
-    def _generators(self) -> list[np.random.Generator]:
+    def generators(self) -> list[np.random.Generator]:
+        """The generators of the runs."""
         if self._own is None:
             self._own = []
             for low, high, inc_low, inc_high in self._states.tolist():
@@ -327,7 +328,7 @@ class RunGenerators:
         rows = out.reshape(len(self), -1)
         shared = _reused_generator(threading.get_ident())
         if self._own is not None or shared is None:
-            for row, rng in zip(rows, self._generators(), strict=True):
+            for row, rng in zip(rows, self.generators(), strict=True):
                 getattr(rng, method)(out=row)
             return out
         rng, memory = shared

@@ -65,6 +65,8 @@ FILTERS = {
     "always": bootstrap(BATCHED, 20, Stratified(), Always()),
     "after": replace(bootstrap(BATCHED, 20, Ssp(), EssBelow(0.9)), resample="after"),
     "every third": bootstrap(BATCHED, 20, Multinomial(), EveryKth(3)),
+    "many draws": bootstrap(BATCHED, 2100, Multinomial(), Always()),
+    "many strata": bootstrap(BATCHED, 1100, Stratified(), Always()),
     "never": bootstrap(BATCHED, 20, Systematic(), Never()),
     "rows": bootstrap(AR1, 20),
     "guided": guided(AR1, optimal, 20),
