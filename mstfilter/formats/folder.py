@@ -81,18 +81,9 @@ def check_writable(path: Path) -> None:
 class RecordingWriter:
     """Writes a recording folder, frame by frame.
 
-    Parameters
-    ----------
-    path : path
-        The new folder. It must not exist, or be empty.
-    camera : Camera
-        Intrinsics, and the pose if it is known.
-    grid : VoxelGrid, optional
-        Workspace.
-    depth_scale : float
-        Metres per unit of the 16-bit depth images.
-    **manifest
-        Further entries of manifest.json: generator, seed, ...
+    The new folder must not exist, or be empty. The camera has its pose if that is known; `grid` is the workspace.
+    `depth_scale` is in metres per unit of the 16-bit depth images. Further entries of manifest.json, such as
+    generator and seed, are given by name.
     """
 
     def __init__(
@@ -134,21 +125,10 @@ class RecordingWriter:
     ) -> int:
         """Add a frame and return its index.
 
-        Parameters
-        ----------
-        rgb : (H, W, 3) uint8
-        depth : (H, W) float
-            Metres, NaN = no reading.
-        role : {"static", "action"}
-            At a pause, or between pauses.
-        instance : (H, W) uint8 or uint16, optional
-            True object of each pixel.
-        robot_mask : (H, W) bool, optional
-            Pixels of the robot.
-        poses : dict, optional
-            True 4x4 T_world_object by object number.
-        **entry
-            Further entries of the frame in the manifest.
+        `rgb` is (H, W, 3) uint8, `depth` (H, W) float in metres, NaN for no reading, and `time_s` in seconds. The
+        role is "static" at a pause, else "action". `instance` (H, W) uint8 or uint16 is the true object of each
+        pixel, `robot_mask` (H, W) bool the pixels of the robot, `poses` the true 4x4 T_world_object by object number.
+        Further entries of the frame in the manifest are given by name.
         """
         index = len(self._frames)
         units = np.rint(np.nan_to_num(np.asarray(depth, dtype=np.float64) / self._scale, nan=0.0, posinf=0.0))

@@ -50,18 +50,13 @@ class Cache:
     def get(self, name: str, key: Hashable, compute: Callable[[], _Value], stored_as: Any = None) -> _Value:
         """The value of ``compute()``, computed if it is not in the cache.
 
-        Parameters
-        ----------
-        name : str
-            What is computed; together with `key` it must determine the value completely.
-        key : hashable
-            Content keys (`Frame.key`, `Camera.key`, `VoxelGrid.key`) and every parameter that matters.
-        compute : callable
-            Computes the value, without random numbers. The value must not be changed afterwards.
-        stored_as : type or tuple of types, optional
-            Type of the value if it is also stored on disk (see `on_disk`): an array, a dataclass whose fields are
-            arrays, strings or None, or a tuple of these. Only for values that take much longer to compute than to
-            read.
+        `name` says what is computed, `key` has content keys (`Frame.key`, `Camera.key`, `VoxelGrid.key`) and every
+        parameter that matters. Together they determine the value completely, so `compute` draws no random numbers.
+        The value must not be changed afterwards.
+
+        `stored_as` is the type of a value that is also stored on disk (see `on_disk`): an array, a dataclass whose
+        fields are arrays, strings or None, or a tuple of these. Only for values that take much longer to compute than
+        to read.
         """
         entry = (name, key)
         with self._lock:

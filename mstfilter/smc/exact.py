@@ -169,14 +169,8 @@ def kalman_filter(F: Any, Q: Any, H: Any, R: Any, m0: Any, P0: Any, observations
 def hidden_markov(initial: Any, transition: Any, log_likelihood: Callable[[Any], Any]) -> StateSpaceModel:
     """A model with K states 0 .. K-1; particles are (n,) int. `forward_backward` has the exact answers.
 
-    Parameters
-    ----------
-    initial : (K,) array_like
-        Probabilities of x_0.
-    transition : (K, K) array_like
-        Row i has the probabilities of x_t given x_{t-1} = i.
-    log_likelihood : callable
-        ``(y) -> (K,)`` log p(y_t | x_t = 0 .. K-1); -inf if impossible.
+    `initial` (K,) has the probabilities of x_0, row i of `transition` (K, K) those of x_t given x_{t-1} = i.
+    ``log_likelihood(y)`` (K,) is log p(y_t | x_t = 0 .. K-1); -inf if impossible.
     """
     start, moves = _chain(initial, transition)
     # The last positive entry is 1 exactly, so that u < 1 never selects a state of probability 0.
@@ -273,16 +267,8 @@ class Linear(NamedTuple):
 class ConditionallyLinear:
     """A model that is linear and Gaussian given the part u, which is drawn.
 
-    Parameters
-    ----------
-    sample_initial : callable
-        ``(rng, n) -> u`` (n, ...) draws u_0.
-    sample_transition : callable
-        ``(rng, u) -> u`` draws u_t given u_{t-1}.
-    linear : callable
-        ``(u) -> Linear``.
-    mean, cov : (d,) and (d, d) array_like
-        Of z_0, for any u_0.
+    ``sample_initial(rng, n)`` draws u_0 (n, ...), ``sample_transition(rng, u)`` draws u_t given u_{t-1}, and
+    ``linear(u)`` gives the matrices. `mean` (d,) and `cov` (d, d) are those of z_0, for any u_0.
     """
 
     sample_initial: Callable[[np.random.Generator, int], np.ndarray]

@@ -89,19 +89,13 @@ def contract_of(cls: type) -> type[Contract]:
 def run_contract(
     component: Any, example: Callable[..., Any] | None = None, exact: Callable[..., Any] | None = None
 ) -> list[CheckResult]:
-    """Test all properties of a component.
+    """Test all properties of a component, whose interface has a contract.
 
-    Parameters
-    ----------
-    component : component
-        Of an interface that has a contract.
-    example : callable, optional
-        ``(rng, n) -> (population, observation)`` that the component can handle. Default: the function ``example`` in
-        the module of its class; without one, a scene for components of images and numbers for others.
-    exact : callable, optional
-        For a `Transition`, `Update` or `Rejuvenation`: ``(rng, n) -> (before, after, observation)``, `n` particles
-        and exact draws of what they become; see the contract. Default: the function ``exact`` in the module of its
-        class, if any.
+    ``example(rng, n)`` returns a population and an observation that the component can handle. Default: the function
+    ``example`` in the module of its class; without one, a scene for components of images and numbers for others.
+
+    ``exact(rng, n)`` of a `Transition`, `Update` or `Rejuvenation` returns `n` particles, exact draws of what they
+    become, and the observation; see the contract. Default: the function ``exact`` in the module of its class, if any.
     """
     cls = type(component)
     contract = contract_of(cls)

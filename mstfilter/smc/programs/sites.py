@@ -38,15 +38,9 @@ def sample(name: str, distribution: Any) -> Any:
 def observe(name: str, distribution: Any, value: Any) -> None:
     """Weight the particles by the probability of an observed value; None is a missing value and has no effect.
 
-    Parameters
-    ----------
-    name : str
-        Used in messages.
-    distribution : Distribution
-        Of the observation given the particle.
-    value : array_like or None
-        The observation, of the event shape of the distribution. Or a value for each particle, of shape
-        ``(n, *event_shape)``, such as the reading that the particle assigns to an object.
+    `distribution` is that of the observation given the particle. The value has its event shape; or it is one for each
+    particle, of shape ``(n, *event_shape)``, such as the reading that the particle assigns to an object. `name` is
+    used in messages.
     """
     _current().observe(name, distribution, value)
 
