@@ -161,13 +161,20 @@ def quality(
     rows = score_pauses(read_estimate(run), read_truth(known))
     if csv is not None:
         write_scores(csv, rows)
-    names = ("mean", "weighted", "best", "top", "one_blob", "components")
+    names = ("mean", "weighted", "best", "top", "estimate", "one_blob", "components")
     print(f"{'pause':<7}{'form':<9}{'n':>4}" + "".join(f"{name:>12}" for name in names))
     for row in rows:
         print(f"{row.pause:<7}{row.form:<9}{row.n:>4}" + "".join(f"{getattr(row, name):>12.3f}" for name in names))
     for form in dict.fromkeys(row.form for row in rows):
         these = [row for row in rows if row.form == form]
         print(f"{'all':<7}{form:<9}{'':>4}" + "".join(f"{fmean(getattr(r, n) for r in these):>12.3f}" for n in names))
+    if rows[0].brier == rows[0].brier:
+        print("\nthe weighted set, asked whether two voxels belong to one object (lower is better)")
+        scores = ("brier", "log_loss", "calibration_error", "energy")
+        print(f"{'pause':<7}" + "".join(f"{name:>19}" for name in scores))
+        for row in rows:
+            if row.form == rows[0].form:
+                print(f"{row.pause:<7}" + "".join(f"{getattr(row, name):>19.3f}" for name in scores))
     if rows[0].where == "image":
         print("scored in the image: hypotheses are projected, hidden parts do not count")
 

@@ -55,33 +55,30 @@ def study(
 
 
 def _print_summary(summary: Any) -> None:
-    """Print the primary endpoint by family and arm, and the differences to the reference."""
+    """Print the primary endpoints by family and arm, and the differences to the reference."""
     from rich.console import Console
     from rich.table import Table
 
     if not summary.metrics or "quality" not in summary.names:
         return
-    table = Table(
-        "family", "arm", "n", "quality, t >= 1", "95 %", f"{summary.reference} - arm", "95 %", "slope", "s a step"
-    )
+    endpoints = [name for name in ("quality", "information") if name in summary.names]
+    columns = [
+        text for name in endpoints for text in (f"{name}, t >= 1", "95 %", f"{summary.reference} - arm", "95 %")
+    ]
+    table = Table("family", "arm", "n", *columns, "s a step")
+    compared = {(one.metric, one.family, one.second): one.difference for one in summary.differences}
     for family in summary.families:
-        compared = {one.second: one.difference for one in summary.compared() if one.family == family}
         for arm in summary.arms:
-            metric, d = summary.metric(family, arm), compared.get(arm)
-            if metric is None:
+            main, seconds = summary.metric(family, arm), summary.metric(family, arm, "core_seconds")
+            if main is None:
                 continue
-            slope, seconds = (summary.metric(family, arm, name) for name in ("quality_slope", "core_seconds"))
-            table.add_row(
-                family,
-                arm,
-                str(len(metric.by_scene)),
-                f"{metric.mean:.3f}",
-                _range(*metric.interval),
-                "" if d is None else f"{d.mean:+.3f}",
-                "" if d is None else _range(d.low, d.high, "+"),
-                "" if slope is None else f"{slope.mean:+.3f}",
-                "" if seconds is None else f"{seconds.mean:.2f}",
-            )
+            cells = []
+            for name in endpoints:
+                metric, d = summary.metric(family, arm, name), compared.get((name, family, arm))
+                cells += ["", ""] if metric is None else [f"{metric.mean:.3f}", _range(*metric.interval)]
+                cells += ["", ""] if d is None else [f"{d.mean:+.3f}", _range(d.low, d.high, "+")]
+            spent = "" if seconds is None else f"{seconds.mean:.2f}"
+            table.add_row(family, arm, str(len(main.by_scene)), *cells, spent)
     Console(width=None if sys.stdout.isatty() else 180).print(table)
 
 

@@ -5,6 +5,7 @@
 >>> belief.same_object_at_pixels(camera, (310, 200), (340, 210))  # probability that two pixels show one object
 >>> belief.object_count()                                         # probability of 0, 1, 2, ... objects
 >>> max(cameras, key=belief.view_information)                     # the most informative camera
+>>> belief.estimate()                                             # the hypothesis of least expected loss
 >>> belief.push_map(tolerance=50)                                 # information of a push at each voxel
 
 Hypothesis i has labels L_i and the normalised weight w_i. Labels of different hypotheses are unrelated, so no query
@@ -42,6 +43,7 @@ from mstfilter.fusion.information import (
 )
 from mstfilter.fusion.similarity import CommonRefinement, common_refinement
 from mstfilter.scene import Camera, Hypothesis, VoxelGrid, project, render_hypothesis
+from mstfilter.scoring import least_loss
 from mstfilter.smc import Population, first_seen
 
 _DEPTH_STEP = 0.01  # voxels: depths are rounded to this step before they are compared
@@ -347,6 +349,18 @@ class Belief:
         if channel.ndim != 2 or not (channel >= 0).all() or not np.allclose(channel.sum(axis=1), 1):
             raise InputError("probabilities of outcomes are negative or do not sum to 1 for a hypothesis")
         return noisy_information(np.array([w for w, _ in pairs]), channel)
+
+    def estimate(self, loss: Callable[[Hypothesis, Hypothesis], float] | None = None) -> Hypothesis:
+        """The hypothesis of least expected loss: ``argmin_i sum_j w_j loss(h_i, h_j)``.
+
+        Default: the loss is 1 - quality (weighted coverage in the form ``objects``), so that the result is the best
+        single answer among the hypotheses if the true scene were distributed as they are.
+        """
+        hypotheses, mass = self._merged
+        if loss is None:
+            return hypotheses[least_loss([h.labels for h in hypotheses], mass)]
+        expected = [sum(w * loss(a, b) for b, w in zip(hypotheses, mass, strict=True)) for a in hypotheses]
+        return hypotheses[int(np.argmin(expected))]
 
     def reweighted(self, log_likelihood: Callable[[Hypothesis], float]) -> Belief:
         """The belief after an observation: adds ``log p(observation | h_i)`` to the log weights; -inf rules out."""

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from mstfilter.forecasts import ForecastTable
 from mstfilter.study import Compared
 
 if TYPE_CHECKING:
@@ -350,8 +351,36 @@ def _boxes(
         )
 
 
-def differences_figure(compared: Sequence[Compared], arms: Sequence[str]) -> str:
-    """Paired differences with their t intervals, by family; the reference is better to the right of zero."""
+def reliability_figure(tables: Mapping[str, ForecastTable], arms: Sequence[str] = ()) -> str:
+    """Reliability diagram: how often two voxels belong to one object, given the forecast that they do.
+
+    Parameters
+    ----------
+    tables : mapping
+        Name of a method or of a family -> its forecasts.
+    arms : sequence of str
+        Sets the colours. Default: the names.
+    """
+    colours = _arm_colours(arms or list(tables))
+    with _style("reliability"):
+        figure, (axes,) = _new_figure(5.2, 4.2)
+        axes.plot([0, 1], [0, 1], color=_MUTED, lw=1.0, dashes=(4, 2))
+        for name, table in tables.items():
+            r = table.reliability()
+            axes.plot(r.forecast, r.frequency, color=colours[name], lw=1.3, zorder=3)
+            size = 12 + 160 * r.count / r.count.sum()
+            axes.scatter(r.forecast, r.frequency, s=size, color=colours[name], alpha=0.6, lw=0, label=name, zorder=3)
+        axes.set_xlim(-0.03, 1.03)
+        axes.set_ylim(-0.03, 1.03)
+        axes.set_xlabel('forecast of "the two voxels belong to one object"')
+        axes.set_ylabel("how often it is true")
+        if len(tables) > 1:
+            figure.legend(loc="outside lower center", ncols=min(4, len(tables)), fontsize=8.5)
+        return _svg_text(figure, "Reliability diagram")
+
+
+def differences_figure(compared: Sequence[Compared], arms: Sequence[str], metric: str = "quality") -> str:
+    """Paired differences of a metric with their t intervals, by family."""
     known = [one for one in compared if one.difference.n]
     colours = _arm_colours(arms)
     with _style("study differences"):
@@ -379,5 +408,5 @@ def differences_figure(compared: Sequence[Compared], arms: Sequence[str]) -> str
         axes.set_yticks([at for at, _ in ticks], [name for _, name in ticks])
         axes.set_ylim(y - 0.3, -0.7)
         reference = known[0].first if known else ""
-        axes.set_xlabel(f"quality of {reference} minus quality of the method")
-        return _svg_text(figure, "Paired differences of quality with 95 % intervals")
+        axes.set_xlabel(f"{metric} of {reference} minus {metric} of the method")
+        return _svg_text(figure, f"Paired differences of {metric} with 95 % intervals")

@@ -24,7 +24,7 @@ from typing import Any
 
 import numpy as np
 
-from mstfilter.report.figures import genealogy_figure, health_figure, quality_figure
+from mstfilter.report.figures import genealogy_figure, health_figure, quality_figure, reliability_figure
 from mstfilter.report.identities import assign_identities, cards_of_pause, truth_card
 from mstfilter.report.page import (
     counts_by_key,
@@ -37,7 +37,14 @@ from mstfilter.report.page import (
 )
 from mstfilter.report.pictures import close_up, data_uri, jpeg_bytes, viewpoint
 from mstfilter.runs import RunFolder
-from mstfilter.scoring import connected_components, one_blob, weighted_coverage
+from mstfilter.scoring import (
+    BeliefScore,
+    connected_components,
+    forecast_table,
+    one_blob,
+    score_belief,
+    weighted_coverage,
+)
 
 _TITLES = {
     "initial": "Initial particles",
@@ -60,6 +67,7 @@ class PauseNumbers:
     n_distinct: int  #: number of distinct hypotheses
     baselines: Mapping[str, float] | None  #: weighted mean quality of trivial baselines; None without ground truth
     true_objects: int | None  #: number of objects in the ground truth
+    belief: BeliefScore | None  #: scores of the weighted set; None without ground truth
     time: float  #: time of the pause in the recording
     clip_seconds: float | None  #: time since the last pause; None for the first pause
 
@@ -192,6 +200,9 @@ class RunNumbers:
         if mean is not None and last.baselines is not None:
             baseline = max(last.baselines.values())
             tiles.append(("quality", f"{mean:.3f}", f"best {last.best:.3f}, baseline {baseline:.3f}"))
+        if last.belief is not None:
+            row = last.belief.row
+            tiles.append(("Brier score", f"{row['brier']:.3f}", f"calibration error {row['calibration_error']:.3f}"))
         tiles.append(
             ("effective sample size", f"{last.info['ess']:.3g}", f"of {last.info['n_candidates']} candidates")
         )
@@ -214,6 +225,10 @@ def read_numbers(run: RunFolder) -> RunNumbers:
     steps = []
     for t in range(run.n_pauses):
         info, hypotheses, truth = run.info(t), run.hypotheses(t), run.truth(t)
+        questions = run.questions(t)
+        belief = None
+        if questions is not None and truth is not None:
+            belief = score_belief(questions, [h.labels for h in hypotheses], info["weights"], truth)
         baselines = None
         if truth is not None:
             weight: dict[bytes, float] = {}
@@ -232,6 +247,7 @@ def read_numbers(run: RunFolder) -> RunNumbers:
                 n_distinct=len({h.key for h in hypotheses}),
                 baselines=baselines,
                 true_objects=None if truth is None else len(set(np.unique(truth).tolist()) - {0}),
+                belief=belief,
                 time=float(times[t]),
                 clip_seconds=None if t == 0 else float(times[t]) - float(times[t - 1]),
             )
@@ -308,6 +324,9 @@ def _figures(numbers: RunNumbers) -> dict[str, Any]:
         baselines = {name: [step.baselines[name] for step in at if step.baselines] for name in names}
         qualities = [step.quality["objects"] for step in at if step.quality]
         found["quality"] = Markup(quality_figure(known, qualities, [step.weights for step in at], baselines))
+    beliefs = [step.belief.counts[0].astype(np.int64) for step in steps if step.belief is not None]
+    if beliefs:
+        found["reliability"] = Markup(reliability_figure({"all pauses": forecast_table(sum(beliefs))}))
     if len(steps) <= 1:
         return found
     health = health_figure(

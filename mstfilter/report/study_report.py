@@ -13,17 +13,20 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from mstfilter.report.figures import differences_figure, figure_groups, time_figure
+from mstfilter.report.figures import differences_figure, figure_groups, reliability_figure, time_figure
 from mstfilter.report.page import fill_template, flatten, seconds_text, short_text, write_page
 from mstfilter.statistics import CLAIM
-from mstfilter.study import ENDPOINT, SLOPE, StudyFolder, Summary
+from mstfilter.study import ENDPOINT, ENDPOINTS, SLOPES, StudyFolder, Summary
 
 # Columns of the table of results: name in the study, heading.
 _FIGURES = (
     (ENDPOINT, "quality"),
-    (SLOPE, "slope a pause"),
+    ("information", "information"),
+    (SLOPES["quality"], "slope of quality"),
+    (SLOPES["information"], "slope of information"),
     ("quality_top", "heaviest"),
     ("quality_best", "best of n"),
+    ("quality_estimate", "estimate"),
     ("quality_visible", "visible objects"),
     ("quality_hidden", "hidden, seen before"),
     ("quality_unseen", "never seen"),
@@ -34,7 +37,13 @@ _FIGURES = (
     ("missed", "missed"),
     ("invented", "invented"),
     ("diversity", "diversity"),
+    ("volume_missed", "missed volume"),
+    ("volume_invented", "invented volume"),
     ("brier", "Brier"),
+    ("log_loss", "log loss"),
+    ("calibration_error", "calibration error"),
+    ("energy", "energy score"),
+    ("energy_floor", "baseline: energy with noise"),
     ("quality_authors", "authors' form"),
     ("quality_paper", "paper's form"),
     ("quality_one_blob", "baseline: one blob"),
@@ -67,14 +76,37 @@ def _page(study: StudyFolder) -> str:
         simulated=any("family" in scene["source"] for scene in study.description["scenes"]),
         scenes=scenes,
         claim=CLAIM,
-        compared=[one for one in summary.compared() if one.difference.n],
+        compared=[one for name in ENDPOINTS for one in summary.compared(name) if one.difference.n],
+        better=[
+            f"{summary.reference} is better than {arm} on {family}."
+            for family in summary.families
+            for arm in summary.arms
+            if summary.is_better(family, arm)
+        ],
         columns=[(name, heading) for name, heading in _FIGURES if name in summary.names],
         figures=_drawn(records, summary, study.reported_only),
+        reliability=_reliability(study, summary),
         costs=_costs(summary),
         arms=_arms(study.description),
         truth_users=study.truth_users,
         failures=failures,
     )
+
+
+def _reliability(study: StudyFolder, summary: Summary) -> list[Any]:
+    """A reliability diagram of each family, of all arms that take part in comparisons."""
+    from markupsafe import Markup
+
+    figures = []
+    arms = [arm for arm in summary.arms if arm not in study.reported_only]
+    for family in summary.families:
+        tables = {arm: table for arm in arms if (table := study.forecasts(family, arm)).n}
+        figures += [
+            (family, Markup(reliability_figure({arm: tables[arm] for arm in group}, summary.arms)))
+            for group in figure_groups(list(tables), summary.reference)
+            if group
+        ]
+    return figures
 
 
 def _number(value: float | None, sign: str = "") -> str:
@@ -104,9 +136,10 @@ def _drawn(records: Sequence[Mapping[str, Any]], summary: Summary, reported_only
     if values and len(ends) > 1:
         groups = figure_groups(ends, summary.reference)
         found["ends"] = [Markup(time_figure(values, group)) for group in groups]
-    compared = [one for one in summary.compared() if one.difference.n]
-    if compared:
-        found["differences"] = Markup(differences_figure(compared, summary.arms))
+    for name in ENDPOINTS:
+        compared = [one for one in summary.compared(name) if one.difference.n]
+        if compared:
+            found.setdefault("differences", []).append(Markup(differences_figure(compared, summary.arms, name)))
     return found
 
 

@@ -8,7 +8,7 @@
 >>> rows = score_pauses(read_estimate(run.path), read_truth(recording))
 
 The same call resumes a run that was stopped, from ``pauses/NNN/state.npz`` of the last complete pause, with the
-result of an uninterrupted run. Modules: `run` (loop), `run_folder` (files), `scoring`, `metrics`, `sources` (input).
+result of an uninterrupted run. Modules: `run` (loop), `run_folder` (files), `scoring`, `sources` (input).
 """
 
 from mstfilter.lazy import attach

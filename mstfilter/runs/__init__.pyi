@@ -1,4 +1,3 @@
-from mstfilter.runs.metrics import measure_pause as measure_pause
 from mstfilter.runs.run import (
     RunProgress as RunProgress,
     code_version as code_version,
@@ -16,6 +15,7 @@ from mstfilter.runs.scoring import (
     PauseEstimate as PauseEstimate,
     PauseScore as PauseScore,
     PauseTruth as PauseTruth,
+    measure_pause as measure_pause,
     read_estimate as read_estimate,
     read_truth as read_truth,
     score_pauses as score_pauses,

@@ -24,6 +24,7 @@ from mstfilter.presets import build_filter, describe_filter
 from mstfilter.registry import nested_components
 from mstfilter.runs.run_folder import RunFolder, as_json
 from mstfilter.scene import Recording
+from mstfilter.scoring import ask
 from mstfilter.smc import Observer
 
 _LIBRARIES = ("numpy", "scipy", "networkx", "opencv-python-headless", "higra", "small_gicp")
@@ -101,7 +102,9 @@ def filter_recording(
             state, info = bound.step(state, clip, observer)
             if folder is None:  # a run that fails in its first step leaves no folder
                 folder = RunFolder.create(path, description)
-            folder.write_pause(clip, state, info, recording.truth(clip.index))
+            truth = recording.truth(clip.index)
+            questions = None if truth is None else ask(recording, clip.index)
+            folder.write_pause(clip, state, info, truth, questions)
             progress(RunProgress(clip.index + 1, len(clips), sum(info.seconds.values())))
     except BaseException as error:
         if folder is not None:

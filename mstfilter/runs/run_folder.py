@@ -40,7 +40,7 @@ from mstfilter.scene import (
     rigid_from_matrix,
     write_image,
 )
-from mstfilter.scoring import FORMS, weighted_coverage
+from mstfilter.scoring import FORMS, Questions, weighted_coverage
 from mstfilter.smc import Codec, Info, State, load_state, save_state
 
 _FORMAT = 2
@@ -134,8 +134,13 @@ class RunFolder:
         """Set the status of the run: running, interrupted, failed or done."""
         write_json(self.path / "run.json", {**self.description, "status": status})
 
-    def write_pause(self, clip: Clip, state: State, info: Info, truth: np.ndarray | None) -> None:
-        """Write the results of a step; an interrupted call writes nothing."""
+    def write_pause(
+        self, clip: Clip, state: State, info: Info, truth: np.ndarray | None, questions: Questions | None = None
+    ) -> None:
+        """Write the results of a step, with the true labels and the questions of the pause if they are known.
+
+        An interrupted call writes nothing.
+        """
         assert state.population is not None
         camera, hypotheses = clip.after.camera, tuple(state.population.particles)
         (self.path / "pauses").mkdir(exist_ok=True)
@@ -154,7 +159,8 @@ class RunFolder:
             save_state(folder / "state.npz", state, HypothesisCodec(), compress=True)
             quality: dict[str, list[float]] | None = None
             if truth is not None:
-                np.savez_compressed(folder / "truth.npz", labels=truth)
+                pairs = np.zeros((2, 0)) if questions is None else np.stack([questions.first, questions.second])
+                np.savez_compressed(folder / "truth.npz", labels=truth, questions=pairs.astype(np.int32))
                 quality = {form: [weighted_coverage(h.labels, truth, form) for h in hypotheses] for form in FORMS}
             record = {
                 "t": info.t,
@@ -204,6 +210,15 @@ class RunFolder:
             return None
         with np.load(path, allow_pickle=False) as data:
             return data["labels"]
+
+    def questions(self, t: int) -> Questions | None:
+        """The questions of a pause with ground truth; None if unknown."""
+        truth = self.truth(t)
+        if truth is None:
+            return None
+        with np.load(self.pause(t) / "truth.npz", allow_pickle=False) as data:
+            pairs = data["questions"].astype(np.int64) if "questions" in data else np.zeros((2, 0), np.int64)
+        return Questions(truth.shape, *pairs) if pairs.size else None
 
     def hypotheses(self, t: int) -> tuple[Hypothesis, ...]:
         """The particles after the step."""

@@ -4,9 +4,11 @@
 >>> rows[0].form, rows[0].mean, rows[0].best, rows[0].one_blob
 
 There is one row for each pause and form of weighted coverage (`mstfilter.scoring`). It has the mean over the
-hypotheses, the weighted mean, the maximum, and the value of the hypothesis of largest weight. It also has two floors:
-the occupied voxels of the same hypotheses as one blob, and as connected components. If the ground truth has instance
-images but no volumes, hypotheses are rendered and compared in the image; pixels of the robot (255) are ignored.
+hypotheses, the weighted mean, the maximum, and the values of the hypothesis of largest weight and of the one of least
+expected loss. It also has two floors: the occupied voxels of the same hypotheses as one blob, and as connected
+components. If the ground truth has instance images but no volumes, hypotheses are rendered and compared in the image;
+pixels of the robot (255) are ignored. For a recording with volumes, rows also have the scores of the weighted set:
+Brier score, log loss, calibration error and energy score (`mstfilter.scoring.score_belief`), the same for all forms.
 """
 
 from __future__ import annotations
@@ -15,6 +17,7 @@ import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -22,7 +25,19 @@ from mstfilter.errors import InputError
 from mstfilter.files import write_csv
 from mstfilter.runs.run_folder import RunFolder
 from mstfilter.scene import Camera, Recording, VoxelGrid, as_labels, render
-from mstfilter.scoring import FORMS, connected_components, one_blob, weighted_coverage
+from mstfilter.scoring import (
+    FORMS,
+    Questions,
+    ask,
+    connected_components,
+    diversity,
+    least_loss,
+    object_status,
+    one_blob,
+    pause_metrics,
+    score_belief,
+    weighted_coverage,
+)
 
 _ROBOT = 255
 
@@ -63,12 +78,15 @@ class PauseTruth:
         Grid of a volume.
     camera : Camera, optional
         Camera of an image.
+    questions : Questions, optional
+        Questions about a volume.
     """
 
     labels: np.ndarray
     frame: int | None = None
     grid: VoxelGrid | None = None
     camera: Camera | None = None
+    questions: Questions | None = None
 
 
 @dataclass(frozen=True)
@@ -83,8 +101,13 @@ class PauseScore:
     weighted: float
     best: float
     top: float
+    estimate: float
     one_blob: float
     components: float
+    brier: float = float("nan")
+    log_loss: float = float("nan")
+    calibration_error: float = float("nan")
+    energy: float = float("nan")
 
 
 def read_estimate(path: Path) -> list[PauseEstimate]:
@@ -112,7 +135,7 @@ def read_truth(source: Path | Recording) -> list[PauseTruth]:
     for t, index in enumerate(source.pauses):
         volume, image = source.truth(t), source.instance(index)
         if volume is not None:
-            found.append(PauseTruth(volume, index, source.grid))
+            found.append(PauseTruth(volume, index, source.grid, questions=ask(source, t)))
         elif image is not None:
             found.append(PauseTruth(image, index, None, source.frames[index].camera))
     if not found:
@@ -150,6 +173,31 @@ def _read_volumes(path: Path, what: str) -> tuple[np.ndarray, list[int | None], 
     if "origin" in data and "voxel_size" in data:
         grid = VoxelGrid(data["origin"], float(data["voxel_size"]), labels.shape[1:])
     return labels, frames, grid
+
+
+def measure_pause(run: RunFolder, recording: Recording, t: int) -> tuple[dict[str, Any], np.ndarray | None]:
+    """Metrics of a run at pause `t`, and the counts of its forecasts.
+
+    Returns
+    -------
+    row : dict
+        Metrics of `mstfilter.scoring.metrics` and `mstfilter.scoring.score_belief`; without ground truth only those
+        that need none. ``qualities`` and ``energy_noise`` are lists, which tables leave out.
+    counts : (r, 1001, 7) int32, or None without ground truth
+        As in `mstfilter.scoring.BeliefScore`.
+    """
+    info, hypotheses = run.info(t), run.hypotheses(t)
+    labels, weights = [h.labels for h in hypotheses], np.array(info["weights"], dtype=float)
+    row: dict[str, Any] = {"pause": t, "time_s": recording.times[recording.pauses[t]], "n": info["n"]}
+    row["n_objects"] = float(np.mean([h.n_objects for h in hypotheses]))
+    truth = recording.truth(t)
+    if truth is None:
+        return {**row, "diversity": diversity(labels)}, None
+    known = all(recording.instance(p) is not None for p in recording.pauses[: t + 1])
+    status = object_status(recording, t) if known else {}
+    found, q = pause_metrics(labels, weights, truth, status)
+    belief = score_belief(ask(recording, t), labels, weights, truth, status)
+    return {**row, **found, **belief.row, "qualities": q.tolist()}, belief.counts
 
 
 def score_pauses(estimates: Sequence[PauseEstimate], truths: Sequence[PauseTruth]) -> list[PauseScore]:
@@ -204,13 +252,18 @@ def _score_pause(pause: int, estimate: PauseEstimate, truth: PauseTruth) -> list
         for floor in (one_blob, connected_components)
     ]
     w = np.asarray(estimate.weights, dtype=float)
+    belief = {}
+    if truth.questions is not None:
+        scores = score_belief(truth.questions, estimate.labels, w, true).row
+        belief = {name: scores[name] for name in ("brier", "log_loss", "calibration_error", "energy")}
+    best_guess = least_loss(found, w)
     rows = []
     for form in FORMS:
         q = np.array([weighted_coverage(labels, true, form) for labels in found])
         low = [float(w @ [weighted_coverage(labels, true, form) for labels in floor]) for floor in floors]
         where = "volume" if truth.camera is None else "image"
-        values = float(q.mean()), float(w @ q), float(q.max()), float(q[w.argmax()])
-        rows.append(PauseScore(pause, where, form, len(q), *values, *low))
+        values = float(q.mean()), float(w @ q), float(q.max()), float(q[w.argmax()]), float(q[best_guess])
+        rows.append(PauseScore(pause, where, form, len(q), *values, *low, **belief))
     return rows
 
 

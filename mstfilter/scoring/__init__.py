@@ -1,8 +1,13 @@
-"""Scores of hypotheses against the ground truth.
+"""Scores of a weighted set of hypotheses against the ground truth.
 
->>> from mstfilter.scoring import object_status, weighted_coverage
->>> weighted_coverage(hypothesis.labels, recording.truth(2))  # doctest: +SKIP
->>> object_status(recording, 2)  # doctest: +SKIP
+*Quality* says how good a hypothesis is (`quality`, `metrics`); *information* says what the weighted set knows
+(`questions`, `information`).
+
+>>> from mstfilter.scoring import ask, object_status, pause_metrics, score_belief
+>>> truth, status = recording.truth(2), object_status(recording, 2)
+>>> row, qualities = pause_metrics(labels, weights, truth, status)  # doctest: +SKIP
+>>> belief = score_belief(ask(recording, 2), labels, weights, truth, status)  # doctest: +SKIP
+>>> row["quality"], belief.row["brier"], belief.row["energy"]  # doctest: +SKIP
 """
 
 from mstfilter.lazy import attach

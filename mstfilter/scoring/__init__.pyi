@@ -1,3 +1,20 @@
+from mstfilter.scoring.information import (
+    CATEGORIES as CATEGORIES,
+    NO_COUNTS as NO_COUNTS,
+    SPLITS as SPLITS,
+    BeliefScore as BeliefScore,
+    FittedForecasts as FittedForecasts,
+    answer_distances as answer_distances,
+    forecast_table as forecast_table,
+    leave_one_out as leave_one_out,
+    score_belief as score_belief,
+)
+from mstfilter.scoring.metrics import (
+    diversity as diversity,
+    least_loss as least_loss,
+    pairwise_quality as pairwise_quality,
+    pause_metrics as pause_metrics,
+)
 from mstfilter.scoring.quality import (
     FORMS as FORMS,
     MIN_PIXELS as MIN_PIXELS,
@@ -11,4 +28,11 @@ from mstfilter.scoring.quality import (
     overlap as overlap,
     quality_of as quality_of,
     weighted_coverage as weighted_coverage,
+)
+from mstfilter.scoring.questions import (
+    NOISE_RATES as NOISE_RATES,
+    Questions as Questions,
+    ask as ask,
+    draw_questions as draw_questions,
+    in_question as in_question,
 )

@@ -21,13 +21,15 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from mstfilter.errors import InputError
 from mstfilter.files import atomic_folder
 from mstfilter.formats import open_recording
 from mstfilter.presets import PACKAGES
-from mstfilter.runs import RunProgress, code_version, filter_recording, measure_pause, open_source
+from mstfilter.runs import RunFolder, RunProgress, code_version, filter_recording, measure_pause, open_source
 from mstfilter.scene import Recording, scene_cache
-from mstfilter.study.results import Job, JobOutcome, write_result
+from mstfilter.study.results import FORECASTS, Job, JobOutcome, write_result
 
 _StepCallback = Callable[[int, int], None]
 
@@ -114,10 +116,19 @@ def _run(job: Job, step: _StepCallback) -> None:
             )
         for t, cost in enumerate(costs):
             cost.update({f"seconds_{stage}": seconds for stage, seconds in run.seconds(t).items()})
-        rows = [measure_pause(run, recording, t) for t in range(run.n_pauses)]
+        rows = write_measures(run, recording)
         write_result(work, {"identity": job["identity"], "status": "done", "rows": rows, "costs": costs})
         if job["keep"] == "tables":
             shutil.rmtree(work / "pauses")
+
+
+def write_measures(run: RunFolder, recording: Recording) -> list[dict[str, Any]]:
+    """The metrics of each pause of a run; the counts of its forecasts are written into its folder."""
+    measured = [measure_pause(run, recording, t) for t in range(run.n_pauses)]
+    counts = [one for _, one in measured if one is not None]
+    if len(counts) == len(measured):
+        np.savez_compressed(run.path / FORECASTS, counts=np.stack(counts))
+    return [row for row, _ in measured]
 
 
 class StagePeaks:

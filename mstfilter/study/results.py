@@ -6,11 +6,13 @@
 Layout::
 
     study.json       description, arms with their configuration, scenes, seeds, the folder of every run
-    runs/NAME/       one `RunFolder` per run; result.json holds its metrics, or why it failed
+    runs/NAME/       one `RunFolder` per run; result.json: its metrics, or why it failed; forecasts.npz: counts of
+                     its forecasts
     runs.csv         one row per pause and run: metrics first, time and memory last
     summary.csv      one row per family, arm and metric: mean over scenes and its interval
     differences.csv  the reference against every other arm: paired differences, intervals, p values, conclusions
     failures.csv     runs that failed, and why
+    recalibration.json  of each family and arm, fitted to all its scenes; for studies of other scenes
     logs/            output of the workers
 """
 
@@ -23,13 +25,19 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from mstfilter.errors import InputError
 from mstfilter.files import write_csv
+from mstfilter.forecasts import ForecastTable
 from mstfilter.runs import write_json
+from mstfilter.scoring import NO_COUNTS, forecast_table
+from mstfilter.study.information import add_information, fit_information
 from mstfilter.study.summary import Summary, summarise
 
 STUDY_FORMAT = 2
 RESULT = "result.json"  # in a run's folder
+FORECASTS = "forecasts.npz"  # in a run's folder: counts of its forecasts at each pause
 _SUMMARY_COLUMNS = ("family", "arm", "metric", "n", "mean", "low", "high")
 _DIFFERENCE_COLUMNS = (
     *("family", "first", "second", "metric", "n", "mean", "low", "high"),
@@ -132,7 +140,25 @@ class StudyFolder:
             named = {"family": run["group"], "scene": run["scene"], "arm": run["arm"], "seed": run["seed"]}
             for row, cost in zip(result["rows"], result["costs"], strict=True):
                 rows.append({**named, **row, **cost})
+        add_information(rows, self._counts, self.description.get("recalibration"))
         return rows
+
+    def _counts(self, family: str, arm: str) -> dict[tuple[str, Any], np.ndarray]:
+        """Counts (T, r, 1001, 7) of the forecasts of every run of an arm that has them, by scene and seed."""
+        found = {}
+        for run in self.description["runs"]:
+            path = self.run(run["folder"]) / FORECASTS
+            if (run["group"], run["arm"]) == (family, arm) and path.is_file():
+                with np.load(path, allow_pickle=False) as data:
+                    found[run["scene"], run["seed"]] = data["counts"]
+        return found
+
+    def forecasts(self, family: str, arm: str) -> ForecastTable:
+        """Forecasts of an arm on a family at pauses t >= 1, as they come, pooled over scenes and seeds."""
+        counts = sum(
+            (one[1:, 0].sum(axis=0, dtype=np.int64) for one in self._counts(family, arm).values()), NO_COUNTS
+        )
+        return forecast_table(counts)
 
     def rows(self) -> list[dict[str, Any]]:
         """One row per pause and finished run, in the order of the study: metrics, time and memory."""
@@ -157,6 +183,8 @@ class StudyFolder:
             ("failures", failed, _FAILURE_COLUMNS),
         ):
             write_csv(self.path / f"{name}.csv", table, names, float_format=".6g")
+        arms = list(dict.fromkeys((row["family"], row["arm"]) for row in rows))
+        write_json(self.path / "recalibration.json", fit_information(rows, self._counts, arms))
 
 
 def cost_columns(rows: Sequence[Mapping[str, Any]]) -> list[str]:

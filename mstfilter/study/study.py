@@ -10,6 +10,7 @@ not repeated; the tables are the same as those of an uninterrupted study.
 from __future__ import annotations
 
 import contextlib
+import json
 import shutil
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -83,12 +84,13 @@ def run_study(
     from mstfilter.simulation import cache_folder
 
     plan = make_plan(study, overrides, allow_files=allow_files)
+    recalibration = _read_recalibration(plan)
     cache = (cache or cache_folder()).absolute()
     with _locked(path) as folder:
         for target in (path, cache):
             _check_free_space(target)
         executor = executor or Local(logs=path / "logs")
-        write_json(path / "study.json", _description(plan))
+        write_json(path / "study.json", {**_description(plan), "recalibration": recalibration})
         _rename_done_runs(plan, folder)
         waiting = [run for run in plan.runs if not _is_done(run, folder)]
         n_before = len(plan.runs) - len(waiting)
@@ -175,6 +177,27 @@ def _check_free_space(folder: Path) -> None:
             f"{folder}: the disk has {free_gb:.2g} GB free, expected at least {_LEAST_FREE_GB} GB",
             'free disk space, choose another folder, or set keep = "tables" in the study',
         )
+
+
+def _read_recalibration(plan: Plan) -> dict[str, Any] | None:
+    """What another study fitted, of the families and arms of this one; None if the study names none."""
+    if not plan.config.recalibration:
+        return None
+    path = plan.config.folder / plan.config.recalibration
+    try:
+        found = json.loads(path.read_text())
+        groups, arms = {scene.group for scene in plan.scenes}, {arm.name for arm in plan.arms}
+        missing = [f"{arm} on {group}" for group in sorted(groups) for arm in sorted(arms) if arm not in found[group]]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError(
+            f"recalibration {path} cannot be used: {type(error).__name__}: {error}",
+            "name the recalibration.json of a study that has the same families and arms",
+        ) from error
+    if missing:
+        raise InputError(
+            f"recalibration {path} has no fit of {', '.join(missing[:5])}", "add these arms to that study"
+        )
+    return {group: {arm: found[group][arm] for arm in arms} for group in groups}
 
 
 def _description(plan: Plan) -> dict[str, Any]:

@@ -3,8 +3,10 @@
 >>> summary = summarise(folder.rows(), reference="mst")
 >>> summary.metric("s1", "mst", "quality").mean, summary.differences[0].words
 
-The primary endpoint is the mean over pauses t >= 1 of the unweighted mean ``objects`` quality. Other metrics are
-averaged over the same pauses. Values are averaged over filter seeds first, then over scenes.
+There are two primary endpoints, both means over pauses t >= 1: *quality*, the unweighted mean ``objects`` quality of
+the hypotheses (higher is better), and *information*, the log loss of their forecasts in nats after recalibration on
+other scenes (lower is better; see `mstfilter.scoring.information`). Other metrics are averaged over the same pauses.
+Values are averaged over filter seeds first, then over scenes. p values of both endpoints are adjusted together.
 """
 
 from __future__ import annotations
@@ -16,10 +18,13 @@ from typing import Any
 
 import numpy as np
 
-from mstfilter.statistics import Difference, compare, conclusion, holm, interval, slope
+from mstfilter.statistics import CLAIM, LEVEL, Difference, compare, conclusion, holm, interval, slope
 
 ENDPOINT = "quality"
-SLOPE = "quality_slope"  # change of quality from pause to pause, t = 0 included
+INFORMATION = "information"
+ENDPOINTS = {ENDPOINT: 1, INFORMATION: -1}  # 1: higher is better
+SLOPES = {name: f"{name}_slope" for name in ENDPOINTS}  # change from pause to pause, t = 0 included
+NOT_WORSE = 0.005  # of the other endpoint, where one filter is claimed to be better
 _NAMES = ("family", "scene", "arm", "seed", "pause", "time_s")
 
 
@@ -58,7 +63,7 @@ class Compared:
     ----------
     family, first, second, metric : str
     difference : Difference
-        For the primary endpoint, p is adjusted over all families and arms.
+        For the primary endpoints, p is adjusted over both, all families and arms.
     reported_only : bool
         The other arm is not part of the adjustment, and no conclusion is drawn.
     """
@@ -73,12 +78,15 @@ class Compared:
     @property
     def adjusted(self) -> bool:
         """Whether `p_holm` of the difference is adjusted."""
-        return self.metric == ENDPOINT and not self.reported_only
+        return self.metric in ENDPOINTS and not self.reported_only
 
     @property
     def words(self) -> str:
         """The conclusion in words."""
-        return conclusion(self.difference, self.first, self.second, self.family)
+        where = f"{self.family} in information (nats, lower is better)"
+        return conclusion(
+            self.difference, self.first, self.second, where if self.metric == INFORMATION else self.family
+        )
 
 
 @dataclass(frozen=True)
@@ -92,7 +100,7 @@ class Summary:
     reference : str
     metrics : tuple of ArmMetric
     differences : tuple of Compared
-        Primary endpoint first, then its slope, then all other metrics.
+        Primary endpoints first, then their slopes, then all other metrics.
     """
 
     families: tuple[str, ...]
@@ -112,6 +120,22 @@ class Summary:
     def compared(self, name: str = ENDPOINT) -> list[Compared]:
         """Differences of a metric."""
         return [one for one in self.differences if one.metric == name]
+
+    def is_better(self, family: str, arm: str) -> bool:
+        """Whether the reference can be claimed to be better than an arm on a family.
+
+        One endpoint is better after adjustment, on at least 20 scenes, and the interval of the other excludes that it
+        is worse by 0.005 or more.
+        """
+        found = {}
+        for one in self.differences:
+            if one.metric in ENDPOINTS and (one.family, one.second) == (family, arm) and one.adjusted:
+                sign, d = ENDPOINTS[one.metric], one.difference
+                low = d.low if sign > 0 else -d.high
+                found[one.metric] = d.n >= CLAIM and low > 0 and d.p_holm < 1 - LEVEL, low > -NOT_WORSE
+        return len(found) == len(ENDPOINTS) and any(
+            better and all(other[1] for other in found.values()) for better, _ in found.values()
+        )
 
     def metric_rows(self) -> list[dict[str, Any]]:
         """Rows of summary.csv."""
@@ -158,9 +182,10 @@ def summarise(
     spent = [k for k in named if k in cost]
     zero = {k: 0.0 for k in spent if not k.startswith("peak_mb")}
     values.update(_by_scene([{**zero, **row} for row in rows], spent, lambda row: True))
-    if ENDPOINT in measured:
-        values.update(_slopes(rows))
-        measured.insert(1 + measured.index(ENDPOINT), SLOPE)
+    for endpoint, slope_name in SLOPES.items():
+        if endpoint in measured:
+            values.update(_slopes(rows, endpoint, slope_name))
+            measured.insert(1 + measured.index(endpoint), slope_name)
     names = tuple([*measured, *(k for k in named if k in cost)])
     metrics = tuple(
         ArmMetric(family, arm, name, values[family, arm, name])
@@ -169,30 +194,28 @@ def summarise(
         for name in names
         if values.get((family, arm, name))
     )
-    # The primary endpoint first, then its slope; all other comparisons are exploratory.
-    order = sorted(measured, key=lambda name: (name != ENDPOINT, name != SLOPE))
-    differences = []
-    for name in order:
-        table = [
-            Compared(
-                family,
-                reference,
-                arm,
-                name,
-                compare(values.get((family, reference, name), {}), others),
-                arm in reported_only,
-            )
-            for family in families
-            for arm in arms
-            if arm != reference and (others := values.get((family, arm, name), {}))
-        ]
-        if name == ENDPOINT:
-            p = holm([float("nan") if one.reported_only else one.difference.p for one in table])
-            table = [
-                replace(one, difference=replace(one.difference, p_holm=float(q)))
-                for one, q in zip(table, p, strict=True)
-            ]
-        differences.extend(table)
+    # The primary endpoints first, then their slopes; all other comparisons are exploratory.
+    first = [*ENDPOINTS, *SLOPES.values()]
+    order = [name for name in first if name in measured] + [name for name in measured if name not in first]
+    differences = [
+        Compared(
+            family,
+            reference,
+            arm,
+            name,
+            compare(values.get((family, reference, name), {}), others),
+            arm in reported_only,
+        )
+        for name in order
+        for family in families
+        for arm in arms
+        if arm != reference and (others := values.get((family, arm, name), {}))
+    ]
+    p = holm([one.difference.p if one.adjusted else float("nan") for one in differences])
+    differences = [
+        replace(one, difference=replace(one.difference, p_holm=float(q))) if one.metric in ENDPOINTS else one
+        for one, q in zip(differences, p, strict=True)
+    ]
     return Summary(families, arms, names, reference, metrics, tuple(differences))
 
 
@@ -215,17 +238,18 @@ def _by_scene(rows: Sequence[Mapping[str, Any]], names: Sequence[str], wanted: A
     return dict(values)
 
 
-def _slopes(rows: Sequence[Mapping[str, Any]]) -> _Values:
-    """Slope of quality over the pauses of each run, averaged over seeds."""
+def _slopes(rows: Sequence[Mapping[str, Any]], endpoint: str, name: str) -> _Values:
+    """Slope of an endpoint over the pauses of each run, averaged over seeds."""
     runs: dict[tuple[str, str, str, Any], list[tuple[float, float]]] = defaultdict(list)
     for row in rows:
-        if row.get(ENDPOINT) is not None:
-            runs[row["family"], row["arm"], row["scene"], row["seed"]].append((row["pause"], row[ENDPOINT]))
+        value = row.get(endpoint)
+        if value is not None and np.isfinite(value):
+            runs[row["family"], row["arm"], row["scene"], row["seed"]].append((row["pause"], value))
     seeds: dict[tuple[str, str, str], list[float]] = defaultdict(list)
     for (family, arm, scene, _), points in runs.items():
         if len(points) > 1:
             seeds[family, arm, scene].append(slope(*np.array(points).T))
     values: _Values = defaultdict(dict)
     for (family, arm, scene), slopes in seeds.items():
-        values[family, arm, SLOPE][scene] = float(np.mean(slopes))
+        values[family, arm, name][scene] = float(np.mean(slopes))
     return dict(values)

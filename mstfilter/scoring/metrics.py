@@ -1,40 +1,38 @@
-"""Metrics of the hypotheses at one pause of a run.
+"""Metrics of the hypotheses at one pause against the ground truth.
 
->>> row = measure_pause(run, recording, t=2)
->>> row["quality"], row["quality_hidden"], row["split"], row["brier"]
+>>> row, qualities = pause_metrics(labels, weights, recording.truth(2), object_status(recording, 2))
+>>> row["quality"], row["quality_hidden"], row["split"], row["volume_invented"]
 
-Unless stated otherwise, a metric is the unweighted mean over the hypotheses, measured in volume against the ground
-truth.
+Unless stated otherwise, a metric is the unweighted mean over the hypotheses, measured in volume.
 
 ``quality``: weighted coverage in the form ``objects``; missed, invented, split and merged objects reduce it.
 ``quality_paper``, ``quality_authors``: the other forms (see `mstfilter.scoring`).
 ``quality_top``, ``quality_weighted``, ``quality_best``: quality of the hypothesis of largest weight, weighted mean,
 and maximum. The maximum can only be compared at equal numbers of hypotheses.
+``quality_estimate``: quality of the hypothesis of least expected loss (`least_loss`).
 ``quality_visible``, ``quality_hidden``, ``quality_unseen``: coverage of the true objects that are visible at this
 pause, were visible at an earlier one only, or never were (`mstfilter.scoring.object_status`).
 ``quality_one_blob``, ``quality_components``: trivial baselines: the occupied voxels as one object, or as their
 connected components.
-``occupancy``: intersection over union of the occupied voxels. ``object_f``: F score of objects at IoU 0.5.
+``occupancy``: intersection over union of the occupied voxels. ``volume_missed``, ``volume_invented``: volume that is
+occupied in the truth only, and in the hypothesis only, divided by the true volume.
+``object_f``: F score of objects at IoU 0.5.
 ``split``, ``merged``, ``missed``, ``invented``: numbers of objects (see `object_errors`).
 ``diversity``: 1 - mean quality of one hypothesis against another; 0 if all are equal.
-``brier``, ``disputed``: see `pair_brier`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 
-from mstfilter.runs.run_folder import RunFolder
-from mstfilter.scene import Recording, occupied_box
-from mstfilter.scoring import (
+from mstfilter.scene import occupied_box
+from mstfilter.scoring.quality import (
     FORMS,
     STATUSES,
     Overlap,
     connected_components,
-    object_status,
     one_blob,
     overlap,
     quality_of,
@@ -43,24 +41,6 @@ from mstfilter.scoring import (
 
 _MOST = 0.5
 _FRAGMENT = 0.1
-_PAIRS_AT_ONCE = 2**22
-
-
-def measure_pause(run: RunFolder, recording: Recording, t: int) -> dict[str, Any]:
-    """The metrics of a run at pause `t`; without ground truth only those that need none.
-
-    ``qualities`` is the list of the quality of each hypothesis; tables leave it out.
-    """
-    info, hypotheses = run.info(t), run.hypotheses(t)
-    labels, weights = [h.labels for h in hypotheses], np.array(info["weights"], dtype=float)
-    row: dict[str, Any] = {"pause": t, "time_s": recording.times[recording.pauses[t]], "n": info["n"]}
-    row["n_objects"] = float(np.mean([h.n_objects for h in hypotheses]))
-    truth = recording.truth(t)
-    if truth is None:
-        return {**row, "diversity": diversity(labels)}
-    known = all(recording.instance(p) is not None for p in recording.pauses[: t + 1])
-    found, q = pause_metrics(labels, weights, truth, object_status(recording, t) if known else {})
-    return {**row, **found, "qualities": q.tolist()}
 
 
 def pause_metrics(
@@ -106,13 +86,17 @@ def pause_metrics(
     row["quality_one_blob"] = mean([weighted_coverage(one_blob(one), truth) for one in distinct])
     row["quality_components"] = mean([weighted_coverage(connected_components(one), truth) for one in distinct])
     row["occupancy"] = mean([occupancy_iou(table) for table in tables])
+    wrong = [volume_errors(table) for table in tables]
+    row["volume_missed"], row["volume_invented"] = (mean([pair[k] for pair in wrong]) for k in (0, 1))
     row["object_f"] = mean([object_f(table) for table in tables])
     errors = [object_errors(table) for table in tables]
     for kind in errors[0]:
         row[kind] = mean([e[kind] for e in errors])
     row["true_objects"] = float(np.count_nonzero(tables[0].labels_b))
-    row["diversity"] = diversity(labels)
-    row["brier"], row["disputed"] = pair_brier(labels, weights, truth)
+    # Expected quality of each hypothesis against the others, by weight: the largest is the best single answer.
+    between = pairwise_quality(distinct)[np.ix_(which, which)]
+    row["quality_estimate"] = float(q[int(np.argmax(between @ weights))])
+    row["diversity"] = _diversity(between)
     return row, q
 
 
@@ -160,6 +144,13 @@ def occupancy_iou(table: Overlap) -> float:
     return float(counts.sum() / union) if union else 1.0
 
 
+def volume_errors(table: Overlap) -> tuple[float, float]:
+    """Volumes that are occupied in the truth only, and in the hypothesis only, over the true volume (at least 1)."""
+    counts, sizes_a, sizes_b, _ = _objects(table)
+    true = max(float(sizes_b.sum()), 1.0)
+    return float(sizes_b.sum() - counts.sum()) / true, float(sizes_a.sum() - counts.sum()) / true
+
+
 def object_f(table: Overlap) -> float:
     """F score of objects, matched by an intersection over union above 0.5, so that no object matches twice (Kirillov
     et al. 2019); 1 if both are empty."""
@@ -189,64 +180,41 @@ def object_errors(table: Overlap) -> dict[str, float]:
     }
 
 
+def pairwise_quality(labels: Sequence[np.ndarray]) -> np.ndarray:
+    """Quality (n, n) of every hypothesis against every other, in the form ``objects``; 1 on the diagonal."""
+    n = len(labels)
+    stacked = np.stack([np.asarray(one).ravel() for one in labels])
+    # Voxels with equal labels in all hypotheses form a pattern; the voxels of each pattern are counted once.
+    patterns, sizes = _patterns(stacked[:, (stacked > 0).any(axis=0)])
+    compact = [np.unique(np.append(row, 0), return_inverse=True) for row in patterns]
+    found = np.eye(n)
+    for a in range(n):
+        for b in range(a):
+            (labels_a, in_a), (labels_b, in_b) = compact[a], compact[b]
+            shape = len(labels_a), len(labels_b)
+            counts = np.bincount(in_a[:-1] * shape[1] + in_b[:-1], sizes, shape[0] * shape[1]).reshape(shape)
+            counts[0, 0] = 1.0  # free in both: of no effect, but no region may be empty
+            found[a, b] = found[b, a] = quality_of(Overlap(labels_a, labels_b, counts))
+    return found
+
+
+def least_loss(labels: Sequence[np.ndarray], weights: np.ndarray) -> int:
+    """The hypothesis of least expected loss: the one that is most like the others, by weight.
+
+    ``argmax_i sum_j w_j q(h_i, h_j)``, q the quality in the form ``objects``: the best single answer among the
+    hypotheses if the truth were distributed as they are.
+    """
+    return int(np.argmax(pairwise_quality(labels) @ np.asarray(weights, dtype=np.float64)))
+
+
 def diversity(labels: Sequence[np.ndarray]) -> float:
     """1 - mean quality over all pairs of hypotheses, equal ones included; NaN for a single hypothesis."""
-    n = len(labels)
-    if n < 2:
-        return float("nan")
-    distinct, which = _distinct(labels)
-    share = np.bincount(which, minlength=len(distinct))
-    total = 0.0
-    for a in range(len(distinct)):
-        for b in range(a):
-            total += share[a] * share[b] * (1 - weighted_coverage(distinct[a], distinct[b]))
-    return float(total / (n * (n - 1) / 2))
+    return _diversity(pairwise_quality(labels))
 
 
-def pair_brier(labels: Sequence[np.ndarray], weights: np.ndarray, truth: np.ndarray) -> tuple[float, float]:
-    """Brier score of the statement "these two voxels belong to the same object", over pairs that are disputed.
-
-    The forecast for a pair is the total weight of the hypotheses in which both voxels belong to one object.
-
-    Parameters
-    ----------
-    labels : n arrays (X, Y, Z) of int
-    weights : (n,) float
-        Sum 1.
-    truth : (X, Y, Z) int
-
-    Returns
-    -------
-    (float, float)
-        Mean squared error over the disputed pairs, which some but not all hypotheses put into one object (NaN if
-        there are none), and their share of the pairs that any hypothesis puts into one object.
-    """
-    # Voxels with equal labels in all hypotheses and in the truth form a pattern; pairs of patterns are counted.
-    stacked = np.stack([np.asarray(one).ravel() for one in labels])
-    occupied = (stacked > 0).any(axis=0)
-    names, sizes = _patterns(np.vstack([stacked[:, occupied], np.asarray(truth).ravel()[occupied]]))
-    n, m = len(labels), names.shape[1]
-    error = disputed = joined = 0.0
-    rows = max(1, _PAIRS_AT_ONCE // max(m, 1))
-    for begin in range(0, m, rows):
-        block = slice(begin, min(begin + rows, m))
-        forecast = np.zeros((block.stop - begin, m), np.float32)
-        times = np.zeros(forecast.shape, np.int32)
-        for name, weight in zip(names[:n], weights, strict=True):
-            same = (name[block, None] == name[None, :]) & (name[block, None] > 0)
-            times += same
-            forecast += np.float32(weight) * same
-        true = (names[n, block, None] == names[n][None, :]) & (names[n, block, None] > 0)
-        pairs = np.outer(sizes[block], sizes)
-        rows_here = np.arange(block.stop - begin)
-        pairs[rows_here, rows_here + begin] -= sizes[block]  # no pair of a voxel with itself
-        joined += float(pairs[times > 0].sum())
-        doubt = (times > 0) & (times < n)
-        disputed += float(pairs[doubt].sum())
-        error += float((pairs[doubt] * (forecast[doubt] - true[doubt]) ** 2).sum())
-    if not joined:
-        return float("nan"), float("nan")
-    return (error / disputed if disputed else float("nan")), disputed / joined
+def _diversity(quality: np.ndarray) -> float:
+    n = len(quality)
+    return float((1 - quality).sum() / (n * (n - 1))) if n > 1 else float("nan")
 
 
 def _patterns(columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -10,16 +10,8 @@ import pytest
 from hypothesis import given, settings, strategies as st
 from hypothesis.extra import numpy as hnp
 
-from mstfilter.runs.metrics import (
-    coverage_of,
-    diversity,
-    object_errors,
-    object_f,
-    occupancy_iou,
-    pair_brier,
-    pause_metrics,
-)
-from mstfilter.scoring import overlap, weighted_coverage
+from mstfilter.scoring import diversity, least_loss, overlap, pairwise_quality, pause_metrics, weighted_coverage
+from mstfilter.scoring.metrics import coverage_of, object_errors, object_f, occupancy_iou, volume_errors
 
 SMALL = hnp.arrays(np.uint16, (3, 3, 2), elements=st.integers(0, 3))
 WORLDS = st.tuples(st.lists(SMALL, min_size=1, max_size=4), SMALL)
@@ -52,18 +44,6 @@ def plain_metrics(hypothesis, truth):
     }
 
 
-def plain_brier(labels, weights, truth):
-    """Pair by pair."""
-    errors, joined = [], 0
-    voxels = list(np.ndindex(truth.shape))
-    for u, v in itertools.combinations(voxels, 2):
-        same = [one[u] == one[v] > 0 for one in labels]
-        joined += any(same)
-        if any(same) and not all(same):
-            errors.append((sum(w for w, s in zip(weights, same, strict=True) if s) - (truth[u] == truth[v] > 0)) ** 2)
-    return (float(np.mean(errors)) if errors else math.nan), (len(errors) / joined if joined else math.nan)
-
-
 @settings(max_examples=60, deadline=None, derandomize=True)
 @given(WORLDS)
 def test_against_sets(world):
@@ -83,23 +63,15 @@ def test_against_sets(world):
 
 @settings(max_examples=25, deadline=None, derandomize=True)
 @given(WORLDS, st.integers(0, 1000))
-def test_brier_and_diversity_against_pairs(world, seed):
-    labels, truth = world
+def test_pairs_of_hypotheses(world, seed):
+    labels, _ = world
     weights = np.random.default_rng(seed).dirichlet(np.ones(len(labels)))
-    assert pair_brier(labels, weights, truth) == pytest.approx(
-        plain_brier(labels, weights, truth), rel=1e-5, abs=1e-6, nan_ok=True
-    )
+    expected = [[weighted_coverage(a, b) for b in labels] for a in labels]
+    np.testing.assert_allclose(pairwise_quality(labels), expected)
     pairs = [1 - weighted_coverage(a, b) for a, b in itertools.combinations(labels, 2)]
     assert diversity(labels) == pytest.approx(np.mean(pairs) if pairs else math.nan, nan_ok=True)
-
-
-def test_brier_in_blocks_is_the_same(monkeypatch):
-    rng = np.random.default_rng(0)
-    labels, truth = [rng.integers(0, 4, (6, 6, 4)) for _ in range(4)], rng.integers(0, 3, (6, 6, 4))
-    whole = pair_brier(labels, np.full(4, 0.25), truth)
-    monkeypatch.setattr("mstfilter.runs.metrics._PAIRS_AT_ONCE", 1000)
-    assert pair_brier(labels, np.full(4, 0.25), truth) == pytest.approx(whole)
-    assert whole == pytest.approx(plain_brier(labels, np.full(4, 0.25), truth), rel=1e-5)
+    losses = [sum(w * (1 - q) for w, q in zip(weights, row, strict=True)) for row in expected]
+    assert losses[least_loss(labels, weights)] == pytest.approx(min(losses))
 
 
 def test_known_errors():
@@ -110,6 +82,7 @@ def test_known_errors():
     assert object_errors(table) == {"split": 1, "merged": 1, "missed": 1, "invented": 1}
     assert object_f(table) == 0.0
     assert occupancy_iou(table) == 12 / 18
+    assert volume_errors(table) == (3 / 15, 3 / 15)
 
 
 def test_metrics_of_a_population():
@@ -127,11 +100,12 @@ def test_metrics_of_a_population():
     assert (row["quality_visible"], row["quality_hidden"]) == (pytest.approx((2 + 0.5) / 3), pytest.approx(2.5 / 3))
     assert row["quality_unseen"] == 1.0
     assert row["merged"] == pytest.approx(1 / 3)
-    assert row["brier"] == pytest.approx(0.36)  # the heavier hypothesis is wrong about every disputed pair
+    assert row["quality_estimate"] == q  # the wrong hypotheses have .6 of the weight
+    assert (row["volume_missed"], row["volume_invented"]) == (0, 0)
     assert row["quality_one_blob"] == pytest.approx(weighted_coverage((truth > 0).astype(int), truth))
     assert (row["n_visible"], row["n_hidden"], row["n_unseen"], row["true_objects"]) == (1, 1, 1, 3)
     one, _ = pause_metrics([truth], np.ones(1), truth, {})
-    assert math.isnan(one["diversity"]) and math.isnan(one["brier"]) and math.isnan(one["quality_hidden"])
+    assert math.isnan(one["diversity"]) and math.isnan(one["quality_hidden"])
 
 
 @settings(max_examples=40, deadline=None, derandomize=True)

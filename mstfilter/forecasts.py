@@ -1,0 +1,250 @@
+"""Scores of forecasts: Brier score, log loss, calibration, recalibration, energy score.
+
+A forecast of an event is a probability p; its outcome y is 0 or 1. Many forecasts are kept as a table of how often
+each value of p was given and how often the event then occurred, so that tables can be pooled.
+
+>>> import numpy as np
+>>> table = ForecastTable.of(p=[0.9, 0.9, 0.2, 0.2], y=[1, 1, 0, 1])
+>>> round(table.brier, 4), round(table.log_loss(), 3)
+(0.175, 0.511)
+>>> fit = Recalibration.fit(table)                  # isotonic: how often the event occurs, given the forecast
+>>> fit(np.array([0.2, 0.9])).tolist()
+[0.5, 0.999]
+
+A forecast of a vector, a segmentation, or any other object is a weighted set. Its energy score needs only distances:
+
+>>> distances = np.array([[0.0, 1.0], [1.0, 0.0]])  # between the two members of the set
+>>> energy_score([0.0, 1.0], distances, [0.5, 0.5])
+0.25
+
+A score is proper if no other forecast has a lower expected score than the true distribution. Brier score and log loss
+are proper; the energy score is proper if the distance is of negative type (`is_negative_type`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from mstfilter.errors import InputError
+
+CLIP = 0.001  # recalibrated forecasts stay this far from 0 and 1
+SOFTENING = 0.02  # e of p <- (1 - e) p + e / 2, so that a forecast of 0 or 1 has a finite log loss
+
+
+@dataclass(frozen=True, eq=False)
+class ForecastTable:
+    """How often each forecast was given, and how often the event then occurred.
+
+    Parameters
+    ----------
+    p : (k,) float
+        Distinct forecasts, ascending.
+    no, yes : (k,) float
+        Numbers of outcomes 0 and 1 of each forecast.
+    """
+
+    p: np.ndarray
+    no: np.ndarray
+    yes: np.ndarray
+
+    @classmethod
+    def of(cls, p: ArrayLike, y: ArrayLike, count: ArrayLike = 1.0) -> ForecastTable:
+        """A table of forecasts p (m,) with outcomes y (m,) in [0, 1], each counted `count` times."""
+        p, y = np.asarray(p, dtype=np.float64), np.asarray(y, dtype=np.float64)
+        if p.ndim != 1 or p.shape != y.shape:
+            raise InputError(f"forecasts have shape {p.shape} and outcomes {y.shape}, expected (m,) twice")
+        for name, values in (("forecast", p), ("outcome", y)):
+            wrong = ~((values >= 0) & (values <= 1))
+            if wrong.any():
+                raise InputError(f"{name} {int(np.argmax(wrong))} is {values[wrong][0]}, expected a value in [0, 1]")
+        count = np.broadcast_to(np.asarray(count, dtype=np.float64), p.shape)
+        values, which = np.unique(p, return_inverse=True)
+        yes, no = (np.bincount(which, count * share, len(values)) for share in (y, 1 - y))
+        return cls(values, no, yes)
+
+    @classmethod
+    def pooled(cls, tables: Sequence[ForecastTable]) -> ForecastTable:
+        """All forecasts of several tables."""
+        p, no, yes = (np.concatenate([getattr(t, name) for t in tables]) for name in ("p", "no", "yes"))
+        count = no + yes
+        return cls.of(p, np.divide(yes, count, out=np.zeros_like(yes), where=count > 0), count)
+
+    @cached_property
+    def count(self) -> np.ndarray:
+        """(k,) number of forecasts of each value."""
+        return self.no + self.yes
+
+    @property
+    def n(self) -> float:
+        """Number of forecasts."""
+        return float(self.count.sum())
+
+    @property
+    def brier(self) -> float:
+        """Mean squared error (p - y)^2; NaN without forecasts."""
+        return self._mean(self.no * self.p**2 + self.yes * (1 - self.p) ** 2)
+
+    def log_loss(self, softening: float = 0.0) -> float:
+        """Mean of -log of the probability given to the outcome, in nats; infinite if an outcome had probability 0.
+
+        With a softening e, p is replaced by (1 - e) p + e / 2.
+        """
+        p = (1 - softening) * self.p + softening / 2
+        with np.errstate(divide="ignore", invalid="ignore"):
+            loss = np.where(self.no > 0, -self.no * np.log1p(-p), 0.0)
+            loss += np.where(self.yes > 0, -self.yes * np.log(p), 0.0)
+        return self._mean(loss)
+
+    def with_forecasts(self, p: np.ndarray) -> ForecastTable:
+        """The same outcomes with other forecasts p (k,)."""
+        share = np.divide(self.yes, self.count, out=np.zeros_like(self.yes), where=self.count > 0)
+        return ForecastTable.of(p, share, self.count)
+
+    def reliability(self, n_bins: int = 10) -> Reliability:
+        """The reliability diagram on bins of equal numbers of forecasts.
+
+        Equal forecasts stay in one bin, so bins differ in size where a forecast is frequent.
+        """
+        middle = np.cumsum(self.count) - self.count / 2  # rank of each forecast
+        which = np.minimum((n_bins * middle / max(self.n, 1e-300)).astype(np.int64), n_bins - 1)
+        count, yes, p = (np.bincount(which, v, n_bins) for v in (self.count, self.yes, self.count * self.p))
+        kept = count > 0
+        return Reliability(p[kept] / count[kept], yes[kept] / count[kept], count[kept])
+
+    def _mean(self, total: np.ndarray) -> float:
+        return float(total.sum() / self.n) if self.n else float("nan")
+
+
+@dataclass(frozen=True, eq=False)
+class Reliability:
+    """A reliability diagram (DeGroot and Fienberg 1983).
+
+    Parameters
+    ----------
+    forecast : (b,) float
+        Mean forecast of each bin.
+    frequency : (b,) float
+        Share of the forecasts of the bin whose event occurred.
+    count : (b,) float
+        Number of forecasts.
+    """
+
+    forecast: np.ndarray
+    frequency: np.ndarray
+    count: np.ndarray
+
+    @property
+    def error(self) -> float:
+        """Calibration error: mean of |forecast - frequency| over the bins, weighted by their counts."""
+        if not self.count.sum():
+            return float("nan")
+        return float(np.average(np.abs(self.forecast - self.frequency), weights=self.count))
+
+
+@dataclass(frozen=True, eq=False)
+class Recalibration:
+    """A monotone map from forecasts to probabilities, by isotonic regression (Zadrozny and Elkan 2002).
+
+    Forecasts between two fitted values are interpolated, and the result is clipped to [0.001, 0.999].
+
+    Parameters
+    ----------
+    p : (k,) float
+        Forecasts, ascending.
+    probability : (k,) float
+        Non-decreasing.
+    """
+
+    p: np.ndarray
+    probability: np.ndarray
+
+    @classmethod
+    def fit(cls, table: ForecastTable) -> Recalibration:
+        """The non-decreasing map of least squared error, weighted by the numbers of forecasts."""
+        from scipy.optimize import isotonic_regression
+
+        kept = table.count > 0
+        if not kept.any():
+            raise InputError("there are no forecasts to fit a recalibration to")
+        p, count = table.p[kept], table.count[kept]
+        fitted = np.asarray(isotonic_regression(table.yes[kept] / count, weights=count).x)
+        flat = np.zeros(len(p), bool)  # inside a constant stretch: no effect on the interpolation
+        flat[1:-1] = (fitted[1:-1] == fitted[:-2]) & (fitted[1:-1] == fitted[2:])
+        return cls(p[~flat], fitted[~flat])
+
+    def __call__(self, p: np.ndarray) -> np.ndarray:
+        """Recalibrated forecasts (...)."""
+        return np.clip(np.interp(p, self.p, self.probability), CLIP, 1 - CLIP)
+
+    def log_loss(self, table: ForecastTable) -> float:
+        """Mean log loss in nats of the forecasts of a table after recalibration."""
+        return table.with_forecasts(self(table.p)).log_loss()
+
+
+def energy_score(
+    to_outcome: ArrayLike, between: ArrayLike, weights: ArrayLike | None = None, fair: bool = False
+) -> float:
+    """Energy score of a weighted set (Gneiting and Raftery 2007, section 4.3); lower is better.
+
+    ``ES = sum_i w_i d(x_i, y) - 1/2 sum_ij w_i w_j d(x_i, x_j)``
+
+    Parameters
+    ----------
+    to_outcome : (n,) float
+        Distances d(x_i, y) of the members to the outcome.
+    between : (n, n) float
+        Distances d(x_i, x_j).
+    weights : (n,) float, optional
+        Sum 1. Default: equal.
+    fair : bool
+        Divide the second sum by n (n - 1) instead of n^2: unbiased for the score of the distribution that the
+        members are independent, equally weighted draws of (Ferro 2014). Needs equal weights and n of at least 2.
+
+    Notes
+    -----
+    The score is proper if the distance is of negative type; see `is_negative_type`.
+    """
+    d, D = np.asarray(to_outcome, dtype=np.float64), np.asarray(between, dtype=np.float64)
+    n = len(d)
+    if d.ndim != 1 or D.shape != (n, n):
+        raise InputError(f"distances have shapes {d.shape} and {D.shape}, expected (n,) and (n, n)")
+    w = np.full(n, 1 / n) if weights is None else np.asarray(weights, dtype=np.float64)
+    if w.shape != (n,) or (w < 0).any() or not np.isclose(w.sum(), 1):
+        raise InputError(f"weights have shape {w.shape} and sum {w.sum():g}, expected ({n},) and sum 1")
+    spread = 0.5 * float(w @ D @ w)
+    if fair:
+        if n < 2 or not np.allclose(w, 1 / n):
+            raise InputError("the fair energy score needs at least two members of equal weight")
+        spread *= n / (n - 1)
+    return float(w @ d) - spread
+
+
+def is_negative_type(distances: ArrayLike, tolerance: float = 1e-9) -> bool:
+    """Whether a distance is of negative type on n points.
+
+    ``sum_ij c_i c_j d_ij <= 0`` for all c with ``sum_i c_i = 0`` (Schoenberg 1938). If this holds for all points, the
+    energy score with d is proper; if it fails, two distributions on these points exist for which the wrong
+    forecast has the lower expected score (Sejdinovic et al. 2013).
+
+    Parameters
+    ----------
+    distances : (n, n) float
+        Symmetric, zero on the diagonal.
+    tolerance : float
+        Largest eigenvalue that counts as 0, relative to the largest distance.
+    """
+    D = np.asarray(distances, dtype=np.float64)
+    if D.ndim != 2 or D.shape[0] != D.shape[1]:
+        raise InputError(f"distances have shape {D.shape}, expected (n, n)")
+    largest = np.abs(D).max(initial=0.0)
+    if not np.allclose(D, D.T, atol=1e-12 * largest) or np.abs(np.diag(D)).max(initial=0.0) > 1e-12 * largest:
+        raise InputError("distances are not symmetric with zeros on the diagonal")
+    if largest == 0:
+        return True
+    centred = D - D.mean(axis=0) - D.mean(axis=1)[:, None] + D.mean()
+    return bool(np.linalg.eigvalsh(centred)[-1] <= tolerance * largest * len(D))

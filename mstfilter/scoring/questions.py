@@ -1,0 +1,243 @@
+"""Questions about a recording, and what a weighted set of hypotheses answers.
+
+A question asks whether two voxels belong to one object. The recording alone fixes the questions of a pause, never the
+ground truth and never a hypothesis, so that all methods answer the same ones and an honest answer is the best one.
+
+>>> questions = ask(recording, t=2)                            # 20,000 pairs of voxels
+>>> p = questions.forecasts(labels, weights)                   # sum_i w_i [same object in hypothesis i]
+>>> y = questions.outcomes(recording.truth(2))                 # bool
+>>> float(np.mean((p - y) ** 2))                               # Brier score
+
+**Law of the questions.** In question at pause t are voxels above the table that the depth images of pause t do not
+observe as free, and that lie on a depth reading above the table, or up to 10 cm behind one along the camera's z axis,
+at pause t or earlier. The first voxel u is uniform among them; the second, v, is uniform among those of them within 8
+voxels of u, without u.
+
+**Noise at the border.** A hypothesis does not say how sure it is of a border. `Questions.forecasts` therefore also
+gives the forecasts of the hypotheses with noise: each voxel takes, with probability e, the label of one of its six
+neighbours, independently of the others. Only voxels at a border change. The expectation over the noise is exact:
+
+    p = sum_i w_i sum_{k > 0} P_i,u(k) P_i,v(k),    P_i,v(k) = (1 - e) [L_i(v) = k] + e / 6 sum_{v'} [L_i(v') = k]
+
+with v' the neighbours of v (beyond the grid: v itself).
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from mstfilter.errors import InputError, check_integer
+from mstfilter.scene import Frame, Recording, VoxelGrid, depth_sigma, frame_geometry
+
+N_QUESTIONS = 20_000
+REACH = 8  # voxels between the two voxels of a question, at most
+DEPTH_BEHIND = 0.10  # metres behind a reading
+NOISE_RATES = (0.0, 0.1, 0.2, 0.4)  # e of noise at the border
+
+_STEPS = np.array([(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1)])
+
+
+@dataclass(frozen=True, eq=False)
+class Questions:
+    """Pairs of voxels of a grid.
+
+    Parameters
+    ----------
+    shape : (3,) int
+        Shape of the grid.
+    first, second : (m,) int64
+        Flat indices of the two voxels of each pair.
+    """
+
+    shape: tuple[int, ...]
+    first: np.ndarray
+    second: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.first)
+
+    def outcomes(self, labels: np.ndarray) -> np.ndarray:
+        """(m,) bool: whether the two voxels have the same label above 0 in `labels` (X, Y, Z)."""
+        flat = self._flat(labels)
+        a = flat[self.first]
+        return np.asarray((a == flat[self.second]) & (a > 0))
+
+    def forecasts(
+        self, labels: Sequence[np.ndarray], weights: np.ndarray, rates: Sequence[float] = (0.0,)
+    ) -> np.ndarray:
+        """Forecasts (r, m) of hypotheses with noise of each rate (r,) at the border; (m,) for the default.
+
+        Parameters
+        ----------
+        labels : n arrays (X, Y, Z) of int
+        weights : (n,) float
+            Sum 1.
+        rates : sequence of float
+            e in [0, 1]; see the module.
+        """
+        e = np.asarray(rates, dtype=np.float64)[:, None]
+        found = np.zeros((len(e), len(self)))
+        u, v = self._around
+        noisy = bool(e.any())
+        for one, weight in zip(labels, weights, strict=True):
+            flat = self._flat(one)
+            a, b = flat[self.first], flat[self.second]
+            same = (a == b) & (a > 0)
+            if not noisy:
+                found += weight * same
+                continue
+            near_u, near_v = flat[u], flat[v]  # (6, m)
+            # Away from borders the noise changes nothing; elsewhere count equal labels over the neighbours.
+            border = np.flatnonzero(((near_u != a) | (near_v != b)).any(axis=0))
+            found += weight * same
+            if len(border):
+                a, b, near_u, near_v = a[border], b[border], near_u[:, border], near_v[:, border]
+                mixed = ((near_v == a) & (a > 0)).sum(axis=0) + ((near_u == b) & (b > 0)).sum(axis=0)
+                both = np.zeros(len(border))
+                for row in near_u:
+                    both += ((near_v == row) & (row > 0)).sum(axis=0)
+                p = (1 - e) ** 2 * same[border] + (1 - e) * e / 6 * mixed + e**2 / 36 * both
+                found[:, border] += weight * (p - same[border])
+        found = np.clip(found, 0.0, 1.0)  # sums of weights exceed 1 by rounding
+        return found[0] if len(e) == 1 and not noisy else found
+
+    def answers(
+        self, labels: Sequence[np.ndarray], rate: float = 0.0, rng: np.random.Generator | None = None
+    ) -> np.ndarray:
+        """(n, m) bool: the answer of each hypothesis; with a rate e, of one draw of its noise at the border."""
+        if not rate:
+            return np.stack([self.outcomes(one) for one in labels])
+        assert rng is not None
+        voxels, place = np.unique(np.concatenate([self.first, self.second]), return_inverse=True)
+        around = _neighbours(voxels, self.shape)
+        found = []
+        for one in labels:
+            flat = self._flat(one)
+            redrawn = around[rng.integers(len(around), size=len(voxels)), np.arange(len(voxels))]
+            drawn = np.where(rng.random(len(voxels)) < rate, flat[redrawn], flat[voxels])[place]
+            a, b = drawn[: len(self)], drawn[len(self) :]
+            found.append((a == b) & (a > 0))
+        return np.stack(found)
+
+    def _flat(self, labels: np.ndarray) -> np.ndarray:
+        labels = np.asarray(labels)
+        if labels.shape != tuple(self.shape):
+            raise InputError(f"labels have shape {labels.shape}, the questions are about a grid {self.shape}")
+        return labels.ravel()
+
+    @cached_property
+    def _around(self) -> tuple[np.ndarray, np.ndarray]:
+        """(6, m) flat indices of the neighbours of both voxels; the voxel itself beyond the grid."""
+        return _neighbours(self.first, self.shape), _neighbours(self.second, self.shape)
+
+
+def _neighbours(flat: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    index = np.stack(np.unravel_index(flat, shape), axis=-1)
+    moved = np.clip(index + _STEPS[:, None], 0, np.array(shape) - 1)
+    return np.asarray(np.ravel_multi_index(tuple(np.moveaxis(moved, -1, 0)), shape))
+
+
+def ask(recording: Recording, t: int, n: int = N_QUESTIONS) -> Questions:
+    """The questions of a pause.
+
+    Parameters
+    ----------
+    recording : Recording
+    t : int
+        Number of the pause.
+    n : int
+        Number of questions. They are drawn with a seed that depends on the depth images of the pause alone.
+
+    Returns
+    -------
+    Questions
+        Empty if fewer than two voxels are in question.
+    """
+    check_integer("number of questions", n)
+    if not 0 <= t < len(recording.pauses):
+        raise InputError(f"recording {recording.name} has no pause {t}, it has {len(recording.pauses)}")
+    now = recording.frames[recording.pauses[t]]
+    digest = hashlib.sha256(b"questions" + b"".join(view.depth.tobytes() for view in now.all_views)).digest()
+    rng = np.random.default_rng(int.from_bytes(digest[:8], "big"))
+    return draw_questions(in_question(recording, t), n, rng)
+
+
+def in_question(recording: Recording, t: int) -> np.ndarray:
+    """(X, Y, Z) bool: voxels about which questions are asked at pause t."""
+    grid, now = recording.grid, recording.frames[recording.pauses[t]]
+    near = np.zeros(grid.shape, bool)
+    for pause in recording.pauses[: t + 1]:
+        near |= _behind_readings(recording.frames[pause], grid)
+    above = grid.origin[2] + (np.arange(grid.shape[2]) + 0.5) * grid.voxel_size > 0
+    return near & above & ~_seen_free(now, grid)
+
+
+def _margin(depth: np.ndarray, grid: VoxelGrid) -> np.ndarray:
+    """Half a voxel, and three standard deviations of a reading at that depth, in metres."""
+    return 0.5 * grid.voxel_size + 3.0 * depth_sigma(depth)
+
+
+def _seen_free(frame: Frame, grid: VoxelGrid) -> np.ndarray:
+    """(X, Y, Z) bool: a view measures a surface behind the voxel."""
+    free = np.zeros(grid.shape, bool)
+    for view in frame.all_views:
+        geometry = frame_geometry(view, grid)
+        free |= geometry.known_free(_margin(geometry.z - geometry.signed, grid))
+    return free
+
+
+def _behind_readings(frame: Frame, grid: VoxelGrid) -> np.ndarray:
+    """(X, Y, Z) bool: on a reading above the table, or up to `DEPTH_BEHIND` behind it."""
+    found = np.zeros(grid.shape, bool)
+    for view in frame.all_views:
+        geometry = frame_geometry(view, grid)
+        with np.errstate(invalid="ignore"):
+            raised = view.valid & (view.points[..., 2] > _margin(view.depth, grid))
+            near = geometry.signed >= -_margin(geometry.z - geometry.signed, grid)
+            near &= geometry.signed <= DEPTH_BEHIND
+        found |= near & (geometry.pixel >= 0) & raised.ravel()[geometry.pixel]
+    return found
+
+
+def draw_questions(where: np.ndarray, n: int, rng: np.random.Generator) -> Questions:
+    """n pairs of voxels of `where` (X, Y, Z) bool, by the law of the module; none if no two voxels are near."""
+    where = np.asarray(where, dtype=bool)
+    voxels = np.argwhere(where)
+    axis = np.arange(-REACH, REACH + 1)
+    offsets = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
+    squared = (offsets**2).sum(axis=1)
+    offsets = offsets[(squared > 0) & (squared <= REACH**2)] + REACH
+    padded = np.pad(where, REACH)
+
+    def partners(u: np.ndarray) -> np.ndarray:
+        """(m, 3) uniform partners of voxels u (m, 3); -1 where there is none."""
+        v, left = np.full(u.shape, -1), np.arange(len(u))
+        for _ in range(32):  # rejection first: most voxels have many partners
+            proposed = u[left] + offsets[rng.integers(len(offsets), size=len(left))]
+            accepted = padded[tuple(proposed.T)]
+            v[left[accepted]] = proposed[accepted] - REACH
+            left = left[~accepted]
+        for k in left:
+            options = u[k] + offsets
+            options = options[padded[tuple(options.T)]]
+            if len(options):
+                v[k] = options[rng.integers(len(options))] - REACH
+        return v
+
+    first = voxels[rng.integers(max(len(voxels), 1), size=n if len(voxels) > 1 else 0)]
+    second = partners(first)
+    alone = second[:, 0] < 0
+    if alone.all():
+        first = second = np.zeros((0, 3), np.int64)
+    elif alone.any():  # u is uniform among the voxels that have a partner
+        first, second = first[~alone], second[~alone]
+        more = draw_questions(where, n - len(first), rng)
+        pairs = np.unravel_index(np.stack([more.first, more.second]), where.shape)
+        first, second = (np.concatenate([own, np.stack(pairs, axis=-1)[k]]) for k, own in enumerate((first, second)))
+    flat = [np.ravel_multi_index(tuple(pair.T), where.shape) for pair in (first, second)]
+    return Questions(where.shape, flat[0], flat[1])

@@ -1,0 +1,124 @@
+"""The law of the questions by enumeration, and forecasts with noise at the border against sampled noise."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings, strategies as st
+from hypothesis.extra import numpy as hnp
+
+from mstfilter.errors import InputError
+from mstfilter.scene import Recording
+from mstfilter.scoring import Questions, ask, draw_questions, in_question
+from mstfilter.scoring.questions import DEPTH_BEHIND, REACH
+from tests.scene.scenes import CAMERA, GRID, table_scene
+
+SMALL = hnp.arrays(np.uint16, (4, 3, 2), elements=st.integers(0, 2))
+
+
+def every_pair(shape):
+    first, second = (k.ravel() for k in np.meshgrid(*[np.arange(np.prod(shape))] * 2, indexing="ij"))
+    return Questions(shape, first[first != second], second[first != second])
+
+
+def recording(n_pauses=2, shifts=(0, 3)):
+    images = [table_scene(shift) for shift in shifts[:n_pauses]]
+    return Recording.from_arrays(
+        rgb=[rgb for rgb, _, _ in images],
+        depth=[depth for _, depth, _ in images],
+        K=CAMERA.K,
+        T_world_camera=CAMERA.T_world_camera,
+        pauses=list(range(n_pauses)),
+        grid=GRID,
+    )
+
+
+def test_the_law_of_the_pairs():
+    """u is uniform; v is uniform among the voxels within 8 of it; voxels without a partner are left out."""
+    where = np.zeros((24, 3, 1), bool)
+    where[[0, 3, 9], 0, 0] = where[23, 2, 0] = True  # 0-3 and 3-9 are near, 0-9 and 23 are not
+    n = 30_000
+    found = draw_questions(where, n, np.random.default_rng(0))
+    assert len(found) == n
+    names = {int(np.ravel_multi_index((x, 0, 0), where.shape)): x for x in (0, 3, 9)}
+    pairs = [(names[a], names[b]) for a, b in zip(found.first, found.second, strict=True)]
+    expected = {(0, 3): 1 / 3, (3, 0): 1 / 6, (3, 9): 1 / 6, (9, 3): 1 / 3}
+    assert set(pairs) == set(expected)
+    for pair, p in expected.items():  # 4 standard errors: 1 false alarm in 4,000 over the four
+        assert abs(pairs.count(pair) / n - p) < 4 * np.sqrt(p * (1 - p) / n)
+
+
+def test_no_two_near_voxels_give_no_questions():
+    where = np.zeros((30, 1, 1), bool)
+    assert len(draw_questions(where, 10, np.random.default_rng(0))) == 0
+    where[[0, 20]] = True
+    assert len(draw_questions(where, 10, np.random.default_rng(0))) == 0
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.lists(SMALL, min_size=1, max_size=3), st.integers(0, 1000))
+def test_forecasts_against_voxels(labels, seed):
+    weights = np.random.default_rng(seed).dirichlet(np.ones(len(labels)))
+    questions = every_pair(labels[0].shape)
+    p = questions.forecasts(labels, weights)
+    same = [[one.flat[a] == one.flat[b] > 0 for one in labels] for a, b in zip(questions.first, questions.second, strict=True)]
+    np.testing.assert_allclose(p, np.array(same) @ weights, atol=1e-12)
+    np.testing.assert_array_equal(questions.answers(labels).T, same)
+    np.testing.assert_array_equal(questions.forecasts(labels, weights, (0.0, 0.3))[0], p)
+
+
+def test_noise_in_expectation_and_drawn():
+    """The exact expectation equals the mean over draws of the noise, and the mean over all neighbours."""
+    rng = np.random.default_rng(5)
+    labels = np.zeros((5, 4, 3), np.uint16)
+    labels[1:3, 1:, :2], labels[3:, :2] = 1, 2
+    questions = every_pair(labels.shape)
+    exact = questions.forecasts([labels], np.ones(1), (0.4,))[0]
+    n = 4000
+    drawn = np.mean([questions.answers([labels], 0.4, rng)[0] for _ in range(n)], axis=0)
+    # 5 standard errors of each of 3,540 pairs: 1 false alarm in 500
+    assert (np.abs(drawn - exact) <= 5 * np.sqrt(np.maximum(exact * (1 - exact), 1 / n) / n)).all()
+    assert np.abs(exact - questions.outcomes(labels)).max() > 0.3  # it changes something
+    deep = np.ones((5, 5, 5), np.uint16)  # no border: no noise
+    np.testing.assert_array_equal(every_pair(deep.shape).forecasts([deep], np.ones(1), (0.4,)), 1.0)
+
+
+def test_questions_depend_on_the_depth_images_alone():
+    one, other = recording(), recording()
+    assert np.array_equal(ask(one, 1).first, ask(other, 1).first)
+    assert len(ask(one, 0, 50)) == 50
+    assert not np.array_equal(ask(one, 0).first, ask(one, 1).first)
+    with pytest.raises(InputError, match="no pause 2"):
+        ask(one, 2)
+
+
+def test_voxels_in_question_against_rays():
+    """Each voxel by the rule of the module, from the depth images, one by one."""
+    made = recording()
+    for t in (0, 1):
+        where = in_question(made, t)
+        assert where.any()
+        checked = 0
+        rng = np.random.default_rng(t)
+        for index in [*rng.permutation(np.argwhere(where))[:40], *rng.permutation(np.argwhere(~where))[:200]]:
+            readings = []
+            for frame in (made.frames[p] for p in made.pauses[: t + 1]):
+                uv, z = CAMERA.project(GRID.centre_of(index))
+                u, v = np.rint(uv).astype(int)
+                inside = 0 <= u < CAMERA.width and 0 <= v < CAMERA.height
+                depth = frame.depth[v, u] if inside else np.nan
+                height = frame.points[v, u, 2] if inside else np.nan
+                readings.append((float(z - depth), float(height)))
+            margin = 0.5 * GRID.voxel_size
+            slack = 0.01  # of the sensor's noise, which the rule adds to both margins
+            behind = [-margin <= s <= DEPTH_BEHIND - slack and h > margin + slack for s, h in readings]
+            never = [not (-margin - slack <= s <= DEPTH_BEHIND and h > margin) for s, h in readings]
+            free, not_free = readings[-1][0] < -margin - slack, not readings[-1][0] < -margin
+            if any(behind) and not_free:
+                assert where[tuple(index)], index
+                checked += 1
+            elif free or all(never):
+                assert not where[tuple(index)], index
+                checked += 1
+        assert checked > 100
+    assert REACH == 8 and (in_question(made, 1) & ~in_question(recording(1), 0)).any()

@@ -1,0 +1,145 @@
+"""Scores of forecasts against sums written out, and against the theory of proper scores by enumeration."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+from hypothesis import given, settings, strategies as st
+
+from mstfilter.errors import InputError
+from mstfilter.forecasts import ForecastTable, Recalibration, energy_score, is_negative_type
+
+FORECASTS = st.lists(st.tuples(st.sampled_from([0.0, 0.1, 0.25, 0.5, 0.9, 1.0]), st.booleans()), min_size=1)
+
+
+@settings(max_examples=60, deadline=None)
+@given(FORECASTS, FORECASTS)
+def test_a_table_against_sums(first, second):
+    p, y = np.array(first).T
+    table = ForecastTable.of(p, y)
+    assert table.brier == pytest.approx(np.mean((p - y) ** 2))
+    soft = 0.98 * p + 0.01
+    assert table.log_loss(0.02) == pytest.approx(np.mean(-np.log(np.where(y == 1, soft, 1 - soft))))
+    both = ForecastTable.pooled([table, ForecastTable.of(*np.array(second).T)])
+    direct = ForecastTable.of(*np.array(first + second).T)
+    for name in ("p", "no", "yes"):
+        np.testing.assert_allclose(getattr(both, name), getattr(direct, name))
+
+
+@pytest.mark.parametrize(
+    ("p", "y", "message"), [([1.1], [1], "forecast 0"), ([0.5], [2], "outcome 0"), ([0.5], [], "shape")]
+)
+def test_wrong_forecasts_are_named(p, y, message):
+    with pytest.raises(InputError, match=message):
+        ForecastTable.of(p, y)
+
+
+def test_theory_of_simple_forecasters():
+    """A constant, a random, and a perfectly informed forecaster of an event of probability .3."""
+    rng = np.random.default_rng(0)
+    y = rng.random(200_000) < 0.3
+    constant = ForecastTable.of(np.full(len(y), 0.3), y)
+    uninformed = ForecastTable.of(np.round(rng.random(len(y)), 3), y)
+    informed = ForecastTable.of(y.astype(float), y)
+    # 4 standard errors of the means: 1 false alarm in 15,000 for each
+    assert constant.brier == pytest.approx(0.3 * 0.7, abs=4 * 0.4 * 0.46 / np.sqrt(len(y)))
+    assert constant.log_loss() == pytest.approx(
+        -0.3 * np.log(0.3) - 0.7 * np.log(0.7), abs=4 * 0.39 / np.sqrt(len(y))
+    )
+    assert uninformed.brier == pytest.approx(1 / 3, abs=4 * 0.3 / np.sqrt(len(y)))
+    assert (informed.brier, informed.log_loss()) == (0, 0)
+    # What a random forecaster says carries nothing: after recalibration it equals the constant one.
+    entropy = constant.log_loss()
+    assert Recalibration.fit(uninformed).log_loss(uninformed) == pytest.approx(entropy, abs=1e-3)
+    assert Recalibration.fit(constant).log_loss(constant) == pytest.approx(entropy)
+    assert Recalibration.fit(informed).log_loss(informed) == pytest.approx(-np.log(0.999))  # clipped
+
+
+def test_reliability_of_a_calibrated_and_an_overconfident_forecaster():
+    rng = np.random.default_rng(1)
+    p = rng.choice(np.linspace(0, 1, 41), size=100_000)
+    honest = ForecastTable.of(p, rng.random(len(p)) < p).reliability()
+    assert honest.error < 0.01  # the standard error of a bin is .005
+    assert honest.count.sum() == len(p) and len(honest.count) == 10
+    bold = ForecastTable.of(np.round(p), rng.random(len(p)) < p).reliability()
+    assert bold.error == pytest.approx(0.25, abs=0.01)  # E|p - round(p)|
+    np.testing.assert_allclose(bold.frequency, [0.25, 0.75], atol=0.02)
+
+
+@settings(max_examples=50, deadline=None)
+@given(FORECASTS)
+def test_recalibration_is_the_best_monotone_map(pairs):
+    """No map with another level of one block has a smaller squared error, and the map never decreases."""
+    table = ForecastTable.of(*np.array(pairs).T)
+    fit = Recalibration.fit(table)
+    values = np.interp(table.p, fit.p, fit.probability)
+    assert (np.diff(values) >= -1e-12).all()
+    # Isotonic regression by its max-min formula.
+    m = np.array(
+        [
+            max(
+                min(table.yes[i : j + 1].sum() / table.count[i : j + 1].sum() for j in range(k, len(values)))
+                for i in range(k + 1)
+            )
+            for k in range(len(values))
+        ]
+    )
+    np.testing.assert_allclose(values, m, atol=1e-9)
+
+
+def test_recalibration_of_a_monotone_transform_is_the_same():
+    """Information does not depend on how sure the forecasts are, only on what they tell apart."""
+    rng = np.random.default_rng(2)
+    p = rng.integers(1, 20, 5000) / 20
+    y = rng.random(len(p)) < p
+    plain, bold = ForecastTable.of(p, y), ForecastTable.of(p**3 / (p**3 + (1 - p) ** 3), y)
+    assert bold.log_loss() > plain.log_loss() + 0.05
+    assert Recalibration.fit(bold).log_loss(bold) == pytest.approx(Recalibration.fit(plain).log_loss(plain))
+
+
+def expected_score(honest, forecast, D):
+    """Expected energy score of a forecast if the outcome is drawn from `honest`."""
+    return sum(p * energy_score(D[:, k], D, forecast) for k, p in enumerate(honest))
+
+
+def test_energy_score_of_numbers():
+    """For |x - y| on a line, the energy score is the integral of (F(x) - [x >= y])^2."""
+    rng = np.random.default_rng(3)
+    x, w, y = rng.normal(size=6), rng.dirichlet(np.ones(6)), 0.3
+    edges = np.sort(np.append(x, y))
+    F = np.array([w[x <= e].sum() for e in edges])
+    integral = ((F - (edges >= y)) ** 2)[:-1] @ np.diff(edges)
+    assert energy_score(np.abs(x - y), np.abs(x[:, None] - x), w) == pytest.approx(integral)
+
+
+def test_the_fair_score_is_unbiased():
+    """Of draws from a distribution on three points, by enumeration of all samples of size 3."""
+    D = np.abs(np.subtract.outer([0.0, 1.0, 3.0], [0.0, 1.0, 3.0]))
+    p, outcome = np.array([0.2, 0.5, 0.3]), 2
+    mean = sum(
+        np.prod(p[list(draw)]) * energy_score(D[list(draw), outcome], D[np.ix_(draw, draw)], fair=True)
+        for draw in itertools.product(range(3), repeat=3)
+    )
+    assert mean == pytest.approx(energy_score(D[:, outcome], D, p))
+    with pytest.raises(InputError, match="equal weight"):
+        energy_score([0.0, 1.0], [[0, 1], [1, 0]], [0.3, 0.7], fair=True)
+
+
+def test_negative_type_decides_whether_the_score_is_proper():
+    line = np.abs(np.subtract.outer(np.arange(4.0), np.arange(4.0)))
+    assert is_negative_type(line) and is_negative_type(np.sqrt(line)) and not is_negative_type(line**3)
+    # Path distances in the complete bipartite graph K(2, 3) are the smallest metric that is not of negative type.
+    group = np.array([0, 0, 1, 1, 1])
+    graph = np.where(np.equal.outer(group, group), 2.0, 1.0) - 2 * np.eye(5)
+    assert not is_negative_type(graph)
+    # Then a wrong forecast has the lower expected score: weight on the first group, outcomes from the second.
+    honest, wrong = np.array([0, 0, 1, 1, 1]) / 3, np.array([1, 1, 0, 0, 0]) / 2
+    assert expected_score(honest, wrong, graph) < expected_score(honest, honest, graph)
+    rng = np.random.default_rng(4)
+    for _ in range(200):  # with a distance of negative type this never happens
+        p, q = rng.dirichlet(np.ones(4)), rng.dirichlet(np.ones(4))
+        assert expected_score(p, p, np.sqrt(line)) <= expected_score(p, q, np.sqrt(line)) + 1e-12
+    with pytest.raises(InputError, match="symmetric"):
+        is_negative_type([[0, 1], [2, 0]])
