@@ -32,6 +32,7 @@ import numpy as np
 
 from mstfilter.errors import InputError
 from mstfilter.forecasts import SOFTENING, ForecastTable, Recalibration, energy_score
+from mstfilter.scene import read_only
 from mstfilter.scoring.quality import STATUSES, Status
 from mstfilter.scoring.questions import NOISE_RATES, Questions
 
@@ -40,8 +41,7 @@ N_LEVELS = 1001  # forecasts are counted to a thousandth
 #: Categories of questions. "same" and "different": the voxels belong to one true object or to two, of which the less
 #: visible one counts; "free": at least one of the voxels is free.
 CATEGORIES = (*(f"same {status}" for status in STATUSES), *(f"different {status}" for status in STATUSES), "free")
-NO_COUNTS = np.zeros((N_LEVELS, len(CATEGORIES)), np.int64)
-NO_COUNTS.flags.writeable = False
+NO_COUNTS = read_only(np.zeros((N_LEVELS, len(CATEGORIES)), np.int64))
 _SAME = np.array([name.startswith("same") for name in CATEGORIES])
 
 #: Splits of the information: name -> categories.

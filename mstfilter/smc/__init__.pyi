@@ -57,7 +57,10 @@ from mstfilter.smc.evaluation import (
     Coalescence as Coalescence,
     RunVariance as RunVariance,
     coalescence as coalescence,
+    log_score as log_score,
+    pit as pit,
     run_variance as run_variance,
+    set_energy_score as set_energy_score,
 )
 from mstfilter.smc.exact import (
     ConditionallyLinear as ConditionallyLinear,

@@ -1,25 +1,33 @@
-"""How good the estimates of a run are, from the run itself: coalescence of its paths, Monte Carlo variances.
+"""How good the estimates of a run are: Monte Carlo variances from the run itself, and scores against the truth.
 
 >>> found = run_variance(bootstrap(model, n=1000), observations, seed=0, lag=20)
 >>> found.log_evidence[-1], found.log_evidence_variance[-1] ** 0.5    # an estimate and its standard error
 >>> coalescence(keep(bootstrap(model, n=1000), observations)).ancestors     # (T,) of the last particles
 
 Both follow ancestors, so they need a filter whose particles all have known parents.
+
+If the true state is known, as in a simulation, weighted particles are a forecast of it (lower scores are better):
+
+>>> log_score(population, lambda x: -0.5 * (x - truth) ** 2)    # -log of the density of the truth
+>>> set_energy_score(population, truth)                         # needs distances only: any particles
+>>> pit(population, truth, rng)                                 # uniform over many data sets if calibrated
 """
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.special import logsumexp
 
 from mstfilter.errors import InputError, check_integer
+from mstfilter.smc.diagnostics import energy_distance
 from mstfilter.smc.filter import ParticleFilter
 from mstfilter.smc.interfaces import State
-from mstfilter.smc.population import Population
+from mstfilter.smc.population import Population, as_matrix
 from mstfilter.smc.smoothing import Record, known_parents
 from mstfilter.smc.transport_resampling import ResamplerWrapper
 
@@ -240,3 +248,46 @@ def _differ(groups: np.ndarray, weights: np.ndarray) -> float:
     """Probability that two draws by weight are of different groups."""
     masses = np.bincount(groups, weights)
     return 1.0 - float(masses @ masses)
+
+
+def log_score(population: Population, log_density: Callable[[Any], np.ndarray]) -> float:
+    """Log score ``-log sum_i w_i p(y | x_i)`` of a population in nats.
+
+    ``log_density(particles)`` gives (n,) ``log p(y | x_i)``: of an observation, of the true state under a kernel
+    around each particle, or 0 and -inf for equal and different discrete states.
+    """
+    values = np.asarray(log_density(population.particles), dtype=np.float64)
+    if values.shape != (len(population),):
+        raise InputError(f"log_density returned shape {values.shape}, expected ({len(population)},)")
+    return -float(logsumexp(values, b=population.weights))
+
+
+def set_energy_score(
+    population: Population, truth: Any, distance: Callable[[Any], np.ndarray] | None = None
+) -> float:
+    """Energy score of a population against the true particle (Gneiting and Raftery 2007); lower is better.
+
+    ``sum_i w_i d(x_i, y) - 1/2 sum_ij w_i w_j d(x_i, x_j)``: half the `energy_distance` to a population of the truth
+    alone. `truth` is one particle: an array (...), a mapping of arrays, or an object. ``distance(particles)`` is as
+    for `energy_distance`; `mstfilter.forecasts.is_negative_type` checks whether it makes the score proper.
+    """
+    particles = population.particles
+    if isinstance(particles, Mapping):
+        one: Any = {name: np.asarray(truth[name])[None] for name in particles}
+    else:
+        one = np.asarray(truth)[None] if isinstance(particles, np.ndarray) else (truth,)
+    return energy_distance(population, Population(one, np.zeros(1)), distance) / 2
+
+
+def pit(population: Population, truth: Any, rng: np.random.Generator) -> np.ndarray:
+    """Probability integral transform (d,) of the true vector under a population of vectors, coordinate by coordinate.
+
+    ``F(y-) + U (F(y) - F(y-))`` with F the weighted distribution function and U uniform. It is uniform on [0, 1] if
+    the truth is distributed as the population is (Czado, Gneiting, Held 2009); over many data sets,
+    ``scipy.stats.kstest(values, "uniform")`` tests the calibration of a filter.
+    """
+    x, y = as_matrix(population.particles), np.asarray(truth, dtype=np.float64).reshape(-1)
+    if x.shape[1] != len(y):
+        raise InputError(f"the truth has {len(y)} coordinates and particles have {x.shape[1]}")
+    below, up_to = population.weights @ (x < y), population.weights @ (x <= y)
+    return np.asarray(below + rng.random(len(y)) * (up_to - below))

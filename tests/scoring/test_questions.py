@@ -61,7 +61,10 @@ def test_forecasts_against_voxels(labels, seed):
     weights = np.random.default_rng(seed).dirichlet(np.ones(len(labels)))
     questions = every_pair(labels[0].shape)
     p = questions.forecasts(labels, weights)
-    same = [[one.flat[a] == one.flat[b] > 0 for one in labels] for a, b in zip(questions.first, questions.second, strict=True)]
+    same = [
+        [one.flat[a] == one.flat[b] > 0 for one in labels]
+        for a, b in zip(questions.first, questions.second, strict=True)
+    ]
     np.testing.assert_allclose(p, np.array(same) @ weights, atol=1e-12)
     np.testing.assert_array_equal(questions.answers(labels).T, same)
     np.testing.assert_array_equal(questions.forecasts(labels, weights, (0.0, 0.3))[0], p)
