@@ -110,4 +110,4 @@ def _fit_to_others(
 def _energy_rate(rows: Sequence[Mapping[str, Any]]) -> float:
     """The rate of noise with the lowest mean energy score over pauses t >= 1."""
     energies = np.array([row["energy_noise"] for row in rows if row["pause"] >= 1 and row.get("energy_noise")])
-    return NOISE_RATES[int(np.argmin(np.nanmean(energies, axis=0)))]
+    return NOISE_RATES[int(np.argmin(np.nansum(energies, axis=0)))]
