@@ -6,27 +6,32 @@ from pathlib import Path
 
 from mstfilter.files import read_csv
 
-#: Part, beginning of the setting, measure, title; errors above, what is selected below.
+#: Part, beginning of the setting, measure, title.
 PANELS = (
-    ("linear_gaussian", "branching", "state_error", "AR(1), 20 of 80:\nstate error"),
-    ("stochastic_volatility", "branching", "state_error", "volatility, 20 of 80:\nstate error"),
-    ("object_hmm", "branching", "state_error", "shelves, 20 of 80:\nstate error"),
-    ("miniature_mst", "plain", "state_error", "miniature MST, 200 of 200:\ndistance from the posterior"),
-    ("select: simulated", "candidates of mst", "diversity", "simulated scenes, mst, 5 of 125:\ndiversity"),
-    ("select: simulated", "candidates of mst", "best_of_n", "simulated scenes, mst, 5 of 125:\nbest quality of 5"),
+    ("linear_gaussian", "plain", "state_error", "AR(1), 100 of 100:\nstate error"),
     (
-        "select: simulated",
-        "candidates of scored",
-        "best_of_n",
-        "simulated scenes, scored, 5 of 60:\nbest quality of 5",
+        "stochastic_volatility",
+        "plain",
+        "log_evidence_variance",
+        "volatility, 100 of 100:\nvariance of the log evidence",
     ),
+    ("select: linear_gaussian", "n to n", "energy_distance", "AR(1), 100 of 100:\nenergy distance of a selection"),
+    ("select: object_hmm", "n to n", "energy_distance", "shelves, 100 of 100:\nenergy distance of a selection"),
+    ("linear_gaussian", "branching", "state_error", "AR(1), 20 of 80:\nstate error"),
+    (
+        "stochastic_volatility",
+        "branching",
+        "log_evidence_variance",
+        "volatility, 20 of 80:\nvariance of the log evidence",
+    ),
+    ("object_hmm", "branching", "state_error", "shelves, 20 of 80:\nstate error"),
     ("select: real", "", "best_of_n", "real particles, 5 of 125:\nbest quality of 5"),
 )
-COLOURS = {"higher": "#b3432b", "lower": "#1b6ca8"}
+WIDEST = 100  # per cent
 
 
 def draw(out: Path) -> None:
-    """Differences from systematic with their 95 % intervals; figure.png."""
+    """Differences from systematic in per cent of its mean, with their 95 % intervals; figure.png."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -38,19 +43,26 @@ def draw(out: Path) -> None:
         panel = [
             r for r in lines if r["part"] == part and r["setting"].startswith(setting) and r["measure"] == measure
         ]
+        base = next((float(r["mean"]) for r in panel if r["scheme"] == "systematic"), 1.0)
         found = [r for r in panel if r["minus_systematic"]]
         for k, r in enumerate(found):
-            colour = COLOURS.get(r["claim"], "0.5")
-            ax.plot([float(r["diff_low"]), float(r["diff_high"])], [k, k], color=colour)
-            ax.plot(float(r["minus_systematic"]), k, "o", color=colour, ms=4)
+            middle, low, high = (
+                100 * float(r[name]) / base for name in ("minus_systematic", "diff_low", "diff_high")
+            )
+            colour = "0.5"
+            if float(r["p_holm"]) < 0.05:
+                colour = "#b3432b" if middle > 0 else "#1b6ca8"
+            ax.plot([low, high], [k, k], color=colour)
+            ax.plot(min(middle, WIDEST), k, "o" if middle <= WIDEST else ">", color=colour, ms=4)
         ax.axvline(0, color="0.3", lw=0.8)
+        left, right = ax.get_xlim()
+        ax.set_xlim(max(left, -WIDEST), min(right, 1.05 * WIDEST))
         ax.set_yticks(range(len(found)), [r["scheme"] for r in found], fontsize=8)
         ax.invert_yaxis()
-        base = next((r["mean"] for r in panel if r["scheme"] == "systematic"), "absent")
         ax.set_title(title, fontsize=9)
-        ax.set_xlabel(f"minus that of systematic ({base})", fontsize=8)
+        ax.set_xlabel(f"difference from systematic ({base:.3g}) in per cent", fontsize=8)
     fig.suptitle(
-        "red: higher, blue: lower than systematic (Holm over the schemes, 5 %); grey: nothing can be claimed"
+        "red: higher, blue: lower than systematic (Holm over the schemes, 5 %); grey: no difference can be claimed"
     )
     fig.savefig(out / "figure.png", dpi=90)
     plt.close(fig)

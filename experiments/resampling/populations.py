@@ -1,9 +1,9 @@
-"""Weighted candidates to resample: of the four models, of MST on real particles and on simulated scenes."""
+"""Weighted candidates to resample: of the four models, and of MST on real particles."""
 
 from __future__ import annotations
 
 import os
-import tempfile
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,38 +11,53 @@ from typing import Any
 
 import numpy as np
 from schemes import Names, Table, schemes
-from worlds import World, branching
+from worlds import World
 
-import mstfilter
 from mstfilter.errors import InputError
-from mstfilter.fusion import Agreement, NoFreeSpace, SameSegmentation, WeightedCoverage
+from mstfilter.fusion import NoFreeSpace, SameSegmentation, WeightedCoverage
 from mstfilter.presets import REGISTRY, load_config
 from mstfilter.scene import Camera, Clip, Frame, Hypothesis, VoxelGrid
 from mstfilter.scoring import weighted_coverage
-from mstfilter.simulation import scene_family, simulate_recording
-from mstfilter.smc import Population, Resampler, Systematic, WeightResampler
+from mstfilter.smc import ParticleFilter, Population, Resampler, Systematic, WeightResampler, energy_distance
 
 
 @dataclass(frozen=True, eq=False)
 class Candidates:
-    """m candidates: log weights (m,), similarities (m, m), classes of equals (m,), quality against the truth (m,)."""
+    """m weighted candidates, and the schemes that are compared on them.
 
-    log_weights: np.ndarray
-    similarity: np.ndarray
-    classes: np.ndarray
+    Parameters
+    ----------
+    population : Population
+        Of numbers, or of the row numbers of m objects.
+    arms : mapping
+        Name -> resampler.
+    alike : (m, m)
+        Similarities.
+    distance : callable or None
+        For `energy_distance`: for objects 1 - similarity, for numbers None.
+    quality : (m,) or None
+        Against the truth.
+    """
+
+    population: Population
+    arms: dict[str, Resampler]
+    alike: np.ndarray
+    distance: Callable[[Any], np.ndarray] | None
     quality: np.ndarray | None = None
 
     @classmethod
     def of(cls, population: Population, similarity: Any, equivalence: Any, quality: Any = None) -> Candidates:
-        """Look at the particles once."""
+        """Compare the particles once."""
         found = population.realised()
-        matrix = np.asarray(similarity.matrix(found.particles))
-        scores = None if quality is None else np.array([quality(p) for p in found.particles])
-        return cls(found.log_weights, (matrix + matrix.T) / 2, equivalence.classes(found.particles), scores)
-
-    def resamplers(self) -> dict[str, Resampler]:
-        """All schemes, on row numbers."""
-        return schemes(Table(self.similarity), Names(self.classes))
+        particles, log_weights = found.particles, found.log_weights
+        matrix = np.asarray(similarity.matrix(particles))
+        alike = (matrix + matrix.T) / 2
+        if isinstance(particles, np.ndarray):
+            return cls(Population(particles, log_weights), schemes(similarity, equivalence), alike, None)
+        arms = schemes(Table(alike), Names(equivalence.classes(particles)))
+        scores = None if quality is None else np.array([quality(p) for p in particles])
+        rows = Population(np.arange(len(found)), log_weights)
+        return cls(rows, arms, alike, lambda rows: 1 - alike[np.ix_(rows, rows)], scores)
 
 
 class Catch(WeightResampler):
@@ -61,12 +76,12 @@ class Catch(WeightResampler):
         return super().resample(rng, population, n)
 
 
-def of_world(world: World, n: int, seed: int) -> Candidates:
-    """Candidates of the last step of the branching filter; where the run is lost, of the last before."""
+def of_world(world: World, filter: Callable[..., ParticleFilter], n: int, seed: int) -> Candidates | None:
+    """The population that a filter resamples last; None if it resamples none."""
     catch = Catch()
-    with suppress(InputError):
-        branching(world, catch, n).run(world.data(seed).observations, seed)
-    return Candidates.of(catch.seen[0], world.similarity, world.equivalence)
+    with suppress(InputError):  # the run is lost
+        filter(world, catch, n).run(world.data(seed).observations, seed)
+    return Candidates.of(catch.seen[0], world.similarity, world.equivalence) if catch.seen else None
 
 
 def real(eta: int = 5) -> Candidates | None:
@@ -100,61 +115,34 @@ def real(eta: int = 5) -> Candidates | None:
     return Candidates.of(fused, WeightedCoverage(), SameSegmentation(), quality)
 
 
-#: Filters whose candidates of simulated scenes are kept. `scored` is `mst` with more scored candidates.
-SIMULATED = ("mst", "scored", "paper")
-
-
-def simulated(seed: int, small: bool = False) -> dict[str, Candidates]:
-    """Candidates of the last step of three filters on a simulated recording of the family `demo`, by filter.
-
-    A small recording has two objects, one push and a quarter of the pixels, and gives 25 candidates or less.
-    """
-    family = scene_family("demo")
-    if small:
-        size = {"n_objects_min": 2, "n_objects_max": 2, "n_twins": 0, "n_actions": 1, "min_moved": 1}
-        family = replace(family, **size, n_candidates=6, width=160, height=120, supersample=False)
-    out = {}
-    with tempfile.TemporaryDirectory() as folder:
-        recording = simulate_recording(family, seed, Path(folder) / "recording")
-        clips = recording.clips()
-        truth = recording.truth(clips[-1].index)
-        for name in SIMULATED:
-            filter = mstfilter.preset("mst" if name == "scored" else name, *(["update.eta=1"] if small else []))
-            if name == "scored":
-                n_scored = 12 if small else 60
-                filter = replace(filter, update=replace(filter.update, evidence=(Agreement(),), n_scored=n_scored))
-            catch = Catch()
-            replace(filter, resampler=catch).run(clips, 0)
-            out[name] = Candidates.of(
-                catch.seen[0], WeightedCoverage(2), SameSegmentation(), lambda h: weighted_coverage(h.labels, truth)
-            )
-    return out
-
-
 def choose(candidates: Candidates, n: int, draws: int, seed: int) -> dict[str, dict[str, float]]:
-    """Measures of each scheme over repeated draws of n; draw k has the same seed for all schemes."""
-    m = len(candidates.log_weights)
-    population = Population(np.arange(m), candidates.log_weights)
-    expected, out = n * population.weights, {}
-    for name, scheme in candidates.resamplers().items():
-        counts, mass = np.zeros((draws, m)), np.zeros((draws, m))
-        diversity, best, average = np.zeros(draws), np.zeros(draws), np.zeros(draws)
+    """Measures of each scheme, means over draws of n; draw k has the same seed for all schemes.
+
+    A scheme that makes new particles has no copies to count: only its energy distance is measured.
+    """
+    population, quality, out = candidates.population, candidates.quality, {}
+    m, expected = len(population), n * population.weights
+    for name, scheme in candidates.arms.items():
+        found: dict[str, list[float]] = {}
+        counts = np.zeros((draws, m))
         for k in range(draws):
             chosen = scheme.resample(np.random.default_rng([seed, k]), population, n)
-            index = chosen.parents["ancestor"]
-            counts[k] = np.bincount(index, minlength=m)
-            mass[k] = n * np.bincount(index, chosen.weights, minlength=m)
-            upper = np.triu_indices(len(index), 1)
-            alike = candidates.similarity[np.ix_(index, index)][upper]
-            diversity[k] = 1 - alike.mean() if len(alike) else 0.0
-            if candidates.quality is not None:
-                best[k], average[k] = candidates.quality[index].max(), chosen.weights @ candidates.quality[index]
-        out[name] = {
-            "offspring_variance": float(counts.var(axis=0, ddof=1).sum() / n),
-            "mass_error": float(((mass - expected) ** 2).mean(axis=0).sum() / n),
-            "unique_ancestors": float((counts > 0).sum(axis=1).mean()),
-            "diversity": float(diversity.mean()),
-        }
-        if candidates.quality is not None:
-            out[name] |= {"best_of_n": float(best.mean()), "mean_quality": float(average.mean())}
+            measured = {"energy_distance": energy_distance(population, chosen, candidates.distance)}
+            if "kdpp" in chosen.notes:
+                measured["fallback"] = chosen.notes["kdpp"].endswith("fallback")
+            if "ancestor" in chosen.parents:
+                index = chosen.parents["ancestor"]
+                counts[k] = np.bincount(index, minlength=m)
+                mass = n * np.bincount(index, chosen.weights, minlength=m)
+                alike = candidates.alike[np.ix_(index, index)][np.triu_indices(len(index), 1)]
+                measured["mass_error"] = float(((mass - expected) ** 2).sum() / n)
+                measured["unique_ancestors"] = float((counts[k] > 0).sum())
+                measured["diversity"] = 1 - alike.mean() if len(alike) else 0.0
+                if quality is not None:
+                    measured |= {"best_of_n": quality[index].max(), "mean_quality": chosen.weights @ quality[index]}
+            for measure, value in measured.items():
+                found.setdefault(measure, []).append(value)
+        out[name] = {measure: float(np.mean(values)) for measure, values in found.items()}
+        if "mass_error" in found:
+            out[name]["offspring_variance"] = float(counts.var(axis=0, ddof=1).sum() / n)
     return out

@@ -1,7 +1,4 @@
-"""The schemes that are compared: every registered resampler that selects particles.
-
-`ensemble_transform` makes new particles, which objects and discrete states do not allow.
-"""
+"""The schemes that are compared: every registered resampler."""
 
 from __future__ import annotations
 
@@ -14,8 +11,10 @@ from mstfilter.smc import (
     Chopthin,
     ClusterStratified,
     Coalesced,
+    EnsembleTransform,
     Equivalence,
     FearnheadClifford,
+    Gaussian,
     GreedyDiverse,
     KDpp,
     KeepWeights,
@@ -39,8 +38,8 @@ BASE = "systematic"  # what all others are compared with
 
 
 def schemes(similarity: Similarity, equivalence: Equivalence) -> dict[str, Resampler]:
-    """Schemes by registered name; wrappers around their default scheme."""
-    return {
+    """Schemes by registered name; wrappers around their default scheme. Two of them need numbers (`Gaussian`)."""
+    for_all = {
         BASE: Systematic(),
         "ssp": Ssp(),
         "shuffled": Shuffled(),
@@ -51,7 +50,6 @@ def schemes(similarity: Similarity, equivalence: Equivalence) -> dict[str, Resam
         "rejection": Rejection(),
         "metropolis": Metropolis(),
         "chopthin": Chopthin(),
-        "sorted": Sorted(),
         "tempered": Tempered(),
         "fearnhead_clifford": FearnheadClifford(),
         "coalesced": Coalesced(equivalence=equivalence),
@@ -61,6 +59,8 @@ def schemes(similarity: Similarity, equivalence: Equivalence) -> dict[str, Resam
         "largest_weights": LargestWeights(),
         "keep_weights": KeepWeights(),
     }
+    for_numbers = {"sorted": Sorted(), "ensemble_transform": EnsembleTransform()}
+    return for_all | (for_numbers if isinstance(similarity, Gaussian) else {})
 
 
 @dataclass(frozen=True, eq=False)

@@ -48,7 +48,7 @@ class Data:
 
 @dataclass(frozen=True, eq=False)
 class World:
-    """A model: its bootstrap filter, its data by seed, the estimate (...) that is compared with the answers.
+    """A model: its bootstrap filter, its data by seed, and the estimate () or (S,) to compare with the answers.
 
     `sizes` are the particles of the plain and of the branching filter.
     """
@@ -59,11 +59,6 @@ class World:
     similarity: Similarity
     equivalence: Equivalence
     sizes: tuple[int, int] = (100, 20)
-
-    def error(self, population: Population, answer: np.ndarray) -> float:
-        """Absolute error of a mean; total variation of a law."""
-        difference = np.abs(self.estimate(population) - answer)
-        return float(difference if difference.ndim == 0 else 0.5 * difference.sum())
 
 
 def plain(world: World, resampler: Resampler, n: int) -> ParticleFilter:
