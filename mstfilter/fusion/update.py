@@ -7,7 +7,7 @@
 3. Every sample i and every predicted hypothesis j make `eta` candidates by crossover. With weights w_i and w_j of the
    parents and lambda = `quality_exponent`, the weight of a candidate,
 
-       log w = log w_i + log w_j + lambda log Q_j,
+       log w = log w_i + log w_j + lambda log Q_j     (section IV-E),
 
    depends on its parents only. So candidates are resampled first, and only those that are chosen are built. `claims`
    says which voxels a prediction may add to a sample when they are built.

@@ -4,9 +4,10 @@
 >>> scene_family("demo").n_frames, scene_family("table").grid().shape
 (15, (100, 100, 50))
 
-A family is a frozen `SceneFamily`; `dataclasses.replace` makes variants. The studies use `s1`, `s2` and `s3`: 5, 9
-and 15 - 20 objects with the same camera, sensor, textures and contacts. `catalogue` separates scenes for tuning from
-scenes for reporting; in `s1` - `s3` the seed decides.
+A family is a frozen `SceneFamily`; `dataclasses.replace` makes variants for `simulate_recording`. Entries of
+`SCENE_FAMILIES` have a name on the command line and in studies. New kinds of objects are added to `_MAKERS` in
+`shapes`. The studies use `s1`, `s2` and `s3`: 5, 9 and 15 - 20 objects with the same camera, sensor, textures and
+contacts. `catalogue` separates scenes for tuning from scenes for reporting; in `s1` - `s3` the seed decides.
 """
 
 from __future__ import annotations

@@ -109,7 +109,8 @@ class Update(Component):
         """Any number of particles, from the predicted and the proposed ones; at least one of the two is given.
 
         `predicted` are the moved particles, None at the first step of a filter that starts from its proposal.
-        `proposed` are new particles, None if the filter has no proposal.
+        `proposed` are new particles, None if the filter has no proposal. The result has the ``parents`` of the
+        particles that it was made from (see `union`).
         """
 
 

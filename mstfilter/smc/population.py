@@ -198,8 +198,9 @@ class Population:
         Natural log, unnormalised. -inf is a weight of 0; NaN and +inf raise InputError. Default: all 0.
     parents : mapping
         ``"previous"`` and ``"proposed"``: (n,) integer index of the parent in the previous population or among the
-        proposed particles, -1 for none. ``"mate"``: the second parent of a particle that two previous ones made.
-        A resampler adds ``"ancestor"``: the index before the resampling.
+        proposed particles, -1 for none; the filter numbers both, an update takes the numbers over. ``"mate"``: the
+        second parent of a particle that two previous ones made. A resampler adds ``"ancestor"``, the index before the
+        resampling, which is in `Info.ancestors` after the step.
     notes : mapping
         Values that a component records: plain numbers, strings and lists.
     """

@@ -4,7 +4,7 @@ All random numbers of a run are drawn from streams named by their use: (seed, st
 workers, the order of work, and removing a component therefore change no other stream.
 
 >>> from mstfilter.smc import Key, child
->>> rng = Key(seed=1).child(3, "transition").generator()     # step 3, slot "transition"
+>>> rng = Key(seed=1).child("step", 3, "transition").generator()     # as `ParticleFilter` does
 >>> child(rng, "object", 7).random() == child(rng, "object", 7).random()    # does not consume `rng`
 True
 

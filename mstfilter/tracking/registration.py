@@ -60,7 +60,7 @@ class Surface:
 class RegistrationResult:
     """Result of a registration."""
 
-    T: np.ndarray  #: (4, 4) motion
+    T: np.ndarray  #: (4, 4) motion of the source
     rms: float  #: root mean square distance from each moved source point to its nearest target point, metres
     overlap: float  #: fraction of the moved source points with a target point within the reach
     #: Objective of the method (small_gicp), or root mean square distance of the inliers in metres (open3d).
@@ -95,7 +95,8 @@ class Registration(ABC):
     def register(self, source: Surface, target: Surface, init: np.ndarray, reach: float) -> RegistrationResult | None:
         """Align source to target; None if the result is not finite.
 
-        `init` (4, 4) is the initial motion, `reach` the largest distance of a correspondence in metres.
+        `init` (4, 4) is the initial motion of the source in world metres, `reach` the largest distance of a
+        correspondence in metres.
         """
 
 

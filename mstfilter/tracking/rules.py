@@ -36,7 +36,7 @@ from mstfilter.tracking.segments import Track
 _MIN_OVERLAP = 0.3  # fraction of the moved surface that has a correspondence after registration
 _MIN_PAIRS = 6  # flow tracks or SIFT matches of a motion
 _MAX_SIFT = 3  # SIFT motions of a segment
-_REST_BONUS = 0.15  # in S; a motion must be better than rest by this much
+_REST_BONUS = 0.15  # in S of `MotionResidual`; a motion must be better than rest by this much
 _SEARCH_RADIUS, _SEARCH_STEP = 0.14, 0.01  # metres
 
 
@@ -47,7 +47,7 @@ class Candidate:
     kind: str  #: "identity", "flow", "icp", "sift" or "search"
     T: RigidTransform  #: world metres
     support: int = 0  #: number of matches or points that determine it
-    #: Criterion of the rule, for SIFT and ICP the root mean square residual in metres; lower is better.
+    #: Criterion of the rule, lower is better: S of `MotionResidual`, or a root mean square residual in metres.
     score: float = 0.0
     registration: RegistrationResult | None = None  #: result of the registration that computed it, if any
 
