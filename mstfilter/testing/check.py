@@ -64,6 +64,11 @@ _CONTRACTS: dict[type, type[Contract]] = {
 }
 
 
+# "unraisableexception" collects garbage several times per session, which takes longer than most contracts.
+_UNUSED_PLUGINS = ("cacheprovider", "doctest", "faulthandler", "junitxml", "logging", "pastebin", "stepwise")
+_UNUSED_PLUGINS += ("terminal", "threadexception", "unittest", "unraisableexception", "warnings")
+
+
 @dataclass(frozen=True)
 class CheckResult:
     """The outcome of one property."""
@@ -113,7 +118,7 @@ def run_contract(
         path = Path(folder, "test_component.py")
         path.touch()  # pytest needs a file to collect; the plugin replaces its content
         options = ["--capture=no", "--assert=plain", "--noconftest", f"--rootdir={folder}", f"-c{os.devnull}"]
-        disabled = [f"-pno:{name}" for name in ("cacheprovider", "faulthandler", "terminal", "warnings")]
+        disabled = [f"-pno:{name}" for name in _UNUSED_PLUGINS]
         status = pytest.main([*options, *disabled, str(path)], plugins=[plugin])
     if status not in (pytest.ExitCode.OK, pytest.ExitCode.TESTS_FAILED):
         raise RuntimeError(f"pytest ended with status {status!r}")
@@ -146,6 +151,10 @@ class _Plugin:
         module.obj = ModuleType(module_path.stem)
         setattr(module.obj, self.tests.__name__, self.tests)
         return module
+
+    def pytest_itemcollected(self, item: Any) -> None:
+        """Failures are reported by their message; pytest would format the source of each."""
+        item.repr_failure = lambda excinfo, style=None: str(excinfo.value)
 
     def pytest_runtest_setup(self, item: Any) -> None:
         """Skip the test if one failed that it relies on."""
