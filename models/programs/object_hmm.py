@@ -8,6 +8,8 @@ counts the boxes and misses each with probability 0.2. A particle is the shelf: 
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 from scipy import stats
 
@@ -15,6 +17,12 @@ from mstfilter.smc import Categorical, Program, observe, per_particle, sample
 
 COLOURS = ("red", "green", "blue")
 SEEN = 0.8
+
+
+@cache
+def counts_of(n):
+    """The law of the count of `n` boxes; scipy.stats takes long to make one."""
+    return stats.binom(n, SEEN)
 
 
 @per_particle
@@ -28,7 +36,7 @@ def model(previous, count):
     elif choice == 2 and shelf:
         removed = int(sample("removed", Categorical(np.ones(len(shelf)))))
         shelf = shelf[:removed] + shelf[removed + 1 :]
-    observe("count", stats.binom(len(shelf), SEEN), count)
+    observe("count", counts_of(len(shelf)), count)
     return {"shelf": shelf}
 
 

@@ -65,8 +65,20 @@ _CONTRACTS: dict[type, type[Contract]] = {
 
 
 # "unraisableexception" collects garbage several times per session, which takes longer than most contracts.
-_UNUSED_PLUGINS = ("cacheprovider", "doctest", "faulthandler", "junitxml", "logging", "pastebin", "stepwise")
-_UNUSED_PLUGINS += ("terminal", "threadexception", "unittest", "unraisableexception", "warnings")
+_UNUSED_PLUGINS = [
+    "cacheprovider",
+    "doctest",
+    "faulthandler",
+    "junitxml",
+    "logging",
+    "pastebin",
+    "stepwise",
+    "terminal",
+    "threadexception",
+    "unittest",
+    "unraisableexception",
+    "warnings",
+]
 
 
 @dataclass(frozen=True)

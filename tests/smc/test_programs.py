@@ -101,10 +101,10 @@ def test_a_guide_gives_the_draws_of_the_guided_filter():
     ids=["bootstrap", "guided", "auxiliary", "auxiliary guided", "resample-move"],
 )
 def test_filters_of_a_program_agree_with_kalman(make, trigger):
-    """Within 4 standard errors (false alarm 6e-5 a case); 2 % of bias would be seen."""
-    mean, standard, _ = mean_ratio(make(Program(ar1), trigger), YS, EXACT, range(500))
+    """Within 4 standard errors (false alarm 6e-5 a case); 3.5 % of bias would be seen."""
+    mean, standard, _ = mean_ratio(make(Program(ar1), trigger), YS, EXACT, range(220))
     assert abs(mean - 1) < 4 * standard
-    assert standard < 0.005
+    assert standard < 0.008
 
 
 @per_particle
@@ -119,7 +119,7 @@ def mild_guide(previous, y):
 
 
 def test_a_program_that_is_run_particle_by_particle():
-    """Within 4 standard errors (false alarm 6e-5 a case); 2 % of bias would be seen."""
+    """Within 4 standard errors (false alarm 6e-5 a case); 3.5 % of bias would be seen."""
     cov = np.array([[1.0, RHO], [RHO, RHO**2 + SIGMA**2]]) + 4.0 * np.eye(2)
     exact_mild = float(stats.multivariate_normal(np.zeros(2), cov).logpdf(YS[:2]))
     for make in (
@@ -129,9 +129,9 @@ def test_a_program_that_is_run_particle_by_particle():
         lambda p, guide: p.resample_move(40, steps=1),
     ):
         filter = make(Program(mild_one_by_one), per_particle(mild_guide))
-        mean, standard, _ = mean_ratio(filter, YS[:2], exact_mild, range(180))
+        mean, standard, _ = mean_ratio(filter, YS[:2], exact_mild, range(80))
         assert abs(mean - 1) < 4 * standard
-        assert standard < 0.005
+        assert standard < 0.008
     state, _ = Program(ar1_one_by_one).bootstrap(5).run(YS, 0)
     assert np.ndim(state.population.particles[0]["x"]) == 0
     with pytest.raises(InputError, match="both be per_particle"):
@@ -203,9 +203,9 @@ def test_switch_agrees_with_enumeration(kind):
         "resample-move": program.resample_move(3000, steps=2),
     }[kind]
     exact, calm = exact_regimes(TRACK)
-    mean, standard, _ = mean_ratio(filter, TRACK, exact, range(200))
+    mean, standard, _ = mean_ratio(filter, TRACK, exact, range(90))
     assert abs(mean - 1) < 4 * standard
-    assert standard < 0.005
+    assert standard < 0.008
     shares = []
     for seed in range(60):
         population = filter.run(TRACK, seed)[0].population
@@ -222,9 +222,9 @@ def test_a_hidden_chain_as_a_program():
         observe("y", Categorical(EMIT[k]), y)
 
     for filter in (Program(chain).bootstrap(1000), Program(chain).resample_move(1000)):
-        mean, standard, _ = mean_ratio(filter, SYMBOLS, forward()[1], range(400))
+        mean, standard, _ = mean_ratio(filter, SYMBOLS, forward()[1], range(180))
         assert abs(mean - 1) < 4 * standard
-        assert standard < 0.005
+        assert standard < 0.008
 
 
 @per_particle
@@ -246,8 +246,8 @@ def test_changing_structure_agrees_with_enumeration():
         n = np.cumsum(path)
         total += np.prod([0.3 if b else 0.7 for b in path]) * stats.poisson.pmf(counts, 0.5 + 2.0 * n).prod()
     for filter, seeds, bound in (
-        (Program(births).bootstrap(50), 400, 0.005),
-        (Program(births).resample_move(50, trigger=Always()), 120, 0.01),  # slow: a run a particle and move
+        (Program(births).bootstrap(50), 180, 0.008),
+        (Program(births).resample_move(50, trigger=Always()), 54, 0.015),  # slow: a run a particle and move
     ):
         mean, standard, _ = mean_ratio(filter, counts, np.log(total), range(seeds))
         assert abs(mean - 1) < 4 * standard

@@ -1,8 +1,9 @@
 """Every proper resampling scheme leaves the evidence unbiased, whatever triggers it.
 
 Mean of L_hat / L within 4 standard errors of 1 (false alarm 6e-5 a case, 3e-3 for the file), and a standard error
-below 0.5 %: a bias of 2 % would be seen. The numbers of particles and seeds keep the standard error at least five of
-its own standard deviations below that limit (false alarm 3e-7 a case), which are 1.3 to 4.5 % of it.
+below 0.8 %: a bias of 3.5 % would be seen (two selections from one stream: 11 %, test_stream_names.py). The numbers
+of particles and seeds keep the standard error at least five of its own standard deviations below that limit (false
+alarm 3e-7 a case), which are 2 to 6.8 % of it.
 """
 
 from __future__ import annotations
@@ -63,20 +64,20 @@ def proper(name):
 def is_unbiased(filter, ys, exact, seeds):
     mean, standard, _ = mean_ratio(filter, ys, exact, range(seeds))
     assert abs(mean - 1) < 4 * standard
-    assert standard < 0.005
+    assert standard < 0.008
 
 
 @TRIGGERS
 @pytest.mark.parametrize("name", [*PLAIN, "residual, stratified", "residual, systematic"])
 def test_kalman(name, trigger):
-    is_unbiased(bootstrap(AR1, 3000, proper(name), trigger), YS, kalman_ar1(YS)[1], 300)
+    is_unbiased(bootstrap(AR1, 3000, proper(name), trigger), YS, kalman_ar1(YS)[1], 135)
 
 
 @TRIGGERS
 @pytest.mark.parametrize("name", [name for name in PLAIN if name != "sorted"])
 def test_hidden_chain_of_objects(name, trigger):
     """The same with particles that are objects."""
-    is_unbiased(bootstrap(hmm("objects"), 170, proper(name), trigger), SYMBOLS[:5], forward(SYMBOLS[:5])[1], 900)
+    is_unbiased(bootstrap(hmm("objects"), 170, proper(name), trigger), SYMBOLS[:5], forward(SYMBOLS[:5])[1], 400)
 
 
 # --- schemes that see the particles, or do not duplicate ----------------------------------------------------------
@@ -103,7 +104,7 @@ def test_kalman_where_schemes_choose(name):
     assert [info.resampled for info in infos] == [False, True, True]
     if name == "kdpp":
         assert "fallback" not in infos[-1].notes["resampler"]["kdpp"]
-    is_unbiased(filter, FAR, exact_mild(FAR), 2500 if name == "kdpp" else 1500)
+    is_unbiased(filter, FAR, exact_mild(FAR), 1110 if name == "kdpp" else 670)
 
 
 @pytest.mark.parametrize("trigger", [Always(), EssBelow(0.95)], ids=lambda t: type(t).__name__)
@@ -111,7 +112,7 @@ def test_kalman_clusters_of_as_many(trigger):
     """n of n: clusters duplicate inside."""
     filter = bootstrap(MILD, 40, SEEING["clusters"], trigger)
     assert any(info.resampled for info in filter.run(FAR, 0)[1])
-    is_unbiased(filter, FAR, exact_mild(FAR), 900)
+    is_unbiased(filter, FAR, exact_mild(FAR), 400)
 
 
 @dataclass(frozen=True)
@@ -131,4 +132,4 @@ def test_hidden_chain_where_clusters_choose():
         transition=Branching(bootstrap(model, 1).transition, 4),
         resample="after",
     )
-    is_unbiased(filter, SYMBOLS[:3], forward(SYMBOLS[:3])[1], 3000)
+    is_unbiased(filter, SYMBOLS[:3], forward(SYMBOLS[:3])[1], 1330)
