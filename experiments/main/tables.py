@@ -3,12 +3,12 @@
     python experiments/main/tables.py STUDY experiments/main/results [--reference "true masks: mst"] [--pooled]
 
 Files are named after the study: NAME.csv (one row per family and arm: means over scenes of pauses t >= 1),
-NAME_scenes.csv (the primary endpoint of each scene) and NAME_differences.csv (reference minus arm in the primary
-endpoint; unadjusted t interval, studentised bootstrap, sign-flip p, p after Holm over families and arms), which is
-also printed as a table for the README. NAME_cases.csv has the quality of visible, hidden and never seen objects; a
-case is one object at one pause t >= 1 (mean over cases, not over scenes). NAME_time.csv has core seconds of a step
-t >= 1: of the first filter seed, in which an arm may be the first to process a recording, and of later seeds, which
-use shared work on disk. With --pooled, differences are over the scenes of all families together:
+NAME_scenes.csv (the primary endpoints of each scene) and NAME_differences.csv (reference minus arm in the primary
+endpoints; unadjusted t interval, studentised bootstrap, sign-flip p, p after Holm over endpoints, families and arms),
+which are also printed as tables for the README. NAME_cases.csv has the quality of visible, hidden and never seen
+objects; a case is one object at one pause t >= 1 (mean over cases, not over scenes). NAME_time.csv has core seconds
+of a step t >= 1: of the first filter seed, in which an arm may be the first to process a recording, and of later
+seeds, which use shared work on disk. With --pooled, differences are over the scenes of all families together:
 NAME_pooled_differences.csv.
 """
 
@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from mstfilter.files import write_csv
-from mstfilter.study import ENDPOINT, StudyFolder, Summary, cost_columns, summarise
+from mstfilter.study import ENDPOINTS, StudyFolder, Summary, cost_columns, summarise
 
 Row = Mapping[str, Any]
 
@@ -44,20 +44,35 @@ METRICS = (
     "missed",
     "invented",
     "diversity",
+    "quality_estimate",
+    "volume_missed",
+    "volume_invented",
+    "information",
+    "information_slope",
+    "information_same",
+    "information_different",
+    "information_free",
+    "information_visible",
+    "information_hidden",
     "brier",
+    "log_loss",
+    "calibration_error",
+    "energy",
+    "energy_floor",
     "core_seconds",
     "peak_mb",
 )
 
 
 def by_scene(found: Summary) -> list[dict[str, str]]:
-    """The primary endpoint, one row per scene and arm."""
-    return [
-        {"family": f.family, "scene": scene, "arm": f.arm, ENDPOINT: f"{value:.4f}"}
-        for f in found.metrics
-        if f.name == ENDPOINT
-        for scene, value in f.by_scene.items()
-    ]
+    """The primary endpoints, one row per scene and arm."""
+    rows: dict[tuple[str, str, str], dict[str, str]] = {}
+    for f in found.metrics:
+        if f.name in ENDPOINTS:
+            for scene, value in f.by_scene.items():
+                row = rows.setdefault((f.family, scene, f.arm), {"family": f.family, "scene": scene, "arm": f.arm})
+                row[f.name] = f"{value:.4f}"
+    return list(rows.values())
 
 
 def means(found: Summary) -> list[dict[str, str]]:
@@ -72,12 +87,19 @@ def means(found: Summary) -> list[dict[str, str]]:
 
 
 def differences(found: Summary) -> list[dict[str, str]]:
-    """One row per family and arm that is compared with the reference."""
+    """One row per endpoint, family and arm that is compared with the reference."""
     lines = []
-    for c in found.compared():
+    for c in [c for name in ENDPOINTS for c in found.compared(name)]:
         d = c.difference
-        if not c.reported_only:
-            row = {"family": c.family, "reference": c.first, "arm": c.second, "n": str(d.n), "mean": f"{d.mean:.4f}"}
+        if not c.reported_only and d.n:
+            row = {
+                "endpoint": c.metric,
+                "family": c.family,
+                "reference": c.first,
+                "arm": c.second,
+                "n": str(d.n),
+                "mean": f"{d.mean:.4f}",
+            }
             row |= {name: f"{getattr(d, name):.4f}" for name in ("low", "high", "low_bootstrap", "high_bootstrap")}
             lines.append(row | {"p": f"{d.p:.4g}", "p_holm": f"{d.p_holm:.4g}"})
     return lines
@@ -122,7 +144,7 @@ def grouped(rows: Sequence[Row]) -> dict[tuple[str, str], list[Row]]:
 
 
 def markdown(rows: list[dict[str, str]]) -> str:
-    """A markdown table: one row per arm, one column per family."""
+    """A markdown table of one endpoint: one row per arm, one column per family."""
     families, arms = (list(dict.fromkeys(r[key] for r in rows)) for key in ("family", "arm"))
     cell = {
         (r["family"], r["arm"]): f"{float(r['mean']):+.3f} [{float(r['low']):+.3f}, {float(r['high']):+.3f}]"
@@ -159,7 +181,8 @@ def main(study: Path, out: Path, reference: str, pooled: bool) -> None:
     tables[f"{name}_differences"] = differences(found)
     for table, lines in tables.items():
         write_csv(out / f"{table}.csv", lines)
-    print(markdown(tables[f"{name}_differences"]))
+    for endpoint in ENDPOINTS:
+        print(f"{endpoint}\n\n{markdown([r for r in tables[f'{name}_differences'] if r['endpoint'] == endpoint])}")
 
 
 if __name__ == "__main__":

@@ -23,10 +23,10 @@ With `tolerance` (in voxels or pixels), outcomes that differ by much less than i
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 
@@ -45,6 +45,8 @@ from mstfilter.fusion.similarity import CommonRefinement, common_refinement
 from mstfilter.scene import Camera, Hypothesis, VoxelGrid, project, render_hypothesis
 from mstfilter.scoring import least_loss
 from mstfilter.smc import Population, first_seen
+
+Action = TypeVar("Action")
 
 _DEPTH_STEP = 0.01  # voxels: depths are rounded to this step before they are compared
 
@@ -315,6 +317,29 @@ class Belief:
             same_outcome = sum(v * near[row, other] for v, other in zip(mass, refined.objects, strict=True))
             information -= w * np.log(same_outcome)
         return np.maximum(information, 0.0)[refined.cells]
+
+    def most_informative(
+        self, actions: Sequence[Action], information: Callable[[Action], float], at_least: float = 1e-9
+    ) -> Action | None:
+        """The action of largest expected information in nats, the first of equal ones.
+
+        None if no action has `at_least` nats: the hypotheses agree on all outcomes, so none can be preferred.
+        """
+        values = [information(action) for action in actions]
+        best = int(np.argmax(values)) if values else 0
+        return actions[best] if values and values[best] >= at_least else None
+
+    def best_push(self, tolerance: float = 0.0, where: Any = None, at_least: float = 1e-9) -> np.ndarray | None:
+        """Voxel (3,) at which a push has the largest information (`push_map`).
+
+        `where` is a region that the finger can reach; default: all voxels. None if no push has `at_least` nats.
+        """
+        information = self.push_map(tolerance).ravel()
+        reachable = np.arange(information.size) if where is None else _flat_region(self.grid, where)
+        if not len(reachable) or information[reachable].max() < at_least:
+            return None
+        best = reachable[int(np.argmax(information[reachable]))]
+        return np.array(np.unravel_index(best, self.grid.shape))
 
     # Functions of the user ------------------------------------------------------------------------------------
 

@@ -5,6 +5,7 @@ from mstfilter.simulation.families import (
     SceneFamily as SceneFamily,
     scene_family as scene_family,
 )
+from mstfilter.simulation.push_loop import LoopState as LoopState, PushLoop as PushLoop
 from mstfilter.simulation.recorder import (
     POSE_TOLERANCE as POSE_TOLERANCE,
     SimulatedScene as SimulatedScene,

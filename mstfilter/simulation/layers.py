@@ -68,6 +68,16 @@ class Stage:
         self._data.qpos[index] = world.data.qpos[index]
         self._mj.mj_kinematics(world.model, self._data)
 
+    def save(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The rendered poses, for `restore`."""
+        return self.poses.copy(), self._finger.copy(), self._data.qpos.copy()
+
+    def restore(self, saved: tuple[np.ndarray, np.ndarray, np.ndarray]) -> None:
+        """Return to saved poses."""
+        self.poses, self._finger = saved[0].copy(), saved[1].copy()
+        self._data.qpos[:] = saved[2]
+        self._mj.mj_kinematics(self.world.model, self._data)
+
     def bodies(self) -> tuple[np.ndarray, np.ndarray]:
         """Poses (k, 12) of all bodies that cast shadows, and capsules (k, 7) that contain them.
 

@@ -41,6 +41,7 @@ from mstfilter.formats import RecordingWriter, open_recording
 from mstfilter.scene import Recording
 from mstfilter.simulation.arrangement import SceneObjects, arrange_objects, draw_objects
 from mstfilter.simulation.families import GENERATOR_VERSION, SceneFamily, scene_family
+from mstfilter.simulation.layers import Stage
 from mstfilter.simulation.renderer import Renderer, visible_texel
 from mstfilter.simulation.sensor import DepthSensor, colour_reading
 from mstfilter.simulation.shapes import label_voxels
@@ -62,7 +63,7 @@ POSE_TOLERANCE = 0.0002
 _Progress = Callable[[int, int, str], None]  # called with frames done, frames in all, and a description
 
 
-def _stream(seed: int, name: str, index: int = 0) -> np.random.Generator:
+def stream(seed: int, name: str, index: int = 0) -> np.random.Generator:
     """The random stream of a part."""
     word = int.from_bytes(hashlib.sha256(name.encode()).digest()[:8], "little")
     return np.random.default_rng([seed, word, index])
@@ -80,23 +81,28 @@ class SimulatedScene:
         _check_seed(seed)
         self.family, self.seed = family, int(seed)
         self.camera, self.grid = family.camera(), family.grid()
-        self.objects: SceneObjects = draw_objects(_stream(self.seed, "things"), family, family.pool(self.seed))
+        self.objects: SceneObjects = draw_objects(stream(self.seed, "things"), family, family.pool(self.seed))
         self.world = PhysicsWorld(self.objects.shapes, family.arm)
-        arrange_objects(_stream(self.seed, "arrangement"), self.world, family, self.objects.twin_of)
-        self.room: Room = draw_room(_stream(self.seed, "room"), visible_texel(self.camera))
+        arrange_objects(stream(self.seed, "arrangement"), self.world, family, self.objects.twin_of)
+        self.room: Room = draw_room(stream(self.seed, "room"), visible_texel(self.camera))
         appearance = self.objects.skins, self.room
         self._renderer = Renderer(self.world, *appearance, self.camera, family.supersample, POSE_TOLERANCE)
 
+    @property
+    def stage(self) -> Stage:
+        """The poses that are rendered."""
+        return self._renderer.stage
+
     def choose_push(self, action: int) -> FingerPush:
         """Choose the push of action number `action` from the current state."""
-        return choose_push(_stream(self.seed, "push", action), self.world, self.family)
+        return choose_push(stream(self.seed, "push", action), self.world, self.family)
 
     def frame_images(self, frame: int) -> dict[str, np.ndarray]:
         """Images of the current state as frame number `frame`: rgb, depth, instance, robot_mask."""
         view = self._renderer.render()
         return {
-            "rgb": colour_reading(_stream(self.seed, "colour", frame), view.colour * self.room.exposure),
-            "depth": DepthSensor().read(_stream(self.seed, "depth", frame), view.depth, view.slant),
+            "rgb": colour_reading(stream(self.seed, "colour", frame), view.colour * self.room.exposure),
+            "depth": DepthSensor().read(stream(self.seed, "depth", frame), view.depth, view.slant),
             "instance": view.instance,
             "robot_mask": view.instance == FINGER_ID,
         }
@@ -107,8 +113,8 @@ class SimulatedScene:
 
     def poses(self) -> np.ndarray:
         """T_world_object (n, 4, 4) of the current state as rendered."""
-        self._renderer.stage.follow()
-        return self._renderer.stage.poses
+        self.stage.follow()
+        return self.stage.poses
 
     def describe(self) -> dict[str, Any]:
         """Description of the scene for the manifest."""

@@ -27,6 +27,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mstfilter.errors import InputError
+from mstfilter.scene import VoxelGrid
 from mstfilter.simulation.families import SceneFamily
 from mstfilter.simulation.shapes import Shape
 from mstfilter.simulation.solids import Piece
@@ -270,6 +271,15 @@ class FingerPush:
     end: tuple[float, float]  #: (x, y) metres, where it goes up
     seconds: float  #: from one pause to the next, without the time to settle
 
+    def swept(self, grid: VoxelGrid) -> np.ndarray:
+        """(X, Y, Z) bool: voxels with centres that the finger passes through while it pushes."""
+        centres = grid.centres()
+        a, b = np.array(self.start), np.array(self.end)
+        along = np.clip((centres[..., :2] - a) @ (b - a) / max(float((b - a) @ (b - a)), 1e-12), 0.0, 1.0)
+        beside = np.linalg.norm(centres[..., :2] - a - along[..., None] * (b - a), axis=-1)
+        above = np.abs(centres[..., 2] - _LOW)
+        return np.asarray((beside <= _FINGER_RADIUS) & (above <= _FINGER_HALF + _FINGER_RADIUS))
+
     def target(self, t: float) -> np.ndarray:
         """Target (3,) of the finger t seconds after the pause."""
         a, b = np.array(self.start), np.array(self.end)
@@ -335,7 +345,7 @@ def push_effect(world: PhysicsWorld, before: np.ndarray, settled: bool, family: 
     return PushEffect(moved, np.arccos(np.clip((trace - 1) / 2, -1, 1)), settled, kept)
 
 
-def _is_clear(world: PhysicsWorld, at: tuple[float, float]) -> bool:
+def is_clear(world: PhysicsWorld, at: tuple[float, float]) -> bool:
     """Whether the finger can come down at a place without touching an object."""
     saved = world.save()
     for height in np.linspace(_HIGH, _LOW, 5):
@@ -348,7 +358,7 @@ def _is_clear(world: PhysicsWorld, at: tuple[float, float]) -> bool:
     return not overlaps
 
 
-def _draw_push(rng: np.random.Generator, world: PhysicsWorld, family: SceneFamily) -> FingerPush:
+def draw_push(rng: np.random.Generator, world: PhysicsWorld, family: SceneFamily) -> FingerPush:
     """A line towards one object, preferably one with others behind it."""
     at = world.positions()[:, :2]
     goal = at[int(rng.integers(len(at)))]
@@ -377,8 +387,8 @@ def choose_push(rng: np.random.Generator, world: PhysicsWorld, family: SceneFami
     saved = world.save()
     best: tuple[float, FingerPush] | None = None
     for _ in range(4 * family.n_candidates):
-        push = _draw_push(rng, world, family)
-        if not _is_clear(world, push.start):
+        push = draw_push(rng, world, family)
+        if not is_clear(world, push.start):
             continue
         result = play_push(world, push, family)
         world.restore(saved)

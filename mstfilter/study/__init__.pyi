@@ -1,5 +1,6 @@
 from mstfilter.study.cluster import Cluster as Cluster
 from mstfilter.study.config import (
+    SceneEntry as SceneEntry,
     StudyConfig as StudyConfig,
     check_arm_names as check_arm_names,
     load_study as load_study,

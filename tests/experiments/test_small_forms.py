@@ -57,6 +57,22 @@ def test_controls(tmp_path):
     assert "'scene'" not in run_script(*arguments), "finished scenes are not run again"
 
 
+def test_decisions(tmp_path):
+    arguments = ("decisions/run.py", "--smoke", "--out", tmp_path)
+    run_script(*arguments)
+    rows = read_csv(tmp_path / "runs.csv")
+    assert len(rows) == 2 * 4 * 3 and {r["k"] for r in rows} == {"0", "1", "2"}
+    start = {(r["scene"], r["coverage"]) for r in rows if r["k"] == "0"}
+    assert len(start) == 2, "all policies start from the same belief about the same scene"
+    tried = [r for r in rows if r["best"]]
+    assert tried and all(float(r[name]) >= 0 for r in tried for name in r if name.startswith("regret"))
+    assert {r["policy"] for r in read_csv(tmp_path / "summary.csv")} == {
+        "information",
+        "one hypothesis",
+        "least sure",
+    }
+
+
 def test_families(tmp_path):
     arguments = ("families/run.py", "--smoke", "--out", tmp_path)
     run_script(*arguments)

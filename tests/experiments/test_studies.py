@@ -9,12 +9,13 @@ import pytest
 from mstfilter.cli import main
 from mstfilter.files import read_csv
 from mstfilter.simulation import FIRST_REPORTED_SEED
-from mstfilter.study import load_study, make_plan
+from mstfilter.study import SceneEntry, load_study, make_plan, run_study
 from tests.experiments.scripts import EXPERIMENTS, run_script
 from tests.study.scenes import InProcess
 
 MAIN = EXPERIMENTS / "main/study.toml"
 FUSION = EXPERIMENTS / "fusion"
+ONE_SCENE = (SceneEntry(family="demo", seeds=(0,), set={"width": 160, "height": 120, "n_actions": 1}),)
 
 
 def run_small(tmp_path, config):
@@ -52,6 +53,25 @@ def test_studies_run_in_their_small_form(tmp_path, name):
     if beside:
         found = write_tables(folder, tmp_path / "tables", "--reference", "true masks: mst")
         assert [row["arm"] for row in found[f"{name}_true_masks_differences"]] == beside[1:]
+
+
+def test_information_of_a_study_in_its_small_form(tmp_path):
+    """Two scenes: each is scored with what the other one says, and the fit serves a third study."""
+    folder = run_small(tmp_path, EXPERIMENTS / "information/study.toml")
+    make_plan(load_study(EXPERIMENTS / "information/study.toml"))
+    rows = read_csv(folder / "runs.csv")
+    assert all(0 < float(row["information"]) < 1 for row in rows)
+    assert all(float(row["energy_floor"]) > 0 for row in rows)
+    found = write_tables(folder, tmp_path / "tables")
+    endpoints = [(row["endpoint"], row["arm"]) for row in found["information_differences"]]
+    assert endpoints == [("quality", "single_frame"), ("information", "single_frame")]
+    fitted = load_study(EXPERIMENTS / "information/study.toml", smoke=True).model_copy(
+        update={"recalibration": "recalibration.json", "folder": folder, "scenes": ONE_SCENE}
+    )
+    result = run_study(fitted, tmp_path / "third", InProcess())
+    third = {(r["arm"], r["pause"]): r["information"] for r in result.folder.rows()}
+    own = {(r["arm"], int(r["pause"])): float(r["information"]) for r in rows if r["scene"] == "demo-0"}
+    assert third.keys() == own.keys() and third != pytest.approx(own)
 
 
 def test_main_study_runs_and_resumes(tmp_path, capsys):
