@@ -12,7 +12,7 @@ import argparse
 from pathlib import Path
 
 import numpy as np
-from scenes import CHECKED_SEEDS, first_pause
+from scenes import CHECKED_SEEDS, first_pause, small
 
 from mstfilter.completion import Extrude
 from mstfilter.files import write_csv
@@ -50,7 +50,7 @@ def main(out: Path, smoke: bool) -> None:
     for name, family in ((name, SCENE_FAMILIES[name]) for name in (("demo",) if smoke else ("demo", "table"))):
         table: dict[str, list[tuple[float, ...]]] = {arm: [] for arm in [*ARMS, "true masks"]}
         for seed in CHECKED_SEEDS[: 1 if smoke else None]:
-            pause = first_pause(family, seed)
+            pause = first_pause(small(family) if smoke else family, seed)
             clip = Clip((pause.frame,), pause.grid, 0)
             for arm, proposal in ARMS.items():
                 n = 1 if isinstance(proposal.sampler, OptimalCut) else N

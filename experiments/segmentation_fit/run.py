@@ -16,7 +16,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
-from scenes import FITTED, FITTED_SEEDS, first_pause
+from scenes import FITTED, FITTED_SEEDS, first_pause, small
 from scipy.optimize import minimize
 
 from mstfilter.segmentation import (
@@ -29,6 +29,7 @@ from mstfilter.segmentation import (
     join_weights,
     pair_features,
 )
+from mstfilter.simulation import SceneFamily
 
 ROUNDS = 3
 PURE = 0.8  # smallest share of one object in a region that is used
@@ -38,10 +39,10 @@ PACKAGED = Path(join_weights.__file__)
 Pairs = tuple[list[np.ndarray], list[bool], list[float]]
 
 
-def measured(seeds: Iterable[int]) -> list[tuple[Regions, np.ndarray, float]]:
+def measured(families: Iterable[SceneFamily], seeds: Iterable[int]) -> list[tuple[Regions, np.ndarray, float]]:
     """Regions of every scene, their pixels of each true object (R, K), and the image scale."""
     found = []
-    for family in FITTED.values():
+    for family in families:
         for seed in seeds:
             try:
                 pause = first_pause(family, seed)
@@ -109,7 +110,8 @@ def write(weights: np.ndarray, path: Path) -> None:
 def main(path: Path, smoke: bool) -> None:
     """Fit the weights and write the module."""
     began = time.time()
-    scenes = measured(FITTED_SEEDS[:2] if smoke else FITTED_SEEDS)
+    families = [small(family) for family in FITTED.values()] if smoke else FITTED.values()
+    scenes = measured(families, FITTED_SEEDS[:2] if smoke else FITTED_SEEDS)
     print(f"{len(scenes)} scenes measured, {time.time() - began:.0f} s")
     weights = np.zeros(len(PAIR_FEATURES))
     weights[:2] = -6.0, 12.0  # initial weights: bias and strength of the border

@@ -34,6 +34,11 @@ class Pause:
     volume: np.ndarray
 
 
+def small(family: SceneFamily) -> SceneFamily:
+    """A family with a quarter of the pixels and an eighth of the voxels, for the small forms."""
+    return replace(family, width=family.width // 2, height=family.height // 2, voxel_size=2 * family.voxel_size)
+
+
 def first_pause(family: SceneFamily, seed: int) -> Pause:
     """The first pause of a scene."""
     scene = SimulatedScene(family, seed)

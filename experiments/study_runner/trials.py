@@ -29,9 +29,14 @@ HERE = Path(__file__).parent
 SCENE = {"width": 160, "height": 120, "n_actions": 1, "frames_per_clip": 8, "voxel_size": 0.02}
 
 
+def scenes_of(n_runs: int) -> int:
+    """Number of scenes of a study of `n_runs` runs."""
+    return min(4, max(1, n_runs // 2))
+
+
 def short_study(n_runs: int):
     """Runs of about a second: each opens its recording, filters two pauses and measures them."""
-    n_scenes = min(4, n_runs // 2)
+    n_scenes = scenes_of(n_runs)
     seeds = list(range(n_runs // n_scenes))
     scenes = [{"family": "demo", "seeds": list(range(n_scenes)), "set": SCENE}]
     arms = [{"preset": "mst"}]
@@ -100,11 +105,11 @@ def main() -> None:
     options = parser.parse_args()
     if options.smoke and options.out == parser.get_default("out"):
         parser.error("--smoke would overwrite the results: name another folder with --out")
-    n, rounds = (4, 1) if options.smoke else (200, options.rounds)
+    n, rounds = (1, 1) if options.smoke else (200, options.rounds)
     rows = []
     with tempfile.TemporaryDirectory() as name:
         folder, cache = Path(name) / "study", Path(name) / "cache"
-        for seed in range(min(4, n // 2)):
+        for seed in range(scenes_of(n)):
             cached_recording("demo", seed, cache / "recordings", **SCENE)
         for round_ in range(rounds):
             for workers in (1, 2):

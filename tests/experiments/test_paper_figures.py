@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import importlib
-import os
-import subprocess
-import sys
+from functools import cache
 from xml.etree import ElementTree
 
 import numpy as np
@@ -14,33 +12,29 @@ from hypothesis import given, settings, strategies as st
 
 from mstfilter.files import read_csv
 from mstfilter.segmentation import MergeLogOdds, optimal_cut
-from tests.conftest import REPOSITORY
+from tests.experiments.scripts import EXPERIMENTS, own_modules, run_script
 from tests.report.test_study_report import make_study
 from tests.segmentation.trees import all_cuts, random_tree
 
-FOLDER = REPOSITORY / "experiments/paper_figures"
+FOLDER = EXPERIMENTS / "paper_figures"
 SIMULATED = ("teaser.png", "initial.png", "over_segmenting.svg", "sampled_cuts.png")
 REAL = ("merging.png", "merge_forms.csv", "fusion_step.png", "fusion_step.csv")
 
 
-def make(tmp_path, *arguments, **environment):
-    command = [sys.executable, str(FOLDER / "make.py"), "--smoke", "--out", str(tmp_path / "out")]
-    command += map(str, arguments)
-    environment = {**os.environ, "MSTFILTER_CACHE": str(tmp_path / "cache"), **environment}
-    return subprocess.run(command, capture_output=True, text=True, env=environment)
+def make(tmp_path, *arguments, **more):
+    return run_script("paper_figures/make.py", "--smoke", "--out", tmp_path / "out", *arguments, **more)
 
 
+@cache
 def script(name):
     """A module of the folder, as the command imports it."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(FOLDER))
+    with own_modules(FOLDER):
         return importlib.import_module(name)
 
 
 def test_simulated_figures(tmp_path):
     names = ("teaser", "initial", "over_segmenting", "sampled_cuts")
-    done = make(tmp_path, *names)
-    assert done.returncode == 0, done.stderr
+    make(tmp_path, *names)
     assert all((tmp_path / "out" / name).stat().st_size > 2000 for name in SIMULATED)
     assert all(0 <= float(row["IoU"]) <= 1 for row in read_csv(tmp_path / "out/teaser.csv"))
     rows = read_csv(tmp_path / "out/over_segmenting.csv")
@@ -52,8 +46,7 @@ def test_simulated_figures(tmp_path):
 
 def test_real_figures(tmp_path, shared_data):
     shared_data("r1")
-    done = make(tmp_path, "merging", "fusion_step")
-    assert done.returncode == 0, done.stderr
+    make(tmp_path, "merging", "fusion_step")
     assert all((tmp_path / "out" / name).stat().st_size > 300 for name in REAL)
     rows = {row["hypotheses"]: row for row in read_csv(tmp_path / "out/fusion_step.csv")}
     assert rows["shipped by the authors"]["mean"] == rows["shipped by the authors"]["one blob"] == "0.733"
@@ -61,12 +54,10 @@ def test_real_figures(tmp_path, shared_data):
 
 
 def test_missing_data_are_reported(tmp_path):
-    done = make(tmp_path, "merging", "quality_over_time", MSTFILTER_SHARED=str(tmp_path))
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.count("left out") == 2
+    printed = make(tmp_path, "merging", "quality_over_time", MSTFILTER_SHARED=tmp_path)
+    assert printed.count("left out") == 2
     assert not (tmp_path / "out").exists()
-    wrong = make(tmp_path, "mergin")
-    assert wrong.returncode == 2 and "no figure is called 'mergin'" in wrong.stderr
+    assert "no figure is called 'mergin'" in make(tmp_path, "mergin", expected_exit=2)
 
 
 def test_quality_over_time_is_a_complete_file(tmp_path):
@@ -78,8 +69,8 @@ def test_quality_over_time_is_a_complete_file(tmp_path):
     assert "ours" in text and "&lt;theirs&gt;" in text and "a ceiling" not in text
     (path,) = script("quality_over_time").make(tmp_path / "out", study, ["ours", "a ceiling"])
     assert "a ceiling" in path.read_text() and "theirs" not in path.read_text()
-    wrong = make(tmp_path, "quality_over_time", "--study", str(study), "--arms", "ours,mine")
-    assert wrong.returncode == 2 and "the study has no arm 'mine'" in wrong.stderr
+    wrong = make(tmp_path, "quality_over_time", "--study", study, "--arms", "ours,mine", expected_exit=2)
+    assert "the study has no arm 'mine'" in wrong
 
 
 def test_the_licence_of_the_r1_data_names_its_owner():

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 import runpy
+from contextlib import nullcontext
+from unittest import mock
 
 import pytest
 
@@ -12,6 +14,7 @@ from mstfilter.files import read_csv
 from mstfilter.scene import read_rgb
 from tests.conftest import REPOSITORY, find_shared
 from tests.experiments.scripts import EXPERIMENTS, run_script
+from tests.study.scenes import InProcess
 
 SCRIPTS = [
     str(p.relative_to(EXPERIMENTS)) for p in sorted(EXPERIMENTS.glob("*/*.py")) if '"--smoke"' in p.read_text()
@@ -219,7 +222,9 @@ def test_inference(tmp_path):
 
 @pytest.mark.parametrize(("script", "table"), [("trials", "results"), ("sharing", "sharing")])
 def test_study_runner(tmp_path, script, table):
-    run_script(f"study_runner/{script}.py", "--smoke", "--out", tmp_path)
+    local = mock.patch("mstfilter.study.Local", lambda workers: InProcess()) if script == "sharing" else nullcontext()
+    with local:
+        run_script(f"study_runner/{script}.py", "--smoke", "--out", tmp_path)
     rows = read_csv(tmp_path / f"{table}.csv")
     assert len(rows) == 3
     if script == "trials":

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from mstfilter.formats import RecordingWriter
+from mstfilter.scene import scene_cache
 from mstfilter.study import Executor
 from mstfilter.study.executors import Event
 from mstfilter.study.jobs import perform
@@ -31,6 +32,7 @@ class InProcess(Executor):
     """
 
     def run(self, jobs, tell):
+        scene_cache.clear()  # as in a new worker
         outcomes = []
         for k, job in enumerate(jobs):
             tell(Event("started", k))

@@ -171,7 +171,7 @@ def test_shared_work_changes_no_result(folder, tmp_path):
             for path in files:
                 path.write_bytes(path.read_bytes()[:-40])
         study = study_of({**data, "cache_gb": 0 if case == "none" else 1})
-        run_study(study, tmp_path / case, Local(1), cache=cache)
+        run_study(study, tmp_path / case, InProcess(), cache=cache)
         found[case] = (tmp_path / case / "runs.csv").read_text() and table(tmp_path / case / "runs.csv")
         assert (cache / "work").exists() == (case != "none")
     with contextlib.closing(sqlite3.connect(cache / "work" / "cache.db")) as database:
