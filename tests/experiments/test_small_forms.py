@@ -48,6 +48,12 @@ def test_benchmark_of_fusion(tmp_path):
     assert float(rows[0]["median"]) == 1
 
 
+def test_benchmark_of_scoring(tmp_path):
+    run_script("benchmarks/scoring.py", "--smoke", "--n", 2, "--out", tmp_path / "scoring.csv")
+    seconds = {r["what"]: float(r["seconds"]) for r in read_csv(tmp_path / "scoring.csv")}
+    assert list(seconds)[-1] == "all" and all(s >= 0 for s in seconds.values())
+
+
 def test_controls(tmp_path):
     arguments = ("controls/run.py", "--smoke", "--out", tmp_path / "out")
     assert "s1-0" in run_script(*arguments)
