@@ -2,9 +2,9 @@
 
     OMP_NUM_THREADS=1 python experiments/benchmarks/scoring.py [--n 20] [--smoke --out FILE]
 
-Processor time in seconds on one core for each pause of a simulated scene (`s1`, seed 0; 100 x 100 x 50 voxels, 640 x
-480 pixels): the questions, their answers by n hypotheses with their scores, and the metrics of objects. The hypotheses
-are the truth, shifted by up to one voxel and with holes, all different. Writes scoring.csv: the median over the pauses.
+Processor time in seconds on one core for a pause of a simulated scene (`s1`, seed 0; 100 x 100 x 50 voxels, 640 x 480
+pixels): the questions, their answers by n hypotheses with their scores, and the metrics of objects. The hypotheses
+are the truth, shifted by up to one voxel and with holes, all different. Writes scoring.csv, medians over pauses.
 """
 
 from __future__ import annotations
@@ -19,7 +19,6 @@ from mstfilter.files import write_csv
 from mstfilter.formats import open_recording
 from mstfilter.scoring import ask, object_status, pause_metrics, score_belief
 from mstfilter.simulation import cached_recording
-
 
 SMALL = {"width": 160, "height": 120, "n_actions": 1, "frames_per_clip": 6}
 
