@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mstfilter.forecasts import ForecastTable
-from mstfilter.study import Compared
+from mstfilter.study import ENDPOINTS, Compared
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -408,5 +408,6 @@ def differences_figure(compared: Sequence[Compared], arms: Sequence[str], metric
         axes.set_yticks([at for at, _ in ticks], [name for _, name in ticks])
         axes.set_ylim(y - 0.3, -0.7)
         reference = known[0].first if known else ""
-        axes.set_xlabel(f"{metric} of {reference} minus {metric} of the method")
+        side = "right" if ENDPOINTS.get(metric, 1) > 0 else "left"
+        axes.set_xlabel(f"{metric} of {reference} minus {metric} of the method ({reference} is better on the {side})")
         return _svg_text(figure, f"Paired differences of {metric} with 95 % intervals")
