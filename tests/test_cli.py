@@ -148,11 +148,12 @@ def test_the_default_path_needs_neither_open3d_nor_torch(recording, tmp_path):
     assert (tmp_path / "run" / "report.html").is_file()
 
 
-def test_a_run_that_was_killed_is_resumed(recording, tmp_path):
+def test_a_run_that_was_killed_is_resumed(recording, tmp_path, capsys):
     """The process is killed in its second step; the same command ends with the bytes of an undisturbed run."""
     marker = tmp_path / "marker"
     hangs = [f"transition={BROKEN}:Breaks", "transition.how=hang", f'transition.marker="{marker}"']
-    command = [sys.executable, "-m", "mstfilter", "run", recording, "n=3", *hangs, "--no-report"]
+    arguments = ["run", recording, "n=3", *hangs, "--no-report"]
+    command = [sys.executable, "-m", "mstfilter", *arguments]
     part = tmp_path / "part"
     process = subprocess.Popen([*command, "--out", part], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     wait_for(marker, process)
@@ -161,7 +162,7 @@ def test_a_run_that_was_killed_is_resumed(recording, tmp_path):
     assert RunFolder.open(part).n_pauses == 1
     assert not (part / "metrics.csv").exists()
     subprocess.run([*command, "--out", part], check=True, capture_output=True, timeout=600)
-    subprocess.run([*command, "--out", tmp_path / "whole"], check=True, capture_output=True, timeout=600)
+    assert call(*arguments, "--out", tmp_path / "whole", capsys=capsys)[0] == 0
     whole, resumed = content(tmp_path / "whole"), content(part)
     assert whole.keys() == resumed.keys()
     assert [k for k in whole if whole[k] != resumed[k]] == []

@@ -21,7 +21,7 @@ SEED = 0
 
 def make(out: Path, smoke: bool) -> list[Path]:
     """Draw the figure."""
-    small = {"width": 160, "height": 120} if smoke else {}
+    small = {"width": 160, "height": 120, "voxel_size": 0.02} if smoke else {}
     figure, axes = page(3, len(FAMILIES), 12.0, 9.4)
     for k, name in enumerate(FAMILIES):
         family = replace(scene_family(name), **small)

@@ -28,7 +28,7 @@ def config(tmp_path, monkeypatch):
 
 
 def test_it_prints_where_and_what(config, tmp_path, capsys):
-    code, out, error = call("study", config, "--smoke", "update.eta=1,2", capsys=capsys)
+    code, out, error = call("study", config, "--smoke", "update.eta=1,2", "--workers", 1, capsys=capsys)
     assert code == 0, error
     assert "study       studies/mine-smoke" in out
     assert "2 done, 0 of them earlier" in out

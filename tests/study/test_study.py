@@ -16,7 +16,6 @@ import pytest
 from mstfilter.errors import InputError
 from mstfilter.runs import RunFolder
 from mstfilter.study.config import SceneEntry, load_study, split_grid, study_of
-from mstfilter.study.executors import Local
 from mstfilter.study.jobs import perform
 from mstfilter.study.plan import make_plan
 from mstfilter.study.study import run_study
@@ -55,7 +54,7 @@ def table(path, costs=False):
 
 def test_a_finished_study_repeats_no_run(folder, tmp_path):
     study = load_study(folder / "base.toml")
-    first = run_study(study, tmp_path / "out", Local(2), cache=tmp_path / "cache")
+    first = run_study(study, tmp_path / "out", InProcess(), cache=tmp_path / "cache")
     assert (first.done, first.repeated, first.failed) == (8, 0, ())
     rows = table(tmp_path / "out" / "runs.csv")
     assert len(rows) == 2 * 2 * 2 * 3
@@ -69,7 +68,7 @@ def test_a_finished_study_repeats_no_run(folder, tmp_path):
         assert len(stages) >= 3 and max(stages) <= float(r["peak_mb"])
     made = {p: p.stat().st_mtime_ns for p in (tmp_path / "out" / "runs").rglob("result.json")}
     before = (tmp_path / "out" / "runs.csv").read_bytes()
-    again = run_study(study, tmp_path / "out", Local(1), cache=tmp_path / "cache")
+    again = run_study(study, tmp_path / "out", InProcess(), cache=tmp_path / "cache")
     assert (again.done, again.repeated) == (8, 8)
     assert {p: p.stat().st_mtime_ns for p in (tmp_path / "out" / "runs").rglob("result.json")} == made
     assert (tmp_path / "out" / "runs.csv").read_bytes() == before
