@@ -235,7 +235,7 @@ def test_a_cleaned_boundary_is_the_measured_one_near_true_borders(recording):
     np.testing.assert_array_equal(cleaned[crisp > 0], measured[crisp > 0])
     far = distance_transform_edt(crisp == 0) > 3
     assert (measured[far] > 0).any() and not cleaned[far].any()
-    with pytest.raises(InputError, match="form 'soft'"):
+    with pytest.raises(InputError, match="form is 'soft'"):
         TrueBoundary("soft")
 
 

@@ -33,6 +33,8 @@ class Scripted(np.random.Generator):
         return int(possible[k])
 
     def random(self, size=None):
+        if isinstance(size, tuple):
+            (size,) = size
         if self.coins and size is not None:
             return Coins(self, size)
         drawn = [(self.digit(np.ones(self.cells)) + 0.5) / self.cells for _ in range(1 if size is None else size)]

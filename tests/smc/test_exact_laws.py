@@ -88,7 +88,8 @@ def enumerated_uniforms(monkeypatch):
         W = np.array(weights) / np.sum(weights)
         middle = np.cumsum(W) - W / 2
 
-        def draw(rng, k):
+        def draw(rng, k, runs=()):
+            assert runs == ()
             return np.sort([middle[rng.digit(W)] for _ in range(k)])
 
         monkeypatch.setattr(resampling, "ordered_uniforms", draw)
