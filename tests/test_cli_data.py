@@ -193,16 +193,19 @@ def test_quality(tmp_path, capsys):
     assert code == 0, err
     code, out, err = call("quality", tmp_path / "run", recording, "--csv", tmp_path / "q.csv", capsys=capsys)
     assert code == 0, err
-    lines = out.splitlines()
-    assert lines[0].split() == ["pause", "form", "n", "mean", "weighted", "best", "top", "one_blob", "components"]
+    out, belief = out.split("\n\n")
+    lines, columns = out.splitlines(), ["mean", "weighted", "best", "top", "estimate", "one_blob", "components"]
+    assert lines[0].split() == ["pause", "form", "n", *columns]
     assert len(lines) == 1 + 3 * 3 + 3
+    assert belief.splitlines()[1].split() == ["pause", "brier", "log_loss", "calibration_error", "energy"]
+    assert len(belief.splitlines()) == 2 + 3
     table = list(csv.DictReader((tmp_path / "q.csv").open()))
     means = [float(row["mean"]) for row in table if row["form"] == "objects"]
     assert float(lines[-3].split()[2]) == pytest.approx(np.mean(means), abs=6e-4)
     code, again, _ = call("quality", tmp_path / "run", recording / "voxels.npz", capsys=capsys)
-    assert (code, again) == (0, out)
+    assert (code, again.strip()) == (0, out)  # volumes alone have no questions
     code, perfect, _ = call("quality", recording / "voxels.npz", recording, capsys=capsys)
-    assert perfect.splitlines()[-3].split()[2] == "1.000"
+    assert perfect.split("\n\n")[0].splitlines()[-3].split()[2] == "1.000"
     for arguments, message in (
         ((tmp_path / "run", tmp_path / "none"), "does not exist"),
         ((tmp_path, recording), "not a run folder"),
