@@ -39,7 +39,7 @@ from mstfilter.smc import State
 from mstfilter.statistics import compare_arms, conclusion
 
 N_PUSHES, N_CANDIDATES = 6, 12
-SMALL = {"width": 128, "height": 96, "frames_per_clip": 6, "voxel_size": 0.02, "supersample": 1}
+SMALL = {"width": 96, "height": 72, "frames_per_clip": 6, "voxel_size": 0.02, "supersample": 1}
 
 
 def measure(loop: PushLoop, state: State) -> dict[str, float]:
@@ -64,7 +64,7 @@ def measure(loop: PushLoop, state: State) -> dict[str, float]:
 
 def play(family: str, seed: int, policy: str, regret: bool, small: bool) -> list[dict[str, Any]]:
     """One scene with one policy; the rows of k = 0 .. n pushes."""
-    changes, n = (SMALL, 2) if small else ({}, N_PUSHES)
+    changes, n = (SMALL, 1) if small else ({}, N_PUSHES)
     mst = preset("mst", *(["n=2", "update.eta=1"] if small else []))
     loop = PushLoop(replace(scene_family(family), **changes), seed)
     state, _ = mst.step(mst.start(0), loop.clip)
@@ -72,7 +72,7 @@ def play(family: str, seed: int, policy: str, regret: bool, small: bool) -> list
     rows = [{**named, "k": 0, **measure(loop, state)}]
     for k in range(1, n + 1):
         rng = np.random.default_rng([seed, k])
-        belief, pushes = Belief(state.population), loop.candidates(3 if small else N_CANDIDATES)
+        belief, pushes = Belief(state.population), loop.candidates(2 if small else N_CANDIDATES)
         chosen = POLICIES[policy](rng, belief, pushes)
         row: dict[str, Any] = {}
         if regret:
