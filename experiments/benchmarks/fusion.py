@@ -172,7 +172,7 @@ def main() -> None:
         return
     if options.smoke and options.out == HERE:
         parser.error("--smoke would overwrite the results: name another folder with --out")
-    n, many, rounds = (1, (4, 3), 1) if options.smoke else (N, (100, 20), options.rounds)
+    n, many, rounds = (1, (2, 1), 1) if options.smoke else (N, (100, 20), options.rounds)
 
     proposed, predicted = populations(1000, n, n)
     crossover, pairs = fusion_update("paper").crossover, [(i, j) for i in range(n) for j in range(n)]

@@ -25,7 +25,7 @@ from mstfilter.scene import Recording
 from mstfilter.scoring import weighted_coverage
 
 METHODS = ("mst", "samples_only", "tracking_only", "union", "paper", "authors")
-SMALL = {"width": 320, "height": 240, "frames_per_clip": 8, "voxel_size": 0.02}
+SMALL = {"width": 160, "height": 120, "frames_per_clip": 8, "voxel_size": 0.02}
 FIELDS = ["scene", "method", "pause", "as_one", "as_two", "missing", "pairwise"]
 
 

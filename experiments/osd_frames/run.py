@@ -47,9 +47,9 @@ SHARED = Path(os.environ.get("MSTFILTER_SHARED", HERE.parents[2] / "shared"))
 
 # First and last frame of each camera set-up.
 GROUPS = [(0, 1), (2, 4), (5, 5), (6, 16), (17, 24), (25, 26), (27, 29), (30, 30), (31, 32), (33, 44)]
-COLOUR_WEIGHTS = (0.0, 0.2, 0.4, 0.6)
-CENTRES = (0.4, 0.45, 0.5, 0.55, 0.6)
-SLOPES = (8.0, 12.0, 20.0)
+COLOUR_WEIGHTS: tuple[float, ...] = (0.0, 0.2, 0.4, 0.6)
+CENTRES: tuple[float, ...] = (0.4, 0.45, 0.5, 0.55, 0.6)
+SLOPES: tuple[float, ...] = (8.0, 12.0, 20.0)
 # Constants chosen without labels: the colour weight; a logistic curve with values .15 and .8 at the .9 and .995
 # quantiles of the merge heights of each tree.
 UNFITTED_COLOUR = 0.6
@@ -305,4 +305,6 @@ if __name__ == "__main__":
     options = parser.parse_args()
     if options.smoke and options.out == HERE / "results":
         parser.error("--smoke would overwrite the results: name another folder with --out")
+    if options.smoke:
+        COLOUR_WEIGHTS, CENTRES, SLOPES = (0.4, 0.6), (0.5,), (8.0, 12.0)
     main((0, 2) if options.smoke else range(45), options.out)

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 from canvas import crop, page, save, show, voxels
+from teaser import FEW
 
 from mstfilter.report import colour, overlay, viewpoint
 from mstfilter.scoring import MIN_PIXELS
@@ -21,7 +22,7 @@ SEED = 0
 
 def make(out: Path, smoke: bool) -> list[Path]:
     """Draw the figure."""
-    small = {"width": 160, "height": 120, "voxel_size": 0.02} if smoke else {}
+    small = {"width": 160, "height": 120, "voxel_size": 0.02, **FEW} if smoke else {}
     figure, axes = page(3, len(FAMILIES), 12.0, 9.4)
     for k, name in enumerate(FAMILIES):
         family = replace(scene_family(name), **small)

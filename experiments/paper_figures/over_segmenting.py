@@ -71,7 +71,7 @@ def scene(seed: int, smoke: bool) -> list[list[object]]:
     rows: list[list[object]] = []
     for value in ("usual", "too fine"):
         for arm in ARMS:
-            filter = mstfilter.preset(arm)
+            filter = mstfilter.preset(arm, *(["n=2"] if smoke else []))
             if value == "too fine":
                 filter = replace(filter, proposal=replace(filter.proposal, value=TooFine()))
             for state, info in filter.iterate(recording.clips(), 0):

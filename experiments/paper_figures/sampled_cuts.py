@@ -15,6 +15,7 @@ import numpy as np
 from canvas import INK, MUTED, crop, page, save, show
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
+from teaser import FEW
 
 import mstfilter
 from mstfilter.report import UNASSIGNED_COLOUR, Colour, colour, overlay
@@ -29,7 +30,7 @@ ABOVE = (176, 179, 175)
 
 def make(out: Path, smoke: bool) -> list[Path]:
     """Draw the figure."""
-    family = replace(scene_family(FAMILY), **({"width": 160, "height": 120} if smoke else {}))
+    family = replace(scene_family(FAMILY), **({"width": 160, "height": 120, **FEW} if smoke else {}))
     scene = SimulatedScene(family, SEED)
     shot = scene.frame_images(0)
     frame = Frame(shot["rgb"], shot["depth"], scene.camera)

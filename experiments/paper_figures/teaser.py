@@ -27,7 +27,8 @@ from mstfilter.simulation import cached_recording
 
 #: The scene of the figures `initial` and `sampled_cuts`.
 FAMILY, SEED = "s2", 0
-SMALL = {"width": 160, "height": 120, "n_actions": 1, "frames_per_clip": 8, "voxel_size": 0.02}
+FEW = {"n_objects_min": 5, "n_objects_max": 5, "n_twins": 1, "n_stacked": 1, "n_hidden": 1}
+SMALL = {"width": 160, "height": 120, "n_actions": 1, "frames_per_clip": 8, "voxel_size": 0.02, **FEW}
 SHOWN = 3
 TURN = RigidTransform.from_rotation(Rotation.from_euler("z", 125, degrees=True))
 
@@ -36,7 +37,7 @@ def make(out: Path, smoke: bool) -> list[Path]:
     """Draw the figure."""
     recording = open_recording(cached_recording(FAMILY, SEED, **(SMALL if smoke else {})))
     with tempfile.TemporaryDirectory() as folder:
-        run = filter_recording(recording, load_config("mst"), Path(folder) / "run", seed=0)
+        run = filter_recording(recording, load_config("mst", ("n=3",) if smoke else ()), Path(folder) / "run", seed=0)
         return [picture(recording, run, out / "teaser.png", smoke), table(recording, run, out / "teaser.csv")]
 
 

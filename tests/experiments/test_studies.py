@@ -15,15 +15,16 @@ from tests.study.scenes import InProcess
 
 MAIN = EXPERIMENTS / "main/study.toml"
 FUSION = EXPERIMENTS / "fusion"
-ONE_SCENE = (SceneEntry(family="demo", seeds=(0,), set={"width": 160, "height": 120, "n_actions": 1}),)
+SMALL = {"width": 160, "height": 120, "n_actions": 1, "voxel_size": 0.02}
+ONE_SCENE = (SceneEntry(family="demo", seeds=(0,), set=SMALL),)
 
 
-def run_small(tmp_path, config):
+def run_small(tmp_path, config, *overrides):
     """The folder of a study in its small form."""
     out = tmp_path / config.stem
     with mock.patch("mstfilter.study.Local", lambda workers, logs: InProcess()):
         try:
-            main(["study", str(config), "--smoke", "--out", str(out)])
+            main(["study", str(config), *overrides, "--smoke", "--out", str(out)])
         except SystemExit as end:
             assert not end.code
     return out
@@ -76,7 +77,7 @@ def test_information_of_a_study_in_its_small_form(tmp_path):
 
 def test_main_study_runs_and_resumes(tmp_path, capsys):
     for _ in range(2):
-        folder = run_small(tmp_path, MAIN)
+        folder = run_small(tmp_path, MAIN, "n=2")
     arms = [arm.name for arm in make_plan(load_study(MAIN)).arms]
     assert f"{len(arms)} of them earlier" in capsys.readouterr().out  # the second time no run is left to do
     rows = read_csv(folder / "runs.csv")
