@@ -140,7 +140,7 @@ class Reliability:
 
     @property
     def error(self) -> float:
-        """Calibration error: mean of |forecast - frequency| over the bins, weighted by their counts."""
+        """Calibration error: mean of ``|forecast - frequency|`` over the bins, weighted by their counts."""
         if not self.count.sum():
             return float("nan")
         return float(np.average(np.abs(self.forecast - self.frequency), weights=self.count))

@@ -83,7 +83,7 @@ def certain_copies(weights: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray,
 
 
 def ordered_uniforms(rng: np.random.Generator, n: int, rows: tuple[int, ...] = ()) -> np.ndarray:
-    """(*rows, n) uniforms on [0, 1], ascending in each row, in O(n): normalised exponential spacings."""
+    """``(*rows, n)`` uniforms on [0, 1], ascending in each row, in O(n): normalised exponential spacings."""
     points = rng.standard_exponential((*rows, n + 1))
     np.cumsum(points, axis=-1, out=points)
     points /= points[..., -1:]
