@@ -152,6 +152,8 @@ def main() -> None:
             ]
             subprocess.run(command, check=True, capture_output=True)
         names = [name for name in tasks(recordings) if options.only in name]
+        if not names:
+            parser.error(f"no task has {options.only!r} in its name: {', '.join(tasks(recordings))}")
         workers = {"this": start(REPOSITORY, recordings), "other": start(options.other.resolve(), recordings)}
         seconds: dict[tuple[str, str], list[float]] = {(task, side): [] for task in names for side in workers}
         for number in range(options.rounds + 1):
