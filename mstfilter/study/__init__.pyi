@@ -10,6 +10,7 @@ from mstfilter.study.executors import Event as Event, Executor as Executor, Loca
 from mstfilter.study.jobs import peak_megabytes as peak_megabytes, perform as perform, reset_peak as reset_peak
 from mstfilter.study.plan import make_plan as make_plan
 from mstfilter.study.results import (
+    FORECASTS as FORECASTS,
     RESULT as RESULT,
     Job as Job,
     JobOutcome as JobOutcome,
