@@ -16,12 +16,12 @@ from pathlib import Path
 import numpy as np
 
 from mstfilter.files import write_csv
-from mstfilter.runs import RunFolder, open_source
+from mstfilter.runs import RunFolder
 from mstfilter.scene import Recording
 from mstfilter.scoring import ask, leave_one_out, score_belief
-from mstfilter.simulation import cached_recording
+from mstfilter.simulation import cache_folder
 from mstfilter.statistics import compare
-from mstfilter.study import RESULT, StudyFolder
+from mstfilter.study import RESULT, StudyFolder, open_scene
 
 RATE, COPIES = 0.3, 2
 
@@ -41,15 +41,6 @@ def with_noise(labels: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     return drawn
 
 
-def recording_of(source: dict) -> Recording:
-    """The recording of a scene of the study."""
-    if "path" in source:
-        return open_source(Path(source["path"]), source["format"], source["options"], source["pauses"])
-    from mstfilter.formats import open_recording
-
-    return open_recording(cached_recording(source["family"], source["seed"], **source["set"]))
-
-
 def main(study: Path, out: Path) -> None:
     """Score all runs and write the table."""
     folder = StudyFolder.open(study)
@@ -63,7 +54,7 @@ def main(study: Path, out: Path) -> None:
             continue
         name, arm = run["scene"], run["arm"]
         if name not in opened:
-            opened = {name: recording_of(sources[name])}
+            opened = {name: open_scene(sources[name], str(cache_folder() / "recordings"))}
         done, rng = RunFolder.open(path), np.random.default_rng(0)
         for noisy in (False, True):
             total, energy = np.zeros(1, np.int64), []

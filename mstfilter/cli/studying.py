@@ -59,9 +59,11 @@ def _print_summary(summary: Any) -> None:
     from rich.console import Console
     from rich.table import Table
 
+    from mstfilter.study import ENDPOINTS
+
     if not summary.metrics or "quality" not in summary.names:
         return
-    endpoints = [name for name in ("quality", "information") if name in summary.names]
+    endpoints = [name for name in ENDPOINTS if name in summary.names]
     columns = [
         text for name in endpoints for text in (f"{name}, t >= 1", "95 %", f"{summary.reference} - arm", "95 %")
     ]

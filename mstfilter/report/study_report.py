@@ -63,7 +63,8 @@ def write_study_report(study: StudyFolder | str | Path, out: str | Path | None =
 
 def _page(study: StudyFolder) -> str:
     filters = dict(seconds=seconds_text, number=_number, signed=lambda x: _number(x, "+"), range=_range)
-    records, summary, failures = study.records(), study.summary(), study.failures()
+    records, failures = study.records(), study.failures()
+    summary = study.summary_of(records)
     scenes: dict[str, list[str]] = defaultdict(list)
     for scene in study.description["scenes"]:
         scenes[scene["group"]].append(scene["name"])

@@ -213,12 +213,12 @@ class RunFolder:
 
     def questions(self, t: int) -> Questions | None:
         """The questions of a pause with ground truth; None if unknown."""
-        truth = self.truth(t)
-        if truth is None:
+        path = self.pause(t) / "truth.npz"
+        if not path.exists():
             return None
-        with np.load(self.pause(t) / "truth.npz", allow_pickle=False) as data:
+        with np.load(path, allow_pickle=False) as data:
             pairs = data["questions"].astype(np.int64) if "questions" in data else np.zeros((2, 0), np.int64)
-        return Questions(truth.shape, *pairs) if pairs.size else None
+            return Questions(data["labels"].shape, *pairs) if pairs.size else None
 
     def hypotheses(self, t: int) -> tuple[Hypothesis, ...]:
         """The particles after the step."""

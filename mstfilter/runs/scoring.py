@@ -196,7 +196,7 @@ def measure_pause(run: RunFolder, recording: Recording, t: int) -> tuple[dict[st
     known = all(recording.instance(p) is not None for p in recording.pauses[: t + 1])
     status = object_status(recording, t) if known else {}
     found, q = pause_metrics(labels, weights, truth, status)
-    belief = score_belief(ask(recording, t), labels, weights, truth, status)
+    belief = score_belief(run.questions(t) or ask(recording, t), labels, weights, truth, status)
     return {**row, **found, **belief.row, "qualities": q.tolist()}, belief.counts
 
 

@@ -82,19 +82,20 @@ class Questions:
         """
         e = np.asarray(rates, dtype=np.float64)[:, None]
         found = np.zeros((len(e), len(self)))
-        u, v = self._around
         noisy = bool(e.any())
+        if noisy:
+            _, place, around = self._voxels
+            u, v = around[:, place[: len(self)]], around[:, place[len(self) :]]
         for one, weight in zip(labels, weights, strict=True):
             flat = self._flat(one)
             a, b = flat[self.first], flat[self.second]
             same = (a == b) & (a > 0)
+            found += weight * same
             if not noisy:
-                found += weight * same
                 continue
             near_u, near_v = flat[u], flat[v]  # (6, m)
             # Away from borders the noise changes nothing; elsewhere count equal labels over the neighbours.
             border = np.flatnonzero(((near_u != a) | (near_v != b)).any(axis=0))
-            found += weight * same
             if len(border):
                 a, b, near_u, near_v = a[border], b[border], near_u[:, border], near_v[:, border]
                 mixed = ((near_v == a) & (a > 0)).sum(axis=0) + ((near_u == b) & (b > 0)).sum(axis=0)
@@ -113,8 +114,7 @@ class Questions:
         if not rate:
             return np.stack([self.outcomes(one) for one in labels])
         assert rng is not None
-        voxels, place = np.unique(np.concatenate([self.first, self.second]), return_inverse=True)
-        around = _neighbours(voxels, self.shape)
+        voxels, place, around = self._voxels
         found = []
         for one in labels:
             flat = self._flat(one)
@@ -131,9 +131,10 @@ class Questions:
         return labels.ravel()
 
     @cached_property
-    def _around(self) -> tuple[np.ndarray, np.ndarray]:
-        """(6, m) flat indices of the neighbours of both voxels; the voxel itself beyond the grid."""
-        return _neighbours(self.first, self.shape), _neighbours(self.second, self.shape)
+    def _voxels(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Distinct voxels (k,), the place (2 m,) of each first and second voxel among them, neighbours (6, k)."""
+        voxels, place = np.unique(np.concatenate([self.first, self.second]), return_inverse=True)
+        return voxels, place, _neighbours(voxels, self.shape)
 
 
 def _neighbours(flat: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:

@@ -24,18 +24,8 @@ from mstfilter.errors import InputError, check_component, check_integer
 from mstfilter.scene import Clip, Frame, Recording, VoxelGrid
 from mstfilter.simulation.families import SceneFamily
 from mstfilter.simulation.recorder import SimulatedScene, stream
-from mstfilter.simulation.world import (
-    FingerPush,
-    PushEffect,
-    advance_push,
-    draw_push,
-    finish_push,
-    is_clear,
-    play_push,
-    push_effect,
-)
+from mstfilter.simulation.world import FingerPush, PushEffect, draw_push, is_clear, play_push
 
-DEPTH_SCALE = 0.001  # metres per unit of a recorded depth image
 _LISTS = ("_frames", "_instances", "_truths", "_pauses", "_times", "effects")
 
 
@@ -119,13 +109,8 @@ class PushLoop:
     def play(self, push: FingerPush) -> Clip:
         """Play a push and record it; returns the clip from the last pause to the new one."""
         check_component("push", push, FingerPush)
-        world, family = self._scene.world, self.family
-        before, began, first = world.poses(), world.time, len(self._frames) - 1
-        for step in range(1, family.frames_per_clip - 1):
-            advance_push(world, push, (step - 1) / family.fps, step / family.fps)
-            self._add_frame(began + step / family.fps)
-        advance_push(world, push, (family.frames_per_clip - 2) / family.fps, push.seconds)
-        self.effects.append(push_effect(world, before, finish_push(world), family))
+        first = len(self._frames) - 1
+        self.effects.append(self._scene.play(push, self._add_frame))
         self._add_frame(pause=True)
         times = tuple(self._times[first:])
         self.clip = Clip(tuple(self._frames[first:]), self.grid, self.n_pushes, times)
@@ -168,8 +153,8 @@ class PushLoop:
     def _add_frame(self, time: float | None = None, pause: bool = False) -> None:
         scene, index = self._scene, len(self._frames)
         images = scene.frame_images(index)
-        # Depth in whole millimetres, as recordings store it.
-        depth = np.rint(np.nan_to_num(images["depth"].astype(np.float64) / DEPTH_SCALE)) * np.float32(DEPTH_SCALE)
+        scale = Recording.depth_scale  # depth in whole units, as recordings store it
+        depth = np.rint(np.nan_to_num(images["depth"].astype(np.float64) / scale)) * np.float32(scale)
         self._frames.append(Frame(images["rgb"], depth, scene.camera, images["robot_mask"]))
         self._instances.append(images["instance"])
         self._times.append(round((scene.world.time if time is None else time) - self._start, 6))

@@ -97,6 +97,16 @@ class SimulatedScene:
         """Choose the push of action number `action` from the current state."""
         return choose_push(stream(self.seed, "push", action), self.world, self.family)
 
+    def play(self, push: FingerPush, on_frame: Callable[[float], None]) -> PushEffect:
+        """Play a push from one pause to the next; ``on_frame(time)`` is called at each frame between them."""
+        family, world = self.family, self.world
+        before, began = world.poses(), world.time
+        for step in range(1, family.frames_per_clip - 1):
+            advance_push(world, push, (step - 1) / family.fps, step / family.fps)
+            on_frame(began + step / family.fps)
+        advance_push(world, push, (family.frames_per_clip - 2) / family.fps, push.seconds)
+        return push_effect(world, before, finish_push(world), family)
+
     def frame_images(self, frame: int) -> dict[str, np.ndarray]:
         """Images of the current state as frame number `frame`: rgb, depth, instance, robot_mask."""
         view = self._renderer.render()
@@ -160,16 +170,16 @@ def record_scene(scene: SimulatedScene, path: str | Path, progress: _Progress | 
         _record_pause(scene, writer, index, 0.0)
         report(1, family.n_frames, "pause 0")
         for action in range(family.n_actions):
-            push = scene.choose_push(action)
-            before, began = world.poses(), world.time
-            for step in range(1, family.frames_per_clip - 1):
+
+            def record(time: float, action: int = action) -> None:
+                nonlocal index
                 index += 1
-                advance_push(world, push, (step - 1) / family.fps, step / family.fps)
-                _record_frame(scene, writer, index, began + step / family.fps - start, "action", action=action)
+                _record_frame(scene, writer, index, time - start, "action", action=action)
                 report(index + 1, family.n_frames, f"action {action}")
+
+            push = scene.choose_push(action)
+            description = _describe_push(push, scene.play(push, record))
             index += 1
-            advance_push(world, push, (family.frames_per_clip - 2) / family.fps, push.seconds)
-            description = _describe_push(push, push_effect(world, before, finish_push(world), family))
             _record_pause(scene, writer, index, world.time - start, action=action, push=description)
             report(index + 1, family.n_frames, f"pause {action + 1}")
     return open_recording(path)

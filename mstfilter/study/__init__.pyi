@@ -7,7 +7,12 @@ from mstfilter.study.config import (
     study_of as study_of,
 )
 from mstfilter.study.executors import Event as Event, Executor as Executor, Local as Local
-from mstfilter.study.jobs import peak_megabytes as peak_megabytes, perform as perform, reset_peak as reset_peak
+from mstfilter.study.jobs import (
+    open_scene as open_scene,
+    peak_megabytes as peak_megabytes,
+    perform as perform,
+    reset_peak as reset_peak,
+)
 from mstfilter.study.plan import make_plan as make_plan
 from mstfilter.study.results import (
     FORECASTS as FORECASTS,

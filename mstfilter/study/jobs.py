@@ -42,7 +42,7 @@ def perform(job: Job, step: _StepCallback = lambda done, total: None) -> JobOutc
     """
     try:
         if job["kind"] == "record":
-            _open_scene(job["source"], job["recordings"])
+            open_scene(job["source"], job["recordings"])
         else:
             _run(job, step)
     except (Exception, SystemExit) as error:
@@ -63,7 +63,7 @@ def _failure(error: BaseException) -> JobOutcome:
     return JobOutcome("failed", f"{type(error).__name__}: {error}", hints, trace)
 
 
-def _open_scene(source: Mapping[str, Any], recordings: str) -> Recording:
+def open_scene(source: Mapping[str, Any], recordings: str) -> Recording:
     """The recording of a scene; a simulated one is made if it is missing."""
     if "path" in source:
         return open_source(Path(source["path"]), source["format"], source["options"], source["pauses"])
@@ -101,7 +101,7 @@ def _run(job: Job, step: _StepCallback) -> None:
         began = time.process_time()
         step(p.done, p.total)
 
-    recording = _open_scene(job["source"], job["recordings"])
+    recording = open_scene(job["source"], job["recordings"])
     with atomic_folder(folder) as work:
         with scene_cache.on_disk(**job["work"]) if job["work"] else contextlib.nullcontext():
             began = time.process_time()

@@ -162,11 +162,15 @@ class StudyFolder:
 
     def rows(self) -> list[dict[str, Any]]:
         """One row per pause and finished run, in the order of the study: metrics, time and memory."""
-        return [{k: v for k, v in row.items() if not isinstance(v, list)} for row in self.records()]
+        return _without_lists(self.records())
 
     def summary(self) -> Summary:
         """Means and differences of the runs that are done."""
-        rows = self.rows()
+        return self.summary_of(self.records())
+
+    def summary_of(self, records: Sequence[Mapping[str, Any]]) -> Summary:
+        """`summary` of records that have been read already."""
+        rows = _without_lists(records)
         return summarise(rows, self.description["reference"], cost_columns(rows), self.reported_only)
 
     def write_tables(self) -> None:
@@ -174,7 +178,7 @@ class StudyFolder:
         rows = self.rows()
         costs = cost_columns(rows)
         columns = [*(c for c in _columns(rows) if c not in costs), *costs]
-        found = self.summary()
+        found = self.summary_of(rows)
         failed = [{"run": f["name"], **f, "hints": "; ".join(f["hints"] or ())} for f in self.failures()]
         for name, table, names in (
             ("runs", rows, columns),
@@ -185,6 +189,10 @@ class StudyFolder:
             write_csv(self.path / f"{name}.csv", table, names, float_format=".6g")
         arms = list(dict.fromkeys((row["family"], row["arm"]) for row in rows))
         write_json(self.path / "recalibration.json", fit_information(rows, self._counts, arms))
+
+
+def _without_lists(records: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    return [{k: v for k, v in row.items() if not isinstance(v, list)} for row in records]
 
 
 def cost_columns(rows: Sequence[Mapping[str, Any]]) -> list[str]:

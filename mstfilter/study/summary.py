@@ -133,9 +133,8 @@ class Summary:
                 sign, d = ENDPOINTS[one.metric], one.difference
                 low = d.low if sign > 0 else -d.high
                 found[one.metric] = d.n >= CLAIM and low > 0 and d.p_holm < 1 - LEVEL, low > -NOT_WORSE
-        return len(found) == len(ENDPOINTS) and any(
-            better and all(other[1] for other in found.values()) for better, _ in found.values()
-        )
+        better, not_worse = zip(*found.values(), strict=True) if found else ((), ())
+        return len(found) == len(ENDPOINTS) and any(better) and all(not_worse)
 
     def metric_rows(self) -> list[dict[str, Any]]:
         """Rows of summary.csv."""
