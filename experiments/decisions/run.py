@@ -8,9 +8,10 @@ their true identity; objects that have left the workspace count as not found.
 
 Columns of runs.csv, one row per scene, policy and number of pushes k:
 coverage: IoU of each object of the first scene with the best object of a hypothesis, weighted by the volume at the
-start, 0 for lost objects, mean over the hypotheses. quality: `objects` quality of what is on the table. brier and
-log_loss: of "do these two voxels belong to one object?" at the present pause. lost: objects that have left. entropy:
-of the segmentation, in nats, as the filter believes.
+start, 0 for lost objects, mean over the hypotheses. quality: `objects` quality of what is on the table. information:
+log loss of "do these two voxels belong to one object?" at the present pause, in nats, after recalibration on the
+other scenes of the family; one recalibration for all policies. brier and log_loss: of the same questions, forecasts
+as they come. lost: objects that have left. entropy: of the segmentation, in nats, as the filter believes.
 
 On the first `--regret` scenes of a family all candidates are tried at every push of the random policy: `best` is
 the coverage after the best one, and the regret of a policy is the best coverage minus that of its choice.
@@ -22,6 +23,7 @@ from __future__ import annotations
 
 import argparse
 import json
+from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -30,11 +32,11 @@ from typing import Any
 import numpy as np
 from policies import POLICIES
 
-from mstfilter import Belief, preset
+from mstfilter import Belief, ParticleFilter, preset
 from mstfilter.files import write_csv, write_text
-from mstfilter.scoring import ask, overlap, pause_metrics, score_belief
+from mstfilter.scoring import ask, leave_one_out, overlap, pause_metrics, score_belief
 from mstfilter.scoring.metrics import coverage_of
-from mstfilter.simulation import PushLoop, scene_family
+from mstfilter.simulation import FingerPush, PushLoop, scene_family
 from mstfilter.smc import State
 from mstfilter.statistics import compare_arms, conclusion
 
@@ -42,8 +44,8 @@ N_PUSHES, N_CANDIDATES = 6, 12
 SMALL = {"width": 96, "height": 72, "frames_per_clip": 6, "voxel_size": 0.02, "supersample": 1}
 
 
-def measure(loop: PushLoop, state: State) -> dict[str, float]:
-    """Scores after the pushes so far."""
+def measure(loop: PushLoop, state: State) -> tuple[dict[str, float], np.ndarray]:
+    """Scores after the pushes so far, and the counts of forecasts."""
     recording, t = loop.recording(), loop.n_pushes
     first, now = recording.truth(0), recording.truth(t)
     labels, weights = [h.labels for h in state.population.particles], state.population.weights
@@ -51,8 +53,8 @@ def measure(loop: PushLoop, state: State) -> dict[str, float]:
     volume = np.array([(first == k).sum() for k in objects], dtype=float)
     tables = [overlap(one, now) for one in labels]
     found = np.array([[np.nan_to_num(coverage_of(table, [k])) for k in objects] for table in tables])
-    scores = score_belief(ask(recording, t), labels, weights, now).row
-    return {
+    scores, counts = score_belief(ask(recording, t), labels, weights, now)
+    row = {
         "coverage": float((found @ volume / volume.sum()).mean()),
         "quality": pause_metrics(labels, weights, now, {})[0]["quality"],
         "brier": scores["brier"],
@@ -60,44 +62,77 @@ def measure(loop: PushLoop, state: State) -> dict[str, float]:
         "lost": float(len(loop.lost)),
         "entropy": Belief(state.population).partition_entropy(),
     }
+    return row, counts
 
 
-def play(family: str, seed: int, policy: str, regret: bool, small: bool) -> list[dict[str, Any]]:
-    """One scene with one policy; the rows of k = 0 .. n pushes."""
+def play(family: str, seed: int, regret: bool, small: bool) -> tuple[list[dict[str, Any]], np.ndarray]:
+    """One scene with all policies: the rows of k = 0 .. n pushes, and their counts of forecasts."""
     changes, n = (SMALL, 1) if small else ({}, N_PUSHES)
     mst = preset("mst", *(["n=2", "update.eta=1"] if small else []))
     loop = PushLoop(replace(scene_family(family), **changes), seed)
-    state, _ = mst.step(mst.start(0), loop.clip)
-    named = {"family": family, "scene": f"{family}-{seed}", "policy": policy}
-    rows = [{**named, "k": 0, **measure(loop, state)}]
-    for k in range(1, n + 1):
-        rng = np.random.default_rng([seed, k])
-        belief, pushes = Belief(state.population), loop.candidates(2 if small else N_CANDIDATES)
-        chosen = POLICIES[policy](rng, belief, pushes)
-        row: dict[str, Any] = {}
-        if regret:
-            saved, outcomes = loop.save(), []
-            for push in pushes:
-                after, _ = mst.step(state, loop.play(push))
-                outcomes.append(measure(loop, after)["coverage"])
-                loop.restore(saved)
-            row["best"] = max(outcomes)
-            for name, choose in POLICIES.items():
-                row[f"regret {name}"] = (
-                    max(outcomes) - outcomes[choose(np.random.default_rng([seed, k]), belief, pushes)]
-                )
-        state, _ = mst.step(state, loop.play(pushes[chosen]))
-        rows.append({**named, "k": k, **measure(loop, state), **row})
-    return rows
+    first, _ = mst.step(mst.start(0), loop.clip)
+    start, at_start = loop.save(), measure(loop, first)
+    rows, counts = [], []
+    for policy, choose in POLICIES.items():
+        loop.restore(start)
+        named = {"family": family, "scene": f"{family}-{seed}", "policy": policy}
+        state, (scores, counted) = first, at_start
+        rows.append({**named, "k": 0, **scores})
+        counts.append(counted)
+        for k in range(1, n + 1):
+            belief, pushes = Belief(state.population), loop.candidates(2 if small else N_CANDIDATES)
+            chosen = choose(np.random.default_rng([seed, k]), belief, pushes)
+            extra = {}
+            if regret and policy == "random":
+                extra = _regret(mst, loop, state, pushes, [seed, k])
+            state, _ = mst.step(state, loop.play(pushes[chosen]))
+            scores, counted = measure(loop, state)
+            rows.append({**named, "k": k, **scores, **extra})
+            counts.append(counted)
+    return rows, np.stack(counts)
+
+
+def _regret(
+    mst: ParticleFilter, loop: PushLoop, state: State, pushes: Sequence[FingerPush], key: Sequence[int]
+) -> dict[str, float]:
+    """The coverage after the best of all candidates, and what the choice of each policy stays below it."""
+    saved, outcomes = loop.save(), []
+    for push in pushes:
+        after, _ = mst.step(state, loop.play(push))
+        outcomes.append(measure(loop, after)[0]["coverage"])
+        loop.restore(saved)
+    belief, best = Belief(state.population), max(outcomes)
+    chosen = {name: choose(np.random.default_rng(key), belief, pushes) for name, choose in POLICIES.items()}
+    return {"best": best, **{f"regret {name}": best - outcomes[k] for name, k in chosen.items()}}
 
 
 def run(arguments: tuple[Any, ...]) -> str:
     """Play a scene and write its rows, unless that has been done."""
-    folder, family, seed, policy, regret, small = arguments
-    path = folder / "scenes" / f"{family}-{seed}-{policy.replace(' ', '_')}.json"
+    folder, family, seed, regret, small = arguments
+    path = folder / "scenes" / f"{family}-{seed}.json"
     if not path.exists():
-        write_text(path, json.dumps(play(family, seed, policy, regret, small)))
+        rows, counts = play(family, seed, regret, small)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        np.savez_compressed(path.with_suffix(".npz"), counts=counts)
+        write_text(path, json.dumps(rows))  # written last: a scene with this file is finished
     return path.name
+
+
+def read_rows(folder: Path) -> list[dict[str, Any]]:
+    """The rows of all finished scenes, with the information."""
+    rows: list[dict[str, Any]] = []
+    counts: dict[str, dict[str, np.ndarray]] = {}
+    for path in sorted(folder.glob("*.json")):
+        own = json.loads(path.read_text())
+        counts.setdefault(own[0]["family"], {})[own[0]["scene"]] = np.load(path.with_suffix(".npz"))["counts"]
+        rows += own
+    for family, found in counts.items():
+        fits = leave_one_out({scene: one.sum(axis=0) for scene, one in found.items()})
+        for scene, one in found.items():
+            own = [row for row in rows if row["family"] == family and row["scene"] == scene]
+            for row, of_pause in zip(own, one, strict=True):
+                row["information"] = fits[scene].log_loss(of_pause) if scene in fits else float("nan")
+    return rows
 
 
 def _scenes(rows: list[dict[str, Any]]) -> list[str]:
@@ -109,7 +144,7 @@ def summarise(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     found = []
     last = max(row["k"] for row in rows)
     for family in dict.fromkeys(row["family"] for row in rows):
-        for score in ("coverage", "quality", "brier", "log_loss", "lost"):
+        for score in ("coverage", "quality", "information", "brier", "log_loss", "lost"):
             for name, chosen in (("all", range(1, last + 1)), (str(last), [last])):
                 table: dict[str, dict[str, float]] = {}
                 for policy in POLICIES:
@@ -139,10 +174,7 @@ def main() -> None:
     families = ["s1"] if chosen.smoke else chosen.families.split(",")
     n_scenes, n_regret = (2, 1) if chosen.smoke else (chosen.scenes, chosen.regret)
     jobs = [
-        (chosen.out, family, seed, policy, policy == "random" and seed < n_regret, chosen.smoke)
-        for seed in range(n_scenes)
-        for family in families
-        for policy in POLICIES
+        (chosen.out, family, seed, seed < n_regret, chosen.smoke) for seed in range(n_scenes) for family in families
     ]
     if chosen.workers > 1:
         with ProcessPoolExecutor(chosen.workers) as pool:
@@ -151,7 +183,7 @@ def main() -> None:
     else:
         for job in jobs:
             print(run(job), flush=True)
-    rows = [row for path in sorted((chosen.out / "scenes").glob("*.json")) for row in json.loads(path.read_text())]
+    rows = read_rows(chosen.out / "scenes")
     write_csv(chosen.out / "runs.csv", rows, dict.fromkeys(k for row in rows for k in row), float_format=".5g")
     write_csv(chosen.out / "summary.csv", summarise(rows), float_format=".4g")
 
