@@ -41,6 +41,8 @@ from mstfilter.smc import State
 from mstfilter.statistics import compare_arms, conclusion
 
 N_PUSHES, N_CANDIDATES = 6, 12
+#: Eight frames a clip instead of fifteen halve the time of the study.
+CHANGES = {"frames_per_clip": 8, "fps": 2.5}
 SMALL = {"width": 96, "height": 72, "frames_per_clip": 6, "voxel_size": 0.02, "supersample": 1}
 
 
@@ -67,7 +69,7 @@ def measure(loop: PushLoop, state: State) -> tuple[dict[str, float], np.ndarray]
 
 def play(family: str, seed: int, regret: bool, small: bool) -> tuple[list[dict[str, Any]], np.ndarray]:
     """One scene with all policies: the rows of k = 0 .. n pushes, and their counts of forecasts."""
-    changes, n = (SMALL, 1) if small else ({}, N_PUSHES)
+    changes, n = (SMALL, 1) if small else (CHANGES, N_PUSHES)
     mst = preset("mst", *(["n=2", "update.eta=1"] if small else []))
     loop = PushLoop(replace(scene_family(family), **changes), seed)
     first, _ = mst.step(mst.start(0), loop.clip)
