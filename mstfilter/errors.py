@@ -11,9 +11,13 @@ mstfilter.errors.InputError: depth image 000003.png is empty
 
 from __future__ import annotations
 
+import linecache
 import math
+import sysconfig
+import traceback
 from collections.abc import Sequence
 from numbers import Integral, Real
+from pathlib import Path
 from typing import Any
 
 
@@ -96,3 +100,44 @@ def check_component(name: str, value: Any, interface: type, optional: bool = Fal
     article = "an" if interface.__name__[0] in "AEIOU" else "a"
     found = f"the class {value.__name__}" if isinstance(value, type) else repr(value)
     raise InputError(f"{name} is {found}, expected {article} {interface.__name__}", *hints)
+
+
+def place_in_user_file(error: BaseException) -> str | None:
+    """``FILE, line N: TEXT`` of the line of a user's file in which an exception was raised; None if there is none.
+
+    It is the deepest frame of the traceback, or of the traceback of the cause, in a Python file that belongs neither
+    to this package nor to an installed library. A syntax error is in the file that it names.
+    """
+    if isinstance(error, SyntaxError) and error.filename and Path(error.filename).is_file():
+        return f"{_short(error.filename)}, line {error.lineno}: {(error.text or '').strip()}"
+    found = None
+    current: BaseException | None = error
+    while current is not None and found is None:
+        for frame, number in traceback.walk_tb(current.__traceback__):
+            file = frame.f_code.co_filename
+            if _is_of_user(file):
+                linecache.checkcache(file)
+                found = f"{_short(file)}, line {number}: {linecache.getline(file, number).strip()}"
+        current = current.__cause__
+    return found
+
+
+def describe_error(error: BaseException) -> str:
+    """One line for an exception: type, message, and the line of a user's file in which it was raised, if any."""
+    if isinstance(error, InputError):
+        return error.message
+    place = place_in_user_file(error)
+    return f"{type(error).__name__}: {error}" + (f" ({place})" if place else "")
+
+
+def _is_of_user(file: str) -> bool:
+    """Whether a file of a frame exists and is neither of this package nor of an installed library."""
+    libraries = {sysconfig.get_path(name) for name in ("stdlib", "platstdlib", "purelib", "platlib")}
+    folders = [str(Path(__file__).parent), *libraries]
+    return Path(file).is_file() and not any(Path(file).is_relative_to(folder) for folder in folders)
+
+
+def _short(file: str) -> str:
+    """A path relative to the working folder if it is below it."""
+    path = Path(file).resolve()
+    return str(path.relative_to(Path.cwd())) if path.is_relative_to(Path.cwd()) else str(path)

@@ -32,7 +32,7 @@ REGISTRY = Registry(*PACKAGES)
 _META = ("description", "source")
 _FIELDS = (
     *("n", "n_proposed", "resample"),
-    *("initial", "transition", "proposal", "update", "resampler", "trigger", "size"),
+    *("initial", "transition", "proposal", "update", "resampler", "trigger", "size", "lookahead", "rejuvenation"),
 )
 
 

@@ -38,7 +38,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from mstfilter.errors import InputError
+from mstfilter.errors import InputError, place_in_user_file
 
 _ENTRY_POINTS = "mstfilter.components"
 
@@ -108,7 +108,14 @@ class Registry:
         location = self._locate(kind, name, where or kind, allow_files)
         path, _, attribute = location.partition(":")
         if path.endswith(".py"):
-            return _from_file(Path(path), attribute)
+            found = _from_file(Path(path), attribute)
+            if kind in self.kinds and not issubclass(found, self.interface(kind)):
+                interface = self.interface(kind)
+                raise InputError(
+                    f"{where or kind}: {attribute} of {path} is no {kind}: it does not inherit {interface.__name__}",
+                    f"from {'.'.join(interface.__module__.split('.')[:2])} import {interface.__name__}",
+                )
+            return found
         try:
             return _import(location)
         except ImportError as error:
@@ -189,6 +196,8 @@ class Registry:
         """The value of a field with annotation `hint`; `current` is its default or its value in `base`."""
         kind = self.kind_of(hint)
         default = current if dataclasses.is_dataclass(current) else None
+        if kind is not None and typing.get_origin(hint) is tuple and isinstance(value, str):
+            value = [value]
         if kind is not None and isinstance(value, list):
             return tuple(self.build(kind, item, f"{path}[{k}]", allow_files) for k, item in enumerate(value))
         if kind is not None and value is None and type(None) in typing.get_args(hint):
@@ -258,6 +267,14 @@ def _import(location: str) -> type:
     return found
 
 
+def loaded_components() -> list[str]:
+    """The components ``FILE:CLASS`` that this process has loaded from files of the user."""
+    return list(_LOADED)
+
+
+_LOADED: dict[str, None] = {}
+
+
 def _from_file(path: Path, attribute: str) -> type:
     name = f"mstfilter_user_{path.stem}"
     spec = importlib.util.spec_from_file_location(name, path)
@@ -267,10 +284,14 @@ def _from_file(path: Path, attribute: str) -> type:
     try:
         spec.loader.exec_module(module)
     except Exception as error:
-        raise InputError(f"{path} cannot be loaded: {type(error).__name__}: {error}") from error
+        place = place_in_user_file(error)
+        hints = [place] if place else []
+        raise InputError(f"{path} cannot be loaded: {type(error).__name__}: {error}", *hints) from error
     found = getattr(module, attribute, None)
     if not isinstance(found, type):
-        raise InputError(f"{path} has no class {attribute!r}")
+        classes = [n for n, value in vars(module).items() if isinstance(value, type) and value.__module__ == name]
+        raise InputError(f"{path} has no class {attribute!r}", f"it has: {', '.join(classes) or 'none'}")
+    _LOADED[f"{path}:{attribute}"] = None
     found.__mst_file__ = f"{path}:{attribute}"  # type: ignore[attr-defined]
     found.__mst_source__ = hashlib.sha256(path.read_bytes()).hexdigest()  # type: ignore[attr-defined]
     return found

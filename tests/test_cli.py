@@ -172,6 +172,86 @@ def test_a_run_that_was_killed_is_resumed(recording, tmp_path, capsys):
     assert [k for k in whole if whole[k] != resumed[k]] == []
 
 
+USER_FILE = """
+from dataclasses import dataclass
+from mstfilter.completion import Completer
+from mstfilter.segmentation import BoundaryModel
+from mstfilter.smc import Population, Size, Transition
+
+@dataclass(frozen=True)
+class Fails(Transition):
+    def predict(self, rng, population, observation):
+        return population.particles[99]
+
+@dataclass(frozen=True)
+class Wrong(Transition):
+    def predict(self, rng, population, observation):
+        return Population(population.particles, [0.0])
+
+@dataclass(frozen=True)
+class Nothing(Transition):
+    def predict(self, rng, population, observation):
+        pass
+
+@dataclass(frozen=True)
+class Flat(BoundaryModel):
+    def boundary(self, frame):
+        pass
+
+@dataclass(frozen=True)
+class Void(Completer):
+    def fill(self, rng, seen):
+        pass
+
+@dataclass(frozen=True)
+class Grows(Size):
+    def choose(self, population):
+        return 1001
+"""
+
+
+def test_an_error_in_a_file_of_the_user_is_located(recording, tmp_path, monkeypatch, capsys):
+    """The message has the file, the line and its text, or at least names the component."""
+    monkeypatch.chdir(tmp_path)
+    Path("mine.py").write_text(USER_FILE)
+    line = USER_FILE.splitlines().index("        return population.particles[99]") + 1
+    cases = {
+        "transition=./mine.py:Fails": (f"(mine.py, line {line}: return population.particles[99])", "step 1, transi"),
+        "transition=./mine.py:Wrong": ("log weights have shape (1,)", "Population(population.particles, [0.0])"),
+        "transition=./mine.py:Nothing": ("step 1, transition: Nothing returned NoneType, expected a Popul", "return"),
+        "proposal.boundary=./mine.py:Flat": ("step 0, proposal: boundary map has shape ()",),
+        "proposal.completer=./mine.py:Void": ("in step 0, proposal", "`mstfilter check mine.py:Void`"),
+        "size=./mine.py:Grows": ("step 0, resampler: Grows chose 1001 particles from 1, more than 1000", "n_max"),
+        "proposal.boundary=./mine.py:Fails": ("Fails of ./mine.py is no boundary", "import BoundaryModel"),
+        "proposal.boundary=./mine.py:Flot": ("has no class 'Flot'", "it has: Fails, Wrong"),
+    }
+    for k, (override, texts) in enumerate(cases.items()):
+        code, out, err = call("run", recording, override, "n_proposed=1", "--out", f"run{k}", capsys=capsys)
+        assert code in (1, 2), override
+        assert "\nerror: " in f"\n{err}"
+        assert all(text in err for text in texts), err
+        assert "Traceback" not in out + err
+        assert "in the program" not in err
+    Path("mine.py").write_text("import numpy\nx = numpy.pie\n")
+    code, _, err = call("run", recording, "transition=./mine.py:A", capsys=capsys)
+    assert code == 2
+    assert "mine.py, line 2: x = numpy.pie" in err
+    Path("mine.py").write_text("import numpy\nx = = 3\n")
+    code, _, err = call("run", recording, "transition=./mine.py:A", capsys=capsys)
+    assert code == 2
+    assert "mine.py, line 2: x = = 3" in err
+
+
+def test_an_earlier_run_is_replaced_if_asked(recording, tmp_path, capsys):
+    arguments = ("run", recording, "--out", tmp_path / "run", "--no-report", "--preset", "floor_one_blob")
+    assert call(*arguments, capsys=capsys)[0] == 0
+    code, _, err = call(*arguments, "n=2", capsys=capsys)
+    assert code == 2
+    assert "--replace" in err
+    assert call(*arguments, "n=2", "--replace", capsys=capsys)[0] == 0
+    assert RunFolder.open(tmp_path / "run").description["config"]["n"] == 2
+
+
 def test_convert(recording, tmp_path, capsys):
     pairs = tmp_path / "pairs"
     pairs.mkdir()

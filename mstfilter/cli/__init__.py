@@ -10,7 +10,8 @@ import sys
 
 from mstfilter.cli import running, studying, components  # isort: skip (the order of the help page)
 from mstfilter.cli.root import app, warnings_as_lines
-from mstfilter.errors import InputError
+from mstfilter.errors import InputError, describe_error, place_in_user_file
+from mstfilter.registry import loaded_components
 
 __all__ = ["app", "components", "main", "running", "studying"]
 
@@ -27,7 +28,9 @@ def main(arguments: list[str] | None = None) -> None:
         if debug:
             raise
         print(f"error: {error.message}", file=sys.stderr)
-        for hint in error.hints:
+        place = place_in_user_file(error) or ""
+        inside = [] if not place or ": raise " in place or place in error.hints else [place]
+        for hint in (*error.hints, *inside):
             print(f"hint: {hint}", file=sys.stderr)
         sys.exit(2)
     except SystemExit as end:
@@ -40,6 +43,11 @@ def main(arguments: list[str] | None = None) -> None:
     except Exception as error:
         if debug:
             raise
-        print(f"error: {type(error).__name__}: {error}", file=sys.stderr)
-        print("hint: this is an error in the program or in a component; --debug shows the traceback", file=sys.stderr)
+        print(f"error: {describe_error(error)}", file=sys.stderr)
+        for note in getattr(error, "__notes__", ()):
+            print(f"hint: {note}", file=sys.stderr)
+        if place_in_user_file(error) is None:
+            for component in loaded_components():
+                print(f"hint: `mstfilter check {component}` tests the component of this command", file=sys.stderr)
+        print("hint: --debug shows the traceback", file=sys.stderr)
         sys.exit(1)

@@ -108,6 +108,8 @@ def _lines(kind: str) -> Iterator[str]:
                 f"{f.width} x {f.height}, voxels {' x '.join(map(str, f.grid().shape))}"
             )
         return
+    if not REGISTRY.known(kind):
+        yield f"no component of this kind has a name; `mstfilter new {kind} mine.py` writes one"
     for name in REGISTRY.known(kind):
         cls = REGISTRY.find_class(kind, name)
         truth = " (uses the ground truth)" if issubclass(cls, UsesTruth) else ""

@@ -37,8 +37,13 @@ def run(
     pauses: Pauses = "",
     frames: Annotated[str, typer.Option(help="Frames of a folder of pairs, separated by commas.")] = "",
     report: Annotated[bool, typer.Option(help="Write report.html into the run folder.")] = True,
+    replace: Annotated[
+        bool, typer.Option("--replace", help="Remove an earlier run in the run folder first.")
+    ] = False,
 ) -> None:
     """Filter a recording into a run folder, or resume a run that was stopped."""
+    import shutil
+
     from mstfilter.presets import build_filter, load_config
 
     config = load_config(preset, overrides or ())
@@ -46,6 +51,8 @@ def run(
     source = read_source(recording, format, option, pauses, frames)
     name = Path(preset).stem
     folder = out or Path("runs") / f"{safe_name(source.name)}-{safe_name(name)}-{seed}"
+    if replace and (folder / "run.json").is_file():
+        shutil.rmtree(folder)
     _execute(source, config, folder, seed)
     if report:
         _report(folder, None)

@@ -126,7 +126,7 @@ def _existing_folder(path: Path, description: dict[str, Any]) -> RunFolder | Non
                 raise InputError(
                     f"run folder {path} holds another run: its {key} differs"
                     + _first_difference(found, description[key]),
-                    "choose another folder, or remove this one",
+                    "choose another folder, or remove this one (on the command line: --replace)",
                 )
         folder.remove_partial_pauses()
         folder.set_status("running")

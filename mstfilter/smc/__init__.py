@@ -43,6 +43,9 @@ __interfaces__ = {
     "size": "Size",
     "similarity": "Similarity",
     "equivalence": "Equivalence",
+    "lookahead": "Lookahead",
+    "rejuvenation": "Rejuvenation",
+    "codec": "Codec",
 }
 __components__ = {
     "resampler": {

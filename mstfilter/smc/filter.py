@@ -65,6 +65,10 @@ _INTERFACES: dict[str, type] = {
 }
 
 
+#: Bounds of the number of particles that a `Size` chooses: for objects, and for rows of arrays.
+_MOST_OBJECTS, _MOST_ROWS = 1_000, 100_000_000
+
+
 @dataclass(frozen=True)
 class ParticleFilter:
     """A particle filter made of components.
@@ -257,7 +261,7 @@ class _Step:
         with self.slot("resampler"):
             if not self.filter.trigger.wants(population, self.state.t):
                 return self.state.population, False
-            n = self.filter.n if self.filter.size is None else self.filter.size.choose(population)
+            n = self.filter.n if self.filter.size is None else _chosen(self.filter.size, population)
             selected = self._resample(population.labelled({}), n, "resampler")
             if priority is not None:
                 ancestors = selected.parents["ancestor"]
@@ -269,7 +273,8 @@ class _Step:
 
     def _resample(self, population: Population, n: int, stream: str) -> Population:
         """Resampled particles; their ancestors are -1 if the resampler does not report them."""
-        selected = self.filter.resampler.resample(self.rng(stream), population, n)
+        resampler = self.filter.resampler
+        selected = _checked(resampler.resample(self.rng(stream), population, n), resampler)
         if "ancestor" in selected.parents:
             return selected
         return selected.with_ancestors(np.full(len(selected), -1))
@@ -280,10 +285,12 @@ class _Step:
             return self._first()
         stayed = {"previous": identity(len(past))}
         population = past.realised().labelled(stayed)
-        if self.filter.transition is None:
+        transition = self.filter.transition
+        if transition is None:
             return population
         with self.slot("transition"):
-            moved = self.filter.transition.predict(self.rng("transition"), population, self.observation)
+            moved = transition.predict(self.rng("transition"), population, self.observation)
+            moved = _checked(moved, transition)
             if "previous" not in moved.parents and len(moved) == len(population):
                 moved = moved.labelled({**moved.parents, **stayed}, moved.notes)
             self.slot.record(moved.notes)
@@ -294,7 +301,7 @@ class _Step:
         if initial is None or initial == self.filter.proposal:
             return None
         with self.slot("initial"):
-            population = initial.sample(self.rng("initial"), self.observation, n)
+            population = _checked(initial.sample(self.rng("initial"), self.observation, n), initial)
             if len(population) != n:
                 raise InputError(f"asked for {n} particles it returned {len(population)}")
             self.slot.record(population.notes)
@@ -309,7 +316,7 @@ class _Step:
             if self.observation is None:
                 raise InputError("the first observation is missing and the filter starts from its proposal")
             n = self.filter.n_proposed or self.filter.n
-            proposed = proposal.sample(self.rng("proposal"), self.observation, n)
+            proposed = _checked(proposal.sample(self.rng("proposal"), self.observation, n), proposal)
             self.slot.record(proposed.notes)
         return proposed.labelled({"proposed": identity(len(proposed))}, proposed.notes)
 
@@ -322,7 +329,7 @@ class _Step:
             return fused
         with self.slot("update"):
             rng = self.rng("update") if update.draws else _unused_generator()
-            fused = update.update(rng, predicted, proposed, self.observation)
+            fused = _checked(update.update(rng, predicted, proposed, self.observation), update)
             self.slot.record(fused.notes)
         return fused
 
@@ -337,7 +344,7 @@ class _Step:
                 # With resample="before", the size was chosen before the prediction: only remove excess particles.
                 limit = max(n, 0 if past is None else len(past))
                 if after or len(fused) > limit:
-                    n = size.choose(fused)
+                    n = _chosen(size, fused)
                     limit = n if after else limit
             if len(fused) > limit or (after and self.filter.trigger.wants(fused, self.state.t)):
                 # A step that resamples before the prediction may resample a second time, so it needs another stream.
@@ -360,6 +367,7 @@ class _Step:
                     raise InputError("rejuvenation needs a parent for every particle, and some have none")
                 previous = past if index is identity(len(past)) else past.take(index)
             moved = rejuvenation.move(self.rng("rejuvenation"), population, previous, self.observation)
+            moved = _checked(moved, rejuvenation)
             if len(moved) != len(population):
                 raise InputError(
                     f"a move returned {len(moved)} of {len(population)} particles, expected all in order"
@@ -425,11 +433,37 @@ class _Slot:
             self.observer(self.name, False)
         if isinstance(error, InputError):
             raise type(error)(f"step {self.t}, {self.name}: {error.message}", *error.hints) from error
+        if isinstance(error, Exception):
+            error.add_note(f"in step {self.t}, {self.name}")
 
     def record(self, notes: Mapping[str, Any]) -> None:
         """Keep the notes of the component, if there are any."""
         if notes:
             self.notes[self.name] = notes
+
+
+def _checked(found: Any, component: Component) -> Population:
+    """The population that a component returned; InputError if it returned something else."""
+    if isinstance(found, Population):
+        return found
+    name = type(component).__name__
+    raise InputError(
+        f"{name} returned {type(found).__name__}, expected a Population", "does every branch of the method return it?"
+    )
+
+
+def _chosen(size: Size, population: Population) -> int:
+    """The number of particles that a size chooses; InputError if it is no integer from 1 to its bound."""
+    n, name = size.choose(population), type(size).__name__
+    check_integer(f"number of particles that {name} chose", n)
+    objects = not isinstance(population.particles, np.ndarray | Mapping)
+    bound = size.n_max or (_MOST_OBJECTS if objects else _MOST_ROWS)
+    if n > bound:
+        raise InputError(
+            f"{name} chose {n} particles from {len(population)}, more than {bound}",
+            f"bound the result of choose, or raise the largest number that is accepted: {name}.n_max",
+        )
+    return int(n)
 
 
 def _priority(lookahead: Lookahead, population: Population, observation: Any) -> np.ndarray:

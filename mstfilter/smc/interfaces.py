@@ -202,6 +202,10 @@ class Trigger(ABC):
 class Size(ABC):
     """Chooses the number of particles of a resampling. The filter then only starts with `n` particles."""
 
+    #: Largest number that a filter accepts; a subclass may declare a field of this name. None: 1,000 if the particles
+    #: are objects, 100 million if they are arrays.
+    n_max: int | None = None
+
     @abstractmethod
     def choose(self, population: Population) -> int:
         """Number of particles (at least 1), from the weighted particles that are about to be resampled."""

@@ -23,7 +23,7 @@ from typing import Any
 
 import numpy as np
 
-from mstfilter.errors import InputError
+from mstfilter.errors import InputError, describe_error
 from mstfilter.files import atomic_folder
 from mstfilter.formats import open_recording
 from mstfilter.presets import PACKAGES
@@ -59,8 +59,10 @@ def _failure(error: BaseException) -> JobOutcome:
         return JobOutcome("failed", f"no space left: {error}", hints, trace)
     if isinstance(error, MemoryError):
         return JobOutcome("failed", "out of memory", ("use fewer workers",), trace)
-    hints = ("this is an error in the program or in a component",)
-    return JobOutcome("failed", f"{type(error).__name__}: {error}", hints, trace)
+    hints = tuple(getattr(error, "__notes__", ()))
+    return JobOutcome(
+        "failed", describe_error(error), hints or ("failures.csv names the file of the traceback",), trace
+    )
 
 
 def open_scene(source: Mapping[str, Any], recordings: str) -> Recording:

@@ -22,7 +22,7 @@ from typing import Any
 
 import pytest
 
-from mstfilter.errors import InputError
+from mstfilter.errors import InputError, describe_error
 from mstfilter.fusion import Evidence
 from mstfilter.smc import (
     Codec,
@@ -184,7 +184,7 @@ class _Plugin:
         elif isinstance(error, AssertionError):
             failure = str(error)
         elif error is not None:
-            failure = f"{type(error).__name__}: {error}"
+            failure = describe_error(error)
         test = item.function
         if failure is not None:
             self._stopped = getattr(test, "prerequisite", False)

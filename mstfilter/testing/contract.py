@@ -26,7 +26,7 @@ from typing import Any, TypeVar
 import numpy as np
 import pytest
 
-from mstfilter.errors import InputError
+from mstfilter.errors import describe_error
 from mstfilter.smc import Population
 
 #: Largest probability that a statistical test fails for a correct component.
@@ -159,9 +159,8 @@ def reports_errors(what: str | dict[str, Any]) -> Iterator[None]:
     except Exception as error:
         if _writes_to_read_only(error):
             raise AssertionError("it changes its input in place: make a copy first") from error
-        message = str(error) if isinstance(error, InputError) else f"{type(error).__name__}: {error}"
         what = what if isinstance(what, str) else _description(what)
-        raise AssertionError(f"{what}: it raises {message}") from error
+        raise AssertionError(f"{what}: it raises {describe_error(error)}") from error
 
 
 @contextmanager
