@@ -18,14 +18,14 @@ import tomllib
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from mstfilter import baselines, completion, formats, fusion, oracles, segmentation, smc, tracking
+from mstfilter import baselines, completion, formats, frontends, fusion, oracles, segmentation, smc, tracking
 from mstfilter.errors import InputError
 from mstfilter.registry import Registry
 from mstfilter.resources import find_preset
 from mstfilter.smc import ParticleFilter
 
 #: Packages that declare components.
-PACKAGES = (smc, segmentation, completion, tracking, fusion, formats, baselines, oracles)
+PACKAGES = (smc, segmentation, completion, tracking, fusion, frontends, formats, baselines, oracles)
 #: All components that presets and overrides can name.
 REGISTRY = Registry(*PACKAGES)
 

@@ -1,4 +1,8 @@
-from mstfilter.segmentation.boundary import BoundaryModel as BoundaryModel, ColourDepthBoundary as ColourDepthBoundary
+from mstfilter.segmentation.boundary import (
+    BoundaryModel as BoundaryModel,
+    ClipBoundary as ClipBoundary,
+    ColourDepthBoundary as ColourDepthBoundary,
+)
 from mstfilter.segmentation.cuts import (
     CutSampler as CutSampler,
     CutValue as CutValue,
@@ -6,6 +10,7 @@ from mstfilter.segmentation.cuts import (
     MergeLogOdds as MergeLogOdds,
     OptimalCut as OptimalCut,
     SceneCutObjectness as SceneCutObjectness,
+    gibbs as gibbs,
     optimal_cut as optimal_cut,
 )
 from mstfilter.segmentation.learned_tree import Agglomeration as Agglomeration, LearnedTree as LearnedTree
@@ -14,6 +19,7 @@ from mstfilter.segmentation.proposal import (
     ObjectRule as ObjectRule,
     Segments as Segments,
     TreeCutProposal as TreeCutProposal,
+    complete_segments as complete_segments,
     hypothesis_of as hypothesis_of,
 )
 from mstfilter.segmentation.regions import (

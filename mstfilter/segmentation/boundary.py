@@ -17,7 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mstfilter.scene import BASELINE, Frame, fit_support_plane, table_residual
+from mstfilter.scene import BASELINE, Clip, Frame, fit_support_plane, table_residual
 
 #: Focal length in pixels that defines the sensor's disparity unit: 1/8 pixel of a 640 x 480 Kinect, whatever the
 #: size of the image. The noise (0.58 units) and all thresholds then stay the same when an image is resized.
@@ -48,6 +48,14 @@ class BoundaryModel(ABC):
     @abstractmethod
     def boundary(self, frame: Frame) -> np.ndarray:
         """(H, W) float32 in 0 .. 1: boundary strength of each pixel."""
+
+
+class ClipBoundary(BoundaryModel):
+    """A boundary model that depends on the clip, for example because it reads a file for each pause."""
+
+    @abstractmethod
+    def at(self, clip: Clip) -> BoundaryModel:
+        """The model of the clip's last frame. Its `component_key` includes the content that it uses."""
 
 
 @dataclass(frozen=True)

@@ -14,16 +14,16 @@ several objects of a hypothesis claim a voxel, one of them gets it, in every hyp
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
-from typing import ClassVar
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, ClassVar
 
 import numpy as np
 
 from mstfilter.completion import Completer, Completion, Extrude, arbitrate
 from mstfilter.errors import check_choice
 from mstfilter.scene import Clip, Frame, Hypothesis, ObjectRecord, VoxelGrid, component_key, memo
-from mstfilter.segmentation.boundary import BoundaryModel, ColourDepthBoundary, pixels_above_table
+from mstfilter.segmentation.boundary import BoundaryModel, ClipBoundary, ColourDepthBoundary, pixels_above_table
 from mstfilter.segmentation.cuts import CutSampler, CutValue, MergeLogOdds, optimal_cut
 from mstfilter.segmentation.learned_tree import LearnedTree
 from mstfilter.segmentation.mh import MetropolisHastingsCuts
@@ -152,6 +152,10 @@ class TreeCutProposal(Proposal):
         key = (frame.key, component_key((self.boundary, self.tree, self.value)))
         return memo("segmentation_tree", key, compute, stored_as=(Tree, np.ndarray))
 
+    def of_clip(self, clip: Clip) -> TreeCutProposal:
+        """The same proposal with the boundary model of a clip, if the model depends on the clip."""
+        return replace(self, boundary=self.boundary.at(clip)) if isinstance(self.boundary, ClipBoundary) else self
+
     def label_image(self, frame: Frame, cut: np.ndarray | None = None) -> np.ndarray:
         """(H, W) int32 segments of a cut, 0 background, k + 1 its k-th node; the optimal cut by default."""
         tree, w = self.tree_of(frame)
@@ -159,36 +163,60 @@ class TreeCutProposal(Proposal):
 
     def sample(self, rng: np.random.Generator, observation: Clip, n: int) -> Population:
         frame, grid = observation.after, observation.grid
-        tree, w = self.tree_of(frame)
+        tree, w = self.of_clip(observation).tree_of(frame)
         drawn = self.sampler.sample(rng, tree, w, n)
         segments = memo(
             "segments",
             (frame.key, grid.key, tree.key, component_key(self.objects)),
             lambda: self.objects.segments(tree, frame, grid),
         )
-        kept = [cut[segments.is_object[cut]] for cut in drawn.cuts]
-        completed: dict[int, Completion] = {}
-        for node in np.unique(np.concatenate([np.zeros(0, np.int64), *kept])).tolist():
-            mask = tree.mask(node) & segments.object_pixels
-            # One stream per segment, so the result does not depend on the other segments.
-            stream = child(rng, "completion", node)
-            completed[node] = self.completer.complete(stream, frame, [mask], grid)[0]
-        built: dict[bytes, Hypothesis] = {}
-        for nodes in kept:
-            if nodes.tobytes() not in built:
-                chosen = [completed[node] for node in nodes.tolist()]
-                built[nodes.tobytes()] = hypothesis_of(chosen, grid, observation.index, self.threshold)
-        particles = tuple(built[nodes.tobytes()] for nodes in kept)
+        particles, counts = complete_segments(
+            rng,
+            observation,
+            [cut[segments.is_object[cut]] for cut in drawn.cuts],
+            lambda node: tree.mask(node) & segments.object_pixels,
+            self.completer,
+            self.threshold,
+        )
         notes = {
             "sampler": drawn.diagnostics,
             "tree_nodes": tree.n_nodes,
             "cut_sizes": [len(cut) for cut in drawn.cuts],
-            "objects": [h.n_objects for h in particles],
-            "distinct_segments": len(completed),
-            "distinct_hypotheses": len(built),
+            **counts,
         }
         log_weights = drawn.log_p if self.weight_rule == "p" else np.zeros(n)
         return Population(particles, log_weights, notes=notes)
+
+
+def complete_segments(
+    rng: np.random.Generator,
+    clip: Clip,
+    samples: Sequence[np.ndarray],
+    mask_of: Callable[[int], np.ndarray],
+    completer: Completer,
+    threshold: float = 0.5,
+) -> tuple[tuple[Hypothesis, ...], dict[str, Any]]:
+    """Hypotheses from sampled segmentations of the last frame of a clip, and counts for the notes.
+
+    Each sample is an array of segments, int64; ``mask_of(segment)`` is (H, W) bool. Each distinct segment is
+    completed once, with the stream ``"completion", segment``, so the result does not depend on the other segments.
+    """
+    completed: dict[int, Completion] = {}
+    for segment in np.unique(np.concatenate([np.zeros(0, np.int64), *samples])).tolist():
+        stream = child(rng, "completion", segment)
+        completed[segment] = completer.complete(stream, clip.after, [mask_of(segment)], clip.grid)[0]
+    built: dict[bytes, Hypothesis] = {}
+    for segments in samples:
+        if segments.tobytes() not in built:
+            chosen = [completed[segment] for segment in segments.tolist()]
+            built[segments.tobytes()] = hypothesis_of(chosen, clip.grid, clip.index, threshold)
+    particles = tuple(built[segments.tobytes()] for segments in samples)
+    counts = {
+        "objects": [h.n_objects for h in particles],
+        "distinct_segments": len(completed),
+        "distinct_hypotheses": len(built),
+    }
+    return particles, counts
 
 
 def hypothesis_of(

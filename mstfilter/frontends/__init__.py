@@ -1,0 +1,22 @@
+"""Front ends of others: segmentations and networks that users supply by path.
+
+>>> import mstfilter
+>>> mst = mstfilter.preset("mst", "proposal=mask_folder", "proposal.folder=masks")        # doctest: +SKIP
+
+=================  ===================================================================
+`mask_files`       folders of instance masks with alternatives: layout, reader, writer
+`mask_trees`       nested masks as a tree whose cuts are levels
+`mask_proposal`    the proposal, the boundary model, and the recipe for SAM
+=================  ===================================================================
+
+No weights are part of the package, and none are downloaded.
+"""
+
+from mstfilter.lazy import attach
+
+__getattr__, __dir__, __all__ = attach(__name__, __file__)
+
+__components__ = {
+    "proposal": {"mask_folder": "MaskProposal"},
+    "boundary": {"mask_folder": "MaskBoundary"},
+}

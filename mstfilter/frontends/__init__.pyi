@@ -1,0 +1,13 @@
+from mstfilter.frontends.mask_files import (
+    MaskRegion as MaskRegion,
+    PauseMasks as PauseMasks,
+    read_masks as read_masks,
+    write_masks as write_masks,
+)
+from mstfilter.frontends.mask_proposal import (
+    MaskBoundary as MaskBoundary,
+    MaskProposal as MaskProposal,
+    border_probability as border_probability,
+    write_automatic_masks as write_automatic_masks,
+)
+from mstfilter.frontends.mask_trees import mask_tree as mask_tree, nested_masks as nested_masks

@@ -1,0 +1,423 @@
+"""Folders of instance masks that another program made, several alternatives for each pause.
+
+>>> write_masks("masks", 0, [labels_a, labels_b], weights=[0.7, 0.3])    # label images (H, W), 0 = no mask
+>>> masks = read_masks("masks", 0, (480, 640))
+>>> [len(region.weights) for region in masks.regions]
+[2]
+
+The layout; numbers are those of the pauses (`Clip.index`), from 0::
+
+    masks/000000.png              one segmentation of the image at pause 0
+    masks/000001/a.png, b.npz     several alternatives of the whole image
+    masks/000002/left/a.json, b.json     alternatives of a region; the regions of a pause are independent
+    masks/000002/sure/0.json      a region with one alternative is certain
+    .../weights.json              optional, beside the alternatives: {"a.png": 2, "b.npz": 1}
+
+A file is one set of masks of the size of the image, disjoint or nested (`mstfilter.frontends.mask_trees`):
+
+* ``.png``: label image, 8 or 16 bits, 0 = no mask.
+* ``.npz``: ``labels`` (H, W) integer, or ``masks`` (n, H, W) bool; optional ``scores`` (n,), for labels in ascending
+  order. An optional ``image`` is the `image_key` of the colour image; masks of another image are then an error.
+* ``.json``: a list of COCO annotations, or ``{"masks": [...]}``. Each has ``segmentation: {size: [H, W], counts}``,
+  run lengths as numbers or compressed, and optionally ``score`` or ``predicted_iou``, as SAM writes it.
+
+Scores are at least 0, and 1 where they are missing. Without weights.json, the weight of an alternative is the mean
+score of its largest masks. Weights of a region need not sum to 1.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+import zipfile
+import zlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mstfilter.errors import InputError
+from mstfilter.files import atomic_path, write_text
+from mstfilter.frontends.mask_trees import label_tree, mask_tree
+from mstfilter.scene import content_key, memo, read_labels
+from mstfilter.segmentation import Tree
+
+MAX_MASKS = 65535  #: Largest label, and largest number of masks of a file
+_SUFFIXES = (".png", ".npz", ".json")
+_WEIGHTS = "weights.json"
+
+
+@dataclass(frozen=True, eq=False)
+class MaskRegion:
+    """Alternatives of a region of the image, of which one is true."""
+
+    name: str
+    weights: np.ndarray  #: (k,) probabilities, their sum is 1
+    trees: tuple[Tree, ...]  #: the masks of each alternative; leaf 0 is the rest of the image
+    values: tuple[np.ndarray, ...]  #: node values of each tree, for a sampler at temperature 1
+
+
+@dataclass(frozen=True, eq=False)
+class PauseMasks:
+    """All masks of a pause."""
+
+    regions: tuple[MaskRegion, ...]  #: independent, and without common pixels
+    key: bytes  #: key of the content of the files
+
+
+def image_key(rgb: np.ndarray) -> str:
+    """Key of a colour image (H, W, 3) uint8."""
+    return content_key("image", np.asarray(rgb)).hex()
+
+
+def read_masks(folder: str | Path, pause: int, shape: tuple[int, int], rgb: np.ndarray | None = None) -> PauseMasks:
+    """Read the masks of a pause. `shape` is that of the image, (H, W); `rgb` is compared with the key in npz files.
+
+    Files are read at each call, and their content is parsed once. Raises InputError if the folder has no masks for
+    the pause, or a file cannot be used.
+    """
+    where = _find(Path(folder), pause)
+    parts = {"": where} if where.is_file() else {p.name: p for p in _entries(where) if p.is_dir()}
+    files = [] if where.is_file() else [p for p in _entries(where) if p.is_file() and p.name != _WEIGHTS]
+    if parts and files and where.is_dir():
+        raise InputError(
+            f"{where} has both files and folders: {files[0].name} and {next(iter(parts))}",
+            "files are alternatives of the whole image, folders are regions; put a certain mask into a folder too",
+        )
+    groups = {name: [p] if p.is_file() else _alternatives(p) for name, p in parts.items()}
+    groups = groups or {"": _alternatives(where)}
+    content = {p: _bytes(p) for group in groups.values() for p in group}
+    weights = {name: _read_weights(group[0].parent, group) for name, group in groups.items() if len(group) > 1}
+    image = "" if rgb is None else image_key(rgb)
+    key = content_key(
+        "masks",
+        shape,
+        image,
+        *(part for p, data in content.items() for part in (p.name, data)),
+        *((w and sorted(w.items()), name) for name, w in weights.items()),
+    )
+
+    def parse() -> PauseMasks:
+        regions = tuple(
+            _region(name, group, content, weights.get(name), shape, image) for name, group in groups.items()
+        )
+        _check_apart(regions, where)
+        return PauseMasks(regions, key)
+
+    return memo("mask_files", key, parse)
+
+
+def _entries(folder: Path) -> list[Path]:
+    """Entries of a folder by name; hidden ones are left out."""
+    return sorted(p for p in folder.iterdir() if not p.name.startswith("."))
+
+
+def _find(folder: Path, pause: int) -> Path:
+    """The file or folder of a pause."""
+    if str(folder) in ("", "."):
+        raise InputError("the folder of masks is not given", "set folder, for example proposal.folder=masks")
+    if not folder.is_dir():
+        raise InputError(f"folder of masks does not exist: {folder}")
+    found: dict[int, list[Path]] = {}
+    for path in _entries(folder):
+        name = path.name if path.is_dir() else path.stem
+        if name.isdecimal() and (path.is_dir() or path.suffix in _SUFFIXES):
+            found.setdefault(int(name), []).append(path)
+    if not found:
+        raise InputError(
+            f"folder {folder} has no masks",
+            "the masks of pause 0 are the file 000000.png, .npz or .json, or the folder 000000",
+        )
+    if pause not in found:
+        numbers = ", ".join(map(str, sorted(found)))
+        raise InputError(
+            f"folder {folder} has no masks for pause {pause}; it has {numbers}", "files are numbered by pause, from 0"
+        )
+    if len(found[pause]) > 1:
+        raise InputError(
+            f"folder {folder} has masks for pause {pause} twice: {', '.join(p.name for p in found[pause])}",
+            f"put alternatives into the folder {pause:06d}",
+        )
+    return found[pause][0]
+
+
+def _alternatives(folder: Path) -> list[Path]:
+    """The mask files of a region."""
+    files = [p for p in _entries(folder) if p.name != _WEIGHTS]
+    for path in files:
+        if path.is_dir() or path.suffix not in _SUFFIXES:
+            raise InputError(f"{path} is not a file of masks", f"expected {', '.join(_SUFFIXES)}")
+    if not files:
+        raise InputError(f"folder {folder} has no masks", f"expected files {', '.join(_SUFFIXES)}")
+    return files
+
+
+def _bytes(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise InputError(f"file of masks cannot be read: {path} ({error.strerror})") from error
+
+
+def _read_weights(folder: Path, files: list[Path]) -> dict[str, float] | None:
+    """The content of weights.json, if there is one."""
+    path = folder / _WEIGHTS
+    if not path.is_file():
+        return None
+    weights = _json(path, _bytes(path))
+    names = {p.name for p in files}
+    if not isinstance(weights, dict) or set(weights) != names:
+        raise InputError(f"{path} does not have one weight for each of {', '.join(sorted(names))}")
+    for name, value in weights.items():
+        valid = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value) and value >= 0
+        if not valid:
+            raise InputError(f"{path}: weight of {name} is {value!r}, expected a finite number of at least 0")
+    if sum(weights.values()) <= 0:
+        raise InputError(f"{path}: all weights are 0")
+    return {name: float(value) for name, value in weights.items()}
+
+
+def _region(
+    name: str,
+    files: list[Path],
+    content: Mapping[Path, bytes],
+    weights: Mapping[str, float] | None,
+    shape: tuple[int, int],
+    image: str,
+) -> MaskRegion:
+    trees, values, means = [], [], []
+    for path in files:
+        try:
+            masks, scores = _READERS[path.suffix](path, content[path], shape, image)
+            tree, w = (label_tree if masks.ndim == 2 else mask_tree)(masks, scores)
+        except InputError as error:
+            prefix = "" if str(path) in error.message else f"{path}: "
+            raise InputError(prefix + error.message, *error.hints) from error
+        trees.append(tree)
+        values.append(w)
+        means.append(_mean_of_largest(masks, scores))
+    given = np.array(means if weights is None else [weights[p.name] for p in files])
+    total = given.sum()
+    return MaskRegion(
+        name, given / total if total > 0 else np.full(len(files), 1 / len(files)), tuple(trees), tuple(values)
+    )
+
+
+def _mean_of_largest(masks: np.ndarray, scores: np.ndarray) -> float:
+    """Mean score of the masks that no other mask contains; 1 without masks."""
+    if len(scores) == 0:
+        return 1.0
+    if masks.ndim == 2:
+        return float(scores.mean())
+    flat = masks.reshape(len(masks), -1)
+    order = np.argsort(-flat.sum(axis=1), kind="stable")
+    taken, largest = np.zeros(flat.shape[1], dtype=bool), []
+    for k in order.tolist():
+        if not taken[flat[k].argmax()]:
+            largest.append(k)
+        taken |= flat[k]
+    return float(scores[largest].mean())
+
+
+def _check_apart(regions: tuple[MaskRegion, ...], where: Path) -> None:
+    """Raise InputError if two regions share pixels."""
+    taken: np.ndarray | None = None
+    for number, region in enumerate(regions):
+        mine = np.any([tree.leaves > 0 for tree in region.trees], axis=0)
+        taken = np.full(mine.shape, -1) if taken is None else taken
+        both = mine & (taken >= 0)
+        if both.any():
+            other = regions[int(taken[both][0])].name
+            raise InputError(
+                f"{where}: regions {other} and {region.name} share {int(both.sum())} pixels",
+                "regions are independent, so a pixel can be in one of them only",
+            )
+        taken[mine] = number
+
+
+def _check_shape(path: Path, found: Sequence[int], shape: tuple[int, int]) -> None:
+    if tuple(found) != tuple(shape):
+        raise InputError(
+            f"masks of {path} are {found[0]} x {found[1]} pixels, the image is {shape[0]} x {shape[1]} (H x W)",
+            "masks have the size of the image",
+        )
+
+
+def _read_png(path: Path, data: bytes, shape: tuple[int, int], image: str) -> tuple[np.ndarray, np.ndarray]:
+    labels = read_labels(path)
+    _check_shape(path, labels.shape, shape)
+    return labels, np.ones(len(np.unique(labels[labels > 0])))
+
+
+def _read_npz(path: Path, data: bytes, shape: tuple[int, int], image: str) -> tuple[np.ndarray, np.ndarray]:
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            names = {name.removesuffix(".npy") for name in archive.namelist()}
+            kind = "labels" if "labels" in names else "masks"
+            if kind not in names:
+                raise InputError(f"{path} has no array labels or masks, only {', '.join(sorted(names)) or 'nothing'}")
+            size, dtype = _header(archive, kind)
+            # The size is checked before memory is allocated for it.
+            if len(size) != (2 if kind == "labels" else 3):
+                raise InputError(
+                    f"{path}: {kind} has shape {size}, expected {'(H, W)' if kind == 'labels' else '(n, H, W)'}"
+                )
+            _check_shape(path, size[-2:], shape)
+            if kind == "masks" and (dtype.kind != "b" or size[0] > MAX_MASKS):
+                raise InputError(
+                    f"{path}: masks has type {dtype} and length {size[0]}, expected bool, at most {MAX_MASKS}"
+                )
+            masks = _member(archive, kind)
+            if kind == "labels":
+                if not np.issubdtype(masks.dtype, np.integer):
+                    raise InputError(f"{path}: labels has type {masks.dtype}, expected integers")
+                if masks.min(initial=0) < 0 or masks.max(initial=0) > MAX_MASKS:
+                    raise InputError(
+                        f"{path}: labels are {masks.min()} to {masks.max()}, expected 0 to {MAX_MASKS}",
+                        "labels have 16 bits; number the masks from 1",
+                    )
+            n = len(masks) if kind == "masks" else len(np.unique(masks[masks > 0]))
+            scores = _member(archive, "scores") if "scores" in names else np.ones(n)
+            made_from = str(_member(archive, "image")) if "image" in names else image
+    except (zipfile.BadZipFile, ValueError, EOFError, OSError, zlib.error, KeyError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(
+            f"file of masks cannot be read: {path} ({error})",
+            "expected arrays of numbers from numpy.savez; objects (pickle) are not read",
+        ) from error
+    if image and made_from != image:
+        raise InputError(f"masks of {path} were made from another image", "files are numbered by pause, from 0")
+    if not np.issubdtype(scores.dtype, np.number):
+        raise InputError(f"{path}: scores has type {scores.dtype}, expected numbers")
+    return masks, scores
+
+
+def _header(archive: zipfile.ZipFile, name: str) -> tuple[tuple[int, ...], np.dtype[Any]]:
+    """Shape and type of an array in an npz file."""
+    with archive.open(f"{name}.npy") as file:
+        read = np.lib.format.read_array_header_1_0
+        if np.lib.format.read_magic(file) != (1, 0):
+            read = np.lib.format.read_array_header_2_0
+        shape, _, dtype = read(file)
+    return shape, dtype
+
+
+def _member(archive: zipfile.ZipFile, name: str) -> np.ndarray:
+    with archive.open(f"{name}.npy") as file:
+        return np.asarray(np.lib.format.read_array(file, allow_pickle=False))
+
+
+def _json(path: Path, data: bytes) -> Any:
+    try:
+        return json.loads(data)
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path} is not valid JSON: {error}") from error
+
+
+def _read_json(path: Path, data: bytes, shape: tuple[int, int], image: str) -> tuple[np.ndarray, np.ndarray]:
+    entries = _json(path, data)
+    entries = entries.get("masks") if isinstance(entries, dict) else entries
+    if not isinstance(entries, list) or len(entries) > MAX_MASKS:
+        raise InputError(f"{path} is not a list of at most {MAX_MASKS} masks, or an object with such a list `masks`")
+    masks, scores = np.zeros((len(entries), *shape), dtype=bool), np.ones(len(entries))
+    for k, entry in enumerate(entries):
+        rle = entry.get("segmentation") if isinstance(entry, dict) else None
+        if not isinstance(rle, dict) or not {"size", "counts"} <= set(rle):
+            raise InputError(
+                f"{path}: mask {k} has no segmentation with size and counts",
+                "run lengths are read, polygons are not; SAM writes them with output_mode='coco_rle'",
+            )
+        size = rle["size"]
+        if not isinstance(size, list) or len(size) != 2:
+            raise InputError(f"{path}: size of mask {k} is {size!r}, expected [H, W]")
+        _check_shape(path, size, shape)
+        try:
+            masks[k] = decode_rle(rle["counts"], shape)
+        except InputError as error:
+            raise InputError(f"{path}: mask {k}: {error.message}", *error.hints) from error
+        score = entry.get("score", entry.get("predicted_iou", 1.0))
+        if not isinstance(score, int | float) or isinstance(score, bool):
+            raise InputError(f"{path}: score of mask {k} is {score!r}, expected a number")
+        scores[k] = score
+    return masks, scores
+
+
+_READERS = {".png": _read_png, ".npz": _read_npz, ".json": _read_json}
+
+
+def decode_rle(counts: Any, shape: tuple[int, int]) -> np.ndarray:
+    """The mask (H, W) bool of COCO run lengths: numbers, or the compressed text (cocoapi, maskApi.c, `rleFrString`).
+
+    Runs go down the columns and alternate, the first is of pixels outside the mask.
+    """
+    runs: list[int] = []
+    if isinstance(counts, str):
+        value = shift = 0
+        for character in counts:
+            code = ord(character) - 48
+            if not 0 <= code < 64 or shift > 30:
+                raise InputError(f"compressed run lengths have the character {character!r}")
+            value |= (code & 31) << shift
+            shift += 5
+            if not code & 32:
+                value -= (code & 16) << (shift - 4)  # the sign bit of the last five bits
+                runs.append(value + (runs[-2] if len(runs) > 2 else 0))
+                value = shift = 0
+        if shift:
+            raise InputError("compressed run lengths end within a number")
+    elif isinstance(counts, list) and all(type(c) is int for c in counts):
+        runs = counts
+    else:
+        raise InputError(f"run lengths are {str(counts)[:40]!r}, expected a text or a list of integers")
+    pixels = shape[0] * shape[1]
+    if any(not 0 <= run <= pixels for run in runs) or sum(runs) != pixels:
+        raise InputError(f"run lengths sum to {sum(runs)}, expected {pixels} for {shape[0]} x {shape[1]} pixels")
+    inside = np.arange(len(runs)) % 2 == 1
+    return np.repeat(inside, runs).reshape(shape[::-1]).T
+
+
+def write_masks(
+    folder: str | Path,
+    pause: int,
+    alternatives: Sequence[np.ndarray | tuple[np.ndarray, Sequence[float] | np.ndarray]],
+    weights: Sequence[float] | None = None,
+    region: str = "",
+    rgb: np.ndarray | None = None,
+) -> None:
+    """Write the alternatives of a pause, or of one of its regions, as npz files.
+
+    Parameters
+    ----------
+    folder : str or Path
+    pause : int
+        `Clip.index` of the clip whose last frame the masks segment.
+    alternatives : sequence
+        Each a label image (H, W), masks (n, H, W) bool that are disjoint or nested, or one of these with its scores.
+    weights : sequence of float, optional
+        One weight for each alternative. Default: from the scores.
+    region : str
+        Name of the region; empty for the whole image.
+    rgb : (H, W, 3) uint8, optional
+        The image. The reader then refuses the masks for another image.
+    """
+    path = Path(folder) / f"{pause:06d}" / region
+    for k, one in enumerate(alternatives):
+        masks, scores = one if isinstance(one, tuple) else (one, None)
+        masks = np.asarray(masks)
+        arrays: dict[str, np.ndarray] = {"labels" if masks.ndim == 2 else "masks": masks}
+        if scores is not None:
+            arrays["scores"] = np.asarray(scores, dtype=np.float64)
+        if rgb is not None:
+            arrays["image"] = np.array(image_key(rgb))
+        file, name = io.BytesIO(), path / f"{k}.npz"
+        np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
+        _region("", [name], {name: file.getvalue()}, None, masks.shape[-2:], "")  # the checks of the reader
+        with atomic_path(name) as partial:
+            partial.write_bytes(file.getvalue())
+    if weights is not None:
+        write_text(path / _WEIGHTS, json.dumps({f"{k}.npz": float(w) for k, w in enumerate(weights)}))
+        _read_weights(path, _alternatives(path))

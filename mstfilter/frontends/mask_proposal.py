@@ -1,0 +1,210 @@
+"""Hypotheses and boundary maps from instance masks that another program made.
+
+>>> filter = mstfilter.preset("mst", "proposal=mask_folder", "proposal.folder=masks")
+>>> MaskProposal("masks").sample(np.random.default_rng(0), clip, 10)
+
+`mstfilter.frontends.mask_files` describes the folder. A sampled segmentation has one alternative of each region,
+drawn by its weight and independently of the other regions, and a cut of the tree of its masks. Combinations are not
+enumerated: the work is that of the alternatives that are drawn, and each distinct mask is completed once.
+
+The same masks can be boundaries of a segmentation tree:
+
+>>> overrides = "proposal.boundary=mask_folder", "proposal.boundary.folder=masks", "proposal.tree=ucm"
+>>> filter = mstfilter.preset("mst", *overrides)
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any, ClassVar, Protocol
+
+import numpy as np
+
+from mstfilter.completion import Completer, Extrude
+from mstfilter.errors import InputError, check_number
+from mstfilter.frontends.mask_files import MaskRegion, PauseMasks, read_masks, write_masks
+from mstfilter.frontends.mask_trees import nested_masks
+from mstfilter.scene import Clip, Frame, component_key, content_key, memo
+from mstfilter.segmentation import (
+    BoundaryModel,
+    ClipBoundary,
+    CutSampler,
+    ExactCuts,
+    ObjectRule,
+    Tree,
+    complete_segments,
+    gibbs,
+)
+from mstfilter.smc import Population, Proposal, child
+
+
+@dataclass(frozen=True)
+class MaskProposal(Proposal):
+    """Hypotheses from a folder of instance masks with alternatives.
+
+    Parameters
+    ----------
+    folder : str
+        The folder of masks.
+    sampler : CutSampler
+        Draws the level of nested masks. At temperature 1 it has the law of `mstfilter.frontends.mask_trees`.
+    objects : ObjectRule
+        Decides which masks are objects; other masks, such as those of the table, are background.
+    completer : Completer
+    threshold : float
+        Smallest probability of an occupied voxel.
+    """
+
+    folder: str = ""
+    sampler: CutSampler = field(default_factory=lambda: ExactCuts(temperature=1.0))
+    objects: ObjectRule = field(default_factory=ObjectRule)
+    completer: Completer = field(default_factory=Extrude)
+    threshold: float = 0.5
+
+    properly_weighted: ClassVar[bool] = False
+
+    def sample(self, rng: np.random.Generator, observation: Clip, n: int) -> Population:
+        """`n` hypotheses about the scene at the end of the clip, with equal weights."""
+        frame, grid = observation.after, observation.grid
+        masks = read_masks(self.folder, observation.index, frame.depth.shape, frame.rgb)
+        chosen: list[list[int]] = [[] for _ in range(n)]
+        pixels: dict[int, np.ndarray] = {}
+        alternatives = {}
+        for region in masks.regions:
+            drawn = child(rng, "region", _number(region.name.encode())).choice(
+                len(region.weights), n, p=region.weights
+            )
+            alternatives[region.name] = np.bincount(drawn, minlength=len(region.weights)).tolist()
+            for k in np.unique(drawn).tolist():
+                tree = region.trees[k]
+                rows = np.flatnonzero(drawn == k)
+                stream = child(rng, "cuts", _number(region.name.encode()), k)
+                cuts = self.sampler.sample(stream, tree, region.values[k], len(rows)).cuts
+                found = memo(
+                    "segments",
+                    (frame.key, grid.key, tree.key, component_key(self.objects)),
+                    partial(self.objects.segments, tree, frame, grid),
+                )
+                numbers: dict[int, int] = {}
+                for row, cut in zip(rows.tolist(), cuts, strict=True):
+                    for node in cut[found.is_object[cut] & (cut > 0)].tolist():  # leaf 0 is the rest of the image
+                        if node not in numbers:
+                            mask = tree.mask(node) & found.object_pixels
+                            # Equal masks of several alternatives have the same number, and share the completion.
+                            numbers[node] = _number(np.packbits(mask).tobytes())
+                            pixels[numbers[node]] = mask
+                        chosen[row].append(numbers[node])
+        samples = [np.array(row, dtype=np.int64) for row in chosen]
+        particles, counts = complete_segments(
+            rng, observation, samples, pixels.__getitem__, self.completer, self.threshold
+        )
+        notes = {"masks": masks.key.hex(), "alternatives": alternatives, **counts}
+        return Population(particles, notes=notes)
+
+
+def _number(content: bytes) -> int:
+    """A number of 62 bits that names a content in random streams."""
+    return int.from_bytes(content_key(content)[:8], "big") >> 2
+
+
+@dataclass(frozen=True)
+class MaskBoundary(ClipBoundary):
+    """The probability that a segmentation drawn from a folder of masks has a border at a pixel.
+
+    The law is that of `MaskProposal` with `ExactCuts` at temperature 1. Borders are borders of masks, so they do not
+    have the statistics of image gradients: combine the model with the tree ``ucm``, not with ``learned``, whose
+    weights were fitted to `ColourDepthBoundary`.
+
+    Parameters
+    ----------
+    folder : str
+        The folder of masks.
+    weight : float
+        Factor of the probability, 0 to 1.
+    other : BoundaryModel, optional
+        A second model; the result is the maximum of both.
+    """
+
+    folder: str = ""
+    weight: float = 1.0
+    other: BoundaryModel | None = None
+
+    def __post_init__(self) -> None:
+        check_number("weight", self.weight, at_least=0, at_most=1)
+
+    def at(self, clip: Clip) -> MaskBoundary:
+        """The model with the masks of the pause that the clip ends at."""
+        bound = copy.copy(self)
+        masks = read_masks(self.folder, clip.index, clip.after.depth.shape, clip.after.rgb)
+        other = self.other.at(clip) if isinstance(self.other, ClipBoundary) else self.other
+        for name, value in (("_masks", masks), ("other", other)):
+            object.__setattr__(bound, name, value)  # components are frozen
+        return bound
+
+    @property
+    def bound_key(self) -> bytes:
+        """Key of the masks; empty before `at`."""
+        masks = self.__dict__.get("_masks")
+        return b"" if masks is None else masks.key
+
+    def boundary(self, frame: Frame) -> np.ndarray:
+        """(H, W) float32; raises InputError before `at`."""
+        masks: PauseMasks | None = self.__dict__.get("_masks")
+        if masks is None:
+            raise InputError("MaskBoundary does not know the pause of a frame", "call MaskBoundary.at(clip) first")
+        edge = self.weight * border_probability(masks.regions, frame.depth.shape)
+        if self.other is not None:
+            edge = np.maximum(edge, self.other.boundary(frame))
+        return edge.astype(np.float32)
+
+
+def border_probability(regions: Iterable[MaskRegion], shape: tuple[int, int]) -> np.ndarray:
+    """(H, W) probability of a border between a pixel and one of its four neighbours, the largest of the four."""
+    joined = np.ones((shape[0], shape[1] - 1)), np.ones((shape[0] - 1, shape[1]))
+    for region in regions:
+        apart = np.zeros_like(joined[0]), np.zeros_like(joined[1])
+        for weight, tree, w in zip(region.weights, region.trees, region.values, strict=True):
+            below, position = _split_probability(tree, w), tree.leaf_position[tree.leaves]
+            for p, a, b in ((apart[0], position[:, :-1], position[:, 1:]), (apart[1], position[:-1], position[1:])):
+                pairs = a != b
+                low, high = np.minimum(a[pairs], b[pairs]), np.maximum(a[pairs], b[pairs])
+                p[pairs] += weight * below[tree.lowest_common(low, high)]
+        for total, p in zip(joined, apart, strict=True):
+            total *= 1 - p
+    out = np.zeros(shape)
+    across, down = 1 - joined[0], 1 - joined[1]
+    for part, p in ((out[:, 1:], across), (out[:, :-1], across), (out[1:], down), (out[:-1], down)):
+        np.maximum(part, p, out=part)
+    return out
+
+
+def _split_probability(tree: Tree, w: np.ndarray) -> np.ndarray:
+    """(N,) probability that a cut consists of nodes below the node, for cuts of the Gibbs law at temperature 1."""
+    stop = gibbs(tree, w, 1.0).stop
+    below = np.ones(tree.n_nodes)
+    for node in range(tree.n_nodes - 1, -1, -1):
+        above = 1.0 if node == tree.root else below[tree.parent[node]]
+        below[node] = above * (1 - stop[node])
+    return below
+
+
+class MaskGenerator(Protocol):
+    """A mask generator as in SAM (`SamAutomaticMaskGenerator`) and SAM 2 (`SAM2AutomaticMaskGenerator`)."""
+
+    def generate(self, image: np.ndarray) -> list[dict[str, Any]]:
+        """Masks of an image (H, W, 3) uint8 RGB; each has `segmentation` (H, W) bool and `predicted_iou`."""
+
+
+def write_automatic_masks(folder: str, clips: Iterable[Clip], generator: MaskGenerator, share: float = 0.9) -> None:
+    """Run a mask generator on the last frame of each clip, and write its masks as nested sets.
+
+    `share` is that of `nested_masks`.
+    """
+    for clip in clips:
+        found = generator.generate(clip.after.rgb.copy())
+        masks = np.array([one["segmentation"] for one in found], dtype=bool).reshape(-1, *clip.after.depth.shape)
+        scores = np.clip([one.get("predicted_iou", 1.0) for one in found], 0, None)
+        write_masks(folder, clip.index, [nested_masks(masks, scores, share)], rgb=clip.after.rgb)

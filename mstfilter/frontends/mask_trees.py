@@ -1,0 +1,170 @@
+"""Instance masks as a tree: masks that nest are nodes, so levels of detail are cuts.
+
+>>> masks = np.zeros((3, 4, 6), bool)
+>>> masks[0, :, :4], masks[1, :, :2], masks[2, :, 2:4] = True, True, True     # an object, and its two parts
+>>> tree, w = mask_tree(masks, scores=[0.9, 0.6, 0.6])
+>>> ExactCuts(temperature=1).sample(rng, tree, w, 10)                        # the object in 60 % of the cuts
+
+Two masks of a set are disjoint, or one contains the other. Leaf 0 of the tree is the part of the image without masks.
+The rest of a mask that contains masks is a leaf too. The root joins everything and is in no cut.
+
+The law of the cuts: a walk starts at the largest masks. At a mask with score s, which contains masks with mean score
+m, it stops with probability s / (s + m); otherwise it visits these masks and the rest. `mask_tree` returns node
+values w for which this is the Gibbs law exp(sum of w over the cut), so every `CutSampler` at temperature 1 draws from
+it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from mstfilter.errors import InputError, check_number
+from mstfilter.segmentation import Tree
+
+_ROOT = -1000.0  # log odds that the root is in a cut; exp(_ROOT) is 0
+_CLIP = 1e-9  # stop probabilities are at least this far from 0 and 1
+
+
+def mask_tree(masks: np.ndarray, scores: Sequence[float] | np.ndarray) -> tuple[Tree, np.ndarray]:
+    """The tree of masks (n, H, W) bool with scores (n,) >= 0, and its node values (N,).
+
+    Raises InputError if a mask is empty, equals another, or overlaps one without containing it.
+    """
+    masks = np.asarray(masks, dtype=bool)
+    n = len(masks)
+    scores = check_scores(scores, n)
+    areas = masks.reshape(n, -1).sum(axis=1)
+    if n and areas.min() == 0:
+        raise InputError(f"mask {int(areas.argmin())} is empty", "leave masks without pixels out")
+    innermost = np.full(masks.shape[1:], -1)  # the smallest mask of each pixel so far
+    container = np.full(n, -1)  # the smallest mask that contains a mask
+    order = np.argsort(-areas, kind="stable")
+    for k in order.tolist():
+        found = np.unique(innermost[masks[k]])
+        if len(found) > 1:
+            other = next(j for j in found[::-1].tolist() if j >= 0)
+            raise InputError(
+                f"masks {other} and {k} overlap: {int((masks[k] & masks[other]).sum())} pixels are in both",
+                "masks of a set are disjoint or nested; mstfilter.frontends.nested_masks makes such a set",
+            )
+        container[k] = found[0]
+        if found[0] >= 0 and areas[found[0]] == areas[k]:
+            raise InputError(f"masks {found[0]} and {k} are equal", "leave one out")
+        innermost[masks[k]] = k
+    return _tree_of(innermost, container, order[::-1].tolist(), scores)
+
+
+def label_tree(labels: np.ndarray, scores: np.ndarray | None = None) -> tuple[Tree, np.ndarray]:
+    """The tree of a label image (H, W), 0 without mask: all masks are disjoint. `scores` (n,) by ascending label."""
+    present, image = np.unique(labels, return_inverse=True)
+    image = image.reshape(labels.shape) - 1 if (present == 0).any() else image.reshape(labels.shape)
+    n = int((present != 0).sum())
+    scores = np.ones(n) if scores is None else check_scores(scores, n)
+    return _tree_of(image, np.full(n, -1), list(range(n)), scores)
+
+
+def check_scores(scores: Sequence[float] | np.ndarray, n: int) -> np.ndarray:
+    """Scores as float64 (n,); raises InputError if their number is wrong or one is negative or not finite."""
+    scores = np.asarray(scores, dtype=np.float64)
+    if scores.shape != (n,):
+        raise InputError(f"scores have shape {scores.shape}, expected one for each of {n} masks")
+    for k in np.flatnonzero(~(np.isfinite(scores) & (scores >= 0))).tolist():
+        raise InputError(f"score of mask {k} is {scores[k]}, expected a finite number of at least 0")
+    return scores
+
+
+def _tree_of(
+    innermost: np.ndarray, container: np.ndarray, ascending: list[int], scores: np.ndarray
+) -> tuple[Tree, np.ndarray]:
+    """The tree of nested masks.
+
+    `innermost` (H, W) is the smallest mask of each pixel, -1 without mask; `container` (n,) the smallest mask that
+    contains a mask, -1 for none; `ascending` lists the masks in order of their area.
+    """
+    n = len(scores)
+    inner = np.zeros(n, dtype=bool)
+    inner[container[container >= 0]] = True
+    rest = np.zeros(n, dtype=bool)  # masks whose own pixels are a leaf
+    rest[innermost[innermost >= 0]] = True
+    leaf = np.where(rest, np.cumsum(rest), 0)
+    node = leaf.copy()
+    joins = [k for k in ascending if inner[k]]
+    n_leaves = 1 + int(rest.sum())
+    node[joins] = n_leaves + np.arange(len(joins))
+    root = n_leaves + len(joins) if n else 0
+    parent = np.full(root + 1, root)
+    stop = np.ones(root + 1)
+    start = np.zeros(root + 1)
+    for k in ascending:
+        above = root if container[k] < 0 else node[container[k]]
+        parent[node[k]] = above
+        if inner[k]:
+            if rest[k]:
+                parent[leaf[k]] = node[k]
+            parts = scores[container == k].mean()
+            stop[node[k]] = scores[k] / (scores[k] + parts) if scores[k] + parts > 0 else 0.5
+            start[node[k]] = max(start[node[k]], 1 - stop[node[k]])
+        if container[k] >= 0:
+            start[above] = max(start[above], start[node[k]])
+    start[root] = float(n > 0)
+    tree = Tree(parent, np.append(leaf, 0)[innermost], start)
+    # exp(w) / (exp(w) + Z of the children) = stop, with log Z = 0 for leaves.
+    stop = np.clip(stop, _CLIP, 1 - _CLIP)
+    w, log_z = np.zeros(root + 1), np.zeros(root + 1)
+    for one in range(n_leaves, root + 1):
+        split = sum(log_z[c] for c in tree.children[one])
+        w[one] = split + (_ROOT if one == root else np.log(stop[one]) - np.log1p(-stop[one]))
+        log_z[one] = np.logaddexp(w[one], split)
+    return tree, w
+
+
+def nested_masks(
+    masks: np.ndarray, scores: Sequence[float] | np.ndarray, share: float = 0.9
+) -> tuple[np.ndarray, np.ndarray]:
+    """The masks of a set that overlaps arbitrarily, made disjoint or nested; returns masks and scores.
+
+    For the output of automatic mask generators. Masks are considered in order of falling score. A mask is kept if it
+    and every mask kept before fulfil one of these conditions: they share at most ``1 - share`` of the smaller one, or
+    at least `share` of it, and their areas differ by more than this factor. Otherwise it is dropped. The smaller mask
+    then loses the pixels outside the mask that contains it; pixels of two neighbours go to the higher score.
+    """
+    check_number("share", share, above=0.5, at_most=1)
+    masks = np.asarray(masks, dtype=bool)
+    scores = check_scores(scores, len(masks))
+    flat = masks.reshape(len(masks), int(np.prod(masks.shape[1:])))
+    areas = flat.sum(axis=1)
+    kept: list[int] = []
+    for k in np.argsort(-scores, kind="stable").tolist():
+        if areas[k] == 0:
+            continue
+        shared = np.array([(flat[k] & flat[j]).sum() for j in kept], dtype=np.float64)
+        small, large = np.minimum(areas[k], areas[kept]), np.maximum(areas[k], areas[kept])
+        nested = (shared >= share * small) & (small < share * large)
+        if (nested | (shared <= (1 - share) * small)).all():
+            kept.append(k)
+    by_area = sorted(kept, key=lambda k: -areas[k])
+    final: dict[int, np.ndarray] = {}
+    for k in by_area:
+        mask = flat[k].copy()
+        for j in final:
+            if (flat[k] & flat[j]).sum() >= share * areas[k]:
+                mask &= final[j]
+            elif scores[k] > scores[j]:
+                final[j] = final[j] & ~mask
+            else:
+                mask &= ~final[j]
+        final[k] = mask
+    # A mask that loses a neighbour's pixels loses them in all masks that it contains.
+    for i, k in enumerate(by_area):
+        for j in by_area[:i]:
+            if (flat[k] & flat[j]).sum() >= share * areas[k]:
+                final[k] = final[k] & final[j]
+    chosen = [k for k in kept if final[k].any()]
+    unique: dict[bytes, int] = {}
+    for k in chosen:
+        unique.setdefault(np.packbits(final[k]).tobytes(), k)
+    chosen = list(unique.values())
+    out = np.array([final[k] for k in chosen], dtype=bool).reshape(len(chosen), *masks.shape[1:])
+    return out, scores[chosen]
