@@ -8,6 +8,7 @@ import re
 import numpy as np
 import pytest
 
+from mstfilter.scene import render
 from tests.conftest import REPOSITORY
 from tests.scene.scenes import CAMERA, GRID, table_scene
 
@@ -18,6 +19,11 @@ PAGES = [
 
 def blocks(page):
     return re.findall(r"```python\n(.*?)```", page.read_text(), flags=re.DOTALL)
+
+
+def _shown(labels):
+    """Label image of a scene, in place of the reader's segmentation."""
+    return render(labels, GRID, CAMERA).labels
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)
@@ -33,6 +39,7 @@ def test_examples_run(page, tmp_path, capsys, monkeypatch):
         "K": CAMERA.K,
         "hypotheses": [Hypothesis.from_labels(s[2], GRID) for s in scenes],
     }
+    given["segment"] = lambda image: [next(_shown(s[2]) for s in scenes if (s[0] == image).all())]
     monkeypatch.chdir(tmp_path)
     for number, block in enumerate(blocks(page)):
         exec(compile(block, f"{page.name}, example {number + 1}", "exec"), given)
