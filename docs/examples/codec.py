@@ -1,7 +1,7 @@
 """A codec: how particles of a user's class are stored in a checkpoint.
 
 mstfilter check ./codec.py:MyCodec
-filter.run(observations, seed=0, checkpoint="run.npz", codec=MyCodec())
+python codec.py
 """
 
 from __future__ import annotations
@@ -45,3 +45,10 @@ def example(rng: np.random.Generator, n: int) -> tuple[Population, Any]:
     """Input for the contract: n particles; the observation is not used."""
     shelves = tuple(Shelf(tuple(rng.choice(["a", "bb", "c"], rng.integers(4)).tolist())) for _ in range(n))
     return Population(shelves), None
+
+
+if __name__ == "__main__":
+    # In a run: filter.run(observations, checkpoint="run.npz", codec=MyCodec())
+    particles = example(np.random.default_rng(0), 4)[0].particles
+    arrays = MyCodec().encode(particles)
+    print(arrays, MyCodec().decode(arrays) == particles)

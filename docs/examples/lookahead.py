@@ -1,17 +1,17 @@
 """A lookahead: which particles the next observation favours. With one, a filter is an auxiliary filter.
 
 mstfilter check ./lookahead.py:MyLookahead
-replace(bootstrap(model, n=100), lookahead=MyLookahead())
+python lookahead.py
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from mstfilter.smc import Lookahead, Population
+from mstfilter.smc import Lookahead, Population, bootstrap, linear_gaussian
 
 
 @dataclass(frozen=True)
@@ -39,3 +39,11 @@ class MyLookahead(Lookahead):
 def example(rng: np.random.Generator, n: int) -> tuple[Population, Any]:
     """Input for the contract: n particles, and the next observation."""
     return Population(rng.standard_normal((n, 2)), rng.standard_normal(n)), np.array([0.3, -0.1])
+
+
+if __name__ == "__main__":
+    # x_0 ~ N(0, 1), x_t ~ N(0.9 x_{t-1}, 0.5), y_t ~ N(x_t, 1)
+    model = linear_gaussian(F=[[0.9]], Q=[[0.5]], H=[[1.0]], R=[[1.0]], m0=[0.0], P0=[[1.0]])
+    filter = replace(bootstrap(model, n=1000), lookahead=MyLookahead())
+    state, infos = filter.run([[0.3], [-0.1], [0.8]], seed=0)
+    print("mean", state.population.weights @ state.population.particles, "ESS", [round(info.ess) for info in infos])

@@ -1,17 +1,17 @@
 """A proposal: new particles from an observation alone.
 
 mstfilter check ./proposal.py:MyProposal
-mstfilter run RECORDING proposal=./proposal.py:MyProposal
+python proposal.py
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from mstfilter.smc import Population, Proposal
+from mstfilter.smc import Population, Proposal, bootstrap, linear_gaussian
 
 
 @dataclass(frozen=True)
@@ -41,3 +41,12 @@ class MyProposal(Proposal):
 def example(rng: np.random.Generator, n: int) -> tuple[Population, Any]:
     """Input for the contract: a population (not used here) and an observation."""
     return Population(rng.standard_normal((n, 2))), np.array([0.3, -0.1])
+
+
+if __name__ == "__main__":
+    # x_0 ~ N(0, 1), x_t ~ N(0.9 x_{t-1}, 0.5), y_t ~ N(x_t, 1)
+    model = linear_gaussian(F=[[0.9]], Q=[[0.5]], H=[[1.0]], R=[[1.0]], m0=[0.0], P0=[[1.0]])
+    # At every step, the update weights 1000 predicted and 100 proposed particles.
+    filter = replace(bootstrap(model, n=1000), proposal=MyProposal(), n_proposed=100)
+    state, infos = filter.run([[0.3], [-0.1], [0.8]], seed=0)
+    print("mean", state.population.weights @ state.population.particles, "ESS", [round(info.ess) for info in infos])

@@ -1,7 +1,7 @@
 """A rejuvenation: a move that leaves p(x_t | x_{t-1}, y_t) unchanged. With one, a filter is a resample-move filter.
 
 mstfilter check ./rejuvenation.py:MyRejuvenation
-replace(bootstrap(model, n=100), rejuvenation=MyRejuvenation())
+python rejuvenation.py
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from mstfilter.smc import Population, Rejuvenation
+from mstfilter.smc import Normal, Population, Rejuvenation, StateSpaceModel, bootstrap
 
 
 @dataclass(frozen=True)
@@ -59,3 +59,10 @@ def exact(rng: np.random.Generator, n: int) -> tuple[Population | None, Populati
     previous = rng.standard_normal(n)
     x = (0.9 * previous + 0.5) / 2 + np.sqrt(0.5) * rng.standard_normal(n)
     return Population(previous), Population(x), 0.5
+
+
+if __name__ == "__main__":
+    model = StateSpaceModel.of(Normal(0.0, 1.0), lambda x: Normal(0.9 * x, 1.0), lambda x: Normal(x, 1.0))
+    filter = replace(bootstrap(model, n=1000), rejuvenation=MyRejuvenation())
+    state, infos = filter.run([0.3, -0.1, 0.8], seed=0)
+    print("mean", state.population.weights @ state.population.particles, "ESS", [round(info.ess) for info in infos])

@@ -1,16 +1,17 @@
 """A resampler: selects particles by weight.
 
 mstfilter check ./resampler.py:MyResampler
-mstfilter run RECORDING resampler=./resampler.py:MyResampler
+mstfilter run demo/recording resampler=./resampler.py:MyResampler --out runs/mine --replace
+python resampler.py
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mstfilter.smc import WeightResampler, normalise
+from mstfilter.smc import WeightResampler, bootstrap, linear_gaussian, normalise
 
 
 @dataclass(frozen=True)
@@ -31,3 +32,11 @@ class MyResampler(WeightResampler):
         ancestors = np.searchsorted(cumulative, points, side="right")  # "right" skips weights of zero
         # None: equal weights. Otherwise return (n,) log weights, log(w_i / expected number of copies).
         return ancestors, None
+
+
+if __name__ == "__main__":
+    # x_0 ~ N(0, 1), x_t ~ N(0.9 x_{t-1}, 0.5), y_t ~ N(x_t, 1)
+    model = linear_gaussian(F=[[0.9]], Q=[[0.5]], H=[[1.0]], R=[[1.0]], m0=[0.0], P0=[[1.0]])
+    filter = replace(bootstrap(model, n=1000), resampler=MyResampler())
+    state, infos = filter.run([[0.3], [-0.1], [0.8]], seed=0)
+    print("mean", state.population.weights @ state.population.particles, "ESS", [round(info.ess) for info in infos])

@@ -1,17 +1,18 @@
 """A size: how many particles a resampling makes.
 
 mstfilter check ./size.py:MySize
-mstfilter run RECORDING size=./size.py:MySize
+mstfilter run demo/recording size=./size.py:MySize size.n_min=3 size.n_max=8 --out runs/mine --replace
+python size.py
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from mstfilter.errors import InputError
-from mstfilter.smc import Population, Size
+from mstfilter.smc import Population, Size, bootstrap, linear_gaussian
 
 
 @dataclass(frozen=True)
@@ -23,7 +24,7 @@ class MySize(Size):
     factor : float
         Number of particles per unit of the perplexity, the exponential of the entropy of the weights.
     n_min, n_max : int
-        Bounds of the answer.
+        Bounds of the answer. The filter stops if the answer is larger than `n_max`.
     """
 
     factor: float = 2.0
@@ -40,3 +41,11 @@ class MySize(Size):
         perplexity = float(np.exp(-(weights @ np.log(weights))))
         # Rounded, since the last bits of a sum depend on the order of the particles.
         return int(np.clip(np.ceil(round(self.factor * perplexity, 6)), self.n_min, self.n_max))
+
+
+if __name__ == "__main__":
+    # x_0 ~ N(0, 1), x_t ~ N(0.9 x_{t-1}, 0.5), y_t ~ N(x_t, 1)
+    model = linear_gaussian(F=[[0.9]], Q=[[0.5]], H=[[1.0]], R=[[1.0]], m0=[0.0], P0=[[1.0]])
+    filter = replace(bootstrap(model, n=1000), size=MySize())
+    state, infos = filter.run([[0.3], [-0.1], [0.8]], seed=0)
+    print("mean", state.population.weights @ state.population.particles, "ESS", [round(info.ess) for info in infos])

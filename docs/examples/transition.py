@@ -1,18 +1,18 @@
 """A transition: how particles move from one time to the next.
 
 mstfilter check ./transition.py:MyTransition
-mstfilter run RECORDING transition=./transition.py:MyTransition
+python transition.py
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from mstfilter.errors import InputError
-from mstfilter.smc import Population, Transition
+from mstfilter.smc import Population, Transition, bootstrap, linear_gaussian
 
 
 @dataclass(frozen=True)
@@ -51,3 +51,11 @@ def exact(rng: np.random.Generator, n: int) -> tuple[Population, Population, Any
     """x_{t-1}, draws of x_t by the model given them, and y_t: the contract tests the distribution with them."""
     previous = rng.standard_normal((n, 2))
     return Population(previous), Population(rng.normal(previous, 1.0)), np.array([0.3, -0.1])
+
+
+if __name__ == "__main__":
+    # x_0 ~ N(0, 1), x_t ~ N(0.9 x_{t-1}, 0.5), y_t ~ N(x_t, 1)
+    model = linear_gaussian(F=[[0.9]], Q=[[0.5]], H=[[1.0]], R=[[1.0]], m0=[0.0], P0=[[1.0]])
+    filter = replace(bootstrap(model, n=1000), transition=MyTransition())
+    state, infos = filter.run([[0.3], [-0.1], [0.8]], seed=0)
+    print("mean", state.population.weights @ state.population.particles, "ESS", [round(info.ess) for info in infos])

@@ -1,17 +1,17 @@
 """An update: how an observation changes the particles.
 
 mstfilter check ./update.py:MyUpdate
-mstfilter run RECORDING update=./update.py:MyUpdate
+python update.py
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from mstfilter.smc import Population, Update, union
+from mstfilter.smc import Population, Update, bootstrap, linear_gaussian, union
 
 
 @dataclass(frozen=True)
@@ -53,3 +53,11 @@ def exact(rng: np.random.Generator, n: int) -> tuple[Population, Population, Any
     # x ~ N(0, 1) and y ~ N(x, 0.5^2) give x | y ~ N(0.8 y, 0.2).
     posterior = rng.normal(0.8 * y, np.sqrt(0.2), (n, 2))
     return Population(rng.standard_normal((n, 2))), Population(posterior), y
+
+
+if __name__ == "__main__":
+    # x_0 ~ N(0, 1), x_t ~ N(0.9 x_{t-1}, 0.5), y_t ~ N(x_t, 1)
+    model = linear_gaussian(F=[[0.9]], Q=[[0.5]], H=[[1.0]], R=[[1.0]], m0=[0.0], P0=[[1.0]])
+    filter = replace(bootstrap(model, n=1000), update=MyUpdate())
+    state, infos = filter.run([[0.3], [-0.1], [0.8]], seed=0)
+    print("mean", state.population.weights @ state.population.particles, "ESS", [round(info.ess) for info in infos])

@@ -70,20 +70,24 @@ def check(
 @app.command()
 def new(
     kind: Annotated[
-        str,
-        typer.Argument(
-            help="resampler, transition, proposal, update, trigger, size, lookahead, rejuvenation or codec."
-        ),
+        str, typer.Argument(help="transition, proposal, update, evidence, resampler, ...; a wrong one lists all.")
     ],
     path: Annotated[Path, typer.Argument(help="Python file to write, for example mine.py.")],
+    target: Annotated[
+        str, typer.Option("--for", metavar="scenes|numbers", help="What the particles are. Default: scenes.")
+    ] = "",
 ) -> None:
     """Write a commented component that works, as a start for a new one, and its test."""
     from mstfilter.testing import write_starter
 
-    file, test = write_starter(kind, path)
-    print(f"component   {file}")
-    print(f"test        {test}")
-    print(f"next        mstfilter check {path.parent}/{path.name}:My{kind.capitalize()}")
+    made = write_starter(kind, path, target)
+    print(f"component   {made.component}")
+    if made.test is not None:
+        print(f"test        {made.test}")
+    if any("demo/recording" in command for command in made.commands) and not Path("demo/recording").exists():
+        print("first       mstfilter demo")
+    for command in made.commands:
+        print(f"next        {command}")
 
 
 def _lines(kind: str) -> Iterator[str]:

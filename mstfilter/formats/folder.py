@@ -36,6 +36,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from mstfilter.errors import InputError
+from mstfilter.formats.pauses import PauseRule
 from mstfilter.formats.video import RecordingFormat
 from mstfilter.scene import (
     Camera,
@@ -327,20 +328,26 @@ def _load(path: Path, model: type[BaseModel]) -> Any:
 
 @dataclass(frozen=True)
 class RecordingFolder(RecordingFormat):
-    """The recording folder of mstfilter: manifest.json, camera.json, rgb/, depth/."""
+    """The recording folder of mstfilter: manifest.json, camera.json, rgb/, depth/.
+
+    `pauses` replaces the pauses that the manifest lists.
+    """
+
+    pauses: PauseRule | None = None
 
     @classmethod
     def detects(cls, path: Path) -> bool:
         return (path / "manifest.json").is_file()
 
     def open(self, path: Path) -> Recording:
-        return open_recording(path)
+        return open_recording(path, self.pauses)
 
 
-def open_recording(path: str | Path) -> Recording:
+def open_recording(path: str | Path, pauses: PauseRule | None = None) -> Recording:
     """Read a recording folder. Images are read when they are used; everything else is checked now.
 
-    `Recording.check` reads all images.
+    `Recording.check` reads all images. A rule `pauses` replaces the pauses that the manifest lists; true volumes are
+    known at the listed ones only.
     """
     path = Path(path)
     if not path.is_dir():
@@ -371,9 +378,15 @@ def open_recording(path: str | Path) -> Recording:
     if camera_file.workspace is not None:
         w = camera_file.workspace
         grid = VoxelGrid.from_bounds(np.array(w.min), np.array(w.max), w.voxel)
-    pauses = tuple(e.index for e in entries if e.role == "static")
-    if not pauses:
-        raise InputError(f"{path / 'manifest.json'}: no frame has role static, so there is no pause to segment")
+    times = tuple(e.time_s for e in entries)
+    marked = tuple(e.index for e in entries if e.role == "static")
+    if pauses is not None:
+        marked = pauses.find(times, lambda index: read_rgb(path / "rgb" / f"{index:06d}.png"))
+    if not marked:
+        raise InputError(
+            f"{path / 'manifest.json'}: no frame has role static, so there is no pause to segment",
+            "give the pauses: --pauses still, or --pauses 0,40,85 (frames)",
+        )
 
     poses = {
         e.index: rigid_from_matrix(e.T_world_camera, f"{path / 'manifest.json'}: T_world_camera of frame {e.index}")
@@ -398,7 +411,7 @@ def open_recording(path: str | Path) -> Recording:
         return Frame(rgb, depth, view, robot)
 
     if camera.T_world_camera is None or grid is None:
-        first = pauses[0]
+        first = marked[0]
         camera, grid = find_world(read(first, camera.at(poses[first]) if first in poses else camera), grid)
 
     def read_posed(index: int) -> Frame:
@@ -412,13 +425,13 @@ def open_recording(path: str | Path) -> Recording:
     return Recording(
         LazyFrames(read_posed, len(entries)),
         grid,
-        pauses,
-        tuple(e.time_s for e in entries),
+        marked,
+        times,
         name=str(manifest_data.get("name") or path.name),
         depth_scale=scale,
         path=path,
         manifest=manifest_data,
-        truth=_read_voxels(truth, grid, pauses) if truth.exists() else lambda t: None,
+        truth=_read_voxels(truth, grid, marked) if truth.exists() else lambda t: None,
         instance=read_instance,
         poses=_read_poses(true_poses) if true_poses.exists() else lambda index: None,
     )

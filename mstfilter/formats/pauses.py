@@ -108,10 +108,10 @@ def _numbers(words: list[str]) -> dict[str, Any]:
 def pauses_from_text(text: str) -> dict[str, Any]:
     """The configuration of a rule from the text of a user: the name of a rule, numbers, or the path of a file."""
     words = text.replace(",", " ").split()
-    if words and all(w[0].isdigit() or w[0] in "-." for w in words):
-        return {"component": "at", **{k: v for k, v in _numbers(words).items() if v}}
     if Path(text).is_file():
         return {"component": "listed", "file": text}
+    if words and ".py:" not in text and all(w[0].isdigit() or w[0] in "-." for w in words):
+        return {"component": "at", **{k: v for k, v in _numbers(words).items() if v}}
     return {"component": text}
 
 

@@ -4,6 +4,7 @@ from mstfilter.segmentation.boundary import (
     ColourDepthBoundary as ColourDepthBoundary,
 )
 from mstfilter.segmentation.cuts import (
+    CutSample as CutSample,
     CutSampler as CutSampler,
     CutValue as CutValue,
     ExactCuts as ExactCuts,

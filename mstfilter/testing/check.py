@@ -40,7 +40,7 @@ from mstfilter.smc import (
     Update,
     WeightResampler,
 )
-from mstfilter.testing import moves, resampling, values
+from mstfilter.testing import moves, resampling, stages, values
 from mstfilter.testing.contract import Contract, number_example
 from mstfilter.testing.scenes import scene_example
 
@@ -61,6 +61,7 @@ _CONTRACTS: dict[type, type[Contract]] = {
     Equivalence: values.EquivalenceContract,
     Codec: values.CodecContract,
     Evidence: values.EvidenceContract,
+    **dict.fromkeys(stages.STAGE_OWNERS, stages.StageContract),
 }
 
 
@@ -116,7 +117,7 @@ def run_contract(
     """
     cls = type(component)
     contract = contract_of(cls)
-    example = example or _function_beside(cls, "example") or (scene_example if _uses_images(cls) else None)
+    example = example or _function_beside(cls, "example") or (scene_example if _uses_images(cls, contract) else None)
     if isinstance(component, Resampler) and resampling.makes_particles(component, example or number_example):
         contract = resampling.TransformResamplerContract
     functions = {
@@ -143,8 +144,10 @@ def _function_beside(cls: type, name: str) -> Callable[..., Any] | None:
     return found if callable(found) else None
 
 
-def _uses_images(cls: type) -> bool:
-    """Whether a class belongs to a package of mstfilter other than smc."""
+def _uses_images(cls: type, contract: type[Contract]) -> bool:
+    """Whether a class is a stage of MST or an evidence, or belongs to a package of mstfilter other than smc."""
+    if contract in (stages.StageContract, values.EvidenceContract):
+        return True
     return cls.__module__.startswith("mstfilter.") and not cls.__module__.startswith("mstfilter.smc.")
 
 

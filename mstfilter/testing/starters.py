@@ -1,42 +1,109 @@
 """Starting files for components of a user: the examples of the documentation, under another name.
 
->>> write_starter("resampler", Path("mine.py"))      # mine.py and test_mine.py
+>>> write_starter("resampler", Path("mine.py"))                # mine.py and test_mine.py
+>>> write_starter("transition", Path("mine.py"), "numbers")    # particles are numbers instead of hypotheses
 """
 
 from __future__ import annotations
 
+import ast
 import re
 from pathlib import Path
+from typing import NamedTuple
 
 from mstfilter.errors import InputError
+from mstfilter.lazy import exported
 from mstfilter.resources import examples_folder
 
+_TEST = '''"""{name} keeps the contract of its interface."""
 
-def starter_kinds() -> list[str]:
-    """Kinds of component that have a starting file."""
-    return sorted(path.stem for path in examples_folder().glob("*.py") if not path.stem.startswith("test_"))
+from {module} import {names}
+
+from mstfilter.testing import {contract}
 
 
-def write_starter(kind: str, path: Path) -> tuple[Path, Path]:
+class Test{name}({contract}):
+    def make(self):
+        return {name}()
+'''
+_METHOD = """
+    def {function}(self, rng, n):
+        return {function}(rng, n)
+"""
+
+
+class Starter(NamedTuple):
+    """A starting file that was written."""
+
+    component: Path
+    test: Path | None  #: None if the interface has no contract
+    commands: list[str]  #: commands that run the component, as its docstring lists them
+
+
+def starter_kinds(target: str = "") -> list[str]:
+    """Kinds of component that have a starting file: for "scenes", for "numbers", or for any of the two."""
+    folders = {"scenes": [_folder("scenes")], "numbers": [_folder("numbers")]}.get(
+        target, list(map(_folder, _TARGETS))
+    )
+    found = {path.stem for folder in folders for path in folder.glob("*.py")}
+    return sorted(found | set(_BOTH))
+
+
+_TARGETS = ("scenes", "numbers")
+_BOTH = ("resampler", "trigger", "size")  # use the weights only, so one file is for both
+
+
+def _folder(target: str) -> Path:
+    return examples_folder() / "scenes" if target == "scenes" else examples_folder()
+
+
+def write_starter(kind: str, path: Path, target: str = "") -> Starter:
     """Write a commented component of one of `starter_kinds` that works, and its test beside it as ``test_NAME.py``.
 
-    Returns both paths. Raises InputError if there is no such kind, the name cannot be imported, or a file exists
-    already.
+    `target` says what the particles are: "scenes" (hypotheses) or "numbers". Default: scenes, if the kind has a file
+    for them. Raises InputError if there is no such file, the name cannot be imported, or a file exists already.
     """
+    if target and target not in _TARGETS:
+        raise InputError(f"there are no components for {target!r}", f"there are: {', '.join(_TARGETS)}")
     if kind not in starter_kinds():
         raise InputError(f"there is no starting file for {kind!r}", f"there are: {', '.join(starter_kinds())}")
+    wanted = target or ("scenes" if kind in starter_kinds("scenes") else "numbers")
+    if kind not in starter_kinds(wanted):
+        raise InputError(
+            f"there is no starting file of a {kind} for {wanted}", f"there are: {', '.join(starter_kinds(wanted))}"
+        )
     if path.suffix != ".py" or not path.stem.isidentifier():
         raise InputError(f"{path.name} cannot be imported as a Python module", "choose a name like mine.py")
-    files = {path: f"{kind}.py", path.with_name(f"test_{path.name}"): f"test_{kind}.py"}
+    source = _folder("numbers" if kind in _BOTH else wanted) / f"{kind}.py"
+    text = re.sub(rf"(\./|python ){kind}\.py\b", rf"\g<1>{path.name}", source.read_text(encoding="utf-8"))
+    files = {path: text}
+    test = path.with_name(f"test_{path.name}")
+    tested = _test_of(text, path.stem)
+    if tested is not None:
+        files[test] = tested
     for file in files:
         if file.exists():
             raise InputError(f"{file} exists already", "choose another name; nothing was written")
     path.parent.mkdir(parents=True, exist_ok=True)
-    for file, source in files.items():
-        text = (examples_folder() / source).read_text(encoding="utf-8")
-        text = re.sub(rf"\./{kind}\.py:", f"./{path.name}:", text)
-        file.write_text(
-            re.sub(rf"^from {kind} import", f"from {path.stem} import", text, flags=re.M), encoding="utf-8"
-        )
-    component, test = files
-    return component, test
+    for file, content in files.items():
+        file.write_text(content, encoding="utf-8")
+    lines = (ast.get_docstring(ast.parse(text)) or "").splitlines()
+    place = path.as_posix() if path.is_absolute() else f"./{path.as_posix()}"
+    commands = [line for line in lines if re.match("mstfilter |python ", line)]
+    if path.parent != Path("."):
+        commands = [re.sub(rf"(\./)?\b{re.escape(path.name)}\b", place, command) for command in commands]
+    return Starter(path, test if tested is not None else None, commands)
+
+
+def _test_of(text: str, module: str) -> str | None:
+    """The test of the component in a file, by the contract of its base class; None if it has none."""
+    contracts = exported(Path(__file__).with_name("__init__.pyi"))
+    found = re.search(r"^class (My\w+)\((\w+)\)", text, flags=re.M)
+    assert found is not None
+    name, contract = found[1], f"{found[2]}Contract"
+    if "mstfilter check" not in text:
+        return None
+    functions = [f for f in ("exact", "example") if re.search(rf"^(def {f}\(|{f} = )", text, flags=re.M)]
+    contract = contract if contract in contracts else "StageContract"
+    test = _TEST.format(name=name, module=module, names=", ".join([name, *functions]), contract=contract)
+    return test + "".join(_METHOD.format(function=f) for f in reversed(functions))

@@ -13,6 +13,7 @@ from mstfilter.tracking.residual import MotionResidual as MotionResidual, refine
 from mstfilter.tracking.rigid import move_points as move_points, rigid_transform as rigid_transform
 from mstfilter.tracking.rules import (
     AuthorsRule as AuthorsRule,
+    Candidate as Candidate,
     MotionRule as MotionRule,
     MstRule as MstRule,
     PaperRule as PaperRule,

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+import runpy
+import shlex
 import subprocess
 import sys
 
@@ -10,28 +12,63 @@ import pytest
 
 from mstfilter.testing import starter_kinds, write_starter
 from tests.conftest import REPOSITORY
+from tests.scene.test_recording import write
 from tests.test_cli import call
 
 FAULTS_FILE = REPOSITORY / "tests" / "testing" / "faults.py"
 
 
-@pytest.mark.parametrize("kind", starter_kinds())
-def test_a_starting_file_passes_its_check(kind, tmp_path, capsys):
-    mine = tmp_path / "mine.py"
-    code, out, err = call("new", kind, mine, capsys=capsys)
+STARTERS = [(kind, "scenes") for kind in starter_kinds("scenes")]
+STARTERS += [(kind, "numbers") for kind in starter_kinds("numbers") if kind not in ("resampler", "trigger", "size")]
+
+
+@pytest.mark.parametrize(("kind", "target"), STARTERS)
+def test_the_printed_commands_run_as_printed(kind, target, tmp_path, monkeypatch, capsys):
+    """On a recording of three frames in place of that of the demo."""
+    monkeypatch.chdir(tmp_path)
+    write(tmp_path / "demo" / "recording", n=3, statics=(0, 2))
+    code, out, err = call("new", kind, "mine.py", "--for", target, capsys=capsys)
     assert code == 0, err
-    assert f"check {mine}:My{kind.capitalize()}" in out
-    assert f"mstfilter check ./mine.py:My{kind.capitalize()}" in mine.read_text()
-    code, out, err = call("check", f"{mine}:My{kind.capitalize()}", capsys=capsys)
-    assert code == 0, out + err
-    assert "all properties that apply hold" in out
-    assert "exact draws" not in out, "the starting file gives those that its law is tested with"
+    commands = [shlex.split(line)[1:] for line in out.splitlines() if line.startswith("next ")]
+    assert {command[0] for command in commands} <= {"mstfilter", "python"}
+    assert any(command[1] == "run" for command in commands) == (target == "scenes")
+    for program, *arguments in commands:
+        if program == "python":
+            runpy.run_path(arguments[0], run_name="__main__")
+            assert "nan" not in capsys.readouterr().out
+        else:
+            fast = ["--no-report"] if arguments[0] == "run" else []
+            code, out, err = call(*arguments, *fast, capsys=capsys)
+            assert code == 0, f"{arguments}\n{out}\n{err}"
+            assert "exact draws" not in out or (kind, target) in (("transition", "scenes"), ("update", "scenes"))
+            assert "all properties that apply hold" in out or arguments[0] != "check"
+
+
+def test_a_starting_file_is_for_scenes_if_there_is_one(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    _, out, _ = call("new", "transition", "a.py", capsys=capsys)
+    assert "run demo/recording transition=./a.py:MyTransition --out runs/mine --replace" in out
+    assert "first       mstfilter demo" in out
+    _, out, _ = call("new", "transition", "b.py", "--for", "numbers", capsys=capsys)
+    assert "python b.py" in out
+    _, out, _ = call("new", "codec", "sub/c.py", capsys=capsys)
+    assert "next        mstfilter check ./sub/c.py:MyCodec" in out
+    for arguments, message in (
+        (("codec", "d.py", "--for", "scenes"), "no starting file of a codec for scenes"),
+        (("boundary", "d.py", "--for", "numbers"), "no starting file of a boundary for numbers"),
+        (("boundary", "d.py", "--for", "images"), "there are: scenes, numbers"),
+    ):
+        code, _, err = call("new", *arguments, capsys=capsys)
+        assert code == 2
+        assert message in err
 
 
 def test_starting_files_pass_their_tests(tmp_path):
-    """All in one run of pytest, since pytest starts slowly."""
-    for kind in starter_kinds():
-        write_starter(kind, tmp_path / f"my_{kind}.py")
+    """All in one run of pytest, since pytest starts slowly. The contracts themselves are run above."""
+    for kind in ("transition", "similarity", "rejuvenation", "resampler"):
+        write_starter(kind, tmp_path / f"my_{kind}.py", "numbers")
+    for kind in ("boundary", "evidence"):
+        write_starter(kind, tmp_path / f"my_{kind}.py", "scenes")
     command = [sys.executable, "-m", "pytest", "-q", "-rs", "-p", "no:cacheprovider", str(tmp_path)]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=600)
     assert done.returncode == 0, done.stdout + done.stderr
@@ -41,7 +78,7 @@ def test_starting_files_pass_their_tests(tmp_path):
 
 def test_the_starting_resampler_has_three_lines_of_logic(tmp_path, capsys):
     call("new", "resampler", tmp_path / "mine.py", capsys=capsys)
-    body = (tmp_path / "mine.py").read_text().split("def select(")[1].split('"""')[2]
+    body = (tmp_path / "mine.py").read_text().split("def select(")[1].split("if __name__")[0].split('"""')[2]
     logic = [line for line in body.splitlines() if line.strip() and not line.strip().startswith("#")]
     assert len(logic) == 4  # three and the return
 
@@ -53,7 +90,7 @@ def test_nothing_is_overwritten(tmp_path, capsys):
     assert "test_mine.py exists already" in err
     assert [p.name for p in tmp_path.iterdir()] == ["test_mine.py"]
     for kind, name, message in (
-        ("spoon", "mine.py", "there are: codec"),
+        ("spoon", "mine.py", "there are: boundary, codec"),
         ("update", "my-own.py", "cannot be imported"),
         ("update", "mine.txt", "cannot be imported"),
     ):
@@ -80,7 +117,7 @@ def test_check_of_registered_components_with_fields(capsys):
         (("systematic",), "KIND.NAME"),
         (("./nowhere.py:X",), "file does not exist"),
         (("resampler.tempered", "power=2"), "of at most 1"),
-        (("boundary.colour_depth",), "no component"),
+        (("format.tum",), "no component"),
     ):
         code, _, err = call("check", *arguments, capsys=capsys)
         assert code == 2
