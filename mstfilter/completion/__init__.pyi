@@ -1,4 +1,5 @@
 from mstfilter.completion.completer import (
+    ClipCompleter as ClipCompleter,
     Completer as Completer,
     Completion as Completion,
     ObservedBox as ObservedBox,

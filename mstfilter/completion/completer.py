@@ -31,7 +31,17 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from mstfilter.errors import InputError
-from mstfilter.scene import Frame, VoxelGrid, component_key, content_key, depth_sigma, frame_geometry, memo, read_only
+from mstfilter.scene import (
+    Clip,
+    Frame,
+    VoxelGrid,
+    component_key,
+    content_key,
+    depth_sigma,
+    frame_geometry,
+    memo,
+    read_only,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,6 +142,14 @@ class Completer(ABC):
             return Completion(read_only(offset), read_only(p), read_only(seen.points), name.hex()[:16])
 
         return compute() if self.stochastic else memo("completion", name, compute, Completion)
+
+
+class ClipCompleter(Completer):
+    """A completer that depends on the clip, for example because it reads a folder for each pause."""
+
+    @abstractmethod
+    def at(self, clip: Clip) -> Completer:
+        """The completer of the clip's last frame."""
 
 
 def observed_box(frame: Frame, mask: np.ndarray, grid: VoxelGrid, rule: Completer) -> tuple[np.ndarray, ObservedBox]:

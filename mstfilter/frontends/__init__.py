@@ -7,6 +7,7 @@
 `mask_files`       folders of instance masks with alternatives: layout, reader, writer
 `mask_trees`       nested masks as a tree whose cuts are levels
 `mask_proposal`    the proposal, the boundary model, and the recipe for SAM
+`completions`      meshes, point clouds and voxels of others as completions
 =================  ===================================================================
 
 No weights are part of the package, and none are downloaded.
@@ -19,4 +20,5 @@ __getattr__, __dir__, __all__ = attach(__name__, __file__)
 __components__ = {
     "proposal": {"mask_folder": "MaskProposal"},
     "boundary": {"mask_folder": "MaskBoundary"},
+    "completer": {"external": "ExternalCompletion"},
 }

@@ -1,3 +1,4 @@
+from mstfilter.frontends.completions import ExternalCompletion as ExternalCompletion, read_shapes as read_shapes
 from mstfilter.frontends.mask_files import (
     MaskRegion as MaskRegion,
     PauseMasks as PauseMasks,

@@ -89,8 +89,8 @@ def read_masks(folder: str | Path, pause: int, shape: tuple[int, int], rgb: np.n
         )
     groups = {name: [p] if p.is_file() else _alternatives(p) for name, p in parts.items()}
     groups = groups or {"": _alternatives(where)}
-    content = {p: _bytes(p) for group in groups.values() for p in group}
-    weights = {name: _read_weights(group[0].parent, group) for name, group in groups.items() if len(group) > 1}
+    content = {p: read_bytes(p) for group in groups.values() for p in group}
+    weights = {name: read_weights(group[0].parent, group) for name, group in groups.items() if len(group) > 1}
     image = "" if rgb is None else image_key(rgb)
     key = content_key(
         "masks",
@@ -155,19 +155,20 @@ def _alternatives(folder: Path) -> list[Path]:
     return files
 
 
-def _bytes(path: Path) -> bytes:
+def read_bytes(path: Path) -> bytes:
+    """The content of a file; raises InputError if it cannot be read."""
     try:
         return path.read_bytes()
     except OSError as error:
-        raise InputError(f"file of masks cannot be read: {path} ({error.strerror})") from error
+        raise InputError(f"file cannot be read: {path} ({error.strerror})") from error
 
 
-def _read_weights(folder: Path, files: list[Path]) -> dict[str, float] | None:
+def read_weights(folder: Path, files: list[Path]) -> dict[str, float] | None:
     """The content of weights.json, if there is one."""
     path = folder / _WEIGHTS
     if not path.is_file():
         return None
-    weights = _json(path, _bytes(path))
+    weights = _json(path, read_bytes(path))
     names = {p.name for p in files}
     if not isinstance(weights, dict) or set(weights) != names:
         raise InputError(f"{path} does not have one weight for each of {', '.join(sorted(names))}")
@@ -420,4 +421,4 @@ def write_masks(
             partial.write_bytes(file.getvalue())
     if weights is not None:
         write_text(path / _WEIGHTS, json.dumps({f"{k}.npz": float(w) for k, w in enumerate(weights)}))
-        _read_weights(path, _alternatives(path))
+        read_weights(path, _alternatives(path))

@@ -14,13 +14,14 @@ several objects of a hypothesis claim a voxel, one of them gets it, in every hyp
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
 import numpy as np
 
-from mstfilter.completion import Completer, Completion, Extrude, arbitrate
+from mstfilter.completion import ClipCompleter, Completer, Completion, Extrude, arbitrate
 from mstfilter.errors import check_choice
 from mstfilter.scene import Clip, Frame, Hypothesis, ObjectRecord, VoxelGrid, component_key, memo
 from mstfilter.segmentation.boundary import BoundaryModel, ClipBoundary, ColourDepthBoundary, pixels_above_table
@@ -199,24 +200,33 @@ def complete_segments(
     """Hypotheses from sampled segmentations of the last frame of a clip, and counts for the notes.
 
     Each sample is an array of segments, int64; ``mask_of(segment)`` is (H, W) bool. Each distinct segment is
-    completed once, with the stream ``"completion", segment``, so the result does not depend on the other segments.
+    completed once, with the stream ``"completion", segment``, so the result does not depend on the other segments. A
+    stochastic completer completes it again for each further sample, with the stream ``"completion", segment, k``.
     """
-    completed: dict[int, Completion] = {}
-    for segment in np.unique(np.concatenate([np.zeros(0, np.int64), *samples])).tolist():
-        stream = child(rng, "completion", segment)
-        completed[segment] = completer.complete(stream, clip.after, [mask_of(segment)], clip.grid)[0]
-    built: dict[bytes, Hypothesis] = {}
+    completer = completer.at(clip) if isinstance(completer, ClipCompleter) else completer
+    completed: dict[tuple[int, ...], Completion] = {}
+    built: dict[tuple[tuple[int, ...], ...], Hypothesis] = {}
+    particles = []
+    times: Counter[int] = Counter()
     for segments in samples:
-        if segments.tobytes() not in built:
-            chosen = [completed[segment] for segment in segments.tolist()]
-            built[segments.tobytes()] = hypothesis_of(chosen, clip.grid, clip.index, threshold)
-    particles = tuple(built[segments.tobytes()] for segments in samples)
+        draws = []
+        for segment in segments.tolist():
+            draw = (segment, times[segment]) if times[segment] else (segment,)
+            times[segment] += completer.stochastic
+            if draw not in completed:
+                stream = child(rng, "completion", *draw)
+                completed[draw] = completer.complete(stream, clip.after, [mask_of(segment)], clip.grid)[0]
+            draws.append(draw)
+        key = tuple(draws)
+        if key not in built:
+            built[key] = hypothesis_of([completed[draw] for draw in draws], clip.grid, clip.index, threshold)
+        particles.append(built[key])
     counts = {
         "objects": [h.n_objects for h in particles],
-        "distinct_segments": len(completed),
+        "distinct_segments": len({draw[0] for draw in completed}),
         "distinct_hypotheses": len(built),
     }
-    return particles, counts
+    return tuple(particles), counts
 
 
 def hypothesis_of(

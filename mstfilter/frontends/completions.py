@@ -1,0 +1,316 @@
+"""Completions of others: meshes, point clouds or voxel arrays of objects, made by another program.
+
+>>> mst = mstfilter.preset("mst", "proposal.completer=external", "proposal.completer.folder=shapes")
+
+The layout; numbers are those of the pauses (`Clip.index`), from 0::
+
+    shapes/000001/cup/mask.png         the mask of the object in the image of the pause, not 0
+    shapes/000001/cup/a.ply  b.npz     its shape; several files are draws
+    shapes/000001/cup/weights.json     optional, beside the draws: {"a.ply": 2, "b.npz": 1}
+
+A shape is in metres, in the frame of the camera (x right, y down, z forward) or of the world:
+
+* ``.ply``, ``.obj``, ``.stl``, ``.off``: a mesh, or a cloud (ply) if there are no triangles; open3d reads it.
+* ``.npz``: ``points`` (n, 3); or ``occupancy`` (A, B, C), the probability of voxels with edge ``voxel_size`` whose
+  first corner is ``origin`` (3,), along the axes of the frame.
+
+A voxel is inside a mesh if its centre is, by the parity of crossings along three axes, of which two decide. So small
+holes do no harm. A voxel is occupied by a cloud if a point is in it; spaces enclosed by such voxels are filled.
+"""
+
+from __future__ import annotations
+
+import copy
+import io
+import zipfile
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+
+from mstfilter.completion import ClipCompleter, Completer, Completion, ObservedBox, observed_box
+from mstfilter.errors import InputError, check_choice, check_number
+from mstfilter.frontends.mask_files import read_bytes, read_weights
+from mstfilter.open3d_import import import_open3d
+from mstfilter.scene import (
+    Camera,
+    Clip,
+    Frame,
+    VoxelGrid,
+    component_key,
+    content_key,
+    memo,
+    occupied_box,
+    read_labels,
+)
+
+_MESHES = (".ply", ".obj", ".stl", ".off")
+_MASK = "mask.png"
+_WEIGHTS = "weights.json"
+#: Directions of the rays of the inside test; not along the axes, so that they miss edges of axis-parallel meshes.
+_RAYS = np.array([[1.0, 1.1e-4, 1.7e-4], [1.3e-4, 1.0, 0.7e-4], [0.9e-4, 1.9e-4, 1.0]], np.float32)
+
+
+@dataclass(frozen=True, eq=False)
+class ObjectShapes:
+    """The shapes of one object at one pause."""
+
+    mask: np.ndarray  #: (H, W) bool
+    files: tuple[Path, ...]
+    weights: np.ndarray  #: (k,) probabilities of the files, their sum is 1
+
+
+@dataclass(frozen=True)
+class ExternalCompletion(ClipCompleter):
+    """Shapes from a folder, in place of an estimate.
+
+    The shapes of a mask are those of the stored mask with the highest IoU. Voxels observed as free are cleared, and
+    the visible surface is occupied, as for any completer.
+
+    Parameters
+    ----------
+    folder : str
+        The folder of shapes.
+    axes : {"camera", "world"}
+        The frame of the shapes.
+    draws : {"sample", "mean"}
+        Several shapes of a mask: one is drawn for each hypothesis by its weight, or their weighted mean is the
+        probability of a voxel.
+    min_iou : float
+        Smallest IoU of a mask with the stored mask, both without pixels that cannot belong to an object.
+    other : Completer, optional
+        For masks without a stored mask. Default: such a mask is an error.
+    """
+
+    folder: str = ""
+    axes: Literal["camera", "world"] = "camera"
+    draws: Literal["sample", "mean"] = "sample"
+    min_iou: float = 0.5
+    other: Completer | None = None
+
+    stochastic: ClassVar[bool] = True
+
+    def __post_init__(self) -> None:
+        check_choice("axes", self.axes, ("camera", "world"))
+        check_choice("draws", self.draws, ("sample", "mean"))
+        check_number("min_iou", self.min_iou, above=0, at_most=1)
+
+    def at(self, clip: Clip) -> ExternalCompletion:
+        """The completer with the shapes of the pause that the clip ends at."""
+        bound = copy.copy(self)
+        found = read_shapes(self.folder, clip.index, clip.after.depth.shape)
+        other = self.other.at(clip) if isinstance(self.other, ClipCompleter) else self.other
+        for name, value in (("_shapes", found), ("other", other)):
+            object.__setattr__(bound, name, value)  # components are frozen
+        return bound
+
+    def fill(self, rng: np.random.Generator, seen: ObservedBox) -> np.ndarray:
+        raise NotImplementedError("shapes are placed by `complete`, which knows the mask")
+
+    def complete(
+        self, rng: np.random.Generator, frame: Frame, masks: Sequence[np.ndarray], grid: VoxelGrid
+    ) -> list[Completion]:
+        """Place the shapes of several masks; raises InputError before `at`, or if a mask has no shapes."""
+        if "_shapes" not in self.__dict__:
+            raise InputError("ExternalCompletion does not know the pause of a frame", "call at(clip) first")
+        return [self._place(rng, frame, np.asarray(mask, dtype=bool), grid) for mask in masks]
+
+    def _place(self, rng: np.random.Generator, frame: Frame, mask: np.ndarray, grid: VoxelGrid) -> Completion:
+        shapes: tuple[ObjectShapes, ...] = self.__dict__["_shapes"]
+        # The given mask has no pixels without reading, so those of the stored masks do not count.
+        ious = [(mask & s.mask).sum() / max((mask | (s.mask & frame.valid)).sum(), 1) for s in shapes]
+        best = int(np.argmax(ious)) if shapes else -1
+        if best < 0 or ious[best] < self.min_iou:
+            if self.other is None:
+                raise InputError(
+                    f"no stored shape fits a mask of {int(mask.sum())} pixels in {self.folder}: "
+                    f"the best IoU is {max(ious, default=0):.2f}, at least {self.min_iou:g} is needed",
+                    "name a completer for other masks, for example proposal.completer.other=extrude",
+                )
+            return self.other.complete(rng, frame, [mask], grid)[0]
+        chosen = shapes[best]
+        if self.draws == "mean":
+            volumes = [self._volume(path, frame.camera, grid) for path in chosen.files]
+            shape = np.tensordot(chosen.weights, np.array(volumes), 1).astype(np.float32)
+            name = ",".join(path.name for path in chosen.files)
+        else:
+            path = chosen.files[int(rng.choice(len(chosen.files), p=chosen.weights))]
+            shape, name = self._volume(path, frame.camera, grid), path.name
+        offset, seen = observed_box(frame, mask, grid, self._reaching(shape, frame, mask, grid))
+        box = tuple(slice(int(a), int(a) + n) for a, n in zip(offset, seen.points.shape, strict=True))
+        p = np.where(seen.free, 0, np.maximum(shape[box], seen.surface)).astype(np.float32)
+        key = content_key("shape", np.packbits(mask), frame.key, grid.key, component_key(self), shape, name)
+        return Completion(offset, p, seen.points, key.hex()[:16])
+
+    def _volume(self, path: Path, camera: Camera, grid: VoxelGrid) -> np.ndarray:
+        """Occupancy (X, Y, Z) float32 of a shape in the grid, placed once."""
+        data = read_bytes(path)
+        T = camera.pose.as_matrix() if self.axes == "camera" else np.eye(4)
+        key = (content_key(path.suffix, data, T), grid.key)
+        return memo("external_shape", key, lambda: place_shape(path, data, T, grid))
+
+    def _reaching(self, shape: np.ndarray, frame: Frame, mask: np.ndarray, grid: VoxelGrid) -> ExternalCompletion:
+        """This completer with a padding that lets the box of the mask contain a shape (X, Y, Z)."""
+        occupied = occupied_box(shape > 0)
+        readings = grid.index_of(frame.points[mask & frame.valid])
+        readings = readings[grid.contains(readings)]
+        if occupied is None or not len(readings):
+            return self
+        low, high = np.array([[s.start, s.stop] for s in occupied]).T
+        reach = max((readings.min(axis=0) - low).max(), (high - 1 - readings.max(axis=0)).max(), 0)
+        wider = copy.copy(self)
+        object.__setattr__(wider, "padding", int(reach))
+        return wider
+
+
+def read_shapes(folder: str | Path, pause: int, shape: tuple[int, int]) -> tuple[ObjectShapes, ...]:
+    """The objects of a pause; `shape` is that of the image, (H, W). Shapes are read when they are placed.
+
+    Raises InputError if the folder, a mask or a shape is missing, or a mask or weights.json cannot be used.
+    """
+    if not str(folder):
+        raise InputError(
+            "the folder of shapes is not given", "set folder, for example proposal.completer.folder=shapes"
+        )
+    where = Path(folder) / f"{pause:06d}"
+    if not where.is_dir():
+        raise InputError(
+            f"folder of shapes has none for pause {pause}: {where} does not exist", "an empty one is allowed"
+        )
+    return tuple(_read_object(path, shape) for path in sorted(where.iterdir()) if path.is_dir())
+
+
+def _read_object(folder: Path, shape: tuple[int, int]) -> ObjectShapes:
+    if not (folder / _MASK).is_file():
+        raise InputError(f"{folder} has no {_MASK}", "it marks the pixels of the object")
+    mask = read_labels(folder / _MASK) > 0
+    if mask.shape != shape:
+        raise InputError(f"{folder / _MASK} has shape {mask.shape}, the image is {shape}")
+    files = [p for p in sorted(folder.iterdir()) if p.name not in (_MASK, _WEIGHTS) and not p.name.startswith(".")]
+    for path in files:
+        if path.suffix not in (*_MESHES, ".npz"):
+            raise InputError(f"{path} is not a file of a shape", f"expected {', '.join((*_MESHES, '.npz'))}")
+    if not files:
+        raise InputError(f"{folder} has no shape", f"expected files {', '.join((*_MESHES, '.npz'))}")
+    weights = read_weights(folder, files)
+    given = np.ones(len(files)) if weights is None else np.array([weights[p.name] for p in files])
+    return ObjectShapes(mask, tuple(files), given / given.sum())
+
+
+def place_shape(path: Path, data: bytes, T: np.ndarray, grid: VoxelGrid) -> np.ndarray:
+    """Occupancy (X, Y, Z) float32 of the shape of a file, moved by `T` (4, 4) into the world.
+
+    Raises InputError if the file cannot be used, or the shape is outside the grid or larger than twice its diagonal.
+    """
+    if path.suffix == ".npz":
+        arrays = _arrays(path, data)
+        if "occupancy" in arrays:
+            volume = _resample(path, arrays, T, grid)
+        else:
+            volume = _cloud(_checked(path, arrays["points"], T, grid), grid)
+    else:
+        points, triangles = _read_mesh(path)
+        points = _checked(path, points, T, grid)
+        volume = _mesh(points, triangles, grid) if len(triangles) else _cloud(points, grid)
+    if not (volume > 0).any():
+        raise InputError(
+            f"{path} occupies no voxel of the workspace from {grid.origin.tolist()} to {grid.upper.tolist()} m",
+            "shapes are in metres, in the frame that the field `axes` names",
+        )
+    return volume
+
+
+def _checked(path: Path, points: np.ndarray, T: np.ndarray, grid: VoxelGrid) -> np.ndarray:
+    """Points (n, 3) in the world."""
+    if points.ndim != 2 or points.shape[1:] != (3,) or not len(points):
+        raise InputError(f"{path} has points of shape {points.shape}, expected (n, 3)")
+    if points.dtype.kind not in "fiu" or not np.isfinite(points).all():
+        raise InputError(f"{path} has a point that is not finite")
+    extent = float(np.linalg.norm(np.ptp(points.astype(np.float64), axis=0)))
+    limit = 2 * float(np.linalg.norm(grid.upper - grid.origin))
+    if extent > limit:
+        raise InputError(f"{path} is {extent:.3g} m large, the workspace {limit / 2:.3g} m", "shapes are in metres")
+    return points @ T[:3, :3].T + T[:3, 3]
+
+
+def _arrays(path: Path, data: bytes) -> dict[str, np.ndarray]:
+    try:
+        with np.load(io.BytesIO(data), allow_pickle=False) as archive:
+            arrays = {name: archive[name] for name in archive.files}
+    except (zipfile.BadZipFile, ValueError, EOFError, OSError, zlib.error, AttributeError) as error:
+        raise InputError(
+            f"file of a shape cannot be read: {path} ({error})", "expected arrays of numbers from numpy.savez"
+        ) from error
+    if "points" not in arrays and not {"occupancy", "origin", "voxel_size"} <= set(arrays):
+        raise InputError(f"{path} has {', '.join(arrays)}; expected points, or occupancy, origin and voxel_size")
+    return arrays
+
+
+def _resample(path: Path, arrays: dict[str, np.ndarray], T: np.ndarray, grid: VoxelGrid) -> np.ndarray:
+    """The value of the array's voxel that holds the centre of each voxel of the grid; 0 outside."""
+    values = arrays["occupancy"]
+    if values.ndim != 3 or values.dtype.kind not in "bfiu" or not values.size:
+        raise InputError(f"{path}: occupancy has shape {values.shape} and type {values.dtype}, expected (A, B, C)")
+    values = values.astype(np.float32)
+    if not np.isfinite(values).all() or values.min() < 0 or values.max() > 1:
+        raise InputError(f"{path}: occupancy is not between 0 and 1")
+    own = VoxelGrid(arrays["origin"], float(arrays["voxel_size"]), values.shape)
+    centres = (grid.centres().reshape(-1, 3) - T[:3, 3]) @ T[:3, :3]
+    index = own.index_of(centres)
+    inside = own.contains(index)
+    out = np.zeros(len(index), np.float32)
+    out[inside] = values[tuple(index[inside].T)]
+    return out.reshape(grid.shape)
+
+
+def _cloud(points: np.ndarray, grid: VoxelGrid) -> np.ndarray:
+    """Voxels with points, and the voxels that they enclose."""
+    from scipy.ndimage import binary_fill_holes
+
+    index = grid.index_of(points)
+    hit = np.zeros(grid.shape, dtype=bool)
+    hit[tuple(index[grid.contains(index)].T)] = True
+    box = occupied_box(hit)
+    if box is not None:
+        hit[box] = binary_fill_holes(hit[box])
+    return hit.astype(np.float32)
+
+
+def _read_mesh(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices (n, 3) and triangles (m, 3); no triangles for a cloud."""
+    o3d = import_open3d()
+    with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
+        mesh: Any = o3d.io.read_triangle_mesh(str(path))
+        points, triangles = np.asarray(mesh.vertices), np.asarray(mesh.triangles)
+        if not len(triangles) and path.suffix == ".ply":
+            points = np.asarray(o3d.io.read_point_cloud(str(path)).points)
+    if not len(points):
+        raise InputError(f"file of a shape cannot be read: {path} (open3d finds no vertices)", "export it again")
+    return points, triangles
+
+
+def _mesh(points: np.ndarray, triangles: np.ndarray, grid: VoxelGrid) -> np.ndarray:
+    """Voxels whose centres are inside a mesh: an odd number of crossings along at least two of three directions."""
+    o3d = import_open3d()
+    low = np.clip(grid.index_of(points.min(axis=0)) - 1, 0, grid.shape)
+    high = np.clip(grid.index_of(points.max(axis=0)) + 2, 0, grid.shape)
+    out = np.zeros(grid.shape, np.float32)
+    if (high <= low).any():
+        return out
+    scene = o3d.t.geometry.RaycastingScene(nthreads=1)
+    centre = points.mean(axis=0)  # subtracted, since rays have 32-bit floats
+    scene.add_triangles(
+        o3d.core.Tensor((points - centre).astype(np.float32)), o3d.core.Tensor(triangles.astype(np.uint32))
+    )
+    index = np.stack(np.meshgrid(*(np.arange(a, b) for a, b in zip(low, high, strict=True)), indexing="ij"), axis=-1)
+    origins = (grid.centre_of(index).reshape(-1, 3) - centre).astype(np.float32)
+    votes = np.zeros(len(origins), np.int64)
+    for direction in _RAYS:
+        rays = np.concatenate([origins, np.broadcast_to(direction, origins.shape)], axis=1)
+        votes += scene.count_intersections(o3d.core.Tensor(rays)).numpy() % 2
+    box = tuple(slice(int(a), int(b)) for a, b in zip(low, high, strict=True))
+    out[box] = (votes >= 2).reshape(tuple(high - low))
+    return out
