@@ -11,11 +11,12 @@ mstfilter.errors.InputError: depth image 000003.png is empty
 
 from __future__ import annotations
 
+import difflib
 import linecache
 import math
 import sysconfig
 import traceback
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from numbers import Integral, Real
 from pathlib import Path
 from typing import Any
@@ -49,6 +50,11 @@ class InputWarning(_WithHints, UserWarning):
 
     The command line shows it as one ``warning:`` line.
     """
+
+
+def suggestion(name: str, names: Iterable[str]) -> list[str]:
+    """A hint with the known name that is closest to an unknown one; no hint if none is close."""
+    return [f"did you mean {close}?" for close in difflib.get_close_matches(name, list(names), n=1)]
 
 
 def check_number(

@@ -20,6 +20,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from mstfilter.errors import InputError
+
 
 @contextmanager
 def atomic_path(path: str | Path) -> Iterator[Path]:
@@ -46,6 +48,17 @@ def atomic_folder(path: str | Path) -> Iterator[Path]:
         os.replace(partial, target)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
+
+
+def check_output(path: Path, folder: bool = False) -> None:
+    """Raise InputError if a file, or with `folder` a folder, cannot be written at `path`."""
+    if path.is_dir() and not folder:
+        raise InputError(f"{path} is a folder, expected the name of a file to write")
+    existing = next(parent for parent in (path.absolute(), *path.absolute().parents) if parent.exists())
+    if existing.is_file() and (folder or existing != path.absolute()):
+        raise InputError(f"cannot write {path}: {existing} is a file", "choose another place")
+    if not os.access(existing, os.W_OK):
+        raise InputError(f"cannot write {path}: no permission to write in {existing}", "choose another place")
 
 
 def write_text(path: str | Path, text: str) -> None:

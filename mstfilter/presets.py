@@ -19,7 +19,7 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 from mstfilter import baselines, completion, formats, frontends, fusion, oracles, segmentation, smc, tracking
-from mstfilter.errors import InputError
+from mstfilter.errors import InputError, suggestion
 from mstfilter.registry import Registry
 from mstfilter.resources import find_preset
 from mstfilter.smc import ParticleFilter
@@ -48,7 +48,10 @@ def load_config(name: str, overrides: Iterable[str] = (), *, allow_files: bool =
         _override(config, override)
     unknown = set(config) - {*_META, *_FIELDS}
     if unknown:
-        raise InputError(f"a filter has no field {sorted(unknown)[0]!r}", f"fields: {', '.join(_FIELDS)}")
+        name = min(unknown)
+        raise InputError(
+            f"a filter has no field {name!r}", *suggestion(name, _FIELDS), f"fields: {', '.join(_FIELDS)}"
+        )
     REGISTRY.check_names(ParticleFilter, config, allow_files)
     return config
 

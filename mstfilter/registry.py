@@ -25,7 +25,6 @@ A component is imported when it is first built; looking up a name imports nothin
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import functools
 import hashlib
 import importlib
@@ -38,7 +37,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from mstfilter.errors import InputError, place_in_user_file
+from mstfilter.errors import InputError, place_in_user_file, suggestion
 
 _ENTRY_POINTS = "mstfilter.components"
 
@@ -136,7 +135,7 @@ class Registry:
         if name not in names:
             raise InputError(
                 f"{where}: there is no {kind} {name!r}",
-                *_suggestion(name, names),
+                *suggestion(name, names),
                 f"there are: {', '.join(sorted(names))}; or ./file.py:Class",
             )
         return names[name]
@@ -180,11 +179,19 @@ class Registry:
             if name not in known:
                 raise InputError(
                     f"{path}: {cls.__name__} has no field {name!r}",
-                    *_suggestion(name, known),
+                    *suggestion(name, known),
                     f"fields: {', '.join(known) or 'none'}",
                 )
             current = default_of(known[name]) if base is None else getattr(base, name)
             values[name] = self._value(hints[name], value, current, path, allow_files)
+        needed = [name for name, field in known.items() if default_of(field) is dataclasses.MISSING]
+        missing = [name for name in needed if name not in values and base is None]
+        if missing:
+            path = f"{where}.{missing[0]}" if where else missing[0]
+            raise InputError(
+                f"{f'{where}: ' if where else ''}{cls.__name__} needs {', '.join(missing)}, without a default",
+                f"give it a value, {path}=VALUE, or a default in the class",
+            )
         try:
             return cls(**values) if base is None else dataclasses.replace(base, **values)
         except InputError as error:
@@ -305,7 +312,3 @@ def _plain(hint: Any, value: Any, where: str) -> Any:
         return TypeAdapter(hint).validate_python(value)
     except ValidationError as error:
         raise InputError(f"{where} is {value!r}: {error.errors()[0]['msg'].lower()}") from error
-
-
-def _suggestion(name: str, names: Mapping[str, Any]) -> list[str]:
-    return [f"did you mean {close}?" for close in difflib.get_close_matches(name, names, n=1)]

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from mstfilter.errors import InputError
+from mstfilter.errors import InputError, suggestion
 
 
 def models_folder() -> Path:
@@ -48,6 +48,8 @@ def find_preset(name: str) -> Path:
     path = models_folder() / f"{name}.toml"
     if name not in preset_names():
         raise InputError(
-            f"there is no preset {name!r}", f"there are: {', '.join(preset_names())}, or the path of a .toml file"
+            f"there is no preset {name!r}",
+            *suggestion(name, preset_names()),
+            f"there are: {', '.join(preset_names())}, or the path of a .toml file",
         )
     return path

@@ -7,9 +7,11 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from mstfilter.cli import main
+from mstfilter.formats import open_recording
 from mstfilter.runs import RunFolder
 from tests.runs.test_run import content
 from tests.scene.test_recording import FAULTS, write
@@ -73,6 +75,11 @@ def test_bad_recordings_are_one_clear_error(recording, tmp_path, capsys, fault):
         (("run", "nowhere", "resampler=sistematic"), "there is no resampler 'sistematic'"),
         (("run", "nowhere", "transition.rule=mzt"), "there is no rule 'mzt'"),
         (("run", "nowhere", "--preset", "best"), "there is no preset 'best'"),
+        (("run", "nowhere", "--preset", "mts"), "did you mean mst?"),
+        (("run", "nowhere", "resamplr=systematic"), "did you mean resampler?"),
+        (("simulate", "dmeo", "out"), "did you mean demo?"),
+        (("simulate", "demo", "out", "n_object_max=3"), "did you mean n_objects_max?"),
+        (("simulate", "demo", "out", "n_actions=-1"), "n_actions is -1"),
         (("simulate", "kitchen", "out"), "kitchen"),
         (("report", "nowhere"), "not a run folder"),
         (("list", "spoons"), "there is no kind"),
@@ -85,6 +92,63 @@ def test_wrong_arguments(tmp_path, monkeypatch, capsys, arguments, message):
     assert err.startswith("error: ")
     assert message in err
     assert list(tmp_path.iterdir()) == []
+
+
+def test_outputs_are_checked_before_the_work(recording, tmp_path, monkeypatch, capsys):
+    """Nothing is read, simulated or computed: the functions that would do so raise another error."""
+    blocked = tmp_path / "file"
+    blocked.write_text("x")
+    full = tmp_path / "full"
+    full.mkdir()
+    (full / "thesis.tex").write_text("x")
+    monkeypatch.setattr("mstfilter.runs.open_source", None)
+    monkeypatch.setattr("mstfilter.simulation.simulate_recording", None)
+    monkeypatch.setattr("mstfilter.report.write_report", None)
+    for arguments in (
+        ("run", recording, "--out", blocked / "run"),
+        ("run", recording, "--out", full),
+        ("simulate", "demo", blocked / "recording"),
+        ("simulate", "demo", full),
+        ("convert", recording, blocked / "copy"),
+        ("report", full, "--out", tmp_path),
+        ("quality", full, recording, "--csv", blocked / "table.csv"),
+    ):
+        code, _, err = call(*arguments, capsys=capsys)
+        assert code == 2, err
+        assert "cannot write" in err or "expected the name of a file" in err
+
+
+def test_simulate_takes_changes_to_the_family(tmp_path, capsys):
+    small = ("n_objects_min=2", "n_objects_max=2", "n_actions=1", "frames_per_clip=5", "width=80", "height=60")
+    code, _, err = call("simulate", "demo", tmp_path / "out", *small, capsys=capsys)
+    assert code == 0, err
+    recording = open_recording(tmp_path / "out")
+    assert (len(recording), recording.pauses) == (5, (0, 4))
+    assert set(np.unique(recording.truth(0))) == {0, 1, 2}
+
+
+@pytest.mark.parametrize(("command", "message"), [("run", "resume"), ("simulate", "starts anew"), ("demo", "anew")])
+def test_an_interrupted_command_says_what_it_keeps(command, message, tmp_path, monkeypatch, capsys):
+    def interrupt(*arguments, **named):
+        raise KeyboardInterrupt
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("mstfilter.simulation.simulate_recording", interrupt)
+    monkeypatch.setattr("mstfilter.runs.open_source", interrupt)
+    arguments = {"run": ("run", "x"), "simulate": ("simulate", "demo", "out"), "demo": ("demo",)}[command]
+    code, _, err = call(*arguments, capsys=capsys)
+    assert code == 130
+    assert message in err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_help_of_study_names_the_table(capsys):
+    assert "table `smoke`" in " ".join(call("study", "--help", capsys=capsys)[1].replace("│", " ").split())
+
+
+def test_one_hypothesis_is_singular(recording, tmp_path, capsys):
+    arguments = ("run", recording, "--preset", "floor_one_blob", "n=1", "n_proposed=1", "--no-report")
+    assert "1 hypothesis of 1 object," in call(*arguments, "--out", tmp_path / "run", capsys=capsys)[1]
 
 
 def test_unknown_commands_are_usage_errors(capsys):
@@ -199,6 +263,13 @@ class Flat(BoundaryModel):
         pass
 
 @dataclass(frozen=True)
+class Needs(Transition):
+    scale: float
+
+    def predict(self, rng, population, observation):
+        return population
+
+@dataclass(frozen=True)
 class Void(Completer):
     def fill(self, rng, seen):
         pass
@@ -223,6 +294,7 @@ def test_an_error_in_a_file_of_the_user_is_located(recording, tmp_path, monkeypa
         "proposal.completer=./mine.py:Void": ("in step 0, proposal", "`mstfilter check mine.py:Void`"),
         "size=./mine.py:Grows": ("step 0, resampler: Grows chose 1001 particles from 1, more than 1000", "n_max"),
         "proposal.boundary=./mine.py:Fails": ("Fails of ./mine.py is no boundary", "import BoundaryModel"),
+        "transition=./mine.py:Needs": ("transition: Needs needs scale, without a default", "transition.scale=VALUE"),
         "proposal.boundary=./mine.py:Flot": ("has no class 'Flot'", "it has: Fails, Wrong"),
     }
     for k, (override, texts) in enumerate(cases.items()):
@@ -232,6 +304,9 @@ def test_an_error_in_a_file_of_the_user_is_located(recording, tmp_path, monkeypa
         assert all(text in err for text in texts), err
         assert "Traceback" not in out + err
         assert "in the program" not in err
+    code, _, err = call("check", "./mine.py:Needs", capsys=capsys)
+    assert code == 2
+    assert "give it a value, scale=VALUE" in err
     Path("mine.py").write_text("import numpy\nx = numpy.pie\n")
     code, _, err = call("run", recording, "transition=./mine.py:A", capsys=capsys)
     assert code == 2

@@ -35,10 +35,10 @@ def main(arguments: list[str] | None = None) -> None:
         sys.exit(2)
     except SystemExit as end:
         if end.code == 130:  # Ctrl-C
-            print("interrupted: repeat the command to resume", file=sys.stderr)
+            print(_interrupted(given), file=sys.stderr)
         raise
     except KeyboardInterrupt:
-        print("interrupted: repeat the command to resume", file=sys.stderr)
+        print(_interrupted(given), file=sys.stderr)
         sys.exit(130)
     except Exception as error:
         if debug:
@@ -51,3 +51,10 @@ def main(arguments: list[str] | None = None) -> None:
                 print(f"hint: `mstfilter check {component}` tests the component of this command", file=sys.stderr)
         print("hint: --debug shows the traceback", file=sys.stderr)
         sys.exit(1)
+
+
+def _interrupted(given: list[str]) -> str:
+    """What an interrupted command leaves behind."""
+    if given[:1] in (["run"], ["study"]):
+        return "interrupted: repeat the command to resume"
+    return "interrupted: the command starts anew if it is repeated"

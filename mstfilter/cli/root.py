@@ -127,7 +127,8 @@ def print_summary(run: Path) -> None:
     for t in range(folder.n_pauses):
         info, hypotheses = folder.info(t), folder.hypotheses(t)
         objects = " ".join(str(h.n_objects) for h in hypotheses)
-        line = f"pause {t}     {len(hypotheses)} hypotheses of {objects} objects, "
+        n = "1 hypothesis" if len(hypotheses) == 1 else f"{len(hypotheses)} hypotheses"
+        line = f"pause {t}     {n} of {objects} {'object' if objects == '1' else 'objects'}, "
         line += f"ESS {info['ess']:.1f} of {info['n_candidates']} candidates"
         if info["quality"] is not None:
             q = info["quality"]["objects"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -21,6 +22,7 @@ from mstfilter.cli.root import (
     safe_name,
 )
 from mstfilter.errors import InputError
+from mstfilter.files import check_output
 
 
 @app.command()
@@ -45,9 +47,12 @@ def run(
     import shutil
 
     from mstfilter.presets import build_filter, load_config
+    from mstfilter.runs import check_run_folder
 
     config = load_config(preset, overrides or ())
     build_filter(config, allow_files=True)  # a wrong setting is reported before the recording is read
+    if out is not None:
+        check_run_folder(out)
     source = read_source(recording, format, option, pauses, frames)
     name = Path(preset).stem
     folder = out or Path("runs") / f"{safe_name(source.name)}-{safe_name(name)}-{seed}"
@@ -92,10 +97,14 @@ def demo(
 def simulate_(
     family: Annotated[str, typer.Argument(help="Kind of scene; `mstfilter list families` shows them.")],
     out: Annotated[Path, typer.Argument(help="Recording folder to make.")],
+    overrides: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="[FIELD=VALUE]...", help="Changes to the family: n_objects_max=8 n_actions=2"),
+    ] = None,
     seed: Seed = 0,
 ) -> None:
     """Simulate a recording with ground truth."""
-    _simulate(family, out, seed)
+    _simulate(family, out, seed, overrides or ())
 
 
 @app.command()
@@ -107,6 +116,8 @@ def report(
     mesh_style: Annotated[str, typer.Option(help="Style of exported meshes: blocky or smooth.")] = "blocky",
 ) -> None:
     """Write the report of a run or a study, which need not be finished."""
+    if out is not None:
+        check_output(out)
     if (run / "study.json").is_file():
         from mstfilter.report import write_study_report
 
@@ -161,6 +172,8 @@ def quality(
     """Score the hypotheses of a run and trivial baselines against the ground truth."""
     from statistics import fmean
 
+    if csv is not None:
+        check_output(csv)
     from mstfilter.runs import read_estimate, read_truth, score_pauses, write_scores
 
     volumes = truth.is_file() and truth.suffix in (".npz", ".npy")
@@ -186,10 +199,13 @@ def quality(
         print("scored in the image: hypotheses are projected, hidden parts do not count")
 
 
-def _simulate(family: str, out: Path, seed: int) -> None:
-    from mstfilter.simulation import scene_family, simulate_recording
+def _simulate(family: str, out: Path, seed: int, overrides: Sequence[str] = ()) -> None:
+    from mstfilter.formats import check_writable
+    from mstfilter.presets import REGISTRY, settings
+    from mstfilter.simulation import SceneFamily, scene_family, simulate_recording
 
-    chosen = scene_family(family)
+    chosen = REGISTRY.make(SceneFamily, settings(overrides), base=scene_family(family))
+    check_writable(out)
     with progress_bar("simulate") as advance:
         simulate_recording(chosen, seed, out, progress=lambda done, total, what: advance(done, total))
     print(f"recording   {out}")

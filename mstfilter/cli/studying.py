@@ -26,7 +26,7 @@ def study(
         str, typer.Option(help="Address of a Dask scheduler, tcp://HOST:PORT. Default: processes of this machine.")
     ] = "",
     smoke: Annotated[
-        bool, typer.Option("--smoke", help="Run the small form that the table [smoke] of the file describes.")
+        bool, typer.Option("--smoke", help="Run the small form that the table `smoke` of the file describes.")
     ] = False,
 ) -> None:
     """Compare filters on many scenes, or resume a study that was stopped."""

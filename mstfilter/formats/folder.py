@@ -36,6 +36,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from mstfilter.errors import InputError
+from mstfilter.files import check_output
 from mstfilter.formats.pauses import PauseRule
 from mstfilter.formats.video import RecordingFormat
 from mstfilter.scene import (
@@ -71,12 +72,13 @@ class _Workspace(BaseModel):
 
 
 def check_writable(path: Path) -> None:
-    """Raise InputError unless the path does not exist or is an empty folder."""
+    """Raise InputError unless the path does not exist or is an empty folder, and a folder can be written there."""
     if path.exists() and (not path.is_dir() or any(path.iterdir())):
         raise InputError(
             f"cannot write a recording to {path}: it exists and is not an empty folder",
             "choose another name, or remove it",
         )
+    check_output(path, folder=True)
 
 
 class RecordingWriter:

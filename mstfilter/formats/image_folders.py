@@ -43,7 +43,11 @@ class PairedImages(RecordingFormat):
         except FileNotFoundError:
             raise InputError(f"{path / 'info.json'} is missing", "it holds K and depth_scale_m") from None
         except (json.JSONDecodeError, KeyError, TypeError, ValueError) as error:
-            raise InputError(f"{path / 'info.json'} does not give K and depth_scale_m: {error!r}") from error
+            why = f"{error} is missing" if isinstance(error, KeyError) else str(error)
+            raise InputError(
+                f"{path / 'info.json'} does not give K and depth_scale_m: {why}",
+                'for example {"K": [525, 525, 319.5, 239.5], "depth_scale_m": 0.001}',
+            ) from error
         if K.shape == (4,):
             K = np.array([[K[0], 0, K[2]], [0, K[1], K[3]], [0, 0, 1]])
         present = sorted(p.name.removesuffix("_rgb.png") for p in path.glob("*_rgb.png"))

@@ -1,5 +1,6 @@
 from mstfilter.runs.run import (
     RunProgress as RunProgress,
+    check_run_folder as check_run_folder,
     code_version as code_version,
     component_files as component_files,
     filter_recording as filter_recording,

@@ -19,6 +19,7 @@ from typing import Any
 
 import mstfilter
 from mstfilter.errors import InputError
+from mstfilter.files import check_output
 from mstfilter.oracles import bind_truth, uses_truth
 from mstfilter.presets import build_filter, describe_filter
 from mstfilter.registry import nested_components
@@ -131,9 +132,17 @@ def _existing_folder(path: Path, description: dict[str, Any]) -> RunFolder | Non
         folder.remove_partial_pauses()
         folder.set_status("running")
         return folder
+    check_run_folder(path)
+    return None
+
+
+def check_run_folder(path: Path) -> None:
+    """Raise InputError unless a path is a run folder, an empty folder, or a new folder can be made there."""
+    if (path / "run.json").is_file():
+        return
     if path.exists() and (not path.is_dir() or any(path.iterdir())):
         raise InputError(f"cannot write a run to {path}: it exists and is not an empty folder", "choose another name")
-    return None
+    check_output(path, folder=True)
 
 
 def _first_difference(found: Any, wanted: Any, where: str = "") -> str:

@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mstfilter.errors import InputError, check_choice
+from mstfilter.errors import InputError, check_choice, suggestion
 from mstfilter.scene import Camera, VoxelGrid, look_at
 from mstfilter.simulation.shapes import ANY, REPORTED, SHAPE_FAMILIES, TUNING, Pool
 
@@ -196,5 +196,7 @@ SCENE_FAMILIES: dict[str, SceneFamily] = {
 def scene_family(name: str) -> SceneFamily:
     """A named family; raises InputError if the name is unknown."""
     if name not in SCENE_FAMILIES:
-        raise InputError(f"unknown scene family {name!r}", f"known: {', '.join(SCENE_FAMILIES)}")
+        raise InputError(
+            f"unknown scene family {name!r}", *suggestion(name, SCENE_FAMILIES), f"known: {', '.join(SCENE_FAMILIES)}"
+        )
     return SCENE_FAMILIES[name]

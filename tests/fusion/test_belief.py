@@ -343,6 +343,8 @@ def test_one_hypothesis_has_no_entropy_and_empty_hypotheses_count():
         assert belief.object_count()[len(set(grid.ravel().tolist()) - {0})] == pytest.approx(1)
         nowhere = np.zeros(SHAPE, bool)
         assert belief.look_information(nowhere) == belief.push_information(nowhere) == 0
+        assert belief.push_map(tolerance=20).max() == 0
+        assert belief.best_push() is belief.best_push(where=belief.boundary_entropy() > 0) is None
         np.testing.assert_allclose(belief.object_count(nowhere), [1.0])
 
 
