@@ -54,6 +54,13 @@ def test_benchmark_of_scoring(tmp_path):
     assert list(seconds)[-1] == "all" and all(s >= 0 for s in seconds.values())
 
 
+def test_front_ends(tmp_path):
+    assert "demo-1" in run_script("front_ends/run.py", "--smoke", "--out", tmp_path)
+    rows = read_csv(tmp_path / "summary.csv")
+    assert {row["score"] for row in rows} == {"quality", "mean_quality", "information"}
+    assert {row["n"] for row in rows} == {"2"}
+
+
 def test_controls(tmp_path):
     arguments = ("controls/run.py", "--smoke", "--out", tmp_path / "out")
     assert "s1-0" in run_script(*arguments)
