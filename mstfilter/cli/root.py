@@ -84,13 +84,16 @@ def read_source(path: Path, format: str, options: list[str] | None, pauses: str,
 def warnings_as_lines() -> Iterator[None]:
     """Print an `InputWarning` as one ``warning:`` line with its hints; other warnings are unchanged."""
     with warnings.catch_warnings():
-        show_other = warnings.showwarning
+        show_other, shown = warnings.showwarning, set()
         warnings.simplefilter("always", InputWarning)
 
         def show(message: Warning | str, *place: Any, **named: Any) -> None:
             if not isinstance(message, InputWarning):
                 show_other(message, *place, **named)
                 return
+            if message.message in shown:
+                return
+            shown.add(message.message)
             print(f"warning: {message.message}", file=sys.stderr)
             for hint in message.hints:
                 print(f"hint: {hint}", file=sys.stderr)

@@ -13,7 +13,7 @@ from mstfilter.lazy import attach
 
 __getattr__, __dir__, __all__ = attach(__name__, __file__)
 
-__interfaces__ = {"format": "RecordingFormat", "pauses": "PauseRule"}
+__interfaces__ = {"format": "RecordingFormat", "pauses": "mstfilter.scene:PauseRule"}
 __components__ = {
     "format": {
         "recording": "RecordingFolder",
@@ -24,5 +24,11 @@ __components__ = {
         "dsr": "Dsr",
         "bag": "Bag",
     },
-    "pauses": {"still": "Still", "at": "At", "listed": "Listed", "ends": "Ends", "every": "EveryNth"},
+    "pauses": {
+        "still": "mstfilter.scene:Still",
+        "at": "mstfilter.scene:At",
+        "listed": "mstfilter.scene:Listed",
+        "ends": "mstfilter.scene:Ends",
+        "every": "mstfilter.scene:EveryNth",
+    },
 }

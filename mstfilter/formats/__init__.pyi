@@ -8,7 +8,13 @@ from mstfilter.formats.folder import (
     save_recording as save_recording,
 )
 from mstfilter.formats.image_folders import PairedImages as PairedImages, Redwood as Redwood, Tum as Tum
-from mstfilter.formats.pauses import (
+from mstfilter.formats.video import (
+    KnownWorld as KnownWorld,
+    RecordingFormat as RecordingFormat,
+    Video as Video,
+    VideoFormat as VideoFormat,
+)
+from mstfilter.scene.pauses import (
     At as At,
     Ends as Ends,
     EveryNth as EveryNth,
@@ -16,10 +22,4 @@ from mstfilter.formats.pauses import (
     PauseRule as PauseRule,
     Still as Still,
     pauses_from_text as pauses_from_text,
-)
-from mstfilter.formats.video import (
-    KnownWorld as KnownWorld,
-    RecordingFormat as RecordingFormat,
-    Video as Video,
-    VideoFormat as VideoFormat,
 )

@@ -15,7 +15,6 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from mstfilter.errors import InputError, MissingLibraryError
-from mstfilter.formats.pauses import EveryNth, PauseRule
 from mstfilter.formats.video import KnownWorld, RecordingFormat, Video
 from mstfilter.scene import (
     Camera,
@@ -31,6 +30,7 @@ from mstfilter.scene import (
     render,
     rigid_from_matrix,
 )
+from mstfilter.scene.pauses import EveryNth, PauseRule
 
 
 @dataclass(frozen=True)

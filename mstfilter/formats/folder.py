@@ -37,7 +37,6 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from mstfilter.errors import InputError
 from mstfilter.files import check_output
-from mstfilter.formats.pauses import PauseRule
 from mstfilter.formats.video import RecordingFormat
 from mstfilter.scene import (
     Camera,
@@ -56,6 +55,7 @@ from mstfilter.scene import (
     warn_if_workspace_is_empty,
     write_image,
 )
+from mstfilter.scene.pauses import PauseRule
 
 VERSION = 1  #: Version of the layout
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +17,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from mstfilter.errors import InputError
 from mstfilter.formats.video import RecordingFormat, Video, VideoFormat, pair_stamps
-from mstfilter.scene import Recording, read_depth, read_rgb, rigid_from_matrix
+from mstfilter.scene import Frame, Recording, read_depth, read_labels, read_rgb, rigid_from_matrix, table_residual
 
 
 @dataclass(frozen=True)
@@ -25,11 +25,19 @@ class PairedImages(RecordingFormat):
     """A folder of pairs NAME_rgb.png, NAME_depth.png with an info.json; every frame is a pause.
 
     ``info.json`` holds ``K`` (fx, fy, cx, cy, or a 3x3 matrix) and ``depth_scale_m``, metres per unit of the 16-bit
-    depth images. There is no pose: the world is found from the support plane. `frames` are the names of frames in
-    order; by default all, sorted by name.
+    depth images. There is no pose: the world is found from the support plane. Label images NAME_label.png (8 or 16
+    bits, one number for each object) become the true instances.
+
+    Parameters
+    ----------
+    frames : tuple of str
+        Names of the frames in order. Default: all, sorted by name.
+    background : tuple of int
+        Labels that are no objects, besides 0. Default: those with most of their readings on the support plane.
     """
 
     frames: tuple[str | int, ...] = ()
+    background: tuple[int, ...] = ()
 
     @classmethod
     def detects(cls, path: Path) -> bool:
@@ -63,9 +71,30 @@ class PairedImages(RecordingFormat):
             if image.shape != rgb[0].shape:
                 raise InputError(f"frame {name} of {path} has shape {image.shape}, the first has {rgb[0].shape}")
         label = chosen[0] if len(chosen) == 1 else f"{chosen[0]}-{chosen[-1]}"
-        return Recording.from_arrays(np.stack(rgb), np.stack(depth), K, pauses=range(len(chosen)), name=label)
+        made = Recording.from_arrays(np.stack(rgb), np.stack(depth), K, pauses=range(len(chosen)), name=label)
+
+        def instance(index: int) -> np.ndarray | None:
+            return self._instance(made.frames[index], path / f"{chosen[index]}_label.png")
+
+        return replace(made, path=path, depth_scale=scale, instance=instance)
+
+    def _instance(self, frame: Frame, file: Path) -> np.ndarray | None:
+        """The true objects (H, W) of a frame; None if there is no label image."""
+        if not file.is_file():
+            return None
+        labels = read_labels(file)
+        if labels.shape != frame.depth.shape:
+            raise InputError(f"label image {file} has shape {labels.shape}, its frame has {frame.depth.shape}")
+        background = self.background
+        if not background:
+            with np.errstate(invalid="ignore"):
+                on_plane = np.abs(table_residual(frame)) < _ON_PLANE
+            known = np.unique(labels[frame.valid])
+            background = tuple(int(k) for k in known if on_plane[frame.valid & (labels == k)].mean() > 0.5)
+        return np.where(np.isin(labels, background), 0, labels)
 
 
+_ON_PLANE = 2.0  # disparity in 1/8 pixels of a Kinect: 6 mm at 1 m
 _COLOUR, _SUFFIXES = ("color", "image", "rgb", "colour"), (".png", ".jpg", ".jpeg")
 _INTRINSICS = ("intrinsic.json", "camera_intrinsic.json", "intrinsics.json")
 

@@ -33,7 +33,6 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from mstfilter.errors import InputError, InputWarning
-from mstfilter.formats.pauses import PauseRule, Still
 from mstfilter.scene import (
     Camera,
     Frame,
@@ -44,6 +43,7 @@ from mstfilter.scene import (
     find_world,
     rigid_from_matrix,
 )
+from mstfilter.scene.pauses import PauseRule, Still
 
 
 class RecordingFormat(ABC):

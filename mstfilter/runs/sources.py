@@ -5,7 +5,7 @@
 
 Options are fields of the format (``mstfilter list format`` shows them), as ``FIELD=VALUE``; commas make a list. The
 format ``./file.py:Class`` is a reader that the user wrote. Each format is a class of `mstfilter.formats`; a ROS bag
-is read by ``formats/bag.py``, and a rule of ``formats/pauses.py`` decides where the pauses are.
+is read by ``formats/bag.py``, and a rule of ``scene/pauses.py`` decides where the pauses are.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def open_source(
     options : sequence of str
         ``FIELD=VALUE`` of the format.
     pauses : str
-        Where a video is cut: see `mstfilter.formats.pauses.pauses_from_text`. Empty: the format's default.
+        Where a video is cut: see `mstfilter.scene.pauses.pauses_from_text`. Empty: the format's default.
     allow_files : bool
         Whether ``./file.py:Class`` is loaded.
     """
@@ -70,6 +70,12 @@ def detect_format(path: Path) -> str:
         raise InputError(
             f"{path} looks like {' and like '.join(found)}", f"choose one: --format {' or --format '.join(found)}"
         )
+    if _is_colour_only(path):
+        raise InputError(
+            f"{path} holds colour images only: hypotheses in 3-D need a depth image for every colour image",
+            "record with an RGB-D camera, with depth aligned to colour; `mstfilter list format` shows the layouts",
+            "if you have estimated depth, make a recording in Python: mstfilter.Recording.from_arrays",
+        )
     if path.is_dir() and (
         not any(path.iterdir()) or any((path / n).exists() for n in ("camera.json", "rgb", "depth"))
     ):
@@ -104,3 +110,16 @@ def _quoted(word: str) -> str:
     if word.lstrip("+-").isdigit():
         return word if str(int(word)) == word else repr(word)
     return repr(number)
+
+
+_VIDEOS = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".gif")
+_IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
+
+
+def _is_colour_only(path: Path) -> bool:
+    """Whether a path is a video file, an image, or a folder of images without any name that contains "depth"."""
+    if path.is_file():
+        return path.suffix.lower() in (*_VIDEOS, *_IMAGES)
+    names = [p.relative_to(path).as_posix().lower() for p in (*path.glob("*"), *path.glob("*/*"))]
+    images = any(name.endswith(_IMAGES) or name.endswith(_VIDEOS) for name in names)
+    return images and not any("depth" in name for name in names)

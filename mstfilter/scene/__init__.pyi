@@ -16,6 +16,19 @@ from mstfilter.scene.geometry import (
     fit_support_plane as fit_support_plane,
     frame_geometry as frame_geometry,
     table_residual as table_residual,
+)
+from mstfilter.scene.pauses import (
+    At as At,
+    Ends as Ends,
+    EveryNth as EveryNth,
+    Listed as Listed,
+    PauseRule as PauseRule,
+    Still as Still,
+    pause_rule as pause_rule,
+    pauses_from_text as pauses_from_text,
+)
+from mstfilter.scene.plausibility import (
+    warn_if_implausible as warn_if_implausible,
     warn_if_workspace_is_empty as warn_if_workspace_is_empty,
 )
 from mstfilter.scene.recording import (

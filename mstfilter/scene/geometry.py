@@ -4,7 +4,6 @@
 >>> plane = fit_support_plane(frame)                      # if the camera pose is not known
 >>> camera = frame.camera.at(plane.T_world_camera)        # z up, table at z = 0
 >>> grid = workspace(frame_with_that_camera)              # voxels around the objects on the table
->>> warn_if_workspace_is_empty(frames, grid, "recording table-7")
 
 Disparity D = 8 f b / z (f focal length, b baseline, z depth) is affine in pixel coordinates on a plane, and its noise
 is the same everywhere. So the support plane is a least-squares fit of D by an affine function of the pixel (u, v).
@@ -14,14 +13,12 @@ correspond to the same noise.
 
 from __future__ import annotations
 
-import warnings
-from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from mstfilter.errors import InputError, InputWarning
+from mstfilter.errors import InputError
 from mstfilter.scene.arrays import read_only
 from mstfilter.scene.cache import memo
 from mstfilter.scene.camera import Camera
@@ -205,44 +202,9 @@ def workspace(frame: Frame) -> VoxelGrid:
     if len(chosen) == 0:
         raise InputError(
             "no workspace: no depth reading is on or above the table",
-            "give the grid: VoxelGrid(origin, voxel_size, shape)",
+            "check the pose (z is up, the table is at z = 0) and the depth scale",
+            "or give the grid: VoxelGrid(origin, voxel_size, shape)",
         )
     low, high = np.percentile(chosen[:, :2], (2, 98), axis=0)
     corner = np.round((low + high) / 2 / voxel_size) * voxel_size - np.array(shape[:2]) * voxel_size / 2
     return VoxelGrid(np.append(corner, 0.0), voxel_size, shape)
-
-
-_MIN_READINGS = 30  # fewer are taken for noise
-
-
-def warn_if_workspace_is_empty(frames: Iterable[Frame], grid: VoxelGrid, where: str) -> None:
-    """Warn if no frame has readings inside the grid and above the table.
-
-    Objects are searched inside the voxel grid only. A grid in other units, at another place, or below a pose that is
-    upside down gives hypotheses without objects and no error. The frames are those at the pauses; they are read until
-    one has such readings. `where` names the recording in the message.
-    """
-    spans = []
-    for frame in frames:
-        points = frame.points[frame.valid]
-        inside = points[grid.contains(grid.index_of(points))]
-        if (inside[:, 2] > _MIN_HEIGHT).sum() >= _MIN_READINGS:
-            return
-        if len(points):
-            spans.append(np.percentile(points, (2, 98), axis=0))
-    if not spans:
-        return
-    low, high = np.min(spans, axis=0)[0], np.max(spans, axis=0)[1]
-    seen = ", ".join(f"{axis} {a:.2f} to {b:.2f}" for axis, a, b in zip("xyz", low, high, strict=True))
-    spanned = ", ".join(
-        f"{axis} {a:.2f} to {b:.2f}" for axis, a, b in zip("xyz", grid.origin, grid.upper, strict=True)
-    )
-    warnings.warn(
-        InputWarning(
-            f"the workspace of {where} has no reading above the table, so no object can be found: "
-            f"it spans {spanned} m, depth readings span {seen} m",
-            "give a workspace around the objects, or none: it is then placed around the objects on the table",
-            "check the pose: z of the world is up, the table is at z = 0",
-        ),
-        stacklevel=3,
-    )

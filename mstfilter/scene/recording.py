@@ -11,6 +11,7 @@ not given, it is placed around the objects on the table.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import dataclass, field
@@ -21,12 +22,16 @@ from typing import Any, overload
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from mstfilter.errors import InputError
+from mstfilter.errors import InputError, InputWarning
 from mstfilter.scene.arrays import content_key
 from mstfilter.scene.camera import Camera, rigid_from_matrix
 from mstfilter.scene.frame import Clip, Frame
-from mstfilter.scene.geometry import fit_support_plane, warn_if_workspace_is_empty, workspace
+from mstfilter.scene.geometry import fit_support_plane, workspace
+from mstfilter.scene.pauses import Ends, PauseRule, Still, pause_rule
+from mstfilter.scene.plausibility import warn_if_implausible
 from mstfilter.scene.voxels import VoxelGrid, as_labels
+
+_LONG = 20  # frames; more are probably not one clip
 
 
 class LazyFrames(Sequence[Frame]):
@@ -115,7 +120,7 @@ class Recording:
         depth: np.ndarray,
         K: np.ndarray,
         *,
-        pauses: Sequence[int] | None = None,
+        pauses: Sequence[int] | str | PauseRule | None = None,
         T_world_camera: np.ndarray | RigidTransform | None = None,
         grid: VoxelGrid | None = None,
         robot_masks: np.ndarray | None = None,
@@ -132,8 +137,9 @@ class Recording:
             Metres; NaN or 0 is no reading.
         K : (3, 3) array
             Intrinsics in pixels.
-        pauses : sequence of int, optional
-            Frames at which nothing moves; a hypothesis is estimated at each. Default: the first and the last.
+        pauses : sequence of int, str or PauseRule, optional
+            Frames at which nothing moves; a hypothesis is estimated at each. A rule or its text finds them: "still",
+            "ends", "every", or "0s,4.2s". Default: "still" if `times` are given, as on the command line; else "ends".
         T_world_camera : (4, 4) array or RigidTransform, optional
             Camera pose; the table must be at z = 0. Default: from the support plane of the first pause.
         grid : VoxelGrid, optional
@@ -145,6 +151,11 @@ class Recording:
         name : str
             For messages and reports.
         """
+        if depth is None:
+            raise InputError(
+                "depth is None: hypotheses in 3-D need a depth image for every colour image",
+                "record with an RGB-D camera, or estimate depth in metres with a program of your choice",
+            )
         rgb, depth = np.asarray(rgb), np.asarray(depth)
         if rgb.ndim == 3 and depth.ndim == 2:
             rgb, depth = rgb[None], depth[None]
@@ -165,7 +176,24 @@ class Recording:
         if T_world_camera is not None and not isinstance(T_world_camera, RigidTransform):
             T_world_camera = rigid_from_matrix(T_world_camera, "T_world_camera")
         camera = Camera(K, width, height, T_world_camera)
-        chosen = tuple(sorted({0, n - 1})) if pauses is None else tuple(int(p) for p in pauses)
+        stamps = tuple(float(t) for t in (times if times is not None else range(n)))
+        if len(stamps) != n:
+            raise InputError(f"there are {len(stamps)} times for {n} frames of {name}")
+        if pauses is None and times is None and n > _LONG:
+            warnings.warn(
+                InputWarning(
+                    f"the {n} frames of {name} are one clip from the first to the last, since no pauses are given",
+                    "give pauses=(0, 40, 85), or times in seconds: pauses are then found where nothing moves",
+                ),
+                stacklevel=2,
+            )
+        if pauses is None:
+            pauses = Still() if times is not None and n > 2 else Ends()
+        if isinstance(pauses, str):
+            pauses = pause_rule(pauses)
+        if isinstance(pauses, PauseRule):
+            pauses = pauses.find(stamps, lambda index: rgb[index])
+        chosen = tuple(int(p) for p in pauses)
         if not chosen or min(chosen) < 0 or max(chosen) >= n:
             raise InputError(f"pauses are {chosen}, expected indices of the {n} frames")
         masks = [None] * n if robot_masks is None else list(np.asarray(robot_masks, dtype=bool))
@@ -176,13 +204,11 @@ class Recording:
                 "one mask per frame, of the size of the images",
             )
         first = Frame(rgb[chosen[0]], depth[chosen[0]], camera, masks[chosen[0]])
-        grid_given = grid is not None
         camera, grid = find_world(first, grid)
         frames = [Frame(rgb[i], depth[i], camera, masks[i]) for i in range(n)]
-        stamps = tuple(float(t) for t in (times if times is not None else range(n)))
-        if grid_given:
-            warn_if_workspace_is_empty((frames[p] for p in chosen), grid, f"recording {name}")
-        return cls(frames, grid, chosen, stamps, name)
+        made = cls(frames, grid, chosen, stamps, name)
+        made._warn_once  # noqa: B018
+        return made
 
     @cached_property
     def key(self) -> bytes:
@@ -202,7 +228,11 @@ class Recording:
         return len(self.frames)
 
     def clips(self) -> tuple[Clip, ...]:
-        """One clip per pause: the first pause alone, then from each pause to the next."""
+        """One clip per pause: the first pause alone, then from each pause to the next.
+
+        Warns if the input is not plausible (`mstfilter.scene.warn_if_implausible`), unless it was done before.
+        """
+        self._warn_once  # noqa: B018
         clips = []
         for t, end in enumerate(self.pauses):
             span = slice(self.pauses[max(t - 1, 0)], end + 1)
@@ -210,9 +240,15 @@ class Recording:
         return tuple(clips)
 
     def check(self) -> None:
-        """Read every image, so that an unreadable one raises InputError before a run; warn of a misplaced grid."""
+        """Read every image, so that an unreadable one raises InputError before a run; warn of implausible input."""
         _ = self.key
-        warn_if_workspace_is_empty((self.frames[p] for p in self.pauses), self.grid, f"recording {self.name}")
+        self.__dict__.pop("_warn_once", None)
+        self._warn_once  # noqa: B018
+
+    @cached_property
+    def _warn_once(self) -> None:
+        """Evaluated once: warnings about the frames at the pauses."""
+        warn_if_implausible((self.frames[p] for p in self.pauses), self.grid, f"recording {self.name}")
 
 
 def check_depth(depth: np.ndarray, where: str) -> None:

@@ -16,9 +16,9 @@ from mstfilter.formats import open_recording
 from mstfilter.formats.datasets import Bop, Dsr
 from mstfilter.formats.folder import save_recording
 from mstfilter.formats.image_folders import Redwood, Tum
-from mstfilter.formats.pauses import Ends, EveryNth
 from mstfilter.formats.video import KnownWorld, _undistort, pair_stamps, undistortion_map
 from mstfilter.scene import Recording, write_image
+from mstfilter.scene.pauses import Ends, EveryNth
 from tests.formats.layouts import (
     FPS,
     PAUSES,

@@ -7,9 +7,11 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from mstfilter.errors import InputError
-from mstfilter.formats.pauses import At, Ends, EveryNth, Listed, Still, grey_blocks, pauses_from_text
+from mstfilter.errors import InputError, InputWarning
+from mstfilter.scene import Recording
+from mstfilter.scene.pauses import At, Ends, EveryNth, Listed, Still, grey_blocks, pauses_from_text
 from tests.formats.layouts import PAUSES, video
+from tests.scene.scenes import CAMERA, table_scene
 
 TIMES = tuple(10 + k / 10 for k in range(40))
 
@@ -50,6 +52,32 @@ def test_pauses_as_text(tmp_path):
     assert pauses_from_text(str(file)) == {"component": "listed", "file": str(file)}
     with pytest.raises(InputError, match="1.5"):
         pauses_from_text("0,1.5")
+
+
+def test_pauses_of_arrays(tmp_path):
+    """The rules of the command line, and its default if the times are known."""
+    scenes = [table_scene(shift) for shift in (0, 0, 0, 1, 2, 3, 3, 3, 3)]
+    rgb, depth = np.stack([s[0] for s in scenes]), np.stack([s[1] for s in scenes])
+    times = 0.3 * np.arange(9)
+
+    def pauses(*, n=9, **named):
+        return Recording.from_arrays(rgb[:n], depth[:n], CAMERA.K, **named).pauses
+
+    assert pauses() == (0, 8)
+    assert pauses(times=times) == pauses(times=times, pauses="still") == (1, 6)
+    assert pauses(times=times[:2], n=2) == (0, 1)
+    assert pauses(pauses="every") == tuple(range(9))
+    assert pauses(pauses="ends", times=times) == pauses(pauses="0,-1") == pauses(pauses=Ends()) == (0, 8)
+    assert pauses(pauses="0s,1.2s", times=times) == (0, 4)
+    assert pauses(pauses=[2, 5]) == (2, 5)
+    for wrong, message in (("evry", "no rule of pauses 'evry'"), ("0,x", "no rule"), ("99", "frame 99")):
+        with pytest.raises(InputError, match=message):
+            pauses(pauses=wrong)
+    with pytest.raises(InputError, match="3 times for 9 frames"):
+        pauses(times=times[:3])
+    many = np.repeat(rgb[:1], 30, axis=0), np.repeat(depth[:1], 30, axis=0)
+    with pytest.warns(InputWarning, match="30 frames of arrays are one clip"):
+        Recording.from_arrays(*many, CAMERA.K)
 
 
 def times_of(images, fps=10.0):

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 
 from mstfilter.errors import InputError
 from mstfilter.presets import REGISTRY
 from mstfilter.runs.sources import detect_format, format_settings, open_source
+from mstfilter.scene import Recording, render, write_image
 from tests.formats import layouts
+from tests.scene.scenes import CAMERA, GRID, table_scene
 from tests.scene.test_recording import write
 
 WRITERS = {
@@ -31,8 +35,8 @@ def test_formats_are_detected(tmp_path, name):
 def test_unknown_and_ambiguous(tmp_path):
     (tmp_path / "notes").mkdir()
     (tmp_path / "notes" / "a.txt").write_text("x")
-    (tmp_path / "video.mp4").write_bytes(b"x")
-    for name in ("notes", "video.mp4"):
+    (tmp_path / "data.bin").write_bytes(b"x")
+    for name in ("notes", "data.bin"):
         with pytest.raises(InputError, match="has no known format") as caught:
             open_source(tmp_path / name)
         assert "tum, bop, redwood, dsr, bag" in caught.value.hints[0]
@@ -103,3 +107,38 @@ def test_a_reader_of_ones_own(tmp_path):
     assert (recording.name, len(recording)) == ("mine", 2)
     with pytest.raises(InputError, match="which is not loaded here"):
         open_source(tmp_path / "mine.npz", f"{tmp_path}/mine.py:Mine", allow_files=False)
+
+
+@pytest.mark.parametrize("layout", ["video.mp4", "image.png", "rgb/000.png", "frames/0.jpg"])
+def test_colour_alone_is_one_error(layout, tmp_path):
+    file = tmp_path / "data" / layout
+    file.parent.mkdir(parents=True)
+    file.write_bytes(b"")
+    path = file if "/" not in layout else tmp_path / "data"
+    with pytest.raises(InputError, match="holds colour images only: hypotheses in 3-D need a depth image") as caught:
+        open_source(path)
+    assert "RGB-D camera" in caught.value.hints[0]
+    with pytest.raises(InputError, match="depth is None"):
+        Recording.from_arrays(np.zeros((4, 5, 3), np.uint8), None, np.eye(3))
+
+
+def test_label_images_beside_pairs_are_true_instances(tmp_path):
+    """The label of the table is no object, unless the labels that are none are given."""
+    rgb, depth, labels = table_scene(noise=np.random.default_rng(0))
+    objects = render(labels, GRID, CAMERA).labels
+    write_image(tmp_path / "a_rgb.png", rgb)
+    write_image(tmp_path / "a_depth.png", np.rint(1000 * depth).astype(np.uint16))
+    write_image(tmp_path / "a_label.png", np.where(np.arange(160) < 5, 0, objects + 1).astype(np.uint8))
+    info = {"K": [131, 131, 79.5, 59.5], "depth_scale_m": 0.001}
+    (tmp_path / "info.json").write_text(json.dumps(info))
+    expected = np.where((objects > 0) & (np.arange(160) >= 5), objects + 1, 0)
+    np.testing.assert_array_equal(open_source(tmp_path).instance(0), expected)
+    assert set(np.unique(open_source(tmp_path, options=["background=0,3"]).instance(0))) == {0, 1, 2}
+    write_image(tmp_path / "a_label.png", objects[:50].astype(np.uint8))
+    with pytest.raises(InputError, match=r"a_label.png has shape \(50, 160\)"):
+        open_source(tmp_path).instance(0)
+    (tmp_path / "a_label.png").unlink()
+    assert open_source(tmp_path).instance(0) is None
+    (tmp_path / "info.json").write_text('{"depth_scale_m": 0.001}')
+    with pytest.raises(InputError, match="'K' is missing"):
+        open_source(tmp_path)

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from mstfilter.errors import InputError, check_integer
+from mstfilter.errors import InputError, check_integer, suggestion
 
 
 class PauseRule(ABC):
@@ -115,6 +115,20 @@ def pauses_from_text(text: str) -> dict[str, Any]:
     return {"component": text}
 
 
+def pause_rule(text: str) -> PauseRule:
+    """The rule of a text: "still", "ends", "every", frames "0,40,85", seconds "0s,4.2s", or the path of a file."""
+    config = pauses_from_text(text)
+    name = str(config.pop("component"))
+    rules: dict[str, type[PauseRule]] = {"still": Still, "ends": Ends, "every": EveryNth, "at": At, "listed": Listed}
+    if name not in rules:
+        raise InputError(
+            f"there is no rule of pauses {name!r}",
+            *suggestion(name, rules),
+            "still, ends, every, frames 0,40,85, seconds 0s,4.2s, or the path of a file that lists them",
+        )
+    return rules[name](**config)
+
+
 _BLOCKS_ACROSS = 80
 _MAX_LEVELS = 4.0  # largest threshold of a block in units of `levels`, also if the block never rests
 
@@ -174,9 +188,10 @@ class Still(PauseRule):
             raise InputError(
                 f"no pause found: in {len(times)} frames ({times[-1] - times[0]:.1f} s) the image is never still for "
                 f"{self.hold_s:g} s",
-                "if the camera moves, give the pauses: --pauses 0,40,85 (frames) or --pauses 0s,4.2s",
+                "if the camera moves, give the pauses: --pauses 0,40,85 (frames) or 0s,4.2s",
                 "if people or shadows move, use a part of the image: -o pauses.region=0.2,0.1,0.8,0.9",
                 "accept shorter intervals: -o pauses.hold_s=0.2; or use the first and last frame: --pauses ends",
+                'in Python pauses=(0, 40, 85), pauses="ends" or a rule, pauses=Still(hold_s=0.2)',
             )
         return tuple((first + last) // 2 for first, last in intervals)
 
