@@ -8,6 +8,8 @@
 `mask_trees`       nested masks as a tree whose cuts are levels
 `mask_proposal`    the proposal, the boundary model, and the recipe for SAM
 `completions`      meshes, point clouds and voxels of others as completions
+`cob`              COB: boundary maps and trees; `cob_network`: its network in torch
+`caffe`            a reader of Caffe's files of weights
 =================  ===================================================================
 
 No weights are part of the package, and none are downloaded.
@@ -19,6 +21,7 @@ __getattr__, __dir__, __all__ = attach(__name__, __file__)
 
 __components__ = {
     "proposal": {"mask_folder": "MaskProposal"},
-    "boundary": {"mask_folder": "MaskBoundary"},
+    "boundary": {"mask_folder": "MaskBoundary", "cob": "CobBoundary"},
+    "tree": {"cob": "CobTree"},
     "completer": {"external": "ExternalCompletion"},
 }

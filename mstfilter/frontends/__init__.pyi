@@ -1,3 +1,5 @@
+from mstfilter.frontends.caffe import read_caffemodel as read_caffemodel
+from mstfilter.frontends.cob import CobBoundary as CobBoundary, CobTree as CobTree
 from mstfilter.frontends.completions import ExternalCompletion as ExternalCompletion, read_shapes as read_shapes
 from mstfilter.frontends.mask_files import (
     MaskRegion as MaskRegion,

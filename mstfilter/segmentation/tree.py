@@ -22,8 +22,10 @@ node: near 0 if the node lies inside one object, near 1 if it contains several.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -237,16 +239,40 @@ def merge_tree(boundary: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray
         return np.array([0]), np.zeros(1), np.zeros(shape, np.int64)
     graph = hg.get_4_adjacency_graph(shape)
     weights = hg.weight_graph(graph, boundary.astype(np.float64), hg.WeightFunction.mean)
+    found = linkage_tree(graph, weights, shape)
+    if found is None:
+        return np.array([0]), np.zeros(1), np.zeros(shape, np.int64)
+    tree, altitude, leaves = found
+    return np.array(tree.parents(), dtype=np.int64), altitude, leaves
+
+
+def linkage_tree(
+    graph: Any,
+    weights: np.ndarray,
+    shape: tuple[int, int],
+    strength: Callable[[np.ndarray], np.ndarray] | None = None,
+) -> tuple[Any, np.ndarray, np.ndarray] | None:
+    """Watershed and average linkage of a pixel graph: higra's tree, merge heights (N,), leaf image (H, W).
+
+    `weights` (E,) belong to the edges of the graph. ``strength(arcs)`` gives the strength of the borders between the
+    watershed regions, with `arcs` (E,) the border of each edge, -1 within a region; by default the mean weight of its
+    edges. None if there is only one region.
+    """
+    import higra as hg
+
     # No edge orientations: the library's convention would weaken axis-parallel borders.
     rag, strengths = hg.oriented_watershed(graph, weights, shape)
-    leaves = np.asarray(hg.CptRegionAdjacencyGraph.construct(rag)["vertex_map"]).reshape(shape)
+    details = hg.CptRegionAdjacencyGraph.construct(rag)
+    leaves = np.asarray(details["vertex_map"]).reshape(shape)
     if rag.num_vertices() == 1:
-        return np.array([0]), np.zeros(1), np.zeros(shape, np.int64)
+        return None
+    if strength is not None:
+        strengths = strength(np.asarray(details["edge_map"]))
     lengths = hg.rag_accumulate_on_edges(rag, hg.Accumulators.sum, np.ones(graph.num_edges()))
     tree, altitude = hg.binary_partition_tree_average_linkage(rag, strengths, lengths)
     # By rounding, the mean of a parent can be lower than that of its child; heights must not decrease upwards.
     altitude = hg.accumulate_and_max_sequential(tree, altitude, np.zeros(tree.num_leaves()), hg.Accumulators.max)
-    return np.array(tree.parents(), dtype=np.int64), np.array(altitude, dtype=np.float64), leaves
+    return tree, np.array(altitude, dtype=np.float64), leaves
 
 
 def prune(

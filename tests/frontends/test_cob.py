@@ -1,0 +1,443 @@
+"""COB with random weights in the format of Caffe: layers against plain references, the tree, broken files."""
+
+from __future__ import annotations
+
+import pickle
+import struct
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mstfilter.errors import InputError
+from mstfilter.frontends import CobBoundary, CobTree, read_caffemodel
+from mstfilter.frontends.cob import _segments, combine_scales, decode_orientation, hha
+from mstfilter.presets import preset
+from mstfilter.scene import Camera, Frame, look_at
+from mstfilter.segmentation import OptimalCut, SceneCutObjectness, TreeCutProposal
+from tests.segmentation.scenes import TWO, clip_of, frame_of
+
+torch = pytest.importorskip("torch")
+
+from mstfilter.frontends.cob_network import (  # noqa: E402 (needs torch)
+    CobNetwork,
+    bilinear_kernel,
+    cob_convolutions,
+    cob_input,
+    enlarge,
+)
+
+LEVELS = {"conv1": (64, 1), "res2c": (256, 2), "res3d": (512, 4), "res4f": (1024, 8), "res5c": (2048, 16)}
+
+
+def varint(n: int) -> bytes:
+    out = b""
+    while n > 127:
+        out, n = out + bytes([n & 127 | 128]), n >> 7
+    return out + bytes([n])
+
+
+def field(number: int, content: bytes) -> bytes:
+    return varint(number << 3 | 2) + varint(len(content)) + content
+
+
+def encode(layers: dict[str, list[np.ndarray]], old: bool = False) -> bytes:
+    """A NetParameter with these blobs, as protoc would write it; `old` is the format before 2015."""
+    out = [field(1, b"COB")]
+    for name, blobs in layers.items():
+        parts = []
+        for blob in blobs:
+            if old:
+                sizes = (1,) * (4 - blob.ndim) + blob.shape
+                shape = b"".join(varint(k << 3) + varint(n) for k, n in enumerate(sizes, start=1))
+            else:
+                shape = field(7, field(1, b"".join(map(varint, blob.shape))))
+            parts.append(shape + field(5, blob.astype("<f4").tobytes()))
+        if old:
+            out.append(field(2, field(4, name.encode()) + b"".join(field(6, p) for p in parts)))
+        else:
+            content = field(1, name.encode()) + field(2, b"Convolution") + b"".join(field(7, p) for p in parts)
+            out.append(field(100, content))
+    return b"".join(out)
+
+
+@pytest.fixture(scope="module")
+def blobs():
+    """Weights of all layers, small enough that outputs are neither 0 nor 1."""
+    rng = np.random.default_rng(0)
+    blobs = {}
+    for c in cob_convolutions():
+        size = (c.outputs, c.inputs, c.kernel, c.kernel)
+        scale = 1.2 / np.sqrt(c.inputs * c.kernel**2) * (0.02 if c.name.startswith("conv1") and c.kernel == 7 else 1)
+        blobs[c.name] = [np.float32(scale) * rng.standard_normal(size, np.float32)]
+        if c.bias:
+            blobs[c.name].append(0.1 * rng.standard_normal(c.outputs).astype(np.float32))
+    return blobs
+
+
+@pytest.fixture(scope="module")
+def model(blobs, tmp_path_factory):
+    """A file of random weights with the deconvolutions and the unused layer of the training network."""
+    extra = {"new-score-weighting": [np.ones((1, 5, 1, 1), np.float32), np.zeros(1, np.float32)]}
+    for stride in (2, 4, 8, 16):
+        kernel = np.outer(*[1 - np.abs(np.arange(2 * stride) + 0.5 - stride) / stride] * 2).astype(np.float32)
+        extra[f"upsample_{stride}"] = [kernel[None, None], np.zeros(1, np.float32)]
+        extra[f"upsample_{stride}_or8_1"] = [np.eye(4, dtype=np.float32)[:, :, None, None] * kernel, np.zeros(4)]
+    path = tmp_path_factory.mktemp("cob") / "random.caffemodel"
+    path.write_bytes(encode({**blobs, **extra}))
+    return path
+
+
+def conv(x: np.ndarray, layer: list[np.ndarray], stride: int = 1) -> np.ndarray:
+    """Convolution (C, H, W) by the definition of Caffe, with a padding that keeps the size at stride 1."""
+    w = layer[0].astype(np.float64)
+    k = w.shape[-1]
+    padded = np.pad(x, ((0, 0), (k // 2, k // 2), (k // 2, k // 2)))
+    windows = np.lib.stride_tricks.sliding_window_view(padded, (k, k), axis=(1, 2))[:, ::stride, ::stride]
+    out = np.einsum("chwij,ocij->ohw", windows, w, optimize=True)
+    return out if len(layer) == 1 else out + layer[1][:, None, None]
+
+
+def deconv(x: np.ndarray, stride: int, size: tuple[int, int]) -> np.ndarray:
+    """Bilinear deconvolution pixel by pixel; the crop is aligned by the centres of the receptive fields."""
+    if stride == 1:
+        return x
+    k = 2 * stride
+    one = [1 - abs(i - (k - 1) / 2) / stride for i in range(k)]
+    full = np.zeros((len(x), (x.shape[1] - 1) * stride + k, (x.shape[2] - 1) * stride + k))
+    for i in range(x.shape[1]):
+        for j in range(x.shape[2]):
+            full[:, i * stride : i * stride + k, j * stride : j * stride + k] += (
+                np.outer(one, one) * x[:, i, j, None, None]
+            )
+    # The pooling takes pixels 2 i and 2 i + 1, later steps take pixel 2 i: pixel y of a level lies at x = s y + 0.5
+    # of the image, and at s y + (k - 1) / 2 = x + s - 1 of the enlargement.
+    return full[:, stride - 1 :, stride - 1 :][:, : size[0], : size[1]]
+
+
+def pool(x: np.ndarray) -> np.ndarray:
+    h, w = (x.shape[1] + 1) // 2, (x.shape[2] + 1) // 2
+    padded = np.full((len(x), 2 * h, 2 * w), -np.inf)
+    padded[:, : x.shape[1], : x.shape[2]] = x
+    return padded.reshape(len(x), h, 2, w, 2).max(axis=(2, 4))
+
+
+def reference(layers: dict[str, list[np.ndarray]], x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The network, written from the names of the layers in the published prototxt, in double precision."""
+    size = x.shape[1:]
+    relu = lambda y: np.maximum(y, 0)  # noqa: E731
+    x = relu(conv(x, layers["conv1" if "conv1" in layers else "conv1_rgbHHA"]))
+    found = {"conv1": x}
+    x = pool(x)
+    for stage, blocks in (("2", "abc"), ("3", "abcd"), ("4", "abcdef"), ("5", "abc")):
+        for block in blocks:
+            name = f"res{stage}{block}"
+            stride = 2 if block == "a" and stage != "2" else 1
+            y = relu(conv(x, layers[f"{name}_branch2a"], stride))
+            y = relu(conv(y, layers[f"{name}_branch2b"]))
+            y = conv(y, layers[f"{name}_branch2c"])
+            x = relu(y + (conv(x, layers[f"{name}_branch1"], stride) if block == "a" else x))
+            found[name] = x
+    sides = [
+        deconv(conv(found[name], layers[f"score-dsn{k}"]), stride, size)
+        for k, (name, (_, stride)) in enumerate(LEVELS.items(), start=1)
+    ]
+    fine = conv(np.concatenate(sides[:4]), layers["new-score-weighting1"])
+    coarse = conv(np.concatenate(sides[1:]), layers["new-score-weighting3"])
+    bins = []
+    for k in range(1, 9):
+        parts = [
+            deconv(conv(conv(found[n], layers[f"{n}_or8_{k}"]), layers[f"{n}_4_or8_{k}"]), stride, size)
+            for n, (_, stride) in LEVELS.items()
+        ]
+        bins.append(conv(np.concatenate(parts), layers[f"score-or8_{k}"]))
+    sigmoid = lambda y: 1 / (1 + np.exp(-y))  # noqa: E731
+    return sigmoid(fine)[0], sigmoid(coarse)[0], sigmoid(np.concatenate(bins))
+
+
+def test_the_layers_are_the_published_ones():
+    """148 convolutions; the ResNet has the parameters of a ResNet-50 without classifier and batch normalisation."""
+    layers = {c.name: c for c in cob_convolutions()}
+    assert len(layers) == 148
+    trunk = [c for c in layers.values() if c.name == "conv1" or "branch" in c.name]
+    assert len(trunk) == 53
+    assert sum(c.inputs * c.outputs * c.kernel**2 for c in trunk) == 25_557_032 - 2_049_000 - 53_120
+    heads = [c for c in layers.values() if "or8" in c.name]
+    assert len(heads) == 88
+    one = 9 * 32 * sum(width for width, _ in LEVELS.values()) + 5 * (32 + 9 * 32 * 4 + 4) + 9 * 20 + 1
+    assert sum(c.outputs * (c.inputs * c.kernel**2 + 1) for c in heads) == 8 * one
+    network = CobNetwork()
+    total = sum(p.numel() for p in network.parameters())
+    assert total == 23_454_912 + 64 + 8 * one + (3904 + 5) + 2 * 5
+    assert len(list(cob_convolutions(6))) == 148
+    assert next(iter(cob_convolutions(6))).name == "conv1_rgbHHA"
+
+
+@pytest.mark.parametrize("size", [(37, 45), (32, 48)])
+def test_the_network_equals_a_plain_reference(blobs, size):
+    image = np.random.default_rng(1).integers(0, 256, (*size, 3)).astype(np.uint8)
+    network = CobNetwork().eval()
+    network.load_caffe({name: tuple(b) for name, b in blobs.items()})
+    data = cob_input(image)
+    means = np.array([104.00698793, 116.66876762, 122.67891434])
+    expected_input = image[..., ::-1].astype(np.float64) - means
+    np.testing.assert_allclose(data.numpy(), expected_input.transpose(2, 0, 1), atol=1e-4)
+    with torch.inference_mode():
+        single = network(data)
+        found = network.double()(data.double())
+    expected = reference(blobs, expected_input.transpose(2, 0, 1))
+    assert found.orientations.shape == (8, *size)
+    assert expected[2].std() > 0.01
+    assert expected[0].std() > 0.01
+    for one, other in zip(found, expected, strict=True):
+        np.testing.assert_allclose(one.numpy(), other, atol=1e-5)
+    for one, other in zip(single, expected, strict=True):
+        np.testing.assert_allclose(one.numpy(), other, atol=1e-4)  # rounding of 32 bits through 53 layers
+
+
+@pytest.mark.parametrize("stride", [2, 4, 8, 16])
+def test_bilinear_deconvolution(stride):
+    rng = np.random.default_rng(0)
+    x = rng.standard_normal((4, 5, 6)).astype(np.float32)
+    size = torch.Size((4 * stride + 1, 5 * stride + stride // 2))
+    found = enlarge(torch.from_numpy(x)[None], stride, size)[0]
+    np.testing.assert_allclose(found.numpy(), deconv(x, stride, tuple(size)), atol=1e-5)
+    ramp = np.broadcast_to(np.arange(8.0, dtype=np.float32), (1, 1, 8, 8)).copy()
+    grown = enlarge(torch.from_numpy(ramp), stride, torch.Size((8 * stride, 8 * stride)))[0, 0].numpy()
+    middle = slice(stride, 7 * stride)  # a ramp stays a ramp: the enlargement is bilinear and not shifted
+    expected = (np.arange(8 * stride) - 0.5) / stride  # pixel i of a level lies at s i + 0.5
+    np.testing.assert_allclose(grown[middle, middle], np.broadcast_to(expected[middle], (6 * stride,) * 2), atol=1e-4)
+    assert bilinear_kernel(stride).sum() == pytest.approx(stride**2)
+
+
+def angle_of(confidence: list[float]) -> float:
+    """The published rule for one pixel: the two best bins, their mean if they are neighbours; or nan."""
+    order = sorted(range(8), key=lambda k: (-confidence[k], k))
+    best, second = order[:2]
+    if confidence[best] < 0.5:
+        return float("nan")
+    a, b = best * np.pi / 8, second * np.pi / 8
+    if {best, second} == {0, 7}:
+        a, b = (np.pi if k == 0 else k * np.pi / 8 for k in (best, second))
+    neighbours = abs(best - second) == 1 or {best, second} == {0, 7}
+    if neighbours and confidence[second] >= 0.01:
+        return (confidence[best] * a + confidence[second] * b) / (confidence[best] + confidence[second])
+    return a if not neighbours else best * np.pi / 8
+
+
+def test_orientation_bins():
+    rng = np.random.default_rng(0)
+    confidence = rng.random((8, 30, 40)) ** 4
+    confidence[:, 0, :5] = np.eye(8)[:, :5]
+    confidence[[0, 7], 1, 1] = 0.9, 0.8
+    confidence[[0, 7], 1, 2] = 0.7, 0.8
+    found = decode_orientation(confidence.astype(np.float32))
+    expected = [[angle_of(confidence.astype(np.float32)[:, i, j].tolist()) for j in range(40)] for i in range(30)]
+    np.testing.assert_allclose(np.mod(found, np.pi), np.mod(expected, np.pi), atol=1e-5)
+    assert 0.2 < np.isnan(found).mean() < 0.9
+
+
+def test_a_file_is_read_name_by_name_and_shape_by_shape(model, blobs, tmp_path):
+    found = read_caffemodel(model)
+    for name, expected in blobs.items():
+        for one, other in zip(found[name], expected, strict=True):
+            assert one.dtype == np.float32
+            assert (one == other).all()
+    old = tmp_path / "old.caffemodel"
+    chosen = {name: blobs[name] for name in ("conv1", "res2a_branch1")}
+    old.write_bytes(encode(chosen, old=True))
+    assert read_caffemodel(old)["conv1"][0].shape == (64, 3, 7, 7)
+    assert read_caffemodel(old)["conv1"][1].shape == (1, 1, 1, 64)
+    single = field(100, field(1, b"a") + field(7, b"".join(varint(5 << 3 | 5) + struct.pack("<f", v) for v in (1, 2))
+                                               + field(7, varint(1 << 3) + varint(2))))  # fmt: skip
+    old.write_bytes(varint(3 << 3) + varint(7) + varint(9 << 3 | 1) + bytes(8) + single)
+    assert read_caffemodel(old)["a"][0].tolist() == [1, 2]
+
+
+def test_the_component_runs_on_a_frame(model):
+    frame = frame_of(TWO, width=96)
+    cob = CobBoundary(str(model))
+    fine, coarse, angle = cob.contours(frame)
+    assert cob.boundary(frame).shape == frame.depth.shape
+    for one in (fine, coarse):
+        assert 0 < one.min() <= one.max() < 1
+    assert np.nanmin(angle) >= 0
+    assert np.nanmax(angle) <= np.pi
+    assert (replace(cob, scale="mean").boundary(frame) == (fine + coarse) / 2).all()
+    assert (replace(cob, scale="coarse").boundary(frame) == coarse).all()
+    proposal = TreeCutProposal(tree=CobTree(cob), value=SceneCutObjectness(), sampler=OptimalCut())
+    tree, _ = proposal.tree_of(frame)
+    assert (tree.start[: tree.n_leaves] == 0).all()
+    assert (tree.start <= tree.start[tree.parent]).all()
+    assert len(proposal.sample(np.random.default_rng(0), clip_of(TWO, width=96), 2)) == 2
+    with pytest.raises(InputError, match="needs the frame"):
+        CobTree(cob).build(fine)
+
+
+def test_large_images_are_resized_as_published(model, monkeypatch):
+    monkeypatch.setattr("mstfilter.frontends.cob._MAX_PIXELS", 2000)
+    shapes = []
+    forward = CobNetwork.forward
+
+    def watched(self, image):
+        shapes.append(tuple(image.shape))
+        return forward(self, torch.nn.functional.interpolate(image[None], (50, 50))[0])._replace()
+
+    monkeypatch.setattr(CobNetwork, "forward", watched)
+    frame = frame_of(TWO, width=80)
+    resized = torch.nn.functional.interpolate
+    monkeypatch.setattr(
+        torch.nn.functional,
+        "interpolate",
+        lambda x, size, **options: resized(x, (50, 50) if size == (500, 500) else size, **options),
+    )
+    assert CobBoundary(str(model)).boundary(frame).shape == (60, 80)
+    assert shapes == [(3, 50, 50)]
+
+
+def discs(size: int = 64) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """P(contour) of a circle and of a chord of it, and the angle of their normals."""
+    rows, columns = np.indices((size, size), dtype=float)
+    y, x = rows - size / 2 + 0.5, columns - size / 2 + 0.5
+    r = np.hypot(x, y)
+    circle, chord = np.exp(-(((r - 20) / 1.5) ** 2)), np.exp(-((x / 1.5) ** 2)) * (r < 20)
+    angle = np.where(circle > chord, np.mod(np.arctan2(y, x), np.pi), 0.0)
+    return circle, 0.5 * chord, angle
+
+
+def test_the_oriented_watershed_keeps_borders_of_the_right_orientation():
+    """With true normals the circle is stronger than with normals turned by 90 degrees."""
+    circle, chord, angle = discs()
+    contours = np.maximum(circle, chord)
+    heights = {}
+    for name, turned in (("true", angle), ("turned", angle + np.pi / 2), ("unknown", np.full_like(angle, np.nan))):
+        parent, height, leaves = combine_scales(contours, contours, turned, 0.05, 1.5)
+        heights[name] = height.max()
+        assert leaves.shape == contours.shape
+        assert (height[parent] >= height - 1e-12).all()
+    assert heights["true"] > 0.9 * contours.max() * 0.8
+    assert heights["turned"] < 0.35 * heights["true"]
+    assert heights["unknown"] == pytest.approx(heights["true"] * 2 / np.pi, rel=0.1)
+
+
+def test_the_combined_tree_has_the_regions_of_both_scales():
+    """The circle is seen at both scales, the chord at the fine one only: it is merged first, at half its height."""
+    circle, chord, angle = discs()
+    parent, height, leaves = combine_scales(np.maximum(circle, chord), circle, angle, 0.05, 1.5)
+    inner = height[height > 0]
+    both = height.max()
+    fine_only = inner[inner < 0.8 * both].max()
+    single, single_height, _ = combine_scales(np.maximum(circle, chord), np.maximum(circle, chord), angle, 0.05, 1.5)
+    assert len(single) >= 5
+    alone = single_height[(single_height > 0) & (single_height < 0.8 * single_height.max())].max()
+    assert fine_only == pytest.approx(alone / 2, rel=0.1)
+    centre, left, right = leaves[2, 2], leaves[32, 25], leaves[32, 38]
+    assert len({int(k) for k in (centre, left, right)}) == 3
+    assert len(parent) > 4
+
+
+def test_polygons_of_a_chain():
+    points = np.array([(0, k) for k in range(10)] + [(k, 9) for k in range(1, 10)], float)
+    assert sorted(_segments(points, 1.5)) == [(0, 9), (9, 18)]
+    stairs = np.array([(k // 2, (k + 1) // 2) for k in range(20)], float)
+    assert _segments(stairs, 1.5) == [(0, 19)]
+
+
+def test_hha_of_a_plane():
+    """Straight down from 1.5 m: disparity 31000 / 150, the height of the table, a normal upwards."""
+    pose = look_at(np.array([0.0, 0.0, 1.5]), np.array([0.0, 1e-6, 0.0]))
+    camera = Camera.from_intrinsics(100, 100, 31.5, 23.5, 64, 48, pose)
+    depth = np.full((48, 64), 1.5, np.float32)
+    depth[20:24, 30:34] = np.nan
+    found = hha(Frame(np.zeros((48, 64, 3), np.uint8), depth, camera), 0.7)
+    assert (found[..., 0] == 207).all()
+    assert (found[..., 1] == 70).all()
+    assert (found[..., 2] == 218).all()
+
+
+def test_rgb_hha(blobs, tmp_path, monkeypatch):
+    blobs = {**blobs, "conv1_rgbHHA": [np.repeat(blobs["conv1"][0], 2, axis=1), blobs["conv1"][1]]}
+    del blobs["conv1"]
+    path = tmp_path / "hha.caffemodel"
+    path.write_bytes(b"read below")
+    monkeypatch.setattr("mstfilter.frontends.cob.read_caffemodel", lambda path: blobs)
+    frame = frame_of(TWO, width=48)
+    cob = CobBoundary(str(path), input="rgbhha")
+    image = np.concatenate([frame.rgb, hha(frame, 0.7)], axis=2)
+    means = np.array([122.67891434, 116.66876762, 104.00698793, 134.0313, 92.0228, 117.3808])
+    data = (image - means)[..., [2, 1, 0, 5, 4, 3]].transpose(2, 0, 1)
+    np.testing.assert_allclose(cob.boundary(frame), reference(blobs, data)[0], atol=1e-4)
+    with pytest.raises(InputError, match="lacks 1 of 148 layers, the first is 'conv1'") as caught:
+        CobBoundary(str(path)).boundary(frame)
+    assert "other input" in caught.value.hints[0]
+
+
+def test_torch_is_imported_when_the_network_is_used():
+    code = (
+        "import sys, mstfilter; from mstfilter.presets import REGISTRY\n"
+        "mstfilter.preset('mst', 'proposal.boundary=cob', 'proposal.tree=cob'); assert 'torch' not in sys.modules"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+FEW = {"a": [np.ones((2, 3, 1, 1)), np.zeros(2)], "b": [np.ones(5)]}
+HOSTILE = {
+    "truncated": (encode(FEW)[:-30], "is not a complete Caffe model"),
+    "cut in a number": (encode(FEW) + b"\xff", "is not a complete Caffe model"),
+    "pickle": (pickle.dumps(print), "is not a complete Caffe model"),
+    "empty": (b"", "has no layer with weights"),
+    "text": (b"layer { name: 'conv1' }", "is not a complete Caffe model"),
+    "huge length": (varint(100 << 3 | 2) + varint(2**62), "is not a complete Caffe model"),
+    "twice": (encode({"a": [np.ones(1)]}) * 2, "two layers are named 'a'"),
+    "shape and data": (
+        field(100, field(1, b"a") + field(7, field(7, field(1, varint(9))) + field(5, bytes(8)))),
+        "has 2 values and shape (9,)",
+    ),
+    "another network": (encode(FEW), "lacks 148 of 148 layers, the first is 'conv1'"),
+}
+
+
+@pytest.mark.parametrize("case", HOSTILE)
+def test_files_that_are_broken_are_one_clear_error(tmp_path, case):
+    content, message = HOSTILE[case]
+    path = tmp_path / "x.caffemodel"
+    path.write_bytes(content)
+    with pytest.raises(InputError) as caught:
+        CobBoundary(str(path)).boundary(frame_of(TWO, width=48))
+    assert message in caught.value.message
+    assert str(path) in caught.value.message
+    assert "\n" not in caught.value.message
+
+
+def test_files_that_are_missing_or_have_another_hash(model, tmp_path):
+    frame = frame_of(TWO, width=48)
+    for weights, message in (("", "are not given"), (str(tmp_path / "none"), "do not exist")):
+        with pytest.raises(InputError, match=message):
+            CobBoundary(weights).boundary(frame)
+    with pytest.raises(InputError, match=r"have the hash [0-9a-f]{64}, expected 00"):
+        CobBoundary(str(model), sha256="00").boundary(frame)
+
+
+def test_weights_of_other_networks_are_one_clear_error(blobs):
+    network = CobNetwork()
+    first = blobs["res2a_branch1"][0]
+    cases = {
+        "lacks 1 of 148 layers, the first is 'score-or8_3'": {"score-or8_3": None},
+        "'res2a_branch1' has blobs of shape": {"res2a_branch1": (first[:, :32],)},
+        "layer 'conv1' has blobs of shape": {"conv1": (blobs["conv1"][0],)},
+        "not finite": {"res2a_branch1": (first * np.nan,)},
+        "is not bilinear": {"upsample_2": (np.ones((1, 1, 4, 4), np.float32),)},
+    }
+    for message, changes in cases.items():
+        changed = {k: v for k, v in {**blobs, **changes}.items() if v is not None}
+        with pytest.raises(InputError) as caught:
+            network.load_caffe(changed)
+        assert message in caught.value.message
+
+
+def test_a_preset_names_it(model):
+    mst = preset("mst", "proposal.boundary=cob", f"proposal.boundary.weights={Path(model)}", "proposal.tree=ucm")
+    assert mst.proposal.boundary == CobBoundary(str(model))
