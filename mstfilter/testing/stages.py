@@ -14,7 +14,7 @@ from mstfilter.segmentation import BoundaryModel, CutSampler, CutValue, TreeBuil
 from mstfilter.smc import Component, Population, Proposal, Transition
 from mstfilter.testing.contract import RandomContract, prerequisite
 from mstfilter.testing.scenes import scene_example
-from mstfilter.tracking import MotionRule, MstRule, Registration, TrackingTransition
+from mstfilter.tracking import MaskTracker, MotionRule, MstRule, Registration, TrackingTransition
 
 #: Interface of a stage -> the component of a filter that uses it.
 STAGE_OWNERS: dict[type, Callable[[Any], Component]] = {
@@ -23,6 +23,7 @@ STAGE_OWNERS: dict[type, Callable[[Any], Component]] = {
     CutValue: lambda stage: TreeCutProposal(value=stage),
     CutSampler: lambda stage: TreeCutProposal(sampler=stage),
     Completer: lambda stage: TreeCutProposal(completer=stage),
+    MaskTracker: lambda stage: TrackingTransition(tracker=stage),
     MotionRule: lambda stage: TrackingTransition(rule=stage),
     Registration: lambda stage: TrackingTransition(rule=MstRule(registration=stage)),
     Projection: lambda stage: FusionUpdate(free_space=stage),

@@ -21,7 +21,7 @@ from mstfilter.lazy import attach
 
 __getattr__, __dir__, __all__ = attach(__name__, __file__)
 
-__interfaces__ = {"rule": "MotionRule", "registration": "Registration"}
+__interfaces__ = {"rule": "MotionRule", "registration": "Registration", "tracker": "MaskTracker"}
 __components__ = {
     "transition": {"tracking": "TrackingTransition", "identity": "IdentityTransition"},
     "rule": {"authors": "AuthorsRule", "mst": "MstRule", "paper": "PaperRule"},

@@ -19,6 +19,7 @@ from mstfilter.tracking.rules import (
     PaperRule as PaperRule,
 )
 from mstfilter.tracking.segments import (
+    MaskTracker as MaskTracker,
     Segment as Segment,
     StaticTest as StaticTest,
     Track as Track,

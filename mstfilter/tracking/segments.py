@@ -12,6 +12,8 @@ A `Track` joins a segment with the flow and the features of the clip: the data o
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -82,6 +84,7 @@ class Track:
     segment: Segment
     clip: Clip
     flow: ClipTracks  #: the dense flow of the clip
+    followed: np.ndarray | None = None  #: (H, W) bool, the support in the last frame according to a `MaskTracker`
 
     @cached_property
     def mask(self) -> np.ndarray:
@@ -92,7 +95,9 @@ class Track:
 
     @cached_property
     def target_mask(self) -> np.ndarray:
-        """The support in the last frame according to the flow, (H, W)."""
+        """The support in the last frame according to the tracker of masks, or else to the flow, (H, W)."""
+        if self.followed is not None:
+            return self.followed & self.clip.after.valid
         return self.flow.warp(self.mask.astype(np.uint8)) > 0
 
     @cached_property
@@ -144,6 +149,18 @@ class Track:
     def colour_after(self) -> np.ndarray:
         """Slightly blurred colour (H, W, 3) of the last frame in the exposure of the first."""
         return matched_colour(self.clip.after, self.clip.before, 5)
+
+
+class MaskTracker(ABC):
+    """Follows masks through a clip."""
+
+    @abstractmethod
+    def track(self, clip: Clip, masks: Sequence[np.ndarray]) -> list[np.ndarray]:
+        """Masks (H, W) bool of the last frame, one for each of the masks (H, W) bool of the first frame.
+
+        A mask without pixels says that the object is lost. Masks may overlap, and the result for one mask should not
+        depend on the others.
+        """
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,7 @@ from mstfilter.smc import Population, Transition, child
 from mstfilter.tracking.flow import DenseFlow
 from mstfilter.tracking.rigid import invert, move_points
 from mstfilter.tracking.rules import IDENTITY, Candidate, MotionRule, MstRule
-from mstfilter.tracking.segments import StaticTest, Track, segments_of
+from mstfilter.tracking.segments import MaskTracker, Segment, StaticTest, Track, segments_of
 
 _SMOOTHING = 0.5  # voxels, standard deviation; .3 to .6 differ little
 
@@ -247,6 +247,8 @@ class TrackingTransition(Transition):
         Objects that pass this test do not move and are not tracked.
     warp : Warp
         Moves the voxels.
+    tracker : MaskTracker, optional
+        Follows the masks of objects that do not rest to the last frame. Default: the flow does.
     min_support : int
         Smallest number of pixels of an object that agree with the depth image; objects with fewer are not tracked.
     """
@@ -256,6 +258,7 @@ class TrackingTransition(Transition):
     static: StaticTest = field(default_factory=StaticTest)
     warp: Warp = field(default_factory=Warp)
     min_support: int = 12
+    tracker: MaskTracker | None = None
 
     properly_weighted: ClassVar[bool] = False
 
@@ -275,21 +278,18 @@ class TrackingTransition(Transition):
         if observation is None or len(observation.frames) < 2:
             return _successor(population, particles, {"motions": {}, "segments": 0})
         clip = observation
-        tracks = self.flow.track(clip)
-        cache: dict[bytes, tuple[str, tuple[Candidate, ...]]] = {}
+        segments_by_hypothesis = [segments_of(h, clip.before) if h.n_objects else {} for h in particles]
+        cache = self._track_all(rng, clip, segments_by_hypothesis)
         occurrences: Counter[bytes] = Counter()
         counts: Counter[str] = Counter()
         moved: list[WarpResult] = []
-        for hypothesis in particles:
+        for hypothesis, segments in zip(particles, segments_by_hypothesis, strict=True):
             # The key of a stream is the content of the hypothesis, so the order of hypotheses has no effect.
             stream = child(rng, "choose", _number(hypothesis.key), occurrences[hypothesis.key])
             occurrences[hypothesis.key] += 1
-            segments = segments_of(hypothesis, clip.before) if hypothesis.n_objects else {}
             motions, scores = {}, {}
             for record in hypothesis.objects:
                 segment = segments.get(record.label)
-                if segment is not None and segment.key not in cache:
-                    cache[segment.key] = self._track(rng, Track(segment, clip, tracks))
                 kind, candidates = ("invisible", ()) if segment is None else cache[segment.key]
                 chosen = IDENTITY
                 if candidates:
@@ -309,14 +309,31 @@ class TrackingTransition(Transition):
         }
         return _successor(population, tuple(m.hypothesis for m in moved), notes)
 
-    def _track(self, rng: np.random.Generator, track: Track) -> tuple[str, tuple[Candidate, ...]]:
-        """Kind of a segment and its candidate motions; no candidate means no motion."""
-        if len(track.segment.support) < self.min_support:
-            return "unsupported", ()
-        if self.static.rests(track):
-            return "static", ()
-        candidates = self.rule.candidates(child(rng, "segment", _number(track.segment.key)), track)
-        return ("tracked" if track.target_mask.any() else "lost"), candidates
+    def _track_all(
+        self, rng: np.random.Generator, clip: Clip, segments: list[dict[int, Segment]]
+    ) -> dict[bytes, tuple[str, tuple[Candidate, ...]]]:
+        """Kind and candidate motions of each distinct segment, by its key; no candidate means no motion."""
+        tracks = self.flow.track(clip)
+        found: dict[bytes, tuple[str, tuple[Candidate, ...]]] = {}
+        moving: list[Track] = []
+        for segment in (one for of_hypothesis in segments for one in of_hypothesis.values()):
+            if segment.key not in found:
+                track = Track(segment, clip, tracks)
+                if len(segment.support) < self.min_support:
+                    found[segment.key] = "unsupported", ()
+                elif self.static.rests(track):
+                    found[segment.key] = "static", ()
+                else:
+                    found[segment.key] = "tracked", ()
+                    moving.append(track)
+        if self.tracker is not None and moving:
+            masks = self.tracker.track(clip, [track.mask for track in moving])
+            moving = [replace(track, followed=mask) for track, mask in zip(moving, masks, strict=True)]
+        for track in moving:
+            key = track.segment.key
+            candidates = self.rule.candidates(child(rng, "segment", _number(key)), track)
+            found[key] = ("tracked" if track.target_mask.any() else "lost"), candidates
+        return found
 
 
 def _number(key: bytes) -> int:

@@ -1,0 +1,436 @@
+"""SiamMask with random weights: names and shapes, layers against plain references, the geometry of tracking."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mstfilter.errors import InputError
+from mstfilter.frontends import SiamMaskTracker
+from mstfilter.frontends.mask_trackers import anchor_boxes, crop_around, follow
+from mstfilter.presets import preset
+from mstfilter.scene import Camera, Clip, Frame
+from mstfilter.tracking import MaskTracker, PaperRule, StaticTest, TrackingTransition
+from tests.segmentation.scenes import GRID
+
+torch = pytest.importorskip("torch")
+
+from mstfilter.frontends.siammask_network import (  # noqa: E402 (needs torch)
+    SiamMaskNetwork,
+    depthwise_correlation,
+    read_checkpoint,
+)
+
+
+def published() -> dict[str, tuple[int, ...]]:
+    """Names and shapes of all tensors, written from the modules of the published program."""
+    found: dict[str, tuple[int, ...]] = {}
+
+    def conv(name: str, o: int, i: int, k: int, bias: bool = False) -> None:
+        found[f"{name}.weight"] = (o, i, k, k)
+        if bias:
+            found[f"{name}.bias"] = (o,)
+
+    def norm(name: str, n: int) -> None:
+        for part in ("weight", "bias", "running_mean", "running_var"):
+            found[f"{name}.{part}"] = (n,)
+
+    conv("features.features.conv1", 64, 3, 7)
+    norm("features.features.bn1", 64)
+    inputs = 64
+    for stage, (blocks, width) in enumerate([(3, 64), (4, 128), (6, 256)], start=1):
+        for block in range(blocks):
+            name = f"features.features.layer{stage}.{block}"
+            for k, (o, i, kernel) in enumerate(
+                [(width, inputs, 1), (width, width, 3), (4 * width, width, 1)], start=1
+            ):
+                conv(f"{name}.conv{k}", o, i, kernel)
+                norm(f"{name}.bn{k}", o)
+            if block == 0:
+                conv(f"{name}.downsample.0", 4 * width, inputs, 1 if stage == 1 else 3)
+                norm(f"{name}.downsample.1", 4 * width)
+            inputs = 4 * width
+    conv("features.downsample.downsample.0", 256, 1024, 1)
+    norm("features.downsample.downsample.1", 256)
+    for name, outputs in (("rpn_model.cls", 10), ("rpn_model.loc", 20), ("mask_model.mask", 63 * 63)):
+        for part in ("conv_kernel", "conv_search"):
+            conv(f"{name}.{part}.0", 256, 256, 3)
+            norm(f"{name}.{part}.1", 256)
+        conv(f"{name}.head.0", 256, 256, 1)
+        norm(f"{name}.head.1", 256)
+        conv(f"{name}.head.3", outputs, 256, 1, True)
+    pairs = {
+        "v0": (64, 16, 4),
+        "v1": (256, 64, 16),
+        "v2": (512, 128, 32),
+        "h2": (32,) * 3,
+        "h1": (16,) * 3,
+        "h0": (4,) * 3,
+    }
+    for name, (a, b, c) in pairs.items():
+        conv(f"refine_model.{name}.0", b, a, 3, True)
+        conv(f"refine_model.{name}.2", c, b, 3, True)
+    found["refine_model.deconv.weight"], found["refine_model.deconv.bias"] = (256, 32, 15, 15), (32,)
+    for name, (a, b) in {"post0": (32, 16), "post1": (16, 4), "post2": (4, 1)}.items():
+        conv(f"refine_model.{name}", b, a, 3, True)
+    return found
+
+
+@pytest.fixture(scope="module")
+def tensors():
+    """Random weights of all tensors; variances are positive."""
+    generator = torch.Generator().manual_seed(0)
+    found = {}
+    for name, shape in published().items():
+        if name.endswith("running_var") or (len(shape) == 1 and name.endswith("weight")):
+            found[name] = 0.5 + torch.rand(shape, generator=generator)
+        else:
+            fan = int(np.prod(shape[1:])) if len(shape) > 1 else 100
+            found[name] = torch.randn(shape, generator=generator) / np.sqrt(fan)
+    return found
+
+
+@pytest.fixture(scope="module")
+def checkpoint(tensors, tmp_path_factory):
+    """A checkpoint as the training program writes it."""
+    path = tmp_path_factory.mktemp("siammask") / "random.pth"
+    state = {f"module.{name}": t for name, t in tensors.items()}
+    torch.save({"epoch": 20, "arch": "Custom", "best_acc": 0.5, "state_dict": state}, path)
+    return path
+
+
+def test_names_and_shapes_are_the_published_ones(tensors, checkpoint):
+    expected = published()
+    network = SiamMaskNetwork()
+    own = {n: tuple(t.shape) for n, t in network.state_dict().items() if not n.endswith("num_batches_tracked")}
+    assert own == expected
+    n_parameters = sum(p.numel() for p in network.parameters())
+    assert n_parameters == sum(int(np.prod(s)) for n, s in expected.items() if "running" not in n)
+    network.load_state(read_checkpoint(checkpoint))
+    for name, tensor in tensors.items():
+        assert torch.equal(network.state_dict()[name], tensor)
+
+
+def test_outputs_have_the_published_sizes(tensors):
+    network = SiamMaskNetwork()
+    network.load_state(tensors)
+    rng = torch.Generator().manual_seed(1)
+    with torch.inference_mode():
+        stages, reduced = network.features(torch.rand(1, 3, 127, 127, generator=rng))
+        assert [tuple(x.shape[1:]) for x in stages] == [(64, 61, 61), (256, 31, 31), (512, 15, 15), (1024, 15, 15)]
+        assert reduced.shape == (1, 256, 7, 7)
+        template = network.template(255 * torch.rand(1, 3, 127, 127, generator=rng))
+        score, boxes, features = network.search(template, 255 * torch.rand(1, 3, 255, 255, generator=rng))
+        assert [tuple(x.shape[1:]) for x in features[0]] == [
+            (64, 125, 125),
+            (256, 63, 63),
+            (512, 31, 31),
+            (1024, 31, 31),
+        ]
+        assert score.shape == (2, 5, 25, 25)
+        assert boxes.shape == (4, 5, 25, 25)
+        for at in ((0, 0), (12, 7), (24, 24)):
+            mask = network.refine(features, *at)
+            assert mask.shape == (127, 127)
+            assert 0 <= mask.min() < mask.max() <= 1
+
+
+def test_depthwise_correlation():
+    rng = np.random.default_rng(0)
+    x, kernel = rng.standard_normal((6, 9, 10)), rng.standard_normal((6, 3, 4))
+    expected = np.zeros((6, 7, 7))
+    for c in range(6):
+        for i in range(7):
+            for j in range(7):
+                expected[c, i, j] = (x[c, i : i + 3, j : j + 4] * kernel[c]).sum()
+    found = depthwise_correlation(torch.from_numpy(x)[None], torch.from_numpy(kernel)[None])
+    np.testing.assert_allclose(found[0].numpy(), expected, atol=1e-5)
+
+
+def conv(x, w, b=None, stride=1, padding=0, dilation=1):
+    """Convolution (C, H, W) by its definition."""
+    k = (w.shape[-1] - 1) * dilation + 1
+    padded = np.pad(x, ((0, 0), (padding,) * 2, (padding,) * 2))
+    windows = np.lib.stride_tricks.sliding_window_view(padded, (k, k), axis=(1, 2))
+    windows = windows[:, ::stride, ::stride, ::dilation, ::dilation]
+    out = np.einsum("chwij,ocij->ohw", windows, w, optimize=True)
+    return out if b is None else out + b[:, None, None]
+
+
+def test_features_and_masks_equal_a_plain_reference(tensors):
+    """The backbone for a template, and the refinement of a position, in double precision."""
+    t = {name: tensor.numpy().astype(np.float64) for name, tensor in tensors.items()}
+    network = SiamMaskNetwork()
+    network.load_state(tensors)
+    network.double()
+    image = np.random.default_rng(0).random((3, 127, 127)) * 255
+
+    def layer(x, name, norm, **options):
+        x = conv(x, t[f"{name}.weight"], **options)
+        scale, shift, mean, variance = (
+            t[f"{norm}.{part}"][:, None, None] for part in ("weight", "bias", "running_mean", "running_var")
+        )
+        return (x - mean) / np.sqrt(variance + 1e-5) * scale + shift
+
+    relu = lambda y: np.maximum(y, 0)  # noqa: E731
+    base = "features.features"
+    stem = relu(layer(image, f"{base}.conv1", f"{base}.bn1", stride=2))
+    padded = np.pad(stem, ((0, 0), (1, 1), (1, 1)), constant_values=-np.inf)
+    x = np.lib.stride_tricks.sliding_window_view(padded, (3, 3), axis=(1, 2))[:, ::2, ::2].max(axis=(3, 4))
+    stages = [stem]
+    for stage, blocks in ((1, 3), (2, 4), (3, 6)):
+        for block in range(blocks):
+            name = f"{base}.layer{stage}.{block}"
+            first = block == 0
+            options = {"stride": 2, "padding": 0} if stage == 2 and first else {"padding": 1}
+            if stage == 3 and not first:
+                options = {"padding": 2, "dilation": 2}
+            y = relu(layer(x, f"{name}.conv1", f"{name}.bn1"))
+            y = relu(layer(y, f"{name}.conv2", f"{name}.bn2", **options))
+            y = layer(y, f"{name}.conv3", f"{name}.bn3")
+            if first:
+                shortcut = [{}, {"stride": 2}, {"padding": 1}][stage - 1]
+                x = layer(x, f"{name}.downsample.0", f"{name}.downsample.1", **shortcut)
+            x = relu(x + y)
+        stages.append(x)
+    reduced = layer(x, "features.downsample.downsample.0", "features.downsample.downsample.1")[:, 4:-4, 4:-4]
+    with torch.inference_mode():
+        found, found_reduced = network.features(torch.from_numpy(image)[None])
+    for one, other in zip([*found, found_reduced], [*stages, reduced], strict=True):
+        np.testing.assert_allclose(one[0].numpy(), other, rtol=1e-5, atol=1e-5 * np.abs(other).max())
+
+    rng = np.random.default_rng(1)
+    shapes = ((64, 125), (256, 63), (512, 31))
+    levels = [rng.standard_normal((c, n, n)) for c, n in shapes]
+    correlation = rng.standard_normal((256, 25, 25))
+    row, column = 3, 20
+
+    def two(x, name):
+        for k in (0, 2):
+            name_k = f"refine_model.{name}.{k}"
+            x = relu(conv(x, t[f"{name_k}.weight"], t[f"{name_k}.bias"], padding=1))
+        return x
+
+    def window(x, margin, step, size):
+        x = np.pad(x, ((0, 0), (margin,) * 2, (margin,) * 2))
+        return x[:, step * row : step * row + size, step * column : step * column + size]
+
+    def post(x, k, size):
+        at = (np.arange(size) * x.shape[1]) // size  # nearest neighbour of the original program
+        x = x[:, at][:, :, at]
+        return conv(x, t[f"refine_model.post{k}.weight"], t[f"refine_model.post{k}.bias"], padding=1)
+
+    x = np.einsum("c,cohw->ohw", correlation[:, row, column], t["refine_model.deconv.weight"])
+    x = x + t["refine_model.deconv.bias"][:, None, None]
+    x = post(two(x, "h2") + two(window(levels[2], 4, 1, 15), "v2"), 0, 31)
+    x = post(two(x, "h1") + two(window(levels[1], 8, 2, 31), "v1"), 1, 61)
+    x = post(two(x, "h0") + two(window(levels[0], 16, 4, 61), "v0"), 2, 127)
+    inputs = tuple(torch.from_numpy(level)[None] for level in levels)
+    with torch.inference_mode():
+        mask = network.refine(((*inputs, inputs[2]), torch.from_numpy(correlation)[None]), row, column)
+    np.testing.assert_allclose(mask.numpy(), 1 / (1 + np.exp(-x[0])), atol=1e-5)
+
+
+def test_anchors():
+    """The five published shapes, centred on a grid with a step of 8 pixels."""
+    anchors = anchor_boxes().reshape(4, 5, 25, 25)
+    sizes = [tuple(anchors[2:, k, 0, 0].astype(int).tolist()) for k in range(5)]
+    assert sizes == [(104, 32), (88, 40), (64, 64), (40, 80), (32, 96)]
+    assert (anchors[:2, :, 12, 12] == 0).all()
+    assert anchors[0, 2, 5, 0] == -96
+    assert anchors[1, 2, 24, 3] == 96
+
+
+@pytest.mark.parametrize("position", [(30.0, 20.0), (2.0, 3.0), (78.0, 58.0), (200.0, 200.0)])
+def test_crops_are_filled_with_the_mean_colour(position):
+    rng = np.random.default_rng(0)
+    image = rng.integers(0, 256, (60, 80, 3)).astype(np.uint8)
+    colour = np.array([10.7, 20.2, 30.9])
+    crop = crop_around(image, np.array(position), 21, 21, colour)
+    low = [int(np.round(p - 11)) for p in position]
+    for i in range(21):
+        for j in range(21):
+            y, x = low[1] + i, low[0] + j
+            inside = 0 <= y < 60 and 0 <= x < 80
+            assert (crop[i, j] == (image[y, x] if inside else [10, 20, 30])).all()
+
+
+class Ideal:
+    """A network that sees red pixels: full score at the nearest position, their box, and their mask."""
+
+    def template(self, crop):
+        return crop
+
+    def search(self, template, crop):
+        red = (crop[0, 2] > 150) & (crop[0, 0] < 100)
+        rows, columns = torch.nonzero(red, as_tuple=True)
+        middle = torch.stack([columns.float().mean(), rows.float().mean()]) - 127
+        j, i = (torch.round(middle / 8).long().clamp(-12, 12) + 12).tolist()
+        score, boxes = torch.zeros(2, 5, 25, 25), torch.zeros(4, 5, 25, 25)
+        score[0], score[1, 2, i, j] = 5.0, 30.0
+        size = torch.tensor([columns.max() - columns.min() + 1.0, rows.max() - rows.min() + 1.0])
+        offset = middle - torch.tensor([(j - 12) * 8.0, (i - 12) * 8.0])
+        boxes[:, 2, i, j] = torch.cat([offset / 64, torch.log(size / 64)])
+        return score, boxes, red
+
+    def refine(self, red, row, column):
+        # The mask of a position covers 127 pixels; position 12 is in the middle of the crop.
+        padded = torch.nn.functional.pad(red.float(), [32] * 4)
+        return padded[8 * row : 8 * row + 127, 8 * column : 8 * column + 127]
+
+
+def video(n: int) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """BGR images of a red box that moves and grows, and its masks."""
+    images, masks = [], []
+    for k in range(n):
+        mask = np.zeros((120, 160), bool)
+        mask[40 + 5 * k : 60 + 6 * k, 30 + 10 * k : 60 + 11 * k] = True
+        image = np.full((120, 160, 3), 120, np.uint8)
+        image[mask] = [30, 40, 200]
+        images.append(image)
+        masks.append(mask)
+    return images, masks
+
+
+@pytest.mark.parametrize("rule", [SiamMaskTracker(), SiamMaskTracker(threshold=0.3, window=0.42, rate=0.25)])
+def test_the_mask_follows_a_moving_box(rule):
+    """With an ideal network the pasted mask is the true one, displaced by at most a pixel as in the original."""
+    images, masks = video(8)
+    found = follow(rule, Ideal(), images, masks[0])
+    assert (found & masks[-1]).sum() / (found | masks[-1]).sum() > 0.85
+    assert (follow(rule, Ideal(), images[:1], masks[0]) == masks[0]).all()
+    assert not follow(rule, Ideal(), images, masks[0] & False).any()
+
+
+def clip_of(images: list[np.ndarray]) -> Clip:
+    camera = Camera.from_intrinsics(131, 131, 79.5, 59.5, 160, 120)
+    frames = [Frame(image[..., ::-1].copy(), np.ones((120, 160), np.float32), camera) for image in images]
+    return Clip(tuple(frames), GRID, 1)
+
+
+def test_the_component_runs_and_shares_work(checkpoint, monkeypatch):
+    images, masks = video(4)
+    seen = []
+    template = SiamMaskNetwork.template
+    monkeypatch.setattr(SiamMaskNetwork, "template", lambda self, crop: seen.append(1) or template(self, crop))
+    tracker = SiamMaskTracker(str(checkpoint), step=3)
+    found = tracker.track(clip_of(images), [masks[0], masks[0], ~masks[0]])
+    assert len(seen) == 2  # equal masks are tracked once
+    assert all(mask.shape == (120, 160) and mask.dtype == bool for mask in found)
+    again = tracker.track(clip_of(images), masks[:1])
+    assert (again[0] == found[0]).all()
+    assert len(seen) == 2
+
+
+@dataclass(frozen=True)
+class Stored(MaskTracker):
+    """Returns what it was given to return, and records its calls."""
+
+    answer: tuple = ()
+    calls: list = field(default_factory=list)
+
+    def track(self, clip, masks):
+        self.calls.append([mask.copy() for mask in masks])
+        return [self.answer[0] if self.answer else mask & False for mask in masks]
+
+
+def test_the_transition_asks_once_for_all_distinct_moving_segments():
+    from mstfilter.testing import scene_example
+
+    population, clip = scene_example(np.random.default_rng(0), 6)
+    tracker = Stored()
+    transition = TrackingTransition(tracker=tracker)
+    moved = transition.predict(np.random.default_rng(0), population, clip)
+    assert len(tracker.calls) == 1
+    keys = {mask.tobytes() for mask in tracker.calls[0]}
+    assert len(keys) == len(tracker.calls[0]) >= 1
+    assert len(keys) < sum(h.n_objects for h in population.particles)
+    assert moved.notes["motions"]["static"] > 0  # objects at rest are not followed
+    everything = TrackingTransition(tracker=(asked := Stored()), static=StaticTest(False))
+    everything.predict(np.random.default_rng(0), population, clip)
+    assert len(asked.calls[0]) > len(keys)
+
+
+def test_the_rules_look_where_the_tracker_saw_the_object():
+    """Registration to the surface in a wrong mask leaves the box where it is; in the true one it follows."""
+    from mstfilter.scene import Hypothesis, render
+    from mstfilter.testing import scene_example
+    from mstfilter.testing.scenes import _labels
+
+    _, clip = scene_example(np.random.default_rng(0), 1)
+    h = Hypothesis.from_labels(_labels(0), clip.grid)
+    after = render(_labels(2), clip.grid, clip.after.camera).labels == 1
+    from mstfilter.smc import Population
+
+    rule = PaperRule(min_inliers=10**6, max_error=0.02)
+    results = {}
+    for name, mask in (("true", after), ("lost", after & False)):
+        transition = TrackingTransition(rule, tracker=Stored((mask,)))
+        moved = transition.predict(np.random.default_rng(0), Population((h,)), clip)
+        results[name] = moved.particles[0].labels == 1
+    truth = _labels(2) == 1
+    assert (results["lost"] == (_labels(0) == 1)).all()
+    assert (results["true"] & truth).sum() / (results["true"] | truth).sum() > 0.7
+
+
+def test_checkpoints_that_cannot_be_used_are_one_clear_error(checkpoint, tensors, tmp_path):
+    images, masks = video(2)
+    clip = clip_of(images)
+    path = tmp_path / "x.pth"
+
+    class Payload:
+        def __reduce__(self):
+            return (Path.touch, (tmp_path / "executed",))
+
+    def tensors_without(name):
+        return {k: v for k, v in tensors.items() if k != name}
+
+    few = {"a": torch.zeros(1)}
+    cases = {
+        "cannot be read": [
+            lambda: path.write_bytes(checkpoint.read_bytes()[:100_000]),
+            lambda: path.write_bytes(b""),
+            lambda: path.write_bytes(b"no checkpoint"),
+            lambda: torch.save({"state_dict": few, "x": Payload()}, path),
+        ],
+        "is no dictionary of tensors": [lambda: torch.save([1, 2], path), lambda: torch.save({"a": 1}, path)],
+        "tensors, the first is 'features.features.conv1.weight'": [lambda: torch.save(few, path)],
+        "lacks 1 of": [lambda: torch.save(tensors_without("refine_model.post2.bias"), path)],
+        "expected (64,)": [lambda: torch.save({**tensors, "features.features.bn1.bias": torch.zeros(3)}, path)],
+        "not finite": [
+            lambda: torch.save({**tensors, "features.features.bn1.bias": torch.full((64,), torch.nan)}, path)
+        ],
+    }
+    for message, writers in cases.items():
+        for write in writers:
+            write()
+            with pytest.raises(InputError) as caught:
+                SiamMaskTracker(str(path)).track(clip, masks[:1])
+            assert message in caught.value.message
+            assert str(path) in caught.value.message
+            assert "\n" not in caught.value.message
+    assert not (tmp_path / "executed").exists()
+    for tracker, message in (
+        (SiamMaskTracker(), "are not given"),
+        (SiamMaskTracker("nowhere.pth"), "do not exist"),
+        (SiamMaskTracker(str(checkpoint), sha256="0"), "have the hash"),
+    ):
+        with pytest.raises(InputError, match=message):
+            tracker.track(clip, masks[:1])
+
+
+def test_a_preset_names_it_without_importing_torch():
+    code = (
+        "import sys, mstfilter\n"
+        "f = mstfilter.preset('paper', 'transition.tracker=siammask', 'transition.tracker.weights=x.pth')\n"
+        "assert f.transition.tracker.weights == 'x.pth' and 'torch' not in sys.modules"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+    paper = preset("paper")
+    assert paper.transition.tracker is None
+    assert replace(paper.transition, tracker=SiamMaskTracker("x.pth")).tracker.step == 1
