@@ -198,9 +198,9 @@ class CobTree(TreeBuilder):
     """COB's tree: oriented watershed and mean contour strength at two scales, combined.
 
     The boundary map that it is given is not used. The strength of a border between two watershed regions is the mean
-    of P(contour) |cos(difference of normals)|, where the normal of the border is that of its line segments. The
-    coarse hierarchy is projected onto the regions of the fine one at height `align`; both are averaged and merged
-    again; a logistic curve maps the height of a merge to P(boundary).
+    of P(contour) times the absolute cosine of the angle between the normal of the contour and that of the border,
+    which consists of line segments. The coarse hierarchy is projected onto the regions of the fine one at height
+    `align`; both are averaged and merged again; a logistic curve maps the height of a merge to P(boundary).
 
     Parameters
     ----------

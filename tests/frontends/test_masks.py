@@ -29,6 +29,8 @@ from mstfilter.frontends.mask_files import decode_rle
 from mstfilter.presets import preset
 from mstfilter.scene import render, scene_cache, write_image
 from mstfilter.segmentation import ExactCuts, ObjectRule, OptimalCut, TreeCutProposal, UcmTree
+from mstfilter.testing import ProposalContract, scene_example
+from mstfilter.testing.scenes import _labels
 from tests.segmentation.scenes import GRID, boxes, clip_of
 
 SCENE = boxes(((8, 20, 0), (20, 34, 12)), ((24, 22, 0), (36, 36, 8)), ((40, 22, 0), (52, 36, 10)))
@@ -434,6 +436,23 @@ def test_files_that_cannot_be_used_are_one_clear_error(tmp_path, case):
         read_masks(tmp_path, 0, SHAPE)
     assert message in caught.value.message + " ".join(caught.value.hints)
     assert "\n" not in caught.value.message
+
+
+class TestContract(ProposalContract):
+    """Two readings of the scene, of which one joins two boxes, and nested masks."""
+
+    @pytest.fixture(autouse=True)
+    def folder(self, tmp_path):
+        clip = scene_example(np.random.default_rng(0), 1)[1]
+        labels = render(_labels(2), clip.grid, clip.after.camera).labels
+        write_masks(tmp_path, 1, [np.minimum(labels, 2), stack(labels == 1, labels > 1, labels == 3)])
+        self.path = str(tmp_path)
+
+    def make(self):
+        return MaskProposal(self.path)
+
+    def example(self, rng, n):
+        return scene_example(rng, n)
 
 
 def test_a_folder_is_required():
