@@ -75,6 +75,15 @@ def test_information_of_a_study_in_its_small_form(tmp_path):
     assert third.keys() == own.keys() and third != pytest.approx(own)
 
 
+def test_number_of_hypotheses(tmp_path):
+    folder = run_small(tmp_path, EXPERIMENTS / "information/number.toml")
+    run_script("information/number.py", folder, "--out", tmp_path / "out")
+    rows = read_csv(tmp_path / "out/number.csv")
+    assert [row["n"] for row in rows] == ["1", "5"] and all(0 < float(row["information"]) < 1 for row in rows)
+    assert rows[0]["low"] == "" and float(rows[1]["low"]) <= float(rows[1]["minus_smaller"]) <= float(rows[1]["high"])
+    assert (tmp_path / "out/number.png").exists()
+
+
 def test_main_study_runs_and_resumes(tmp_path, capsys):
     for _ in range(2):
         folder = run_small(tmp_path, MAIN, "n=2")
@@ -93,7 +102,9 @@ def test_reported_seeds_are_no_tuning_seeds(config, first):
     assert max(small) < 100
 
 
-@pytest.mark.parametrize("name", ["ablations/study", "main/paper_best", "fusion/study", "error_budget/study"])
+@pytest.mark.parametrize(
+    "name", ["ablations/study", "main/paper_best", "fusion/study", "error_budget/study", "information/number"]
+)
 def test_tuning_studies_use_tuning_seeds(name):
     plan = make_plan(load_study(EXPERIMENTS / f"{name}.toml"))
     assert all(scene.source["seed"] < 100 for scene in plan.scenes)

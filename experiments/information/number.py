@@ -1,0 +1,83 @@
+"""What each further hypothesis is worth: the table and the figure of a study of the number of hypotheses.
+
+    python experiments/information/number.py STUDY [--out experiments/information/results]
+
+number.csv has one row per number of hypotheses, means over the scenes that all numbers have: information (nats, lower
+is better) and how much it improves on the next smaller number, paired by scene with a 95 % interval; the calibration
+error of the forecasts as they come; the quality of the estimate (`Belief.estimate`) and the mean quality; the energy
+score and its floor, the same hypotheses with noise at the border; processor seconds of a step.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+from pathlib import Path
+
+import numpy as np
+
+from mstfilter.files import write_csv
+from mstfilter.statistics import compare_arms
+
+COLUMNS = (
+    *("information", "calibration_error", "quality_estimate", "quality"),
+    *("energy", "energy_floor", "core_seconds"),
+)
+
+
+def by_scene(path: Path, column: str) -> dict[int, dict[str, float]]:
+    """Number of hypotheses -> scene -> mean over the pauses t >= 1."""
+    found: dict[int, dict[str, list[float]]] = {}
+    with path.open() as file:
+        for row in csv.DictReader(file):
+            if int(row["pause"]) >= 1 and row.get(column):
+                n = int(row["arm"].rsplit("=", 1)[1])
+                found.setdefault(n, {}).setdefault(f"{row['family']} {row['scene']}", []).append(float(row[column]))
+    return {n: {scene: float(np.mean(v)) for scene, v in found[n].items()} for n in sorted(found)}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("study", type=Path)
+    parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results")
+    chosen = parser.parse_args()
+    values = {column: by_scene(chosen.study / "runs.csv", column) for column in COLUMNS}
+    numbers = list(values["information"])
+    scenes = set.intersection(*(set(values["information"][n]) for n in numbers))
+    rows = []
+    for k, n in enumerate(numbers):
+        row = {"n": n, "scenes": len(scenes)}
+        row |= {c: float(np.mean([v for s, v in values[c].get(n, {}).items() if s in scenes])) for c in COLUMNS}
+        if k:
+            pair = {str(m): {s: values["information"][m][s] for s in scenes} for m in (n, numbers[k - 1])}
+            d = compare_arms(pair, str(n))[str(numbers[k - 1])]
+            row |= {"minus_smaller": d.mean, "low": d.low, "high": d.high}
+        rows.append(row)
+        print({name: round(value, 4) for name, value in row.items()})
+    columns = dict.fromkeys(name for row in reversed(rows) for name in row)
+    write_csv(chosen.out / "number.csv", rows, columns, float_format=".4g")
+    draw(rows, chosen.out / "number.png")
+
+
+def draw(rows: list[dict[str, float]], path: Path) -> None:
+    """Information and energy score against the number of hypotheses."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot as plt
+
+    figure, axes = plt.subplots(1, 3, figsize=(10, 3.2), layout="constrained")
+    n = [row["n"] for row in rows]
+    panels = (("information",), ("energy", "energy_floor"), ("quality_estimate", "quality"))
+    titles = ("information, nats (lower is better)", "energy score (lower is better)", "quality (higher is better)")
+    for axis, names, title in zip(axes, panels, titles, strict=True):
+        for name in names:
+            axis.plot(n, [row[name] for row in rows], "o-", label=name.replace("_", " "))
+        axis.set(xscale="log", xlabel="hypotheses", title=title, xticks=n, xticklabels=[str(k) for k in n])
+        axis.minorticks_off()
+        axis.legend(frameon=False)
+    figure.savefig(path, dpi=120)
+
+
+if __name__ == "__main__":
+    main()
