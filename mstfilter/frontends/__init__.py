@@ -10,7 +10,7 @@
 `completions`      meshes, point clouds and voxels of others as completions
 `cob`              COB: boundary maps and trees; `cob_network`: its network in torch
 `caffe`            a reader of Caffe's files of weights
-`mask_trackers`    SiamMask as a tracker of masks; `siammask_network`: its network in torch
+`mask_trackers`    SiamMask and SAM 2 as trackers of masks; `siammask_network`: SiamMask's network in torch
 =================  ===================================================================
 
 No weights are part of the package, and none are downloaded.
@@ -25,5 +25,5 @@ __components__ = {
     "boundary": {"mask_folder": "MaskBoundary", "cob": "CobBoundary"},
     "tree": {"cob": "CobTree"},
     "completer": {"external": "ExternalCompletion"},
-    "tracker": {"siammask": "SiamMaskTracker"},
+    "tracker": {"siammask": "SiamMaskTracker", "sam2": "Sam2Tracker"},
 }

@@ -9,6 +9,9 @@ object there, in place of where the optical flow leads (paper, section IV-C).
 SiamMask: Wang, Zhang, Bertinetto, Hu, Torr: Fast Online Object Tracking and Segmentation, CVPR 2019. Its authors
 distribute code and checkpoints at https://github.com/foolwood/SiamMask (MIT). The code here was checked with random
 weights. It was never run with the published ones.
+
+SAM 2: Ravi et al., 2024, https://github.com/facebookresearch/sam2 (Apache-2.0, weights too). The user supplies its
+package and a checkpoint. The adapter was checked with a stand-in of the package.
 """
 
 from __future__ import annotations
@@ -17,13 +20,15 @@ import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
+from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from mstfilter.errors import InputError, MissingLibraryError, check_integer, check_number
-from mstfilter.scene import Clip, component_key, content_key, memo
+from mstfilter.scene import Clip, Frame, component_key, content_key, memo
 from mstfilter.tracking import MaskTracker
 
 if TYPE_CHECKING:
@@ -73,8 +78,7 @@ class SiamMaskTracker(MaskTracker):
     def track(self, clip: Clip, masks: Sequence[np.ndarray]) -> list[np.ndarray]:
         """Masks (H, W) bool of the last frame. Raises InputError if the weights are missing or of another network."""
         network, digest = self._network()
-        frames = list(clip.frames)
-        frames = [*frames[: -1 : self.step], frames[-1]] if len(frames) > 1 else frames
+        frames = _thinned(clip, self.step)
         images = [np.ascontiguousarray(frame.rgb[..., ::-1]) for frame in frames]  # BGR, as it was trained
         clip_key = content_key("frames", *(frame.key for frame in frames))
         return [
@@ -104,6 +108,83 @@ class SiamMaskTracker(MaskTracker):
                 f"weights {path} have the hash {digest}, expected {self.sha256}", "download the file again"
             )
         return network, digest
+
+
+@dataclass(frozen=True)
+class Sam2Tracker(MaskTracker):
+    """The video predictor of the package ``sam2`` (SAM 2, or EdgeTAM, whose package has the same name).
+
+    All masks are tracked together, with one pass of the image encoder for each frame.
+
+    Parameters
+    ----------
+    checkpoint : str
+        Path of a checkpoint, for example sam2.1_hiera_tiny.pt.
+    config : str
+        Name of the configuration of the checkpoint, as in the package.
+    device : str
+        Device of torch.
+    step : int
+        Every `step`-th frame is used, and the last one.
+    """
+
+    checkpoint: str = ""
+    config: str = "configs/sam2.1/sam2.1_hiera_t.yaml"
+    device: str = "cpu"
+    step: int = 1
+
+    def __post_init__(self) -> None:
+        check_integer("step", self.step)
+
+    def track(self, clip: Clip, masks: Sequence[np.ndarray]) -> list[np.ndarray]:
+        """Masks (H, W) bool of the last frame. Raises InputError if the package or the checkpoint is missing."""
+        path = Path(self.checkpoint)
+        if not self.checkpoint or not path.is_file():
+            raise InputError(
+                f"the checkpoint of SAM 2 does not exist: {path}" if self.checkpoint else "checkpoint is not given",
+                "set the field checkpoint to the path of a file, see https://github.com/facebookresearch/sam2",
+            )
+        frames = _thinned(clip, self.step)
+        if len(frames) == 1:
+            return [mask.astype(bool) for mask in masks]
+        predictor = _load_sam2(self.config, str(path.resolve()), self.device)
+        found = [np.zeros(mask.shape, dtype=bool) for mask in masks]
+        with TemporaryDirectory() as folder:
+            for k, frame in enumerate(frames):  # the predictor reads numbered JPEG files
+                _write_jpeg(Path(folder) / f"{k:05d}.jpg", frame.rgb)
+            state = predictor.init_state(video_path=folder)
+            numbers = [k for k, mask in enumerate(masks) if mask.any()]
+            for k in numbers:
+                predictor.add_new_mask(inference_state=state, frame_idx=0, obj_id=k, mask=masks[k].astype(bool))
+            for index, objects, logits in predictor.propagate_in_video(state) if numbers else ():
+                if index == len(frames) - 1:
+                    for k, logit in zip(objects, logits, strict=True):
+                        found[k] = (logit[0] > 0).cpu().numpy()
+        return found
+
+
+@lru_cache(maxsize=1)
+def _load_sam2(config: str, checkpoint: str, device: str) -> Any:
+    """The video predictor; the last one is kept."""
+    try:
+        build = import_module("sam2.build_sam").build_sam2_video_predictor
+    except ImportError as error:
+        raise MissingLibraryError(
+            f"sam2 cannot be imported: {error}", "install it as https://github.com/facebookresearch/sam2 says"
+        ) from error
+    return build(config, checkpoint, device=device)
+
+
+def _thinned(clip: Clip, step: int) -> list[Frame]:
+    """Every `step`-th frame of a clip, and the last one."""
+    return [*list(clip.frames)[: len(clip.frames) - 1 : step], clip.after]
+
+
+def _write_jpeg(path: Path, rgb: np.ndarray) -> None:
+    import cv2
+
+    if not cv2.imwrite(str(path), rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 100]):
+        raise InputError(f"image cannot be written: {path}")
 
 
 @lru_cache(maxsize=1)

@@ -1,20 +1,24 @@
-"""SiamMask with random weights: names and shapes, layers against plain references, the geometry of tracking."""
+"""Trackers of masks: SiamMask with random weights (shapes, references, geometry), SAM 2 with a stand-in."""
 
 from __future__ import annotations
 
 import subprocess
 import sys
+import types
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from mstfilter.errors import InputError
-from mstfilter.frontends import SiamMaskTracker
+from mstfilter.errors import InputError, MissingLibraryError
+from mstfilter.frontends import Sam2Tracker, SiamMaskTracker
 from mstfilter.frontends.mask_trackers import anchor_boxes, crop_around, follow
 from mstfilter.presets import preset
-from mstfilter.scene import Camera, Clip, Frame
+from mstfilter.scene import Camera, Clip, Frame, Hypothesis, read_rgb, render
+from mstfilter.smc import Population
+from mstfilter.testing import scene_example
+from mstfilter.testing.scenes import _labels
 from mstfilter.tracking import MaskTracker, PaperRule, StaticTest, TrackingTransition
 from tests.segmentation.scenes import GRID
 
@@ -340,7 +344,6 @@ class Stored(MaskTracker):
 
 
 def test_the_transition_asks_once_for_all_distinct_moving_segments():
-    from mstfilter.testing import scene_example
 
     population, clip = scene_example(np.random.default_rng(0), 6)
     tracker = Stored()
@@ -358,14 +361,10 @@ def test_the_transition_asks_once_for_all_distinct_moving_segments():
 
 def test_the_rules_look_where_the_tracker_saw_the_object():
     """Registration to the surface in a wrong mask leaves the box where it is; in the true one it follows."""
-    from mstfilter.scene import Hypothesis, render
-    from mstfilter.testing import scene_example
-    from mstfilter.testing.scenes import _labels
 
     _, clip = scene_example(np.random.default_rng(0), 1)
     h = Hypothesis.from_labels(_labels(0), clip.grid)
     after = render(_labels(2), clip.grid, clip.after.camera).labels == 1
-    from mstfilter.smc import Population
 
     rule = PaperRule(min_inliers=10**6, max_error=0.02)
     results = {}
@@ -434,3 +433,55 @@ def test_a_preset_names_it_without_importing_torch():
     paper = preset("paper")
     assert paper.transition.tracker is None
     assert replace(paper.transition, tracker=SiamMaskTracker("x.pth")).tracker.step == 1
+
+
+class Predictor:
+    """The part of SAM 2's video predictor that the adapter uses; objects move 10 pixels to the right in a frame."""
+
+    def __init__(self, config, checkpoint, device):
+        self.built = (config, checkpoint, device)
+        self.encoded = 0
+
+    def init_state(self, video_path):
+        names = sorted(path.name for path in Path(video_path).iterdir())
+        images = [read_rgb(Path(video_path) / name) for name in names]
+        self.encoded += len(images)
+        return {"names": names, "images": images, "masks": {}}
+
+    def add_new_mask(self, inference_state, frame_idx, obj_id, mask):
+        assert frame_idx == 0
+        inference_state["masks"][obj_id] = mask
+
+    def propagate_in_video(self, state):
+        for k in range(len(state["images"])):
+            masks = [np.roll(mask, 10 * k, axis=1) for mask in state["masks"].values()]
+            logits = torch.from_numpy(np.array(masks)[:, None]).float() * 20 - 10
+            yield k, list(state["masks"]), logits
+
+
+def test_sam2_tracks_all_masks_with_one_pass_over_the_frames(tmp_path, monkeypatch):
+    built = []
+
+    def build(config, checkpoint, device):
+        built.append(Predictor(config, checkpoint, device))
+        return built[-1]
+
+    monkeypatch.setitem(sys.modules, "sam2", types.ModuleType("sam2"))
+    monkeypatch.setitem(sys.modules, "sam2.build_sam", types.SimpleNamespace(build_sam2_video_predictor=build))
+    path = tmp_path / "sam2.pt"
+    path.write_bytes(b"")
+    images, masks = video(6)
+    tracker = Sam2Tracker(str(path), step=2)
+    first, empty, second = tracker.track(clip_of(images), [masks[0], masks[0] & False, masks[2]])
+    assert (first == np.roll(masks[0], 30, axis=1)).all()  # frames 0, 2, 4 and the last one
+    assert not empty.any()
+    assert (second == np.roll(masks[2], 30, axis=1)).all()
+    assert built[0].encoded == 4
+    assert built[0].built == ("configs/sam2.1/sam2.1_hiera_t.yaml", str(path), "cpu")
+    assert (tracker.track(clip_of(images[:1]), masks[:1])[0] == masks[0]).all()
+    monkeypatch.setitem(sys.modules, "sam2.build_sam", None)
+    with pytest.raises(MissingLibraryError, match="sam2 cannot be imported"):
+        replace(tracker, device="cuda").track(clip_of(images), masks[:1])
+    for checkpoint, message in (("", "is not given"), ("nowhere", "does not exist")):
+        with pytest.raises(InputError, match=message):
+            Sam2Tracker(checkpoint).track(clip_of(images), masks[:1])
