@@ -1,4 +1,4 @@
-"""Front doors of packages: names that are imported when they are first used.
+"""Front doors of packages: names that are imported when they are first used; methods that import what draws.
 
 A package's ``__init__.py`` holds its documentation and two lines::
 
@@ -13,8 +13,9 @@ module of `Camera` only (the scheme of Scientific Python's SPEC 1).
 from __future__ import annotations
 
 import ast
+import contextlib
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -40,3 +41,32 @@ def attach(package: str, init: str) -> tuple[Callable[[str], Any], Callable[[], 
         return value
 
     return get, lambda: names, names
+
+
+def late(location: str, summary: str) -> Callable[..., Any]:
+    """A method that calls ``module:function``, which is imported at the first call.
+
+    For methods that draw: the classes of `mstfilter.scene` and `mstfilter.smc` do not depend on `mstfilter.report`,
+    and work without it.
+    """
+    module, _, name = location.partition(":")
+
+    def method(self: Any, *arguments: Any, **named: Any) -> Any:
+        return getattr(import_module(module), name)(self, *arguments, **named)
+
+    method.__doc__ = f"{summary} See `{module}.{name}`."
+    method.__name__ = name
+    return method
+
+
+@contextlib.contextmanager
+def progress_of(progress: Any, what: str = "", bars: str = "progress_bar") -> Iterator[Callable[..., None]]:
+    """The function to call when work is done: of a bar of `mstfilter.report.progress` if `progress` is True.
+
+    Otherwise `progress` itself, or a function that does nothing if it is False.
+    """
+    if progress is True:
+        with getattr(import_module("mstfilter.report.progress"), bars)(*([what] if what else [])) as advance:
+            yield advance
+    else:
+        yield progress or (lambda *arguments: None)

@@ -6,7 +6,7 @@ import contextlib
 import re
 import sys
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -100,26 +100,6 @@ def warnings_as_lines() -> Iterator[None]:
 
         warnings.showwarning = show
         yield
-
-
-@contextlib.contextmanager
-def progress_bar(what: str) -> Iterator[Callable[[int, int], None]]:
-    """A progress bar on standard error; yields ``advance(done, total)``."""
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-
-    columns = (TextColumn("{task.description:<12}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    bars = Progress(*columns, console=Console(stderr=True))
-    task = bars.add_task(what, total=None)
-
-    def advance(done: int, total: int) -> None:
-        bars.start()  # not before the first call, so that an earlier error is printed without a bar
-        bars.update(task, completed=done, total=total)
-
-    try:
-        yield advance
-    finally:
-        bars.stop()
 
 
 def print_summary(run: Path) -> None:

@@ -17,12 +17,12 @@ from mstfilter.cli.root import (
     Seed,
     app,
     print_summary,
-    progress_bar,
     read_source,
     safe_name,
 )
 from mstfilter.errors import InputError
 from mstfilter.files import check_output
+from mstfilter.report.progress import progress_bar
 
 
 @app.command()

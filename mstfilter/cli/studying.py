@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import contextlib
 import sys
-from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
 from mstfilter.cli.root import app
+from mstfilter.report.progress import study_bars
 
 
 @app.command()
@@ -42,7 +41,7 @@ def study(
         from mstfilter.study import Cluster
 
         executor = Cluster(scheduler)
-    with _progress_bars() as progress:
+    with study_bars() as progress:
         result = run_study(wanted, folder, executor, overrides or (), progress=progress)
     print(f"study       {folder}")
     print(f"runs        {result.done} done, {result.repeated} of them earlier; table {folder / 'runs.csv'}")
@@ -87,52 +86,3 @@ def _print_summary(summary: Any) -> None:
 def _range(low: float, high: float, sign: str = "") -> str:
     """An interval; a dash if there is none."""
     return "–" if low != low else f"{low:{sign}.3f} .. {high:{sign}.3f}"
-
-
-@contextlib.contextmanager
-def _progress_bars() -> Iterator[Callable[[Any], None]]:
-    """Progress bars on standard error: one for all jobs and one for every running job."""
-    from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
-
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-    )
-    bars = Progress(*columns, console=Console(stderr=True))
-    overall: dict[str, Any] = {}
-    running: dict[str, Any] = {}
-
-    def update(p: Any) -> None:
-        bars.start()
-        if p.what not in overall:
-            overall[p.what] = bars.add_task(p.what, total=p.total)
-        failed = f", {p.failed} failed" if p.failed else ""
-        bars.update(overall[p.what], completed=p.done + p.failed, description=f"{p.what}{failed}")
-        if p.event is None:
-            return
-        if p.event.kind == "started":
-            running[p.name] = bars.add_task(f"  {p.name}", total=None)
-        elif p.event.kind == "step" and p.name in running:
-            bars.update(running[p.name], completed=p.event.done, total=p.event.total)
-        elif p.event.kind in ("ended", "lost") and p.name in running:
-            bars.remove_task(running.pop(p.name))
-        if p.event.kind == "lost":
-            bars.console.print(f"a worker died in {p.name}")
-        elif p.event.outcome is not None and p.event.outcome.status != "done":
-            bars.console.print(f"failed: {p.name}: {p.event.outcome.error}", markup=False)
-
-    try:
-        yield update
-    finally:
-        bars.stop()

@@ -42,6 +42,7 @@ from mstfilter.fusion.information import (
     partition_distance,
 )
 from mstfilter.fusion.similarity import CommonRefinement, common_refinement
+from mstfilter.lazy import late
 from mstfilter.scene import Camera, Hypothesis, VoxelGrid, project, render_hypothesis
 from mstfilter.scoring import least_loss
 from mstfilter.smc import Population, first_seen
@@ -75,6 +76,13 @@ class Belief:
             raise InputError("the particles of a belief must be hypotheses, not vectors or other objects")
         for k, h in enumerate(particles):
             check_grid(f"hypothesis {k}", h, self.grid)
+
+    def __repr__(self) -> str:
+        weights = ", ".join(f"{w:.3g}" for w in np.sort(self._mass)[::-1][:8]) + ", ..." * (len(self._mass) > 8)
+        head = f"Belief of {len(self)} hypotheses, {len(self._mass)} distinct"
+        return f"{head}\n  {self.grid.text}\n  weights {weights}"
+
+    _repr_html_ = late("mstfilter.report.display:to_html", "What a notebook shows.")
 
     def __len__(self) -> int:
         return len(self.population)

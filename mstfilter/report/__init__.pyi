@@ -4,6 +4,7 @@ from mstfilter.report.identities import (
     TRUTH as TRUTH,
     Identities as Identities,
     assign_identities as assign_identities,
+    match_objects as match_objects,
     order_by_weight as order_by_weight,
 )
 from mstfilter.report.pictures import (

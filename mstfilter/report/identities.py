@@ -60,6 +60,14 @@ def assign_identities(run: RunFolder) -> Identities:
     return Identities(assignment.table)
 
 
+def match_objects(hypotheses: Sequence[Hypothesis], weights: Sequence[float]) -> list[dict[int, Colour]]:
+    """Colours of the objects of each hypothesis about one pause; objects that match have the same colour."""
+    assignment = _Assignment()
+    assignment.add(0, hypotheses, weights, None, None)
+    found = Identities(assignment.table)
+    return [found.colours(0, k) for k in range(len(hypotheses))]
+
+
 class _Assignment:
     """Identities of the pauses so far."""
 

@@ -20,6 +20,7 @@ from typing import Any
 import mstfilter
 from mstfilter.errors import InputError
 from mstfilter.files import check_output
+from mstfilter.lazy import progress_of
 from mstfilter.oracles import bind_truth, uses_truth
 from mstfilter.presets import build_filter, describe_filter
 from mstfilter.registry import nested_components
@@ -47,7 +48,7 @@ def filter_recording(
     seed: int = 0,
     *,
     allow_files: bool = False,
-    progress: Callable[[RunProgress], None] = lambda progress: None,
+    progress: bool | Callable[[RunProgress], None] = False,
     observer: Observer | None = None,
 ) -> RunFolder:
     """Filter a recording and return the run folder.
@@ -63,8 +64,8 @@ def filter_recording(
         Seed of all random streams.
     allow_files : bool
         Whether components may come from ``./file.py:Class``.
-    progress : callable
-        Called before the first step and after every step.
+    progress : bool or callable
+        True shows a progress bar; a function is called before the first step and after every step.
     observer : callable, optional
         ``observer(slot, begins)``, called when a component of the filter begins and ends its work.
 
@@ -97,20 +98,22 @@ def filter_recording(
     clips = recording.clips()
     done = 0 if folder is None else folder.n_pauses
     state = folder.state(done - 1) if folder is not None and done else bound.start(int(seed))
-    progress(RunProgress(done, len(clips)))
-    try:
-        for clip in clips[done:]:
-            state, info = bound.step(state, clip, observer)
-            if folder is None:  # a run that fails in its first step leaves no folder
-                folder = RunFolder.create(path, description)
-            truth = recording.truth(clip.index)
-            questions = None if truth is None else ask(recording, clip.index)
-            folder.write_pause(clip, state, info, truth, questions)
-            progress(RunProgress(clip.index + 1, len(clips), sum(info.seconds.values())))
-    except BaseException as error:
-        if folder is not None:
-            folder.set_status("interrupted" if isinstance(error, KeyboardInterrupt) else "failed")
-        raise
+    with progress_of(progress, "filter") as show:
+        advance: Callable[[RunProgress], None] = (lambda p: show(p.done, p.total)) if progress is True else show
+        advance(RunProgress(done, len(clips)))
+        try:
+            for clip in clips[done:]:
+                state, info = bound.step(state, clip, observer)
+                if folder is None:  # a run that fails in its first step leaves no folder
+                    folder = RunFolder.create(path, description)
+                truth = recording.truth(clip.index)
+                questions = None if truth is None else ask(recording, clip.index)
+                folder.write_pause(clip, state, info, truth, questions)
+                advance(RunProgress(clip.index + 1, len(clips), sum(info.seconds.values())))
+        except BaseException as error:
+            if folder is not None:
+                folder.set_status("interrupted" if isinstance(error, KeyboardInterrupt) else "failed")
+            raise
     assert folder is not None
     folder.write_metrics()
     folder.set_status("done")

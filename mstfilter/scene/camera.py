@@ -41,6 +41,10 @@ class Camera:
     height: int
     T_world_camera: RigidTransform | None = None
 
+    def __repr__(self) -> str:
+        at = "without a pose" if self.T_world_camera is None else f"at {np.round(self.position, 3).tolist()} m"
+        return f"Camera {self.width} x {self.height}, focal length {self.K[0, 0]:.4g} pixels, {at}"
+
     def __post_init__(self) -> None:
         try:
             K = np.asarray(self.K, dtype=np.float64)

@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mstfilter.errors import InputError
+from mstfilter.lazy import late
 from mstfilter.scene.arrays import content_key, frozen, read_only
 from mstfilter.scene.camera import Camera
 from mstfilter.scene.voxels import VoxelGrid
@@ -163,6 +164,18 @@ class Frame:
                 "give every camera its T_world_camera in one world",
             )
 
+    def __repr__(self) -> str:
+        known = self.depth[np.isfinite(self.depth)]
+        depth = "no depth"
+        if len(known):
+            share = known.size / self.depth.size
+            depth = f"depth {known.min():.2f} to {known.max():.2f} m in {share:.0%} of the pixels"
+        more = "" if self.robot_mask is None else ", robot mask"
+        more += f", {len(self.views)} more views" if self.views else ""
+        return f"Frame: {depth}{more}\n  {self.camera!r}"
+
+    _repr_html_ = late("mstfilter.report.display:to_html", "What a notebook shows.")
+
     @cached_property
     def key(self) -> bytes:
         """Content key."""
@@ -218,6 +231,13 @@ class Clip:
             raise InputError(f"clip {self.index} has no frames")
         if self.times and len(self.times) != len(self.frames):
             raise InputError(f"clip {self.index} has {len(self.frames)} frames and {len(self.times)} times")
+
+    def __repr__(self) -> str:
+        seconds = f" over {self.times[-1] - self.times[0]:.1f} s" if self.times else ""
+        frames = "1 frame" if len(self) == 1 else f"{len(self)} frames"
+        return f"Clip {self.index}: {frames}{seconds}\n  {self.grid.text}"
+
+    _repr_html_ = late("mstfilter.report.display:to_html", "What a notebook shows.")
 
     @cached_property
     def key(self) -> bytes:

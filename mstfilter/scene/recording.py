@@ -23,6 +23,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from mstfilter.errors import InputError, InputWarning
+from mstfilter.lazy import late
 from mstfilter.scene.arrays import content_key
 from mstfilter.scene.camera import Camera, rigid_from_matrix
 from mstfilter.scene.frame import Clip, Frame
@@ -112,6 +113,16 @@ class Recording:
         ):
             raise InputError(f"times of recording {self.name} are not {n} ascending numbers")
         object.__setattr__(self, "pauses", pauses)
+
+    def __repr__(self) -> str:
+        pauses = ", ".join(map(str, self.pauses[:10])) + ", ..." * (len(self.pauses) > 10)
+        n, seconds = len(self), self.times[-1] - self.times[0]
+        frames = "1 frame" if n == 1 else f"{n} frames over {seconds:.1f} s"
+        where = "" if self.path is None else f"\n  {str(self.path)[-100:]}"
+        return f"Recording {self.name[:60]!r}: {frames}, pauses at {pauses}\n  {self.grid.text}{where}"
+
+    plot = late("mstfilter.report.display:plot_recording", "Images at the pauses, and the time line.")
+    _repr_html_ = late("mstfilter.report.display:to_html", "What a notebook shows.")
 
     @classmethod
     def from_arrays(

@@ -28,6 +28,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from mstfilter.errors import InputError
+from mstfilter.lazy import late
 from mstfilter.scene.arrays import content_key, frozen
 
 MAX_LABEL = 65535
@@ -102,6 +103,12 @@ class VoxelGrid:
         return content_key("grid", self.origin, self.voxel_size, self.shape)
 
     @property
+    def text(self) -> str:
+        """Size of the workspace and of its voxels, for messages."""
+        extent = " x ".join(f"{self.voxel_size * n:.2f}" for n in self.shape)
+        return f"workspace {extent} m, {' x '.join(map(str, self.shape))} voxels of {1000 * self.voxel_size:g} mm"
+
+    @property
     def upper(self) -> np.ndarray:
         """Maximum corner, (3,) metres."""
         return self.origin + self.voxel_size * np.array(self.shape)
@@ -152,6 +159,9 @@ class Crop:
     occupied: np.ndarray  #: (a, b, c) bool, the box
     offset: np.ndarray  #: (3,) int, index of its first voxel in the grid
 
+    def __repr__(self) -> str:
+        return f"Crop of {int(self.occupied.sum())} voxels at {self.offset.tolist()}"
+
     def __post_init__(self) -> None:
         object.__setattr__(self, "occupied", frozen(np.asarray(self.occupied, dtype=bool)))
         object.__setattr__(self, "offset", frozen(np.asarray(self.offset, dtype=np.int64)))
@@ -186,6 +196,10 @@ class ObjectRecord:
     #: Ids of objects of the same hypothesis that were observed to move apart from it, so that they are not the
     #: same object.
     apart: frozenset[int] = frozenset()
+
+    def __repr__(self) -> str:
+        moved = ", moved" * (self.motion is not _NO_MOTION)
+        return f"ObjectRecord(label={self.label}, id={self.id}, birth={self.birth}{moved})"
 
     @classmethod
     def born(cls, label: int, birth: int, completion_key: str | None = None) -> ObjectRecord:
@@ -253,6 +267,15 @@ class Hypothesis:
                 f"no record for {len(no_record)} labels {no_record[:5]}, no voxel for {len(no_voxel)} {no_voxel[:5]}",
                 "use Hypothesis.from_labels, or with_labels to change a hypothesis",
             )
+
+    def __repr__(self) -> str:
+        volumes = [f"{label}: {n}" for label, n in self._volumes.items()]
+        more = ", ..." if len(volumes) > 12 else ""
+        lines = [f"Hypothesis of {len(volumes)} {'object' if len(volumes) == 1 else 'objects'}", self.grid.text]
+        return "\n  ".join([*lines, f"voxels by label: {', '.join(volumes[:12])}{more}"] if volumes else lines)
+
+    show = late("mstfilter.report.display:show_hypothesis", "The voxels as a page that can be rotated.")
+    _repr_html_ = late("mstfilter.report.display:to_html", "What a notebook shows.")
 
     @classmethod
     def from_labels(cls, labels: np.ndarray, grid: VoxelGrid, birth: int = 0) -> Hypothesis:

@@ -92,6 +92,7 @@ from mstfilter.smc.interfaces import (
     Distribution as Distribution,
     Equivalence as Equivalence,
     Info as Info,
+    Infos as Infos,
     Lookahead as Lookahead,
     Observer as Observer,
     Proposal as Proposal,

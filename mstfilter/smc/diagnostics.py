@@ -35,6 +35,7 @@ import numpy as np
 
 from mstfilter.errors import InputError, LostRunError, MissingLibraryError, check_integer
 from mstfilter.files import atomic_path
+from mstfilter.lazy import progress_of
 from mstfilter.smc.batching import batch, batched_slots
 from mstfilter.smc.checkpoint import digest
 from mstfilter.smc.filter import ParticleFilter
@@ -227,7 +228,7 @@ def run_many(
     seeds: Iterable[int] = range(10),
     workers: int = 1,
     folder: str | Path | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: bool | Callable[[int, int | None], None] = False,
     **collectors: Collector,
 ) -> History:
     """Run each filter with each seed.
@@ -242,8 +243,8 @@ def run_many(
     folder : path, optional
         Every finished run is stored there. The same call runs only those that are missing. InputError if a stored run
         was made by another filter, other observations or other collectors.
-    progress : callable, optional
-        ``progress(done, total)``, called as runs finish.
+    progress : bool or callable
+        True shows a progress bar; a function is called as ``progress(done, total)`` when runs finish.
     **collectors
         As for `collect`; default `log_evidence`. If they are `log_evidence`, `ess` and `mean` only, `batch` runs many
         seeds at once where the filter allows it.
@@ -267,10 +268,10 @@ def run_many(
         missing = [seed for seed in seeds if (arm, seed) not in found]
         size = 1 if job.batched(arm) is False else -(-len(missing) // (4 * workers if workers > 1 else 1)) or 1
         chunks += [(arm, missing[k : k + size]) for k in range(0, len(missing), size)]
-    for done in _finished_chunks(job, chunks, workers):
-        found.update(done)
-        if progress is not None:
-            progress(len(found), total)
+    with progress_of(progress, "runs") as advance:
+        for done in _finished_chunks(job, chunks, workers):
+            found.update(done)
+            advance(len(found), total)
     lost = {task: run.lost for task, run in found.items() if run.lost}
     shape = (len(arms), len(seeds), len(job.observations))
     values = {

@@ -23,7 +23,7 @@ function of a `State`, so a run can be stopped, stored and resumed at any step.
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sized
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -32,11 +32,13 @@ from typing import Any, Literal
 import numpy as np
 
 from mstfilter.errors import InputError, check_choice, check_component, check_integer
+from mstfilter.lazy import late, progress_of
 from mstfilter.smc.components import EssBelow
 from mstfilter.smc.interfaces import (
     Codec,
     Component,
     Info,
+    Infos,
     Lookahead,
     Observer,
     Proposal,
@@ -131,6 +133,13 @@ class ParticleFilter:
                 'use resample="before"',
             )
 
+    def __repr__(self) -> str:
+        parts = {slot: type(getattr(self, slot)).__name__ for slot in _INTERFACES if getattr(self, slot) is not None}
+        lines = [f"ParticleFilter(n={self.n}, n_proposed={self.n_proposed}, resample={self.resample!r})"]
+        return "\n  ".join([*lines, ", ".join(f"{slot} {name[:24]}" for slot, name in parts.items())])
+
+    _repr_html_ = late("mstfilter.report.display:to_html", "What a notebook shows.")
+
     @property
     def properly_weighted(self) -> bool:
         """Whether all components are properly weighted and there is no `proposal`.
@@ -198,18 +207,25 @@ class ParticleFilter:
         codec: Codec | None = None,
         observer: Observer | None = None,
         keep_arrays: bool = True,
-    ) -> tuple[State, list[Info]]:
+        progress: bool | Callable[[int, int | None], None] = False,
+    ) -> tuple[State, Infos]:
         """Run all steps; returns the last state and the infos. Parameters as in `iterate`.
+
+        ``progress=True`` shows a progress bar; a function is called as ``progress(done, total)``.
 
         If the run continues from a checkpoint, it returns the infos of the later steps only. The infos hold some (n,)
         arrays of each step, so memory grows with n times the number of steps; with ``keep_arrays=False``, they do not
         (see `Info.without_arrays`). `collect` keeps only what it is asked for.
         """
+        total = len(observations) if isinstance(observations, Sized) else None
         observations, state, store = self._begin(observations, seed, checkpoint, codec)
-        infos = []
-        for current, info in self._steps(observations, state, store, observer):
-            state = current
-            infos.append(info if keep_arrays else info.without_arrays())
+        infos = Infos()
+        with progress_of(progress, "filter") as advance:
+            advance(state.t, total)
+            for current, info in self._steps(observations, state, store, observer):
+                state = current
+                infos.append(info if keep_arrays else info.without_arrays())
+                advance(state.t, total)
         return state, infos
 
     def _begin(

@@ -26,6 +26,8 @@ another one: `DensityTransition`, `WeightResampler`. Models and programs are mad
 
 from __future__ import annotations
 
+import importlib
+import importlib.util
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
@@ -35,6 +37,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from mstfilter.errors import InputError
+from mstfilter.lazy import late
 from mstfilter.smc.population import Population
 from mstfilter.smc.streams import Key
 
@@ -336,6 +339,13 @@ class State:
     key: Key  #: names the random streams of the run
     properly_weighted: bool = True  #: whether the weights are those of an exact filter
 
+    def __repr__(self) -> str:
+        evidence = "" if self.log_evidence is None else f", log evidence {self.log_evidence:.4g}"
+        particles = "" if self.population is None else f"\n  {self.population!r}"
+        return f"State after {self.t} observations, seed {self.key.seed}{evidence}{particles}"
+
+    _repr_html_ = late("mstfilter.report.display:to_html", "What a notebook shows.")
+
     @property
     def log_evidence(self) -> float | None:
         """Log of the unbiased estimate of p(y_1 .. y_t); None if a component is not properly weighted."""
@@ -361,6 +371,14 @@ class Info:
     notes: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)  #: notes of the components, by slot
     seconds: Mapping[str, float] = field(default_factory=dict)  #: wall time by slot. Not reproducible
 
+    def __repr__(self) -> str:
+        how = "resampled" if self.resampled else "not resampled"
+        times = ", ".join(f"{slot} {s:.2g}" for slot, s in self.seconds.items())
+        lines = [f"Info of step {self.t}: {self.n} of {self.n_candidates} candidates, ESS {self.ess:.1f}, {how}"]
+        return "\n  ".join([*lines, f"seconds {times}"] if times else lines)
+
+    _repr_html_ = late("mstfilter.report.display:to_html", "What a notebook shows.")
+
     @cached_property
     def unique_ancestors(self) -> int:
         """Number of particles of the previous population that have descendants."""
@@ -373,3 +391,42 @@ class Info:
         light = replace(self, ancestors=none, parents={}, log_weights=np.zeros(0))
         light.__dict__["unique_ancestors"] = self.unique_ancestors
         return light
+
+
+class Infos(list[Info]):
+    """The records of the steps of a run: a list that can be read as a table.
+
+    >>> state, infos = filter.run(observations)
+    >>> infos.table()                       # a data frame of pandas or polars if one is installed, else text (CSV)
+    """
+
+    def rows(self) -> list[dict[str, Any]]:
+        """One row for each step: its numbers, and the wall time in seconds of the step and of each slot."""
+        slots = dict.fromkeys(slot for info in self for slot in info.seconds)
+        return [
+            {
+                **{name: getattr(info, name) for name in ("t", "n", "n_candidates", "ess", "resampled")},
+                "unique_ancestors": info.unique_ancestors,
+                "seconds": sum(info.seconds.values()),
+                **{f"{slot}_seconds": info.seconds.get(slot, 0.0) for slot in slots},
+            }
+            for info in self
+        ]
+
+    def table(self) -> Any:
+        """The rows as a data frame of pandas, or of polars, whichever is installed; else as text in CSV."""
+        rows = self.rows()
+        for library in ("pandas", "polars"):
+            if importlib.util.find_spec(library) is not None:
+                return importlib.import_module(library).DataFrame(rows)
+        lines = [",".join(rows[0])] if rows else []
+        return "\n".join([*lines, *(",".join(map(str, row.values())) for row in rows)])
+
+    def __repr__(self) -> str:
+        if not self:
+            return "Infos of 0 steps"
+        ess, seconds = [info.ess for info in self], sum(sum(info.seconds.values()) for info in self)
+        spread = f"ESS {min(ess):.1f} to {max(ess):.1f}"
+        return f"Infos of {len(self)} steps: {spread}, {sum(i.resampled for i in self)} resampled, {seconds:.3g} s"
+
+    _repr_html_ = late("mstfilter.report.display:to_html", "What a notebook shows.")

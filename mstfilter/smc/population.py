@@ -27,6 +27,7 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 
 from mstfilter.errors import InputError, LostRunError
+from mstfilter.lazy import late
 
 _T = TypeVar("_T")
 _U = TypeVar("_U")
@@ -228,6 +229,17 @@ class Population:
         object.__setattr__(self, "log_weights", lw)
         object.__setattr__(self, "parents", parents)
 
+    def __repr__(self) -> str:
+        lines = [f"Population of {len(self)} {_kind(self.particles)}, ESS {self.ess:.1f}"]
+        heaviest = np.sort(self.weights)[::-1][:8]
+        lines.append("weights " + ", ".join(f"{w:.3g}" for w in heaviest) + ", ..." * (len(self) > 8))
+        if self.parents:
+            lines.append(f"parents {', '.join(self.parents)}")
+        return "\n  ".join(lines)
+
+    plot = late("mstfilter.report.display:plot_population", "Hypotheses by weight, or weighted histograms.")
+    _repr_html_ = late("mstfilter.report.display:to_html", "What a notebook shows.")
+
     def __len__(self) -> int:
         return len(self.log_weights)
 
@@ -332,6 +344,18 @@ class Population:
         new.__dict__["log_weights"] = lw
         new.__dict__.pop("_both", None)
         return new
+
+
+def _kind(particles: Particles) -> str:
+    """What the particles are, in a few words."""
+    if isinstance(particles, Candidates):
+        return f"candidates, {particles.n_built} built"
+    if isinstance(particles, Mapping):
+        named = [f"{name} {np.dtype(a.dtype)} {a.shape}" for name, a in list(particles.items())[:4]]
+        return f"particles: {', '.join(named)}{', ...' * (len(particles) > 4)}"
+    if isinstance(particles, np.ndarray):
+        return f"particles: {particles.dtype} {particles.shape}"
+    return f"particles: {type(particles[0]).__name__}"
 
 
 def union(predicted: Population | None, proposed: Population | None) -> Population:

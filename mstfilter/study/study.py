@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from mstfilter.errors import InputError
+from mstfilter.lazy import progress_of
 from mstfilter.runs import library_versions, write_json
 from mstfilter.study.config import StudyConfig
 from mstfilter.study.executors import Event, Executor, Local, Tell
@@ -57,7 +58,7 @@ def run_study(
     *,
     allow_files: bool = True,
     cache: Path | None = None,
-    progress: Callable[[StudyProgress], None] = lambda progress: None,
+    progress: bool | Callable[[StudyProgress], None] = False,
 ) -> StudyResult:
     """Run a study into a folder.
 
@@ -73,8 +74,8 @@ def run_study(
         Whether components may come from ``./file.py:Class``.
     cache : Path, optional
         Folder of simulated recordings and of intermediate results. Default: the user's cache folder.
-    progress : callable
-        Called with every event.
+    progress : bool or callable
+        True shows progress bars; a function is called with every event.
 
     Raises
     ------
@@ -86,7 +87,7 @@ def run_study(
     plan = make_plan(study, overrides, allow_files=allow_files)
     recalibration = _read_recalibration(plan)
     cache = (cache or cache_folder()).absolute()
-    with _locked(path) as folder:
+    with _locked(path) as folder, progress_of(progress, bars="study_bars") as report:
         for target in (path, cache):
             _check_free_space(target)
         executor = executor or Local(logs=path / "logs")
@@ -94,14 +95,14 @@ def run_study(
         _rename_done_runs(plan, folder)
         waiting = [run for run in plan.runs if not _is_done(run, folder)]
         n_before = len(plan.runs) - len(waiting)
-        failed_scenes = _record_scenes(waiting, cache, plan.config, executor, progress)
+        failed_scenes = _record_scenes(waiting, cache, plan.config, executor, report)
         failed = {run.name: failed_scenes[run.scene.key] for run in waiting if run.scene.key in failed_scenes}
         for run in waiting:
             if run.name in failed:
                 _write_failure(folder, run, failed[run.name])
         waiting = [run for run in waiting if run.name not in failed]
         names = [run.name for run in waiting]
-        count = _counter(progress, "runs", names, n_before, len(plan.runs), len(failed))
+        count = _counter(report, "runs", names, n_before, len(plan.runs), len(failed))
 
         def tell(event: Event) -> None:
             run = waiting[event.job]

@@ -1,0 +1,179 @@
+"""What a person sees of an object: its text, its HTML, plots, the page that can be rotated, tables and progress."""
+
+from __future__ import annotations
+
+import base64
+import json
+import re
+import sys
+from html.parser import HTMLParser
+from types import ModuleType
+
+import numpy as np
+import pytest
+
+import mstfilter
+from mstfilter.errors import InputError
+from mstfilter.lazy import exported
+from mstfilter.report.display import Drawing, ScenePage
+from mstfilter.scene import Crop, Hypothesis, ObjectRecord, Recording, VoxelGrid
+from mstfilter.smc import Candidates, Infos, Population, bootstrap, linear_gaussian, run_many
+from mstfilter.testing import scene_example
+from tests.scene.scenes import CAMERA, table_scene
+
+MODEL = linear_gaussian(F=[[0.9]], Q=[[0.5]], H=[[1.0]], R=[[1.0]], m0=[0.0], P0=[[1.0]])
+NUMBERS = bootstrap(MODEL, n=50)
+STATE, INFOS = NUMBERS.run([[0.3], [0.1]], seed=0)
+SCENES, CLIP = scene_example(np.random.default_rng(0), 5)
+RGB, DEPTH, _ = table_scene()
+RECORDING = Recording.from_arrays(
+    np.repeat(RGB[None], 30, 0), np.repeat(DEPTH[None], 30, 0), CAMERA.K, pauses="every", name="a long name " * 10
+)
+MANY = Hypothesis.from_labels(np.arange(1, 1001).reshape(10, 10, 10), VoxelGrid((0, 0, 0), 0.01, (10, 10, 10)))
+FLOOR = mstfilter.preset("floor_one_blob")
+OBJECTS = {
+    "recording": RECORDING,
+    "clip": CLIP,
+    "clip of one frame": RECORDING.clips()[0],
+    "frame": CLIP.after,
+    "camera": CAMERA,
+    "hypothesis": SCENES.particles[0],
+    "hypothesis of 1000 objects": MANY,
+    "empty hypothesis": Hypothesis.from_labels(np.zeros((2, 2, 2), int), VoxelGrid((0, 0, 0), 0.01, (2, 2, 2))),
+    "record": ObjectRecord(3, 65539, 1, Crop.of(np.ones((4, 4, 4), bool))),
+    "population of hypotheses": SCENES,
+    "population of numbers": STATE.population,
+    "population of a mapping": Population({f"coordinate {k}": np.zeros((90, 3)) for k in range(20)}),
+    "candidates": Population(Candidates(lambda k: k, 1000)),
+    "state": STATE,
+    "first state": NUMBERS.start(0),
+    "state of scenes": FLOOR.step(FLOOR.start(1), CLIP)[0],
+    "info": INFOS[1],
+    "infos": INFOS,
+    "no infos": Infos(),
+    "belief": mstfilter.Belief(SCENES),
+    "filter": NUMBERS,
+    "preset": mstfilter.preset("mst"),
+}
+
+
+class Checked(HTMLParser):
+    """Fails if an element is not closed or anything is loaded from elsewhere."""
+
+    def __init__(self):
+        super().__init__()
+        self.open = []
+
+    def handle_starttag(self, tag, attrs):
+        for name, value in attrs:
+            if name in ("src", "href"):
+                assert value.startswith("data:"), value
+        if tag not in ("img", "meta", "br"):
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+
+def check_html(text):
+    parser = Checked()
+    parser.feed(text)
+    parser.close()
+    assert parser.open == []
+    assert not re.search(r"https?://|import\(|fetch\(|@import", text)
+
+
+@pytest.mark.parametrize("name", OBJECTS)
+def test_text_and_html_are_short_and_complete(name):
+    text = repr(OBJECTS[name])
+    assert 0 < len(text) <= 300
+    assert len(text.splitlines()) <= 5
+    assert " at 0x" not in text
+    assert "array(" not in text
+    if hasattr(OBJECTS[name], "_repr_html_"):
+        made = OBJECTS[name]._repr_html_()
+        check_html(made)
+        assert text.splitlines()[0].replace("'", "&#x27;") in made
+        assert len(made) < 1_000_000
+
+
+def test_texts_hold_the_facts():
+    assert repr(SCENES.particles[0]).splitlines()[0] == f"Hypothesis of {SCENES.particles[0].n_objects} objects"
+    assert "24 x 24 x 8 voxels of 20 mm" in repr(CLIP)
+    assert "3 frames over 0.4 s" in repr(CLIP)
+    assert repr(STATE.population).startswith("Population of 50 particles: float64 (50, 1), ESS ")
+    assert "1000 candidates, 0 built" in repr(OBJECTS["candidates"])
+    assert "log evidence -" in repr(STATE)
+    assert "resampler ClusterStratified" in repr(OBJECTS["preset"])
+
+
+def test_the_front_door_names_classes_that_can_be_shown():
+    for name in ("Recording", "Clip", "Frame", "Hypothesis", "Population", "Belief", "ParticleFilter"):
+        assert name in exported(mstfilter.__file__)
+        assert callable(getattr(mstfilter, name)._repr_html_)
+
+
+def test_plots():
+    for figure, axes in (
+        (RECORDING.plot(), 2 * 6 + 2),  # colour and depth of six pauses, time line, colour bar
+        (SCENES.plot(), None),
+        (STATE.population.plot(), 1),
+        (Population({"a": np.arange(9.0), "b": np.zeros((9, 2))}).plot(), 3),
+    ):
+        assert isinstance(figure, Drawing)
+        assert axes is None or len(figure.axes) == axes
+        assert figure._repr_png_().startswith(b"\x89PNG")
+    bars = STATE.population.plot().axes[0].patches
+    assert sum(bar.get_height() for bar in bars) == pytest.approx(1)
+
+
+def test_the_page_has_the_open_faces(tmp_path):
+    """Every face of a voxel whose neighbour is another object or free, found voxel by voxel."""
+    labels = np.random.default_rng(0).integers(0, 3, (4, 3, 2))
+    hypothesis = Hypothesis.from_labels(labels, VoxelGrid((0, 0, 0), 0.01, (4, 3, 2)))
+    page = hypothesis.show()
+    assert isinstance(page, ScenePage)
+    check_html(page._repr_html_())
+    check_html(page.save(tmp_path / "scene.html").read_text())
+    data = json.loads(re.search(r'<script id="data"[^>]*>(.*?)</script>', page.text)[1])
+    rows = np.frombuffer(base64.b64decode(data["faces"]), "<u2").reshape(-1, 5).tolist()
+    steps = [(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1)]
+    expected = []
+    for x, y, z in np.argwhere(labels > 0).tolist():
+        for side, (dx, dy, dz) in enumerate(steps):
+            i, j, k = x + dx, y + dy, z + dz
+            inside = 0 <= i < 4 and 0 <= j < 3 and 0 <= k < 2
+            if not inside or labels[i, j, k] != labels[x, y, z]:
+                expected.append([x, y, z, side, int(labels[x, y, z])])
+    assert sorted(rows) == sorted(expected)
+    assert [o["text"] for o in data["objects"]] == [f"{k}: {n} voxels" for k, n in hypothesis.volumes().items()]
+    with pytest.raises(InputError, match="is a folder"):
+        page.save(tmp_path)
+
+
+def test_infos_as_a_table(monkeypatch):
+    assert isinstance(INFOS, list)
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    head, *lines = INFOS.table().splitlines()
+    assert head.startswith("t,n,n_candidates,ess,resampled,unique_ancestors,seconds,")
+    assert [line.split(",")[0] for line in lines] == ["0", "1"]
+    fake = ModuleType("polars")
+    fake.DataFrame = lambda rows: ("frame", rows)
+    monkeypatch.setitem(sys.modules, "polars", fake)
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: name if name == "polars" else None)
+    assert INFOS.table() == ("frame", INFOS.rows())
+    assert Infos().rows() == []
+
+
+def test_progress_is_shown_if_asked(capsys):
+    NUMBERS.run([[0.1]] * 4, seed=0)
+    assert capsys.readouterr() == ("", "")
+    NUMBERS.run([[0.1]] * 4, seed=0, progress=True)
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert "4/4" in err
+    calls = []
+    NUMBERS.run(iter([[0.1]] * 2), seed=0, progress=lambda *call: calls.append(call))
+    assert calls == [(0, None), (1, None), (2, None)]
+    run_many({"a": NUMBERS}, [[0.1]], range(3), progress=True)
+    assert "3/3" in capsys.readouterr().err
