@@ -47,11 +47,12 @@ def run(
     import shutil
 
     from mstfilter.presets import build_filter, load_config
-    from mstfilter.runs import check_run_folder
 
     config = load_config(preset, overrides or ())
     build_filter(config, allow_files=True)  # a wrong setting is reported before the recording is read
     if out is not None:
+        from mstfilter.runs import check_run_folder
+
         check_run_folder(out)
     source = read_source(recording, format, option, pauses, frames)
     name = Path(preset).stem
