@@ -189,16 +189,23 @@ def table_residual(frame: Frame) -> np.ndarray:
 
 _MIN_HEIGHT = 0.01  # metres above the table beyond which a reading may show an object
 
+_BORDER = 0.03  # metres: a wall may stand at the border of the visible table
+
 
 def workspace(frame: Frame) -> VoxelGrid:
     """A grid of 1 x 1 x 0.5 m in voxels of 1 cm around the objects on the table, which is at z = 0.
 
     The grid is centred on the readings more than 1 cm above the table, or on the table if there are fewer than 200.
+    Readings beside the visible table, for example on a wall behind it, do not count.
     """
     voxel_size, shape = 0.01, (100, 100, 50)
     points = frame.points[frame.valid]
+    table = points[np.abs(points[:, 2]) < _MIN_HEIGHT]
     raised = points[(points[:, 2] > _MIN_HEIGHT) & (points[:, 2] < shape[2] * voxel_size)]
-    chosen = raised if len(raised) >= 200 else points[np.abs(points[:, 2]) < _MIN_HEIGHT]
+    if len(table):
+        low, high = np.percentile(table[:, :2], (1, 99), axis=0)
+        raised = raised[((raised[:, :2] > low + _BORDER) & (raised[:, :2] < high - _BORDER)).all(axis=1)]
+    chosen = raised if len(raised) >= 200 else table
     if len(chosen) == 0:
         raise InputError(
             "no workspace: no depth reading is on or above the table",

@@ -67,10 +67,6 @@ _INTERFACES: dict[str, type] = {
 }
 
 
-#: Bounds of the number of particles that a `Size` chooses: for objects, and for rows of arrays.
-_MOST_OBJECTS, _MOST_ROWS = 1_000, 100_000_000
-
-
 @dataclass(frozen=True)
 class ParticleFilter:
     """A particle filter made of components.
@@ -277,7 +273,7 @@ class _Step:
         with self.slot("resampler"):
             if not self.filter.trigger.wants(population, self.state.t):
                 return self.state.population, False
-            n = self.filter.n if self.filter.size is None else _chosen(self.filter.size, population)
+            n = self.filter.n if self.filter.size is None else self.filter.size.checked(population)
             selected = self._resample(population.labelled({}), n, "resampler")
             if priority is not None:
                 ancestors = selected.parents["ancestor"]
@@ -360,7 +356,7 @@ class _Step:
                 # With resample="before", the size was chosen before the prediction: only remove excess particles.
                 limit = max(n, 0 if past is None else len(past))
                 if after or len(fused) > limit:
-                    n = _chosen(size, fused)
+                    n = size.checked(fused)
                     limit = n if after else limit
             if len(fused) > limit or (after and self.filter.trigger.wants(fused, self.state.t)):
                 # A step that resamples before the prediction may resample a second time, so it needs another stream.
@@ -466,20 +462,6 @@ def _checked(found: Any, component: Component) -> Population:
     raise InputError(
         f"{name} returned {type(found).__name__}, expected a Population", "does every branch of the method return it?"
     )
-
-
-def _chosen(size: Size, population: Population) -> int:
-    """The number of particles that a size chooses; InputError if it is no integer from 1 to its bound."""
-    n, name = size.choose(population), type(size).__name__
-    check_integer(f"number of particles that {name} chose", n)
-    objects = not isinstance(population.particles, np.ndarray | Mapping)
-    bound = size.n_max or (_MOST_OBJECTS if objects else _MOST_ROWS)
-    if n > bound:
-        raise InputError(
-            f"{name} chose {n} particles from {len(population)}, more than {bound}",
-            f"bound the result of choose, or raise the largest number that is accepted: {name}.n_max",
-        )
-    return int(n)
 
 
 def _priority(lookahead: Lookahead, population: Population, observation: Any) -> np.ndarray:

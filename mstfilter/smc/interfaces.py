@@ -36,7 +36,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from mstfilter.errors import InputError
+from mstfilter.errors import InputError, check_integer
 from mstfilter.lazy import late
 from mstfilter.smc.population import Population
 from mstfilter.smc.streams import Key
@@ -202,6 +202,10 @@ class Trigger(ABC):
         """True to resample at step `t`."""
 
 
+#: Largest numbers of particles that a `Size` may choose by default: of objects, of rows of arrays.
+_MOST_OBJECTS, _MOST_ROWS = 1_000, 100_000_000
+
+
 class Size(ABC):
     """Chooses the number of particles of a resampling. The filter then only starts with `n` particles."""
 
@@ -212,6 +216,19 @@ class Size(ABC):
     @abstractmethod
     def choose(self, population: Population) -> int:
         """Number of particles (at least 1), from the weighted particles that are about to be resampled."""
+
+    def checked(self, population: Population) -> int:
+        """The number that `choose` returns; InputError if it is no integer from 1 to the largest accepted one."""
+        n, name = self.choose(population), type(self).__name__
+        check_integer(f"number of particles that {name} chose", n)
+        objects = not isinstance(population.particles, np.ndarray | Mapping)
+        bound = self.n_max or (_MOST_OBJECTS if objects else _MOST_ROWS)
+        if n > bound:
+            raise InputError(
+                f"{name} chose {n} particles from {len(population)}, more than {bound}",
+                f"bound the result of choose, or raise the largest number that is accepted: {name}.n_max",
+            )
+        return int(n)
 
 
 class Similarity(ABC):

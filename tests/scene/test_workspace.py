@@ -108,3 +108,16 @@ def test_a_workspace_with_objects_gives_no_warning(tmp_path):
                 rgb, depth, _ = table_scene(empty=empty)
                 writer.add_frame(rgb, depth, float(k), "static")
         open_recording(tmp_path / "r").check()
+
+
+def test_a_wall_behind_the_table_does_not_move_the_workspace():
+    rgb, depth, _ = table_scene()
+    directions = CAMERA.rays() @ CAMERA.pose.as_matrix()[:3, :3].T
+    with np.errstate(divide="ignore"):
+        wall = (0.5 - CAMERA.position[1]) / directions[..., 1]  # the plane y = 0.5, which is visible up to z = 0.2
+    behind = np.where((wall > 0) & (wall < depth), wall, depth)
+    assert (behind < depth).sum() > 2000
+    alone = Recording.from_arrays(rgb, depth, CAMERA.K, T_world_camera=CAMERA.pose)
+    np.testing.assert_array_equal(
+        Recording.from_arrays(rgb, behind, CAMERA.K, T_world_camera=CAMERA.pose).grid.origin, alone.grid.origin
+    )

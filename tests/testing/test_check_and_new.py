@@ -42,6 +42,7 @@ def test_the_printed_commands_run_as_printed(kind, target, tmp_path, monkeypatch
             assert code == 0, f"{arguments}\n{out}\n{err}"
             assert "exact draws" not in out or (kind, target) in (("transition", "scenes"), ("update", "scenes"))
             assert "all properties that apply hold" in out or arguments[0] != "check"
+            assert " of 0 " not in out, "hypotheses without objects"
 
 
 def test_a_starting_file_is_for_scenes_if_there_is_one(tmp_path, monkeypatch, capsys):

@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy import ndimage
 
 from mstfilter.fusion import Division
 from mstfilter.scene import Clip
@@ -16,15 +17,18 @@ from mstfilter.scene import Clip
 
 @dataclass(frozen=True)
 class MyDivision(Division):
-    """Pixels whose depth changed, and pixels whose depth did not. Fields need an annotation and a default.
+    """Pixels that moved, and pixels far from them that rested. Fields need an annotation and a default.
 
     Parameters
     ----------
     step : float
         Change of depth that shows a motion, in metres.
+    far : int
+        Distance to the moved pixels, in pixels, from which a pixel that did not change counts as resting.
     """
 
-    step: float = 0.01
+    step: float = 0.02
+    far: int = 15
 
     def divide(self, clip: Clip) -> np.ndarray | None:
         """(H, W) int32 numbers of the pixels of the last frame, -1 is unknown; None if the clip shows nothing.
@@ -35,4 +39,6 @@ class MyDivision(Division):
             return None
         known = clip.before.valid & clip.after.valid
         change = np.where(known, np.abs(clip.after.depth - clip.before.depth), np.nan)
-        return np.where(known, np.nan_to_num(change) > self.step, -1).astype(np.int32)
+        moved = np.nan_to_num(change) > self.step
+        near = ndimage.binary_dilation(moved, iterations=self.far)
+        return np.where(moved, 1, np.where(near | ~known, -1, 0)).astype(np.int32)
