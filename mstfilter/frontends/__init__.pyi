@@ -14,4 +14,8 @@ from mstfilter.frontends.mask_proposal import (
     write_automatic_masks as write_automatic_masks,
 )
 from mstfilter.frontends.mask_trackers import Sam2Tracker as Sam2Tracker, SiamMaskTracker as SiamMaskTracker
-from mstfilter.frontends.mask_trees import mask_tree as mask_tree, nested_masks as nested_masks
+from mstfilter.frontends.mask_trees import (
+    mask_tree as mask_tree,
+    nested_masks as nested_masks,
+    node_values as node_values,
+)

@@ -57,7 +57,7 @@ class MaskRegion:
     name: str
     weights: np.ndarray  #: (k,) probabilities, their sum is 1
     trees: tuple[Tree, ...]  #: the masks of each alternative; leaf 0 is the rest of the image
-    values: tuple[np.ndarray, ...]  #: node values of each tree, for a sampler at temperature 1
+    stops: tuple[np.ndarray, ...]  #: probabilities to stop at the nodes of each tree (see `mask_tree`)
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,21 +189,21 @@ def _region(
     shape: tuple[int, int],
     image: str,
 ) -> MaskRegion:
-    trees, values, means = [], [], []
+    trees, stops, means = [], [], []
     for path in files:
         try:
             masks, scores = _READERS[path.suffix](path, content[path], shape, image)
-            tree, w = (label_tree if masks.ndim == 2 else mask_tree)(masks, scores)
+            tree, stop = (label_tree if masks.ndim == 2 else mask_tree)(masks, scores)
         except InputError as error:
             prefix = "" if str(path) in error.message else f"{path}: "
             raise InputError(prefix + error.message, *error.hints) from error
         trees.append(tree)
-        values.append(w)
+        stops.append(stop)
         means.append(_mean_of_largest(masks, scores))
     given = np.array(means if weights is None else [weights[p.name] for p in files])
     total = given.sum()
     return MaskRegion(
-        name, given / total if total > 0 else np.full(len(files), 1 / len(files)), tuple(trees), tuple(values)
+        name, given / total if total > 0 else np.full(len(files), 1 / len(files)), tuple(trees), tuple(stops)
     )
 
 

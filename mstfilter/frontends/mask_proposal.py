@@ -26,7 +26,7 @@ import numpy as np
 from mstfilter.completion import Completer, Extrude
 from mstfilter.errors import InputError, check_number
 from mstfilter.frontends.mask_files import MaskRegion, PauseMasks, read_masks, write_masks
-from mstfilter.frontends.mask_trees import nested_masks
+from mstfilter.frontends.mask_trees import nested_masks, node_values
 from mstfilter.scene import Clip, Frame, component_key, content_key, memo
 from mstfilter.segmentation import (
     BoundaryModel,
@@ -36,7 +36,6 @@ from mstfilter.segmentation import (
     ObjectRule,
     Tree,
     complete_segments,
-    gibbs,
 )
 from mstfilter.smc import Population, Proposal, child
 
@@ -52,7 +51,8 @@ class MaskProposal(Proposal):
     sampler : CutSampler
         Draws the level of nested masks. At temperature 1 it has the law of `mstfilter.frontends.mask_trees`.
     objects : ObjectRule
-        Decides which masks are objects; other masks, such as those of the table, are background.
+        Decides which masks are objects. Other masks, such as that of the table, are background; if they contain
+        masks, their parts are always used.
     completer : Completer
     threshold : float
         Smallest probability of an occupied voxel.
@@ -82,12 +82,13 @@ class MaskProposal(Proposal):
                 tree = region.trees[k]
                 rows = np.flatnonzero(drawn == k)
                 stream = child(rng, "cuts", _number(region.name.encode()), k)
-                cuts = self.sampler.sample(stream, tree, region.values[k], len(rows)).cuts
                 found = memo(
                     "segments",
                     (frame.key, grid.key, tree.key, component_key(self.objects)),
                     partial(self.objects.segments, tree, frame, grid),
                 )
+                w = node_values(tree, _stops_at_objects(tree, region.stops[k], found.is_object))
+                cuts = self.sampler.sample(stream, tree, w, len(rows)).cuts
                 numbers: dict[int, int] = {}
                 for row, cut in zip(rows.tolist(), cuts, strict=True):
                     for node in cut[found.is_object[cut] & (cut > 0)].tolist():  # leaf 0 is the rest of the image
@@ -103,6 +104,12 @@ class MaskProposal(Proposal):
         )
         notes = {"masks": masks.key.hex(), "alternatives": alternatives, **counts}
         return Population(particles, notes=notes)
+
+
+def _stops_at_objects(tree: Tree, stop: np.ndarray, is_object: np.ndarray) -> np.ndarray:
+    """Probabilities (N,) to stop, 0 at masks that contain masks and are no object, such as that of the table."""
+    inner = np.arange(tree.n_nodes) >= tree.n_leaves
+    return np.where(inner & ~is_object, 0.0, stop)
 
 
 def _number(content: bytes) -> int:
@@ -124,12 +131,15 @@ class MaskBoundary(ClipBoundary):
         The folder of masks.
     weight : float
         Factor of the probability, 0 to 1.
+    objects : ObjectRule
+        Decides which masks are objects, as in `MaskProposal`.
     other : BoundaryModel, optional
         A second model; the result is the maximum of both.
     """
 
     folder: str = ""
     weight: float = 1.0
+    objects: ObjectRule = field(default_factory=ObjectRule)
     other: BoundaryModel | None = None
 
     def __post_init__(self) -> None:
@@ -155,19 +165,21 @@ class MaskBoundary(ClipBoundary):
         masks: PauseMasks | None = self.__dict__.get("_masks")
         if masks is None:
             raise InputError("MaskBoundary does not know the pause of a frame", "call MaskBoundary.at(clip) first")
-        edge = self.weight * border_probability(masks.regions, frame.depth.shape)
+        edge = self.weight * border_probability(masks.regions, frame, self.objects)
         if self.other is not None:
             edge = np.maximum(edge, self.other.boundary(frame))
         return edge.astype(np.float32)
 
 
-def border_probability(regions: Iterable[MaskRegion], shape: tuple[int, int]) -> np.ndarray:
+def border_probability(regions: Iterable[MaskRegion], frame: Frame, objects: ObjectRule) -> np.ndarray:
     """(H, W) probability of a border between a pixel and one of its four neighbours, the largest of the four."""
+    shape = frame.depth.shape
     joined = np.ones((shape[0], shape[1] - 1)), np.ones((shape[0] - 1, shape[1]))
     for region in regions:
         apart = np.zeros_like(joined[0]), np.zeros_like(joined[1])
-        for weight, tree, w in zip(region.weights, region.trees, region.values, strict=True):
-            below, position = _split_probability(tree, w), tree.leaf_position[tree.leaves]
+        for weight, tree, stop in zip(region.weights, region.trees, region.stops, strict=True):
+            stop = _stops_at_objects(tree, stop, objects.segments(tree, frame).is_object)
+            below, position = _split_probability(tree, stop), tree.leaf_position[tree.leaves]
             for p, a, b in ((apart[0], position[:, :-1], position[:, 1:]), (apart[1], position[:-1], position[1:])):
                 pairs = a != b
                 low, high = np.minimum(a[pairs], b[pairs]), np.maximum(a[pairs], b[pairs])
@@ -181,9 +193,8 @@ def border_probability(regions: Iterable[MaskRegion], shape: tuple[int, int]) ->
     return out
 
 
-def _split_probability(tree: Tree, w: np.ndarray) -> np.ndarray:
-    """(N,) probability that a cut consists of nodes below the node, for cuts of the Gibbs law at temperature 1."""
-    stop = gibbs(tree, w, 1.0).stop
+def _split_probability(tree: Tree, stop: np.ndarray) -> np.ndarray:
+    """(N,) probability that a walk goes below the node, if it stops with probabilities `stop` (N,)."""
     below = np.ones(tree.n_nodes)
     for node in range(tree.n_nodes - 1, -1, -1):
         above = 1.0 if node == tree.root else below[tree.parent[node]]

@@ -2,16 +2,16 @@
 
 >>> masks = np.zeros((3, 4, 6), bool)
 >>> masks[0, :, :4], masks[1, :, :2], masks[2, :, 2:4] = True, True, True     # an object, and its two parts
->>> tree, w = mask_tree(masks, scores=[0.9, 0.6, 0.6])
+>>> tree, stop = mask_tree(masks, scores=[0.9, 0.6, 0.6])
+>>> w = node_values(tree, stop)
 >>> ExactCuts(temperature=1).sample(rng, tree, w, 10)                        # the object in 60 % of the cuts
 
 Two masks of a set are disjoint, or one contains the other. Leaf 0 of the tree is the part of the image without masks.
 The rest of a mask that contains masks is a leaf too. The root joins everything and is in no cut.
 
 The law of the cuts: a walk starts at the largest masks. At a mask with score s, which contains masks with mean score
-m, it stops with probability s / (s + m); otherwise it visits these masks and the rest. `mask_tree` returns node
-values w for which this is the Gibbs law exp(sum of w over the cut), so every `CutSampler` at temperature 1 draws from
-it.
+m, it stops with probability s / (s + m); otherwise it visits these masks and the rest. `node_values` returns values
+w for which this is the Gibbs law exp(sum of w over the cut), so every `CutSampler` at temperature 1 draws from it.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ import numpy as np
 from mstfilter.errors import InputError, check_number
 from mstfilter.segmentation import Tree
 
-_ROOT = -1000.0  # log odds that the root is in a cut; exp(_ROOT) is 0
-_CLIP = 1e-9  # stop probabilities are at least this far from 0 and 1
+_NEVER = -1000.0  # log odds of probability 0; exp(_NEVER) is 0
+_CLIP = 1e-9  # other probabilities are at least this far from 0 and 1
 
 
 def mask_tree(masks: np.ndarray, scores: Sequence[float] | np.ndarray) -> tuple[Tree, np.ndarray]:
-    """The tree of masks (n, H, W) bool with scores (n,) >= 0, and its node values (N,).
+    """The tree of masks (n, H, W) bool with scores (n,) >= 0, and the probabilities (N,) to stop at its nodes.
 
     Raises InputError if a mask is empty, equals another, or overlaps one without containing it.
     """
@@ -78,7 +78,7 @@ def check_scores(scores: Sequence[float] | np.ndarray, n: int) -> np.ndarray:
 def _tree_of(
     innermost: np.ndarray, container: np.ndarray, ascending: list[int], scores: np.ndarray
 ) -> tuple[Tree, np.ndarray]:
-    """The tree of nested masks.
+    """The tree of nested masks, and the probabilities (N,) to stop at its nodes.
 
     `innermost` (H, W) is the smallest mask of each pixel, -1 without mask; `container` (n,) the smallest mask that
     contains a mask, -1 for none; `ascending` lists the masks in order of their area.
@@ -109,15 +109,20 @@ def _tree_of(
         if container[k] >= 0:
             start[above] = max(start[above], start[node[k]])
     start[root] = float(n > 0)
-    tree = Tree(parent, np.append(leaf, 0)[innermost], start)
+    stop[root] = float(n == 0)
+    return Tree(parent, np.append(leaf, 0)[innermost], start), stop
+
+
+def node_values(tree: Tree, stop: np.ndarray) -> np.ndarray:
+    """Values (N,) for which the Gibbs law at temperature 1 stops at the nodes with probabilities `stop` (N,)."""
     # exp(w) / (exp(w) + Z of the children) = stop, with log Z = 0 for leaves.
-    stop = np.clip(stop, _CLIP, 1 - _CLIP)
-    w, log_z = np.zeros(root + 1), np.zeros(root + 1)
-    for one in range(n_leaves, root + 1):
-        split = sum(log_z[c] for c in tree.children[one])
-        w[one] = split + (_ROOT if one == root else np.log(stop[one]) - np.log1p(-stop[one]))
-        log_z[one] = np.logaddexp(w[one], split)
-    return tree, w
+    w, log_z = np.zeros(tree.n_nodes), np.zeros(tree.n_nodes)
+    for node in range(tree.n_leaves, tree.n_nodes):
+        split = sum(log_z[child] for child in tree.children[node])
+        p = np.clip(stop[node], _CLIP, 1 - _CLIP)
+        w[node] = split + (_NEVER if stop[node] == 0 else np.log(p) - np.log1p(-p))
+        log_z[node] = np.logaddexp(w[node], split)
+    return w
 
 
 def nested_masks(

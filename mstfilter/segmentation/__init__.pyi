@@ -11,7 +11,6 @@ from mstfilter.segmentation.cuts import (
     MergeLogOdds as MergeLogOdds,
     OptimalCut as OptimalCut,
     SceneCutObjectness as SceneCutObjectness,
-    gibbs as gibbs,
     optimal_cut as optimal_cut,
 )
 from mstfilter.segmentation.learned_tree import Agglomeration as Agglomeration, LearnedTree as LearnedTree

@@ -21,6 +21,7 @@ from mstfilter.frontends import (
     border_probability,
     mask_tree,
     nested_masks,
+    node_values,
     read_masks,
     write_automatic_masks,
     write_masks,
@@ -102,7 +103,7 @@ def test_the_boundary_is_the_probability_of_a_border(tmp_path):
     """At the cuts through the three boxes, the probabilities of a split; 1 around the boxes."""
     law(tmp_path)
     masks = read_masks(tmp_path / "masks", 0, SHAPE)
-    p = border_probability(masks.regions, SHAPE)
+    p = border_probability(masks.regions, CLIP.after, ObjectRule())
     for box, axis, split in ((BOX[0], 1, 0.25), (BOX[1], 0, 0.4), (BOX[2], 1, 0.8 / 1.3)):
         one, other = halves(box, axis)
         shift = np.roll(other, -1, axis)
@@ -185,11 +186,24 @@ def test_masks_of_the_table_and_specks_are_no_objects(tmp_path):
     assert hypothesis.n_objects == 1
 
 
+def test_a_mask_of_the_table_hides_no_objects(tmp_path):
+    """A mask of everything, as mask generators return it, is never taken as a whole."""
+    whole = np.ones(SHAPE, bool)
+    left, right = halves(BOX[0], 1)
+    write_masks(tmp_path, 0, [(stack(whole, BOX[0], BOX[1], left, right), [1.0, 0.5, 0.5, 0.5, 0.5])])
+    population = MaskProposal(str(tmp_path)).sample(np.random.default_rng(0), CLIP, 60)
+    assert {h.n_objects for h in population.particles} == {2, 3}
+    p = border_probability(read_masks(tmp_path, 0, SHAPE).regions, CLIP.after, ObjectRule())
+    rim = BOX[1] & ~np.roll(BOX[1], 1, axis=1)
+    np.testing.assert_allclose(p[rim], 1, atol=1e-6)
+
+
 def test_no_masks_give_no_objects(tmp_path):
     write_masks(tmp_path, 0, [np.zeros(SHAPE, int)])
     (hypothesis,) = MaskProposal(str(tmp_path)).sample(np.random.default_rng(0), CLIP, 1).particles
     assert hypothesis.n_objects == 0
-    assert (border_probability(read_masks(tmp_path, 0, SHAPE).regions, SHAPE) == 0).all()
+    regions = read_masks(tmp_path, 0, SHAPE).regions
+    assert (border_probability(regions, CLIP.after, ObjectRule()) == 0).all()
 
 
 def test_three_levels_of_nested_masks():
@@ -199,8 +213,8 @@ def test_three_levels_of_nested_masks():
     left, right = halves(whole, 1)
     top, bottom = halves(left, 0)
     corner = top & (np.indices(top.shape)[1] == 1)
-    tree, w = mask_tree(stack(corner, whole, top, left, right, bottom), [1.0, 0.8, 0.5, 0.6, 0.2, 0.7])
-    sample = ExactCuts(temperature=1).sample(np.random.default_rng(0), tree, w, 6000)
+    tree, stop = mask_tree(stack(corner, whole, top, left, right, bottom), [1.0, 0.8, 0.5, 0.6, 0.2, 0.7])
+    sample = ExactCuts(temperature=1).sample(np.random.default_rng(0), tree, node_values(tree, stop), 6000)
     found = Counter(len(cut) - 1 for cut in sample.cuts)  # without leaf 0
     stop_whole, stop_left, stop_top = 0.8 / (0.8 + 0.4), 0.6 / (0.6 + 0.6), 0.5 / (0.5 + 1.0)
     expected = [
