@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import sys
 
-from mstfilter.cli import running, studying, components  # isort: skip (the order of the help page)
+from mstfilter.cli import running, studying, training, components  # isort: skip (the order of the help page)
 from mstfilter.cli.root import app, warnings_as_lines
 from mstfilter.errors import InputError, describe_error, place_in_user_file
 from mstfilter.registry import loaded_components
 
-__all__ = ["app", "components", "main", "running", "studying"]
+__all__ = ["app", "components", "main", "running", "studying", "training"]
 
 
 def main(arguments: list[str] | None = None) -> None:

@@ -9,4 +9,12 @@ from mstfilter.lazy import attach
 __getattr__, __dir__, __all__ = attach(__name__, __file__)
 
 __interfaces__ = {"completer": "Completer"}
-__components__ = {"completer": {"extrude": "Extrude", "surface": "SurfaceOnly"}}
+__components__ = {
+    "completer": {
+        "extrude": "Extrude",
+        "network": "NetworkCompleter",
+        "surface": "SurfaceOnly",
+        "hull": "Hull",
+        "hilbert_map": "HilbertMap",
+    }
+}

@@ -7,3 +7,5 @@ from mstfilter.completion.completer import (
     observed_box as observed_box,
 )
 from mstfilter.completion.extrude import Extrude as Extrude, SurfaceOnly as SurfaceOnly
+from mstfilter.completion.geometric import HilbertMap as HilbertMap, Hull as Hull
+from mstfilter.completion.network import NetworkCompleter as NetworkCompleter

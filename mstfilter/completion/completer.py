@@ -9,7 +9,7 @@ share the work.
 
 For a new method, subclass `Completer` and override `fill`: the argument is an `ObservedBox`, a small box of the grid,
 and the result is the probability of each voxel. `complete` clears voxels that are observed as free and keeps the
-visible surface.
+visible surface. A method that is faster for many boxes together overrides `fill_many`.
 
 `arbitrate` makes the label grid. If several completions claim a voxel:
 
@@ -40,8 +40,10 @@ from mstfilter.scene import (
     depth_sigma,
     frame_geometry,
     memo,
+    memo_many,
     read_only,
 )
+from mstfilter.smc import child
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,6 +76,9 @@ class ObservedBox:
     free: np.ndarray  #: (a, b, c) bool, observed as free
     #: (a, b, c) bool, the pixel of the centre is in the mask and the centre is behind the measured surface.
     behind: np.ndarray
+    hidden: np.ndarray  #: (a, b, c) bool, the same for a pixel outside the mask: hidden by something else.
+    #: (a, b, c) float32, voxels behind the measured surface along the optical axis; NaN if it is unknown.
+    signed: np.ndarray
     height: np.ndarray  #: (c,) height of the voxel centres above the table in metres
 
 
@@ -104,9 +109,26 @@ class Completer(ABC):
     #: Whether `fill` draws random numbers. The result is then not reused for the next hypothesis.
     stochastic: ClassVar[bool] = False
 
+    @property
+    def weights_key(self) -> str:
+        """Key of the contents of trained weights; empty if there are none."""
+        return ""
+
     @abstractmethod
     def fill(self, rng: np.random.Generator, seen: ObservedBox) -> np.ndarray:
         """Probability (a, b, c) of being occupied."""
+
+    def fill_many(self, rngs: Sequence[np.random.Generator], seen: Sequence[ObservedBox]) -> list[np.ndarray]:
+        """The probabilities of several boxes."""
+        return [self.fill(rng, one) for rng, one in zip(rngs, seen, strict=True)]
+
+    def box(self, voxels: np.ndarray, grid: VoxelGrid) -> tuple[np.ndarray, np.ndarray]:
+        """First voxel (3,) of the box of a mask with readings in `voxels` (k, 3), and the one after its last."""
+        # The surface may reach `depth` voxels behind the readings.
+        margin = max(self.padding, int(np.ceil(self.depth)))
+        low = np.maximum(voxels.min(axis=0) - margin, 0).astype(np.int64)
+        low[2] = 0
+        return low, np.minimum(voxels.max(axis=0) + 1 + margin, grid.shape).astype(np.int64)
 
     def complete(
         self, rng: np.random.Generator, frame: Frame, masks: Sequence[np.ndarray], grid: VoxelGrid
@@ -116,7 +138,7 @@ class Completer(ABC):
         Parameters
         ----------
         rng : Generator
-            Only stochastic completers draw from it.
+            Only stochastic completers draw from it; each mask has its own stream.
         masks : sequence of (H, W) bool
             Each one segment. Pixels without a reading, of the robot, or outside the grid are ignored.
 
@@ -124,24 +146,43 @@ class Completer(ABC):
         -------
         list of Completion
             One for each mask. Voxels observed as free have probability 0. A mask with a reading in the grid has at
-            least one voxel of probability 1, so every visible object exists.
+            least one voxel of probability 0.5 or more, so every visible object exists.
         """
-        return [self._one(rng, frame, np.asarray(mask, dtype=bool), grid) for mask in masks]
+        streams = [child(rng, "mask", k) if self.stochastic else rng for k in range(len(masks))]
+        return self.complete_each(streams, frame, masks, grid)
 
-    def _one(self, rng: np.random.Generator, frame: Frame, mask: np.ndarray, grid: VoxelGrid) -> Completion:
-        if mask.shape != frame.depth.shape:
-            raise InputError(f"mask has shape {mask.shape}, the frame is {frame.depth.shape}")
-        name = content_key("mask", np.packbits(mask), frame.key, grid.key, component_key(self))
+    def complete_each(
+        self, rngs: Sequence[np.random.Generator], frame: Frame, masks: Sequence[np.ndarray], grid: VoxelGrid
+    ) -> list[Completion]:
+        """`complete` with a given stream for each mask. The result of a mask does not depend on the other masks."""
+        masks = [np.asarray(mask, dtype=bool) for mask in masks]
+        for mask in masks:
+            if mask.shape != frame.depth.shape:
+                raise InputError(f"mask has shape {mask.shape}, the frame is {frame.depth.shape}")
+        version = (self.weights_key,) if self.weights_key else ()
+        component = component_key(self)
+        names = [content_key("mask", np.packbits(m), frame.key, grid.key, component, *version) for m in masks]
 
-        def compute() -> Completion:
-            offset, seen = observed_box(frame, mask, grid, self)
-            p = np.array(self.fill(rng, seen), dtype=np.float32)
-            p[seen.free] = 0
-            if p.size and not (p == 1).any():
-                p[seen.surface] = 1
-            return Completion(read_only(offset), read_only(p), read_only(seen.points), name.hex()[:16])
+        def compute(missing: Sequence[int]) -> list[Completion]:
+            boxes = [observed_box(frame, masks[k], grid, self) for k in missing]
+            filled = self.fill_many([rngs[k] for k in missing], [seen for _, seen in boxes])
+            return [
+                finish(offset, seen, p, names[k].hex()[:16])
+                for k, (offset, seen), p in zip(missing, boxes, filled, strict=True)
+            ]
 
-        return compute() if self.stochastic else memo("completion", name, compute, Completion)
+        if self.stochastic:
+            return compute(range(len(masks)))
+        return memo_many("completion", names, compute, Completion)
+
+
+def finish(offset: np.ndarray, seen: ObservedBox, filled: np.ndarray, key: str) -> Completion:
+    """A completion after the veto of free space; a visible object keeps its surface if nothing of it is left."""
+    p = np.array(filled, dtype=np.float32)
+    p[seen.free] = 0
+    if p.size and not (p >= 0.5).any():
+        p[seen.surface] = 1
+    return Completion(read_only(offset), read_only(p), read_only(seen.points), key)
 
 
 class ClipCompleter(Completer):
@@ -155,22 +196,19 @@ class ClipCompleter(Completer):
 def observed_box(frame: Frame, mask: np.ndarray, grid: VoxelGrid, rule: Completer) -> tuple[np.ndarray, ObservedBox]:
     """The box of a mask: its offset (3,) in the grid, and what the frame shows of it.
 
-    The box holds the readings of the mask, the space below them, and a margin. `rule` has the parameters of the
-    margin, the visible surface and the free space.
+    `rule` says how large the box is, and what counts as visible surface and as free space.
     """
     pixels, voxels = _frame_points(frame, grid)
     mine = voxels[mask.ravel()[pixels]]
     if len(mine) == 0:
         empty = np.zeros((0, 0, 0))
         no = empty.astype(bool)
-        return np.zeros(3, np.int64), ObservedBox(empty.astype(np.int32), no, no, no, no, np.zeros(0))
-    # The surface may reach `depth` voxels behind the readings.
-    margin = max(rule.padding, int(np.ceil(rule.depth)))
-    low = np.maximum(mine.min(axis=0) - margin, 0).astype(np.int64)
-    low[2] = 0
-    high = np.minimum(mine.max(axis=0) + 1 + margin, grid.shape)
+        unknown = empty.astype(np.float32)
+        return np.zeros(3, np.int64), ObservedBox(empty.astype(np.int32), no, no, no, no, no, unknown, np.zeros(0))
+    low, high = rule.box(mine, grid)
     box = tuple(slice(int(a), int(b)) for a, b in zip(low, high, strict=True))
     shape = tuple(int(n) for n in high - low)
+    mine = mine[((mine >= low) & (mine < high)).all(axis=1)]
     flat = np.ravel_multi_index(tuple((mine - low).T), shape)
     points = np.bincount(flat, minlength=int(np.prod(shape))).reshape(shape).astype(np.int32)
 
@@ -179,14 +217,16 @@ def observed_box(frame: Frame, mask: np.ndarray, grid: VoxelGrid, rule: Complete
     inside = (pixel >= 0) & mask.ravel()[np.maximum(pixel, 0)]
     with np.errstate(invalid="ignore"):
         surface = (signed >= -rule.in_front * grid.voxel_size) & (signed < rule.depth * grid.voxel_size)
-        behind = inside & (signed > 0)
+        behind = signed > 0
     in_mask = surface & inside
     free = _free(frame, grid, rule.free_margin, rule.free_sigmas)[box]
     if not in_mask.any():
         in_mask[np.unravel_index(points.argmax(), shape)] = True
         free = free & ~in_mask
     height = grid.origin[2] + (np.arange(shape[2]) + 0.5) * grid.voxel_size
-    return low, ObservedBox(points, in_mask, surface & ~inside & ~in_mask, free, behind, height)
+    other = surface & ~inside & ~in_mask
+    distance = signed / np.float32(grid.voxel_size)
+    return low, ObservedBox(points, in_mask, other, free, behind & inside, behind & ~inside, distance, height)
 
 
 def _frame_points(frame: Frame, grid: VoxelGrid) -> tuple[np.ndarray, np.ndarray]:

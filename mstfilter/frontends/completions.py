@@ -110,13 +110,15 @@ class ExternalCompletion(ClipCompleter):
     def fill(self, rng: np.random.Generator, seen: ObservedBox) -> np.ndarray:
         raise NotImplementedError("shapes are placed by `complete`, which knows the mask")
 
-    def complete(
-        self, rng: np.random.Generator, frame: Frame, masks: Sequence[np.ndarray], grid: VoxelGrid
+    def complete_each(
+        self, rngs: Sequence[np.random.Generator], frame: Frame, masks: Sequence[np.ndarray], grid: VoxelGrid
     ) -> list[Completion]:
         """Place the shapes of several masks; raises InputError before `at`, or if a mask has no shapes."""
         if "_shapes" not in self.__dict__:
             raise InputError("ExternalCompletion does not know the pause of a frame", "call at(clip) first")
-        return [self._place(rng, frame, np.asarray(mask, dtype=bool), grid) for mask in masks]
+        return [
+            self._place(rng, frame, np.asarray(mask, dtype=bool), grid) for rng, mask in zip(rngs, masks, strict=True)
+        ]
 
     def _place(self, rng: np.random.Generator, frame: Frame, mask: np.ndarray, grid: VoxelGrid) -> Completion:
         shapes: tuple[ObjectShapes, ...] = self.__dict__["_shapes"]
@@ -130,7 +132,7 @@ class ExternalCompletion(ClipCompleter):
                     f"the best IoU is {max(ious, default=0):.2f}, at least {self.min_iou:g} is needed",
                     "name a completer for other masks, for example proposal.completer.other=extrude",
                 )
-            return self.other.complete(rng, frame, [mask], grid)[0]
+            return self.other.complete_each([rng], frame, [mask], grid)[0]
         chosen = shapes[best]
         if self.draws == "mean":
             volumes = [self._volume(path, frame.camera, grid) for path in chosen.files]

@@ -1,5 +1,10 @@
 from mstfilter.scene.arrays import component_key as component_key, content_key as content_key, read_only as read_only
-from mstfilter.scene.cache import Cache as Cache, memo as memo, scene_cache as scene_cache
+from mstfilter.scene.cache import (
+    Cache as Cache,
+    memo as memo,
+    memo_many as memo_many,
+    scene_cache as scene_cache,
+)
 from mstfilter.scene.camera import Camera as Camera, look_at as look_at, rigid_from_matrix as rigid_from_matrix
 from mstfilter.scene.disk_cache import DiskCache as DiskCache
 from mstfilter.scene.frame import (

@@ -19,7 +19,7 @@ from __future__ import annotations
 import contextlib
 import threading
 from collections import Counter, OrderedDict
-from collections.abc import Callable, Hashable, Iterator
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -58,22 +58,42 @@ class Cache:
         fields are arrays, strings or None, or a tuple of these. Only for values that take much longer to compute than
         to read.
         """
-        entry = (name, key)
-        with self._lock:
-            if entry in self._entries:
-                self._entries.move_to_end(entry)
-                self.hits[name] += 1
-                return self._entries[entry][0]
+        return self.get_many(name, [key], lambda _: [compute()], stored_as)[0]
+
+    def get_many(
+        self,
+        name: str,
+        keys: Sequence[Hashable],
+        compute: Callable[[Sequence[int]], Sequence[_Value]],
+        stored_as: Any = None,
+    ) -> list[_Value]:
+        """The values of several keys; ``compute(indices)`` gives those that are missing, together."""
+        found: dict[Hashable, _Value] = {}
+        missing: dict[Hashable, int] = {}
         disk = self._disk if stored_as is not None else None
-        value = None if disk is None else disk.find(name, key, stored_as)
-        if value is not None:
+        for k, key in enumerate(keys):
+            if key in found or key in missing:
+                continue
+            with self._lock:
+                if (name, key) in self._entries:
+                    self._entries.move_to_end((name, key))
+                    self.hits[name] += 1
+                    found[key] = self._entries[name, key][0]
+                    continue
+            value = None if disk is None else disk.find(name, key, stored_as)
+            if value is None:
+                missing[key] = k
+                continue
             self.hits[name] += 1
-        else:
-            value = compute()
-            if disk is not None:
-                disk.store(name, key, value)
-        self._keep(entry, value)
-        return value
+            self._keep((name, key), value)
+            found[key] = value
+        if missing:
+            for key, value in zip(missing, compute(tuple(missing.values())), strict=True):
+                if disk is not None:
+                    disk.store(name, key, value)
+                self._keep((name, key), value)
+                found[key] = value
+        return [found[key] for key in keys]
 
     def _keep(self, entry: tuple[str, Hashable], value: Any) -> None:
         size = _size_of(value)
@@ -116,6 +136,13 @@ scene_cache = Cache()  #: The cache of this process
 def memo(name: str, key: Hashable, compute: Callable[[], _Value], stored_as: Any = None) -> _Value:
     """The value of ``compute()``, computed if it is not in `scene_cache`. Parameters: `Cache.get`."""
     return scene_cache.get(name, key, compute, stored_as)
+
+
+def memo_many(
+    name: str, keys: Sequence[Hashable], compute: Callable[[Sequence[int]], Sequence[_Value]], stored_as: Any = None
+) -> list[_Value]:
+    """The values of several keys; ``compute(indices)`` gives those that are missing. See `Cache.get_many`."""
+    return scene_cache.get_many(name, keys, compute, stored_as)
 
 
 def _size_of(value: Any) -> int:

@@ -204,29 +204,27 @@ def complete_segments(
     stochastic completer completes it again for each further sample, with the stream ``"completion", segment, k``.
     """
     completer = completer.at(clip) if isinstance(completer, ClipCompleter) else completer
-    completed: dict[tuple[int, ...], Completion] = {}
-    built: dict[tuple[tuple[int, ...], ...], Hypothesis] = {}
-    particles = []
     times: Counter[int] = Counter()
+    keys: list[tuple[tuple[int, ...], ...]] = []
     for segments in samples:
-        draws = []
-        for segment in segments.tolist():
-            draw = (segment, times[segment]) if times[segment] else (segment,)
-            times[segment] += completer.stochastic
-            if draw not in completed:
-                stream = child(rng, "completion", *draw)
-                completed[draw] = completer.complete(stream, clip.after, [mask_of(segment)], clip.grid)[0]
-            draws.append(draw)
-        key = tuple(draws)
-        if key not in built:
-            built[key] = hypothesis_of([completed[draw] for draw in draws], clip.grid, clip.index, threshold)
-        particles.append(built[key])
+        keys.append(tuple((s, times[s]) if times[s] else (s,) for s in segments.tolist()))
+        times.update(segments.tolist() if completer.stochastic else ())
+    draws = list(dict.fromkeys(draw for key in keys for draw in key))
+    masks = {segment: mask_of(segment) for segment in dict.fromkeys(draw[0] for draw in draws)}
+    streams = [child(rng, "completion", *draw) for draw in draws]
+    found = completer.complete_each(streams, clip.after, [masks[draw[0]] for draw in draws], clip.grid)
+    completed = dict(zip(draws, found, strict=True))
+    built = {
+        key: hypothesis_of([completed[draw] for draw in key], clip.grid, clip.index, threshold)
+        for key in dict.fromkeys(keys)
+    }
+    particles = tuple(built[key] for key in keys)
     counts = {
         "objects": [h.n_objects for h in particles],
-        "distinct_segments": len({draw[0] for draw in completed}),
+        "distinct_segments": len(masks),
         "distinct_hypotheses": len(built),
     }
-    return tuple(particles), counts
+    return particles, counts
 
 
 def hypothesis_of(

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
-from mstfilter.completion import Completer, Completion, Extrude, ObservedBox, SurfaceOnly, arbitrate
+from mstfilter.completion import Completer, Completion, Extrude, HilbertMap, Hull, ObservedBox, SurfaceOnly, arbitrate
 from mstfilter.errors import InputError
 from mstfilter.scene import Frame, VoxelGrid, frame_geometry, render, scene_cache
 from tests.segmentation.scenes import GRID, TWO, boxes, frame_of
@@ -27,7 +27,7 @@ class Greedy(Completer):
         return np.ones(seen.points.shape)
 
 
-COMPLETERS = [Extrude(), SurfaceOnly(), Greedy()]
+COMPLETERS = [Extrude(), SurfaceOnly(), Greedy(), Hull(), HilbertMap()]
 STACK = boxes(((22, 22, 0), (38, 38, 6)), ((26, 26, 6), (34, 34, 14)))
 
 
@@ -105,7 +105,8 @@ def test_the_answer_depends_on_frame_and_mask_alone():
 def test_extrusion_turns_with_its_evidence(turns):
     rng = np.random.default_rng(5)
     points = rng.integers(0, 3, (7, 6, 5)).astype(np.int32) * (rng.random((7, 6, 5)) < 0.2)
-    fields = [points, points > 1, (rng.random(points.shape) < 0.1) & (points < 2), points < -1, points < -1]
+    nothing = points < -1
+    fields = [points, points > 1, (rng.random(points.shape) < 0.1) & (points < 2), *[nothing] * 3, points * 0.0]
     height = np.arange(5) * 0.01 + 0.005
     for completer in (Extrude(), SurfaceOnly()):
         straight = completer.fill(rng, ObservedBox(*fields, height))

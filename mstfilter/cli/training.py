@@ -1,0 +1,39 @@
+"""The command train."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from mstfilter.cli.root import app
+
+
+@app.command()
+def train(
+    part: Annotated[str, typer.Argument(help="What to train: completion.")],
+    overrides: Annotated[
+        list[str] | None, typer.Argument(metavar="[NAME=VALUE]...", help="Changes to the settings: steps=10000")
+    ] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder of the model. Default: trained/PART.")] = None,
+    recipe: Annotated[str, typer.Option(help="Settings to start from: cpu, gpu or smoke.")] = "cpu",
+    workers: Annotated[int, typer.Option(min=1, help="Processes that make samples.")] = 1,
+    device: Annotated[str, typer.Option(help="Device of torch. Default: a GPU if there is one.")] = "",
+) -> None:
+    """Train a learned part on simulated scenes; the same command resumes a training that was stopped."""
+    from mstfilter.errors import check_choice
+
+    check_choice("part", part, ("completion",))
+    from mstfilter.training import completion_settings, train_completion
+
+    settings = completion_settings(recipe, overrides or ())
+    folder = out or Path("trained") / part
+
+    def report(done: int, total: int, text: str) -> None:
+        print(f"{done:7d} of {total}  {text}", flush=True)
+
+    figures = train_completion(settings, folder, workers, report, device or None)
+    print(f"model       {folder}; use it with proposal.completer=network proposal.completer.weights={folder}")
+    for name, value in (figures or {}).items():
+        print(f"{name:28s} {value:.4f}")

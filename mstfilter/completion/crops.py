@@ -1,0 +1,93 @@
+"""What the completion network sees of an object: a crop of the voxel lattice around its visible part.
+
+>>> low, high = crop_box(voxels, grid)                     # the limits of the crop
+>>> bits, signed = encode_box(seen)                        # packed, for storage
+>>> x = channels(bits, signed, height)                     # the input of the network
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from mstfilter.completion.completer import ObservedBox
+from mstfilter.scene import VoxelGrid
+
+LATTICE = 0.01  # metres, edge of a voxel of the network's lattice
+EDGE = 32  # voxels, edge of a crop
+LARGER = (48, 64)  # crops for larger objects: the network is convolutional
+_REACH = 4.0  # voxels, distance from the surface at which `signed` saturates
+
+#: Channels of the input. The first five and the last are 0 or 1; "distance" is the signed distance behind the
+#: measured surface, in units of `_REACH`, 0 where it is unknown; "height" is above the table, in units of 0.25 m;
+#: "extruded" is what `Extrude` gives, from which the network starts.
+CHANNELS = (
+    "own surface",
+    "other surface",
+    "free",
+    "hidden by itself",
+    "hidden by another",
+    "distance",
+    "height",
+    "extruded",
+)
+
+
+def crop_box(voxels: np.ndarray, grid: VoxelGrid) -> tuple[np.ndarray, np.ndarray]:
+    """Limits of the crop of an object with readings in `voxels` (k, 3): first voxel (3,), and the one after its last.
+
+    The crop is centred on the 2 - 98 % range of the readings, and stands on the lowest voxels of the grid. It is cut
+    off where the grid ends.
+    """
+    low, high = np.percentile(voxels, (2, 98), axis=0)
+    extent = max(*(high - low + 1)[:2] + 4, float(high[2]) + 3) * grid.voxel_size / LATTICE
+    edge = next((n for n in (EDGE, *LARGER) if extent <= n), LARGER[-1])
+    edge = int(np.ceil(edge * LATTICE / grid.voxel_size - 1e-6))
+    start = np.floor((low + high + 1) / 2).astype(np.int64) - edge // 2
+    start[2] = 0
+    return np.maximum(start, 0), np.minimum(start + edge, grid.shape)
+
+
+def encode_box(seen: ObservedBox) -> tuple[np.ndarray, np.ndarray]:
+    """What a box shows as bits (a, b, c) uint8, and its signed distances (a, b, c) int8 in `_REACH` / 127."""
+    bits = np.zeros(seen.surface.shape, np.uint8)
+    for k, one in enumerate((seen.surface, seen.other_surface, seen.free, seen.behind, seen.hidden)):
+        bits |= one.astype(np.uint8) << k
+    signed = np.clip(np.nan_to_num(seen.signed, nan=0.0) / _REACH, -1, 1)
+    return bits, np.rint(signed * 127).astype(np.int8)
+
+
+def decode_signed(signed: np.ndarray) -> np.ndarray:
+    """Signed distances in voxels, of `encode_box`."""
+    return np.asarray(signed, np.float32) * np.float32(_REACH / 127)
+
+
+def channels(bits: Any, signed: Any, height: Any) -> Any:
+    """Input (b, 8, X, Y, Z) float32 of the network, as a torch tensor.
+
+    Parameters
+    ----------
+    bits, signed : (b, X, Y, Z) tensors of uint8 and int8
+        Of `encode_box`, padded with zeros.
+    height : (Z,) float tensor
+        Heights of the layers above the table in metres.
+    """
+    import torch
+
+    x = torch.empty((len(bits), len(CHANNELS), *bits.shape[1:]), dtype=torch.float32)
+    for k in range(5):
+        x[:, k] = (bits >> k) & 1
+    x[:, 5] = signed.float() / 127
+    x[:, 6] = height / 0.25
+    x[:, 7] = extruded(bits)
+    return x
+
+
+def extruded(bits: Any) -> Any:
+    """What `Extrude` gives for packed crops (b, X, Y, Z), a torch tensor or an array; bool, free space cleared."""
+    own, other, free = (((bits >> k) & 1) > 0 for k in range(3))
+    filled = own.copy() if isinstance(own, np.ndarray) else own.clone()
+    for k in range(own.shape[3] - 2, -1, -1):
+        filled[..., k] |= filled[..., k + 1] & ~other[..., k]
+    return filled & ~free

@@ -1,0 +1,108 @@
+"""Completion by a trained network (`mstfilter.completion.unet`).
+
+>>> NetworkCompleter().complete(rng, frame, masks, grid)                     # the most probable extent
+>>> NetworkCompleter(draw=True).complete(rng, frame, masks, grid)            # a different extent for every hypothesis
+
+The network works on a lattice of 1 cm. If the voxels of the workspace have another size, the object is completed on
+that lattice and the result is interpolated.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from mstfilter.completion.completer import Completer, Completion, ObservedBox, finish, observed_box
+from mstfilter.completion.crops import EDGE, LARGER, LATTICE, crop_box
+from mstfilter.scene import Frame, VoxelGrid
+
+if TYPE_CHECKING:
+    from mstfilter.completion.unet import TrainedNetwork
+
+_BATCH = 8
+
+
+@dataclass(frozen=True)
+class NetworkCompleter(Completer):
+    """Completion by a trained network.
+
+    Parameters
+    ----------
+    weights : str
+        Name of trained weights of the package (folder ``completion``), or the path of a ``.safetensors`` file.
+    draw : bool
+        Draw the hidden extent for each hypothesis from the network's law, instead of taking its mode.
+    spread : float
+        Factor of the standard deviation of that law.
+    """
+
+    weights: str = "completion"
+    draw: bool = False
+    spread: float = 1.0
+
+    @property
+    def stochastic(self) -> bool:  # type: ignore[override]
+        return self.draw
+
+    @property
+    def network(self) -> TrainedNetwork:
+        """The network with its weights. Raises InputError if they are missing or damaged."""
+        from mstfilter.completion.unet import load_network
+
+        return load_network(self.weights)
+
+    @property
+    def weights_key(self) -> str:
+        return self.network.key
+
+    def box(self, voxels: np.ndarray, grid: VoxelGrid) -> tuple[np.ndarray, np.ndarray]:
+        return crop_box(voxels, grid)
+
+    def complete_each(
+        self, rngs: Sequence[np.random.Generator], frame: Frame, masks: Sequence[np.ndarray], grid: VoxelGrid
+    ) -> list[Completion]:
+        if abs(grid.voxel_size - LATTICE) < 1e-6:
+            return super().complete_each(rngs, frame, masks, grid)
+        upper = np.asarray(grid.origin) + np.array(grid.shape) * grid.voxel_size
+        lattice = VoxelGrid.from_bounds(np.asarray(grid.origin), upper, LATTICE)
+        return [
+            self._on_grid(one, frame, np.asarray(mask, dtype=bool), grid, lattice)
+            for one, mask in zip(super().complete_each(rngs, frame, masks, lattice), masks, strict=True)
+        ]
+
+    def _on_grid(
+        self, one: Completion, frame: Frame, mask: np.ndarray, grid: VoxelGrid, lattice: VoxelGrid
+    ) -> Completion:
+        """A completion of the lattice, interpolated at the voxels of the grid."""
+        from scipy.ndimage import map_coordinates
+
+        offset, seen = observed_box(frame, mask, grid, self)
+        p = np.zeros(seen.surface.shape, np.float32)
+        if p.size and one.probability.size:
+            index = np.indices(p.shape).reshape(3, -1).T + offset
+            at = (grid.centre_of(index) - np.asarray(lattice.origin)) / LATTICE - 0.5 - one.offset
+            p = map_coordinates(one.probability, at.T, order=1, mode="nearest").reshape(p.shape)
+        return finish(offset, seen, p, one.key)
+
+    def fill(self, rng: np.random.Generator, seen: ObservedBox) -> np.ndarray:
+        return self.fill_many([rng], [seen])[0]
+
+    def fill_many(self, rngs: Sequence[np.random.Generator], seen: Sequence[ObservedBox]) -> list[np.ndarray]:
+        results: list[np.ndarray] = [np.zeros(one.surface.shape, np.float32) for one in seen]
+        noise = [rng.standard_normal(self.network.latent) * self.spread if self.draw else None for rng in rngs]
+        by_edge: dict[int, list[int]] = {}
+        for k, one in enumerate(seen):
+            if one.surface.size:
+                edge = next(n for n in (EDGE, *LARGER) if max(one.surface.shape) <= n)
+                by_edge.setdefault(edge, []).append(k)
+        for edge, members in by_edge.items():
+            for start in range(0, len(members), _BATCH):
+                chosen = members[start : start + _BATCH]
+                p = self.network.probabilities([seen[k] for k in chosen], [noise[k] for k in chosen], edge)
+                for k, one in zip(chosen, p, strict=True):
+                    a, b, c = seen[k].surface.shape
+                    results[k] = one[:a, :b, :c]
+        return results

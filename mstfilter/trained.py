@@ -1,0 +1,118 @@
+"""Trained networks on disk: a folder with weights (safetensors), their description (TOML) and a card.
+
+>>> model = open_model("completion")              # of the package; or the path of a folder
+>>> model.description["network"], model.tensors["head.bias"].shape
+>>> write_model(folder, {"architecture": "completion-unet", "network": {...}}, tensors)
+
+`model.toml` names the architecture and holds a SHA-256 hash of `weights.safetensors`; a folder whose files do not
+belong together is not opened. Weights are stored in half precision. Nothing is unpickled.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mstfilter.errors import InputError
+from mstfilter.files import atomic_path, write_text
+from mstfilter.resources import models_folder
+
+WEIGHTS, DESCRIPTION = "weights.safetensors", "model.toml"
+_TRAIN = "train it with: mstfilter train {kind} --out FOLDER"
+
+
+@dataclass(frozen=True, eq=False)
+class TrainedModel:
+    """A network's weights and their description."""
+
+    folder: Path
+    description: Mapping[str, Any]  #: contents of ``model.toml``
+    tensors: Mapping[str, np.ndarray]  #: name -> float32
+    key: str  #: hash of description and weights
+
+    def check_tensors(self, expected: Mapping[str, tuple[int, ...]]) -> None:
+        """Raise InputError unless the tensors have the names and shapes of the architecture."""
+        found = {name: tuple(t.shape) for name, t in self.tensors.items()}
+        wrong = sorted(set(found) ^ set(expected)) or sorted(n for n in found if found[n] != tuple(expected[n]))
+        if wrong:
+            name = wrong[0]
+            raise InputError(
+                f"{self.folder / WEIGHTS}: tensor {name!r} is {found.get(name, 'missing')}, "
+                f"the architecture has {expected.get(name, 'none')}",
+                f"{DESCRIPTION} and {WEIGHTS} must come from the same training",
+            )
+
+
+def open_model(name: str, architecture: str | None = None) -> TrainedModel:
+    """The model of the package with this name, or the one in this folder.
+
+    Raises InputError if it is missing, damaged, or of another architecture.
+    """
+    given = Path(name)
+    folder = given if given.is_dir() else models_folder() / name
+    hint = _TRAIN.format(kind="completion or border")
+    for file in (DESCRIPTION, WEIGHTS):
+        if not (folder / file).is_file():
+            where = f"in the folder {given}" if given.is_dir() else f"in the package, and no folder {name!r}"
+            raise InputError(f"trained model {name!r}: there is no {file} {where}", hint)
+    text = (folder / DESCRIPTION).read_bytes()
+    try:
+        description = tomllib.loads(text.decode())
+    except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise InputError(f"{folder / DESCRIPTION} is not a TOML file: {error}", hint) from None
+    if architecture is not None and description.get("architecture") != architecture:
+        raise InputError(
+            f"{folder / DESCRIPTION}: architecture is {description.get('architecture')!r}, expected {architecture!r}",
+            "name a model that was trained for this component",
+        )
+    data = (folder / WEIGHTS).read_bytes()
+    found = hashlib.sha256(data).hexdigest()
+    if found != description.get("sha256"):
+        raise InputError(
+            f"{folder / WEIGHTS}: SHA-256 is {found[:16]}..., not as in {DESCRIPTION}",
+            "the file is damaged or belongs to another description; copy both files again",
+        )
+    from safetensors import SafetensorError
+    from safetensors.numpy import load
+
+    try:
+        tensors = {key: value.astype(np.float32) for key, value in load(data).items()}
+    except (SafetensorError, ValueError, KeyError, TypeError) as error:
+        raise InputError(f"{folder / WEIGHTS} is not a safetensors file: {error}", hint) from None
+    return TrainedModel(folder, description, tensors, hashlib.sha256(text + data).hexdigest()[:16])
+
+
+def write_model(folder: str | Path, description: Mapping[str, Any], tensors: Mapping[str, np.ndarray]) -> None:
+    """Write weights in half precision, and their description with the hash."""
+    from safetensors.numpy import save
+
+    data = save({name: np.ascontiguousarray(value, dtype=np.float16) for name, value in tensors.items()})
+    target = Path(folder)
+    with atomic_path(target / WEIGHTS) as partial:
+        partial.write_bytes(data)
+    write_text(target / DESCRIPTION, _toml({**description, "sha256": hashlib.sha256(data).hexdigest()}))
+
+
+def _toml(values: Mapping[str, Any]) -> str:
+    """Plain values first, then one table for each mapping."""
+    lines = [f"{key} = {_value(value)}" for key, value in values.items() if not isinstance(value, Mapping)]
+    for key, table in values.items():
+        if isinstance(table, Mapping):
+            lines += ["", f"[{key}]", *(f"{name} = {_value(value)}" for name, value in table.items())]
+    return "\n".join(lines) + "\n"
+
+
+def _value(value: Any) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, str):
+        return '"' + value.replace("\\", "\\\\").replace('"', '\\"') + '"'
+    if isinstance(value, (list, tuple)):
+        return "[" + ", ".join(_value(one) for one in value) + "]"
+    return repr(float(value)) if isinstance(value, (float, np.floating)) else str(int(value))

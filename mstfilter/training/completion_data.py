@@ -1,0 +1,379 @@
+"""Samples for the completion network: what a camera sees of an object, and the space that the object fills.
+
+>>> samples = scene_samples(seed=0, index=3)               # of one scene, always the same
+>>> write_samples(folder, seed=0, n_scenes=1000, workers=2)     # resumable; the same files for any number of workers
+
+A scene has 2 to 12 objects of the kinds in `mstfilter.training.shapes`, side by side, stacked, leaning and hidden, at
+rest under physics. It is seen by two cameras with the noise of the simulated sensor and a small error of the camera's
+pose. The masks are those that a filter meets: the true masks with displaced borders, and the segments of sampled cuts
+of the segmentation tree, which also hold parts of objects, and several objects. Some samples have the evidence of a
+second frame, after other objects were taken away.
+
+The true shape of a mask: each object with visible pixels in the mask contributes the voxels whose nearest visible
+point lies in the mask. So a whole object gets all its voxels, the masks of two halves share them, and a mask of two
+objects gets both.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from mstfilter.completion import Extrude, ObservedBox, observed_box
+from mstfilter.completion.crops import EDGE, LATTICE, crop_box, decode_signed, encode_box
+from mstfilter.errors import InputError
+from mstfilter.files import atomic_path
+from mstfilter.scene import Camera, Frame, VoxelGrid, look_at, scene_cache
+from mstfilter.segmentation import MetropolisHastingsCuts, TreeCutProposal
+from mstfilter.simulation.arrangement import arrange_objects
+from mstfilter.simulation.families import SceneFamily
+from mstfilter.simulation.sensor import DepthSensor
+from mstfilter.simulation.shapes import label_voxels
+from mstfilter.simulation.world import PhysicsWorld
+from mstfilter.training.shapes import TRAINED, draw_kind, draw_training_shape
+
+WIDTH, HEIGHT = 320, 240
+_GRID = VoxelGrid(np.array([-0.45, -0.45, 0.0]), LATTICE, (90, 90, 40))
+_N_VIEWS, _N_MASKS = 3, 14  # cameras of a scene, masks of a view
+_SECOND_FRAME = 0.25  # share of views with a second frame
+_PARENTS = 0.25  # share of the segments of a cut that are replaced by their parents
+_LEAST_PIXELS = 20
+_LEAST_SHARE = 0.1  # of the pixels of a mask, or of an object's visible pixels, below which an object counts as noise
+MASK_KINDS = ("whole", "part", "several")
+
+
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """Samples of one or of many scenes."""
+
+    bits: np.ndarray  #: (n, 32, 32, 32) uint8, what is seen (`encode_box`)
+    signed: np.ndarray  #: (n, 32, 32, 32) int8
+    truth: np.ndarray  #: (n, 32, 32, 32) bool
+    kind: np.ndarray  #: (n,) str, kind of the shape with most pixels in the mask
+    mask: np.ndarray  #: (n,) uint8, index in `MASK_KINDS`
+    scene: np.ndarray  #: (n,) int32, number of the scene
+    visible: np.ndarray  #: (n,) float32, visible share of the object's silhouette (0 hidden, 1 nothing in front)
+
+    def __len__(self) -> int:
+        return len(self.bits)
+
+    def take(self, index: np.ndarray) -> Samples:
+        """Some samples."""
+        return Samples(*(getattr(self, name)[index] for name in self.__dataclass_fields__))
+
+    def box(self, k: int) -> ObservedBox:
+        """What sample k shows, as a completer sees it."""
+        own, other, free, behind, hidden = (((self.bits[k] >> i) & 1).astype(bool) for i in range(5))
+        height = (np.arange(EDGE) + 0.5) * LATTICE
+        return ObservedBox(
+            own.astype(np.int32), own, other, free, behind, hidden, decode_signed(self.signed[k]), height
+        )
+
+    @classmethod
+    def join(cls, parts: Sequence[Samples]) -> Samples:
+        """All samples of several parts."""
+        return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in cls.__dataclass_fields__))
+
+
+def scene_samples(seed: int, index: int, kinds: tuple[str, ...] = TRAINED) -> Samples:
+    """The samples of scene number `index`."""
+    for attempt in range(20):
+        rng = np.random.default_rng([seed, index, attempt])
+        world = _draw_scene(rng, kinds)
+        if world is not None:
+            parts = [part for _ in range(_N_VIEWS) if (part := _view_samples(rng, world, index)) is not None]
+            if parts:
+                return Samples.join(parts)
+    raise InputError(f"no scene could be made of the kinds {', '.join(kinds)}")
+
+
+def _draw_scene(rng: np.random.Generator, kinds: tuple[str, ...]) -> PhysicsWorld | None:
+    """A scene at rest; None if the objects do not fit."""
+    n = int(rng.integers(2, 13))
+    shapes = [draw_training_shape(rng, draw_kind(rng, kinds)) for _ in range(n)]
+    world = PhysicsWorld(shapes, arm=False)
+    n_dropped = int(rng.integers(0, n // 2 + 1)) if rng.uniform() < 0.6 else 0
+    family = SceneFamily(
+        name="training",
+        n_objects_min=n,
+        n_objects_max=n,
+        n_twins=0,
+        contact=float(rng.uniform(0.3, 1.0)),
+        n_actions=0,
+    )
+    order = rng.permutation(n)
+    try:
+        # Dropped objects start far away; the others are arranged first.
+        first = PhysicsWorld([shapes[k] for k in order[n_dropped:]], arm=False)
+        arrange_objects(rng, first, replace(family, n_objects_min=n - n_dropped), (-1,) * (n - n_dropped))
+    except InputError:
+        return None
+    for k, position, rotation in zip(order[n_dropped:].tolist(), first.positions(), first.rotations(), strict=True):
+        world.place(k, position, rotation)
+    world.forward()
+    for k in order[:n_dropped].tolist():
+        near = world.positions()[order[n_dropped:]]
+        at = near[int(rng.integers(len(near))), :2] + rng.normal(0.0, 0.03, 2)
+        world.place(k, (*at, 0.12 + shapes[k].radius + rng.uniform(0.0, 0.1)), Rotation.random(rng=rng).as_matrix())
+        world.forward()
+        if not world.overlaps(k):
+            world.settle()
+        else:
+            world.place(k, (10.0 + 2.0 * k, 0.0, 1.0), np.eye(3))
+    world.forward()
+    return world
+
+
+def _view_samples(rng: np.random.Generator, world: PhysicsWorld, index: int) -> Samples | None:
+    """The samples of one camera; None if there are none."""
+    poses = world.poses()
+    inside = (np.abs(poses[:, :2, 3]) < 0.4).all(axis=1) & (poses[:, 2, 3] > 0)
+    if not inside.any():
+        return None
+    target = np.append(poses[inside, :2, 3].mean(axis=0), 0.05) + rng.normal(0.0, 0.03, 3)
+    azimuth, elevation, distance = rng.uniform(0, 2 * np.pi), np.deg2rad(rng.uniform(22, 68)), rng.uniform(0.55, 1.05)
+    flat = np.cos(elevation)
+    away = np.array([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)])
+    camera = Camera.from_intrinsics(525.0, 525.0, 319.5, 239.5, 640, 480, look_at(target + distance * away, target))
+    camera = camera.scaled(WIDTH / 640)
+    frame, instance = _frame(rng, world, camera)
+    truth = label_voxels(world.shapes, poses, _GRID)
+    second = None
+    if rng.uniform() < _SECOND_FRAME and inside.sum() > 1:
+        gone = np.flatnonzero(inside)[rng.random(int(inside.sum())) < 0.5]
+        state = world.save()
+        for k in gone.tolist():
+            world.place(k, (10.0 + 2.0 * k, 0.0, 1.0), np.eye(3))
+        world.forward()
+        second = (*_frame(rng, world, camera), set((gone + 1).tolist()))
+        world.restore(state)
+    alone = _silhouettes(world, camera, instance)
+    rows = []
+    for mask in _masks(rng, frame, instance):
+        found = _sample(frame, instance, mask, truth, second)
+        if found is not None:
+            which, bits, signed, shape, k = found
+            rows.append((bits, signed, shape, world.shapes[k - 1].family, which, alone[k]))
+    if not rows:
+        return None
+    columns = [np.array(column) for column in zip(*rows, strict=True)]
+    bits, signed, shapes, kinds, masks, visible = columns
+    scene = np.full(len(bits), index, np.int32)
+    return Samples(bits, signed, shapes, kinds, masks.astype(np.uint8), scene, visible.astype(np.float32))
+
+
+def _cast(world: PhysicsWorld, camera: Camera, groups: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    turn = camera.pose.as_matrix()[:3, :3]
+    return world.cast(np.array(camera.position), camera.rays().reshape(-1, 3) @ turn.T, groups)
+
+
+def _frame(rng: np.random.Generator, world: PhysicsWorld, camera: Camera) -> tuple[Frame, np.ndarray]:
+    """An image with noise, with a small error of the camera's pose, and the true instances (H, W)."""
+    turn = camera.pose.as_matrix()[:3, :3]
+    rays = camera.rays().reshape(-1, 3) @ turn.T
+    geom, z, normal = _cast(world, camera, (0, 1))
+    instance = np.where(geom >= 0, world.geom_object[np.maximum(geom, 0)], 0)
+    slant = np.abs((rays * normal).sum(axis=1)) / np.linalg.norm(rays, axis=1)
+    depth = np.where(geom >= 0, z, np.nan).astype(np.float32).reshape(HEIGHT, WIDTH)
+    sensor = replace(DepthSensor(), edge_dropout=float(rng.uniform(0.05, 0.2)))
+    reading = sensor.read(rng, depth, slant.reshape(HEIGHT, WIDTH).astype(np.float32))
+    # One colour an object, with shading: the tree sees edges of colour and of depth.
+    albedo = rng.uniform(0.1, 0.9, (256, 3))
+    light = 0.45 + 0.5 * np.clip(normal @ np.array([0.3, -0.4, 0.87]), 0, 1)
+    rgb = albedo[instance] * light[:, None] + rng.normal(0.0, 0.02, (len(instance), 3))
+    image = np.clip(255 * rgb, 0, 255).astype(np.uint8).reshape(HEIGHT, WIDTH, 3)
+    shift, tilt = rng.normal(0.0, 0.0015, 3), Rotation.from_rotvec(rng.normal(0.0, 0.003, 3))
+    pose = RigidTransform.from_components(shift, tilt) * camera.pose
+    return Frame(image, reading, camera.at(pose)), instance.reshape(HEIGHT, WIDTH)
+
+
+def _silhouettes(world: PhysicsWorld, camera: Camera, instance: np.ndarray) -> dict[int, float]:
+    """Object -> visible share of its silhouette."""
+    seen = np.bincount(instance.ravel(), minlength=world.n_objects + 1)
+    state, shares = world.save(), {}
+    positions, rotations = world.positions(), world.rotations()
+    for k in np.flatnonzero(seen[1:] >= _LEAST_PIXELS).tolist():
+        for other in range(world.n_objects):
+            if other != k:
+                world.place(other, (10.0 + 2.0 * other, 0.0, 1.0), np.eye(3))
+        world.place(k, positions[k], rotations[k])
+        world.forward()
+        geom, _, _ = _cast(world, camera, (1,))
+        shares[k + 1] = float(seen[k + 1] / max((geom >= 0).sum(), 1))
+        world.restore(state)
+    return shares
+
+
+def _masks(rng: np.random.Generator, frame: Frame, instance: np.ndarray) -> list[np.ndarray]:
+    """True masks with displaced borders, and segments of sampled cuts."""
+    import cv2
+
+    true = []
+    for k in np.unique(instance[instance > 0]):
+        mask = (instance == k).astype(np.uint8)
+        change = int(rng.integers(-1, 2))
+        if change:
+            mask = (cv2.dilate if change > 0 else cv2.erode)(mask, np.ones((3, 3), np.uint8))
+        true.append(mask > 0)
+    proposal = TreeCutProposal()
+    tree, w = proposal.tree_of(frame)
+    segments = proposal.objects.segments(tree, frame, _GRID)
+    sampler = MetropolisHastingsCuts(temperature=float(rng.choice([1.0, 4.0])), burn_in=300, thinning=100)
+    cuts = sampler.sample(rng, tree, w, 3).cuts
+    nodes = np.unique(np.concatenate([cut[segments.is_object[cut]] for cut in cuts]))
+    # Some parents, so that there are enough masks of several objects.
+    parents = tree.parent[nodes]
+    up = (rng.random(len(nodes)) < _PARENTS) & segments.is_object[parents] & (parents != tree.root)
+    nodes = np.unique(np.where(up, parents, nodes))
+    drawn = [tree.mask(int(node)) & segments.object_pixels for node in rng.permutation(nodes)]
+    scene_cache.clear()
+    n_true = min(len(true), _N_MASKS // 3)
+    chosen = [true[k] for k in rng.permutation(len(true))[:n_true]]
+    return chosen + drawn[: _N_MASKS - n_true]
+
+
+def _sample(
+    frame: Frame,
+    instance: np.ndarray,
+    mask: np.ndarray,
+    truth: np.ndarray,
+    second: tuple[Frame, np.ndarray, set[int]] | None,
+) -> tuple[int, np.ndarray, np.ndarray, np.ndarray, int] | None:
+    """Kind of mask, bits, distances, true shape and main object of one mask; None if it shows no object."""
+    counts = np.bincount(instance[mask & frame.valid], minlength=256)
+    whole = np.bincount(instance[frame.valid], minlength=256)
+    counts[0] = 0
+    found = [k for k in np.flatnonzero(counts) if counts[k] >= _LEAST_SHARE * max(counts.sum(), whole[k])]
+    main = int(counts.argmax())
+    if counts[main] < _LEAST_PIXELS or main not in found:
+        return None
+    rule = _Crop()
+    offset, seen = observed_box(frame, mask, _GRID, rule)
+    if not seen.surface.size:
+        return None
+    if second is not None and not second[2].intersection(found):
+        later, ids, _ = second
+        again = np.isin(ids, found)
+        merged = _again(offset, seen, later, again)
+        seen = seen if merged is None else merged
+    box = tuple(slice(int(o), int(o) + n) for o, n in zip(offset, seen.surface.shape, strict=True))
+    shape = np.zeros(seen.surface.shape, bool)
+    for k in found:
+        shape |= _claimed(frame, instance == k, mask, truth[box] == k, offset)
+    index = 2 if len(found) > 1 else int(counts[main] < 0.8 * whole[main])
+    bits, signed = (_padded(one) for one in encode_box(seen))
+    return index, bits, signed, _padded(shape), main
+
+
+class _Crop(Extrude):
+    """The crop of the network, with the rules of a completer."""
+
+    def box(self, voxels: np.ndarray, grid: VoxelGrid) -> tuple[np.ndarray, np.ndarray]:
+        low, high = crop_box(voxels, grid)
+        if (high - low).max() > EDGE:  # a larger object is cut off in training
+            middle = (low + high) // 2
+            low = np.maximum(np.append(middle[:2] - EDGE // 2, 0), 0)
+            high = np.minimum(low + EDGE, grid.shape)
+        return low, high
+
+
+def _padded(values: np.ndarray) -> np.ndarray:
+    full = np.zeros((EDGE,) * 3, values.dtype)
+    a, b, c = values.shape
+    full[:a, :b, :c] = values
+    return full
+
+
+def _again(offset: np.ndarray, seen: ObservedBox, later: Frame, mask: np.ndarray) -> ObservedBox | None:
+    """The evidence of both frames in the box of the first; None if the second one shows nothing of the mask."""
+    limits = offset, offset + seen.surface.shape
+
+    class _Same(Extrude):
+        def box(self, voxels: np.ndarray, grid: VoxelGrid) -> tuple[np.ndarray, np.ndarray]:
+            return limits
+
+    pixels = later.valid & mask
+    voxels = _GRID.index_of(later.points[pixels])
+    if not len(voxels) or not ((voxels >= limits[0]) & (voxels < limits[1])).all(axis=1).all():
+        return None
+    return combine(seen, observed_box(later, mask, _GRID, _Same())[1])
+
+
+def combine(a: ObservedBox, b: ObservedBox) -> ObservedBox:
+    """The evidence of two frames about the same box: free in one is free; hidden is what both leave hidden."""
+    free = a.free | b.free
+    surface = (a.surface | b.surface) & ~free
+    other = (a.other_surface | b.other_surface) & ~free & ~surface
+    behind = (a.behind | b.behind) & ~free
+    hidden = (a.hidden | b.hidden) & ~free & ~behind
+    signed = np.fmin(a.signed, b.signed)
+    return ObservedBox(a.points + b.points, surface, other, free, behind, hidden, signed, a.height)
+
+
+def _claimed(
+    frame: Frame, visible: np.ndarray, mask: np.ndarray, truth: np.ndarray, offset: np.ndarray
+) -> np.ndarray:
+    """The voxels of an object, (a, b, c) bool in the box at `offset`, whose nearest visible point is in the mask."""
+    pixels = np.flatnonzero(visible & frame.valid)
+    inside = mask.ravel()[pixels]
+    if inside.mean() > 0.95:
+        return truth
+    points = frame.points.reshape(-1, 3)[pixels]
+    voxels = np.argwhere(truth)
+    _, nearest = cKDTree(points).query(_GRID.centre_of(voxels + offset))
+    claimed = np.zeros_like(truth)
+    claimed[tuple(voxels[inside[nearest]].T)] = True
+    return claimed
+
+
+def _shard(job: tuple[Path, int, int, int, tuple[str, ...]]) -> None:
+    path, seed, start, stop, kinds = job
+    if path.exists():
+        return
+    samples = Samples.join([scene_samples(seed, index, kinds) for index in range(start, stop)])
+    with atomic_path(path) as partial, partial.open("wb") as file:
+        np.savez_compressed(
+            file,
+            **{name: getattr(samples, name) for name in Samples.__dataclass_fields__ if name != "truth"},
+            truth=np.packbits(samples.truth, axis=-1),
+        )
+
+
+def write_samples(
+    folder: str | Path,
+    seed: int,
+    n_scenes: int,
+    workers: int = 1,
+    kinds: tuple[str, ...] = TRAINED,
+    per_file: int = 10,
+) -> list[Path]:
+    """Write the samples of scenes 0 .. n - 1 to files of a folder; existing files are kept."""
+    target = Path(folder)
+    jobs = [
+        (target / f"scenes-{start:06d}.npz", seed, start, min(start + per_file, n_scenes), kinds)
+        for start in range(0, n_scenes, per_file)
+    ]
+    if workers > 1:
+        with ProcessPoolExecutor(workers) as pool:
+            list(pool.map(_shard, jobs))
+    else:
+        for job in jobs:
+            _shard(job)
+    return [job[0] for job in jobs]
+
+
+def read_samples(paths: Sequence[Path]) -> Samples:
+    """The samples of files."""
+    parts = []
+    for path in paths:
+        with np.load(path, allow_pickle=False) as file:
+            values = {name: file[name] for name in Samples.__dataclass_fields__}
+        values["truth"] = np.unpackbits(values["truth"], axis=-1).astype(bool)
+        parts.append(Samples(**values))
+    return Samples.join(parts)

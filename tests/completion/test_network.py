@@ -1,0 +1,165 @@
+"""The completion network as a completer, with random weights: what must hold for any weights."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from mstfilter.completion import Extrude, NetworkCompleter, arbitrate, observed_box
+from mstfilter.completion.crops import CHANNELS, channels, crop_box, encode_box, extruded
+from mstfilter.completion.unet import ARCHITECTURE, CompletionNet, Normal
+from mstfilter.errors import InputError
+from mstfilter.scene import Frame, VoxelGrid, frame_geometry, scene_cache
+from mstfilter.trained import write_model
+from tests.completion.test_completion import masks_of, placed
+from tests.segmentation.scenes import GRID, TWO, boxes, frame_of
+
+STACK = boxes(((22, 22, 0), (38, 38, 6)), ((26, 26, 6), (34, 34, 14)))
+
+
+def describe(**network) -> dict:
+    values = {"channels": list(CHANNELS), "width": 8, "latent": 4, **network}
+    return {"architecture": ARCHITECTURE, "network": values, "calibration": {"scale": 0.9, "shift": 0.1}}
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory):
+    """A network with random weights that uses its latent variable."""
+    torch.manual_seed(0)
+    net = CompletionNet(len(CHANNELS), 8, 4)
+    torch.nn.init.normal_(net.head.weight, std=0.5)
+    folder = tmp_path_factory.mktemp("model")
+    write_model(folder, describe(), {name: t.numpy() for name, t in net.state_dict().items()})
+    return str(folder)
+
+
+@pytest.fixture(scope="module")
+def completer(weights):
+    return NetworkCompleter(weights=weights)
+
+
+@pytest.fixture(scope="module")
+def frame():
+    return frame_of(STACK, width=320, noise=0.3)
+
+
+def test_crops_equal_the_rules_of_extrusion(frame):
+    """What the network starts from is what `Extrude` gives, but for the floor."""
+    for mask in masks_of(STACK, frame):
+        _, seen = observed_box(frame, mask, GRID, Extrude())
+        expected = (Extrude().fill(np.random.default_rng(0), seen) > 0.5) & ~seen.free
+        bits, signed = encode_box(seen)
+        assert np.array_equal(extruded(bits[None])[0], expected)
+        x = channels(torch.from_numpy(bits[None]), torch.from_numpy(signed[None]), torch.zeros(bits.shape[2]))
+        assert np.array_equal(x[0, 0].numpy() > 0, seen.surface) and np.array_equal(x[0, 2].numpy() > 0, seen.free)
+        assert np.array_equal(x[0, 7].numpy() > 0, expected)
+        known = np.isfinite(seen.signed)
+        assert np.abs(4 * x[0, 5].numpy() - np.clip(seen.signed, -4, 4))[known].max() < 0.02
+
+
+def test_crops_stand_on_the_table_and_stay_in_the_grid():
+    grid = VoxelGrid(np.zeros(3), 0.01, (100, 100, 50))
+    for low, high, edge in (
+        ((40, 50, 0), (50, 60, 9), 32),
+        ((20, 20, 0), (60, 60, 9), 48),
+        ((2, 50, 3), (9, 60, 9), 32),
+    ):
+        voxels = np.argwhere(np.ones(np.subtract(high, low))) + low
+        first, last = crop_box(voxels, grid)
+        assert first[2] == 0 and (first >= 0).all() and (last <= grid.shape).all()
+        assert (last - first).max() == edge
+        assert (voxels >= first).all() and (voxels < last).all()
+
+
+def test_free_space_and_order(completer, frame):
+    """No voxel that the frame saw as free; the result of a mask does not depend on the others or on the cache."""
+    rng = np.random.default_rng(0)
+    masks = masks_of(STACK, frame)
+    free = frame_geometry(frame, GRID).known_free(0.01)
+    scene_cache.clear()
+    together = completer.complete(rng, frame, masks * 5, GRID)
+    for k, mask in enumerate(masks):
+        scene_cache.clear()
+        alone = completer.complete(rng, frame, [mask], GRID)[0]
+        assert np.array_equal(alone.probability, together[k].probability)
+        assert not ((placed(alone) > 0) & free).any()
+        assert (placed(alone) >= 0.5).any()
+
+
+def test_draws(weights, frame):
+    """Each mask of a list has its own draw; the mode is one of the possible extents, and costs no randomness."""
+    masks = masks_of(STACK, frame)[:1]
+    drawing = NetworkCompleter(weights=weights, draw=True)
+    first = drawing.complete(np.random.default_rng(1), frame, masks * 2, GRID)
+    again = drawing.complete(np.random.default_rng(1), frame, masks, GRID)
+    assert not np.array_equal(first[0].probability, first[1].probability)
+    assert np.array_equal(first[0].probability, again[0].probability)
+    still = replace(drawing, spread=0.0).complete(np.random.default_rng(1), frame, masks, GRID)[0]
+    mode = NetworkCompleter(weights=weights).complete(np.random.default_rng(2), frame, masks, GRID)[0]
+    assert np.array_equal(still.probability, mode.probability)
+    assert drawing.stochastic and not NetworkCompleter(weights=weights).stochastic
+
+
+def test_divergence_of_normal_laws():
+    """Against the average log ratio of densities over draws (100,000 draws, error below 0.03)."""
+    torch.manual_seed(1)
+    a, b = (Normal(torch.randn(1, 3), 0.4 * torch.randn(1, 3)) for _ in range(2))
+    x = a.draw(torch.randn(100_000, 3))
+
+    def log_density(law):
+        return (-0.5 * ((x - law.mean) * (-law.log_std).exp()) ** 2 - law.log_std).sum(dim=1)
+
+    assert float(a.divergence(b)) == pytest.approx(float((log_density(a) - log_density(b)).mean()), abs=0.03)
+    assert float(a.divergence(a)) == 0
+
+
+@pytest.mark.parametrize("size", [0.02, 0.008])
+def test_other_voxel_sizes(completer, size):
+    """The network works on its own lattice; the volume hardly depends on the voxels of the workspace."""
+    frame = frame_of(TWO, width=320)
+    upper = np.asarray(GRID.origin) + np.array(GRID.shape) * GRID.voxel_size
+    other = VoxelGrid.from_bounds(np.asarray(GRID.origin), upper, size)
+    rng = np.random.default_rng(0)
+    for mask in masks_of(TWO, frame):
+        fine, coarse = (completer.complete(rng, frame, [mask], grid)[0] for grid in (GRID, other))
+        volumes = [(one.probability >= 0.5).sum() * g.voxel_size**3 for one, g in ((fine, GRID), (coarse, other))]
+        assert volumes[1] == pytest.approx(volumes[0], rel=0.35)
+
+
+def test_empty_masks_and_large_objects(completer):
+    frame = frame_of(TWO)
+    nothing = np.zeros(frame.depth.shape, bool)
+    one = completer.complete(np.random.default_rng(0), frame, [nothing], GRID)[0]
+    assert one.probability.size == 0
+    wide = frame_of(boxes(((8, 10, 0), (52, 50, 4))), width=320)
+    mask = masks_of(boxes(((8, 10, 0), (52, 50, 4))), wide)
+    assert arbitrate(completer.complete(np.random.default_rng(0), wide, mask, GRID), GRID).any()
+
+
+def test_wrong_models(tmp_path, frame):
+    net = CompletionNet(len(CHANNELS), 8, 4)
+    tensors = {name: t.numpy() for name, t in net.state_dict().items()}
+    mask = [np.ones(frame.depth.shape, bool)]
+
+    def complete(name: str) -> None:
+        NetworkCompleter(weights=str(tmp_path / name)).complete(np.random.default_rng(0), frame, mask, GRID)
+
+    write_model(tmp_path / "narrow", describe(width=16), tensors)
+    with pytest.raises(InputError, match="the architecture has"):
+        complete("narrow")
+    write_model(tmp_path / "channels", describe(channels=["a"]), tensors)
+    with pytest.raises(InputError, match="channels"):
+        complete("channels")
+    write_model(tmp_path / "bare", {"architecture": ARCHITECTURE}, tensors)
+    with pytest.raises(InputError, match=r"model\.toml"):
+        complete("bare")
+
+
+def test_robot_pixels_are_unknown(completer, frame):
+    """A mask under the robot has no evidence, and a frame with a robot differs from one without."""
+    hidden = Frame(frame.rgb, frame.depth, frame.camera, np.ones(frame.depth.shape, bool))
+    mask = masks_of(STACK, frame)[0]
+    assert completer.complete(np.random.default_rng(0), hidden, [mask], GRID)[0].probability.size == 0

@@ -1,0 +1,67 @@
+"""Folders of trained networks: what is written is read back, and damaged files give one clear error."""
+
+from __future__ import annotations
+
+import hashlib
+
+import numpy as np
+import pytest
+
+from mstfilter.errors import InputError
+from mstfilter.trained import DESCRIPTION, WEIGHTS, open_model, write_model
+
+TENSORS = {"a.weight": np.arange(6, dtype=np.float32).reshape(2, 3) / 4, "b": np.float32([0.5])}
+
+
+@pytest.fixture
+def folder(tmp_path):
+    write_model(tmp_path / "model", {"architecture": "test", "network": {"width": 8, "names": ["x", 'y"']}}, TENSORS)
+    return tmp_path / "model"
+
+
+def test_what_is_written_is_read_back(folder):
+    model = open_model(str(folder), "test")
+    assert model.description["network"] == {"width": 8, "names": ["x", 'y"']}
+    assert {k: v.tolist() for k, v in model.tensors.items()} == {k: v.tolist() for k, v in TENSORS.items()}
+    model.check_tensors({"a.weight": (2, 3), "b": (1,)})
+    assert open_model(str(folder)).key == model.key
+
+
+def test_the_key_follows_the_contents(folder, tmp_path):
+    write_model(tmp_path / "other", {"architecture": "test"}, {**TENSORS, "b": np.float32([0.25])})
+    assert open_model(str(folder)).key != open_model(str(tmp_path / "other")).key
+
+
+def test_a_model_that_is_not_there(tmp_path):
+    for name in ("no_such_model", str(tmp_path)):
+        with pytest.raises(InputError, match=r"there is no model\.toml"):
+            open_model(name)
+
+
+@pytest.mark.parametrize("damage", ["truncated", "changed", "pickle"])
+def test_damaged_weights(folder, damage):
+    path = folder / WEIGHTS
+    data = path.read_bytes()
+    broken = {"truncated": data[:-5], "changed": data[:-1] + b"\x01", "pickle": b"\x80\x04cos\nsystem\n."}[damage]
+    path.write_bytes(broken)
+    with pytest.raises(InputError, match="SHA-256"):
+        open_model(str(folder))
+    # With a matching hash the contents are still checked, and nothing is unpickled.
+    text = (folder / DESCRIPTION).read_text()
+    before = hashlib.sha256(data).hexdigest()
+    (folder / DESCRIPTION).write_text(text.replace(before, hashlib.sha256(broken).hexdigest()))
+    if damage != "changed":
+        with pytest.raises(InputError, match="not a safetensors file"):
+            open_model(str(folder))
+
+
+def test_wrong_descriptions(folder):
+    with pytest.raises(InputError, match="architecture is 'test', expected 'other'"):
+        open_model(str(folder), "other")
+    with pytest.raises(InputError, match=r"tensor 'b' is \(1,\), the architecture has \(2,\)"):
+        open_model(str(folder)).check_tensors({"a.weight": (2, 3), "b": (2,)})
+    with pytest.raises(InputError, match="tensor 'c' is missing"):
+        open_model(str(folder)).check_tensors({"a.weight": (2, 3), "b": (1,), "c": (1,)})
+    (folder / DESCRIPTION).write_text("architecture = [")
+    with pytest.raises(InputError, match="not a TOML file"):
+        open_model(str(folder))
