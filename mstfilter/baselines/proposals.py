@@ -19,7 +19,7 @@ import numpy as np
 from mstfilter.completion import Completer, Extrude
 from mstfilter.scene import Clip, Frame, Hypothesis
 from mstfilter.scoring import connected_components, one_blob
-from mstfilter.segmentation import ObjectRule, TreeCutProposal, hypothesis_of
+from mstfilter.segmentation import ObjectRule, TreeCutProposal, complete_segments, hypothesis_of
 from mstfilter.smc import Population, Proposal, child
 
 
@@ -95,11 +95,11 @@ class ImageComponents(Proposal):
     def sample(self, rng: np.random.Generator, observation: Clip, n: int) -> Population:
         frame, grid = observation.after, observation.grid
         labels = self.label_image(frame, self.objects.object_pixels(frame, grid))
-        completed = [
-            self.completer.complete(child(rng, "completion", k), frame, [labels == k], grid)[0]
-            for k in range(1, int(labels.max(initial=0)) + 1)
-        ]
-        return Population((hypothesis_of(completed, grid, observation.index, self.threshold),) * n)
+        segments = np.arange(1, int(labels.max(initial=0)) + 1)
+        particles, _ = complete_segments(
+            rng, observation, [segments] * n, lambda k: labels == k, self.completer, self.threshold
+        )
+        return Population(particles)
 
     def label_image(self, frame: Frame, own: np.ndarray) -> np.ndarray:
         """Components (H, W) int32, numbered from 1, of the pixels `own` (H, W) bool; 0 elsewhere."""

@@ -23,12 +23,13 @@ from mstfilter.completion import Completer, Completion, Extrude, ObservedBox, ob
 from mstfilter.errors import InputError, check_choice, check_number
 from mstfilter.oracles.degradation import degrade
 from mstfilter.oracles.truth import Need, UsesTruth
-from mstfilter.scene import Clip, Frame, Hypothesis, VoxelGrid, content_key, memo, read_only
+from mstfilter.scene import Clip, Frame, VoxelGrid, content_key, memo, read_only
 from mstfilter.scoring import MIN_PIXELS, weighted_coverage
-from mstfilter.segmentation import BoundaryModel, ColourDepthBoundary, ObjectRule, hypothesis_of
+from mstfilter.segmentation import BoundaryModel, ColourDepthBoundary, ObjectRule, complete_segments
 from mstfilter.smc import Key, Population, Proposal, child
 
 _REACH = 4.0  # distance to a true border up to which strength is kept, in pixels of an image of 640 px width
+_SEGMENTS = 65536  # segments of a sample have numbers from i * _SEGMENTS on
 
 
 @dataclass(frozen=True)
@@ -79,23 +80,26 @@ class TrueMasks(UsesTruth, Proposal):
 
     def sample(self, rng: np.random.Generator, observation: Clip, n: int) -> Population:
         """`n` hypotheses about the scene at the end of the clip; equal ones where their masks are."""
-        frame, grid = observation.after, observation.grid
-        true = self.masks(frame, observation)
+        true = self.masks(observation.after, observation)
         same_masks = self.quality == 1 or self.errors == "lasting"
-        particles: list[Hypothesis] = []
-        qualities: list[float] = []
+        images: list[np.ndarray] = []
+        samples: list[np.ndarray] = []
         for i in range(1 if same_masks else n):
-            masks = degrade(self._errors(rng, i), true, self.quality, self.over, self.under)
-            qualities.append(round(weighted_coverage(masks, true), 4))
-            numbers = [int(k) for k in np.unique(masks) if k > 0]
-            completed = [
-                self.completer.complete(child(rng, "completion", i, k), frame, [masks == k], grid)[0] for k in numbers
-            ]
-            particles.append(hypothesis_of(completed, grid, observation.index, self.threshold))
+            images.append(degrade(self._errors(rng, i), true, self.quality, self.over, self.under))
+            numbers = np.unique(images[-1])
+            samples.append(i * _SEGMENTS + numbers[numbers > 0].astype(np.int64))
+        qualities = [round(weighted_coverage(image, true), 4) for image in images]
         if same_masks:
-            particles, qualities = particles * n, qualities * n
-        notes = {"mask_quality": qualities, "objects": [h.n_objects for h in particles]}
-        return Population(tuple(particles), notes=notes)
+            samples, qualities = samples * n, qualities * n
+        particles, counts = complete_segments(
+            rng,
+            observation,
+            samples,
+            lambda segment: images[segment // _SEGMENTS] == segment % _SEGMENTS,
+            self.completer,
+            self.threshold,
+        )
+        return Population(particles, notes={"mask_quality": qualities, "objects": counts["objects"]})
 
     def _errors(self, rng: np.random.Generator, i: int) -> np.random.Generator:
         """The stream that the errors of sample `i` are drawn from."""
@@ -160,8 +164,8 @@ class TrueCompletion(UsesTruth, Completer):
         """1 on the visible surface, for masks that show no true object."""
         return seen.surface.astype(np.float32)
 
-    def complete(
-        self, rng: np.random.Generator, frame: Frame, masks: Sequence[np.ndarray], grid: VoxelGrid
+    def complete_each(
+        self, rngs: Sequence[np.random.Generator], frame: Frame, masks: Sequence[np.ndarray], grid: VoxelGrid
     ) -> list[Completion]:
         """Complete several masks of a frame at a pause."""
         t = self.truth.pause_of(frame)
@@ -170,7 +174,10 @@ class TrueCompletion(UsesTruth, Completer):
             (frame.key, grid.key, self.bound_key),
             lambda: self._pixels(frame, grid, t),
         )
-        return [self._true(rng, frame, np.asarray(mask, bool), grid, voxels, pixel) for mask in masks]
+        return [
+            self._true(rng, frame, np.asarray(mask, bool), grid, voxels, pixel)
+            for rng, mask in zip(rngs, masks, strict=True)
+        ]
 
     def _true(
         self,
@@ -183,7 +190,7 @@ class TrueCompletion(UsesTruth, Completer):
     ) -> Completion:
         filled = voxels[mask.ravel()[pixel]]
         if not len(filled):
-            return super().complete(rng, frame, [mask], grid)[0]
+            return super().complete_each([rng], frame, [mask], grid)[0]
         offset, seen = observed_box(frame, mask, grid, self)
         low, high = filled.min(axis=0), filled.max(axis=0) + 1
         if seen.points.size:

@@ -409,8 +409,10 @@ _NOISE_RATES = (0.1, 0.2, 0.4, 0.6, 0.8)
 
 
 def _by_scene(values: np.ndarray, scene: np.ndarray) -> tuple[float, float]:
-    """Mean over scenes, and half the width of its 95 % interval (Student's t)."""
+    """Mean over scenes, and half the width of its 95 % interval (Student's t); NaN for one scene."""
     of_scene = np.array([values[scene == k].mean() for k in np.unique(scene)])
+    if len(of_scene) < 2:
+        return float(of_scene.mean()), float("nan")
     half = stats.t.ppf(0.975, len(of_scene) - 1) * of_scene.std(ddof=1) / np.sqrt(len(of_scene))
     return float(of_scene.mean()), float(half)
 

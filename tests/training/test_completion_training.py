@@ -1,0 +1,140 @@
+"""Samples and training of the completion network, in a small form."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from mstfilter.completion import NetworkCompleter, observed_box
+from mstfilter.completion.crops import extruded
+from mstfilter.errors import InputError
+from mstfilter.trained import open_model
+from mstfilter.training import CompletionTraining, Samples, completion_settings, read_samples, write_samples
+from mstfilter.training.completion import calibration_error, train_completion
+from mstfilter.training.completion_data import combine
+from mstfilter.training.shapes import HELD_OUT, TRAINED, draw_training_shape
+from tests.completion.test_completion import masks_of
+from tests.completion.test_network import STACK
+from tests.segmentation.scenes import GRID, TWO, frame_of
+
+SMALL = CompletionTraining(
+    n_scenes=2, n_validation=1, n_test=1, width=8, latent=4, steps=40, batch=8, rate=4e-3, average=0.9
+)
+
+
+@pytest.fixture(scope="module")
+def samples(tmp_path_factory) -> Samples:
+    return read_samples(write_samples(tmp_path_factory.mktemp("samples"), 5, 2, per_file=1))
+
+
+def test_samples_do_not_depend_on_the_number_of_workers(samples, tmp_path):
+    again = read_samples(write_samples(tmp_path, 5, 2, workers=2, per_file=1))
+    for name in Samples.__dataclass_fields__:
+        assert np.array_equal(getattr(samples, name), getattr(again, name))
+    assert set(samples.scene.tolist()) == {0, 1} and len(samples) > 20
+
+
+def test_what_samples_show(samples):
+    """The true shape is hardly ever where free space was seen, and starts at the visible surface of the mask."""
+    own, free, behind = ((samples.bits >> k) & 1 for k in (0, 2, 3))
+    assert (samples.truth & (free > 0)).sum() < 0.01 * samples.truth.sum()
+    assert (samples.truth & (own > 0)).sum() > 0.6 * own.sum()
+    # In the column of a crop, something is hidden behind most surfaces.
+    assert (behind.sum(axis=(1, 2, 3)) > 0).mean() > 0.9
+    assert samples.truth.any(axis=(1, 2, 3)).mean() > 0.95
+    assert set(samples.kind.tolist()) <= set(TRAINED)
+    assert ((samples.visible > 0) & (samples.visible <= 1.05)).all()
+
+
+def test_parts_of_an_object_share_its_voxels(samples):
+    """Parts get less than whole objects in proportion to what is visible of them."""
+    volume, surface = samples.truth.sum(axis=(1, 2, 3)), (samples.bits & 1).sum(axis=(1, 2, 3))
+    whole, part = (volume[samples.mask == k].sum() / surface[samples.mask == k].sum() for k in (0, 1))
+    assert 0.4 < part / whole < 1.6
+    assert volume[samples.mask == 1].mean() < volume[samples.mask == 0].mean()
+
+
+@pytest.mark.parametrize("kind", [*TRAINED, *HELD_OUT])
+def test_shapes(kind):
+    """Centred on the origin, of a size that fits a table; every drawn size differs."""
+    shapes = [draw_training_shape(np.random.default_rng(k), kind) for k in range(20)]
+    assert len({tuple(s.half) for s in shapes}) == 20
+    for shape in shapes:
+        assert shape.half.min() > 0.005 and shape.half.max() < 0.25
+        corners = shape.half * np.array([[1, 1, 1], [-1, -1, -1]]) * 1.001
+        assert not shape.inside(corners * 1.01).all() and shape.mass > 0
+
+
+def test_evidence_of_two_frames():
+    """The second frame shows the lower object without the upper one: less is hidden, and what was free stays free."""
+    first, second = frame_of(STACK, width=320), frame_of(np.where(STACK == 1, 1, 0), width=320)
+    mask = masks_of(STACK, first)[0]
+    again = masks_of(np.where(STACK == 1, 1, 0), second)[0]
+
+    class Whole(NetworkCompleter):
+        def box(self, voxels, grid):
+            return np.zeros(3, np.int64), np.array(grid.shape)
+
+    _, a = observed_box(first, mask, GRID, Whole())
+    _, b = observed_box(second, again, GRID, Whole())
+    both = combine(a, b)
+    assert (both.free >= a.free).all() and (both.free >= b.free).all()
+    assert not (both.free & (both.surface | both.other_surface | both.behind | both.hidden)).any()
+    assert both.hidden.sum() < a.hidden.sum() and both.surface.sum() > a.surface.sum()
+
+
+def test_training_learns_resumes_and_is_used(tmp_path):
+    """The log loss after a few steps is below that of extrusion with the best probability inside and outside."""
+    torch.set_num_threads(1)
+    texts: list[str] = []
+
+    def report(done: int, total: int, text: str) -> None:
+        texts.append(text)
+
+    assert train_completion(SMALL, tmp_path / "a", on_progress=report, max_steps=15) is None
+    figures = train_completion(SMALL, tmp_path / "a", on_progress=report)
+    assert figures is not None and "loss" in texts[-1]
+    shutil.copytree(tmp_path / "a/samples", tmp_path / "b/samples")
+    train_completion(SMALL, tmp_path / "b")
+    resumed, straight = (open_model(str(tmp_path / name)) for name in "ab")
+    for name, tensor in straight.tensors.items():
+        assert np.allclose(resumed.tensors[name], tensor, atol=1e-3)
+
+    found = read_samples(sorted((tmp_path / "a/samples/validation").glob("*.npz")))
+    unknown, rule = (found.bits & 4) == 0, extruded(found.bits)
+    loss = 0.0
+    for inside in (rule, ~rule & unknown):
+        p = found.truth[inside].mean()
+        loss -= inside.sum() * (p * np.log(p) + (1 - p) * np.log(1 - p)) / unknown.sum()
+    lines = [line.split(",") for line in (tmp_path / "a/curves.csv").read_text().split()]
+    assert float(lines[-1][lines[0].index("log_loss")]) < loss
+    assert figures["iou"] > figures["iou_extrude"] - 0.03
+
+    one = NetworkCompleter(weights=str(tmp_path / "a"))
+    frame = frame_of(TWO, width=320)
+    completion = one.complete(np.random.default_rng(0), frame, masks_of(TWO, frame)[:1], GRID)[0]
+    assert (completion.probability >= 0.5).any()
+    with pytest.raises(InputError, match="other settings"):
+        train_completion(replace(SMALL, steps=41), tmp_path / "a")
+
+
+def test_settings():
+    assert completion_settings("cpu", ["steps=7", "half_precision=false", "rate=0.1"]) == CompletionTraining(
+        steps=7, half_precision=False, rate=0.1
+    )
+    for text, message in (("stps=7", "no setting 'stps'"), ("steps=many", "expected int"), ("steps", "expected int")):
+        with pytest.raises(InputError, match=message):
+            completion_settings("cpu", [text])
+    with pytest.raises(InputError, match="recipe"):
+        completion_settings("fast")
+
+
+def test_calibration_error():
+    rng = np.random.default_rng(0)
+    p = rng.random(200_000)
+    assert calibration_error(p, rng.random(len(p)) < p) < 0.01
+    assert calibration_error(np.full(1000, 0.9), np.arange(1000) < 500) == pytest.approx(0.4)
