@@ -32,7 +32,7 @@ ARCHITECTURE = "completion-unet"
 _BATCH = 8  # results do not depend on the other boxes of a batch only if all batches have one size
 
 
-class Normal(NamedTuple):
+class LatentLaw(NamedTuple):
     """A diagonal normal law."""
 
     mean: Tensor  #: (b, d)
@@ -42,7 +42,7 @@ class Normal(NamedTuple):
         """A draw (b, d) from standard normal noise (b, d)."""
         return self.mean + noise * self.log_std.exp()
 
-    def divergence(self, other: Normal) -> Tensor:
+    def divergence(self, other: LatentLaw) -> Tensor:
         """Kullback-Leibler divergence (b,) from `other`, in nats."""
         ratio = 2 * (self.log_std - other.log_std)
         distance = ((self.mean - other.mean) * (-other.log_std).exp()) ** 2
@@ -113,7 +113,7 @@ class CompletionNet(nn.Module):
         #: Logit of a voxel that is not extruded, and what extrusion adds: the network starts from this rule.
         self.rule = nn.Parameter(torch.tensor([-3.0, 4.4]))
 
-    def encode(self, x: Tensor) -> tuple[list[Tensor], Normal]:
+    def encode(self, x: Tensor) -> tuple[list[Tensor], LatentLaw]:
         """Features of an input (b, channels, X, Y, Z), and the prior of z. Edges are multiples of 8 voxels."""
         fine = self.fine(self.stem(_to_channels(x)))
         middle = self.middle(self.down1(fine))
@@ -121,7 +121,7 @@ class CompletionNet(nn.Module):
         for block in self.coarse:
             coarse = block(coarse)
         mean, log_std = self.prior(coarse.mean(dim=(2, 3, 4)).float()).chunk(2, dim=1)
-        return [fine, middle, coarse, x[:, -1]], Normal(mean, log_std.clamp(-4, 2))
+        return [fine, middle, coarse, x[:, -1]], LatentLaw(mean, log_std.clamp(-4, 2))
 
     def decode(self, features: list[Tensor], z: Tensor) -> Tensor:
         """Logits (b, X, Y, Z) of a latent vector (b, latent)."""
@@ -146,14 +146,14 @@ class ShapePosterior(nn.Module):
         self.down2 = nn.Conv3d(2 * width, 4 * width, 3, stride=2, padding=1)
         self.law = nn.Linear(8 * width, 2 * latent)
 
-    def forward(self, features: list[Tensor], truth: Tensor) -> Normal:
+    def forward(self, features: list[Tensor], truth: Tensor) -> LatentLaw:
         """From the features of the input, and the true shape (b, X, Y, Z) as 0 and 1."""
         x = functional.silu(self.stem(_to_channels(truth[:, None])))
         x = functional.silu(self.down1(torch.cat([x, features[0].detach()], dim=1)))
         x = functional.silu(self.down2(x))
         pooled = torch.cat([x.mean(dim=(2, 3, 4)), features[2].detach().mean(dim=(2, 3, 4))], dim=1)
         mean, log_std = self.law(pooled.float()).chunk(2, dim=1)
-        return Normal(mean, log_std.clamp(-4, 2))
+        return LatentLaw(mean, log_std.clamp(-4, 2))
 
 
 class TrainedNetwork:

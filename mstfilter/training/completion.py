@@ -29,7 +29,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from mstfilter.completion.crops import CHANNELS, LATTICE, channels, extruded
-from mstfilter.completion.unet import ARCHITECTURE, CompletionNet, Normal, ShapePosterior
+from mstfilter.completion.unet import ARCHITECTURE, CompletionNet, LatentLaw, ShapePosterior
 from mstfilter.errors import InputError, check_choice
 from mstfilter.files import atomic_path, write_csv, write_text
 from mstfilter.trained import write_model
@@ -235,7 +235,7 @@ class _Run:
         noise = torch.randn((len(x), s.latent), generator=torch.Generator().manual_seed(self.step)).to(self.device)
         with torch.autocast(self.device.type, dtype=torch.bfloat16, enabled=s.half_precision):
             features, prior = self.net.encode(x)
-            law: Normal = self.posterior(features, truth.float())
+            law: LatentLaw = self.posterior(features, truth.float())
             logits = self.net.decode(features, law.draw(noise))
         unknown, own = (bits & 4) == 0, ((bits & 9) > 0).sum(dim=(1, 2, 3))
         loss = functional.binary_cross_entropy_with_logits(logits.float(), truth.float(), reduction="none")
@@ -360,8 +360,8 @@ def measure(
         for part, logits in _logits(net, samples, device, noise):
             drawn = (torch.sigmoid(scale * logits + shift).numpy() >= 0.5) & unknown[part]
             share[part] += drawn / np.float32(n_draws)
-            draw_iou[k, part] = overlap(drawn, truth[part])
-    iou = {"network": overlap(mode, truth), "extrude": overlap(rule, truth)}
+            draw_iou[k, part] = shape_iou(drawn, truth[part])
+    iou = {"network": shape_iou(mode, truth), "extrude": shape_iou(rule, truth)}
     volume = {
         name: found.sum(axis=(1, 2, 3)) / np.maximum(truth.sum(axis=(1, 2, 3)), 1)
         for name, found in (("network", mode), ("extrude", rule))
@@ -417,7 +417,7 @@ def _by_scene(values: np.ndarray, scene: np.ndarray) -> tuple[float, float]:
     return float(of_scene.mean()), float(half)
 
 
-def overlap(found: np.ndarray, truth: np.ndarray) -> np.ndarray:
+def shape_iou(found: np.ndarray, truth: np.ndarray) -> np.ndarray:
     """IoU (n,) of shapes (n, X, Y, Z) bool."""
     axes = (1, 2, 3)
     return np.asarray((found & truth).sum(axis=axes) / np.maximum((found | truth).sum(axis=axes), 1))

@@ -10,7 +10,7 @@ import torch
 
 from mstfilter.completion import Extrude, NetworkCompleter, arbitrate, observed_box
 from mstfilter.completion.crops import CHANNELS, channels, crop_box, encode_box, extruded
-from mstfilter.completion.unet import ARCHITECTURE, CompletionNet, Normal
+from mstfilter.completion.unet import ARCHITECTURE, CompletionNet, LatentLaw
 from mstfilter.errors import InputError
 from mstfilter.scene import Frame, VoxelGrid, frame_geometry, scene_cache
 from mstfilter.trained import write_model
@@ -106,7 +106,7 @@ def test_draws(weights, frame):
 def test_divergence_of_normal_laws():
     """Against the average log ratio of densities over draws (100,000 draws, error below 0.03)."""
     torch.manual_seed(1)
-    a, b = (Normal(torch.randn(1, 3), 0.4 * torch.randn(1, 3)) for _ in range(2))
+    a, b = (LatentLaw(torch.randn(1, 3), 0.4 * torch.randn(1, 3)) for _ in range(2))
     x = a.draw(torch.randn(100_000, 3))
 
     def log_density(law):
