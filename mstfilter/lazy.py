@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import ast
 import contextlib
+import dataclasses
 import sys
 from collections.abc import Callable, Iterator
 from importlib import import_module
@@ -41,6 +42,27 @@ def attach(package: str, init: str) -> tuple[Callable[[str], Any], Callable[[], 
         return value
 
     return get, lambda: names, names
+
+
+def short_repr(component: Any) -> str:
+    """The text of a dataclass with the fields that differ from their defaults."""
+    parts = []
+    for field in dataclasses.fields(component):
+        value = getattr(component, field.name)
+        default = field.default if field.default_factory is dataclasses.MISSING else field.default_factory()
+        if field.repr and not (value is default or (type(value) is type(default) and _equal(value, default))):
+            nested = dataclasses.is_dataclass(value) and not isinstance(value, type)
+            text = short_repr(value) if nested and not hasattr(value, "_repr_html_") else repr(value)
+            parts.append(f"{field.name}={text if len(text) <= 200 else f'{text[:196]} ...'}")
+    text = f"{type(component).__name__}({', '.join(parts)})"
+    return text if len(text) <= 300 else f"{text[:295]} ...)"
+
+
+def _equal(a: Any, b: Any) -> bool:
+    try:
+        return bool(a == b)
+    except ValueError:  # arrays
+        return False
 
 
 def late(location: str, summary: str) -> Callable[..., Any]:

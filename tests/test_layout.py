@@ -77,7 +77,7 @@ def test_the_package_does_not_grow():
     assert n_lines(FILES) <= 37_400
     assert len(FILES) <= 170
     smc = [path for path in FILES if path.is_relative_to(PACKAGE / "smc") and path.name != "__init__.py"]
-    assert n_lines(smc) <= 7_820
+    assert n_lines(smc) <= 7_830
     assert len({path if path.parent.name == "smc" else path.parent for path in smc}) <= 18  # programs/ is one
     assert max(n_lines([path]) for path in FILES) <= 500
 

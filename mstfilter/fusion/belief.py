@@ -79,7 +79,8 @@ class Belief:
 
     def __repr__(self) -> str:
         weights = ", ".join(f"{w:.3g}" for w in np.sort(self._mass)[::-1][:8]) + ", ..." * (len(self._mass) > 8)
-        head = f"Belief of {len(self)} hypotheses, {len(self._mass)} distinct"
+        head = f"Belief: {len(self)} hypotheses, {len(self._mass)} distinct"
+        head = "Belief: 1 hypothesis" if len(self) == 1 else head
         return f"{head}\n  {self.grid.text}\n  weights {weights}"
 
     _repr_html_ = late("mstfilter.report.display:to_html", "What a notebook shows.")

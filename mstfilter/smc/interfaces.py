@@ -37,7 +37,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from mstfilter.errors import InputError, check_integer
-from mstfilter.lazy import late
+from mstfilter.lazy import late, short_repr
 from mstfilter.smc.population import Population
 from mstfilter.smc.streams import Key
 
@@ -50,6 +50,11 @@ class Component(ABC):
 
     The two properties can be overridden by class attributes: ``properly_weighted = False``.
     """
+
+    def __init_subclass__(cls, **named: Any) -> None:
+        super().__init_subclass__(**named)
+        if "__repr__" not in cls.__dict__:  # a dataclass keeps it instead of writing all fields
+            cls.__repr__ = short_repr  # type: ignore[method-assign]
 
     @property
     def properly_weighted(self) -> bool:
@@ -359,7 +364,7 @@ class State:
     def __repr__(self) -> str:
         evidence = "" if self.log_evidence is None else f", log evidence {self.log_evidence:.4g}"
         particles = "" if self.population is None else f"\n  {self.population!r}"
-        return f"State after {self.t} observations, seed {self.key.seed}{evidence}{particles}"
+        return f"State at t = {self.t}, seed {self.key.seed}{evidence}{particles}"
 
     _repr_html_ = late("mstfilter.report.display:to_html", "What a notebook shows.")
 
@@ -441,9 +446,9 @@ class Infos(list[Info]):
 
     def __repr__(self) -> str:
         if not self:
-            return "Infos of 0 steps"
+            return "Infos: no steps"
         ess, seconds = [info.ess for info in self], sum(sum(info.seconds.values()) for info in self)
         spread = f"ESS {min(ess):.1f} to {max(ess):.1f}"
-        return f"Infos of {len(self)} steps: {spread}, {sum(i.resampled for i in self)} resampled, {seconds:.3g} s"
+        return f"Infos: steps {len(self)}, resampled {sum(i.resampled for i in self)}, {spread}, {seconds:.3g} s"
 
     _repr_html_ = late("mstfilter.report.display:to_html", "What a notebook shows.")

@@ -230,7 +230,7 @@ class Population:
         object.__setattr__(self, "parents", parents)
 
     def __repr__(self) -> str:
-        lines = [f"Population of {len(self)} {_kind(self.particles)}, ESS {self.ess:.1f}"]
+        lines = [f"Population: n = {len(self)}, {_kind(self.particles)}, ESS {self.ess:.1f}"]
         heaviest = np.sort(self.weights)[::-1][:8]
         lines.append("weights " + ", ".join(f"{w:.3g}" for w in heaviest) + ", ..." * (len(self) > 8))
         if self.parents:
@@ -352,10 +352,10 @@ def _kind(particles: Particles) -> str:
         return f"candidates, {particles.n_built} built"
     if isinstance(particles, Mapping):
         named = [f"{name} {np.dtype(a.dtype)} {a.shape}" for name, a in list(particles.items())[:4]]
-        return f"particles: {', '.join(named)}{', ...' * (len(particles) > 4)}"
+        return ", ".join(named) + ", ..." * (len(particles) > 4)
     if isinstance(particles, np.ndarray):
-        return f"particles: {particles.dtype} {particles.shape}"
-    return f"particles: {type(particles[0]).__name__}"
+        return f"{particles.dtype} {particles.shape}"
+    return f"particles {type(particles[0]).__name__}"
 
 
 def union(predicted: Population | None, proposed: Population | None) -> Population:

@@ -60,9 +60,8 @@ def _failure(error: BaseException) -> JobOutcome:
     if isinstance(error, MemoryError):
         return JobOutcome("failed", "out of memory", ("use fewer workers",), trace)
     hints = tuple(getattr(error, "__notes__", ()))
-    return JobOutcome(
-        "failed", describe_error(error), hints or ("failures.csv names the file of the traceback",), trace
-    )
+    hints = hints or ("result.json in the folder of the run has the traceback",)
+    return JobOutcome("failed", describe_error(error), hints, trace)
 
 
 def open_scene(source: Mapping[str, Any], recordings: str) -> Recording:

@@ -16,8 +16,9 @@ import mstfilter
 from mstfilter.errors import InputError
 from mstfilter.lazy import exported
 from mstfilter.report.display import Drawing, ScenePage
+from mstfilter.resources import preset_names
 from mstfilter.scene import Crop, Hypothesis, ObjectRecord, Recording, VoxelGrid
-from mstfilter.smc import Candidates, Infos, Population, bootstrap, linear_gaussian, run_many
+from mstfilter.smc import Candidates, Infos, Population, Ssp, Tempered, bootstrap, linear_gaussian, run_many
 from mstfilter.testing import scene_example
 from tests.scene.scenes import CAMERA, table_scene
 
@@ -101,10 +102,20 @@ def test_texts_hold_the_facts():
     assert repr(SCENES.particles[0]).splitlines()[0] == f"Hypothesis of {SCENES.particles[0].n_objects} objects"
     assert "24 x 24 x 8 voxels of 20 mm" in repr(CLIP)
     assert "3 frames over 0.4 s" in repr(CLIP)
-    assert repr(STATE.population).startswith("Population of 50 particles: float64 (50, 1), ESS ")
-    assert "1000 candidates, 0 built" in repr(OBJECTS["candidates"])
+    assert repr(STATE.population).startswith("Population: n = 50, float64 (50, 1), ESS ")
+    assert "n = 1000, candidates, 0 built" in repr(OBJECTS["candidates"])
     assert "log evidence -" in repr(STATE)
     assert "resampler ClusterStratified" in repr(OBJECTS["preset"])
+
+
+def test_the_texts_of_components_name_changed_fields():
+    for name in preset_names():
+        made = mstfilter.preset(name)
+        for slot in ("transition", "proposal", "update", "resampler"):
+            assert len(repr(getattr(made, slot))) <= 300
+    assert repr(mstfilter.preset("mst").transition) == "TrackingTransition(warp=Warp(method='smooth'))"
+    assert repr(Tempered()) == "Tempered()"
+    assert repr(Tempered(power=0.25, scheme=Ssp())) == "Tempered(scheme=Ssp(), power=0.25)"
 
 
 def test_the_front_door_names_classes_that_can_be_shown():
