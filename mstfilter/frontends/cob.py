@@ -22,7 +22,7 @@ import numpy as np
 
 from mstfilter.errors import InputError, MissingLibraryError, check_choice, check_integer, check_number
 from mstfilter.frontends.caffe import read_caffemodel
-from mstfilter.scene import Frame, memo
+from mstfilter.scene import Frame, Recording, UsesFiles, memo
 from mstfilter.segmentation import BoundaryModel, Tree, TreeBuilder
 from mstfilter.segmentation.boundary import fill_from_nearest
 from mstfilter.segmentation.tree import linkage_tree, prune
@@ -36,7 +36,7 @@ _MEAN_COSINE = 2 / np.pi  # mean of |cos| over all angles
 
 
 @dataclass(frozen=True)
-class CobBoundary(BoundaryModel):
+class CobBoundary(BoundaryModel, UsesFiles):
     """P(contour) of COB.
 
     Parameters
@@ -69,6 +69,10 @@ class CobBoundary(BoundaryModel):
         """Hash of the file of weights; empty without a file."""
         path = Path(self.weights)
         return _hash(*_stamp(path)).encode() if self.weights and path.is_file() else b""
+
+    def check_files(self, recording: Recording) -> None:
+        """Load the weights."""
+        self._network()
 
     def boundary(self, frame: Frame) -> np.ndarray:
         """(H, W) float32. Raises InputError if the weights are missing or of another network."""

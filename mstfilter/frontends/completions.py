@@ -39,6 +39,8 @@ from mstfilter.scene import (
     Camera,
     Clip,
     Frame,
+    Recording,
+    UsesFiles,
     VoxelGrid,
     component_key,
     content_key,
@@ -64,7 +66,7 @@ class ObjectShapes:
 
 
 @dataclass(frozen=True)
-class ExternalCompletion(ClipCompleter):
+class ExternalCompletion(ClipCompleter, UsesFiles):
     """Shapes from a folder, in place of an estimate.
 
     The shapes of a mask are those of the stored mask with the highest IoU. Voxels observed as free are cleared, and
@@ -97,6 +99,13 @@ class ExternalCompletion(ClipCompleter):
         check_choice("axes", self.axes, ("camera", "world"))
         check_choice("draws", self.draws, ("sample", "mean"))
         check_number("min_iou", self.min_iou, above=0, at_most=1)
+
+    def check_files(self, recording: Recording) -> None:
+        """Read the masks of all pauses, and place all shapes."""
+        for clip in recording.clips():
+            for one in read_shapes(self.folder, clip.index, clip.after.depth.shape):
+                for path in one.files:
+                    self._volume(path, clip.after.camera, clip.grid)
 
     def at(self, clip: Clip) -> ExternalCompletion:
         """The completer with the shapes of the pause that the clip ends at."""

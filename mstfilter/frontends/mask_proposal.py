@@ -27,7 +27,7 @@ from mstfilter.completion import Completer, Extrude
 from mstfilter.errors import InputError, check_number
 from mstfilter.frontends.mask_files import MaskRegion, PauseMasks, read_masks, write_masks
 from mstfilter.frontends.mask_trees import nested_masks, node_values
-from mstfilter.scene import Clip, Frame, component_key, content_key, memo
+from mstfilter.scene import Clip, Frame, Recording, UsesFiles, component_key, content_key, memo
 from mstfilter.segmentation import (
     BoundaryModel,
     ClipBoundary,
@@ -41,7 +41,7 @@ from mstfilter.smc import Population, Proposal, child
 
 
 @dataclass(frozen=True)
-class MaskProposal(Proposal):
+class MaskProposal(Proposal, UsesFiles):
     """Hypotheses from a folder of instance masks with alternatives.
 
     Parameters
@@ -65,6 +65,11 @@ class MaskProposal(Proposal):
     threshold: float = 0.5
 
     properly_weighted: ClassVar[bool] = False
+
+    def check_files(self, recording: Recording) -> None:
+        """Read the masks of all pauses."""
+        for clip in recording.clips():
+            read_masks(self.folder, clip.index, clip.after.depth.shape, clip.after.rgb)
 
     def sample(self, rng: np.random.Generator, observation: Clip, n: int) -> Population:
         """`n` hypotheses about the scene at the end of the clip, with equal weights."""
@@ -118,7 +123,7 @@ def _number(content: bytes) -> int:
 
 
 @dataclass(frozen=True)
-class MaskBoundary(ClipBoundary):
+class MaskBoundary(ClipBoundary, UsesFiles):
     """The probability that a segmentation drawn from a folder of masks has a border at a pixel.
 
     The law is that of `MaskProposal` with `ExactCuts` at temperature 1. Borders are borders of masks, so they do not
@@ -144,6 +149,10 @@ class MaskBoundary(ClipBoundary):
 
     def __post_init__(self) -> None:
         check_number("weight", self.weight, at_least=0, at_most=1)
+
+    def check_files(self, recording: Recording) -> None:
+        """Read the masks of all pauses."""
+        MaskProposal(self.folder).check_files(recording)
 
     def at(self, clip: Clip) -> MaskBoundary:
         """The model with the masks of the pause that the clip ends at."""

@@ -28,7 +28,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mstfilter.errors import InputError, MissingLibraryError, check_integer, check_number
-from mstfilter.scene import Clip, Frame, component_key, content_key, memo
+from mstfilter.scene import Clip, Frame, Recording, UsesFiles, component_key, content_key, memo
 from mstfilter.tracking import MaskTracker
 
 if TYPE_CHECKING:
@@ -43,7 +43,7 @@ _MAX_LOG = 10.0  # log of the ratio of a box to its anchor; only untrained netwo
 
 
 @dataclass(frozen=True)
-class SiamMaskTracker(MaskTracker):
+class SiamMaskTracker(MaskTracker, UsesFiles):
     """SiamMask with refinement. Each mask starts a tracker of its own; equal masks are tracked once.
 
     Parameters
@@ -74,6 +74,10 @@ class SiamMaskTracker(MaskTracker):
         for name in ("threshold", "window", "rate"):
             check_number(name, getattr(self, name), at_least=0, at_most=1)
         check_number("penalty", self.penalty, at_least=0)
+
+    def check_files(self, recording: Recording) -> None:
+        """Load the weights."""
+        self._network()
 
     def track(self, clip: Clip, masks: Sequence[np.ndarray]) -> list[np.ndarray]:
         """Masks (H, W) bool of the last frame. Raises InputError if the weights are missing or of another network."""
@@ -111,7 +115,7 @@ class SiamMaskTracker(MaskTracker):
 
 
 @dataclass(frozen=True)
-class Sam2Tracker(MaskTracker):
+class Sam2Tracker(MaskTracker, UsesFiles):
     """The video predictor of the package ``sam2`` (SAM 2, or EdgeTAM, whose package has the same name).
 
     All masks are tracked together, with one pass of the image encoder for each frame.
@@ -136,18 +140,24 @@ class Sam2Tracker(MaskTracker):
     def __post_init__(self) -> None:
         check_integer("step", self.step)
 
-    def track(self, clip: Clip, masks: Sequence[np.ndarray]) -> list[np.ndarray]:
-        """Masks (H, W) bool of the last frame. Raises InputError if the package or the checkpoint is missing."""
+    def check_files(self, recording: Recording) -> None:
+        """Load the checkpoint."""
+        self._predictor()
+
+    def _predictor(self) -> Any:
         path = Path(self.checkpoint)
         if not self.checkpoint or not path.is_file():
             raise InputError(
                 f"the checkpoint of SAM 2 does not exist: {path}" if self.checkpoint else "checkpoint is not given",
                 "set the field checkpoint to the path of a file, see https://github.com/facebookresearch/sam2",
             )
-        frames = _thinned(clip, self.step)
+        return _load_sam2(self.config, str(path.resolve()), self.device)
+
+    def track(self, clip: Clip, masks: Sequence[np.ndarray]) -> list[np.ndarray]:
+        """Masks (H, W) bool of the last frame. Raises InputError if the package or the checkpoint is missing."""
+        predictor, frames = self._predictor(), _thinned(clip, self.step)
         if len(frames) == 1:
             return [mask.astype(bool) for mask in masks]
-        predictor = _load_sam2(self.config, str(path.resolve()), self.device)
         found = [np.zeros(mask.shape, dtype=bool) for mask in masks]
         with TemporaryDirectory() as folder:
             for k, frame in enumerate(frames):  # the predictor reads numbered JPEG files

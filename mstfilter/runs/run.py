@@ -25,7 +25,7 @@ from mstfilter.oracles import bind_truth, uses_truth
 from mstfilter.presets import build_filter, describe_filter
 from mstfilter.registry import nested_components
 from mstfilter.runs.run_folder import RunFolder, as_json
-from mstfilter.scene import Recording
+from mstfilter.scene import Recording, UsesFiles
 from mstfilter.scoring import ask
 from mstfilter.smc import Observer
 
@@ -77,6 +77,9 @@ def filter_recording(
     filter = build_filter(config, allow_files=allow_files)
     recording.check()
     bound = bind_truth(filter, recording)
+    for part in nested_components(filter):
+        if isinstance(part, UsesFiles):
+            part.check_files(recording)
     description = as_json(
         {
             "seed": int(seed),

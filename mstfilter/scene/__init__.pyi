@@ -39,6 +39,7 @@ from mstfilter.scene.plausibility import (
 from mstfilter.scene.recording import (
     LazyFrames as LazyFrames,
     Recording as Recording,
+    UsesFiles as UsesFiles,
     check_depth as check_depth,
     find_world as find_world,
     truth_reader as truth_reader,

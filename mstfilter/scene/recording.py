@@ -12,6 +12,7 @@ not given, it is placed around the objects on the table.
 from __future__ import annotations
 
 import warnings
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import dataclass, field
@@ -260,6 +261,14 @@ class Recording:
     def _warn_once(self) -> None:
         """Evaluated once: warnings about the frames at the pauses."""
         warn_if_implausible((self.frames[p] for p in self.pauses), self.grid, f"recording {self.name}")
+
+
+class UsesFiles(ABC):
+    """A component that reads files of the user, for example one for each pause. Inherit it with its interface."""
+
+    @abstractmethod
+    def check_files(self, recording: Recording) -> None:
+        """Raise InputError if a file is missing or cannot be used for a recording; called before a run."""
 
 
 def check_depth(depth: np.ndarray, where: str) -> None:

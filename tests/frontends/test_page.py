@@ -5,10 +5,13 @@ from __future__ import annotations
 import re
 
 import numpy as np
+import pytest
 
 import mstfilter
 from mstfilter.frontends import write_masks
 from mstfilter.oracles import TrueMasks, bind_truth, degrade
+from mstfilter.presets import load_config
+from mstfilter.runs import filter_recording
 from mstfilter.simulation import cached_recording
 from mstfilter.smc import Key
 from tests.conftest import REPOSITORY
@@ -16,6 +19,25 @@ from tests.conftest import REPOSITORY
 PAGE = (REPOSITORY / "docs" / "front-ends.md").read_text()
 #: Shares of splits and of merges among the errors; the rest displaces borders.
 WAYS = [(1.0, 0.0), (0.0, 1.0), (0.0, 0.0)]
+
+
+def test_all_pauses_are_checked_before_a_run(tmp_path):
+    """A missing file of a later pause is found before the folder of the run is made."""
+    recording = mstfilter.open_recording(cached_recording("demo", 0))
+    write_masks(tmp_path / "masks", 0, [recording.instance(0) * 0])
+    folder = f"folder={tmp_path / 'masks'}"
+    for overrides, message in (
+        (("proposal=mask_folder", f"proposal.{folder}"), "no masks for pause 1"),
+        (("proposal.boundary=mask_folder", f"proposal.boundary.{folder}"), "no masks for pause 1"),
+        (("proposal.completer=external", f"proposal.completer.{folder}"), "none for pause 1"),
+        (("proposal.boundary=cob", "proposal.boundary.weights=none"), "do not exist"),
+        (("proposal.tree=cob", "proposal.tree.contours.weights=none"), "do not exist"),
+        (("transition.tracker=siammask", "transition.tracker.weights=none"), "do not exist"),
+        (("transition.tracker=sam2", "transition.tracker.checkpoint=none"), "does not exist"),
+    ):
+        with pytest.raises(mstfilter.InputError, match=message):
+            filter_recording(recording, load_config("mst", overrides), tmp_path / "run")
+        assert not (tmp_path / "run").exists()
 
 
 def test_the_estimate_is_better_than_the_best_alternative(tmp_path, monkeypatch, capsys):
