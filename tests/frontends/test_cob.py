@@ -347,7 +347,7 @@ def test_polygons_of_a_chain():
 
 
 def test_hha_of_a_plane():
-    """Straight down from 1.5 m: disparity 31000 / 150, the height of the table, a normal upwards."""
+    """Straight down from 1.5 m: disparity 31000 / 150, the height of the table, an angle of 0 (the floor has 38)."""
     pose = look_at(np.array([0.0, 0.0, 1.5]), np.array([0.0, 1e-6, 0.0]))
     camera = Camera.from_intrinsics(100, 100, 31.5, 23.5, 64, 48, pose)
     depth = np.full((48, 64), 1.5, np.float32)
@@ -355,7 +355,10 @@ def test_hha_of_a_plane():
     found = hha(Frame(np.zeros((48, 64, 3), np.uint8), depth, camera), 0.7)
     assert (found[..., 0] == 207).all()
     assert (found[..., 1] == 70).all()
-    assert (found[..., 2] == 218).all()
+    assert (found[..., 2] == 38).all()
+    blank = Frame(np.zeros((48, 64, 3), np.uint8), depth * np.nan, camera)
+    with pytest.raises(InputError, match="no depth"):
+        hha(blank, 0.7)
 
 
 def test_rgb_hha(blobs, tmp_path, monkeypatch):
