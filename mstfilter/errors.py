@@ -52,6 +52,11 @@ class InputWarning(_WithHints, UserWarning):
     """
 
 
+def reason(error: BaseException) -> str:
+    """The message of an exception; of a KeyError, which has the name alone, that the name is missing."""
+    return f"{error} is missing" if isinstance(error, KeyError) else str(error)
+
+
 def suggestion(name: str, names: Iterable[str]) -> list[str]:
     """A hint with the known name that is closest to an unknown one; no hint if none is close."""
     return [f"did you mean {close}?" for close in difflib.get_close_matches(name, list(names), n=1)]

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from mstfilter.errors import InputError, MissingLibraryError
+from mstfilter.errors import InputError, MissingLibraryError, reason
 from mstfilter.formats.video import KnownWorld, RecordingFormat, Video
 from mstfilter.scene import (
     Camera,
@@ -105,7 +105,7 @@ def _cameras(path: Path) -> dict[int, dict[str, Any]]:
             if len(entry["cam_K"]) != 9 or not np.isfinite(entry["cam_K"]).all():
                 raise ValueError(f"cam_K of {where} is not 9 numbers")
             if "depth_scale" not in entry:
-                raise KeyError(f"{where} has no depth_scale")
+                raise ValueError(f"{where} has no depth_scale")
             entry["depth_scale"] = float(entry["depth_scale"])
     except FileNotFoundError:
         raise InputError(
@@ -113,7 +113,7 @@ def _cameras(path: Path) -> dict[int, dict[str, Any]]:
         ) from None
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise InputError(
-            f"{path} does not give cam_K and depth_scale of each image: {error}",
+            f"{path} does not give cam_K and depth_scale of each image: {reason(error)}",
             "depth_scale is in millimetres per unit",
         ) from error
     return found

@@ -35,7 +35,7 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from mstfilter.errors import InputError
+from mstfilter.errors import InputError, reason
 from mstfilter.files import check_output
 from mstfilter.formats.video import RecordingFormat
 from mstfilter.scene import (
@@ -52,7 +52,7 @@ from mstfilter.scene import (
     read_rgb,
     rigid_from_matrix,
     truth_reader,
-    warn_if_workspace_is_empty,
+    warn_if_implausible,
     write_image,
 )
 from mstfilter.scene.pauses import PauseRule
@@ -273,9 +273,8 @@ def save_recording(
             if truth is not None:
                 writer.add_voxels(truth)
             progress(index + 1, total)
-    warn_if_workspace_is_empty(
-        (recording.frames[p] for p in recording.pauses), recording.grid, f"recording {recording.name}"
-    )
+    at_pauses = (recording.frames[p] for p in recording.pauses)
+    warn_if_implausible(at_pauses, recording.grid, f"recording {recording.name}")
     return writer.path
 
 
@@ -448,7 +447,7 @@ def _read_poses(path: Path) -> Any:
             entries = {int(e["frame"]): dict(e["T_world_object"]) for e in json.loads(path.read_text())}
             return {i: {int(k): rigid_from_matrix(T).as_matrix() for k, T in e.items()} for i, e in entries.items()}
         except (OSError, ValueError, KeyError, TypeError) as error:
-            raise InputError(f"true poses cannot be read: {path} ({error})") from error
+            raise InputError(f"true poses cannot be read: {path} ({reason(error)})") from error
 
     return lambda index: load().get(index)
 
@@ -459,7 +458,7 @@ def _read_voxels(path: Path, grid: VoxelGrid, pauses: tuple[int, ...]) -> Any:
             labels, frames = data["labels"], data["frame"]
             origin, size = data["origin"], float(data["voxel_size"])
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-        raise InputError(f"true volumes cannot be read: {path} ({error})") from error
+        raise InputError(f"true volumes cannot be read: {path} ({reason(error)})") from error
     if labels.shape[1:] != grid.shape or not np.allclose(origin, grid.origin) or abs(size - grid.voxel_size) > 1e-9:
         raise InputError(
             f"{path}: grid {labels.shape[1:]} at {origin.tolist()} with voxels of {size} m differs from "

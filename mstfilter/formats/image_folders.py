@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from mstfilter.errors import InputError
+from mstfilter.errors import InputError, reason
 from mstfilter.formats.video import RecordingFormat, Video, VideoFormat, pair_stamps
 from mstfilter.scene import Frame, Recording, read_depth, read_labels, read_rgb, rigid_from_matrix, table_residual
 
@@ -51,9 +51,8 @@ class PairedImages(RecordingFormat):
         except FileNotFoundError:
             raise InputError(f"{path / 'info.json'} is missing", "it holds K and depth_scale_m") from None
         except (json.JSONDecodeError, KeyError, TypeError, ValueError) as error:
-            why = f"{error} is missing" if isinstance(error, KeyError) else str(error)
             raise InputError(
-                f"{path / 'info.json'} does not give K and depth_scale_m: {why}",
+                f"{path / 'info.json'} does not give K and depth_scale_m: {reason(error)}",
                 'for example {"K": [525, 525, 319.5, 239.5], "depth_scale_m": 0.001}',
             ) from error
         if K.shape == (4,):
@@ -190,7 +189,7 @@ def _intrinsics(path: Path) -> tuple[float, ...]:
     try:
         matrix = np.reshape(np.asarray(json.loads(file.read_text())["intrinsic_matrix"], dtype=float), (3, 3)).T
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(f"{file} does not hold an Open3D intrinsic_matrix: {error!r}") from error
+        raise InputError(f"{file} does not hold an Open3D intrinsic_matrix: {reason(error)}") from error
     if not np.allclose(matrix[2], (0, 0, 1)):
         raise InputError(
             f"{file}: intrinsic_matrix is {matrix.T.ravel().tolist()}, expected 9 numbers column by column",

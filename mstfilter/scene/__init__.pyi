@@ -32,10 +32,7 @@ from mstfilter.scene.pauses import (
     pause_rule as pause_rule,
     pauses_from_text as pauses_from_text,
 )
-from mstfilter.scene.plausibility import (
-    warn_if_implausible as warn_if_implausible,
-    warn_if_workspace_is_empty as warn_if_workspace_is_empty,
-)
+from mstfilter.scene.plausibility import warn_if_implausible as warn_if_implausible
 from mstfilter.scene.recording import (
     LazyFrames as LazyFrames,
     Recording as Recording,

@@ -41,7 +41,7 @@ def warn_if_implausible(frames: Iterable[Frame], grid: VoxelGrid, where: str) ->
         return
     for message, *hints in (*_scale(first, grid), *_intrinsics(first), *_plane(first)):
         _warn(f"{where}: {message}", *hints)
-    warn_if_workspace_is_empty(chain((first,), frames), grid, where)
+    _warn_if_empty(chain((first,), frames), grid, where)
 
 
 def _scale(frame: Frame, grid: VoxelGrid) -> list[tuple[str, ...]]:
@@ -120,7 +120,7 @@ def _plane(frame: Frame) -> list[tuple[str, ...]]:
 _MIN_READINGS = 30  # fewer are taken for noise
 
 
-def warn_if_workspace_is_empty(frames: Iterable[Frame], grid: VoxelGrid, where: str) -> None:
+def _warn_if_empty(frames: Iterable[Frame], grid: VoxelGrid, where: str) -> None:
     """Warn if no frame has readings inside the grid and above the table.
 
     Objects are searched inside the voxel grid only. A grid in other units, at another place, or below a pose that is

@@ -15,8 +15,10 @@ import pytest
 import mstfilter
 from mstfilter.errors import InputError
 from mstfilter.lazy import exported
+from mstfilter.presets import load_config
 from mstfilter.report.display import Drawing, ScenePage
 from mstfilter.resources import preset_names
+from mstfilter.runs import filter_recording
 from mstfilter.scene import Crop, Hypothesis, ObjectRecord, Recording, VoxelGrid
 from mstfilter.smc import Candidates, Infos, Population, Ssp, Tempered, bootstrap, linear_gaussian, run_many
 from mstfilter.testing import scene_example
@@ -176,7 +178,7 @@ def test_infos_as_a_table(monkeypatch):
     assert Infos().rows() == []
 
 
-def test_progress_is_shown_if_asked(capsys):
+def test_progress_is_shown_if_asked(tmp_path, capsys):
     NUMBERS.run([[0.1]] * 4, seed=0)
     assert capsys.readouterr() == ("", "")
     NUMBERS.run([[0.1]] * 4, seed=0, progress=True)
@@ -188,3 +190,6 @@ def test_progress_is_shown_if_asked(capsys):
     assert calls == [(0, None), (1, None), (2, None)]
     run_many({"a": NUMBERS}, [[0.1]], range(3), progress=True)
     assert "3/3" in capsys.readouterr().err
+    arrays = Recording.from_arrays(RGB, DEPTH, CAMERA.K)
+    filter_recording(arrays, load_config("floor_one_blob"), tmp_path / "run", progress=True)
+    assert "1/1" in capsys.readouterr().err

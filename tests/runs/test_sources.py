@@ -142,3 +142,14 @@ def test_label_images_beside_pairs_are_true_instances(tmp_path):
     (tmp_path / "info.json").write_text('{"depth_scale_m": 0.001}')
     with pytest.raises(InputError, match="'K' is missing"):
         open_source(tmp_path)
+
+
+def test_a_missing_entry_is_named(tmp_path):
+    layouts.write_bop(tmp_path / "bop")
+    (tmp_path / "bop" / "scene_camera.json").write_text('{"1": {"depth_scale": 1.0}}')
+    with pytest.raises(InputError, match="'cam_K' is missing"):
+        open_source(tmp_path / "bop")
+    layouts.write_redwood(tmp_path / "redwood")
+    (tmp_path / "redwood" / "intrinsic.json").write_text("{}")
+    with pytest.raises(InputError, match="'intrinsic_matrix' is missing"):
+        open_source(tmp_path / "redwood")

@@ -52,10 +52,11 @@ def table(path, costs=False):
     return [{k: row[k] for k in kept} for row in rows]
 
 
-def test_a_finished_study_repeats_no_run(folder, tmp_path):
+def test_a_finished_study_repeats_no_run(folder, tmp_path, capsys):
     study = load_study(folder / "base.toml")
-    first = run_study(study, tmp_path / "out", InProcess(), cache=tmp_path / "cache")
+    first = run_study(study, tmp_path / "out", InProcess(), cache=tmp_path / "cache", progress=True)
     assert (first.done, first.repeated, first.failed) == (8, 0, ())
+    assert "8/8" in capsys.readouterr().err
     rows = table(tmp_path / "out" / "runs.csv")
     assert len(rows) == 2 * 2 * 2 * 3
     assert {r["arm"] for r in rows} == {
