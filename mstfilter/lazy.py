@@ -45,10 +45,10 @@ def attach(package: str, init: str) -> tuple[Callable[[str], Any], Callable[[], 
 
 
 def short_repr(component: Any) -> str:
-    """The text of a dataclass with the fields that differ from their defaults."""
+    """The text of a dataclass with the fields that differ from their defaults; of another class, its name."""
     parts = []
-    for field in dataclasses.fields(component):
-        value = getattr(component, field.name)
+    for field in dataclasses.fields(component) if dataclasses.is_dataclass(component) else ():
+        value = getattr(component, field.name, None)
         default = field.default if field.default_factory is dataclasses.MISSING else field.default_factory()
         if field.repr and not (value is default or (type(value) is type(default) and _equal(value, default))):
             nested = dataclasses.is_dataclass(value) and not isinstance(value, type)

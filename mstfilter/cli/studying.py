@@ -77,7 +77,11 @@ def _print_summary(summary: Any) -> None:
             for name in endpoints:
                 metric, d = summary.metric(family, arm, name), compared.get((name, family, arm))
                 cells += ["", ""] if metric is None else [f"{metric.mean:.3f}", _range(*metric.interval)]
-                cells += ["", ""] if d is None else [f"{d.mean:+.3f}", _range(d.low, d.high, "+")]
+                cells += (
+                    ["", ""]
+                    if d is None
+                    else ["–" if d.mean != d.mean else f"{d.mean:+.3f}", _range(d.low, d.high, "+")]
+                )
             spent = "" if seconds is None else f"{seconds.mean:.2f}"
             table.add_row(family, arm, str(len(main.by_scene)), *cells, spent)
     Console(width=None if sys.stdout.isatty() else 180).print(table)

@@ -11,7 +11,7 @@ import re
 from pathlib import Path
 from typing import NamedTuple
 
-from mstfilter.errors import InputError
+from mstfilter.errors import InputError, suggestion
 from mstfilter.lazy import exported
 from mstfilter.resources import examples_folder
 
@@ -66,7 +66,10 @@ def write_starter(kind: str, path: Path, target: str = "") -> Starter:
     if target and target not in _TARGETS:
         raise InputError(f"there are no components for {target!r}", f"there are: {', '.join(_TARGETS)}")
     if kind not in starter_kinds():
-        raise InputError(f"there is no starting file for {kind!r}", f"there are: {', '.join(starter_kinds())}")
+        kinds = starter_kinds()
+        raise InputError(
+            f"there is no starting file for {kind!r}", *suggestion(kind, kinds), f"there are: {', '.join(kinds)}"
+        )
     wanted = target or ("scenes" if kind in starter_kinds("scenes") else "numbers")
     if kind not in starter_kinds(wanted):
         raise InputError(

@@ -20,7 +20,17 @@ from mstfilter.report.display import Drawing, ScenePage
 from mstfilter.resources import preset_names
 from mstfilter.runs import filter_recording
 from mstfilter.scene import Crop, Hypothesis, ObjectRecord, Recording, VoxelGrid
-from mstfilter.smc import Candidates, Infos, Population, Ssp, Tempered, bootstrap, linear_gaussian, run_many
+from mstfilter.smc import (
+    Candidates,
+    Infos,
+    Population,
+    Ssp,
+    Tempered,
+    Transition,
+    bootstrap,
+    linear_gaussian,
+    run_many,
+)
 from mstfilter.testing import scene_example
 from tests.scene.scenes import CAMERA, table_scene
 
@@ -117,6 +127,12 @@ def test_the_texts_of_components_name_changed_fields():
             assert len(repr(getattr(made, slot))) <= 300
     assert repr(mstfilter.preset("mst").transition) == "TrackingTransition(warp=Warp(method='smooth'))"
     assert repr(Tempered()) == "Tempered()"
+
+    class Plain(Transition):
+        def predict(self, rng, population, observation):
+            return population
+
+    assert repr(Plain()) == "Plain()"
     assert repr(Tempered(power=0.25, scheme=Ssp())) == "Tempered(scheme=Ssp(), power=0.25)"
 
 

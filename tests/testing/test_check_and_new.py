@@ -92,6 +92,7 @@ def test_nothing_is_overwritten(tmp_path, capsys):
     assert [p.name for p in tmp_path.iterdir()] == ["test_mine.py"]
     for kind, name, message in (
         ("spoon", "mine.py", "there are: boundary, codec"),
+        ("transitoin", "mine.py", "did you mean transition?"),
         ("update", "my-own.py", "cannot be imported"),
         ("update", "mine.txt", "cannot be imported"),
     ):
