@@ -3,15 +3,16 @@
 >>> import mstfilter
 >>> mst = mstfilter.preset("mst", "proposal=mask_folder", "proposal.folder=masks")        # doctest: +SKIP
 
-=================  ===================================================================
-`mask_files`       folders of instance masks with alternatives: layout, reader, writer
-`mask_trees`       nested masks as a tree whose cuts are levels
-`mask_proposal`    the proposal, the boundary model, and the recipe for SAM
-`completions`      meshes, point clouds and voxels of others as completions
-`cob`              COB: boundary maps and trees; `cob_network`: its network in torch
-`caffe`            a reader of Caffe's files of weights
-`mask_trackers`    SiamMask and SAM 2 as trackers of masks; `siammask_network`: SiamMask's network in torch
-=================  ===================================================================
+==================  ===================================================================
+`mask_files`        folders of instance masks with alternatives: layout, reader, writer
+`mask_trees`        nested masks as a tree whose cuts are levels
+`mask_proposal`     the proposal, the boundary model, and the recipe for SAM
+`completions`       meshes, point clouds and voxels of others as completions
+`cob`               COB: boundary maps and trees; `cob_network`: its network in torch
+`caffe`             a reader of Caffe's files of weights
+`mask_trackers`     SiamMask as a tracker of masks; `siammask_network`: its network in torch
+`package_trackers`  SAM 2, EdgeTAM and Cutie through their packages
+==================  ===================================================================
 
 No weights are part of the package, and none are downloaded.
 """
@@ -25,5 +26,5 @@ __components__ = {
     "boundary": {"mask_folder": "MaskBoundary", "cob": "CobBoundary"},
     "tree": {"cob": "CobTree"},
     "completer": {"external": "ExternalCompletion"},
-    "tracker": {"siammask": "SiamMaskTracker", "sam2": "Sam2Tracker"},
+    "tracker": {"siammask": "SiamMaskTracker", "sam2": "Sam2Tracker", "cutie": "CutieTracker"},
 }

@@ -13,9 +13,10 @@ from mstfilter.frontends.mask_proposal import (
     border_probability as border_probability,
     write_automatic_masks as write_automatic_masks,
 )
-from mstfilter.frontends.mask_trackers import Sam2Tracker as Sam2Tracker, SiamMaskTracker as SiamMaskTracker
+from mstfilter.frontends.mask_trackers import SiamMaskTracker as SiamMaskTracker
 from mstfilter.frontends.mask_trees import (
     mask_tree as mask_tree,
     nested_masks as nested_masks,
     node_values as node_values,
 )
+from mstfilter.frontends.package_trackers import CutieTracker as CutieTracker, Sam2Tracker as Sam2Tracker

@@ -1,4 +1,4 @@
-"""Trackers of masks by others, for the motion rules.
+"""SiamMask, a tracker of masks for the motion rules.
 
 >>> overrides = "transition.tracker=siammask", "transition.tracker.weights=SiamMask_DAVIS.pth"
 >>> filter = mstfilter.preset("paper", *overrides)
@@ -9,9 +9,6 @@ object there, in place of where the optical flow leads (paper, section IV-C).
 SiamMask: Wang, Zhang, Bertinetto, Hu, Torr: Fast Online Object Tracking and Segmentation, CVPR 2019. Its authors
 distribute code and checkpoints at https://github.com/foolwood/SiamMask (MIT). The code here was checked with random
 weights. It was never run with the published ones.
-
-SAM 2: Ravi et al., 2024, https://github.com/facebookresearch/sam2 (Apache-2.0, weights too). The user supplies its
-package and a checkpoint. The adapter was checked with a stand-in of the package.
 """
 
 from __future__ import annotations
@@ -20,10 +17,8 @@ import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
-from importlib import import_module
 from pathlib import Path
-from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -82,7 +77,7 @@ class SiamMaskTracker(MaskTracker, UsesFiles):
     def track(self, clip: Clip, masks: Sequence[np.ndarray]) -> list[np.ndarray]:
         """Masks (H, W) bool of the last frame. Raises InputError if the weights are missing or of another network."""
         network, digest = self._network()
-        frames = _thinned(clip, self.step)
+        frames = thinned(clip, self.step)
         images = [np.ascontiguousarray(frame.rgb[..., ::-1]) for frame in frames]  # BGR, as it was trained
         clip_key = content_key("frames", *(frame.key for frame in frames))
         return [
@@ -114,87 +109,9 @@ class SiamMaskTracker(MaskTracker, UsesFiles):
         return network, digest
 
 
-@dataclass(frozen=True)
-class Sam2Tracker(MaskTracker, UsesFiles):
-    """The video predictor of the package ``sam2`` (SAM 2, or EdgeTAM, whose package has the same name).
-
-    All masks are tracked together, with one pass of the image encoder for each frame.
-
-    Parameters
-    ----------
-    checkpoint : str
-        Path of a checkpoint, for example sam2.1_hiera_tiny.pt.
-    config : str
-        Name of the configuration of the checkpoint, as in the package.
-    device : str
-        Device of torch.
-    step : int
-        Every `step`-th frame is used, and the last one.
-    """
-
-    checkpoint: str = ""
-    config: str = "configs/sam2.1/sam2.1_hiera_t.yaml"
-    device: str = "cpu"
-    step: int = 1
-
-    def __post_init__(self) -> None:
-        check_integer("step", self.step)
-
-    def check_files(self, recording: Recording) -> None:
-        """Load the checkpoint."""
-        self._predictor()
-
-    def _predictor(self) -> Any:
-        path = Path(self.checkpoint)
-        if not self.checkpoint or not path.is_file():
-            raise InputError(
-                f"the checkpoint of SAM 2 does not exist: {path}" if self.checkpoint else "checkpoint is not given",
-                "set the field checkpoint to the path of a file, see https://github.com/facebookresearch/sam2",
-            )
-        return _load_sam2(self.config, str(path.resolve()), self.device)
-
-    def track(self, clip: Clip, masks: Sequence[np.ndarray]) -> list[np.ndarray]:
-        """Masks (H, W) bool of the last frame. Raises InputError if the package or the checkpoint is missing."""
-        predictor, frames = self._predictor(), _thinned(clip, self.step)
-        if len(frames) == 1:
-            return [mask.astype(bool) for mask in masks]
-        found = [np.zeros(mask.shape, dtype=bool) for mask in masks]
-        with TemporaryDirectory() as folder:
-            for k, frame in enumerate(frames):  # the predictor reads numbered JPEG files
-                _write_jpeg(Path(folder) / f"{k:05d}.jpg", frame.rgb)
-            state = predictor.init_state(video_path=folder)
-            numbers = [k for k, mask in enumerate(masks) if mask.any()]
-            for k in numbers:
-                predictor.add_new_mask(inference_state=state, frame_idx=0, obj_id=k, mask=masks[k].astype(bool))
-            for index, objects, logits in predictor.propagate_in_video(state) if numbers else ():
-                if index == len(frames) - 1:
-                    for k, logit in zip(objects, logits, strict=True):
-                        found[k] = (logit[0] > 0).cpu().numpy()
-        return found
-
-
-@lru_cache(maxsize=1)
-def _load_sam2(config: str, checkpoint: str, device: str) -> Any:
-    """The video predictor; the last one is kept."""
-    try:
-        build = import_module("sam2.build_sam").build_sam2_video_predictor
-    except ImportError as error:
-        raise MissingLibraryError(
-            f"sam2 cannot be imported: {error}", "install it as https://github.com/facebookresearch/sam2 says"
-        ) from error
-    return build(config, checkpoint, device=device)
-
-
-def _thinned(clip: Clip, step: int) -> list[Frame]:
+def thinned(clip: Clip, step: int) -> list[Frame]:
     """Every `step`-th frame of a clip, and the last one."""
     return [*list(clip.frames)[: len(clip.frames) - 1 : step], clip.after]
-
-
-def _write_jpeg(path: Path, rgb: np.ndarray) -> None:
-    import cv2
-
-    if not cv2.imwrite(str(path), rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 100]):
-        raise InputError(f"image cannot be written: {path}")
 
 
 @lru_cache(maxsize=1)

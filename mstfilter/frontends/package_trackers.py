@@ -1,0 +1,211 @@
+"""Trackers of masks that are used through packages of their authors: SAM 2, EdgeTAM and Cutie.
+
+>>> overrides = "transition.tracker=sam2", "transition.tracker.checkpoint=sam2.1_hiera_tiny.pt"
+>>> filter = mstfilter.preset("mst", *overrides)
+
+SAM 2: Ravi et al., 2024, https://github.com/facebookresearch/sam2 (Apache-2.0, weights too). EdgeTAM has a package of
+the same name and interface. Cutie: Cheng et al., CVPR 2024, https://github.com/hkchengrex/Cutie (MIT). The user
+supplies package and checkpoint. The adapters were checked with stand-ins of the packages, not with the packages.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from importlib import import_module
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+
+from mstfilter.errors import InputError, MissingLibraryError, check_integer
+from mstfilter.frontends.mask_trackers import thinned
+from mstfilter.scene import Clip, Recording, UsesFiles
+from mstfilter.tracking import MaskTracker
+
+
+@dataclass(frozen=True)
+class Sam2Tracker(MaskTracker, UsesFiles):
+    """The video predictor of the package ``sam2`` (SAM 2, or EdgeTAM, whose package has the same name).
+
+    All masks are tracked together, with one pass of the image encoder for each frame.
+
+    Parameters
+    ----------
+    checkpoint : str
+        Path of a checkpoint, for example sam2.1_hiera_tiny.pt.
+    config : str
+        Name of the configuration of the checkpoint, as in the package.
+    device : str
+        Device of torch.
+    step : int
+        Every `step`-th frame is used, and the last one.
+    """
+
+    checkpoint: str = ""
+    config: str = "configs/sam2.1/sam2.1_hiera_t.yaml"
+    device: str = "cpu"
+    step: int = 1
+
+    def __post_init__(self) -> None:
+        check_integer("step", self.step)
+
+    def check_files(self, recording: Recording) -> None:
+        """Load the checkpoint."""
+        self._predictor()
+
+    def _predictor(self) -> Any:
+        path = existing(self.checkpoint, "SAM 2", "https://github.com/facebookresearch/sam2")
+        return _load_sam2(self.config, path, self.device)
+
+    def track(self, clip: Clip, masks: Sequence[np.ndarray]) -> list[np.ndarray]:
+        """Masks (H, W) bool of the last frame. Raises InputError if the package or the checkpoint is missing."""
+        predictor, frames = self._predictor(), thinned(clip, self.step)
+        if len(frames) == 1:
+            return [mask.astype(bool) for mask in masks]
+        found = [np.zeros(mask.shape, dtype=bool) for mask in masks]
+        with TemporaryDirectory() as folder:
+            for k, frame in enumerate(frames):  # the predictor reads numbered JPEG files
+                _write_jpeg(Path(folder) / f"{k:05d}.jpg", frame.rgb)
+            state = predictor.init_state(video_path=folder)
+            numbers = [k for k, mask in enumerate(masks) if mask.any()]
+            for k in numbers:
+                predictor.add_new_mask(inference_state=state, frame_idx=0, obj_id=k, mask=masks[k].astype(bool))
+            for index, objects, logits in predictor.propagate_in_video(state) if numbers else ():
+                if index == len(frames) - 1:
+                    for k, logit in zip(objects, logits, strict=True):
+                        found[k] = (logit[0] > 0).cpu().numpy()
+        return found
+
+
+@lru_cache(maxsize=1)
+def _load_sam2(config: str, checkpoint: str, device: str) -> Any:
+    """The video predictor; the last one is kept."""
+    build = imported("sam2.build_sam", "https://github.com/facebookresearch/sam2").build_sam2_video_predictor
+    return build(config, checkpoint, device=device)
+
+
+def _write_jpeg(path: Path, rgb: np.ndarray) -> None:
+    import cv2
+
+    if not cv2.imwrite(str(path), rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 100]):
+        raise InputError(f"image cannot be written: {path}")
+
+
+@dataclass(frozen=True)
+class CutieTracker(MaskTracker, UsesFiles):
+    """The package ``cutie``. Masks that do not overlap are tracked together; every frame is encoded once.
+
+    Parameters
+    ----------
+    checkpoint : str
+        Path of a checkpoint, for example cutie-base-mega.pth.
+    device : str
+        Device of torch.
+    step : int
+        Every `step`-th frame is used, and the last one.
+    """
+
+    checkpoint: str = ""
+    device: str = "cpu"
+    step: int = 1
+
+    def __post_init__(self) -> None:
+        check_integer("step", self.step)
+
+    def check_files(self, recording: Recording) -> None:
+        """Load the checkpoint."""
+        self._network()
+
+    def _network(self) -> tuple[Any, Any]:
+        path = existing(self.checkpoint, "Cutie", "https://github.com/hkchengrex/Cutie")
+        return _load_cutie(path, self.device)
+
+    def track(self, clip: Clip, masks: Sequence[np.ndarray]) -> list[np.ndarray]:
+        """Masks (H, W) bool of the last frame. Raises InputError if the package or the checkpoint is missing."""
+        (network, config), frames = self._network(), thinned(clip, self.step)
+        if len(frames) == 1:
+            return [mask.astype(bool) for mask in masks]
+        import torch
+
+        core = import_module("cutie.inference.inference_core").InferenceCore
+        store = import_module("cutie.inference.image_feature_store").ImageFeatureStore(network)
+        images = [
+            torch.from_numpy(frame.rgb.transpose(2, 0, 1).copy()).float().to(self.device) / 255 for frame in frames
+        ]
+        found = [np.zeros(mask.shape, dtype=bool) for mask in masks]
+        groups = disjoint_groups(masks)
+        with torch.inference_mode():
+            for number, group in enumerate(groups):
+                last = {"delete_buffer": number == len(groups) - 1}  # else the features serve the next group
+                tracker = core(network, cfg=config, image_feature_store=store)
+                labels = np.zeros(clip.before.depth.shape, np.int64)
+                for label, k in enumerate(group, start=1):
+                    labels[masks[k]] = label
+                objects = list(range(1, len(group) + 1))
+                chance = tracker.step(images[0], torch.from_numpy(labels).to(self.device), objects=objects, **last)
+                for image in images[1:]:
+                    chance = tracker.step(image, **last)
+                best = chance.argmax(dim=0).cpu().numpy()  # 0 is the background
+                for label, k in enumerate(group, start=1):
+                    found[k] = best == label
+        return found
+
+
+@lru_cache(maxsize=1)
+def _load_cutie(checkpoint: str, device: str) -> tuple[Any, Any]:
+    """Network and configuration as the package's own default, without its download; the last one is kept."""
+    where = "https://github.com/hkchengrex/Cutie"
+    module = imported("cutie.model.cutie", where)
+    hydra, omegaconf = imported("hydra", where), imported("omegaconf", where)
+    import torch
+
+    folder = Path(module.__file__).resolve().parents[1] / "config"
+    with hydra.initialize_config_dir(version_base="1.3.2", config_dir=str(folder)):
+        config = hydra.compose(config_name="eval_config")
+    with omegaconf.open_dict(config):
+        config["weights"] = checkpoint
+    imported("cutie.inference.utils.args_utils", where).get_dataset_cfg(config)
+    network = module.CUTIE(config).to(device).eval()
+    network.load_weights(torch.load(checkpoint, map_location=device, weights_only=True))
+    return network, config
+
+
+def disjoint_groups(masks: Sequence[np.ndarray]) -> list[list[int]]:
+    """Numbers of the masks that have pixels, in groups without common pixels; each mask joins the first that fits."""
+    groups: list[list[int]] = []
+    unions: list[np.ndarray] = []
+    for k, mask in enumerate(masks):
+        if not mask.any():
+            continue
+        fits = next((g for g, union in enumerate(unions) if not (union & mask).any()), None)
+        if fits is None:
+            groups.append([k])
+            unions.append(mask.astype(bool))
+        else:
+            groups[fits].append(k)
+            unions[fits] = unions[fits] | mask
+    return groups
+
+
+def existing(checkpoint: str, name: str, where: str) -> str:
+    """The absolute path of a checkpoint; raises InputError if it is not given or does not exist."""
+    path = Path(checkpoint)
+    if not checkpoint or not path.is_file():
+        raise InputError(
+            f"checkpoint of {name} does not exist: {path}"
+            if checkpoint
+            else f"the checkpoint of {name} is not given",
+            f"set the field checkpoint to the path of a file, see {where}",
+        )
+    return str(path.resolve())
+
+
+def imported(module: str, where: str) -> Any:
+    """A module of another package; raises MissingLibraryError if it cannot be imported."""
+    try:
+        return import_module(module)
+    except ImportError as error:
+        raise MissingLibraryError(f"{module} cannot be imported: {error}", f"install it as {where} says") from error
