@@ -5,6 +5,8 @@ from __future__ import annotations
 import base64
 import json
 import re
+import shutil
+import subprocess
 import sys
 from html.parser import HTMLParser
 from types import ModuleType
@@ -17,9 +19,10 @@ from mstfilter.errors import InputError
 from mstfilter.lazy import exported
 from mstfilter.presets import load_config
 from mstfilter.report.display import Drawing, ScenePage
+from mstfilter.report.pictures import colour
 from mstfilter.resources import preset_names
 from mstfilter.runs import filter_recording
-from mstfilter.scene import Crop, Hypothesis, ObjectRecord, Recording, VoxelGrid
+from mstfilter.scene import Crop, Hypothesis, ObjectRecord, Recording, VoxelGrid, read_rgb
 from mstfilter.smc import (
     Candidates,
     Infos,
@@ -209,3 +212,20 @@ def test_progress_is_shown_if_asked(tmp_path, capsys):
     arrays = Recording.from_arrays(RGB, DEPTH, CAMERA.K)
     filter_recording(arrays, load_config("floor_one_blob"), tmp_path / "run", progress=True)
     assert "1/1" in capsys.readouterr().err
+
+
+@pytest.mark.skipif(shutil.which("chromium") is None, reason="chromium is not installed")
+def test_a_browser_draws_the_page(tmp_path):
+    """A headless browser without network draws every object in its colour."""
+    SCENES.particles[0].show().save(tmp_path / "scene.html")
+    picture = tmp_path / "scene.png"
+    options = ["--headless", "--no-sandbox", "--disable-gpu", "--proxy-server=127.0.0.1:9", "--window-size=600,500"]
+    command = ["chromium", *options, f"--user-data-dir={tmp_path / 'profile'}", f"--screenshot={picture}"]
+    subprocess.run([*command, f"file://{tmp_path / 'scene.html'}"], check=True, capture_output=True, timeout=120)
+    pixels = read_rgb(picture)[:400].reshape(-1, 3).astype(int)
+    for k in range(SCENES.particles[0].n_objects):
+        # Shaded by at most a factor of 0.62: the hue stays.
+        direction = np.array(colour(k)) / np.linalg.norm(colour(k))
+        length = np.linalg.norm(pixels, axis=1)
+        near = (pixels @ direction > 0.999 * length) & (length < 1.02 * np.linalg.norm(colour(k)))
+        assert (near & (length > 0.6 * np.linalg.norm(colour(k)))).sum() > 500
