@@ -46,6 +46,7 @@ from mstfilter.scene import content_key, memo, read_labels
 from mstfilter.segmentation import Tree
 
 MAX_MASKS = 65535  #: Largest label, and largest number of masks of a file
+MAX_PIXELS = 2**31  #: Largest number of pixels of all masks of a file
 _SUFFIXES = (".png", ".npz", ".json")
 _WEIGHTS = "weights.json"
 
@@ -79,6 +80,8 @@ def read_masks(folder: str | Path, pause: int, shape: tuple[int, int], rgb: np.n
     Files are read at each call, and their content is parsed once. Raises InputError if the folder has no masks for
     the pause, or a file cannot be used.
     """
+    if not str(folder):
+        raise InputError("the folder of masks is not given", "set folder, for example proposal.folder=masks")
     where = _find(Path(folder), pause)
     parts = {"": where} if where.is_file() else {p.name: p for p in _entries(where) if p.is_dir()}
     files = [] if where.is_file() else [p for p in _entries(where) if p.is_file() and p.name != _WEIGHTS]
@@ -96,7 +99,7 @@ def read_masks(folder: str | Path, pause: int, shape: tuple[int, int], rgb: np.n
         "masks",
         shape,
         image,
-        *(part for p, data in content.items() for part in (p.name, data)),
+        *(part for p, data in content.items() for part in (p.relative_to(where.parent).as_posix(), data)),
         *((w and sorted(w.items()), name) for name, w in weights.items()),
     )
 
@@ -117,8 +120,6 @@ def _entries(folder: Path) -> list[Path]:
 
 def _find(folder: Path, pause: int) -> Path:
     """The file or folder of a pause."""
-    if str(folder) in ("", "."):
-        raise InputError("the folder of masks is not given", "set folder, for example proposal.folder=masks")
     if not folder.is_dir():
         raise InputError(f"folder of masks does not exist: {folder}")
     found: dict[int, list[Path]] = {}
@@ -247,6 +248,12 @@ def _check_shape(path: Path, found: Sequence[int], shape: tuple[int, int]) -> No
         )
 
 
+def _check_amount(path: Path, n: int, shape: tuple[int, int]) -> None:
+    """Raise InputError if masks need too much memory; a small file can hold many empty ones."""
+    if n * shape[0] * shape[1] > MAX_PIXELS:
+        raise InputError(f"{path} has {n} masks, at most {MAX_PIXELS // (shape[0] * shape[1])} of this size are read")
+
+
 def _read_png(path: Path, data: bytes, shape: tuple[int, int], image: str) -> tuple[np.ndarray, np.ndarray]:
     labels = read_labels(path)
     _check_shape(path, labels.shape, shape)
@@ -271,6 +278,7 @@ def _read_npz(path: Path, data: bytes, shape: tuple[int, int], image: str) -> tu
                 raise InputError(
                     f"{path}: masks has type {dtype} and length {size[0]}, expected bool, at most {MAX_MASKS}"
                 )
+            _check_amount(path, int(np.prod(size[:-2], dtype=np.int64)), shape)
             masks = _member(archive, kind)
             if kind == "labels":
                 if not np.issubdtype(masks.dtype, np.integer):
@@ -281,8 +289,8 @@ def _read_npz(path: Path, data: bytes, shape: tuple[int, int], image: str) -> tu
                         "labels have 16 bits; number the masks from 1",
                     )
             n = len(masks) if kind == "masks" else len(np.unique(masks[masks > 0]))
-            scores = _member(archive, "scores") if "scores" in names else np.ones(n)
-            made_from = str(_member(archive, "image")) if "image" in names else image
+            scores = _member(archive, "scores", MAX_MASKS) if "scores" in names else np.ones(n)
+            made_from = str(_member(archive, "image", 1)) if "image" in names else image
     except (zipfile.BadZipFile, ValueError, EOFError, OSError, zlib.error, KeyError) as error:
         if isinstance(error, InputError):
             raise
@@ -307,7 +315,10 @@ def _header(archive: zipfile.ZipFile, name: str) -> tuple[tuple[int, ...], np.dt
     return shape, dtype
 
 
-def _member(archive: zipfile.ZipFile, name: str) -> np.ndarray:
+def _member(archive: zipfile.ZipFile, name: str, limit: int | None = None) -> np.ndarray:
+    """An array of an npz file, with at most `limit` elements."""
+    if limit is not None and math.prod(_header(archive, name)[0]) > limit:
+        raise ValueError(f"{name} has more than {limit} elements")
     with archive.open(f"{name}.npy") as file:
         return np.asarray(np.lib.format.read_array(file, allow_pickle=False))
 
@@ -324,6 +335,7 @@ def _read_json(path: Path, data: bytes, shape: tuple[int, int], image: str) -> t
     entries = entries.get("masks") if isinstance(entries, dict) else entries
     if not isinstance(entries, list) or len(entries) > MAX_MASKS:
         raise InputError(f"{path} is not a list of at most {MAX_MASKS} masks, or an object with such a list `masks`")
+    _check_amount(path, len(entries), shape)
     masks, scores = np.zeros((len(entries), *shape), dtype=bool), np.ones(len(entries))
     for k, entry in enumerate(entries):
         rle = entry.get("segmentation") if isinstance(entry, dict) else None

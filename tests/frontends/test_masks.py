@@ -374,6 +374,7 @@ HOSTILE = {
     "pickled scores": (npz(masks=stack(*BOX), scores=np.array([None] * 3, dtype=object)), "Object arrays"),
     "pickled labels": (npz(labels=np.full(SHAPE, None, dtype=object)), "Object arrays"),
     "huge npz": (huge, "at most 65535"),
+    "huge scores": (npz(masks=stack(BOX[0]), scores=np.zeros(70000)), "more than 65535 elements"),
     "other arrays": (npz(x=np.zeros(3)), "no array labels or masks"),
     "text for npz": (text("000000.npz", "not a zip"), "cannot be read"),
     "another size, npz": (npz(labels=np.zeros((10, 20), int)), "10 x 20 pixels, the image is 120 x 160"),
@@ -450,6 +451,17 @@ def test_files_that_cannot_be_used_are_one_clear_error(tmp_path, case):
         read_masks(tmp_path, 0, SHAPE)
     assert message in caught.value.message + " ".join(caught.value.hints)
     assert "\n" not in caught.value.message
+
+
+def test_the_memory_of_a_file_is_bounded(tmp_path, monkeypatch):
+    """Files of a few kilobytes can announce gigabytes of empty masks."""
+    monkeypatch.setattr("mstfilter.frontends.mask_files.MAX_PIXELS", 10 * SHAPE[0] * SHAPE[1])
+    for write in (text("000000.json", [ENTRY] * 11), npz(masks=np.zeros((11, *SHAPE), bool))):
+        for path in tmp_path.iterdir():
+            path.unlink()
+        write(tmp_path)
+        with pytest.raises(InputError, match="has 11 masks, at most 10 of this size"):
+            read_masks(tmp_path, 0, SHAPE)
 
 
 class TestContract(ProposalContract):
