@@ -52,6 +52,7 @@ from mstfilter.scene import (
 _MESHES = (".ply", ".obj", ".stl", ".off")
 _MASK = "mask.png"
 _WEIGHTS = "weights.json"
+_MAX_BYTES = 2**31  # of an unpacked npz file
 #: Directions of the rays of the inside test; not along the axes, so that they miss edges of axis-parallel meshes.
 _RAYS = np.array([[1.0, 1.1e-4, 1.7e-4], [1.3e-4, 1.0, 0.7e-4], [0.9e-4, 1.9e-4, 1.0]], np.float32)
 
@@ -117,7 +118,8 @@ class ExternalCompletion(ClipCompleter, UsesFiles):
         return bound
 
     def fill(self, rng: np.random.Generator, seen: ObservedBox) -> np.ndarray:
-        raise NotImplementedError("shapes are placed by `complete`, which knows the mask")
+        """The visible surface; `complete_each` adds the shape of the mask."""
+        return seen.surface.astype(np.float32)
 
     def complete_each(
         self, rngs: Sequence[np.random.Generator], frame: Frame, masks: Sequence[np.ndarray], grid: VoxelGrid
@@ -152,7 +154,7 @@ class ExternalCompletion(ClipCompleter, UsesFiles):
             shape, name = self._volume(path, frame.camera, grid), path.name
         offset, seen = observed_box(frame, mask, grid, self._reaching(shape, frame, mask, grid))
         box = tuple(slice(int(a), int(a) + n) for a, n in zip(offset, seen.points.shape, strict=True))
-        p = np.where(seen.free, 0, np.maximum(shape[box], seen.surface)).astype(np.float32)
+        p = np.where(seen.free, 0, np.maximum(shape[box], self.fill(rng, seen))).astype(np.float32)
         key = content_key("shape", np.packbits(mask), frame.key, grid.key, component_key(self), shape, name)
         return Completion(offset, p, seen.points, key.hex()[:16])
 
@@ -249,6 +251,10 @@ def _checked(path: Path, points: np.ndarray, T: np.ndarray, grid: VoxelGrid) -> 
 
 def _arrays(path: Path, data: bytes) -> dict[str, np.ndarray]:
     try:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            size = sum(entry.file_size for entry in archive.infolist())
+        if size > _MAX_BYTES:
+            raise ValueError(f"{size} bytes when unpacked, at most {_MAX_BYTES} are read")
         with np.load(io.BytesIO(data), allow_pickle=False) as archive:
             arrays = {name: archive[name] for name in archive.files}
     except (zipfile.BadZipFile, ValueError, EOFError, OSError, zlib.error, AttributeError) as error:
