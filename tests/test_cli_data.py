@@ -101,7 +101,7 @@ ERRORS = {
     "intrinsics lost": (unnamed, [], "intrinsics are missing"),
     "table 1 km away": (layouts.write_redwood, ["-o", "depth_scale=1.25"], "expected between 0.05 and 30 m"),
     "table 1 mm away": (layouts.write_redwood, ["-o", "depth_scale=1.25e-6"], "expected between 0.05 and 30 m"),
-    "unknown format": (photos, [], "has no known format"),
+    "colour alone": (photos, [], "holds colour images only"),
     "wrong format": (layouts.write_redwood, ["--format", "tum"], "not a TUM folder"),
     "wrong topic": (bag(), ["-o", "colour=/rgb"], "no image topic '/rgb'"),
     "sizes differ": (small_depth, [], "differ in size"),
