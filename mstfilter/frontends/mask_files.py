@@ -40,7 +40,7 @@ from typing import Any
 import numpy as np
 
 from mstfilter.errors import InputError
-from mstfilter.files import atomic_path, write_text
+from mstfilter.files import atomic_folder, write_text
 from mstfilter.frontends.mask_trees import label_tree, mask_tree
 from mstfilter.scene import content_key, memo, read_labels
 from mstfilter.segmentation import Tree
@@ -401,7 +401,9 @@ def write_masks(
     region: str = "",
     rgb: np.ndarray | None = None,
 ) -> None:
-    """Write the alternatives of a pause, or of one of its regions, as npz files.
+    """Write the alternatives of a pause, or of one of its regions, as npz files. Earlier ones are replaced.
+
+    Nothing is written if the masks cannot be read: see `mstfilter.frontends.mask_files`.
 
     Parameters
     ----------
@@ -418,19 +420,24 @@ def write_masks(
         The image. The reader then refuses the masks for another image.
     """
     path = Path(folder) / f"{pause:06d}" / region
-    for k, one in enumerate(alternatives):
-        masks, scores = one if isinstance(one, tuple) else (one, None)
-        masks = np.asarray(masks)
-        arrays: dict[str, np.ndarray] = {"labels" if masks.ndim == 2 else "masks": masks}
-        if scores is not None:
-            arrays["scores"] = np.asarray(scores, dtype=np.float64)
-        if rgb is not None:
-            arrays["image"] = np.array(image_key(rgb))
-        file, name = io.BytesIO(), path / f"{k}.npz"
-        np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
-        _region("", [name], {name: file.getvalue()}, None, masks.shape[-2:], "")  # the checks of the reader
-        with atomic_path(name) as partial:
-            partial.write_bytes(file.getvalue())
-    if weights is not None:
-        write_text(path / _WEIGHTS, json.dumps({f"{k}.npz": float(w) for k, w in enumerate(weights)}))
-        read_weights(path, _alternatives(path))
+    if not len(alternatives) or (weights is not None and len(weights) != len(alternatives)):
+        given = "none" if weights is None else len(weights)
+        raise InputError(
+            f"there are {len(alternatives)} alternatives and {given} weights, expected at least 1 of each"
+        )
+    with atomic_folder(path) as partial:
+        partial.mkdir(parents=True)
+        for k, one in enumerate(alternatives):
+            masks, scores = one if isinstance(one, tuple) else (one, None)
+            masks = np.asarray(masks)
+            arrays: dict[str, np.ndarray] = {"labels" if masks.ndim == 2 else "masks": masks}
+            if scores is not None:
+                arrays["scores"] = np.asarray(scores, dtype=np.float64)
+            if rgb is not None:
+                arrays["image"] = np.array(image_key(rgb))
+            name = partial / f"{k}.npz"
+            np.savez_compressed(name, **arrays)  # type: ignore[arg-type]
+            _region("", [name], {name: read_bytes(name)}, None, masks.shape[-2:], "")  # the checks of the reader
+        if weights is not None:
+            write_text(partial / _WEIGHTS, json.dumps({f"{k}.npz": float(w) for k, w in enumerate(weights)}))
+            read_weights(partial, _alternatives(partial))

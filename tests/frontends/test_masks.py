@@ -493,3 +493,16 @@ def test_nothing_is_written_that_cannot_be_read(tmp_path):
     with pytest.raises(InputError, match="overlap"):
         write_masks(tmp_path, 0, [stack(BOX[0], SHIFTED)])
     assert not list(tmp_path.rglob("*.npz"))
+    for alternatives, weights in (([], None), ([SHOWN], [1, 2])):
+        with pytest.raises(InputError, match="expected at least 1 of each"):
+            write_masks(tmp_path, 0, alternatives, weights)
+
+
+def test_writing_again_replaces_what_was_there(tmp_path):
+    write_masks(tmp_path, 0, [SHOWN, BOX[0].astype(int), BOX[1].astype(int)], [1, 1, 1])
+    write_masks(tmp_path, 0, [SHOWN])
+    assert len(read_masks(tmp_path, 0, SHAPE).regions[0].trees) == 1
+    with pytest.raises(InputError, match="overlap"):
+        write_masks(tmp_path, 0, [stack(BOX[0], SHIFTED)])
+    assert (read_masks(tmp_path, 0, SHAPE).regions[0].trees[0].leaves == SHOWN).all()
+    assert [path.name for path in tmp_path.iterdir()] == ["000000"]
