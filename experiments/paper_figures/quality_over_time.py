@@ -1,6 +1,7 @@
-"""Figure `quality_over_time`: quality of all hypotheses over pauses, by family and method, from a study folder.
+"""Figure `quality_over_time`: both endpoints over pauses, by family and method, from a study folder.
 
-It is the figure of the study report as a file, in the report's light colours.
+The quality of all hypotheses is the figure of the study report as a file, in the report's light colours; the same
+figure of the information of the runs is `information_over_time`.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ PAGE = 'xmlns="http://www.w3.org/2000/svg" style="background:var(--paper);font-f
 
 
 def make(out: Path, study: Path, chosen: Sequence[str] = ()) -> list[Path]:
-    """The figure of the runs that are done, with the arms chosen, or else all but those beside the comparisons.
+    """The figures of the runs that are done, with the arms chosen, or else all but those beside the comparisons.
 
     More than twelve arms make several figures.
     """
@@ -27,21 +28,24 @@ def make(out: Path, study: Path, chosen: Sequence[str] = ()) -> list[Path]:
     if unknown := [name for name in chosen if name not in known]:
         raise InputError(f"the study has no arm {unknown[0]!r}", f"it has {', '.join(known)}")
     arms = list(chosen) or [name for name in known if name not in folder.reported_only]
-    values: dict[str, dict[str, dict[int, list[float]]]] = {}
-    scenes: dict[str, set[str]] = {}
-    for row in folder.records():
-        if row["arm"] in arms and row.get("qualities"):
-            by_pause = values.setdefault(row["family"], {}).setdefault(row["arm"], {})
-            by_pause.setdefault(row["pause"], []).extend(row["qualities"])
-            scenes.setdefault(row["family"], set()).add(row["scene"])
-    if not values:
-        return []
-    out.mkdir(parents=True, exist_ok=True)
-    titled = {f"{family}, n = {len(scenes[family])} scenes": of_arms for family, of_arms in values.items()}
+    rows = [row for row in folder.records() if row["arm"] in arms]
     paths = []
-    for k, group in enumerate(figure_groups(arms, folder.description["reference"])):
-        paths.append(out / f"quality_over_time{f'_{k + 1}' if k else ''}.svg")
-        paths[-1].write_text(standalone(time_figure(titled, group)))
+    for measure in ("quality", "information"):
+        values: dict[str, dict[str, dict[int, list[float]]]] = {}
+        scenes: dict[str, set[str]] = {}
+        for row in rows:
+            found = row.get("qualities") if measure == "quality" else row.get("information")
+            if found:
+                by_pause = values.setdefault(row["family"], {}).setdefault(row["arm"], {})
+                by_pause.setdefault(row["pause"], []).extend(found if measure == "quality" else [found])
+                scenes.setdefault(row["family"], set()).add(row["scene"])
+        if not values:
+            continue
+        out.mkdir(parents=True, exist_ok=True)
+        titled = {f"{family}, n = {len(scenes[family])} scenes": of_arms for family, of_arms in values.items()}
+        for k, group in enumerate(figure_groups(arms, folder.description["reference"])):
+            paths.append(out / f"{measure}_over_time{f'_{k + 1}' if k else ''}.svg")
+            paths[-1].write_text(standalone(time_figure(titled, group, measure)))
     return paths
 
 

@@ -280,13 +280,15 @@ def figure_groups(arms: Sequence[str], reference: str) -> list[list[str]]:
     return [first + others[k : k + size] for k in range(0, len(others), size)]
 
 
-def time_figure(values: Mapping[str, Mapping[str, Mapping[int, Sequence[float]]]], arms: Sequence[str]) -> str:
-    """Quality of all hypotheses over time, one panel per family.
+def time_figure(
+    values: Mapping[str, Mapping[str, Mapping[int, Sequence[float]]]], arms: Sequence[str], measure: str = "quality"
+) -> str:
+    """Quality of all hypotheses, or another measure of the runs, over time, one panel per family.
 
-    `values` is family -> arm -> pause -> quality of every hypothesis of every scene and seed. `arms` gives the order
-    of the boxes (see `figure_groups` for many arms); arms without values are left out. Boxes contain the middle half
-    of the hypotheses, the bar is their median, whiskers reach the 5th and 95th percentile; points are hypotheses,
-    lines join the means.
+    `values` is family -> arm -> pause -> values: one of each scene and seed, or of each hypothesis. `arms` gives the
+    order of the boxes (see `figure_groups` for many arms); arms without values are left out. Boxes contain the middle
+    half of the values, the bar is their median, whiskers reach the 5th and 95th percentile; points are values, lines
+    join the means.
     """
     values = {family: {a: v for a, v in of_arms.items() if a in arms} for family, of_arms in values.items()}
     colours, n = _arm_colours(arms), len(values)
@@ -314,7 +316,7 @@ def time_figure(values: Mapping[str, Mapping[str, Mapping[int, Sequence[float]]]
             drawn = np.concatenate([np.asarray(q) for by_pause in of_arms.values() for q in by_pause.values()])
             axes.set_ylim(max(-0.02, drawn.min() - 0.05), min(1.02, drawn.max() + 0.05))
             axes.set_title(family)
-            axes.set_ylabel("quality")
+            axes.set_ylabel("information, nats" if measure == "information" else measure)
         panels[-1].set_xlabel("pause")
         handles = {line.get_label(): line for axes in panels for line in axes.get_lines() if line.get_label() in arms}
         figure.legend(
@@ -324,7 +326,7 @@ def time_figure(values: Mapping[str, Mapping[str, Mapping[int, Sequence[float]]]
             ncols=min(4, len(shown)),
             fontsize=8.5,
         )
-        return _svg_text(figure, "Quality of the hypotheses over time by family and method")
+        return _svg_text(figure, f"{measure.capitalize()} over time by family and method")
 
 
 def _boxes(

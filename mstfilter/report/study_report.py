@@ -124,19 +124,22 @@ def _drawn(records: Sequence[Mapping[str, Any]], summary: Summary, reported_only
     """Inline SVG by name."""
     from markupsafe import Markup
 
-    values: dict[str, dict[str, dict[int, list[float]]]] = defaultdict(lambda: defaultdict(lambda: defaultdict(list)))
-    for row in records:
-        if row.get("qualities"):
-            values[row["family"]][row["arm"]][row["pause"]].extend(row["qualities"])
     found: dict[str, Any] = {}
     arms = [arm for arm in summary.arms if arm not in reported_only]
-    if values:
-        groups = figure_groups(arms, summary.reference)
-        found["time"] = [Markup(time_figure(values, group)) for group in groups]
     ends = [summary.reference, *(arm for arm in summary.arms if arm in reported_only)]
-    if values and len(ends) > 1:
-        groups = figure_groups(ends, summary.reference)
-        found["ends"] = [Markup(time_figure(values, group)) for group in groups]
+    for name in ENDPOINTS:
+        values: dict[str, Any] = defaultdict(lambda: defaultdict(lambda: defaultdict(list)))
+        for row in records:
+            of_row = row.get("qualities") if name == "quality" else row.get(name)
+            if of_row:
+                values[row["family"]][row["arm"]][row["pause"]] += of_row if name == "quality" else [of_row]
+        if not values:
+            continue
+        groups = figure_groups(arms, summary.reference)
+        found.setdefault("time", []).extend(Markup(time_figure(values, group, name)) for group in groups)
+        if len(ends) > 1:
+            groups = figure_groups(ends, summary.reference)
+            found.setdefault("ends", []).extend(Markup(time_figure(values, group, name)) for group in groups)
     for name in ENDPOINTS:
         compared = [one for one in summary.compared(name) if one.difference.n]
         if compared:
