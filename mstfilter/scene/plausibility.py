@@ -23,7 +23,7 @@ from mstfilter.scene.voxels import VoxelGrid
 
 _MIN_HEIGHT = 0.01  # metres above the table beyond which a reading may show an object
 _DISTANCES = (0.2, 4.0)  # metres: median depth of the readings
-_FIELDS = (15.0, 130.0)  # degrees: horizontal field of view
+_FIELDS = (12.0, 130.0)  # degrees: horizontal field of view
 _VOXELS = (0.001, 0.05)  # metres
 _MAX_TILT, _MAX_HEIGHT = 4.0, 0.025  # degrees and metres between the plane of the readings and z = 0
 _OTHER_PLANE = 30.0  # degrees: a plane that is tilted by more is a wall or the side of a box, not the table
