@@ -12,7 +12,7 @@ from mstfilter.cli.root import app
 
 @app.command()
 def train(
-    part: Annotated[str, typer.Argument(help="What to train: completion.")],
+    part: Annotated[str, typer.Argument(help="What to train: completion or border.")],
     overrides: Annotated[
         list[str] | None, typer.Argument(metavar="[NAME=VALUE]...", help="Changes to the settings: steps=10000")
     ] = None,
@@ -24,16 +24,18 @@ def train(
     """Train a learned part on simulated scenes; the same command resumes a training that was stopped."""
     from mstfilter.errors import check_choice
 
-    check_choice("part", part, ("completion",))
-    from mstfilter.training import completion_settings, train_completion
+    check_choice("part", part, ("completion", "border"))
+    from mstfilter.training import BorderTraining, CompletionTraining, train as run_training
 
-    settings = completion_settings(recipe, overrides or ())
+    trained = CompletionTraining if part == "completion" else BorderTraining
+    settings = trained.recipe(recipe, overrides or ())
     folder = out or Path("trained") / part
 
     def report(done: int, total: int, text: str) -> None:
         print(f"{done:7d} of {total}  {text}", flush=True)
 
-    figures = train_completion(settings, folder, workers, report, device or None)
-    print(f"model       {folder}; use it with proposal.completer=network proposal.completer.weights={folder}")
+    figures = run_training(settings, folder, workers, report, device or None)
+    use = f"; use it with proposal.completer=network proposal.completer.weights={folder}"
+    print(f"model       {folder}{use if part == 'completion' else ''}")
     for name, value in (figures or {}).items():
         print(f"{name:28s} {value:.4f}")

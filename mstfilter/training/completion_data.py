@@ -17,28 +17,35 @@ objects gets both.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial import cKDTree
-from scipy.spatial.transform import RigidTransform, Rotation
 
 from mstfilter.completion import Extrude, ObservedBox, observed_box
 from mstfilter.completion.crops import EDGE, LATTICE, crop_box, decode_signed, encode_box
 from mstfilter.errors import InputError
-from mstfilter.files import atomic_path
-from mstfilter.scene import Camera, Frame, VoxelGrid, look_at, scene_cache
+from mstfilter.scene import Camera, Frame, VoxelGrid, scene_cache
 from mstfilter.segmentation import MetropolisHastingsCuts, TreeCutProposal
-from mstfilter.simulation.arrangement import arrange_objects
-from mstfilter.simulation.families import SceneFamily
 from mstfilter.simulation.sensor import DepthSensor
 from mstfilter.simulation.shapes import label_voxels
 from mstfilter.simulation.world import PhysicsWorld
-from mstfilter.training.shapes import TRAINED, draw_kind, draw_training_shape
+from mstfilter.training.scenes import (
+    HEIGHT,
+    WIDTH,
+    Columns,
+    cast,
+    displaced,
+    draw_camera,
+    draw_scene,
+    on_table,
+    read_shard,
+    write_shards,
+)
+from mstfilter.training.shapes import TRAINED
 
-WIDTH, HEIGHT = 320, 240
 _GRID = VoxelGrid(np.array([-0.45, -0.45, 0.0]), LATTICE, (90, 90, 40))
 _N_VIEWS, _N_MASKS = 3, 14  # cameras of a scene, masks of a view
 _SECOND_FRAME = 0.25  # share of views with a second frame
@@ -49,7 +56,7 @@ MASK_KINDS = ("whole", "part", "several")
 
 
 @dataclass(frozen=True, eq=False)
-class Samples:
+class Samples(Columns):
     """Samples of one or of many scenes."""
 
     bits: np.ndarray  #: (n, 32, 32, 32) uint8, what is seen (`encode_box`)
@@ -60,13 +67,6 @@ class Samples:
     scene: np.ndarray  #: (n,) int32, number of the scene
     visible: np.ndarray  #: (n,) float32, visible share of the object's silhouette (0 hidden, 1 nothing in front)
 
-    def __len__(self) -> int:
-        return len(self.bits)
-
-    def take(self, index: np.ndarray) -> Samples:
-        """Some samples."""
-        return Samples(*(getattr(self, name)[index] for name in self.__dataclass_fields__))
-
     def box(self, k: int) -> ObservedBox:
         """What sample k shows, as a completer sees it."""
         own, other, free, behind, hidden = (((self.bits[k] >> i) & 1).astype(bool) for i in range(5))
@@ -75,17 +75,12 @@ class Samples:
             own.astype(np.int32), own, other, free, behind, hidden, decode_signed(self.signed[k]), height
         )
 
-    @classmethod
-    def join(cls, parts: Sequence[Samples]) -> Samples:
-        """All samples of several parts."""
-        return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in cls.__dataclass_fields__))
-
 
 def scene_samples(seed: int, index: int, kinds: tuple[str, ...] = TRAINED) -> Samples:
     """The samples of scene number `index`."""
     for attempt in range(20):
         rng = np.random.default_rng([seed, index, attempt])
-        world = _draw_scene(rng, kinds)
+        world = draw_scene(rng, kinds)
         if world is not None:
             parts = [part for _ in range(_N_VIEWS) if (part := _view_samples(rng, world, index)) is not None]
             if parts:
@@ -93,55 +88,13 @@ def scene_samples(seed: int, index: int, kinds: tuple[str, ...] = TRAINED) -> Sa
     raise InputError(f"no scene could be made of the kinds {', '.join(kinds)}")
 
 
-def _draw_scene(rng: np.random.Generator, kinds: tuple[str, ...]) -> PhysicsWorld | None:
-    """A scene at rest; None if the objects do not fit."""
-    n = int(rng.integers(2, 13))
-    shapes = [draw_training_shape(rng, draw_kind(rng, kinds)) for _ in range(n)]
-    world = PhysicsWorld(shapes, arm=False)
-    n_dropped = int(rng.integers(0, n // 2 + 1)) if rng.uniform() < 0.6 else 0
-    family = SceneFamily(
-        name="training",
-        n_objects_min=n,
-        n_objects_max=n,
-        n_twins=0,
-        contact=float(rng.uniform(0.3, 1.0)),
-        n_actions=0,
-    )
-    order = rng.permutation(n)
-    try:
-        # Dropped objects start far away; the others are arranged first.
-        first = PhysicsWorld([shapes[k] for k in order[n_dropped:]], arm=False)
-        arrange_objects(rng, first, replace(family, n_objects_min=n - n_dropped), (-1,) * (n - n_dropped))
-    except InputError:
-        return None
-    for k, position, rotation in zip(order[n_dropped:].tolist(), first.positions(), first.rotations(), strict=True):
-        world.place(k, position, rotation)
-    world.forward()
-    for k in order[:n_dropped].tolist():
-        near = world.positions()[order[n_dropped:]]
-        at = near[int(rng.integers(len(near))), :2] + rng.normal(0.0, 0.03, 2)
-        world.place(k, (*at, 0.12 + shapes[k].radius + rng.uniform(0.0, 0.1)), Rotation.random(rng=rng).as_matrix())
-        world.forward()
-        if not world.overlaps(k):
-            world.settle()
-        else:
-            world.place(k, (10.0 + 2.0 * k, 0.0, 1.0), np.eye(3))
-    world.forward()
-    return world
-
-
 def _view_samples(rng: np.random.Generator, world: PhysicsWorld, index: int) -> Samples | None:
     """The samples of one camera; None if there are none."""
     poses = world.poses()
-    inside = (np.abs(poses[:, :2, 3]) < 0.4).all(axis=1) & (poses[:, 2, 3] > 0)
+    inside = on_table(poses)
     if not inside.any():
         return None
-    target = np.append(poses[inside, :2, 3].mean(axis=0), 0.05) + rng.normal(0.0, 0.03, 3)
-    azimuth, elevation, distance = rng.uniform(0, 2 * np.pi), np.deg2rad(rng.uniform(22, 68)), rng.uniform(0.55, 1.05)
-    flat = np.cos(elevation)
-    away = np.array([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)])
-    camera = Camera.from_intrinsics(525.0, 525.0, 319.5, 239.5, 640, 480, look_at(target + distance * away, target))
-    camera = camera.scaled(WIDTH / 640)
+    camera = draw_camera(rng, poses[inside, :2, 3].mean(axis=0), (22, 68), (0.55, 1.05))
     frame, instance = _frame(rng, world, camera)
     truth = label_voxels(world.shapes, poses, _GRID)
     second = None
@@ -168,16 +121,11 @@ def _view_samples(rng: np.random.Generator, world: PhysicsWorld, index: int) -> 
     return Samples(bits, signed, shapes, kinds, masks.astype(np.uint8), scene, visible.astype(np.float32))
 
 
-def _cast(world: PhysicsWorld, camera: Camera, groups: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    turn = camera.pose.as_matrix()[:3, :3]
-    return world.cast(np.array(camera.position), camera.rays().reshape(-1, 3) @ turn.T, groups)
-
-
 def _frame(rng: np.random.Generator, world: PhysicsWorld, camera: Camera) -> tuple[Frame, np.ndarray]:
     """An image with noise, with a small error of the camera's pose, and the true instances (H, W)."""
     turn = camera.pose.as_matrix()[:3, :3]
     rays = camera.rays().reshape(-1, 3) @ turn.T
-    geom, z, normal = _cast(world, camera, (0, 1))
+    geom, z, normal = cast(world, camera, (0, 1))
     instance = np.where(geom >= 0, world.geom_object[np.maximum(geom, 0)], 0)
     slant = np.abs((rays * normal).sum(axis=1)) / np.linalg.norm(rays, axis=1)
     depth = np.where(geom >= 0, z, np.nan).astype(np.float32).reshape(HEIGHT, WIDTH)
@@ -188,9 +136,7 @@ def _frame(rng: np.random.Generator, world: PhysicsWorld, camera: Camera) -> tup
     light = 0.45 + 0.5 * np.clip(normal @ np.array([0.3, -0.4, 0.87]), 0, 1)
     rgb = albedo[instance] * light[:, None] + rng.normal(0.0, 0.02, (len(instance), 3))
     image = np.clip(255 * rgb, 0, 255).astype(np.uint8).reshape(HEIGHT, WIDTH, 3)
-    shift, tilt = rng.normal(0.0, 0.0015, 3), Rotation.from_rotvec(rng.normal(0.0, 0.003, 3))
-    pose = RigidTransform.from_components(shift, tilt) * camera.pose
-    return Frame(image, reading, camera.at(pose)), instance.reshape(HEIGHT, WIDTH)
+    return Frame(image, reading, displaced(rng, camera)), instance.reshape(HEIGHT, WIDTH)
 
 
 def _silhouettes(world: PhysicsWorld, camera: Camera, instance: np.ndarray) -> dict[int, float]:
@@ -204,7 +150,7 @@ def _silhouettes(world: PhysicsWorld, camera: Camera, instance: np.ndarray) -> d
                 world.place(other, (10.0 + 2.0 * other, 0.0, 1.0), np.eye(3))
         world.place(k, positions[k], rotations[k])
         world.forward()
-        geom, _, _ = _cast(world, camera, (1,))
+        geom, _, _ = cast(world, camera, (1,))
         shares[k + 1] = float(seen[k + 1] / max((geom >= 0).sum(), 1))
         world.restore(state)
     return shares
@@ -332,17 +278,10 @@ def _claimed(
     return claimed
 
 
-def _shard(job: tuple[Path, int, int, int, tuple[str, ...]]) -> None:
-    path, seed, start, stop, kinds = job
-    if path.exists():
-        return
-    samples = Samples.join([scene_samples(seed, index, kinds) for index in range(start, stop)])
-    with atomic_path(path) as partial, partial.open("wb") as file:
-        np.savez_compressed(
-            file,
-            **{name: getattr(samples, name) for name in Samples.__dataclass_fields__ if name != "truth"},
-            truth=np.packbits(samples.truth, axis=-1),
-        )
+def _columns(seed: int, kinds: tuple[str, ...], start: int, stop: int) -> dict[str, np.ndarray]:
+    """The samples of scenes start .. stop - 1 as they are stored."""
+    columns = Samples.join([scene_samples(seed, index, kinds) for index in range(start, stop)]).columns()
+    return {**columns, "truth": np.packbits(columns["truth"], axis=-1)}
 
 
 def write_samples(
@@ -354,26 +293,14 @@ def write_samples(
     per_file: int = 10,
 ) -> list[Path]:
     """Write the samples of scenes 0 .. n - 1 to files of a folder; existing files are kept."""
-    target = Path(folder)
-    jobs = [
-        (target / f"scenes-{start:06d}.npz", seed, start, min(start + per_file, n_scenes), kinds)
-        for start in range(0, n_scenes, per_file)
-    ]
-    if workers > 1:
-        with ProcessPoolExecutor(workers) as pool:
-            list(pool.map(_shard, jobs))
-    else:
-        for job in jobs:
-            _shard(job)
-    return [job[0] for job in jobs]
+    return write_shards(folder, partial(_columns, seed, kinds), n_scenes, workers, per_file)
 
 
 def read_samples(paths: Sequence[Path]) -> Samples:
     """The samples of files."""
-    parts = []
-    for path in paths:
-        with np.load(path, allow_pickle=False) as file:
-            values = {name: file[name] for name in Samples.__dataclass_fields__}
-        values["truth"] = np.unpackbits(values["truth"], axis=-1).astype(bool)
-        parts.append(Samples(**values))
-    return Samples.join(parts)
+    return Samples.join(
+        [
+            Samples(**{**columns, "truth": np.unpackbits(columns["truth"], axis=-1).astype(bool)})
+            for columns in map(read_shard, paths)
+        ]
+    )

@@ -13,9 +13,9 @@ from mstfilter.completion import NetworkCompleter, observed_box
 from mstfilter.completion.crops import extruded
 from mstfilter.errors import InputError
 from mstfilter.trained import open_model
-from mstfilter.training import CompletionTraining, Samples, completion_settings, read_samples, write_samples
-from mstfilter.training.completion import calibration_error, train_completion
+from mstfilter.training import CompletionTraining, Samples, read_samples, train, write_samples
 from mstfilter.training.completion_data import combine
+from mstfilter.training.loop import calibration_error
 from mstfilter.training.shapes import HELD_OUT, TRAINED, draw_training_shape
 from tests.completion.test_completion import masks_of
 from tests.completion.test_network import STACK
@@ -95,11 +95,11 @@ def test_training_learns_resumes_and_is_used(tmp_path):
     def report(done: int, total: int, text: str) -> None:
         texts.append(text)
 
-    assert train_completion(SMALL, tmp_path / "a", on_progress=report, max_steps=15) is None
-    figures = train_completion(SMALL, tmp_path / "a", on_progress=report)
+    assert train(SMALL, tmp_path / "a", on_progress=report, max_steps=15) is None
+    figures = train(SMALL, tmp_path / "a", on_progress=report)
     assert figures is not None and "loss" in texts[-1]
     shutil.copytree(tmp_path / "a/samples", tmp_path / "b/samples")
-    train_completion(SMALL, tmp_path / "b")
+    train(SMALL, tmp_path / "b")
     resumed, straight = (open_model(str(tmp_path / name)) for name in "ab")
     for name, tensor in straight.tensors.items():
         assert np.allclose(resumed.tensors[name], tensor, atol=1e-3)
@@ -119,18 +119,18 @@ def test_training_learns_resumes_and_is_used(tmp_path):
     completion = one.complete(np.random.default_rng(0), frame, masks_of(TWO, frame)[:1], GRID)[0]
     assert (completion.probability >= 0.5).any()
     with pytest.raises(InputError, match="other settings"):
-        train_completion(replace(SMALL, steps=41), tmp_path / "a")
+        train(replace(SMALL, steps=41), tmp_path / "a")
 
 
 def test_settings():
-    assert completion_settings("cpu", ["steps=7", "half_precision=false", "rate=0.1"]) == CompletionTraining(
+    assert CompletionTraining.recipe("cpu", ["steps=7", "half_precision=false", "rate=0.1"]) == CompletionTraining(
         steps=7, half_precision=False, rate=0.1
     )
     for text, message in (("stps=7", "no setting 'stps'"), ("steps=many", "expected int"), ("steps", "expected int")):
         with pytest.raises(InputError, match=message):
-            completion_settings("cpu", [text])
+            CompletionTraining.recipe("cpu", [text])
     with pytest.raises(InputError, match="recipe"):
-        completion_settings("fast")
+        CompletionTraining.recipe("fast")
 
 
 def test_calibration_error():

@@ -1,0 +1,200 @@
+"""The border network: a small 2-D U-Net that sees where objects end, and where their centres are. Imports torch.
+
+>>> network = load_border_network("border")
+>>> seen = network.look(frame)                     # maps of the frame's size
+>>> seen.border[row, column], seen.foreground[row, column], seen.centre[row, column]
+
+The network works on images of 320 pixels per row (`encode_image`); a frame is reduced to that size, and the maps are
+interpolated. Its blocks work at a half, a quarter and an eighth of this resolution; 2 x 2 pixels enter and leave as
+channels. The outputs are the log odds that a pixel is at the border of an object and that it belongs to an object,
+and the offset to the object's centre in the image (after D. Neven, B. De Brabandere, M. Proesmans, L. Van Gool,
+"Instance segmentation by jointly optimizing spatial embeddings and clustering bandwidth", CVPR 2019).
+"""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from mstfilter.errors import InputError
+from mstfilter.scene import BASELINE, Camera, Frame, fit_support_plane
+from mstfilter.segmentation.boundary import SENSOR_FOCAL, TABLE_TOLERANCE, fill_from_nearest
+from mstfilter.trained import TrainedModel, open_model
+
+BORDER_ARCHITECTURE = "border-unet"
+RASTER = 320  # pixels per row of the network's images
+CENTRE_UNIT = 32.0  #: pixels of the network's raster, unit of the offsets to the centres
+#: Channels of the input: disparity above the table, compressed; disparity against the mean of the surroundings; the
+#: normal (right in the image, up from the table, and at a right angle to both); whether there is a reading; colour.
+IMAGE_CHANNELS = ("above", "relief", "right", "up", "front", "reading", "lightness", "a", "b")
+_HEIGHT_UNIT = 4.0  # sensor disparity units (1/8 px) at which `above` turns from linear to logarithmic
+_SURROUNDINGS = 6.0  # pixels, standard deviation of the mean for `relief`
+_MULTIPLE = 8  # image sizes that the network works on
+
+
+def encode_image(frame: Frame) -> np.ndarray:
+    """The input (9, H, W) float32 of the network for a frame with a camera pose."""
+    h, w = frame.depth.shape
+    disparity = 8 * SENSOR_FOCAL * BASELINE / fill_from_nearest(frame.depth, ~frame.valid)
+    disparity = disparity.astype(np.float32) if frame.valid.any() else np.zeros((h, w), np.float32)
+    camera = frame.camera
+    matrix = camera.pose.as_matrix()
+    up = matrix[2, :3]  # of the table, in the camera's axes
+    # A point z K^-1 (u, v, 1) of the table is at -h along `up`, h the height of the camera: 1 / z is affine in u, v.
+    table = -8 * SENSOR_FOCAL * BASELINE / max(float(matrix[2, 3]), 1e-3) * (camera.rays() @ up)
+    x = np.zeros((len(IMAGE_CHANNELS), h, w), np.float32)
+    x[0] = np.arcsinh((disparity - table) / _HEIGHT_UNIT) / 3
+    x[1] = np.clip(disparity - cv2.GaussianBlur(disparity, (0, 0), _SURROUNDINGS), -16, 16) / 4
+    x[2:5] = _normals(disparity, camera, up)
+    x[5] = frame.valid
+    lab = cv2.cvtColor(frame.rgb.astype(np.float32) / 255, cv2.COLOR_RGB2Lab).transpose(2, 0, 1)
+    x[6:] = (lab - np.array([50, 0, 0], np.float32)[:, None, None]) / 50
+    return x
+
+
+def _normals(disparity: np.ndarray, camera: Camera, up: np.ndarray) -> np.ndarray:
+    """Normals (3, H, W) of a smoothed disparity image along the image's rows, `up`, and a third axis."""
+    smooth = cv2.GaussianBlur(disparity, (0, 0), 1.5)
+    a = cv2.Sobel(smooth, cv2.CV_32F, 1, 0) / 8
+    b = cv2.Sobel(smooth, cv2.CV_32F, 0, 1) / 8
+    rows, columns = np.indices(disparity.shape, dtype=np.float32)
+    # The plane with disparity a u + b v + c has the normal K^T (a, b, c) in the camera's axes, away from the camera.
+    plane = np.stack([a, b, smooth - a * columns - b * rows])
+    normal = -np.tensordot(camera.K.T.astype(np.float32), plane, axes=1)
+    normal /= np.maximum(np.linalg.norm(normal, axis=0), 1e-9)
+    right = np.array([1.0, 0.0, 0.0]) - up[0] * up
+    right /= max(float(np.linalg.norm(right)), 1e-9)
+    axes = np.stack([right, up, np.cross(right, up)]).astype(np.float32)
+    return np.asarray(np.tensordot(axes, normal, axes=1))
+
+
+def near_objects(x: np.ndarray) -> np.ndarray:
+    """Pixels (H, W) of an input with something above the table within eight pixels."""
+    raised = (x[0] > np.arcsinh(TABLE_TOLERANCE / _HEIGHT_UNIT) / 3) & (x[5] > 0)
+    raised = cv2.morphologyEx(raised.astype(np.uint8), cv2.MORPH_OPEN, np.ones((2, 2), np.uint8))
+    return np.asarray(cv2.dilate(raised, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (17, 17))) > 0)
+
+
+class _Block(nn.Module):
+    """Residual block with two convolutions."""
+
+    def __init__(self, width: int, dilation: int = 1) -> None:
+        super().__init__()
+        self.norm1, self.norm2 = nn.GroupNorm(8, width), nn.GroupNorm(8, width)
+        self.conv1 = nn.Conv2d(width, width, 3, padding=dilation, dilation=dilation)
+        self.conv2 = nn.Conv2d(width, width, 3, padding=1)
+
+    def forward(self, x: Tensor) -> Tensor:
+        y = self.conv1(functional.silu(self.norm1(x)))
+        return x + self.conv2(functional.silu(self.norm2(y)))
+
+
+class BorderNet(nn.Module):
+    """See the module. `width` features at half the resolution, a multiple of 8; two and four times as many below."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.stem = nn.Conv2d(4 * len(IMAGE_CHANNELS), width, 3, padding=1)
+        self.fine = _Block(width)
+        self.down1 = nn.Conv2d(width, 2 * width, 2, stride=2)
+        self.middle = _Block(2 * width)
+        self.down2 = nn.Conv2d(2 * width, 4 * width, 2, stride=2)
+        self.coarse = nn.Sequential(_Block(4 * width), _Block(4 * width, 2))
+        self.up1 = nn.Conv2d(4 * width, 2 * width, 1)
+        self.join1 = nn.Conv2d(4 * width, 2 * width, 1)
+        self.rise = _Block(2 * width)
+        self.up2 = nn.Conv2d(2 * width, width, 1)
+        self.join2 = nn.Conv2d(2 * width, width, 1)
+        self.end = _Block(width)
+        self.head = nn.Conv2d(width, 16, 1)
+        nn.init.zeros_(self.head.weight)
+        # Start at the usual share of border and foreground pixels near objects.
+        self.head.bias = nn.Parameter(torch.tensor([-2.0, -1.0, 0.0, 0.0]).repeat_interleave(4))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(b, 9, H, W) -> (b, 4, H, W): logits of border and foreground, offset in `CENTRE_UNIT` (right, down).
+
+        H and W are multiples of 8.
+        """
+        fine = self.fine(self.stem(functional.pixel_unshuffle(x, 2)))
+        middle = self.middle(self.down1(fine))
+        y = self.coarse(self.down2(middle))
+        y = functional.interpolate(self.up1(y), scale_factor=2)
+        y = self.rise(self.join1(torch.cat([y, middle], dim=1)))
+        y = functional.interpolate(self.up2(y), scale_factor=2)
+        y = self.end(self.join2(torch.cat([y, fine], dim=1)))
+        return functional.pixel_shuffle(self.head(functional.silu(y)).float(), 2)
+
+
+@dataclass(frozen=True, eq=False)
+class SeenBorders:
+    """What the network sees in a frame."""
+
+    border: np.ndarray  #: (H, W) float32, calibrated log odds that the pixel is at the border of an object
+    foreground: np.ndarray  #: (H, W) float32, log odds that the pixel belongs to an object
+    centre: np.ndarray  #: (H, W, 2) float32, column and row of the centre of the pixel's object
+
+
+class BorderNetwork:
+    """A border network that is ready for use."""
+
+    def __init__(self, model: TrainedModel) -> None:
+        network = model.description.get("network", {})
+        try:
+            if list(network["channels"]) != list(IMAGE_CHANNELS):
+                raise InputError(
+                    f"{model.folder}: channels {network['channels']}, this version has {list(IMAGE_CHANNELS)}"
+                )
+            self.net = BorderNet(int(network["width"]))
+            calibration = model.description["calibration"]
+            self.scale, self.shift = float(calibration["scale"]), float(calibration["shift"])
+        except (KeyError, TypeError, ValueError) as error:
+            raise InputError(f"{model.folder}: model.toml has no valid {error}", "train the model again") from None
+        model.check_tensors({name: tuple(t.shape) for name, t in self.net.state_dict().items()})
+        self.net.load_state_dict({name: torch.from_numpy(t) for name, t in model.tensors.items()})
+        self.net.eval()
+        self.key = model.key
+
+    def look(self, frame: Frame) -> SeenBorders:
+        """The maps of a frame of any size. Without a camera pose, the table is fitted (`fit_support_plane`)."""
+        h, w = frame.depth.shape
+        small = reduced(frame)
+        x = encode_image(small)
+        missing = [-n % _MULTIPLE for n in x.shape[1:]]
+        with torch.inference_mode():
+            padded = functional.pad(torch.from_numpy(x)[None], (0, missing[1], 0, missing[0]))
+            y = self.net(padded)[0, :, : x.shape[1], : x.shape[2]].permute(1, 2, 0).contiguous().numpy()
+        y = cv2.resize(y, (w, h), interpolation=cv2.INTER_LINEAR)
+        rows, columns = np.indices((h, w), dtype=np.float32)
+        at = np.stack([columns, rows], axis=-1)
+        unit = CENTRE_UNIT * w / small.depth.shape[1]
+        return SeenBorders(self.scale * y[..., 0] + self.shift, y[..., 1], at + unit * y[..., 2:])
+
+
+def reduced(frame: Frame) -> Frame:
+    """The frame with `RASTER` pixels per row and a camera pose; depth is that of the nearest pixel."""
+    camera = frame.camera
+    if camera.T_world_camera is None:
+        camera = camera.at(fit_support_plane(frame).T_world_camera)
+    w = camera.width
+    if w == RASTER:
+        return Frame(frame.rgb, frame.depth, camera, frame.robot_mask)
+    camera = camera.scaled(RASTER / w)
+    size = camera.width, camera.height
+    depth = cv2.resize(frame.depth, size, interpolation=cv2.INTER_NEAREST)
+    robot = frame.robot_mask
+    if robot is not None:
+        robot = cv2.resize(robot.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
+    return Frame(cv2.resize(frame.rgb, size, interpolation=cv2.INTER_AREA), depth, camera, robot)
+
+
+@functools.lru_cache(maxsize=4)
+def load_border_network(name: str) -> BorderNetwork:
+    """The network of a model's name or folder; see `mstfilter.trained.open_model`."""
+    return BorderNetwork(open_model(name, BORDER_ARCHITECTURE))

@@ -1,0 +1,159 @@
+"""What the generators of training samples share: clutter at rest under physics, its cameras, and files of samples.
+
+>>> world = draw_scene(np.random.default_rng(0), TRAINED)
+>>> camera = draw_camera(rng, (0, 0), elevation=(22, 68), distance=(0.55, 1.05))
+>>> geom, z, normal = cast(world, camera, (0, 1))
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, ClassVar, Self
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from mstfilter.errors import InputError
+from mstfilter.files import atomic_path
+from mstfilter.scene import Camera, look_at
+from mstfilter.simulation.arrangement import arrange_objects
+from mstfilter.simulation.families import SceneFamily
+from mstfilter.simulation.world import PhysicsWorld
+from mstfilter.training.shapes import draw_kind, draw_training_shape
+
+WIDTH, HEIGHT = 320, 240  # pixels of an image
+
+
+def draw_scene(rng: np.random.Generator, kinds: tuple[str, ...]) -> PhysicsWorld | None:
+    """Draw a scene of 2 to 12 objects of some kinds, at rest; None if the objects do not fit."""
+    n = int(rng.integers(2, 13))
+    shapes = [draw_training_shape(rng, draw_kind(rng, kinds)) for _ in range(n)]
+    world = PhysicsWorld(shapes, arm=False)
+    n_dropped = int(rng.integers(0, n // 2 + 1)) if rng.uniform() < 0.6 else 0
+    family = SceneFamily(
+        name="training",
+        n_objects_min=n,
+        n_objects_max=n,
+        n_twins=0,
+        contact=float(rng.uniform(0.3, 1.0)),
+        n_actions=0,
+    )
+    order = rng.permutation(n)
+    try:
+        # Dropped objects start far away; the others are arranged first.
+        first = PhysicsWorld([shapes[k] for k in order[n_dropped:]], arm=False)
+        arrange_objects(rng, first, replace(family, n_objects_min=n - n_dropped), (-1,) * (n - n_dropped))
+    except InputError:
+        return None
+    for k, position, rotation in zip(order[n_dropped:].tolist(), first.positions(), first.rotations(), strict=True):
+        world.place(k, position, rotation)
+    world.forward()
+    for k in order[:n_dropped].tolist():
+        near = world.positions()[order[n_dropped:]]
+        at = near[int(rng.integers(len(near))), :2] + rng.normal(0.0, 0.03, 2)
+        world.place(k, (*at, 0.12 + shapes[k].radius + rng.uniform(0.0, 0.1)), Rotation.random(rng=rng).as_matrix())
+        world.forward()
+        if not world.overlaps(k):
+            world.settle()
+        else:
+            world.place(k, (10.0 + 2.0 * k, 0.0, 1.0), np.eye(3))
+    world.forward()
+    return world
+
+
+def on_table(poses: np.ndarray) -> np.ndarray:
+    """Objects (n,) bool with poses (n, 4, 4) in the middle of the table."""
+    return np.asarray((np.abs(poses[:, :2, 3]) < 0.4).all(axis=1) & (poses[:, 2, 3] > 0))
+
+
+def draw_camera(
+    rng: np.random.Generator,
+    middle: ArrayLike,
+    elevation: tuple[float, float],
+    distance: tuple[float, float],
+    zoom: float = 1.0,
+) -> Camera:
+    """Draw a camera that looks at the table near `middle` (x, y), from an elevation in degrees and a distance in m.
+
+    The focal length is that of a Kinect times `zoom`.
+    """
+    target = np.append(middle, 0.05) + rng.normal(0.0, 0.03, 3)
+    azimuth, raised, far = rng.uniform(0, 2 * np.pi), np.deg2rad(rng.uniform(*elevation)), rng.uniform(*distance)
+    flat = np.cos(raised)
+    away = np.array([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(raised)])
+    focal = 525.0 * zoom
+    camera = Camera.from_intrinsics(focal, focal, 319.5, 239.5, 640, 480, look_at(target + far * away, target))
+    return camera.scaled(WIDTH / 640)
+
+
+def displaced(rng: np.random.Generator, camera: Camera) -> Camera:
+    """The camera with a small error of its pose, as of a calibration."""
+    shift, tilt = rng.normal(0.0, 0.0015, 3), Rotation.from_rotvec(rng.normal(0.0, 0.003, 3))
+    return camera.at(RigidTransform.from_components(shift, tilt) * camera.pose)
+
+
+def cast(world: PhysicsWorld, camera: Camera, groups: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Geom (n,), z-depth (n,) and normal (n, 3) of every pixel of a camera (`PhysicsWorld.cast`)."""
+    turn = camera.pose.as_matrix()[:3, :3]
+    return world.cast(np.array(camera.position), camera.rays().reshape(-1, 3) @ turn.T, groups)
+
+
+class Columns:
+    """Samples as a dataclass of arrays; the first axis of each is the sample."""
+
+    __dataclass_fields__: ClassVar[dict[str, Any]]
+
+    def columns(self) -> dict[str, np.ndarray]:
+        """The arrays by name."""
+        return {name: getattr(self, name) for name in self.__dataclass_fields__}
+
+    def __len__(self) -> int:
+        return len(next(iter(self.columns().values())))
+
+    def take(self, index: np.ndarray) -> Self:
+        """Some samples."""
+        return type(self)(*(values[index] for values in self.columns().values()))
+
+    @classmethod
+    def join(cls, parts: Sequence[Self]) -> Self:
+        """All samples of several parts."""
+        return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in cls.__dataclass_fields__))
+
+
+def write_shards(
+    folder: str | Path,
+    make: Callable[[int, int], dict[str, np.ndarray]],
+    n_scenes: int,
+    workers: int = 1,
+    per_file: int = 10,
+) -> list[Path]:
+    """Write the samples ``make(start, stop)`` of scenes 0 .. n - 1 to files of a folder; existing files are kept."""
+    jobs = [
+        (Path(folder) / f"scenes-{start:06d}.npz", make, start, min(start + per_file, n_scenes))
+        for start in range(0, n_scenes, per_file)
+    ]
+    if workers > 1:
+        with ProcessPoolExecutor(workers) as pool:
+            list(pool.map(_write_shard, jobs))
+    else:
+        for job in jobs:
+            _write_shard(job)
+    return [job[0] for job in jobs]
+
+
+def _write_shard(job: tuple[Path, Callable[[int, int], dict[str, np.ndarray]], int, int]) -> None:
+    path, make, start, stop = job
+    if not path.exists():
+        columns: dict[str, Any] = make(start, stop)
+        with atomic_path(path) as partial, partial.open("wb") as file:
+            np.savez_compressed(file, **columns)
+
+
+def read_shard(path: Path) -> dict[str, np.ndarray]:
+    """The arrays of a file by name."""
+    with np.load(path, allow_pickle=False) as file:
+        return dict(file)
