@@ -25,7 +25,7 @@ def train(
     from mstfilter.errors import check_choice
 
     check_choice("part", part, ("completion", "border"))
-    from mstfilter.training import BorderTraining, CompletionTraining, train as run_training
+    from mstfilter.training import BorderTraining, CompletionTraining, run_training
 
     trained = CompletionTraining if part == "completion" else BorderTraining
     settings = trained.recipe(recipe, overrides or ())

@@ -7,5 +7,5 @@ from mstfilter.training.completion_data import (
     scene_samples as scene_samples,
     write_samples as write_samples,
 )
-from mstfilter.training.loop import Training as Training, train as train
+from mstfilter.training.loop import Training as Training, run_training as run_training
 from mstfilter.training.shapes import HELD_OUT as HELD_OUT, TRAINED as TRAINED

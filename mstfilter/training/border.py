@@ -1,6 +1,6 @@
 """Training of the border network.
 
->>> train(BorderTraining.recipe("cpu"), "border-model")
+>>> run_training(BorderTraining.recipe("cpu"), "border-model")
 
 The loss is the log loss of border and foreground, and the Huber loss of the offset to the centre on objects. Pixels
 far from everything above the table count a tenth. This weight depends on the input only, and borders count no more

@@ -1,6 +1,6 @@
 """Training of the completion network.
 
->>> train(CompletionTraining(n_scenes=900, steps=40_000), "completion-model")
+>>> run_training(CompletionTraining(n_scenes=900, steps=40_000), "completion-model")
 
 The loss is the evidence lower bound of a conditional variational autoencoder: the log loss of the voxels that are
 not observed as free, and the divergence of the posterior of the latent variable from its prior. The log loss of a

@@ -1,7 +1,7 @@
 """The training loop of the learned parts: settings, steps, state on disk, calibration.
 
 >>> settings = CompletionTraining.recipe("cpu", ["steps=10000"])
->>> train(settings, "completion-model", on_progress=print)     # resumes where it stopped
+>>> run_training(settings, "completion-model", on_progress=print)     # resumes where it stopped
 
 A part defines its settings as a subclass of `Training`, which says how samples are made and what the loss is. The
 folder gets the samples (``samples/``), the state (``state.safetensors``), the curves (``curves.csv``), and at the end
@@ -119,7 +119,7 @@ class Training(ABC):
             yield step, order[k * self.batch : (k + 1) * self.batch]
 
 
-def train(
+def run_training(
     settings: Training,
     out: str | Path,
     workers: int = 1,

@@ -19,7 +19,7 @@ from mstfilter.segmentation.border_network import (
     near_objects,
     reduced,
 )
-from mstfilter.training import BorderSamples, BorderTraining, train
+from mstfilter.training import BorderSamples, BorderTraining, run_training
 from mstfilter.training.border import Tally, encoded
 from mstfilter.training.border_data import border_samples, read_border_samples, targets, write_border_samples
 from tests.segmentation.scenes import TWO, frame_of
@@ -108,9 +108,9 @@ def test_training_learns_resumes_and_is_used(folder, tmp_path):
         (tmp_path / f"a/samples/{name}").mkdir(parents=True)
         shutil.copy(folder / "train/scenes-000000.npz", tmp_path / f"a/samples/{name}")
     shutil.copytree(tmp_path / "a", tmp_path / "b")
-    assert train(SMALL, tmp_path / "a", max_steps=6) is None
-    figures = train(SMALL, tmp_path / "a")
-    train(SMALL, tmp_path / "b")
+    assert run_training(SMALL, tmp_path / "a", max_steps=6) is None
+    figures = run_training(SMALL, tmp_path / "a")
+    run_training(SMALL, tmp_path / "b")
     resumed, straight = (load_border_network(str(tmp_path / name)) for name in "ab")
     for one, other in zip(resumed.net.parameters(), straight.net.parameters(), strict=True):
         assert torch.allclose(one, other, atol=1e-3)

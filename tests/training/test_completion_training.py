@@ -13,7 +13,7 @@ from mstfilter.completion import NetworkCompleter, observed_box
 from mstfilter.completion.crops import extruded
 from mstfilter.errors import InputError
 from mstfilter.trained import open_model
-from mstfilter.training import CompletionTraining, Samples, read_samples, train, write_samples
+from mstfilter.training import CompletionTraining, Samples, read_samples, run_training, write_samples
 from mstfilter.training.completion_data import combine
 from mstfilter.training.loop import calibration_error
 from mstfilter.training.shapes import HELD_OUT, TRAINED, draw_training_shape
@@ -95,11 +95,11 @@ def test_training_learns_resumes_and_is_used(tmp_path):
     def report(done: int, total: int, text: str) -> None:
         texts.append(text)
 
-    assert train(SMALL, tmp_path / "a", on_progress=report, max_steps=15) is None
-    figures = train(SMALL, tmp_path / "a", on_progress=report)
+    assert run_training(SMALL, tmp_path / "a", on_progress=report, max_steps=15) is None
+    figures = run_training(SMALL, tmp_path / "a", on_progress=report)
     assert figures is not None and "loss" in texts[-1]
     shutil.copytree(tmp_path / "a/samples", tmp_path / "b/samples")
-    train(SMALL, tmp_path / "b")
+    run_training(SMALL, tmp_path / "b")
     resumed, straight = (open_model(str(tmp_path / name)) for name in "ab")
     for name, tensor in straight.tensors.items():
         assert np.allclose(resumed.tensors[name], tensor, atol=1e-3)
@@ -119,7 +119,7 @@ def test_training_learns_resumes_and_is_used(tmp_path):
     completion = one.complete(np.random.default_rng(0), frame, masks_of(TWO, frame)[:1], GRID)[0]
     assert (completion.probability >= 0.5).any()
     with pytest.raises(InputError, match="other settings"):
-        train(replace(SMALL, steps=41), tmp_path / "a")
+        run_training(replace(SMALL, steps=41), tmp_path / "a")
 
 
 def test_settings():
