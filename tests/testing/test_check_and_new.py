@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import re
 import runpy
 import shlex
@@ -10,6 +11,7 @@ import sys
 
 import pytest
 
+from mstfilter.presets import REGISTRY
 from mstfilter.testing import starter_kinds, write_starter
 from tests.conftest import REPOSITORY
 from tests.scene.test_recording import write
@@ -43,6 +45,10 @@ def test_the_printed_commands_run_as_printed(kind, target, tmp_path, monkeypatch
             assert "exact draws" not in out or (kind, target) in (("transition", "scenes"), ("update", "scenes"))
             assert "all properties that apply hold" in out or arguments[0] != "check"
             assert " of 0 " not in out, "hypotheses without objects"
+
+
+def test_every_kind_has_a_starting_file():
+    assert [k for k in REGISTRY.kinds if inspect.isabstract(REGISTRY.interface(k)) and k not in starter_kinds()] == []
 
 
 def test_a_starting_file_is_for_scenes_if_there_is_one(tmp_path, monkeypatch, capsys):
