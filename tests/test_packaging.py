@@ -52,6 +52,8 @@ def test_in_a_wheel(wheel, tmp_path):
         archive.extractall(tmp_path / "site")
     assert "mstfilter/_models/mst.toml" in names
     assert "mstfilter/_examples/resampler.py" in names
+    assert "mstfilter/_examples/scenes/transition.py" in names
+    assert "mstfilter/report/templates/scene.html" in names
     assert "mstfilter/py.typed" in names
     assert any(name.startswith("mstfilter/report/") and name.endswith((".html", ".j2", ".jinja")) for name in names)
     assert not [name for name in names if name.startswith(("tests/", "experiments/", "docs/"))]
