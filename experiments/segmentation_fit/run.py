@@ -1,8 +1,10 @@
 """Fit the weights of `mstfilter.segmentation.join_weights` on simulated scenes; no real image is used.
 
     python experiments/segmentation_fit/run.py
+    python experiments/segmentation_fit/run.py --border FOLDER       # of a border model, with its evidence
     python experiments/segmentation_fit/run.py --smoke --out FILE    # few scenes, one round: a quick test
 
+With ``--border`` the features include what the network sees, and the weights are written into the model.
 Regions of each scene are merged in the order of their odds under the present weights. A pair of different objects is
 recorded and not merged; a pair of one object is recorded and merged. So the pairs are those that the tree evaluates.
 Three rounds; each fits a logistic regression to the pairs of all rounds so far.
@@ -12,7 +14,7 @@ from __future__ import annotations
 
 import argparse
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import numpy as np
@@ -20,26 +22,33 @@ from scenes import FITTED, FITTED_SEEDS, first_pause, small
 from scipy.optimize import minimize
 
 from mstfilter.segmentation import (
+    EVIDENCE_FEATURES,
     PAIR_FEATURES,
     REGION,
     Agglomeration,
+    BorderTree,
     ColourDepthBoundary,
     LearnedTree,
     Regions,
+    all_features,
     join_weights,
     pair_features,
 )
 from mstfilter.simulation import SceneFamily
+from mstfilter.trained import open_model, write_model
 
 ROUNDS = 3
 PURE = 0.8  # smallest share of one object in a region that is used
 RIDGE = 1.0
 PACKAGED = Path(join_weights.__file__)
 
+Features = Callable[..., np.ndarray]
 Pairs = tuple[list[np.ndarray], list[bool], list[float]]
 
 
-def measured(families: Iterable[SceneFamily], seeds: Iterable[int]) -> list[tuple[Regions, np.ndarray, float]]:
+def measured(
+    families: Iterable[SceneFamily], seeds: Iterable[int], builder: LearnedTree | BorderTree
+) -> list[tuple[Regions, np.ndarray, float]]:
     """Regions of every scene, their pixels of each true object (R, K), and the image scale."""
     found = []
     for family in families:
@@ -50,7 +59,7 @@ def measured(families: Iterable[SceneFamily], seeds: Iterable[int]) -> list[tupl
                 print(family.name, seed, error)
                 continue
             boundary = ColourDepthBoundary().boundary(pause.frame)
-            tree, regions = LearnedTree().regions(boundary, pause.frame)
+            tree, regions = builder.regions(boundary, pause.frame)
             n, k = len(regions.sums), int(pause.image.max()) + 1
             code = regions.of_leaf[tree.leaves] * k + pause.image
             pixels = np.bincount(code.ravel(), minlength=n * k).reshape(n, k).astype(np.float64)
@@ -59,15 +68,17 @@ def measured(families: Iterable[SceneFamily], seeds: Iterable[int]) -> list[tupl
     return found
 
 
-def episode(regions: Regions, pixels: np.ndarray, scale: float, weights: np.ndarray, pairs: Pairs) -> None:
+def episode(
+    regions: Regions, pixels: np.ndarray, scale: float, weights: np.ndarray, pairs: Pairs, features: Features
+) -> None:
     """Merge the regions of one scene by the ground truth and record the pairs that come up."""
-    growing = Agglomeration(regions, lambda *pair: pair_features(*pair, scale) @ weights)
+    growing = Agglomeration(regions, lambda *pair: features(*pair, scale) @ weights)
     true = np.zeros((2 * len(pixels), pixels.shape[1]))
     true[: len(pixels)] = pixels
     while (pair := growing.pop()) is not None:
         odds, i, j = pair
         rows = growing.sums[[i]], growing.sums[[j]], growing.borders[i][j][None]
-        x = pair_features(*rows, growing.table[i][None], growing.table[j][None], scale)[0]
+        x = features(*rows, growing.table[i][None], growing.table[j][None], scale)[0]
         first, second = (int(true[r].argmax()) for r in (i, j))
         if all(true[r].max() >= PURE * true[r].sum() for r in (i, j)):
             size = growing.sums[[i, j], REGION["pixels"].start].min() / scale**2
@@ -107,19 +118,29 @@ def write(weights: np.ndarray, path: Path) -> None:
     path.write_text(f"{head}JOIN_WEIGHTS: dict[str, float] = {{\n{rows}}}\n")
 
 
-def main(path: Path, smoke: bool) -> None:
-    """Fit the weights and write the module."""
+def write_into_model(weights: np.ndarray, folder: str) -> None:
+    """Write the weights into the description of a border model."""
+    model = open_model(folder)
+    names = [*PAIR_FEATURES, *EVIDENCE_FEATURES]
+    evidence = {"features": names, "weights": [float(f"{w:.4g}") for w in weights]}
+    write_model(folder, {**model.description, "evidence": evidence}, model.tensors)
+
+
+def main(path: Path, smoke: bool, border: str = "") -> None:
+    """Fit the weights and write the module, or the description of a border model."""
     began = time.time()
     families = [small(family) for family in FITTED.values()] if smoke else FITTED.values()
-    scenes = measured(families, FITTED_SEEDS[:2] if smoke else FITTED_SEEDS)
+    builder: LearnedTree | BorderTree = BorderTree(weights=border) if border else LearnedTree()
+    features = all_features if border else pair_features
+    scenes = measured(families, FITTED_SEEDS[:2] if smoke else FITTED_SEEDS, builder)
     print(f"{len(scenes)} scenes measured, {time.time() - began:.0f} s")
-    weights = np.zeros(len(PAIR_FEATURES))
+    weights = np.zeros(len(PAIR_FEATURES) + (len(EVIDENCE_FEATURES) if border else 0))
     weights[:2] = -6.0, 12.0  # initial weights: bias and strength of the border
     pairs: Pairs = ([], [], [])
     for _ in range(1 if smoke else ROUNDS):
         before = len(pairs[0])
         for regions, pixels, scale in scenes:
-            episode(regions, pixels, scale, weights, pairs)
+            episode(regions, pixels, scale, weights, pairs, features)
         weights = logistic(pairs)
         X, different = np.array(pairs[0][before:]), np.array(pairs[1][before:])
         wrong = ((X @ weights > 0) != different).mean()
@@ -127,14 +148,18 @@ def main(path: Path, smoke: bool) -> None:
             f"{len(X)} pairs, {different.mean():.3f} different, {wrong:.4f} misclassified, "
             f"{time.time() - began:.0f} s"
         )
-    write(weights, path)
+    if border:
+        write_into_model(weights, border)
+    else:
+        write(weights, path)
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--smoke", action="store_true", help="a few scenes, one round; needs --out")
     parser.add_argument("--out", type=Path, default=PACKAGED, help="the module to write")
+    parser.add_argument("--border", default="", help="folder of a border model: fit with its evidence, write into it")
     options = parser.parse_args()
-    if options.smoke and options.out == PACKAGED:
+    if options.smoke and options.out == PACKAGED and not options.border:
         parser.error("--smoke would overwrite the weights of the package: name another file with --out")
-    main(options.out, options.smoke)
+    main(options.out, options.smoke, options.border)

@@ -35,7 +35,11 @@ def train(
         print(f"{done:7d} of {total}  {text}", flush=True)
 
     figures = run_training(settings, folder, workers, report, device or None)
-    use = f"; use it with proposal.completer=network proposal.completer.weights={folder}"
-    print(f"model       {folder}{use if part == 'completion' else ''}")
+    use = {
+        "completion": f"use it with proposal.completer=network proposal.completer.weights={folder}",
+        "border": f"next: python experiments/segmentation_fit/run.py --border {folder}, then use it with "
+        f"proposal.tree=border proposal.tree.weights={folder}",
+    }
+    print(f"model       {folder}; {use[part]}")
     for name, value in (figures or {}).items():
         print(f"{name:28s} {value:.4f}")

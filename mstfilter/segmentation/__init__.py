@@ -13,6 +13,7 @@
 `tree`            the tree and its helpers; the ultrametric contour map
 `regions`         measurements of regions and features of pairs of regions
 `learned_tree`    a tree from learned log odds; `join_weights`: the fitted weights
+`border_tree`     the same with the evidence of a trained network, `border_network`
 `cuts`            node values, the optimal cut, exact samples
 `mh`              Metropolis-Hastings samples
 `proposal`        which regions are objects; the proposal of the filter
@@ -32,7 +33,7 @@ __interfaces__ = {
 __components__ = {
     "proposal": {"tree_cuts": "TreeCutProposal"},
     "boundary": {"colour_depth": "ColourDepthBoundary"},
-    "tree": {"learned": "LearnedTree", "ucm": "UcmTree"},
+    "tree": {"learned": "LearnedTree", "ucm": "UcmTree", "border": "BorderTree"},
     "value": {"scenecut": "SceneCutObjectness", "merge_log_odds": "MergeLogOdds"},
     "sampler": {"mh": "MetropolisHastingsCuts", "exact": "ExactCuts", "optimal": "OptimalCut"},
 }

@@ -1,3 +1,9 @@
+from mstfilter.segmentation.border_tree import (
+    EVIDENCE_FEATURES as EVIDENCE_FEATURES,
+    BorderTree as BorderTree,
+    all_features as all_features,
+    evidence_features as evidence_features,
+)
 from mstfilter.segmentation.boundary import (
     BoundaryModel as BoundaryModel,
     ClipBoundary as ClipBoundary,
@@ -26,6 +32,7 @@ from mstfilter.segmentation.regions import (
     PAIR_FEATURES as PAIR_FEATURES,
     REGION as REGION,
     Regions as Regions,
+    SeenBorders as SeenBorders,
     pair_features as pair_features,
 )
 from mstfilter.segmentation.tree import Tree as Tree, TreeBuilder as TreeBuilder, UcmTree as UcmTree

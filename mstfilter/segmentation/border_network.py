@@ -14,7 +14,6 @@ and the offset to the object's centre in the image (after D. Neven, B. De Braban
 from __future__ import annotations
 
 import functools
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -25,6 +24,7 @@ from torch.nn import functional
 from mstfilter.errors import InputError
 from mstfilter.scene import BASELINE, Camera, Frame, fit_support_plane
 from mstfilter.segmentation.boundary import SENSOR_FOCAL, TABLE_TOLERANCE, fill_from_nearest
+from mstfilter.segmentation.regions import SeenBorders
 from mstfilter.trained import TrainedModel, open_model
 
 BORDER_ARCHITECTURE = "border-unet"
@@ -132,15 +132,6 @@ class BorderNet(nn.Module):
         return functional.pixel_shuffle(self.head(functional.silu(y)).float(), 2)
 
 
-@dataclass(frozen=True, eq=False)
-class SeenBorders:
-    """What the network sees in a frame."""
-
-    border: np.ndarray  #: (H, W) float32, calibrated log odds that the pixel is at the border of an object
-    foreground: np.ndarray  #: (H, W) float32, log odds that the pixel belongs to an object
-    centre: np.ndarray  #: (H, W, 2) float32, column and row of the centre of the pixel's object
-
-
 class BorderNetwork:
     """A border network that is ready for use."""
 
@@ -159,6 +150,9 @@ class BorderNetwork:
         model.check_tensors({name: tuple(t.shape) for name, t in self.net.state_dict().items()})
         self.net.load_state_dict({name: torch.from_numpy(t) for name, t in model.tensors.items()})
         self.net.eval()
+        evidence = model.description.get("evidence", {})
+        #: Weights of the features of `mstfilter.segmentation.border_tree`; empty if they were not fitted.
+        self.evidence = dict(zip(evidence.get("features", ()), evidence.get("weights", ()), strict=True))
         self.key = model.key
 
     def look(self, frame: Frame) -> SeenBorders:

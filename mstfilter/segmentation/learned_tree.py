@@ -64,6 +64,12 @@ class Agglomeration:
                 return odds, i, j
         return None
 
+    def merge_all(self) -> None:
+        """Merge until no two regions have a border."""
+        while (pair := self.pop()) is not None:
+            odds, i, j = pair
+            self.merge(i, j, odds)
+
     def remove_border(self, i: int, j: int) -> None:
         """Remove the border of a pair, for the two regions and for those that they are merged into."""
         del self.borders[i][j], self.borders[j][i]
@@ -112,9 +118,7 @@ class LearnedTree(TreeBuilder):
         scale = frame.camera.width / 640
         weights = np.array([JOIN_WEIGHTS[name] for name in PAIR_FEATURES])
         growing = Agglomeration(regions, lambda a, b, ab, at, bt: pair_features(a, b, ab, at, bt, scale) @ weights)
-        while (pair := growing.pop()) is not None:
-            odds, i, j = pair
-            growing.merge(i, j, odds)
+        growing.merge_all()
         return tree_of_merges(regions.of_leaf[tree.leaves], len(regions.sums), growing.merges)
 
 

@@ -47,6 +47,7 @@ _WIDTHS = {
     "spread": 1,
     "bend": 1,
     "heights": _BINS,
+    "centre": 2,
     "perimeter": 1,
 }
 
@@ -58,14 +59,28 @@ def _columns(widths: dict[str, int]) -> dict[str, slice]:
 
 #: Columns of `Regions.sums`. All but the perimeter are sums over the region's readings above the table: their number,
 #: Lab colour and its squares, normal equations and squares of the quadric fit of disparity, ground coordinates (m)
-#: and their squares, signed curvature of disparity (> 0 where the surface is concave), histogram of heights. The
-#: perimeter is the number of pairs of neighbouring pixels of which one is outside the region.
+#: and their squares, signed curvature of disparity (> 0 where the surface is concave), histogram of heights, column
+#: and row of the object's centre that a network sees (0 without one). The perimeter is the number of pairs of
+#: neighbouring pixels of which one is outside the region.
 REGION = _columns(_WIDTHS)
 
 #: Columns of a border: number of neighbouring pixel pairs, sums over them of boundary strength, concave ("hollow")
-#: and convex curvature, step of disparity (first region minus second) and its magnitude, number of clear steps.
-BORDER = {name: k for k, name in enumerate(("length", "strength", "hollow", "convex", "step", "size", "clear"))}
-_SIGN = np.array([1, 1, 1, 1, -1, 1, 1], dtype=np.float64)
+#: and convex curvature, step of disparity (first region minus second) and its magnitude, number of clear steps, and
+#: the sum of the log odds of a border that a network sees (0 without one).
+BORDER = {
+    name: k for k, name in enumerate(("length", "strength", "hollow", "convex", "step", "size", "clear", "seen"))
+}
+_SIGN = np.array([1, 1, 1, 1, -1, 1, 1, 1], dtype=np.float64)
+_MOST_LOG_ODDS = 6.0  # of a seen border
+
+
+@dataclass(frozen=True, eq=False)
+class SeenBorders:
+    """What a border network sees in a frame."""
+
+    border: np.ndarray  #: (H, W) float32, calibrated log odds that the pixel is at the border of an object
+    foreground: np.ndarray  #: (H, W) float32, log odds that the pixel belongs to an object
+    centre: np.ndarray  #: (H, W, 2) float32, column and row of the centre of the pixel's object
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,8 +94,10 @@ class Regions:
     borders: list[dict[int, np.ndarray]]
 
 
-def measure_regions(leaves: np.ndarray, frame: Frame, boundary: np.ndarray) -> Regions:
-    """Measure the leaves (H, W) of a tree of a boundary map (H, W).
+def measure_regions(
+    leaves: np.ndarray, frame: Frame, boundary: np.ndarray, seen: SeenBorders | None = None
+) -> Regions:
+    """Measure the leaves (H, W) of a tree of a boundary map (H, W), and what a network sees.
 
     A leaf belongs to the table if most of its pixels do.
     """
@@ -129,11 +146,17 @@ def measure_regions(leaves: np.ndarray, frame: Frame, boundary: np.ndarray) -> R
     put("ground", points[:, 0], points[:, 1])
     put("spread", points[:, 0] ** 2 + points[:, 1] ** 2)
     put("bend", (hollow - convex)[at])
+    if seen is not None:
+        put("centre", *seen.centre[at].T)
     bins = np.clip(points[:, 2] / _HEIGHT_BIN, 0, _BINS - 1).astype(np.int64)
     sums[:, REGION["heights"]] = np.bincount(which * _BINS + bins, minlength=n * _BINS).reshape(n, _BINS)
 
     smooth = cv2.GaussianBlur(D, (0, 0), max(0.7, 1.5 * width / 640))
-    borders = _borders(region, n, boundary, hollow, convex, smooth)
+    # The border that the network sees can be beside that of the leaves: the largest log odds in the surroundings.
+    reach = 2 * max(1, round(2 * width / 640)) + 1
+    odds = np.zeros(leaves.shape, np.float32) if seen is None else seen.border
+    odds = np.clip(cv2.dilate(odds, np.ones((reach, reach), np.uint8)), -_MOST_LOG_ODDS, _MOST_LOG_ODDS)
+    borders = _borders(region, n, boundary, hollow, convex, smooth, odds)
     sums[:, REGION["perimeter"].start] = [sum(row[0] for row in near.values()) for near in borders]
     return Regions(of_leaf, sums, borders)
 
@@ -153,6 +176,7 @@ def _borders(
     hollow: np.ndarray,
     convex: np.ndarray,
     disparity: np.ndarray,
+    odds: np.ndarray,
 ) -> list[dict[int, np.ndarray]]:
     """For every region its neighbours and the border rows (columns `BORDER`)."""
     reach = max(1, round(3 * region.shape[1] / 640))
@@ -184,6 +208,7 @@ def _borders(
                 step,
                 np.abs(step),
                 np.abs(step) > _CLEAR_STEP,
+                (odds[here] + odds[there]) / 2,
             ],
             axis=1,
         )
