@@ -92,6 +92,6 @@ class BorderTree(TreeBuilder):
             )
         tree, regions = self.regions(boundary, frame)
         weights, scale = np.array(list(self.network.evidence.values())), frame.camera.width / 640
-        growing = Agglomeration(regions, lambda *pair: all_features(*pair, scale) @ weights)
+        growing = Agglomeration(regions, lambda a, b, ab, at, bt: all_features(a, b, ab, at, bt, scale) @ weights)
         growing.merge_all()
         return tree_of_merges(regions.of_leaf[tree.leaves], len(regions.sums), growing.merges)
