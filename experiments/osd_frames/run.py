@@ -2,6 +2,7 @@
 
     python experiments/osd_frames/run.py
     python experiments/osd_frames/run.py --smoke --out DIR    # two frames: shows only that it works
+    python experiments/osd_frames/run.py --border FOLDER --out DIR    # also with the evidence of a border model
 
 Needs the frames in MSTFILTER_SHARED (default ../shared) under real/osd_learn. Writes results/*.csv beside this file.
 The learned tree was fitted on simulated scenes only. SceneCut's constants (colour weight, centre and slope of the
@@ -27,6 +28,7 @@ from mstfilter.files import write_csv
 from mstfilter.scene import Camera, Frame
 from mstfilter.scoring import weighted_coverage
 from mstfilter.segmentation import (
+    BorderTree,
     ColourDepthBoundary,
     CutSampler,
     ExactCuts,
@@ -87,6 +89,7 @@ class Case:
     touching: bool
     trees: dict[float, tuple[Tree, Segments]]
     learned: dict[float, tuple[Tree, Segments]]
+    seen: dict[float, tuple[Tree, Segments]]  #: with the evidence of a border model, if one is given
 
     def score(self, labels: np.ndarray) -> float:
         """`objects` quality; pixels without a label count on neither side."""
@@ -118,21 +121,26 @@ def touching(label: np.ndarray) -> bool:
     )
 
 
-def load(number: int) -> Case:
+def load(number: int, border: str = "") -> Case:
     stem = str(SHARED / "real" / "osd_learn" / f"learn{number}")
     rgb = np.ascontiguousarray(cv2.imread(f"{stem}_rgb.png")[..., ::-1])
     depth = cv2.imread(f"{stem}_depth.png", cv2.IMREAD_UNCHANGED) * np.float32(0.001)
     label = cv2.imread(f"{stem}_label.png", cv2.IMREAD_UNCHANGED).astype(np.int64)
     frame = Frame(rgb, depth, Camera.from_intrinsics(525, 525, 319.5, 239.5, 640, 480))
-    trees, learned = {}, {}
+    trees: dict[float, tuple[Tree, Segments]] = {}
+    learned, seen = dict(trees), dict(trees)
     for weight in COLOUR_WEIGHTS:
         boundary = ColourDepthBoundary(colour_weight=weight).boundary(frame)
         tree = UcmTree(calibrate=False).build(boundary)
         trees[weight] = (tree, RULE.segments(tree, frame))
-        tree = LearnedTree(leaves=_Given(tree)).build(boundary, frame)
+        leaves = _Given(tree)
+        tree = LearnedTree(leaves).build(boundary, frame)
         learned[weight] = (tree, RULE.segments(tree, frame))
+        if border:
+            tree = BorderTree(leaves, border).build(boundary, frame)
+            seen[weight] = (tree, RULE.segments(tree, frame))
     truth = np.where(label >= 2, label - 1, 0)
-    return Case(f"learn{number}", frame, truth, label == 0, touching(label), trees, learned)
+    return Case(f"learn{number}", frame, truth, label == 0, touching(label), trees, learned, seen)
 
 
 def calibrated(tree: Tree, centre: float, slope: float) -> Tree:
@@ -171,10 +179,10 @@ def write_rows(target: Path, header: list[str], rows: Iterable[Iterable]) -> Non
     write_csv(target, [dict(zip(header, row, strict=True)) for row in rows], header)
 
 
-def main(numbers: Sequence[int], out: Path) -> None:
+def main(numbers: Sequence[int], out: Path, border: str = "") -> None:
     """Score every arm on the given frames."""
     began = time.time()
-    cases = [load(number) for number in numbers]
+    cases = [load(number, border) for number in numbers]
     setup = np.array([next(g for g, (a, b) in enumerate(GROUPS) if a <= i <= b) for i in numbers])
     groups = [(g, a, b) for g, (a, b) in enumerate(GROUPS) if g in setup]
     near = np.array([case.touching for case in cases])
@@ -191,30 +199,38 @@ def main(numbers: Sequence[int], out: Path) -> None:
             scores[k, i] = case.score_cut(tree, found, optimal_cut(tree, VALUE.values(tree, case.frame)))
 
     chosen = {g: int(scores[:, setup != g].mean(axis=1).argmax()) for g, _, _ in groups}
-    judged = np.zeros((len(COLOUR_WEIGHTS), len(cases)))
-    for k, weight in enumerate(COLOUR_WEIGHTS):
-        for i, case in enumerate(cases):
-            tree, found = case.learned[weight]
-            judged[k, i] = case.score_cut(tree, found, optimal_cut(tree, ODDS.values(tree, case.frame)))
-    picked = {g: int(judged[:, setup != g].mean(axis=1).argmax()) for g, _, _ in groups}
+
+    def judge(parts: Callable[[Case, float], tuple[Tree, Segments]]) -> tuple[np.ndarray, dict[int, int], np.ndarray]:
+        """Scores (weights, frames), the best weight without each set-up, the scores at these weights."""
+        judged = np.zeros((len(COLOUR_WEIGHTS), len(cases)))
+        for k, weight in enumerate(COLOUR_WEIGHTS):
+            for i, case in enumerate(cases):
+                tree, found = parts(case, weight)
+                judged[k, i] = case.score_cut(tree, found, optimal_cut(tree, ODDS.values(tree, case.frame)))
+        picked = {g: int(judged[:, setup != g].mean(axis=1).argmax()) for g, _, _ in groups}
+        return judged, picked, np.array([judged[picked[g], i] for i, g in enumerate(setup)])
+
+    judged, picked, held_out = judge(lambda case, weight: case.learned[weight])
     default = COLOUR_WEIGHTS.index(0.4)
     arms: dict[str, np.ndarray] = {
-        "learned tree, optimal cut, colour weight held out": np.array(
-            [judged[picked[g], i] for i, g in enumerate(setup)]
-        ),
+        "learned tree, optimal cut, colour weight held out": held_out,
         "learned tree, optimal cut, colour 0.4 (default)": judged[default],
         "learned tree, optimal cut, colour 0.6 (no labels used)": judged[COLOUR_WEIGHTS.index(UNFITTED_COLOUR)],
         "scenecut, optimal cut, constants held out": np.array([scores[chosen[g], i] for i, g in enumerate(setup)]),
         "scenecut, optimal cut, constants of all frames": scores[scores.mean(axis=1).argmax()],
     }
+    if border:
+        arms["border tree, optimal cut, colour weight held out"] = judge(lambda case, weight: case.seen[weight])[2]
     unlabelled, unlabelled_best = [], []
-    best_node: dict[str, list[float]] = {"learned": [], "contour": []}
+    best_node: dict[str, list[float]] = {"learned": [], "contour": [], **({"border": []} if border else {})}
     for case in cases:
         for weight, sink in ((UNFITTED_COLOUR, unlabelled), (0.4, unlabelled_best)):
             tree, found = case.trees[weight]
             tree = without_labels(tree)
             sink.append(case.score_cut(tree, found, optimal_cut(tree, VALUE.values(tree, case.frame))))
-        for name, trees in (("learned", case.learned), ("contour", case.trees)):
+        for name, trees in (("learned", case.learned), ("contour", case.trees), ("border", case.seen)):
+            if name not in best_node:
+                continue
             tree, found = trees[0.4]
             pixels = tree.accumulate_pixels(found.object_pixels & ~case.ignored)
             recall = []
@@ -301,10 +317,11 @@ def main(numbers: Sequence[int], out: Path) -> None:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--smoke", action="store_true", help="two frames of two set-ups; needs --out")
+    parser.add_argument("--border", default="", help="folder of a border model with fitted evidence")
     parser.add_argument("--out", type=Path, default=HERE / "results")
     options = parser.parse_args()
-    if options.smoke and options.out == HERE / "results":
-        parser.error("--smoke would overwrite the results: name another folder with --out")
+    if (options.smoke or options.border) and options.out == HERE / "results":
+        parser.error("this would overwrite the results: name another folder with --out")
     if options.smoke:
         COLOUR_WEIGHTS, CENTRES, SLOPES = (0.4, 0.6), (0.5,), (8.0, 12.0)
-    main((0, 2) if options.smoke else range(45), options.out)
+    main((0, 2) if options.smoke else range(45), options.out, options.border)
