@@ -27,7 +27,7 @@ from torch.nn import functional
 
 from mstfilter.errors import InputError, check_choice
 from mstfilter.files import atomic_path, write_csv, write_text
-from mstfilter.trained import write_model
+from mstfilter.trained import DESCRIPTION, open_model, write_model
 from mstfilter.training.shapes import HELD_OUT, TRAINED
 
 _STATE = "state.safetensors"
@@ -132,7 +132,8 @@ def run_training(
     Parameters
     ----------
     out : path
-        Folder. A folder with the same settings is continued; other settings raise InputError.
+        Folder. A folder with the same settings is continued, and a finished model is left as it is; other settings
+        raise InputError.
     workers : int
         Processes that make samples.
     device : str, optional
@@ -147,6 +148,8 @@ def run_training(
     """
     folder, report = Path(out), on_progress or (lambda done, total, text: None)
     _check_settings(settings, folder)
+    if (folder / DESCRIPTION).is_file():  # it is finished
+        return dict(open_model(str(folder), settings.architecture).description["test"])
     report(0, settings.steps, "making samples")
     seed, place = settings.seed, folder / "samples"
     parts = {

@@ -116,6 +116,9 @@ def test_training_learns_resumes_and_is_used(folder, tmp_path):
         assert torch.allclose(one, other, atol=1e-3)
 
     assert figures is not None
+    model = (tmp_path / "a/model.toml").read_bytes()
+    assert run_training(SMALL, tmp_path / "a") == pytest.approx(figures, abs=1e-4)
+    assert (tmp_path / "a/model.toml").read_bytes() == model
     found = read_border_samples(sorted((tmp_path / "a/samples/test").glob("*.npz")))
     near = [encoded(found, k) for k in range(len(found))]
     p = np.concatenate([truth[0][inside] for _, inside, truth, _ in near]).mean()
