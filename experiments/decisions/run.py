@@ -156,8 +156,8 @@ def summarise(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
                 for policy, d in compare_arms(table, "random").items():
                     row = {"family": family, "score": score, "pushes": name, "policy": policy, "n": d.n}
                     row["random"] = float(np.mean(list(table["random"].values())))
-                    row |= {"difference": -d.mean, "low": -d.high, "high": -d.low, "p_holm": d.p_holm}
-                    found.append({**row, "conclusion": conclusion(d, "random", policy, f"{family}, {score}")})
+                    row |= {"difference": d.mean, "low": d.low, "high": d.high, "p_holm": d.p_holm}
+                    found.append({**row, "conclusion": conclusion(d, policy, "random", f"{family}, {score}")})
     return found
 
 

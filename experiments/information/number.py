@@ -50,7 +50,7 @@ def main() -> None:
         row |= {c: float(np.mean([v for s, v in values[c].get(n, {}).items() if s in scenes])) for c in COLUMNS}
         if k:
             pair = {str(m): {s: values["information"][m][s] for s in scenes} for m in (n, numbers[k - 1])}
-            d = compare_arms(pair, str(n))[str(numbers[k - 1])]
+            d = compare_arms(pair, str(numbers[k - 1]))[str(n)]
             row |= {"minus_smaller": d.mean, "low": d.low, "high": d.high}
         rows.append(row)
         print({name: round(value, 4) for name, value in row.items()})

@@ -73,6 +73,9 @@ def test_controls(tmp_path):
     assert "'scene'" not in run_script(*arguments), "finished scenes are not run again"
 
 
+POLICIES = ("random", "information", "one hypothesis", "least sure")
+
+
 def test_decisions(tmp_path):
     arguments = ("decisions/run.py", "--smoke", "--out", tmp_path)
     run_script(*arguments)
@@ -80,13 +83,14 @@ def test_decisions(tmp_path):
     assert len(rows) == 2 * 4 * 2 and {r["k"] for r in rows} == {"0", "1"}
     start = {(r["scene"], r["coverage"]) for r in rows if r["k"] == "0"}
     assert len(start) == 2, "all policies start from the same belief about the same scene"
+    quality = {p: [float(r["quality"]) for r in rows if (r["policy"], r["k"]) == (p, "1")] for p in POLICIES}
+    for r in read_csv(tmp_path / "summary.csv"):
+        if (r["score"], r["pushes"]) == ("quality", "1"):
+            expected = (sum(quality[r["policy"]]) - sum(quality["random"])) / len(quality["random"])
+            assert float(r["difference"]) == pytest.approx(expected, abs=2e-4)
     tried = [r for r in rows if r["best"]]
     assert tried and all(float(r[name]) >= 0 for r in tried for name in r if name.startswith("regret"))
-    assert {r["policy"] for r in read_csv(tmp_path / "summary.csv")} == {
-        "information",
-        "one hypothesis",
-        "least sure",
-    }
+    assert {r["policy"] for r in read_csv(tmp_path / "summary.csv")} == set(POLICIES) - {"random"}
 
 
 def test_families(tmp_path):

@@ -80,6 +80,8 @@ def test_number_of_hypotheses(tmp_path):
     run_script("information/number.py", folder, "--out", tmp_path / "out")
     rows = read_csv(tmp_path / "out/number.csv")
     assert [row["n"] for row in rows] == ["1", "5"] and all(0 < float(row["information"]) < 1 for row in rows)
+    difference = float(rows[1]["information"]) - float(rows[0]["information"])
+    assert float(rows[1]["minus_smaller"]) == pytest.approx(difference, abs=2e-3)
     assert rows[0]["low"] == "" and float(rows[1]["low"]) <= float(rows[1]["minus_smaller"]) <= float(rows[1]["high"])
     assert (tmp_path / "out/number.png").exists()
 
