@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import hashlib
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -86,6 +86,30 @@ def open_model(name: str, architecture: str | None = None) -> TrainedModel:
     except (SafetensorError, ValueError, KeyError, TypeError) as error:
         raise InputError(f"{folder / WEIGHTS} is not a safetensors file: {error}", hint) from None
     return TrainedModel(folder, description, tensors, hashlib.sha256(text + data).hexdigest()[:16])
+
+
+def calibrated_network(
+    model: TrainedModel, channels: Sequence[str], build: Callable[[Mapping[str, Any]], Any]
+) -> tuple[Any, float, float]:
+    """The torch network of a model, ready for use, and scale and shift of its logits.
+
+    ``build(values)`` makes the network from the table ``network`` of the description. Raises InputError if the
+    description lacks something, or was made for other input channels, or does not fit the weights.
+    """
+    import torch
+
+    network = model.description.get("network", {})
+    try:
+        if list(network["channels"]) != list(channels):
+            raise InputError(f"{model.folder}: channels {network['channels']}, this version has {list(channels)}")
+        net = build(network)
+        calibration = model.description["calibration"]
+        scale, shift = float(calibration["scale"]), float(calibration["shift"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"{model.folder}: {DESCRIPTION} has no valid {error}", "train the model again") from None
+    model.check_tensors({name: tuple(t.shape) for name, t in net.state_dict().items()})
+    net.load_state_dict({name: torch.from_numpy(t) for name, t in model.tensors.items()})
+    return net.eval(), scale, shift
 
 
 def write_model(folder: str | Path, description: Mapping[str, Any], tensors: Mapping[str, np.ndarray]) -> None:

@@ -25,8 +25,7 @@ from torch.nn import functional
 
 from mstfilter.completion.completer import ObservedBox
 from mstfilter.completion.crops import CHANNELS, channels, encode_box
-from mstfilter.errors import InputError
-from mstfilter.trained import TrainedModel, open_model
+from mstfilter.trained import TrainedModel, calibrated_network, open_model
 
 ARCHITECTURE = "completion-unet"
 _BATCH = 8  # results do not depend on the other boxes of a batch only if all batches have one size
@@ -160,19 +159,10 @@ class TrainedNetwork:
     """A completion network that is ready for use."""
 
     def __init__(self, model: TrainedModel) -> None:
-        network = model.description.get("network", {})
-        try:
-            if list(network["channels"]) != list(CHANNELS):
-                raise InputError(f"{model.folder}: channels {network['channels']}, this version has {list(CHANNELS)}")
-            self.net = CompletionNet(len(CHANNELS), int(network["width"]), int(network["latent"]))
-            calibration = model.description["calibration"]
-            self.scale, self.shift = float(calibration["scale"]), float(calibration["shift"])
-        except (KeyError, TypeError, ValueError) as error:
-            raise InputError(f"{model.folder}: model.toml has no valid {error}", "train the model again") from None
-        model.check_tensors({name: tuple(t.shape) for name, t in self.net.state_dict().items()})
-        self.net.load_state_dict({name: torch.from_numpy(t) for name, t in model.tensors.items()})
-        self.net.eval()
-        self.latent, self.key = int(network["latent"]), model.key
+        self.net, self.scale, self.shift = calibrated_network(
+            model, CHANNELS, lambda values: CompletionNet(len(CHANNELS), int(values["width"]), int(values["latent"]))
+        )
+        self.latent, self.key = self.net.prior.out_features // 2, model.key
 
     def probabilities(self, seen: Sequence[ObservedBox], noise: Sequence[np.ndarray | None], edge: int) -> np.ndarray:
         """Calibrated probabilities (n, edge, edge, edge) float32 of at most eight boxes.

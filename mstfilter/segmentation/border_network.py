@@ -21,11 +21,10 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from mstfilter.errors import InputError
 from mstfilter.scene import BASELINE, Camera, Frame, fit_support_plane
 from mstfilter.segmentation.boundary import SENSOR_FOCAL, TABLE_TOLERANCE, fill_from_nearest
 from mstfilter.segmentation.regions import SeenBorders
-from mstfilter.trained import TrainedModel, open_model
+from mstfilter.trained import TrainedModel, calibrated_network, open_model
 
 BORDER_ARCHITECTURE = "border-unet"
 RASTER = 320  # pixels per row of the network's images
@@ -136,20 +135,9 @@ class BorderNetwork:
     """A border network that is ready for use."""
 
     def __init__(self, model: TrainedModel) -> None:
-        network = model.description.get("network", {})
-        try:
-            if list(network["channels"]) != list(IMAGE_CHANNELS):
-                raise InputError(
-                    f"{model.folder}: channels {network['channels']}, this version has {list(IMAGE_CHANNELS)}"
-                )
-            self.net = BorderNet(int(network["width"]))
-            calibration = model.description["calibration"]
-            self.scale, self.shift = float(calibration["scale"]), float(calibration["shift"])
-        except (KeyError, TypeError, ValueError) as error:
-            raise InputError(f"{model.folder}: model.toml has no valid {error}", "train the model again") from None
-        model.check_tensors({name: tuple(t.shape) for name, t in self.net.state_dict().items()})
-        self.net.load_state_dict({name: torch.from_numpy(t) for name, t in model.tensors.items()})
-        self.net.eval()
+        self.net, self.scale, self.shift = calibrated_network(
+            model, IMAGE_CHANNELS, lambda values: BorderNet(int(values["width"]))
+        )
         evidence = model.description.get("evidence", {})
         #: Weights of the features of `mstfilter.segmentation.border_tree`; empty if they were not fitted.
         self.evidence = dict(zip(evidence.get("features", ()), evidence.get("weights", ()), strict=True))
