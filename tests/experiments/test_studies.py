@@ -36,7 +36,9 @@ def write_tables(folder, out, *more):
     return {path.stem: read_csv(path) for path in out.iterdir()}
 
 
-@pytest.mark.parametrize("name", ["main/paper_best", "fusion/study", "fusion/reported", "ablations/study"])
+@pytest.mark.parametrize(
+    "name", ["main/paper_best", "fusion/study", "fusion/reported", "ablations/study", "completion/study"]
+)
 def test_studies_run_in_their_small_form(tmp_path, name):
     path = EXPERIMENTS / f"{name}.toml"
     make_plan(load_study(path))  # the long form can be planned
@@ -105,7 +107,11 @@ def test_reported_seeds_are_no_tuning_seeds(config, first):
 
 
 @pytest.mark.parametrize(
-    "name", ["ablations/study", "main/paper_best", "fusion/study", "error_budget/study", "information/number"]
+    "name",
+    [
+        *("ablations/study", "main/paper_best", "fusion/study", "error_budget/study", "information/number"),
+        *("completion/study", "completion/tuning"),
+    ],
 )
 def test_tuning_studies_use_tuning_seeds(name):
     plan = make_plan(load_study(EXPERIMENTS / f"{name}.toml"))

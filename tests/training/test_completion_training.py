@@ -12,6 +12,7 @@ import torch
 from mstfilter.completion import NetworkCompleter, observed_box
 from mstfilter.completion.crops import extruded
 from mstfilter.errors import InputError
+from mstfilter.files import read_csv
 from mstfilter.trained import open_model
 from mstfilter.training import CompletionTraining, Samples, read_samples, run_training, write_samples
 from mstfilter.training.completion_data import combine
@@ -19,6 +20,7 @@ from mstfilter.training.loop import calibration_error
 from mstfilter.training.shapes import HELD_OUT, TRAINED, draw_training_shape
 from tests.completion.test_completion import masks_of
 from tests.completion.test_network import STACK
+from tests.experiments.scripts import run_script
 from tests.segmentation.scenes import GRID, TWO, frame_of
 
 SMALL = CompletionTraining(
@@ -113,6 +115,10 @@ def test_training_learns_resumes_and_is_used(tmp_path):
     lines = [line.split(",") for line in (tmp_path / "a/curves.csv").read_text().split()]
     assert float(lines[-1][lines[0].index("log_loss")]) < loss
     assert figures["iou"] > figures["iou_extrude"] - 0.03
+
+    run_script("completion/compare.py", tmp_path / "a", "--most", 6, "--out", tmp_path / "out")
+    rows = {row["completer"]: row for row in read_csv(tmp_path / "out/completion.csv") if row["group"] == "all"}
+    assert len(rows) == 6 and float(rows["extrude"]["iou"]) > float(rows["surface"]["iou"])
 
     one = NetworkCompleter(weights=str(tmp_path / "a"))
     frame = frame_of(TWO, width=320)
