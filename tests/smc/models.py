@@ -6,10 +6,16 @@ from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
-from filterpy.kalman import KalmanFilter
+import pytest
 from scipy import stats
 
 from mstfilter.smc import Normal, StateSpaceModel, batch
+
+
+def filterpy_class(name: str):
+    """A class of filterpy's Kalman filters; a test that needs one is skipped without filterpy."""
+    return getattr(pytest.importorskip("filterpy.kalman"), name)
+
 
 # --- scalar AR(1) observed in noise -------------------------------------------------------------------------------
 RHO, SIGMA, TAU = 0.9, 0.6, 0.4
@@ -46,7 +52,7 @@ def predictive(x, y):
 
 def kalman_ar1(ys):
     """(T, 2) filtered means and variances, and the log evidence. None in `ys` is a missing observation."""
-    kf = KalmanFilter(dim_x=1, dim_z=1)
+    kf = filterpy_class("KalmanFilter")(dim_x=1, dim_z=1)
     kf.F, kf.Q, kf.H, kf.R = (np.array([[v]]) for v in (RHO, SIGMA**2, 1.0, TAU**2))
     kf.x, kf.P = np.zeros(1), np.array([[SD0**2]])
     total, out = 0.0, []

@@ -7,11 +7,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from filterpy.kalman import ExtendedKalmanFilter, MerweScaledSigmaPoints, UnscentedKalmanFilter
 from scipy import stats
 
 from mstfilter.errors import InputError
 from mstfilter.smc import bootstrap, ekf_proposal, guided, nonlinear_gaussian, ukf_proposal
+from tests.smc.models import filterpy_class
 
 Q, R = np.array([[0.4, 0.1], [0.1, 0.3]]), np.array([[0.2, 0.05], [0.05, 0.1]])
 Y = np.array([1.3, 0.4])
@@ -37,7 +37,7 @@ PARTICLES = np.random.default_rng(0).normal(1.0, 0.7, (6, 2))
 def test_ekf_proposal_is_the_update_of_filterpy():
     found = ekf_proposal(f, Q, h, R, jacobian)(PARTICLES, Y)
     for i, x in enumerate(PARTICLES):
-        kf = ExtendedKalmanFilter(2, 2)
+        kf = filterpy_class("ExtendedKalmanFilter")(2, 2)
         kf.x, kf.P, kf.R = f(x), Q.copy(), R
         kf.update(Y, jacobian, h)
         np.testing.assert_allclose(found.mean[i], kf.x, atol=1e-12)
@@ -47,7 +47,9 @@ def test_ekf_proposal_is_the_update_of_filterpy():
 def test_ukf_proposal_is_the_update_of_filterpy():
     found = ukf_proposal(f, Q, h, R, alpha=0.9, beta=2.0, kappa=1.0)(PARTICLES, Y)
     for i, x in enumerate(PARTICLES):
-        kf = UnscentedKalmanFilter(2, 2, 1.0, h, lambda x, dt: x, MerweScaledSigmaPoints(2, 0.9, 2.0, 1.0))
+        kf = filterpy_class("UnscentedKalmanFilter")(
+            2, 2, 1.0, h, lambda x, dt: x, filterpy_class("MerweScaledSigmaPoints")(2, 0.9, 2.0, 1.0)
+        )
         kf.x, kf.P, kf.R, kf.Q = f(x), Q.copy(), R, np.zeros((2, 2))
         kf.predict()
         # filterpy propagates the points of the previous state; here the state before the noise is known.

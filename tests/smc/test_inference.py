@@ -11,7 +11,6 @@ from itertools import product
 
 import numpy as np
 import pytest
-from filterpy.kalman import KalmanFilter
 from scipy import stats
 
 from mstfilter.errors import InputError
@@ -55,6 +54,7 @@ from tests.smc.models import (
     START,
     TAU,
     ar1_observations,
+    filterpy_class,
     hmm,
     predictive,
     states_of,
@@ -257,7 +257,7 @@ def filter_of(theta, n=30):
 
 
 def kalman(rho):
-    kf = KalmanFilter(dim_x=1, dim_z=1)
+    kf = filterpy_class("KalmanFilter")(dim_x=1, dim_z=1)
     kf.F, kf.Q, kf.H, kf.R = (np.array([[v]]) for v in (rho, SIGMA**2, 1.0, TAU**2))
     kf.x, kf.P = np.zeros(1), np.array([[SD0**2]])
     total = 0.0

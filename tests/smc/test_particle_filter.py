@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from filterpy.kalman import KalmanFilter
 from scipy import stats
 
 from mstfilter.errors import InputError
@@ -27,6 +26,7 @@ from mstfilter.smc import (
     bootstrap,
     linear_gaussian,
 )
+from tests.smc.models import filterpy_class
 
 F, Q = np.array([[1.0, 0.5], [0.0, 0.9]]), np.array([[0.2, 0.05], [0.05, 0.3]])
 H, R = np.array([[1.0, 0.0]]), np.array([[0.7]])
@@ -47,7 +47,7 @@ def observations(T=12, seed=8):
 
 def kalman(ys):
     """Filtered means, covariances and the log likelihood; the first observation updates the prior."""
-    kf = KalmanFilter(dim_x=2, dim_z=1)
+    kf = filterpy_class("KalmanFilter")(dim_x=2, dim_z=1)
     kf.F, kf.Q, kf.H, kf.R = F, Q, H, R
     kf.x, kf.P = M0.copy(), P0.copy()
     total, means = 0.0, []

@@ -10,7 +10,6 @@ from itertools import pairwise, product
 
 import numpy as np
 import pytest
-from filterpy.kalman import KalmanFilter
 
 from mstfilter.errors import InputError
 from mstfilter.smc import (
@@ -42,6 +41,7 @@ from tests.smc.models import (
     SYMBOLS,
     TAU,
     ar1_observations,
+    filterpy_class,
     hmm,
     kalman_ar1,
     optimal,
@@ -64,7 +64,7 @@ def smoothed():
 
 
 def test_the_oracles_agree():
-    kf = KalmanFilter(dim_x=1, dim_z=1)
+    kf = filterpy_class("KalmanFilter")(dim_x=1, dim_z=1)
     kf.F, kf.Q = np.array([[RHO]]), np.array([[SIGMA**2]])
     moments, _ = kalman_ar1(YS)
     mean, variance, *_ = kf.rts_smoother(moments[:, :1, None], moments[:, 1:, None])
