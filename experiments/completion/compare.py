@@ -14,10 +14,10 @@ import time
 from pathlib import Path
 
 import numpy as np
-from scipy import stats
 
 from mstfilter.completion import Completer, Extrude, HilbertMap, Hull, NetworkCompleter, SurfaceOnly
 from mstfilter.files import write_csv
+from mstfilter.statistics import interval
 from mstfilter.training import HELD_OUT, Samples, read_samples
 
 
@@ -68,7 +68,8 @@ def main() -> None:
         both, either = (filled & samples.truth).sum(axis=axes), (filled | samples.truth).sum(axis=axes)
         iou = both / np.maximum(either, 1)
         of_scene = np.array([iou[samples.scene == k].mean() for k in np.unique(samples.scene)])
-        half = stats.t.ppf(0.975, len(of_scene) - 1) * of_scene.std(ddof=1) / np.sqrt(len(of_scene))
+        low, high = interval(of_scene)
+        half = (high - low) / 2
         volume = filled.sum(axis=axes) / np.maximum(samples.truth.sum(axis=axes), 1)
         for group, of in groups.items():
             if of.any():

@@ -11,12 +11,11 @@ score and its floor, the same hypotheses with noise at the border; processor sec
 from __future__ import annotations
 
 import argparse
-import csv
 from pathlib import Path
 
 import numpy as np
 
-from mstfilter.files import write_csv
+from mstfilter.files import read_csv, write_csv
 from mstfilter.statistics import compare_arms
 
 COLUMNS = (
@@ -28,11 +27,10 @@ COLUMNS = (
 def by_scene(path: Path, column: str) -> dict[int, dict[str, float]]:
     """Number of hypotheses -> scene -> mean over the pauses t >= 1."""
     found: dict[int, dict[str, list[float]]] = {}
-    with path.open() as file:
-        for row in csv.DictReader(file):
-            if int(row["pause"]) >= 1 and row.get(column):
-                n = int(row["arm"].rsplit("=", 1)[1])
-                found.setdefault(n, {}).setdefault(f"{row['family']} {row['scene']}", []).append(float(row[column]))
+    for row in read_csv(path):
+        if int(row["pause"]) >= 1 and row.get(column):
+            n = int(row["arm"].rsplit("=", 1)[1])
+            found.setdefault(n, {}).setdefault(f"{row['family']} {row['scene']}", []).append(float(row[column]))
     return {n: {scene: float(np.mean(v)) for scene, v in found[n].items()} for n in sorted(found)}
 
 

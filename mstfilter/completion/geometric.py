@@ -14,7 +14,7 @@ from scipy.spatial import ConvexHull, Delaunay, QhullError
 from scipy.spatial.distance import cdist
 from scipy.special import expit
 
-from mstfilter.completion.completer import ObservedBox
+from mstfilter.completion.completer import Completer, ObservedBox
 from mstfilter.completion.extrude import Extrude
 
 
@@ -34,7 +34,7 @@ class Hull(Extrude):
 
 
 @dataclass(frozen=True)
-class HilbertMap(Extrude):
+class HilbertMap(Completer):
     """Occupancy as Bayesian logistic regression on radial features, after V-PRISM.
 
     The visible surface is occupied; voxels observed as free, other surfaces and the space below the table are not.

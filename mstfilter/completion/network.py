@@ -16,13 +16,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mstfilter.completion.completer import Completer, Completion, ObservedBox, finish, observed_box
-from mstfilter.completion.crops import EDGE, LARGER, LATTICE, crop_box
+from mstfilter.completion.crops import BATCH, EDGE, LARGER, LATTICE, crop_box
 from mstfilter.scene import Frame, VoxelGrid
 
 if TYPE_CHECKING:
     from mstfilter.completion.unet import TrainedNetwork
-
-_BATCH = 8
 
 
 @dataclass(frozen=True)
@@ -32,7 +30,7 @@ class NetworkCompleter(Completer):
     Parameters
     ----------
     weights : str
-        Name of trained weights of the package (folder ``completion``), or the path of a ``.safetensors`` file.
+        Name of a trained model of the package, or the folder of one (`mstfilter.trained`).
     draw : bool
         Draw the hidden extent for each hypothesis from the network's law, instead of taking its mode.
     spread : float
@@ -99,8 +97,8 @@ class NetworkCompleter(Completer):
                 edge = next(n for n in (EDGE, *LARGER) if max(one.surface.shape) <= n)
                 by_edge.setdefault(edge, []).append(k)
         for edge, members in by_edge.items():
-            for start in range(0, len(members), _BATCH):
-                chosen = members[start : start + _BATCH]
+            for start in range(0, len(members), BATCH):
+                chosen = members[start : start + BATCH]
                 p = self.network.probabilities([seen[k] for k in chosen], [noise[k] for k in chosen], edge)
                 for k, one in zip(chosen, p, strict=True):
                     a, b, c = seen[k].surface.shape

@@ -24,11 +24,10 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from mstfilter.completion.completer import ObservedBox
-from mstfilter.completion.crops import CHANNELS, channels, encode_box
+from mstfilter.completion.crops import BATCH, CHANNELS, channels, encode_box
 from mstfilter.trained import TrainedModel, calibrated_network, open_model
 
 ARCHITECTURE = "completion-unet"
-_BATCH = 8  # results do not depend on the other boxes of a batch only if all batches have one size
 
 
 class LatentLaw(NamedTuple):
@@ -165,11 +164,11 @@ class TrainedNetwork:
         self.latent, self.key = self.net.prior.out_features // 2, model.key
 
     def probabilities(self, seen: Sequence[ObservedBox], noise: Sequence[np.ndarray | None], edge: int) -> np.ndarray:
-        """Calibrated probabilities (n, edge, edge, edge) float32 of at most eight boxes.
+        """Calibrated probabilities (n, edge, edge, edge) float32 of at most `BATCH` boxes.
 
         `noise` is standard normal (latent,) for a draw of the hidden extent, None for the mode.
         """
-        bits = np.zeros((_BATCH, edge, edge, edge), np.uint8)
+        bits = np.zeros((BATCH, edge, edge, edge), np.uint8)
         signed = np.zeros(bits.shape, np.int8)
         height = np.zeros(edge)
         for k, one in enumerate(seen):
@@ -177,7 +176,7 @@ class TrainedNetwork:
             bits[k, :a, :b, :c], signed[k, :a, :b, :c] = encode_box(one)
             step = one.height[1] - one.height[0] if c > 1 else 0.01
             height = one.height[0] + step * np.arange(edge)
-        drawn = np.zeros((_BATCH, self.latent), np.float32)
+        drawn = np.zeros((BATCH, self.latent), np.float32)
         for k, values in enumerate(noise):
             if values is not None:
                 drawn[k] = values

@@ -36,6 +36,8 @@ from mstfilter.training.scenes import (
     draw_scene,
     on_table,
     read_shard,
+    slant_of,
+    world_rays,
     write_shards,
 )
 from mstfilter.training.shapes import TRAINED
@@ -109,11 +111,10 @@ def _view(rng: np.random.Generator, world: PhysicsWorld) -> tuple[np.ndarray, ..
     instance = np.where(hit, world.geom_object[np.maximum(geom, 0)], 0).astype(np.uint8)
     if np.bincount(instance)[1:].max(initial=0) < _LEAST_PIXELS:
         return None
-    rays = camera.rays().reshape(-1, 3) @ camera.pose.as_matrix()[:3, :3].T
-    slant = np.abs((rays * normal).sum(axis=1)) / np.linalg.norm(rays, axis=1)
+    rays = world_rays(camera)
     true_depth = np.where(hit, z, np.nan).astype(np.float32).reshape(HEIGHT, WIDTH)
     shaped = instance.reshape(HEIGHT, WIDTH)
-    depth = _depth(rng, true_depth, slant.reshape(HEIGHT, WIDTH).astype(np.float32), shaped)
+    depth = _depth(rng, true_depth, slant_of(rays, normal), shaped)
     points = np.array(camera.position) + rays * np.where(hit, z, 0)[:, None]
     rgb = _colours(rng, world, poses, geom, points, normal, instance)
     centre = np.zeros((_MOST_OBJECTS + 1, 2), np.float32)

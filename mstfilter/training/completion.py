@@ -18,12 +18,12 @@ from typing import Any, ClassVar
 
 import numpy as np
 import torch
-from scipy import stats
 from torch import Tensor, nn
 from torch.nn import functional
 
 from mstfilter.completion.crops import CHANNELS, LATTICE, channels, extruded
 from mstfilter.completion.unet import ARCHITECTURE, CompletionNet, LatentLaw, ShapePosterior
+from mstfilter.statistics import interval
 from mstfilter.training.completion_data import MASK_KINDS, Samples, read_samples, write_samples
 from mstfilter.training.loop import Training, calibration_error, fit_calibration
 from mstfilter.training.shapes import HELD_OUT
@@ -225,10 +225,8 @@ _NOISE_RATES = (0.1, 0.2, 0.4, 0.6, 0.8)
 def _by_scene(values: np.ndarray, scene: np.ndarray) -> tuple[float, float]:
     """Mean over scenes, and half the width of its 95 % interval (Student's t); NaN for one scene."""
     of_scene = np.array([values[scene == k].mean() for k in np.unique(scene)])
-    if len(of_scene) < 2:
-        return float(of_scene.mean()), float("nan")
-    half = stats.t.ppf(0.975, len(of_scene) - 1) * of_scene.std(ddof=1) / np.sqrt(len(of_scene))
-    return float(of_scene.mean()), float(half)
+    low, high = interval(of_scene)
+    return float(of_scene.mean()), (high - low) / 2
 
 
 def shape_iou(found: np.ndarray, truth: np.ndarray) -> np.ndarray:

@@ -4,10 +4,10 @@
 >>> write_samples(folder, seed=0, n_scenes=1000, workers=2)     # resumable; the same files for any number of workers
 
 A scene has 2 to 12 objects of the kinds in `mstfilter.training.shapes`, side by side, stacked, leaning and hidden, at
-rest under physics. It is seen by two cameras with the noise of the simulated sensor and a small error of the camera's
-pose. The masks are those that a filter meets: the true masks with displaced borders, and the segments of sampled cuts
-of the segmentation tree, which also hold parts of objects, and several objects. Some samples have the evidence of a
-second frame, after other objects were taken away.
+rest under physics. It is seen by three cameras with the noise of the simulated sensor and a small error of the
+camera's pose. The masks are those that a filter meets: the true masks with displaced borders, and the segments of
+sampled cuts of the segmentation tree, which also hold parts of objects, and several objects. Some samples have the
+evidence of a second frame, after other objects were taken away.
 
 The true shape of a mask: each object with visible pixels in the mask contributes the voxels whose nearest visible
 point lies in the mask. So a whole object gets all its voxels, the masks of two halves share them, and a mask of two
@@ -41,7 +41,10 @@ from mstfilter.training.scenes import (
     draw_camera,
     draw_scene,
     on_table,
+    put_away,
     read_shard,
+    slant_of,
+    world_rays,
     write_shards,
 )
 from mstfilter.training.shapes import TRAINED
@@ -102,7 +105,7 @@ def _view_samples(rng: np.random.Generator, world: PhysicsWorld, index: int) -> 
         gone = np.flatnonzero(inside)[rng.random(int(inside.sum())) < 0.5]
         state = world.save()
         for k in gone.tolist():
-            world.place(k, (10.0 + 2.0 * k, 0.0, 1.0), np.eye(3))
+            put_away(world, k)
         world.forward()
         second = (*_frame(rng, world, camera), set((gone + 1).tolist()))
         world.restore(state)
@@ -123,14 +126,11 @@ def _view_samples(rng: np.random.Generator, world: PhysicsWorld, index: int) -> 
 
 def _frame(rng: np.random.Generator, world: PhysicsWorld, camera: Camera) -> tuple[Frame, np.ndarray]:
     """An image with noise, with a small error of the camera's pose, and the true instances (H, W)."""
-    turn = camera.pose.as_matrix()[:3, :3]
-    rays = camera.rays().reshape(-1, 3) @ turn.T
     geom, z, normal = cast(world, camera, (0, 1))
     instance = np.where(geom >= 0, world.geom_object[np.maximum(geom, 0)], 0)
-    slant = np.abs((rays * normal).sum(axis=1)) / np.linalg.norm(rays, axis=1)
     depth = np.where(geom >= 0, z, np.nan).astype(np.float32).reshape(HEIGHT, WIDTH)
     sensor = replace(DepthSensor(), edge_dropout=float(rng.uniform(0.05, 0.2)))
-    reading = sensor.read(rng, depth, slant.reshape(HEIGHT, WIDTH).astype(np.float32))
+    reading = sensor.read(rng, depth, slant_of(world_rays(camera), normal))
     # One colour an object, with shading: the tree sees edges of colour and of depth.
     albedo = rng.uniform(0.1, 0.9, (256, 3))
     light = 0.45 + 0.5 * np.clip(normal @ np.array([0.3, -0.4, 0.87]), 0, 1)
@@ -147,7 +147,7 @@ def _silhouettes(world: PhysicsWorld, camera: Camera, instance: np.ndarray) -> d
     for k in np.flatnonzero(seen[1:] >= _LEAST_PIXELS).tolist():
         for other in range(world.n_objects):
             if other != k:
-                world.place(other, (10.0 + 2.0 * other, 0.0, 1.0), np.eye(3))
+                put_away(world, other)
         world.place(k, positions[k], rotations[k])
         world.forward()
         geom, _, _ = cast(world, camera, (1,))

@@ -26,7 +26,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from mstfilter.errors import InputError, check_choice
-from mstfilter.files import atomic_path, write_csv, write_text
+from mstfilter.files import atomic_path, read_csv, write_csv, write_text
 from mstfilter.trained import DESCRIPTION, open_model, write_model
 from mstfilter.training.shapes import HELD_OUT, TRAINED
 
@@ -228,8 +228,7 @@ class _Run:
         self.step = int(tensors["step"])
         path = self.folder / "curves.csv"
         if path.exists():
-            names, *lines = (line.split(",") for line in path.read_text().split())
-            self.curves = [dict(zip(names, map(float, line), strict=True)) for line in lines]
+            self.curves = [{name: float(value) for name, value in row.items()} for row in read_csv(path)]
 
     def train(self, samples: Any, validation: Any, last: int, report: Progress) -> None:
         """Steps up to `last`."""

@@ -60,9 +60,14 @@ def draw_scene(rng: np.random.Generator, kinds: tuple[str, ...]) -> PhysicsWorld
         if not world.overlaps(k):
             world.settle()
         else:
-            world.place(k, (10.0 + 2.0 * k, 0.0, 1.0), np.eye(3))
+            put_away(world, k)
     world.forward()
     return world
+
+
+def put_away(world: PhysicsWorld, k: int) -> None:
+    """Put object k far beside the table."""
+    world.place(k, (10.0 + 2.0 * k, 0.0, 1.0), np.eye(3))
 
 
 def on_table(poses: np.ndarray) -> np.ndarray:
@@ -96,10 +101,20 @@ def displaced(rng: np.random.Generator, camera: Camera) -> Camera:
     return camera.at(RigidTransform.from_components(shift, tilt) * camera.pose)
 
 
+def world_rays(camera: Camera) -> np.ndarray:
+    """Directions (n, 3) of all pixels in the world, of unit z-depth."""
+    return camera.rays().reshape(-1, 3) @ camera.pose.as_matrix()[:3, :3].T
+
+
+def slant_of(rays: np.ndarray, normal: np.ndarray) -> np.ndarray:
+    """Slant (H, W) float32, the cosine of the angle of incidence, of rays (n, 3) on surfaces with normals (n, 3)."""
+    cosine = np.abs((rays * normal).sum(axis=1)) / np.linalg.norm(rays, axis=1)
+    return cosine.reshape(HEIGHT, WIDTH).astype(np.float32)
+
+
 def cast(world: PhysicsWorld, camera: Camera, groups: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Geom (n,), z-depth (n,) and normal (n, 3) of every pixel of a camera (`PhysicsWorld.cast`)."""
-    turn = camera.pose.as_matrix()[:3, :3]
-    return world.cast(np.array(camera.position), camera.rays().reshape(-1, 3) @ turn.T, groups)
+    return world.cast(np.array(camera.position), world_rays(camera), groups)
 
 
 class Columns:
