@@ -1,4 +1,4 @@
-"""Commands about recordings and runs: run, demo, simulate, report, convert, quality."""
+"""Commands about recordings and runs: run, demo, simulate, report, view, convert, quality."""
 
 from __future__ import annotations
 
@@ -39,6 +39,9 @@ def run(
     pauses: Pauses = "",
     frames: Annotated[str, typer.Option(help="Frames of a folder of pairs, separated by commas.")] = "",
     report: Annotated[bool, typer.Option(help="Write report.html into the run folder.")] = True,
+    compare: Annotated[
+        bool, typer.Option("--compare", help="Also run the filter without past and on single frames, for the report.")
+    ] = False,
     replace: Annotated[
         bool, typer.Option("--replace", help="Remove an earlier run in the run folder first.")
     ] = False,
@@ -47,9 +50,13 @@ def run(
     import shutil
 
     from mstfilter.presets import build_filter, load_config
+    from mstfilter.runs import COMPARED
 
-    config = load_config(preset, overrides or ())
-    build_filter(config, allow_files=True)  # a wrong setting is reported before the recording is read
+    configs = {"": load_config(preset, overrides or ())}
+    if compare:
+        configs |= {k: load_config(preset, [*(overrides or ()), *changes]) for k, changes in COMPARED.items()}
+    for config in configs.values():
+        build_filter(config, allow_files=True)  # a wrong setting is reported before the recording is read
     if out is not None:
         from mstfilter.runs import check_run_folder
 
@@ -59,7 +66,8 @@ def run(
     folder = out or Path("runs") / f"{safe_name(source.name)}-{safe_name(name)}-{seed}"
     if replace and (folder / "run.json").is_file():
         shutil.rmtree(folder)
-    _execute(source, config, folder, seed)
+    for name, config in configs.items():
+        _execute(source, config, folder / "compare" / name.replace(" ", "-") if name else folder, seed)
     if report:
         _report(folder, None)
     print_summary(folder)
@@ -133,6 +141,38 @@ def report(
 
         export_run(RunFolder.open(run), export, mesh_format, mesh_style)
         print(f"hypotheses  {export}")
+
+
+@app.command()
+def view(
+    source: Annotated[Path, typer.Argument(help="Run folder, or recording of any format.")],
+    html: Annotated[Path | None, typer.Option(help="Write a page that any browser opens, without rerun.")] = None,
+    save: Annotated[Path | None, typer.Option(help="Write a file of rerun (.rrd) and do not open it.")] = None,
+    format: FormatOption = "",
+    option: Options = None,
+    pauses: Pauses = "",
+) -> None:
+    """Look at a run or a recording: time line, image, voxels, weights, genealogy, truth. Opens rerun by default."""
+    import tempfile
+
+    from mstfilter.report import viewer
+    from mstfilter.runs import RunFolder
+
+    for path in (html, save):
+        if path is not None:
+            check_output(path)
+    if html is None or save is not None:
+        viewer.import_rerun()
+    known = (source / "run.json").is_file()
+    chosen = RunFolder.open(source) if known else read_source(source, format, option, pauses)
+    if html is not None:
+        page = viewer.run_page(chosen) if isinstance(chosen, RunFolder) else viewer.recording_page(chosen)
+        print(f"page        {page.save(html)}")
+    if save is not None:
+        print(f"rerun       {viewer.save_rerun(chosen, save)}")
+    if html is None and save is None:
+        with tempfile.TemporaryDirectory() as folder:
+            viewer.show_rerun(viewer.save_rerun(chosen, Path(folder) / "scenes.rrd"))
 
 
 @app.command()

@@ -19,3 +19,9 @@ from mstfilter.report.pictures import (
 )
 from mstfilter.report.run_report import write_report as write_report
 from mstfilter.report.study_report import write_study_report as write_study_report
+from mstfilter.report.viewer import (
+    recording_page as recording_page,
+    run_page as run_page,
+    save_rerun as save_rerun,
+    show_rerun as show_rerun,
+)

@@ -12,26 +12,19 @@ this module when they are called (`mstfilter.lazy.late`). Pages are self-contain
 from __future__ import annotations
 
 import html
-import json
-from base64 import b64encode
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from functools import singledispatch
-from importlib.resources import files
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 
-from mstfilter.files import check_output, write_text
 from mstfilter.fusion import Belief
 from mstfilter.report.identities import match_objects
 from mstfilter.report.pictures import (
     Colour,
     colour,
     data_uri,
-    hexadecimal,
     jpeg_bytes,
     png_bytes,
     viewpoint,
@@ -41,7 +34,6 @@ from mstfilter.scene import Clip, Frame, Hypothesis, Recording
 from mstfilter.smc import Candidates, Info, Infos, ParticleFilter, Population, State, as_matrix
 
 _MOST_PICTURES = 6
-_SIDES = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]])
 
 
 class Drawing(Figure):
@@ -55,56 +47,9 @@ class Drawing(Figure):
         return file.getvalue()
 
 
-@dataclass(frozen=True)
-class ScenePage:
-    """A page with a scene that can be rotated; a notebook shows it in place."""
-
-    text: str  #: HTML, self-contained
-    title: str
-
-    def __repr__(self) -> str:
-        return f"ScenePage {self.title!r}: .save('scene.html') writes it"
-
-    def _repr_html_(self) -> str:
-        frame = 'width="100%" height="460" style="border:0" sandbox="allow-scripts"'
-        return f'<iframe title="{html.escape(self.title)}" srcdoc="{html.escape(self.text)}" {frame}></iframe>'
-
-    def save(self, path: str | Path) -> Path:
-        """Write the page to a file, which any browser opens."""
-        check_output(Path(path))
-        write_text(path, self.text)
-        return Path(path)
-
-
 def colours_of(hypothesis: Hypothesis) -> dict[int, Colour]:
     """A colour for each label, in ascending order of labels."""
     return {record.label: colour(k) for k, record in enumerate(hypothesis.objects)}
-
-
-def show_hypothesis(hypothesis: Hypothesis, title: str = "") -> ScenePage:
-    """The voxels of a hypothesis as a page: drag to rotate, scroll to zoom, click an object to hide it."""
-    labels, grid = hypothesis.labels, hypothesis.grid
-    padded = np.pad(labels, 1)
-    voxels = np.argwhere(labels > 0)
-    own = labels[tuple(voxels.T)]
-    faces = []
-    for side, step in enumerate(_SIDES):
-        open_ = padded[tuple((voxels + 1 + step).T)] != own
-        faces.append(np.column_stack([voxels[open_], np.full(open_.sum(), side), own[open_]]))
-    rows = np.concatenate(faces).astype("<u2")
-    volumes, colours = hypothesis.volumes(), colours_of(hypothesis)
-    data = {
-        "faces": b64encode(rows.tobytes()).decode(),
-        "shape": grid.shape,
-        "voxel": grid.voxel_size,
-        "objects": [
-            {"label": k, "colour": hexadecimal(colours[k]), "text": f"{k}: {n} voxels"} for k, n in volumes.items()
-        ],
-    }
-    title = title or f"{hypothesis.n_objects} objects"
-    template = (files("mstfilter.report") / "templates" / "scene.html").read_text(encoding="utf-8")
-    text = template.replace("{{ title }}", html.escape(title)).replace("{{ data }}", json.dumps(data))
-    return ScenePage(text, title)
 
 
 def plot_recording(recording: Recording) -> Drawing:

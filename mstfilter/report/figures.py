@@ -1,6 +1,6 @@
 """Figures of runs and studies as inline SVG.
 
->>> svg = quality_figure(times, qualities, weights, {"one blob": [...], "connected components": [...]})
+>>> svg = quality_figure(times, qualities, weights, {"without past": [...]}, {"one blob": [...]})
 >>> svg = time_figure({"s1": {"mst": {0: [0.5, 0.6], 1: [0.7]}}}, arms=["mst"])
 
 Each function returns the text of an ``<svg>`` element that uses the colours and fonts of its page, so it follows a
@@ -11,7 +11,8 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Mapping, Sequence
+import textwrap
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
@@ -27,10 +28,13 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-# Placeholders, which are replaced by the colours of the page.
-_INK, _MUTED, _LINE, _ACCENT, _BASELINE = "#010203", "#020304", "#030405", "#040506", "#050607"
-#: Placeholders of the colours of arms.
-SERIES = tuple(f"#06{k:02x}08" for k in range(12))
+# Colours of the style file that a page replaces by its own, which follow a light or a dark theme.
+_INK, _MUTED, _LINE, _ACCENT, _BASELINE = "#1d2126", "#646b74", "#e1e2e0", "#2f6db4", "#b26a1c"
+#: Colours of arms.
+SERIES = (
+    *("#336fb9", "#ee9138", "#2ca281", "#93285c", "#a3d3eb", "#e8d34f"),
+    *("#d381d8", "#8b8f86", "#4f4100", "#502684", "#70d6b5", "#a95317"),
+)
 _PAGE = {
     _INK: "currentColor",
     _MUTED: "var(--muted)",
@@ -39,38 +43,15 @@ _PAGE = {
     _BASELINE: "var(--baseline)",
     **{mark: f"var(--s{k})" for k, mark in enumerate(SERIES)},
 }
+_WIDEST = 10.0  # inches
 
 
 @contextmanager
 def _style(name: str) -> Iterator[None]:
-    """Settings of figures; `name` makes the ids of their elements unique in a page."""
-    import matplotlib
+    """The style of the project; `name` makes the ids of the elements of a figure unique in a page."""
+    import matplotlib.style
 
-    settings = {
-        "svg.fonttype": "none",
-        "svg.hashsalt": f"mstfilter {name}",
-        "font.size": 9.5,
-        "axes.edgecolor": _LINE,
-        "axes.labelcolor": _MUTED,
-        "axes.titlecolor": _INK,
-        "axes.titlesize": 10,
-        "axes.titlelocation": "left",
-        "axes.spines.top": False,
-        "axes.spines.right": False,
-        "axes.spines.left": False,
-        "axes.axisbelow": True,
-        "text.color": _INK,
-        "xtick.color": _LINE,
-        "ytick.color": _LINE,
-        "xtick.labelcolor": _MUTED,
-        "ytick.labelcolor": _MUTED,
-        "ytick.left": False,
-        "grid.color": _LINE,
-        "grid.linewidth": 0.7,
-        "legend.frameon": False,
-        "legend.labelcolor": _MUTED,
-    }
-    with matplotlib.rc_context(settings):
+    with matplotlib.style.context("mstfilter.report.figures"), matplotlib.rc_context({"svg.hashsalt": name}):
         yield
 
 
@@ -85,7 +66,6 @@ def _new_figure(width: float, height: float, n: int = 1, *, below: bool = False)
     axes = [figure.add_subplot(*((n, 1) if below else (1, n)), k + 1) for k in range(n)]
     for a in axes:
         a.patch.set_alpha(0)
-        a.grid(axis="y")
     return figure, axes
 
 
@@ -137,57 +117,52 @@ def quality_figure(
     times: Sequence[int],
     qualities: Sequence[Sequence[float]],
     weights: Sequence[Sequence[float]],
+    compared: Mapping[str, Sequence[float]],
     baselines: Mapping[str, Sequence[float]],
 ) -> str:
-    """Quality of every hypothesis (points, area by weight), their weighted mean (line) and baselines (dashed).
+    """Quality of every hypothesis (points, area by weight), their mean (line), other filters and baselines (dashed).
 
     `times` are the pauses with ground truth. `qualities` and `weights` have one value per hypothesis for each of
-    them, `baselines` one value per pause for each name.
+    them, `compared` and `baselines` one value per pause for each name; NaN for none.
     """
     with _style("quality"):
         figure, (axes,) = _new_figure(6.6, 3.3)
-        mean = [float(np.dot(q, w) / np.sum(w)) for q, w in zip(qualities, weights, strict=True)]
+        for (name, values), mark in zip(compared.items(), SERIES[2:], strict=False):
+            axes.plot(times, values, color=mark, lw=1.6, marker="o", ms=4, label=name)
         for (name, values), dash in zip(baselines.items(), ((4, 2), (1, 2)), strict=False):
             axes.plot(times, values, color=_BASELINE, lw=1.3, dashes=dash, marker="_", ms=12, label=name)
         for t, q, w in zip(times, qualities, weights, strict=True):
             offset = np.linspace(-0.09, 0.09, len(q)) if len(q) > 1 else np.zeros(1)
             axes.scatter(t + offset, q, s=16 + 130 * np.asarray(w), color=_ACCENT, alpha=0.4, lw=0)
-        axes.plot(times, mean, color=_ACCENT, lw=2, marker="o", ms=4.5, label="weighted mean")
+        mean = [float(np.mean(q)) for q in qualities]
+        axes.plot(times, mean, color=_ACCENT, lw=2, marker="o", ms=4.5, label="mean over hypotheses")
         axes.scatter([], [], s=30, color=_ACCENT, alpha=0.4, lw=0, label="hypothesis")
         axes.set_ylim(0, 1.02)
         _pause_axis(axes, times)
         axes.set_title("Quality against the ground truth")
-        figure.legend(loc="outside lower center", ncols=4, fontsize=8.5, handlelength=2.2, columnspacing=1.4)
+        figure.legend(loc="outside lower center", ncols=3, handlelength=2.2, columnspacing=1.4)
         return _svg_text(figure, "Quality of the hypotheses over time")
 
 
-def health_figure(
-    times: Sequence[int],
-    ess: Sequence[tuple[float, int] | None],
-    ancestors: Sequence[tuple[float, int] | None],
-) -> str:
-    """Effective sample size before resampling, and how many previous particles have descendants.
-
-    `ess` and `ancestors` have (value, most possible value) for each pause, drawn as a share; None for no bar.
-    """
+def health_figure(values: Mapping[str, Sequence[tuple[float, int] | None]]) -> str:
+    """Panels of bars: each has (value, most possible value) for each pause, drawn as a share; None for no bar."""
     with _style("health"):
-        figure, axes = _new_figure(6.6, 2.3, 2)
-        both = (("Effective sample size", ess), ("Previous particles with descendants", ancestors))
-        for a, (title, values) in zip(axes, both, strict=True):
-            known = [(t, *pair) for t, pair in zip(times, values, strict=True) if pair is not None]
+        figure, axes = _new_figure(6.6, 2.3, len(values))
+        for a, (title, pairs) in zip(axes, values.items(), strict=True):
+            known = [(t, *pair) for t, pair in enumerate(pairs) if pair is not None]
             at = [t for t, _, _ in known]
             share = [100 * value / max(most, 1) for _, value, most in known]
             a.bar(at, 100, width=0.62, color=_LINE, lw=0, alpha=0.55)
             a.bar(at, share, width=0.62, color=_ACCENT, lw=0, alpha=0.85)
-            _pause_axis(a, times)
-            a.set_ylim(0, 116)
+            _pause_axis(a, range(len(pairs)))
+            a.set_ylim(0, 122)
             a.set_yticks([0, 50, 100], ["0", "50 %", "100 %"])
             for (t, value, most), s in zip(known, share, strict=True):
-                if len(known) <= 8:
-                    text = f"{value:.3g} of {most}"
-                    a.annotate(text, (t, s), (0, 2), textcoords="offset points", ha="center", fontsize=8)
+                if len(pairs) <= 5:
+                    text = f"{value:.2g}/{most}"
+                    a.annotate(text, (t, s), (0, 2), textcoords="offset points", ha="center", fontsize=9)
             a.set_title(title)
-        return _svg_text(figure, "Effective sample size and unique ancestors over time")
+        return _svg_text(figure, " and ".join(values))
 
 
 def genealogy_figure(
@@ -225,7 +200,7 @@ def genealogy_figure(
                             (t - 0.115, k - 0.3),
                             ha="right",
                             va="center",
-                            fontsize=7.5,
+                            fontsize=9,
                             color=_BASELINE,
                         )
         for t, w in enumerate(weights):
@@ -236,7 +211,7 @@ def genealogy_figure(
                 axes.scatter(np.full(mask.sum(), t), np.flatnonzero(mask), s=size[mask], color=colour, lw=0, zorder=3)
             if named:
                 for k in range(len(w)):
-                    axes.annotate(f"#{k}", (t, k), (7, 6), textcoords="offset points", fontsize=8, color=_MUTED)
+                    axes.annotate(f"#{k}", (t, k), (7, 6), textcoords="offset points", fontsize=9, color=_MUTED)
         axes.set_ylim(n - 0.4, -0.75)
         axes.set_yticks([])
         _pause_axis(axes, range(len(weights)))
@@ -296,7 +271,7 @@ def time_figure(
     most_pauses = max(len({t for by_pause in of_arms.values() for t in by_pause}) for of_arms in values.values())
     most_boxes = most_pauses * len(shown)
     with _style("study over time"):
-        figure, panels = _new_figure(max(6.6, 1.1 + 0.42 * most_boxes), 3.4 * n, n, below=True)
+        figure, panels = _new_figure(min(max(6.6, 1.1 + 0.42 * most_boxes), _WIDEST), 3.4 * n, n, below=True)
         for axes, (family, of_arms) in zip(panels, values.items(), strict=True):
             pauses = sorted({t for by_pause in of_arms.values() for t in by_pause})
             width = 0.84 / max(len(shown), 1)
@@ -319,14 +294,14 @@ def time_figure(
             axes.set_ylabel("information, nats" if measure == "information" else measure)
         panels[-1].set_xlabel("pause")
         handles = {line.get_label(): line for axes in panels for line in axes.get_lines() if line.get_label() in arms}
-        figure.legend(
-            [handles[arm] for arm in arms if arm in handles],
-            [arm for arm in arms if arm in handles],
-            loc="outside lower center",
-            ncols=min(4, len(shown)),
-            fontsize=8.5,
-        )
+        named = [arm for arm in arms if arm in handles]
+        figure.legend([handles[arm] for arm in named], named, loc="outside lower center", ncols=_columns(named))
         return _svg_text(figure, f"{measure.capitalize()} over time by family and method")
+
+
+def _columns(names: Iterable[str]) -> int:
+    """Columns of a legend that fit the narrowest figure."""
+    return max(1, min(4, 84 // (8 + max(len(name) for name in names))))
 
 
 def _boxes(
@@ -365,7 +340,7 @@ def reliability_figure(tables: Mapping[str, ForecastTable], arms: Sequence[str] 
     """
     colours = _arm_colours(arms or list(tables))
     with _style("reliability"):
-        figure, (axes,) = _new_figure(5.2, 4.2)
+        figure, (axes,) = _new_figure(6.6, 4.4)
         axes.plot([0, 1], [0, 1], color=_MUTED, lw=1.0, dashes=(4, 2))
         for name, table in tables.items():
             r = table.reliability()
@@ -377,7 +352,7 @@ def reliability_figure(tables: Mapping[str, ForecastTable], arms: Sequence[str] 
         axes.set_xlabel('forecast of "the two voxels belong to one object"')
         axes.set_ylabel("how often it is true")
         if len(tables) > 1:
-            figure.legend(loc="outside lower center", ncols=min(4, len(tables)), fontsize=8.5)
+            figure.legend(loc="outside lower center", ncols=_columns(tables))
         return _svg_text(figure, "Reliability diagram")
 
 
@@ -411,5 +386,6 @@ def differences_figure(compared: Sequence[Compared], arms: Sequence[str], metric
         axes.set_ylim(y - 0.3, -0.7)
         reference = known[0].first if known else ""
         side = "right" if ENDPOINTS.get(metric, 1) > 0 else "left"
-        axes.set_xlabel(f"{metric} of {reference} minus {metric} of the method ({reference} is better on the {side})")
+        label = f"{metric} of {reference} minus that of the method; {reference} is better on the {side}"
+        axes.set_xlabel("\n".join(textwrap.wrap(label, 60)))
         return _svg_text(figure, f"Paired differences of {metric} with 95 % intervals")

@@ -27,7 +27,8 @@ from mstfilter.scoring import overlap
 
 TRUTH = -1  #: Index of the ground truth in place of a hypothesis
 
-_DESCENT_SCORE = 0.5  # score of descent; an overlap (Jaccard index) of 1 at this pause scores 1
+# Scores of descent, with and without a known truth; an overlap (Jaccard index) of 1 at this pause scores 1.
+_DESCENT_SCORES = {True: 0.1, False: 0.5}
 _EARLIER_SCORE = 0.4  # score of an overlap of 1 with the last pause
 _LEAST_SCORE = 0.2  # below, an object gets a new identity
 _TRUTH_SCORE = 2.0  # score of the same label of the truth, more than any overlap
@@ -39,25 +40,33 @@ _MOST_CARDS = 12
 class Identities:
     """Identity of every object of every hypothesis."""
 
-    #: ``(pause, hypothesis) -> {label: identity}``; hypothesis -1 is the ground truth.
-    table: Mapping[tuple[int, int], Mapping[int, int]] = field(default_factory=dict)
+    #: ``(pause, hypothesis) -> {label: identity}``; hypothesis -1 is the ground truth, a name that of another run.
+    table: Mapping[tuple[int, int | str], Mapping[int, int]] = field(default_factory=dict)
 
-    def of(self, t: int, k: int) -> Mapping[int, int]:
+    def of(self, t: int, k: int | str) -> Mapping[int, int]:
         """``{label: identity}`` of hypothesis `k` (-1: the truth) at pause `t`."""
         return self.table.get((t, k), {})
 
-    def colours(self, t: int, k: int) -> dict[int, Colour]:
+    def colours(self, t: int, k: int | str) -> dict[int, Colour]:
         """``{label: (r, g, b)}`` of hypothesis `k` (-1: the truth) at pause `t`."""
         return {label: colour(identity) for label, identity in self.of(t, k).items()}
 
 
 def assign_identities(run: RunFolder) -> Identities:
-    """Identities of all objects of a run, pause by pause."""
-    assignment = _Assignment()
+    """Identities of all objects of a run, pause by pause, and of the heaviest hypothesis of each compared run."""
+    assignment, compared = _Assignment(), run.compared()
     for t in range(run.n_pauses):
         info = run.info(t)
         assignment.add(t, run.hypotheses(t), info["weights"], info["parents"].get("previous"), run.truth(t))
+        for name, other in compared.items():
+            if t < other.n_pauses:
+                assignment.add_other(t, name, heaviest(other, t))
     return Identities(assignment.table)
+
+
+def heaviest(run: RunFolder, t: int) -> Hypothesis:
+    """The hypothesis of largest weight at a pause."""
+    return run.hypotheses(t)[int(np.argmax(run.info(t)["weights"]))]
 
 
 def match_objects(hypotheses: Sequence[Hypothesis], weights: Sequence[float]) -> list[dict[int, Colour]]:
@@ -72,8 +81,8 @@ class _Assignment:
     """Identities of the pauses so far."""
 
     def __init__(self) -> None:
-        self.table: dict[tuple[int, int], dict[int, int]] = {}
-        self._ids: dict[tuple[int, int], dict[int, int]] = {}  # (pause, hypothesis) -> {stable id: identity}
+        self.table: dict[tuple[int, int | str], dict[int, int]] = {}
+        self._ids: dict[tuple[int, int | str], dict[int, int]] = {}  # (pause, hypothesis) -> {stable id: identity}
         # Voxels with identity + 1 (0 for none) of the truth and the heaviest hypotheses: of this pause, of the last.
         self._now: list[np.ndarray] = []
         self._before: list[np.ndarray] = []
@@ -103,12 +112,18 @@ class _Assignment:
                 self._ids[t, k] = {ids[label]: identity for label, identity in self.table[t, k].items()}
                 continue
             parent = -2 if parents is None else int(parents[k])
-            self._assign(t, k, h.labels, ids, self._ids.get((t - 1, parent), {}), _DESCENT_SCORE)
+            score = _DESCENT_SCORES[truth is not None]
+            self._assign(t, k, h.labels, ids, self._ids.get((t - 1, parent), {}), score)
+
+    def add_other(self, t: int, name: str, hypothesis: Hypothesis) -> None:
+        """Add a hypothesis of another run after those of the pause."""
+        ids = {o.label: o.id for o in hypothesis.objects}
+        self._assign(t, name, hypothesis.labels, ids, self._ids.get((t - 1, name), {}), _DESCENT_SCORES[True])
 
     def _assign(
         self,
         t: int,
-        k: int,
+        k: int | str,
         labels: np.ndarray,
         ids: Mapping[int, int],
         inherited: Mapping[int, int],
@@ -172,10 +187,10 @@ class Tag:
 
 @dataclass(frozen=True)
 class Card:
-    """Pictures and numbers of equal hypotheses, or of the ground truth (without indices), at one pause."""
+    """Pictures and numbers of equal hypotheses, of the ground truth, or of another run, at one pause."""
 
-    indices: tuple[int, ...]
-    weight: float
+    name: str  #: ``#0`` or ``#0, #3``; ``Truth``; ``without past``
+    weight: float | None  #: None for the truth and other runs
     n_objects: int
     voxels_occupied: int
     quality: float | None
@@ -183,51 +198,58 @@ class Card:
     voxels: str
     tags: tuple[Tag, ...]
 
-    @property
-    def name(self) -> str:
-        """``#0`` or ``#0, #3``; ``truth`` for the ground truth."""
-        if not self.indices:
-            return "truth"
-        names = [f"#{k}" for k in self.indices[:4]]
-        more = len(self.indices) - len(names)
-        return ", ".join(names) + (f" and {more} more" if more else "")
+
+def names_of(indices: Sequence[int]) -> str:
+    """``#0`` or ``#0, #3``, for hypotheses that are equal; at most four are named."""
+    more = len(indices) - 4
+    return ", ".join(f"#{k}" for k in indices[:4]) + (f" and {more} more" if more > 0 else "")
+
+
+def weigh_distinct(hypotheses: Sequence[Hypothesis], weights: Sequence[float]) -> list[tuple[tuple[int, ...], float]]:
+    """Indices of equal hypotheses and their total weight, from heavy to light."""
+    groups: dict[bytes, list[int]] = {}
+    for k, h in enumerate(hypotheses):
+        groups.setdefault(h.key, []).append(k)
+    found = [(tuple(members), float(sum(weights[k] for k in members))) for members in groups.values()]
+    return [found[g] for g in order_by_weight([weight for _, weight in found])]
 
 
 def cards_of_pause(run: RunFolder, t: int, identities: Identities, view: Camera) -> tuple[list[Card], float]:
     """Cards of the distinct hypotheses of a pause, heaviest first, and the weight of those without a card."""
-    info, hypotheses, camera = run.info(t), run.hypotheses(t), run.camera(t)
-    groups: dict[bytes, list[int]] = {}
-    for k, h in enumerate(hypotheses):
-        groups.setdefault(h.key, []).append(k)
-    weight = [sum(info["weights"][k] for k in members) for members in groups.values()]
-    order = order_by_weight(weight)
-    members = list(groups.values())
-    quality = info["quality"]
+    info, hypotheses = run.info(t), run.hypotheses(t)
+    groups, quality = weigh_distinct(hypotheses, info["weights"]), info["quality"]
     cards = []
-    for g in order[:_MOST_CARDS]:
-        k = members[g][0]
+    for members, weight in groups[:_MOST_CARDS]:
+        k = members[0]
         q = None if quality is None else quality["objects"][k]
-        cards.append(_make_card(hypotheses[k], camera, tuple(members[g]), weight[g], q, identities.of(t, k), view))
-    return cards, float(sum(weight[g] for g in order[_MOST_CARDS:]))
+        of_card = names_of(members), weight, q, identities.of(t, k)
+        cards.append(_make_card(hypotheses[k], run.camera(t), view, *of_card))
+    return cards, float(sum(weight for _, weight in groups[_MOST_CARDS:]))
 
 
-def truth_card(run: RunFolder, t: int, identities: Identities, view: Camera) -> Card | None:
-    """The card of the ground truth of a pause; None if it is unknown."""
-    truth = run.truth(t)
-    if truth is None:
-        return None
-    hypothesis = Hypothesis.from_labels(truth, run.hypotheses(t)[0].grid)
-    return _make_card(hypothesis, run.camera(t), (), 0.0, None, identities.of(t, TRUTH), view)
+def further_cards(run: RunFolder, t: int, identities: Identities, view: Camera) -> list[Card]:
+    """Cards of the ground truth, if it is known, and of the heaviest hypothesis of each compared run."""
+    truth, cards = run.truth(t), []
+    if truth is not None:
+        known = Hypothesis.from_labels(truth, run.hypotheses(t)[0].grid)
+        cards.append(_make_card(known, run.camera(t), view, "Truth", None, None, identities.of(t, TRUTH)))
+    for name, other in run.compared().items():
+        if t < other.n_pauses:
+            q = other.info(t)["quality"]
+            best = None if q is None else q["objects"][int(np.argmax(other.info(t)["weights"]))]
+            of_card = name.capitalize(), None, best, identities.of(t, name)
+            cards.append(_make_card(heaviest(other, t), run.camera(t), view, *of_card))
+    return cards
 
 
 def _make_card(
     hypothesis: Hypothesis,
     camera: Camera,
-    indices: Sequence[int],
-    weight: float,
+    view: Camera,
+    name: str,
+    weight: float | None,
     quality: float | None,
     identity: Mapping[int, int],
-    view: Camera,
 ) -> Card:
     colours = {label: colour(i) for label, i in identity.items()}
     image = project(hypothesis, camera)
@@ -235,8 +257,8 @@ def _make_card(
     scale = max(1, round(960 / camera.width))
     line = max(2, round(scale * camera.width / 340))
     return Card(
-        tuple(indices),
-        float(weight),
+        name,
+        weight,
         hypothesis.n_objects,
         sum(hypothesis.volumes().values()),
         quality,

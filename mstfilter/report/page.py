@@ -103,13 +103,3 @@ def note_rows(notes: Sequence[Mapping[str, Any]]) -> list[tuple[str, list[str]]]
     flat = [flatten(n) if n else {} for n in notes]
     keys = list(dict.fromkeys(key for rows in flat for key in rows))
     return [(key, [short_text(rows[key]) if key in rows else "" for rows in flat]) for key in keys]
-
-
-def counts_by_key(notes: Sequence[Mapping[str, Any]]) -> dict[str, list[dict[str, int]]]:
-    """Entries of notes that are counts (mappings of names to non-negative integers): key -> one table per pause."""
-    found: dict[str, list[dict[str, int]]] = {}
-    for t, note in enumerate(notes):
-        for key, value in note.items():
-            if isinstance(value, Mapping) and value and all(type(v) is int and v >= 0 for v in value.values()):
-                found.setdefault(key, [{} for _ in notes])[t] = dict(value)
-    return found

@@ -4,8 +4,8 @@
 >>> write_report("runs/demo", "demo.html")
 
 The report is made from the run folder alone, of a finished or an interrupted run, and loads no code of the user.
-Pictures are embedded, figures are inline SVG, there are no scripts and no links. The same run gives the same bytes,
-except for the times of the steps.
+Pictures are embedded, figures are inline SVG, there are no links. The only script turns the three-dimensional view,
+in a frame that cannot reach the rest of the page. The same run gives the same bytes, except for the times of steps.
 
 `read_numbers` collects the numbers and sentences of the report.
 
@@ -25,9 +25,8 @@ from typing import Any
 import numpy as np
 
 from mstfilter.report.figures import genealogy_figure, health_figure, quality_figure, reliability_figure
-from mstfilter.report.identities import assign_identities, cards_of_pause, truth_card
+from mstfilter.report.identities import assign_identities, cards_of_pause, further_cards
 from mstfilter.report.page import (
-    counts_by_key,
     fill_template,
     flatten,
     note_rows,
@@ -36,15 +35,10 @@ from mstfilter.report.page import (
     write_page,
 )
 from mstfilter.report.pictures import close_up, data_uri, jpeg_bytes, viewpoint
+from mstfilter.report.viewer import run_page
 from mstfilter.runs import RunFolder
-from mstfilter.scoring import (
-    BeliefScore,
-    connected_components,
-    forecast_table,
-    one_blob,
-    score_belief,
-    weighted_coverage,
-)
+from mstfilter.scene import project, render
+from mstfilter.scoring import BeliefScore, forecast_table, pause_metrics, score_belief, weighted_coverage
 
 _TITLES = {
     "initial": "Initial particles",
@@ -54,7 +48,7 @@ _TITLES = {
     "resampler": "Resampling",
     "build": "Building the resampled hypotheses",
 }
-_BASELINES = {"one blob": one_blob, "connected components": connected_components}
+_BASELINES = {"one blob": "quality_one_blob", "connected components": "quality_components"}
 
 
 @dataclass(frozen=True)
@@ -65,8 +59,9 @@ class PauseNumbers:
     seconds: Mapping[str, float]  #: contents of seconds.json
     objects: Sequence[int]  #: number of objects of each hypothesis
     n_distinct: int  #: number of distinct hypotheses
-    baselines: Mapping[str, float] | None  #: weighted mean quality of trivial baselines; None without ground truth
-    true_objects: int | None  #: number of objects in the ground truth
+    metrics: Mapping[str, float] | None  #: of `mstfilter.scoring.pause_metrics`; None without ground truth
+    in_image: float | None  #: mean quality of the outlines in the image; None without ground truth
+    compared: Mapping[str, float]  #: mean quality of the compared runs, where it is known
     belief: BeliefScore | None  #: scores of the weighted set; None without ground truth
     time: float  #: time of the pause in the recording
     clip_seconds: float | None  #: time since the last pause; None for the first pause
@@ -77,9 +72,26 @@ class PauseNumbers:
         return list(self.info["weights"])
 
     @property
-    def quality(self) -> Mapping[str, Sequence[float]] | None:
-        """Quality of each hypothesis, by form; None without ground truth."""
-        return self.info["quality"]
+    def quality(self) -> Sequence[float] | None:
+        """Quality of each hypothesis; None without ground truth."""
+        return None if self.info["quality"] is None else self.info["quality"]["objects"]
+
+    @property
+    def baselines(self) -> dict[str, float]:
+        """Mean quality of the trivial baselines; empty without ground truth."""
+        return {} if self.metrics is None else {name: self.metrics[key] for name, key in _BASELINES.items()}
+
+    @property
+    def true_objects(self) -> int | None:
+        """Number of objects in the ground truth."""
+        return None if self.metrics is None else int(self.metrics["true_objects"])
+
+    @property
+    def base_rate_loss(self) -> float:
+        """Log loss of the forecast that gives all questions the share of those that are true, in nats."""
+        assert self.belief is not None
+        table = forecast_table(self.belief.counts[0].astype(np.int64))
+        return table.with_forecasts(np.full(len(table.p), table.yes.sum() / max(table.n, 1))).log_loss()
 
     @property
     def step_seconds(self) -> float:
@@ -87,24 +99,25 @@ class PauseNumbers:
 
     @property
     def mean_objects(self) -> float:
-        """Weighted mean number of objects."""
-        return float(np.dot(self.objects, self.weights))
+        """Mean number of objects."""
+        return float(np.mean(self.objects))
 
     @property
     def distinct_text(self) -> str:
-        """How many hypotheses differ, in words."""
+        """How many hypotheses are distinct, in words."""
         if self.n_distinct == len(self.weights):
-            return "all different"
-        return "all the same" if self.n_distinct == 1 else f"{self.n_distinct} different"
+            return "all distinct"
+        return "all the same" if self.n_distinct == 1 else f"{self.n_distinct} distinct"
 
-    def mean(self, form: str = "objects") -> float | None:
-        """Weighted mean quality; None without ground truth."""
-        return None if self.quality is None else float(np.dot(self.quality[form], self.weights))
+    @property
+    def mean(self) -> float | None:
+        """Mean quality over the hypotheses, each counted once; None without ground truth."""
+        return None if self.quality is None else float(np.mean(self.quality))
 
     @property
     def best(self) -> float | None:
         """Quality of the best hypothesis; None without ground truth."""
-        return None if self.quality is None else max(self.quality["objects"])
+        return None if self.quality is None else max(self.quality)
 
     def parents(self, kind: str) -> list[int] | None:
         """``"previous"`` or ``"proposed"`` parents; None if they were not recorded."""
@@ -113,9 +126,8 @@ class PauseNumbers:
     def notes(self, slot: str) -> Mapping[str, Any]:
         """Notes of a component, without those that it only passed on from an earlier one."""
         notes: Mapping[str, Mapping[str, Any]] = self.info["notes"]
-        earlier = itertools.takewhile(lambda name: name != slot, notes)
-        chosen = notes.get(slot, {})
-        return {} if chosen in [notes[name] for name in earlier] else chosen
+        earlier = [notes[name] for name in itertools.takewhile(lambda name: name != slot, notes)]
+        return {k: v for k, v in notes.get(slot, {}).items() if not any(k in e and e[k] == v for e in earlier)}
 
 
 @dataclass(frozen=True)
@@ -158,6 +170,11 @@ class RunNumbers:
         return [t for t, step in enumerate(self.steps) if step.quality is not None]
 
     @property
+    def compared(self) -> list[str]:
+        """Names of the compared runs whose quality is known."""
+        return list(dict.fromkeys(name for step in self.steps for name in step.compared))
+
+    @property
     def summary(self) -> list[str]:
         """The run in one to four sentences."""
         planned = len(self.description["recording"]["pauses"])
@@ -176,13 +193,40 @@ class RunNumbers:
         truth = "" if last.true_objects is None else f"; the ground truth has {last.true_objects}"
         hypotheses = _count(n, "hypothesis", "hypotheses")
         sentences.append(f"{hypotheses}{same} after {_count(done, 'pause')}, with {count}{truth}.")
-        mean = last.mean()
-        if mean is not None and last.baselines is not None:
-            baselines = " and ".join(f"{name} {value:.2f}" for name, value in last.baselines.items())
-            sentences.append(f"Their mean quality is {mean:.2f}; trivial baselines: {baselines}.")
-            if mean <= max(last.baselines.values()) + 0.005:
+        if last.mean is not None:
+            others = [f"{name} {value:.2f}" for name, value in last.compared.items()]
+            baselines = [f"{name} {value:.2f}" for name, value in last.baselines.items()]
+            beside = f" Beside it: {', '.join(others)}." if others else ""
+            sentences.append(
+                f"Their mean quality is {last.mean:.2f} of 1.{beside} Trivial baselines: {', '.join(baselines)}."
+            )
+            if last.mean <= max(last.baselines.values()) + 0.005:
                 sentences.append("That is no better than the baselines.")
         return sentences
+
+    @property
+    def reasons(self) -> list[str]:
+        """Why the quality of the last pause with ground truth is what it is, in sentences."""
+        if not self.with_truth:
+            return []
+        step = self.steps[self.with_truth[-1]]
+        m, mean = step.metrics, step.mean
+        assert m is not None and mean is not None
+        percent = {name: f"{100 * m[f'volume_{name}']:.0f} %" for name in ("missed", "invented")}
+        sentences = [
+            "Quality is the volume that a hypothesis and the truth share: the intersection over union of each object "
+            "with its best match, weighted by volume, in both directions. Parts that no image shows count as much as "
+            "visible ones.",
+            f"In the image the outlines overlap with a quality of {step.in_image:.2f}; in the volume it is "
+            f"{mean:.2f}. An image shows only the front of an object; the rest is completed. Compared with the true "
+            f"volume, {percent['missed']} is missed and {percent['invented']} is invented.",
+            "Small errors of shape cost much: a cube of ten voxels that is one voxel too large on each side has "
+            "(10 / 12)³ = .58.",
+        ]
+        counts = [(m[name], name) for name in ("split", "merged", "missed", "invented") if m[name] >= 0.05]
+        wrong = ", ".join(f"{n:.1f} {name}" for n, name in counts)
+        end = f"objects on average: {wrong}." if wrong else "no object is split, merged, missed or invented."
+        return [*sentences, f"Wrong {end}" if wrong else f"Beyond shape, {end}"]
 
     @property
     def tiles(self) -> list[tuple[str, str, str]]:
@@ -194,18 +238,18 @@ class RunNumbers:
         truth = "" if last.true_objects is None else f", true {last.true_objects}"
         tiles = [
             ("hypotheses", str(n), last.distinct_text),
-            ("objects", f"{last.mean_objects:.1f}", f"weighted mean{truth}"),
+            ("objects", f"{last.mean_objects:.1f}", f"mean{truth}"),
         ]
-        mean = last.mean()
-        if mean is not None and last.baselines is not None:
-            baseline = max(last.baselines.values())
-            tiles.append(("quality", f"{mean:.3f}", f"best {last.best:.3f}, baseline {baseline:.3f}"))
+        if last.mean is not None:
+            tiles.append(
+                ("mean quality", f"{last.mean:.3f}", f"best {last.best:.3f}, in the image {last.in_image:.3f}")
+            )
         if last.belief is not None:
             row = last.belief.row
-            tiles.append(("Brier score", f"{row['brier']:.3f}", f"calibration error {row['calibration_error']:.3f}"))
-        tiles.append(
-            ("effective sample size", f"{last.info['ess']:.3g}", f"of {last.info['n_candidates']} candidates")
-        )
+            remark = f"nats; base rate {last.base_rate_loss:.3f}; calibration error {row['calibration_error']:.3f}"
+            tiles.append(("log loss", f"{row['log_loss']:.3f}", remark))
+        remark = f"of {last.info['n_candidates']} candidates; {last.n_distinct} of {n} kept are distinct"
+        tiles.append(("effective sample size", f"{last.info['ess']:.3g}", remark))
         if len(self.steps) > 1:
             tiles.append(("unique ancestors", str(last.info["unique_ancestors"]), f"of {n} particles"))
         seconds = [step.step_seconds for step in self.steps]
@@ -229,24 +273,27 @@ def read_numbers(run: RunFolder) -> RunNumbers:
         belief = None
         if questions is not None and truth is not None:
             belief = score_belief(questions, [h.labels for h in hypotheses], info["weights"], truth)
-        baselines = None
+        metrics, in_image = None, None
         if truth is not None:
-            weight: dict[bytes, float] = {}
-            for h, w in zip(hypotheses, info["weights"], strict=True):
-                weight[h.key] = weight.get(h.key, 0.0) + w
-            distinct = {h.key: h.labels for h in hypotheses}
-            baselines = {
-                name: sum(w * weighted_coverage(baseline(distinct[key]), truth) for key, w in weight.items())
-                for name, baseline in _BASELINES.items()
-            }
+            labels, weights = [h.labels for h in hypotheses], np.array(info["weights"], float)
+            metrics = pause_metrics(labels, weights, truth, {})[0]
+            grid, camera = hypotheses[0].grid, run.camera(t)
+            seen = render(truth, grid, camera).labels
+            in_image = float(np.mean([weighted_coverage(project(h, camera), seen) for h in hypotheses]))
+        beside = {
+            name: float(np.mean(q["objects"]))
+            for name, other in run.compared().items()
+            if t < other.n_pauses and (q := other.info(t)["quality"]) is not None
+        }
         steps.append(
             PauseNumbers(
                 info=info,
                 seconds=run.seconds(t),
                 objects=[h.n_objects for h in hypotheses],
                 n_distinct=len({h.key for h in hypotheses}),
-                baselines=baselines,
-                true_objects=None if truth is None else len(set(np.unique(truth).tolist()) - {0}),
+                metrics=metrics,
+                in_image=in_image,
+                compared=beside,
                 belief=belief,
                 time=float(times[t]),
                 clip_seconds=None if t == 0 else float(times[t]) - float(times[t - 1]),
@@ -260,6 +307,8 @@ def write_report(run: RunFolder | str | Path, out: str | Path | None = None) -> 
 
     Returns the file. Raises InputError if the folder is no run folder, or the file cannot be written.
     """
+    from markupsafe import Markup
+
     run = RunFolder.open(run.path if isinstance(run, RunFolder) else run)
     numbers = read_numbers(run)
     filters: dict[str, Callable[..., Any]] = {
@@ -273,6 +322,7 @@ def write_report(run: RunFolder | str | Path, out: str | Path | None = None) -> 
         run=numbers,
         pauses=_pauses(run, numbers),
         figures=_figures(numbers),
+        rotatable=Markup(run_page(run, photos=False, head=False).frame(640)) if numbers.steps else "",
         parts=[_part(numbers, slot) for slot in numbers.slots],
         config=_config_rows(numbers.description["config"]),
         facts=_facts(numbers.description),
@@ -305,7 +355,7 @@ def _pauses(run: RunFolder, numbers: RunNumbers) -> list[dict[str, Any]]:
                 "close_up": close_up(volumes, camera),
                 "cards": cards,
                 "hidden": hidden,
-                "truth": truth_card(run, t, identities, view),
+                "further": further_cards(run, t, identities, view),
             }
         )
     return pauses
@@ -320,19 +370,22 @@ def _figures(numbers: RunNumbers) -> dict[str, Any]:
     known = numbers.with_truth
     if known:
         at = [steps[t] for t in known]
-        names = at[0].baselines or ()
-        baselines = {name: [step.baselines[name] for step in at if step.baselines] for name in names}
-        qualities = [step.quality["objects"] for step in at if step.quality]
-        found["quality"] = Markup(quality_figure(known, qualities, [step.weights for step in at], baselines))
+        compared, baselines = (_columns([getattr(step, name) for step in at]) for name in ("compared", "baselines"))
+        qualities, weights = [step.quality for step in at if step.quality], [step.weights for step in at]
+        found["quality"] = Markup(quality_figure(known, qualities, weights, compared, baselines))
     beliefs = [step.belief.counts[0].astype(np.int64) for step in steps if step.belief is not None]
     if beliefs:
         found["reliability"] = Markup(reliability_figure({"all pauses": forecast_table(sum(beliefs))}))
     if len(steps) <= 1:
         return found
     health = health_figure(
-        range(len(steps)),
-        [(step.info["ess"], step.info["n_candidates"]) for step in steps],
-        [None if t == 0 else (step.info["unique_ancestors"], step.info["n"]) for t, step in enumerate(steps)],
+        {
+            "Effective sample size": [(step.info["ess"], step.info["n_candidates"]) for step in steps],
+            "Distinct hypotheses": [(step.n_distinct, step.info["n"]) for step in steps],
+            "Ancestors": [
+                (step.info["unique_ancestors"], step.info["n"]) if t else None for t, step in enumerate(steps)
+            ],
+        }
     )
     genealogy = genealogy_figure(
         [step.weights for step in steps],
@@ -342,21 +395,18 @@ def _figures(numbers: RunNumbers) -> dict[str, Any]:
     return {**found, "health": Markup(health), "genealogy": Markup(genealogy)}
 
 
+def _columns(rows: Sequence[Mapping[str, float]]) -> dict[str, list[float]]:
+    """Values by name, NaN where a row has none."""
+    return {name: [row.get(name, np.nan) for row in rows] for name in dict.fromkeys(n for row in rows for n in row)}
+
+
 def _part(numbers: RunNumbers, slot: str) -> dict[str, Any]:
     """Notes and times of a component over all pauses."""
-    notes = [step.notes(slot) for step in numbers.steps]
-    bars = []
-    for key, table in counts_by_key(notes).items():
-        names = sorted({name for row in table for name in row}, key=lambda n: (-sum(r.get(n, 0) for r in table), n))
-        bars.append({"key": key, "names": names, "rows": table})
-    barred = {bar["key"] for bar in bars}
-    rest = [{k: v for k, v in note.items() if k not in barred} for note in notes]
     return {
         "slot": slot,
         "title": _TITLES.get(slot, slot),
         "component": numbers.component(slot),
-        "bars": bars,
-        "rows": note_rows(rest),
+        "rows": note_rows([step.notes(slot) for step in numbers.steps]),
         "seconds": [step.seconds.get(slot, 0.0) for step in numbers.steps],
     }
 

@@ -1,4 +1,5 @@
 from mstfilter.runs.run import (
+    COMPARED as COMPARED,
     RunProgress as RunProgress,
     check_run_folder as check_run_folder,
     code_version as code_version,

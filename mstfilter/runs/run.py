@@ -31,6 +31,12 @@ from mstfilter.smc import Observer
 
 _LIBRARIES = ("numpy", "scipy", "networkx", "opencv-python-headless", "higra", "small_gicp")
 
+#: Filters that a run is compared with: name -> changes of its configuration.
+COMPARED = {
+    "without past": ("transition=identity", "update=samples_only"),
+    "single frame": ("transition=identity", "update=samples_only", "proposal.sampler=optimal"),
+}
+
 
 @dataclass(frozen=True)
 class RunProgress:

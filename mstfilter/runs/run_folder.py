@@ -10,6 +10,7 @@ Layout::
     pauses/000/info.json     record of the step              pauses/000/camera.json      pose at the pause
     pauses/000/truth.npz     true labels, if known           pauses/000/seconds.json     wall time by component
     metrics.csv              one row per pause and hypothesis
+    compare/without-past     run folders of other filters on the same recording, if asked for
 
 A pause is written under a temporary name and renamed when it is complete, so a run that was stopped at any moment
 holds complete pauses only. `filter_recording` resumes from state.npz of the last one. Its arrays ``particles/...``
@@ -129,6 +130,11 @@ class RunFolder:
     def pause(self, t: int) -> Path:
         """Folder of a pause."""
         return self.path / "pauses" / f"{t:03d}"
+
+    def compared(self) -> dict[str, RunFolder]:
+        """Runs of other filters on the same recording, by name: the run folders in ``compare/``."""
+        found = sorted(path.parent for path in self.path.glob("compare/*/run.json"))
+        return {path.name.replace("-", " "): RunFolder(path) for path in found}
 
     def set_status(self, status: str) -> None:
         """Set the status of the run: running, interrupted, failed or done."""

@@ -274,7 +274,7 @@ class Hypothesis:
         lines = [f"Hypothesis of {len(volumes)} {'object' if len(volumes) == 1 else 'objects'}", self.grid.text]
         return "\n  ".join([*lines, f"voxels by label: {', '.join(volumes[:12])}{more}"] if volumes else lines)
 
-    show = late("mstfilter.report.display:show_hypothesis", "The voxels as a page that can be rotated.")
+    show = late("mstfilter.report.viewer:show_hypothesis", "The voxels as a page that can be rotated.")
     _repr_html_ = late("mstfilter.report.display:to_html", "What a notebook shows.")
 
     @classmethod

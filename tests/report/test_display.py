@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-import base64
-import json
 import re
-import shutil
-import subprocess
 import sys
 from html.parser import HTMLParser
 from types import ModuleType
@@ -15,14 +11,12 @@ import numpy as np
 import pytest
 
 import mstfilter
-from mstfilter.errors import InputError
 from mstfilter.lazy import exported
 from mstfilter.presets import load_config
-from mstfilter.report.display import Drawing, ScenePage
-from mstfilter.report.pictures import colour
+from mstfilter.report.display import Drawing
 from mstfilter.resources import preset_names
 from mstfilter.runs import filter_recording
-from mstfilter.scene import Crop, Hypothesis, ObjectRecord, Recording, VoxelGrid, read_rgb
+from mstfilter.scene import Crop, Hypothesis, ObjectRecord, Recording, VoxelGrid
 from mstfilter.smc import (
     Candidates,
     Infos,
@@ -159,30 +153,6 @@ def test_plots():
     assert sum(bar.get_height() for bar in bars) == pytest.approx(1)
 
 
-def test_the_page_has_the_open_faces(tmp_path):
-    """Every face of a voxel whose neighbour is another object or free, found voxel by voxel."""
-    labels = np.random.default_rng(0).integers(0, 3, (4, 3, 2))
-    hypothesis = Hypothesis.from_labels(labels, VoxelGrid((0, 0, 0), 0.01, (4, 3, 2)))
-    page = hypothesis.show()
-    assert isinstance(page, ScenePage)
-    check_html(page._repr_html_())
-    check_html(page.save(tmp_path / "scene.html").read_text())
-    data = json.loads(re.search(r'<script id="data"[^>]*>(.*?)</script>', page.text)[1])
-    rows = np.frombuffer(base64.b64decode(data["faces"]), "<u2").reshape(-1, 5).tolist()
-    steps = [(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1)]
-    expected = []
-    for x, y, z in np.argwhere(labels > 0).tolist():
-        for side, (dx, dy, dz) in enumerate(steps):
-            i, j, k = x + dx, y + dy, z + dz
-            inside = 0 <= i < 4 and 0 <= j < 3 and 0 <= k < 2
-            if not inside or labels[i, j, k] != labels[x, y, z]:
-                expected.append([x, y, z, side, int(labels[x, y, z])])
-    assert sorted(rows) == sorted(expected)
-    assert [o["text"] for o in data["objects"]] == [f"{k}: {n} voxels" for k, n in hypothesis.volumes().items()]
-    with pytest.raises(InputError, match="is a folder"):
-        page.save(tmp_path)
-
-
 def test_infos_as_a_table(monkeypatch):
     assert isinstance(INFOS, list)
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
@@ -212,20 +182,3 @@ def test_progress_is_shown_if_asked(tmp_path, capsys):
     arrays = Recording.from_arrays(RGB, DEPTH, CAMERA.K)
     filter_recording(arrays, load_config("floor_one_blob"), tmp_path / "run", progress=True)
     assert "1/1" in capsys.readouterr().err
-
-
-@pytest.mark.skipif(shutil.which("chromium") is None, reason="chromium is not installed")
-def test_a_browser_draws_the_page(tmp_path):
-    """A headless browser without network draws every object in its colour."""
-    SCENES.particles[0].show().save(tmp_path / "scene.html")
-    picture = tmp_path / "scene.png"
-    options = ["--headless", "--no-sandbox", "--disable-gpu", "--proxy-server=127.0.0.1:9", "--window-size=600,500"]
-    command = ["chromium", *options, f"--user-data-dir={tmp_path / 'profile'}", f"--screenshot={picture}"]
-    subprocess.run([*command, f"file://{tmp_path / 'scene.html'}"], check=True, capture_output=True, timeout=120)
-    pixels = read_rgb(picture)[:400].reshape(-1, 3).astype(int)
-    for k in range(SCENES.particles[0].n_objects):
-        # Shaded by at most a factor of 0.62: the hue stays.
-        direction = np.array(colour(k)) / np.linalg.norm(colour(k))
-        length = np.linalg.norm(pixels, axis=1)
-        near = (pixels @ direction > 0.999 * length) & (length < 1.02 * np.linalg.norm(colour(k)))
-        assert (near & (length > 0.6 * np.linalg.norm(colour(k)))).sum() > 500

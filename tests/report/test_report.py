@@ -16,6 +16,7 @@ from mstfilter.errors import InputError
 from mstfilter.report import run_report, viewpoint
 from mstfilter.report.run_report import read_numbers, write_report
 from mstfilter.runs import HypothesisCodec, RunFolder
+from mstfilter.scene import Hypothesis, project
 from mstfilter.scoring import weighted_coverage
 from mstfilter.smc import Key, Population, State, save_state
 from tests.report.runs import make_run
@@ -82,7 +83,9 @@ def test_the_page_is_self_contained(finished):
     run, path = finished
     assert path == run.path / "report.html"
     text, page = read(path)
-    assert "script" not in page.tags and "link" not in page.tags and "iframe" not in page.tags
+    # The only script is in a frame that cannot reach the page.
+    assert "script" not in page.tags and "link" not in page.tags and page.tags.count("iframe") == 1
+    assert 'sandbox="allow-scripts"' in text
     for link in page.links:
         assert link.startswith(("data:image/", "#")), link[:80]
         if link.startswith("#"):
@@ -98,7 +101,7 @@ def test_contents_of_the_page(finished):
     text, page = read(path)
     assert "two boxes" in page.text and "seed 7" in page.text
     assert "3 hypotheses" in page.text and "after 3 pauses" in page.text
-    for words in ("static 6", "icp 2", "nothing moved", "sampler.acceptance", "transition", "one blob", "Genealogy"):
+    for words in ("motions.static", "nothing moved", "sampler.acceptance", "transition", "one blob", "Genealogy"):
         assert words in page.text
     assert "connected components" in page.text and "own.py:Stay" in page.text
     # One picture of the camera a pause, used by every card of it; truth and heaviest are drawn at the top too.
@@ -139,10 +142,10 @@ def test_baselines_are_the_quality_of_the_occupied_voxels(finished):
     numbers = read_numbers(run)
     for t, step in enumerate(numbers.steps):
         truth, expected = run.truth(t), 0.0
-        for h, w in zip(run.hypotheses(t), step.weights, strict=True):
-            expected += w * weighted_coverage((h.labels > 0).astype(int), truth)
+        for h in run.hypotheses(t):
+            expected += weighted_coverage((h.labels > 0).astype(int), truth) / len(run.hypotheses(t))
         assert step.baselines["one blob"] == pytest.approx(expected)
-        assert step.mean() == pytest.approx(np.dot(step.quality["objects"], step.weights))
+        assert step.mean == pytest.approx(np.mean([weighted_coverage(h.labels, truth) for h in run.hypotheses(t)]))
         assert step.true_objects == 2
 
 
@@ -233,3 +236,46 @@ def test_a_run_that_uses_the_ground_truth_is_marked(finished, tmp_path):
     (run.path / "run.json").write_text(json.dumps({**description, "uses_truth": ["TrueMasks"]}))
     page = read(write_report(run))[1].text
     assert "uses the ground truth" in page and "from images alone: TrueMasks" in page
+
+
+def test_the_quality_is_explained(finished):
+    """Objects that are right in the image and too deep in the volume: outlines agree, volume is invented."""
+    run, path = finished
+    numbers = read_numbers(run)
+    last = numbers.steps[-1]
+    truth, hypotheses = run.truth(2), run.hypotheses(2)
+    invented = np.mean([np.sum((h.labels > 0) & (truth == 0)) / np.sum(truth > 0) for h in hypotheses])
+    missed = np.mean([np.sum((h.labels == 0) & (truth > 0)) / np.sum(truth > 0) for h in hypotheses])
+    assert last.metrics["volume_invented"] == pytest.approx(invented)
+    assert f"{100 * missed:.0f} % is missed and {100 * invented:.0f} % is invented" in read(path)[1].text
+    views = [project(h, run.camera(2)) for h in hypotheses]
+    seen = project(Hypothesis.from_labels(truth, hypotheses[0].grid), run.camera(2))
+    assert last.in_image == pytest.approx(np.mean([weighted_coverage(view, seen) for view in views]))
+
+
+def test_notes_that_a_stage_passes_on_are_shown_once(tmp_path):
+    run = make_run(tmp_path / "run", pauses=1)
+    info = run.info(0)
+    info["notes"] = {"proposal": {"passed": 1, "changed": 1}, "resampler": {"passed": 1, "changed": 2, "own": 3}}
+    (run.pause(0) / "info.json").write_text(json.dumps(info))
+    step = read_numbers(run).steps[0]
+    assert step.notes("resampler") == {"changed": 2, "own": 3}
+
+
+def test_compared_runs_stand_beside_the_run(tmp_path):
+    """In the summary, the table, the figure, and as a card at every pause that they have."""
+    run = make_run(tmp_path / "run", pauses=2)
+    other = make_run(tmp_path / "run" / "compare" / "without-past", pauses=1)
+    assert list(run.compared()) == ["without past"]
+    assert read_numbers(run).steps[0].compared == {"without past": np.mean(other.info(0)["quality"]["objects"])}
+    text, page = read(write_report(run))
+    assert page.text.count("Without past") == 2  # the card of pause 0 and the note
+    assert "without past" in re.search(r'<svg class="figure".*?</svg>', text, flags=re.S)[0]
+
+
+def test_text_of_the_figures_is_large_enough(finished):
+    """At least 9 pixels where a figure is 840 pixels wide."""
+    for svg in re.findall(r'<svg class="figure".*?</svg>', finished[1].read_text(), flags=re.S):
+        width = float(re.search(r'viewBox="\S+ \S+ (\S+) ', svg)[1])
+        sizes = [float(size) for size in re.findall(r"font-size: ?([\d.]+)px", svg)]
+        assert sizes and min(sizes) * 840 / width >= 9

@@ -1,0 +1,212 @@
+"""Scenes in three dimensions: the page, seen by a headless browser, and the file of rerun."""
+
+from __future__ import annotations
+
+import base64
+import html
+import json
+import re
+import shutil
+import subprocess
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mstfilter.errors import InputError, MissingLibraryError
+from mstfilter.report import recording_page, run_page, viewer
+from mstfilter.report.pictures import colour
+from mstfilter.scene import Hypothesis, VoxelGrid, read_rgb
+from mstfilter.testing import scene_example
+from tests.report.runs import GRID, make_run, recording, truth_at
+from tests.report.test_display import check_html
+from tests.test_cli import call
+
+LABELS = np.random.default_rng(0).integers(0, 3, (4, 3, 2))
+SMALL = Hypothesis.from_labels(LABELS, VoxelGrid((0, 0, 0), 0.01, (4, 3, 2)))
+needs_browser = pytest.mark.skipif(shutil.which("chromium") is None, reason="chromium is not installed")
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    return make_run(tmp_path_factory.mktemp("viewer") / "run")
+
+
+def data_of(page):
+    return json.loads(re.search(r'<script id="data"[^>]*>(.*?)</script>', page.text)[1])
+
+
+def volume(view, shape):
+    """The labels (X, Y, Z) that the data of a page hold."""
+    rows = np.frombuffer(base64.b64decode(view["runs"]), "<u2").reshape(-1, 2)
+    labels = np.zeros(shape, int)
+    inside = np.repeat(rows[:, 0], rows[:, 1]).reshape(view["shape"])
+    box = tuple(slice(low, low + n) for low, n in zip(view["low"], view["shape"], strict=True))
+    labels[box] = inside
+    return labels
+
+
+def open_faces(labels):
+    """Number of faces between a voxel and another object or free space, found voxel by voxel."""
+    padded = np.pad(labels, 1)
+    steps = [(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1)]
+    voxels = np.argwhere(padded > 0)
+    return sum(int(padded[tuple(v + s)] != padded[tuple(v)]) for v in voxels for s in steps)
+
+
+def browse(page, tmp_path, *options, size="600,500"):
+    """Output of a headless browser without network that opens a page."""
+    common = ["--headless", "--no-sandbox", "--disable-gpu", "--proxy-server=127.0.0.1:9", f"--window-size={size}"]
+    command = ["chromium", *common, "--virtual-time-budget=2000", f"--user-data-dir={tmp_path / 'profile'}", *options]
+    done = subprocess.run([*command, page.as_uri()], check=True, capture_output=True, timeout=120)
+    return done.stdout.decode()
+
+
+def pixels_of(picture, wanted):
+    """Number of pixels with the hue of a colour, shaded by at most a factor of 0.62."""
+    pixels = read_rgb(picture).reshape(-1, 3).astype(int)
+    direction, length = np.array(wanted) / np.linalg.norm(wanted), np.linalg.norm(pixels, axis=1)
+    near = (pixels @ direction > 0.999 * length) & (length < 1.02 * np.linalg.norm(wanted))
+    return int((near & (length > 0.6 * np.linalg.norm(wanted))).sum())
+
+
+def test_a_page_holds_the_labels(tmp_path):
+    page = SMALL.show()
+    check_html(page._repr_html_())
+    check_html(page.save(tmp_path / "scene.html").read_text())
+    view = data_of(page)["pauses"][0]["views"][0]
+    assert np.array_equal(volume(view, LABELS.shape), LABELS)
+    assert {o["text"] for o in view["objects"]} == {f"{k}: {n} voxels" for k, n in SMALL.volumes().items()}
+    with pytest.raises(InputError, match="is a folder"):
+        page.save(tmp_path)
+
+
+@pytest.mark.parametrize("labels", [[], [0], [1] * 65535, [2] * 65536 + [0] + [3] * 200_000])
+def test_runs_give_the_labels_back(labels):
+    rows = viewer.encode_runs(np.array(labels, np.uint16))
+    assert np.array_equal(np.repeat(rows[:, 0], rows[:, 1]), labels)
+    assert (rows[:, 1] > 0).all()
+
+
+def test_the_page_of_a_run(run):
+    """Every distinct hypothesis and the truth of every pause; lines lead from a view to that of its ancestor."""
+    page = run_page(run)
+    check_html(page.text)
+    pauses, before = data_of(page)["pauses"], {}
+    assert [p["name"] for p in pauses] == [
+        f"pause {t}, {run.description['recording']['times'][t]:.1f} s" for t in range(3)
+    ]
+    for t, pause in enumerate(pauses):
+        info, hypotheses = run.info(t), run.hypotheses(t)
+        *views, truth = pause["views"]
+        assert len(views) == len({h.key for h in hypotheses})
+        assert sum(view["weight"] for view in views) == pytest.approx(1)
+        assert np.array_equal(volume(truth, GRID.shape), truth_at(t))
+        place = {k: v for v, view in enumerate(views) for k in map(int, re.findall(r"#(\d+)", view["name"]))}
+        for k, v in place.items():
+            assert np.array_equal(volume(views[v], GRID.shape), hypotheses[k].labels)
+        if t:
+            parents = info["parents"]["previous"]
+            assert {tuple(link) for link in pause["links"]} == {
+                (before[p], place[k]) for k, p in enumerate(parents) if p >= 0
+            }
+        before = place
+    assert all(p["photo"] is None for p in data_of(run_page(run, photos=False))["pauses"])
+
+
+def test_the_page_of_a_recording():
+    """The truth, or the measured surface where there is none."""
+    (view,) = data_of(recording_page(recording()))["pauses"][1]["views"]
+    assert view["name"] == "truth" and np.array_equal(volume(view, GRID.shape), truth_at(1))
+    (view,) = data_of(recording_page(recording(truth=False)))["pauses"][1]["views"]
+    measured = volume(view, GRID.shape) > 0
+    reached = np.pad(truth_at(1) > 0, 1)
+    near = np.any([np.roll(reached, s, a)[1:-1, 1:-1, 1:-1] for a in range(3) for s in (-1, 0, 1)], axis=0)
+    near[:, :, 0] = True  # the table
+    assert measured.any() and (measured & ~near).sum() < 0.02 * measured.sum()
+
+
+def test_an_empty_scene_has_a_page():
+    empty = Hypothesis.from_labels(np.zeros((2, 2, 2), int), VoxelGrid((0, 0, 0), 0.01, (2, 2, 2)))
+    assert data_of(empty.show())["pauses"][0]["views"][0]["runs"] == ""
+
+
+@needs_browser
+def test_a_browser_finds_the_open_faces(tmp_path):
+    text = browse(SMALL.show().save(tmp_path / "scene.html"), tmp_path, "--dump-dom")
+    assert int(re.search(r'data-faces="(\d+)"', text)[1]) == open_faces(LABELS)
+
+
+@needs_browser
+def test_a_browser_draws_every_object_of_a_hypothesis(tmp_path):
+    hypothesis = scene_example(np.random.default_rng(0), 5)[0].particles[0]
+    page = hypothesis.show().save(tmp_path / "scene.html")
+    browse(page, tmp_path, f"--screenshot={tmp_path / 'scene.png'}")
+    for k in range(hypothesis.n_objects):
+        assert pixels_of(tmp_path / "scene.png", colour(k)) > 500
+
+
+@needs_browser
+def test_a_browser_draws_a_run(run, tmp_path, capsys):
+    """The command writes one page; image, voxels and time line are drawn without network."""
+    page = tmp_path / "run.html"
+    code, out, _ = call("view", run.path, "--html", page, capsys=capsys)
+    assert code == 0 and "run.html" in out
+    text = browse(page, tmp_path, "--dump-dom", size="1000,800")
+    last = data_of(run_page(run))["pauses"][-1]["views"]
+    assert text.count("<circle") == 2 * sum(len(p["views"]) for p in data_of(run_page(run))["pauses"])
+    heaviest = volume(last[0], GRID.shape)
+    assert int(re.search(r'data-faces="(\d+)"', text)[1]) == open_faces(heaviest)
+    assert html.escape(last[0]["name"]) in text
+    browse(page, tmp_path, f"--screenshot={tmp_path / 'run.png'}", size="1000,800")
+    for one in last[0]["objects"]:
+        rgb = [int(one["colour"][k : k + 2], 16) for k in (1, 3, 5)]
+        assert pixels_of(tmp_path / "run.png", rgb) > 200
+
+
+def test_files_of_rerun_hold_every_entity(run, tmp_path, capsys):
+    rerun = pytest.importorskip("rerun")
+    rerun.set_strict_mode(True)
+    code, out, _ = call("view", run.path, "--save", tmp_path / "run.rrd", capsys=capsys)
+    assert code == 0 and "run.rrd" in out
+    viewer.save_rerun(replace(recording(), name="two boxes"), tmp_path / "recording.rrd")
+    for name, wanted in (
+        (
+            "run",
+            ("/world/hypothesis_0", "/world/truth", "/world/camera/image/hypothesis_0", "/weight/", "/genealogy"),
+        ),
+        ("recording", ("/world/truth", "/world/camera/image/depth")),
+    ):
+        command = [sys.executable, "-m", "rerun_cli", "rrd", "print", str(tmp_path / f"{name}.rrd")]
+        shown = subprocess.run(
+            command, capture_output=True, check=True, timeout=60, env={"CI": "1", "HOME": str(tmp_path)}
+        )
+        for entity in wanted:
+            assert entity in shown.stdout.decode(), entity
+
+
+def test_the_viewer_listens_on_this_machine_only_and_sends_no_analytics(run, tmp_path, monkeypatch, capsys):
+    pytest.importorskip("rerun")
+    calls = []
+    monkeypatch.setenv("FORCE_RERUN_ANALYTICS", "1")
+    monkeypatch.setattr(
+        viewer.subprocess,
+        "run",
+        lambda *command, **named: calls.append((*command, named)) or subprocess.CompletedProcess("", 0),
+    )
+    assert call("view", run.path, capsys=capsys)[0] == 0
+    ((command, named),) = calls
+    assert command[command.index("--bind") + 1] == "127.0.0.1"
+    assert named["env"]["CI"] and "FORCE_RERUN_ANALYTICS" not in named["env"]
+
+
+def test_without_rerun_one_error_says_what_to_install(run, tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "rerun", None)
+    for arguments in ((), ("--save", tmp_path / "run.rrd")):
+        code, _, error = call("view", run.path, *arguments, capsys=capsys)
+        assert code == 2 and error.count("error:") == 1
+        assert "rerun-sdk" in error and "mstfilter[viewer]" in error and "--html" in error
+    with pytest.raises(MissingLibraryError):
+        viewer.save_rerun(run, tmp_path / "run.rrd")
+    assert call("view", run.path, "--html", tmp_path / "run.html", capsys=capsys)[0] == 0
