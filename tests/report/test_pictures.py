@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mstfilter.report.identities import TRUTH, assign_identities
-from mstfilter.report.page import counts_by_key, flatten, note_rows, short_text
+from mstfilter.report.page import flatten, note_rows, short_text
 from mstfilter.report.pictures import (
     PALETTE,
     UNASSIGNED_COLOUR,
@@ -174,6 +174,3 @@ def test_tables():
     ]
     assert short_text(list(range(100))) == "median 49.5, 0 to 99"
     assert note_rows([{"a": 1}, {"b": {"c": 2}}]) == [("a", ["1", ""]), ("b.c", ["", "2"])]
-    assert counts_by_key([{"m": {"icp": 2}, "r": {"x": 0.5}}, {"m": {"flow": 1}}, {}]) == {
-        "m": [{"icp": 2}, {"flow": 1}, {}]
-    }
