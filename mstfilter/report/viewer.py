@@ -68,7 +68,7 @@ class ScenePage:
 
 
 @dataclass(frozen=True)
-class View:
+class ShownHypothesis:
     """A hypothesis, or the truth, at a pause."""
 
     name: str
@@ -85,11 +85,11 @@ class View:
 
 
 @dataclass(frozen=True)
-class Scene:
+class ShownPause:
     """What is shown at a pause."""
 
     name: str
-    views: Sequence[View]
+    views: Sequence[ShownHypothesis]
     time: float = 0.0
     image: np.ndarray | None = None
     camera: Camera | None = None
@@ -99,7 +99,9 @@ class Scene:
 def show_hypothesis(hypothesis: Hypothesis, title: str = "") -> ScenePage:
     """The voxels of a hypothesis as a page: drag to rotate, click and scroll to zoom, click an object to hide it."""
     order = {record.label: k for k, record in enumerate(hypothesis.objects)}
-    return _page([Scene("", [View("", "", hypothesis, order)])], title or f"{hypothesis.n_objects} objects")
+    return _page(
+        [ShownPause("", [ShownHypothesis("", "", hypothesis, order)])], title or f"{hypothesis.n_objects} objects"
+    )
 
 
 def run_page(run: RunFolder | str | Path, *, photos: bool = True, head: bool = True) -> ScenePage:
@@ -116,10 +118,10 @@ def recording_page(recording: Recording) -> ScenePage:
     return _page(scenes_of_recording(recording), recording.name, note)
 
 
-def scenes_of_run(run: RunFolder) -> list[Scene]:
+def scenes_of_run(run: RunFolder) -> list[ShownPause]:
     """The pauses of a run: distinct hypotheses from heavy to light (at most twelve), then the truth."""
     identities, times = assign_identities(run), run.description["recording"]["times"]
-    scenes: list[Scene] = []
+    scenes: list[ShownPause] = []
     view_of: dict[int, int] = {}
     for t in range(run.n_pauses):
         info, hypotheses, earlier = run.info(t), run.hypotheses(t), view_of
@@ -129,19 +131,19 @@ def scenes_of_run(run: RunFolder) -> list[Scene]:
             quality = None if info["quality"] is None else info["quality"]["objects"][k]
             text = f"weight {weight:.2f}" + ("" if quality is None else f", quality {quality:.2f}")
             identity = identities.of(t, k)
-            views.append(View(names_of(members), text, hypotheses[k], identity, weight, quality=quality))
+            views.append(ShownHypothesis(names_of(members), text, hypotheses[k], identity, weight, quality=quality))
             view_of |= dict.fromkeys(members, v)
         parents = enumerate(info["parents"].get("previous") or ())
         links = {(earlier[p], view_of[k]) for k, p in parents if p in earlier and k in view_of}
         truth = run.truth(t)
         if truth is not None:
             known = Hypothesis.from_labels(truth, hypotheses[0].grid)
-            views.append(View("truth", "", known, identities.of(t, TRUTH)))
-        scenes.append(Scene(f"pause {t}", views, float(times[t]), run.rgb(t), run.camera(t), sorted(links)))
+            views.append(ShownHypothesis("truth", "", known, identities.of(t, TRUTH)))
+        scenes.append(ShownPause(f"pause {t}", views, float(times[t]), run.rgb(t), run.camera(t), sorted(links)))
     return scenes
 
 
-def scenes_of_recording(recording: Recording) -> list[Scene]:
+def scenes_of_recording(recording: Recording) -> list[ShownPause]:
     """The pauses of a recording with the truth; without it with the surface that the camera sees."""
     scenes = []
     for t, clip in enumerate(recording.clips()):
@@ -150,12 +152,12 @@ def scenes_of_recording(recording: Recording) -> list[Scene]:
             view = _surface(frame, clip.grid)
         else:
             known = Hypothesis.from_labels(truth, clip.grid)
-            view = View("truth", "", known, {k: k - 1 for k in known.volumes()})
-        scenes.append(Scene(f"pause {t}", [view], recording.times[recording.pauses[t]], frame.rgb, frame.camera))
+            view = ShownHypothesis("truth", "", known, {k: k - 1 for k in known.volumes()})
+        scenes.append(ShownPause(f"pause {t}", [view], recording.times[recording.pauses[t]], frame.rgb, frame.camera))
     return scenes
 
 
-def _surface(frame: Frame, grid: VoxelGrid) -> View:
+def _surface(frame: Frame, grid: VoxelGrid) -> ShownHypothesis:
     """Voxels that contain a measured point, in its colour, rounded to six levels a channel."""
     points, rgb = frame.points[frame.valid], frame.rgb[frame.valid]
     index = grid.index_of(points)
@@ -165,11 +167,11 @@ def _surface(frame: Frame, grid: VoxelGrid) -> View:
     labels[tuple(index[inside].T)] = 1 + level @ np.array([36, 6, 1], np.uint16)
     hypothesis = Hypothesis.from_labels(labels, grid)
     colours = {k: tuple(21 + 43 * ((k - 1) // d % 6) for d in (36, 6, 1)) for k in hypothesis.volumes()}
-    return View("surface", "voxels that contain a measured point", hypothesis, {}, None, colours)  # type: ignore[arg-type]
+    return ShownHypothesis("surface", "voxels that contain a measured point", hypothesis, {}, None, colours)  # type: ignore[arg-type]
 
 
 def _page(
-    scenes: Sequence[Scene], title: str, note: str = "", *, photos: bool = True, head: bool = True
+    scenes: Sequence[ShownPause], title: str, note: str = "", *, photos: bool = True, head: bool = True
 ) -> ScenePage:
     boxes = [box for scene in scenes for v in scene.views if (box := occupied_box(v.hypothesis.labels > 0))]
     grid = scenes[0].views[0].hypothesis.grid
@@ -193,7 +195,7 @@ def _page(
     return ScenePage(template, title)
 
 
-def _scene_data(scene: Scene, photos: bool) -> dict[str, Any]:
+def _scene_data(scene: ShownPause, photos: bool) -> dict[str, Any]:
     """A pause for the script of the page. Labels are runs (label, length) of the occupied box, 16 bits each."""
     views = []
     for view in scene.views:
@@ -294,12 +296,12 @@ def import_rerun() -> Any:
     return rerun
 
 
-def _entities(scene: Scene) -> dict[str, View]:
+def _entities(scene: ShownPause) -> dict[str, ShownHypothesis]:
     """Name of the entity of each view: hypotheses are numbered from heavy to light."""
     return {(view.name if view.weight is None else f"hypothesis_{v}"): view for v, view in enumerate(scene.views)}
 
 
-def _log_scenes(stream: Any, scenes: Sequence[Scene]) -> None:
+def _log_scenes(stream: Any, scenes: Sequence[ShownPause]) -> None:
     """Images, labels in the image, voxels, weights and quality at the pauses; the genealogy."""
     rr = import_rerun()
     stream.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
@@ -382,7 +384,7 @@ def _enclosed(labels: np.ndarray) -> np.ndarray:
     return inside
 
 
-def _blueprint(scenes: Sequence[Scene]) -> Any:
+def _blueprint(scenes: Sequence[ShownPause]) -> Any:
     """The image with the heaviest hypothesis, a view of each hypothesis, weights, genealogy."""
     rrb = import_rerun().blueprint
     names = list(dict.fromkeys(name for scene in scenes for name in _entities(scene)))
