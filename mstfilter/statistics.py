@@ -208,9 +208,8 @@ def conclusion(difference: Difference, first: str, second: str, where: str = "",
     found = f"{numbers}, p {d.p_holm:.2g} after Holm, n = {d.n}"
     if not (d.low > 0 or d.high < 0):
         return f"{first} and {second}{at}: no difference can be claimed at n = {d.n} ({found})."
-    word = "above" if d.mean > 0 else "below"
     if d.n < CLAIM:
-        return f"{first} is {word} {second}{at} ({found}): a first look, no claim below {CLAIM} {unit}s."
+        return f"{first} minus {second}{at}: {found}. A first look: claims need {CLAIM} {unit}s."
     if not d.p_holm < 1 - LEVEL:
-        return f"{first} is {word} {second}{at} by its interval, but not after adjustment ({found}): no claim."
-    return f"{first} is {word} {second}{at} ({found})."
+        return f"{first} minus {second}{at}: {found}. The interval excludes 0, but no claim is left after adjustment."
+    return f"{first} is {'above' if d.mean > 0 else 'below'} {second}{at} ({found})."

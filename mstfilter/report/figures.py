@@ -78,7 +78,10 @@ def _svg_text(figure: Figure, title: str) -> str:
     text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.S)
     view = re.search(r'viewBox="([^"]*)"', text)
     assert view is not None
-    head = f'<svg class="figure" viewBox="{view[1]}" role="img" aria-label="{title}">'
+    widest = 1.45 * float(view[1].split()[2])  # pixels: text of 10 points is not drawn larger than 19 pixels
+    head = (
+        f'<svg class="figure" style="max-width:{widest:.0f}px" viewBox="{view[1]}" role="img" aria-label="{title}">'
+    )
     text = head + text[text.index(">") + 1 :]
     text = re.sub(r"font(-family)?: ?[^;\"]*'[^;\"]*(;|(?=\"))", _keep_font_size, text)
     text = text.replace("xlink:href", "href")
@@ -256,17 +259,21 @@ def figure_groups(arms: Sequence[str], reference: str) -> list[list[str]]:
 
 
 def time_figure(
-    values: Mapping[str, Mapping[str, Mapping[int, Sequence[float]]]], arms: Sequence[str], measure: str = "quality"
+    values: Mapping[str, Mapping[str, Mapping[int, Sequence[float]]]],
+    arms: Sequence[str],
+    measure: str = "quality",
+    every_arm: Sequence[str] = (),
 ) -> str:
     """Quality of all hypotheses, or another measure of the runs, over time, one panel per family.
 
     `values` is family -> arm -> pause -> values: one of each scene and seed, or of each hypothesis. `arms` gives the
-    order of the boxes (see `figure_groups` for many arms); arms without values are left out. Boxes contain the middle
-    half of the values, the bar is their median, whiskers reach the 5th and 95th percentile; points are values, lines
-    join the means.
+    order of the boxes (see `figure_groups` for many arms); arms without values are left out. An arm has the same
+    colour in all figures with the same `every_arm`, if these are at most twelve. Boxes contain the middle half of the
+    values, the bar is their median, whiskers reach the 5th and 95th percentile; points are values, lines join the
+    means.
     """
     values = {family: {a: v for a, v in of_arms.items() if a in arms} for family, of_arms in values.items()}
-    colours, n = _arm_colours(arms), len(values)
+    colours, n = _arm_colours(every_arm if 0 < len(every_arm) <= len(SERIES) else arms), len(values)
     shown = [arm for arm in arms if any(arm in of_arms for of_arms in values.values())]
     most_pauses = max(len({t for by_pause in of_arms.values() for t in by_pause}) for of_arms in values.values())
     most_boxes = most_pauses * len(shown)
@@ -360,32 +367,49 @@ def differences_figure(compared: Sequence[Compared], arms: Sequence[str], metric
     """Paired differences of a metric with their t intervals, by family."""
     known = [one for one in compared if one.difference.n]
     colours = _arm_colours(arms)
+    rows = [
+        (one.family, one.second, (d.mean, d.low, d.high), colours[one.second])
+        for one in known
+        for d in [one.difference]
+    ]
     with _style("study differences"):
-        figure, (axes,) = _new_figure(6.6, 0.9 + 0.26 * len(known) + 0.3 * len({one.family for one in known}))
-        axes.grid(axis="y", visible=False)
-        axes.grid(axis="x")
-        axes.axvline(0, color=_MUTED, lw=1.0)
-        y, ticks, family = 0.0, [], None
-        for one in known:
-            if one.family != family:
-                y += 0.0 if family is None else 0.9
-                where: dict[str, Any] = {
-                    "xycoords": ("axes fraction", "data"),
-                    "textcoords": "offset points",
-                    "va": "center",
-                }
-                axes.annotate(one.family, (0, y), (4, 0), fontsize=9, color=_INK, fontweight="bold", **where)
-                family, y = one.family, y + 0.9
-            d = one.difference
-            if np.isfinite(d.low):
-                axes.plot([d.low, d.high], [y, y], color=colours[one.second], lw=2.2, solid_capstyle="butt")
-            axes.plot([d.mean], [y], marker="o", ms=6, color=colours[one.second])
-            ticks.append((y, one.second))
-            y += 1.0
-        axes.set_yticks([at for at, _ in ticks], [name for _, name in ticks])
-        axes.set_ylim(y - 0.3, -0.7)
+        figure, (axes,) = _new_figure(6.6, 1.0 + 0.26 * forest_height(rows))
+        draw_forest(axes, rows)
         reference = known[0].first if known else ""
         side = "right" if ENDPOINTS.get(metric, 1) > 0 else "left"
         label = f"{metric} of {reference} minus that of the method; {reference} is better on the {side}"
-        axes.set_xlabel("\n".join(textwrap.wrap(label, 60)))
+        figure.supxlabel("\n".join(textwrap.wrap(label, 76)), fontsize=10, color=_MUTED)
         return _svg_text(figure, f"Paired differences of {metric} with 95 % intervals")
+
+
+#: Group, name, (mean, low, high), colour.
+ForestRow = tuple[str, str, tuple[float, float, float], str]
+
+
+def forest_height(rows: Sequence[ForestRow]) -> float:
+    """Number of lines of a forest plot."""
+    return len(rows) + 1.8 * len({group for group, *_ in rows})
+
+
+def draw_forest(axes: Axes, rows: Sequence[ForestRow]) -> None:
+    """Draw differences with their intervals below each other, under the names of their groups."""
+    axes.grid(axis="y", visible=False)
+    axes.grid(axis="x")
+    axes.axvline(0, color=_MUTED, lw=1.0)
+    y, ticks = 0.0, []
+    for k, (group, name, (mean, low, high), mark) in enumerate(rows):
+        if k == 0 or group != rows[k - 1][0]:
+            y += 0.9 * (k > 0)
+            ticks.append((y, group, True))
+            y += 0.9
+        if np.isfinite(low):
+            axes.plot([low, high], [y, y], color=mark, lw=2.4, solid_capstyle="butt")
+        axes.plot([mean], [y], marker="o", ms=6, color=mark)
+        ticks.append((y, name, False))
+        y += 1.0
+    axes.set_yticks([at for at, *_ in ticks], [text for _, text, _ in ticks])
+    for label, (*_, head) in zip(axes.get_yticklabels(), ticks, strict=True):
+        if head:
+            label.set(fontweight="bold", color=_INK)
+    axes.locator_params(axis="x", nbins=6)
+    axes.set_ylim(y - 0.3, -0.7)

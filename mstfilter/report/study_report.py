@@ -18,37 +18,43 @@ from mstfilter.report.page import fill_template, flatten, seconds_text, short_te
 from mstfilter.statistics import CLAIM
 from mstfilter.study import ENDPOINT, ENDPOINTS, SLOPES, StudyFolder, Summary
 
-# Columns of the table of results: name in the study, heading.
-_FIGURES = (
-    (ENDPOINT, "quality"),
-    ("information", "information"),
-    (SLOPES["quality"], "slope of quality"),
-    (SLOPES["information"], "slope of information"),
-    ("quality_top", "heaviest"),
-    ("quality_best", "best of n"),
-    ("quality_estimate", "estimate"),
-    ("quality_visible", "visible objects"),
-    ("quality_hidden", "hidden, seen before"),
-    ("quality_unseen", "never seen"),
-    ("occupancy", "occupancy IoU"),
-    ("object_f", "object F"),
-    ("split", "split"),
-    ("merged", "merged"),
-    ("missed", "missed"),
-    ("invented", "invented"),
-    ("diversity", "diversity"),
-    ("volume_missed", "missed volume"),
-    ("volume_invented", "invented volume"),
-    ("brier", "Brier"),
-    ("log_loss", "log loss"),
-    ("calibration_error", "calibration error"),
-    ("energy", "energy score"),
-    ("energy_floor", "baseline: energy with noise"),
-    ("quality_authors", "authors' form"),
-    ("quality_paper", "paper's form"),
-    ("quality_one_blob", "baseline: one blob"),
-    ("quality_components", "baseline: components"),
-)
+# Columns of the tables of results: name in the study, heading.
+_TABLES = {
+    "Quality": (
+        (ENDPOINT, "quality"),
+        (SLOPES["quality"], "slope"),
+        ("quality_top", "heaviest"),
+        ("quality_best", "best of n"),
+        ("quality_estimate", "estimate"),
+        ("quality_visible", "visible objects"),
+        ("quality_hidden", "hidden, seen before"),
+        ("quality_unseen", "never seen"),
+        ("quality_one_blob", "baseline: one blob"),
+        ("quality_components", "baseline: components"),
+    ),
+    "Information": (
+        ("information", "information"),
+        (SLOPES["information"], "slope"),
+        ("log_loss", "log loss"),
+        ("calibration_error", "calibration error"),
+        ("brier", "Brier"),
+        ("energy", "energy score"),
+        ("energy_floor", "baseline: energy with noise"),
+        ("diversity", "diversity"),
+    ),
+    "Objects and volume": (
+        ("object_f", "object F"),
+        ("split", "split"),
+        ("merged", "merged"),
+        ("missed", "missed"),
+        ("invented", "invented"),
+        ("occupancy", "occupancy IoU"),
+        ("volume_missed", "missed volume"),
+        ("volume_invented", "invented volume"),
+        ("quality_authors", "quality, authors' form"),
+        ("quality_paper", "quality, paper's form"),
+    ),
+}
 
 
 def write_study_report(study: StudyFolder | str | Path, out: str | Path | None = None) -> Path:
@@ -84,7 +90,11 @@ def _page(study: StudyFolder) -> str:
             for arm in summary.arms
             if summary.is_better(family, arm)
         ],
-        columns=[(name, heading) for name, heading in _FIGURES if name in summary.names],
+        tables={
+            title: chosen
+            for title, columns in _TABLES.items()
+            if (chosen := [(name, heading) for name, heading in columns if name in summary.names])
+        },
         figures=_drawn(records, summary, study.reported_only),
         reliability=_reliability(study, summary),
         costs=_costs(summary),
@@ -136,10 +146,14 @@ def _drawn(records: Sequence[Mapping[str, Any]], summary: Summary, reported_only
         if not values:
             continue
         groups = figure_groups(arms, summary.reference)
-        found.setdefault("time", []).extend(Markup(time_figure(values, group, name)) for group in groups)
+        found.setdefault("time", []).extend(
+            Markup(time_figure(values, group, name, summary.arms)) for group in groups
+        )
         if len(ends) > 1:
             groups = figure_groups(ends, summary.reference)
-            found.setdefault("ends", []).extend(Markup(time_figure(values, group, name)) for group in groups)
+            found.setdefault("ends", []).extend(
+                Markup(time_figure(values, group, name, summary.arms)) for group in groups
+            )
     for name in ENDPOINTS:
         compared = [one for one in summary.compared(name) if one.difference.n]
         if compared:

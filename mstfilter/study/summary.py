@@ -28,6 +28,16 @@ NOT_WORSE = 0.005  # of the other endpoint, where one filter is claimed to be be
 _NAMES = ("family", "scene", "arm", "seed", "pause", "time_s")
 
 
+_SHARES = ("quality", "occupancy", "object_f", "diversity", "brier", "calibration_error")
+
+
+def bounds_of(metric: str) -> tuple[float, float]:
+    """The least and the largest value of a metric; slopes are not bounded."""
+    if metric.endswith("_slope"):
+        return -np.inf, np.inf
+    return 0.0, 1.0 if metric.startswith(_SHARES) else np.inf
+
+
 @dataclass(frozen=True)
 class ArmMetric:
     """A metric of an arm on the scenes of a family.
@@ -51,8 +61,10 @@ class ArmMetric:
 
     @property
     def interval(self) -> tuple[float, float]:
-        """t interval of the mean over scenes."""
-        return interval(np.array(list(self.by_scene.values())))
+        """t interval of the mean over scenes, cut at the least and the largest value that the metric can have."""
+        low, high = interval(np.array(list(self.by_scene.values())))
+        least, most = bounds_of(self.name)
+        return max(low, least), min(high, most)
 
 
 @dataclass(frozen=True)
@@ -170,7 +182,8 @@ def summarise(
         The arm that others are compared with.
     cost : sequence of str
         Columns of time and memory. They are averaged over all pauses and not compared; a stage that a step lacks
-        took 0 seconds.
+        took 0 seconds. If an arm has several filter seeds, the first is left out: it also fills the cache with what
+        later runs share.
     reported_only : collection of str
         Arms that are not part of the comparisons.
     """
@@ -180,7 +193,12 @@ def summarise(
     values = _by_scene(rows, measured, lambda row: row["pause"] >= 1)
     spent = [k for k in named if k in cost]
     zero = {k: 0.0 for k in spent if not k.startswith("peak_mb")}
-    values.update(_by_scene([{**zero, **row} for row in rows], spent, lambda row: True))
+    seeds: dict[Any, set[Any]] = defaultdict(set)
+    for row in rows:
+        seeds[row["family"], row["arm"]].add(row["seed"])
+    filling = {of_arm: min(found) for of_arm, found in seeds.items() if len(found) > 1}
+    warm = [{**zero, **row} for row in rows if filling.get((row["family"], row["arm"])) != row["seed"]]
+    values.update(_by_scene(warm, spent, lambda row: True))
     for endpoint, slope_name in SLOPES.items():
         if endpoint in measured:
             values.update(_slopes(rows, endpoint, slope_name))
