@@ -1,4 +1,11 @@
-"""Sphinx configuration."""
+"""Sphinx configuration. Pages with ``file_format: mystnb`` are notebooks as text: the build executes them."""
+
+import os
+from copy import deepcopy
+from pathlib import Path
+
+import latex2mathml.converter
+from docutils import nodes
 
 from mstfilter import __version__
 
@@ -6,9 +13,19 @@ project = "mstfilter"
 author = "The mstfilter developers"
 copyright = "2026, the mstfilter developers"
 release = version = __version__
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.viewcode", "sphinx.ext.mathjax"]
+extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.autosummary", "sphinx.ext.viewcode"]
+templates_path = ["_templates"]
+html_math_renderer = "mathml"  # drawn by the browser, without a script or a network
 myst_enable_extensions = ["dollarmath", "colon_fence", "deflist"]
 myst_heading_anchors = 3
+os.environ["PYTHONPATH"] = os.pathsep.join(  # the cells of exactness.md import from there
+    [str(Path(__file__).parent.parent / "experiments" / "miniature"), os.environ.get("PYTHONPATH", "")]
+)
+nb_execution_mode = "auto"
+nb_execution_timeout = 300
+nb_execution_raise_on_error = True
+nb_execution_in_temp = True
+nb_merge_streams = True
 autodoc_member_order = "bysource"
 autodoc_typehints = "signature"
 autodoc_preserve_defaults = True
@@ -16,5 +33,37 @@ napoleon_google_docstring = False
 napoleon_use_rtype = False
 html_theme = "furo"
 html_title = "mstfilter"
+html_static_path = ["_static"]
+html_css_files = ["pages.css"]
 exclude_patterns = ["_build"]
-suppress_warnings = ["ref.python"]
+suppress_warnings = ["ref.python", "mystnb.unknown_mime_type"]
+
+
+def show_pictures(app, tree, page):
+    """Put the first picture of each page that a heading of the gallery links to below that heading."""
+    if page != "gallery":
+        return
+    for link in list(tree.findall(nodes.reference)):
+        target = link.get("refuri", "").removesuffix(".html").partition("#")[0]
+        if not isinstance(link.parent, nodes.title) or target not in app.env.found_docs:
+            continue
+        pictures = list(app.env.get_doctree(target).findall(nodes.image))
+        if pictures:
+            title = link.parent
+            title.parent.insert(title.parent.index(title) + 1, deepcopy(pictures[0]))
+
+
+def add_mathml(display):
+    """A visitor that writes a formula as MathML."""
+
+    def visit(translator, node):
+        formula = latex2mathml.converter.convert(node.astext(), display=display)
+        translator.body.append(formula if display == "inline" else f'<div class="formula">{formula}</div>')
+        raise nodes.SkipNode
+
+    return visit
+
+
+def setup(app):
+    app.add_html_math_renderer("mathml", (add_mathml("inline"), None), (add_mathml("block"), None))
+    app.connect("doctree-resolved", show_pictures)

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
+import tomllib
 import zipfile
 
 import pytest
 
+import mstfilter
 from tests.conftest import REPOSITORY
 
 ASK = (
@@ -44,6 +47,14 @@ def wheel(tmp_path_factory):
     done = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, timeout=600)
     assert done.returncode == 0, done.stderr
     return next(out.glob("*.whl"))
+
+
+def test_versions_agree():
+    """The places that a release changes."""
+    project = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["project"]
+    citation = re.search(r"^version: (\S+)$", (REPOSITORY / "CITATION.cff").read_text(), flags=re.MULTILINE)
+    assert project["version"] == mstfilter.__version__ == citation[1]
+    assert f"## [{project['version']}]" in (REPOSITORY / "CHANGELOG.md").read_text()
 
 
 def test_in_a_wheel(wheel, tmp_path):

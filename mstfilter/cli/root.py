@@ -16,7 +16,6 @@ from mstfilter import __version__
 from mstfilter.errors import InputWarning
 
 app = typer.Typer(
-    add_completion=False,
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},

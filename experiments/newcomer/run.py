@@ -1,0 +1,157 @@
+"""Play the first hour of a new user: the commands of the documentation, in an empty folder, in their order.
+
+    python experiments/newcomer/run.py [--smoke] [--out FOLDER]
+
+Every step is a process of its own. A step fails if its exit code is not 0, its output lacks what the documentation
+shows, or contains a traceback. FOLDER gets hour.csv (one row per step) and outputs.txt; default: results/.
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+import shlex
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import NamedTuple
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+DOCS = REPOSITORY / "docs"
+SMALL = "simulate demo demo/recording n_actions=1 n_objects_min=2 n_objects_max=2 supersample=false"
+NOTEBOOKS = ("tutorial", "own-component", "comparing", "beliefs")
+#: What the documentation says that a command prints.
+SHOWN = {
+    "demo": r"report +demo/report.html",
+    "simulate": r"recording +\S+",
+    "run": r"pause \d+ +\d+ hypothes[ei]s of .* objects?, ESS",
+    "report": r"report +\S+\.html",
+    "new": r"component +\S+\.py\n(test +\S+\.py\n)?next +\S+",
+    "check": r"all properties that apply hold",
+    "study": r"runs +\d+ done",
+    "convert": r"pauses +\d+ of \d+ frames",
+    "quality": r"components",
+    "view": r"page +\S+\.html",
+    "list": r"presets:\n +authors",
+    "python": r"\S",
+}
+#: Own arrays: the first example of the README, with the arrays of the demo's recording.
+ARRAYS = """
+import numpy as np
+from mstfilter import open_recording
+frames = open_recording("demo/recording").frames
+rgb, depth = np.stack([frame.rgb for frame in frames]), np.stack([frame.depth for frame in frames])
+K = frames[0].camera.K
+"""
+#: A notebook: the cells of a page, executed by Jupyter.
+NOTEBOOK = """
+import re, sys
+from pathlib import Path
+import nbclient, nbformat
+text = Path(sys.argv[1]).read_text()
+cells = re.findall(r"^```{code-cell}\\n(.*?)```", text, flags=re.DOTALL | re.MULTILINE)
+book = nbformat.v4.new_notebook(cells=[nbformat.v4.new_code_cell(cell) for cell in cells])
+book = nbclient.NotebookClient(book, timeout=600, kernel_name="python3").execute()
+shown = [kind for cell in book.cells for output in cell.outputs for kind in output.get("data", {})]
+print(len(cells), "cells executed,", shown.count("image/png"), "pictures")
+"""
+
+
+class Step(NamedTuple):
+    """A step of the hour."""
+
+    part: str
+    command: list[str]  #: arguments of `mstfilter`, or of Python
+    text: str  #: the command as the documentation shows it
+
+
+def commands(page: str) -> list[str]:
+    """The mstfilter commands of the shell blocks of a page."""
+    blocks = re.findall(r"^```bash\n(.*?)```", (DOCS / page).read_text(), flags=re.DOTALL | re.MULTILINE)
+    lines = [line.partition("  #")[0].strip() for block in blocks for line in block.splitlines()]
+    return [line for line in lines if line.startswith("mstfilter ")]
+
+
+def steps(smoke: bool) -> list[Step]:
+    """All steps, in order."""
+    from mstfilter.testing import starter_kinds
+
+    def plan(part: str, text: str) -> Step:
+        return Step(part, shlex.split(text)[1:], text)
+
+    demo = f"mstfilter {SMALL}" if smoke else "mstfilter demo --out demo"
+    found = [plan("demo", demo), plan("demo", "mstfilter list")]
+    first = re.search(r"```python\n(.*?)```", (REPOSITORY / "README.md").read_text(), flags=re.DOTALL)
+    assert first is not None
+    found.append(Step("own arrays", ["-c", ARRAYS + first[1]], "README.md, first example"))
+    own = commands("own-component.md")
+    found += [plan("own component", text) for text in own if "two" not in text]
+    found += [plan("study", text) for text in own if "two" in text]
+    for kind in ("evidence",) if smoke else starter_kinds("scenes"):
+        found.append(plan("every kind", f"mstfilter new {kind} my_{kind}.py"))
+    found.append(plan("viewer", "mstfilter view runs/mine --html run.html"))
+    if not smoke:
+        found += [plan("command line", text) for text in commands("tutorial.md")]
+    for name in ("comparing",) if smoke else NOTEBOOKS:
+        found.append(Step("notebook", ["-c", NOTEBOOK, str(DOCS / f"{name}.md")], f"docs/{name}.md"))
+    return found
+
+
+def play(step: Step, folder: Path) -> tuple[str, str, float]:
+    """Run a step; returns its fault or "", its output, its seconds."""
+    name = "python" if step.command[0] == "-c" else step.command[0]
+    arguments = step.command if name == "python" else ["-m", "mstfilter", *step.command]
+    start = time.perf_counter()
+    done = subprocess.run([sys.executable, *arguments], cwd=folder, capture_output=True, text=True, timeout=3600)
+    seconds, output = time.perf_counter() - start, done.stdout + done.stderr
+    if done.returncode:
+        return f"exit code {done.returncode}", output, seconds
+    if "Traceback" in output or "fault of the program" in output:
+        return "traceback", output, seconds
+    if not re.search(SHOWN[name], output):
+        return f"the output lacks {SHOWN[name]!r}", output, seconds
+    return "", output, seconds
+
+
+def main(out: Path, smoke: bool) -> int:
+    """Play all steps; returns the number that failed."""
+    from mstfilter.files import write_csv, write_text
+
+    rows, outputs = [], []
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        study = re.search(
+            r"^```toml\n(.*?)```", (DOCS / "own-component.md").read_text(), flags=re.DOTALL | re.MULTILINE
+        )
+        assert study is not None
+        (folder / "two.toml").write_text(study[1].replace('"0-1"', '"0"') if smoke else study[1])
+        waiting = steps(smoke)
+        while waiting:
+            step = waiting.pop(0)
+            fault, output, seconds = play(step, folder)
+            if step.part == "every kind" and step.command[0] == "new":  # the commands that it prints, as printed
+                printed = [line.split(maxsplit=1)[1] for line in output.splitlines() if line.startswith("next")]
+                waiting[:0] = [
+                    Step(step.part, shlex.split(text)[1:], text) for text in printed if text.startswith("mstfilter")
+                ]
+            rows.append({"part": step.part, "step": step.text, "fault": fault, "seconds": round(seconds, 1)})
+            outputs.append(f"$ {step.text}\n{output.replace(str(folder), '.').strip()}\n")
+            print(f"{seconds:6.1f} s  {step.text}  {fault}", flush=True)
+    out.mkdir(parents=True, exist_ok=True)
+    write_csv(out / "hour.csv", rows)
+    write_text(out / "outputs.txt", "\n".join(outputs))
+    failed = sum(bool(row["fault"]) for row in rows)
+    print(f"{len(rows)} steps, {failed} failed, {sum(row['seconds'] for row in rows) / 60:.0f} minutes")
+    return failed
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--smoke", action="store_true", help="small and quick; needs --out")
+    parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results")
+    options = parser.parse_args()
+    if options.smoke and options.out == parser.get_default("out"):
+        parser.error("--smoke would overwrite the results: name another folder with --out")
+    sys.exit(min(main(options.out, options.smoke), 1))
