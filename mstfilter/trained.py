@@ -24,7 +24,7 @@ from mstfilter.files import atomic_path, write_text
 from mstfilter.resources import models_folder
 
 WEIGHTS, DESCRIPTION = "weights.safetensors", "model.toml"
-_TRAIN = "train it with: mstfilter train {kind} --out FOLDER"
+_HINT = "train it with: mstfilter train completion or border --out FOLDER; others are written by write_model"
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,16 +56,15 @@ def open_model(name: str, architecture: str | None = None) -> TrainedModel:
     """
     given = Path(name)
     folder = given if given.is_dir() else models_folder() / name
-    hint = _TRAIN.format(kind="completion or border")
     for file in (DESCRIPTION, WEIGHTS):
         if not (folder / file).is_file():
             where = f"in the folder {given}" if given.is_dir() else f"in the package, and no folder {name!r}"
-            raise InputError(f"trained model {name!r}: there is no {file} {where}", hint)
+            raise InputError(f"trained model {name!r}: there is no {file} {where}", _HINT)
     text = (folder / DESCRIPTION).read_bytes()
     try:
         description = tomllib.loads(text.decode())
     except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise InputError(f"{folder / DESCRIPTION} is not a TOML file: {error}", hint) from None
+        raise InputError(f"{folder / DESCRIPTION} is not a TOML file: {error}", _HINT) from None
     if architecture is not None and description.get("architecture") != architecture:
         raise InputError(
             f"{folder / DESCRIPTION}: architecture is {description.get('architecture')!r}, expected {architecture!r}",
@@ -84,7 +83,7 @@ def open_model(name: str, architecture: str | None = None) -> TrainedModel:
     try:
         tensors = {key: value.astype(np.float32) for key, value in load(data).items()}
     except (SafetensorError, ValueError, KeyError, TypeError) as error:
-        raise InputError(f"{folder / WEIGHTS} is not a safetensors file: {error}", hint) from None
+        raise InputError(f"{folder / WEIGHTS} is not a safetensors file: {error}", _HINT) from None
     return TrainedModel(folder, description, tensors, hashlib.sha256(text + data).hexdigest()[:16])
 
 

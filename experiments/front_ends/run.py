@@ -1,6 +1,6 @@
 """Masks of another front end, given as alternatives: what does the filter add to the best of them?
 
-    python experiments/front_ends/run.py [--scenes 20] [--quality 0.7] [--smoke --out FOLDER]
+    python experiments/front_ends/run.py [--family demo] [--scenes 20] [--quality 0.7] [--smoke --out FOLDER]
 
 The true masks of each pause are degraded to the same quality in the image in three ways: objects are split, touching
 objects are merged, borders are displaced. The errors of an object last from pause to pause. The three label images
@@ -18,6 +18,7 @@ the one of `split`, `merged`, `displaced` with the best mean over all scenes.
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import tempfile
 from dataclasses import replace
@@ -65,9 +66,9 @@ def arms(folder: Path, masks: dict[str, list[np.ndarray]]) -> dict[str, tuple[st
     }
 
 
-def run_scene(seed: int, quality: float, small: bool) -> tuple[list[dict[str, Any]], np.ndarray]:
-    """Rows of all arms on a scene, and their counts of forecasts (arm, r, 1001, 7)."""
-    family = replace(scene_family("demo"), **(SMALL if small else {}))
+def run_scene(name: str, seed: int, quality: float, small: bool) -> tuple[list[dict[str, Any]], np.ndarray]:
+    """Rows of all arms on a scene of a family, and their counts of forecasts (arm, r, 1001, 7)."""
+    family = replace(scene_family(name), **(SMALL if small else {}))
     rows, counts = [], []
     with tempfile.TemporaryDirectory() as work:
         recording = simulate_recording(family, seed, Path(work) / "recording")
@@ -89,7 +90,7 @@ def run_scene(seed: int, quality: float, small: bool) -> tuple[list[dict[str, An
                 )
                 counted.append(score_belief(ask(recording, clip.index), labels, weights, truth).counts)
             means = {name: float(np.mean([one[name] for one in found])) for name in found[0]}
-            rows.append({"scene": f"demo-{seed}", "arm": arm, **means})
+            rows.append({"scene": f"{name}-{seed}", "arm": arm, **means})
             counts.append(np.sum(counted, axis=0))
     scene_cache.clear()
     return rows, np.stack(counts)
@@ -135,17 +136,19 @@ def summarise(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--scenes", type=int, default=20)
+    parser.add_argument("--family", default="demo", help="one or several families of scenes, separated by commas")
+    parser.add_argument("--scenes", type=int, default=20, help="scenes of each family")
     parser.add_argument("--quality", type=float, default=0.7)
     parser.add_argument("--smoke", action="store_true", help="two small scenes; needs --out")
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results")
     options = parser.parse_args()
     if options.smoke and options.out == parser.get_default("out"):
         parser.error("--smoke would overwrite the results: name another folder with --out")
-    for seed in range(2 if options.smoke else options.scenes):
-        path = options.out / "scenes" / f"demo-{seed}.json"
+    scenes = range(2 if options.smoke else options.scenes)
+    for family, seed in itertools.product(options.family.split(","), scenes):
+        path = options.out / "scenes" / f"{family}-{seed}.json"
         if not path.exists():
-            rows, counts = run_scene(seed, options.quality, options.smoke)
+            rows, counts = run_scene(family, seed, options.quality, options.smoke)
             path.parent.mkdir(parents=True, exist_ok=True)
             np.savez_compressed(path.with_suffix(".npz"), counts=counts)
             write_text(path, json.dumps(rows))  # written last: a scene with this file is finished

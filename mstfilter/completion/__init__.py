@@ -8,7 +8,7 @@ from mstfilter.lazy import attach
 
 __getattr__, __dir__, __all__ = attach(__name__, __file__)
 
-__interfaces__ = {"completer": "Completer"}
+__interfaces__ = {"completer": "Completer", "architecture": "Architecture"}
 __components__ = {
     "completer": {
         "extrude": "Extrude",

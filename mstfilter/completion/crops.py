@@ -7,12 +7,17 @@
 
 from __future__ import annotations
 
-from typing import Any
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
 from mstfilter.completion.completer import ObservedBox
 from mstfilter.scene import VoxelGrid
+
+if TYPE_CHECKING:
+    from torch import nn
 
 LATTICE = 0.01  # metres, edge of a voxel of the network's lattice
 EDGE = 32  # voxels, edge of a crop
@@ -34,6 +39,24 @@ CHANNELS = (
     "height",
     "extruded",
 )
+
+
+@dataclass(frozen=True)
+class Architecture(ABC):
+    """Builds a completion network of the user. Its weights are in the folder of a model (`mstfilter.trained`).
+
+    ``model.toml`` of the folder has the name of the class as `architecture`.
+    """
+
+    latent: ClassVar[int] = 0  #: length of the vector of standard normal noise that the network takes; 0 for none
+
+    @abstractmethod
+    def build(self) -> nn.Module:
+        """The network, with any weights.
+
+        Its input is (b, 8, X, Y, Z) float32, with the channels of `CHANNELS`, and, if
+        `latent` is not 0, (b, latent) float32. Its output are logits, (b, X, Y, Z) or (b, 1, X, Y, Z).
+        """
 
 
 def crop_box(voxels: np.ndarray, grid: VoxelGrid) -> tuple[np.ndarray, np.ndarray]:

@@ -1,7 +1,9 @@
-"""Completion by a trained network (`mstfilter.completion.unet`).
+"""Completion by a trained network: that of this package (`mstfilter.completion.unet`), or one of the user.
 
 >>> NetworkCompleter().complete(rng, frame, masks, grid)                     # the most probable extent
 >>> NetworkCompleter(draw=True).complete(rng, frame, masks, grid)            # a different extent for every hypothesis
+>>> NetworkCompleter(weights="trained/mine", architecture=MyArchitecture())  # an `Architecture` of the user
+>>> NetworkCompleter(weights="mine.onnx")                                    # needs the extra `onnx`
 
 The network works on a lattice of 1 cm. If the voxels of the workspace have another size, the object is completed on
 that lattice and the result is interpolated.
@@ -16,21 +18,24 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mstfilter.completion.completer import Completer, Completion, ObservedBox, finish, observed_box
-from mstfilter.completion.crops import BATCH, EDGE, LARGER, LATTICE, crop_box
-from mstfilter.scene import Frame, VoxelGrid
+from mstfilter.completion.crops import BATCH, EDGE, LARGER, LATTICE, Architecture, crop_box
+from mstfilter.errors import InputError, MissingLibraryError
+from mstfilter.scene import Frame, Recording, UsesFiles, VoxelGrid
 
 if TYPE_CHECKING:
     from mstfilter.completion.unet import TrainedNetwork
 
 
 @dataclass(frozen=True)
-class NetworkCompleter(Completer):
+class NetworkCompleter(Completer, UsesFiles):
     """Completion by a trained network.
 
     Parameters
     ----------
     weights : str
-        Name of a trained model of the package, or the folder of one (`mstfilter.trained`).
+        Name of a trained model of the package, or the folder of one (`mstfilter.trained`), or an ONNX file.
+    architecture : Architecture, optional
+        The architecture of a folder. Default: that of this package.
     draw : bool
         Draw the hidden extent for each hypothesis from the network's law, instead of taking its mode.
     spread : float
@@ -38,6 +43,7 @@ class NetworkCompleter(Completer):
     """
 
     weights: str = "completion"
+    architecture: Architecture | None = None
     draw: bool = False
     spread: float = 1.0
 
@@ -47,10 +53,19 @@ class NetworkCompleter(Completer):
 
     @property
     def network(self) -> TrainedNetwork:
-        """The network with its weights. Raises InputError if they are missing or damaged."""
-        from mstfilter.completion.unet import load_network
+        """The network with its weights. Raises InputError if they are missing or cannot be used."""
+        try:
+            from mstfilter.completion.unet import load_network
+        except ImportError as error:
+            raise MissingLibraryError(f"torch cannot be imported: {error}", "pip install torch") from error
+        network = load_network(self.weights, self.architecture)
+        if self.draw and not network.latent:
+            raise InputError(f"{self.weights}: the network takes no noise, so it cannot draw", "set draw=false")
+        return network
 
-        return load_network(self.weights)
+    def check_files(self, recording: Recording) -> None:
+        """Load the network."""
+        _ = self.network
 
     @property
     def weights_key(self) -> str:

@@ -10,12 +10,16 @@ V. Dumoulin, A. Courville, "FiLM: visual reasoning with a general conditioning l
 prior that depends on the input; in training from a posterior that also sees the true shape (conditional variational
 autoencoder; K. Sohn, H. Lee, X. Yan, "Learning structured output representation using deep conditional generative
 models", NeurIPS 2015).
+
+`load_network` also opens networks of users: an `Architecture` with weights in a folder, or an ONNX file.
 """
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
+import hashlib
+from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -24,8 +28,9 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from mstfilter.completion.completer import ObservedBox
-from mstfilter.completion.crops import BATCH, CHANNELS, channels, encode_box
-from mstfilter.trained import TrainedModel, calibrated_network, open_model
+from mstfilter.completion.crops import BATCH, CHANNELS, EDGE, LARGER, Architecture, channels, encode_box
+from mstfilter.errors import InputError, MissingLibraryError, describe_error
+from mstfilter.trained import calibrated_network, open_model
 
 ARCHITECTURE = "completion-unet"
 
@@ -133,6 +138,11 @@ class CompletionNet(nn.Module):
         logits = _to_voxels(self.head(functional.silu(x)).float())
         return logits + self.rule[0] + self.rule[1] * extruded.float()
 
+    def forward(self, x: Tensor, noise: Tensor) -> Tensor:
+        """Logits (b, X, Y, Z) of an input (b, channels, X, Y, Z), with standard normal noise (b, latent) for z."""
+        features, prior = self.encode(x)
+        return self.decode(features, prior.draw(noise))
+
 
 class ShapePosterior(nn.Module):
     """The law of z given the input and the true shape; used in training only."""
@@ -155,13 +165,24 @@ class ShapePosterior(nn.Module):
 
 
 class TrainedNetwork:
-    """A completion network that is ready for use."""
+    """A completion network that is ready for use.
 
-    def __init__(self, model: TrainedModel) -> None:
-        self.net, self.scale, self.shift = calibrated_network(
-            model, CHANNELS, lambda values: CompletionNet(len(CHANNELS), int(values["width"]), int(values["latent"]))
-        )
-        self.latent, self.key = self.net.prior.out_features // 2, model.key
+    Parameters
+    ----------
+    forward : callable
+        From the input (b, channels, X, Y, Z) and standard normal noise (b, latent) to logits (b, X, Y, Z).
+    latent : int
+        Length of the noise; 0 if the network does not draw.
+    key : str
+        Key of the contents of the weights.
+    scale, shift : float
+        Calibration of the logits.
+    """
+
+    def __init__(
+        self, forward: Callable[[Tensor, Tensor], Tensor], latent: int, key: str, scale: float = 1, shift: float = 0
+    ) -> None:
+        self.forward, self.latent, self.key, self.scale, self.shift = forward, latent, key, scale, shift
 
     def probabilities(self, seen: Sequence[ObservedBox], noise: Sequence[np.ndarray | None], edge: int) -> np.ndarray:
         """Calibrated probabilities (n, edge, edge, edge) float32 of at most `BATCH` boxes.
@@ -182,13 +203,95 @@ class TrainedNetwork:
                 drawn[k] = values
         with torch.inference_mode():
             x = channels(torch.from_numpy(bits), torch.from_numpy(signed), torch.from_numpy(height).float())
-            features, prior = self.net.encode(x)
-            logits = self.net.decode(features, prior.draw(torch.from_numpy(drawn)))
-            p = torch.sigmoid(self.scale * logits + self.shift)
+            p = torch.sigmoid(self.scale * self.forward(x, torch.from_numpy(drawn)) + self.shift)
         return np.asarray(p.numpy()[: len(seen)])
 
 
 @functools.lru_cache(maxsize=4)
-def load_network(name: str) -> TrainedNetwork:
-    """The network of a model's name or folder; see `mstfilter.trained.open_model`."""
-    return TrainedNetwork(open_model(name, ARCHITECTURE))
+def load_network(name: str, architecture: Architecture | None = None) -> TrainedNetwork:
+    """The network of a model's name or folder (see `mstfilter.trained.open_model`), or of an ONNX file.
+
+    A network of the user is tried on each size of crops. Raises InputError if it cannot be used.
+    """
+    if architecture is None and not name.endswith(".onnx"):
+        model = open_model(name, ARCHITECTURE)
+        net, scale, shift = calibrated_network(
+            model, CHANNELS, lambda values: CompletionNet(len(CHANNELS), int(values["width"]), int(values["latent"]))
+        )
+        return TrainedNetwork(net, net.prior.out_features // 2, model.key, scale, shift)
+    if name.endswith(".onnx"):
+        if architecture is not None:
+            raise InputError(f"{name} contains its architecture", "leave the field architecture out")
+        opened = _open_onnx(Path(name))
+    else:
+        assert architecture is not None
+        model = open_model(name, type(architecture).__name__)
+        built, latent = architecture.build(), architecture.latent
+        if not isinstance(built, nn.Module):
+            raise InputError(
+                f"build of {type(architecture).__name__} returns {type(built).__name__}, no torch.nn.Module"
+            )
+        net, scale, shift = calibrated_network(model, CHANNELS, lambda values: built)
+        forward = net if latent else lambda x, noise: net(x)
+        opened = TrainedNetwork(forward, latent, model.key, scale, shift)
+    opened.forward = functools.partial(_checked, name, opened.forward)
+    with torch.inference_mode():
+        for edge in (EDGE, *LARGER):
+            opened.forward(torch.zeros(1, len(CHANNELS), edge, edge, edge), torch.zeros(1, opened.latent))
+    return opened
+
+
+def _checked(name: str, forward: Callable[[Tensor, Tensor], Tensor], x: Tensor, noise: Tensor) -> Tensor:
+    """The logits (b, X, Y, Z) of a network of the user; InputError if it fails or its output cannot be used."""
+    try:
+        out = forward(x, noise)
+    except Exception as error:  # of the user's code or of the runtime: any
+        cause = describe_error(error).splitlines()[0]
+        raise InputError(f"{name}: the network fails on an input of shape {tuple(x.shape)}: {cause}") from error
+    shape = (len(x), *x.shape[2:])
+    found = tuple(out.shape) if isinstance(out, Tensor) else type(out).__name__
+    if not isinstance(out, Tensor) or found not in (shape, (len(x), 1, *shape[1:])):
+        raise InputError(
+            f"{name}: the output of the network is {found}, expected {shape}", "one logit for each voxel of the input"
+        )
+    if not out.isfinite().all():
+        raise InputError(f"{name}: the output of the network is not finite")
+    return out.reshape(shape).float()
+
+
+def _open_onnx(path: Path) -> TrainedNetwork:
+    try:
+        import onnxruntime
+    except ImportError as error:
+        raise MissingLibraryError(
+            f"a network in ONNX needs onnxruntime, which cannot be imported: {error}", "pip install 'mstfilter[onnx]'"
+        ) from error
+    if not path.is_file():
+        raise InputError(f"file of a network does not exist: {path}")
+    data = path.read_bytes()
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = 1  # results must not depend on the number of cores
+    options.log_severity_level = 4
+    try:  # from bytes, so that no other file is read
+        session = onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
+    except Exception as error:  # its errors have no common base
+        raise InputError(
+            f"{path} is no network that onnxruntime {onnxruntime.__version__} can run: {str(error).splitlines()[0]}",
+            "export it again with the weights in the same file: external_data=False",
+        ) from error
+    inputs = session.get_inputs()
+    x = inputs[0].shape if inputs else []
+    fixed = [n for k, n in enumerate(x) if k != 1 and isinstance(n, int)]
+    noise = inputs[1].shape if len(inputs) == 2 else [None, 0]
+    if len(x) != 5 or x[1] != len(CHANNELS) or fixed or len(inputs) > 2 or not isinstance(noise[-1], int):
+        raise InputError(
+            f"{path}: the inputs of the network are {[one.shape for one in inputs]}, expected "
+            f"[n, {len(CHANNELS)}, x, y, z], and [n, latent] for one that draws",
+            "export it with dynamic axes: all but the second of the first input, the first of the second",
+        )
+
+    def forward(x: Tensor, drawn: Tensor) -> Tensor:
+        given = {one.name: value.numpy() for one, value in zip(inputs, (x, drawn), strict=False)}
+        return torch.from_numpy(session.run(None, given)[0])
+
+    return TrainedNetwork(forward, noise[-1], hashlib.sha256(data).hexdigest()[:16])

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from mstfilter.errors import InputError, reason
+from mstfilter.errors import InputError, check_number, reason
 from mstfilter.formats.video import RecordingFormat, Video, VideoFormat, pair_stamps
 from mstfilter.scene import Frame, Recording, read_depth, read_labels, read_rgb, rigid_from_matrix, table_residual
 
@@ -103,23 +103,27 @@ class Redwood(VideoFormat):
     """Redwood / Open3D: color/, depth/, intrinsic.json, and a trajectory .log if the camera moves.
 
     ``intrinsic.json`` (or ``camera_intrinsic.json``) is the file of Open3D: width, height, ``intrinsic_matrix``
-    column by column. A trajectory has five lines per frame: three numbers, then a 4x4 camera-to-world matrix. Images
-    are paired by the first number in their names. Format: http://redwood-data.org/indoor/fileformat.html.
+    column by column, and from its recorders ``depth_scale`` (units per metre) and ``fps``. A trajectory has five
+    lines per frame: three numbers, then a 4x4 camera-to-world matrix. Images are paired by the first number in their
+    names. Format: http://redwood-data.org/indoor/fileformat.html.
 
     Further parameters: `VideoFormat`.
 
     Parameters
     ----------
+    depth_scale : float
+        Metres per unit of 16-bit depth. Default: from ``intrinsic.json``, else 0.001.
     distortion : tuple of float
         OpenCV's k1, k2, p1, p2, k3.
     fps : float
-        Frames per second; the layout stores no times.
+        Frames per second. Default: from ``intrinsic.json``, else 30; the layout stores no times.
     moving : bool
         Use the trajectory, if there is one.
     """
 
+    depth_scale: float = 0.0
     distortion: tuple[float, ...] = ()
-    fps: float = 30.0
+    fps: float = 0.0
     moving: bool = True
 
     @classmethod
@@ -148,14 +152,16 @@ class Redwood(VideoFormat):
             raise InputError(
                 f"{path} has {len(logs)} trajectories: {', '.join(p.name for p in logs)}", "remove all but one"
             )
+        scale = self.depth_scale or 1 / _stored(path, "depth_scale", 1000)
+        fps = self.fps or _stored(path, "fps", 30)
         video = Video(
             path.resolve().name,
-            tuple(k / self.fps for k in range(len(colour))),
+            tuple(k / fps for k in range(len(colour))),
             lambda index: read_rgb(colour[index]),
-            lambda index: read_depth(depth[index], self.depth_scale),
+            lambda index: read_depth(depth[index], scale),
             self.K or _intrinsics(path),
             path,
-            self.depth_scale,
+            scale,
             motion=_trajectory(logs[0], len(colour)) if logs else None,
             distortion=self.distortion,
         )
@@ -178,9 +184,24 @@ def _number(file: Path) -> int:
     return int(found.group()) if found else -1
 
 
+def _open3d_file(path: Path) -> Path | None:
+    return next((path / name for name in _INTRINSICS if (path / name).is_file()), None)
+
+
+def _stored(path: Path, name: str, default: float) -> float:
+    """A number of at least 1 from Open3D's file: ``depth_scale`` (units per metre) or ``fps``."""
+    file = _open3d_file(path)
+    try:
+        value = default if file is None else json.loads(file.read_text()).get(name, default)
+    except (OSError, ValueError, AttributeError) as error:
+        raise InputError(f"{file} is not a file of Open3D: {error}") from error
+    check_number(f"{file}: {name}", value, f"give it: {name}=VALUE", at_least=1)
+    return float(value)
+
+
 def _intrinsics(path: Path) -> tuple[float, ...]:
     """fx, fy, cx, cy from Open3D's file."""
-    file = next((path / name for name in _INTRINSICS if (path / name).is_file()), None)
+    file = _open3d_file(path)
     if file is None:
         raise InputError(
             f"{path}: intrinsics are missing, there is no {_INTRINSICS[0]}",

@@ -115,6 +115,21 @@ def test_redwood(tmp_path):
     same_on_disk(recording, tmp_path / "out")
 
 
+def test_depth_scale_and_rate_of_the_recorders_of_open3d(tmp_path):
+    """Units per metre and frames per second are those of intrinsic.json, unless they are given."""
+    path = write_redwood(tmp_path / "frames", SHIFTS, scale=0.00025)
+    edit(path / "intrinsic.json", lambda d: d.update(depth_scale=4000.0, fps=FPS, device_name="Intel RealSense L515"))
+    recording = Redwood(world=WORLD).open(path)
+    _, depth, _ = video()
+    assert recording.depth_scale == 0.00025
+    np.testing.assert_allclose(recording.times[1], 1 / FPS)
+    np.testing.assert_allclose(np.nan_to_num(recording.frames[0].depth), np.nan_to_num(depth[0]), atol=0.0002)
+    assert Redwood(depth_scale=0.000251, world=WORLD).open(path).depth_scale == 0.000251
+    edit(path / "intrinsic.json", lambda d: d.update(depth_scale=0.00025))
+    with pytest.raises(InputError, match="depth_scale is 0.00025, expected a finite number of at least 1"):
+        Redwood().open(path)
+
+
 def test_redwood_trajectory(tmp_path):
     path = write_redwood(tmp_path / "redwood")
     blocks = [

@@ -97,7 +97,7 @@ def test_nothing_is_overwritten(tmp_path, capsys):
     assert "test_mine.py exists already" in err
     assert [p.name for p in tmp_path.iterdir()] == ["test_mine.py"]
     for kind, name, message in (
-        ("spoon", "mine.py", "there are: boundary, codec"),
+        ("spoon", "mine.py", "there are: architecture, boundary"),
         ("transitoin", "mine.py", "did you mean transition?"),
         ("update", "my-own.py", "cannot be imported"),
         ("update", "mine.txt", "cannot be imported"),
