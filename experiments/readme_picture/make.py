@@ -4,7 +4,7 @@
     python experiments/readme_picture/make.py --smoke --out FILE    # a small scene: shows only that it works
 
 Rows are the first, second and last pause; columns the image, the heaviest hypothesis, the one that differs most from
-it, and the voxels of the heaviest.
+it, and the voxels of the heaviest. An object has the same colour in all pictures.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ import numpy as np
 from mstfilter.presets import load_config
 from mstfilter.report import assign_identities, overlay, viewpoint, voxel_picture
 from mstfilter.runs import RunFolder, filter_recording
-from mstfilter.scene import project, write_image
+from mstfilter.scene import project
 from mstfilter.scoring import weighted_coverage
 from mstfilter.simulation import scene_family, simulate_recording
 
-WIDTH, HEIGHT, GAP = 400, 300, 10
+WIDTH, HEIGHT = 400, 300
 SMALL = {"width": 160, "height": 120, "n_actions": 1, "frames_per_clip": 8, "voxel_size": 0.02}
 PICTURE = Path("docs/images/demo.png")
-PAPER = np.array([252, 252, 250], float)
+HEADS = ("image", "heaviest hypothesis", "another hypothesis", "voxels of the heaviest")
 
 
 def window(masks: list[np.ndarray], shape: tuple[int, int]) -> tuple[slice, slice]:
@@ -40,39 +40,48 @@ def window(masks: list[np.ndarray], shape: tuple[int, int]) -> tuple[slice, slic
     return slice(low[0], high[0]), slice(low[1], high[1])
 
 
-def row(run: RunFolder, t: int, box: tuple[slice, slice], colours, view) -> np.ndarray:
-    """Image, two hypotheses, voxels of a pause."""
-    import cv2
+def draw(run: RunFolder, out: Path) -> None:
+    """Draw three pauses of a run below each other."""
+    import matplotlib.style
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
 
-    camera, rgb, hypotheses = run.camera(t), run.rgb(t), run.hypotheses(t)
-    heaviest = int(np.argmax(run.info(t)["weights"]))
-    other = int(np.argmin([weighted_coverage(h.labels, hypotheses[heaviest].labels) for h in hypotheses]))
-    cells = [rgb[box]]
-    for k in (heaviest, other):
-        cells.append(overlay(rgb, project(hypotheses[k], camera), colours.colours(t, k))[box])
-    shown = voxel_picture(hypotheses[heaviest].labels, hypotheses[heaviest].grid, view, colours.colours(t, heaviest))
-    alpha = shown[..., 3:] / 255.0
-    cells.append(np.rint(shown[..., :3] * alpha + PAPER * (1 - alpha)).astype(np.uint8))
-    cells = [cv2.resize(cell, (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA) for cell in cells]
-    gap = np.broadcast_to(PAPER.astype(np.uint8), (HEIGHT, GAP, 3))
-    return np.hstack([part for cell in cells for part in (cell, gap)][:-1])
+    colours, pauses = assign_identities(run), (0, 1, run.n_pauses - 1)
+    everything = [h for t in pauses for h in run.hypotheses(t)]
+    view = viewpoint(everything, run.camera(0), WIDTH, HEIGHT)
+    masks = [project(h, run.camera(0)) > 0 for h in everything]
+    box = window(masks, masks[0].shape)
+    with matplotlib.style.context("mstfilter.report.figures"):
+        figure = Figure((8.75, 5.2), layout="constrained")
+        FigureCanvasAgg(figure)
+        figure.get_layout_engine().set(w_pad=0.02, h_pad=0.02, wspace=0.01, hspace=0.01)
+        for t, line in zip(pauses, figure.subplots(3, 4), strict=True):
+            hypotheses, camera, rgb = run.hypotheses(t), run.camera(t), run.rgb(t)
+            heaviest = int(np.argmax(run.info(t)["weights"]))
+            other = int(np.argmin([weighted_coverage(h.labels, hypotheses[heaviest].labels) for h in hypotheses]))
+            labels, grid, own = hypotheses[heaviest].labels, hypotheses[heaviest].grid, colours.colours(t, heaviest)
+            cells = [rgb[box]]
+            cells += [
+                overlay(rgb, project(hypotheses[k], camera), colours.colours(t, k))[box] for k in (heaviest, other)
+            ]
+            cells.append(voxel_picture(labels, grid, view, own))
+            for axes, cell, head in zip(line, cells, HEADS, strict=True):
+                axes.imshow(cell, aspect="auto", interpolation="antialiased")
+                axes.set(xticks=[], yticks=[], title=head if t == 0 else "")
+                axes.spines[:].set_visible(False)
+                axes.title.set_horizontalalignment("left")
+            seconds = run.description["recording"]["times"][t]
+            line[0].set_ylabel(f"pause {t}, {seconds:.0f} s")
+        out.parent.mkdir(parents=True, exist_ok=True)
+        figure.savefig(out, dpi=150, metadata={"Software": None})
 
 
 def main(seed: int, out: Path, smoke: bool) -> None:
-    """Simulate, filter, and paste the pauses together."""
+    """Simulate, filter, draw."""
     with tempfile.TemporaryDirectory() as folder:
         family = replace(scene_family("demo"), **SMALL) if smoke else scene_family("table")
         recording = simulate_recording(family, seed, Path(folder) / "recording")
-        run = filter_recording(recording, load_config("mst"), Path(folder) / "run", seed=0)
-        colours, pauses = assign_identities(run), (0, 1, run.n_pauses - 1)
-        everything = [h for t in pauses for h in run.hypotheses(t)]
-        view = viewpoint(everything, run.camera(0), WIDTH, HEIGHT)
-        masks = [project(h, run.camera(0)) > 0 for h in everything]
-        box = window(masks, masks[0].shape)
-        rows = [row(run, t, box, colours, view) for t in pauses]
-    gap = np.broadcast_to(PAPER.astype(np.uint8), (GAP, rows[0].shape[1], 3))
-    out.parent.mkdir(parents=True, exist_ok=True)
-    write_image(out, np.vstack([part for line in rows for part in (line, gap)][:-1]))
+        draw(filter_recording(recording, load_config("mst"), Path(folder) / "run", seed=0), out)
     print(out)
 
 

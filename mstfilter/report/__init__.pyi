@@ -1,5 +1,10 @@
 from mstfilter.report.export import export_mesh as export_mesh, export_run as export_run
-from mstfilter.report.figures import SERIES as SERIES, figure_groups as figure_groups, time_figure as time_figure
+from mstfilter.report.figures import (
+    SERIES as SERIES,
+    draw_forest as draw_forest,
+    figure_groups as figure_groups,
+    time_figure as time_figure,
+)
 from mstfilter.report.identities import (
     TRUTH as TRUTH,
     Identities as Identities,

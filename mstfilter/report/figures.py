@@ -392,13 +392,13 @@ def forest_height(rows: Sequence[ForestRow]) -> float:
 
 
 def draw_forest(axes: Axes, rows: Sequence[ForestRow]) -> None:
-    """Draw differences with their intervals below each other, under the names of their groups."""
+    """Draw differences with their intervals below each other, under the names of their groups, if these are given."""
     axes.grid(axis="y", visible=False)
     axes.grid(axis="x")
     axes.axvline(0, color=_MUTED, lw=1.0)
     y, ticks = 0.0, []
     for k, (group, name, (mean, low, high), mark) in enumerate(rows):
-        if k == 0 or group != rows[k - 1][0]:
+        if group and (k == 0 or group != rows[k - 1][0]):
             y += 0.9 * (k > 0)
             ticks.append((y, group, True))
             y += 0.9

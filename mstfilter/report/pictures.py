@@ -107,10 +107,15 @@ def overlay_layer(
 def overlay(
     rgb: np.ndarray, labels: np.ndarray, colours: Mapping[int, Colour], *, fill: float = 0.42, line: int = 2
 ) -> np.ndarray:
-    """An image (H, W, 3) with a label image (H, W) over it: translucent fill and contours."""
+    """An image (H, W, 3) with a label image (H, W) over it: translucent fill and contours.
+
+    Inside objects the image is grey (luma of ITU-R BT.601), so that an object has the hue of its colour.
+    """
     above = overlay_layer(labels, colours, fill=fill, line=line).astype(float)
     alpha = above[..., 3:] / 255
-    return np.rint(rgb * (1 - alpha) + above[..., :3] * alpha).astype(np.uint8)
+    grey = rgb @ np.array([0.299, 0.587, 0.114])
+    below = np.where(labels[..., None] > 0, grey[..., None], rgb)
+    return np.rint(below * (1 - alpha) + above[..., :3] * alpha).astype(np.uint8)
 
 
 def _occupied_points(volumes: Iterable[_Volume]) -> tuple[np.ndarray, VoxelGrid]:
