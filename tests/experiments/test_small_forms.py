@@ -238,6 +238,15 @@ def test_inference(tmp_path):
     assert "4 data sets" not in run_script(*arguments).split("chi-square")[0], "finished data sets are not run again"
 
 
+@pytest.mark.slow
+def test_newcomer(tmp_path):
+    """The first hour of a new user: commands of the documentation in processes of their own."""
+    assert "0 failed" in run_script("newcomer/run.py", "--smoke", "--out", tmp_path)
+    rows = read_csv(tmp_path / "hour.csv")
+    assert {row["part"] for row in rows} >= {"demo", "own arrays", "own component", "study", "viewer", "notebook"}
+    assert [row["step"] for row in rows if row["fault"]] == []
+
+
 @pytest.mark.parametrize(("script", "table"), [("trials", "results"), ("sharing", "sharing")])
 def test_study_runner(tmp_path, script, table):
     local = mock.patch("mstfilter.study.Local", lambda workers: InProcess()) if script == "sharing" else nullcontext()
