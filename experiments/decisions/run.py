@@ -55,7 +55,7 @@ def measure(loop: PushLoop, state: State) -> tuple[dict[str, float], np.ndarray]
     volume = np.array([(first == k).sum() for k in objects], dtype=float)
     tables = [overlap(one, now) for one in labels]
     found = np.array([[np.nan_to_num(coverage_of(table, [k])) for k in objects] for table in tables])
-    scores, counts = score_belief(ask(recording, t), labels, weights, now)
+    scores, counts = score_belief(ask(recording, t), state.population.particles, weights, now)
     row = {
         "coverage": float((found @ volume / volume.sum()).mean()),
         "quality": pause_metrics(labels, weights, now, {})[0]["quality"],

@@ -88,7 +88,8 @@ def run_scene(name: str, seed: int, quality: float, small: bool) -> tuple[list[d
                         "mean_quality": pause_metrics(labels, weights, truth, {})[0]["quality_weighted"],
                     }
                 )
-                counted.append(score_belief(ask(recording, clip.index), labels, weights, truth).counts)
+                hypotheses = state.population.particles
+                counted.append(score_belief(ask(recording, clip.index), hypotheses, weights, truth).counts)
             means = {name: float(np.mean([one[name] for one in found])) for name in found[0]}
             rows.append({"scene": f"{name}-{seed}", "arm": arm, **means})
             counts.append(np.sum(counted, axis=0))

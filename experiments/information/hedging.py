@@ -59,11 +59,12 @@ def main(study: Path, out: Path) -> None:
         for noisy in (False, True):
             total, energy = np.zeros(1, np.int64), []
             for t in range(1, done.n_pauses):
-                labels, weights = [h.labels for h in done.hypotheses(t)], np.array(done.info(t)["weights"])
+                hypotheses: list = list(done.hypotheses(t))
+                weights = np.array(done.info(t)["weights"])
                 if noisy:
-                    labels = [with_noise(one, rng) for one in labels for _ in range(COPIES)]
+                    hypotheses = [with_noise(one.labels, rng) for one in hypotheses for _ in range(COPIES)]
                     weights = np.repeat(weights, COPIES) / COPIES
-                score = score_belief(ask(opened[name], t), labels, weights, opened[name].truth(t))
+                score = score_belief(ask(opened[name], t), hypotheses, weights, opened[name].truth(t))
                 total, energy = total + score.counts, [*energy, score.row["energy"]]
             counts.setdefault((run["group"], arm, noisy), {})[name] = total
             energies.setdefault((arm, noisy), {})[name] = float(np.mean(energy))

@@ -16,6 +16,7 @@ import numpy as np
 
 from mstfilter.errors import InputError
 from mstfilter.fusion import FreeSpace, FusionUpdate, Projection, log_quality
+from mstfilter.fusion.division import divided
 from mstfilter.scene import Clip
 from mstfilter.smc import Population, Update, union
 
@@ -80,8 +81,10 @@ class Union(Update):
         if predicted is None or proposed is None:
             return self.fusion.update(rng, predicted, proposed, observation)
         refined, quality = self.fusion.free_space.refine(predicted.particles, observation)
-        refined = self.fusion.divided(refined, observation, proposed=False)
-        samples = self.fusion.divided(tuple(proposed.particles), observation, proposed=True)
+        refined = divided(self.fusion.division, self.fusion.parts, refined, observation, proposed=False)
+        samples = divided(
+            self.fusion.division, self.fusion.parts, tuple(proposed.particles), observation, proposed=True
+        )
         log_q = self.fusion.quality_exponent * log_quality(quality)
         weighed = predicted.log_weights - predicted.log_mean_weight + log_q
         both = union(

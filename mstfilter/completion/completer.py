@@ -30,16 +30,24 @@ from typing import ClassVar
 import numpy as np
 from scipy.spatial import cKDTree
 
+from mstfilter.completion.observed import (
+    ObservedBox,
+    encode_box,
+    mask_voxels,
+    observed_in,
+    observed_box,
+    recall,
+    view_surface,
+)
 from mstfilter.errors import InputError
 from mstfilter.scene import (
     Clip,
     Frame,
+    ObjectView,
+    Occupancy,
     VoxelGrid,
     component_key,
     content_key,
-    depth_sigma,
-    frame_geometry,
-    memo,
     memo_many,
     read_only,
 )
@@ -61,25 +69,6 @@ class Completion:
         """Slices of the box in the grid."""
         a, b, c = (slice(int(o), int(o) + n) for o, n in zip(self.offset, self.probability.shape, strict=True))
         return a, b, c
-
-
-@dataclass(frozen=True, eq=False)
-class ObservedBox:
-    """What a frame shows of a box of the grid around one mask."""
-
-    points: np.ndarray  #: (a, b, c) int32: readings of the mask in each voxel
-    #: (a, b, c) bool, visible surface of the mask: the pixel of the voxel's centre is in the mask, and the centre
-    #: is at the measured surface or just behind it. If no centre falls into a small mask, the voxel with most
-    #: readings.
-    surface: np.ndarray
-    other_surface: np.ndarray  #: (a, b, c) bool, visible surface outside the mask, by the same rule
-    free: np.ndarray  #: (a, b, c) bool, observed as free
-    #: (a, b, c) bool, the pixel of the centre is in the mask and the centre is behind the measured surface.
-    behind: np.ndarray
-    hidden: np.ndarray  #: (a, b, c) bool, the same for a pixel outside the mask: hidden by something else.
-    #: (a, b, c) float32, voxels behind the measured surface along the optical axis; NaN if it is unknown.
-    signed: np.ndarray
-    height: np.ndarray  #: (c,) height of the voxel centres above the table in metres
 
 
 @dataclass(frozen=True)
@@ -175,6 +164,48 @@ class Completer(ABC):
             return compute(range(len(masks)))
         return memo_many("completion", names, compute, Completion)
 
+    def complete_again(
+        self,
+        rngs: Sequence[np.random.Generator],
+        frame: Frame,
+        objects: Sequence[tuple[np.ndarray, tuple[ObjectView, ...]]],
+        grid: VoxelGrid,
+    ) -> list[tuple[Completion, ObjectView | None]]:
+        """Complete objects from a frame and from earlier views of them.
+
+        Each object is its mask (H, W) bool in the frame, which may be empty, and its views, moved to where the
+        object is now. Each result is the completion, and the view of the frame; None if the frame shows nothing.
+        """
+        component = component_key(self)
+        version = (self.weights_key,) if self.weights_key else ()
+        names = [
+            content_key(
+                "again", np.packbits(mask), frame.key, grid.key, component, *version, *(v.name for v in views)
+            )
+            for mask, views in objects
+        ]
+
+        def compute(missing: Sequence[int]) -> list[tuple[Completion, ObjectView | None]]:
+            boxes = []
+            for k in missing:
+                mask, views = objects[k]
+                voxels = np.concatenate([mask_voxels(frame, mask, grid), *(view_surface(v, grid) for v in views)])
+                voxels = voxels[grid.contains(voxels)]
+                low, high = self.box(voxels, grid) if len(voxels) else (np.zeros(3, np.int64),) * 2
+                now = observed_in(frame, mask, grid, self, low, high)
+                boxes.append((low, now, recall(now, low, grid, views)))
+            filled = self.fill_many([rngs[k] for k in missing], [seen for *_, seen in boxes])
+            found = []
+            for k, (offset, now, seen), p in zip(missing, boxes, filled, strict=True):
+                key = names[k].hex()[:16]
+                view = ObjectView(offset, *encode_box(now), key) if now.surface.any() else None
+                found.append((finish(offset, seen, p, key), view))
+            return found
+
+        if self.stochastic:
+            return compute(range(len(objects)))
+        return memo_many("completion_again", names, compute)
+
 
 def finish(offset: np.ndarray, seen: ObservedBox, filled: np.ndarray, key: str) -> Completion:
     """A completion after the veto of free space; a visible object keeps its surface if nothing of it is left."""
@@ -191,64 +222,6 @@ class ClipCompleter(Completer):
     @abstractmethod
     def at(self, clip: Clip) -> Completer:
         """The completer of the clip's last frame."""
-
-
-def observed_box(frame: Frame, mask: np.ndarray, grid: VoxelGrid, rule: Completer) -> tuple[np.ndarray, ObservedBox]:
-    """The box of a mask: its offset (3,) in the grid, and what the frame shows of it.
-
-    `rule` says how large the box is, and what counts as visible surface and as free space.
-    """
-    pixels, voxels = _frame_points(frame, grid)
-    mine = voxels[mask.ravel()[pixels]]
-    if len(mine) == 0:
-        empty = np.zeros((0, 0, 0))
-        no = empty.astype(bool)
-        unknown = empty.astype(np.float32)
-        return np.zeros(3, np.int64), ObservedBox(empty.astype(np.int32), no, no, no, no, no, unknown, np.zeros(0))
-    low, high = rule.box(mine, grid)
-    box = tuple(slice(int(a), int(b)) for a, b in zip(low, high, strict=True))
-    shape = tuple(int(n) for n in high - low)
-    mine = mine[((mine >= low) & (mine < high)).all(axis=1)]
-    flat = np.ravel_multi_index(tuple((mine - low).T), shape)
-    points = np.bincount(flat, minlength=int(np.prod(shape))).reshape(shape).astype(np.int32)
-
-    geometry = frame_geometry(frame, grid)
-    pixel, signed = geometry.pixel[box], geometry.signed[box]
-    inside = (pixel >= 0) & mask.ravel()[np.maximum(pixel, 0)]
-    with np.errstate(invalid="ignore"):
-        surface = (signed >= -rule.in_front * grid.voxel_size) & (signed < rule.depth * grid.voxel_size)
-        behind = signed > 0
-    in_mask = surface & inside
-    free = _free(frame, grid, rule.free_margin, rule.free_sigmas)[box]
-    if not in_mask.any():
-        in_mask[np.unravel_index(points.argmax(), shape)] = True
-        free = free & ~in_mask
-    height = grid.origin[2] + (np.arange(shape[2]) + 0.5) * grid.voxel_size
-    other = surface & ~inside & ~in_mask
-    distance = signed / np.float32(grid.voxel_size)
-    return low, ObservedBox(points, in_mask, other, free, behind & inside, behind & ~inside, distance, height)
-
-
-def _frame_points(frame: Frame, grid: VoxelGrid) -> tuple[np.ndarray, np.ndarray]:
-    """Flat pixels with a reading inside the grid (k,), and their voxels (k, 3)."""
-
-    def compute() -> tuple[np.ndarray, np.ndarray]:
-        index = grid.index_of(frame.points)
-        pixels = np.flatnonzero(frame.valid & grid.contains(index))
-        return read_only(pixels), read_only(index.reshape(-1, 3)[pixels].astype(np.int32))
-
-    return memo("frame_points", (frame.key, grid.key), compute)
-
-
-def _free(frame: Frame, grid: VoxelGrid, margin: float, sigmas: float) -> np.ndarray:
-    """Voxels (X, Y, Z) bool in front of the measured surface by `margin` voxels and by `sigmas` of its noise."""
-
-    def compute() -> np.ndarray:
-        geometry = frame_geometry(frame, grid)
-        distance = np.maximum(margin * grid.voxel_size, sigmas * depth_sigma(geometry.z - geometry.signed))
-        return read_only(geometry.known_free(distance))
-
-    return memo("seen_free", (frame.key, grid.key, margin, sigmas), compute)
 
 
 def arbitrate(completions: Sequence[Completion], grid: VoxelGrid, threshold: float = 0.5) -> np.ndarray:
@@ -274,6 +247,30 @@ def arbitrate(completions: Sequence[Completion], grid: VoxelGrid, threshold: flo
     if tied.any():
         _break_ties(labels, tied, most, best, completions, threshold)
     return labels
+
+
+def occupancy_of(
+    completions: Sequence[Completion], labels: np.ndarray, grid: VoxelGrid, least: float = 0.02
+) -> Occupancy | None:
+    """The probabilities of the completions of one hypothesis; None if all are 0 or 1.
+
+    A voxel is free or belongs to one of the objects that claim it. The odds of an object against free space are those
+    of its completion. `labels` (X, Y, Z) are those of `arbitrate`; probabilities below `least` count as 0.
+    """
+    if all(((one.probability == 0) | (one.probability == 1)).all() for one in completions):
+        return None
+    owner, best = labels.copy(), np.zeros(grid.shape, np.float32)
+    total = np.ones(grid.shape, np.float32)
+    for k, one in enumerate(completions):
+        box = one.box
+        p = np.clip(one.probability, 0, 0.999)
+        odds = np.where(p >= least, p / (1 - p), 0).astype(np.float32)
+        total[box] += odds
+        own, best_here = labels[box] == k + 1, best[box]
+        more = (labels[box] == 0) & (odds > best_here)
+        owner[box][more] = k + 1
+        best[box] = np.where(own | more, odds, best_here)
+    return Occupancy(owner, best / total)
 
 
 def _break_ties(

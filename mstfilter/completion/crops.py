@@ -1,7 +1,6 @@
 """What the completion network sees of an object: a crop of the voxel lattice around its visible part.
 
 >>> low, high = crop_box(voxels, grid)                     # the limits of the crop
->>> bits, signed = encode_box(seen)                        # packed, for storage
 >>> x = channels(bits, signed, height)                     # the input of the network
 """
 
@@ -13,7 +12,6 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from mstfilter.completion.completer import ObservedBox
 from mstfilter.scene import VoxelGrid
 
 if TYPE_CHECKING:
@@ -24,10 +22,9 @@ EDGE = 32  # voxels, edge of a crop
 LARGER = (48, 64)  # crops for larger objects: the network is convolutional
 #: Boxes of a batch. Results do not depend on the other boxes of a batch only if all batches have one size.
 BATCH = 8
-_REACH = 4.0  # voxels, distance from the surface at which `signed` saturates
 
 #: Channels of the input. The first five and the last are 0 or 1; "distance" is the signed distance behind the
-#: measured surface, in units of `_REACH`, 0 where it is unknown; "height" is above the table, in units of 0.25 m;
+#: measured surface, in units of 4 voxels, 0 where it is unknown; "height" is above the table, in units of 0.25 m;
 #: "extruded" is what `Extrude` gives, from which the network starts.
 CHANNELS = (
     "own surface",
@@ -72,20 +69,6 @@ def crop_box(voxels: np.ndarray, grid: VoxelGrid) -> tuple[np.ndarray, np.ndarra
     start = np.floor((low + high + 1) / 2).astype(np.int64) - edge // 2
     start[2] = 0
     return np.maximum(start, 0), np.minimum(start + edge, grid.shape)
-
-
-def encode_box(seen: ObservedBox) -> tuple[np.ndarray, np.ndarray]:
-    """What a box shows as bits (a, b, c) uint8, and its signed distances (a, b, c) int8 in `_REACH` / 127."""
-    bits = np.zeros(seen.surface.shape, np.uint8)
-    for k, one in enumerate((seen.surface, seen.other_surface, seen.free, seen.behind, seen.hidden)):
-        bits |= one.astype(np.uint8) << k
-    signed = np.clip(np.nan_to_num(seen.signed, nan=0.0) / _REACH, -1, 1)
-    return bits, np.rint(signed * 127).astype(np.int8)
-
-
-def decode_signed(signed: np.ndarray) -> np.ndarray:
-    """Signed distances in voxels, of `encode_box`."""
-    return np.asarray(signed, np.float32) * np.float32(_REACH / 127)
 
 
 def channels(bits: Any, signed: Any, height: Any) -> Any:

@@ -9,7 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mstfilter.completion.completer import Completer, ObservedBox
+from mstfilter.completion.completer import Completer
+from mstfilter.completion.observed import ObservedBox
 
 
 @dataclass(frozen=True)

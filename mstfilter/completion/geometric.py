@@ -14,8 +14,9 @@ from scipy.spatial import ConvexHull, Delaunay, QhullError
 from scipy.spatial.distance import cdist
 from scipy.special import expit
 
-from mstfilter.completion.completer import Completer, ObservedBox
+from mstfilter.completion.completer import Completer
 from mstfilter.completion.extrude import Extrude
+from mstfilter.completion.observed import ObservedBox
 
 
 @dataclass(frozen=True)

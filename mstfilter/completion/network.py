@@ -17,8 +17,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from mstfilter.completion.completer import Completer, Completion, ObservedBox, finish, observed_box
+from mstfilter.completion.completer import Completer, Completion, finish
 from mstfilter.completion.crops import BATCH, EDGE, LARGER, LATTICE, Architecture, crop_box
+from mstfilter.completion.observed import ObservedBox, observed_box
 from mstfilter.errors import InputError, MissingLibraryError
 from mstfilter.scene import Frame, Recording, UsesFiles, VoxelGrid
 

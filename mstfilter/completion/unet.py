@@ -27,8 +27,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from mstfilter.completion.completer import ObservedBox
-from mstfilter.completion.crops import BATCH, CHANNELS, EDGE, LARGER, Architecture, channels, encode_box
+from mstfilter.completion.crops import BATCH, CHANNELS, EDGE, LARGER, Architecture, channels
+from mstfilter.completion.observed import ObservedBox, encode_box
 from mstfilter.errors import InputError, MissingLibraryError, describe_error
 from mstfilter.trained import calibrated_network, open_model
 

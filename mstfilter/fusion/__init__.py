@@ -30,7 +30,7 @@ __interfaces__ = {
     "mode_filter": "ModeFilter",
 }
 __components__ = {
-    "update": {"fusion": "FusionUpdate", "projection": "ProjectionUpdate"},
+    "update": {"fusion": "FusionUpdate", "projection": "ProjectionUpdate", "partition": "PartitionUpdate"},
     "similarity": {"weighted_coverage": "WeightedCoverage"},
     "equivalence": {"same_segmentation": "SameSegmentation"},
     "free_space": {"projective": "FreeSpace", "none": "NoFreeSpace"},

@@ -27,6 +27,7 @@ from mstfilter.fusion.interfaces import (
     Projection as Projection,
     Structure as Structure,
 )
+from mstfilter.fusion.partition import PartitionUpdate as PartitionUpdate
 from mstfilter.fusion.similarity import (
     Agreement as Agreement,
     SameSegmentation as SameSegmentation,

@@ -9,9 +9,10 @@
 >>> belief.push_map(tolerance=50)                                 # information of a push at each voxel
 
 Hypothesis i has labels L_i and the normalised weight w_i. Labels of different hypotheses are unrelated, so no query
-compares them, and renaming them changes no result. Voxels are integer indices (x, y, z); `Belief.voxel` and
-`Belief.box` convert metres. Pixels are (column, row). A region is a bool array of the grid's shape, or voxels
-(..., 3). Entropy and information are in nats (divide by log 2 for bits).
+compares them, and renaming them changes no result. Probabilities of voxels also use how sure a hypothesis is of each
+(`Hypothesis.occupancy`); queries of segmentations and actions use the labels. Voxels are integer indices (x, y, z);
+`Belief.voxel` and `Belief.box` convert metres. Pixels are (column, row). A region is a bool array of the grid's
+shape, or voxels (..., 3). Entropy and information are in nats (divide by log 2 for bits).
 
 **Information.** Every action (look at a region, look from a camera, push) has one outcome under each hypothesis. Its
 expected information is the mutual information of hypothesis and outcome. Without noise this is the entropy of the
@@ -23,6 +24,7 @@ With `tolerance` (in voxels or pixels), outcomes that differ by much less than i
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -167,26 +169,40 @@ class Belief:
     # Probabilities --------------------------------------------------------------------------------------------
 
     def occupancy(self) -> np.ndarray:
-        """Probability (X, Y, Z) that a voxel is occupied: ``p(v) = sum_i w_i [L_i(v) > 0]``."""
-        return (self._mass @ (self._refined.objects > 0))[self._refined.cells]
+        """Probability (X, Y, Z) that a voxel is occupied: ``p(v) = sum_i w_i o_i(v)``.
+
+        o_i(v) is the probability of hypothesis i that v belongs to its most probable object (`Hypothesis.shares`).
+        """
+        shares = [h.shares.probability for h in self._merged[0]]
+        return sum((w * p.astype(np.float64) for w, p in zip(self._mass, shares, strict=True)), np.zeros(()))
 
     def occupancy_entropy(self) -> np.ndarray:
         """Entropy (X, Y, Z) of "occupied or free": ``-p log p - (1 - p) log(1 - p)``, p the `occupancy`."""
-        return binary_entropy(self._mass @ (self._refined.objects > 0))[self._refined.cells]
+        return binary_entropy(self.occupancy())
 
     def same_object(self, a: Any, b: Any) -> np.ndarray:
-        """Probability (...) that two voxels belong to the same object: ``sum_i w_i [L_i(a) = L_i(b) > 0]``.
+        """Probability (...) that two voxels belong to the same object.
 
-        `a` and `b` (..., 3) are broadcast against each other. For a = b the result is the occupancy.
+        ``sum_i w_i [k_i(a) = k_i(b) > 0] o_i(a) o_i(b)``, with k_i the most probable object of a voxel in hypothesis
+        i and o_i its probability (`Hypothesis.shares`). `a` and `b` (..., 3) are broadcast against each other. For a
+        = b the result is the occupancy.
         """
-        at_a, at_b = self._refined.objects[:, self._cells(a)], self._refined.objects[:, self._cells(b)]
-        return np.tensordot(self._mass, (at_a == at_b) & (at_a > 0), axes=1)
+        at_a, at_b = np.broadcast_arrays(_flat_voxels(self.grid, a), _flat_voxels(self.grid, b))
+        found = np.zeros(at_a.shape)
+        for w, (owner, p) in zip(self._mass, self._flat_shares, strict=True):
+            both = np.where(at_a == at_b, p[at_a], p[at_a] * p[at_b])
+            found += w * ((owner[at_a] == owner[at_b]) & (owner[at_a] > 0)) * both
+        return found
+
+    @cached_property
+    def _flat_shares(self) -> list[tuple[np.ndarray, np.ndarray]]:
+        shares = [h.shares for h in self._merged[0]]
+        return [(one.owner.ravel(), one.probability.ravel().astype(np.float64)) for one in shares]
 
     def object_at(self, voxel: Any) -> np.ndarray:
         """Extent (X, Y, Z) of the object at a voxel (3,): ``same_object(voxel, v)`` for every voxel v."""
-        at_voxel = self._refined.objects[:, self._cells(_one_index(voxel, 3)), None]
-        same = (self._refined.objects == at_voxel) & (at_voxel > 0)
-        return (self._mass @ same)[self._refined.cells]
+        every = np.stack(np.unravel_index(np.arange(math.prod(self.grid.shape)), self.grid.shape), axis=-1)
+        return self.same_object(_one_index(voxel, 3), every).reshape(self.grid.shape)
 
     def same_object_at_pixels(self, camera: Camera, a: Any, b: Any) -> np.ndarray:
         """Probability (...) that two pixels show the same object: ``sum_i w_i [R_i(a) = R_i(b) > 0]``.
@@ -278,7 +294,7 @@ class Belief:
     def look_information(self, region: Any, tolerance: float = 0.0) -> float:
         """Information of the occupancy of a region, occluded voxels included.
 
-        Outcome: ``{v in region: L_i(v) > 0}``. For one voxel this is `occupancy_entropy`.
+        Outcome: ``{v in region: L_i(v) > 0}``. For one voxel of certain hypotheses this is `occupancy_entropy`.
         """
         cells, sizes = self._region(region)
         return outcome_information(self._mass, self._refined.objects[:, cells] > 0, hamming, sizes, tolerance)

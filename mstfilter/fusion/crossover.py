@@ -11,7 +11,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
 
@@ -33,7 +33,7 @@ from mstfilter.fusion.conflicts import (
 )
 from mstfilter.fusion.division import inherit_apart, split_like
 from mstfilter.fusion.interfaces import Structure
-from mstfilter.scene import MAX_LABEL, Hypothesis, ObjectRecord, as_labels
+from mstfilter.scene import MAX_LABEL, Hypothesis, ObjectRecord, Occupancy, as_labels
 
 _CHUNK = 2**19  # number of window cells processed together, so that they fit in the cache of the processor
 
@@ -309,11 +309,30 @@ def _with_records(
         records.append(record if unchanged[number] else record.changed())
     child = Hypothesis(voxels.spread(numbers.astype(np.uint16)), predicted.grid, tuple(records))
     number_of = {g: number for number, g in enumerate(groups.tolist(), start=1)}
+    claims: list[tuple[np.ndarray, np.ndarray]] = []
     for which, parent in enumerate(parents):
         on_side = graph.side == which
         heirs = zip(graph.label[on_side].tolist(), resolution.group[on_side].tolist(), strict=True)
-        child = inherit_apart(child, parent, {k: number_of[g] for k, g in heirs if g in number_of})
-    return child
+        heir_of = {k: number_of[g] for k, g in heirs if g in number_of}
+        child = inherit_apart(child, parent, heir_of)
+        table = np.zeros(MAX_LABEL + 1, np.uint16)
+        table[list(heir_of)] = list(heir_of.values())
+        claims.append((table[parent.shares.owner], parent.shares.probability))
+    if all(parent.occupancy is None for parent in parents):
+        return child
+    return replace(child, occupancy=_crossed(child.labels, claims))
+
+
+def _crossed(labels: np.ndarray, claims: Sequence[tuple[np.ndarray, np.ndarray]]) -> Occupancy:
+    """The occupancy of a child with `labels` from owners (X, Y, Z), in its labels, and probabilities of its parents.
+
+    The larger probability counts, and at least one half where the child has a label.
+    """
+    owner, p = labels.copy(), np.where(labels > 0, np.float16(0.5), np.float16(0))
+    for claimed, probability in claims:
+        more = (claimed > 0) & (probability > p) & ((labels == 0) | (claimed == labels))
+        owner[more], p[more] = claimed[more], probability[more]
+    return Occupancy(owner, np.where(labels > 0, p, np.minimum(p, np.float16(0.5))))
 
 
 # The sweeps of the mode filter --------------------------------------------------------------------------------------

@@ -139,12 +139,12 @@ def _with_parts(
     """The hypothesis after a split: the largest part keeps the record of its parent, the others get new records."""
     if labels is hypothesis.labels:
         return hypothesis
-    records = [r.changed() if r.label in parents else r for r in hypothesis.objects]
+    records = [replace(r.changed(), views=()) if r.label in parents else r for r in hypothesis.objects]
     for label, parent in sorted(parents.items()):
         if label != parent:
             new = ObjectRecord.born(label if proposed else MAX_LABEL - label, birth)
             records.append(replace(new, label=label, apart=hypothesis.record(parent).apart))
-    return Hypothesis(labels, hypothesis.grid, tuple(sorted(records, key=lambda r: r.label)))
+    return hypothesis.relabelled(labels, tuple(sorted(records, key=lambda r: r.label)))
 
 
 def _record_apart(hypothesis: Hypothesis, motion_of: dict[int, int]) -> Hypothesis:
@@ -157,7 +157,19 @@ def _record_apart(hypothesis: Hypothesis, motion_of: dict[int, int]) -> Hypothes
         for other in apart[k] & apart.keys():
             apart[other].add(k)
     records = tuple(replace(r, apart=frozenset(apart[r.id])) for r in hypothesis.objects)
-    return Hypothesis(hypothesis.labels, hypothesis.grid, records)
+    return replace(hypothesis, objects=records)
+
+
+def divided(
+    division: Division, parts: PartRule, hypotheses: tuple[Hypothesis, ...], clip: Clip, proposed: bool
+) -> tuple[Hypothesis, ...]:
+    """Hypotheses about the end of a clip with objects split by motion. A repeated hypothesis is split once."""
+    motions = division.divide(clip)
+    if motions is None:
+        return hypotheses
+    distinct = {id(h): h for h in hypotheses}
+    split = {name: split_by_motion(h, motions, clip, parts, proposed) for name, h in distinct.items()}
+    return tuple(split[id(h)] for h in hypotheses)
 
 
 def split_like(proposed: Hypothesis, predicted: Hypothesis) -> Hypothesis:
@@ -210,4 +222,4 @@ def inherit_apart(child: Hypothesis, parent: Hypothesis, merged_into: Mapping[in
             for a in heirs[record.id]:
                 apart[a] |= {ids[b] for b in heirs.get(other, set()) if b != a}
     records = tuple(replace(r, apart=frozenset(apart[r.label])) for r in child.objects)
-    return Hypothesis(child.labels, child.grid, records)
+    return replace(child, objects=records)

@@ -108,12 +108,14 @@ class FreeSpace(Projection):
         occupied = hypothesis.labels != 0
         hit = occupied & self.known_free(frame, hypothesis.grid)
         n_hit = int(hit.sum())
-        if n_hit == 0:
+        if isinstance(hypothesis, Hypothesis) and hypothesis.occupancy is not None:
+            hit = (hypothesis.occupancy.probability > 0) & self.known_free(frame, hypothesis.grid)
+        if not hit.any():
             return hypothesis, 1.0
         labels = np.where(hit, 0, hypothesis.labels).astype(hypothesis.labels.dtype)
-        quality = 1.0 - n_hit / int(occupied.sum())
+        quality = 1.0 - n_hit / max(int(occupied.sum()), 1)
         if isinstance(hypothesis, Hypothesis):
-            return hypothesis.with_labels(labels), quality
+            return hypothesis.without(hit), quality
         if not is_dataclass(hypothesis) or isinstance(hypothesis, type):
             raise InputError(
                 f"a particle is a {type(hypothesis).__name__}, and free space cannot clear it",

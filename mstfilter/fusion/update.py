@@ -25,7 +25,7 @@ import numpy as np
 from mstfilter.errors import check_choice, check_integer, check_number
 from mstfilter.fusion.conflicts import check_grid
 from mstfilter.fusion.crossover import Crossover
-from mstfilter.fusion.division import NoDivision, PartRule, split_by_motion
+from mstfilter.fusion.division import NoDivision, PartRule, divided
 from mstfilter.fusion.free_space import FreeSpace, log_quality
 from mstfilter.fusion.interfaces import Division, Evidence, Projection
 from mstfilter.scene import Clip, Hypothesis, frame_geometry
@@ -135,7 +135,7 @@ class FusionUpdate(Update):
             return union(None, proposed)
         refined, quality = self.free_space.refine(predicted.particles, observation)
         doubtful = [self.claims.doubtful(h, r) for h, r in zip(predicted.particles, refined, strict=True)]
-        refined = self.divided(refined, observation, proposed=False)
+        refined = divided(self.division, self.parts, refined, observation, proposed=False)
         log_q = self.quality_exponent * log_quality(quality)
         notes = {"quality": quality.tolist(), "eta": self.eta}
         if proposed is None:
@@ -143,7 +143,7 @@ class FusionUpdate(Update):
 
         i, j = _pairs(child(rng, "order"), len(proposed), len(predicted), self.eta)
         key, crossover = key_of(rng), self.crossover
-        samples = self.divided(tuple(proposed.particles), observation, proposed=True)
+        samples = divided(self.division, self.parts, tuple(proposed.particles), observation, proposed=True)
         claims, exposed = self.claims, self.claims.exposed(observation)
         grid = refined[0].grid if exposed is None else observation.grid
         for name, hypotheses in (("predicted", refined), ("proposed", samples)):
@@ -179,15 +179,6 @@ class FusionUpdate(Update):
             scores[f"{name} {k}" if name in scores else name] = score.round(3).tolist()
             total += score
         return total, scores
-
-    def divided(self, hypotheses: tuple[Hypothesis, ...], clip: Clip, proposed: bool) -> tuple[Hypothesis, ...]:
-        """Hypotheses about the end of a clip with objects split by motion. A repeated hypothesis is split once."""
-        motions = self.division.divide(clip)
-        if motions is None:
-            return hypotheses
-        distinct = {id(h): h for h in hypotheses}
-        split = {name: split_by_motion(h, motions, clip, self.parts, proposed) for name, h in distinct.items()}
-        return tuple(split[id(h)] for h in hypotheses)
 
 
 def parents_of_pairs(

@@ -272,7 +272,7 @@ def read_numbers(run: RunFolder) -> RunNumbers:
         questions = run.questions(t)
         belief = None
         if questions is not None and truth is not None:
-            belief = score_belief(questions, [h.labels for h in hypotheses], info["weights"], truth)
+            belief = score_belief(questions, hypotheses, info["weights"], truth)
         metrics, in_image = None, None
         if truth is not None:
             labels, weights = [h.labels for h in hypotheses], np.array(info["weights"], float)

@@ -24,7 +24,7 @@ import numpy as np
 from mstfilter.errors import InputError
 from mstfilter.files import write_csv
 from mstfilter.runs.run_folder import RunFolder
-from mstfilter.scene import Camera, Recording, VoxelGrid, as_labels, render
+from mstfilter.scene import Camera, Hypothesis, Recording, VoxelGrid, as_labels, render
 from mstfilter.scoring import (
     FORMS,
     Questions,
@@ -56,12 +56,15 @@ class PauseEstimate:
         Frame of the recording at this pause.
     grid : VoxelGrid, optional
         Grid of the volumes.
+    hypotheses : sequence of Hypothesis
+        The hypotheses of a run, which also say how sure they are of each voxel.
     """
 
     labels: Sequence[np.ndarray]
     weights: np.ndarray
     frame: int | None = None
     grid: VoxelGrid | None = None
+    hypotheses: Sequence[Hypothesis] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,7 +125,8 @@ def read_estimate(path: Path) -> list[PauseEstimate]:
     found = []
     for t in range(run.n_pauses):
         hypotheses, weights = run.hypotheses(t), np.asarray(run.info(t)["weights"], dtype=float)
-        found.append(PauseEstimate([h.labels for h in hypotheses], weights, frames[t], hypotheses[0].grid))
+        labels = [h.labels for h in hypotheses]
+        found.append(PauseEstimate(labels, weights, frames[t], hypotheses[0].grid, hypotheses))
     return found
 
 
@@ -196,7 +200,7 @@ def measure_pause(run: RunFolder, recording: Recording, t: int) -> tuple[dict[st
     known = all(recording.instance(p) is not None for p in recording.pauses[: t + 1])
     status = object_status(recording, t) if known else {}
     found, q = pause_metrics(labels, weights, truth, status)
-    belief = score_belief(run.questions(t) or ask(recording, t), labels, weights, truth, status)
+    belief = score_belief(run.questions(t) or ask(recording, t), hypotheses, weights, truth, status)
     return {**row, **found, **belief.row, "qualities": q.tolist()}, belief.counts
 
 
@@ -254,7 +258,7 @@ def _score_pause(pause: int, estimate: PauseEstimate, truth: PauseTruth) -> list
     w = np.asarray(estimate.weights, dtype=float)
     belief = {}
     if truth.questions is not None:
-        scores = score_belief(truth.questions, estimate.labels, w, true).row
+        scores = score_belief(truth.questions, estimate.hypotheses or estimate.labels, w, true).row
         belief = {name: scores[name] for name in ("brier", "log_loss", "calibration_error", "energy")}
     best_guess = least_loss(found, w)
     rows = []

@@ -52,6 +52,8 @@ from mstfilter.scene.voxels import (
     Crop as Crop,
     Hypothesis as Hypothesis,
     ObjectRecord as ObjectRecord,
+    ObjectView as ObjectView,
+    Occupancy as Occupancy,
     VoxelGrid as VoxelGrid,
     as_labels as as_labels,
     decode_hypotheses as decode_hypotheses,

@@ -19,7 +19,7 @@ Hypotheses are stored as plain arrays, without pickle.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
@@ -154,10 +154,12 @@ def occupied_box(mask: np.ndarray) -> tuple[slice, ...] | None:
 
 @dataclass(frozen=True, eq=False)
 class Crop:
-    """Occupied voxels of one object inside a small box of the grid."""
+    """Voxels of one object inside a small box of the grid."""
 
     occupied: np.ndarray  #: (a, b, c) bool, the box
     offset: np.ndarray  #: (3,) int, index of its first voxel in the grid
+    #: (a, b, c) float16, probability that the object is there; None: certain where `occupied` is True
+    probability: np.ndarray | None = None
 
     def __repr__(self) -> str:
         return f"Crop of {int(self.occupied.sum())} voxels at {self.offset.tolist()}"
@@ -165,20 +167,46 @@ class Crop:
     def __post_init__(self) -> None:
         object.__setattr__(self, "occupied", frozen(np.asarray(self.occupied, dtype=bool)))
         object.__setattr__(self, "offset", frozen(np.asarray(self.offset, dtype=np.int64)))
+        if self.probability is not None:
+            object.__setattr__(self, "probability", frozen(np.asarray(self.probability, dtype=np.float16)))
 
     @classmethod
-    def of(cls, mask: np.ndarray) -> Crop:
-        """The tight crop of a boolean grid; an empty mask gives an empty crop."""
-        box = occupied_box(mask)
+    def of(cls, mask: np.ndarray, probability: np.ndarray | None = None) -> Crop:
+        """The tight crop of a boolean grid, and of a grid of probabilities; an empty mask gives an empty crop."""
+        box = occupied_box(mask if probability is None else mask | (probability > 0))
         if box is None:
             return cls(np.zeros((0, 0, 0), bool), np.zeros(3, np.int64))
-        return cls(mask[box].copy(), np.array([side.start for side in box]))
+        offset = np.array([side.start for side in box])
+        return cls(mask[box].copy(), offset, None if probability is None else probability[box].copy())
 
     @property
     def box(self) -> tuple[slice, slice, slice]:
         """Slices of the crop in the grid."""
         a, b, c = (slice(int(o), int(o) + n) for o, n in zip(self.offset, self.occupied.shape, strict=True))
         return a, b, c
+
+
+@dataclass(frozen=True, eq=False)
+class ObjectView:
+    """What one frame showed of an object, in a box of the grid, and where the object moved since then."""
+
+    offset: np.ndarray  #: (3,) int, index of the box's first voxel in the grid
+    #: (a, b, c) uint8: 1 visible surface of the object, 2 another surface, 4 free, 8 behind the surface of the
+    #: object, 16 behind another surface
+    bits: np.ndarray
+    signed: np.ndarray  #: (a, b, c) int8, signed distance behind the measured surface (`encode_box`)
+    key: str  #: key of the contents
+    #: Rigid motion of the object in world metres since the frame.
+    motion: RigidTransform = field(default_factory=lambda: _NO_MOTION)
+
+    def moved(self, T: RigidTransform) -> ObjectView:
+        """The view after the object moved by T."""
+        return replace(self, motion=T * self.motion)
+
+    @cached_property
+    def name(self) -> tuple[str, bytes]:
+        """Key of the contents and of the motion."""
+        return self.key, self.motion.as_matrix().tobytes()
 
 
 @dataclass(frozen=True, eq=False)
@@ -196,15 +224,23 @@ class ObjectRecord:
     #: Ids of objects of the same hypothesis that were observed to move apart from it, so that they are not the
     #: same object.
     apart: frozenset[int] = frozenset()
+    views: tuple[ObjectView, ...] = ()  #: what the frames so far showed of it, oldest first
 
     def __repr__(self) -> str:
         moved = ", moved" * (self.motion is not _NO_MOTION)
         return f"ObjectRecord(label={self.label}, id={self.id}, birth={self.birth}{moved})"
 
     @classmethod
-    def born(cls, label: int, birth: int, completion_key: str | None = None) -> ObjectRecord:
+    def born(
+        cls, label: int, birth: int, completion_key: str | None = None, views: tuple[ObjectView, ...] = ()
+    ) -> ObjectRecord:
         """The record of a new object, with id ``65536 * birth + label``, which differs for different births."""
-        return cls(label, birth * (MAX_LABEL + 1) + label, birth, completion_key=completion_key)
+        return cls(label, birth * (MAX_LABEL + 1) + label, birth, completion_key=completion_key, views=views)
+
+    def moved(self, T: RigidTransform, source: Crop) -> ObjectRecord:
+        """The record after a motion T of the object, of which `source` are the voxels before all motions."""
+        total = T if self.source is None else T * self.motion
+        return replace(self, source=source, motion=total, views=tuple(view.moved(T) for view in self.views))
 
     def changed(self) -> ObjectRecord:
         """The record after the voxels changed other than by a rigid motion."""
@@ -237,6 +273,32 @@ def labels_on(grid: VoxelGrid, labels: np.ndarray) -> np.ndarray:
 
 
 @dataclass(frozen=True, eq=False)
+class Occupancy:
+    """How sure a hypothesis is of each voxel, given which objects there are and where."""
+
+    #: (X, Y, Z) uint16, the most probable object, also where free space is more probable. Equal to the label where
+    #: there is one.
+    owner: np.ndarray
+    probability: np.ndarray  #: (X, Y, Z) float16, probability that the voxel belongs to its owner
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "owner", frozen(np.asarray(self.owner, dtype=np.uint16)))
+        object.__setattr__(self, "probability", frozen(np.asarray(self.probability, dtype=np.float16)))
+
+    def relabelled(self, before: np.ndarray, after: np.ndarray, known: np.ndarray) -> Occupancy:
+        """After a change of labels (X, Y, Z): certain where they change; objects that are not `known` are gone."""
+        changed = before != after
+        owner = np.where(changed | (after > 0), after, self.owner)
+        p = np.where(changed, after > 0, self.probability)
+        gone = ~np.isin(owner, known)
+        return Occupancy(np.where(gone, 0, owner), np.where(gone, 0, p))
+
+    def without(self, voxels: np.ndarray) -> Occupancy:
+        """With some voxels (X, Y, Z) bool free."""
+        return Occupancy(np.where(voxels, 0, self.owner), np.where(voxels, 0, self.probability))
+
+
+@dataclass(frozen=True, eq=False)
 class Hypothesis:
     """A 3-D instance segmentation of the workspace: the particle.
 
@@ -248,14 +310,19 @@ class Hypothesis:
         Where the voxels are.
     objects : tuple of ObjectRecord
         One for each label that occurs, in ascending order of labels. `Hypothesis.from_labels` makes them.
+    occupancy : Occupancy, optional
+        How sure the hypothesis is of each voxel. Default: certain.
     """
 
     labels: np.ndarray
     grid: VoxelGrid
     objects: tuple[ObjectRecord, ...] = ()
+    occupancy: Occupancy | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "labels", frozen(labels_on(self.grid, self.labels)))
+        if self.occupancy is not None and self.occupancy.owner.shape != self.grid.shape:
+            raise InputError(f"occupancy has shape {self.occupancy.owner.shape}, the voxel grid is {self.grid.shape}")
         numbers = [o.label for o in self.objects]
         if any(b <= a for a, b in pairwise(numbers)):
             raise InputError(f"object records are not in ascending order of labels: {numbers}")
@@ -296,12 +363,39 @@ class Hypothesis:
         changed = set(np.unique(labels[different])) | set(np.unique(self.labels[different]))
         present = np.bincount(labels.ravel(), minlength=MAX_LABEL + 1) > 0
         records = (record.changed() if record.label in changed else record for record in self.objects)
-        return Hypothesis(labels, self.grid, tuple(record for record in records if present[record.label]))
+        return self.relabelled(labels, tuple(record for record in records if present[record.label]))
+
+    def relabelled(self, labels: np.ndarray, objects: tuple[ObjectRecord, ...]) -> Hypothesis:
+        """Other labels and records. Voxels whose label changes are certain, the others keep their probability."""
+        occupancy = self.occupancy
+        if occupancy is not None:
+            known = np.array([0, *(record.label for record in objects)])
+            occupancy = occupancy.relabelled(self.labels, labels, known)
+        return Hypothesis(labels, self.grid, objects, occupancy)
+
+    def without(self, voxels: np.ndarray) -> Hypothesis:
+        """The same objects without some voxels (X, Y, Z) bool, which are certainly free; see `with_labels`."""
+        found = self.with_labels(np.where(voxels, 0, self.labels).astype(np.uint16))
+        occupancy = found.occupancy
+        return found if occupancy is None else replace(found, occupancy=occupancy.without(voxels))
+
+    @property
+    def shares(self) -> Occupancy:
+        """The occupancy, also of a hypothesis that is certain."""
+        return self.occupancy or Occupancy(self.labels, (self.labels > 0).astype(np.float16))
+
+    def crop(self, label: int) -> Crop:
+        """The voxels of an object, with their probabilities if the hypothesis has some."""
+        mask = self.labels == label
+        if self.occupancy is None:
+            return Crop.of(mask)
+        return Crop.of(mask, np.where(self.occupancy.owner == label, self.occupancy.probability, np.float16(0)))
 
     @cached_property
     def key(self) -> bytes:
         """Content key of the voxels."""
-        return content_key("hypothesis", self.labels, self.grid.key)
+        more = () if self.occupancy is None else (self.occupancy.owner, self.occupancy.probability)
+        return content_key("hypothesis", self.labels, self.grid.key, *more)
 
     @cached_property
     def _volumes(self) -> Mapping[int, int]:
@@ -336,6 +430,11 @@ def encode_hypotheses(hypotheses: Sequence[Hypothesis]) -> dict[str, np.ndarray]
     ``owner`` (index of the hypothesis), ``label``, ``id``, ``birth``, ``motion`` (4, 4), ``completion_key``,
     ``apart`` (ids, comma separated). The source crops are stored as ``has_source``, ``source_offset`` (3,),
     ``source_shape`` (3,) and ``source_bits``, the packed bits of all crops in order.
+
+    If a hypothesis is not certain, ``voxel_owner`` and ``probability`` (n, X, Y, Z) are its occupancy, and
+    ``source_probability`` has the probabilities of all crops in order. Views of objects are one row each:
+    ``view_of`` (the row of the object), ``view_offset``, ``view_shape`` (3,), ``view_motion`` (4, 4), ``view_key``;
+    ``view_bits`` and ``view_signed`` have the values of all views in order.
     """
     grid = hypotheses[0].grid
     if any(h.grid != grid for h in hypotheses):
@@ -343,7 +442,7 @@ def encode_hypotheses(hypotheses: Sequence[Hypothesis]) -> dict[str, np.ndarray]
     rows = [(n, record) for n, h in enumerate(hypotheses) for record in h.objects]
     crops = [record.source for _, record in rows]
     bits = [np.packbits(c.occupied) for c in crops if c is not None]
-    return {
+    arrays = {
         "labels": np.stack([h.labels for h in hypotheses]),
         "origin": grid.origin,
         "voxel_size": np.array(grid.voxel_size),
@@ -351,7 +450,7 @@ def encode_hypotheses(hypotheses: Sequence[Hypothesis]) -> dict[str, np.ndarray]
         "label": np.array([r.label for _, r in rows], np.int64),
         "id": np.array([r.id for _, r in rows], np.int64),
         "birth": np.array([r.birth for _, r in rows], np.int64),
-        "motion": np.array([r.motion.as_matrix() for _, r in rows], np.float64).reshape(-1, 4, 4),
+        "motion": _matrices(r.motion for _, r in rows),
         "completion_key": np.array([r.completion_key or "" for _, r in rows], np.str_),
         "apart": np.array([",".join(map(str, sorted(r.apart))) for _, r in rows], np.str_),
         "has_source": np.array([c is not None for c in crops], bool),
@@ -361,6 +460,48 @@ def encode_hypotheses(hypotheses: Sequence[Hypothesis]) -> dict[str, np.ndarray]
         ),
         "source_bits": np.concatenate(bits) if bits else np.zeros(0, np.uint8),
     }
+    if any(h.occupancy is not None for h in hypotheses):
+        shares = [h.shares for h in hypotheses]
+        arrays |= {
+            "certain": np.array([h.occupancy is None for h in hypotheses]),
+            "voxel_owner": np.stack([one.owner for one in shares]),
+            "probability": np.stack([one.probability for one in shares]),
+            "source_certain": np.array([c is None or c.probability is None for c in crops], bool),
+            "source_probability": _joined(
+                [c.probability for c in crops if c is not None and c.probability is not None], np.float16
+            ),
+        }
+    views = [(k, view) for k, (_, record) in enumerate(rows) for view in record.views]
+    if views:
+        arrays |= {
+            "view_of": np.array([k for k, _ in views], np.int64),
+            "view_offset": np.array([view.offset for _, view in views], np.int64),
+            "view_shape": np.array([view.bits.shape for _, view in views], np.int64),
+            "view_motion": _matrices(view.motion for _, view in views),
+            "view_key": np.array([view.key for _, view in views], np.str_),
+            "view_bits": _joined([view.bits for _, view in views], np.uint8),
+            "view_signed": _joined([view.signed for _, view in views], np.int8),
+        }
+    return arrays
+
+
+def _matrices(motions: Iterable[RigidTransform]) -> np.ndarray:
+    return np.array([T.as_matrix() for T in motions], np.float64).reshape(-1, 4, 4)
+
+
+def _joined(arrays: Sequence[np.ndarray], dtype: type) -> np.ndarray:
+    return np.concatenate([np.zeros(0, dtype), *(one.ravel() for one in arrays)])
+
+
+class _Reader:
+    """Arrays one after the other from their joined values."""
+
+    def __init__(self, values: np.ndarray) -> None:
+        self.values, self.at = values, 0
+
+    def take(self, shape: Sequence[int]) -> np.ndarray:
+        begin, self.at = self.at, self.at + int(np.prod(shape))
+        return self.values[begin : self.at].reshape(shape)
 
 
 def decode_hypotheses(arrays: Mapping[str, np.ndarray]) -> tuple[Hypothesis, ...]:
@@ -368,7 +509,8 @@ def decode_hypotheses(arrays: Mapping[str, np.ndarray]) -> tuple[Hypothesis, ...
     labels = arrays["labels"]
     grid = VoxelGrid(arrays["origin"], float(arrays["voxel_size"]), labels.shape[1:])
     records: list[list[ObjectRecord]] = [[] for _ in labels]
-    begin = 0
+    begin, views = 0, _decode_views(arrays)
+    probabilities = _Reader(arrays["source_probability"]) if "source_probability" in arrays else None
     for row, owner in enumerate(arrays["owner"].tolist()):
         crop = None
         if arrays["has_source"][row]:
@@ -376,7 +518,10 @@ def decode_hypotheses(arrays: Mapping[str, np.ndarray]) -> tuple[Hypothesis, ...
             size = int(np.prod(shape))
             packed = arrays["source_bits"][begin : begin + (size + 7) // 8]
             begin += len(packed)
-            crop = Crop(np.unpackbits(packed, count=size).astype(bool).reshape(shape), arrays["source_offset"][row])
+            occupied = np.unpackbits(packed, count=size).astype(bool).reshape(shape)
+            certain = probabilities is None or arrays["source_certain"][row]
+            p = None if certain or probabilities is None else probabilities.take(shape)
+            crop = Crop(occupied, arrays["source_offset"][row], p)
         records[owner].append(
             ObjectRecord(
                 int(arrays["label"][row]),
@@ -386,6 +531,27 @@ def decode_hypotheses(arrays: Mapping[str, np.ndarray]) -> tuple[Hypothesis, ...
                 RigidTransform(arrays["motion"][row], normalize=False),  # bit-identical
                 str(arrays["completion_key"][row]) or None,
                 frozenset(int(other) for other in str(arrays["apart"][row]).split(",") if other),
+                tuple(views.get(row, ())),
             )
         )
-    return tuple(Hypothesis(grid_labels, grid, tuple(r)) for grid_labels, r in zip(labels, records, strict=True))
+    found = []
+    for n, (grid_labels, own) in enumerate(zip(labels, records, strict=True)):
+        occupancy = None
+        if "certain" in arrays and not arrays["certain"][n]:
+            occupancy = Occupancy(arrays["voxel_owner"][n], arrays["probability"][n])
+        found.append(Hypothesis(grid_labels, grid, tuple(own), occupancy))
+    return tuple(found)
+
+
+def _decode_views(arrays: Mapping[str, np.ndarray]) -> dict[int, list[ObjectView]]:
+    """Row of an object -> its views."""
+    found: dict[int, list[ObjectView]] = {}
+    if "view_of" in arrays:
+        bits, signed = _Reader(arrays["view_bits"]), _Reader(arrays["view_signed"])
+        for k, row in enumerate(arrays["view_of"].tolist()):
+            shape = arrays["view_shape"][k].tolist()
+            motion = RigidTransform(arrays["view_motion"][k], normalize=False)
+            key = str(arrays["view_key"][k])
+            view = ObjectView(arrays["view_offset"][k], bits.take(shape), signed.take(shape), key, motion)
+            found.setdefault(row, []).append(view)
+    return found

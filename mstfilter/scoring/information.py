@@ -1,6 +1,6 @@
 """What a weighted set of hypotheses knows: scores of its answers to `questions`.
 
->>> belief = score_belief(ask(recording, t), labels, weights, recording.truth(t), object_status(recording, t))
+>>> belief = score_belief(ask(recording, t), hypotheses, weights, recording.truth(t), object_status(recording, t))
 >>> belief.row["brier"], belief.row["energy"]                  # as the hypotheses come
 >>> found = {scene: counts}                                    # counts: belief.counts, summed over pauses
 >>> leave_one_out(found)["scene-3"].log_loss(found["scene-3"]) # information, in nats
@@ -32,7 +32,7 @@ import numpy as np
 
 from mstfilter.errors import InputError
 from mstfilter.forecasts import SOFTENING, ForecastTable, Recalibration, energy_score
-from mstfilter.scene import read_only
+from mstfilter.scene import Hypothesis, read_only
 from mstfilter.scoring.quality import STATUSES, Status
 from mstfilter.scoring.questions import NOISE_RATES, Questions
 
@@ -72,7 +72,7 @@ class BeliefScore(NamedTuple):
 
 def score_belief(
     questions: Questions,
-    labels: Sequence[np.ndarray],
+    hypotheses: Sequence[np.ndarray | Hypothesis],
     weights: np.ndarray,
     truth: np.ndarray,
     status: Mapping[int, Status] | None = None,
@@ -82,7 +82,7 @@ def score_belief(
     Parameters
     ----------
     questions : Questions
-    labels : n arrays (X, Y, Z) of int
+    hypotheses : n hypotheses, or label grids (X, Y, Z) of int
     weights : (n,) float
         Sum 1.
     truth : (X, Y, Z) int
@@ -90,8 +90,8 @@ def score_belief(
         True label -> visible, hidden or unseen. Default: all count as visible.
     """
     weights = np.asarray(weights, dtype=np.float64)
-    if len(labels) != len(weights) or not len(labels):
-        raise InputError(f"there are {len(labels)} hypotheses and {len(weights)} weights")
+    if len(hypotheses) != len(weights) or not len(hypotheses):
+        raise InputError(f"there are {len(hypotheses)} hypotheses and {len(weights)} weights")
     m = len(questions)
     if not m:
         nan = float("nan")
@@ -99,7 +99,8 @@ def score_belief(
         empty = np.zeros((len(NOISE_RATES), N_LEVELS, len(CATEGORIES)), np.int32)
         return BeliefScore({**unknown, "energy_noise": [nan] * len(NOISE_RATES)}, empty)
     outcome = questions.outcomes(truth)
-    forecasts = questions.forecasts(labels, weights, NOISE_RATES)
+    forecasts = questions.forecasts(hypotheses, weights, NOISE_RATES)
+    labels = [one.labels if isinstance(one, Hypothesis) else one for one in hypotheses]
     table = ForecastTable.of(np.round(forecasts[0], 12), outcome)  # weights sum to 1 up to rounding
     rng = np.random.default_rng(m)
     energy = [

@@ -17,9 +17,11 @@ voxels of u, without u.
 gives the forecasts of the hypotheses with noise: each voxel takes, with probability e, the label of one of its six
 neighbours, independently of the others. Only voxels at a border change. The expectation over the noise is exact:
 
-    p = sum_i w_i sum_{k > 0} P_i,u(k) P_i,v(k),    P_i,v(k) = (1 - e) [L_i(v) = k] + e / 6 sum_{v'} [L_i(v') = k]
+    p = sum_i w_i sum_{k > 0} P_i,u(k) P_i,v(k),    P_i,v(k) = (1 - e) o_i,v(k) + e / 6 sum_{v'} o_i,v'(k)
 
-with v' the neighbours of v (beyond the grid: v itself).
+with v' the neighbours of v (beyond the grid: v itself), and o_i,v(k) the probability that object k fills v according
+to hypothesis i: that of its occupancy, or 1 for the label of a hypothesis that is certain. The voxels of an object
+count as independent.
 """
 
 from __future__ import annotations
@@ -32,7 +34,7 @@ from functools import cached_property
 import numpy as np
 
 from mstfilter.errors import InputError, check_integer
-from mstfilter.scene import Frame, Recording, VoxelGrid, depth_sigma, frame_geometry
+from mstfilter.scene import Frame, Hypothesis, Recording, VoxelGrid, depth_sigma, frame_geometry
 
 N_QUESTIONS = 20_000
 REACH = 8  # voxels between the two voxels of a question, at most
@@ -68,13 +70,16 @@ class Questions:
         return np.asarray((a == flat[self.second]) & (a > 0))
 
     def forecasts(
-        self, labels: Sequence[np.ndarray], weights: np.ndarray, rates: Sequence[float] = (0.0,)
+        self,
+        hypotheses: Sequence[np.ndarray | Hypothesis],
+        weights: np.ndarray,
+        rates: Sequence[float] = (0.0,),
     ) -> np.ndarray:
         """Forecasts (r, m) of hypotheses with noise of each rate (r,) at the border; (m,) for the default.
 
         Parameters
         ----------
-        labels : n arrays (X, Y, Z) of int
+        hypotheses : n hypotheses, or label grids (X, Y, Z) of int
         weights : (n,) float
             Sum 1.
         rates : sequence of float
@@ -86,23 +91,19 @@ class Questions:
         if noisy:
             _, place, around = self._voxels
             u, v = around[:, place[: len(self)]], around[:, place[len(self) :]]
-        for one, weight in zip(labels, weights, strict=True):
-            flat = self._flat(one)
-            a, b = flat[self.first], flat[self.second]
-            same = (a == b) & (a > 0)
+        for one, weight in zip(hypotheses, weights, strict=True):
+            label, q = self._shares(one)
+            a, b = label[self.first], label[self.second]
+            both = np.ones(len(self)) if q is None else q[self.first] * q[self.second]
+            same = ((a == b) & (a > 0)) * both
             found += weight * same
             if not noisy:
                 continue
-            near_u, near_v = flat[u], flat[v]  # (6, m)
-            # Away from borders the noise changes nothing; elsewhere count equal labels over the neighbours.
-            border = np.flatnonzero(((near_u != a) | (near_v != b)).any(axis=0))
+            # Where all probabilities are 1, the noise changes nothing away from borders.
+            near = ((label[u] != a) | (label[v] != b)).any(axis=0) if q is None else np.ones(len(self), bool)
+            border = np.flatnonzero(near)
             if len(border):
-                a, b, near_u, near_v = a[border], b[border], near_u[:, border], near_v[:, border]
-                mixed = ((near_v == a) & (a > 0)).sum(axis=0) + ((near_u == b) & (b > 0)).sum(axis=0)
-                both = np.zeros(len(border))
-                for row in near_u:
-                    both += ((near_v == row) & (row > 0)).sum(axis=0)
-                p = (1 - e) ** 2 * same[border] + (1 - e) * e / 6 * mixed + e**2 / 36 * both
+                p = _noisy(label, q, self.first[border], self.second[border], u[:, border], v[:, border], e)
                 found[:, border] += weight * (p - same[border])
         found = np.clip(found, 0.0, 1.0)  # sums of weights exceed 1 by rounding
         return found[0] if len(e) == 1 and not noisy else found
@@ -124,6 +125,14 @@ class Questions:
             found.append((a == b) & (a > 0))
         return np.stack(found)
 
+    def _shares(self, one: np.ndarray | Hypothesis) -> tuple[np.ndarray, np.ndarray | None]:
+        """The object of each voxel, flat, and its probability; None if it is 1 for every object."""
+        if not isinstance(one, Hypothesis):
+            return self._flat(one), None
+        if one.occupancy is None:
+            return self._flat(one.labels), None
+        return self._flat(one.occupancy.owner), self._flat(one.occupancy.probability).astype(np.float64)
+
     def _flat(self, labels: np.ndarray) -> np.ndarray:
         labels = np.asarray(labels)
         if labels.shape != tuple(self.shape):
@@ -135,6 +144,28 @@ class Questions:
         """Distinct voxels (k,), the place (2 m,) of each first and second voxel among them, neighbours (6, k)."""
         voxels, place = np.unique(np.concatenate([self.first, self.second]), return_inverse=True)
         return voxels, place, _neighbours(voxels, self.shape)
+
+
+def _noisy(
+    label: np.ndarray,
+    q: np.ndarray | None,
+    first: np.ndarray,
+    second: np.ndarray,
+    u: np.ndarray,
+    v: np.ndarray,
+    e: np.ndarray,
+) -> np.ndarray:
+    """Forecasts (r, m) for noise of rates e (r, 1); u and v (6, m) are the neighbours of the two voxels."""
+    q = np.ones(len(label)) if q is None else q
+    a, b, near_a, near_b = label[first], label[second], label[u], label[v]
+    q_a, q_b, q_near_a, q_near_b = q[first], q[second], q[u], q[v]
+    same = ((a == b) & (a > 0)) * q_a * q_b
+    mixed = q_a * (((near_b == a) & (a > 0)) * q_near_b).sum(axis=0)
+    mixed = mixed + q_b * (((near_a == b) & (b > 0)) * q_near_a).sum(axis=0)
+    both = np.zeros(len(a))
+    for row, q_row in zip(near_a, q_near_a, strict=True):
+        both += q_row * (((near_b == row) & (row > 0)) * q_near_b).sum(axis=0)
+    return np.asarray((1 - e) ** 2 * same + (1 - e) * e / 6 * mixed + e**2 / 36 * both)
 
 
 def _neighbours(flat: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:

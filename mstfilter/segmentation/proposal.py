@@ -21,7 +21,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from mstfilter.completion import ClipCompleter, Completer, Completion, Extrude, arbitrate
+from mstfilter.completion import ClipCompleter, Completer, Completion, Extrude, arbitrate, occupancy_of
 from mstfilter.errors import check_choice
 from mstfilter.scene import Clip, Frame, Hypothesis, ObjectRecord, VoxelGrid, component_key, memo
 from mstfilter.segmentation.boundary import BoundaryModel, ClipBoundary, ColourDepthBoundary, pixels_above_table
@@ -238,4 +238,4 @@ def hypothesis_of(
     labels = arbitrate(completions, grid, threshold)
     present = np.bincount(labels.ravel(), minlength=len(completions) + 1)
     records = tuple(ObjectRecord.born(k, birth, one.key) for k, one in enumerate(completions, start=1) if present[k])
-    return Hypothesis(labels, grid, records)
+    return Hypothesis(labels, grid, records, occupancy_of(completions, labels, grid))

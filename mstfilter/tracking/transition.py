@@ -11,7 +11,7 @@ Flow and features are computed once per clip. A segment that several hypotheses 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import ClassVar, NamedTuple
 
@@ -20,7 +20,7 @@ from scipy.ndimage import distance_transform_edt, gaussian_filter, map_coordinat
 from scipy.spatial.transform import RigidTransform
 
 from mstfilter.errors import check_choice
-from mstfilter.scene import Clip, Crop, Hypothesis, ObjectRecord, VoxelGrid
+from mstfilter.scene import Clip, Crop, Hypothesis, ObjectRecord, Occupancy, VoxelGrid
 from mstfilter.smc import Population, Transition, child
 from mstfilter.tracking.flow import DenseFlow
 from mstfilter.tracking.rigid import invert, move_points
@@ -28,6 +28,7 @@ from mstfilter.tracking.rules import IDENTITY, Candidate, MotionRule, MstRule
 from mstfilter.tracking.segments import MaskTracker, Segment, StaticTest, Track, segments_of
 
 _SMOOTHING = 0.5  # voxels, standard deviation; .3 to .6 differ little
+_LEAST_PROBABILITY = 0.02  # of a voxel that is more probably free
 
 
 @dataclass(frozen=True)
@@ -109,11 +110,14 @@ class Warp:
         for record, *_ in resting:
             if record.source is None and self.method != "splat":
                 # Voxels lost in this collision are restored when the object moves.
-                records[record.label] = replace(record, source=Crop.of(hypothesis.mask(record.label)))
+                records[record.label] = replace(record, source=hypothesis.crop(record.label))
         present = np.bincount(labels.ravel(), minlength=max(records) + 1) > 0
         kept = tuple(records[k] for k in sorted(records) if present[k])
         dropped = tuple(records[k].id for k in sorted(records) if not present[k])
-        return WarpResult(Hypothesis(labels, grid, kept), n_outside, contested, dropped)
+        occupancy = hypothesis.occupancy
+        if occupancy is not None:
+            occupancy = _moved_occupancy(occupancy, labels, [r for r in kept if r.label in moving], grid)
+        return WarpResult(Hypothesis(labels, grid, kept, occupancy), n_outside, contested, dropped)
 
     def _moved_voxels(
         self, record: ObjectRecord, hypothesis: Hypothesis, T: np.ndarray
@@ -121,15 +125,15 @@ class Warp:
         """Voxels (N, 3) that a moved object claims, their depth inside it (N,) in voxels, and its new record."""
         grid = hypothesis.grid
         if self.method == "splat":
-            crop = Crop.of(hypothesis.mask(record.label))
+            crop = hypothesis.crop(record.label)
             index, depth = _push(crop, T, grid)
             return index, depth, replace(record, source=None, motion=RigidTransform.identity())
-        crop = record.source or Crop.of(hypothesis.mask(record.label))
+        crop = record.source or hypothesis.crop(record.label)
         total = T if record.source is None else T @ record.motion.as_matrix()
         index, depth = (_pull_smooth if self.method == "smooth" else _pull)(crop, total, grid)
         if not len(index):  # a thin object between two rows of voxel centres
             index, depth = _push(crop, total, grid)
-        return index, depth, replace(record, source=crop, motion=RigidTransform.from_matrix(total))
+        return index, depth, record.moved(RigidTransform.from_matrix(T), crop)
 
     def _assign(self, labels: np.ndarray, claims: list[_Claim], residuals: Mapping[int, float]) -> int:
         """Assign every claimed voxel to one object; returns the number of contested voxels."""
@@ -149,6 +153,34 @@ class Warp:
         first = np.append(True, index[1:] != index[:-1])
         labels.ravel()[index[first]] = owner[first]
         return len(np.unique(index[~first]))
+
+
+def _moved_occupancy(
+    before: Occupancy, labels: np.ndarray, moved: Sequence[ObjectRecord], grid: VoxelGrid
+) -> Occupancy:
+    """The occupancy after a motion, for the labels (X, Y, Z) after it; `moved` are the objects that moved.
+
+    The probabilities of an object are those of its source, interpolated. Every object keeps the voxels of its label:
+    these have a probability of at least one half, and no other voxel has more.
+    """
+    still = np.isin(before.owner, [0, *(r.label for r in moved)], invert=True)
+    still &= (labels == 0) | (labels == before.owner)
+    owner, p = np.where(still, before.owner, labels), np.where(still, before.probability, labels > 0)
+    for record in moved:
+        crop = record.source
+        if crop is None or crop.probability is None:
+            continue
+        index, at_source = _moved_box(crop, record.motion.as_matrix(), grid, 1)
+        inside = grid.contains(index)
+        value = map_coordinates(
+            np.pad(crop.probability.astype(np.float32), 1), at_source[inside].T + 0.5, order=1, mode="constant"
+        )
+        at = tuple(index[inside].T)
+        own, free = labels[at] == record.label, labels[at] == 0
+        more = free & (value > p[at]) & (value > _LEAST_PROBABILITY)
+        p[at] = np.where(own, np.maximum(value, 0.5), np.where(more, np.minimum(value, 0.5), p[at]))
+        owner[at] = np.where(more, record.label, owner[at])
+    return Occupancy(owner, p)
 
 
 def _resting_claims(hypothesis: Hypothesis, labels: np.ndarray, claims: list[_Claim]) -> list[_Claim]:

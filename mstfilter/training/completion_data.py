@@ -25,7 +25,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from mstfilter.completion import Extrude, ObservedBox, observed_box
-from mstfilter.completion.crops import EDGE, LATTICE, crop_box, decode_signed, encode_box
+from mstfilter.completion.crops import EDGE, LATTICE, crop_box
+from mstfilter.completion.observed import decode_signed, encode_box
 from mstfilter.errors import InputError
 from mstfilter.scene import Camera, Frame, VoxelGrid, scene_cache
 from mstfilter.segmentation import MetropolisHastingsCuts, TreeCutProposal

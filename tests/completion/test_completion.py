@@ -2,14 +2,27 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
+from scipy.spatial.transform import RigidTransform
 
-from mstfilter.completion import Completer, Completion, Extrude, HilbertMap, Hull, ObservedBox, SurfaceOnly, arbitrate
+from mstfilter.completion import (
+    Completer,
+    Completion,
+    Extrude,
+    HilbertMap,
+    Hull,
+    ObservedBox,
+    SurfaceOnly,
+    arbitrate,
+    observed_box,
+    occupancy_of,
+)
+from mstfilter.completion.observed import recall, view_surface
 from mstfilter.errors import InputError
 from mstfilter.scene import Frame, VoxelGrid, frame_geometry, render, scene_cache
 from tests.segmentation.scenes import GRID, TWO, boxes, frame_of
@@ -197,3 +210,75 @@ def test_arbitration_by_its_definition(seed, n):
 
 def test_nothing_to_arbitrate():
     assert not arbitrate([], SMALL).any()
+
+
+def overlapping_completions(seed: int, n: int = 4) -> list[Completion]:
+    rng, made = np.random.default_rng(seed), []
+    for k in range(n):
+        low, size = rng.integers(0, 6, 3), rng.integers(3, 7, 3)
+        p = rng.choice([0.0, 0.01, 1.0, *rng.random(5)], size).astype(np.float32)
+        made.append(Completion(low, p, np.zeros(size, np.int32), f"{k}"))
+    return made
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_occupancy_is_that_of_one_owner_or_free_space(seed):
+    """By enumeration at each voxel: at most one of the objects is there, given independent claims."""
+    grid = VoxelGrid((0, 0, 0), 0.01, (12, 12, 12))
+    made = overlapping_completions(seed)
+    labels = arbitrate(made, grid)
+    occupancy = occupancy_of(made, labels, grid)
+    claims = np.clip([placed(one, grid) for one in made], 0, 0.999).astype(float)
+    claims[claims < 0.02] = 0
+    for voxel in np.argwhere((claims > 0).any(axis=0)):
+        p = claims[(slice(None), *voxel)]
+        alone = [np.prod(np.where(np.arange(len(p)) == k, p, 1 - p)) for k in range(len(p))]
+        law = np.array(alone) / (sum(alone) + np.prod(1 - p))
+        owner, found = int(occupancy.owner[tuple(voxel)]), float(occupancy.probability[tuple(voxel)])
+        assert found == pytest.approx(law[owner - 1], abs=1e-3)
+        if not labels[tuple(voxel)]:
+            assert law[owner - 1] == pytest.approx(law.max(), abs=1e-9)
+    np.testing.assert_array_equal(occupancy.owner[labels > 0], labels[labels > 0])
+    assert not occupancy.probability[~(claims > 0).any(axis=0)].any()
+    sure = [replace(one, probability=np.rint(one.probability)) for one in made]
+    assert occupancy_of(sure, arbitrate(sure, grid), grid) is None
+
+
+def surface_and_free(seen: ObservedBox) -> tuple[np.ndarray, ...]:
+    return seen.surface, seen.free, seen.behind, seen.hidden, seen.other_surface
+
+
+def test_views_are_recalled_where_the_object_is_now():
+    """A box that moved by whole voxels, seen again: its evidence moves with it; other objects stay behind."""
+    before, after = TWO, np.roll(TWO, 6, axis=1)
+    frames = [frame_of(scene, noise=0) for scene in (before, after)]
+    rule = Extrude()
+    mask, empty = masks_of(before, frames[0])[0], np.zeros(frames[0].depth.shape, bool)
+    rng = [np.random.default_rng(0)]
+    [(_, view)] = rule.complete_again(rng, frames[0], [(mask, ())], GRID)
+    voxels = view_surface(view, GRID)
+    assert len(voxels) > 50 and (before[tuple(voxels.T)] == 1).mean() > 0.9
+    moved = view.moved(RigidTransform.from_translation([0, 6 * GRID.voxel_size, 0]))
+    assert (after[tuple(view_surface(moved, GRID).T)] == 1).mean() > 0.9
+    # The same object in the second frame: what the first one showed is added.
+    again = masks_of(after, frames[1])[0]
+    low, now = observed_box(frames[1], again, GRID, rule)
+    both = recall(now, low, GRID, [moved])
+    assert (both.surface >= now.surface).all() and (both.free >= now.free).all()
+    assert not (both.free & both.surface).any() and not (both.other_surface > now.other_surface).any()
+    # Moved back to where it was, all of the evidence about the object is what it was.
+    start, first = observed_box(frames[0], mask, GRID, rule)
+    blind = replace(first, **{k: np.zeros_like(getattr(first, k)) for k in ("surface", "free", "behind", "hidden")})
+    blind = replace(blind, signed=np.full_like(first.signed, np.nan))
+    there_and_back = moved.moved(RigidTransform.from_translation([0, -6 * GRID.voxel_size, 0]))
+    found = recall(blind, start, GRID, [there_and_back])
+    np.testing.assert_array_equal(found.surface, first.surface & ~found.free)
+    assert (found.free <= first.free).all() and found.free.sum() > 0.8 * (first.free & (first.signed < -1)).sum() > 0
+    # Out of sight it is completed from its views alone.
+    [(hidden, none)] = rule.complete_again(rng, frames[1], [(empty, (moved,))], GRID)
+    assert none is None and iou(placed(hidden) >= 0.5, after == 1) > 0.5
+    # A view that the frame refutes is not used: the object did not move there.
+    wrong = view.moved(RigidTransform.from_translation([0, 0, 0.1]))
+    unchanged = recall(now, low, GRID, [wrong])
+    for a, b in zip(surface_and_free(unchanged), surface_and_free(now), strict=True):
+        np.testing.assert_array_equal(a, b)

@@ -9,7 +9,8 @@ import pytest
 import torch
 
 from mstfilter.completion import Extrude, NetworkCompleter, arbitrate, observed_box
-from mstfilter.completion.crops import CHANNELS, channels, crop_box, encode_box, extruded
+from mstfilter.completion.crops import CHANNELS, channels, crop_box, extruded
+from mstfilter.completion.observed import encode_box
 from mstfilter.completion.unet import ARCHITECTURE, CompletionNet, LatentLaw
 from mstfilter.errors import InputError
 from mstfilter.scene import Frame, VoxelGrid, frame_geometry, scene_cache

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from hypothesis import given, settings, strategies as st
 import mstfilter
 from mstfilter.fusion.belief import Belief
 from mstfilter.fusion.information import noisy_information
-from mstfilter.scene import Camera, Hypothesis, VoxelGrid, look_at, render
+from mstfilter.scene import Camera, Hypothesis, Occupancy, VoxelGrid, look_at, render
 from mstfilter.smc import Population
 
 SHAPE = (4, 3, 2)
@@ -367,3 +368,28 @@ def test_one_object_or_two():
 
 def test_exported():
     assert mstfilter.Belief is Belief
+
+
+def test_probabilities_of_unsure_hypotheses():
+    """Occupancy and "same object" by their definition, with hypotheses that say how sure they are of each voxel."""
+    rng = np.random.default_rng(4)
+    grids, log_weights = scenes(4, n=3)
+    hypotheses = []
+    for k, labels in enumerate(grids):
+        made = Hypothesis.from_labels(labels, GRID)
+        owner = np.where(labels > 0, labels, rng.choice(list(made.volumes()), SHAPE))
+        sure = Occupancy(owner, rng.random(SHAPE))
+        hypotheses.append(replace(made, occupancy=sure) if k else made)
+    belief = Belief(Population(tuple(hypotheses), log_weights))
+    w = np.exp(log_weights - log_weights.max())
+    w /= w.sum()
+    occupied, same = np.zeros(SHAPE), np.zeros((len(VOXELS),) * 2)
+    for weight, one in zip(w, hypotheses, strict=True):
+        occupied += weight * one.shares.probability.astype(float)
+        for (i, a), (j, b) in itertools.product(enumerate(VOXELS), repeat=2):
+            owner, p = one.shares.owner, one.shares.probability.astype(float)
+            same[i, j] += weight * (owner[a] == owner[b] > 0) * (p[a] if a == b else p[a] * p[b])
+    np.testing.assert_allclose(belief.occupancy(), occupied, atol=1e-12)
+    every = np.array(VOXELS)
+    np.testing.assert_allclose(belief.same_object(every[:, None], every[None]), same, atol=1e-12)
+    np.testing.assert_allclose(belief.object_at(VOXELS[5]), same[5].reshape(SHAPE), atol=1e-12)

@@ -17,7 +17,7 @@ from mstfilter.fusion.free_space import NoFreeSpace
 from mstfilter.fusion.interfaces import Projection
 from mstfilter.fusion.update import FusionUpdate
 from mstfilter.presets import REGISTRY, load_config
-from mstfilter.scene import Clip, Crop, Frame, Hypothesis, VoxelGrid
+from mstfilter.scene import Clip, Crop, Frame, Hypothesis, Occupancy, VoxelGrid
 from mstfilter.scoring import weighted_coverage
 from mstfilter.smc import Population
 from tests.fusion.test_mode_filter import book_and_rod
@@ -32,6 +32,27 @@ crossovers = st.builds(
     merge=st.sampled_from(["share", "iou", "always", "never"]),
     mode_filter=st.just(NO_FILTER),
 )
+
+
+@settings(max_examples=60, deadline=None)
+@given(labels, labels, crossovers, st.integers(0, 1000))
+def test_crossover_carries_probabilities(a, b, crossover, seed):
+    """The labels do not depend on them. A voxel gets no more than its parents say, and half at least for a label."""
+    rng = np.random.default_rng(seed)
+    sure = [Hypothesis.from_labels(a, SMALL, birth=1), Hypothesis.from_labels(b, SMALL, birth=0)]
+    unsure = [
+        replace(h, occupancy=Occupancy(h.labels, np.where(h.labels > 0, rng.uniform(0.5, 1, SMALL.shape), 0)))
+        for h in sure
+    ]
+    child = crossover.cross(np.random.default_rng(seed), *unsure)
+    np.testing.assert_array_equal(child.labels, crossover.cross(np.random.default_rng(seed), *sure).labels)
+    p = child.shares.probability
+    assert (p[child.labels > 0] >= 0.5).all() and (p[child.labels == 0] <= 0.5).all()
+    assert (p <= np.maximum(*(h.shares.probability for h in unsure))).all()
+    np.testing.assert_array_equal(child.shares.owner[child.labels > 0], child.labels[child.labels > 0])
+    same = crossover.cross(np.random.default_rng(seed), unsure[0], replace(unsure[0]))
+    if crossover.merge != "always" and (same.labels > 0).any():
+        np.testing.assert_array_equal(same.shares.probability[same.labels > 0], unsure[0].shares.probability[a > 0])
 
 
 @settings(max_examples=150, deadline=None)

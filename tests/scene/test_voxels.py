@@ -11,7 +11,16 @@ from hypothesis.extra import numpy as hnp
 from scipy.spatial.transform import RigidTransform
 
 from mstfilter.errors import InputError
-from mstfilter.scene.voxels import Crop, Hypothesis, ObjectRecord, VoxelGrid, decode_hypotheses, encode_hypotheses
+from mstfilter.scene.voxels import (
+    Crop,
+    Hypothesis,
+    ObjectRecord,
+    ObjectView,
+    Occupancy,
+    VoxelGrid,
+    decode_hypotheses,
+    encode_hypotheses,
+)
 
 GRID = VoxelGrid((-0.3, -0.3, -0.05), 0.01, (6, 5, 4))
 
@@ -100,27 +109,76 @@ def test_records_must_match_the_grid():
         Hypothesis(array, GRID, (ObjectRecord(3, 3), ObjectRecord(1, 1)))
 
 
+def sure_of(array, rng):
+    """Random probabilities of labels (X, Y, Z), also of voxels that are more probably free."""
+    present = [k for k in np.unique(array) if k] or [0]
+    owner = np.where(array > 0, array, rng.choice(present, array.shape))
+    return Occupancy(owner, rng.uniform(0, 1, array.shape) * (owner > 0))
+
+
+@settings(max_examples=40, deadline=None)
+@given(labels, labels)
+def test_probabilities_follow_the_labels(before, after):
+    rng = np.random.default_rng(0)
+    start = replace(Hypothesis.from_labels(before, GRID), occupancy=sure_of(before, rng))
+    after = np.where(np.isin(after, list(start.volumes())), after, 0).astype(np.uint16)
+    end = start.with_labels(after)
+    owner, p = end.occupancy.owner, end.occupancy.probability
+    np.testing.assert_array_equal(owner[after > 0], after[after > 0])
+    same = before == after
+    np.testing.assert_array_equal(p[~same], (after > 0)[~same])
+    gone = ~np.isin(start.occupancy.owner, [o.label for o in end.objects])
+    np.testing.assert_array_equal(p[same & ~gone], start.occupancy.probability[same & ~gone])
+    assert not p[same & gone].any() and not owner[same & gone].any()
+    cleared = rng.random(GRID.shape) < 0.5
+    free = start.without(cleared)
+    assert not free.labels[cleared].any() and not free.occupancy.probability[cleared].any()
+    assert Hypothesis.from_labels(before, GRID).shares.probability.sum() == (before > 0).sum()
+
+
+def test_an_occupancy_of_another_shape_is_refused():
+    with pytest.raises(InputError, match="occupancy has shape"):
+        Hypothesis(np.zeros(GRID.shape, np.uint16), GRID, (), Occupancy(np.zeros((1, 1, 1)), np.zeros((1, 1, 1))))
+
+
 def test_encoding_is_lossless_and_reproducible():
     rng = np.random.default_rng(0)
     hypotheses = []
+
+    def crop_of(mask, n):
+        return Crop.of(mask, rng.random(GRID.shape) if n == 2 else None)
+
     for n in range(4):
         array = rng.choice([0, 0, 0, 1, 4], GRID.shape).astype(np.uint16) * (n > 0)
         h = Hypothesis.from_labels(array, GRID, birth=n)
         records = tuple(
             replace(
                 o,
-                source=Crop.of(array == o.label) if o.label == 4 else None,
+                source=crop_of(array == o.label, n) if o.label == 4 else None,
                 motion=RigidTransform.from_exp_coords(rng.normal(size=6)),
                 completion_key="a" * n,
+                views=tuple(
+                    ObjectView(
+                        rng.integers(3, size=3),
+                        rng.integers(32, size=(2, 3, k + 1), dtype=np.uint8),
+                        rng.integers(-127, 128, size=(2, 3, k + 1), dtype=np.int8),
+                        f"view {k}",
+                        RigidTransform.from_exp_coords(rng.normal(size=6)),
+                    )
+                    for k in range(n - 1)
+                ),
             )
             for o in h.objects
         )
-        hypotheses.append(Hypothesis(array, GRID, records))
+        hypotheses.append(Hypothesis(array, GRID, records, sure_of(array, rng) if n > 1 else None))
     arrays = encode_hypotheses(hypotheses)
     loaded = decode_hypotheses(arrays)
     for a, b in zip(hypotheses, loaded, strict=True):
         np.testing.assert_array_equal(a.labels, b.labels)
-        assert a.grid == b.grid
+        assert a.grid == b.grid and a.key == b.key
+        assert (a.occupancy is None) == (b.occupancy is None)
+        np.testing.assert_array_equal(a.shares.owner, b.shares.owner)
+        np.testing.assert_array_equal(a.shares.probability, b.shares.probability)
         for p, q in zip(a.objects, b.objects, strict=True):
             assert (p.label, p.id, p.birth, p.completion_key or None) == (q.label, q.id, q.birth, q.completion_key)
             np.testing.assert_allclose(p.motion.as_matrix(), q.motion.as_matrix(), atol=1e-12)
@@ -128,5 +186,10 @@ def test_encoding_is_lossless_and_reproducible():
             if p.source is not None:
                 np.testing.assert_array_equal(p.source.occupied, q.source.occupied)
                 np.testing.assert_array_equal(p.source.offset, q.source.offset)
+                np.testing.assert_array_equal(p.source.probability, q.source.probability)
+            assert [v.name for v in p.views] == [v.name for v in q.views]
+            for v, w in zip(p.views, q.views, strict=True):
+                for name in ("offset", "bits", "signed"):
+                    np.testing.assert_array_equal(getattr(v, name), getattr(w, name))
     again = encode_hypotheses(loaded)
     assert {name: a.tobytes() for name, a in again.items()} == {name: a.tobytes() for name, a in arrays.items()}

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 from hypothesis.extra import numpy as hnp
 
 from mstfilter.errors import InputError
-from mstfilter.scene import Recording
+from mstfilter.scene import Hypothesis, Occupancy, Recording, VoxelGrid
 from mstfilter.scoring import Questions, ask, draw_questions, in_question
 from mstfilter.scoring.questions import DEPTH_BEHIND, REACH
 from tests.scene.scenes import CAMERA, GRID, table_scene
@@ -84,6 +86,32 @@ def test_noise_in_expectation_and_drawn():
     assert np.abs(exact - questions.outcomes(labels)).max() > 0.3  # it changes something
     deep = np.ones((5, 5, 5), np.uint16)  # no border: no noise
     np.testing.assert_array_equal(every_pair(deep.shape).forecasts([deep], np.ones(1), (0.4,)), 1.0)
+
+
+def test_forecasts_of_unsure_hypotheses():
+    """Against draws: each voxel belongs to its owner with its probability, then takes a neighbour's label."""
+    rng = np.random.default_rng(6)
+    owner = np.zeros((4, 3, 2), np.uint16)
+    owner[:2], owner[2:, :2] = 1, 2
+    p = rng.uniform(0, 1, owner.shape).astype(np.float16)
+    grid = VoxelGrid((0, 0, 0), 0.01, owner.shape)
+    one = replace(Hypothesis.from_labels(np.where(p > 0.5, owner, 0), grid), occupancy=Occupancy(owner, p))
+    questions = every_pair(owner.shape)
+    sure, noisy = questions.forecasts([one], np.ones(1), (0.0, 0.4))
+    a, b = questions.first, questions.second
+    product = (
+        p.ravel()[a].astype(float) * p.ravel()[b] * (owner.ravel()[a] == owner.ravel()[b]) * (owner.ravel()[a] > 0)
+    )
+    np.testing.assert_allclose(sure, product, atol=1e-12)
+    mixed = questions.forecasts([one, owner], np.array([0.25, 0.75]))
+    np.testing.assert_allclose(mixed, 0.25 * product + 0.75 * questions.outcomes(owner), atol=1e-12)
+    # The two voxels are independent: each takes the label of a neighbour with probability .4, and what it takes is an
+    # owner with the probability there.
+    share = np.stack([np.where(owner == k, p, 0).astype(float) for k in (1, 2)])
+    padded = np.pad(share, ((0, 0), (1, 1), (1, 1), (1, 1)), mode="edge")
+    around = [np.roll(padded, s, axis)[:, 1:-1, 1:-1, 1:-1] for axis in (1, 2, 3) for s in (1, -1)]
+    law = (0.6 * share + 0.4 * np.mean(around, axis=0)).reshape(2, -1)
+    np.testing.assert_allclose(noisy, (law[:, a] * law[:, b]).sum(axis=0), atol=1e-12)
 
 
 def test_questions_depend_on_the_depth_images_alone():

@@ -1,10 +1,12 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 from scipy.spatial.transform import Rotation
 
 from mstfilter.errors import InputError
-from mstfilter.scene import Hypothesis, VoxelGrid
+from mstfilter.scene import Hypothesis, Occupancy, VoxelGrid
 from mstfilter.tracking.rigid import rigid_transform
 from mstfilter.tracking.transition import Warp
 from tests.tracking.scenes import at, iou
@@ -52,6 +54,32 @@ def test_whole_voxel_shift_is_exact(shift, method):
     h = hypothesis(BOX)
     moved = move(Warp(method), h, {1: at(*np.array(shift) * 0.01)})
     np.testing.assert_array_equal(moved.hypothesis.labels, np.roll(h.labels, shift, (0, 1, 2)))
+
+
+@pytest.mark.parametrize("method", ["pull", "smooth"])
+def test_probabilities_move_with_their_object(method):
+    """Exactly by whole voxels; what rests keeps its probabilities, and labels are at least as probable as not."""
+    h = hypothesis(BOX, OTHER)
+    owner = np.where(h.labels > 0, h.labels, np.where(np.arange(60)[:, None, None] < 35, 1, 2))
+    p = np.random.default_rng(0).uniform(0, 0.5, GRID.shape)
+    near = np.zeros(GRID.shape, bool)
+    near[18:32, 18:30, :8] = near[38:50, 18:30, :8] = True
+    p = np.where(h.labels > 0, 1 - p, p) * near
+    h = replace(h, occupancy=Occupancy(np.where(near, owner, 0), p))
+    shift = (0, 20, 3)
+    moved = move(Warp(method), h, {1: at(*np.array(shift) * 0.01)}).hypothesis
+    own = np.where(h.occupancy.owner == 1, h.occupancy.probability, 0)
+    expected = np.where(h.occupancy.owner == 2, h.occupancy.probability, np.roll(own, shift, (0, 1, 2)))
+    known = expected > 0.02  # smaller ones are not moved
+    np.testing.assert_allclose(moved.occupancy.probability[known], expected[known], atol=2e-3)
+    assert (moved.occupancy.probability[~known] <= 0.02).all()
+    np.testing.assert_array_equal(moved.occupancy.owner[known & (expected == np.roll(own, shift, (0, 1, 2)))], 1)
+    back = move(Warp(method), moved, {1: at(*np.array(shift) * -0.01)}).hypothesis
+    np.testing.assert_allclose(back.occupancy.probability, h.occupancy.probability, atol=0.021)
+    turned = move(Warp(method), h, {1: turn(30)}).hypothesis
+    found, sure = turned.labels, turned.occupancy
+    np.testing.assert_array_equal(sure.owner[found > 0], found[found > 0])
+    assert (sure.probability[found > 0] >= 0.5).all() and (sure.probability[found == 0] <= 0.5).all()
 
 
 def test_smooth_is_nearer_to_the_true_voxels_than_pull():

@@ -1,0 +1,180 @@
+"""What frames show of an object, in a box of the grid around it: the input of completion.
+
+>>> offset, seen = observed_box(frame, mask, grid, completer)     # of one frame
+>>> bits, signed = encode_box(seen)                               # packed: the contents of an `ObjectView`
+>>> seen = recall(seen, offset, grid, views)                      # and of earlier frames
+
+**Earlier frames.** The views of an object are moved with it, and read at the nearest voxel. Its surface, the space
+behind it and the space that was free around it are evidence about its shape for ever; other objects and the space
+that they hid are not, since they may have moved. The latest frame decides where it measures the object's surface.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from mstfilter.scene import Frame, ObjectView, VoxelGrid, depth_sigma, frame_geometry, memo, read_only
+
+if TYPE_CHECKING:
+    from mstfilter.completion.completer import Completer
+
+_REACH = 4.0  # voxels, distance from the surface at which `signed` saturates
+_OWN, _FREE, _BEHIND = np.uint8(1), np.uint8(4), np.uint8(8)  # bits of a view
+_SHAPE = _OWN | _FREE | _BEHIND  # those that are evidence about the object's shape
+
+_CONTRADICTED = 0.3  # share of the surface at which the latest frame refutes a view
+_CLEAR = 1.0  # voxels: space of an earlier frame is free if it lay this far in front of the surface
+
+
+@dataclass(frozen=True, eq=False)
+class ObservedBox:
+    """What a frame shows of a box of the grid around one mask."""
+
+    points: np.ndarray  #: (a, b, c) int32: readings of the mask in each voxel
+    #: (a, b, c) bool, visible surface of the mask: the pixel of the voxel's centre is in the mask, and the centre
+    #: is at the measured surface or just behind it. If no centre falls into a small mask, the voxel with most
+    #: readings.
+    surface: np.ndarray
+    other_surface: np.ndarray  #: (a, b, c) bool, visible surface outside the mask, by the same rule
+    free: np.ndarray  #: (a, b, c) bool, observed as free
+    #: (a, b, c) bool, the pixel of the centre is in the mask and the centre is behind the measured surface.
+    behind: np.ndarray
+    hidden: np.ndarray  #: (a, b, c) bool, the same for a pixel outside the mask: hidden by something else.
+    #: (a, b, c) float32, voxels behind the measured surface along the optical axis; NaN if it is unknown.
+    signed: np.ndarray
+    height: np.ndarray  #: (c,) height of the voxel centres above the table in metres
+
+
+def observed_box(frame: Frame, mask: np.ndarray, grid: VoxelGrid, rule: Completer) -> tuple[np.ndarray, ObservedBox]:
+    """The box of a mask: its offset (3,) in the grid, and what the frame shows of it.
+
+    `rule` says how large the box is, and what counts as visible surface and as free space.
+    """
+    mine = mask_voxels(frame, mask, grid)
+    if len(mine) == 0:
+        empty = np.zeros((0, 0, 0))
+        no = empty.astype(bool)
+        unknown = empty.astype(np.float32)
+        return np.zeros(3, np.int64), ObservedBox(empty.astype(np.int32), no, no, no, no, no, unknown, np.zeros(0))
+    low, high = rule.box(mine, grid)
+    return low, observed_in(frame, mask, grid, rule, low, high)
+
+
+def mask_voxels(frame: Frame, mask: np.ndarray, grid: VoxelGrid) -> np.ndarray:
+    """Voxels (k, 3) of the readings of a mask (H, W)."""
+    pixels, voxels = _frame_points(frame, grid)
+    return voxels[mask.ravel()[pixels]]
+
+
+def observed_in(
+    frame: Frame, mask: np.ndarray, grid: VoxelGrid, rule: Completer, low: np.ndarray, high: np.ndarray
+) -> ObservedBox:
+    """What a frame shows of a mask in the box from voxel `low` to `high`. The mask may be empty."""
+    box = tuple(slice(int(a), int(b)) for a, b in zip(low, high, strict=True))
+    shape = tuple(int(n) for n in high - low)
+    mine = mask_voxels(frame, mask, grid)
+    mine = mine[((mine >= low) & (mine < high)).all(axis=1)]
+    flat = np.ravel_multi_index(tuple((mine - low).T), shape)
+    points = np.bincount(flat, minlength=int(np.prod(shape))).reshape(shape).astype(np.int32)
+
+    geometry = frame_geometry(frame, grid)
+    pixel, signed = geometry.pixel[box], geometry.signed[box]
+    inside = (pixel >= 0) & mask.ravel()[np.maximum(pixel, 0)]
+    with np.errstate(invalid="ignore"):
+        surface = (signed >= -rule.in_front * grid.voxel_size) & (signed < rule.depth * grid.voxel_size)
+        behind = signed > 0
+    in_mask = surface & inside
+    free = _free(frame, grid, rule.free_margin, rule.free_sigmas)[box]
+    if len(mine) and not in_mask.any():
+        in_mask[np.unravel_index(points.argmax(), shape)] = True
+        free = free & ~in_mask
+    height = grid.origin[2] + (np.arange(shape[2]) + 0.5) * grid.voxel_size
+    other = surface & ~inside & ~in_mask
+    distance = signed / np.float32(grid.voxel_size)
+    return ObservedBox(points, in_mask, other, free, behind & inside, behind & ~inside, distance, height)
+
+
+def _frame_points(frame: Frame, grid: VoxelGrid) -> tuple[np.ndarray, np.ndarray]:
+    """Flat pixels with a reading inside the grid (k,), and their voxels (k, 3)."""
+
+    def compute() -> tuple[np.ndarray, np.ndarray]:
+        index = grid.index_of(frame.points)
+        pixels = np.flatnonzero(frame.valid & grid.contains(index))
+        return read_only(pixels), read_only(index.reshape(-1, 3)[pixels].astype(np.int32))
+
+    return memo("frame_points", (frame.key, grid.key), compute)
+
+
+def _free(frame: Frame, grid: VoxelGrid, margin: float, sigmas: float) -> np.ndarray:
+    """Voxels (X, Y, Z) bool in front of the measured surface by `margin` voxels and by `sigmas` of its noise."""
+
+    def compute() -> np.ndarray:
+        geometry = frame_geometry(frame, grid)
+        distance = np.maximum(margin * grid.voxel_size, sigmas * depth_sigma(geometry.z - geometry.signed))
+        return read_only(geometry.known_free(distance))
+
+    return memo("seen_free", (frame.key, grid.key, margin, sigmas), compute)
+
+
+def encode_box(seen: ObservedBox) -> tuple[np.ndarray, np.ndarray]:
+    """What a box shows as bits (a, b, c) uint8, and its signed distances (a, b, c) int8 in `_REACH` / 127."""
+    bits = np.zeros(seen.surface.shape, np.uint8)
+    for k, one in enumerate((seen.surface, seen.other_surface, seen.free, seen.behind, seen.hidden)):
+        bits |= one.astype(np.uint8) << k
+    signed = np.clip(np.nan_to_num(seen.signed, nan=0.0) / _REACH, -1, 1)
+    return bits, np.rint(signed * 127).astype(np.int8)
+
+
+def decode_signed(signed: np.ndarray) -> np.ndarray:
+    """Signed distances in voxels, of `encode_box`."""
+    return np.asarray(signed, np.float32) * np.float32(_REACH / 127)
+
+
+def recall(seen: ObservedBox, offset: np.ndarray, grid: VoxelGrid, views: Sequence[ObjectView]) -> ObservedBox:
+    """What a frame shows of a box at `offset` (3,), together with earlier views of the object."""
+    if not views:
+        return seen
+    shape = seen.surface.shape
+    centres = grid.centre_of(np.indices(shape).reshape(3, -1).T + offset)
+    bits: np.ndarray = np.zeros(len(centres), np.uint8)
+    signed = np.full(len(centres), np.nan, np.float32)
+    for view in views:
+        index = grid.index_of(view.motion.inv().apply(centres)) - view.offset
+        inside = ((index >= 0) & (index < view.bits.shape)).all(axis=1)
+        at = tuple(index[inside].T)
+        distance = decode_signed(view.signed[at])
+        found = view.bits[at] & _SHAPE
+        clear = np.where(distance > -_CLEAR, found & (_OWN | _BEHIND), found)
+        if _contradicts(clear, seen, inside):
+            continue
+        bits[inside] |= clear
+        signed[inside] = np.fmin(signed[inside], np.where(found > 0, distance, np.nan))
+    bits = bits.reshape(shape)
+    free = seen.free | (((bits & _FREE) > 0) & ~seen.surface)
+    surface = (seen.surface | ((bits & _OWN) > 0)) & ~free
+    behind = (seen.behind | ((bits & _BEHIND) > 0)) & ~free
+    other, hidden = seen.other_surface & ~free & ~surface, seen.hidden & ~free & ~behind
+    return ObservedBox(
+        seen.points, surface, other, free, behind, hidden, np.fmin(seen.signed, signed.reshape(shape)), seen.height
+    )
+
+
+def _contradicts(found: np.ndarray, seen: ObservedBox, inside: np.ndarray) -> bool:
+    """Whether the latest frame contradicts a view: its surface is seen free, or its free space is the surface.
+
+    `found` (k,) are its bits at the voxels `inside` (n,) bool of the box.
+    """
+    own, free = (found & _OWN) > 0, (found & _FREE) > 0
+    now_free, now_own = seen.free.ravel()[inside], seen.surface.ravel()[inside]
+    n_own, n_now = int(own.sum()), int(now_own.sum())
+    return bool((own & now_free).sum() > _CONTRADICTED * n_own or (free & now_own).sum() > _CONTRADICTED * n_now)
+
+
+def view_surface(view: ObjectView, grid: VoxelGrid) -> np.ndarray:
+    """Voxels (k, 3), also outside the grid, that the surface of a view has moved to."""
+    centres = grid.centre_of(np.argwhere(view.bits & _OWN) + view.offset)
+    return grid.index_of(view.motion.apply(centres)) if len(centres) else np.zeros((0, 3), np.int64)

@@ -1,0 +1,268 @@
+"""A measurement update that partitions the image, and completes every object from all that was seen of it.
+
+>>> update = PartitionUpdate(completer=NetworkCompleter())
+>>> fused = update.update(rng, predicted, proposed, clip)       # candidates of sampled pairs, with weights
+
+A sample and a prediction are read as partitions of the readings of the last frame: the sample by its segments, the
+prediction by the objects that lie at the readings. The conflict graph has an edge for each segment and predicted
+object that share readings. Each of its components gets the partition of one side, drawn at random.
+
+An object of the result continues the predicted object with which it shares most readings, and keeps its views: what
+earlier frames showed of it (`mstfilter.scene.ObjectView`). It is completed from the readings of this frame and from
+its views together. So evidence is remembered and guesses are not: no voxel that was guessed at an earlier pause is
+carried on. Predicted objects without readings stay, unless the frame sees through them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import ClassVar, NamedTuple
+
+import networkx as nx
+import numpy as np
+from scipy.ndimage import distance_transform_edt
+
+from mstfilter.completion import Completer, Extrude, arbitrate, occupancy_of
+from mstfilter.errors import check_integer, check_number
+from mstfilter.fusion.conflicts import check_grid
+from mstfilter.fusion.division import NoDivision, PartRule, divided, split_like
+from mstfilter.fusion.free_space import FreeSpace, log_quality
+from mstfilter.fusion.interfaces import Division, Evidence, Projection
+from mstfilter.scene import Clip, Frame, Hypothesis, ObjectRecord, ObjectView, VoxelGrid
+from mstfilter.smc import Population, Systematic, Update, child
+
+_EDGE = 0.1  # share of the smaller of a segment and an object that they have in common if they are in conflict
+_SAME = 0.5  # share of a predicted object's readings in the segment that continues it, if both have no other conflict
+_CONTAINED = 0.8  # the same, if they have other conflicts
+
+
+class Readings(NamedTuple):
+    """The depth readings of a frame inside the grid."""
+
+    pixels: np.ndarray  #: (m,) flat pixels
+    voxels: np.ndarray  #: (m, 3) voxels
+
+    @classmethod
+    def of(cls, frame: Frame, grid: VoxelGrid) -> Readings:
+        """Of a frame."""
+        index = grid.index_of(frame.points)
+        pixels = np.flatnonzero(frame.valid & grid.contains(index))
+        return cls(pixels, index.reshape(-1, 3)[pixels])
+
+    def labels(self, labels: np.ndarray, reach: float) -> np.ndarray:
+        """Label (m,) of each reading: of its voxel, or of the nearest object within `reach` voxels; 0 is none."""
+        found = labels[tuple(self.voxels.T)].astype(np.int64)
+        left = np.flatnonzero(found == 0)
+        if not len(left):
+            return found
+        low = np.maximum(self.voxels[left].min(axis=0) - 3, 0)
+        high = np.minimum(self.voxels[left].max(axis=0) + 4, labels.shape)
+        box = labels[tuple(slice(a, b) for a, b in zip(low, high, strict=True))]
+        if box.any():
+            distance, index = distance_transform_edt(box == 0, return_indices=True)
+            at = tuple((self.voxels[left] - low).T)
+            found[left] = np.where(distance[at] <= reach, box[tuple(axis[at] for axis in index)], 0)
+        return found
+
+
+class _Part(NamedTuple):
+    """An object of a candidate."""
+
+    readings: np.ndarray  #: (m,) bool, its readings
+    continues: tuple[ObjectRecord, ...]  #: the predicted objects that it continues, the largest first
+
+
+@dataclass(frozen=True)
+class PartitionUpdate(Update):
+    """Partition of the readings, and completion from all views.
+
+    Parameters
+    ----------
+    completer : Completer
+        Completes the objects. That of the proposal is then of no use, and may be `SurfaceOnly`.
+    free_space : Projection
+        Gives the share Q of a prediction that the frame does not see through, and the objects that are left.
+    division : Division
+        Objects of both sides whose parts move apart in the clip are split first.
+    parts : PartRule
+        When a part of an object becomes a separate object.
+    evidence : tuple of Evidence
+        Terms whose sum is the log weight of a candidate. Without them all candidates have equal weights: they are
+        drawn by the weights of their pairs, log w = log w_i + log w_j + lambda log Q_j.
+    quality_exponent : float
+        lambda.
+    n_candidates : int
+        Candidates; 0 means four for each predicted hypothesis.
+    past : float
+        Probability that a component of the conflict graph gets the partition of the prediction.
+    reach : float
+        Voxels between a reading and the predicted object that explains it, at most.
+    least_kept : float
+        Share of its voxels that a predicted object without readings must keep. The frame sees through the others.
+    n_views : int
+        Views that an object keeps, at most: the latest ones.
+    threshold : float
+        Smallest probability of an occupied voxel.
+    """
+
+    completer: Completer = field(default_factory=Extrude)
+    free_space: Projection = FreeSpace()  # noqa: RUF009 (frozen)
+    division: Division = NoDivision()  # noqa: RUF009 (frozen)
+    parts: PartRule = PartRule()  # noqa: RUF009 (frozen)
+    evidence: tuple[Evidence, ...] = ()
+    quality_exponent: float = 3.0
+    n_candidates: int = 0
+    past: float = 0.5
+    reach: float = 1.5
+    least_kept: float = 0.5
+    n_views: int = 4
+    threshold: float = 0.5
+
+    properly_weighted: ClassVar[bool] = False
+
+    def __post_init__(self) -> None:
+        check_integer("n_candidates", self.n_candidates, at_least=0)
+        check_integer("n_views", self.n_views, at_least=0)
+        for name, largest in (("past", 1.0), ("least_kept", 1.0), ("threshold", 1.0)):
+            check_number(name, getattr(self, name), at_least=0, at_most=largest)
+        check_number("quality_exponent", self.quality_exponent, at_least=0)
+        check_number("reach", self.reach, at_least=0)
+
+    def update(
+        self, rng: np.random.Generator, predicted: Population | None, proposed: Population | None, observation: Clip
+    ) -> Population:
+        """Candidates. Without a proposal the refined predictions pass."""
+        frame, grid = observation.after, observation.grid
+        notes: dict = {}
+        if predicted is None:
+            assert proposed is not None
+            empty = Hypothesis(np.zeros(grid.shape, np.uint16), grid)
+            predicted, log_q = Population((empty,)), np.zeros(1)
+            refined: tuple[Hypothesis, ...] = (empty,)
+        else:
+            refined, quality = self.free_space.refine(predicted.particles, observation)
+            log_q, notes = self.quality_exponent * log_quality(quality), {"quality": quality.tolist()}
+        if proposed is None:
+            return Population(refined, predicted.log_weights + log_q, predicted.parents, notes)
+        for name, hypotheses in (("predicted", predicted.particles), ("proposed", proposed.particles)):
+            for k, hypothesis in enumerate(hypotheses):
+                check_grid(f"{name} hypothesis {k}", hypothesis, grid)
+        i, j = self._pairs(child(rng, "pairs"), proposed, predicted, log_q)
+        predictions = divided(self.division, self.parts, tuple(predicted.particles), observation, proposed=False)
+        refined = divided(self.division, self.parts, refined, observation, proposed=False)
+        samples = divided(self.division, self.parts, tuple(proposed.particles), observation, proposed=True)
+        readings = Readings.of(frame, grid)
+        at_readings = {k: readings.labels(predictions[k].labels, self.reach) for k in np.unique(j).tolist()}
+        candidates = []
+        for number, (a, b) in enumerate(zip(i.tolist(), j.tolist(), strict=True)):
+            segments = readings.labels(split_like(samples[a], predictions[b]).labels, 1.0)
+            stream = child(rng, "candidate", number)
+            candidates.append(self._partition(stream, segments, at_readings[b], predictions[b], refined[b]))
+        built = self._complete(rng, candidates, readings, observation)
+        parents = {
+            "previous": predicted.parents.get("previous", np.full(len(predicted), -1))[j],
+            "proposed": proposed.parents.get("proposed", np.full(len(proposed), -1))[i],
+        }
+        total, scores = np.zeros(len(built)), {}
+        for term in self.evidence:
+            score = term.log_score(built, observation)
+            scores[type(term).__name__] = score.round(3).tolist()
+            total += score
+        return Population(built, total, parents, {**notes, "scores": scores})
+
+    def _pairs(
+        self, rng: np.random.Generator, proposed: Population, predicted: Population, log_q: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Sample and prediction of each candidate, drawn by weight."""
+        n = self.n_candidates or 4 * max(len(predicted), len(proposed))
+        sides = [
+            Systematic().resample(child(rng, name), Population(range(len(log_w)), log_w), n).realised().particles
+            for name, log_w in (("proposed", proposed.log_weights), ("predicted", predicted.log_weights + log_q))
+        ]
+        i, j = (np.asarray(side) for side in sides)
+        return i, child(rng, "order").permutation(j)
+
+    def _partition(
+        self,
+        rng: np.random.Generator,
+        segments: np.ndarray,
+        past: np.ndarray,
+        prediction: Hypothesis,
+        refined: Hypothesis,
+    ) -> list[_Part]:
+        """The objects of a candidate, from the segment and the predicted object (m,) of each reading, 0 is none."""
+        past = np.where(segments > 0, past, 0)
+        shape = int(segments.max(initial=0)) + 1, int(past.max(initial=0)) + 1
+        shared = np.bincount(segments * shape[1] + past, minlength=shape[0] * shape[1]).reshape(shape)
+        record_of = {record.label: record for record in prediction.objects}
+        parts: list[_Part] = []
+        seen: set[int] = set()
+        for of_sample, of_past in _components(shared):
+            seen.update(of_past)
+            alone = len(of_sample) == len(of_past) == 1
+            if not of_past or alone or rng.random() >= self.past:
+                for a in of_sample:
+                    least = (_SAME if alone else _CONTAINED) * shared.sum(axis=0)
+                    own = sorted((b for b in of_past if shared[a, b] > least[b]), key=lambda b: -shared[a, b])
+                    parts.append(_Part(segments == a, tuple(record_of[b] for b in own)))
+            else:
+                inside = np.isin(segments, of_sample)
+                owner = np.where(inside & np.isin(past, of_past), past, 0)
+                for a in of_sample:
+                    owner[(segments == a) & (owner == 0)] = max(of_past, key=lambda b: shared[a, b])
+                parts += [_Part(owner == b, (record_of[b],)) for b in of_past if (owner == b).any()]
+        before, after = prediction.volumes(), refined.volumes()
+        nothing = np.zeros(len(segments), bool)
+        hidden = [k for k in record_of if k not in seen and after.get(k, 0) > self.least_kept * before[k]]
+        return parts + [_Part(nothing, (record_of[k],)) for k in hidden]
+
+    def _complete(
+        self, rng: np.random.Generator, candidates: Sequence[Sequence[_Part]], readings: Readings, clip: Clip
+    ) -> tuple[Hypothesis, ...]:
+        """The hypotheses. Each distinct object is completed once, all together."""
+        frame, objects = clip.after, []
+        for part in (part for parts in candidates for part in parts):
+            mask = np.zeros(frame.depth.size, bool)
+            mask[readings.pixels[part.readings]] = True
+            views = tuple(view for record in part.continues for view in record.views)
+            objects.append((mask.reshape(frame.depth.shape), views[-self.n_views :] if self.n_views else ()))
+        streams = [child(rng, "completion", k) for k in range(len(objects))]
+        completed = iter(self.completer.complete_again(streams, frame, objects, clip.grid))
+        views_of = iter(views for _, views in objects)
+        built = []
+        for parts in candidates:
+            found, records = [], []
+            for label, part in enumerate(parts, start=1):
+                completion, view = next(completed)
+                views = next(views_of) if view is None else (*next(views_of), view)
+                views = views[-self.n_views :] if self.n_views else ()
+                found.append(completion)
+                records.append(_record(part, label, clip.index, completion.key, views))
+            labels = arbitrate(found, clip.grid, self.threshold)
+            present = np.bincount(labels.ravel(), minlength=len(found) + 1)
+            kept = tuple(record for record in records if present[record.label])
+            built.append(Hypothesis(labels, clip.grid, kept, occupancy_of(found, labels, clip.grid)))
+        return tuple(built)
+
+
+def _components(shared: np.ndarray) -> list[tuple[list[int], list[int]]]:
+    """Segments and predicted objects of each component, from their numbers of common readings (s + 1, p + 1)."""
+    graph = nx.Graph()
+    sizes, past_sizes = shared.sum(axis=1), shared.sum(axis=0)
+    for a in range(1, len(shared)):
+        if sizes[a]:
+            graph.add_node((0, a))
+        for b in range(1, len(past_sizes)):
+            if shared[a, b] > _EDGE * min(sizes[a], past_sizes[b]):
+                graph.add_edge((0, a), (1, b))
+    components = sorted(sorted(found) for found in nx.connected_components(graph))
+    return [([k for side, k in found if side == 0], [k for side, k in found if side == 1]) for found in components]
+
+
+def _record(part: _Part, label: int, birth: int, key: str, views: tuple[ObjectView, ...]) -> ObjectRecord:
+    """The record of an object: of the predicted object that it continues, or new."""
+    if not part.continues:
+        return ObjectRecord.born(label, birth, key, views)
+    apart = frozenset().union(*(record.apart for record in part.continues))
+    return replace(part.continues[0].changed(), label=label, views=views, apart=apart)

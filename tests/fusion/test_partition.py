@@ -1,0 +1,149 @@
+"""Partition of the readings and completion from all views: what is carried on, what is not, and the law of draws."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from mstfilter.completion import Extrude, SurfaceOnly
+from mstfilter.errors import InputError
+from mstfilter.fusion import PartitionUpdate
+from mstfilter.fusion.partition import Readings
+from mstfilter.scene import Clip, Hypothesis
+from mstfilter.segmentation import hypothesis_of
+from mstfilter.smc import Population
+from tests.completion.test_completion import masks_of
+from tests.segmentation.scenes import GRID, TWO, boxes, frame_of
+
+#: A tall box in front of where a small one stands, as seen from the camera.
+ALONE = boxes(((22, 30, 0), (28, 36, 5)))
+
+
+def clip_of(scene, index=0):
+    return Clip([frame_of(scene, noise=0)], GRID, index)
+
+
+def sample_of(clip, masks, completer=None):
+    completions = (completer or SurfaceOnly()).complete(np.random.default_rng(0), clip.after, masks, GRID)
+    return hypothesis_of(completions, GRID, clip.index)
+
+
+def step(update, clip, sample, state=None, seed=0):
+    proposed = Population((sample,))
+    predicted = None if state is None else Population((state,))
+    return update.update(np.random.default_rng(seed), predicted, proposed, clip)
+
+
+def test_a_first_frame_is_its_samples_completed():
+    clip = clip_of(TWO)
+    found = step(PartitionUpdate(), clip, sample_of(clip, masks_of(TWO, clip.after)))
+    for one in found.particles:
+        assert [record.birth for record in one.objects] == [0, 0]
+        assert [len(record.views) for record in one.objects] == [1, 1]
+        for k in (1, 2):
+            same, either = (one.labels == k) & (k == TWO), (one.labels == k) | (k == TWO)
+            assert same.sum() > 0.6 * either.sum()
+
+
+def test_guesses_are_not_added_up():
+    """The same view again and again changes nothing: volumes, identities and the number of views stay bounded."""
+    update, clip = PartitionUpdate(n_views=3), clip_of(TWO)
+    sample = sample_of(clip, masks_of(TWO, clip.after))
+    state = step(update, clip, sample).particles[0]
+    first, ids = state.labels, [record.id for record in state.objects]
+    for index in range(1, 6):
+        found = step(update, clip_of(TWO, index), sample, state, seed=index)
+        for one in found.particles:
+            np.testing.assert_array_equal(one.labels, first)
+            assert [record.id for record in one.objects] == ids
+        state = found.particles[-1]
+        assert [len(record.views) for record in state.objects] == [min(index + 1, 3)] * 2
+
+
+def test_hidden_objects_stay_until_the_frame_sees_through_them():
+    update, clip = PartitionUpdate(), clip_of(TWO)
+    state = step(update, clip, sample_of(clip, masks_of(TWO, clip.after))).particles[0]
+    identity = state.record(2).id
+    # In front of the second object the frame has no readings: nothing says that it is gone.
+    blind = frame_of(TWO, noise=0)
+    depth = np.where(masks_of(TWO, blind)[1], np.nan, blind.depth)
+    hidden = Clip([type(blind)(blind.rgb, depth, blind.camera)], GRID, 1)
+    mask = masks_of(TWO, blind)[:1]
+    for one in step(update, hidden, sample_of(hidden, mask), state).particles:
+        kept = [record for record in one.objects if record.id == identity]
+        assert len(kept) == 1 and len(kept[0].views) == 1
+        assert (one.mask(kept[0].label) & (TWO == 2)).sum() > 0.5 * (TWO == 2).sum()
+    only_first = np.where(TWO == 1, 1, 0).astype(np.uint16)
+    gone = clip_of(only_first, 1)
+    for one in step(update, gone, sample_of(gone, masks_of(only_first, gone.after)), state).particles:
+        assert [record.id for record in one.objects] == [state.record(1).id]
+
+
+def test_one_side_gives_the_partition_of_a_component():
+    """A sample that sees two predicted objects as one: each side as often as `past` says."""
+    clip = clip_of(TWO)
+    masks = masks_of(TWO, clip.after)
+    state = step(PartitionUpdate(), clip, sample_of(clip, masks)).particles[0]
+    merged = sample_of(clip_of(TWO, 1), [masks[0] | masks[1]])
+    for past, n_objects in ((0.0, 1), (1.0, 2)):
+        found = step(PartitionUpdate(past=past), clip_of(TWO, 1), merged, state).particles
+        assert {one.n_objects for one in found} == {n_objects}
+    # Both views are kept by the object that continues both.
+    one = step(PartitionUpdate(past=0.0), clip_of(TWO, 1), merged, state).particles[0]
+    assert len(one.objects[0].views) == 3
+    n = 400
+    update = PartitionUpdate(past=0.3, n_candidates=n, completer=SurfaceOnly())
+    found = step(update, clip_of(TWO, 1), merged, state).particles
+    share = np.mean([one.n_objects == 2 for one in found])
+    assert abs(share - 0.3) < 4 * np.sqrt(0.3 * 0.7 / n)  # 1 false alarm in 16,000
+    # Weighted prediction and sample: a sample that cuts the first object in two.
+    half = masks[0] & (np.arange(masks[0].shape[1]) < np.nonzero(masks[0])[1].mean())
+    cut = sample_of(clip_of(TWO, 1), [half, masks[0] & ~half, masks[1]])
+    found = step(PartitionUpdate(past=0.0), clip_of(TWO, 1), cut, state).particles[0]
+    assert found.n_objects == 3 and state.record(2).id in {record.id for record in found.objects}
+    found = step(PartitionUpdate(past=1.0), clip_of(TWO, 1), cut, state).particles[0]
+    assert [record.id for record in found.objects] == [record.id for record in state.objects]
+
+
+def test_labels_of_readings_by_brute_force():
+    rng = np.random.default_rng(0)
+    readings = Readings(np.arange(300), rng.integers(10, 30, (300, 3)))
+    labels = np.zeros(GRID.shape, np.uint16)
+    for k in range(1, 40):
+        labels[tuple(rng.integers(10, 30, 3))] = k
+    occupied = np.argwhere(labels)
+    found = readings.labels(labels, 2.5)
+    for voxel, label in zip(readings.voxels, found, strict=True):
+        distance = np.linalg.norm(occupied - voxel, axis=1)
+        nearest = {int(labels[tuple(v)]) for v in occupied[distance == distance.min()]}
+        assert label in nearest if distance.min() <= 2.5 else label == 0
+
+
+def test_pairs_are_drawn_by_their_weights():
+    clip = clip_of(ALONE)
+    sample = sample_of(clip, masks_of(ALONE, clip.after), Extrude())
+    n, w = 1000, np.array([0.7, 0.2, 0.1])
+    update = PartitionUpdate(n_candidates=n, completer=SurfaceOnly())
+    proposed = Population((sample,) * 3, np.log(w), {"proposed": np.arange(3)})
+    predicted = Population((sample,) * 3, np.log(w[::-1]), {"previous": np.arange(3)})
+    found = update.update(np.random.default_rng(0), predicted, proposed, clip)
+    np.testing.assert_allclose(np.bincount(found.parents["proposed"]) / n, w, atol=1 / n + 1e-9)
+    quality = PartitionUpdate().free_space.refine((sample,), clip)[1][0]
+    assert quality == 1.0  # so the pairs have the weights of their parents
+    np.testing.assert_allclose(np.bincount(found.parents["previous"]) / n, w[::-1], atol=1 / n + 1e-9)
+    assert np.ptp(found.log_weights) == 0
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"), [({"past": 1.5}, "past"), ({"n_views": -1}, "n_views"), ({"least_kept": 2}, "least_kept")]
+)
+def test_invalid_fields(fields, message):
+    with pytest.raises(InputError, match=message):
+        PartitionUpdate(**fields)
+
+
+def test_hypotheses_of_another_grid_are_refused():
+    clip = clip_of(ALONE)
+    other = Hypothesis(np.zeros((2, 2, 2), np.uint16), type(GRID)((0, 0, 0), 0.01, (2, 2, 2)))
+    with pytest.raises(InputError, match="grid of proposed hypothesis 0"):
+        step(PartitionUpdate(), clip, other)
