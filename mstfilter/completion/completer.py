@@ -34,8 +34,8 @@ from mstfilter.completion.observed import (
     ObservedBox,
     encode_box,
     mask_voxels,
-    observed_in,
     observed_box,
+    observed_in,
     recall,
     view_surface,
 )

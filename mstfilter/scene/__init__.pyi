@@ -7,6 +7,10 @@ from mstfilter.scene.cache import (
 )
 from mstfilter.scene.camera import Camera as Camera, look_at as look_at, rigid_from_matrix as rigid_from_matrix
 from mstfilter.scene.disk_cache import DiskCache as DiskCache
+from mstfilter.scene.encoding import (
+    decode_hypotheses as decode_hypotheses,
+    encode_hypotheses as encode_hypotheses,
+)
 from mstfilter.scene.frame import (
     Clip as Clip,
     Frame as Frame,
@@ -56,7 +60,5 @@ from mstfilter.scene.voxels import (
     Occupancy as Occupancy,
     VoxelGrid as VoxelGrid,
     as_labels as as_labels,
-    decode_hypotheses as decode_hypotheses,
-    encode_hypotheses as encode_hypotheses,
     occupied_box as occupied_box,
 )

@@ -11,16 +11,8 @@ from hypothesis.extra import numpy as hnp
 from scipy.spatial.transform import RigidTransform
 
 from mstfilter.errors import InputError
-from mstfilter.scene.voxels import (
-    Crop,
-    Hypothesis,
-    ObjectRecord,
-    ObjectView,
-    Occupancy,
-    VoxelGrid,
-    decode_hypotheses,
-    encode_hypotheses,
-)
+from mstfilter.scene.encoding import decode_hypotheses, encode_hypotheses
+from mstfilter.scene.voxels import Crop, Hypothesis, ObjectRecord, ObjectView, Occupancy, VoxelGrid
 
 GRID = VoxelGrid((-0.3, -0.3, -0.05), 0.01, (6, 5, 4))
 
