@@ -15,7 +15,8 @@ from torch import nn
 
 import mstfilter
 from mstfilter.completion import CHANNELS, Architecture, NetworkCompleter, observed_box
-from mstfilter.completion.crops import channels, crop_box, encode_box
+from mstfilter.completion.crops import channels, crop_box
+from mstfilter.completion.observed import encode_box
 from mstfilter.completion.unet import load_network
 from mstfilter.errors import InputError, MissingLibraryError
 from mstfilter.presets import REGISTRY
