@@ -5,7 +5,8 @@
 
 A sample and a prediction are read as partitions of the readings of the last frame: the sample by its segments, the
 prediction by the objects that lie at the readings. The conflict graph has an edge for each segment and predicted
-object that share readings. Each of its components gets the partition of one side, drawn at random.
+object that share readings. Each of its components gets the partition of one side, drawn at random. A segment
+with objects that were seen to move apart always gets that of the prediction.
 
 An object of the result continues the predicted object with which it shares most readings, and keeps its views: what
 earlier frames showed of it (`mstfilter.scene.ObjectView`). It is completed from the readings of this frame and from
@@ -15,6 +16,7 @@ carried on. Predicted objects without readings stay, unless the frame sees throu
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import ClassVar, NamedTuple
@@ -26,7 +28,7 @@ from scipy.ndimage import distance_transform_edt
 from mstfilter.completion import Completer, Extrude, arbitrate, occupancy_of
 from mstfilter.errors import check_integer, check_number
 from mstfilter.fusion.conflicts import check_grid
-from mstfilter.fusion.division import NoDivision, PartRule, divided, split_like
+from mstfilter.fusion.division import NoDivision, PartRule, divided
 from mstfilter.fusion.free_space import FreeSpace, log_quality
 from mstfilter.fusion.interfaces import Division, Evidence, Projection
 from mstfilter.scene import Clip, Frame, Hypothesis, ObjectRecord, ObjectView, VoxelGrid
@@ -150,13 +152,12 @@ class PartitionUpdate(Update):
                 check_grid(f"{name} hypothesis {k}", hypothesis, grid)
         i, j = self._pairs(child(rng, "pairs"), proposed, predicted, log_q)
         predictions = divided(self.division, self.parts, tuple(predicted.particles), observation, proposed=False)
-        refined = divided(self.division, self.parts, refined, observation, proposed=False)
         samples = divided(self.division, self.parts, tuple(proposed.particles), observation, proposed=True)
         readings = Readings.of(frame, grid)
         at_readings = {k: readings.labels(predictions[k].labels, self.reach) for k in np.unique(j).tolist()}
         candidates = []
         for number, (a, b) in enumerate(zip(i.tolist(), j.tolist(), strict=True)):
-            segments = readings.labels(split_like(samples[a], predictions[b]).labels, 1.0)
+            segments = readings.labels(samples[a].labels, 1.0)
             stream = child(rng, "candidate", number)
             candidates.append(self._partition(stream, segments, at_readings[b], predictions[b], refined[b]))
         built = self._complete(rng, candidates, readings, observation)
@@ -201,20 +202,22 @@ class PartitionUpdate(Update):
         for of_sample, of_past in _components(shared):
             seen.update(of_past)
             alone = len(of_sample) == len(of_past) == 1
-            if not of_past or alone or rng.random() >= self.past:
-                for a in of_sample:
-                    least = (_SAME if alone else _CONTAINED) * shared.sum(axis=0)
-                    own = sorted((b for b in of_past if shared[a, b] > least[b]), key=lambda b: -shared[a, b])
+            by_sample = not of_past or alone or rng.random() >= self.past
+            owner = np.zeros(len(segments), np.int64)  # of the readings of which the prediction gives the partition
+            for a in of_sample:
+                least = (_SAME if alone else _CONTAINED) * shared.sum(axis=0)
+                own = sorted((b for b in of_past if shared[a, b] > least[b]), key=lambda b: -shared[a, b])
+                if by_sample and not any(record_of[b].apart & {record_of[c].id for c in own} for b in own):
                     parts.append(_Part(segments == a, tuple(record_of[b] for b in own)))
-            else:
-                inside = np.isin(segments, of_sample)
-                owner = np.where(inside & np.isin(past, of_past), past, 0)
-                for a in of_sample:
-                    owner[(segments == a) & (owner == 0)] = max(of_past, key=lambda b: shared[a, b])
-                parts += [_Part(owner == b, (record_of[b],)) for b in of_past if (owner == b).any()]
-        before, after = prediction.volumes(), refined.volumes()
+                else:
+                    inside, among = segments == a, own if by_sample else of_past
+                    nearest = max(among, key=lambda b: shared[a, b])
+                    owner[inside] = np.where(np.isin(past, among), past, nearest)[inside]
+            parts += [_Part(owner == b, (record_of[b],)) for b in of_past if (owner == b).any()]
+        before = prediction.volumes()
+        after = Counter(prediction.labels[refined.labels > 0].tolist())
         nothing = np.zeros(len(segments), bool)
-        hidden = [k for k in record_of if k not in seen and after.get(k, 0) > self.least_kept * before[k]]
+        hidden = [k for k in record_of if k not in seen and after[k] > self.least_kept * before[k]]
         return parts + [_Part(nothing, (record_of[k],)) for k in hidden]
 
     def _complete(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -103,6 +105,19 @@ def test_one_side_gives_the_partition_of_a_component():
     assert found.n_objects == 3 and state.record(2).id in {record.id for record in found.objects}
     found = step(PartitionUpdate(past=1.0), clip_of(TWO, 1), cut, state).particles[0]
     assert [record.id for record in found.objects] == [record.id for record in state.objects]
+
+
+def test_objects_that_moved_apart_are_not_merged():
+    clip = clip_of(TWO)
+    masks = masks_of(TWO, clip.after)
+    state = step(PartitionUpdate(), clip, sample_of(clip, masks)).particles[0]
+    a, b = state.objects
+    apart = (replace(a, apart=frozenset({b.id})), replace(b, apart=frozenset({a.id})))
+    state = replace(state, objects=apart)
+    merged = sample_of(clip_of(TWO, 1), [masks[0] | masks[1]])
+    for one in step(PartitionUpdate(past=0.0), clip_of(TWO, 1), merged, state).particles:
+        assert [(r.id, r.apart) for r in one.objects] == [(r.id, r.apart) for r in apart]
+        np.testing.assert_array_equal(one.labels, state.labels)
 
 
 def test_labels_of_readings_by_brute_force():
