@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import subprocess
 import sys
@@ -155,6 +156,14 @@ def test_unknown_commands_are_usage_errors(capsys):
     code, _, err = call("florp", capsys=capsys)
     assert code == 2
     assert "florp" in err
+
+
+def test_shells_complete_commands():
+    """What the function of bash calls, which `--install-completion` installs."""
+    question = {"_MSTFILTER_COMPLETE": "complete_bash", "COMP_WORDS": "mstfilter si", "COMP_CWORD": "1"}
+    command = [sys.executable, "-m", "mstfilter"]
+    done = subprocess.run(command, env={**os.environ, **question}, capture_output=True, text=True, timeout=600)
+    assert done.stdout.split() == ["simulate"]
 
 
 def test_list_shows_components_and_fields(capsys):

@@ -48,6 +48,8 @@ def study(
     _print_summary(result.folder.summary())
     for name, outcome in result.failed:
         print(f"failed      {name}: {outcome.error}")
+        for hint in outcome.hints:
+            print(f"hint: {hint}", file=sys.stderr)
     if result.failed:
         print(f"hint: the same command repeats the runs that failed; see {folder / 'failures.csv'}", file=sys.stderr)
         raise typer.Exit(1)

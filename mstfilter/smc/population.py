@@ -129,7 +129,7 @@ def as_matrix(particles: Any) -> np.ndarray:
         return np.concatenate([as_matrix(np.asarray(a)) for _, a in sorted(particles.items())], axis=1)
     raise InputError(
         f"particles are {type(particles[0]).__name__} objects, expected an array or a mapping of arrays",
-        "choose a similarity or equivalence for these objects, or write your own",
+        "choose a similarity or equivalence for them, such as resampler.similarity=weighted_coverage for hypotheses",
     )
 
 
