@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mstfilter.files import write_csv
+from mstfilter.files import read_csv, write_csv
 from mstfilter.scoring import forecast_table
 from mstfilter.study import FORECASTS, StudyFolder
 
@@ -38,11 +38,7 @@ def counts_of(folder: StudyFolder, arm: str) -> list[np.ndarray]:
 
 def main(study: Path, out: Path) -> None:
     """Write the table and the figure."""
-    import matplotlib.pyplot as plt
-
     folder, rng, rows = StudyFolder.open(study), np.random.default_rng(0), []
-    figure, axes = plt.subplots(figsize=(5, 4.2), layout="constrained")
-    axes.plot([0, 1], [0, 1], color="0.5", lw=1, ls="--")
     for arm in (arm for arm in ARMS if any(run["arm"] == arm for run in folder.description["runs"])):
         scenes = np.array(counts_of(folder, arm))
         drawn = scenes[rng.integers(len(scenes), size=(1000, len(scenes)))].sum(axis=1)
@@ -53,13 +49,29 @@ def main(study: Path, out: Path) -> None:
         for k in np.flatnonzero(total[:, 0]):
             row = {"arm": arm, "forecast": forecast[k], "true": true[k], "low": low[k], "high": high[k]}
             rows.append(row | {"share": total[k, 0] / total[:, 0].sum()})
-        kept = total[:, 0] > 0
-        error = np.abs(np.stack([true - low, high - true])[:, kept])
-        axes.errorbar(forecast[kept], true[kept], yerr=error, marker="o", ms=5, lw=1.4, capsize=3, label=arm)
-    axes.set(xlabel="forecast that two voxels belong to one object", ylabel="share for which it is true")
-    axes.legend(frameon=False)
-    figure.savefig(out / "reliability.png", dpi=110, metadata={"Software": None})
     write_csv(out / "reliability.csv", rows, float_format=".3f")
+    draw(out)
+
+
+def draw(out: Path) -> None:
+    """Draw reliability.png from reliability.csv."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    plt.style.use("mstfilter.report.figures")
+    rows = read_csv(out / "reliability.csv")
+    figure, axes = plt.subplots(figsize=(6, 4.4))
+    axes.plot([0, 1], [0, 1], color="0.5", lw=1, ls="--")
+    for arm in dict.fromkeys(row["arm"] for row in rows):
+        own = [row for row in rows if row["arm"] == arm]
+        x, y, low, high = (np.array([float(row[c]) for row in own]) for c in ("forecast", "true", "low", "high"))
+        axes.errorbar(x, y, yerr=np.abs([y - low, high - y]), marker="o", ms=5, lw=1.4, capsize=3, label=arm)
+    axes.set(xlabel="forecast that two voxels belong to one object", ylabel="share for which it is true")
+    axes.legend()
+    figure.savefig(out / "reliability.png", dpi=110, metadata={"Software": None})
+    plt.close(figure)
 
 
 if __name__ == "__main__":

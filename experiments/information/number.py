@@ -64,7 +64,8 @@ def draw(rows: list[dict[str, float]], path: Path) -> None:
     matplotlib.use("Agg")
     from matplotlib import pyplot as plt
 
-    figure, axes = plt.subplots(1, 3, figsize=(10, 3.2), layout="constrained")
+    plt.style.use("mstfilter.report.figures")
+    figure, axes = plt.subplots(1, 3, figsize=(10, 3.2))
     n = [row["n"] for row in rows]
     panels = (("information",), ("energy", "energy_floor"), ("quality_estimate", "quality"))
     titles = ("information, nats (lower is better)", "energy score (lower is better)", "quality (higher is better)")
@@ -73,7 +74,7 @@ def draw(rows: list[dict[str, float]], path: Path) -> None:
             axis.plot(n, [row[name] for row in rows], "o-", label=name.replace("_", " "))
         axis.set(xscale="log", xlabel="hypotheses", title=title, xticks=n, xticklabels=[str(k) for k in n])
         axis.minorticks_off()
-        axis.legend(frameon=False)
+        axis.legend()
     figure.savefig(path, dpi=120)
 
 

@@ -28,8 +28,9 @@ def draw(out: Path) -> None:
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
+    plt.style.use("mstfilter.report.figures")
     distances, steps, ranks = (read_csv(out / f"{f}.csv") for f in ("distances", "over_time", "calibration"))
-    fig = plt.figure(figsize=(11, 8.6), layout="constrained")
+    fig = plt.figure(figsize=(10, 8.6))
     top, bottom = fig.subfigures(2, 1, height_ratios=[1.15, 1])
     axes = top.subplots(1, 3)
     for ax, world in zip(axes, ("shelf", "row"), strict=False):
@@ -48,10 +49,7 @@ def draw(out: Path) -> None:
         x, y = [int(r["t"]) for r in rows], [float(r["tv"]) for r in rows]
         axes[2].plot(x, y, color=colour, marker="o", ms=3, lw=1.5, label=NAMES.get(name, name))
     axes[2].set(ylim=(0, 1), xlabel="step t", title=f"shelf, n = {n}")
-    top.legend(*axes[2].get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False)
-    for ax in axes:
-        ax.spines[["top", "right"]].set_visible(False)
-        ax.grid(alpha=0.25)
+    top.legend(*axes[2].get_legend_handles_labels(), loc="outside lower center", ncols=4)
 
     arms = [a for a in RANKED if any(r["arm"] == a for r in ranks)]
     boxes = bottom.subplots(2, (len(arms) + 1) // 2, sharex=True, sharey=True, squeeze=False).ravel()
@@ -65,7 +63,6 @@ def draw(out: Path) -> None:
         ax.axhline(int(row["worlds"]) / 10, color="black", lw=0.8, ls=":")
         size = f", n = {row['n']}" if row["n"] != "0" else ""
         ax.set_title(f"{NAMES.get(name, name)}{size}: p = {row['p_value']}", fontsize=9)
-        ax.spines[["top", "right"]].set_visible(False)
         ax.set_xticks([0, 9])
     for ax in boxes[len(arms) :]:
         ax.set_visible(False)

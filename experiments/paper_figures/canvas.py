@@ -15,30 +15,8 @@ from mstfilter.files import write_csv
 from mstfilter.report import Colour, close_up, voxel_picture
 from mstfilter.scene import Camera, VoxelGrid
 
-PAPER, INK, MUTED, LINE = "#fcfcfa", "#1d2126", "#646b74", "#d6d7d4"
+PAPER, INK, MUTED = "#fcfcfa", "#1d2126", "#646b74"
 BLUE, ORANGE, FLOOR = "#336fb9", "#ee9138", "#b26a1c"
-
-#: Settings under which all figures are drawn.
-STYLE = {
-    "font.size": 10,
-    "axes.edgecolor": LINE,
-    "axes.labelcolor": MUTED,
-    "axes.titlesize": 10.5,
-    "axes.titlelocation": "left",
-    "axes.titlecolor": INK,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.axisbelow": True,
-    "xtick.color": LINE,
-    "ytick.color": LINE,
-    "xtick.labelcolor": MUTED,
-    "ytick.labelcolor": MUTED,
-    "grid.color": LINE,
-    "grid.linewidth": 0.7,
-    "legend.frameon": False,
-    "legend.labelcolor": MUTED,
-    "svg.hashsalt": "mstfilter",
-}
 
 
 def page(rows: int, columns: int, width: float, height: float, **layout: Any) -> tuple[Figure, np.ndarray]:

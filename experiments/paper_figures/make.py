@@ -15,8 +15,7 @@ import argparse
 import importlib
 from pathlib import Path
 
-import matplotlib
-from canvas import STYLE
+import matplotlib.style
 
 from mstfilter.errors import InputError
 
@@ -47,7 +46,7 @@ def main() -> None:
     if unknown:
         parser.error(f"no figure is called {unknown[0]!r}; there are {', '.join(FIGURES)}")
     arms = [name.strip() for name in options.arms.split(",") if name.strip()]
-    with matplotlib.rc_context(STYLE):
+    with matplotlib.style.context("mstfilter.report.figures"), matplotlib.rc_context({"svg.hashsalt": "mstfilter"}):
         for name in options.figures or FIGURES:
             figure = importlib.import_module(name)
             if name == "quality_over_time":

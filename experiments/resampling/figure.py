@@ -37,8 +37,10 @@ def draw(out: Path) -> None:
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
+    plt.style.use("mstfilter.report.figures")
+
     lines = read_csv(out / "summary.csv")
-    fig, axes = plt.subplots(2, 4, figsize=(15, 9), layout="constrained")
+    fig, axes = plt.subplots(4, 2, figsize=(9, 16))
     for ax, (part, setting, measure, title) in zip(axes.ravel(), PANELS, strict=True):
         panel = [
             r for r in lines if r["part"] == part and r["setting"].startswith(setting) and r["measure"] == measure
@@ -57,12 +59,15 @@ def draw(out: Path) -> None:
         ax.axvline(0, color="0.3", lw=0.8)
         left, right = ax.get_xlim()
         ax.set_xlim(max(left, -WIDEST), min(right, 1.05 * WIDEST))
-        ax.set_yticks(range(len(found)), [r["scheme"] for r in found], fontsize=8)
+        ax.set_yticks(range(len(found)), [r["scheme"] for r in found])
         ax.invert_yaxis()
-        ax.set_title(title, fontsize=9)
-        ax.set_xlabel(f"difference from systematic ({base:.3g}) in per cent", fontsize=8)
+        ax.set_title(title)
+        ax.grid(axis="x")
+        ax.grid(axis="y", visible=False)
+        ax.set_xlabel(f"per cent of systematic ({base:.3g})")
     fig.suptitle(
-        "red: higher, blue: lower than systematic (Holm over the schemes, 5 %); grey: no difference can be claimed"
+        "red: higher, blue: lower than systematic (Holm over the schemes, 5 %)\ngrey: no difference can be claimed",
+        fontsize=11,
     )
-    fig.savefig(out / "figure.png", dpi=90)
+    fig.savefig(out / "figure.png", dpi=110)
     plt.close(fig)

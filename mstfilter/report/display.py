@@ -16,6 +16,7 @@ from collections.abc import Mapping, Sequence
 from functools import singledispatch
 from typing import Any
 
+import matplotlib.style
 import numpy as np
 from matplotlib.figure import Figure
 
@@ -52,6 +53,7 @@ def colours_of(hypothesis: Hypothesis) -> dict[int, Colour]:
     return {record.label: colour(k) for k, record in enumerate(hypothesis.objects)}
 
 
+@matplotlib.style.context("mstfilter.report.figures")
 def plot_recording(recording: Recording) -> Drawing:
     """Colour and depth at the pauses (at most six), and a time line of all frames with the pauses marked."""
     chosen = _evenly(range(len(recording.pauses)), _MOST_PICTURES)
@@ -78,6 +80,7 @@ def plot_recording(recording: Recording) -> Drawing:
     return figure
 
 
+@matplotlib.style.context("mstfilter.report.figures")
 def plot_population(population: Population) -> Drawing:
     """Hypotheses: the heaviest six with their weights. Numbers: weighted histograms of the first coordinates."""
     population = population.realised()
