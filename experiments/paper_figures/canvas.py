@@ -15,7 +15,7 @@ from mstfilter.files import write_csv
 from mstfilter.report import Colour, close_up, voxel_picture
 from mstfilter.scene import Camera, VoxelGrid
 
-PAPER, INK, MUTED = "#fcfcfa", "#1d2126", "#646b74"
+PAPER, INK, MUTED, LINE = "#fcfcfa", "#1d2126", "#646b74", "#e1e2e0"
 BLUE, ORANGE, FLOOR = "#336fb9", "#ee9138", "#b26a1c"
 
 
