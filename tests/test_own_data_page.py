@@ -10,7 +10,7 @@ import shutil
 import numpy as np
 import pytest
 
-from mstfilter.scene import read_depth, read_rgb, write_image
+from mstfilter.scene import read_depth, read_labels, read_rgb, write_image
 from tests.conftest import REPOSITORY
 from tests.formats import layouts
 from tests.formats.bags import scene_messages, write as write_bag
@@ -31,6 +31,7 @@ def data(tmp_path_factory):
     """A folder with the data that the page uses."""
     path = tmp_path_factory.mktemp("data")
     write(path / "table-7")
+    shutil.copytree(path / "table-7", path / "table-9")
     write_bag(path / "session", "bag", scene_messages(True))
     mcap = write_bag(path / "s", "mcap", scene_messages(False))
     shutil.move(next(mcap.glob("*.mcap")), path / "session.mcap")
@@ -45,6 +46,7 @@ def data(tmp_path_factory):
         for part in ("rgb", "depth"):
             shutil.copy(path / f"table-7/{part}/{k:06d}.png", path / f"frames/v{k}_{part}.png")
     (path / "frames" / "info.json").write_text(json.dumps({"K": layouts.K, "depth_scale_m": 0.001}))
+    shutil.copytree(path / "frames", path / "osd")
     example = next(b for b in re.findall(r"```python\n(.*?)```", PAGE, flags=re.DOTALL) if "class Mine" in b)
     (path / "mine.py").write_text(example.partition("\n\nnp.savez")[0])
     rgb, depth, _ = layouts.video((0, 2))
@@ -65,16 +67,38 @@ def here(data, tmp_path, monkeypatch):
 @pytest.mark.parametrize("command", COMMANDS)
 def test_commands_run(here, command, capsys):
     words = shlex.split(command)[1:]
-    if words[:3] == ["convert", "session.mcap", "table-7"]:
-        shutil.rmtree(here / "table-7")
+    if words[0] == "convert" and (here / words[2]).exists():
+        shutil.rmtree(here / words[2])
     if words[0] == "run":
         words += ["--no-report", "n=2"]
-    if words[0] == "quality":
-        call("run", "table-7", "--out", "run-7", "--no-report", "n=2", capsys=capsys)
+    if words[0] in ("quality", "report"):
+        call("run", words[1].replace("run", "table"), "--out", words[1], "--no-report", "n=2", capsys=capsys)
     code, _, err = call(*words, capsys=capsys)
     assert code == 0, err
-    if words[0] == "convert":
-        assert (here / words[2] / "manifest.json").is_file()
+    made = {"convert": f"{words[2]}/manifest.json", "view": words[-1], "report": "meshes"} if len(words) > 2 else {}
+    assert (here / made.get(words[0], ".")).exists()
+
+
+def test_point_clouds_of_the_data_set_become_pairs(tmp_path, monkeypatch):
+    """Two organised clouds with the fields of the data set, written by the test."""
+    pytest.importorskip("open3d", reason="open3d absent or without its system libraries", exc_type=ImportError)
+    (example,) = re.findall(r"```py\n(.*?)```", PAGE, flags=re.DOTALL)
+    header = "VERSION 0.7\nFIELDS x y z rgb label\nSIZE 4 4 4 4 4\nTYPE F F F F U\nCOUNT 1 1 1 1 1\n"
+    header += f"WIDTH 640\nHEIGHT 480\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {640 * 480}\nDATA binary\n"
+    rng = np.random.default_rng(0)
+    label = rng.choice([0, 1, 3, 20, 31], (480, 640)).astype(np.uint32)
+    z = np.where(label > 0, rng.uniform(0.5, 1.5, label.shape), np.nan).astype(np.float32)
+    rgb = rng.integers(0, 256, (480, 640, 3), dtype=np.uint32)
+    packed = (rgb << np.uint32([16, 8, 0])).sum(axis=-1, dtype=np.uint32)
+    columns = [np.zeros_like(z), np.zeros_like(z), z, packed.view(np.float32), label.view(np.float32)]
+    monkeypatch.chdir(tmp_path)
+    for k in (17, 18):
+        (tmp_path / f"learn{k}.pcd").write_bytes(header.encode() + np.stack(columns, axis=-1).tobytes())
+    exec(compile(example.replace("range(17, 25)", "range(17, 19)"), "own-data.md", "exec"), {})
+    assert (read_rgb(tmp_path / "osd/learn18_rgb.png") == rgb).all()
+    assert np.nanmax(np.abs(read_depth(tmp_path / "osd/learn18_depth.png", 0.001) - z)) < 0.00051
+    expected = np.select([label == 0, label < 10, label < 30], [0, 1, 2], 3)
+    assert (read_labels(tmp_path / "osd/learn18_label.png") == expected).all()
 
 
 def test_every_format_has_a_command():

@@ -74,7 +74,7 @@ def run_scene(name: str, seed: int, quality: float, small: bool) -> tuple[list[d
         recording = simulate_recording(family, seed, Path(work) / "recording")
         for arm, (preset, folder) in arms(Path(work), alternatives(recording, seed, quality)).items():
             filter = mstfilter.preset(preset, "proposal=mask_folder", f"proposal.folder={folder}")
-            state, found, counted = filter.start(0), [], []
+            state, found, counted = filter.start(seed), [], []
             for clip in recording.clips():
                 state, _ = filter.step(state, clip)
                 if clip.index == 0:
