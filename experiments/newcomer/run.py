@@ -21,6 +21,7 @@ from typing import NamedTuple
 REPOSITORY = Path(__file__).resolve().parents[2]
 DOCS = REPOSITORY / "docs"
 SMALL = "simulate demo demo/recording n_actions=1 n_objects_min=2 n_objects_max=2 supersample=false"
+REMOVE = "import shutil; shutil.rmtree('demo/recording'); print('removed')"
 NOTEBOOKS = ("tutorial", "own-component", "comparing", "beliefs")
 #: What the documentation says that a command prints.
 SHOWN = {
@@ -89,11 +90,15 @@ def steps(smoke: bool) -> list[Step]:
     own = commands("own-component.md")
     found += [plan("own component", text) for text in own if "two" not in text]
     found += [plan("study", text) for text in own if "two" in text]
+    if not smoke:
+        found += [plan("command line", text) for text in commands("tutorial.md")]
+        found += [
+            Step("every kind", ["-c", REMOVE], "rm -r demo/recording"),
+            plan("every kind", f"mstfilter {SMALL}"),
+        ]
     for kind in ("evidence",) if smoke else starter_kinds("scenes"):
         found.append(plan("every kind", f"mstfilter new {kind} my_{kind}.py"))
     found.append(plan("viewer", "mstfilter view runs/mine --html run.html"))
-    if not smoke:
-        found += [plan("command line", text) for text in commands("tutorial.md")]
     for name in ("comparing",) if smoke else NOTEBOOKS:
         found.append(Step("notebook", ["-c", NOTEBOOK, str(DOCS / f"{name}.md")], f"docs/{name}.md"))
     return found
