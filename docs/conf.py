@@ -1,6 +1,7 @@
 """Sphinx configuration. Pages with ``file_format: mystnb`` are notebooks as text: the build executes them."""
 
 import os
+import re
 from copy import deepcopy
 from pathlib import Path
 
@@ -38,6 +39,8 @@ html_css_files = ["pages.css"]
 exclude_patterns = ["_build"]
 suppress_warnings = ["ref.python", "mystnb.unknown_mime_type"]
 
+_THIN = '<mspace width="0.15em"/>'  # around exp and log, which browsers set without space
+
 
 def show_pictures(app, tree, page):
     """Put the first picture of each page that a heading of the gallery links to below that heading."""
@@ -58,6 +61,7 @@ def add_mathml(display):
 
     def visit(translator, node):
         formula = latex2mathml.converter.convert(node.astext(), display=display)
+        formula = re.sub(r"(?<!<msub>)(?<!<msup>)(<mi>(?:exp|log)</mi>)", rf"{_THIN}\1{_THIN}", formula)
         translator.body.append(formula if display == "inline" else f'<div class="formula">{formula}</div>')
         raise nodes.SkipNode
 

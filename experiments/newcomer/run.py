@@ -71,7 +71,7 @@ class Step(NamedTuple):
 def commands(page: str) -> list[str]:
     """The mstfilter commands of the shell blocks of a page."""
     blocks = re.findall(r"^```bash\n(.*?)```", (DOCS / page).read_text(), flags=re.DOTALL | re.MULTILINE)
-    lines = [line.partition("  #")[0].strip() for block in blocks for line in block.splitlines()]
+    lines = [line.partition(" #")[0].strip() for block in blocks for line in block.splitlines()]
     return [line for line in lines if line.startswith("mstfilter ")]
 
 
@@ -106,7 +106,7 @@ def steps(smoke: bool) -> list[Step]:
 
 def play(step: Step, folder: Path) -> tuple[str, str, float]:
     """Run a step; returns its fault or "", its output, its seconds."""
-    name = "python" if step.command[0] == "-c" else step.command[0]
+    name = "python" if step.command[0] == "-c" or step.command[0].endswith(".py") else step.command[0]
     arguments = step.command if name == "python" else ["-m", "mstfilter", *step.command]
     start = time.perf_counter()
     done = subprocess.run([sys.executable, *arguments], cwd=folder, capture_output=True, text=True, timeout=3600)
@@ -138,9 +138,7 @@ def main(out: Path, smoke: bool) -> int:
             fault, output, seconds = play(step, folder)
             if step.part == "every kind" and step.command[0] == "new":  # the commands that it prints, as printed
                 printed = [line.split(maxsplit=1)[1] for line in output.splitlines() if line.startswith("next")]
-                waiting[:0] = [
-                    Step(step.part, shlex.split(text)[1:], text) for text in printed if text.startswith("mstfilter")
-                ]
+                waiting[:0] = [Step(step.part, shlex.split(text)[1:], text) for text in printed]
             rows.append({"part": step.part, "step": step.text, "fault": fault, "seconds": round(seconds, 1)})
             outputs.append(f"$ {step.text}\n{output.replace(str(folder), '.').strip()}\n")
             print(f"{seconds:6.1f} s  {step.text}  {fault}", flush=True)
