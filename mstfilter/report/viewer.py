@@ -306,7 +306,8 @@ def _log_scenes(stream: Any, scenes: Sequence[ShownPause]) -> None:
     rr = import_rerun()
     stream.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     identities = {i for scene in scenes for view in scene.views for i in view.identity.values()}
-    classes = [rr.AnnotationInfo(id=i + 1, label=str(i + 1), color=colour(i)) for i in sorted(identities)]
+    classes = [rr.AnnotationInfo(id=0, color=(0, 0, 0, 0))]  # free pixels are transparent
+    classes += [rr.AnnotationInfo(id=i + 1, label=str(i + 1), color=colour(i)) for i in sorted(identities)]
     stream.log("world", rr.AnnotationContext(classes), static=True)
     names = dict.fromkeys(name for scene in scenes for name in _entities(scene))
     for t, scene in enumerate(scenes):
