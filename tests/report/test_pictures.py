@@ -84,6 +84,22 @@ def test_the_identity_of_a_moved_object_is_inherited_from_its_ancestor(tmp_path)
     assert book.table[1, 0] == {2: 0, 1: 1}
 
 
+def test_the_larger_part_of_a_split_object_keeps_its_identity():
+    """Where the truth is known, also if the smaller part descends from the object."""
+    from mstfilter.report.identities import _Assignment
+
+    book, truth = _Assignment(), labels_of((1, 1, 3), (12, 12, 3))
+    whole = Hypothesis.from_labels(truth, GRID)
+    split = truth.copy()
+    split[truth == 2] = 3
+    split[12, 12:16, :3] = split[13, 12:14, :3] = 2  # 6 of 16 columns of the second object keep its label and id
+    parts = (*whole.objects, type(whole.objects[0])(3, 99))
+    book.add(0, (whole,), [1.0], None, truth)
+    book.add(1, (Hypothesis(split, GRID, parts),), [1.0], [0], truth)
+    assert book.table[1, 0][3] == book.table[1, -1][2] == book.table[0, 0][2]
+    assert book.table[1, 0][2] not in book.table[0, 0].values()
+
+
 def test_overlay_touches_objects_only():
     rgb = np.random.default_rng(0).integers(0, 255, (20, 30, 3), dtype=np.uint8)
     labels = np.zeros((20, 30), np.uint16)
