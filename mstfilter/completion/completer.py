@@ -95,6 +95,8 @@ class Completer(ABC):
 
     #: Voxels around the visible part that `fill` may use, besides all those below it.
     padding: ClassVar[int] = 0
+    #: Whether earlier views of an object are used (`complete_again`).
+    remembers: ClassVar[bool] = True
     #: Whether `fill` draws random numbers. The result is then not reused for the next hypothesis.
     stochastic: ClassVar[bool] = False
 
@@ -174,8 +176,11 @@ class Completer(ABC):
         """Complete objects from a frame and from earlier views of them.
 
         Each object is its mask (H, W) bool in the frame, which may be empty, and its views, moved to where the
-        object is now. Each result is the completion, and the view of the frame; None if the frame shows nothing.
+        object is now. Each result is the completion, and the view of the frame; None if the frame shows nothing. A
+        completer that does not remember gives the completions of the masks, and no views.
         """
+        if not self.remembers:
+            return [(one, None) for one in self.complete_each(rngs, frame, [mask for mask, _ in objects], grid)]
         component = component_key(self)
         version = (self.weights_key,) if self.weights_key else ()
         names = [

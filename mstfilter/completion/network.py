@@ -19,9 +19,9 @@ import numpy as np
 
 from mstfilter.completion.completer import Completer, Completion, finish
 from mstfilter.completion.crops import BATCH, EDGE, LARGER, LATTICE, Architecture, crop_box
-from mstfilter.completion.observed import ObservedBox, observed_box
+from mstfilter.completion.observed import ObservedBox, observed_in
 from mstfilter.errors import InputError, MissingLibraryError
-from mstfilter.scene import Frame, Recording, UsesFiles, VoxelGrid
+from mstfilter.scene import Frame, ObjectView, Recording, UsesFiles, VoxelGrid
 
 if TYPE_CHECKING:
     from mstfilter.completion.unet import TrainedNetwork
@@ -80,11 +80,26 @@ class NetworkCompleter(Completer, UsesFiles):
     ) -> list[Completion]:
         if abs(grid.voxel_size - LATTICE) < 1e-6:
             return super().complete_each(rngs, frame, masks, grid)
-        upper = np.asarray(grid.origin) + np.array(grid.shape) * grid.voxel_size
-        lattice = VoxelGrid.from_bounds(np.asarray(grid.origin), upper, LATTICE)
+        lattice = _lattice(grid)
         return [
             self._on_grid(one, frame, np.asarray(mask, dtype=bool), grid, lattice)
             for one, mask in zip(super().complete_each(rngs, frame, masks, lattice), masks, strict=True)
+        ]
+
+    def complete_again(
+        self,
+        rngs: Sequence[np.random.Generator],
+        frame: Frame,
+        objects: Sequence[tuple[np.ndarray, tuple[ObjectView, ...]]],
+        grid: VoxelGrid,
+    ) -> list[tuple[Completion, ObjectView | None]]:
+        if abs(grid.voxel_size - LATTICE) < 1e-6:
+            return super().complete_again(rngs, frame, objects, grid)
+        lattice = _lattice(grid)  # the boxes of all views are boxes of it
+        found = super().complete_again(rngs, frame, objects, lattice)
+        return [
+            (self._on_grid(one, frame, mask, grid, lattice), view)
+            for (one, view), (mask, _) in zip(found, objects, strict=True)
         ]
 
     def _on_grid(
@@ -93,13 +108,16 @@ class NetworkCompleter(Completer, UsesFiles):
         """A completion of the lattice, interpolated at the voxels of the grid."""
         from scipy.ndimage import map_coordinates
 
-        offset, seen = observed_box(frame, mask, grid, self)
+        corners = np.array([one.offset, one.offset + one.probability.shape]) * LATTICE / grid.voxel_size
+        low, high = np.floor(corners[0] + 1e-6).astype(np.int64), np.ceil(corners[1] - 1e-6).astype(np.int64)
+        high = np.maximum(np.minimum(high, grid.shape), low)
+        seen = observed_in(frame, mask, grid, self, low, high)
         p = np.zeros(seen.surface.shape, np.float32)
-        if p.size and one.probability.size:
-            index = np.indices(p.shape).reshape(3, -1).T + offset
+        if p.size:
+            index = np.indices(p.shape).reshape(3, -1).T + low
             at = (grid.centre_of(index) - np.asarray(lattice.origin)) / LATTICE - 0.5 - one.offset
             p = map_coordinates(one.probability, at.T, order=1, mode="nearest").reshape(p.shape)
-        return finish(offset, seen, p, one.key)
+        return finish(low, seen, p, one.key)
 
     def fill(self, rng: np.random.Generator, seen: ObservedBox) -> np.ndarray:
         return self.fill_many([rng], [seen])[0]
@@ -120,3 +138,9 @@ class NetworkCompleter(Completer, UsesFiles):
                     a, b, c = seen[k].surface.shape
                     results[k] = one[:a, :b, :c]
         return results
+
+
+def _lattice(grid: VoxelGrid) -> VoxelGrid:
+    """The network's lattice over the workspace of a grid."""
+    upper = np.asarray(grid.origin) + np.array(grid.shape) * grid.voxel_size
+    return VoxelGrid.from_bounds(np.asarray(grid.origin), upper, LATTICE)

@@ -95,6 +95,7 @@ class ExternalCompletion(ClipCompleter, UsesFiles):
     other: Completer | None = None
 
     stochastic: ClassVar[bool] = True
+    remembers: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         check_choice("axes", self.axes, ("camera", "world"))

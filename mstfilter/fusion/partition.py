@@ -17,7 +17,7 @@ carried on. Predicted objects without readings stay, unless the frame sees throu
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import ClassVar, NamedTuple
 
@@ -25,7 +25,7 @@ import networkx as nx
 import numpy as np
 from scipy.ndimage import distance_transform_edt
 
-from mstfilter.completion import Completer, Extrude, arbitrate, occupancy_of
+from mstfilter.completion import ClipCompleter, Completer, Completion, Extrude, arbitrate, occupancy_of
 from mstfilter.errors import check_integer, check_number
 from mstfilter.fusion.conflicts import check_grid
 from mstfilter.fusion.division import NoDivision, PartRule, divided
@@ -52,6 +52,12 @@ class Readings(NamedTuple):
         pixels = np.flatnonzero(frame.valid & grid.contains(index))
         return cls(pixels, index.reshape(-1, 3)[pixels])
 
+    def mask(self, chosen: np.ndarray, frame: Frame) -> np.ndarray:
+        """Pixels (H, W) bool of the chosen readings (m,) bool."""
+        mask = np.zeros(frame.depth.size, bool)
+        mask[self.pixels[chosen]] = True
+        return mask.reshape(frame.depth.shape)
+
     def labels(self, labels: np.ndarray, reach: float) -> np.ndarray:
         """Label (m,) of each reading: of its voxel, or of the nearest object within `reach` voxels; 0 is none."""
         found = labels[tuple(self.voxels.T)].astype(np.int64)
@@ -73,6 +79,7 @@ class _Part(NamedTuple):
 
     readings: np.ndarray  #: (m,) bool, its readings
     continues: tuple[ObjectRecord, ...]  #: the predicted objects that it continues, the largest first
+    predicted: Completion | None = None  #: the voxels of a predicted object without readings
 
 
 @dataclass(frozen=True)
@@ -218,35 +225,48 @@ class PartitionUpdate(Update):
         after = Counter(prediction.labels[refined.labels > 0].tolist())
         nothing = np.zeros(len(segments), bool)
         hidden = [k for k in record_of if k not in seen and after[k] > self.least_kept * before[k]]
-        return parts + [_Part(nothing, (record_of[k],)) for k in hidden]
+        return parts + [_Part(nothing, (record_of[k],), _left(prediction, refined, k)) for k in hidden]
 
     def _complete(
         self, rng: np.random.Generator, candidates: Sequence[Sequence[_Part]], readings: Readings, clip: Clip
     ) -> tuple[Hypothesis, ...]:
-        """The hypotheses. Each distinct object is completed once, all together."""
-        frame, objects = clip.after, []
-        for part in (part for parts in candidates for part in parts):
-            mask = np.zeros(frame.depth.size, bool)
-            mask[readings.pixels[part.readings]] = True
-            views = tuple(view for record in part.continues for view in record.views)
-            objects.append((mask.reshape(frame.depth.shape), views[-self.n_views :] if self.n_views else ()))
-        streams = [child(rng, "completion", k) for k in range(len(objects))]
-        completed = iter(self.completer.complete_again(streams, frame, objects, clip.grid))
-        views_of = iter(views for _, views in objects)
-        built = []
+        """The hypotheses. Each distinct object is completed once, all together.
+
+        Objects without readings and views keep their predicted voxels.
+        """
+        completer = self.completer.at(clip) if isinstance(self.completer, ClipCompleter) else self.completer
+        every = [part for parts in candidates for part in parts]
+        views = [self._latest(view for record in part.continues for view in record.views) for part in every]
+        seen = [k for k, part in enumerate(every) if part.readings.any() or (completer.remembers and views[k])]
+        streams = [child(rng, "completion", k) for k in seen]
+        objects = [(readings.mask(every[k].readings, clip.after), views[k]) for k in seen]
+        completed = dict(zip(seen, completer.complete_again(streams, clip.after, objects, clip.grid), strict=True))
+        built, at = [], 0
         for parts in candidates:
             found, records = [], []
             for label, part in enumerate(parts, start=1):
-                completion, view = next(completed)
-                views = next(views_of) if view is None else (*next(views_of), view)
-                views = views[-self.n_views :] if self.n_views else ()
+                completion, view = completed.get(at, (part.predicted, None))
+                assert completion is not None
+                known = views[at] if view is None else self._latest((*views[at], view))
                 found.append(completion)
-                records.append(_record(part, label, clip.index, completion.key, views))
+                records.append(_record(part, label, clip.index, completion.key, known))
+                at += 1
             labels = arbitrate(found, clip.grid, self.threshold)
             present = np.bincount(labels.ravel(), minlength=len(found) + 1)
             kept = tuple(record for record in records if present[record.label])
             built.append(Hypothesis(labels, clip.grid, kept, occupancy_of(found, labels, clip.grid)))
         return tuple(built)
+
+    def _latest(self, views: Iterable[ObjectView]) -> tuple[ObjectView, ...]:
+        return tuple(views)[-self.n_views :] if self.n_views else ()
+
+
+def _left(prediction: Hypothesis, refined: Hypothesis, label: int) -> Completion:
+    """What free space leaves of a predicted object."""
+    crop, left = prediction.crop(label), refined.shares.probability
+    p = crop.occupied if crop.probability is None else crop.probability
+    p = np.where(left[crop.box] > 0, p, 0).astype(np.float32)
+    return Completion(crop.offset, p, np.zeros(p.shape, np.int32), prediction.record(label).completion_key or "")
 
 
 def _components(shared: np.ndarray) -> list[tuple[list[int], list[int]]]:

@@ -159,6 +159,7 @@ class TrueCompletion(UsesTruth, Completer):
     objects: ObjectRule = ObjectRule()  # noqa: RUF009 (frozen)
 
     needs: ClassVar[tuple[Need, ...]] = ("voxels", "instance")
+    remembers: ClassVar[bool] = False
 
     def fill(self, rng: np.random.Generator, seen: ObservedBox) -> np.ndarray:
         """1 on the visible surface, for masks that show no true object."""

@@ -128,6 +128,11 @@ def test_other_voxel_sizes(completer, size):
         fine, coarse = (completer.complete(rng, frame, [mask], grid)[0] for grid in (GRID, other))
         volumes = [(one.probability >= 0.5).sum() * g.voxel_size**3 for one, g in ((fine, GRID), (coarse, other))]
         assert volumes[1] == pytest.approx(volumes[0], rel=0.35)
+        [(same, view)] = completer.complete_again([rng], frame, [(mask, ())], other)
+        assert np.array_equal(same.probability, coarse.probability) and view is not None
+        blind = Frame(frame.rgb, np.full_like(frame.depth, np.nan), frame.camera)
+        [(hidden, none)] = completer.complete_again([rng], blind, [(np.zeros_like(mask), (view,))], other)
+        assert none is None and (hidden.probability >= 0.5).sum() * size**3 == pytest.approx(volumes[0], rel=0.5)
 
 
 def test_empty_masks_and_large_objects(completer):

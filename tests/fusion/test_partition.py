@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from mstfilter.completion import Extrude, SurfaceOnly
 from mstfilter.errors import InputError
 from mstfilter.fusion import PartitionUpdate
 from mstfilter.fusion.partition import Readings
-from mstfilter.scene import Clip, Hypothesis
+from mstfilter.scene import Clip, Hypothesis, Occupancy
 from mstfilter.segmentation import hypothesis_of
 from mstfilter.smc import Population
 from tests.completion.test_completion import masks_of
@@ -79,6 +80,30 @@ def test_hidden_objects_stay_until_the_frame_sees_through_them():
     gone = clip_of(only_first, 1)
     for one in step(update, gone, sample_of(gone, masks_of(only_first, gone.after)), state).particles:
         assert [record.id for record in one.objects] == [state.record(1).id]
+
+
+@dataclass(frozen=True)
+class Forgetful(Extrude):
+    """Does not use earlier views."""
+
+    remembers: ClassVar[bool] = False
+
+
+def test_objects_without_views_keep_their_voxels_where_the_frame_does_not_see_through():
+    """Objects of a completer that does not remember, with their probabilities."""
+    update, clip = PartitionUpdate(completer=Forgetful()), clip_of(TWO)
+    state = step(update, clip, sample_of(clip, masks_of(TWO, clip.after))).particles[0]
+    assert not any(record.views for record in state.objects)
+    p = np.where(state.labels > 0, 0.8, 0).astype(np.float16)
+    state = replace(state, occupancy=Occupancy(state.labels, p))
+    blind = frame_of(TWO, noise=0)
+    depth = np.where(masks_of(TWO, blind)[1], np.nan, blind.depth)
+    hidden = Clip([type(blind)(blind.rgb, depth, blind.camera)], GRID, 1)
+    for one in step(update, hidden, sample_of(hidden, masks_of(TWO, blind)[:1]), state).particles:
+        record = next(record for record in one.objects if record.id == state.record(2).id)
+        kept = one.mask(record.label)
+        assert (kept <= state.mask(2)).all() and kept.sum() > 0.8 * state.mask(2).sum()
+        np.testing.assert_allclose(one.shares.probability[kept], 0.8, atol=2e-3)
 
 
 def test_one_side_gives_the_partition_of_a_component():
