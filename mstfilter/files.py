@@ -10,6 +10,8 @@ the temporary file is removed and an earlier file is left as it was.
 from __future__ import annotations
 
 import csv
+import functools
+import hashlib
 import math
 import numbers
 import os
@@ -96,3 +98,26 @@ def read_csv(path: str | Path) -> list[dict[str, str]]:
     """Rows of a CSV file with a header: column name -> text."""
     with Path(path).open(encoding="utf-8", newline="") as file:
         return list(csv.DictReader(file))
+
+
+def weights_file(given: str, name: str, where: str, sha256: str = "") -> tuple[str, str]:
+    """Absolute path and SHA-256 of a file of weights that the user supplies for a network `name`.
+
+    Raises InputError if it is not given, does not exist, or has another hash than `sha256`; `where` is an address for
+    the hint. The hash of an unchanged file is computed once.
+    """
+    path = Path(given)
+    if not given or not path.is_file():
+        problem = f"do not exist: {path}" if given else "are not given"
+        raise InputError(f"the weights of {name} {problem}", f"set the field to the path of a file, see {where}")
+    status = path.stat()
+    digest = _sha256(str(path.resolve()), status.st_mtime_ns, status.st_size)
+    if sha256 and digest != sha256.lower():
+        raise InputError(f"weights {path} have the hash {digest}, expected {sha256}", "download the file again")
+    return str(path.resolve()), digest
+
+
+@functools.lru_cache(maxsize=8)
+def _sha256(path: str, modified: int, size: int) -> str:
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

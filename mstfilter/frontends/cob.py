@@ -12,7 +12,6 @@ code here was checked against a plain reference with random weights. It was neve
 
 from __future__ import annotations
 
-import hashlib
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
@@ -21,6 +20,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from mstfilter.errors import InputError, MissingLibraryError, check_choice, check_integer, check_number
+from mstfilter.files import weights_file
 from mstfilter.frontends.caffe import read_caffemodel
 from mstfilter.scene import Frame, Recording, UsesFiles, memo
 from mstfilter.segmentation import BoundaryModel, Tree, TreeBuilder
@@ -30,6 +30,7 @@ from mstfilter.segmentation.tree import linkage_tree, prune
 if TYPE_CHECKING:
     from mstfilter.frontends.cob_network import CobNetwork
 
+_SOURCE = "COB", "https://github.com/kmaninis/COB"
 _MAX_PIXELS = 500 * 500  # larger images are resized to 500 x 500 (`cob_detect.m`)
 _LEAST_CONFIDENCE, _LEAST_SECOND = 0.5, 0.01  # of the best and of the second bin (`trainedOrientation.m`)
 _MEAN_COSINE = 2 / np.pi  # mean of |cos| over all angles
@@ -67,8 +68,7 @@ class CobBoundary(BoundaryModel, UsesFiles):
     @property
     def bound_key(self) -> bytes:
         """Hash of the file of weights; empty without a file."""
-        path = Path(self.weights)
-        return _hash(*_stamp(path)).encode() if self.weights and path.is_file() else b""
+        return weights_file(self.weights, *_SOURCE)[1].encode() if Path(self.weights).is_file() else b""
 
     def check_files(self, recording: Recording) -> None:
         """Load the weights."""
@@ -108,32 +108,8 @@ class CobBoundary(BoundaryModel, UsesFiles):
         return maps[0], maps[1], decode_orientation(maps[2:])
 
     def _network(self) -> CobNetwork:
-        path = Path(self.weights)
-        if not self.weights:
-            raise InputError(
-                "the weights of COB are not given",
-                "set the field weights to the path of a .caffemodel, see https://github.com/kmaninis/COB",
-            )
-        if not path.is_file():
-            raise InputError(
-                f"weights of COB do not exist: {path}", "download them from https://github.com/kmaninis/COB"
-            )
-        digest = _hash(*_stamp(path))
-        if self.sha256 and digest != self.sha256.lower():
-            raise InputError(
-                f"weights {path} have the hash {digest}, expected {self.sha256}", "download the file again"
-            )
-        return _load(digest, str(path), self.input)
-
-
-def _stamp(path: Path) -> tuple[str, int, int]:
-    status = path.stat()
-    return str(path.resolve()), status.st_mtime_ns, status.st_size
-
-
-@lru_cache(maxsize=8)
-def _hash(path: str, modified: int, size: int) -> str:
-    return hashlib.sha256(Path(path).read_bytes()).hexdigest()
+        path, digest = weights_file(self.weights, *_SOURCE, self.sha256)
+        return _load(digest, path, self.input)
 
 
 @lru_cache(maxsize=1)

@@ -13,7 +13,6 @@ weights. It was never run with the published ones.
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
@@ -23,6 +22,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mstfilter.errors import InputError, MissingLibraryError, check_integer, check_number
+from mstfilter.files import weights_file
 from mstfilter.scene import Clip, Frame, Recording, UsesFiles, component_key, content_key, memo
 from mstfilter.tracking import MaskTracker
 
@@ -90,23 +90,9 @@ class SiamMaskTracker(MaskTracker, UsesFiles):
         ]
 
     def _network(self) -> tuple[SiamMaskNetwork, str]:
-        path = Path(self.weights)
-        if not self.weights:
-            raise InputError(
-                "the weights of SiamMask are not given",
-                "set the field weights to the path of a checkpoint, see https://github.com/foolwood/SiamMask",
-            )
-        if not path.is_file():
-            raise InputError(
-                f"weights of SiamMask do not exist: {path}", "download them from https://github.com/foolwood/SiamMask"
-            )
-        status = path.stat()
-        network, digest = _load(str(path), status.st_mtime_ns, status.st_size)
-        if self.sha256 and digest != self.sha256.lower():
-            raise InputError(
-                f"weights {path} have the hash {digest}, expected {self.sha256}", "download the file again"
-            )
-        return network, digest
+        where = "https://github.com/foolwood/SiamMask"
+        path, digest = weights_file(self.weights, "SiamMask", where, self.sha256)
+        return _load(path, digest), digest
 
 
 def thinned(clip: Clip, step: int) -> list[Frame]:
@@ -115,8 +101,8 @@ def thinned(clip: Clip, step: int) -> list[Frame]:
 
 
 @lru_cache(maxsize=1)
-def _load(path: str, modified: int, size: int) -> tuple[SiamMaskNetwork, str]:
-    """The network with the weights of a file, and the hash of the file; the last one is kept."""
+def _load(path: str, digest: str) -> SiamMaskNetwork:
+    """The network with the weights of a file; the last one is kept."""
     try:
         from mstfilter.frontends.siammask_network import SiamMaskNetwork, read_checkpoint
     except ImportError as error:
@@ -128,7 +114,7 @@ def _load(path: str, modified: int, size: int) -> tuple[SiamMaskNetwork, str]:
         raise InputError(
             error.message if path in error.message else f"{path}: {error.message}", *error.hints
         ) from error
-    return network, hashlib.sha256(Path(path).read_bytes()).hexdigest()
+    return network
 
 
 def follow(

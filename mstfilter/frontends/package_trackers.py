@@ -10,7 +10,8 @@ supplies package and checkpoint. The adapters were checked with stand-ins of the
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
 from importlib import import_module
@@ -20,10 +21,13 @@ from typing import Any
 
 import numpy as np
 
-from mstfilter.errors import InputError, MissingLibraryError, check_integer
+from mstfilter.errors import InputError, MissingLibraryError, check_integer, describe_error
+from mstfilter.files import weights_file
 from mstfilter.frontends.mask_trackers import thinned
 from mstfilter.scene import Clip, Recording, UsesFiles
 from mstfilter.tracking import MaskTracker
+
+_SAM2, _CUTIE = "https://github.com/facebookresearch/sam2", "https://github.com/hkchengrex/Cutie"
 
 
 @dataclass(frozen=True)
@@ -42,12 +46,15 @@ class Sam2Tracker(MaskTracker, UsesFiles):
         Device of torch.
     step : int
         Every `step`-th frame is used, and the last one.
+    sha256 : str
+        Expected hash of the file; empty: not compared.
     """
 
     checkpoint: str = ""
     config: str = "configs/sam2.1/sam2.1_hiera_t.yaml"
     device: str = "cpu"
     step: int = 1
+    sha256: str = ""
 
     def __post_init__(self) -> None:
         check_integer("step", self.step)
@@ -57,8 +64,9 @@ class Sam2Tracker(MaskTracker, UsesFiles):
         self._predictor()
 
     def _predictor(self) -> Any:
-        path = existing(self.checkpoint, "SAM 2", "https://github.com/facebookresearch/sam2")
-        return _load_sam2(self.config, path, self.device)
+        file = weights_file(self.checkpoint, "SAM 2", _SAM2, self.sha256)
+        with loading("sam2", file[0]):
+            return _load_sam2(self.config, *file, self.device)
 
     def track(self, clip: Clip, masks: Sequence[np.ndarray]) -> list[np.ndarray]:
         """Masks (H, W) bool of the last frame. Raises InputError if the package or the checkpoint is missing."""
@@ -81,9 +89,9 @@ class Sam2Tracker(MaskTracker, UsesFiles):
 
 
 @lru_cache(maxsize=1)
-def _load_sam2(config: str, checkpoint: str, device: str) -> Any:
+def _load_sam2(config: str, checkpoint: str, digest: str, device: str) -> Any:
     """The video predictor; the last one is kept."""
-    build = imported("sam2.build_sam", "https://github.com/facebookresearch/sam2").build_sam2_video_predictor
+    build = imported("sam2.build_sam", _SAM2).build_sam2_video_predictor
     return build(config, checkpoint, device=device)
 
 
@@ -106,11 +114,14 @@ class CutieTracker(MaskTracker, UsesFiles):
         Device of torch.
     step : int
         Every `step`-th frame is used, and the last one.
+    sha256 : str
+        Expected hash of the file; empty: not compared.
     """
 
     checkpoint: str = ""
     device: str = "cpu"
     step: int = 1
+    sha256: str = ""
 
     def __post_init__(self) -> None:
         check_integer("step", self.step)
@@ -120,8 +131,9 @@ class CutieTracker(MaskTracker, UsesFiles):
         self._network()
 
     def _network(self) -> tuple[Any, Any]:
-        path = existing(self.checkpoint, "Cutie", "https://github.com/hkchengrex/Cutie")
-        return _load_cutie(path, self.device)
+        file = weights_file(self.checkpoint, "Cutie", _CUTIE, self.sha256)
+        with loading("cutie", file[0]):
+            return _load_cutie(*file, self.device)
 
     def track(self, clip: Clip, masks: Sequence[np.ndarray]) -> list[np.ndarray]:
         """Masks (H, W) bool of the last frame. Raises InputError if the package or the checkpoint is missing."""
@@ -155,11 +167,10 @@ class CutieTracker(MaskTracker, UsesFiles):
 
 
 @lru_cache(maxsize=1)
-def _load_cutie(checkpoint: str, device: str) -> tuple[Any, Any]:
+def _load_cutie(checkpoint: str, digest: str, device: str) -> tuple[Any, Any]:
     """Network and configuration as the package's own default, without its download; the last one is kept."""
-    where = "https://github.com/hkchengrex/Cutie"
-    module = imported("cutie.model.cutie", where)
-    hydra, omegaconf = imported("hydra", where), imported("omegaconf", where)
+    module = imported("cutie.model.cutie", _CUTIE)
+    hydra, omegaconf = imported("hydra", _CUTIE), imported("omegaconf", _CUTIE)
     import torch
 
     folder = Path(module.__file__).resolve().parents[1] / "config"
@@ -167,7 +178,7 @@ def _load_cutie(checkpoint: str, device: str) -> tuple[Any, Any]:
         config = hydra.compose(config_name="eval_config")
     with omegaconf.open_dict(config):
         config["weights"] = checkpoint
-    imported("cutie.inference.utils.args_utils", where).get_dataset_cfg(config)
+    imported("cutie.inference.utils.args_utils", _CUTIE).get_dataset_cfg(config)
     network = module.CUTIE(config).to(device).eval()
     network.load_weights(torch.load(checkpoint, map_location=device, weights_only=True))
     return network, config
@@ -190,17 +201,18 @@ def disjoint_groups(masks: Sequence[np.ndarray]) -> list[list[int]]:
     return groups
 
 
-def existing(checkpoint: str, name: str, where: str) -> str:
-    """The absolute path of a checkpoint; raises InputError if it is not given or does not exist."""
-    path = Path(checkpoint)
-    if not checkpoint or not path.is_file():
+@contextmanager
+def loading(package: str, checkpoint: str) -> Iterator[None]:
+    """Raise InputError if a package fails to load a checkpoint in the block."""
+    try:
+        yield
+    except InputError:
+        raise
+    except Exception as error:  # of the package: any
+        cause = f"{describe_error(error)}\n".splitlines()[0]
         raise InputError(
-            f"checkpoint of {name} does not exist: {path}"
-            if checkpoint
-            else f"the checkpoint of {name} is not given",
-            f"set the field checkpoint to the path of a file, see {where}",
-        )
-    return str(path.resolve())
+            f"the package {package} cannot load {checkpoint}: {cause}", "is it a checkpoint of this network and size?"
+        ) from error
 
 
 def imported(module: str, where: str) -> Any:

@@ -483,9 +483,39 @@ def test_sam2_tracks_all_masks_with_one_pass_over_the_frames(tmp_path, monkeypat
     monkeypatch.setitem(sys.modules, "sam2.build_sam", None)
     with pytest.raises(MissingLibraryError, match="cannot be imported"):
         replace(tracker, device="cuda").track(clip_of(images), masks[:1])
-    for checkpoint, message in (("", "is not given"), ("nowhere", "does not exist")):
+    cases = [({}, "of SAM 2 are not given"), ({"checkpoint": "nowhere"}, "do not exist: nowhere")]
+    cases.append(({"checkpoint": str(path), "sha256": "0"}, "have the hash"))
+    for fields, message in cases:
         with pytest.raises(InputError, match=message):
-            Sam2Tracker(checkpoint).track(clip_of(images), masks[:1])
+            Sam2Tracker(**fields).track(clip_of(images), masks[:1])
+
+
+def test_a_checkpoint_that_a_package_cannot_load_is_one_error(tmp_path, monkeypatch):
+    """The package raises anything; pickled code in a checkpoint is refused and not executed."""
+    images, masks = video(2)
+    path = tmp_path / "x.pth"
+
+    class Payload:
+        def __reduce__(self):
+            return (Path.touch, (tmp_path / "executed",))
+
+    def build(config, checkpoint, device):
+        raise RuntimeError("missing keys\nand more")
+
+    monkeypatch.setitem(sys.modules, "sam2", types.ModuleType("sam2"))
+    monkeypatch.setitem(sys.modules, "sam2.build_sam", types.SimpleNamespace(build_sam2_video_predictor=build))
+    for name, module in cutie_stand_in(path, []).items():
+        monkeypatch.setitem(sys.modules, name, module)
+    for tracker, saved, message in (
+        (Sam2Tracker(str(path)), {}, r"sam2 cannot load .*x\.pth: RuntimeError: missing keys$"),
+        (CutieTracker(str(path)), {"a": 2}, r"cutie cannot load .*x\.pth: AssertionError"),
+        (CutieTracker(str(path)), Payload(), r"cutie cannot load .*x\.pth: UnpicklingError"),
+    ):
+        torch.save(saved, path)
+        with pytest.raises(InputError, match=message) as caught:
+            tracker.track(clip_of(images), masks[:1])
+        assert "\n" not in caught.value.message
+    assert not (tmp_path / "executed").exists()
 
 
 def cutie_stand_in(path: Path, encoded: list[int]) -> dict[str, object]:
@@ -572,5 +602,5 @@ def test_cutie_tracks_overlapping_masks_in_groups_that_share_the_features(tmp_pa
     monkeypatch.setitem(sys.modules, "cutie.model.cutie", None)
     with pytest.raises(MissingLibraryError, match=r"cutie\.model\.cutie cannot be imported"):
         CutieTracker(str(path), device="cuda").track(clip_of(images), given)
-    with pytest.raises(InputError, match="is not given"):
+    with pytest.raises(InputError, match="of Cutie are not given"):
         CutieTracker().track(clip_of(images), given)

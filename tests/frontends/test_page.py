@@ -33,7 +33,7 @@ def test_all_pauses_are_checked_before_a_run(tmp_path):
         (("proposal.boundary=cob", "proposal.boundary.weights=none"), "do not exist"),
         (("proposal.tree=cob", "proposal.tree.contours.weights=none"), "do not exist"),
         (("transition.tracker=siammask", "transition.tracker.weights=none"), "do not exist"),
-        (("transition.tracker=sam2", "transition.tracker.checkpoint=none"), "does not exist"),
+        (("transition.tracker=sam2", "transition.tracker.checkpoint=none"), "do not exist"),
     ):
         with pytest.raises(mstfilter.InputError, match=message):
             filter_recording(recording, load_config("mst", overrides), tmp_path / "run")
