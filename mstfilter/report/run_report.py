@@ -38,7 +38,14 @@ from mstfilter.report.pictures import close_up, data_uri, jpeg_bytes, viewpoint
 from mstfilter.report.viewer import run_page
 from mstfilter.runs import RunFolder
 from mstfilter.scene import project, render
-from mstfilter.scoring import BeliefScore, forecast_table, pause_metrics, score_belief, weighted_coverage
+from mstfilter.scoring import (
+    MIN_PIXELS,
+    BeliefScore,
+    forecast_table,
+    pause_metrics,
+    score_belief,
+    weighted_coverage,
+)
 
 _TITLES = {
     "initial": "Initial particles",
@@ -223,6 +230,10 @@ class RunNumbers:
             "Small errors of shape cost much: a cube of ten voxels that is one voxel too large on each side has "
             "(10 / 12)³ = .58.",
         ]
+        kinds = {"visible": "visible", "hidden": "hidden, seen before", "unseen": "never seen"}
+        parts = [f"{m[f'n_{k}']:.0f} {text} {m[f'quality_{k}']:.2f}" for k, text in kinds.items() if m[f"n_{k}"]]
+        if len(parts) > 1:
+            sentences.append(f"Coverage of the true objects by what the camera shows: {', '.join(parts)}.")
         counts = [(m[name], name) for name in ("split", "merged", "missed", "invented") if m[name] >= 0.05]
         wrong = ", ".join(f"{n:.1f} {name}" for n, name in counts)
         end = f"objects on average: {wrong}." if wrong else "no object is split, merged, missed or invented."
@@ -267,6 +278,7 @@ def read_numbers(run: RunFolder) -> RunNumbers:
     description = run.description
     times = description["recording"]["times"]
     steps = []
+    shown: set[int] = set()  # true objects that an image has shown
     for t in range(run.n_pauses):
         info, hypotheses, truth = run.info(t), run.hypotheses(t), run.truth(t)
         questions = run.questions(t)
@@ -276,9 +288,16 @@ def read_numbers(run: RunFolder) -> RunNumbers:
         metrics, in_image = None, None
         if truth is not None:
             labels, weights = [h.labels for h in hypotheses], np.array(info["weights"], float)
-            metrics = pause_metrics(labels, weights, truth, {})[0]
             grid, camera = hypotheses[0].grid, run.camera(t)
             seen = render(truth, grid, camera).labels
+            enough = np.bincount(seen.ravel()) >= max(1.0, MIN_PIXELS * seen.size / 307200)
+            visible = set(np.flatnonzero(enough).tolist())
+            shown |= visible
+            status = {
+                k: "visible" if k in visible else "hidden" if k in shown else "unseen"
+                for k in np.unique(truth[truth > 0]).tolist()
+            }
+            metrics = pause_metrics(labels, weights, truth, status)[0]
             in_image = float(np.mean([weighted_coverage(project(h, camera), seen) for h in hypotheses]))
         beside = {
             name: float(np.mean(q["objects"]))

@@ -338,7 +338,7 @@ def _log_scenes(stream: Any, scenes: Sequence[ShownPause]) -> None:
                 table = np.zeros(int(labels.max(initial=0)) + 1, np.uint16)
                 for label, identity in view.identity.items():
                     table[label] = identity + 1
-                seen = rr.SegmentationImage(table[project(view.hypothesis, camera)], opacity=0.5)
+                seen = rr.SegmentationImage(table[project(view.hypothesis, camera)], opacity=0.6)
                 stream.log(f"world/camera/image/{name}", seen)
             for what in ("weight", "quality"):
                 value = getattr(view, what)

@@ -19,7 +19,7 @@ from mstfilter.runs import HypothesisCodec, RunFolder
 from mstfilter.scene import Hypothesis, project
 from mstfilter.scoring import weighted_coverage
 from mstfilter.smc import Key, Population, State, save_state
-from tests.report.runs import make_run
+from tests.report.runs import labels_of, make_run
 
 
 class Page(HTMLParser):
@@ -279,3 +279,28 @@ def test_text_of_the_figures_is_large_enough(finished):
         width = float(re.search(r'viewBox="\S+ \S+ (\S+) ', svg)[1])
         sizes = [float(size) for size in re.findall(r"font-size: ?([\d.]+)px", svg)]
         assert sizes and min(sizes) * 840 / width >= 9
+
+
+def test_hidden_objects_are_named(tmp_path, monkeypatch):
+    """The second box stands behind a wall from pause 1 on, which the first box has become."""
+    hidden = labels_of((12, 8, 3))
+
+    def truth(t):
+        labels = hidden * 2
+        labels[10:18, 4:6, :9] = 1 if t else 0
+        labels[3:7, 8:12, :5] = 0 if t else 1
+        return labels.astype(np.uint16)
+
+    monkeypatch.setattr("tests.report.runs.truth_at", truth)
+    run = make_run(tmp_path / "run", pauses=2)
+    numbers = read_numbers(run)
+    assert [step.metrics["n_visible"] for step in numbers.steps] == [2, 1]
+    assert numbers.steps[1].metrics["n_hidden"] == 1
+    quality = np.mean([best_overlap(h.labels, truth(1) == 2) for h in run.hypotheses(1)])
+    assert f"1 hidden, seen before {quality:.2f}" in " ".join(numbers.reasons)
+
+
+def best_overlap(labels, mask):
+    """Largest intersection over union of an object with a mask."""
+    overlaps = [np.sum((labels == k) & mask) / np.sum((labels == k) | mask) for k in range(1, labels.max() + 1)]
+    return max(overlaps, default=0.0)
