@@ -50,10 +50,11 @@ def run(
     import shutil
 
     from mstfilter.presets import build_filter, load_config
-    from mstfilter.runs import COMPARED
 
     configs = {"": load_config(preset, overrides or ())}
     if compare:
+        from mstfilter.runs import COMPARED
+
         configs |= {k: load_config(preset, [*(overrides or ()), *changes]) for k, changes in COMPARED.items()}
     for config in configs.values():
         build_filter(config, allow_files=True)  # a wrong setting is reported before the recording is read
