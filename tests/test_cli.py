@@ -147,6 +147,16 @@ def test_help_of_study_names_the_table(capsys):
     assert "table `smoke`" in " ".join(call("study", "--help", capsys=capsys)[1].replace("│", " ").split())
 
 
+def test_runs_to_compare_are_kept_beside_the_run(recording, tmp_path, capsys):
+    arguments = ("run", recording, "n=1", "n_proposed=1", "--compare", "--no-report", "--out", tmp_path / "run")
+    code, out, _ = call(*arguments, capsys=capsys)
+    compared = RunFolder.open(tmp_path / "run").compared()
+    assert code == 0 and list(compared) == ["single frame", "without past"]
+    samplers = {name: run.description["config"]["proposal"]["sampler"] for name, run in compared.items()}
+    assert samplers["single frame"]["component"] == "optimal" != samplers["without past"]["component"]
+    assert all(run.description["config"]["transition"]["component"] == "identity" for run in compared.values())
+
+
 def test_one_hypothesis_is_singular(recording, tmp_path, capsys):
     arguments = ("run", recording, "--preset", "floor_one_blob", "n=1", "n_proposed=1", "--no-report")
     assert "1 hypothesis of 1 object," in call(*arguments, "--out", tmp_path / "run", capsys=capsys)[1]
