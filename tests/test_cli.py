@@ -149,7 +149,7 @@ def test_help_of_study_names_the_table(capsys):
 
 def test_runs_to_compare_are_kept_beside_the_run(recording, tmp_path, capsys):
     arguments = ("run", recording, "n=1", "n_proposed=1", "--compare", "--no-report", "--out", tmp_path / "run")
-    code, out, _ = call(*arguments, capsys=capsys)
+    code, _, _ = call(*arguments, capsys=capsys)
     compared = RunFolder.open(tmp_path / "run").compared()
     assert code == 0 and list(compared) == ["single frame", "without past"]
     samplers = {name: run.description["config"]["proposal"]["sampler"] for name, run in compared.items()}
