@@ -64,7 +64,7 @@ def test_in_a_wheel(wheel, tmp_path):
     assert "mstfilter/_models/mst.toml" in names
     assert "mstfilter/_examples/resampler.py" in names
     assert "mstfilter/_examples/scenes/transition.py" in names
-    assert "mstfilter/report/templates/scene.html" in names
+    assert {"mstfilter/report/templates/viewer.html", "mstfilter/report/figures.mplstyle"} <= set(names)
     assert "mstfilter/py.typed" in names
     assert any(name.startswith("mstfilter/report/") and name.endswith((".html", ".j2", ".jinja")) for name in names)
     assert not [name for name in names if name.startswith(("tests/", "experiments/", "docs/"))]
