@@ -56,6 +56,7 @@ def standalone(svg: str) -> str:
     colours = {f"--s{k}": hexadecimal(colour(k)) for k in range(len(SERIES))}  # also for colours that the sheet lacks
     colours |= dict(re.findall(r"(--[a-z0-9]+): (#[0-9a-f]{3,6})", light))
     width, height = re.findall(r"[\d.]+", svg[svg.index("viewBox") :])[2:4]
+    svg = re.sub(r' style="max-width:\d+px"', "", svg, count=1)
     svg = svg.replace("<svg ", f'<svg {PAGE} width="{width}pt" height="{height}pt" ', 1)
     svg = svg.replace("currentColor", "var(--ink)")
     return re.sub(r"var\((--[a-z0-9]+)\)", lambda found: colours[found[1]], svg)
