@@ -108,7 +108,7 @@ class Belief:
     @cached_property
     def _merged(self) -> tuple[tuple[Hypothesis, ...], np.ndarray]:
         """Distinct hypotheses of positive weight, and their weights."""
-        which = first_seen(h.key for h in self.hypotheses)
+        which = first_seen(h.key + (h.occupancy.key if h.occupancy else b"") for h in self.hypotheses)
         mass = np.bincount(which, self.weights)
         example = np.unique(which, return_index=True)[1]
         kept = np.flatnonzero(mass > 0)

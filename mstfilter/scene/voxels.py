@@ -280,6 +280,11 @@ class Occupancy:
         object.__setattr__(self, "owner", frozen(np.asarray(self.owner, dtype=np.uint16)))
         object.__setattr__(self, "probability", frozen(np.asarray(self.probability, dtype=np.float16)))
 
+    @cached_property
+    def key(self) -> bytes:
+        """Content key."""
+        return content_key("occupancy", self.owner, self.probability)
+
     def relabelled(self, before: np.ndarray, after: np.ndarray, known: np.ndarray) -> Occupancy:
         """After a change of labels (X, Y, Z): certain where they change; objects that are not `known` are gone."""
         changed = before != after
@@ -388,9 +393,8 @@ class Hypothesis:
 
     @cached_property
     def key(self) -> bytes:
-        """Content key of the voxels."""
-        more = () if self.occupancy is None else (self.occupancy.owner, self.occupancy.probability)
-        return content_key("hypothesis", self.labels, self.grid.key, *more)
+        """Content key of the labels; the occupancy has a key of its own."""
+        return content_key("hypothesis", self.labels, self.grid.key)
 
     @cached_property
     def _volumes(self) -> Mapping[int, int]:

@@ -13,7 +13,7 @@ observe as free, and that lie on a depth reading above the table, or up to 10 cm
 at pause t or earlier. The first voxel u is uniform among them; the second, v, is uniform among those of them within 8
 voxels of u, without u.
 
-**Noise at the border.** A hypothesis does not say how sure it is of a border. `Questions.forecasts` therefore also
+**Noise at the border.** Labels do not say how sure a hypothesis is of a border. `Questions.forecasts` therefore also
 gives the forecasts of the hypotheses with noise: each voxel takes, with probability e, the label of one of its six
 neighbours, independently of the others. Only voxels at a border change. The expectation over the noise is exact:
 

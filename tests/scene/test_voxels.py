@@ -169,6 +169,7 @@ def test_encoding_is_lossless_and_reproducible():
         np.testing.assert_array_equal(a.labels, b.labels)
         assert a.grid == b.grid and a.key == b.key
         assert (a.occupancy is None) == (b.occupancy is None)
+        assert a.occupancy is None or (b.occupancy is not None and a.occupancy.key == b.occupancy.key)
         np.testing.assert_array_equal(a.shares.owner, b.shares.owner)
         np.testing.assert_array_equal(a.shares.probability, b.shares.probability)
         for p, q in zip(a.objects, b.objects, strict=True):
