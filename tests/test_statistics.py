@@ -144,7 +144,7 @@ def test_a_table_of_any_units_is_compared_with_a_reference():
     assert [found[arm].p_holm for arm in ("same", "better")] == pytest.approx(
         holm([sign_flip(d), sign_flip(table["better"] - table["base"])])
     )
-    assert "no claim below 20 seeds" in conclusion(found["better"], "better", "base", unit="seed")
+    assert "claims need 20 seeds" in conclusion(found["better"], "better", "base", unit="seed")
     for wrong, message in (
         ({"base": [1.0], "b": [1.0, 2.0]}, r"shapes \(2,\) and \(1,\)"),
         ({"base": [[1.0]], "b": [[1.0]]}, "one number per unit"),

@@ -13,7 +13,7 @@ from tests.conftest import REPOSITORY
 
 def test_components_of_an_installed_package_have_a_name(tmp_path):
     page = (REPOSITORY / "docs" / "components.md").read_text()
-    blocks = re.findall(r"```python\n(.*?)```", page, flags=re.DOTALL)
+    blocks = re.findall(r"```(?:python|{code-cell})\n(.*?)```", page, flags=re.DOTALL)
     top = next(b for b in blocks if "class Top(" in b)
     test = next(b for b in blocks if "class TestTop(" in b)
     project = tomllib.loads(
