@@ -9,6 +9,8 @@
 `update`         `FusionUpdate`: the steps below in their order, and the weights of the candidates
 `free_space`     clears predicted voxels that the depth image observes as free
 `division`       splits objects whose parts move apart in a clip
+`partition`      `PartitionUpdate`: partitions of the image are crossed, shapes completed from all views
+`cells`          the common refinement of partitions, and draws of partitions by its pairs of cells
 `conflicts`      the conflict graph of two hypotheses (networkx), painting orders, merge probabilities
 `crossover`      makes one hypothesis of two, and smooths the result by a mode filter
 `similarity`     similarity of hypotheses, for diverse resampling and for evidence

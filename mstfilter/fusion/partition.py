@@ -19,14 +19,15 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import ClassVar, NamedTuple
+from typing import ClassVar, Literal, NamedTuple
 
 import networkx as nx
 import numpy as np
 from scipy.ndimage import distance_transform_edt
 
 from mstfilter.completion import ClipCompleter, Completer, Completion, Extrude, arbitrate, occupancy_of
-from mstfilter.errors import check_integer, check_number
+from mstfilter.errors import check_choice, check_integer, check_number
+from mstfilter.fusion.cells import Cells, PairEvidence
 from mstfilter.fusion.conflicts import check_grid
 from mstfilter.fusion.division import NoDivision, PartRule, divided
 from mstfilter.fusion.free_space import FreeSpace, log_quality
@@ -102,9 +103,14 @@ class PartitionUpdate(Update):
     quality_exponent : float
         lambda.
     n_candidates : int
-        Candidates; 0 means four for each predicted hypothesis.
+        Candidates; 0 means four for each hypothesis of the larger side.
+    partitions : {"sides", "pairs"}
+        "sides": each component of the conflict graph gets the partition of the sample or of the prediction. "pairs":
+        partitions are drawn by what all samples and predictions say of pairs of cells (`mstfilter.fusion.cells`).
     past : float
-        Probability that a component of the conflict graph gets the partition of the prediction.
+        Probability that a component of the conflict graph gets the partition of the prediction, for "sides".
+    pairs : PairEvidence
+        The log odds of pairs, for "pairs".
     reach : float
         Voxels between a reading and the predicted object that explains it, at most.
     least_kept : float
@@ -122,7 +128,9 @@ class PartitionUpdate(Update):
     evidence: tuple[Evidence, ...] = ()
     quality_exponent: float = 3.0
     n_candidates: int = 0
+    partitions: Literal["sides", "pairs"] = "sides"
     past: float = 0.5
+    pairs: PairEvidence = PairEvidence()  # noqa: RUF009 (frozen)
     reach: float = 1.5
     least_kept: float = 0.5
     n_views: int = 4
@@ -133,6 +141,7 @@ class PartitionUpdate(Update):
     def __post_init__(self) -> None:
         check_integer("n_candidates", self.n_candidates, at_least=0)
         check_integer("n_views", self.n_views, at_least=0)
+        check_choice("partitions", self.partitions, ("sides", "pairs"))
         for name, largest in (("past", 1.0), ("least_kept", 1.0), ("threshold", 1.0)):
             check_number(name, getattr(self, name), at_least=0, at_most=largest)
         check_number("quality_exponent", self.quality_exponent, at_least=0)
@@ -161,16 +170,25 @@ class PartitionUpdate(Update):
         predictions = divided(self.division, self.parts, tuple(predicted.particles), observation, proposed=False)
         samples = divided(self.division, self.parts, tuple(proposed.particles), observation, proposed=True)
         readings = Readings.of(frame, grid)
-        at_readings = {k: readings.labels(predictions[k].labels, self.reach) for k in np.unique(j).tolist()}
+        past = [readings.labels(h.labels, self.reach) for h in predictions]
+        segments = [readings.labels(h.labels, 1.0) for h in samples]
+        if self.partitions == "pairs":
+            cells = Cells.of(readings.pixels, frame.depth.shape, segments, past)
+            weights = Population(predicted.particles, predicted.log_weights + log_q).weights
+            log_odds = self.pairs.log_odds(cells, weights)
+            drawn = cells.draw(child(rng, "partition"), log_odds, len(i))
+            chosen = list(np.pad(drawn, ((0, 0), (0, 1)))[:, cells.of_reading])  # the last column is no object
+            i = np.full(len(i), -1)  # all samples made it
+        else:
+            chosen = [segments[a] for a in i.tolist()]
         candidates = []
-        for number, (a, b) in enumerate(zip(i.tolist(), j.tolist(), strict=True)):
-            segments = readings.labels(samples[a].labels, 1.0)
+        for number, b in enumerate(j.tolist()):
             stream = child(rng, "candidate", number)
-            candidates.append(self._partition(stream, segments, at_readings[b], predictions[b], refined[b]))
+            candidates.append(self._partition(stream, chosen[number], past[b], predictions[b], refined[b]))
         built = self._complete(rng, candidates, readings, observation)
         parents = {
             "previous": predicted.parents.get("previous", np.full(len(predicted), -1))[j],
-            "proposed": proposed.parents.get("proposed", np.full(len(proposed), -1))[i],
+            "proposed": np.append(proposed.parents.get("proposed", np.full(len(proposed), -1)), -1)[i],
         }
         total, scores = np.zeros(len(built)), {}
         for term in self.evidence:
@@ -209,7 +227,7 @@ class PartitionUpdate(Update):
         for of_sample, of_past in _components(shared):
             seen.update(of_past)
             alone = len(of_sample) == len(of_past) == 1
-            by_sample = not of_past or alone or rng.random() >= self.past
+            by_sample = not of_past or alone or self.partitions == "pairs" or rng.random() >= self.past
             owner = np.zeros(len(segments), np.int64)  # of the readings of which the prediction gives the partition
             for a in of_sample:
                 least = (_SAME if alone else _CONTAINED) * shared.sum(axis=0)

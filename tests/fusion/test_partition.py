@@ -11,12 +11,13 @@ import pytest
 from mstfilter.completion import Extrude, SurfaceOnly
 from mstfilter.errors import InputError
 from mstfilter.fusion import PartitionUpdate
+from mstfilter.fusion.cells import PairEvidence
 from mstfilter.fusion.partition import Readings
 from mstfilter.scene import Clip, Hypothesis, Occupancy
 from mstfilter.segmentation import hypothesis_of
 from mstfilter.smc import Population
 from tests.completion.test_completion import masks_of
-from tests.segmentation.scenes import GRID, TWO, boxes, frame_of
+from tests.segmentation.scenes import GRID, TOUCHING, TWO, boxes, frame_of
 
 #: A tall box in front of where a small one stands, as seen from the camera.
 ALONE = boxes(((22, 30, 0), (28, 36, 5)))
@@ -143,6 +144,25 @@ def test_objects_that_moved_apart_are_not_merged():
     for one in step(PartitionUpdate(past=0.0), clip_of(TWO, 1), merged, state).particles:
         assert [(r.id, r.apart) for r in one.objects] == [(r.id, r.apart) for r in apart]
         np.testing.assert_array_equal(one.labels, state.labels)
+
+
+def test_partitions_by_pairs_follow_image_and_past():
+    """Two objects that half of the samples join: the past decides, in the proportion of the weights by hand."""
+    clip = clip_of(TOUCHING)
+    masks = masks_of(TOUCHING, clip.after)
+    apart, merged = sample_of(clip, masks), sample_of(clip, [masks[0] | masks[1]])
+    state = step(PartitionUpdate(), clip, apart).particles[0]
+    n, pairs = 300, PairEvidence(constant=0.0, image=1.0, past=0.3, past_constant=0.0)
+    update = PartitionUpdate(partitions="pairs", pairs=pairs, n_candidates=n, completer=SurfaceOnly())
+    proposed = Population((apart, merged))
+    later = clip_of(TOUCHING, 1)
+    found = update.update(np.random.default_rng(0), Population((state,)), proposed, later).particles
+    share = np.mean([one.n_objects == 2 for one in found])
+    odds = 0.3 * np.log(1.02 / 0.02)  # the image says 1 : 1, the prediction that they are two
+    expected = 1 / (1 + np.exp(-odds))
+    assert abs(share - expected) < 4 * np.sqrt(expected * (1 - expected) / n)  # 1 false alarm in 16,000
+    first = update.update(np.random.default_rng(0), None, proposed, clip).particles
+    assert abs(np.mean([one.n_objects == 2 for one in first]) - 0.5) < 4 * 0.5 / np.sqrt(n)
 
 
 def test_labels_of_readings_by_brute_force():
