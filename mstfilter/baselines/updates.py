@@ -17,6 +17,7 @@ import numpy as np
 from mstfilter.errors import InputError
 from mstfilter.fusion import FreeSpace, FusionUpdate, Projection, log_quality
 from mstfilter.fusion.division import divided
+from mstfilter.fusion.update import scored
 from mstfilter.scene import Clip
 from mstfilter.smc import Population, Update, union
 
@@ -91,6 +92,6 @@ class Union(Update):
             Population(refined, weighed, predicted.parents),
             Population(samples, proposed.log_weights - proposed.log_mean_weight, proposed.parents),
         )
-        total, scores = self.fusion.scored(tuple(both.particles), observation)
+        total, scores = scored(self.fusion.evidence, tuple(both.particles), observation)
         notes = {"quality": quality.tolist(), "scores": scores}
         return Population(both.particles, both.log_weights + total, both.parents, notes)

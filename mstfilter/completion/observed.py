@@ -66,7 +66,7 @@ def observed_box(frame: Frame, mask: np.ndarray, grid: VoxelGrid, rule: Complete
 
 def mask_voxels(frame: Frame, mask: np.ndarray, grid: VoxelGrid) -> np.ndarray:
     """Voxels (k, 3) of the readings of a mask (H, W)."""
-    pixels, voxels = _frame_points(frame, grid)
+    pixels, voxels = frame_points(frame, grid)
     return voxels[mask.ravel()[pixels]]
 
 
@@ -98,7 +98,7 @@ def observed_in(
     return ObservedBox(points, in_mask, other, free, behind & inside, behind & ~inside, distance, height)
 
 
-def _frame_points(frame: Frame, grid: VoxelGrid) -> tuple[np.ndarray, np.ndarray]:
+def frame_points(frame: Frame, grid: VoxelGrid) -> tuple[np.ndarray, np.ndarray]:
     """Flat pixels with a reading inside the grid (k,), and their voxels (k, 3)."""
 
     def compute() -> tuple[np.ndarray, np.ndarray]:

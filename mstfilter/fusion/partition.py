@@ -26,12 +26,14 @@ import numpy as np
 from scipy.ndimage import distance_transform_edt
 
 from mstfilter.completion import ClipCompleter, Completer, Completion, Extrude, arbitrate, occupancy_of
+from mstfilter.completion.observed import frame_points
 from mstfilter.errors import check_choice, check_integer, check_number
 from mstfilter.fusion.cells import Cells, PairEvidence
 from mstfilter.fusion.conflicts import check_grid
 from mstfilter.fusion.division import NoDivision, PartRule, divided
 from mstfilter.fusion.free_space import FreeSpace, log_quality
 from mstfilter.fusion.interfaces import Division, Evidence, Projection
+from mstfilter.fusion.update import parents_of_pairs, scored
 from mstfilter.scene import Clip, Frame, Hypothesis, ObjectRecord, ObjectView, VoxelGrid
 from mstfilter.smc import Population, Systematic, Update, child
 
@@ -49,9 +51,7 @@ class Readings(NamedTuple):
     @classmethod
     def of(cls, frame: Frame, grid: VoxelGrid) -> Readings:
         """Of a frame."""
-        index = grid.index_of(frame.points)
-        pixels = np.flatnonzero(frame.valid & grid.contains(index))
-        return cls(pixels, index.reshape(-1, 3)[pixels])
+        return cls(*frame_points(frame, grid))
 
     def mask(self, chosen: np.ndarray, frame: Frame) -> np.ndarray:
         """Pixels (H, W) bool of the chosen readings (m,) bool."""
@@ -178,7 +178,6 @@ class PartitionUpdate(Update):
             log_odds = self.pairs.log_odds(cells, weights)
             drawn = cells.draw(child(rng, "partition"), log_odds, len(i))
             chosen = list(np.pad(drawn, ((0, 0), (0, 1)))[:, cells.of_reading])  # the last column is no object
-            i = np.full(len(i), -1)  # all samples made it
         else:
             chosen = [segments[a] for a in i.tolist()]
         candidates = []
@@ -186,15 +185,10 @@ class PartitionUpdate(Update):
             stream = child(rng, "candidate", number)
             candidates.append(self._partition(stream, chosen[number], past[b], predictions[b], refined[b]))
         built = self._complete(rng, candidates, readings, observation)
-        parents = {
-            "previous": predicted.parents.get("previous", np.full(len(predicted), -1))[j],
-            "proposed": np.append(proposed.parents.get("proposed", np.full(len(proposed), -1)), -1)[i],
-        }
-        total, scores = np.zeros(len(built)), {}
-        for term in self.evidence:
-            score = term.log_score(built, observation)
-            scores[type(term).__name__] = score.round(3).tolist()
-            total += score
+        parents = parents_of_pairs(proposed, i, predicted, j)
+        if self.partitions == "pairs":  # all samples made it
+            parents["proposed"] = np.full(len(i), -1)
+        total, scores = scored(self.evidence, built, observation)
         return Population(built, total, parents, {**notes, "scores": scores})
 
     def _pairs(

@@ -17,6 +17,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar, Literal
 
@@ -166,19 +167,22 @@ class FusionUpdate(Update):
     def _resampled(self, rng: np.random.Generator, fused: Population, clip: Clip, n: int) -> Population:
         """Second stage: `n` candidates drawn by pair weight, weighted by their score."""
         drawn = Systematic().resample(rng, fused, n).realised()
-        total, scores = self.scored(tuple(drawn.particles), clip)
+        total, scores = scored(self.evidence, tuple(drawn.particles), clip)
         log_weights = drawn.log_weights + total
         parents = {name: index for name, index in drawn.parents.items() if name != "ancestor"}
         return Population(drawn.particles, log_weights, parents, {**fused.notes, "scores": scores})
 
-    def scored(self, hypotheses: tuple[Hypothesis, ...], clip: Clip) -> tuple[np.ndarray, dict[str, list[float]]]:
-        """The sum (n,) of all terms of evidence in nats, and the score of each term by name."""
-        total, scores = np.zeros(len(hypotheses)), {}
-        for k, term in enumerate(self.evidence):
-            name, score = type(term).__name__, term.log_score(hypotheses, clip)
-            scores[f"{name} {k}" if name in scores else name] = score.round(3).tolist()
-            total += score
-        return total, scores
+
+def scored(
+    evidence: Sequence[Evidence], hypotheses: tuple[Hypothesis, ...], clip: Clip
+) -> tuple[np.ndarray, dict[str, list[float]]]:
+    """The sum (n,) of all terms of evidence in nats, and the score of each term by name."""
+    total, scores = np.zeros(len(hypotheses)), {}
+    for k, term in enumerate(evidence):
+        name, score = type(term).__name__, term.log_score(hypotheses, clip)
+        scores[f"{name} {k}" if name in scores else name] = score.round(3).tolist()
+        total += score
+    return total, scores
 
 
 def parents_of_pairs(
