@@ -214,23 +214,32 @@ def test_a_light_start(arguments):
     assert "heavy: []" in done.stdout, done.stdout + done.stderr
 
 
-def test_the_default_path_needs_neither_open3d_nor_torch(two_pauses, tmp_path):
-    """A run with the default preset and a report, with both made unimportable."""
+@pytest.mark.parametrize(
+    "preset, blocked", [("mst", ["open3d"]), ("mst_rules", ["open3d", "torch"]), ("mst", ["torch"])]
+)
+def test_what_the_presets_need(preset, blocked, two_pauses, tmp_path):
+    """A run and its report with libraries made unimportable. Only the network of `mst` needs torch, and says so."""
     done = python(
         "import sys\n"
         "class Blocked:\n"
         "    def find_spec(self, name, path=None, target=None):\n"
-        "        if name.partition('.')[0] in ('open3d', 'torch'):\n"
-        "            raise ImportError(f'{name} is blocked')\n"
+        f"        if name.partition('.')[0] in {blocked}:\n"
+        "            raise ImportError(name + ' is blocked')\n"
         "sys.meta_path.insert(0, Blocked())\n"
         "from mstfilter.cli import main\n"
         "main(sys.argv[1:])",
         "run",
         two_pauses,
         "n=3",
+        "--preset",
+        preset,
         "--out",
         tmp_path / "run",
     )
+    if preset == "mst" and "torch" in blocked:
+        assert done.returncode == 2 and "torch cannot be imported" in done.stderr and "mst_rules" in done.stderr
+        assert not (tmp_path / "run").exists()
+        return
     assert done.returncode == 0, done.stderr
     assert "<html" in (tmp_path / "run" / "report.html").read_text()
 

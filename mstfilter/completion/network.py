@@ -58,7 +58,11 @@ class NetworkCompleter(Completer, UsesFiles):
         try:
             from mstfilter.completion.unet import load_network
         except ImportError as error:
-            raise MissingLibraryError(f"torch cannot be imported: {error}", "pip install torch") from error
+            raise MissingLibraryError(
+                f"torch cannot be imported: {error}",
+                "pip install torch",
+                "or complete by a rule: the preset mst_rules, or proposal.completer=extrude",
+            ) from error
         network = load_network(self.weights, self.architecture)
         if self.draw and not network.latent:
             raise InputError(f"{self.weights}: the network takes no noise, so it cannot draw", "set draw=false")

@@ -208,7 +208,7 @@ def best_of_both(proposed: Hypothesis, predicted: Hypothesis, true: np.ndarray) 
 #: Overrides of the preset ``mst`` by stage. A new component keeps the fields of ``mst`` that it has too.
 STAGES: dict[str, tuple[str, ...]] = {
     "boundary": ('proposal.boundary={component="true_boundary", form="cleaned"}',),
-    "masks": ("proposal=true_masks",),
+    "masks": ("proposal=true_masks", "proposal.completer=network"),
     "completion": ("proposal.completer=true_completion",),
     "motions": ("transition=true_motions",),
     "choice": ('update.evidence=["true_quality"]', "update.n_scored=100"),

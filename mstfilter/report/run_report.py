@@ -442,7 +442,7 @@ def _config_rows(config: Mapping[str, Any]) -> list[tuple[str, list[tuple[str, s
 
 
 def _facts(description: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Preset, seed, recording and versions."""
+    """Preset, seed, recording, hashes of files and weights, and versions."""
     recording = description["recording"]
     facts = [
         ("preset", str(description["description"])),
@@ -452,5 +452,5 @@ def _facts(description: Mapping[str, Any]) -> list[tuple[str, str]]:
         ("recording key", str(recording["key"])),
         ("generator", short_text(recording["generator"])),
     ]
-    facts += [(name, str(version)) for name, version in description["versions"].items()]
+    facts += [(name, str(one)) for name, one in (description["files"] | description["versions"]).items()]
     return [fact for fact in facts if fact[1] not in ("", "–")]

@@ -168,9 +168,12 @@ def _first_difference(found: Any, wanted: Any, where: str = "") -> str:
 
 
 def component_files(component: Any) -> dict[str, str]:
-    """Files of the user that a component and its parts come from -> hash of their content."""
-    sources = [type(part).__dict__ for part in nested_components(component)]
-    return {source["__mst_file__"]: source["__mst_source__"] for source in sources if "__mst_file__" in source}
+    """Files of the user that a component and its parts come from, and their trained weights -> hash of the content."""
+    parts = nested_components(component)
+    sources = [type(part).__dict__ for part in parts]
+    found = {source["__mst_file__"]: source["__mst_source__"] for source in sources if "__mst_file__" in source}
+    keys = {f"weights of {type(part).__name__}": str(getattr(part, "weights_key", "")) for part in parts}
+    return found | {name: key for name, key in keys.items() if key}
 
 
 def library_versions() -> dict[str, str]:

@@ -72,9 +72,14 @@ class BorderTree(TreeBuilder):
         return load_border_network(self.weights)
 
     @property
+    def weights_key(self) -> str:
+        """Key of the contents of the weights."""
+        return self.network.key
+
+    @property
     def bound_key(self) -> bytes:
-        """Hash of the weights: what is cached depends on them."""
-        return self.network.key.encode()
+        """What is cached depends on the weights."""
+        return self.weights_key.encode()
 
     def regions(self, boundary: np.ndarray, frame: Frame) -> tuple[Tree, Regions]:
         """The initial tree and its measured leaves."""

@@ -125,9 +125,10 @@ def make_plan(study: StudyConfig, overrides: Sequence[str] = (), *, allow_files:
 def _arm(request: ArmRequest, versions: dict[str, str], code: str, allow_files: bool) -> Arm:
     with request.name_in_errors():
         filter = build_filter(request.config(allow_files), allow_files=allow_files)
+        files = component_files(filter)
     config = as_json(describe_filter(filter))
     known_code = all(type(part).__module__.startswith("mstfilter") for part in nested_components(filter))
-    key = _hash([config, component_files(filter), versions, code])
+    key = _hash([config, files, versions, code])
     return Arm(request.name, config, key, known_code, tuple(uses_truth(filter)), request.reported_only)
 
 

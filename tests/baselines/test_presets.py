@@ -44,6 +44,7 @@ def test_baselines_share_budget_selection_and_completion_with_mst(name):
 
 
 def test_baselines_differ_from_mst_only_where_they_must():
+    assert differences(described("mst_rules"), MST) == ["proposal.completer"]
     assert differences(described("samples_only"), MST) == ["transition", "update"]
     assert sorted(differences(described("single_frame"), MST)) == ["proposal.sampler", "transition", "update"]
     assert differences(described("tracking_only"), MST) == ["proposal", "update"]
@@ -89,8 +90,8 @@ def test_changes_to_mst_reach_the_baselines(tmp_path, monkeypatch):
     models.mkdir()
     for name in preset_names():
         (models / f"{name}.toml").write_bytes(resources.find_preset(name).read_bytes())
-    text = (models / "mst.toml").read_text().replace("n = 5\n", "n = 9\n").replace("eta = 5", "eta = 4")
-    (models / "mst.toml").write_text(text)
+    text = (models / "mst_rules.toml").read_text().replace("n = 5\n", "n = 9\n").replace("eta = 5", "eta = 4")
+    (models / "mst_rules.toml").write_text(text)
     monkeypatch.setattr(resources, "models_folder", lambda: models)
     assert described("union")["n"] == 9
     assert described("union")["update"]["fusion"]["eta"] == 4
