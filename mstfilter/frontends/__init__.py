@@ -1,7 +1,7 @@
 """Front ends of others: segmentations and networks that users supply by path.
 
 >>> import mstfilter
->>> mst = mstfilter.preset("mst", "proposal=mask_folder", "proposal.folder=masks")        # doctest: +SKIP
+>>> mst = mstfilter.preset("mst_rules", "proposal=mask_folder", "proposal.folder=masks")        # doctest: +SKIP
 
 ==================  ===================================================================
 `mask_files`        folders of instance masks with alternatives: layout, reader, writer

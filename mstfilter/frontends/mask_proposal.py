@@ -1,6 +1,6 @@
 """Hypotheses and boundary maps from instance masks that another program made.
 
->>> filter = mstfilter.preset("mst", "proposal=mask_folder", "proposal.folder=masks")
+>>> filter = mstfilter.preset("mst_rules", "proposal=mask_folder", "proposal.folder=masks")
 >>> MaskProposal("masks").sample(np.random.default_rng(0), clip, 10)
 
 `mstfilter.frontends.mask_files` describes the folder. A sampled segmentation has one alternative of each region,

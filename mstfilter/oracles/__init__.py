@@ -3,7 +3,7 @@
 A simulated recording holds its true voxels, instance images and poses. Components
 named ``true_...`` use them in place of an estimate, which shows how much each stage loses:
 
->>> filter = mstfilter.preset("mst", "proposal=true_masks", "transition=true_motions")
+>>> filter = mstfilter.preset("mst", "proposal.completer=true_completion", "transition=true_motions")
 >>> filter = bind_truth(filter, recording)                  # a clip holds no truth; the recording does
 >>> state, infos = filter.run(recording.clips(), seed=0)
 

@@ -168,7 +168,7 @@ def _first_difference(found: Any, wanted: Any, where: str = "") -> str:
 
 
 def component_files(component: Any) -> dict[str, str]:
-    """Files of the user that a component and its parts come from, and their trained weights -> hash of the content."""
+    """Files of the user that a component and its parts come from, and trained weights -> hash of the content."""
     parts = nested_components(component)
     sources = [type(part).__dict__ for part in parts]
     found = {source["__mst_file__"]: source["__mst_source__"] for source in sources if "__mst_file__" in source}

@@ -61,7 +61,9 @@ def test_the_estimate_is_better_than_the_best_alternative(tmp_path, monkeypatch,
     alone = []
     for k in range(3):
         write_masks(f"alone{k}", clip.index, [masks[clip.after.rgb.tobytes()][k]])
-        proposal = mstfilter.preset("single_frame", "proposal=mask_folder", f"proposal.folder=alone{k}").proposal
+        proposal = mstfilter.preset(
+            "single_frame", "proposal=mask_folder", f"proposal.folder=alone{k}", "proposal.completer=network"
+        ).proposal
         (hypothesis,) = proposal.sample(np.random.default_rng(0), clip, 1).particles
         alone.append(mstfilter.weighted_coverage(hypothesis.labels, truth))
     assert mstfilter.weighted_coverage(given["belief"].estimate().labels, truth) > max(alone)
