@@ -1,4 +1,4 @@
-"""The forest plot of the README: differences between `mst` and other methods, from tables of other studies.
+"""The forest plot of the README: differences between `mst_rules` and other methods, from tables of other studies.
 
     python experiments/readme_picture/differences.py [--out docs/images/differences.png]
 
@@ -32,8 +32,8 @@ METHODS = {
     "mst n = 1": "one hypothesis",
     "never merge": "objects are never merged",
 }
-SIGN = {"quality": 1, "information": -1}  # so that mst is better on the right
-LABELS = {"quality": "mst minus the method", "information": "the method minus mst, nats"}
+SIGN = {"quality": 1, "information": -1}  # so that it is better on the right
+LABELS = {"quality": "mst_rules minus the method", "information": "the method minus mst_rules, nats"}
 BLUE, GREEN = "#336fb9", "#2ca281"
 
 
@@ -70,7 +70,7 @@ def main(out: Path) -> None:
             low, high = min(d.low for d in known.values()), max(d.high for d in known.values())
             axes.set_xlim(low - 0.1 * (high - low), high + 0.42 * (high - low))
             axes.tick_params(labelleft=axes is panels[0])
-            axes.set_title(f"{measure.capitalize()}: mst is better on the right")
+            axes.set_title(f"{measure.capitalize()}: mst_rules is better on the right")
             axes.set_xlabel(LABELS[measure])
         out.parent.mkdir(parents=True, exist_ok=True)
         figure.savefig(out, dpi=150, metadata={"Software": None})
