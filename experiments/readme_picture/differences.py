@@ -70,7 +70,7 @@ def main(out: Path) -> None:
             low, high = min(d.low for d in known.values()), max(d.high for d in known.values())
             axes.set_xlim(low - 0.1 * (high - low), high + 0.42 * (high - low))
             axes.tick_params(labelleft=axes is panels[0])
-            axes.set_title(f"{measure.capitalize()}: mst_rules is better on the right")
+            axes.set_title(f"{measure.capitalize()}: right is better")
             axes.set_xlabel(LABELS[measure])
         out.parent.mkdir(parents=True, exist_ok=True)
         figure.savefig(out, dpi=150, metadata={"Software": None})
