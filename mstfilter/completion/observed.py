@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.ndimage import binary_dilation
 
 from mstfilter.scene import Frame, ObjectView, VoxelGrid, depth_sigma, frame_geometry, memo, read_only
 
@@ -26,7 +27,9 @@ _REACH = 4.0  # voxels, distance from the surface at which `signed` saturates
 _OWN, _FREE, _BEHIND = np.uint8(1), np.uint8(4), np.uint8(8)  # bits of a view
 _SHAPE = _OWN | _FREE | _BEHIND  # those that are evidence about the object's shape
 
-_CONTRADICTED = 0.3  # share of the surface at which the latest frame refutes a view
+# Shares at which the latest frame refutes a view: of its surface that is seen free, of the surface seen now that was
+# free in it, and of its surface that is seen now.
+_CLEARED, _PIERCED, _SEEN = 0.2, 0.15, 0.05
 _CLEAR = 1.0  # voxels: space of an earlier frame is free if it lay this far in front of the surface
 
 
@@ -164,14 +167,17 @@ def recall(seen: ObservedBox, offset: np.ndarray, grid: VoxelGrid, views: Sequen
 
 
 def _contradicts(found: np.ndarray, seen: ObservedBox, inside: np.ndarray) -> bool:
-    """Whether the latest frame contradicts a view: its surface is seen free, or its free space is the surface.
+    """Whether the latest frame contradicts a view.
 
-    `found` (k,) are its bits at the voxels `inside` (n,) bool of the box.
+    Its surface is seen free, or its free space is the surface now, or nothing of its surface is near the surface
+    seen now. `found` (k,) are its bits at the voxels `inside` (n,) bool of the box.
     """
     own, free = (found & _OWN) > 0, (found & _FREE) > 0
     now_free, now_own = seen.free.ravel()[inside], seen.surface.ravel()[inside]
-    n_own, n_now = int(own.sum()), int(now_own.sum())
-    return bool((own & now_free).sum() > _CONTRADICTED * n_own or (free & now_own).sum() > _CONTRADICTED * n_now)
+    near = binary_dilation(seen.surface).ravel()[inside]
+    n_own, n_now = int(own.sum()), int(seen.surface.sum())
+    cleared, pierced = (own & now_free).sum() > _CLEARED * n_own, (free & now_own).sum() > _PIERCED * n_now
+    return bool(cleared or pierced or (n_now and (own & near).sum() < _SEEN * n_own))
 
 
 def view_surface(view: ObjectView, grid: VoxelGrid) -> np.ndarray:

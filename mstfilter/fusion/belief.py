@@ -183,15 +183,15 @@ class Belief:
     def same_object(self, a: Any, b: Any) -> np.ndarray:
         """Probability (...) that two voxels belong to the same object.
 
-        ``sum_i w_i [k_i(a) = k_i(b) > 0] o_i(a) o_i(b)``, with k_i the most probable object of a voxel in hypothesis
-        i and o_i its probability (`Hypothesis.shares`). `a` and `b` (..., 3) are broadcast against each other. For a
+        ``sum_i w_i [k_i(a) = k_i(b) > 0] min(o_i(a), o_i(b))``, with k_i the most probable object of a voxel in
+        hypothesis i and o_i its probability (`Hypothesis.shares`). An object is a level set of its probabilities: a
+        voxel is in it whenever a less probable one is. `a` and `b` (..., 3) are broadcast against each other. For a
         = b the result is the occupancy.
         """
         at_a, at_b = np.broadcast_arrays(_flat_voxels(self.grid, a), _flat_voxels(self.grid, b))
         found = np.zeros(at_a.shape)
         for w, (owner, p) in zip(self._mass, self._flat_shares, strict=True):
-            both = np.where(at_a == at_b, p[at_a], p[at_a] * p[at_b])
-            found += w * ((owner[at_a] == owner[at_b]) & (owner[at_a] > 0)) * both
+            found += w * ((owner[at_a] == owner[at_b]) & (owner[at_a] > 0)) * np.minimum(p[at_a], p[at_b])
         return found
 
     @cached_property

@@ -388,7 +388,7 @@ def test_probabilities_of_unsure_hypotheses():
         occupied += weight * one.shares.probability.astype(float)
         for (i, a), (j, b) in itertools.product(enumerate(VOXELS), repeat=2):
             owner, p = one.shares.owner, one.shares.probability.astype(float)
-            same[i, j] += weight * (owner[a] == owner[b] > 0) * (p[a] if a == b else p[a] * p[b])
+            same[i, j] += weight * (owner[a] == owner[b] > 0) * min(p[a], p[b])
     np.testing.assert_allclose(belief.occupancy(), occupied, atol=1e-12)
     every = np.array(VOXELS)
     np.testing.assert_allclose(belief.same_object(every[:, None], every[None]), same, atol=1e-12)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -89,7 +90,7 @@ def test_noise_in_expectation_and_drawn():
 
 
 def test_forecasts_of_unsure_hypotheses():
-    """Against draws: each voxel belongs to its owner with its probability, then takes a neighbour's label."""
+    """Against all level sets, the voxels of probability U and more; then voxels take a neighbour's label."""
     rng = np.random.default_rng(6)
     owner = np.zeros((4, 3, 2), np.uint16)
     owner[:2], owner[2:, :2] = 1, 2
@@ -99,19 +100,21 @@ def test_forecasts_of_unsure_hypotheses():
     questions = every_pair(owner.shape)
     sure, noisy = questions.forecasts([one], np.ones(1), (0.0, 0.4))
     a, b = questions.first, questions.second
-    product = (
-        p.ravel()[a].astype(float) * p.ravel()[b] * (owner.ravel()[a] == owner.ravel()[b]) * (owner.ravel()[a] > 0)
-    )
-    np.testing.assert_allclose(sure, product, atol=1e-12)
+    levels = np.unique(np.append(p.astype(float), (0.0, 1.0)))
+    plain, blurred = np.zeros(len(a)), np.zeros(len(a))
+    for low, high in itertools.pairwise(levels):  # U in (low, high]
+        labels = np.where(p.astype(float) >= high, owner, 0)
+        plain += (high - low) * questions.outcomes(labels)
+        # Given the level set, the two voxels are independent: each takes a neighbour's label with probability .4.
+        share = np.stack([labels == k for k in (1, 2)]).astype(float)
+        padded = np.pad(share, ((0, 0), (1, 1), (1, 1), (1, 1)), mode="edge")
+        around = [np.roll(padded, s, axis)[:, 1:-1, 1:-1, 1:-1] for axis in (1, 2, 3) for s in (1, -1)]
+        law = (0.6 * share + 0.4 * np.mean(around, axis=0)).reshape(2, -1)
+        blurred += (high - low) * (law[:, a] * law[:, b]).sum(axis=0)
+    np.testing.assert_allclose(sure, plain, atol=1e-12)
+    np.testing.assert_allclose(noisy, blurred, atol=1e-12)
     mixed = questions.forecasts([one, owner], np.array([0.25, 0.75]))
-    np.testing.assert_allclose(mixed, 0.25 * product + 0.75 * questions.outcomes(owner), atol=1e-12)
-    # The two voxels are independent: each takes the label of a neighbour with probability .4, and what it takes is an
-    # owner with the probability there.
-    share = np.stack([np.where(owner == k, p, 0).astype(float) for k in (1, 2)])
-    padded = np.pad(share, ((0, 0), (1, 1), (1, 1), (1, 1)), mode="edge")
-    around = [np.roll(padded, s, axis)[:, 1:-1, 1:-1, 1:-1] for axis in (1, 2, 3) for s in (1, -1)]
-    law = (0.6 * share + 0.4 * np.mean(around, axis=0)).reshape(2, -1)
-    np.testing.assert_allclose(noisy, (law[:, a] * law[:, b]).sum(axis=0), atol=1e-12)
+    np.testing.assert_allclose(mixed, 0.25 * plain + 0.75 * questions.outcomes(owner), atol=1e-12)
 
 
 def test_questions_depend_on_the_depth_images_alone():
