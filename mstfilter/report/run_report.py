@@ -452,5 +452,5 @@ def _facts(description: Mapping[str, Any]) -> list[tuple[str, str]]:
         ("recording key", str(recording["key"])),
         ("generator", short_text(recording["generator"])),
     ]
-    facts += [(name, str(one)) for name, one in (description["files"] | description["versions"]).items()]
+    facts += [(name, str(one)) for name, one in (description.get("files", {}) | description["versions"]).items()]
     return [fact for fact in facts if fact[1] not in ("", "–")]
