@@ -10,6 +10,7 @@ import pytest
 
 from mstfilter.formats import RecordingWriter, open_recording
 from mstfilter.scene import VoxelGrid
+from mstfilter.scoring import ask
 from tests.formats import layouts
 from tests.formats.bags import COLOUR, DEPTH, Messages, scene_messages, write as write_bag
 from tests.scene.scenes import CAMERA, table_scene
@@ -194,11 +195,16 @@ def test_quality(tmp_path, capsys):
     code, out, err = call("quality", tmp_path / "run", recording, "--csv", tmp_path / "q.csv", capsys=capsys)
     assert code == 0, err
     out, belief = out.split("\n\n")
+    scores = ["log_loss", "base_rate", "brier", "calibration_error", "energy"]
     lines, columns = out.splitlines(), ["mean", "weighted", "best", "top", "estimate", "one_blob", "components"]
     assert lines[0].split() == ["pause", "form", "n", *columns]
     assert len(lines) == 1 + 3 * 3 + 3
-    assert belief.splitlines()[1].split() == ["pause", "brier", "log_loss", "calibration_error", "energy"]
-    assert len(belief.splitlines()) == 2 + 3
+    assert belief.splitlines()[1].split() == ["pause", *scores]
+    assert len(belief.splitlines()) == 2 + 3 + 1 + 2
+    by_pause = [float(line.split()[2]) for line in belief.splitlines()[2:5]]
+    one = open_recording(recording)
+    shares = [ask(one, t).outcomes(one.truth(t)).mean() for t in range(3)]
+    assert by_pause == pytest.approx([-p * np.log(p) - (1 - p) * np.log(1 - p) for p in shares], abs=6e-4)
     table = list(csv.DictReader((tmp_path / "q.csv").open()))
     means = [float(row["mean"]) for row in table if row["form"] == "objects"]
     assert float(lines[-3].split()[2]) == pytest.approx(np.mean(means), abs=6e-4)

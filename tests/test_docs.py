@@ -27,7 +27,7 @@ PEERS = ("particles", "stonesoup")
 def blocks(page):
     """Python examples of a page, without the options of notebook cells."""
     cells = re.findall(
-        r"^```(?:python|{code-cell})\n(?::.*\n)*(.*?)```", page.read_text(), flags=re.DOTALL | re.MULTILINE
+        r"^```(?:python|{code-cell})\n(?::[^\n]*\n)*(.*?)```", page.read_text(), flags=re.DOTALL | re.MULTILINE
     )
     return [cell.lstrip("\n") for cell in cells]
 

@@ -106,7 +106,7 @@ def draw(lines: list[dict[str, Any]], path: Path) -> None:
 
     plt.style.use("mstfilter.report.figures")
     methods = list(dict.fromkeys(line["method"] for line in lines))
-    figure, axes = plt.subplots(1, 3, figsize=(10, 4), width_ratios=(1, 1, 0.8))
+    figure, axes = plt.subplots(1, 3, figsize=(10, 4.3), width_ratios=(1, 1, 0.8))
     axes[2].sharey(axes[1])
     for k, method in enumerate(methods):
         shade = np.array(colour(k)) / 255
@@ -126,11 +126,12 @@ def draw(lines: list[dict[str, Any]], path: Path) -> None:
                 axis = axes[2 if source == "independent" else 1]
                 axis.errorbar(x + aside, gain, (gain - low, high - gain), fmt=marker, capsize=2, lw=1.1, **style)
     axes[0].plot([], [], "D", color="grey", mfc="white", ms=4.5, label="masks of mst itself")
-    axes[0].legend()
+    figure.legend(loc="outside lower center", ncols=4)
     axes[0].set(title="errors that last", ylabel="3-D quality, pauses t >= 1")
     axes[1].set(title="errors that last", ylabel="mst minus the method")
     axes[2].set(title="errors drawn anew", ylabel="mst minus the method")
-    figure.supxlabel("quality of the masks in the image", fontsize=10)
+    for axis in axes:
+        axis.set_xlabel("quality of the masks")
     for axis in axes[1:]:
         axis.axhline(0, color="black", lw=0.8)
     figure.savefig(path, dpi=110)

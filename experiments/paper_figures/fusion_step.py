@@ -116,7 +116,7 @@ def picture(
     smoke: bool,
 ) -> Path:
     """Scores of all hypotheses; below, the fused hypothesis with the median score of each kind."""
-    figure = Figure((11.5, 7.0), layout="constrained", facecolor=PAPER)
+    figure = Figure((11.0, 6.7), layout="constrained", facecolor=PAPER)
     FigureCanvasAgg(figure)
     shown = list(groups)[2:]
     grid = figure.add_gridspec(2, len(shown), height_ratios=[1.35, 1])
@@ -134,8 +134,8 @@ def picture(
         axes = figure.add_subplot(grid[1, k])
         show(axes, voxels(labels, particles.grid, view, colours))
         axes.set_title(title, fontsize=9)
-    figure.supxlabel(NOTICE, fontsize=8, color=MUTED)
-    return save(figure, path, 50 if smoke else 100)
+    figure.supxlabel(NOTICE, fontsize=9, color=MUTED)
+    return save(figure, path, 50 if smoke else 105)
 
 
 def strip(axes: Axes, scores: dict[str, np.ndarray], floors: dict[str, list[float]]) -> None:

@@ -23,7 +23,7 @@ SEED = 0
 def make(out: Path, smoke: bool) -> list[Path]:
     """Draw the figure."""
     small = {"width": 160, "height": 120, "voxel_size": 0.02, **FEW} if smoke else {}
-    figure, axes = page(3, len(FAMILIES), 12.0, 9.4)
+    figure, axes = page(3, len(FAMILIES), 11.0, 8.6)
     for k, name in enumerate(FAMILIES):
         family = replace(scene_family(name), **small)
         scene = SimulatedScene(family, SEED)
@@ -40,4 +40,4 @@ def make(out: Path, smoke: bool) -> list[Path]:
         show(axes[1, k], overlay(shot["rgb"], shot["instance"], colours, fill=0.5)[box])
         view = viewpoint([(truth, grid)], camera, *((160, 120) if smoke else (600, 450)))
         show(axes[2, k], voxels(truth, grid, view, colours))
-    return [save(figure, out / "initial.png", 50 if smoke else 75)]
+    return [save(figure, out / "initial.png", 50 if smoke else 82)]

@@ -76,7 +76,7 @@ def picture(particles: Particles, path: Path, smoke: bool) -> Path:
     colours, places = colours_of(graph), layout(graph)
     size = (240, 180) if smoke else (600, 450)
     view = viewpoint([sample, prediction], None, *size)
-    figure, axes = page(3, 3, 12.6, 9.9)
+    figure, axes = page(3, 3, 11.0, 8.7)
     for k, (title, side, one) in enumerate(
         (("A sample of the new image", PROPOSED, sample), ("A moved earlier hypothesis", PREDICTED, prediction))
     ):
@@ -94,8 +94,8 @@ def picture(particles: Particles, path: Path, smoke: bool) -> Path:
         show(axes[row, 1], voxels(labels, sample.grid, view, own), f"Painted: {count(labels)} objects")
         title = f"After the mode filter: {count(smooth)} objects"
         show(axes[row, 2], voxels(smooth, sample.grid, view, own), title)
-    figure.supxlabel(NOTICE, fontsize=8, color=MUTED)
-    return save(figure, path, 50 if smoke else 100)
+    figure.supxlabel(NOTICE, fontsize=9, color=MUTED)
+    return save(figure, path, 50 if smoke else 115)
 
 
 def count(labels: np.ndarray) -> int:
@@ -165,7 +165,7 @@ def draw_graph(
     if draw is not None:
         for number, v in enumerate(draw.order, start=1):
             bright = np.dot(colours[v], (0.3, 0.59, 0.11)) > 140
-            style = {"ha": "center", "va": "center", "fontsize": 7, "zorder": 4}
+            style = {"ha": "center", "va": "center", "fontsize": 8.6, "zorder": 4}
             axes.text(*places[v], str(number), color=INK if bright else "white", **style)
     else:
         axes.text(places[:, 0].mean(), 1.2, "objects of the sample", ha="center", color=MUTED)

@@ -48,7 +48,7 @@ def make(out: Path, smoke: bool) -> list[Path]:
     colours = colours_of(tree, found, shown)
     part = Drawn.of(tree, shown)
     box = crop(scene.truth(), family.grid(), scene.camera)
-    figure, axes = page(2, len(shown), 12.6, 7.2)
+    figure, axes = page(2, len(shown), 11.0, 6.3)
     for k, (cut, log_p) in enumerate(zip(shown, probability, strict=True)):
         own = {int(n): colours.get(int(n), UNASSIGNED_COLOUR) for n in cut}
         draw_tree(axes[0, k], part, own, ylabel=k == 0)
@@ -56,7 +56,7 @@ def make(out: Path, smoke: bool) -> list[Path]:
         axes[0, k].set_title(f"{name}: {len(objects(found, cut))} objects")
         labels = np.where(found.object_pixels, np.where(found.is_object[cut], cut, 0)[tree.label_image(cut)], 0)
         show(axes[1, k], overlay(shot["rgb"], labels, own, fill=0.55)[box])
-    return [save(figure, out / "sampled_cuts.png", 50 if smoke else 90)]
+    return [save(figure, out / "sampled_cuts.png", 50 if smoke else 105)]
 
 
 def objects(found: Segments, cut: np.ndarray) -> list[int]:

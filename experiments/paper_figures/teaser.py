@@ -51,7 +51,7 @@ def picture(recording: Recording, run: RunFolder, path: Path, smoke: bool) -> Pa
     # From the camera's right, where hidden objects are visible.
     aside = replace(camera, T_world_camera=TURN * camera.pose)
     view = viewpoint([(everything, grid)], aside, *((160, 120) if smoke else (480, 360)))
-    figure, axes = page(2 + SHOWN, run.n_pauses, 2.7 * run.n_pauses, 2.15 * (2 + SHOWN))
+    figure, axes = page(2 + SHOWN, run.n_pauses, 2.2 * run.n_pauses, 1.8 * (2 + SHOWN))
     for t, truth in enumerate(truths):
         status = object_status(recording, t)
         hidden, unseen = ([k for k, s in status.items() if s == wanted] for wanted in ("hidden", "unseen"))
@@ -65,7 +65,7 @@ def picture(recording: Recording, run: RunFolder, path: Path, smoke: bool) -> Pa
         axes[row, 0].text(
             -0.04, 0.5, name, transform=axes[row, 0].transAxes, rotation=90, va="center", ha="right", color=MUTED
         )
-    return save(figure, path, 50 if smoke else 100)
+    return save(figure, path, 50 if smoke else 120)
 
 
 def hypotheses(column: np.ndarray, run: RunFolder, t: int, identities: Identities, view: Camera) -> None:
@@ -90,7 +90,7 @@ def bar(axes: Axes, weight: float, said: str) -> None:
         axes.add_patch(
             Rectangle((0.02, 1.02), width, 0.025, transform=axes.transAxes, color=colour, lw=0, clip_on=False)
         )
-    axes.text(0.45, 1.01, f"{weight:.2f}   {said}", transform=axes.transAxes, fontsize=8.5, color=MUTED)
+    axes.text(0.45, 1.01, f"{weight:.2f}   {said}", transform=axes.transAxes, fontsize=9, color=MUTED)
 
 
 def table(recording: Recording, run: RunFolder, path: Path) -> Path:

@@ -232,11 +232,14 @@ def quality(
         print(f"{'all':<7}{form:<9}{'':>4}" + "".join(f"{fmean(getattr(r, n) for r in these):>12.3f}" for n in names))
     if rows[0].brier == rows[0].brier:
         print("\nthe weighted set, asked whether two voxels belong to one object (lower is better)")
-        scores = ("brier", "log_loss", "calibration_error", "energy")
+        scores = ("log_loss", "base_rate", "brier", "calibration_error", "energy")
+        these = [row for row in rows if row.form == rows[0].form]
         print(f"{'pause':<7}" + "".join(f"{name:>19}" for name in scores))
-        for row in rows:
-            if row.form == rows[0].form:
-                print(f"{row.pause:<7}" + "".join(f"{getattr(row, name):>19.3f}" for name in scores))
+        for row in these:
+            print(f"{row.pause:<7}" + "".join(f"{getattr(row, name):>19.3f}" for name in scores))
+        print(f"{'all':<7}" + "".join(f"{fmean(getattr(r, n) for r in these):>19.3f}" for n in scores))
+        print("base_rate is the log loss of a forecast that knows only how often the answer is yes. The scores are")
+        print("those of the forecasts as they come: only studies have other scenes to recalibrate them on.")
     if rows[0].where == "image":
         print("scored in the image: hypotheses are projected, hidden parts do not count")
 

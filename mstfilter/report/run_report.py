@@ -94,13 +94,6 @@ class PauseNumbers:
         return None if self.metrics is None else int(self.metrics["true_objects"])
 
     @property
-    def base_rate_loss(self) -> float:
-        """Log loss of the forecast that gives all questions the share of those that are true, in nats."""
-        assert self.belief is not None
-        table = forecast_table(self.belief.counts[0].astype(np.int64))
-        return table.with_forecasts(np.full(len(table.p), table.yes.sum() / max(table.n, 1))).log_loss()
-
-    @property
     def step_seconds(self) -> float:
         return float(sum(self.seconds.values()))
 
@@ -183,7 +176,7 @@ class RunNumbers:
 
     @property
     def summary(self) -> list[str]:
-        """The run in one to four sentences."""
+        """The run in one to five sentences."""
         planned = len(self.description["recording"]["pauses"])
         done = len(self.steps)
         sentences = []
@@ -209,6 +202,12 @@ class RunNumbers:
             )
             if last.mean <= max(last.baselines.values()) + 0.005:
                 sentences.append("That is no better than the baselines.")
+        if last.belief is not None:
+            sentences.append(
+                "Asked whether two voxels belong to one object, the weighted set has a log loss of "
+                f"{last.belief.row['log_loss']:.2f} nats; a forecast that knows only "
+                f"how often the answer is yes has {last.belief.base_rate_loss:.2f}."
+            )
         return sentences
 
     @property
@@ -257,7 +256,9 @@ class RunNumbers:
             )
         if last.belief is not None:
             row = last.belief.row
-            remark = f"nats; base rate {last.base_rate_loss:.3f}; calibration error {row['calibration_error']:.3f}"
+            remark = (
+                f"nats; base rate {last.belief.base_rate_loss:.3f}; calibration error {row['calibration_error']:.3f}"
+            )
             tiles.append(("log loss", f"{row['log_loss']:.3f}", remark))
         remark = f"of {last.info['n_candidates']} candidates; {last.n_distinct} of {n} kept are distinct"
         tiles.append(("effective sample size", f"{last.info['ess']:.3g}", remark))

@@ -8,7 +8,8 @@ hypotheses, the weighted mean, the maximum, and the values of the hypothesis of 
 expected loss. It also has two floors: the occupied voxels of the same hypotheses as one blob, and as connected
 components. If the ground truth has instance images but no volumes, hypotheses are rendered and compared in the image;
 pixels of the robot (255) are ignored. For a recording with volumes, rows also have the scores of the weighted set:
-Brier score, log loss, calibration error and energy score (`mstfilter.scoring.score_belief`), the same for all forms.
+Brier score, log loss and that of the base rate, calibration error and energy score
+(`mstfilter.scoring.score_belief`), the same for all forms.
 """
 
 from __future__ import annotations
@@ -111,6 +112,7 @@ class PauseScore:
     log_loss: float = float("nan")
     calibration_error: float = float("nan")
     energy: float = float("nan")
+    base_rate: float = float("nan")
 
 
 def read_estimate(path: Path) -> list[PauseEstimate]:
@@ -258,8 +260,9 @@ def _score_pause(pause: int, estimate: PauseEstimate, truth: PauseTruth) -> list
     w = np.asarray(estimate.weights, dtype=float)
     belief = {}
     if truth.questions is not None:
-        scores = score_belief(truth.questions, estimate.hypotheses or estimate.labels, w, true).row
-        belief = {name: scores[name] for name in ("brier", "log_loss", "calibration_error", "energy")}
+        scores = score_belief(truth.questions, estimate.hypotheses or estimate.labels, w, true)
+        belief = {name: scores.row[name] for name in ("brier", "log_loss", "calibration_error", "energy")}
+        belief["base_rate"] = scores.base_rate_loss
     best_guess = least_loss(found, w)
     rows = []
     for form in FORMS:

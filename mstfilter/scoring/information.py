@@ -69,6 +69,14 @@ class BeliefScore(NamedTuple):
     row: dict[str, Any]
     counts: np.ndarray
 
+    @property
+    def base_rate_loss(self) -> float:
+        """Log loss, in nats, of the forecast that gives all questions the share of those that are true."""
+        table = forecast_table(self.counts[0].astype(np.int64))
+        if not table.n:
+            return float("nan")
+        return table.with_forecasts(np.full(len(table.p), table.yes.sum() / table.n)).log_loss()
+
 
 def score_belief(
     questions: Questions,
