@@ -377,8 +377,9 @@ def differences_figure(compared: Sequence[Compared], arms: Sequence[str], metric
         draw_forest(axes, rows)
         reference = known[0].first if known else ""
         side = "right" if ENDPOINTS.get(metric, 1) > 0 else "left"
-        label = f"{metric} of {reference} minus that of the method; {reference} is better on the {side}"
-        figure.supxlabel("\n".join(textwrap.wrap(label, 76)), fontsize=10, color=_MUTED)
+        parts = f"{metric} of {reference} minus that of the method;", f"{reference} is better on the {side}"
+        label = "\n".join(line for part in parts for line in textwrap.wrap(part, 76))
+        figure.supxlabel(label, fontsize=10, color=_MUTED)
         return _svg_text(figure, f"Paired differences of {metric} with 95 % intervals")
 
 

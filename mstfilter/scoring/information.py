@@ -5,11 +5,11 @@
 >>> found = {scene: counts}                                    # counts: belief.counts, summed over pauses
 >>> leave_one_out(found)["scene-3"].log_loss(found["scene-3"]) # information, in nats
 
-**Information.** A raw proper score of hypotheses rewards noise: hypotheses have no uncertainty of shape, so noise at
-their borders makes forecasts less sure where they are often wrong. Information takes this out. The forecasts are
-recalibrated by isotonic regression, fitted to other scenes, and the score is the mean log loss in nats; lower is
-better. Noise at the border is added where the other scenes say that it helps. So a forecaster gains nothing by
-adding noise itself, and two forecasters are compared by what their forecasts tell apart.
+**Information.** A raw proper score of hypotheses rewards noise: hypotheses of labels alone have no uncertainty of
+shape, so noise at their borders makes forecasts less sure where they are often wrong. Information takes this out. The
+forecasts are recalibrated by isotonic regression, fitted to other scenes, and the score is the mean log loss in nats;
+lower is better. Noise at the border is added where the other scenes say that it helps. So a forecaster gains nothing
+by adding noise itself, and two forecasters are compared by what their forecasts tell apart.
 
 **Energy score.** With d the root of the share of questions that are answered differently,
 
