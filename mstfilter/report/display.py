@@ -65,7 +65,7 @@ def plot_recording(recording: Recording) -> Drawing:
     low, high = np.percentile(known, (1, 99)) if len(known) else (0.0, 1.0)
     for k, (t, frame) in enumerate(zip(chosen, frames, strict=True)):
         axes[0, k].imshow(frame.rgb)
-        axes[0, k].set_title(f"pause {t}, {recording.times[recording.pauses[t]]:.1f} s", fontsize=9)
+        axes[0, k].set_title(f"pause {t}, {recording.times[recording.pauses[t]]:.1f} s")
         image = axes[1, k].imshow(frame.depth, vmin=low, vmax=high, cmap="viridis_r")
         for axis in axes[:2, k]:
             axis.set_axis_off()
@@ -113,7 +113,7 @@ def _plot_hypotheses(population: Population) -> Drawing:
         axis.set_axis_off()
     for axis, (picture, text) in zip(figure.axes, pictures, strict=False):
         axis.imshow(picture)
-        axis.set_title(text, fontsize=9)
+        axis.set_title(text, fontsize=12)
     return figure
 
 
