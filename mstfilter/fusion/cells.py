@@ -30,6 +30,8 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from mstfilter.smc import Systematic
+
 _SOFT = 0.02
 _REACH = 2  # pixels between two readings of neighbouring cells, at most
 _PART = 0.25  # share of a cell of the image that a prediction may split off
@@ -49,17 +51,18 @@ class PairEvidence:
         """Log odds (e,) of the pairs of cells; `weights` (n,) are those of the predictions."""
         a, b = cells.pairs.T
         image = np.mean(cells.samples[:, a] == cells.samples[:, b], axis=0)
-        found = self.constant + self.image * _logit(image)
+        found = self.constant + self.image * softened_logit(image)
         if len(cells.predictions):
             both = (cells.predictions[:, a] > 0) & (cells.predictions[:, b] > 0)
             explained = weights @ both
             same = weights @ (both & (cells.predictions[:, a] == cells.predictions[:, b]))
             share = np.divide(same, explained, out=np.full(len(same), 0.5), where=explained > 0)
-            found = found + explained * (self.past * _logit(share) + self.past_constant)
+            found = found + explained * (self.past * softened_logit(share) + self.past_constant)
         return found
 
 
-def _logit(p: np.ndarray) -> np.ndarray:
+def softened_logit(p: np.ndarray) -> np.ndarray:
+    """Log odds of shares, which are softened by 2 %."""
     return np.log((p + _SOFT) / (1 - p + _SOFT))
 
 
@@ -129,13 +132,15 @@ class Cells:
         return -np.logaddexp(0, -sign * log_odds[inside]).sum(axis=1)
 
     def draw(self, rng: np.random.Generator, log_odds: np.ndarray, n: int) -> np.ndarray:
-        """n partitions (n, K): each component gets one of its alternatives, independently."""
+        """n partitions (n, K). Components are independent.
+
+        In each, the alternatives are drawn by systematic selection: as often as their weights say, up to rounding.
+        """
         drawn = np.zeros((n, self.samples.shape[1]), np.int64)
         used = 0
         for cells, partitions in self.alternatives():
             score = self.scores(log_odds, cells, partitions)
-            p = np.exp(score - score.max())
-            chosen = rng.choice(len(p), size=n, p=p / p.sum())
+            chosen = rng.permutation(Systematic().select(rng, score, n)[0])
             drawn[:, cells] = partitions[chosen] + used + 1
             used += int(partitions.max()) + 1
         return drawn

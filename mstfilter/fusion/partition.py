@@ -98,12 +98,13 @@ class PartitionUpdate(Update):
     parts : PartRule
         When a part of an object becomes a separate object.
     evidence : tuple of Evidence
-        Terms whose sum is the log weight of a candidate. Without them all candidates have equal weights: they are
-        drawn by the weights of their pairs, log w = log w_i + log w_j + lambda log Q_j.
+        Terms whose sum is the log weight of a candidate, to select among more candidates than hypotheses. Without
+        them all candidates have equal weights: they are drawn by the weights of their pairs, log w = log w_i + log
+        w_j + lambda log Q_j.
     quality_exponent : float
         lambda.
     n_candidates : int
-        Candidates; 0 means four for each hypothesis of the larger side.
+        Candidates; 0 means one for each hypothesis of the larger side.
     partitions : {"sides", "pairs"}
         "sides": each component of the conflict graph gets the partition of the sample or of the prediction. "pairs":
         partitions are drawn by what all samples and predictions say of pairs of cells (`mstfilter.fusion.cells`).
@@ -195,7 +196,7 @@ class PartitionUpdate(Update):
         self, rng: np.random.Generator, proposed: Population, predicted: Population, log_q: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """Sample and prediction of each candidate, drawn by weight."""
-        n = self.n_candidates or 4 * max(len(predicted), len(proposed))
+        n = self.n_candidates or max(len(predicted), len(proposed))
         sides = [
             Systematic().resample(child(rng, name), Population(range(len(log_w)), log_w), n).realised().particles
             for name, log_w in (("proposed", proposed.log_weights), ("predicted", predicted.log_weights + log_q))

@@ -54,6 +54,15 @@ def test_benchmark_of_scoring(tmp_path):
     assert list(seconds)[-1] == "all" and all(s >= 0 for s in seconds.values())
 
 
+def test_partition_fit(tmp_path):
+    """Pairs of both kinds of clips are fitted; what is known of a pair beats knowing nothing (log 2)."""
+    run_script("partition_fit/run.py", "--smoke", "--out", tmp_path)
+    rows = read_csv(tmp_path / "fit.csv")
+    assert [row["evidence"] for row in rows] == ["image", "past", "both"] * 2
+    assert [row["clips"] for row in rows] == ["video"] * 3 + ["two frames"] * 3
+    assert all(int(row["pairs"]) > 100 and float(row["log_loss"]) < math.log(2) for row in rows)
+
+
 def test_front_ends(tmp_path):
     assert "demo-1" in run_script("front_ends/run.py", "--smoke", "--out", tmp_path)
     rows = read_csv(tmp_path / "summary.csv")
