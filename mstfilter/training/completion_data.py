@@ -6,8 +6,9 @@
 A scene has 2 to 12 objects of the kinds in `mstfilter.training.shapes`, side by side, stacked, leaning and hidden, at
 rest under physics. It is seen by three cameras with the noise of the simulated sensor and a small error of the
 camera's pose. The masks are those that a filter meets: the true masks with displaced borders, and the segments of
-sampled cuts of the segmentation tree, which also hold parts of objects, and several objects. Some samples have the
-evidence of a second frame, after other objects were taken away.
+sampled cuts of the segmentation tree, which also hold parts of objects, and several objects. Half of the samples also
+have one to three earlier views of the whole object (`mstfilter.completion.observed.recall`), like an object that was
+moved: from other cameras, with a small error of the motion since then, and some of them without some other objects.
 
 The true shape of a mask: each object with visible pixels in the mask contributes the voxels whose nearest visible
 point lies in the mask. So a whole object gets all its voxels, the masks of two halves share them, and a mask of two
@@ -20,15 +21,17 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import RigidTransform, Rotation
 
-from mstfilter.completion import Extrude, ObservedBox, observed_box
+from mstfilter.completion import Completer, Extrude, ObservedBox, observed_box
 from mstfilter.completion.crops import EDGE, LATTICE, crop_box
-from mstfilter.completion.observed import decode_signed, encode_box
+from mstfilter.completion.observed import decode_signed, encode_box, mask_voxels, observed_in, recall, view_surface
 from mstfilter.errors import InputError
-from mstfilter.scene import Camera, Frame, VoxelGrid, scene_cache
+from mstfilter.scene import Camera, Frame, ObjectView, VoxelGrid, scene_cache
 from mstfilter.segmentation import MetropolisHastingsCuts, TreeCutProposal
 from mstfilter.simulation.sensor import DepthSensor
 from mstfilter.simulation.shapes import label_voxels
@@ -52,10 +55,13 @@ from mstfilter.training.shapes import TRAINED
 
 _GRID = VoxelGrid(np.array([-0.45, -0.45, 0.0]), LATTICE, (90, 90, 40))
 _N_VIEWS, _N_MASKS = 3, 14  # cameras of a scene, masks of a view
-_SECOND_FRAME = 0.25  # share of views with a second frame
+_EARLIER = 0.5  # share of views with earlier frames
+_TAKEN_AWAY = 0.4  # share of earlier frames without some of the objects
+_MOTION_ERROR = (0.003, 0.02)  # metres and radians, standard deviations: the error of a tracked motion
 _PARENTS = 0.25  # share of the segments of a cut that are replaced by their parents
 _LEAST_PIXELS = 20
 _LEAST_SHARE = 0.1  # of the pixels of a mask, or of an object's visible pixels, below which an object counts as noise
+_WHOLE = 0.8  # of an object's visible pixels that a mask of the whole object has
 MASK_KINDS = ("whole", "part", "several")
 
 
@@ -101,19 +107,11 @@ def _view_samples(rng: np.random.Generator, world: PhysicsWorld, index: int) -> 
     camera = draw_camera(rng, poses[inside, :2, 3].mean(axis=0), (22, 68), (0.55, 1.05))
     frame, instance = _frame(rng, world, camera)
     truth = label_voxels(world.shapes, poses, _GRID)
-    second = None
-    if rng.uniform() < _SECOND_FRAME and inside.sum() > 1:
-        gone = np.flatnonzero(inside)[rng.random(int(inside.sum())) < 0.5]
-        state = world.save()
-        for k in gone.tolist():
-            put_away(world, k)
-        world.forward()
-        second = (*_frame(rng, world, camera), set((gone + 1).tolist()))
-        world.restore(state)
+    earlier = _earlier_frames(rng, world)
     alone = _silhouettes(world, camera, instance)
     rows = []
     for mask in _masks(rng, frame, instance):
-        found = _sample(frame, instance, mask, truth, second)
+        found = _sample(rng, frame, instance, mask, truth, earlier)
         if found is not None:
             which, bits, signed, shape, k = found
             rows.append((bits, signed, shape, world.shapes[k - 1].family, which, alone[k]))
@@ -123,6 +121,29 @@ def _view_samples(rng: np.random.Generator, world: PhysicsWorld, index: int) -> 
     bits, signed, shapes, kinds, masks, visible = columns
     scene = np.full(len(bits), index, np.int32)
     return Samples(bits, signed, shapes, kinds, masks.astype(np.uint8), scene, visible.astype(np.float32))
+
+
+class _Earlier(NamedTuple):
+    """A frame, its true instances (H, W), and the objects that were taken away."""
+
+    frame: Frame
+    instance: np.ndarray
+    gone: frozenset[int]
+
+
+def _earlier_frames(rng: np.random.Generator, world: PhysicsWorld) -> list[_Earlier]:
+    """Up to three frames of other cameras; for some, objects were taken away."""
+    state, poses, found = world.save(), world.poses(), []
+    inside = np.flatnonzero(on_table(poses))
+    for _ in range(int(rng.integers(1, 4)) if rng.random() < _EARLIER else 0):
+        camera = draw_camera(rng, poses[inside, :2, 3].mean(axis=0), (22, 68), (0.55, 1.05))
+        gone = inside[rng.random(len(inside)) < 0.5] if rng.random() < _TAKEN_AWAY else inside[:0]
+        for k in gone.tolist():
+            put_away(world, k)
+        world.forward()
+        found.append(_Earlier(*_frame(rng, world, camera), frozenset((gone + 1).tolist())))
+        world.restore(state)
+    return found
 
 
 def _frame(rng: np.random.Generator, world: PhysicsWorld, camera: Camera) -> tuple[Frame, np.ndarray]:
@@ -186,34 +207,39 @@ def _masks(rng: np.random.Generator, frame: Frame, instance: np.ndarray) -> list
 
 
 def _sample(
+    rng: np.random.Generator,
     frame: Frame,
     instance: np.ndarray,
     mask: np.ndarray,
     truth: np.ndarray,
-    second: tuple[Frame, np.ndarray, set[int]] | None,
+    earlier: Sequence[_Earlier],
 ) -> tuple[int, np.ndarray, np.ndarray, np.ndarray, int] | None:
     """Kind of mask, bits, distances, true shape and main object of one mask; None if it shows no object."""
     counts = np.bincount(instance[mask & frame.valid], minlength=256)
     whole = np.bincount(instance[frame.valid], minlength=256)
     counts[0] = 0
-    found = [k for k in np.flatnonzero(counts) if counts[k] >= _LEAST_SHARE * max(counts.sum(), whole[k])]
+    found = [k for k in np.flatnonzero(counts).tolist() if counts[k] >= _LEAST_SHARE * max(counts.sum(), whole[k])]
     main = int(counts.argmax())
     if counts[main] < _LEAST_PIXELS or main not in found:
         return None
     rule = _Crop()
-    offset, seen = observed_box(frame, mask, _GRID, rule)
-    if not seen.surface.size:
+    whole_mask = all(counts[k] > _WHOLE * whole[k] for k in found)
+    views = [_view(rng, rule, one, found) for one in earlier] if whole_mask else []
+    known = [view for view in views if view is not None]
+    voxels = np.concatenate([mask_voxels(frame, mask, _GRID), *(view_surface(view, _GRID) for view in known)])
+    voxels = voxels[_GRID.contains(voxels)]
+    if not len(voxels):
         return None
-    if second is not None and not second[2].intersection(found):
-        later, ids, _ = second
-        again = np.isin(ids, found)
-        merged = _again(offset, seen, later, again)
-        seen = seen if merged is None else merged
+    offset, end = rule.box(voxels, _GRID)
+    seen = observed_in(frame, mask, _GRID, rule, offset, end)
+    if not seen.surface.any():
+        return None
+    seen = recall(seen, offset, _GRID, known)
     box = tuple(slice(int(o), int(o) + n) for o, n in zip(offset, seen.surface.shape, strict=True))
     shape = np.zeros(seen.surface.shape, bool)
     for k in found:
         shape |= _claimed(frame, instance == k, mask, truth[box] == k, offset)
-    index = 2 if len(found) > 1 else int(counts[main] < 0.8 * whole[main])
+    index = 2 if len(found) > 1 else int(counts[main] < _WHOLE * whole[main])
     bits, signed = (_padded(one) for one in encode_box(seen))
     return index, bits, signed, _padded(shape), main
 
@@ -237,30 +263,17 @@ def _padded(values: np.ndarray) -> np.ndarray:
     return full
 
 
-def _again(offset: np.ndarray, seen: ObservedBox, later: Frame, mask: np.ndarray) -> ObservedBox | None:
-    """The evidence of both frames in the box of the first; None if the second one shows nothing of the mask."""
-    limits = offset, offset + seen.surface.shape
-
-    class _Same(Extrude):
-        def box(self, voxels: np.ndarray, grid: VoxelGrid) -> tuple[np.ndarray, np.ndarray]:
-            return limits
-
-    pixels = later.valid & mask
-    voxels = _GRID.index_of(later.points[pixels])
-    if not len(voxels) or not ((voxels >= limits[0]) & (voxels < limits[1])).all(axis=1).all():
+def _view(rng: np.random.Generator, rule: Completer, earlier: _Earlier, found: Sequence[int]) -> ObjectView | None:
+    """A view of the objects `found`, with an error of their motion since then; None if not all of them are there."""
+    mask = np.isin(earlier.instance, found)
+    offset, seen = observed_box(earlier.frame, mask, _GRID, rule)
+    few = (mask & earlier.frame.valid).sum() < _LEAST_PIXELS
+    if few or not seen.surface.any() or earlier.gone.intersection(found):
         return None
-    return combine(seen, observed_box(later, mask, _GRID, _Same())[1])
-
-
-def combine(a: ObservedBox, b: ObservedBox) -> ObservedBox:
-    """The evidence of two frames about the same box: free in one is free; hidden is what both leave hidden."""
-    free = a.free | b.free
-    surface = (a.surface | b.surface) & ~free
-    other = (a.other_surface | b.other_surface) & ~free & ~surface
-    behind = (a.behind | b.behind) & ~free
-    hidden = (a.hidden | b.hidden) & ~free & ~behind
-    signed = np.fmin(a.signed, b.signed)
-    return ObservedBox(a.points + b.points, surface, other, free, behind, hidden, signed, a.height)
+    turn = Rotation.from_rotvec(rng.normal(0.0, _MOTION_ERROR[1], 3))
+    centre = _GRID.centre_of(np.argwhere(seen.surface) + offset).mean(axis=0)
+    shift = centre - turn.apply(centre) + rng.normal(0.0, _MOTION_ERROR[0], 3)
+    return ObjectView(offset, *encode_box(seen), "", RigidTransform.from_components(shift, turn))
 
 
 def _claimed(

@@ -9,17 +9,17 @@ import numpy as np
 import pytest
 import torch
 
-from mstfilter.completion import NetworkCompleter, observed_box
+from mstfilter.completion import NetworkCompleter
 from mstfilter.completion.crops import extruded
 from mstfilter.errors import InputError
 from mstfilter.files import read_csv
+from mstfilter.simulation.shapes import label_voxels
 from mstfilter.trained import open_model
-from mstfilter.training import CompletionTraining, Samples, read_samples, run_training, write_samples
-from mstfilter.training.completion_data import combine
+from mstfilter.training import CompletionTraining, Samples, completion_data, read_samples, run_training, write_samples
 from mstfilter.training.loop import calibration_error
+from mstfilter.training.scenes import draw_camera, draw_scene
 from mstfilter.training.shapes import HELD_OUT, TRAINED, draw_training_shape
 from tests.completion.test_completion import masks_of
-from tests.completion.test_network import STACK
 from tests.experiments.scripts import run_script
 from tests.segmentation.scenes import GRID, TWO, frame_of
 
@@ -71,22 +71,31 @@ def test_shapes(kind):
         assert not shape.inside(corners * 1.01).all() and shape.mass > 0
 
 
-def test_evidence_of_two_frames():
-    """The second frame shows the lower object without the upper one: less is hidden, and what was free stays free."""
-    first, second = frame_of(STACK, width=320), frame_of(np.where(STACK == 1, 1, 0), width=320)
-    mask = masks_of(STACK, first)[0]
-    again = masks_of(np.where(STACK == 1, 1, 0), second)[0]
-
-    class Whole(NetworkCompleter):
-        def box(self, voxels, grid):
-            return np.zeros(3, np.int64), np.array(grid.shape)
-
-    _, a = observed_box(first, mask, GRID, Whole())
-    _, b = observed_box(second, again, GRID, Whole())
-    both = combine(a, b)
-    assert (both.free >= a.free).all() and (both.free >= b.free).all()
-    assert not (both.free & (both.surface | both.other_surface | both.behind | both.hidden)).any()
-    assert both.hidden.sum() < a.hidden.sum() and both.surface.sum() > a.surface.sum()
+def test_earlier_views_are_evidence_about_the_object():
+    """The same masks with and without them: more is known, and nearly all of it is true."""
+    world = draw_scene(np.random.default_rng([3, 0, 0]), TRAINED)
+    assert world is not None
+    rng = np.random.default_rng(1)
+    camera = draw_camera(rng, world.poses()[:, :2, 3].mean(axis=0), (22, 68), (0.55, 1.05))
+    frame, instance = completion_data._frame(rng, world, camera)
+    truth = label_voxels(world.shapes, world.poses(), completion_data._GRID)
+    frames = []
+    while len(frames) < 3:
+        frames += completion_data._earlier_frames(rng, world)
+    compared = 0
+    for k in np.unique(instance[instance > 0]):
+        samples = [
+            completion_data._sample(np.random.default_rng(0), frame, instance, instance == k, truth, views)
+            for views in ((), frames)
+        ]
+        if None in samples or samples[1][3].shape != (32, 32, 32) or not np.array_equal(samples[0][3], samples[1][3]):
+            continue  # the crop has another place
+        (_, alone, *_), (_, more, *_) = samples
+        compared += 1
+        assert ((more & 1) > 0).sum() + ((more & 4) > 0).sum() >= ((alone & 1) > 0).sum() + ((alone & 4) > 0).sum()
+        assert not ((more & 4 > 0) & (more & 1 > 0)).any()
+        assert (samples[1][3] & (more & 4 > 0)).sum() <= 0.1 * samples[1][3].sum()  # errors of the motion
+    assert compared >= 1
 
 
 def test_training_learns_resumes_and_is_used(tmp_path):
