@@ -137,8 +137,13 @@ def decode_signed(signed: np.ndarray) -> np.ndarray:
     return np.asarray(signed, np.float32) * np.float32(_REACH / 127)
 
 
-def recall(seen: ObservedBox, offset: np.ndarray, grid: VoxelGrid, views: Sequence[ObjectView]) -> ObservedBox:
-    """What a frame shows of a box at `offset` (3,), together with earlier views of the object."""
+def recall(
+    seen: ObservedBox, offset: np.ndarray, grid: VoxelGrid, views: Sequence[ObjectView], refute: bool = True
+) -> ObservedBox:
+    """What a frame shows of a box at `offset` (3,), together with earlier views of the object.
+
+    Views that the frame contradicts are left out, unless `refute` is false: their motions are then known.
+    """
     if not views:
         return seen
     shape = seen.surface.shape
@@ -152,7 +157,7 @@ def recall(seen: ObservedBox, offset: np.ndarray, grid: VoxelGrid, views: Sequen
         distance = decode_signed(view.signed[at])
         found = view.bits[at] & _SHAPE
         clear = np.where(distance > -_CLEAR, found & (_OWN | _BEHIND), found)
-        if _contradicts(clear, seen, inside):
+        if refute and _contradicts(clear, seen, inside):
             continue
         bits[inside] |= clear
         signed[inside] = np.fmin(signed[inside], np.where(found > 0, distance, np.nan))

@@ -234,7 +234,7 @@ def _sample(
     seen = observed_in(frame, mask, _GRID, rule, offset, end)
     if not seen.surface.any():
         return None
-    seen = recall(seen, offset, _GRID, known)
+    seen = recall(seen, offset, _GRID, known, refute=False)
     box = tuple(slice(int(o), int(o) + n) for o, n in zip(offset, seen.surface.shape, strict=True))
     shape = np.zeros(seen.surface.shape, bool)
     for k in found:
