@@ -11,9 +11,9 @@ the predictions say in how many of them both belong to one object. The log odds 
     l = constant + image logit(f_image) + past logit(f_past) + past_constant,
 
 with shares f softened by 2 %. The last two terms count in proportion to the weight of the predictions that explain
-both cells. The coefficients were fitted by log loss to 100,000 pairs of readings of nine tuning scenes, with 30 samples
-an image (`experiments/partition_fit`). Left out in turn, the scenes have a log loss of .205 with the image alone, .221
-with the past alone, and .148 with both.
+both cells. The coefficients were fitted by log loss to 100,000 pairs of readings of nine tuning scenes, with 30
+samples an image (`experiments/partition_fit`). Left out in turn, the scenes have a log loss of .205 with the image
+alone, .221 with the past alone, and .148 with both.
 
 Cells that some partition joins form a component. The alternatives of a component are the partitions that the samples
 and predictions give it. The weight of an alternative is the product over its pairs of neighbouring cells of the
