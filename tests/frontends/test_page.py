@@ -51,7 +51,8 @@ def test_the_estimate_is_better_than_the_best_alternative(tmp_path, monkeypatch,
         masks[clip.after.rgb.tobytes()] = [
             degrade(Key(0).child(k).generator(), shown, 0.7, *WAYS[k]) for k in range(3)
         ]
-    example = next(b for b in re.findall(r"```python\n(.*?)```", PAGE, flags=re.DOTALL) if "write_masks" in b)
+    cells = re.findall(r"```\{code-cell\}\n(.*?)```", PAGE, flags=re.DOTALL)
+    example = next(cell for cell in cells if "write_masks" in cell)
     assert len([line for line in example.splitlines() if line.strip()]) <= 10
     given = {"mstfilter": mstfilter, "recording": recording, "segment": lambda rgb: masks[rgb.tobytes()]}
     exec(compile(example, "front-ends.md", "exec"), given)
