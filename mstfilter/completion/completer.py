@@ -30,15 +30,7 @@ from typing import ClassVar
 import numpy as np
 from scipy.spatial import cKDTree
 
-from mstfilter.completion.observed import (
-    ObservedBox,
-    encode_box,
-    mask_voxels,
-    observed_box,
-    observed_in,
-    recall,
-    view_surface,
-)
+from mstfilter.completion.observed import ObservedBox, encode_box, observed_again, observed_box
 from mstfilter.errors import InputError
 from mstfilter.scene import (
     Clip,
@@ -191,14 +183,7 @@ class Completer(ABC):
         ]
 
         def compute(missing: Sequence[int]) -> list[tuple[Completion, ObjectView | None]]:
-            boxes = []
-            for k in missing:
-                mask, views = objects[k]
-                voxels = np.concatenate([mask_voxels(frame, mask, grid), *(view_surface(v, grid) for v in views)])
-                voxels = voxels[grid.contains(voxels)]
-                low, high = self.box(voxels, grid) if len(voxels) else (np.zeros(3, np.int64),) * 2
-                now = observed_in(frame, mask, grid, self, low, high)
-                boxes.append((low, now, recall(now, low, grid, views)))
+            boxes = [observed_again(frame, *objects[k], grid, self) for k in missing]
             filled = self.fill_many([rngs[k] for k in missing], [seen for *_, seen in boxes])
             found = []
             for k, (offset, now, seen), p in zip(missing, boxes, filled, strict=True):

@@ -137,6 +137,21 @@ def decode_signed(signed: np.ndarray) -> np.ndarray:
     return np.asarray(signed, np.float32) * np.float32(_REACH / 127)
 
 
+def observed_again(
+    frame: Frame, mask: np.ndarray, views: Sequence[ObjectView], grid: VoxelGrid, rule: Completer, refute: bool = True
+) -> tuple[np.ndarray, ObservedBox, ObservedBox]:
+    """The box of a mask, which may be empty, and of earlier views of the object.
+
+    Returns its offset (3,), what the frame shows of it, and that together with the views (`recall`). The box is empty
+    if neither shows anything inside the grid.
+    """
+    voxels = np.concatenate([mask_voxels(frame, mask, grid), *(view_surface(view, grid) for view in views)])
+    voxels = voxels[grid.contains(voxels)]
+    low, high = rule.box(voxels, grid) if len(voxels) else (np.zeros(3, np.int64),) * 2
+    now = observed_in(frame, mask, grid, rule, low, high)
+    return low, now, recall(now, low, grid, views, refute)
+
+
 def recall(
     seen: ObservedBox, offset: np.ndarray, grid: VoxelGrid, views: Sequence[ObjectView], refute: bool = True
 ) -> ObservedBox:
@@ -147,6 +162,7 @@ def recall(
     if not views:
         return seen
     shape = seen.surface.shape
+    near = binary_dilation(seen.surface).ravel()
     centres = grid.centre_of(np.indices(shape).reshape(3, -1).T + offset)
     bits: np.ndarray = np.zeros(len(centres), np.uint8)
     signed = np.full(len(centres), np.nan, np.float32)
@@ -157,7 +173,7 @@ def recall(
         distance = decode_signed(view.signed[at])
         found = view.bits[at] & _SHAPE
         clear = np.where(distance > -_CLEAR, found & (_OWN | _BEHIND), found)
-        if refute and _contradicts(clear, seen, inside):
+        if refute and _contradicts(clear, seen, near, inside):
             continue
         bits[inside] |= clear
         signed[inside] = np.fmin(signed[inside], np.where(found > 0, distance, np.nan))
@@ -171,18 +187,17 @@ def recall(
     )
 
 
-def _contradicts(found: np.ndarray, seen: ObservedBox, inside: np.ndarray) -> bool:
+def _contradicts(found: np.ndarray, seen: ObservedBox, near: np.ndarray, inside: np.ndarray) -> bool:
     """Whether the latest frame contradicts a view.
 
     Its surface is seen free, or its free space is the surface now, or nothing of its surface is near the surface
-    seen now. `found` (k,) are its bits at the voxels `inside` (n,) bool of the box.
+    seen now (`near`, (n,) bool). `found` (k,) are its bits at the voxels `inside` (n,) bool of the box.
     """
     own, free = (found & _OWN) > 0, (found & _FREE) > 0
     now_free, now_own = seen.free.ravel()[inside], seen.surface.ravel()[inside]
-    near = binary_dilation(seen.surface).ravel()[inside]
     n_own, n_now = int(own.sum()), int(seen.surface.sum())
     cleared, pierced = (own & now_free).sum() > _CLEARED * n_own, (free & now_own).sum() > _PIERCED * n_now
-    return bool(cleared or pierced or (n_now and (own & near).sum() < _SEEN * n_own))
+    return bool(cleared or pierced or (n_now and (own & near[inside]).sum() < _SEEN * n_own))
 
 
 def view_surface(view: ObjectView, grid: VoxelGrid) -> np.ndarray:

@@ -29,7 +29,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from mstfilter.completion import Completer, Extrude, ObservedBox, observed_box
 from mstfilter.completion.crops import EDGE, LATTICE, crop_box
-from mstfilter.completion.observed import decode_signed, encode_box, mask_voxels, observed_in, recall, view_surface
+from mstfilter.completion.observed import decode_signed, encode_box, observed_again
 from mstfilter.errors import InputError
 from mstfilter.scene import Camera, Frame, ObjectView, VoxelGrid, scene_cache
 from mstfilter.segmentation import MetropolisHastingsCuts, TreeCutProposal
@@ -226,15 +226,9 @@ def _sample(
     whole_mask = all(counts[k] > _WHOLE * whole[k] for k in found)
     views = [_view(rng, rule, one, found) for one in earlier] if whole_mask else []
     known = [view for view in views if view is not None]
-    voxels = np.concatenate([mask_voxels(frame, mask, _GRID), *(view_surface(view, _GRID) for view in known)])
-    voxels = voxels[_GRID.contains(voxels)]
-    if not len(voxels):
+    offset, now, seen = observed_again(frame, mask, known, _GRID, rule, refute=False)
+    if not now.surface.any():
         return None
-    offset, end = rule.box(voxels, _GRID)
-    seen = observed_in(frame, mask, _GRID, rule, offset, end)
-    if not seen.surface.any():
-        return None
-    seen = recall(seen, offset, _GRID, known, refute=False)
     box = tuple(slice(int(o), int(o) + n) for o, n in zip(offset, seen.surface.shape, strict=True))
     shape = np.zeros(seen.surface.shape, bool)
     for k in found:
