@@ -20,13 +20,13 @@ from mstfilter.smc import Resampler, Ssp
 OVERRIDES = {
     "resampler=sistematic": "did you mean systematic",
     "transition.rule=mzt": "there is no rule",
-    "update.etaa=3": "did you mean eta",
-    "update.eta=many": "update.eta is 'many'",
+    "update.n_veiws=3": "did you mean n_views",
+    "update.n_views=many": "update.n_views is 'many'",
     "n=-2": "n is -2",
     "colour=blue": "no field 'colour'",
     "update": "path=value",
     "n.x=3": "has no fields",
-    "update.crossover.mode_filter.window=4": "window is 4",
+    "update.reach=-1": "reach is -1",
     "resampler=./nowhere.py:Mine": "does not exist",
 }
 
@@ -41,15 +41,16 @@ def test_wrong_overrides_are_one_clear_error(override):
 def test_overrides_change_what_they_name():
     filter = build_filter(
         load_config(
-            "mst", ["n=7", "resampler=residual", "update.eta=2", "transition.rule=paper", "update.free_space=none"]
+            "mst",
+            ["n=7", "resampler=residual", "update.n_views=2", "transition.rule=paper", "update.free_space=none"],
         )
     )
     assert filter.n == 7
     assert type(filter.resampler).__name__ == "Residual"
-    assert filter.update.eta == 2
+    assert filter.update.n_views == 2
     assert type(filter.transition.rule).__name__ == "PaperRule"
     assert type(filter.update.free_space).__name__ == "NoFreeSpace"
-    assert filter.update.crossover == build_filter(load_config("mst")).update.crossover
+    assert filter.update.completer == build_filter(load_config("mst")).update.completer
     authors = build_filter(load_config("authors", ["transition.rule.sift.descriptor_radius=200"])).transition.rule
     plain = build_filter(load_config("authors")).transition.rule
     assert authors.sift.descriptor_radius == 200

@@ -103,7 +103,7 @@ def cpu(work: Callable[[], object]) -> float:
 def one_round(seed: int, n: int, order: np.random.Generator) -> dict[str, float]:
     """Seconds of each program; per candidate if it makes several."""
     proposed, predicted = populations(seed, n, n)
-    clip, paper, mst = clip_of(seed), fusion_update("paper"), fusion_update("mst")
+    clip, paper, rules = clip_of(seed), fusion_update("paper"), fusion_update("mst_rules")
     unseen = replace(paper, free_space=NoFreeSpace())
     pairs = [(i, j) for i in range(n) for j in range(n)]
 
@@ -123,11 +123,11 @@ def one_round(seed: int, n: int, order: np.random.Generator) -> dict[str, float]
         chosen = Systematic().resample(np.random.default_rng(seed), fused, KEPT).realised()
         assert len(chosen) == KEPT and candidates.n_built == (KEPT if lazy else n * n * ETA)
 
-    drawn = replace(mst, evidence=()).update(np.random.default_rng(seed), predicted, proposed, clip)
+    drawn = replace(rules, evidence=()).update(np.random.default_rng(seed), predicted, proposed, clip)
     drawn = Systematic().resample(np.random.default_rng(seed), drawn, 4 * n).realised()
 
     def score() -> None:
-        for term in mst.evidence:
+        for term in rules.evidence:
             term.log_score(drawn.particles, clip)
 
     def projected() -> None:
@@ -138,7 +138,7 @@ def one_round(seed: int, n: int, order: np.random.Generator) -> dict[str, float]
     work: dict[str, tuple[Callable[[], None], int]] = {
         "plain": (direct, len(pairs)),
         "paper": (lambda: ours(paper.crossover), len(pairs)),
-        "mst": (lambda: ours(mst.crossover), len(pairs)),
+        "mst_rules": (lambda: ours(rules.crossover), len(pairs)),
         "all": (lambda: step(unseen, lazy=False), 1),
         "lazy": (lambda: step(unseen, lazy=True), 1),
         "projection": (projected, 1),
@@ -207,10 +207,10 @@ def main() -> None:
             lambda r: r["all"] + r["projection"],
             lambda r: r["lazy"] + r["projection"],
         ),
-        measured("a candidate, mst's crossover", "mst"),
-        measured(f"mst's evidence, a scored candidate of {4 * n}", "evidence"),
+        measured("a candidate, crossover of mst_rules", "mst_rules"),
+        measured(f"evidence of mst_rules, a scored candidate of {4 * n}", "evidence"),
     ]
-    for name, target in (("paper", "<= 2048"), ("mst", "")):
+    for name, target in (("paper", "<= 2048"), ("mst_rules", "")):
         command = [sys.executable, __file__, "--large", name, *map(str, many)]
         found = json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
         assert found["kept"] == many[0]

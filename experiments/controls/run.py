@@ -16,6 +16,8 @@ On tuning scenes, primary endpoint (objects quality against the true volumes, me
 - start: at t = 0 `mst` and samples of the latest image are the same hypotheses (by construction; it checks the
   program).
 
+`mst` is the preset `mst_rules`; all shapes are extruded.
+
 Writes results/scenes.csv, one row per scene, and results/summary.csv. Finished scenes are not run again.
 """
 
@@ -109,8 +111,8 @@ def tracked(transition: Transition, labels: np.ndarray, truth: np.ndarray, clip:
 
 def run(scene: tuple[str, int], stranger: Recording, recording: Recording) -> dict[str, object]:
     """Means over the pauses of a scene."""
-    filters = {name: mstfilter.preset("mst", *changes) for name, changes in FILTERS.items()}
-    mst, samples = filters["mst"], mstfilter.preset("samples_only")
+    filters = {name: mstfilter.preset("mst_rules", *changes) for name, changes in FILTERS.items()}
+    mst, samples = filters["mst"], mstfilter.preset("samples_only", "proposal.completer=extrude")
     rng = np.random.default_rng(scene[1])
     found: dict[str, list[float]] = {name: [] for name in FIELDS[1:]}
     states = {chain: filters[chain[0]].start(0) for chain in CHAINS}

@@ -70,7 +70,7 @@ def measure(loop: PushLoop, state: State) -> tuple[dict[str, float], np.ndarray]
 def play(family: str, seed: int, regret: bool, small: bool) -> tuple[list[dict[str, Any]], np.ndarray]:
     """One scene with all policies: the rows of k = 0 .. n pushes, and their counts of forecasts."""
     changes, n = (SMALL, 1) if small else (CHANGES, N_PUSHES)
-    mst = preset("mst", *(["n=2", "update.eta=1"] if small else []))
+    mst = preset("mst", *(["n=2"] if small else []))
     loop = PushLoop(replace(scene_family(family), **changes), seed)
     first, _ = mst.step(mst.start(0), loop.clip)
     start, at_start = loop.save(), measure(loop, first)

@@ -73,7 +73,8 @@ def run_scene(name: str, seed: int, quality: float, small: bool) -> tuple[list[d
     with tempfile.TemporaryDirectory() as work:
         recording = simulate_recording(family, seed, Path(work) / "recording")
         for arm, (preset, folder) in arms(Path(work), alternatives(recording, seed, quality)).items():
-            filter = mstfilter.preset(preset, "proposal=mask_folder", f"proposal.folder={folder}")
+            completer = () if preset == "mst" else ("proposal.completer=network",)  # `mst` completes in its update
+            filter = mstfilter.preset(preset, "proposal=mask_folder", f"proposal.folder={folder}", *completer)
             state, found, counted = filter.start(seed), [], []
             for clip in recording.clips():
                 state, _ = filter.step(state, clip)

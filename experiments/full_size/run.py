@@ -1,4 +1,4 @@
-"""Time and memory of `mst` at full size: 640 x 480, 15 frames per clip, 100 x 100 x 50 voxels, 5 x 10 x 5 candidates.
+"""Time and memory of `mst` at full size: 640 x 480, 15 frames per clip, 100 x 100 x 50 voxels.
 
     python experiments/full_size/run.py [--seed 1]
     python experiments/full_size/run.py --smoke --out DIR    # a small recording: shows only that it works
@@ -24,7 +24,6 @@ from mstfilter.runs import RunFolder
 from mstfilter.simulation import scene_family, simulate_recording
 
 HERE = Path(__file__).resolve().parent
-SIZE = ["n=5", "n_proposed=10", "update.eta=5"]
 SMALL = {"width": 160, "height": 120, "n_actions": 1, "frames_per_clip": 8, "voxel_size": 0.02}
 
 
@@ -34,7 +33,7 @@ def main(seed: int, out: Path, smoke: bool) -> None:
         recording, run = Path(folder) / "recording", Path(folder) / "run"
         family = replace(scene_family("demo"), **SMALL) if smoke else scene_family("table")
         simulate_recording(family, seed, recording)
-        command = [sys.executable, "-m", "mstfilter", "run", str(recording), *(["n=2"] if smoke else SIZE)]
+        command = [sys.executable, "-m", "mstfilter", "run", str(recording), *(["n=2"] if smoke else [])]
         threads = {name: "1" for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")}
         subprocess.run(
             [*command, "--out", str(run), "--no-report"],

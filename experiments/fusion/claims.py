@@ -5,7 +5,7 @@
 On tuning scenes (seeds 0, 1 of s1, s2, s3) every pair of a sample and a moved hypothesis is compared with the true
 volumes. A voxel is right if it belongs to the true object that contains most of the claiming object. Fractions are by
 the claiming parent, by whether the last frame measures the voxel, and by the fraction of the predicted object that
-free space has cleared. Writes results/claims.csv. `Claims` of the preset `mst` is based on these fractions.
+free space has cleared. Writes results/claims.csv. `Claims` of the preset `mst_rules` is based on these fractions.
 
 results/hidden.csv has the hidden voxels that only the prediction claims, in objects that free space hardly cleared:
 by the overlap (IoU) of the predicted object with the object of the sample that overlaps it most, and by the
@@ -92,25 +92,25 @@ def main(out: Path, smoke: bool) -> None:
     found: dict[tuple[str, str, str], np.ndarray] = defaultdict(lambda: np.zeros(2, np.int64))
     found_hidden: dict[tuple[str, str, str], np.ndarray] = defaultdict(lambda: np.zeros(2, np.int64))
     # What the parents claim without limits, along the path of the preset.
-    mst = mstfilter.preset("mst")
+    rules = mstfilter.preset("mst_rules")
     for family in ("s1",) if smoke else ("s1", "s2", "s3"):
         for seed in (0,) if smoke else (0, 1):
             recording = open_recording(cached_recording(family, seed, **(SMALL if smoke else {})))
-            state = mst.start(0)
+            state = rules.start(0)
             for clip in recording.clips():
                 if clip.index:
                     before = replace(state.population, parents={"previous": np.arange(len(state.population))})
-                    predicted = mst.transition.predict(np.random.default_rng(0), before, clip)
-                    samples = mst.proposal.sample(np.random.default_rng(1), clip, 3)
+                    predicted = rules.transition.predict(np.random.default_rng(0), before, clip)
+                    samples = rules.proposal.sample(np.random.default_rng(1), clip, 3)
                     truth = recording.truth(clip.index).astype(np.int64)
-                    refined, _ = mst.update.free_space.refine(predicted.particles, clip)
+                    refined, _ = rules.update.free_space.refine(predicted.particles, clip)
                     votes = np.mean([h.labels > 0 for h in refined], axis=0).round(6)
                     for sample in samples.particles:
                         for h, r in list(zip(predicted.particles, refined, strict=True))[:3]:
                             count(found, clip, truth, sample, h, r)
-                            doubtful = mst.update.claims.doubtful(h, r)
+                            doubtful = rules.update.claims.doubtful(h, r)
                             count_hidden(found_hidden, family, clip, truth, sample, r, doubtful, votes)
-                state, _ = mst.step(state, clip)
+                state, _ = rules.step(state, clip)
     write(out / "claims.csv", ["claimed by", "where", "cleared"], found)
     write(out / "hidden.csv", ["family", "overlap", "predictions"], found_hidden)
 

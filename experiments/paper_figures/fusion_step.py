@@ -21,7 +21,7 @@ from mstfilter.report import colour, viewpoint
 from mstfilter.scoring import connected_components, one_blob
 
 ETA = 5
-PRESETS = ("authors", "paper", "mst")
+PRESETS = ("authors", "paper", "mst_rules")
 
 
 def make(out: Path, smoke: bool) -> list[Path]:

@@ -186,7 +186,7 @@ FORMS: tuple[tuple[str, str, Chance], ...] = (
     ("IoU", "IoU", lambda i, a, b: merge_probability("iou", i, a, b)),
     ("containment", "I / n1", lambda i, a, b: i / a),
     ("containment of the smaller", "I / min(n1, n2)", lambda i, a, b: i / np.minimum(a, b)),
-    ("mst: covered", "1 if I / n1 >= 3/4", lambda i, a, b: merge_probability("covered", i, a, b)),
+    ("mst_rules: covered", "1 if I / n1 >= 3/4", lambda i, a, b: merge_probability("covered", i, a, b)),
     ("match", "1 if IoU > 1/2", lambda i, a, b: merge_probability("match", i, a, b)),
 )
 STRUCTURES: tuple[tuple[str, Structure], ...] = (

@@ -2,7 +2,8 @@
 
 Every merge of the segmentation tree gets `SHIFT` more log odds of joining different objects, so that the sampled cuts
 hold two to three times as many segments as there are objects. `mst` and its samples alone, each with the usual and
-with the shifted value, on simulated scenes of the tuning seeds at a quarter of the studies' pixels.
+with the shifted value, on simulated scenes of the tuning seeds at a quarter of the studies' pixels. `mst` is the
+crossover, `mst_rules` with the completion network, so that both are equal at the first pause.
 """
 
 from __future__ import annotations
@@ -30,6 +31,7 @@ FAMILY, SEEDS = "s1", range(8)
 SIZE = {"width": 320, "height": 240}
 SMALL = {"width": 160, "height": 120, "n_actions": 1, "frames_per_clip": 8, "voxel_size": 0.02}
 ARMS = {"mst": BLUE, "samples_only": ORANGE}
+PRESETS = {"mst": ("mst_rules", "proposal.completer=network"), "samples_only": ("samples_only",)}
 COLUMNS = ("seed", "value", "arm", "pause", "quality", "objects", "true objects")
 
 
@@ -71,7 +73,7 @@ def scene(seed: int, smoke: bool) -> list[list[object]]:
     rows: list[list[object]] = []
     for value in ("usual", "too fine"):
         for arm in ARMS:
-            filter = mstfilter.preset(arm, *(["n=2"] if smoke else []))
+            filter = mstfilter.preset(*PRESETS[arm], *(["n=2"] if smoke else []))
             if value == "too fine":
                 filter = replace(filter, proposal=replace(filter.proposal, value=TooFine()))
             for state, info in filter.iterate(recording.clips(), 0):

@@ -2,11 +2,11 @@
 
     python experiments/partition_fit/run.py [--seeds 3] [--smoke --out FOLDER]
 
-A filter with `PartitionUpdate` runs on tuning scenes of `s1`, `s2`, `s3`, once with the video of the clips and once
-with their first and last frames only. At each pause t >= 1, 4,000 pairs of readings of objects, up to 40 pixels
-apart, are drawn. Of each pair: the share of 30 samples of the image, and the weighted share of the predictions that
-explain both readings, in which they belong to one object; and whether they do in truth. A logistic regression gives
-the log odds of "one object". Each scene is scored with the coefficients of the other scenes.
+`mst` runs on tuning scenes of `s1`, `s2`, `s3`, once with the video of the clips and once with their first and last
+frames only. At each pause t >= 1, 4,000 pairs of readings of objects, up to 40 pixels apart, are drawn. Of each pair:
+the share of 30 samples of the image, and the weighted share of the predictions that explain both readings, in which
+they belong to one object; and whether they do in truth. A logistic regression gives the log odds of "one object".
+Each scene is scored with the coefficients of the other scenes.
 
 pairs/*.npz: the pairs of one scene (finished scenes are not run again). fit.csv: coefficients and log losses in nats.
 """
@@ -30,11 +30,6 @@ from mstfilter.simulation import cached_recording
 from mstfilter.smc import Key
 
 N_SAMPLES, N_PAIRS, REACH = 30, 4000, 40
-FILTER = (
-    "proposal.completer=surface",
-    "update={component='partition', completer='network', division='rigid_motions'}",
-    "update.parts={min_pixels=80, min_share=0.3}",
-)
 SMALL = {"width": 160, "height": 120, "n_actions": 1}
 #: Columns of the regression for each model.
 MODELS = {"image": (0, 1), "past": (0, 2, 3), "both": (0, 1, 2, 3)}
@@ -51,7 +46,7 @@ def pairs_of(family: str, seed: int, video: bool, small: bool) -> np.ndarray:
     """(m, 4): share of the samples, share and weight of the predictions that explain both readings, truth."""
     recording = mstfilter.open_recording(cached_recording(family, seed, **(SMALL if small else {})))
     truth, rows = RecordingTruth(recording), []
-    filter = mstfilter.preset("mst_rules", *FILTER)
+    filter = mstfilter.preset("mst")
     state = filter.start(0)
     for t, clip in enumerate(recording.clips()):
         clip = clip if video or len(clip.frames) < 3 else without_video(clip)

@@ -44,6 +44,7 @@ ALONE = ("transition=identity", "update=samples_only")
 #: Name -> preset, changes, where the proposal stands that cuts trees ("" : none).
 METHODS = {
     "mst": ("mst", (), "proposal"),
+    "crossover": ("mst_rules", ("proposal.completer=network",), "proposal"),
     "paper": ("paper", (), "proposal"),
     "authors": ("authors", (), "proposal"),
     "union": ("union", (), "proposal"),
@@ -62,6 +63,7 @@ FIXED = ("single_frame", "floor_one_blob", "floor_components", "floor_image")
 #: What a method's samples score alone: the same front end without a past.
 OWN_SAMPLES = {
     "mst": "samples_only",
+    "crossover": "samples_only",
     "union": "samples_only",
     "tracking_only": "samples_only",
     "paper": "paper, samples only",
@@ -195,8 +197,9 @@ def summarise(lines: Sequence[dict[str, str]], out: Path) -> None:
         }
         for method, groups in means.items()
     ]
-    found = adjusted([compare(means[m], means[own]) for m, own in OWN_SAMPLES.items()])
-    past = [{"method": m, "minus": own, **columns(d)} for (m, own), d in zip(OWN_SAMPLES.items(), found, strict=True)]
+    pairs = {m: own for m, own in OWN_SAMPLES.items() if m in means}
+    found = adjusted([compare(means[m], means[own]) for m, own in pairs.items()])
+    past = [{"method": m, "minus": own, **columns(d)} for (m, own), d in zip(pairs.items(), found, strict=True)]
     for name, rows in (("summary", summary), ("past", past)):
         write_csv(out / f"{name}.csv", rows)
         print(

@@ -17,7 +17,7 @@ def study(
     config: Annotated[Path, typer.Argument(help="TOML file of the study.")],
     overrides: Annotated[
         list[str] | None,
-        typer.Argument(metavar="[PATH=VALUE]...", help="Changes to every arm; a comma makes a grid: update.eta=3,5"),
+        typer.Argument(metavar="[PATH=VALUE]...", help="Changes to every arm; a comma makes a grid: n=3,5"),
     ] = None,
     out: Annotated[Path | None, typer.Option(help="Study folder. Default: studies/NAME.")] = None,
     workers: Annotated[int, typer.Option(min=0, help="Processes; 0 is one per core.")] = 0,

@@ -36,7 +36,7 @@ def train(
 
     figures = run_training(settings, folder, workers, report, device or None)
     use = {
-        "completion": f"use it with proposal.completer=network proposal.completer.weights={folder}",
+        "completion": f"use it with update.completer=network update.completer.weights={folder}",
         "border": f"next: python experiments/segmentation_fit/run.py --border {folder}, then use it with "
         f"proposal.tree=border proposal.tree.weights={folder}",
     }

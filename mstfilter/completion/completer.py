@@ -24,7 +24,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
@@ -61,6 +61,12 @@ class Completion:
         """Slices of the box in the grid."""
         a, b, c = (slice(int(o), int(o) + n) for o, n in zip(self.offset, self.probability.shape, strict=True))
         return a, b, c
+
+    def shifted(self, log_odds: float) -> Completion:
+        """The same with `log_odds` added where the probability is neither 0 nor 1."""
+        p = self.probability
+        odds = np.exp(np.float32(np.clip(log_odds, -80, 80))) * p  # float32 overflows at 89
+        return replace(self, probability=read_only(odds / (odds + (1 - p))))
 
 
 @dataclass(frozen=True)

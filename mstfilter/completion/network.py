@@ -61,7 +61,7 @@ class NetworkCompleter(Completer, UsesFiles):
             raise MissingLibraryError(
                 f"torch cannot be imported: {error}",
                 "pip install torch",
-                "or complete by a rule: the preset mst_rules, or proposal.completer=extrude",
+                "or complete by a rule: the preset mst_rules",
             ) from error
         network = load_network(self.weights, self.architecture)
         if self.draw and not network.latent:

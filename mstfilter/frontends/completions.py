@@ -1,6 +1,6 @@
 """Completions of others: meshes, point clouds or voxel arrays of objects, made by another program.
 
->>> mst = mstfilter.preset("mst", "proposal.completer=external", "proposal.completer.folder=shapes")
+>>> mst = mstfilter.preset("mst", "update.completer=external", "update.completer.folder=shapes")
 
 The layout; numbers are those of the pauses (`Clip.index`), from 0::
 
@@ -142,7 +142,7 @@ class ExternalCompletion(ClipCompleter, UsesFiles):
                 raise InputError(
                     f"no stored shape fits a mask of {int(mask.sum())} pixels in {self.folder}: "
                     f"the best IoU is {max(ious, default=0):.2f}, at least {self.min_iou:g} is needed",
-                    "name a completer for other masks, for example proposal.completer.other=extrude",
+                    "name a completer for other masks, for example update.completer.other=extrude",
                 )
             return self.other.complete_each([rng], frame, [mask], grid)[0]
         chosen = shapes[best]
@@ -187,7 +187,7 @@ def read_shapes(folder: str | Path, pause: int, shape: tuple[int, int]) -> tuple
     """
     if not str(folder):
         raise InputError(
-            "the folder of shapes is not given", "set folder, for example proposal.completer.folder=shapes"
+            "the folder of shapes is not given", "set folder, for example update.completer.folder=shapes"
         )
     where = Path(folder) / f"{pause:06d}"
     if not where.is_dir():

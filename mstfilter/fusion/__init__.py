@@ -1,21 +1,21 @@
 """Fusion: the measurement update of MST (paper, section IV-D), and queries of the fused population.
 
->>> update = FusionUpdate(eta=5, crossover=Crossover(merge="covered"))
->>> fused = update.update(rng, predicted, proposed, clip)     # candidates of all pairs, with weights
+>>> update = PartitionUpdate(completer=NetworkCompleter())
+>>> fused = update.update(rng, predicted, proposed, clip)     # candidates, with weights
 >>> belief = Belief(resampler.resample(rng, fused, 5))
 >>> belief.occupancy()                                        # (X, Y, Z) probability
 
 ===============  =======================================================================================
-`update`         `FusionUpdate`: the steps below in their order, and the weights of the candidates
+`update`         `FusionUpdate`: the published update, which crosses every sample with every prediction
 `free_space`     clears predicted voxels that the depth image observes as free
 `division`       splits objects whose parts move apart in a clip
-`partition`      `PartitionUpdate`: partitions of the image are crossed, shapes completed from all views
+`partition`      `PartitionUpdate`: partitions of the image are drawn, shapes completed from all views
 `cells`          the common refinement of partitions, and draws of partitions by its pairs of cells
 `conflicts`      the conflict graph of two hypotheses (networkx), painting orders, merge probabilities
 `crossover`      makes one hypothesis of two, and smooths the result by a mode filter
 `similarity`     similarity of hypotheses, for diverse resampling and for evidence
 `belief`         probabilities and expected information, for planners; `information` has the formulas
-`interfaces`     `Projection`, `Division`, `Structure`, `Evidence`: what a user can replace
+`interfaces`     `PairOdds`, `Projection`, `Division`, `Structure`, `Evidence`: what a user can replace
 ===============  =======================================================================================
 """
 
@@ -24,6 +24,7 @@ from mstfilter.lazy import attach
 __getattr__, __dir__, __all__ = attach(__name__, __file__)
 
 __interfaces__ = {
+    "pairs": "PairOdds",
     "free_space": "Projection",
     "crossover": "Crossover",
     "structure": "Structure",
@@ -33,6 +34,7 @@ __interfaces__ = {
 }
 __components__ = {
     "update": {"fusion": "FusionUpdate", "projection": "ProjectionUpdate", "partition": "PartitionUpdate"},
+    "pairs": {"shares": "PairEvidence"},
     "similarity": {"weighted_coverage": "WeightedCoverage"},
     "equivalence": {"same_segmentation": "SameSegmentation"},
     "free_space": {"projective": "FreeSpace", "none": "NoFreeSpace"},

@@ -1,4 +1,5 @@
 from mstfilter.fusion.belief import Belief as Belief
+from mstfilter.fusion.cells import Cells as Cells, PairEvidence as PairEvidence
 from mstfilter.fusion.conflicts import (
     PREDICTED as PREDICTED,
     PROPOSED as PROPOSED,
@@ -24,6 +25,7 @@ from mstfilter.fusion.free_space import (
 from mstfilter.fusion.interfaces import (
     Division as Division,
     Evidence as Evidence,
+    PairOdds as PairOdds,
     Projection as Projection,
     Structure as Structure,
 )

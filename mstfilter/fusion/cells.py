@@ -1,7 +1,7 @@
 """The common refinement of several partitions of a depth image, and draws of partitions by its pairs of cells.
 
 >>> cells = Cells.of(pixels, shape, samples, predictions)
->>> log_odds = PairEvidence().log_odds(cells, weights)      # (e,) of "same object" for neighbouring cells
+>>> log_odds = PairEvidence().log_odds(cells, weights, clip)      # (e,) of "one object" for neighbouring cells
 >>> labels = cells.draw(rng, log_odds, 20)                  # (20, K) object of each cell in each draw
 
 A cell is a set of readings that all partitions treat alike. The borders of a prediction are inexact, so it splits a
@@ -30,27 +30,28 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from mstfilter.fusion.interfaces import PairOdds
+from mstfilter.scene import Clip
 from mstfilter.smc import Systematic
 
 _SOFT = 0.02
 _REACH = 2  # pixels between two readings of neighbouring cells, at most
 _PART = 0.25  # share of a cell of the image that a prediction may split off
-_LEAST = 20  # readings of a cell in an image of 640 x 480 pixels; smaller ones join a neighbour
+LEAST = 20  # readings of a cell in an image of 640 x 480 pixels; smaller ones join a neighbour
 
 
 @dataclass(frozen=True)
-class PairEvidence:
-    """Coefficients of the log odds that two neighbouring cells belong to one object."""
+class PairEvidence(PairOdds):
+    """Log odds by the shares of the samples and of the predictions in which two cells belong to one object."""
 
     constant: float = -0.43
     image: float = 0.52
     past: float = 0.54
     past_constant: float = 0.59
 
-    def log_odds(self, cells: Cells, weights: np.ndarray) -> np.ndarray:
-        """Log odds (e,) of the pairs of cells; `weights` (n,) are those of the predictions."""
+    def log_odds(self, cells: Cells, weights: np.ndarray, clip: Clip) -> np.ndarray:
         a, b = cells.pairs.T
-        image = np.mean(cells.samples[:, a] == cells.samples[:, b], axis=0)
+        image = np.mean((cells.samples[:, a] == cells.samples[:, b]) & (cells.samples[:, a] > 0), axis=0)
         found = self.constant + self.image * softened_logit(image)
         if len(cells.predictions):
             both = (cells.predictions[:, a] > 0) & (cells.predictions[:, b] > 0)
@@ -70,6 +71,7 @@ def softened_logit(p: np.ndarray) -> np.ndarray:
 class Cells:
     """The common refinement of samples and predictions."""
 
+    pixels: np.ndarray  #: (m,) flat pixels of the readings
     of_reading: np.ndarray  #: (m,) cell of each reading, -1 for readings of no object
     samples: np.ndarray  #: (s, K) label of each cell in each sample
     predictions: np.ndarray  #: (n, K) label of each cell in each prediction, 0 is none
@@ -100,7 +102,7 @@ class Cells:
         of_reading = np.full(len(kept), -1)
         of_reading[kept] = code
         pairs = _borders(code, pixels[kept], shape)[0]
-        return cls(of_reading, labels[: len(samples)], labels[len(samples) :], pairs)
+        return cls(pixels, of_reading, labels[: len(samples)], labels[len(samples) :], pairs)
 
     def alternatives(self) -> list[tuple[np.ndarray, np.ndarray]]:
         """Of each component its cells (k,) and its distinct partitions (p, k)."""
@@ -193,7 +195,7 @@ def _borders(code: np.ndarray, pixels: np.ndarray, shape: tuple[int, int]) -> tu
 
 def _without_slivers(code: np.ndarray, pixels: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
     """Cells renumbered 0, 1, ..., after small ones have joined the neighbour with the longest border."""
-    least = _LEAST * shape[0] * shape[1] / 307200
+    least = LEAST * shape[0] * shape[1] / 307200
     for _ in range(20):
         sizes = np.bincount(code) if len(code) else np.zeros(0, int)
         small = np.flatnonzero((sizes > 0) & (sizes < least))

@@ -63,25 +63,48 @@ def split_by_motion(
     ids.
     """
     image = project(hypothesis, clip.after.camera)
-    known = (image > 0) & (motions >= 0)
-    if not known.any() or motions[known].min() == motions[known].max():
+    count, parts = _counts(image, motions, rule)
+    if not len(count):
         return hypothesis
-    n = int(motions.max()) + 1
-    size = int(hypothesis.labels.max()) + 1
-    count = np.bincount(image[known].astype(np.int64) * n + motions[known], minlength=size * n).reshape(size, n)
-    total = count.sum(axis=1, keepdims=True)
-    parts = (count >= rule.min_pixels) & (count >= rule.min_share * total)
+    total = count.sum(axis=1)
     labels, origin = hypothesis.labels, {}
     for label in np.flatnonzero(parts.sum(axis=1) >= 2).tolist():
         labels, made = _split_by_pixels(hypothesis, labels, label, np.flatnonzero(parts[label]), image, motions, clip)
         origin.update(made)
     motion_of = {
-        k: int(count[k].argmax()) for k in range(size) if count[k].max() >= max(rule.min_pixels, _PURE * total[k, 0])
+        k: int(count[k].argmax())
+        for k in range(len(count))
+        if count[k].max() >= max(rule.min_pixels, _PURE * total[k])
     }
     for label, (_, motion) in origin.items():
         motion_of[label] = motion
     divided = _with_parts(hypothesis, labels, {k: parent for k, (parent, _) in origin.items()}, clip.index, proposed)
     return _record_apart(divided, motion_of)
+
+
+def split_segments(segments: np.ndarray, motions: np.ndarray, voxels: np.ndarray, rule: PartRule) -> np.ndarray:
+    """Segments (m,) of readings in `voxels` (m, 3), those with several of the `motions` (m,) split; 0 is no segment.
+
+    A reading gets the part of the nearest reading of its segment whose motion is a part; motion -1 is unknown.
+    """
+    _, parts = _counts(segments, motions, rule)
+    found = segments.copy()
+    for label in np.flatnonzero(parts.sum(axis=1) >= 2).tolist():
+        at = np.flatnonzero(segments == label)
+        number = motions[at]
+        part = _nearest(tuple(voxels[at].T), number, np.isin(number, np.flatnonzero(parts[label])))
+        found[at] = np.where(part == part[0], label, found.max() + 1 + part)
+    return found
+
+
+def _counts(labels: np.ndarray, motions: np.ndarray, rule: PartRule) -> tuple[np.ndarray, np.ndarray]:
+    """Pixels (k, n) of each label with each motion, and which of them are parts; empty if there is one motion."""
+    known = (labels > 0) & (motions >= 0)
+    if not known.any() or motions[known].min() == motions[known].max():
+        return np.zeros((0, 1), int), np.zeros((0, 1), bool)
+    n, size = int(motions.max()) + 1, int(labels.max()) + 1
+    count = np.bincount(labels[known].astype(np.int64) * n + motions[known], minlength=size * n).reshape(size, n)
+    return count, (count >= rule.min_pixels) & (count >= rule.min_share * count.sum(axis=1, keepdims=True))
 
 
 def _split_by_pixels(

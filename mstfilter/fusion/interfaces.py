@@ -3,6 +3,7 @@
 ==============  =====================================================================  ===========================
 interface       task                                                                   field of a preset
 ==============  =====================================================================  ===========================
+`PairOdds`      log odds that two cells of the image belong to one object              ``update.pairs``
 `Projection`    clears voxels of a prediction that a frame observes as free            ``update.free_space``
 `Division`      groups the pixels of a frame by object, as far as a clip shows it      ``update.division``
 `Structure`     draws which conflicts may merge, and the painting order                ``update.crossover.structure``
@@ -16,12 +17,15 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import networkx as nx
 import numpy as np
 
 from mstfilter.scene import Clip, Frame, Hypothesis
+
+if TYPE_CHECKING:
+    from mstfilter.fusion.cells import Cells
 
 #: Vertices in painting order, and edges (child, parent); see `Structure.draw`.
 OrderAndEdges = tuple[list[int], list[tuple[int, int]]]
@@ -49,6 +53,24 @@ class Division(ABC):
 
         Pixels with different numbers >= 0 belong to different objects; -1 is unknown. A clip of a single frame, for
         example, gives no information.
+        """
+
+
+class PairOdds(ABC):
+    """How likely two neighbouring cells of an image belong to one object."""
+
+    @abstractmethod
+    def log_odds(self, cells: Cells, weights: np.ndarray, clip: Clip) -> np.ndarray:
+        """Log odds (e,) of "one object" for ``cells.pairs`` (e, 2).
+
+        Parameters
+        ----------
+        cells : mstfilter.fusion.Cells
+            The common refinement of the samples and the predictions, with the label of every cell in each of them.
+        weights : (n,) ndarray
+            Weights of the predictions; their sum is 1.
+        clip : Clip
+            Its last frame is the image.
         """
 
 

@@ -158,7 +158,8 @@ class FusionUpdate(Update):
             return crossover.cross(stream, sample, prediction)
 
         log_weights = proposed.log_weights[i] + (predicted.log_weights + log_q)[j]
-        parents = parents_of_pairs(proposed, i, predicted, j)
+        sides = (("previous", predicted, j), ("proposed", proposed, i))
+        parents = {name: side.parents.get(name, np.full(len(side), -1))[k] for name, side, k in sides}
         fused = Population(Candidates(build, len(i)), log_weights, parents, notes)
         if not self.evidence:
             return fused
@@ -183,16 +184,6 @@ def scored(
         scores[f"{name} {k}" if name in scores else name] = score.round(3).tolist()
         total += score
     return total, scores
-
-
-def parents_of_pairs(
-    proposed: Population, i: np.ndarray, predicted: Population, j: np.ndarray
-) -> dict[str, np.ndarray]:
-    """Parents of candidates made of the samples `i` and the predictions `j`; -1 if unknown."""
-    return {
-        "previous": predicted.parents.get("previous", np.full(len(predicted), -1))[j],
-        "proposed": proposed.parents.get("proposed", np.full(len(proposed), -1))[i],
-    }
 
 
 def _pairs(rng: np.random.Generator, n_proposed: int, n_predicted: int, eta: int) -> tuple[np.ndarray, np.ndarray]:

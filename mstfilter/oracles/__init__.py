@@ -3,7 +3,7 @@
 A simulated recording holds its true voxels, instance images and poses. Components
 named ``true_...`` use them in place of an estimate, which shows how much each stage loses:
 
->>> filter = mstfilter.preset("mst", "proposal.completer=true_completion", "transition=true_motions")
+>>> filter = mstfilter.preset("mst", "update.completer=true_completion", "transition=true_motions")
 >>> filter = bind_truth(filter, recording)                  # a clip holds no truth; the recording does
 >>> state, infos = filter.run(recording.clips(), seed=0)
 
@@ -17,7 +17,7 @@ __getattr__, __dir__, __all__ = attach(__name__, __file__)
 __components__ = {
     "transition": {"true_motions": "TrueMotions"},
     "proposal": {"true_masks": "TrueMasks"},
-    "update": {"true_fusion": "TrueFusion"},
+    "pairs": {"true_pairs": "TruePairs"},
     "boundary": {"true_boundary": "TrueBoundary"},
     "completer": {"true_completion": "TrueCompletion"},
     "free_space": {"true_free_space": "TrueFreeSpace"},

@@ -7,8 +7,8 @@ from mstfilter.oracles.front_end import (
 from mstfilter.oracles.stages import (
     STAGES as STAGES,
     TrueFreeSpace as TrueFreeSpace,
-    TrueFusion as TrueFusion,
     TrueMotions as TrueMotions,
+    TruePairs as TruePairs,
     TrueQuality as TrueQuality,
     overrides_of as overrides_of,
 )

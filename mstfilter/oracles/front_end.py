@@ -149,11 +149,16 @@ class TrueBoundary(UsesTruth, BoundaryModel):
         return np.where(near, self.measured.boundary(frame), 0).astype(np.float32)
 
 
+_STRAY = 0.1  # an object with a smaller share of a mask is not shown by it
+_WHOLE = 0.75  # share of the pixels of an object in a mask that shows all of it
+
+
 @dataclass(frozen=True)
 class TrueCompletion(UsesTruth, Completer):
     """The true voxels of what a mask shows. A mask that shows no true object keeps its visible surface.
 
-    `objects` says which pixels can belong to an object; true voxels are assigned to these pixels.
+    `objects` says which pixels can belong to an object; true voxels are assigned to these pixels. A mask with 75 % of
+    an object's pixels shows all of it. Objects with less than 10 % of a mask, and less than half in it, are ignored.
     """
 
     objects: ObjectRule = ObjectRule()  # noqa: RUF009 (frozen)
@@ -170,13 +175,14 @@ class TrueCompletion(UsesTruth, Completer):
     ) -> list[Completion]:
         """Complete several masks of a frame at a pause."""
         t = self.truth.pause_of(frame)
+        owner = np.where(self.objects.object_pixels(frame, grid), self.truth.instance(t), 0).ravel()
         voxels, pixel = memo(
             "true_pixels",
             (frame.key, grid.key, self.bound_key),
             lambda: self._pixels(frame, grid, t),
         )
         return [
-            self._true(rng, frame, np.asarray(mask, bool), grid, voxels, pixel)
+            self._true(rng, frame, np.asarray(mask, bool), grid, voxels, pixel, owner)
             for rng, mask in zip(rngs, masks, strict=True)
         ]
 
@@ -188,8 +194,15 @@ class TrueCompletion(UsesTruth, Completer):
         grid: VoxelGrid,
         voxels: np.ndarray,
         pixel: np.ndarray,
+        owner: np.ndarray,
     ) -> Completion:
-        filled = voxels[mask.ravel()[pixel]]
+        shown = np.bincount(owner[mask.ravel()], minlength=int(owner.max(initial=0)) + 1)
+        shown[0] = 0
+        of_object = shown / np.maximum(np.bincount(owner, minlength=len(shown)), 1)
+        stray = (shown < _STRAY * shown.sum()) & (of_object < 0.5)
+        of_voxel = owner[pixel]
+        inside = mask.ravel()[pixel] & ~stray[of_voxel]
+        filled = voxels[inside | (of_object[of_voxel] >= _WHOLE)]
         if not len(filled):
             return super().complete_each([rng], frame, [mask], grid)[0]
         offset, seen = observed_box(frame, mask, grid, self)

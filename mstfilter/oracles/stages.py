@@ -1,10 +1,10 @@
-"""Tracking, free space, fusion and selection replaced by the truth, and the overrides of all stages.
+"""Tracking, free space, partition and selection replaced by the truth, and the overrides of all stages.
 
 >>> transition = TrueMotions()                                     # the rigid motion of each object
->>> FusionUpdate(free_space=TrueFreeSpace())                       # exactly the free space that is visible
->>> FusionUpdate(evidence=(TrueQuality(),), n_scored=100)          # the best of fusion's own candidates
->>> TrueFusion()                                                   # the best that both parents allow
->>> filter = mstfilter.preset("mst", *STAGES["selection"])            # the n best of the candidates
+>>> PartitionUpdate(free_space=TrueFreeSpace())                    # exactly the free space that is visible
+>>> PartitionUpdate(evidence=(TrueQuality(),), n_candidates=100)   # the best of the update's own candidates
+>>> PartitionUpdate(pairs=TruePairs())                             # the best of the partitions that it considers
+>>> filter = mstfilter.preset("mst", *STAGES["selection"])         # the n best of the candidates
 
 The time of an observation is the index of its clip. A resampler gets no clip, so for true selection the candidates
 are weighted by their true quality (`TrueQuality`), and `LargestWeights` selects the n best.
@@ -16,17 +16,16 @@ stage costs a filter that is perfect elsewhere. The two differ because stages co
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
-from typing import ClassVar, NamedTuple
+from dataclasses import dataclass, field
+from typing import ClassVar
 
 import numpy as np
 
-from mstfilter.fusion import Evidence, FreeSpace, Projection
-from mstfilter.fusion.update import parents_of_pairs
+from mstfilter.fusion import Cells, Evidence, PairOdds, Projection
 from mstfilter.oracles.truth import Need, UsesTruth
-from mstfilter.scene import Clip, Frame, Hypothesis, ObjectRecord, frame_geometry, render
+from mstfilter.scene import Clip, Frame, Hypothesis, frame_geometry, render
 from mstfilter.scoring import overlap, weighted_coverage
-from mstfilter.smc import Candidates, Population, Transition, Update, union
+from mstfilter.smc import Population, Transition
 from mstfilter.tracking import Warp, move_points, rigid_transform
 
 _REST = 0.0005  # metres; objects that move less are not moved, since simulated objects settle a little
@@ -111,108 +110,32 @@ class TrueQuality(UsesTruth, Evidence):
 
 
 @dataclass(frozen=True)
-class TrueFusion(UsesTruth, Update):
-    """The best hypothesis that the objects of two parents allow, without random draws.
+class TruePairs(UsesTruth, PairOdds):
+    """Practically certain odds of the truth, so that each component gets the best of its alternatives.
 
-    `free_space` projects the predicted hypotheses first. For every true object: the best object of either parent (by
-    Jaccard index), merged with all objects that improve it. Better objects are painted over worse ones; other objects
-    are dropped. Each pair makes one candidate. If there are terms of `evidence`, all candidates are built and
-    weighted by them, else by the weights of the pairs.
+    A cell belongs to the true object of most of its readings.
     """
 
-    free_space: Projection = FreeSpace()  # noqa: RUF009 (frozen)
-    evidence: tuple[Evidence, ...] = ()
+    needs: ClassVar[tuple[Need, ...]] = ("voxels", "instance")
 
-    properly_weighted: ClassVar[bool] = False
-    draws: ClassVar[bool] = False
-
-    def update(
-        self, rng: np.random.Generator, predicted: Population | None, proposed: Population | None, observation: Clip
-    ) -> Population:
-        """One candidate per pair; a single parent passes unchanged."""
-        if predicted is None:
-            return union(None, proposed)
-        refined, _ = self.free_space.refine(predicted.particles, observation)
-        if proposed is None:
-            return Population(refined, predicted.log_weights, predicted.parents)
-        labels, samples = self.truth.labels(observation.index), tuple(proposed.particles)
-        i, j = np.divmod(np.arange(len(proposed) * len(predicted)), len(predicted))
-        parents = parents_of_pairs(proposed, i, predicted, j)
-        candidates = Candidates(lambda c: best_of_both(samples[i[c]], refined[j[c]], labels), len(i))
-        fused = Population(candidates, proposed.log_weights[i] + predicted.log_weights[j], parents)
-        if not self.evidence:
-            return fused
-        built = fused.realised()
-        scores = [term.log_score(tuple(built.particles), observation) for term in self.evidence]
-        return Population(built.particles, np.sum(scores, axis=0), parents)
-
-
-class _Part(NamedTuple):
-    """An object of a parent."""
-
-    number: int  # among the objects of both parents, the predicted ones first
-    record: ObjectRecord
-    mask: np.ndarray
-    jaccard: dict[int, float]  # with each true object that it overlaps
-
-    @property
-    def target(self) -> int:
-        """The true object that it overlaps best."""
-        return max(self.jaccard, key=lambda label: (self.jaccard[label], -label))
-
-
-def best_of_both(proposed: Hypothesis, predicted: Hypothesis, true: np.ndarray) -> Hypothesis:
-    """The candidate that `TrueFusion` builds from two hypotheses."""
-    parts: list[_Part] = []
-    for parent in (predicted, proposed):
-        table = overlap(parent.labels, true)
-        jaccard = table.jaccard()
-        for record in parent.objects:
-            row = int(np.searchsorted(table.labels_a, record.label))
-            columns = np.flatnonzero((table.counts[row] > 0) & (table.labels_b > 0))
-            overlaps = {int(table.labels_b[c]): float(jaccard[row, c]) for c in columns}
-            mask = parent.mask(record.label)
-            parts.append(_Part(len(parts), record, mask, overlaps))
-
-    chosen: list[tuple[float, int, ObjectRecord, np.ndarray, bool]] = []
-    for label in {k for part in parts for k in part.jaccard}:
-        candidates = [part for part in parts if part.jaccard and part.target == label]
-        if not candidates:
-            continue
-        candidates.sort(key=lambda part: -part.jaccard[label])
-        first = candidates[0]
-        record, mask, best, merged = first.record, first.mask, first.jaccard[label], False
-        for part in candidates[1:]:
-            joined = mask | part.mask
-            score = float((joined & (true == label)).sum() / (joined | (true == label)).sum())
-            if score > best + 1e-9:
-                mask, best, merged = joined, score, True
-        known = [part.record for part in candidates if part.number < predicted.n_objects]
-        if known:  # the object keeps its identity
-            record = replace(record, id=known[0].id, birth=known[0].birth)
-        chosen.append((best, -first.number, record, mask, merged))
-
-    chosen.sort(key=lambda entry: entry[:2])
-    labels = np.zeros(true.shape, np.uint16)
-    for number, (_, _, _, mask, _) in enumerate(chosen, start=1):
-        labels[mask] = number
-    records = []
-    for number, (_, _, record, mask, merged) in enumerate(chosen, start=1):
-        visible = labels == number
-        if visible.any():
-            record = replace(record, label=number)
-            records.append(record if not merged and np.array_equal(visible, mask) else record.changed())
-    return Hypothesis(labels, predicted.grid, tuple(records))
+    def log_odds(self, cells: Cells, weights: np.ndarray, clip: Clip) -> np.ndarray:
+        inside = cells.of_reading >= 0
+        owner = self.truth.instance(clip.index).ravel()[cells.pixels[inside]]
+        table = np.zeros((cells.samples.shape[1], int(owner.max(initial=0)) + 1), int)
+        np.add.at(table, (cells.of_reading[inside], owner), 1)
+        true = table.argmax(axis=1)
+        a, b = cells.pairs.T
+        return np.where(true[a] == true[b], _NATS, -_NATS)
 
 
 #: Overrides of the preset ``mst`` by stage. A new component keeps the fields of ``mst`` that it has too.
 STAGES: dict[str, tuple[str, ...]] = {
     "boundary": ('proposal.boundary={component="true_boundary", form="cleaned"}',),
-    "masks": ("proposal=true_masks", "proposal.completer=network"),
-    "completion": ("proposal.completer=true_completion",),
+    "masks": ("proposal=true_masks", "proposal.completer=surface"),
+    "completion": ("update.completer=true_completion",),
     "motions": ("transition=true_motions",),
-    "choice": ('update.evidence=["true_quality"]', "update.n_scored=100"),
-    "fusion": ("update=true_fusion", "update.evidence=[]"),
+    "choice": ('update.evidence=["true_quality"]', "update.n_candidates=100"),
+    "partition": ("update.pairs=true_pairs",),
     "free space": ("update.free_space=true_free_space",),
     "selection": ('update.evidence=["true_quality"]', "resampler=largest_weights"),
 }

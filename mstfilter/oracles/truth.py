@@ -3,7 +3,7 @@
 A component gets a clip, and a clip holds no truth. So a component that inherits `UsesTruth` is bound to a recording
 before a run. `bind_truth` binds all such components of a filter, also nested ones:
 
->>> filter = mstfilter.preset("mst", "proposal.completer=true_completion", "transition=true_motions")
+>>> filter = mstfilter.preset("mst", "update.completer=true_completion", "transition=true_motions")
 >>> filter = bind_truth(filter, recording)            # the same filter if no component uses the truth
 >>> state, infos = filter.run(recording.clips(), seed=0)
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from mstfilter.completion import Completer
-from mstfilter.fusion import Crossover, Division, FusionUpdate, Projection, Structure
+from mstfilter.fusion import Crossover, Division, FusionUpdate, PairOdds, PartitionUpdate, Projection, Structure
 from mstfilter.scene import Hypothesis
 from mstfilter.segmentation import BoundaryModel, CutSampler, CutValue, TreeBuilder, TreeCutProposal
 from mstfilter.smc import Component, Population, Proposal, Transition
@@ -29,6 +29,7 @@ STAGE_OWNERS: dict[type, Callable[[Any], Component]] = {
     Projection: lambda stage: FusionUpdate(free_space=stage),
     Structure: lambda stage: FusionUpdate(crossover=Crossover(structure=stage)),
     Division: lambda stage: FusionUpdate(division=stage),
+    PairOdds: lambda stage: PartitionUpdate(pairs=stage),
 }
 
 
@@ -47,9 +48,10 @@ class StageContract(RandomContract):
         elif isinstance(owner, Transition):
             found = owner.predict(rng, population, clip)
         else:
-            assert isinstance(owner, FusionUpdate)
+            assert isinstance(owner, FusionUpdate | PartitionUpdate)
             found = owner.update(rng, population, population.take(np.arange(min(2, len(population)))), clip)
-            found = found.take(np.arange(0, len(found), 5))
+            if isinstance(owner, FusionUpdate):
+                found = found.take(np.arange(0, len(found), 5))
         return found.realised()
 
     def check_result(self, result: Any, inputs: dict[str, Any]) -> None:

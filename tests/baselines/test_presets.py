@@ -1,4 +1,4 @@
-"""Presets of the baselines: what they share with mst, and presets that stand on another."""
+"""Presets of the baselines: what they share with mst_rules, and presets that stand on another."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from mstfilter.errors import InputError
 from mstfilter.presets import build_filter, describe_filter, load_config
 from mstfilter.resources import preset_names
 
-MST = describe_filter(build_filter(load_config("mst")))
+MST = describe_filter(build_filter(load_config("mst_rules", ["proposal.completer=network"])))
 BASELINES = (
     "single_frame",
     "samples_only",
@@ -33,7 +33,7 @@ def differences(a, b, where=""):
 
 
 @pytest.mark.parametrize("name", BASELINES)
-def test_baselines_share_budget_selection_and_completion_with_mst(name):
+def test_baselines_share_budget_selection_and_completion(name):
     config = described(name)
     for field in ("n", "n_proposed", "resample", "resampler", "trigger", "initial", "size"):
         assert config[field] == MST[field], field
@@ -43,8 +43,10 @@ def test_baselines_share_budget_selection_and_completion_with_mst(name):
     assert proposal["threshold"] == MST["proposal"]["threshold"]
 
 
-def test_baselines_differ_from_mst_only_where_they_must():
+def test_baselines_differ_only_where_they_must():
     assert differences(described("mst_rules"), MST) == ["proposal.completer"]
+    rules = {"n_proposed", "resampler", "proposal.completer", "update"}  # mst has the same front end and tracker
+    assert set(differences(described("mst"), MST)) == rules
     assert differences(described("samples_only"), MST) == ["transition", "update"]
     assert sorted(differences(described("single_frame"), MST)) == ["proposal.sampler", "transition", "update"]
     assert differences(described("tracking_only"), MST) == ["proposal", "update"]
@@ -52,7 +54,6 @@ def test_baselines_differ_from_mst_only_where_they_must():
     assert described("tracking_only")["update"]["free_space"] == MST["update"]["free_space"]
     assert differences(described("union"), MST) == ["update"]
     assert described("union")["update"]["fusion"] == MST["update"]
-    assert differences(described("mst", "update.crossover.merge=always"), MST) == ["update.crossover.merge"]
 
 
 @pytest.mark.parametrize("whose", ["paper", "authors"])
@@ -77,12 +78,12 @@ def _in_update(config):
         (["n=1", "update.eta=25"], ["n", "update.eta"]),
     ],
 )
-def test_arms_that_are_changes_to_mst_change_no_more(overrides, where):
-    """As documented; what mst does so already is no difference."""
-    assert set(differences(described("mst", *overrides), MST)) <= set(where)
+def test_arms_that_are_changes_to_a_preset_change_no_more(overrides, where):
+    """As documented; what the preset does so already is no difference."""
+    assert set(differences(described("mst_rules", *overrides), described("mst_rules"))) <= set(where)
 
 
-def test_changes_to_mst_reach_the_baselines(tmp_path, monkeypatch):
+def test_changes_to_a_preset_reach_the_baselines(tmp_path, monkeypatch):
     """A preset holds its differences alone: another base, and it is a baseline of that one."""
     from mstfilter import resources
 
@@ -90,8 +91,8 @@ def test_changes_to_mst_reach_the_baselines(tmp_path, monkeypatch):
     models.mkdir()
     for name in preset_names():
         (models / f"{name}.toml").write_bytes(resources.find_preset(name).read_bytes())
-    text = (models / "mst_rules.toml").read_text().replace("n = 5\n", "n = 9\n").replace("eta = 5", "eta = 4")
-    (models / "mst_rules.toml").write_text(text)
+    (models / "mst.toml").write_text((models / "mst.toml").read_text().replace("n = 5\n", "n = 9\n"))
+    (models / "mst_rules.toml").write_text((models / "mst_rules.toml").read_text().replace("eta = 5", "eta = 4"))
     monkeypatch.setattr(resources, "models_folder", lambda: models)
     assert described("union")["n"] == 9
     assert described("union")["update"]["fusion"]["eta"] == 4
@@ -108,7 +109,7 @@ def test_changes_to_mst_reach_the_baselines(tmp_path, monkeypatch):
         ('base = "mst"\noverrides = ["n"]', "not of the form path=value"),
         ('base = "mst"\nwrap = ["update.fusion=unoin"]', "there is no update 'unoin'"),
         (
-            'base = "mst"\nwrap = ["update.fusion=union", "update.fusion=union"]',
+            'base = "mst_rules"\nwrap = ["update.fusion=union", "update.fusion=union"]',
             "is a Union, expected a FusionUpdate",
         ),
     ],

@@ -11,6 +11,7 @@ from mstfilter.baselines.updates import SamplesOnly, TrackingOnly, Union
 from mstfilter.fusion import Division, Evidence, FreeSpace, FusionUpdate, NoFreeSpace
 from mstfilter.presets import build_filter, load_config
 from mstfilter.scene import Hypothesis
+from mstfilter.scoring import weighted_coverage
 from mstfilter.smc import Population
 from mstfilter.testing import UpdateContract, scene_example
 from tests.baselines.scenes import ProposalRecorder, slide
@@ -31,8 +32,8 @@ def run(name, recording, seed=3, *overrides):
 
 
 @pytest.fixture(scope="module")
-def mst(recording):
-    return run("mst", recording)
+def rules(recording):
+    return run("mst_rules", recording, 3, "proposal.completer=network")
 
 
 def keys(population):
@@ -40,13 +41,21 @@ def keys(population):
 
 
 @pytest.mark.parametrize("name", ["samples_only", "tracking_only", "union"])
-def test_at_the_first_pause_filter_and_baselines_tie_exactly(recording, mst, name):
+def test_at_the_first_pause_filter_and_baselines_tie_exactly(recording, rules, name):
     population = run(name, recording)[0]
-    assert keys(population) == keys(mst[0])
-    np.testing.assert_array_equal(population.log_weights, mst[0].log_weights)
+    assert keys(population) == keys(rules[0])
+    np.testing.assert_array_equal(population.log_weights, rules[0].log_weights)
 
 
-def test_another_seed_breaks_the_tie(recording, mst):
+def test_at_the_first_pause_mst_has_its_samples(recording):
+    """Those of `samples_only` with as many samples and the same selection, up to the borders of segments."""
+    mst = run("mst", recording)[0]
+    samples = run("samples_only", recording, 3, "n_proposed=30", "resampler=systematic")[0]
+    for a, b in zip(mst.particles, samples.particles, strict=True):
+        assert a.n_objects == b.n_objects and weighted_coverage(a.labels, b.labels) > 0.95
+
+
+def test_another_seed_breaks_the_tie(recording):
     sampler = "proposal.sampler.temperature=8"  # so that samples differ at all on so plain a scene
     assert keys(run("samples_only", recording, 3, sampler)[0]) != keys(run("samples_only", recording, 4, sampler)[0])
 
@@ -54,13 +63,13 @@ def test_another_seed_breaks_the_tie(recording, mst):
 def test_samples_are_those_that_the_filter_draws_at_the_same_pause(recording):
     """The proposal's stream is the same in both arms at every pause."""
     seen = {}
-    for name in ("mst", "samples_only"):
-        filter = build_filter(load_config(name, ["proposal.sampler.temperature=8"]))
+    for name in ("mst_rules", "samples_only"):
+        filter = build_filter(load_config(name, ["proposal.sampler.temperature=8", "proposal.completer=network"]))
         recorder = ProposalRecorder(filter.proposal)
         replace(filter, proposal=recorder).run(recording.clips(), seed=5)
         seen[name] = recorder.drawn
-    assert len(seen["mst"]) == len(recording.clips())
-    assert seen["mst"] == seen["samples_only"]
+    assert len(seen["mst_rules"]) == len(recording.clips())
+    assert seen["mst_rules"] == seen["samples_only"]
 
 
 def test_the_single_frame_baseline_is_the_optimal_cut_and_knows_no_past(recording):

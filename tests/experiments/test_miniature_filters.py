@@ -40,7 +40,7 @@ from tests.experiments.test_miniature_world import FALSE_ALARM, chi_square, ids,
 
 WORLD = Miniature((3, 2))
 PROPER = {"bootstrap": bootstrap_filter, "guided": guided_filter, "balanced": balanced_filter}
-RULES = {"paper": ("p", False), "authors": ("p", True), "mst": ("equal", False)}
+RULES = {"paper": ("p", False), "authors": ("p", True), "mst_rules": ("equal", False)}
 
 
 def preset(name, world, n):
@@ -167,7 +167,7 @@ def test_presets_run_and_report_no_evidence(name):
 
 
 def test_evidence_becomes_the_likelihood_of_the_observation():
-    mst = mstfilter.preset("mst")
+    mst = mstfilter.preset("mst_rules")
     scored = replace(mst, update=replace(mst.update, evidence=(LikelihoodEvidence(Miniature((2, 2))),), n_scored=99))
     filter = adapt_to_miniature(scored, WORLD, 10)
     _, observations = WORLD.simulate(np.random.default_rng(1), 2)
@@ -185,7 +185,9 @@ def test_scored_candidates_are_distinct_and_weighted_by_prediction_times_likelih
     predicted = Population(WORLD.states.take(WORLD.draw_prior(rng, 10)), np.log(np.arange(1.0, 11.0)))
     law = predictive_distribution(WORLD, predicted)
     assert law.sum() == pytest.approx(1)
-    rule = ScoredFusion(WORLD, preset("mst", WORLD, 10).update, distinct=True, predictive=True, include_parents=True)
+    rule = ScoredFusion(
+        WORLD, preset("mst_rules", WORLD, 10).update, distinct=True, predictive=True, include_parents=True
+    )
     fused = rule.update(np.random.default_rng(0), predicted, proposed, y)
     states = WORLD.states.index(fused.particles)
     assert len(set(states.tolist())) == len(states)
@@ -198,7 +200,7 @@ def test_scoring_without_crossover_returns_the_parents():
     _, observations = WORLD.simulate(np.random.default_rng(1), 2)
     proposed = CutProposal(WORLD).sample(np.random.default_rng(2), observations[1], 6)
     predicted = Population(WORLD.states.take(WORLD.draw_prior(np.random.default_rng(3), 6)))
-    fusion = preset("mst", WORLD, 6).update
+    fusion = preset("mst_rules", WORLD, 6).update
     fused = ScoredFusion(WORLD, fusion, built_per_particle=0, include_parents=True).update(
         np.random.default_rng(0), predicted, proposed, observations[1]
     )

@@ -63,6 +63,16 @@ def test_partition_fit(tmp_path):
     assert all(int(row["pairs"]) > 100 and float(row["log_loss"]) < math.log(2) for row in rows)
 
 
+def test_calibration_of_the_partition_update(tmp_path):
+    """The losses that are minimised are those of the table, and a forecast is better than knowing nothing."""
+    run_script("partition_fit/calibration.py", "--smoke", "--out", tmp_path)
+    rows = {(row["field"], row["value"]): row for row in read_csv(tmp_path / "calibration.csv")}
+    assert float(rows["occupied_log_odds", "0.0"]["loss"]) < math.log(2)
+    for field in ("temperature", "occupied_log_odds"):
+        losses = [float(row["loss"]) for (name, value), row in rows.items() if name == field and value != "held out"]
+        assert float(rows[field, "held out"]["loss"]) >= min(losses) - 1e-4
+
+
 def test_front_ends(tmp_path):
     assert "demo-1" in run_script("front_ends/run.py", "--smoke", "--out", tmp_path)
     rows = read_csv(tmp_path / "summary.csv")

@@ -54,7 +54,7 @@ def test_studies_run_in_their_small_form(tmp_path, name):
     beside = [arm for arm in arms if arm.startswith("true masks")]
     assert [row["arm"] for row in found[f"{name}_differences"]] == [a for a in arms[1:] if a not in beside]
     if beside:
-        found = write_tables(folder, tmp_path / "tables", "--reference", "true masks: mst")
+        found = write_tables(folder, tmp_path / "tables", "--reference", "true masks: mst_rules")
         assert [row["arm"] for row in found[f"{name}_true_masks_differences"]] == beside[1:]
 
 
@@ -110,7 +110,7 @@ def test_reported_seeds_are_no_tuning_seeds(config, first):
     "name",
     [
         *("ablations/study", "main/paper_best", "fusion/study", "error_budget/study", "information/number"),
-        *("completion/study", "completion/tuning"),
+        *("completion/study", "completion/tuning", "information/update"),
     ],
 )
 def test_tuning_studies_use_tuning_seeds(name):
@@ -129,7 +129,7 @@ def test_error_budget(tmp_path):
     folder = run_small(tmp_path, EXPERIMENTS / "error_budget/study.toml")
     quality = {row["arm"]: float(row["quality"]) for row in read_csv(folder / "runs.csv")}
     assert len(quality) == 3
-    assert quality["all true"] >= 0.97 > quality["mst"]
+    assert quality["all true"] >= 0.95 > quality["mst"]  # readings change their segment at borders, voxels are 2 cm
 
 
 def test_mask_quality(tmp_path):

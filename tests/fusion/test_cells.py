@@ -79,10 +79,10 @@ def test_log_odds_by_hand():
     def logit(p):
         return np.log((p + 0.02) / (1 - p + 0.02))
 
-    odds = evidence.log_odds(found, np.array([0.6, 0.2, 0.2]))
+    odds = evidence.log_odds(found, np.array([0.6, 0.2, 0.2]), None)
     assert odds == pytest.approx([-0.2 + 0.7 * logit(0.25) + 0.8 * (0.4 * logit(0.6 / 0.8) + 0.3)])
     alone = Cells.of(PIXELS, SHAPE, [one, two], [])
-    assert evidence.log_odds(alone, np.zeros(0)) == pytest.approx([-0.2])
+    assert evidence.log_odds(alone, np.zeros(0), None) == pytest.approx([-0.2])
 
 
 def test_partitions_are_drawn_with_their_weights():
@@ -118,7 +118,7 @@ def test_partitions_are_drawn_with_their_weights():
 
 
 def test_slivers_join_a_neighbour(monkeypatch):
-    monkeypatch.setattr(module, "_LEAST", 20 * 307200 / (SHAPE[0] * SHAPE[1] * 6))  # cells of less than 3.3 readings
+    monkeypatch.setattr(module, "LEAST", 20 * 307200 / (SHAPE[0] * SHAPE[1] * 6))  # cells of less than 3.3 readings
     one, two = two_halves()
     thin = two.reshape(SHAPE).copy()
     thin[:3, 3] = 1  # a border that is one pixel off

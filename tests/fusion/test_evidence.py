@@ -66,7 +66,7 @@ def test_two_stages_give_pair_weight_times_score():
 
 
 def test_terms_are_named_in_presets():
-    filter = build_filter(load_config("mst", ['update.evidence=["agreement"]', "update.n_scored=12"]))
+    filter = build_filter(load_config("mst_rules", ['update.evidence=["agreement"]', "update.n_scored=12"]))
     assert [type(e) for e in filter.update.evidence] == [Agreement]
     clips = [Clip(frames((0,)), GRID, 0), Clip(frames((0, 1, 2)), GRID, 1)]
     _, infos = filter.run(clips, seed=0)

@@ -202,14 +202,14 @@ def test_views_belong_to_the_content_of_a_frame_and_are_checked(tmp_path):
 
 @pytest.mark.parametrize("voxel", [0.01, 0.02])
 def test_a_perfect_prediction_and_a_perfect_measurement_leave_the_scene_unchanged(voxel):
-    """Under all of mst's fusion, a book on a box and a rod one voxel thick included."""
+    """Under all of the fusion of mst_rules, a book on a box and a rod one voxel thick included."""
     grid, labels, frame = shelf(voxel)
     truth = Hypothesis.from_labels(labels, grid)
     assert FreeSpace().project(truth, frame) == (truth, 1.0)
     clip = Clip((frame, frame, frame), grid, 1, (0.0, 0.2, 0.4))
     predicted = Population((truth, truth), np.zeros(2), {"previous": np.arange(2)})
     proposed = Population((Hypothesis.from_labels(labels, grid, 1),), np.zeros(1), {"proposed": np.zeros(1, int)})
-    fused = mstfilter.preset("mst").update.update(np.random.default_rng(0), predicted, proposed, clip)
+    fused = mstfilter.preset("mst_rules").update.update(np.random.default_rng(0), predicted, proposed, clip)
     assert fused.notes["quality"] == [1.0, 1.0]
     for child in fused.particles:
         np.testing.assert_array_equal(child.labels > 0, labels > 0)

@@ -7,11 +7,12 @@ from typing import ClassVar
 
 import numpy as np
 import pytest
+from scipy.special import expit
 
-from mstfilter.completion import Extrude, SurfaceOnly
+from mstfilter.completion import Completion, Extrude, SurfaceOnly
 from mstfilter.errors import InputError
 from mstfilter.fusion import PartitionUpdate
-from mstfilter.fusion.cells import PairEvidence
+from mstfilter.fusion.cells import Cells, PairEvidence
 from mstfilter.fusion.partition import Readings
 from mstfilter.scene import Clip, Hypothesis, Occupancy
 from mstfilter.segmentation import hypothesis_of
@@ -107,30 +108,68 @@ def test_objects_without_views_keep_their_voxels_where_the_frame_does_not_see_th
         np.testing.assert_allclose(one.shares.probability[kept], 0.8, atol=2e-3)
 
 
-def test_one_side_gives_the_partition_of_a_component():
-    """A sample that sees two predicted objects as one: each side as often as `past` says."""
-    clip = clip_of(TWO)
-    masks = masks_of(TWO, clip.after)
+#: Log odds that leave no doubt, in favour of the image or of the past.
+IMAGE = PairEvidence(constant=0.0, image=100.0, past=0.0, past_constant=0.0)
+PAST = PairEvidence(constant=0.0, image=0.0, past=100.0, past_constant=0.0)
+
+
+def test_objects_continue_what_lies_in_them():
+    """A sample that sees two predicted objects as one, and one that cuts an object in two."""
+    clip, later = clip_of(TOUCHING), clip_of(TOUCHING, 1)
+    masks = masks_of(TOUCHING, clip.after)
     state = step(PartitionUpdate(), clip, sample_of(clip, masks)).particles[0]
-    merged = sample_of(clip_of(TWO, 1), [masks[0] | masks[1]])
-    for past, n_objects in ((0.0, 1), (1.0, 2)):
-        found = step(PartitionUpdate(past=past), clip_of(TWO, 1), merged, state).particles
-        assert {one.n_objects for one in found} == {n_objects}
-    # Both views are kept by the object that continues both.
-    one = step(PartitionUpdate(past=0.0), clip_of(TWO, 1), merged, state).particles[0]
-    assert len(one.objects[0].views) == 3
-    n = 400
-    update = PartitionUpdate(past=0.3, n_candidates=n, completer=SurfaceOnly())
-    found = step(update, clip_of(TWO, 1), merged, state).particles
-    share = np.mean([one.n_objects == 2 for one in found])
-    assert abs(share - 0.3) < 4 * np.sqrt(0.3 * 0.7 / n)  # 1 false alarm in 16,000
-    # Weighted prediction and sample: a sample that cuts the first object in two.
+    merged = sample_of(later, [masks[0] | masks[1]])
+    (one,) = step(PartitionUpdate(pairs=IMAGE), later, merged, state).particles
+    assert one.n_objects == 1 and len(one.objects[0].views) == 3  # the views of both
+    (one,) = step(PartitionUpdate(pairs=PAST), later, merged, state).particles
+    assert [record.id for record in one.objects] == [record.id for record in state.objects]
     half = masks[0] & (np.arange(masks[0].shape[1]) < np.nonzero(masks[0])[1].mean())
-    cut = sample_of(clip_of(TWO, 1), [half, masks[0] & ~half, masks[1]])
-    found = step(PartitionUpdate(past=0.0), clip_of(TWO, 1), cut, state).particles[0]
-    assert found.n_objects == 3 and state.record(2).id in {record.id for record in found.objects}
-    found = step(PartitionUpdate(past=1.0), clip_of(TWO, 1), cut, state).particles[0]
-    assert [record.id for record in found.objects] == [record.id for record in state.objects]
+    cut = sample_of(later, [half, masks[0] & ~half, masks[1]])
+    (one,) = step(PartitionUpdate(pairs=IMAGE), later, cut, state).particles
+    assert one.n_objects == 3 and state.record(2).id in {record.id for record in one.objects}
+    (one,) = step(PartitionUpdate(pairs=PAST), later, cut, state).particles
+    assert [record.id for record in one.objects] == [record.id for record in state.objects]
+
+
+@pytest.mark.parametrize(
+    ("segments", "past", "continued"),
+    [
+        ([1] * 60 + [2] * 240, [1] * 100 + [2] * 200, [[1], [2]]),  # the second comes to stand before the first
+        ([1] * 20 + [2] * 280, [1] * 100 + [2] * 200, [[1], [2]]),
+        ([1] * 15 + [2] * 285, [1] * 100 + [2] * 200, [[1], [2]]),  # identity and views go to one segment only
+        ([1] * 15 + [2] * 285 + [3] * 100, [1] * 100 + [2] * 300, [[1], [], []]),
+        ([1] * 60 + [2] * 40, [1] * 100, [[], []]),  # one object is cut in two
+        ([1] * 90 + [2] * 10, [1] * 100, [[1], []]),
+        ([1] * 300, [1] * 100 + [2] * 200, [[2, 1]]),  # two are one
+        ([1] * 300, [1] * 10 + [2] * 290, [[2]]),  # the first is hidden: readings of the second lie near it
+        ([1] * 10 + [2] * 290, [1] * 10 + [2] * 290, [[1], [2]]),
+        ([1] * 100, [0] * 100, [[]]),
+    ],
+)
+def test_which_objects_a_segment_continues(segments, past, continued):
+    labels = np.zeros(GRID.shape, np.uint16)
+    labels[2:4, 2:4, :2], labels[6:8, 6:8, :2] = 1, 2
+    prediction = Hypothesis.from_labels(labels, GRID)
+    past = np.array(past + [0] * (len(segments) - len(past)))
+    parts = PartitionUpdate()._parts(np.array(segments), past, prediction, prediction, few=20)
+    seen = [part for part in parts if part.readings.any()]
+    assert [[record.label for record in part.continues] for part in seen] == continued
+    if continued == [[2]]:
+        assert [part.continues[0].label for part in parts if part.predicted is not None] == [1]
+
+
+@pytest.mark.parametrize("log_odds", [-200.0, -20.0, -2.0, 0.0, 0.2, 0.5, 100.0])
+def test_added_log_odds_leave_certain_voxels(log_odds):
+    p = np.array([0, 0.25, 0.5, 1], np.float32).reshape(1, 1, 4)
+    found = Completion(np.zeros(3, int), p, np.zeros(p.shape, np.int32), "key").shifted(log_odds).probability.ravel()
+    assert found.dtype == np.float32 and found[0] == 0 and found[-1] == 1
+    np.testing.assert_allclose(found[1:3], expit(np.log([1 / 3, 1]) + log_odds), rtol=1e-5, atol=1e-30)
+
+
+def test_cells_that_a_sample_gives_to_no_object_are_not_one_object_there():
+    cells = Cells(np.arange(2), np.arange(2), np.array([[1, 1], [0, 0]]), np.zeros((0, 2), int), np.array([[0, 1]]))
+    found = PairEvidence(constant=0.0, image=1.0).log_odds(cells, np.zeros(0), clip_of(ALONE))
+    np.testing.assert_allclose(found, 0.0, atol=1e-12)  # one of two samples
 
 
 def test_objects_that_moved_apart_are_not_merged():
@@ -141,7 +180,7 @@ def test_objects_that_moved_apart_are_not_merged():
     apart = (replace(a, apart=frozenset({b.id})), replace(b, apart=frozenset({a.id})))
     state = replace(state, objects=apart)
     merged = sample_of(clip_of(TWO, 1), [masks[0] | masks[1]])
-    for one in step(PartitionUpdate(past=0.0), clip_of(TWO, 1), merged, state).particles:
+    for one in step(PartitionUpdate(pairs=IMAGE), clip_of(TWO, 1), merged, state).particles:
         assert [(r.id, r.apart) for r in one.objects] == [(r.id, r.apart) for r in apart]
         np.testing.assert_array_equal(one.labels, state.labels)
 
@@ -153,7 +192,7 @@ def test_partitions_by_pairs_follow_image_and_past():
     apart, merged = sample_of(clip, masks), sample_of(clip, [masks[0] | masks[1]])
     state = step(PartitionUpdate(), clip, apart).particles[0]
     n, pairs = 300, PairEvidence(constant=0.0, image=1.0, past=0.3, past_constant=0.0)
-    update = PartitionUpdate(partitions="pairs", pairs=pairs, n_candidates=n, completer=SurfaceOnly())
+    update = PartitionUpdate(pairs=pairs, n_candidates=n, completer=SurfaceOnly())
     proposed = Population((apart, merged))
     later = clip_of(TOUCHING, 1)
     found = update.update(np.random.default_rng(0), Population((state,)), proposed, later).particles
@@ -161,8 +200,8 @@ def test_partitions_by_pairs_follow_image_and_past():
     odds = 0.3 * np.log(1.02 / 0.02)  # the image says 1 : 1, the prediction that they are two
     expected = 1 / (1 + np.exp(-odds))
     assert abs(share - expected) < 4 * np.sqrt(expected * (1 - expected) / n)  # 1 false alarm in 16,000
-    first = update.update(np.random.default_rng(0), None, proposed, clip).particles
-    assert abs(np.mean([one.n_objects == 2 for one in first]) - 0.5) < 4 * 0.5 / np.sqrt(n)
+    first = update.update(np.random.default_rng(0), None, proposed, clip)  # candidates are the samples
+    assert [one.n_objects for one in first.particles] == [2, 1]
 
 
 def test_labels_of_readings_by_brute_force():
@@ -179,23 +218,24 @@ def test_labels_of_readings_by_brute_force():
         assert label in nearest if distance.min() <= 2.5 else label == 0
 
 
-def test_pairs_are_drawn_by_their_weights():
+def test_predictions_are_drawn_by_their_weights():
     clip = clip_of(ALONE)
     sample = sample_of(clip, masks_of(ALONE, clip.after), Extrude())
     n, w = 1000, np.array([0.7, 0.2, 0.1])
     update = PartitionUpdate(n_candidates=n, completer=SurfaceOnly())
-    proposed = Population((sample,) * 3, np.log(w), {"proposed": np.arange(3)})
-    predicted = Population((sample,) * 3, np.log(w[::-1]), {"previous": np.arange(3)})
+    proposed = Population((sample,) * 3, np.zeros(3), {"proposed": np.arange(3)})
+    predicted = Population((sample,) * 3, np.log(w), {"previous": np.arange(3)})
     found = update.update(np.random.default_rng(0), predicted, proposed, clip)
-    np.testing.assert_allclose(np.bincount(found.parents["proposed"]) / n, w, atol=1 / n + 1e-9)
     quality = PartitionUpdate().free_space.refine((sample,), clip)[1][0]
-    assert quality == 1.0  # so the pairs have the weights of their parents
-    np.testing.assert_allclose(np.bincount(found.parents["previous"]) / n, w[::-1], atol=1 / n + 1e-9)
+    assert quality == 1.0  # so the predictions keep their weights
+    np.testing.assert_allclose(np.bincount(found.parents["previous"]) / n, w, atol=1 / n + 1e-9)
     assert np.ptp(found.log_weights) == 0
+    assert len(PartitionUpdate().update(np.random.default_rng(0), predicted, proposed, clip)) == 3
 
 
 @pytest.mark.parametrize(
-    ("fields", "message"), [({"past": 1.5}, "past"), ({"n_views": -1}, "n_views"), ({"least_kept": 2}, "least_kept")]
+    ("fields", "message"),
+    [({"threshold": 1.5}, "threshold"), ({"n_views": -1}, "n_views"), ({"least_kept": 2}, "least_kept")],
 )
 def test_invalid_fields(fields, message):
     with pytest.raises(InputError, match=message):

@@ -13,17 +13,17 @@ from mstfilter.presets import REGISTRY, build_filter, describe_filter, load_conf
 from tests.baselines.test_presets import differences
 from tests.conftest import REPOSITORY
 
-#: A filter without any estimate: true masks need no boundary, true fusion no choice.
-PERFECT_STAGES = ("masks", "completion", "motions", "fusion", "free space", "selection")
+#: A filter without any estimate: true masks need no boundary, and the best candidates are selected.
+PERFECT_STAGES = ("masks", "completion", "motions", "partition", "free space", "selection")
 MST = describe_filter(build_filter(load_config("mst")))
 
 WHERE = {
     "boundary": ["proposal.boundary"],
     "masks": ["proposal"],
-    "completion": ["proposal.completer"],
+    "completion": ["update.completer"],
     "motions": ["transition"],
-    "choice": ["update.evidence", "update.n_scored"],
-    "fusion": ["update"],
+    "choice": ["update.evidence", "update.n_candidates"],
+    "partition": ["update.pairs"],
     "free space": ["update.free_space"],
     "selection": ["resampler", "update.evidence"],
 }
@@ -40,7 +40,6 @@ def test_a_stage_changes_only_itself(stage):
     for slot, fields in {
         "proposal": ("completer", "objects", "threshold"),
         "transition": ("warp",),
-        "update": ("free_space",),
     }.items():
         if [slot] == WHERE[stage]:  # another component stands there: what both have is the same
             for field in fields:
@@ -53,7 +52,7 @@ def test_with_all_stages_replaced_nothing_is_estimated():
         "TrueMotions",
         "TrueMasks",
         "TrueCompletion",
-        "TrueFusion",
+        "TruePairs",
         "TrueFreeSpace",
         "TrueQuality",
     }

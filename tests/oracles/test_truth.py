@@ -10,21 +10,20 @@ import pytest
 from scipy.ndimage import distance_transform_edt
 
 from mstfilter.errors import InputError
-from mstfilter.fusion import FusionUpdate
+from mstfilter.fusion import Cells, PartitionUpdate
 from mstfilter.oracles import (
     TrueBoundary,
     TrueCompletion,
     TrueFreeSpace,
-    TrueFusion,
     TrueMasks,
     TrueMotions,
+    TruePairs,
     TrueQuality,
     UsesTruth,
     bind_truth,
     front_end,
     uses_truth,
 )
-from mstfilter.oracles.stages import best_of_both
 from mstfilter.oracles.truth import RecordingTruth
 from mstfilter.presets import build_filter, describe_filter, load_config
 from mstfilter.runs import filter_recording
@@ -35,9 +34,10 @@ from mstfilter.smc import Key, LargestWeights, Population
 from tests.baselines.scenes import ProposalRecorder, slide
 
 ALL = (
-    'proposal={component="true_masks", completer="true_completion"}',
+    'proposal={component="true_masks", completer="surface"}',
     "transition=true_motions",
-    'update={component="true_fusion", free_space="true_free_space", evidence=["true_quality"]}',
+    'update={component="partition", completer="true_completion", pairs="true_pairs", free_space="true_free_space", '
+    'evidence=["true_quality"]}',
     "resampler=largest_weights",
 )
 RNG = np.random.default_rng(0)
@@ -56,15 +56,18 @@ def bound(component, recording):
 
 
 def test_all_nested_components_are_bound_and_nothing_else_changes(recording):
-    filter = build_filter(load_config("mst", [*ALL[:2], 'update.evidence=["true_quality"]', ALL[3]]))
-    assert uses_truth(filter) == ["TrueMotions", "TrueMasks", "TrueCompletion", "TrueQuality"]
+    filter = build_filter(load_config("mst", ALL))
+    names = ["TrueMotions", "TrueMasks", "TrueCompletion", "TrueFreeSpace", "TruePairs", "TrueQuality"]
+    assert uses_truth(filter) == names
     ready = bind_truth(filter, recording)
     assert ready == filter
     assert describe_filter(ready) == describe_filter(filter)
     for part in (
         ready.transition,
         ready.proposal,
-        ready.proposal.completer,
+        ready.update.completer,
+        ready.update.pairs,
+        ready.update.free_space,
         ready.update.evidence[0],
     ):
         assert part.truth.recording is recording
@@ -123,7 +126,7 @@ def test_a_run_with_oracles_resumes(recording, tmp_path):
 
 def samples_of(recording, *overrides):
     """Keys of what the proposal draws at each pause of a run."""
-    config = load_config("mst", ["proposal.sampler.temperature=8", "update.eta=1", *overrides])
+    config = load_config("mst", ["proposal.sampler.temperature=8", *overrides])
     filter = bind_truth(build_filter(config), recording)
     recorder = ProposalRecorder(filter.proposal)
     replace(filter, proposal=recorder).run(recording.clips(), 2)
@@ -141,7 +144,7 @@ def test_an_oracle_leaves_the_streams_of_other_stages_alone(recording, plain_sam
     assert samples_of(recording, override) == plain_samples
 
 
-@pytest.mark.parametrize("make", [TrueMasks, TrueMotions, TrueFusion, lambda: TrueMasks(quality=0.8)])
+@pytest.mark.parametrize("make", [TrueMasks, TrueMotions, lambda: TrueMasks(quality=0.8)])
 def test_oracles_do_not_advance_their_generator(recording, make):
     """They draw from child streams only."""
     component, clip = bound(make(), recording), recording.clips()[1]
@@ -151,10 +154,8 @@ def test_oracles_do_not_advance_their_generator(recording, make):
     population = Population((truth, truth))
     if isinstance(component, TrueMasks):
         component.sample(rng, clip, 2)
-    elif isinstance(component, TrueMotions):
-        component.predict(rng, population, clip)
     else:
-        component.update(rng, population, population, clip).realised()
+        component.predict(rng, population, clip)
     assert rng.bit_generator.state == before
 
 
@@ -308,20 +309,20 @@ def test_true_free_space_clears_what_is_free_and_seen(recording):
     assert bound(TrueFreeSpace(), recording).project(exact, frame) == (exact, 1.0)
 
 
-def test_the_best_of_both_parents(recording):
-    true, grid = recording.truth(0), recording.grid
-    split = true.copy()
-    split[true == 1] = 1
-    split[15:20][split[15:20] == 1] = 7  # box 1 in two halves
-    wrong = np.where(true == 2, 2, 0).astype(np.uint16)
-    wrong[0:3, 0:3, 0:3] = 4  # invented
-    proposed, predicted = Hypothesis.from_labels(split, grid, birth=1), Hypothesis.from_labels(wrong, grid)
-    fused = best_of_both(proposed, predicted, true)
-    assert weighted_coverage(fused.labels, true) == 1.0  # halves merged, box 2 kept, invention dropped
-    kept = {o.id for o in fused.objects}
-    assert predicted.record(2).id in kept
-    assert best_of_both(proposed, proposed, np.zeros_like(true)).n_objects == 0
-    assert best_of_both(Hypothesis.from_labels(true * 0, grid), predicted, true).n_objects == 1
+def test_true_pairs_choose_what_agrees_with_the_truth(recording):
+    """Cells of one true object belong together, all others do not; each component gets its best alternative."""
+    clip, true = recording.clips()[1], recording.instance(recording.pauses[1])
+    pixels = np.flatnonzero(true.ravel() > 0)
+    owner = true.ravel()[pixels].astype(np.int64)
+    column = pixels % true.shape[1]
+    half = np.where(owner == 1, np.where(column > np.median(column[owner == 1]), 1, 3), owner)
+    cells = Cells.of(pixels, true.shape, [half, np.ones_like(owner)], [owner])
+    odds = bound(TruePairs(), recording).log_odds(cells, np.ones(1), clip)
+    label = np.array([np.bincount(owner[cells.of_reading == c]).argmax() for c in range(cells.samples.shape[1])])
+    same = label[cells.pairs[:, 0]] == label[cells.pairs[:, 1]]
+    assert same.any() and (odds[same] > 100).all() and (odds[~same] < -100).all()
+    for row in cells.draw(RNG, odds, 5):
+        np.testing.assert_array_equal(row[:, None] == row[None], label[:, None] == label[None])
 
 
 def test_choice_and_selection_prefer_true_quality(recording):
@@ -340,7 +341,7 @@ def test_choice_and_selection_prefer_true_quality(recording):
 
 
 def test_choice_by_true_quality_is_not_worse(recording):
-    config = load_config("mst", ['update.evidence=["true_quality"]', "update.n_scored=50"])
+    config = load_config("mst", ['update.evidence=["true_quality"]', "update.n_candidates=50"])
     filter = bind_truth(build_filter(config), recording)
     plain = build_filter(load_config("mst"))
     quality = {}
@@ -353,24 +354,8 @@ def test_choice_by_true_quality_is_not_worse(recording):
     assert quality["oracle"] >= quality["plain"]
 
 
-def test_true_fusion_keeps_parents_and_passes_single_parents(recording):
-    update, clip = bound(TrueFusion(), recording), recording.clips()[1]
-    true = Hypothesis.from_labels(recording.truth(1), recording.grid)
-    predicted = Population((true, true), np.log([1.0, 3.0]), {"previous": np.array([4, 5])})
-    proposed = Population((true,) * 3, np.log([1.0, 2.0, 3.0]), {"proposed": np.arange(3)})
-    fused = update.update(RNG, predicted, proposed, clip)
-    assert len(fused) == 6
-    np.testing.assert_allclose(np.exp(fused.log_weights), [1, 3, 2, 6, 3, 9])
-    assert fused.parents["previous"].tolist() == [4, 5, 4, 5, 4, 5]
-    assert fused.parents["proposed"].tolist() == [0, 0, 1, 1, 2, 2]
-    assert len(update.update(RNG, None, proposed, clip)) == 3
-    assert len(update.update(RNG, predicted, None, clip)) == 2
-    scored = bound(TrueFusion(evidence=(TrueQuality(),)), recording).update(RNG, predicted, proposed, clip)
-    np.testing.assert_allclose(scored.log_weights, 1e4)
-
-
 def test_oracles_are_frozen_dataclasses():
     for cls in UsesTruth.__subclasses__():
         assert dataclasses.is_dataclass(cls) and cls.__dataclass_params__.frozen, cls
         assert cls() == cls()
-    assert FusionUpdate(evidence=(TrueQuality(),)) == FusionUpdate(evidence=(TrueQuality(),))
+    assert PartitionUpdate(evidence=(TrueQuality(),)) == PartitionUpdate(evidence=(TrueQuality(),))

@@ -114,7 +114,7 @@ def test_texts_hold_the_facts():
     assert repr(STATE.population).startswith("Population: n = 50, float64 (50, 1), ESS ")
     assert "n = 1000, candidates, 0 built" in repr(OBJECTS["candidates"])
     assert "log evidence -" in repr(STATE)
-    assert "resampler ClusterStratified" in repr(OBJECTS["preset"])
+    assert "resampler Systematic" in repr(OBJECTS["preset"])
 
 
 def test_the_texts_of_components_name_changed_fields():

@@ -168,7 +168,9 @@ def test_a_changed_component_file_or_recording_is_another_run(recording, tmp_pat
     assert open_recording(changed).key != recording.key
 
 
-@pytest.mark.parametrize("override", ["update.eta=0", "n_proposed=-1", "update.quality_exponent=nan", "trigger.k=0"])
+@pytest.mark.parametrize(
+    "override", ["update.n_views=-1", "n_proposed=-1", "update.quality_exponent=nan", "trigger.k=0"]
+)
 def test_useless_settings_make_no_folder(recording, tmp_path, override):
     with pytest.raises(InputError):
         filter_recording(recording, load_config("mst", ["trigger=every", override]), tmp_path / "run")

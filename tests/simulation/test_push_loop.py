@@ -77,7 +77,7 @@ def test_the_voxels_that_a_finger_sweeps():
 
 
 def test_a_filter_decides():
-    loop, mst = PushLoop(FAMILY, 5), preset("mst", "n=2", "update.eta=1")
+    loop, mst = PushLoop(FAMILY, 5), preset("mst", "n=2")
     state, _ = mst.step(mst.start(0), loop.clip)
     belief, pushes = Belief(state.population), loop.candidates(4)
     push = belief.most_informative(pushes, lambda p: belief.push_information(p.swept(loop.grid), tolerance=20))

@@ -29,7 +29,7 @@ recordings = "slide-*"
 group = "slide"
 [[arms]]
 preset = "mst"
-set = ["transition=identity", "update.eta=1,2"]
+set = ["transition=identity", "update.n_views=1,2"]
 [smoke]
 seeds = 3
 """
@@ -60,8 +60,8 @@ def test_a_finished_study_repeats_no_run(folder, tmp_path, capsys):
     rows = table(tmp_path / "out" / "runs.csv")
     assert len(rows) == 2 * 2 * 2 * 3
     assert {r["arm"] for r in rows} == {
-        "mst transition=identity update.eta=1",
-        "mst transition=identity update.eta=2",
+        "mst transition=identity update.n_views=1",
+        "mst transition=identity update.n_views=2",
     }
     assert {(r["scene"], r["family"]) for r in rows} == {("slide-0", "slide"), ("slide-1", "slide")}
     for r in table(tmp_path / "out" / "runs.csv", costs=True):

@@ -1,8 +1,8 @@
-"""A completion network in torch, and its weights in a folder that `proposal.completer=network` opens.
+"""A completion network in torch, and its weights in a folder that `update.completer=network` opens.
 
 python architecture.py
-mstfilter run demo/recording proposal.completer=network proposal.completer.weights=trained/mine \
-proposal.completer.architecture=./architecture.py:MyArchitecture --out runs/mine --replace
+mstfilter run demo/recording update.completer=network update.completer.weights=trained/mine \
+update.completer.architecture=./architecture.py:MyArchitecture --out runs/mine --replace
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """A completer: from the visible part of an object to the space that it fills.
 
 mstfilter check ./completer.py:MyCompleter
-mstfilter run demo/recording proposal.completer=./completer.py:MyCompleter --out runs/mine --replace
+mstfilter run demo/recording update.completer=./completer.py:MyCompleter --out runs/mine --replace
 """
 
 from __future__ import annotations

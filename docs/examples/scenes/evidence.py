@@ -1,4 +1,4 @@
-"""A term of the score of candidates, for the fusion of `mst`.
+"""A term of the score of candidates, for the update of `mst`.
 
 mstfilter check ./evidence.py:MyEvidence
 mstfilter run demo/recording 'update.evidence=["agreement", "./evidence.py:MyEvidence"]' --out runs/mine --replace

@@ -1,7 +1,7 @@
 """A similarity of scenes, for resamplers that compare hypotheses.
 
 mstfilter check ./similarity.py:MySimilarity
-mstfilter run demo/recording resampler.similarity=./similarity.py:MySimilarity --out runs/mine --replace
+mstfilter run demo/recording resampler=clusters resampler.similarity=./similarity.py:MySimilarity --replace
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """A structure: in which order objects in conflict are painted, and which of them may be merged.
 
 mstfilter check ./structure.py:MyStructure
-mstfilter run demo/recording update.crossover.structure=./structure.py:MyStructure --out runs/mine --replace
+mstfilter run demo/recording --preset mst_rules update.crossover.structure=./structure.py:MyStructure --replace
 """
 
 from __future__ import annotations

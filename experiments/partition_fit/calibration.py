@@ -1,0 +1,207 @@
+"""Fits `PartitionUpdate.temperature` and `PartitionUpdate.occupied_log_odds` to tuning scenes.
+
+    python experiments/partition_fit/calibration.py [--seeds 5] [--smoke --out FOLDER]
+
+`mst` runs with temperature 1 and no added log odds.
+
+Temperature: of each component with several alternatives, the log weights of the alternatives, and which of them agree
+best with the truth. The loss is the mean negative log probability of the best ones.
+
+Log odds: for the questions of each pause (`mstfilter.scoring.ask`), the probabilities of the two voxels in every
+hypothesis. The loss is the mean of two log losses of forecasts as they come: "is the first voxel occupied?" and "do
+both belong to one object?". Each scene is scored with the value of least loss on the other scenes.
+
+scenes/*.npz: what is kept of one scene (finished scenes are not run again). calibration.csv: losses in nats and
+calibration errors for each value. reliability.png: how often forecasts come true, without and with the default of
+`PartitionUpdate`.
+"""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+from scipy.special import expit, logit, logsumexp
+
+import mstfilter
+from mstfilter.files import write_csv
+from mstfilter.fusion import Cells, PairOdds, PartitionUpdate
+from mstfilter.oracles import bind_truth
+from mstfilter.oracles.stages import TruePairs
+from mstfilter.scene import Clip
+from mstfilter.scoring import ask
+from mstfilter.simulation import cached_recording
+
+TEMPERATURES = (0.5, 1.0, 1.25, 1.5, 2.0, 3.0, 4.0)
+LOG_ODDS = (0.0, 0.2, 0.4, 0.5, 0.6, 0.8, 1.0)
+SMALL = {"width": 160, "height": 120, "n_actions": 1}
+_SOFT = 0.02  # of the log loss: p <- (1 - e) p + e / 2
+
+
+@dataclass(frozen=True)
+class Recorder(PairOdds):
+    """The odds of `pairs`; keeps the alternatives' log weights and those by the truth."""
+
+    pairs: PairOdds
+    true: TruePairs
+    kept: list = field(default_factory=list)
+
+    def log_odds(self, cells: Cells, weights: np.ndarray, clip: Clip) -> np.ndarray:
+        odds, true = self.pairs.log_odds(cells, weights, clip), self.true.log_odds(cells, weights, clip)
+        for inside, partitions in cells.alternatives():
+            if len(partitions) > 1:
+                score, best = (cells.scores(one, inside, partitions) for one in (odds, true))
+                self.kept.append((score, best >= best.max() - 1e-6))
+        return odds
+
+
+def of_scene(family: str, seed: int, small: bool) -> dict[str, np.ndarray]:
+    """What is kept of a scene: components (`score`, `best`, `component`) and questions (`p`, `same`, `truth`)."""
+    recording = mstfilter.open_recording(cached_recording(family, seed, **(SMALL if small else {})))
+    filter = mstfilter.preset("mst", "update.temperature=1.0", "update.occupied_log_odds=0.0")
+    recorder = Recorder(filter.update.pairs, bind_truth(TruePairs(), recording))
+    filter = replace(filter, update=replace(filter.update, pairs=recorder))
+    state, p, same, truth = filter.start(0), [], [], []
+    for t, clip in enumerate(recording.clips()):
+        state, _ = filter.step(state, clip)
+        if not t:
+            continue
+        questions, true = ask(recording, t), recording.truth(t)
+        a, b = questions.first[::4], questions.second[::4]
+        shares = [h.shares for h in state.population.particles]
+        owner = np.stack([one.owner.ravel() for one in shares])
+        probability = np.stack([one.probability.ravel() for one in shares])
+        p.append(np.stack([np.where(owner[:, v] > 0, probability[:, v], 0) for v in (a, b)]))
+        same.append((owner[:, a] == owner[:, b]) & (owner[:, a] > 0))
+        truth.append(np.stack([true.ravel()[a] > 0, questions.outcomes(true)[::4]]))
+    return {
+        "score": np.concatenate([np.zeros(0), *(score for score, _ in recorder.kept)]),
+        "best": np.concatenate([np.zeros(0, bool), *(best for _, best in recorder.kept)]),
+        "component": np.repeat(np.arange(len(recorder.kept)), [len(score) for score, _ in recorder.kept]),
+        "p": np.concatenate(p, axis=2),
+        "same": np.concatenate(same, axis=1),
+        "truth": np.concatenate(truth, axis=1),
+    }
+
+
+def temperature_loss(scene: dict[str, np.ndarray], temperature: float) -> float:
+    """Mean negative log probability of the best alternatives."""
+    losses = []
+    for k in np.unique(scene["component"]):
+        inside = scene["component"] == k
+        score = scene["score"][inside] / temperature
+        losses.append(logsumexp(score) - logsumexp(score[scene["best"][inside]]))
+    return float(np.mean(losses)) if losses else 0.0
+
+
+def forecasts(scene: dict[str, np.ndarray], log_odds: float) -> np.ndarray:
+    """(2, m): the first voxel is occupied; both voxels belong to one object."""
+    p = scene["p"].astype(np.float64)
+    inner = (p > 0) & (p < 1)
+    p[inner] = expit(logit(p[inner]) + log_odds)
+    return np.stack([p[0].mean(axis=0), (scene["same"] * p.min(axis=0)).mean(axis=0)])
+
+
+def log_losses(scene: dict[str, np.ndarray], log_odds: float) -> np.ndarray:
+    """(2,) mean log loss of each forecast."""
+    p = (1 - _SOFT) * forecasts(scene, log_odds) + _SOFT / 2
+    return np.asarray(-np.log(np.where(scene["truth"], p, 1 - p)).mean(axis=1))
+
+
+def reliability(scenes: list[dict[str, np.ndarray]], log_odds: float) -> np.ndarray:
+    """(2, 15, 3) of each question and bin of equal mass: mean forecast, share of true answers, share of forecasts."""
+    p = np.concatenate([forecasts(scene, log_odds) for scene in scenes], axis=1)
+    y = np.concatenate([scene["truth"] for scene in scenes], axis=1)
+    found = []
+    for one, truth in zip(p, y, strict=True):
+        bins = np.array_split(np.argsort(one, kind="stable"), 15)
+        found.append([(one[k].mean(), truth[k].mean(), len(k) / len(one)) for k in bins])
+    return np.array(found)
+
+
+def calibration_errors(scenes: list[dict[str, np.ndarray]], log_odds: float) -> np.ndarray:
+    """(2,) mean absolute difference of forecast and share of true answers, all scenes together."""
+    forecast, true, share = np.moveaxis(reliability(scenes, log_odds), 2, 0)
+    return np.asarray((np.abs(forecast - true) * share).sum(axis=1))
+
+
+def draw(scenes: list[dict[str, np.ndarray]], path: Path) -> None:
+    """The reliability diagrams of both questions."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    plt.style.use("mstfilter.report.figures")
+    figure, places = plt.subplots(1, 2, figsize=(8, 4.1), sharey=True, layout="constrained")
+    default = PartitionUpdate().occupied_log_odds
+    for k, question in enumerate(("is this voxel occupied?", "do these two belong to one object?")):
+        place = places[k]
+        place.plot([0, 1], [0, 1], color=".6", lw=1)
+        for log_odds, marker in ((0.0, "o"), (default, "s")):
+            forecast, true, _ = reliability(scenes, log_odds)[k].T
+            error = calibration_errors(scenes, log_odds)[k]
+            label = f"added log odds {log_odds:g}: error {error:.3f}"
+            place.plot(forecast, true, marker=marker, ms=4, label=label)
+        place.set(title=question, xlabel="forecast", xlim=(0, 1), ylim=(0, 1), aspect="equal")
+        place.legend(loc="lower right", frameon=False, fontsize=9)
+    places[0].set_ylabel("share of true answers")
+    figure.savefig(path, dpi=110, metadata={"Software": None})
+    plt.close(figure)
+
+
+def held_out(losses: np.ndarray) -> float:
+    """Mean loss of scenes (s, v), each with the value that is best on the others."""
+    total = losses.sum(axis=0)
+    return float(np.mean([row[np.argmin(total - row)] for row in losses]))
+
+
+def main() -> None:
+    """Run the missing scenes, then fit."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seeds", type=int, default=5, help="scenes of each family, seeds 0, 1, ...")
+    parser.add_argument("--smoke", action="store_true", help="two small scenes; needs --out")
+    parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results")
+    chosen = parser.parse_args()
+    if chosen.smoke and chosen.out == parser.get_default("out"):
+        parser.error("--smoke would overwrite the results: name another folder with --out")
+    (chosen.out / "scenes").mkdir(parents=True, exist_ok=True)
+    scenes = []
+    for seed in range(2 if chosen.smoke else chosen.seeds):
+        for family in ("demo",) if chosen.smoke else ("s1", "s2", "s3"):
+            path = chosen.out / "scenes" / f"{family}-{seed}.npz"
+            if not path.exists():
+                np.savez_compressed(path, **of_scene(family, seed, chosen.smoke))
+                print(path.stem, flush=True)
+            scenes.append(dict(np.load(path)))
+    by_temperature = np.array([[temperature_loss(scene, T) for T in TEMPERATURES] for scene in scenes])
+    by_log_odds = np.array([[log_losses(scene, a) for a in LOG_ODDS] for scene in scenes])
+    rows = [
+        {"field": "temperature", "value": f"{T}", "loss": f"{loss:.4f}"}
+        for T, loss in zip(TEMPERATURES, by_temperature.mean(axis=0), strict=True)
+    ]
+    rows.append({"field": "temperature", "value": "held out", "loss": f"{held_out(by_temperature):.4f}"})
+    for k, a in enumerate(LOG_ODDS):
+        occupied, same = by_log_odds[:, k].mean(axis=0)
+        errors = calibration_errors(scenes, a)
+        rows.append(
+            {
+                **{"field": "occupied_log_odds", "value": f"{a}", "loss": f"{(occupied + same) / 2:.4f}"},
+                **{"occupied_loss": f"{occupied:.4f}", "same_loss": f"{same:.4f}"},
+                **{"occupied_error": f"{errors[0]:.3f}", "same_error": f"{errors[1]:.3f}"},
+            }
+        )
+    total = held_out(by_log_odds.mean(axis=2))
+    rows.append({"field": "occupied_log_odds", "value": "held out", "loss": f"{total:.4f}"})
+    draw(scenes, chosen.out / "reliability.png")
+    names = list(dict.fromkeys(name for row in rows for name in row))
+    rows = [{name: row.get(name, "") for name in names} for row in rows]
+    write_csv(chosen.out / "calibration.csv", rows)
+    for row in rows:
+        print("  ".join(f"{value:>18}" for value in row.values()))
+
+
+if __name__ == "__main__":
+    main()
