@@ -39,9 +39,9 @@ class Cluster(Executor):
     address : str
         For example ``tcp://head:8786``.
     connect_s : float
-        Time limit in seconds for the first answer of the scheduler.
+        Time limit in seconds for the first answer of the scheduler, and for its first worker.
     without_workers_s : float
-        `run` raises InputError if the scheduler has no workers at the beginning, or later for this time in seconds.
+        `run` raises InputError if later the scheduler has no workers for this time in seconds.
     """
 
     address: str
@@ -52,7 +52,7 @@ class Cluster(Executor):
         if not jobs:
             return []
         with self._client() as client:
-            _check_workers(client)
+            _check_workers(client, self.connect_s)
             return _ClusterRun(client, jobs, tell, self.without_workers_s).run()
 
     @contextlib.contextmanager
@@ -196,15 +196,17 @@ class _ClusterRun:
                 self._fail(k, f"it took longer than {limit:g} s, {times(self._tries[k])}", *hints)
 
 
-def _check_workers(client: Any) -> None:
-    """Raise InputError if there are no workers, or if a worker has several threads or another version."""
+def _check_workers(client: Any, timeout_s: float) -> None:
+    """Wait for a worker. Raise InputError if none comes, or if one has several threads or another version."""
     from mstfilter import __version__
 
-    found = client.run(_worker_version)
-    if not found:
+    try:  # workers may be starting, or starting again after an earlier job
+        client.wait_for_workers(1, timeout=timeout_s)
+    except TimeoutError as error:
         raise InputError(
             f"the Dask scheduler at {client.scheduler.address} has no workers", "start some: dask worker ADDRESS"
-        )
+        ) from error
+    found = client.run(_worker_version)
     for worker, n in client.nthreads().items():
         if n > 1:
             hint = "start workers with --nthreads 1 --nworkers N"
