@@ -45,5 +45,5 @@ class MyPairs(PairOdds):
         mean = sums / np.bincount(cell, minlength=n)[:, None]
         a, b = cells.pairs.T
         distance = np.linalg.norm(mean[a] - mean[b], axis=1)
-        share = np.mean(cells.samples[:, a] == cells.samples[:, b], axis=0)
+        share = np.mean((cells.samples[:, a] == cells.samples[:, b]) & (cells.samples[:, a] > 0), axis=0)
         return self.image * (2 * share - 1) + self.colour * (self.typical - distance)
