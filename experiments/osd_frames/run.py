@@ -7,6 +7,7 @@
 Needs the frames in MSTFILTER_SHARED (default ../shared) under real/osd_learn. Writes results/*.csv beside this file.
 The learned tree was fitted on simulated scenes only. SceneCut's constants (colour weight, centre and slope of the
 calibration) are fitted on the frames of the other camera set-ups, and so is the colour weight of the first row.
+border.csv compares the learned tree with that of a border model.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from measures import segment_f
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
@@ -43,6 +45,7 @@ from mstfilter.segmentation import (
     UcmTree,
     optimal_cut,
 )
+from mstfilter.statistics import compare
 
 HERE = Path(__file__).resolve().parent
 SHARED = Path(os.environ.get("MSTFILTER_SHARED", HERE.parents[2] / "shared"))
@@ -97,8 +100,17 @@ class Case:
 
     def score_cut(self, tree: Tree, found: Segments, cut: np.ndarray) -> float:
         """Quality of a cut without its background."""
-        numbers = np.where(found.is_object[cut], np.arange(1, len(cut) + 1), 0)
-        return self.score(np.where(found.object_pixels, numbers[tree.label_image(cut)], 0))
+        return self.score(objects_of(tree, found, cut))
+
+    def f(self, labels: np.ndarray) -> tuple[float, float]:
+        """Overlap F and boundary F."""
+        return segment_f(np.where(self.ignored, 0, labels), self.truth)
+
+
+def objects_of(tree: Tree, found: Segments, cut: np.ndarray) -> np.ndarray:
+    """Labels (H, W) of a cut without its background."""
+    numbers = np.where(found.is_object[cut], np.arange(1, len(cut) + 1), 0)
+    return np.where(found.object_pixels, numbers[tree.label_image(cut)], 0)
 
 
 @dataclass(frozen=True)
@@ -220,7 +232,16 @@ def main(numbers: Sequence[int], out: Path, border: str = "") -> None:
         "scenecut, optimal cut, constants of all frames": scores[scores.mean(axis=1).argmax()],
     }
     if border:
-        arms["border tree, optimal cut, colour weight held out"] = judge(lambda case, weight: case.seen[weight])[2]
+        judged, _, held_out = judge(lambda case, weight: case.seen[weight])
+        arms["border tree, optimal cut, colour weight held out"] = held_out
+        arms["border tree, optimal cut, colour 0.4 (default)"] = judged[default]
+    for name in ("learned", "seen") if border else ("learned",):
+        f = []
+        for case in cases:
+            tree, found = getattr(case, name)[COLOUR_WEIGHTS[default]]
+            f.append(case.f(objects_of(tree, found, optimal_cut(tree, ODDS.values(tree, case.frame)))))
+        for measure, values in zip(("overlap F", "boundary F"), np.array(f).T, strict=True):
+            arms[f"{'border' if name == 'seen' else 'learned'} tree, optimal cut, default: {measure}"] = values
     unlabelled, unlabelled_best = [], []
     best_node: dict[str, list[float]] = {"learned": [], "contour": [], **({"border": []} if border else {})}
     for case in cases:
@@ -242,6 +263,10 @@ def main(numbers: Sequence[int], out: Path, border: str = "") -> None:
     arms["scenecut, optimal cut, no labels used (colour 0.4)"] = np.array(unlabelled_best)
     arms["floor: plane + components"] = np.array([c.score(components(c)) for c in cases])
     arms["floor: plane + components cut at 1 cm steps"] = np.array([c.score(components(c, 0.01)) for c in cases])
+    for measure, values in zip(
+        ("overlap F", "boundary F"), np.array([c.f(components(c)) for c in cases]).T, strict=True
+    ):
+        arms[f"floor: plane + components: {measure}"] = values
     arms["floor: one blob"] = np.array([c.score(components(c) > 0) for c in cases])
     for name, values in best_node.items():
         arms[f"IoU of the best node of the {name} tree, mean over objects"] = np.array(values)
@@ -296,6 +321,21 @@ def main(numbers: Sequence[int], out: Path, border: str = "") -> None:
     print(f"  on all frames: {grid[int(scores.mean(axis=1).argmax())]}")
     print(f"{time.time() - began:.0f} s")
 
+    if border:
+        rows = []
+        for name in arms:
+            if name.replace("border", "learned") in arms and "border" in name:
+                for where, chosen_frames in (("all", near | ~near), ("touching", near), ("apart", ~near)):
+                    d = compare(arms[name][chosen_frames], arms[name.replace("border", "learned")][chosen_frames])
+                    rows.append([name, where, d.n, *(f"{x:.3f}" for x in (d.mean, d.low, d.high))])
+        floor = arms["floor: plane + components"][~near]
+        d = compare(arms["border tree, optimal cut, colour weight held out"][~near], floor)
+        rows.append(
+            ["held out, minus plane + components", "apart", d.n, *(f"{x:.3f}" for x in (d.mean, d.low, d.high))]
+        )
+        for row in rows:
+            print(*row)
+        write_rows(out / "border.csv", ["border minus learned", "frames", "n", "mean", "low", "high"], rows)
     write_rows(out / "summary.csv", ["arm", "all", "touching", "apart"], summary)
     write_rows(out / "samplers.csv", ["sampler", "objects", "distinct_of_10"], sampled)
     names = list(arms)

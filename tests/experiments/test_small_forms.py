@@ -7,13 +7,14 @@ import runpy
 from contextlib import nullcontext
 from unittest import mock
 
+import numpy as np
 import pytest
 
 from mstfilter import smc
 from mstfilter.files import read_csv
 from mstfilter.scene import read_rgb
 from tests.conftest import REPOSITORY, find_shared
-from tests.experiments.scripts import EXPERIMENTS, run_script
+from tests.experiments.scripts import EXPERIMENTS, import_script, run_script
 from tests.study.scenes import InProcess
 
 SCRIPTS = [
@@ -217,6 +218,19 @@ def test_miniature(tmp_path):
     tests = read_csv(tmp_path / "calibration.csv")
     ranks = [int(v) for r in tests for k, v in r.items() if k.startswith("rank_")]
     assert sum(ranks) == 10 * len(tests)
+
+
+def test_f_of_segments_and_borders():
+    segment_f = import_script("osd_frames/measures.py").segment_f
+    truth = np.zeros((480, 640), np.int64)
+    truth[100:200, 100:200], truth[100:200, 300:400] = 1, 2
+    assert segment_f(truth, truth) == segment_f((3 - truth) * (truth > 0), truth) == (1.0, 1.0)
+    assert segment_f(np.minimum(truth, 1), truth)[0] == 0.5  # half of its pixels are of the object that it matches
+    assert segment_f(np.where(truth == 1, 1, 0), truth) == pytest.approx((2 / 3, 2 / 3))
+    assert segment_f(np.zeros_like(truth), truth) == (0.0, 0.0)
+    overlap, border = segment_f(np.roll(truth, 2, axis=1), truth)  # within 3 pixels, .3 % of the diagonal
+    assert overlap == pytest.approx(0.98) and border == 1
+    assert segment_f(np.roll(truth, 10, axis=1), truth)[1] < 0.6
 
 
 def test_osd_frames(tmp_path):
