@@ -7,7 +7,7 @@
 Needs the frames in MSTFILTER_SHARED (default ../shared) under real/osd_learn. Writes results/*.csv beside this file.
 The learned tree was fitted on simulated scenes only. SceneCut's constants (colour weight, centre and slope of the
 calibration) are fitted on the frames of the other camera set-ups, and so is the colour weight of the first row.
-border.csv compares the learned tree with that of a border model.
+differences.csv: paired differences by frame, in particular of the tree of a border model.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from mstfilter.files import write_csv
+from mstfilter.forecasts import ForecastTable, Recalibration
 from mstfilter.scene import Camera, Frame
 from mstfilter.scoring import weighted_coverage
 from mstfilter.segmentation import (
@@ -58,6 +59,7 @@ SLOPES: tuple[float, ...] = (8.0, 12.0, 20.0)
 # Constants chosen without labels: the colour weight; a logistic curve with values .15 and .8 at the .9 and .995
 # quantiles of the merge heights of each tree.
 UNFITTED_COLOUR = 0.6
+N_QUESTIONS = 8000
 
 # Samplers under the learned tree's log odds, and under SceneCut's value on the contour tree.
 LEARNED_SAMPLERS = {
@@ -101,6 +103,26 @@ class Case:
     def score_cut(self, tree: Tree, found: Segments, cut: np.ndarray) -> float:
         """Quality of a cut without its background."""
         return self.score(objects_of(tree, found, cut))
+
+    def asked(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Pairs of flat pixels (m,) above the table, near each other, and whether one object has both."""
+        rng = np.random.default_rng(int(self.name[5:]))
+        asked = self.trees[COLOUR_WEIGHTS[0]][1].object_pixels & ~self.ignored
+        v, u = np.nonzero(asked)
+        k = rng.integers(0, len(v), N_QUESTIONS)
+        row, column = v[k] + rng.integers(-40, 41, N_QUESTIONS), u[k] + rng.integers(-40, 41, N_QUESTIONS)
+        inside = (row >= 0) & (row < asked.shape[0]) & (column >= 0) & (column < asked.shape[1])
+        inside[inside] = asked[row[inside], column[inside]]
+        first = (v[k] * asked.shape[1] + u[k])[inside]
+        second = (row * asked.shape[1] + column)[inside]
+        true = self.truth.ravel()
+        return first, second, (true[first] == true[second]) & (true[first] > 0)
+
+    def forecasts(self, tree: Tree, found: Segments, cuts: Sequence[np.ndarray]) -> ForecastTable:
+        """The share of the cuts in which both pixels of a pair belong to one object, and the answer."""
+        first, second, same = self.asked()
+        rows = [objects_of(tree, found, cut).ravel() for cut in cuts]
+        return ForecastTable.of(np.mean([(r[first] == r[second]) & (r[first] > 0) for r in rows], axis=0), same)
 
     def f(self, labels: np.ndarray) -> tuple[float, float]:
         """Overlap F and boundary F."""
@@ -304,6 +326,25 @@ def main(numbers: Sequence[int], out: Path, border: str = "") -> None:
 
         sample(name, sampler, scenecut_parts)
 
+    # What the samples know: log loss of "one object?" in nats, recalibrated on the other set-ups.
+    for name in ("learned", "seen") if border else ("learned",):
+        tables: dict[str, list[ForecastTable]] = {"10 samples": [], "optimal cut": []}
+        for i, case in enumerate(cases):
+            tree, found = getattr(case, name)[COLOUR_WEIGHTS[default]]
+            w = ODDS.values(tree, case.frame)
+            drawn = MetropolisHastingsCuts(temperature=1.0).sample(np.random.default_rng((1, i)), tree, w, 10)
+            tables["10 samples"].append(case.forecasts(tree, found, drawn.cuts))
+            tables["optimal cut"].append(case.forecasts(tree, found, [optimal_cut(tree, w)]))
+        for what, of_frame in tables.items():
+            fitted = {
+                g: Recalibration.fit(
+                    ForecastTable.pooled([t for t, k in zip(of_frame, setup, strict=True) if k != g])
+                )
+                for g, _, _ in groups
+            }
+            losses = [fitted[g].log_loss(t) for t, g in zip(of_frame, setup, strict=True)]
+            arms[f"{'border' if name == 'seen' else 'learned'} tree, {what}: log loss"] = np.array(losses)
+
     print(f"\n{'objects quality, mean':66s} all   touching  apart")
     summary = [[n, *(f"{x:.3f}" for x in (v.mean(), v[near].mean(), v[~near].mean()))] for n, v in arms.items()]
     for name, a, b, c in summary:
@@ -321,21 +362,23 @@ def main(numbers: Sequence[int], out: Path, border: str = "") -> None:
     print(f"  on all frames: {grid[int(scores.mean(axis=1).argmax())]}")
     print(f"{time.time() - began:.0f} s")
 
+    rows = []
+
+    def row(first: str, second: str, where: str, frames: np.ndarray) -> None:
+        d = compare(arms[first][frames], arms[second][frames])
+        rows.append([first, second, where, d.n, *(f"{x:.3f}" for x in (d.mean, d.low, d.high))])
+        print(*rows[-1])
+
+    row("learned tree, 10 samples: log loss", "learned tree, optimal cut: log loss", "all", near | ~near)
     if border:
-        rows = []
+        row("border tree, 10 samples: log loss", "border tree, optimal cut: log loss", "all", near | ~near)
         for name in arms:
-            if name.replace("border", "learned") in arms and "border" in name:
-                for where, chosen_frames in (("all", near | ~near), ("touching", near), ("apart", ~near)):
-                    d = compare(arms[name][chosen_frames], arms[name.replace("border", "learned")][chosen_frames])
-                    rows.append([name, where, d.n, *(f"{x:.3f}" for x in (d.mean, d.low, d.high))])
-        floor = arms["floor: plane + components"][~near]
-        d = compare(arms["border tree, optimal cut, colour weight held out"][~near], floor)
-        rows.append(
-            ["held out, minus plane + components", "apart", d.n, *(f"{x:.3f}" for x in (d.mean, d.low, d.high))]
-        )
-        for row in rows:
-            print(*row)
-        write_rows(out / "border.csv", ["border minus learned", "frames", "n", "mean", "low", "high"], rows)
+            other = name.replace("border", "learned")
+            if other != name:
+                for where, frames in (("all", near | ~near), ("touching", near), ("apart", ~near)):
+                    row(name, other, where, frames)
+        row("border tree, optimal cut, colour weight held out", "floor: plane + components", "apart", ~near)
+    write_rows(out / "differences.csv", ["first", "second", "frames", "n", "mean", "low", "high"], rows)
     write_rows(out / "summary.csv", ["arm", "all", "touching", "apart"], summary)
     write_rows(out / "samplers.csv", ["sampler", "objects", "distinct_of_10"], sampled)
     names = list(arms)

@@ -1,6 +1,7 @@
 """Quality of both front ends on simulated first pauses that were not used in the fit, in the image and in space.
 
     python experiments/segmentation_fit/check.py
+    python experiments/segmentation_fit/check.py --border FOLDER      # also with the evidence of a border model
     python experiments/segmentation_fit/check.py --smoke --out DIR    # one scene: a quick test
 
 Writes results/quality.csv beside this file.
@@ -12,13 +13,14 @@ import argparse
 from pathlib import Path
 
 import numpy as np
-from scenes import CHECKED_SEEDS, first_pause, small
+from scenes import CHECKED, CHECKED_SEEDS, first_pause, small
 
 from mstfilter.completion import Extrude
 from mstfilter.files import write_csv
 from mstfilter.scene import Clip
 from mstfilter.scoring import weighted_coverage
 from mstfilter.segmentation import (
+    BorderTree,
     LearnedTree,
     MergeLogOdds,
     MetropolisHastingsCuts,
@@ -32,7 +34,7 @@ from mstfilter.simulation import SCENE_FAMILIES
 
 OLD = {"tree": UcmTree(), "value": SceneCutObjectness()}
 NEW = {"tree": LearnedTree(), "value": MergeLogOdds()}
-ARMS = {
+ARMS: dict[str, TreeCutProposal] = {
     "scenecut, optimal cut": TreeCutProposal(**OLD, sampler=OptimalCut()),
     "scenecut, samples": TreeCutProposal(**OLD, sampler=MetropolisHastingsCuts()),
     "learned, optimal cut": TreeCutProposal(**NEW, sampler=OptimalCut()),
@@ -44,15 +46,21 @@ N = 10
 RESULTS = Path(__file__).resolve().parent / "results"
 
 
-def main(out: Path, smoke: bool) -> None:
-    """Score both front ends on every scene and write the table."""
-    rows = []
-    for name, family in ((name, SCENE_FAMILIES[name]) for name in (("demo",) if smoke else ("demo", "table"))):
-        table: dict[str, list[tuple[float, ...]]] = {arm: [] for arm in [*ARMS, "true masks"]}
+def main(out: Path, smoke: bool, border: str = "") -> None:
+    """Score all front ends on every scene and write the table."""
+    rows, arms = [], dict(ARMS)
+    if border:
+        seen = {"tree": BorderTree(weights=border), "value": MergeLogOdds()}
+        arms["border, optimal cut"] = TreeCutProposal(**seen, sampler=OptimalCut())
+        arms["border, samples at temperature 1"] = TreeCutProposal(
+            **seen, sampler=MetropolisHastingsCuts(temperature=1.0)
+        )
+    for name, family in ((name, SCENE_FAMILIES[name]) for name in (("demo",) if smoke else CHECKED)):
+        table: dict[str, list[tuple[float, ...]]] = {arm: [] for arm in [*arms, "true masks"]}
         for seed in CHECKED_SEEDS[: 1 if smoke else None]:
             pause = first_pause(small(family) if smoke else family, seed)
             clip = Clip((pause.frame,), pause.grid, 0)
-            for arm, proposal in ARMS.items():
+            for arm, proposal in arms.items():
                 n = 1 if isinstance(proposal.sampler, OptimalCut) else N
                 population = proposal.sample(np.random.default_rng(seed), clip, n)
                 tree, w = proposal.tree_of(pause.frame)
@@ -86,8 +94,9 @@ def _true_masks(pause) -> tuple[float, ...]:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--smoke", action="store_true", help="one scene; needs --out")
+    parser.add_argument("--border", default="", help="folder of a border model with fitted evidence")
     parser.add_argument("--out", type=Path, default=RESULTS)
     options = parser.parse_args()
     if options.smoke and options.out == RESULTS:
         parser.error("--smoke would overwrite the results: name another folder with --out")
-    main(options.out, options.smoke)
+    main(options.out, options.smoke, options.border)
