@@ -27,6 +27,7 @@ from scipy.special import expit, logit, logsumexp
 
 import mstfilter
 from mstfilter.files import write_csv
+from mstfilter.forecasts import SOFTENING, ForecastTable
 from mstfilter.fusion import Cells, PairOdds, PartitionUpdate
 from mstfilter.oracles import bind_truth
 from mstfilter.oracles.stages import TruePairs
@@ -37,7 +38,6 @@ from mstfilter.simulation import cached_recording
 TEMPERATURES = (0.5, 1.0, 1.25, 1.5, 2.0, 3.0, 4.0)
 LOG_ODDS = (0.0, 0.2, 0.4, 0.5, 0.6, 0.8, 1.0)
 SMALL = {"width": 160, "height": 120, "n_actions": 1}
-_SOFT = 0.02  # of the log loss: p <- (1 - e) p + e / 2
 
 
 @dataclass(frozen=True)
@@ -104,27 +104,11 @@ def forecasts(scene: dict[str, np.ndarray], log_odds: float) -> np.ndarray:
     return np.stack([p[0].mean(axis=0), (scene["same"] * p.min(axis=0)).mean(axis=0)])
 
 
-def log_losses(scene: dict[str, np.ndarray], log_odds: float) -> np.ndarray:
-    """(2,) mean log loss of each forecast."""
-    p = (1 - _SOFT) * forecasts(scene, log_odds) + _SOFT / 2
-    return np.asarray(-np.log(np.where(scene["truth"], p, 1 - p)).mean(axis=1))
-
-
-def reliability(scenes: list[dict[str, np.ndarray]], log_odds: float) -> np.ndarray:
-    """(2, 15, 3) of each question and bin of equal mass: mean forecast, share of true answers, share of forecasts."""
+def tables(scenes: list[dict[str, np.ndarray]], log_odds: float) -> list[ForecastTable]:
+    """The forecasts of each question in all scenes together."""
     p = np.concatenate([forecasts(scene, log_odds) for scene in scenes], axis=1)
     y = np.concatenate([scene["truth"] for scene in scenes], axis=1)
-    found = []
-    for one, truth in zip(p, y, strict=True):
-        bins = np.array_split(np.argsort(one, kind="stable"), 15)
-        found.append([(one[k].mean(), truth[k].mean(), len(k) / len(one)) for k in bins])
-    return np.array(found)
-
-
-def calibration_errors(scenes: list[dict[str, np.ndarray]], log_odds: float) -> np.ndarray:
-    """(2,) mean absolute difference of forecast and share of true answers, all scenes together."""
-    forecast, true, share = np.moveaxis(reliability(scenes, log_odds), 2, 0)
-    return np.asarray((np.abs(forecast - true) * share).sum(axis=1))
+    return [ForecastTable.of(*both) for both in zip(p, y, strict=True)]
 
 
 def draw(scenes: list[dict[str, np.ndarray]], path: Path) -> None:
@@ -141,10 +125,9 @@ def draw(scenes: list[dict[str, np.ndarray]], path: Path) -> None:
         place = places[k]
         place.plot([0, 1], [0, 1], color=".6", lw=1)
         for log_odds, marker in ((0.0, "o"), (default, "s")):
-            forecast, true, _ = reliability(scenes, log_odds)[k].T
-            error = calibration_errors(scenes, log_odds)[k]
-            label = f"added log odds {log_odds:g}: error {error:.3f}"
-            place.plot(forecast, true, marker=marker, ms=4, label=label)
+            found = tables(scenes, log_odds)[k].reliability(15)
+            label = f"added log odds {log_odds:g}: error {found.error:.3f}"
+            place.plot(found.forecast, found.frequency, marker=marker, ms=4, label=label)
         place.set(title=question, xlabel="forecast", xlim=(0, 1), ylim=(0, 1), aspect="equal")
         place.legend(loc="lower right", frameon=False, fontsize=9)
     places[0].set_ylabel("share of true answers")
@@ -177,7 +160,9 @@ def main() -> None:
                 print(path.stem, flush=True)
             scenes.append(dict(np.load(path)))
     by_temperature = np.array([[temperature_loss(scene, T) for T in TEMPERATURES] for scene in scenes])
-    by_log_odds = np.array([[log_losses(scene, a) for a in LOG_ODDS] for scene in scenes])
+    by_log_odds = np.array(
+        [[[t.log_loss(SOFTENING) for t in tables([scene], a)] for a in LOG_ODDS] for scene in scenes]
+    )
     rows = [
         {"field": "temperature", "value": f"{T}", "loss": f"{loss:.4f}"}
         for T, loss in zip(TEMPERATURES, by_temperature.mean(axis=0), strict=True)
@@ -185,7 +170,7 @@ def main() -> None:
     rows.append({"field": "temperature", "value": "held out", "loss": f"{held_out(by_temperature):.4f}"})
     for k, a in enumerate(LOG_ODDS):
         occupied, same = by_log_odds[:, k].mean(axis=0)
-        errors = calibration_errors(scenes, a)
+        errors = [table.reliability(15).error for table in tables(scenes, a)]
         rows.append(
             {
                 **{"field": "occupied_log_odds", "value": f"{a}", "loss": f"{(occupied + same) / 2:.4f}"},

@@ -55,6 +55,12 @@ def test_benchmark_of_scoring(tmp_path):
     assert list(seconds)[-1] == "all" and all(s >= 0 for s in seconds.values())
 
 
+def test_benchmark_of_the_networks(tmp_path):
+    run_script("benchmarks/networks.py", "--smoke", "--out", tmp_path / "networks.csv")
+    (row,) = read_csv(tmp_path / "networks.csv")
+    assert row["what"] == "completion of an object" and float(row["ms"]) > 0 and float(row["ratio"]) > 0
+
+
 def test_partition_fit(tmp_path):
     """Pairs of both kinds of clips are fitted; what is known of a pair beats knowing nothing (log 2)."""
     run_script("partition_fit/run.py", "--smoke", "--out", tmp_path)
