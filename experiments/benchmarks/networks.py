@@ -2,7 +2,8 @@
 
     OMP_NUM_THREADS=1 python experiments/benchmarks/networks.py [--border FOLDER] [--smoke --out FILE]
 
-Processor time on one core, on the pauses of a simulated scene (`s3`, seed 0; 640 x 480 pixels, 1 cm voxels). The objects of a pause are completed in one batch from their true masks, by the network and by extrusion; the border
+Processor time on one core, on the pauses of a simulated scene (`s3`, seed 0; 640 x 480 pixels, 1 cm voxels). The
+objects of a pause are completed in one batch from their true masks, by the network and by extrusion; the border
 network sees the frame, and the tree without it is built beside. Writes networks.csv, medians over pauses; `ratio` is
 the median ratio to the weight-free rival of the same pause.
 """
