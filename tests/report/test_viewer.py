@@ -59,7 +59,7 @@ def browse(page, tmp_path, *options, size="600,500"):
     """Output of a headless browser without network that opens a page."""
     common = ["--headless", "--no-sandbox", "--disable-gpu", "--proxy-server=127.0.0.1:9", f"--window-size={size}"]
     command = ["chromium", *common, "--virtual-time-budget=2000", f"--user-data-dir={tmp_path / 'profile'}", *options]
-    done = subprocess.run([*command, page.as_uri()], check=True, capture_output=True, timeout=120)
+    done = subprocess.run([*command, page.as_uri()], check=True, capture_output=True, timeout=600)
     return done.stdout.decode()
 
 
@@ -180,7 +180,7 @@ def test_files_of_rerun_hold_every_entity(run, tmp_path, capsys):
     ):
         command = [sys.executable, "-m", "rerun_cli", "rrd", "print", str(tmp_path / f"{name}.rrd")]
         shown = subprocess.run(
-            command, capture_output=True, check=True, timeout=60, env={"CI": "1", "HOME": str(tmp_path)}
+            command, capture_output=True, check=True, timeout=600, env={"CI": "1", "HOME": str(tmp_path)}
         )
         for entity in wanted:
             assert entity in shown.stdout.decode(), entity
