@@ -126,13 +126,13 @@ def write_into_model(weights: np.ndarray, folder: str) -> None:
     write_model(folder, {**model.description, "evidence": evidence}, model.tensors)
 
 
-def main(path: Path, smoke: bool, border: str = "") -> None:
+def main(path: Path, smoke: bool, border: str = "", n_scenes: int = len(FITTED_SEEDS)) -> None:
     """Fit the weights and write the module, or the description of a border model."""
     began = time.time()
     families = [small(family) for family in FITTED.values()] if smoke else FITTED.values()
     builder: LearnedTree | BorderTree = BorderTree(weights=border) if border else LearnedTree()
     features = all_features if border else pair_features
-    scenes = measured(families, FITTED_SEEDS[:2] if smoke else FITTED_SEEDS, builder)
+    scenes = measured(families, FITTED_SEEDS[: 2 if smoke else n_scenes], builder)
     print(f"{len(scenes)} scenes measured, {time.time() - began:.0f} s")
     weights = np.zeros(len(PAIR_FEATURES) + (len(EVIDENCE_FEATURES) if border else 0))
     weights[:2] = -6.0, 12.0  # initial weights: bias and strength of the border
@@ -159,7 +159,8 @@ if __name__ == "__main__":
     parser.add_argument("--smoke", action="store_true", help="a few scenes, one round; needs --out")
     parser.add_argument("--out", type=Path, default=PACKAGED, help="the module to write")
     parser.add_argument("--border", default="", help="folder of a border model: fit with its evidence, write into it")
+    parser.add_argument("--scenes", type=int, default=len(FITTED_SEEDS), help="scenes of each family")
     options = parser.parse_args()
     if options.smoke and options.out == PACKAGED and not options.border:
         parser.error("--smoke would overwrite the weights of the package: name another file with --out")
-    main(options.out, options.smoke, options.border)
+    main(options.out, options.smoke, options.border, options.scenes)
