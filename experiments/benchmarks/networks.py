@@ -1,6 +1,6 @@
 """How long do the networks take on a CPU?
 
-    OMP_NUM_THREADS=1 python experiments/benchmarks/networks.py [--border FOLDER] [--smoke --out FILE]
+    OMP_NUM_THREADS=1 python experiments/benchmarks/networks.py [--smoke --out FILE]
 
 Processor time on one core, on the pauses of a simulated scene (`s3`, seed 0; 640 x 480 pixels, 1 cm voxels). The
 objects of a pause are completed in one batch from their true masks, by the network and by extrusion; the border
@@ -37,7 +37,7 @@ def spent(work: Callable[..., object], *arguments: object) -> float:
     return 1e3 * (time.process_time() - began)
 
 
-def main(border: str, small: bool, out: Path) -> None:
+def main(small: bool, out: Path) -> None:
     """Measure and write the table."""
     torch.set_num_threads(1)
     recording = open_recording(cached_recording("demo", 0, **SMALL) if small else cached_recording("s3", 0))
@@ -49,11 +49,10 @@ def main(border: str, small: bool, out: Path) -> None:
         batch = np.random.default_rng(0), frame, masks, clip.grid
         network, rule = (spent(c.complete, *batch) / len(masks) for c in (NetworkCompleter(), Extrude()))
         pairs = {"completion of an object": (network, rule)}
-        if border:
-            tree, boundary = BorderTree(weights=border), ColourDepthBoundary().boundary(frame)
-            plain = spent(LearnedTree().build, boundary, frame)
-            pairs["border network, an image"] = spent(tree.network.look, frame), plain
-            pairs["tree with borders, an image"] = spent(tree.build, boundary, frame), plain
+        boundary = ColourDepthBoundary().boundary(frame)
+        plain = spent(LearnedTree().build, boundary, frame)
+        pairs["border network, an image"] = spent(BorderTree().network.look, frame), plain
+        pairs["tree with borders, an image"] = spent(BorderTree().build, boundary, frame), plain
         for name, both in pairs.items():
             rows.setdefault(name, []).append(both)
     table = []
@@ -73,10 +72,9 @@ def main(border: str, small: bool, out: Path) -> None:
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--border", default="", help="a border model")
     parser.add_argument("--smoke", action="store_true", help="a small scene; needs --out")
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "networks.csv")
     given = parser.parse_args()
     if given.smoke and given.out == parser.get_default("out"):
         parser.error("--smoke would overwrite the results: name another file with --out")
-    main(given.border, given.smoke, given.out)
+    main(given.smoke, given.out)

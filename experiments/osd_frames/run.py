@@ -2,12 +2,12 @@
 
     python experiments/osd_frames/run.py
     python experiments/osd_frames/run.py --smoke --out DIR    # two frames: shows only that it works
-    python experiments/osd_frames/run.py --border FOLDER --out DIR    # also with the evidence of a border model
+    python experiments/osd_frames/run.py --border FOLDER --out DIR    # another border model than that of the package
 
 Needs the frames in MSTFILTER_SHARED (default ../shared) under real/osd_learn. Writes results/*.csv beside this file.
 The learned tree was fitted on simulated scenes only. SceneCut's constants (colour weight, centre and slope of the
 calibration) are fitted on the frames of the other camera set-ups, and so is the colour weight of the first row.
-differences.csv: paired differences by frame, in particular of the tree of a border model.
+differences.csv: paired differences by frame, of the tree with a border model and without.
 """
 
 from __future__ import annotations
@@ -94,7 +94,7 @@ class Case:
     touching: bool
     trees: dict[float, tuple[Tree, Segments]]
     learned: dict[float, tuple[Tree, Segments]]
-    seen: dict[float, tuple[Tree, Segments]]  #: with the evidence of a border model, if one is given
+    seen: dict[float, tuple[Tree, Segments]]  #: with the evidence of a border model
 
     def score(self, labels: np.ndarray) -> float:
         """`objects` quality; pixels without a label count on neither side."""
@@ -155,7 +155,7 @@ def touching(label: np.ndarray) -> bool:
     )
 
 
-def load(number: int, border: str = "") -> Case:
+def load(number: int, border: str) -> Case:
     stem = str(SHARED / "real" / "osd_learn" / f"learn{number}")
     rgb = np.ascontiguousarray(cv2.imread(f"{stem}_rgb.png")[..., ::-1])
     depth = cv2.imread(f"{stem}_depth.png", cv2.IMREAD_UNCHANGED) * np.float32(0.001)
@@ -170,9 +170,8 @@ def load(number: int, border: str = "") -> Case:
         leaves = _Given(tree)
         tree = LearnedTree(leaves).build(boundary, frame)
         learned[weight] = (tree, RULE.segments(tree, frame))
-        if border:
-            tree = BorderTree(leaves, border).build(boundary, frame)
-            seen[weight] = (tree, RULE.segments(tree, frame))
+        tree = BorderTree(leaves, border).build(boundary, frame)
+        seen[weight] = (tree, RULE.segments(tree, frame))
     truth = np.where(label >= 2, label - 1, 0)
     return Case(f"learn{number}", frame, truth, label == 0, touching(label), trees, learned, seen)
 
@@ -213,7 +212,7 @@ def write_rows(target: Path, header: list[str], rows: Iterable[Iterable]) -> Non
     write_csv(target, [dict(zip(header, row, strict=True)) for row in rows], header)
 
 
-def main(numbers: Sequence[int], out: Path, border: str = "") -> None:
+def main(numbers: Sequence[int], out: Path, border: str) -> None:
     """Score every arm on the given frames."""
     began = time.time()
     cases = [load(number, border) for number in numbers]
@@ -253,11 +252,10 @@ def main(numbers: Sequence[int], out: Path, border: str = "") -> None:
         "scenecut, optimal cut, constants held out": np.array([scores[chosen[g], i] for i, g in enumerate(setup)]),
         "scenecut, optimal cut, constants of all frames": scores[scores.mean(axis=1).argmax()],
     }
-    if border:
-        judged, _, held_out = judge(lambda case, weight: case.seen[weight])
-        arms["border tree, optimal cut, colour weight held out"] = held_out
-        arms["border tree, optimal cut, colour 0.4 (default)"] = judged[default]
-    for name in ("learned", "seen") if border else ("learned",):
+    judged, _, held_out = judge(lambda case, weight: case.seen[weight])
+    arms["border tree, optimal cut, colour weight held out"] = held_out
+    arms["border tree, optimal cut, colour 0.4 (default)"] = judged[default]
+    for name in ("learned", "seen"):
         f = []
         for case in cases:
             tree, found = getattr(case, name)[COLOUR_WEIGHTS[default]]
@@ -265,15 +263,13 @@ def main(numbers: Sequence[int], out: Path, border: str = "") -> None:
         for measure, values in zip(("overlap F", "boundary F"), np.array(f).T, strict=True):
             arms[f"{'border' if name == 'seen' else 'learned'} tree, optimal cut, default: {measure}"] = values
     unlabelled, unlabelled_best = [], []
-    best_node: dict[str, list[float]] = {"learned": [], "contour": [], **({"border": []} if border else {})}
+    best_node: dict[str, list[float]] = {"learned": [], "contour": [], "border": []}
     for case in cases:
         for weight, sink in ((UNFITTED_COLOUR, unlabelled), (0.4, unlabelled_best)):
             tree, found = case.trees[weight]
             tree = without_labels(tree)
             sink.append(case.score_cut(tree, found, optimal_cut(tree, VALUE.values(tree, case.frame))))
         for name, trees in (("learned", case.learned), ("contour", case.trees), ("border", case.seen)):
-            if name not in best_node:
-                continue
             tree, found = trees[0.4]
             pixels = tree.accumulate_pixels(found.object_pixels & ~case.ignored)
             recall = []
@@ -327,7 +323,7 @@ def main(numbers: Sequence[int], out: Path, border: str = "") -> None:
         sample(name, sampler, scenecut_parts)
 
     # What the samples know: log loss of "one object?" in nats, recalibrated on the other set-ups.
-    for name in ("learned", "seen") if border else ("learned",):
+    for name in ("learned", "seen"):
         tables: dict[str, list[ForecastTable]] = {"10 samples": [], "optimal cut": []}
         for i, case in enumerate(cases):
             tree, found = getattr(case, name)[COLOUR_WEIGHTS[default]]
@@ -370,14 +366,13 @@ def main(numbers: Sequence[int], out: Path, border: str = "") -> None:
         print(*rows[-1])
 
     row("learned tree, 10 samples: log loss", "learned tree, optimal cut: log loss", "all", near | ~near)
-    if border:
-        row("border tree, 10 samples: log loss", "border tree, optimal cut: log loss", "all", near | ~near)
-        for name in arms:
-            other = name.replace("border", "learned")
-            if other != name:
-                for where, frames in (("all", near | ~near), ("touching", near), ("apart", ~near)):
-                    row(name, other, where, frames)
-        row("border tree, optimal cut, colour weight held out", "floor: plane + components", "apart", ~near)
+    row("border tree, 10 samples: log loss", "border tree, optimal cut: log loss", "all", near | ~near)
+    for name in arms:
+        other = name.replace("border", "learned")
+        if other != name:
+            for where, frames in (("all", near | ~near), ("touching", near), ("apart", ~near)):
+                row(name, other, where, frames)
+    row("border tree, optimal cut, colour weight held out", "floor: plane + components", "apart", ~near)
     write_rows(out / "differences.csv", ["first", "second", "frames", "n", "mean", "low", "high"], rows)
     write_rows(out / "summary.csv", ["arm", "all", "touching", "apart"], summary)
     write_rows(out / "samplers.csv", ["sampler", "objects", "distinct_of_10"], sampled)
@@ -400,10 +395,10 @@ def main(numbers: Sequence[int], out: Path, border: str = "") -> None:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--smoke", action="store_true", help="two frames of two set-ups; needs --out")
-    parser.add_argument("--border", default="", help="folder of a border model with fitted evidence")
+    parser.add_argument("--border", default="border", help="a border model with fitted evidence")
     parser.add_argument("--out", type=Path, default=HERE / "results")
     options = parser.parse_args()
-    if (options.smoke or options.border) and options.out == HERE / "results":
+    if (options.smoke or options.border != "border") and options.out == HERE / "results":
         parser.error("this would overwrite the results: name another folder with --out")
     if options.smoke:
         COLOUR_WEIGHTS, CENTRES, SLOPES = (0.4, 0.6), (0.5,), (8.0, 12.0)

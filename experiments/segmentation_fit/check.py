@@ -1,7 +1,7 @@
 """Quality of both front ends on simulated first pauses that were not used in the fit, in the image and in space.
 
     python experiments/segmentation_fit/check.py
-    python experiments/segmentation_fit/check.py --border FOLDER      # also with the evidence of a border model
+    python experiments/segmentation_fit/check.py --border FOLDER --out DIR    # another border model
     python experiments/segmentation_fit/check.py --smoke --out DIR    # one scene: a quick test
 
 Writes results/quality.csv beside this file.
@@ -46,15 +46,14 @@ N = 10
 RESULTS = Path(__file__).resolve().parent / "results"
 
 
-def main(out: Path, smoke: bool, border: str = "") -> None:
+def main(out: Path, smoke: bool, border: str) -> None:
     """Score all front ends on every scene and write the table."""
-    rows, arms = [], dict(ARMS)
-    if border:
-        seen = {"tree": BorderTree(weights=border), "value": MergeLogOdds()}
-        arms["border, optimal cut"] = TreeCutProposal(**seen, sampler=OptimalCut())
-        arms["border, samples at temperature 1"] = TreeCutProposal(
-            **seen, sampler=MetropolisHastingsCuts(temperature=1.0)
-        )
+    rows, seen = [], {"tree": BorderTree(weights=border), "value": MergeLogOdds()}
+    arms = {
+        **ARMS,
+        "border, optimal cut": TreeCutProposal(**seen, sampler=OptimalCut()),
+        "border, samples at temperature 1": TreeCutProposal(**seen, sampler=MetropolisHastingsCuts(temperature=1.0)),
+    }
     for name, family in ((name, SCENE_FAMILIES[name]) for name in (("demo",) if smoke else CHECKED)):
         table: dict[str, list[tuple[float, ...]]] = {arm: [] for arm in [*arms, "true masks"]}
         for seed in CHECKED_SEEDS[: 1 if smoke else None]:
@@ -94,9 +93,9 @@ def _true_masks(pause) -> tuple[float, ...]:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--smoke", action="store_true", help="one scene; needs --out")
-    parser.add_argument("--border", default="", help="folder of a border model with fitted evidence")
+    parser.add_argument("--border", default="border", help="a border model with fitted evidence")
     parser.add_argument("--out", type=Path, default=RESULTS)
     options = parser.parse_args()
-    if options.smoke and options.out == RESULTS:
-        parser.error("--smoke would overwrite the results: name another folder with --out")
+    if (options.smoke or options.border != "border") and options.out == RESULTS:
+        parser.error("this would overwrite the results: name another folder with --out")
     main(options.out, options.smoke, options.border)

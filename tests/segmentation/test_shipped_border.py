@@ -1,0 +1,50 @@
+"""The border weights that are part of the package: they open, and see borders and centres on new scenes."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mstfilter.resources import models_folder
+from mstfilter.segmentation import BorderTree, ColourDepthBoundary
+from mstfilter.segmentation.border_network import encode_image, load_border_network, near_objects
+from mstfilter.training.border_data import border_samples, targets
+from tests.segmentation.scenes import TOUCHING, frame_of
+
+SEED = 99  # of no training
+
+
+def test_borders_and_centres_on_new_scenes():
+    """On a dozen images. The forecasts beat the share of border pixels, which the network does not know."""
+    network = load_border_network("border")
+    odds, true, off, by_pixel = [], [], [], []
+    for scene in (0, 1):
+        samples = border_samples(SEED, scene)
+        for k in range(len(samples)):
+            frame = samples.frame(k)
+            seen, near = network.look(frame), near_objects(encode_image(frame))
+            border, foreground, _ = targets(samples.instance[k], samples.centre[k])
+            odds.append(seen.border[near])
+            true.append(border[near])
+            rows, columns = np.nonzero(foreground)
+            centre = samples.centre[k][samples.instance[k][foreground]]
+            off.append(np.linalg.norm(seen.centre[foreground] - centre, axis=1))
+            by_pixel.append(np.linalg.norm(np.stack([columns, rows], axis=1) - centre, axis=1))
+    l, y = np.concatenate(odds).astype(float), np.concatenate(true)
+    loss = np.logaddexp(0, np.where(y, -l, l)).mean()
+    share = y.mean()
+    assert loss < 0.6 * -(share * np.log(share) + (1 - share) * np.log(1 - share))
+    assert np.mean(np.concatenate(off)) < 0.6 * np.mean(np.concatenate(by_pixel))
+
+
+def test_the_tree_has_weights_for_the_evidence():
+    frame = frame_of(TOUCHING, noise=0.4)
+    tree = BorderTree().build(ColourDepthBoundary().boundary(frame), frame)
+    assert np.isfinite(tree.odds).all() and tree.n_leaves > 2 and BorderTree().weights_key
+
+
+def test_size_and_card():
+    sizes = [path.stat().st_size for name in ("border", "completion") for path in (models_folder() / name).iterdir()]
+    assert sum(sizes) < 8e6
+    card = (models_folder() / "border/README.md").read_text()
+    for part in ("mstfilter train border", "MIT", "not trained on", "Limits"):
+        assert part in card
