@@ -7,8 +7,7 @@ cache under the same paths and have the same version of mstfilter. If a worker d
 another worker; after its ``allowed-failures`` (3) the job has failed. If a job exceeds its time limit, the process of
 its worker is restarted by the worker's nanny. If no worker is left for a while, an error ends the wait.
 
-A worker sends the outcome of a job as an event, not as the value of the task. The outcome therefore remains when the
-worker dies later, and no value has to be fetched from a worker that may be gone.
+A worker sends the outcome of a job as an event, not as the value of the task, so it remains when the worker dies later.
 """
 
 from __future__ import annotations
@@ -203,9 +202,8 @@ def _check_workers(client: Any, timeout_s: float) -> None:
     try:  # workers may be starting, or starting again after an earlier job
         client.wait_for_workers(1, timeout=timeout_s)
     except TimeoutError as error:
-        raise InputError(
-            f"the Dask scheduler at {client.scheduler.address} has no workers", "start some: dask worker ADDRESS"
-        ) from error
+        hint = "start some: dask worker ADDRESS"
+        raise InputError(f"the Dask scheduler at {client.scheduler.address} has no workers", hint) from error
     found = client.run(_worker_version)
     for worker, n in client.nthreads().items():
         if n > 1:
