@@ -7,7 +7,7 @@ cache under the same paths and have the same version of mstfilter. If a worker d
 another worker; after its ``allowed-failures`` (3) the job has failed. If a job exceeds its time limit, the process of
 its worker is restarted by the worker's nanny. If no worker is left for a while, an error ends the wait.
 
-A worker sends the outcome of a job as an event, not as the value of the task, so it remains when the worker dies later.
+A worker sends the outcome of a job as an event, not as the value of the task: it remains if the worker dies later.
 """
 
 from __future__ import annotations
