@@ -94,7 +94,7 @@ class Case:
     touching: bool
     trees: dict[float, tuple[Tree, Segments]]
     learned: dict[float, tuple[Tree, Segments]]
-    seen: dict[float, tuple[Tree, Segments]]  #: with the evidence of a border model
+    border: dict[float, tuple[Tree, Segments]]  #: with the evidence of a border model
 
     def score(self, labels: np.ndarray) -> float:
         """`objects` quality; pixels without a label count on neither side."""
@@ -252,16 +252,16 @@ def main(numbers: Sequence[int], out: Path, border: str) -> None:
         "scenecut, optimal cut, constants held out": np.array([scores[chosen[g], i] for i, g in enumerate(setup)]),
         "scenecut, optimal cut, constants of all frames": scores[scores.mean(axis=1).argmax()],
     }
-    judged, _, held_out = judge(lambda case, weight: case.seen[weight])
+    judged, _, held_out = judge(lambda case, weight: case.border[weight])
     arms["border tree, optimal cut, colour weight held out"] = held_out
     arms["border tree, optimal cut, colour 0.4 (default)"] = judged[default]
-    for name in ("learned", "seen"):
+    for name in ("learned", "border"):
         f = []
         for case in cases:
             tree, found = getattr(case, name)[COLOUR_WEIGHTS[default]]
             f.append(case.f(objects_of(tree, found, optimal_cut(tree, ODDS.values(tree, case.frame)))))
         for measure, values in zip(("overlap F", "boundary F"), np.array(f).T, strict=True):
-            arms[f"{'border' if name == 'seen' else 'learned'} tree, optimal cut, default: {measure}"] = values
+            arms[f"{name} tree, optimal cut, default: {measure}"] = values
     unlabelled, unlabelled_best = [], []
     best_node: dict[str, list[float]] = {"learned": [], "contour": [], "border": []}
     for case in cases:
@@ -269,7 +269,7 @@ def main(numbers: Sequence[int], out: Path, border: str) -> None:
             tree, found = case.trees[weight]
             tree = without_labels(tree)
             sink.append(case.score_cut(tree, found, optimal_cut(tree, VALUE.values(tree, case.frame))))
-        for name, trees in (("learned", case.learned), ("contour", case.trees), ("border", case.seen)):
+        for name, trees in (("learned", case.learned), ("contour", case.trees), ("border", case.border)):
             tree, found = trees[0.4]
             pixels = tree.accumulate_pixels(found.object_pixels & ~case.ignored)
             recall = []
@@ -323,7 +323,7 @@ def main(numbers: Sequence[int], out: Path, border: str) -> None:
         sample(name, sampler, scenecut_parts)
 
     # What the samples know: log loss of "one object?" in nats, recalibrated on the other set-ups.
-    for name in ("learned", "seen"):
+    for name in ("learned", "border"):
         tables: dict[str, list[ForecastTable]] = {"10 samples": [], "optimal cut": []}
         for i, case in enumerate(cases):
             tree, found = getattr(case, name)[COLOUR_WEIGHTS[default]]
@@ -339,7 +339,7 @@ def main(numbers: Sequence[int], out: Path, border: str) -> None:
                 for g, _, _ in groups
             }
             losses = [fitted[g].log_loss(t) for t, g in zip(of_frame, setup, strict=True)]
-            arms[f"{'border' if name == 'seen' else 'learned'} tree, {what}: log loss"] = np.array(losses)
+            arms[f"{name} tree, {what}: log loss"] = np.array(losses)
 
     print(f"\n{'objects quality, mean':66s} all   touching  apart")
     summary = [[n, *(f"{x:.3f}" for x in (v.mean(), v[near].mean(), v[~near].mean()))] for n, v in arms.items()]
