@@ -12,8 +12,8 @@ the predictions say in how many of them both belong to one object. The log odds 
 
 with shares f softened by 2 %. The last two terms count in proportion to the weight of the predictions that explain
 both cells. The coefficients were fitted by log loss to 100,000 pairs of readings of nine tuning scenes, with 30
-samples an image (`experiments/partition_fit`). Left out in turn, the scenes have a log loss of .205 with the image
-alone, .221 with the past alone, and .148 with both.
+samples an image (`experiments/partition_fit`). Left out in turn, the scenes have a log loss of .200 with the image
+alone, .213 with the past alone, and .144 with both.
 
 Cells that some partition joins form a component. The alternatives of a component are the partitions that the samples
 and predictions give it. The weight of an alternative is the product over its pairs of neighbouring cells of the
@@ -44,10 +44,10 @@ LEAST = 20  # readings of a cell in an image of 640 x 480 pixels; smaller ones j
 class PairEvidence(PairOdds):
     """Log odds by the shares of the samples and of the predictions in which two cells belong to one object."""
 
-    constant: float = -0.43
-    image: float = 0.52
-    past: float = 0.54
-    past_constant: float = 0.59
+    constant: float = -0.30
+    image: float = 0.51
+    past: float = 0.51
+    past_constant: float = 0.61
 
     def log_odds(self, cells: Cells, weights: np.ndarray, clip: Clip) -> np.ndarray:
         a, b = cells.pairs.T
