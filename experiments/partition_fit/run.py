@@ -2,11 +2,12 @@
 
     python experiments/partition_fit/run.py [--seeds 3] [--smoke --out FOLDER]
 
-`mst` runs on tuning scenes of `s1`, `s2`, `s3`, once with the video of the clips and once with their first and last
-frames only. At each pause t >= 1, 4,000 pairs of readings of objects, up to 40 pixels apart, are drawn. Of each pair:
-the share of 30 samples of the image, and the weighted share of the predictions that explain both readings, in which
-they belong to one object; and whether they do in truth. A logistic regression gives the log odds of "one object".
-Each scene is scored with the coefficients of the other scenes.
+`mst` runs on tuning scenes of `s1`, `s2`, `s3`. At each pause t >= 1, 4,000 pairs of readings of objects, up to 40
+pixels apart, are drawn. Of each pair: the share of 30 samples of the image, and the weighted share of the predictions
+that explain both readings, in which they belong to one object; and whether they do in truth. There are three pasts of
+a pause: the hypotheses of the pause before, moved along the video; the same, moved by the first and the last frame
+only; and the hypotheses of another scene. A logistic regression gives the log odds of "one object". It is fitted with
+the first past, and scored with all three. Each scene is scored with the coefficients of the other scenes.
 
 pairs/*.npz: the pairs of one scene (finished scenes are not run again). fit.csv: coefficients and log losses in nats.
 """
@@ -14,6 +15,7 @@ pairs/*.npz: the pairs of one scene (finished scenes are not run again). fit.csv
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -23,6 +25,7 @@ from scipy.optimize import minimize
 import mstfilter
 from mstfilter.files import write_csv
 from mstfilter.fusion.cells import softened_logit
+from mstfilter.fusion.free_space import log_quality
 from mstfilter.fusion.partition import Readings
 from mstfilter.oracles.truth import RecordingTruth
 from mstfilter.scene import Clip
@@ -31,9 +34,12 @@ from mstfilter.smc import Key
 
 N_SAMPLES, N_PAIRS, REACH = 30, 4000, 40
 SMALL = {"width": 160, "height": 120, "n_actions": 1}
-#: Columns of the regression for each model.
-MODELS = {"image": (0, 1), "past": (0, 2, 3), "both": (0, 1, 2, 3)}
-NAMES = ("constant", "image", "past", "past_constant")
+PASTS = ("video", "two frames", "stranger")
+#: Columns of the regression for each model, and whether the past is taken to be right. The last model has the
+#: coefficients of the first for a wrong past.
+MODELS = {"image": ((0, 1), False), "past": ((2, 4, 5), True), "both, past right": ((2, 3, 4, 5), True)}
+BOTH = "both"
+NAMES = ("alone_constant", "alone_image", "constant", "image", "past", "past_constant")
 
 
 def without_video(clip: Clip) -> Clip:
@@ -42,36 +48,43 @@ def without_video(clip: Clip) -> Clip:
     return replace(clip, frames=(clip.frames[0], clip.frames[-1]), times=times)
 
 
-def pairs_of(family: str, seed: int, video: bool, small: bool) -> np.ndarray:
-    """(m, 4): share of the samples, share and weight of the predictions that explain both readings, truth."""
-    recording = mstfilter.open_recording(cached_recording(family, seed, **(SMALL if small else {})))
-    truth, rows = RecordingTruth(recording), []
-    filter = mstfilter.preset("mst")
-    state = filter.start(0)
-    for t, clip in enumerate(recording.clips()):
-        clip = clip if video or len(clip.frames) < 3 else without_video(clip)
-        before = state
+def pairs_of(family: str, seed: int, n_scenes: int, small: bool) -> dict[str, np.ndarray]:
+    """(m, 5) for each past: shares of the samples and of the predictions, weight of the predictions that explain both
+    readings, of all predictions, truth."""
+    change = SMALL if small else {}
+    recording, other = (
+        mstfilter.open_recording(cached_recording(family, k, **change)) for k in (seed, (seed + 1) % n_scenes)
+    )
+    truth, filter = RecordingTruth(recording), mstfilter.preset("mst")
+    rows: dict[str, list[np.ndarray]] = {past: [] for past in PASTS}
+    state, foreign = filter.start(0), filter.start(0)
+    for t, (clip, other_clip) in enumerate(zip(recording.clips(), other.clips(), strict=False)):
+        before, before_foreign = state.population, foreign.population
         state, _ = filter.step(state, clip)
+        foreign, _ = filter.step(foreign, other_clip)
         if not t:
             continue
         rng = Key(seed).child(t).generator()
-        predicted = filter.transition.predict(rng, before.population, clip)
         readings = Readings.of(clip.after, clip.grid)
         tree, values = filter.proposal.tree_of(clip.after)
         cuts = filter.proposal.sampler.sample(rng, tree, values, N_SAMPLES).cuts
         images = [filter.proposal.objects.label_image(tree, cut, clip.after, clip.grid) for cut in cuts]
         samples = np.stack([image.ravel()[readings.pixels] for image in images])
-        past = np.stack([readings.labels(h.labels, filter.update.reach) for h in predicted.particles])
         a, b, same = _drawn(rng, readings, samples, truth.instance(t))
         if not len(a):
             continue
-        explained = (past[:, a] > 0) & (past[:, b] > 0)
-        weight = predicted.weights @ explained
-        agreeing = predicted.weights @ (explained & (past[:, a] == past[:, b]))
-        share = np.divide(agreeing, weight, out=np.full(len(a), 0.5), where=weight > 0)
         image = np.mean((samples[:, a] == samples[:, b]) & (samples[:, a] > 0), axis=0)
-        rows.append(np.stack([image, share, weight, same], axis=1))
-    return np.concatenate(rows) if rows else np.zeros((0, 4))
+        of_past = zip(PASTS, (before, before, before_foreign), (clip, without_video(clip), clip), strict=True)
+        for name, population, seen in of_past:
+            predicted = filter.transition.predict(rng, population, seen)
+            quality = filter.update.free_space.refine(predicted.particles, seen)[1]
+            weights = predicted.weights * np.exp(filter.update.quality_exponent * log_quality(quality))
+            past = np.stack([readings.labels(h.labels, filter.update.reach) for h in predicted.particles])
+            explained = (past[:, a] > 0) & (past[:, b] > 0)
+            weight, agreeing = weights @ explained, weights @ (explained & (past[:, a] == past[:, b]))
+            share = np.divide(agreeing, weight, out=np.full(len(a), 0.5), where=weight > 0)
+            rows[name].append(np.stack([image, share, weight, np.full(len(a), weights.sum()), same], axis=1))
+    return {name: np.concatenate(found) if found else np.zeros((0, 5)) for name, found in rows.items()}
 
 
 def _drawn(
@@ -96,40 +109,69 @@ def _drawn(
     return first, second, owner[first] == owner[second]
 
 
-def design(pairs: np.ndarray) -> np.ndarray:
-    """Columns (m, 4) of the regression, in the order of the fields of `PairEvidence`."""
-    image, share, weight, _ = pairs.T
-    return np.stack([np.ones(len(pairs)), softened_logit(image), weight * softened_logit(share), weight], axis=1)
+def design(pairs: np.ndarray, right: bool) -> np.ndarray:
+    """Columns (m, 6) of the regression, in the order of the fields of `PairEvidence`."""
+    image, share, explained, past, _ = pairs.T
+    if right:
+        explained, past = explained / past, np.ones(len(past))
+    logit = softened_logit(image)
+    return np.stack(
+        [1 - past, (1 - past) * logit, past, past * logit, explained * softened_logit(share), explained], axis=1
+    )
 
 
-def fit(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Coefficients of the logistic regression of least log loss."""
-    sign = 2 * y - 1
-    found = minimize(lambda b: np.logaddexp(0, -sign * (x @ b)).mean(), np.zeros(x.shape[1]), method="BFGS")
-    return np.asarray(found.x)
+def fit(x: np.ndarray, y: np.ndarray, columns: Sequence[int], known: np.ndarray) -> np.ndarray:
+    """`known` coefficients (6,), with those of some columns chosen by the least log loss."""
+    coefficients, sign, chosen = known.copy(), 2 * y - 1, list(columns)
+    offset = x @ known - x[:, chosen] @ known[chosen]
+
+    def loss(b: np.ndarray) -> float:
+        return float(np.logaddexp(0, -sign * (offset + x[:, chosen] @ b)).mean())
+
+    coefficients[chosen] = minimize(loss, known[chosen], method="BFGS").x
+    return coefficients
 
 
-def table(scenes: dict[str, np.ndarray], clips: str) -> list[dict[str, str]]:
-    """A row for each model: coefficients of all scenes, mean log loss of scenes that were left out."""
+def fits(scenes: Iterable[np.ndarray]) -> dict[str, np.ndarray]:
+    """The coefficients (6,) of every model."""
+    pairs = np.concatenate(list(scenes))
+    y, found = pairs[:, -1], {}
+    for name, (columns, right) in MODELS.items():
+        x = design(pairs, right)
+        if name == "image":
+            x[:, :2] = x[:, :2] + x[:, 2:4]
+        found[name] = fit(x, y, columns, np.zeros(6))
+    start = np.where(np.arange(6) < 2, found["image"], found["both, past right"])
+    found[BOTH] = fit(design(pairs, False), y, (2, 3, 4, 5), start)
+    return found
+
+
+def loss(name: str, coefficients: np.ndarray, pairs: np.ndarray) -> float:
+    """The mean log loss of a model, in nats."""
+    x = design(pairs, name != BOTH)
+    if name == "image":
+        x[:, :2] = x[:, 2:4]
+    return float(np.logaddexp(0, -(2 * pairs[:, -1] - 1) * (x @ coefficients)).mean())
+
+
+def table(scenes: dict[str, dict[str, np.ndarray]]) -> list[dict[str, str]]:
+    """A row for each model: coefficients of all scenes, mean log loss of scenes that were left out, by past."""
+    losses: dict[str, list[list[float]]] = {name: [] for name in (*MODELS, BOTH)}
+    for left, of_past in scenes.items():
+        others = [scene for scene in scenes if scene != left] or [left]
+        for name, b in fits(scenes[scene]["video"] for scene in others).items():
+            losses[name].append([loss(name, b, of_past[past]) for past in PASTS])
     rows = []
-    for name, columns in MODELS.items():
-        x = {scene: design(pairs)[:, columns] for scene, pairs in scenes.items()}
-        y = {scene: pairs[:, 3] for scene, pairs in scenes.items()}
-        losses = []
-        for left in scenes:
-            others = [scene for scene in scenes if scene != left] or [left]
-            b = fit(np.concatenate([x[s] for s in others]), np.concatenate([y[s] for s in others]))
-            losses.append(np.logaddexp(0, -(2 * y[left] - 1) * (x[left] @ b)).mean())
-        b = fit(np.concatenate(list(x.values())), np.concatenate(list(y.values())))
-        found = {NAMES[k]: f"{value:.2f}" for k, value in zip(columns, b, strict=True)}
-        row = {"clips": clips, "evidence": name, "scenes": str(len(scenes)), "pairs": str(sum(map(len, y.values())))}
-        rows.append({**row, **{k: found.get(k, "") for k in NAMES}, "log_loss": f"{np.mean(losses):.4f}"})
+    for name, b in fits(found["video"] for found in scenes.values()).items():
+        row = {"evidence": name, "scenes": str(len(scenes))}
+        row |= {field: f"{value:.2f}" if value else "" for field, value in zip(NAMES, b, strict=True)}
+        rows.append(row | {past: f"{x:.4f}" for past, x in zip(PASTS, np.mean(losses[name], axis=0), strict=True)})
     return rows
 
 
 def main() -> None:
     """Run the missing scenes, then fit."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, default=3, help="scenes of each family, seeds 0, 1, ...")
     parser.add_argument("--smoke", action="store_true", help="two small scenes; needs --out")
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results")
@@ -137,22 +179,19 @@ def main() -> None:
     if chosen.smoke and chosen.out == parser.get_default("out"):
         parser.error("--smoke would overwrite the results: name another folder with --out")
     (chosen.out / "pairs").mkdir(parents=True, exist_ok=True)
-    rows = []
-    for video in (True, False):
-        scenes = {}
-        for seed in range(2 if chosen.smoke else chosen.seeds):
-            for family in ("demo",) if chosen.smoke else ("s1", "s2", "s3"):
-                path = chosen.out / "pairs" / f"{family}-{seed}{'' if video else '-two-frames'}.npz"
-                if not path.exists():
-                    np.savez_compressed(path, pairs=pairs_of(family, seed, video, chosen.smoke))
-                    print(path.stem, flush=True)
-                scenes[f"{family}-{seed}"] = np.load(path)["pairs"]
-        rows += table(
-            {scene: pairs for scene, pairs in scenes.items() if len(pairs)}, "video" if video else "two frames"
-        )
+    scenes, seeds = {}, 2 if chosen.smoke else chosen.seeds
+    for seed in range(seeds):
+        for family in ("demo",) if chosen.smoke else ("s1", "s2", "s3"):
+            path = chosen.out / "pairs" / f"{family}-{seed}.npz"
+            if not path.exists():
+                np.savez_compressed(path, **pairs_of(family, seed, seeds, chosen.smoke))
+                print(path.stem, flush=True)
+            found = np.load(path)
+            scenes[path.stem] = {past: found[past] for past in PASTS}
+    rows = table({scene: of_past for scene, of_past in scenes.items() if len(of_past["video"])})
     write_csv(chosen.out / "fit.csv", rows)
     for row in rows:
-        print("  ".join(f"{value:>10}" for value in row.values()))
+        print("  ".join(f"{value:>16}" for value in row.values()))
 
 
 if __name__ == "__main__":

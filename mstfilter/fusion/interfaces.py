@@ -68,7 +68,7 @@ class PairOdds(ABC):
         cells : mstfilter.fusion.Cells
             The common refinement of the samples and the predictions, with the label of every cell in each of them.
         weights : (n,) ndarray
-            Weights of the predictions; their sum is 1.
+            Weights of the predictions. What their sum lacks of 1 is the probability that all of them are wrong.
         clip : Clip
             Its last frame is the image.
         """

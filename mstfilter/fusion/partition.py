@@ -5,9 +5,11 @@
 
 1. Every sample and every prediction is a partition of the readings of the last frame: a sample by its segments, a
    prediction by the objects that lie at the readings. All of them together say how likely two neighbouring cells of
-   their common refinement belong to one object. Partitions are drawn by these odds (`mstfilter.fusion.cells`).
-2. Each drawn partition is combined with a prediction j, drawn with probability proportional to w_j Q_j^lambda, where
-   Q_j is the share of its voxels that the frame does not see through. A segment continues the predicted objects that
+   their common refinement belong to one object. The past is right with probability sum_j w_j Q_j^lambda, where Q_j is
+   the share of the voxels of prediction j that the frame does not see through. Partitions are drawn by these odds
+   (`mstfilter.fusion.cells`).
+2. Each drawn partition is combined with a prediction j, drawn with probability proportional to w_j Q_j^lambda. A
+   segment continues the predicted objects that
    lie mostly in it; an object has at most one. Objects that were seen to move apart are divided as in the prediction.
 3. An object keeps its views: what earlier frames showed of it (`mstfilter.scene.ObjectView`). It is completed from
    the readings of this frame and from its views together. So evidence is remembered and guesses are not: no voxel
@@ -118,7 +120,7 @@ class PartitionUpdate(Update):
         Terms whose sum is the log weight of a candidate. Without them all candidates have equal weights, as they are
         drawn from what they approximate.
     quality_exponent : float
-        lambda.
+        lambda. With 0 the past is always taken to be right.
     n_candidates : int
         Candidates after the first pause; 0 means one for each predicted hypothesis, or four if there is evidence.
     reach : float
@@ -181,7 +183,7 @@ class PartitionUpdate(Update):
         past = [readings.labels(h.labels, self.reach) for h in predictions]
         segments = self._segments(proposed, readings, observation)
         cells = Cells.of(readings.pixels, observation.after.depth.shape, segments, past)
-        weights = Population(predicted.particles, log_weights).weights
+        weights = predicted.weights * np.exp(self.quality_exponent * log_quality(quality))
         log_odds = self.pairs.log_odds(cells, weights, observation)
         drawn = cells.draw(child(rng, "partition"), log_odds / self.temperature, n)
         chosen = np.pad(drawn, ((0, 0), (0, 1)))[:, cells.of_reading]  # the last column is no object

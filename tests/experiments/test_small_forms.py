@@ -62,12 +62,14 @@ def test_benchmark_of_the_networks(tmp_path):
 
 
 def test_partition_fit(tmp_path):
-    """Pairs of both kinds of clips are fitted; what is known of a pair beats knowing nothing (log 2)."""
+    """What is known of a pair beats knowing nothing (log 2), and weighing the past limits what a wrong one costs."""
     run_script("partition_fit/run.py", "--smoke", "--out", tmp_path)
-    rows = read_csv(tmp_path / "fit.csv")
-    assert [row["evidence"] for row in rows] == ["image", "past", "both"] * 2
-    assert [row["clips"] for row in rows] == ["video"] * 3 + ["two frames"] * 3
-    assert all(int(row["pairs"]) > 100 and float(row["log_loss"]) < math.log(2) for row in rows)
+    rows = {row["evidence"]: row for row in read_csv(tmp_path / "fit.csv")}
+    assert list(rows) == ["image", "past", "both, past right", "both"]
+    assert all(float(row[past]) < math.log(2) for row in rows.values() for past in ("video", "two frames"))
+    assert float(rows["both"]["stranger"]) < float(rows["both, past right"]["stranger"])
+    pairs = np.load(tmp_path / "pairs/demo-0.npz")
+    assert all(len(pairs[past]) > 100 for past in pairs)
 
 
 def test_calibration_of_the_partition_update(tmp_path):
@@ -91,7 +93,7 @@ def test_controls(tmp_path):
     arguments = ("controls/run.py", "--smoke", "--out", tmp_path / "out")
     assert "s1-0" in run_script(*arguments)
     rows = {row["what"]: row for row in read_csv(tmp_path / "out/summary.csv")}
-    assert float(rows["same hypotheses at the start"]["mean"]) == 1.0
+    assert abs(float(rows["mst in order - samples at the start"]["mean"])) < 0.2
     assert int(rows["a still clip"]["n"]) >= 1
     assert int(rows["stranger - samples"]["n"]) == int(rows["again - samples"]["n"]) == 2
     # An object moved, and following it is better than leaving it.

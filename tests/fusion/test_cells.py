@@ -74,15 +74,21 @@ def test_log_odds_by_hand():
     one, two = two_halves()
     nothing = np.zeros_like(one)
     found = Cells.of(PIXELS, SHAPE, [one, two, two, two], [one, two, nothing])
-    evidence = PairEvidence(constant=-0.2, image=0.7, past=0.4, past_constant=0.3)
+    evidence = PairEvidence(
+        alone_constant=0.1, alone_image=0.9, constant=-0.2, image=0.7, past=0.4, past_constant=0.3
+    )
 
     def logit(p):
         return np.log((p + 0.02) / (1 - p + 0.02))
 
     odds = evidence.log_odds(found, np.array([0.6, 0.2, 0.2]), None)
-    assert odds == pytest.approx([-0.2 + 0.7 * logit(0.25) + 0.8 * (0.4 * logit(0.6 / 0.8) + 0.3)])
+    right = -0.2 + 0.7 * logit(0.25) + 0.8 * (0.4 * logit(0.6 / 0.8) + 0.3)
+    assert odds == pytest.approx([right])
+    wrong = 0.1 + 0.9 * logit(0.25)  # with probability 3/4
+    odds = evidence.log_odds(found, np.array([0.6, 0.2, 0.2]) / 4, None)
+    assert odds == pytest.approx([right / 4 + wrong * 3 / 4])
     alone = Cells.of(PIXELS, SHAPE, [one, two], [])
-    assert evidence.log_odds(alone, np.zeros(0), None) == pytest.approx([-0.2])
+    assert evidence.log_odds(alone, np.zeros(0), None) == pytest.approx([0.1])
 
 
 def test_partitions_are_drawn_with_their_weights():

@@ -131,6 +131,26 @@ def test_objects_continue_what_lies_in_them():
     assert [record.id for record in one.objects] == [record.id for record in state.objects]
 
 
+def test_a_past_that_the_frame_sees_through_says_nothing_about_pairs():
+    """Two objects touch. A prediction that joins them decides; with much else that is seen through, the image does."""
+    clip, later = clip_of(TOUCHING), clip_of(TOUCHING, 1)
+    masks = masks_of(TOUCHING, clip.after)
+    state = step(PartitionUpdate(), clip, sample_of(clip, [masks[0] | masks[1]])).particles[0]
+    pairs = PairEvidence(alone_constant=0.0, alone_image=1.0, constant=0.0, image=0.0, past=100.0, past_constant=0.0)
+    proposed = sample_of(later, masks)
+
+    def objects(past, **changes):
+        update = PartitionUpdate(pairs=pairs, completer=SurfaceOnly(), **changes)
+        return step(update, later, proposed, past).particles[0].n_objects
+
+    assert objects(state) == 1
+    labels = state.labels.copy()
+    labels[:, :, -8:] = 2  # a slab in the air
+    wrong = Hypothesis.from_labels(labels, clip.grid)
+    assert objects(wrong) == 2
+    assert objects(wrong, quality_exponent=0.0) == 1
+
+
 @pytest.mark.parametrize(
     ("segments", "past", "continued"),
     [
@@ -168,7 +188,7 @@ def test_added_log_odds_leave_certain_voxels(log_odds):
 
 def test_cells_that_a_sample_gives_to_no_object_are_not_one_object_there():
     cells = Cells(np.arange(2), np.arange(2), np.array([[1, 1], [0, 0]]), np.zeros((0, 2), int), np.array([[0, 1]]))
-    found = PairEvidence(constant=0.0, image=1.0).log_odds(cells, np.zeros(0), clip_of(ALONE))
+    found = PairEvidence(alone_constant=0.0).log_odds(cells, np.zeros(0), clip_of(ALONE))
     np.testing.assert_allclose(found, 0.0, atol=1e-12)  # one of two samples
 
 
