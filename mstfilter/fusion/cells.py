@@ -47,10 +47,10 @@ class PairEvidence(PairOdds):
 
     alone_constant: float = 0.47
     alone_image: float = 0.74
-    constant: float = -0.30
+    constant: float = -0.34
     image: float = 0.51
-    past: float = 0.51
-    past_constant: float = 0.61
+    past: float = 0.52
+    past_constant: float = 0.62
 
     def log_odds(self, cells: Cells, weights: np.ndarray, clip: Clip) -> np.ndarray:
         a, b = cells.pairs.T
