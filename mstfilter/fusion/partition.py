@@ -9,12 +9,12 @@
    the share of the voxels of prediction j that the frame does not see through. Partitions are drawn by these odds
    (`mstfilter.fusion.cells`).
 2. Each drawn partition is combined with a prediction j, drawn with probability proportional to w_j Q_j^lambda. A
-   segment continues the predicted objects that
-   lie mostly in it; an object has at most one. Objects that were seen to move apart are divided as in the prediction.
+   segment continues the predicted objects that lie mostly in it; an object has at most one. Objects that were seen to
+   move apart are divided as in the prediction.
 3. An object keeps its views: what earlier frames showed of it (`mstfilter.scene.ObjectView`). It is completed from
    the readings of this frame and from its views together. So evidence is remembered and guesses are not: no voxel
-   that was guessed at an earlier pause is carried on. Predicted objects without readings stay, unless the frame sees
-   through them.
+   that was guessed at an earlier pause is carried on. A predicted object without readings stays with probability
+   (Q_j q)^lambda, where q is the share of its own voxels that the frame does not see through.
 
 At the first pause there is no prediction, and the candidates are the samples.
 """
@@ -120,13 +120,11 @@ class PartitionUpdate(Update):
         Terms whose sum is the log weight of a candidate. Without them all candidates have equal weights, as they are
         drawn from what they approximate.
     quality_exponent : float
-        lambda. With 0 the past is always taken to be right.
+        lambda. With 0 the past is always taken to be right, and every hidden object stays.
     n_candidates : int
         Candidates after the first pause; 0 means one for each predicted hypothesis, or four if there is evidence.
     reach : float
         Voxels between a reading and the predicted object that explains it, at most.
-    least_kept : float
-        Share of its voxels that a predicted object without readings must keep. The frame sees through the others.
     n_views : int
         Views that an object keeps, at most: the latest ones.
     threshold : float
@@ -144,7 +142,6 @@ class PartitionUpdate(Update):
     quality_exponent: float = 3.0
     n_candidates: int = 0
     reach: float = 1.5
-    least_kept: float = 0.5
     n_views: int = 4
     threshold: float = 0.5
 
@@ -153,8 +150,7 @@ class PartitionUpdate(Update):
     def __post_init__(self) -> None:
         check_integer("n_candidates", self.n_candidates, at_least=0)
         check_integer("n_views", self.n_views, at_least=0)
-        for name in ("least_kept", "threshold"):
-            check_number(name, getattr(self, name), at_least=0, at_most=1)
+        check_number("threshold", self.threshold, at_least=0, at_most=1)
         check_number("quality_exponent", self.quality_exponent, at_least=0)
         check_number("temperature", self.temperature, above=0)
         check_number("occupied_log_odds", self.occupied_log_odds)
@@ -173,7 +169,8 @@ class PartitionUpdate(Update):
             assert proposed is not None
             return self._first(rng, proposed, readings, observation)
         refined, quality = self.free_space.refine(predicted.particles, observation)
-        log_weights = predicted.log_weights + self.quality_exponent * log_quality(quality)
+        log_right = self.quality_exponent * log_quality(quality)
+        log_weights = predicted.log_weights + log_right
         notes = {"quality": quality.tolist()}
         if proposed is None:
             return Population(refined, log_weights, predicted.parents, notes)
@@ -183,14 +180,14 @@ class PartitionUpdate(Update):
         past = [readings.labels(h.labels, self.reach) for h in predictions]
         segments = self._segments(proposed, readings, observation)
         cells = Cells.of(readings.pixels, observation.after.depth.shape, segments, past)
-        weights = predicted.weights * np.exp(self.quality_exponent * log_quality(quality))
-        log_odds = self.pairs.log_odds(cells, weights, observation)
+        right = np.exp(log_right)
+        log_odds = self.pairs.log_odds(cells, predicted.weights * right, observation)
         drawn = cells.draw(child(rng, "partition"), log_odds / self.temperature, n)
         chosen = np.pad(drawn, ((0, 0), (0, 1)))[:, cells.of_reading]  # the last column is no object
         few = LEAST * observation.after.depth.size / 307200
         candidates = [
-            self._parts(segment, past[b], predictions[b], refined[b], few)
-            for segment, b in zip(chosen, j.tolist(), strict=True)
+            self._parts(child(rng, "hidden", c), segment, past[b], predictions[b], refined[b], float(right[b]), few)
+            for c, (segment, b) in enumerate(zip(chosen, j.tolist(), strict=True))
         ]
         parents = {"previous": predicted.parents.get("previous", np.full(len(predicted), -1))[j]}
         return self._candidates(rng, candidates, readings, observation, np.zeros(n), parents, notes)
@@ -236,9 +233,19 @@ class PartitionUpdate(Update):
         return Population(built, log_weights + total, parents, {**notes, "scores": scores})
 
     def _parts(
-        self, segments: np.ndarray, past: np.ndarray, prediction: Hypothesis, refined: Hypothesis, few: float
+        self,
+        rng: np.random.Generator,
+        segments: np.ndarray,
+        past: np.ndarray,
+        prediction: Hypothesis,
+        refined: Hypothesis,
+        right: float,
+        few: float,
     ) -> list[_Part]:
-        """The objects of a candidate, from the segment and the predicted object (m,) of each reading, 0 is none."""
+        """The objects of a candidate, from the segment and the predicted object (m,) of each reading, 0 is none.
+
+        `right` is the probability of the prediction.
+        """
         past = np.where(segments > 0, past, 0)
         shape = int(segments.max(initial=0)) + 1, int(past.max(initial=0)) + 1
         shared = np.bincount(segments * shape[1] + past, minlength=shape[0] * shape[1]).reshape(shape)
@@ -265,7 +272,8 @@ class PartitionUpdate(Update):
                     parts.append(_Part(inside, tuple(record_of[b] for b in own)))
             parts += [_Part(owner == b, (record_of[b],)) for b in of_past if (owner == b).any()]
         before, after = prediction.volumes(), Counter(prediction.labels[refined.labels > 0].tolist())
-        hidden = [k for k in record_of if k not in seen and after[k] > self.least_kept * before[k]]
+        kept = {k: (after[k] / max(before[k], 1)) ** self.quality_exponent for k in record_of if k not in seen}
+        hidden = [k for k, share in kept.items() if rng.random() < right * share]
         return parts + [_Part(segments < 0, (record_of[k],), _left(prediction, refined, k)) for k in hidden]
 
     def _complete(

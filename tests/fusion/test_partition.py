@@ -84,6 +84,26 @@ def test_hidden_objects_stay_until_the_frame_sees_through_them():
         assert [record.id for record in one.objects] == [state.record(1).id]
 
 
+def test_hidden_objects_of_a_prediction_that_the_frame_refutes_stay_less_often():
+    n = 400
+    update = PartitionUpdate(n_candidates=n, completer=SurfaceOnly())
+    labels = TWO.astype(np.uint16)
+    in_the_air = np.zeros(labels.shape, bool)
+    in_the_air[4:12, 4:12, -2:] = True
+    labels[in_the_air & (labels == 0)] = 3
+    past = Hypothesis.from_labels(labels, GRID)
+    blind = frame_of(TWO, noise=0)
+    depth = np.where(masks_of(TWO, blind)[1], np.nan, blind.depth)
+    hidden = Clip([type(blind)(blind.rgb, depth, blind.camera)], GRID, 1)
+    left, quality = update.free_space.project(past, hidden.after)
+    own = (left.labels == 2).sum() / (labels == 2).sum()
+    expected = (quality * own) ** update.quality_exponent
+    assert 0.2 < expected < 0.9
+    found = step(update, hidden, sample_of(hidden, masks_of(TWO, blind)[:1]), past).particles
+    share = np.mean([past.record(2).id in {record.id for record in one.objects} for one in found])
+    assert abs(share - expected) < 4 * np.sqrt(expected * (1 - expected) / n)  # 1 false alarm in 16,000
+
+
 @dataclass(frozen=True)
 class Forgetful(Extrude):
     """Does not use earlier views."""
@@ -132,7 +152,7 @@ def test_objects_continue_what_lies_in_them():
 
 
 def test_a_past_that_the_frame_sees_through_says_nothing_about_pairs():
-    """Two objects touch. A prediction that joins them decides; with much else that is seen through, the image does."""
+    """Two objects touch. A prediction that joins them decides; if much else is seen through, the image does."""
     clip, later = clip_of(TOUCHING), clip_of(TOUCHING, 1)
     masks = masks_of(TOUCHING, clip.after)
     state = step(PartitionUpdate(), clip, sample_of(clip, [masks[0] | masks[1]])).particles[0]
@@ -171,7 +191,9 @@ def test_which_objects_a_segment_continues(segments, past, continued):
     labels[2:4, 2:4, :2], labels[6:8, 6:8, :2] = 1, 2
     prediction = Hypothesis.from_labels(labels, GRID)
     past = np.array(past + [0] * (len(segments) - len(past)))
-    parts = PartitionUpdate()._parts(np.array(segments), past, prediction, prediction, few=20)
+    parts = PartitionUpdate()._parts(
+        np.random.default_rng(0), np.array(segments), past, prediction, prediction, right=1.0, few=20
+    )
     seen = [part for part in parts if part.readings.any()]
     assert [[record.label for record in part.continues] for part in seen] == continued
     if continued == [[2]]:
@@ -255,7 +277,7 @@ def test_predictions_are_drawn_by_their_weights():
 
 @pytest.mark.parametrize(
     ("fields", "message"),
-    [({"threshold": 1.5}, "threshold"), ({"n_views": -1}, "n_views"), ({"least_kept": 2}, "least_kept")],
+    [({"threshold": 1.5}, "threshold"), ({"n_views": -1}, "n_views")],
 )
 def test_invalid_fields(fields, message):
     with pytest.raises(InputError, match=message):
