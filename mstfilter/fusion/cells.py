@@ -11,10 +11,9 @@ are
 
     l = constant + image logit(f_image) + past logit(f_past) + past_constant,
 
-with shares f softened by 2 %. The last two terms count in proportion to the weight of the predictions that explain
-both cells. If it is wrong, l = alone_constant + alone_image logit(f_image). The two are mixed by the probability that
-the past is right, the sum of the weights of the predictions. The coefficients were fitted by log loss to 100,000
-pairs of readings of nine tuning scenes, with 30 samples an image (`experiments/partition_fit`).
+with shares f softened by 2 %; the last two terms count by the weight of the predictions that explain both cells. If
+it is wrong, l = alone_constant + alone_image logit(f_image). The sum of the weights of the predictions, which is the
+probability that the past is right, mixes both. `experiments/partition_fit` fits the coefficients.
 
 Cells that some partition joins form a component. The alternatives of a component are the partitions that the samples
 and predictions give it. The weight of an alternative is the product over its pairs of neighbouring cells of the
@@ -32,6 +31,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from mstfilter.fusion.interfaces import PairOdds
+from mstfilter.fusion.similarity import canonical
 from mstfilter.scene import Clip
 from mstfilter.smc import Systematic
 
@@ -120,12 +120,10 @@ class Cells:
         found = []
         for c in range(n):
             cells = np.flatnonzero(component == c)
-            rows = every[:, cells].copy()
-            for row in rows:  # a cell that a prediction does not explain is an object of its own
-                row[row == 0] = -1 - np.arange(int((row == 0).sum()))
-            canonical = np.array([np.unique(row, return_inverse=True)[1] for row in rows])
-            order = np.array([_by_first(row) for row in canonical])
-            found.append((cells, np.unique(order, axis=0)))
+            rows = every[:, cells]  # a cell that a prediction does not explain is an object of its own
+            rows = np.where(rows > 0, rows, -1 - np.arange(len(cells)))
+            named = np.array([canonical(np.unique(row, return_inverse=True)[1] + 1) for row in rows])
+            found.append((cells, np.unique(named, axis=0).astype(np.int64)))
         return found
 
     def scores(self, log_odds: np.ndarray, cells: np.ndarray, partitions: np.ndarray) -> np.ndarray:
@@ -148,8 +146,8 @@ class Cells:
         for cells, partitions in self.alternatives():
             score = self.scores(log_odds, cells, partitions)
             chosen = rng.permutation(Systematic().select(rng, score, n)[0])
-            drawn[:, cells] = partitions[chosen] + used + 1
-            used += int(partitions.max()) + 1
+            drawn[:, cells] = partitions[chosen] + used
+            used += int(partitions.max())
         return drawn
 
 
@@ -170,12 +168,6 @@ def _snapped(cells: np.ndarray, labels: np.ndarray) -> np.ndarray:
     table = np.bincount(cells * shape[1] + labels, minlength=shape[0] * shape[1]).reshape(shape)
     large = table >= _PART * table.sum(axis=1, keepdims=True)
     return np.where(large[cells, labels], labels, table.argmax(axis=1)[cells]) if len(cells) else labels
-
-
-def _by_first(row: np.ndarray) -> np.ndarray:
-    """Labels renumbered in the order of their first occurrence."""
-    _, first, inverse = np.unique(row, return_index=True, return_inverse=True)
-    return np.argsort(np.argsort(first))[inverse]
 
 
 def _usual_reading(rows: np.ndarray, code: np.ndarray, cell: int) -> int:

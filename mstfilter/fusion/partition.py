@@ -14,9 +14,8 @@
 3. An object keeps its views: what earlier frames showed of it (`mstfilter.scene.ObjectView`). It is completed from
    the readings of this frame and from its views together. So evidence is remembered and guesses are not: no voxel
    that was guessed at an earlier pause is carried on. A predicted object without readings stays with probability
-   (Q_j q)^lambda, where q is the share of its own voxels that the frame does not see through.
-
-At the first pause there is no prediction, and the candidates are the samples.
+   (Q_j q)^lambda, where q is the share of its own voxels that the frame does not see through. At the first pause, the
+   candidates are the samples.
 """
 
 from __future__ import annotations
@@ -95,6 +94,15 @@ class _Part(NamedTuple):
     predicted: Completion | None = None  #: the voxels of a predicted object without readings
 
 
+class _Past(NamedTuple):
+    """A prediction."""
+
+    objects: np.ndarray  #: (m,) its object of each reading, 0 is none
+    prediction: Hypothesis
+    refined: Hypothesis  #: without what the frame sees through
+    right: float  #: the probability that it is right
+
+
 @dataclass(frozen=True)
 class PartitionUpdate(Update):
     """Partition of the readings, and completion from all views.
@@ -105,10 +113,8 @@ class PartitionUpdate(Update):
         Completes the objects. That of the proposal is then of no use, and may be `SurfaceOnly`.
     free_space : Projection
         Gives the share Q of a prediction that the frame does not see through, and the objects that are left.
-    division : Division
-        Objects of both sides whose parts move apart in the clip are split first.
-    parts : PartRule
-        When a part of an object becomes a separate object.
+    division, parts : Division, PartRule
+        Objects of both sides whose parts move apart in the clip are split first, if `parts` says so.
     pairs : PairOdds
         The log odds that two cells belong to one object.
     temperature : float
@@ -167,7 +173,13 @@ class PartitionUpdate(Update):
         readings = Readings.of(observation.after, grid)
         if predicted is None:
             assert proposed is not None
-            return self._first(rng, proposed, readings, observation)
+            candidates = [
+                [_Part(segments == k, ()) for k in np.unique(segments[segments > 0])]
+                for segments in self._segments(proposed, readings, observation)
+            ]
+            return self._candidates(
+                rng, candidates, readings, observation, proposed.log_weights, proposed.parents, {}
+            )
         refined, quality = self.free_space.refine(predicted.particles, observation)
         log_right = self.quality_exponent * log_quality(quality)
         log_weights = predicted.log_weights + log_right
@@ -182,30 +194,22 @@ class PartitionUpdate(Update):
         cells = Cells.of(readings.pixels, observation.after.depth.shape, segments, past)
         right = np.exp(log_right)
         log_odds = self.pairs.log_odds(cells, predicted.weights * right, observation)
+        known = [_Past(*one) for one in zip(past, predictions, refined, right.tolist(), strict=True)]
         drawn = cells.draw(child(rng, "partition"), log_odds / self.temperature, n)
         chosen = np.pad(drawn, ((0, 0), (0, 1)))[:, cells.of_reading]  # the last column is no object
         few = LEAST * observation.after.depth.size / 307200
         candidates = [
-            self._parts(child(rng, "hidden", c), segment, past[b], predictions[b], refined[b], float(right[b]), few)
+            self._parts(child(rng, "hidden", c), segment, known[b], few)
             for c, (segment, b) in enumerate(zip(chosen, j.tolist(), strict=True))
         ]
         parents = {"previous": predicted.parents.get("previous", np.full(len(predicted), -1))[j]}
         return self._candidates(rng, candidates, readings, observation, np.zeros(n), parents, notes)
 
-    def _first(self, rng: np.random.Generator, proposed: Population, readings: Readings, clip: Clip) -> Population:
-        """The samples, completed."""
-        candidates = [
-            [_Part(segments == k, ()) for k in np.unique(segments[segments > 0])]
-            for segments in self._segments(proposed, readings, clip)
-        ]
-        return self._candidates(rng, candidates, readings, clip, proposed.log_weights, proposed.parents, {})
-
     def _segments(self, proposed: Population, readings: Readings, clip: Clip) -> list[np.ndarray]:
         """The segment (m,) of each reading in each sample, 0 is none.
 
         A reading belongs to the segment of its voxel, or of the nearest within a voxel: at the borders of objects,
-        pixels of one object have readings of another. (With the segments of the pixels, eight tuning scenes have
-        .011 [.001, .020] less quality.)
+        pixels of one object have readings of another.
         """
         motions = self.division.divide(clip)
         distinct = {id(h): h for h in proposed.particles}
@@ -232,21 +236,10 @@ class PartitionUpdate(Update):
         total, scores = scored(self.evidence, built, clip)
         return Population(built, log_weights + total, parents, {**notes, "scores": scores})
 
-    def _parts(
-        self,
-        rng: np.random.Generator,
-        segments: np.ndarray,
-        past: np.ndarray,
-        prediction: Hypothesis,
-        refined: Hypothesis,
-        right: float,
-        few: float,
-    ) -> list[_Part]:
-        """The objects of a candidate, from the segment and the predicted object (m,) of each reading, 0 is none.
-
-        `right` is the probability of the prediction.
-        """
-        past = np.where(segments > 0, past, 0)
+    def _parts(self, rng: np.random.Generator, segments: np.ndarray, known: _Past, few: float) -> list[_Part]:
+        """The objects of a candidate, from the segment (m,) of each reading, 0 is none, and from a prediction."""
+        prediction, refined = known.prediction, known.refined
+        past = np.where(segments > 0, known.objects, 0)
         shape = int(segments.max(initial=0)) + 1, int(past.max(initial=0)) + 1
         shared = np.bincount(segments * shape[1] + past, minlength=shape[0] * shape[1]).reshape(shape)
         main = np.append(0, shared[1:, 1:].argmax(axis=1) + 1) if shape[1] > 1 else np.zeros(shape[0], int)
@@ -273,7 +266,7 @@ class PartitionUpdate(Update):
             parts += [_Part(owner == b, (record_of[b],)) for b in of_past if (owner == b).any()]
         before, after = prediction.volumes(), Counter(prediction.labels[refined.labels > 0].tolist())
         kept = {k: (after[k] / max(before[k], 1)) ** self.quality_exponent for k in record_of if k not in seen}
-        hidden = [k for k, share in kept.items() if rng.random() < right * share]
+        hidden = [k for k, share in kept.items() if rng.random() < known.right * share]
         return parts + [_Part(segments < 0, (record_of[k],), _left(prediction, refined, k)) for k in hidden]
 
     def _complete(

@@ -13,7 +13,7 @@ from mstfilter.completion import Completion, Extrude, SurfaceOnly
 from mstfilter.errors import InputError
 from mstfilter.fusion import PartitionUpdate
 from mstfilter.fusion.cells import Cells, PairEvidence
-from mstfilter.fusion.partition import Readings
+from mstfilter.fusion.partition import Readings, _Past
 from mstfilter.scene import Clip, Hypothesis, Occupancy
 from mstfilter.segmentation import hypothesis_of
 from mstfilter.smc import Population
@@ -192,7 +192,7 @@ def test_which_objects_a_segment_continues(segments, past, continued):
     prediction = Hypothesis.from_labels(labels, GRID)
     past = np.array(past + [0] * (len(segments) - len(past)))
     parts = PartitionUpdate()._parts(
-        np.random.default_rng(0), np.array(segments), past, prediction, prediction, right=1.0, few=20
+        np.random.default_rng(0), np.array(segments), _Past(past, prediction, prediction, 1.0), few=20
     )
     seen = [part for part in parts if part.readings.any()]
     assert [[record.label for record in part.continues] for part in seen] == continued
