@@ -6,7 +6,7 @@
 
 **Earlier frames.** The views of an object are moved with it, and read at the nearest voxel. Its surface, the space
 behind it and the space that was free around it are evidence about its shape for ever; other objects and the space
-that they hid are not, since they may have moved. The latest frame decides where it measures the object's surface.
+that they hid are not, since they may have moved. The latest frame decides where it measures the object's surface, and a voxel around it.
 """
 
 from __future__ import annotations
@@ -27,8 +27,7 @@ _REACH = 4.0  # voxels, distance from the surface at which `signed` saturates
 _OWN, _FREE, _BEHIND = np.uint8(1), np.uint8(4), np.uint8(8)  # bits of a view
 _SHAPE = _OWN | _FREE | _BEHIND  # those that are evidence about the object's shape
 
-# Shares at which the latest frame refutes a view: of its surface that is seen free, of the surface seen now that was
-# free in it, and of its surface that is seen now.
+# Shares that refute a view: of its surface now free, of the surface now that was free in it, of its surface seen now.
 _CLEARED, _PIERCED, _SEEN = 0.2, 0.15, 0.05
 _CLEAR = 1.0  # voxels: space of an earlier frame is free if it lay this far in front of the surface
 
@@ -162,7 +161,7 @@ def recall(
     if not views:
         return seen
     shape = seen.surface.shape
-    near = binary_dilation(seen.surface).ravel()
+    near = binary_dilation(seen.surface)  # an earlier surface there is the same one, seen with noise
     centres = grid.centre_of(np.indices(shape).reshape(3, -1).T + offset)
     bits: np.ndarray = np.zeros(len(centres), np.uint8)
     signed = np.full(len(centres), np.nan, np.float32)
@@ -173,13 +172,13 @@ def recall(
         distance = decode_signed(view.signed[at])
         found = view.bits[at] & _SHAPE
         clear = np.where(distance > -_CLEAR, found & (_OWN | _BEHIND), found)
-        if refute and _contradicts(clear, seen, near, inside):
+        if refute and _contradicts(clear, seen, near.ravel(), inside):
             continue
         bits[inside] |= clear
         signed[inside] = np.fmin(signed[inside], np.where(found > 0, distance, np.nan))
     bits = bits.reshape(shape)
     free = seen.free | (((bits & _FREE) > 0) & ~seen.surface)
-    surface = (seen.surface | ((bits & _OWN) > 0)) & ~free
+    surface = (seen.surface | (((bits & _OWN) > 0) & ~near)) & ~free
     behind = (seen.behind | ((bits & _BEHIND) > 0)) & ~free
     other, hidden = seen.other_surface & ~free & ~surface, seen.hidden & ~free & ~behind
     return ObservedBox(

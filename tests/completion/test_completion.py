@@ -266,6 +266,11 @@ def test_views_are_recalled_where_the_object_is_now():
     both = recall(now, low, GRID, [moved])
     assert (both.surface >= now.surface).all() and (both.free >= now.free).all()
     assert not (both.free & both.surface).any() and not (both.other_surface > now.other_surface).any()
+    # The same view once more, from a motion that is wrong by a voxel, does not make the surface thicker.
+    [(_, latest)] = rule.complete_again(rng, frames[1], [(again, ())], GRID)
+    off = latest.moved(RigidTransform.from_translation([0, GRID.voxel_size, 0]))
+    assert not (view_surface(off, GRID)[:, None] == np.argwhere(now.surface) + low).all(axis=2).any(axis=1).all()
+    assert (recall(now, low, GRID, [off]).surface <= now.surface).all()
     # Moved back to where it was, all of the evidence about the object is what it was.
     start, first = observed_box(frames[0], mask, GRID, rule)
     blind = replace(first, **{k: np.zeros_like(getattr(first, k)) for k in ("surface", "free", "behind", "hidden")})
