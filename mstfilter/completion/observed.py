@@ -6,7 +6,7 @@
 
 **Earlier frames.** The views of an object are moved with it, and read at the nearest voxel. Its surface, the space
 behind it and the space that was free around it are evidence about its shape for ever; other objects and the space
-that they hid are not, since they may have moved. The latest frame decides where it measures the object's surface, and a voxel around it.
+that they hid are not, since they may have moved. The latest frame decides where it measures the object's surface.
 """
 
 from __future__ import annotations
@@ -27,7 +27,8 @@ _REACH = 4.0  # voxels, distance from the surface at which `signed` saturates
 _OWN, _FREE, _BEHIND = np.uint8(1), np.uint8(4), np.uint8(8)  # bits of a view
 _SHAPE = _OWN | _FREE | _BEHIND  # those that are evidence about the object's shape
 
-# Shares that refute a view: of its surface now free, of the surface now that was free in it, of its surface seen now.
+# Shares at which the latest frame refutes a view: of its surface that is seen free, of the surface seen now that was
+# free in it, and of its surface that is seen now.
 _CLEARED, _PIERCED, _SEEN = 0.2, 0.15, 0.05
 _CLEAR = 1.0  # voxels: space of an earlier frame is free if it lay this far in front of the surface
 
