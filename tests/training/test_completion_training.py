@@ -123,8 +123,8 @@ def test_training_learns_resumes_and_is_used(tmp_path):
         loss -= inside.sum() * (p * np.log(p) + (1 - p) * np.log(1 - p)) / unknown.sum()
     lines = [line.split(",") for line in (tmp_path / "a/curves.csv").read_text().split()]
     assert float(lines[-1][lines[0].index("log_loss")]) < loss
-    # The test samples are those of one scene, and the IoU there changes with rounding (.31 to .36 for .39 to .41). The
-    # weights of the package are compared by IoU in tests/completion/test_shipped.py.
+    # The test samples are those of one scene. The IoU there changes with rounding: .31 to .36, for .39 to .41.
+    # tests/completion/test_shipped.py compares the weights of the package by IoU.
     assert figures["iou"] > 0.5 * figures["iou_extrude"]
 
     run_script("completion/compare.py", tmp_path / "a", "--most", 6, "--out", tmp_path / "out")
