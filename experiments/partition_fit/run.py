@@ -35,10 +35,14 @@ from mstfilter.smc import Key
 N_SAMPLES, N_PAIRS, REACH = 30, 4000, 40
 SMALL = {"width": 160, "height": 120, "n_actions": 1}
 PASTS = ("video", "two frames", "stranger")
-#: Columns of the regression for each model, and whether the past is taken to be right. The last model has the
-#: coefficients of the first for a wrong past.
-MODELS = {"image": ((0, 1), False), "past": ((2, 4, 5), True), "both, past right": ((2, 3, 4, 5), True)}
-BOTH = "both"
+#: Columns of the regression that each model fits, and the probability that the past is right (None: as measured). The
+#: last model has the coefficients of the first for a wrong past.
+MODELS: dict[str, tuple[Sequence[int], float | None]] = {
+    "image": ((0, 1), 0.0),
+    "past": ((2, 4, 5), 1.0),
+    "both, past right": ((2, 3, 4, 5), 1.0),
+    "both": ((2, 3, 4, 5), None),
+}
 NAMES = ("alone_constant", "alone_image", "constant", "image", "past", "past_constant")
 
 
@@ -109,11 +113,11 @@ def _drawn(
     return first, second, owner[first] == owner[second]
 
 
-def design(pairs: np.ndarray, right: bool) -> np.ndarray:
+def design(pairs: np.ndarray, right: float | None) -> np.ndarray:
     """Columns (m, 6) of the regression, in the order of the fields of `PairEvidence`."""
     image, share, explained, past, _ = pairs.T
-    if right:
-        explained, past = explained / past, np.ones(len(past))
+    if right is not None:
+        explained, past = right * explained / past, np.full(len(past), right)
     logit = softened_logit(image)
     return np.stack(
         [1 - past, (1 - past) * logit, past, past * logit, explained * softened_logit(share), explained], axis=1
@@ -137,26 +141,20 @@ def fits(scenes: Iterable[np.ndarray]) -> dict[str, np.ndarray]:
     pairs = np.concatenate(list(scenes))
     y, found = pairs[:, -1], {}
     for name, (columns, right) in MODELS.items():
-        x = design(pairs, right)
-        if name == "image":
-            x[:, :2] = x[:, :2] + x[:, 2:4]
-        found[name] = fit(x, y, columns, np.zeros(6))
-    start = np.where(np.arange(6) < 2, found["image"], found["both, past right"])
-    found[BOTH] = fit(design(pairs, False), y, (2, 3, 4, 5), start)
+        known = np.zeros(6) if right is not None else found["image"] + found["both, past right"]
+        found[name] = fit(design(pairs, right), y, columns, known)
     return found
 
 
 def loss(name: str, coefficients: np.ndarray, pairs: np.ndarray) -> float:
     """The mean log loss of a model, in nats."""
-    x = design(pairs, name != BOTH)
-    if name == "image":
-        x[:, :2] = x[:, 2:4]
+    x = design(pairs, MODELS[name][1])
     return float(np.logaddexp(0, -(2 * pairs[:, -1] - 1) * (x @ coefficients)).mean())
 
 
 def table(scenes: dict[str, dict[str, np.ndarray]]) -> list[dict[str, str]]:
     """A row for each model: coefficients of all scenes, mean log loss of scenes that were left out, by past."""
-    losses: dict[str, list[list[float]]] = {name: [] for name in (*MODELS, BOTH)}
+    losses: dict[str, list[list[float]]] = {name: [] for name in MODELS}
     for left, of_past in scenes.items():
         others = [scene for scene in scenes if scene != left] or [left]
         for name, b in fits(scenes[scene]["video"] for scene in others).items():
