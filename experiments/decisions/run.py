@@ -16,7 +16,8 @@ as they come. lost: objects that have left. entropy: of the segmentation, in nat
 On the first `--regret` scenes of a family all candidates are tried at every push of the random policy: `best` is
 the coverage after the best one, and the regret of a policy is the best coverage minus that of its choice.
 
-Finished scenes are not run again. summary.csv has the differences to the random policy, paired by scene.
+Finished scenes are not run again; with `--scenes 0` the tables are made of those. summary.csv has the differences to
+the random policy, paired by scene; decisions.png has the means.
 """
 
 from __future__ import annotations
@@ -43,6 +44,7 @@ from mstfilter.statistics import compare_arms, conclusion
 N_PUSHES, N_CANDIDATES = 6, 12
 #: Eight frames a clip instead of fifteen halve the time of the study.
 CHANGES = {"frames_per_clip": 8, "fps": 2.5}
+SCORES = ("coverage", "quality", "information", "brier", "log_loss", "lost")
 SMALL = {"width": 96, "height": 72, "frames_per_clip": 6, "voxel_size": 0.02, "supersample": 1}
 
 
@@ -137,28 +139,59 @@ def read_rows(folder: Path) -> list[dict[str, Any]]:
     return rows
 
 
-def _scenes(rows: list[dict[str, Any]]) -> list[str]:
-    return list(dict.fromkeys(row["scene"] for row in rows))
-
-
 def summarise(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Differences to the random policy by family, score and number of pushes; the mean over k >= 1 is named "all"."""
-    found = []
+    """Differences to the random policy by family, score and number of pushes; "all": all families, the mean over k.
+
+    The regret of all policies is that at the scenes which the random policy made.
+    """
     last = max(row["k"] for row in rows)
-    for family in dict.fromkeys(row["family"] for row in rows):
-        for score in ("coverage", "quality", "information", "brier", "log_loss", "lost"):
-            for name, chosen in (("all", range(1, last + 1)), (str(last), [last])):
-                table: dict[str, dict[str, float]] = {}
-                for policy in POLICIES:
-                    own = [row for row in rows if (row["family"], row["policy"]) == (family, policy)]
-                    of = {s: [r[score] for r in own if r["scene"] == s and r["k"] in chosen] for s in _scenes(own)}
-                    table[policy] = {scene: float(np.mean(values)) for scene, values in of.items()}
+    pushes = {"all": range(1, last + 1), **{str(k): [k] for k in sorted({min(4, last), last})}}
+    found = []
+    for family in ("all", *dict.fromkeys(row["family"] for row in rows)):
+        own = [row for row in rows if family in ("all", row["family"])]
+        for score in (*SCORES, "regret"):
+            for name, chosen in pushes.items():
+                table = {policy: _by_scene(own, policy, score, chosen) for policy in POLICIES}
                 for policy, d in compare_arms(table, "random").items():
                     row = {"family": family, "score": score, "pushes": name, "policy": policy, "n": d.n}
                     row["random"] = float(np.mean(list(table["random"].values())))
                     row |= {"difference": d.mean, "low": d.low, "high": d.high, "p_holm": d.p_holm}
                     found.append({**row, "conclusion": conclusion(d, policy, "random", f"{family}, {score}")})
     return found
+
+
+def _by_scene(rows: list[dict[str, Any]], policy: str, score: str, pushes: Sequence[int]) -> dict[str, float]:
+    """Mean of a score over numbers of pushes, by scene."""
+    found: dict[str, list[float]] = {}
+    name, plays = (f"regret {policy}", "random") if score == "regret" else (score, policy)
+    for row in rows:
+        if row["policy"] == plays and row["k"] in pushes and name in row:
+            found.setdefault(row["scene"], []).append(row[name])
+    return {scene: float(np.mean(values)) for scene, values in found.items()}
+
+
+def draw(rows: list[dict[str, Any]], path: Path) -> None:
+    """Coverage, information and quality against the number of pushes, means over all scenes."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot as plt
+
+    plt.style.use("mstfilter.report.figures")
+    titles = {
+        "coverage": "coverage of the first objects (higher is better)",
+        "information": "information, nats (lower is better)",
+        "quality": "quality (higher is better)",
+    }
+    figure, axes = plt.subplots(1, 3, figsize=(11, 3.2))
+    pushes = sorted({row["k"] for row in rows})
+    for axis, (score, title) in zip(axes, titles.items(), strict=True):
+        for policy in POLICIES:
+            means = [np.mean(list(_by_scene(rows, policy, score, [k]).values())) for k in pushes]
+            axis.plot(pushes, means, "o-", label=policy)
+        axis.set(xlabel="pushes", title=title, xticks=pushes)
+    axes[0].legend()
+    figure.savefig(path, dpi=120)
 
 
 def main() -> None:
@@ -188,6 +221,7 @@ def main() -> None:
     rows = read_rows(chosen.out / "scenes")
     write_csv(chosen.out / "runs.csv", rows, dict.fromkeys(k for row in rows for k in row), float_format=".5g")
     write_csv(chosen.out / "summary.csv", summarise(rows), float_format=".4g")
+    draw(rows, chosen.out / "decisions.png")
 
 
 if __name__ == "__main__":
