@@ -38,14 +38,16 @@ def one_hypothesis(rng: np.random.Generator, belief: Belief, pushes: Sequence[Fi
 
 def least_sure(rng: np.random.Generator, belief: Belief, pushes: Sequence[FingerPush]) -> int:
     """The push that touches the least sure object of the estimate: the lowest mean probability that two voxels of it
-    belong together."""
-    labels = belief.estimate().labels
+    belong together, given that both are occupied."""
+    labels, occupancy = belief.estimate().labels, belief.occupancy()
     numbers = [k for k in np.unique(labels) if k > 0]
     doubt = {}
     for k in numbers:
         voxels = np.argwhere(labels == k)
         pairs = rng.integers(len(voxels), size=(2, 500))
-        doubt[k] = 1 - float(belief.same_object(voxels[pairs[0]], voxels[pairs[1]]).mean())
+        first, second = voxels[pairs]
+        occupied = np.minimum(occupancy[tuple(first.T)], occupancy[tuple(second.T)])
+        doubt[k] = 1 - float((belief.same_object(first, second) / occupied).mean())
     touched = [_touched(labels, push.swept(belief.grid)) for push in pushes]
     return _largest(rng, [max((doubt[k] for k in found), default=0.0) for found in touched])
 

@@ -99,7 +99,10 @@ def play(family: str, seed: int, regret: bool, small: bool) -> tuple[list[dict[s
 def _regret(
     mst: ParticleFilter, loop: PushLoop, state: State, pushes: Sequence[FingerPush], key: Sequence[int]
 ) -> dict[str, float]:
-    """The coverage after the best of all candidates, and what the choice of each policy stays below it."""
+    """The coverage after the best of all candidates, and what the choice of each policy stays below it.
+
+    That of the random policy is the mean over all candidates.
+    """
     saved, outcomes = loop.save(), []
     for push in pushes:
         after, _ = mst.step(state, loop.play(push))
@@ -107,7 +110,8 @@ def _regret(
         loop.restore(saved)
     belief, best = Belief(state.population), max(outcomes)
     chosen = {name: choose(np.random.default_rng(key), belief, pushes) for name, choose in POLICIES.items()}
-    return {"best": best, **{f"regret {name}": best - outcomes[k] for name, k in chosen.items()}}
+    regrets = {f"regret {name}": best - outcomes[k] for name, k in chosen.items()}
+    return {"best": best, **regrets, "regret random": best - float(np.mean(outcomes))}
 
 
 def run(arguments: tuple[Any, ...]) -> str:
