@@ -1,15 +1,11 @@
-"""Fits `PartitionUpdate.temperature` and `PartitionUpdate.occupied_log_odds` to tuning scenes.
+"""Fits `PartitionUpdate.occupied_log_odds` to tuning scenes.
 
     python experiments/partition_fit/calibration.py [--seeds 5] [--smoke --out FOLDER]
 
-`mst` runs with temperature 1 and no added log odds.
-
-Temperature: of each component with several alternatives, the log weights of the alternatives, and which of them agree
-best with the truth. The loss is the mean negative log probability of the best ones.
-
-Log odds: for the questions of each pause (`mstfilter.scoring.ask`), the probabilities of the two voxels in every
-hypothesis. The loss is the mean of two log losses of forecasts as they come: "is the first voxel occupied?" and "do
-both belong to one object?". Each scene is scored with the value of least loss on the other scenes.
+`mst` runs with no added log odds. For the questions of each pause (`mstfilter.scoring.ask`), the probabilities of the
+two voxels in every hypothesis are kept. The loss is the mean of two log losses of forecasts as they come: "is the
+first voxel occupied?" and "do both belong to one object?". Each scene is scored with the value of least loss on the
+others.
 
 scenes/*.npz: what is kept of one scene (finished scenes are not run again). calibration.csv: losses in nats and
 calibration errors for each value. reliability.png: how often forecasts come true, without and with the default of
@@ -19,50 +15,26 @@ calibration errors for each value. reliability.png: how often forecasts come tru
 from __future__ import annotations
 
 import argparse
-from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
-from scipy.special import expit, logit, logsumexp
+from scipy.special import expit, logit
 
 import mstfilter
 from mstfilter.files import write_csv
 from mstfilter.forecasts import SOFTENING, ForecastTable
-from mstfilter.fusion import Cells, PairOdds, PartitionUpdate
-from mstfilter.oracles import bind_truth
-from mstfilter.oracles.stages import TruePairs
-from mstfilter.scene import Clip
+from mstfilter.fusion import PartitionUpdate
 from mstfilter.scoring import ask
 from mstfilter.simulation import cached_recording
 
-TEMPERATURES = (0.5, 1.0, 1.25, 1.5, 2.0, 3.0, 4.0)
 LOG_ODDS = (0.0, 0.2, 0.4, 0.5, 0.6, 0.8, 1.0)
 SMALL = {"width": 160, "height": 120, "n_actions": 1}
 
 
-@dataclass(frozen=True)
-class Recorder(PairOdds):
-    """The odds of `pairs`; keeps the alternatives' log weights and those by the truth."""
-
-    pairs: PairOdds
-    true: TruePairs
-    kept: list = field(default_factory=list)
-
-    def log_odds(self, cells: Cells, weights: np.ndarray, clip: Clip) -> np.ndarray:
-        odds, true = self.pairs.log_odds(cells, weights, clip), self.true.log_odds(cells, weights, clip)
-        for inside, partitions in cells.alternatives():
-            if len(partitions) > 1:
-                score, best = (cells.scores(one, inside, partitions) for one in (odds, true))
-                self.kept.append((score, best >= best.max() - 1e-6))
-        return odds
-
-
 def of_scene(family: str, seed: int, small: bool) -> dict[str, np.ndarray]:
-    """What is kept of a scene: components (`score`, `best`, `component`) and questions (`p`, `same`, `truth`)."""
+    """Of every question: probabilities of its voxels, whether hypotheses give them to one object, and the answer."""
     recording = mstfilter.open_recording(cached_recording(family, seed, **(SMALL if small else {})))
-    filter = mstfilter.preset("mst", "update.temperature=1.0", "update.occupied_log_odds=0.0")
-    recorder = Recorder(filter.update.pairs, bind_truth(TruePairs(), recording))
-    filter = replace(filter, update=replace(filter.update, pairs=recorder))
+    filter = mstfilter.preset("mst", "update.occupied_log_odds=0.0")
     state, p, same, truth = filter.start(0), [], [], []
     for t, clip in enumerate(recording.clips()):
         state, _ = filter.step(state, clip)
@@ -77,23 +49,10 @@ def of_scene(family: str, seed: int, small: bool) -> dict[str, np.ndarray]:
         same.append((owner[:, a] == owner[:, b]) & (owner[:, a] > 0))
         truth.append(np.stack([true.ravel()[a] > 0, questions.outcomes(true)[::4]]))
     return {
-        "score": np.concatenate([np.zeros(0), *(score for score, _ in recorder.kept)]),
-        "best": np.concatenate([np.zeros(0, bool), *(best for _, best in recorder.kept)]),
-        "component": np.repeat(np.arange(len(recorder.kept)), [len(score) for score, _ in recorder.kept]),
         "p": np.concatenate(p, axis=2),
         "same": np.concatenate(same, axis=1),
         "truth": np.concatenate(truth, axis=1),
     }
-
-
-def temperature_loss(scene: dict[str, np.ndarray], temperature: float) -> float:
-    """Mean negative log probability of the best alternatives."""
-    losses = []
-    for k in np.unique(scene["component"]):
-        inside = scene["component"] == k
-        score = scene["score"][inside] / temperature
-        losses.append(logsumexp(score) - logsumexp(score[scene["best"][inside]]))
-    return float(np.mean(losses)) if losses else 0.0
 
 
 def forecasts(scene: dict[str, np.ndarray], log_odds: float) -> np.ndarray:
@@ -159,15 +118,10 @@ def main() -> None:
                 np.savez_compressed(path, **of_scene(family, seed, chosen.smoke))
                 print(path.stem, flush=True)
             scenes.append(dict(np.load(path)))
-    by_temperature = np.array([[temperature_loss(scene, T) for T in TEMPERATURES] for scene in scenes])
     by_log_odds = np.array(
         [[[t.log_loss(SOFTENING) for t in tables([scene], a)] for a in LOG_ODDS] for scene in scenes]
     )
-    rows = [
-        {"field": "temperature", "value": f"{T}", "loss": f"{loss:.4f}"}
-        for T, loss in zip(TEMPERATURES, by_temperature.mean(axis=0), strict=True)
-    ]
-    rows.append({"field": "temperature", "value": "held out", "loss": f"{held_out(by_temperature):.4f}"})
+    rows: list[dict[str, str]] = []
     for k, a in enumerate(LOG_ODDS):
         occupied, same = by_log_odds[:, k].mean(axis=0)
         errors = [table.reliability(15).error for table in tables(scenes, a)]

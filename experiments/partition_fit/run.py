@@ -1,13 +1,14 @@
-"""How much do samples and predictions say about two pixels? Fits `mstfilter.fusion.cells.PairEvidence`.
+"""How much do samples and predictions say about two cells? Fits `mstfilter.fusion.cells.PairEvidence`.
 
     python experiments/partition_fit/run.py [--seeds 3] [--smoke --out FOLDER]
 
-`mst` runs on tuning scenes of `s1`, `s2`, `s3`. At each pause t >= 1, 4,000 pairs of readings of objects, up to 40
-pixels apart, are drawn. Of each pair: the share of 30 samples of the image, and the weighted share of the predictions
-that explain both readings, in which they belong to one object; and whether they do in truth. There are three pasts of
-a pause: the hypotheses of the pause before, moved along the video; the same, moved by the first and the last frame
-only; and the hypotheses of another scene. A logistic regression gives the log odds of "one object". It is fitted with
-the first past, and scored with all three. Each scene is scored with the coefficients of the other scenes.
+`mst` runs on tuning scenes of `s1`, `s2`, `s3`. At each pause t >= 1, `PartitionUpdate` compares 30 samples of the
+image with the predictions, and asks for the log odds that two cells belong to one object. Of each pair of cells that
+it asks about, the terms of `PairEvidence.terms` are kept, the share of the pairs of readings of both cells that show
+one object in truth, and the number of these pairs as its weight. There are three pasts of a pause: the hypotheses of
+the pause before, moved along the video; the same, moved by the first and the last frame only; and the hypotheses of
+another scene. A logistic regression is fitted with the first past, and scored with all three. All pauses count alike.
+Each scene is scored with the coefficients of the other scenes.
 
 pairs/*.npz: the pairs of one scene (finished scenes are not run again). fit.csv: coefficients and log losses in nats.
 """
@@ -16,25 +17,24 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 from scipy.optimize import minimize
 
 import mstfilter
+from mstfilter.completion import SurfaceOnly
 from mstfilter.files import write_csv
-from mstfilter.fusion.cells import softened_logit
-from mstfilter.fusion.free_space import log_quality
-from mstfilter.fusion.partition import Readings
+from mstfilter.fusion import Cells, PairEvidence, PairOdds
 from mstfilter.oracles.truth import RecordingTruth
 from mstfilter.scene import Clip
 from mstfilter.simulation import cached_recording
 from mstfilter.smc import Key
 
-N_SAMPLES, N_PAIRS, REACH = 30, 4000, 40
 SMALL = {"width": 160, "height": 120, "n_actions": 1}
 PASTS = ("video", "two frames", "stranger")
+NAMES = ("alone_constant", "alone_image", "constant", "image", "past", "past_constant")
 #: Columns of the regression that each model fits, and the probability that the past is right (None: as measured). The
 #: last model has the coefficients of the first for a wrong past.
 MODELS: dict[str, tuple[Sequence[int], float | None]] = {
@@ -43,7 +43,26 @@ MODELS: dict[str, tuple[Sequence[int], float | None]] = {
     "both, past right": ((2, 3, 4, 5), 1.0),
     "both": ((2, 3, 4, 5), None),
 }
-NAMES = ("alone_constant", "alone_image", "constant", "image", "past", "past_constant")
+
+
+@dataclass(frozen=True)
+class Recorder(PairOdds):
+    """Keeps the terms of all pairs, their weights, and the shares of their pairs of readings that show one object."""
+
+    instance: np.ndarray  #: (H, W) true object of each pixel, 0 is none
+    kept: list[np.ndarray] = field(default_factory=list)
+
+    def log_odds(self, cells: Cells, weights: np.ndarray, clip: Clip) -> np.ndarray:
+        terms = PairEvidence().terms(cells, weights)
+        owner = self.instance.ravel()[cells.pixels]
+        known = (cells.of_reading >= 0) & (owner > 0)
+        counts = np.zeros((len(cells.sizes), int(self.instance.max()) + 1))
+        np.add.at(counts, (cells.of_reading[known], owner[known]), 1)
+        a, b = cells.pairs.T
+        of_pair = counts[a].sum(axis=1) * counts[b].sum(axis=1)
+        same = np.divide((counts[a] * counts[b]).sum(axis=1), of_pair, out=np.zeros(len(a)), where=of_pair > 0)
+        self.kept.append(np.column_stack([terms, same, of_pair / max(of_pair.sum(), 1)]))
+        return np.zeros(len(a))
 
 
 def without_video(clip: Clip) -> Clip:
@@ -53,14 +72,13 @@ def without_video(clip: Clip) -> Clip:
 
 
 def pairs_of(family: str, seed: int, n_scenes: int, small: bool) -> dict[str, np.ndarray]:
-    """(m, 5) for each past: shares of the samples and of the predictions, weight of the predictions that explain both
-    readings, of all predictions, truth."""
+    """(m, 8) for each past: six terms, the share of "one object", the weight."""
     change = SMALL if small else {}
     recording, other = (
         mstfilter.open_recording(cached_recording(family, k, **change)) for k in (seed, (seed + 1) % n_scenes)
     )
     truth, filter = RecordingTruth(recording), mstfilter.preset("mst")
-    rows: dict[str, list[np.ndarray]] = {past: [] for past in PASTS}
+    rows: dict[str, list[np.ndarray]] = {past: [np.zeros((0, 8))] for past in PASTS}
     state, foreign = filter.start(0), filter.start(0)
     for t, (clip, other_clip) in enumerate(zip(recording.clips(), other.clips(), strict=False)):
         before, before_foreign = state.population, foreign.population
@@ -69,87 +87,54 @@ def pairs_of(family: str, seed: int, n_scenes: int, small: bool) -> dict[str, np
         if not t:
             continue
         rng = Key(seed).child(t).generator()
-        readings = Readings.of(clip.after, clip.grid)
-        tree, values = filter.proposal.tree_of(clip.after)
-        cuts = filter.proposal.sampler.sample(rng, tree, values, N_SAMPLES).cuts
-        images = [filter.proposal.objects.label_image(tree, cut, clip.after, clip.grid) for cut in cuts]
-        samples = np.stack([image.ravel()[readings.pixels] for image in images])
-        a, b, same = _drawn(rng, readings, samples, truth.instance(t))
-        if not len(a):
-            continue
-        image = np.mean((samples[:, a] == samples[:, b]) & (samples[:, a] > 0), axis=0)
+        proposed = filter.proposal.sample(rng, clip, filter.n_proposed)
         of_past = zip(PASTS, (before, before, before_foreign), (clip, without_video(clip), clip), strict=True)
         for name, population, seen in of_past:
+            recorder = Recorder(truth.instance(t))
             predicted = filter.transition.predict(rng, population, seen)
-            quality = filter.update.free_space.refine(predicted.particles, seen)[1]
-            weights = predicted.weights * np.exp(filter.update.quality_exponent * log_quality(quality))
-            past = np.stack([readings.labels(h.labels, filter.update.reach) for h in predicted.particles])
-            explained = (past[:, a] > 0) & (past[:, b] > 0)
-            weight, agreeing = weights @ explained, weights @ (explained & (past[:, a] == past[:, b]))
-            share = np.divide(agreeing, weight, out=np.full(len(a), 0.5), where=weight > 0)
-            rows[name].append(np.stack([image, share, weight, np.full(len(a), weights.sum()), same], axis=1))
-    return {name: np.concatenate(found) if found else np.zeros((0, 5)) for name, found in rows.items()}
-
-
-def _drawn(
-    rng: np.random.Generator, readings: Readings, samples: np.ndarray, instance: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Pairs of readings of objects (m,), (m,), and whether they show one object."""
-    owner = instance.ravel()[readings.pixels]
-    objects = np.flatnonzero((np.mean(samples > 0, axis=0) > 0.5) & (owner > 0))
-    if len(objects) < 2:
-        return objects[:0], objects[:0], owner[:0]
-    size = np.array(instance.shape)
-    place = np.full(instance.size, -1)
-    place[readings.pixels[objects]] = objects
-    first = rng.choice(objects, N_PAIRS)
-    pixel = np.stack(np.divmod(readings.pixels[first], size[1]), axis=1) + rng.integers(
-        -REACH, REACH + 1, (N_PAIRS, 2)
-    )
-    pixel = np.clip(pixel, 0, size - 1)
-    second = place[pixel[:, 0] * size[1] + pixel[:, 1]]
-    kept = second >= 0
-    first, second = first[kept], second[kept]
-    return first, second, owner[first] == owner[second]
+            update = replace(filter.update, pairs=recorder, completer=SurfaceOnly())
+            update.update(rng, predicted, proposed, seen)
+            rows[name] += recorder.kept
+    return {name: np.concatenate(found) for name, found in rows.items()}
 
 
 def design(pairs: np.ndarray, right: float | None) -> np.ndarray:
     """Columns (m, 6) of the regression, in the order of the fields of `PairEvidence`."""
-    image, share, explained, past, _ = pairs.T
-    if right is not None:
-        explained, past = right * explained / past, np.full(len(past), right)
-    logit = softened_logit(image)
-    return np.stack(
-        [1 - past, (1 - past) * logit, past, past * logit, explained * softened_logit(share), explained], axis=1
-    )
+    terms = pairs[:, :6]
+    if right is None:
+        return terms
+    logit, past = terms[:, 1] + terms[:, 3], terms[:, 2]
+    of_past = right * terms[:, 4:] / np.maximum(past, 1e-9)[:, None]
+    alone, both = np.full(len(pairs), 1 - right), np.full(len(pairs), right)
+    return np.column_stack([alone, alone * logit, both, both * logit, of_past])
 
 
-def fit(x: np.ndarray, y: np.ndarray, columns: Sequence[int], known: np.ndarray) -> np.ndarray:
+def fit(x: np.ndarray, pairs: np.ndarray, columns: Sequence[int], known: np.ndarray) -> np.ndarray:
     """`known` coefficients (6,), with those of some columns chosen by the least log loss."""
-    coefficients, sign, chosen = known.copy(), 2 * y - 1, list(columns)
-    offset = x @ known - x[:, chosen] @ known[chosen]
+    coefficients, chosen = known.copy(), list(columns)
 
-    def loss(b: np.ndarray) -> float:
-        return float(np.logaddexp(0, -sign * (offset + x[:, chosen] @ b)).mean())
+    def objective(b: np.ndarray) -> float:
+        coefficients[chosen] = b
+        return log_loss(x @ coefficients, pairs)
 
-    coefficients[chosen] = minimize(loss, known[chosen], method="BFGS").x
+    coefficients[chosen] = minimize(objective, known[chosen], method="BFGS").x
     return coefficients
+
+
+def log_loss(log_odds: np.ndarray, pairs: np.ndarray) -> float:
+    """The weighted mean log loss in nats."""
+    same, weight = pairs[:, 6:].T
+    each = same * np.logaddexp(0, -log_odds) + (1 - same) * np.logaddexp(0, log_odds)
+    return float(weight @ each / weight.sum())
 
 
 def fits(scenes: Iterable[np.ndarray]) -> dict[str, np.ndarray]:
     """The coefficients (6,) of every model."""
-    pairs = np.concatenate(list(scenes))
-    y, found = pairs[:, -1], {}
+    pairs, found = np.concatenate(list(scenes)), {}
     for name, (columns, right) in MODELS.items():
         known = np.zeros(6) if right is not None else found["image"] + found["both, past right"]
-        found[name] = fit(design(pairs, right), y, columns, known)
+        found[name] = fit(design(pairs, right), pairs, columns, known)
     return found
-
-
-def loss(name: str, coefficients: np.ndarray, pairs: np.ndarray) -> float:
-    """The mean log loss of a model, in nats."""
-    x = design(pairs, MODELS[name][1])
-    return float(np.logaddexp(0, -(2 * pairs[:, -1] - 1) * (x @ coefficients)).mean())
 
 
 def table(scenes: dict[str, dict[str, np.ndarray]]) -> list[dict[str, str]]:
@@ -158,7 +143,8 @@ def table(scenes: dict[str, dict[str, np.ndarray]]) -> list[dict[str, str]]:
     for left, of_past in scenes.items():
         others = [scene for scene in scenes if scene != left] or [left]
         for name, b in fits(scenes[scene]["video"] for scene in others).items():
-            losses[name].append([loss(name, b, of_past[past]) for past in PASTS])
+            right = MODELS[name][1]
+            losses[name].append([log_loss(design(of_past[past], right) @ b, of_past[past]) for past in PASTS])
     rows = []
     for name, b in fits(found["video"] for found in scenes.values()).items():
         row = {"evidence": name, "scenes": str(len(scenes))}

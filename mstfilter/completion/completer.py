@@ -251,16 +251,21 @@ def occupancy_of(
     """The probabilities of the completions of one hypothesis; None if all are 0 or 1.
 
     A voxel is free or belongs to one of the objects that claim it. The odds of an object against free space are those
-    of its completion. `labels` (X, Y, Z) are those of `arbitrate`; probabilities below `least` count as 0.
+    of its completion. `labels` (X, Y, Z) are those of `arbitrate`. Objects with fewer readings in a voxel than the
+    labelled one do not claim it, and probabilities below `least` count as 0.
     """
     if all(((one.probability == 0) | (one.probability == 1)).all() for one in completions):
         return None
     owner, best = labels.copy(), np.zeros(grid.shape, np.float32)
     total = np.ones(grid.shape, np.float32)
+    readings = np.zeros(grid.shape, np.int32)
+    for k, one in enumerate(completions):
+        own = labels[one.box] == k + 1
+        readings[one.box][own] = one.points[own]
     for k, one in enumerate(completions):
         box = one.box
         p = np.clip(one.probability, 0, 0.999)
-        odds = np.where(p >= least, p / (1 - p), 0).astype(np.float32)
+        odds = np.where((p >= least) & (one.points >= readings[box]), p / (1 - p), 0).astype(np.float32)
         total[box] += odds
         own, best_here = labels[box] == k + 1, best[box]
         more = (labels[box] == 0) & (odds > best_here)

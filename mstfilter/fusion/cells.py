@@ -1,13 +1,12 @@
 """The common refinement of several partitions of a depth image, and draws of partitions by its pairs of cells.
 
 >>> cells = Cells.of(pixels, shape, samples, predictions)
->>> log_odds = PairEvidence().log_odds(cells, weights, clip)      # (e,) of "one object" for neighbouring cells
+>>> log_odds = PairEvidence().log_odds(cells, weights, clip)      # (e,) of "one object"
 >>> labels = cells.draw(rng, log_odds, 20)                  # (20, K) object of each cell in each draw
 
-A cell is a set of readings that all partitions treat alike. The borders of a prediction are inexact, so it splits a
-cell of the samples only into parts of at least a quarter. For two neighbouring cells, the samples of the image and
-the predictions say in how many of them both belong to one object. If the past is right, the log odds of "same object"
-are
+A cell is a set of readings that all partitions treat alike. Cells that some partition joins form a component. For two
+cells of a component, the samples of the image and the predictions say in how many of them both belong to one object.
+If the past is right, the log odds of "same object" are
 
     l = constant + image logit(f_image) + past logit(f_past) + past_constant,
 
@@ -15,20 +14,20 @@ with shares f softened by 2 %; the last two terms count by the weight of the pre
 it is wrong, l = alone_constant + alone_image logit(f_image). The sum of the weights of the predictions, which is the
 probability that the past is right, mixes both. `experiments/partition_fit` fits the coefficients.
 
-Cells that some partition joins form a component. The alternatives of a component are the partitions that the samples
-and predictions give it. The weight of an alternative is the product over its pairs of neighbouring cells of the
-probability of "same" or "different", as the alternative has it. This is a heuristic: pairs on a cycle are not
-independent.
+The alternatives of a component are the partitions that the samples and the predictions give it. A cell that a
+prediction does not explain joins a predicted object as each sample has it. The probabilities of the alternatives are
+those whose probabilities of pairs are nearest to the fitted ones (least cross entropy over the pairs of readings).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
-from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
+from scipy.special import expit
 
 from mstfilter.fusion.interfaces import PairOdds
 from mstfilter.fusion.similarity import canonical
@@ -37,34 +36,40 @@ from mstfilter.smc import Systematic
 
 _SOFT = 0.02
 _REACH = 2  # pixels between two readings of neighbouring cells, at most
-_PART = 0.25  # share of a cell of the image that a prediction may split off
-LEAST = 20  # readings of a cell in an image of 640 x 480 pixels; smaller ones join a neighbour
+_LEAST_SHARE, _TOLERANCE, _STEPS = 1e-9, 1e-3, 200
+LEAST = 60  # readings of a cell, as `ObjectRule.min_points`; in an image of 640 x 480 pixels
 
 
 @dataclass(frozen=True)
 class PairEvidence(PairOdds):
     """Log odds by the shares of the samples and of the predictions in which two cells belong to one object."""
 
-    alone_constant: float = 0.47
-    alone_image: float = 0.74
-    constant: float = -0.34
+    alone_constant: float = -0.82
+    alone_image: float = 0.64
+    constant: float = -1.04
     image: float = 0.51
     past: float = 0.52
-    past_constant: float = 0.62
+    past_constant: float = 0.84
 
     def log_odds(self, cells: Cells, weights: np.ndarray, clip: Clip) -> np.ndarray:
+        fields = (self.alone_constant, self.alone_image, self.constant, self.image, self.past, self.past_constant)
+        return self.terms(cells, weights) @ np.array(fields)
+
+    def terms(self, cells: Cells, weights: np.ndarray) -> np.ndarray:
+        """What each field is multiplied by, (e, 6) in the order of the fields."""
         a, b = cells.pairs.T
-        image = np.mean((cells.samples[:, a] == cells.samples[:, b]) & (cells.samples[:, a] > 0), axis=0)
-        right, logit = weights.sum(), softened_logit(image)
-        found = (1 - right) * (self.alone_constant + self.alone_image * logit)
-        found = found + right * (self.constant + self.image * logit)
+        image = softened_logit(
+            np.mean((cells.samples[:, a] == cells.samples[:, b]) & (cells.samples[:, a] > 0), axis=0)
+        )
+        right, explained, share = weights.sum(), np.zeros(len(a)), np.full(len(a), 0.5)
         if len(cells.predictions):
             both = (cells.predictions[:, a] > 0) & (cells.predictions[:, b] > 0)
             explained = weights @ both
             same = weights @ (both & (cells.predictions[:, a] == cells.predictions[:, b]))
-            share = np.divide(same, explained, out=np.full(len(same), 0.5), where=explained > 0)
-            found = found + explained * (self.past * softened_logit(share) + self.past_constant)
-        return found
+            np.divide(same, explained, out=share, where=explained > 0)
+        alone, known = np.full(len(a), 1 - right), np.full(len(a), right)
+        past = explained * softened_logit(share)
+        return np.column_stack([alone, alone * image, known, known * image, past, explained])
 
 
 def softened_logit(p: np.ndarray) -> np.ndarray:
@@ -80,7 +85,8 @@ class Cells:
     of_reading: np.ndarray  #: (m,) cell of each reading, -1 for readings of no object
     samples: np.ndarray  #: (s, K) label of each cell in each sample
     predictions: np.ndarray  #: (n, K) label of each cell in each prediction, 0 is none
-    pairs: np.ndarray  #: (e, 2) neighbouring cells
+    component: np.ndarray  #: (K,) component of each cell
+    pairs: np.ndarray  #: (e, 2) cells of one component
 
     @classmethod
     def of(
@@ -98,7 +104,7 @@ class Cells:
         rows = np.stack([labels[kept] for labels in (*samples, *predictions)])
         code = _refinement(rows[: len(samples)])
         for row in rows[len(samples) :]:
-            row[:] = _snapped(code, row)
+            row[:] = _explained(code, row)
         code = _refinement(np.concatenate([code[None], rows[len(samples) :]]))
         code = _without_slivers(code, pixels[kept], shape)
         # Every cell has one label in each partition, but for the readings of slivers.
@@ -106,49 +112,88 @@ class Cells:
         labels = rows[:, np.array(example, np.int64)]
         of_reading = np.full(len(kept), -1)
         of_reading[kept] = code
-        pairs = _borders(code, pixels[kept], shape)[0]
-        return cls(pixels, of_reading, labels[: len(samples)], labels[len(samples) :], pairs)
+        same = (labels[:, :, None] == labels[:, None]) & (labels[:, :, None] > 0)
+        _, component = connected_components(same.any(axis=0), directed=False)
+        pairs = np.argwhere(np.triu(component[:, None] == component, 1))
+        return cls(pixels, of_reading, labels[: len(samples)], labels[len(samples) :], component, pairs)
+
+    @cached_property
+    def sizes(self) -> np.ndarray:
+        """Readings (K,) of each cell."""
+        return np.bincount(self.of_reading[self.of_reading >= 0], minlength=self.samples.shape[1])
 
     def alternatives(self) -> list[tuple[np.ndarray, np.ndarray]]:
         """Of each component its cells (k,) and its distinct partitions (p, k)."""
-        k = self.samples.shape[1]
-        every = np.concatenate([self.samples, self.predictions])
-        a, b = self.pairs.T
-        joined = ((every[:, a] == every[:, b]) & (every[:, a] > 0)).any(axis=0)
-        links = coo_array((np.ones(int(joined.sum())), (a[joined], b[joined])), shape=(k, k))
-        n, component = connected_components(links, directed=False)
         found = []
-        for c in range(n):
-            cells = np.flatnonzero(component == c)
-            rows = every[:, cells]  # a cell that a prediction does not explain is an object of its own
-            rows = np.where(rows > 0, rows, -1 - np.arange(len(cells)))
+        for c in range(int(self.component.max(initial=-1)) + 1):
+            cells = np.flatnonzero(self.component == c)
+            own = self.samples[:, cells]
+            samples = np.unique(np.where(own > 0, own, -1 - np.arange(len(cells))), axis=0)
+            rows = [*samples]
+            for past in np.unique(self.predictions[:, cells], axis=0):
+                rows += [past] if past.all() else [_filled(past, sample, self.sizes[cells]) for sample in samples]
             named = np.array([canonical(np.unique(row, return_inverse=True)[1] + 1) for row in rows])
             found.append((cells, np.unique(named, axis=0).astype(np.int64)))
         return found
 
-    def scores(self, log_odds: np.ndarray, cells: np.ndarray, partitions: np.ndarray) -> np.ndarray:
-        """Log weights (p,) of the partitions (p, k) of a component."""
-        place = np.full(self.samples.shape[1], -1)
-        place[cells] = np.arange(len(cells))
-        a, b = place[self.pairs].T
-        inside = (a >= 0) & (b >= 0)
-        same = partitions[:, a[inside]] == partitions[:, b[inside]]
-        sign = np.where(same, 1.0, -1.0)
-        return -np.logaddexp(0, -sign * log_odds[inside]).sum(axis=1)
+    def probabilities(self, log_odds: np.ndarray, cells: np.ndarray, partitions: np.ndarray) -> np.ndarray:
+        """Probabilities (p,) of the partitions (p, k) of a component."""
+        if len(partitions) == 1:
+            return np.ones(1)
+        inside = self.component[self.pairs[:, 0]] == self.component[cells[0]]
+        place = np.searchsorted(cells, self.pairs[inside])
+        joined = (partitions[:, place[:, 0]] == partitions[:, place[:, 1]]).astype(float)
+        weights = self.sizes[self.pairs[inside]].prod(axis=1).astype(float)
+        return _matched(joined, expit(log_odds[inside]), weights / weights.sum())
 
     def draw(self, rng: np.random.Generator, log_odds: np.ndarray, n: int) -> np.ndarray:
         """n partitions (n, K). Components are independent.
 
-        In each, the alternatives are drawn by systematic selection: as often as their weights say, up to rounding.
+        In each, the alternatives are drawn by systematic selection: as often as their probabilities say, up to
+        rounding.
         """
         drawn = np.zeros((n, self.samples.shape[1]), np.int64)
         used = 0
         for cells, partitions in self.alternatives():
-            score = self.scores(log_odds, cells, partitions)
-            chosen = rng.permutation(Systematic().select(rng, score, n)[0])
+            with np.errstate(divide="ignore"):
+                log_weights = np.log(self.probabilities(log_odds, cells, partitions))
+            chosen = rng.permutation(Systematic().select(rng, log_weights, n)[0])
             drawn[:, cells] = partitions[chosen] + used
             used += int(partitions.max())
         return drawn
+
+
+def _filled(past: np.ndarray, sample: np.ndarray, sizes: np.ndarray) -> np.ndarray:
+    """A prediction (k,) of cells of these sizes (k,), with objects for the cells that it does not explain.
+
+    Such a cell joins the predicted object with most readings in its segment of the sample (k,). Without one, the
+    segment is an object.
+    """
+    filled = past.copy()
+    for segment in np.unique(sample[past == 0]):
+        inside = sample == segment
+        readings = np.bincount(past[inside], sizes[inside])
+        readings[0] = 0
+        filled[inside & (past == 0)] = readings.argmax() or past.max() + 1 + np.flatnonzero(inside)[0]
+    return filled
+
+
+def _matched(joined: np.ndarray, same: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """The mixture (p,) of partitions that forecasts pairs best.
+
+    It has the least cross entropy between the probabilities `same` (e,) that the objects of a pair are one and the
+    total probability of the partitions that join the pair, `joined` (p, e); pairs count by `weights` (e,). The
+    problem is convex; this is expectation maximisation for the proportions of a mixture.
+    """
+    q = np.full(len(joined), 1 / len(joined))
+    for _ in range(_STEPS):
+        together = np.clip(q @ joined, _LEAST_SHARE, 1 - _LEAST_SHARE)
+        factor = joined @ (weights * same / together) + (1 - joined) @ (weights * (1 - same) / (1 - together))
+        q = q * factor
+        q /= q.sum()
+        if np.abs(factor - 1)[q > _LEAST_SHARE].max() < _TOLERANCE:
+            break
+    return q
 
 
 def _refinement(rows: np.ndarray) -> np.ndarray:
@@ -159,15 +204,19 @@ def _refinement(rows: np.ndarray) -> np.ndarray:
     return code
 
 
-def _snapped(cells: np.ndarray, labels: np.ndarray) -> np.ndarray:
-    """Labels (m,) without those that fill only a small part of a cell (m,), which get the most frequent label there.
+def _explained(cells: np.ndarray, labels: np.ndarray) -> np.ndarray:
+    """Labels (m,) of a prediction, with the most frequent label of the cell (m,) where there is none.
 
-    The borders of a prediction are inexact, those of the image are not.
+    This holds for cells of which the prediction explains at least half.
     """
     shape = int(cells.max(initial=-1)) + 1, int(labels.max(initial=0)) + 1
     table = np.bincount(cells * shape[1] + labels, minlength=shape[0] * shape[1]).reshape(shape)
-    large = table >= _PART * table.sum(axis=1, keepdims=True)
-    return np.where(large[cells, labels], labels, table.argmax(axis=1)[cells]) if len(cells) else labels
+    usual = (
+        np.where(table[:, 1:].sum(axis=1) >= table[:, 0], 1 + table[:, 1:].argmax(axis=1), 0)
+        if shape[1] > 1
+        else np.zeros(shape[0], int)
+    )
+    return np.where(labels > 0, labels, usual[cells])
 
 
 def _usual_reading(rows: np.ndarray, code: np.ndarray, cell: int) -> int:

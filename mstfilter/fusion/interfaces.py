@@ -57,11 +57,11 @@ class Division(ABC):
 
 
 class PairOdds(ABC):
-    """How likely two neighbouring cells of an image belong to one object."""
+    """How likely two cells of an image belong to one object."""
 
     @abstractmethod
     def log_odds(self, cells: Cells, weights: np.ndarray, clip: Clip) -> np.ndarray:
-        """Log odds (e,) of "one object" for ``cells.pairs`` (e, 2).
+        """Log odds (e,) of "one object" for ``cells.pairs`` (e, 2), all pairs of cells of one component.
 
         Parameters
         ----------

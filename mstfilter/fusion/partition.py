@@ -4,8 +4,8 @@
 >>> fused = update.update(rng, predicted, proposed, clip)       # a candidate for each predicted hypothesis
 
 1. Every sample and every prediction is a partition of the readings of the last frame: a sample by its segments, a
-   prediction by the objects that lie at the readings. All of them together say how likely two neighbouring cells of
-   their common refinement belong to one object. The past is right with probability sum_j w_j Q_j^lambda, where Q_j is
+   prediction by the objects that lie at the readings. All of them together say how likely two cells of their common
+   refinement belong to one object. The past is right with probability sum_j w_j Q_j^lambda, where Q_j is
    the share of the voxels of prediction j that the frame does not see through. Partitions are drawn by these odds
    (`mstfilter.fusion.cells`).
 2. Each drawn partition is combined with a prediction j, drawn with probability proportional to w_j Q_j^lambda. A
@@ -21,9 +21,10 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import islice, zip_longest
 from typing import ClassVar, NamedTuple
 
 import networkx as nx
@@ -117,11 +118,9 @@ class PartitionUpdate(Update):
         Objects of both sides whose parts move apart in the clip are split first, if `parts` says so.
     pairs : PairOdds
         The log odds that two cells belong to one object.
-    temperature : float
-        Of the draw of partitions. Pairs of cells are not independent, so their product is too sure.
     occupied_log_odds : float
         Added to the log odds of every voxel that the completer is not certain about, since the network is calibrated
-        for its own training scenes. This and `temperature` were fitted in `experiments/partition_fit`.
+        for its own training scenes. It was fitted in `experiments/partition_fit`.
     evidence : tuple of Evidence
         Terms whose sum is the log weight of a candidate. Without them all candidates have equal weights, as they are
         drawn from what they approximate.
@@ -142,7 +141,6 @@ class PartitionUpdate(Update):
     division: Division = NoDivision()  # noqa: RUF009 (frozen)
     parts: PartRule = PartRule()  # noqa: RUF009 (frozen)
     pairs: PairOdds = PairEvidence()  # noqa: RUF009 (frozen)
-    temperature: float = 1.25
     occupied_log_odds: float = 0.6
     evidence: tuple[Evidence, ...] = ()
     quality_exponent: float = 3.0
@@ -158,7 +156,6 @@ class PartitionUpdate(Update):
         check_integer("n_views", self.n_views, at_least=0)
         check_number("threshold", self.threshold, at_least=0, at_most=1)
         check_number("quality_exponent", self.quality_exponent, at_least=0)
-        check_number("temperature", self.temperature, above=0)
         check_number("occupied_log_odds", self.occupied_log_odds)
         check_number("reach", self.reach, at_least=0)
 
@@ -195,7 +192,7 @@ class PartitionUpdate(Update):
         right = np.exp(log_right)
         log_odds = self.pairs.log_odds(cells, predicted.weights * right, observation)
         known = [_Past(*one) for one in zip(past, predictions, refined, right.tolist(), strict=True)]
-        drawn = cells.draw(child(rng, "partition"), log_odds / self.temperature, n)
+        drawn = cells.draw(child(rng, "partition"), log_odds, n)
         chosen = np.pad(drawn, ((0, 0), (0, 1)))[:, cells.of_reading]  # the last column is no object
         few = LEAST * observation.after.depth.size / 307200
         candidates = [
@@ -259,11 +256,13 @@ class PartitionUpdate(Update):
                 held = {b: heir[b] == a if b in heir else common[a, b] > least * past_sizes[b] for b in of_past}
                 own = sorted((b for b in of_past if held[b]), key=lambda b: -shared[a, b])
                 inside = segments == a
-                if any(record_of[b].apart & {record_of[c].id for c in own} for b in own):
-                    owner[inside] = np.where(np.isin(past, own), past, own[0])[inside]
+                within = [b for b in of_past if common[a, b]]
+                if any(record_of[b].apart & {record_of[c].id for c in within} for b in within):
+                    usual = max(within, key=lambda b: shared[a, b])
+                    owner[inside] = np.where(np.isin(past, within), past, usual)[inside]
                 else:
                     parts.append(_Part(inside, tuple(record_of[b] for b in own)))
-            parts += [_Part(owner == b, (record_of[b],)) for b in of_past if (owner == b).any()]
+            parts = _joined(parts, [_Part(owner == b, (record_of[b],)) for b in of_past if (owner == b).any()])
         before, after = prediction.volumes(), Counter(prediction.labels[refined.labels > 0].tolist())
         kept = {k: (after[k] / max(before[k], 1)) ** self.quality_exponent for k in record_of if k not in seen}
         hidden = [k for k, share in kept.items() if rng.random() < known.right * share]
@@ -278,7 +277,7 @@ class PartitionUpdate(Update):
         """
         completer = self.completer.at(clip) if isinstance(self.completer, ClipCompleter) else self.completer
         every = [part for parts in candidates for part in parts]
-        views = [self._latest(view for record in part.continues for view in record.views) for part in every]
+        views = [self._latest(*(record.views for record in part.continues)) for part in every]
         seen = [k for k, part in enumerate(every) if part.readings.any() or (completer.remembers and views[k])]
         streams = [child(rng, "completion", k) for k in seen]
         objects = [(readings.mask(every[k].readings, clip.after), views[k]) for k in seen]
@@ -300,8 +299,22 @@ class PartitionUpdate(Update):
             built.append(Hypothesis(labels, clip.grid, kept, occupancy_of(found, labels, clip.grid)))
         return tuple(built)
 
-    def _latest(self, views: Iterable[ObjectView]) -> tuple[ObjectView, ...]:
-        return tuple(views)[-self.n_views :] if self.n_views else ()
+    def _latest(self, *histories: tuple[ObjectView, ...]) -> tuple[ObjectView, ...]:
+        """The latest views of several objects, each with its oldest view first."""
+        newest = (view for level in zip_longest(*map(reversed, histories)) for view in level if view is not None)
+        return tuple(islice(newest, self.n_views))[::-1]
+
+
+def _joined(parts: Sequence[_Part], more: Sequence[_Part]) -> list[_Part]:
+    """Objects with more of them; readings of an object that is continued already are added to it."""
+    found = list(parts)
+    for part in more:
+        same = [k for k, one in enumerate(found) if part.continues[0] in one.continues]
+        for k in same:
+            found[k] = found[k]._replace(readings=found[k].readings | part.readings)
+        if not same:
+            found.append(part)
+    return found
 
 
 def _left(prediction: Hypothesis, refined: Hypothesis, label: int) -> Completion:

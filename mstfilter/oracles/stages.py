@@ -111,7 +111,7 @@ class TrueQuality(UsesTruth, Evidence):
 
 @dataclass(frozen=True)
 class TruePairs(UsesTruth, PairOdds):
-    """Practically certain odds of the truth, so that each component gets the best of its alternatives.
+    """Practically certain odds of the truth, so that draws are as near to it as possible.
 
     A cell belongs to the true object of most of its readings.
     """

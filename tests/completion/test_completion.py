@@ -244,6 +244,16 @@ def test_occupancy_is_that_of_one_owner_or_free_space(seed):
     assert occupancy_of(sure, arbitrate(sure, grid), grid) is None
 
 
+def test_only_the_object_with_most_readings_claims_a_voxel():
+    grid, box = VoxelGrid((0, 0, 0), 0.01, (2, 1, 1)), (2, 1, 1)
+    p = [np.array(v, np.float32).reshape(box) for v in ([0.6, 0.6], [0.9, 0.9])]
+    points = [np.array(v, np.int32).reshape(box) for v in ([30, 0], [2, 0])]
+    made = [Completion(np.zeros(3, np.int64), a, n, str(k)) for k, (a, n) in enumerate(zip(p, points, strict=True))]
+    found = occupancy_of(made, arbitrate(made, grid), grid)
+    np.testing.assert_array_equal(found.owner.ravel(), [1, 2])
+    np.testing.assert_allclose(found.probability.ravel(), [0.6, 9 / (1 + 9 + 1.5)], rtol=1e-3)
+
+
 def surface_and_free(seen: ObservedBox) -> tuple[np.ndarray, ...]:
     return seen.surface, seen.free, seen.behind, seen.hidden, seen.other_surface
 

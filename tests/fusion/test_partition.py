@@ -209,7 +209,14 @@ def test_added_log_odds_leave_certain_voxels(log_odds):
 
 
 def test_cells_that_a_sample_gives_to_no_object_are_not_one_object_there():
-    cells = Cells(np.arange(2), np.arange(2), np.array([[1, 1], [0, 0]]), np.zeros((0, 2), int), np.array([[0, 1]]))
+    cells = Cells(
+        np.arange(2),
+        np.arange(2),
+        np.array([[1, 1], [0, 0]]),
+        np.zeros((0, 2), int),
+        np.zeros(2, int),
+        np.array([[0, 1]]),
+    )
     found = PairEvidence(alone_constant=0.0).log_odds(cells, np.zeros(0), clip_of(ALONE))
     np.testing.assert_allclose(found, 0.0, atol=1e-12)  # one of two samples
 
@@ -225,6 +232,29 @@ def test_objects_that_moved_apart_are_not_merged():
     for one in step(PartitionUpdate(pairs=IMAGE), clip_of(TWO, 1), merged, state).particles:
         assert [(r.id, r.apart) for r in one.objects] == [(r.id, r.apart) for r in apart]
         np.testing.assert_array_equal(one.labels, state.labels)
+
+
+def test_readings_of_an_object_that_moved_apart_go_to_it():
+    """A segment with few readings of an object that has its own segment, and has moved apart from the main one."""
+    labels = np.zeros(GRID.shape, np.uint16)
+    labels[2:4, 2:4, :2], labels[6:8, 6:8, :2] = 1, 2
+    prediction = Hypothesis.from_labels(labels, GRID)
+    a, b = prediction.objects
+    apart = replace(prediction, objects=(replace(a, apart=frozenset({b.id})), replace(b, apart=frozenset({a.id}))))
+    segments, past = np.array([1] * 375 + [2] * 25), np.array([1] * 300 + [2] * 100)
+    for known, sizes in ((prediction, [375, 25]), (apart, [300, 100])):
+        parts = PartitionUpdate()._parts(np.random.default_rng(0), segments, _Past(past, known, known, 1.0), few=20)
+        found = sorted((part for part in parts), key=lambda part: -part.readings.sum())
+        assert [int(part.readings.sum()) for part in found] == sizes
+        assert [part.continues[0].label for part in found] == [1, 2]
+
+
+def test_a_merged_object_keeps_the_latest_views_of_both():
+    first, second = ("a0", "a1", "a2", "a3"), ("b0", "b1", "b2")
+    assert PartitionUpdate()._latest(first, second) == ("b1", "a2", "b2", "a3")
+    assert PartitionUpdate()._latest(first) == first
+    assert PartitionUpdate(n_views=3)._latest((*first, "now")) == ("a2", "a3", "now")
+    assert PartitionUpdate(n_views=0)._latest(first, second) == ()
 
 
 def test_partitions_by_pairs_follow_image_and_past():

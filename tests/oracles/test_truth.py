@@ -310,7 +310,7 @@ def test_true_free_space_clears_what_is_free_and_seen(recording):
 
 
 def test_true_pairs_choose_what_agrees_with_the_truth(recording):
-    """Cells of one true object belong together, all others do not; each component gets its best alternative."""
+    """Cells of one true object belong together, all others do not; an alternative that agrees is always drawn."""
     clip, true = recording.clips()[1], recording.instance(recording.pauses[1])
     pixels = np.flatnonzero(true.ravel() > 0)
     owner = true.ravel()[pixels].astype(np.int64)

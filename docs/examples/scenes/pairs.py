@@ -1,4 +1,4 @@
-"""Odds of pairs: how likely two neighbouring cells of the image belong to one object.
+"""Odds of pairs: how likely two cells of the image belong to one object.
 
 mstfilter check ./pairs.py:MyPairs
 mstfilter run demo/recording update.pairs=./pairs.py:MyPairs --out runs/mine --replace
