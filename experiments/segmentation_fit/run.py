@@ -87,7 +87,7 @@ def episode(
             for sink, value in zip(pairs, (x, first != second, weight), strict=True):
                 sink.append(value)
         if first != second:
-            growing.remove_border(i, j)
+            del growing.borders[i][j], growing.borders[j][i]
         else:
             new = growing.merge(i, j, odds)
             true[new] = true[i] + true[j]

@@ -153,10 +153,6 @@ class Belief:
             )
         return inside
 
-    def _cells(self, voxels: Any) -> np.ndarray:
-        """Cells (...) of voxels (..., 3)."""
-        return self._refined.cells.ravel()[_flat_voxels(self.grid, voxels)]
-
     def _region(self, region: Any) -> tuple[np.ndarray, np.ndarray]:
         """Cells with voxels in a region, and the number of these voxels; None is the whole grid."""
         counts = self._refined.sizes

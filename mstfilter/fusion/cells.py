@@ -22,20 +22,20 @@ those whose probabilities of pairs are nearest to the fitted ones (least cross e
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from functools import cached_property
 
 import numpy as np
+from scipy.ndimage import distance_transform_edt
 from scipy.sparse.csgraph import connected_components
 from scipy.special import expit
 
 from mstfilter.fusion.interfaces import PairOdds
-from mstfilter.fusion.similarity import canonical
+from mstfilter.fusion.similarity import canonical, common_refinement
 from mstfilter.scene import Clip
 from mstfilter.smc import Systematic
 
 _SOFT = 0.02
-_REACH = 2  # pixels between two readings of neighbouring cells, at most
 _LEAST_SHARE, _TOLERANCE, _STEPS = 1e-9, 1e-3, 200
 LEAST = 60  # readings of a cell, as `ObjectRule.min_points`; in an image of 640 x 480 pixels
 
@@ -44,16 +44,15 @@ LEAST = 60  # readings of a cell, as `ObjectRule.min_points`; in an image of 640
 class PairEvidence(PairOdds):
     """Log odds by the shares of the samples and of the predictions in which two cells belong to one object."""
 
-    alone_constant: float = -0.82
+    alone_constant: float = -0.78
     alone_image: float = 0.64
-    constant: float = -1.04
+    constant: float = -0.87
     image: float = 0.51
-    past: float = 0.52
-    past_constant: float = 0.84
+    past: float = 0.62
+    past_constant: float = 0.96
 
     def log_odds(self, cells: Cells, weights: np.ndarray, clip: Clip) -> np.ndarray:
-        fields = (self.alone_constant, self.alone_image, self.constant, self.image, self.past, self.past_constant)
-        return self.terms(cells, weights) @ np.array(fields)
+        return self.terms(cells, weights) @ np.array(astuple(self))
 
     def terms(self, cells: Cells, weights: np.ndarray) -> np.ndarray:
         """What each field is multiplied by, (e, 6) in the order of the fields."""
@@ -102,16 +101,15 @@ class Cells:
         """
         kept = np.mean([labels > 0 for labels in samples], axis=0) >= 0.5
         rows = np.stack([labels[kept] for labels in (*samples, *predictions)])
-        code = _refinement(rows[: len(samples)])
+        code = common_refinement([*rows[: len(samples)]]).cells
         for row in rows[len(samples) :]:
             row[:] = _explained(code, row)
-        code = _refinement(np.concatenate([code[None], rows[len(samples) :]]))
-        code = _without_slivers(code, pixels[kept], shape)
-        # Every cell has one label in each partition, but for the readings of slivers.
-        example = [_usual_reading(rows, code, c) for c in range(int(code.max(initial=-1)) + 1)]
-        labels = rows[:, np.array(example, np.int64)]
+        exact = common_refinement([code, *rows[len(samples) :]]).cells
+        code = _without_slivers(exact, pixels[kept], shape)
+        own = np.flatnonzero(code == exact)  # the other readings are of slivers
+        labels = rows[:, own[np.unique(code[own], return_index=True)[1]]]
         of_reading = np.full(len(kept), -1)
-        of_reading[kept] = code
+        of_reading[kept] = np.unique(code, return_inverse=True)[1]
         same = (labels[:, :, None] == labels[:, None]) & (labels[:, :, None] > 0)
         _, component = connected_components(same.any(axis=0), directed=False)
         pairs = np.argwhere(np.triu(component[:, None] == component, 1))
@@ -155,8 +153,7 @@ class Cells:
         drawn = np.zeros((n, self.samples.shape[1]), np.int64)
         used = 0
         for cells, partitions in self.alternatives():
-            with np.errstate(divide="ignore"):
-                log_weights = np.log(self.probabilities(log_odds, cells, partitions))
+            log_weights = np.log(np.maximum(self.probabilities(log_odds, cells, partitions), 1e-300))
             chosen = rng.permutation(Systematic().select(rng, log_weights, n)[0])
             drawn[:, cells] = partitions[chosen] + used
             used += int(partitions.max())
@@ -196,67 +193,25 @@ def _matched(joined: np.ndarray, same: np.ndarray, weights: np.ndarray) -> np.nd
     return q
 
 
-def _refinement(rows: np.ndarray) -> np.ndarray:
-    """The common refinement (m,) of partitions (p, m) of non-negative labels, numbered 0, 1, ..."""
-    code = np.zeros(rows.shape[1], np.int64)
-    for row in rows:
-        _, code = np.unique(code * (int(row.max(initial=0)) + 1) + row, return_inverse=True)
-    return code
-
-
 def _explained(cells: np.ndarray, labels: np.ndarray) -> np.ndarray:
     """Labels (m,) of a prediction, with the most frequent label of the cell (m,) where there is none.
 
     This holds for cells of which the prediction explains at least half.
     """
-    shape = int(cells.max(initial=-1)) + 1, int(labels.max(initial=0)) + 1
-    table = np.bincount(cells * shape[1] + labels, minlength=shape[0] * shape[1]).reshape(shape)
-    usual = (
-        np.where(table[:, 1:].sum(axis=1) >= table[:, 0], 1 + table[:, 1:].argmax(axis=1), 0)
-        if shape[1] > 1
-        else np.zeros(shape[0], int)
-    )
+    table = np.zeros((int(cells.max(initial=-1)) + 1, int(labels.max(initial=0)) + 1), np.int64)
+    np.add.at(table, (cells, labels), 1)
+    unexplained, table[:, 0] = table[:, 0].copy(), 0
+    usual = np.where(table.sum(axis=1) >= unexplained, table.argmax(axis=1), 0)
     return np.where(labels > 0, labels, usual[cells])
 
 
-def _usual_reading(rows: np.ndarray, code: np.ndarray, cell: int) -> int:
-    """A reading with the most frequent labels of a cell."""
-    inside = np.flatnonzero(code == cell)
-    _, first, counts = np.unique(rows[:, inside], axis=1, return_index=True, return_counts=True)
-    return int(inside[first[counts.argmax()]])
-
-
-def _borders(code: np.ndarray, pixels: np.ndarray, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-    """Pairs (e, 2) of neighbouring cells and the lengths (e,) of their borders."""
-    image = np.full(shape, -1)
-    image.ravel()[pixels] = code
-    found = []
-    for step in range(1, _REACH + 1):
-        for a, b in ((image[:, step:], image[:, :-step]), (image[step:], image[:-step])):
-            different = (a != b) & (a >= 0) & (b >= 0)
-            found.append(np.sort(np.stack([a[different], b[different]], axis=1), axis=1))
-    pairs, lengths = np.unique(np.concatenate(found), axis=0, return_counts=True)
-    return pairs, lengths
-
-
 def _without_slivers(code: np.ndarray, pixels: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """Cells renumbered 0, 1, ..., after small ones have joined the neighbour with the longest border."""
+    """Cells (m,) after the readings of small ones have joined the nearest large cell, if one is near."""
     least = LEAST * shape[0] * shape[1] / 307200
-    for _ in range(20):
-        sizes = np.bincount(code) if len(code) else np.zeros(0, int)
-        small = np.flatnonzero((sizes > 0) & (sizes < least))
-        if not len(small):
-            break
-        pairs, lengths = _borders(code, pixels, shape)
-        target = np.arange(len(sizes))
-        for c in small:
-            touching = (pairs == c).any(axis=1)
-            if touching.any():
-                k = np.flatnonzero(touching)[lengths[touching].argmax()]
-                target[c] = int(pairs[k].sum() - c)
-        # Only small cells move, and never in a cycle: a cell joins one that is larger or has a smaller number.
-        moved = [c for c in small if (sizes[target[c]], -target[c]) > (sizes[c], -c)]
-        if not moved:
-            break
-        code = np.where(np.isin(code, moved), target[code], code)
-    return np.unique(code, return_inverse=True)[1]
+    large = np.bincount(code, minlength=1)[code] >= least
+    if not large.any():
+        return code
+    image = np.full(shape, -1)
+    image.ravel()[pixels[large]] = code[large]
+    distance, nearest = distance_transform_edt(image < 0, return_indices=True)
+    return np.where(distance.ravel()[pixels] <= np.sqrt(least), image[tuple(nearest)].ravel()[pixels], code)

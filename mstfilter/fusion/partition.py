@@ -29,6 +29,7 @@ from typing import ClassVar, NamedTuple
 
 import networkx as nx
 import numpy as np
+from scipy.spatial import cKDTree
 
 from mstfilter.completion import ClipCompleter, Completer, Completion, Extrude, arbitrate, occupancy_of
 from mstfilter.completion.observed import frame_points
@@ -67,18 +68,12 @@ class Readings:
 
     def labels(self, labels: np.ndarray, reach: float) -> np.ndarray:
         """Label (m,) of each reading: of its voxel, or of the nearest object within `reach` voxels; 0 is none."""
-        voxels, of_reading = self._distinct
-        width = int(reach)
-        steps = np.argwhere(np.ones((2 * width + 1,) * 3, bool)) - width
-        distance = np.linalg.norm(steps, axis=1)
-        padded = np.pad(labels, width)
-        found = np.zeros(len(voxels), np.int64)
-        for k in np.argsort(distance, kind="stable"):
-            left = np.flatnonzero(found == 0)
-            if distance[k] > reach or not len(left):
-                break
-            found[left] = padded[tuple((voxels[left] + width + steps[k]).T)]
-        return found[of_reading]
+        occupied, (voxels, of_reading) = np.argwhere(labels), self._distinct
+        if not len(occupied):
+            return np.zeros(len(of_reading), np.int64)
+        _, nearest = cKDTree(occupied).query(voxels, distance_upper_bound=reach + 1e-6)
+        found = np.append(labels[tuple(occupied.T)], 0).astype(np.int64)  # the last one is that of no neighbour
+        return found[nearest][of_reading]
 
     @cached_property
     def _distinct(self) -> tuple[np.ndarray, np.ndarray]:
@@ -252,6 +247,7 @@ class PartitionUpdate(Update):
             least = _SAME if len(of_sample) == len(of_past) == 1 else _CONTAINED
             owner = np.zeros(len(segments), np.int64)  # of the readings of which the prediction gives the partition
             heir = {main[a]: a for a in of_sample if common[a, main[a]] > least * rivals[main[a]]}
+            whole: list[tuple[np.ndarray, list[int]]] = []
             for a in of_sample:  # an object with an heir has no other one
                 held = {b: heir[b] == a if b in heir else common[a, b] > least * past_sizes[b] for b in of_past}
                 own = sorted((b for b in of_past if held[b]), key=lambda b: -shared[a, b])
@@ -261,8 +257,10 @@ class PartitionUpdate(Update):
                     usual = max(within, key=lambda b: shared[a, b])
                     owner[inside] = np.where(np.isin(past, within), past, usual)[inside]
                 else:
-                    parts.append(_Part(inside, tuple(record_of[b] for b in own)))
-            parts = _joined(parts, [_Part(owner == b, (record_of[b],)) for b in of_past if (owner == b).any()])
+                    whole.append((inside, own))
+            parts += [_Part(inside | np.isin(owner, own), tuple(record_of[b] for b in own)) for inside, own in whole]
+            rest = [b for b in of_past if not any(b in own for _, own in whole) and (owner == b).any()]
+            parts += [_Part(owner == b, (record_of[b],)) for b in rest]
         before, after = prediction.volumes(), Counter(prediction.labels[refined.labels > 0].tolist())
         kept = {k: (after[k] / max(before[k], 1)) ** self.quality_exponent for k in record_of if k not in seen}
         hidden = [k for k, share in kept.items() if rng.random() < known.right * share]
@@ -303,18 +301,6 @@ class PartitionUpdate(Update):
         """The latest views of several objects, each with its oldest view first."""
         newest = (view for level in zip_longest(*map(reversed, histories)) for view in level if view is not None)
         return tuple(islice(newest, self.n_views))[::-1]
-
-
-def _joined(parts: Sequence[_Part], more: Sequence[_Part]) -> list[_Part]:
-    """Objects with more of them; readings of an object that is continued already are added to it."""
-    found = list(parts)
-    for part in more:
-        same = [k for k, one in enumerate(found) if part.continues[0] in one.continues]
-        for k in same:
-            found[k] = found[k]._replace(readings=found[k].readings | part.readings)
-        if not same:
-            found.append(part)
-    return found
 
 
 def _left(prediction: Hypothesis, refined: Hypothesis, label: int) -> Completion:

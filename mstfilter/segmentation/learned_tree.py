@@ -70,10 +70,6 @@ class Agglomeration:
             odds, i, j = pair
             self.merge(i, j, odds)
 
-    def remove_border(self, i: int, j: int) -> None:
-        """Remove the border of a pair, for the two regions and for those that they are merged into."""
-        del self.borders[i][j], self.borders[j][i]
-
     def merge(self, i: int, j: int, odds: float) -> int:
         """Merge two regions and return the number of the new one."""
         new = len(self.borders)

@@ -184,6 +184,20 @@ def test_slivers_join_a_neighbour(monkeypatch):
     assert (found.of_reading.reshape(SHAPE)[:, :3] == found.of_reading[0]).all()
 
 
+def test_small_objects_far_from_others_are_not_slivers(monkeypatch):
+    monkeypatch.setattr(
+        module, "LEAST", 4 * 307200 / 40
+    )  # cells of less than four readings join others within two pixels
+    one = np.zeros((1, 40), int)
+    one[0, :10], one[0, 30:32] = 1, 2
+    two = one.copy()
+    two[0, 9] = 3
+    found = Cells.of(np.arange(40), (1, 40), [one.ravel(), two.ravel()], [])
+    assert found.of_reading[0] == found.of_reading[9] != found.of_reading[30] >= 0
+    assert found.samples[:, found.of_reading[30]].tolist() == [2, 2]
+    np.testing.assert_array_equal(np.sort(found.sizes), [2, 10])
+
+
 def test_no_objects():
     found = Cells.of(PIXELS, SHAPE, [np.zeros(30, int)], [np.ones(30, int)])
     assert (found.of_reading == -1).all() and found.draw(np.random.default_rng(0), np.zeros(0), 3).shape == (3, 0)
