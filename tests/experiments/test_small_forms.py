@@ -69,7 +69,9 @@ def test_partition_fit(tmp_path):
     assert all(float(row[past]) < math.log(2) for row in rows.values() for past in ("video", "two frames"))
     assert float(rows["both"]["stranger"]) < float(rows["both, past right"]["stranger"])
     pairs = np.load(tmp_path / "pairs/demo-0.npz")
-    assert all(len(pairs[past]) > 100 for past in pairs)
+    for found in (pairs[past] for past in pairs):  # of one pause
+        assert found[:, 7].sum() == pytest.approx(1) and ((found[:, 6] >= 0) & (found[:, 6] <= 1)).all()
+        np.testing.assert_allclose(found[:, 0] + found[:, 2], 1)  # the past is wrong, or right
 
 
 def test_calibration_of_the_partition_update(tmp_path):
