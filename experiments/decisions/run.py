@@ -110,8 +110,8 @@ def _regret(
         loop.restore(saved)
     belief, best = Belief(state.population), max(outcomes)
     chosen = {name: choose(np.random.default_rng(key), belief, pushes) for name, choose in POLICIES.items()}
-    regrets = {f"regret {name}": best - outcomes[k] for name, k in chosen.items()}
-    return {"best": best, **regrets, "regret random": best - float(np.mean(outcomes))}
+    reached = {name: outcomes[k] for name, k in chosen.items()} | {"random": float(np.mean(outcomes))}
+    return {"best": best, **{f"regret {name}": best - coverage for name, coverage in reached.items()}}
 
 
 def run(arguments: tuple[Any, ...]) -> str:

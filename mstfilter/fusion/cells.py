@@ -60,13 +60,11 @@ class PairEvidence(PairOdds):
         image = softened_logit(
             np.mean((cells.samples[:, a] == cells.samples[:, b]) & (cells.samples[:, a] > 0), axis=0)
         )
-        right, explained, share = weights.sum(), np.zeros(len(a)), np.full(len(a), 0.5)
-        if len(cells.predictions):
-            both = (cells.predictions[:, a] > 0) & (cells.predictions[:, b] > 0)
-            explained = weights @ both
-            same = weights @ (both & (cells.predictions[:, a] == cells.predictions[:, b]))
-            np.divide(same, explained, out=share, where=explained > 0)
-        alone, known = np.full(len(a), 1 - right), np.full(len(a), right)
+        both = (cells.predictions[:, a] > 0) & (cells.predictions[:, b] > 0)
+        explained = weights @ both
+        same = weights @ (both & (cells.predictions[:, a] == cells.predictions[:, b]))
+        share = np.divide(same, explained, out=np.full(len(a), 0.5), where=explained > 0)
+        alone, known = np.full(len(a), 1 - weights.sum()), np.full(len(a), weights.sum())
         past = explained * softened_logit(share)
         return np.column_stack([alone, alone * image, known, known * image, past, explained])
 
@@ -119,6 +117,13 @@ class Cells:
     def sizes(self) -> np.ndarray:
         """Readings (K,) of each cell."""
         return np.bincount(self.of_reading[self.of_reading >= 0], minlength=self.samples.shape[1])
+
+    def counts(self, image: np.ndarray) -> np.ndarray:
+        """Readings (K, m) of each cell with each label of an image (H, W) int."""
+        inside = self.of_reading >= 0
+        found = np.zeros((len(self.sizes), int(image.max()) + 1), np.int64)
+        np.add.at(found, (self.of_reading[inside], image.ravel()[self.pixels[inside]]), 1)
+        return found
 
     def alternatives(self) -> list[tuple[np.ndarray, np.ndarray]]:
         """Of each component its cells (k,) and its distinct partitions (p, k)."""

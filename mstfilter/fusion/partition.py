@@ -69,8 +69,6 @@ class Readings:
     def labels(self, labels: np.ndarray, reach: float) -> np.ndarray:
         """Label (m,) of each reading: of its voxel, or of the nearest object within `reach` voxels; 0 is none."""
         occupied, (voxels, of_reading) = np.argwhere(labels), self._distinct
-        if not len(occupied):
-            return np.zeros(len(of_reading), np.int64)
         _, nearest = cKDTree(occupied).query(voxels, distance_upper_bound=reach + 1e-6)
         found = np.append(labels[tuple(occupied.T)], 0).astype(np.int64)  # the last one is that of no neighbour
         return found[nearest][of_reading]

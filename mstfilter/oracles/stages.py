@@ -119,11 +119,7 @@ class TruePairs(UsesTruth, PairOdds):
     needs: ClassVar[tuple[Need, ...]] = ("voxels", "instance")
 
     def log_odds(self, cells: Cells, weights: np.ndarray, clip: Clip) -> np.ndarray:
-        inside = cells.of_reading >= 0
-        owner = self.truth.instance(clip.index).ravel()[cells.pixels[inside]]
-        table = np.zeros((cells.samples.shape[1], int(owner.max(initial=0)) + 1), int)
-        np.add.at(table, (cells.of_reading[inside], owner), 1)
-        true = table.argmax(axis=1)
+        true = cells.counts(self.truth.instance(clip.index)).argmax(axis=1)
         a, b = cells.pairs.T
         return np.where(true[a] == true[b], _NATS, -_NATS)
 
