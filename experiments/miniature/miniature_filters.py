@@ -20,12 +20,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
 from miniature_world import Miniature, Observation, draw_states
 from scipy import stats
 
+from mstfilter.scene import Occupancy
 from mstfilter.smc import ParticleFilter, Population, Proposal, Reweight, Transition
 
 N_RANK_DRAWS = 9  # ranks 0 .. 9: ten bins
@@ -160,8 +162,30 @@ def guided_filter(world: Miniature, n: int, **changes: Any) -> ParticleFilter:
 
 
 def state_weights(world: Miniature, population: Population) -> np.ndarray:
-    """(S,) sum of the weights of the particles in each state."""
-    return np.bincount(world.states.index(population.particles), population.weights, len(world.states))
+    """(S,) sum of the weights of the particles in each state.
+
+    A particle that is unsure of cells is divided among states: each of its objects is a level set of its
+    probabilities, independently of the others.
+    """
+    p = np.zeros(len(world.states))
+    for hypothesis, weight in zip(population.particles, population.weights.tolist(), strict=True):
+        if hypothesis.occupancy is None:
+            p[world.states.index_of_labels(hypothesis.labels)] += weight
+        else:
+            for labels, share in level_sets(hypothesis.occupancy):
+                p[world.states.index_of_labels(labels)] += weight * share
+    return p
+
+
+def level_sets(occupancy: Occupancy) -> list[tuple[np.ndarray, float]]:
+    """Label grids, and their probabilities, if each object is a level set of its probabilities."""
+    found = [(np.zeros(occupancy.owner.shape, np.uint16), 1.0)]
+    for k in np.unique(occupancy.owner[occupancy.probability > 0]):
+        p = np.where(occupancy.owner == k, occupancy.probability, 0).astype(np.float64)
+        levels = np.unique(np.append(p, [0.0, 1.0]))
+        sets = [(p >= high, high - low) for low, high in pairwise(levels.tolist())]
+        found = [(np.where(own, k, labels), q * share) for labels, q in found for own, share in sets]
+    return found
 
 
 def iid_weights(rng: np.random.Generator, p: np.ndarray, n: int) -> np.ndarray:

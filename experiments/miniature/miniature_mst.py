@@ -48,13 +48,11 @@ class DepthFreeSpace(Projection):
     """Clears the cells in front of the depth reading; Q is the fraction of cells that remain."""
 
     def project(self, hypothesis: Hypothesis, frame: Any) -> tuple[Hypothesis, float]:
-        free = np.arange(hypothesis.labels.shape[1])[None, :, None] < frame.depth[:, None, None]
-        occupied = hypothesis.labels != 0
-        hit = occupied & free
-        if not hit.any():
+        free = np.arange(hypothesis.labels.shape[1])[None, :, None] < np.reshape(frame.depth, (-1, 1, 1))
+        if not (free & (hypothesis.shares.probability > 0)).any():
             return hypothesis, 1.0
-        cleared = hypothesis.with_labels(np.where(hit, 0, hypothesis.labels).astype(np.uint16))
-        return cleared, float(1.0 - hit.sum() / occupied.sum())
+        occupied = hypothesis.labels != 0
+        return hypothesis.without(free), 1.0 - float((occupied & free).sum() / max(occupied.sum(), 1))
 
 
 @dataclass(frozen=True)

@@ -28,67 +28,95 @@ from miniature_filters import (
     state_weights,
 )
 from miniature_mst import ScoredFusion, adapt_to_miniature, balanced_filter
+from miniature_partition import (
+    LoggedPairs,
+    TableCompleter,
+    components_apart,
+    fit,
+    partition_filter,
+    with_likelihood,
+)
 from miniature_world import Miniature
 from scipy import stats
 
 import mstfilter
 from mstfilter.files import write_csv
+from mstfilter.fusion import PairEvidence
 from mstfilter.smc import FearnheadClifford, KeepWeights, Multinomial, ParticleFilter, Systematic
 
 HERE = Path(__file__).resolve().parent
 WORLDS = {"shelf": Miniature((3, 2)), "row": Miniature((6, 1))}
 PROPER = {"bootstrap": bootstrap_filter, "guided": guided_filter, "balanced": balanced_filter}
-PRESETS = {"paper": ("p", False), "authors": ("p", True), "mst": ("equal", False)}
+PRESETS = {"paper": ("p", False), "authors": ("p", True), "mst_rules": ("equal", False)}
+PARTITION = ("mst", "mst, likelihood")
 LADDER = ("+ score", "+ distinct", "+ predictive", "+ parents", "+ optimal", "+ cover")
-CHANGES = ("mst, p twice", "mst, weights kept", "mst, no Q", "mst, no score", "mst, systematic")
+CHANGES = (
+    "mst_rules, p twice",
+    "mst_rules, weights kept",
+    "mst_rules, no Q",
+    "mst_rules, no score",
+    "mst_rules, systematic",
+)
 UNIONS = {"union, optimal": "+ optimal", "union, cover": "+ cover"}  # the same without crossover
 T = 6
+N_FIT = 200  # scenes to which the shapes and pairs of `mst` are fitted
 
 
 @cache
 def preset(name: str) -> ParticleFilter:
-    """A preset of MST, read once. The arm `mst` has the crossover of `mst_rules`."""
-    return mstfilter.preset("mst_rules" if name == "mst" else name)
+    """A preset, read once."""
+    return mstfilter.preset(name)
 
 
-def arm(name: str, world: Miniature, n: int) -> ParticleFilter:
-    """A filter by the name of its arm."""
+@cache
+def fitted(world: Miniature, n_scenes: int) -> tuple[TableCompleter, PairEvidence]:
+    """Shape and pairs of `mst`, fitted once."""
+    return fit(world, range(n_scenes))
+
+
+def arm(name: str, world: Miniature, n: int, n_fit: int = N_FIT) -> ParticleFilter:
+    """A filter by the name of its arm. What `mst` fits is fitted to `n_fit` scenes."""
     if name in PROPER:
         return PROPER[name](world, n)
     if name in PRESETS:
         return adapt_to_miniature(preset(name), world, n, *PRESETS[name])
-    mst = adapt_to_miniature(preset("mst"), world, n, *PRESETS["mst"])
-    if name == "mst, p twice":
-        return replace(mst, proposal=replace(mst.proposal, weight_rule="p"))
-    if name == "mst, weights kept":
-        return replace(mst, resampler=KeepWeights(Multinomial()))
-    if name == "mst, no Q":
-        return replace(mst, update=replace(mst.update, quality_exponent=0.0))
-    if name == "mst, no score":  # candidates are not scored
-        return replace(mst, update=replace(mst.update, evidence=()))
-    if name == "mst, systematic":
-        return replace(mst, resampler=Systematic())
+    if name in PARTITION:
+        filter = partition_filter(world, n, *fitted(world, n_fit))
+        return filter if name == "mst" else with_likelihood(world, filter)
+    rules = adapt_to_miniature(preset("mst_rules"), world, n, *PRESETS["mst_rules"])
+    if name == "mst_rules, p twice":
+        return replace(rules, proposal=replace(rules.proposal, weight_rule="p"))
+    if name == "mst_rules, weights kept":
+        return replace(rules, resampler=KeepWeights(Multinomial()))
+    if name == "mst_rules, no Q":
+        return replace(rules, update=replace(rules.update, quality_exponent=0.0))
+    if name == "mst_rules, no score":  # candidates are not scored
+        return replace(rules, update=replace(rules.update, evidence=()))
+    if name == "mst_rules, systematic":
+        return replace(rules, resampler=Systematic())
     if name in UNIONS:
         filter = arm(UNIONS[name], world, n)
         return replace(filter, update=replace(filter.update, built_per_particle=0))
     rung = LADDER.index(name)  # each rung includes the changes of those below
-    rule = ScoredFusion(world, mst.update, distinct=rung >= 1, predictive=rung >= 2, include_parents=rung >= 3)
-    filter = replace(mst, update=rule)
+    rule = ScoredFusion(world, rules.update, distinct=rung >= 1, predictive=rung >= 2, include_parents=rung >= 3)
+    filter = replace(rules, update=rule)
     if rung >= 4:
         filter = replace(filter, resampler=FearnheadClifford())
-    return replace(filter, proposal=replace(mst.proposal, prior_share=0.2)) if rung >= 5 else filter
+    return replace(filter, proposal=replace(rules.proposal, prior_share=0.2)) if rung >= 5 else filter
 
 
 Plan = list[tuple[tuple[str, ...], int, int]]  # arms, n, number of worlds
 
 
-def distances(plan: Plan, steps: int = T, processes: int = len(WORLDS)) -> list[dict[str, object]]:
+def distances(
+    plan: Plan, steps: int = T, processes: int = len(WORLDS), n_fit: int = N_FIT
+) -> list[dict[str, object]]:
     """One row per world, arm, size and step; by default one process per shape of world."""
-    parts = Parallel(processes)(delayed(distances_of_shape)(shape, plan, steps) for shape in WORLDS)
+    parts = Parallel(processes)(delayed(distances_of_shape)(shape, plan, steps, n_fit) for shape in WORLDS)
     return [row for rows in parts for row in rows]
 
 
-def distances_of_shape(shape: str, plan: Plan, n_steps: int) -> list[dict[str, object]]:
+def distances_of_shape(shape: str, plan: Plan, n_steps: int, n_fit: int) -> list[dict[str, object]]:
     """Rows of one shape of world."""
     rows, world = [], WORLDS[shape]
     for arms, n, n_worlds in plan:
@@ -100,7 +128,7 @@ def distances_of_shape(shape: str, plan: Plan, n_steps: int) -> list[dict[str, o
                 "n exact draws": [iid_weights(np.random.default_rng([seed, 12]), p, n) for p in exact],
             }
             for name in arms:
-                steps = arm(name, world, n).iterate(observations, seed)
+                steps = arm(name, world, n, n_fit).iterate(observations, seed)
                 answers[name] = [state_weights(world, state.population) for state, _ in steps]
             for name, laws in answers.items():
                 for t, p in enumerate(laws):
@@ -146,7 +174,7 @@ def summarise(rows: list[dict], out: Path) -> None:
     paired = []
     means = {m: by_world(rows, lambda r: (r["world"], r["n"], r["arm"]), m) for m in ("tv", "same_object_error")}
     for (world, n, name), _ in means["tv"].items():
-        for other in ("paper", "authors", "mst", "+ optimal", "+ cover"):
+        for other in ("paper", "authors", "mst_rules", "mst", "+ optimal", "+ cover"):
             if (world, n, other) not in means["tv"] or other == name or name in ("exact", "n exact draws"):
                 continue
             row: dict[str, object] = {"world": world, "n": n, "arm": name, "against": other}
@@ -157,7 +185,7 @@ def summarise(rows: list[dict], out: Path) -> None:
     write_csv(out / "paired.csv", paired)
 
 
-def calibrate(arms: dict[str, int], n_worlds: int, steps: int, out: Path) -> None:
+def calibrate(arms: dict[str, int], n_worlds: int, steps: int, out: Path, n_fit: int = N_FIT) -> None:
     """Ranks of true scalars in the answers after `steps` observations of the shelf."""
     world = WORLDS["shelf"]
     scalars, rows = state_statistics(world), []
@@ -168,7 +196,7 @@ def calibrate(arms: dict[str, int], n_worlds: int, steps: int, out: Path) -> Non
             if name == "exact":
                 p = exact_filter(world, observations).posterior[-1]
             else:
-                p = state_weights(world, arm(name, world, n).run(observations, seed)[0].population)
+                p = state_weights(world, arm(name, world, n, n_fit).run(observations, seed)[0].population)
             for s, scalar in scalars.items():
                 ranks[s].append(rank_of_truth(np.random.default_rng([seed, 14]), scalar, p, int(truth[-1])))
         for s, found in ranks.items():
@@ -185,6 +213,27 @@ def calibrate(arms: dict[str, int], n_worlds: int, steps: int, out: Path) -> Non
     write_csv(out / "calibration.csv", rows)
 
 
+def resolve_apart(n_worlds: int, out: Path, n: int = 20, n_fit: int = N_FIT) -> None:
+    """components.csv: the error of drawing the components of the readings apart, which `mst` does."""
+    rows = []
+    for shape, world in WORLDS.items():
+        errors = []
+        for seed in range(n_worlds):
+            _, observations = world.simulate(np.random.default_rng([seed, 11]), T)
+            exact = exact_filter(world, observations).posterior
+            completer, pairs = fitted(world, n_fit)
+            logged = LoggedPairs(pairs)
+            steps = partition_filter(world, n, completer, logged).iterate(observations, seed)
+            for t, _ in enumerate(steps):  # the first step has no past, and asks nothing
+                found = [components_apart(world, exact[t], cells, observations[t]) for cells, _ in logged.log]
+                logged.log.clear()
+                errors += [(seed, error) for error in found]
+        by_seed = [np.mean([e for s, e in errors if s == seed]) for seed in sorted({s for s, _ in errors})]
+        mean, half = interval(np.array(by_seed))
+        rows.append({"world": shape, "n": n, "worlds": n_worlds, "tv": round(mean, 4), "tv_pm": round(half, 4)})
+    write_csv(out / "components.csv", rows)
+
+
 def main() -> None:
     """The command line."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -197,26 +246,28 @@ def main() -> None:
     if options.smoke and options.out == HERE / "results":
         parser.error("--smoke would overwrite the results: name another folder with --out")
     options.out.mkdir(parents=True, exist_ok=True)
-    every = (*PROPER, *PRESETS, *CHANGES, *LADDER, *UNIONS)
+    every = (*PROPER, *PRESETS, *PARTITION, *CHANGES, *LADDER, *UNIONS)
     if options.presets:
         options.out = options.out / "presets"
         options.out.mkdir(exist_ok=True)
-        summarise(
-            distances([(tuple(PRESETS), 5, 100), (tuple(PRESETS), 20, 100), (tuple(PRESETS), 100, 50)]), options.out
-        )
+        presets = (*PRESETS, *PARTITION)
+        summarise(distances([(presets, 5, 100), (presets, 20, 100), (presets, 100, 50)]), options.out)
+        resolve_apart(100, options.out)
         return
     if options.smoke:
         plan, ranked, n_worlds = [(every, 5, 2), (tuple(PROPER), 20, 2)], {"exact": 0, "guided": 50, "mst": 5}, 10
-        found = distances(plan, 2, processes=1)
+        found = distances(plan, 2, processes=1, n_fit=2)
     else:
-        few = (*PROPER, *PRESETS, "+ parents", "+ cover", "union, cover")
+        few = (*PROPER, *PRESETS, "mst", "+ parents", "+ cover", "union, cover")
         plan = [(every, 5, 100), (every, 20, 100), (every, 100, 50), (few, 500, 24)]
         ranked = {"exact": 0, "bootstrap": 1000, "guided": 500, "balanced": 500, "paper": 20, "authors": 20}
-        ranked |= {"mst": 20, "+ cover": 20}
+        ranked |= {"mst_rules": 20, "mst": 20, "+ cover": 20}
         n_worlds = 400
         found = distances(plan)
     summarise(found, options.out)
-    calibrate(ranked, n_worlds, 3, options.out)
+    n_fit = 2 if options.smoke else N_FIT
+    calibrate(ranked, n_worlds, 3, options.out, n_fit)
+    resolve_apart(2 if options.smoke else 100, options.out, n_fit=n_fit)
     from figure import draw
 
     draw(options.out)
