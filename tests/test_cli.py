@@ -154,6 +154,8 @@ def test_runs_to_compare_are_kept_beside_the_run(recording, tmp_path, capsys):
     assert code == 0 and list(compared) == ["single frame", "without past"]
     samplers = {name: run.description["config"]["proposal"]["sampler"] for name, run in compared.items()}
     assert samplers["single frame"]["component"] == "optimal" != samplers["without past"]["component"]
+    completers = [run.description["config"]["proposal"]["completer"]["component"] for run in compared.values()]
+    assert completers == ["network", "network"]  # that of the update of `mst`, whose samples are surfaces
     assert all(run.description["config"]["transition"]["component"] == "identity" for run in compared.values())
 
 

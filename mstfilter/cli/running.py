@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -47,15 +48,13 @@ def run(
     ] = False,
 ) -> None:
     """Filter a recording into a run folder, or resume a run that was stopped."""
-    import shutil
-
     from mstfilter.presets import build_filter, load_config
 
     configs = {"": load_config(preset, overrides or ())}
     if compare:
-        from mstfilter.runs import COMPARED
+        from mstfilter.runs import compared_configs
 
-        configs |= {k: load_config(preset, [*(overrides or ()), *changes]) for k, changes in COMPARED.items()}
+        configs |= compared_configs(configs[""])
     for config in configs.values():
         build_filter(config, allow_files=True)  # a wrong setting is reported before the recording is read
     if out is not None:
@@ -82,8 +81,6 @@ def demo(
     seed: Seed = 3,
 ) -> None:
     """Simulate a robot at a cluttered table, filter the recording, write a report."""
-    import shutil
-
     from mstfilter.formats import open_recording
     from mstfilter.presets import load_config
 

@@ -1,8 +1,8 @@
 from mstfilter.runs.run import (
-    COMPARED as COMPARED,
     RunProgress as RunProgress,
     check_run_folder as check_run_folder,
     code_version as code_version,
+    compared_configs as compared_configs,
     component_files as component_files,
     filter_recording as filter_recording,
     library_versions as library_versions,

@@ -31,11 +31,14 @@ from mstfilter.smc import Observer
 
 _LIBRARIES = ("numpy", "scipy", "networkx", "opencv-python-headless", "higra", "small_gicp")
 
-#: Filters that a run is compared with: name -> changes of its configuration.
-COMPARED = {
-    "without past": ("transition=identity", "update=samples_only"),
-    "single frame": ("transition=identity", "update=samples_only", "proposal.sampler=optimal"),
-}
+
+def compared_configs(config: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """Configurations of the filters that a run is compared with. Their samples get the completer of the filter."""
+    parts = (config.get(slot) or {} for slot in ("proposal", "update"))
+    proposal, update = ({"component": part} if isinstance(part, str) else part for part in parts)
+    proposal = {**proposal, **{k: v for k, v in update.items() if k == "completer"}}
+    found = {**config, "transition": "identity", "update": "samples_only", "proposal": proposal}
+    return {"without past": found, "single frame": found | {"proposal": {**proposal, "sampler": "optimal"}}}
 
 
 @dataclass(frozen=True)
