@@ -160,9 +160,9 @@ def test_claims_of_fusion(tmp_path):
 
 
 def test_full_size(tmp_path):
-    assert "peak memory" in run_script("full_size/run.py", "--smoke", "--out", tmp_path)
+    assert "peak_GiB: mst" in run_script("full_size/run.py", "--smoke", "--out", tmp_path)
     rows = read_csv(tmp_path / "full_size.csv")
-    assert [r["pause"] for r in rows] == ["0", "1"]
+    assert [(r["preset"], r["pause"]) for r in rows] == [(p, t) for p in ("mst", "mst_rules") for t in ("0", "1")]
     for r in rows:
         assert 0 <= float(r["quality_mean"]) <= 1 and float(r["peak_GiB"]) > 0.05
         parts = [float(v) for k, v in r.items() if k.endswith("_s") and k != "step_s"]
