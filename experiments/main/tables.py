@@ -15,15 +15,20 @@ NAME_pooled_differences.csv.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import product
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from mstfilter.files import write_csv
+from mstfilter.statistics import interval
 from mstfilter.study import ENDPOINTS, StudyFolder, Summary, cost_columns, summarise
 
 Row = Mapping[str, Any]
+
+DESCRIBED = ("quality_estimate", "log_loss", "calibration_error", "energy", "volume_missed", "volume_invented")
 
 METRICS = (
     "quality",
@@ -86,10 +91,10 @@ def means(found: Summary) -> list[dict[str, str]]:
     return lines
 
 
-def differences(found: Summary) -> list[dict[str, str]]:
-    """One row per endpoint, family and arm that is compared with the reference."""
+def differences(found: Summary, metrics: Iterable[str] = ENDPOINTS) -> list[dict[str, str]]:
+    """One row per metric, family and arm that is compared with the reference."""
     lines = []
-    for c in [c for name in ENDPOINTS for c in found.compared(name)]:
+    for c in [c for name in metrics for c in found.compared(name)]:
         d = c.difference
         if not c.reported_only and d.n:
             row = {
@@ -102,6 +107,27 @@ def differences(found: Summary) -> list[dict[str, str]]:
             }
             row |= {name: f"{getattr(d, name):.4f}" for name in ("low", "high", "low_bootstrap", "high_bootstrap")}
             lines.append(row | {"p": f"{d.p:.4g}", "p_holm": f"{d.p_holm:.4g}"})
+    return lines
+
+
+def by_pause(rows: Sequence[Row]) -> list[dict[str, str]]:
+    """One row per metric and arm: means over scenes by pause t >= 1, and the change from the first to the last."""
+    lines = []
+    for metric, arm in product((*ENDPOINTS, *DESCRIBED), dict.fromkeys(row["arm"] for row in rows)):
+        values: dict[tuple[str, str], dict[int, list[float]]] = {}
+        for row in rows:
+            if row["arm"] == arm and row["pause"] >= 1 and row.get(metric) is not None:
+                scene = values.setdefault((row["family"], row["scene"]), {})
+                scene.setdefault(row["pause"], []).append(row[metric])  # one for each filter seed
+        pauses = sorted({t for scene in values.values() for t in scene})
+        means = {t: [np.mean(scene[t]) for scene in values.values() if t in scene] for t in pauses}
+        line = {"metric": metric, "arm": arm} | {f"pause_{t}": f"{np.mean(v):.4f}" for t, v in means.items()}
+        whole = [scene for scene in values.values() if len(scene) == len(pauses) > 1]
+        change = np.array([np.mean(scene[pauses[-1]]) - np.mean(scene[pauses[0]]) for scene in whole])
+        if len(change):
+            low, high = interval(change)
+            line |= {"change": f"{change.mean():.4f}", "low": f"{low:.4f}", "high": f"{high:.4f}"}
+        lines.append(line)
     return lines
 
 
@@ -174,6 +200,7 @@ def main(study: Path, out: Path, reference: str, pooled: bool) -> None:
             reported_only=folder.reported_only,
         )
         name += "_pooled"
+        tables = {f"{name}_described": differences(found, DESCRIBED), f"{name}_pauses": by_pause(rows)}
     else:
         found = summarise(rows, folder.description["reference"], cost_columns(rows), folder.reported_only)
         tables |= {name: means(found), f"{name}_scenes": by_scene(found)}

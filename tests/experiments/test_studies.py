@@ -68,6 +68,10 @@ def test_information_of_a_study_in_its_small_form(tmp_path):
     found = write_tables(folder, tmp_path / "tables")
     endpoints = [(row["endpoint"], row["arm"]) for row in found["information_differences"]]
     assert endpoints == [("quality", "single_frame"), ("information", "single_frame")]
+    pauses = write_tables(folder, tmp_path / "tables", "--pooled")["information_pooled_pauses"]
+    invented = {row["arm"]: row for row in pauses if row["metric"] == "volume_invented"}
+    own = [float(row["volume_invented"]) for row in rows if row["pause"] == "1" and row["arm"] == "mst"]
+    assert float(invented["mst"]["pause_1"]) == pytest.approx(sum(own) / len(own), abs=1e-4)
     fitted = load_study(EXPERIMENTS / "information/study.toml", smoke=True).model_copy(
         update={"recalibration": "recalibration.json", "folder": folder, "scenes": ONE_SCENE}
     )
