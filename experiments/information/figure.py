@@ -4,7 +4,8 @@
 
 Writes reliability.csv, the share of true answers by forecast, and reliability.png: the forecasts of some methods that
 "these two voxels belong to one object", pooled over families, scenes and pauses t >= 1, with 95 % bootstrap intervals
-over scenes. Forecasts between 0 and 1 are in bins of .2.
+over scenes. Forecasts between 0 and 1 are in bins of .2. Prints the calibration error of all forecasts of a method
+together (ten bins).
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from mstfilter.files import read_csv, write_csv
+from mstfilter.forecasts import ForecastTable
 from mstfilter.scoring import forecast_table
 from mstfilter.study import FORECASTS, StudyFolder
 
@@ -22,25 +24,31 @@ ARMS = ("mst", "single_frame", "true completion")
 EDGES = (-0.01, 0.0005, 0.2, 0.4, 0.6, 0.8, 0.9995, 1.01)
 
 
-def counts_of(folder: StudyFolder, arm: str) -> list[np.ndarray]:
-    """For each scene: forecasts by bin, columns count, sum of forecasts, true answers."""
+def forecasts_of(folder: StudyFolder, arm: str) -> list[ForecastTable]:
+    """The forecasts of each scene."""
     found = []
     for run in folder.description["runs"]:
         path = folder.run(run["folder"]) / FORECASTS
         if run["arm"] == arm and path.exists():
             with np.load(path) as data:
-                table = forecast_table(data["counts"][1:, 0].sum(axis=0))
-            which = np.searchsorted(EDGES, table.p) - 1
-            columns = (table.count, table.count * table.p, table.yes)
-            found.append(np.stack([np.bincount(which, c, len(EDGES) - 1) for c in columns], axis=1))
+                found.append(forecast_table(data["counts"][1:, 0].sum(axis=0)))
     return found
+
+
+def binned(table: ForecastTable) -> np.ndarray:
+    """Forecasts by bin, columns count, sum of forecasts, true answers."""
+    which = np.searchsorted(EDGES, table.p) - 1
+    columns = (table.count, table.count * table.p, table.yes)
+    return np.stack([np.bincount(which, c, len(EDGES) - 1) for c in columns], axis=1)
 
 
 def main(study: Path, out: Path) -> None:
     """Write the table and the figure."""
     folder, rng, rows = StudyFolder.open(study), np.random.default_rng(0), []
     for arm in (arm for arm in ARMS if any(run["arm"] == arm for run in folder.description["runs"])):
-        scenes = np.array(counts_of(folder, arm))
+        tables = forecasts_of(folder, arm)
+        print(f"{arm}: calibration error {ForecastTable.pooled(tables).reliability().error:.3f}")
+        scenes = np.array([binned(table) for table in tables])
         drawn = scenes[rng.integers(len(scenes), size=(1000, len(scenes)))].sum(axis=1)
         total = scenes.sum(axis=0)
         with np.errstate(invalid="ignore", divide="ignore"):

@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from functools import cache
+from itertools import repeat
 from pathlib import Path
 
 import numpy as np
-from joblib import Parallel, delayed
 from miniature_filters import (
     N_RANK_DRAWS,
     POSTERIOR_ERRORS,
@@ -112,7 +113,12 @@ def distances(
     plan: Plan, steps: int = T, processes: int = len(WORLDS), n_fit: int = N_FIT
 ) -> list[dict[str, object]]:
     """One row per world, arm, size and step; by default one process per shape of world."""
-    parts = Parallel(processes)(delayed(distances_of_shape)(shape, plan, steps, n_fit) for shape in WORLDS)
+    arguments = (list(WORLDS), repeat(plan), repeat(steps), repeat(n_fit))
+    if processes == 1:
+        parts = list(map(distances_of_shape, *arguments))
+    else:
+        with ProcessPoolExecutor(processes) as pool:
+            parts = list(pool.map(distances_of_shape, *arguments))
     return [row for rows in parts for row in rows]
 
 

@@ -1,10 +1,9 @@
-"""The forest plot of the README: differences between `mst_rules` and other methods, from tables of other studies.
+"""The forest plot of the README: differences between `mst` and other methods, from a table of another study.
 
     python experiments/readme_picture/differences.py [--out docs/images/differences.png]
 
-Quality is of scenes that were not used for tuning: 30 of `experiments/fusion`, or 15 of `experiments/main` for
-methods that only that study has. Information is of the 30 tuning scenes of `experiments/information`. Differences are
-paired by scene over all families, with t intervals that are not adjusted for multiple comparisons.
+The scenes are the sixty of `experiments/information/update.toml`, which nothing was tuned on. Differences are paired
+by scene over all families, with t intervals that are not adjusted for multiple comparisons.
 """
 
 from __future__ import annotations
@@ -17,10 +16,7 @@ from mstfilter.report import draw_forest
 from mstfilter.statistics import Difference, compare
 
 EXPERIMENTS = Path(__file__).parents[1]
-TABLES = {
-    "quality": ("fusion/results/fusion_reported_scenes.csv", "main/results/main_scenes.csv"),
-    "information": ("information/results/information_scenes.csv",),
-}
+TABLE = EXPERIMENTS / "information/results/update/update_scenes.csv"
 METHODS = {
     "paper": "the published method",
     "authors": "the authors' program",
@@ -30,24 +26,19 @@ METHODS = {
     "single_frame": "the best cut of the latest image",
     "object_fusion": "one map of all images",
     "mst n = 1": "one hypothesis",
-    "never merge": "objects are never merged",
+    "crossover": "the crossover of mst_rules",
 }
 SIGN = {"quality": 1, "information": -1}  # so that it is better on the right
-LABELS = {"quality": "mst_rules minus the method", "information": "the method minus mst_rules, nats"}
+LABELS = {"quality": "mst minus the method", "information": "the method minus mst, nats"}
 BLUE, GREEN = "#336fb9", "#2ca281"
 
 
 def differences(measure: str) -> dict[str, Difference]:
-    """The difference of each method in a measure, from the first table that has the method."""
-    found: dict[str, Difference] = {}
-    for table in TABLES[measure]:
-        values: dict[str, dict[str, float]] = {}
-        for row in read_csv(EXPERIMENTS / table):
-            values.setdefault(row["arm"], {})[row["scene"]] = SIGN[measure] * float(row[measure])
-        for arm in METHODS:
-            if arm in values:
-                found.setdefault(arm, compare(values["mst"], values[arm]))
-    return found
+    """The difference of each method in a measure."""
+    values: dict[str, dict[str, float]] = {}
+    for row in read_csv(TABLE):
+        values.setdefault(row["arm"], {})[row["scene"]] = SIGN[measure] * float(row[measure])
+    return {arm: compare(values["mst"], values[arm]) for arm in METHODS}
 
 
 def main(out: Path) -> None:
@@ -60,15 +51,10 @@ def main(out: Path) -> None:
         figure = Figure((8.75, 3.6), layout="constrained")
         FigureCanvasAgg(figure)
         panels = figure.subplots(1, 2)
-        for axes, measure, mark in zip(panels, TABLES, (BLUE, GREEN), strict=True):
+        for axes, measure, mark in zip(panels, SIGN, (BLUE, GREEN), strict=True):
             known = differences(measure)
             rows = [("", name, (d.mean, d.low, d.high), mark) for a, name in METHODS.items() for d in [known[a]]]
             draw_forest(axes, rows)
-            for y, arm in enumerate(METHODS):
-                place = {"xycoords": ("axes fraction", "data"), "va": "center", "ha": "right", "fontsize": 9}
-                axes.annotate(f"{known[arm].n} scenes", (1.0, y), color="#646b74", **place)
-            low, high = min(d.low for d in known.values()), max(d.high for d in known.values())
-            axes.set_xlim(low - 0.1 * (high - low), high + 0.42 * (high - low))
             axes.tick_params(labelleft=axes is panels[0])
             axes.set_title(f"{measure.capitalize()}: right is better")
             axes.set_xlabel(LABELS[measure])
