@@ -258,6 +258,7 @@ def main() -> None:
         options.out.mkdir(exist_ok=True)
         presets = (*PRESETS, *PARTITION)
         summarise(distances([(presets, 5, 100), (presets, 20, 100), (presets, 100, 50)]), options.out)
+        calibrate({"exact": 0, "mst_rules": 20, "mst": 20}, 400, 3, options.out)
         resolve_apart(100, options.out)
         return
     if options.smoke:
