@@ -9,7 +9,8 @@ which are also printed as tables for the README. NAME_cases.csv has the quality 
 objects; a case is one object at one pause t >= 1 (mean over cases, not over scenes). NAME_time.csv has core seconds
 of a step t >= 1: of the first filter seed, in which an arm may be the first to process a recording, and of later
 seeds, which use shared work on disk. With --pooled, differences are over the scenes of all families together:
-NAME_pooled_differences.csv.
+NAME_pooled_differences.csv; NAME_pooled_described.csv has those of further metrics, and NAME_pooled_pauses.csv the
+means by pause, and the change from pause 1 to the last one with its 95 % interval over scenes.
 """
 
 from __future__ import annotations

@@ -27,7 +27,7 @@ from scipy.special import expit
 
 from mstfilter.completion import Completion
 from mstfilter.fusion import Cells, Evidence, PairEvidence, PairOdds, PartitionUpdate
-from mstfilter.scene import Hypothesis, ObjectRecord, Occupancy, VoxelGrid
+from mstfilter.scene import Hypothesis, Occupancy, VoxelGrid
 from mstfilter.smc import ParticleFilter, Population, Systematic, Transition, Update
 
 OWN, FREE, BEHIND, OTHER, HIDDEN = range(5)  # what an observation shows of a cell; a view has the first three
@@ -178,12 +178,10 @@ class KnownPush(Transition):
         takes = target | ((arriving > p) & ((labels == 0) | own))
         new = np.where(target, label, np.where(own, 0, labels))
         owner = np.where(takes, label, np.where(mine, 0, shares.owner))
-        records = tuple(self._moved(r, step) if r.label == label else r for r in hypothesis.objects)
+        record = hypothesis.record(label)
+        moved = replace(record, views=tuple(view.shifted(step) for view in record.views))
+        records = tuple(moved if r is record else r for r in hypothesis.objects)
         return Hypothesis(new, hypothesis.grid, records, Occupancy(owner, np.where(takes, arriving, p)))
-
-    @staticmethod
-    def _moved(record: ObjectRecord, step: tuple[int, int]) -> ObjectRecord:
-        return replace(record, views=tuple(view.shifted(step) for view in record.views))
 
 
 @dataclass(frozen=True)
