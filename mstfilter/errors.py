@@ -16,7 +16,8 @@ import linecache
 import math
 import sysconfig
 import traceback
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from numbers import Integral, Real
 from pathlib import Path
 from typing import Any
@@ -50,6 +51,16 @@ class InputWarning(_WithHints, UserWarning):
 
     The command line shows it as one ``warning:`` line.
     """
+
+
+@contextmanager
+def naming(where: str) -> Iterator[None]:
+    """Put `where` in front of the message of an InputError in the block, unless the message contains it."""
+    try:
+        yield
+    except InputError as error:
+        message = error.message if where in error.message else f"{where}: {error.message}"
+        raise InputError(message, *error.hints) from error
 
 
 def reason(error: BaseException) -> str:

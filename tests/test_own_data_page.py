@@ -48,7 +48,7 @@ def data(tmp_path_factory):
     (path / "frames" / "info.json").write_text(json.dumps({"K": layouts.K, "depth_scale_m": 0.001}))
     shutil.copytree(path / "frames", path / "osd")
     example = next(b for b in re.findall(r"```python\n(.*?)```", PAGE, flags=re.DOTALL) if "class Mine" in b)
-    (path / "mine.py").write_text(example.partition("\n\nnp.savez")[0])
+    (path / "mine.py").write_text(example)
     rgb, depth, _ = layouts.video((0, 2))
     K = np.array([[131, 0, 79.5], [0, 131, 59.5], [0, 0, 1]])
     np.savez(path / "mine.npz", rgb=rgb, depth=depth, K=K)

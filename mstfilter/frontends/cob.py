@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from mstfilter.errors import InputError, MissingLibraryError, check_choice, check_integer, check_number
+from mstfilter.errors import InputError, MissingLibraryError, check_choice, check_integer, check_number, naming
 from mstfilter.files import weights_file
 from mstfilter.frontends.caffe import read_caffemodel
 from mstfilter.scene import Frame, Recording, UsesFiles, memo
@@ -120,12 +120,8 @@ def _load(digest: str, path: str, kind: str) -> CobNetwork:
     except ImportError as error:
         raise MissingLibraryError(f"torch cannot be imported: {error}", "pip install torch") from error
     network = CobNetwork(3 if kind == "rgb" else 6)
-    try:
+    with naming(path):
         network.load_caffe(read_caffemodel(path))
-    except InputError as error:
-        raise InputError(
-            error.message if path in error.message else f"{path}: {error.message}", *error.hints
-        ) from error
     return network.eval()
 
 

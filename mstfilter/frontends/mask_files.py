@@ -39,7 +39,7 @@ from typing import Any
 
 import numpy as np
 
-from mstfilter.errors import InputError
+from mstfilter.errors import InputError, naming
 from mstfilter.files import atomic_folder, write_text
 from mstfilter.frontends.mask_trees import label_tree, mask_tree
 from mstfilter.scene import content_key, memo, read_labels
@@ -192,12 +192,9 @@ def _region(
 ) -> MaskRegion:
     trees, stops, means = [], [], []
     for path in files:
-        try:
+        with naming(str(path)):
             masks, scores = _READERS[path.suffix](path, content[path], shape, image)
             tree, stop = (label_tree if masks.ndim == 2 else mask_tree)(masks, scores)
-        except InputError as error:
-            prefix = "" if str(path) in error.message else f"{path}: "
-            raise InputError(prefix + error.message, *error.hints) from error
         trees.append(tree)
         stops.append(stop)
         means.append(_mean_of_largest(masks, scores))
@@ -348,10 +345,8 @@ def _read_json(path: Path, data: bytes, shape: tuple[int, int], image: str) -> t
         if not isinstance(size, list) or len(size) != 2:
             raise InputError(f"{path}: size of mask {k} is {size!r}, expected [H, W]")
         _check_shape(path, size, shape)
-        try:
+        with naming(f"{path}: mask {k}"):
             masks[k] = decode_rle(rle["counts"], shape)
-        except InputError as error:
-            raise InputError(f"{path}: mask {k}: {error.message}", *error.hints) from error
         score = entry.get("score", entry.get("predicted_iou", 1.0))
         if not isinstance(score, int | float) or isinstance(score, bool):
             raise InputError(f"{path}: score of mask {k} is {score!r}, expected a number")

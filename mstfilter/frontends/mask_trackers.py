@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from mstfilter.errors import InputError, MissingLibraryError, check_integer, check_number
+from mstfilter.errors import MissingLibraryError, check_integer, check_number, naming
 from mstfilter.files import weights_file
 from mstfilter.scene import Clip, Frame, Recording, UsesFiles, component_key, content_key, memo
 from mstfilter.tracking import MaskTracker
@@ -108,12 +108,8 @@ def _load(path: str, digest: str) -> SiamMaskNetwork:
     except ImportError as error:
         raise MissingLibraryError(f"torch cannot be imported: {error}", "pip install torch") from error
     network = SiamMaskNetwork()
-    try:
+    with naming(path):
         network.load_state(read_checkpoint(Path(path)))
-    except InputError as error:
-        raise InputError(
-            error.message if path in error.message else f"{path}: {error.message}", *error.hints
-        ) from error
     return network
 
 

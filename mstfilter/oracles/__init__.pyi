@@ -10,6 +10,5 @@ from mstfilter.oracles.stages import (
     TrueMotions as TrueMotions,
     TruePairs as TruePairs,
     TrueQuality as TrueQuality,
-    overrides_of as overrides_of,
 )
 from mstfilter.oracles.truth import UsesTruth as UsesTruth, bind_truth as bind_truth, uses_truth as uses_truth

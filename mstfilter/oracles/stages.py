@@ -135,8 +135,3 @@ STAGES: dict[str, tuple[str, ...]] = {
     "free space": ("update.free_space=true_free_space",),
     "selection": ('update.evidence=["true_quality"]', "resampler=largest_weights"),
 }
-
-
-def overrides_of(*stages: str) -> tuple[str, ...]:
-    """Overrides of ``mst`` that replace several stages, in an order in which no override undoes another."""
-    return tuple(change for stage in STAGES if stage in stages for change in STAGES[stage])

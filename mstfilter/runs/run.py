@@ -29,7 +29,7 @@ from mstfilter.scene import Recording, UsesFiles
 from mstfilter.scoring import ask
 from mstfilter.smc import Observer
 
-_LIBRARIES = ("numpy", "scipy", "networkx", "opencv-python-headless", "higra", "small_gicp")
+_LIBRARIES = ("numpy", "scipy", "networkx", "opencv-python-headless", "higra", "small_gicp", "torch")
 
 
 def compared_configs(config: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
@@ -171,12 +171,18 @@ def _first_difference(found: Any, wanted: Any, where: str = "") -> str:
 
 
 def component_files(component: Any) -> dict[str, str]:
-    """Files of the user that a component and its parts come from, and trained weights -> hash of the content."""
-    parts = nested_components(component)
-    sources = [type(part).__dict__ for part in parts]
-    found = {source["__mst_file__"]: source["__mst_source__"] for source in sources if "__mst_file__" in source}
-    keys = {f"weights of {type(part).__name__}": str(getattr(part, "weights_key", "")) for part in parts}
-    return found | {name: key for name, key in keys.items() if key}
+    """Hashes of what a component and its parts read: source files of the user, trained weights, other files."""
+    found = {}
+    for part in nested_components(component):
+        name, source = type(part).__name__, type(part).__dict__
+        if "__mst_file__" in source:
+            found[source["__mst_file__"]] = source["__mst_source__"]
+        if key := str(getattr(part, "weights_key", "")):
+            found[f"weights of {name}"] = key
+        elif isinstance(part, UsesFiles):
+            paths = {field: str(getattr(part, field, "")) for field in part.path_fields}
+            found |= {f"{field} of {name}": _hash_of(Path(path)) for field, path in paths.items() if path}
+    return found
 
 
 def library_versions() -> dict[str, str]:
@@ -192,8 +198,13 @@ def library_versions() -> dict[str, str]:
 
 def code_version() -> str:
     """A hash of the Python files of mstfilter."""
-    package = Path(mstfilter.__file__).parent
+    return _hash_of(Path(mstfilter.__file__).parent, "*.py")
+
+
+def _hash_of(path: Path, pattern: str = "*") -> str:
+    """A hash of a file, or of the names and contents of the files below a folder that fit a pattern."""
     digest = hashlib.sha256()
-    for path in sorted(package.rglob("*.py")):
-        digest.update(path.relative_to(package).as_posix().encode() + b"\0" + path.read_bytes())
+    for file in sorted(path.rglob(pattern)) if path.is_dir() else [path]:
+        if file.is_file():
+            digest.update(file.relative_to(path).as_posix().encode() + b"\0" + file.read_bytes())
     return digest.hexdigest()[:16]

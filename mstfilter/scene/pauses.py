@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from mstfilter.errors import InputError, check_integer, suggestion
+from mstfilter.errors import InputError, check_integer, naming, suggestion
 
 
 class PauseRule(ABC):
@@ -86,10 +86,8 @@ class Listed(PauseRule):
         except (OSError, UnicodeDecodeError) as error:
             raise InputError(f"file of pauses cannot be read: {self.file} ({error})") from error
         words = [word for line in lines for word in line.partition("#")[0].replace(",", " ").split()]
-        try:
+        with naming(self.file):
             rule = At(**_numbers(words))
-        except InputError as error:
-            raise InputError(f"{self.file}: {error.message}", *error.hints) from error
         return rule.find(times, read_rgb)
 
 

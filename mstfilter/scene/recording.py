@@ -18,7 +18,7 @@ from copy import copy
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import Any, overload
+from typing import Any, ClassVar, overload
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
@@ -265,6 +265,9 @@ class Recording:
 
 class UsesFiles(ABC):
     """A component that reads files of the user, for example one for each pause. Inherit it with its interface."""
+
+    #: Fields with paths of files or folders. A run whose files have changed is another run.
+    path_fields: ClassVar[tuple[str, ...]] = ("folder", "weights", "checkpoint")
 
     @abstractmethod
     def check_files(self, recording: Recording) -> None:

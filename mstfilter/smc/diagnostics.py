@@ -33,7 +33,7 @@ from urllib.parse import quote
 
 import numpy as np
 
-from mstfilter.errors import InputError, LostRunError, MissingLibraryError, check_integer
+from mstfilter.errors import InputError, LostRunError, MissingLibraryError, check_integer, naming
 from mstfilter.files import atomic_path
 from mstfilter.lazy import progress_of
 from mstfilter.smc.batching import batch, batched_slots
@@ -103,7 +103,8 @@ def energy_distance(
     2 E d(X, Y) - E d(X, X') - E d(Y, Y') for draws X, X' of the first and Y, Y' of the second; the square of
     `scipy.stats.energy_distance` for numbers. It is 0 if both represent the same distribution, else positive.
 
-    ``distance(particles)`` is (n, n), such as ``lambda p: 1 - similarity.matrix(p)``, and must be of negative type.
+    ``distance(particles)`` is (n, n), such as ``lambda p: 1 - Gaussian().matrix(p)``, and must be of negative type
+    (`mstfilter.forecasts.is_negative_type`); otherwise the result can be 0 for different distributions.
     Default: Euclidean, for arrays and mappings of arrays.
     """
     both = union(first.realised().labelled({}), second.realised().labelled({}))
@@ -306,7 +307,7 @@ class _Job:
     def run(self, arm: str, seeds: list[int]) -> dict[tuple[str, int], _Run]:
         """Run some seeds of an arm, and store the results."""
         found = {}
-        try:
+        with naming(f"arm {arm!r}, seed {seeds[0]}"):
             if self.batched(arm):
                 means: dict[str, Any] = {"mean": _mean} if mean in self.collectors.values() else {}
                 runs = batch(self.arms[arm], self.observations, seeds, **means)
@@ -317,8 +318,6 @@ class _Job:
                     found[arm, seed] = _Run(rows, runs.lost.get(r, ""))
             else:
                 found = {(arm, seed): self.single(arm, seed) for seed in seeds}
-        except InputError as error:
-            raise InputError(f"arm {arm!r}, seed {seeds[0]}: {error.message}", *error.hints) from error
         for (_, seed), run in found.items():
             self.save(arm, seed, run)
         return found

@@ -1,7 +1,7 @@
 """Resampling that keeps different particles, with unequal output weights.
 
 `FearnheadClifford` and `Chopthin` need only the weights. The other schemes compare the particles by a `Similarity`.
-All but `Chopthin` need more candidates than particles to select.
+All but `Chopthin` and `ClusterStratified` need more candidates than particles to select.
 
 >>> import numpy as np
 >>> from mstfilter.smc import ClusterStratified, Gaussian, GreedyDiverse, KDpp, Population

@@ -152,7 +152,7 @@ class ParticleFilter:
         return State(0, None, seed if isinstance(seed, Key) else Key(seed), self.properly_weighted)
 
     def step(self, state: State, observation: Any, observer: Observer | None = None) -> tuple[State, Info]:
-        """Process one observation; None if it is missing, then the particles are only moved.
+        """Process one observation; None if it is missing: then without proposal and update.
 
         Raises InputError if a component raises it. The message starts with the step and the slot of the component.
         """

@@ -370,7 +370,7 @@ class State:
 
     @property
     def log_evidence(self) -> float | None:
-        """Log of the unbiased estimate of p(y_1 .. y_t); None if a component is not properly weighted."""
+        """Log of the unbiased estimate of p(y_0 .. y_{t-1}); None if a component is not properly weighted."""
         if not self.properly_weighted:
             return None
         return 0.0 if self.population is None else self.population.log_mean_weight

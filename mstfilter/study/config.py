@@ -28,7 +28,6 @@ The file::
 
 from __future__ import annotations
 
-import contextlib
 import itertools
 import tomllib
 from collections.abc import Iterator, Sequence
@@ -38,7 +37,7 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
-from mstfilter.errors import InputError
+from mstfilter.errors import InputError, naming
 from mstfilter.presets import load_config
 
 
@@ -178,19 +177,11 @@ class ArmRequest:
         """The configuration of the arm; unknown names of components raise InputError."""
         return load_config(self.preset, self.overrides, allow_files=allow_files)
 
-    @contextlib.contextmanager
-    def name_in_errors(self) -> Iterator[None]:
-        """Put the name of the arm in front of errors inside the block."""
-        try:
-            yield
-        except InputError as error:
-            raise InputError(f"arm {self.name!r}: {error.message}", *error.hints) from error
-
 
 def check_arm_names(study: StudyConfig, overrides: Sequence[str] = (), *, allow_files: bool = True) -> None:
     """Raise InputError if an arm names an unknown preset or component; imports no component."""
     for request in expand_arms(study, overrides):
-        with request.name_in_errors():
+        with naming(f"arm {request.name!r}"):
             request.config(allow_files)
 
 

@@ -20,7 +20,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from mstfilter.errors import InputError
+from mstfilter.errors import InputError, naming
 from mstfilter.oracles import uses_truth
 from mstfilter.presets import REGISTRY, build_filter, describe_filter
 from mstfilter.registry import nested_components
@@ -123,7 +123,7 @@ def make_plan(study: StudyConfig, overrides: Sequence[str] = (), *, allow_files:
 
 
 def _arm(request: ArmRequest, versions: dict[str, str], code: str, allow_files: bool) -> Arm:
-    with request.name_in_errors():
+    with naming(f"arm {request.name!r}"):
         filter = build_filter(request.config(allow_files), allow_files=allow_files)
         files = component_files(filter)
     config = as_json(describe_filter(filter))

@@ -8,7 +8,7 @@ import pytest
 
 from mstfilter import oracles
 from mstfilter.oracles import uses_truth
-from mstfilter.oracles.stages import STAGES, overrides_of
+from mstfilter.oracles.stages import STAGES
 from mstfilter.presets import REGISTRY, build_filter, describe_filter, load_config
 from tests.baselines.test_presets import differences
 from tests.conftest import REPOSITORY
@@ -16,6 +16,12 @@ from tests.conftest import REPOSITORY
 #: A filter without any estimate: true masks need no boundary, and the best candidates are selected.
 PERFECT_STAGES = ("masks", "completion", "motions", "partition", "free space", "selection")
 MST = describe_filter(build_filter(load_config("mst")))
+
+
+def overrides_of(*stages):
+    """Overrides of `mst` that replace several stages, in the order of `STAGES`."""
+    return tuple(change for stage in STAGES if stage in stages for change in STAGES[stage])
+
 
 WHERE = {
     "boundary": ["proposal.boundary"],

@@ -9,6 +9,7 @@ import pytest
 
 from mstfilter.errors import InputError
 from mstfilter.formats import RecordingWriter, open_recording
+from mstfilter.frontends import write_masks
 from mstfilter.presets import build_filter, describe_filter, load_config
 from mstfilter.runs.run import filter_recording
 from mstfilter.runs.run_folder import RunFolder
@@ -166,6 +167,28 @@ def test_a_changed_component_file_or_recording_is_another_run(recording, tmp_pat
     shutil.copytree(recording.path, changed)
     shutil.copy(changed / "rgb" / "000000.png", changed / "rgb" / "000001.png")
     assert open_recording(changed).key != recording.key
+
+
+def test_a_run_on_other_masks_is_another_run(recording, tmp_path):
+    """Masks of the user that have changed since, at any pause, and the same masks written again."""
+
+    def run():
+        overrides = "proposal=mask_folder", f"proposal.folder={tmp_path / 'masks'}"
+        return filter_recording(recording, load_config("mst_rules", ["n=1", *overrides]), tmp_path / "run")
+
+    def write(k, shift):
+        masks = np.zeros(recording.frames[0].depth.shape, np.uint16)
+        masks[20 + shift : 40, 20:40] = 1
+        write_masks(tmp_path / "masks", k, [masks])
+
+    for k in range(3):
+        write(k, 0)
+    run()
+    write(2, 0)
+    run()
+    write(2, 1)
+    with pytest.raises(InputError, match="its files differs .folder of MaskProposal: "):
+        run()
 
 
 @pytest.mark.parametrize(
