@@ -19,46 +19,64 @@ def random(rng: np.random.Generator, belief: Belief, pushes: Sequence[FingerPush
 
 def information(rng: np.random.Generator, belief: Belief, pushes: Sequence[FingerPush]) -> int:
     """The largest expected information about which voxels move; any candidate if the hypotheses agree."""
-    regions = [push.swept(belief.grid) for push in pushes]
-    best = belief.most_informative(range(len(pushes)), lambda k: belief.push_information(regions[k], TOLERANCE))
+    found = expected_information(belief, pushes)
+    best = belief.most_informative(range(len(pushes)), found.__getitem__)
     return random(rng, belief, pushes) if best is None else best
 
 
 def one_hypothesis(rng: np.random.Generator, belief: Belief, pushes: Sequence[FingerPush]) -> int:
     """By the hypothesis of least expected loss alone: the push of objects with the largest contact with others."""
-    labels = belief.estimate().labels
-    contact = np.zeros(int(labels.max()) + 1)
-    for axis in range(3):
-        a, b = (np.moveaxis(labels, axis, 0)[part] for part in (slice(None, -1), slice(1, None)))
-        meet = (a != b) & (a > 0) & (b > 0)
-        np.add.at(contact, a[meet], 1)
-        np.add.at(contact, b[meet], 1)
-    return _largest(rng, [contact[_touched(labels, push.swept(belief.grid))].sum() for push in pushes])
+    return _largest(rng, contact(belief, pushes))
 
 
 def least_sure(rng: np.random.Generator, belief: Belief, pushes: Sequence[FingerPush]) -> int:
-    """The push that touches the least sure object of the estimate: the lowest mean probability that two voxels of it
-    belong together, given that both are occupied."""
+    """The push that touches the least sure object of the estimate."""
+    return _largest(rng, doubt(rng, belief, pushes))
+
+
+def expected_information(belief: Belief, pushes: Sequence[FingerPush]) -> list[float]:
+    """Expected information of each push about which voxels move, in nats."""
+    return [belief.push_information(push.swept(belief.grid), TOLERANCE) for push in pushes]
+
+
+def contact(belief: Belief, pushes: Sequence[FingerPush]) -> list[float]:
+    """Faces of voxels between the objects that each push touches and other objects, in the estimate."""
+    labels = belief.estimate().labels
+    faces = np.zeros(int(labels.max()) + 1)
+    for axis in range(3):
+        a, b = (np.moveaxis(labels, axis, 0)[part] for part in (slice(None, -1), slice(1, None)))
+        meet = (a != b) & (a > 0) & (b > 0)
+        np.add.at(faces, a[meet], 1)
+        np.add.at(faces, b[meet], 1)
+    return [faces[found].sum() for found in touched(labels, pushes, belief)]
+
+
+def doubt(rng: np.random.Generator, belief: Belief, pushes: Sequence[FingerPush]) -> list[float]:
+    """1 - the lowest mean probability, over the objects that each push touches, that two voxels of an object of the
+    estimate belong together, given that both are occupied."""
     labels, occupancy = belief.estimate().labels, belief.occupancy()
-    numbers = [k for k in np.unique(labels) if k > 0]
-    doubt = {}
-    for k in numbers:
+    found = {}
+    for k in np.unique(labels[labels > 0]).tolist():
         voxels = np.argwhere(labels == k)
-        pairs = rng.integers(len(voxels), size=(2, 500))
-        first, second = voxels[pairs]
+        first, second = voxels[rng.integers(len(voxels), size=(2, 500))]
         occupied = np.minimum(occupancy[tuple(first.T)], occupancy[tuple(second.T)])
-        doubt[k] = 1 - float((belief.same_object(first, second) / occupied).mean())
-    touched = [_touched(labels, push.swept(belief.grid)) for push in pushes]
-    return _largest(rng, [max((doubt[k] for k in found), default=0.0) for found in touched])
+        found[k] = 1 - float((belief.same_object(first, second) / occupied).mean())
+    return [max((found[k] for k in objects), default=0.0) for objects in touched(labels, pushes, belief)]
+
+
+def volume(belief: Belief, pushes: Sequence[FingerPush]) -> list[float]:
+    """Voxels of the objects that each push touches, in the estimate."""
+    labels = belief.estimate().labels
+    sizes = np.bincount(labels.ravel())
+    return [float(sizes[found].sum()) for found in touched(labels, pushes, belief)]
+
+
+def touched(labels: np.ndarray, pushes: Sequence[FingerPush], belief: Belief) -> list[list[int]]:
+    """Objects that the finger of each push meets if nothing moves."""
+    return [[k for k in np.unique(labels[push.swept(belief.grid)]).tolist() if k > 0] for push in pushes]
 
 
 POLICIES = {"random": random, "information": information, "one hypothesis": one_hypothesis, "least sure": least_sure}
-
-
-def _touched(labels: np.ndarray, swept: np.ndarray) -> np.ndarray:
-    """Objects that the finger meets if nothing moves."""
-    found = np.unique(labels[swept])
-    return found[found > 0]
 
 
 def _largest(rng: np.random.Generator, values: Sequence[float]) -> int:

@@ -122,6 +122,22 @@ def test_decisions(tmp_path):
     assert {r["policy"] for r in read_csv(tmp_path / "summary.csv")} == set(POLICIES) - {"random"}
 
 
+def test_candidates_of_decisions(tmp_path):
+    """The lead of the largest volume is that of the table; an interval needs two scenes with a preferred push."""
+    run_script("decisions/candidates.py", "--smoke", "--out", tmp_path)
+    pushes: dict[str, list[tuple[float, float]]] = {}
+    for row in read_csv(tmp_path / "candidates.csv"):
+        pushes.setdefault(row["scene"], []).append((float(row["volume"]), float(row["gain coverage"])))
+    leads = []
+    for found in pushes.values():
+        largest = [gain for volume, gain in found if volume == max(v for v, _ in found)]
+        leads.append(sum(largest) / len(largest) - sum(gain for _, gain in found) / len(found))
+    rows = {(r["gain"], r["score"], r["criterion"]): r for r in read_csv(tmp_path / "criteria.csv")}
+    assert len(pushes) == 2 and len(rows) == 4 * 2 * 5
+    assert float(rows["coverage", "lead", "volume"]["mean"]) == pytest.approx(sum(leads) / len(leads), abs=1e-3)
+    assert all(abs(float(r["mean"])) <= 1 for key, r in rows.items() if key[1] == "rank" and r["mean"])
+
+
 def test_families(tmp_path):
     arguments = ("families/run.py", "--smoke", "--out", tmp_path)
     run_script(*arguments)
