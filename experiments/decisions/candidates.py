@@ -10,9 +10,9 @@ both in nats.
 
 criteria.csv has, for each criterion and each gain: `rank`, the mean over scenes of Spearman's rank correlation of the
 twelve pushes; and `lead`, the gain after the push that the criterion prefers minus the mean over all twelve, which a
-random choice has. The row `another seed` has the correlation of a gain with itself under the other filter seed: more
-cannot be foreseen. `best` is the push with the largest gain under the first seed, scored by the second one, so that it
-does not profit from chance. Intervals are 95 % t intervals over scenes.
+random choice has. The row `another seed` has the correlation of a gain with itself under the other filter seed:
+more cannot be foreseen. `best` is the push with the largest gain under the first seed, scored by the second one, so
+that it does not profit from chance. Intervals are 95 % t intervals over scenes.
 
 Finished scenes are not run again.
 """
