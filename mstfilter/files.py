@@ -12,17 +12,19 @@ from __future__ import annotations
 import csv
 import functools
 import hashlib
+import json
 import math
 import numbers
 import os
 import shutil
 import uuid
+import zipfile
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from mstfilter.errors import InputError
+from mstfilter.errors import InputError, naming, reason
 
 
 @contextmanager
@@ -50,6 +52,22 @@ def atomic_folder(path: str | Path) -> Iterator[Path]:
         os.replace(partial, target)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
+
+
+@contextmanager
+def reading(path: Path, kind: str, *hints: str) -> Iterator[None]:
+    """Turn errors in a block that reads a file into InputError; `kind` is what is missing without the file."""
+    try:
+        with naming(str(path)):
+            yield
+    except InputError:
+        raise
+    except FileNotFoundError:
+        raise InputError(f"not {kind}: {path} is missing", *hints) from None
+    except (json.JSONDecodeError, RecursionError) as error:
+        raise InputError(f"{path} is not valid JSON: {error}", *hints) from error
+    except (OSError, EOFError, zipfile.BadZipFile, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise InputError(f"{path} cannot be read: {reason(error)}", *hints) from error
 
 
 def check_output(path: Path, folder: bool = False) -> None:

@@ -63,6 +63,8 @@ class ForecastTable:
             if wrong.any():
                 raise InputError(f"{name} {int(np.argmax(wrong))} is {values[wrong][0]}, expected a value in [0, 1]")
         count = np.broadcast_to(np.asarray(count, dtype=np.float64), p.shape)
+        if not (np.isfinite(count) & (count >= 0)).all():
+            raise InputError("counts of forecasts are negative, infinite or NaN")
         values, which = np.unique(p, return_inverse=True)
         yes, no = (np.bincount(which, count * share, len(values)) for share in (y, 1 - y))
         return cls(values, no, yes)
@@ -236,7 +238,7 @@ def is_negative_type(distances: ArrayLike, tolerance: float = 1e-9) -> bool:
     distances : (n, n) float
         Symmetric, zero on the diagonal.
     tolerance : float
-        Largest eigenvalue that counts as 0, relative to the largest distance.
+        Largest eigenvalue that counts as 0, relative to n times the largest distance.
     """
     D = np.asarray(distances, dtype=np.float64)
     if D.ndim != 2 or D.shape[0] != D.shape[1]:

@@ -25,7 +25,7 @@ from mstfilter.errors import InputError
 
 LEVEL = 0.95
 CLAIM = 20  # fewest units for a claim
-EXACT = 12  # most units for which all sign flips are enumerated
+EXACT = 13  # most units for which all sign flips are enumerated
 N_FLIPS = 9999
 N_BOOTSTRAP = 4999
 
@@ -110,8 +110,8 @@ def studentised(values: np.ndarray, n_resamples: int = N_BOOTSTRAP) -> tuple[flo
     """Studentised bootstrap interval of the mean (Efron, Tibshirani 1993, section 12.5); NaN for fewer
     than five values.
 
-    The random generator is fixed, so the same values give the same interval. Resamples whose values are all equal
-    have no standard error and are left out.
+    The random generator is fixed, so the same values give the same interval. A resample of equal values has an
+    infinite t ratio, so a limit is infinite if most values are equal.
     """
     n = len(values)
     if n < 5:
@@ -122,14 +122,16 @@ def studentised(values: np.ndarray, n_resamples: int = N_BOOTSTRAP) -> tuple[flo
     rng = np.random.default_rng(20210)
     drawn = values[rng.integers(0, n, (n_resamples, n))]
     scale = drawn.std(axis=1, ddof=1)
+    away = drawn.mean(axis=1) - values.mean()
     good = scale > 1e-9 * spread
-    ratio = (drawn.mean(axis=1)[good] - values.mean()) / scale[good]
-    low, high = np.quantile(ratio, [0.5 - LEVEL / 2, 0.5 + LEVEL / 2])
+    ratio = np.divide(away, scale, out=np.copysign(1e200, away), where=good)  # numbers, since quantiles interpolate
+    found = np.quantile(ratio, [0.5 - LEVEL / 2, 0.5 + LEVEL / 2])
+    low, high = np.where(np.abs(found) > 1e100, np.copysign(np.inf, found), found)
     return float(values.mean() - high * spread), float(values.mean() - low * spread)
 
 
 def sign_flip(values: np.ndarray) -> float:
-    """Two-sided p value of the sign-flip test of a zero mean: exact up to 12 values, else 9999 random flips."""
+    """Two-sided p value of the sign-flip test of a zero mean: exact up to 13 values, else 9999 random flips."""
     from scipy.stats import permutation_test
 
     n = len(values)

@@ -50,15 +50,15 @@ class TrainedModel:
 
 
 def open_model(name: str, architecture: str | None = None) -> TrainedModel:
-    """The model of the package with this name, or the one in this folder.
+    """The model of the package with this name, or else the one in this folder.
 
     Raises InputError if it is missing, damaged, or of another architecture.
     """
-    given = Path(name)
-    folder = given if given.is_dir() else models_folder() / name
+    given, packaged = Path(name), models_folder() / name
+    folder = packaged if (given.name == name and packaged.is_dir()) or not given.is_dir() else given
     for file in (DESCRIPTION, WEIGHTS):
         if not (folder / file).is_file():
-            where = f"in the folder {given}" if given.is_dir() else f"in the package, and no folder {name!r}"
+            where = f"in the folder {given}" if folder == given else f"in the package, and no folder {name!r}"
             raise InputError(f"trained model {name!r}: there is no {file} {where}", _HINT)
     text = (folder / DESCRIPTION).read_bytes()
     try:

@@ -64,6 +64,14 @@ def test_coverage_by_simulation():
     assert missed < plain  # what it is for: t intervals miss too often where values are skewed
 
 
+def test_the_bootstrap_interval_of_rare_values_is_wide():
+    """Resamples of equal values have an infinite t ratio, and most of them are such."""
+    low, high = studentised(np.array([0.0] * 19 + [1.0]))
+    assert low < 0 and high == np.inf
+    low, high = studentised(-np.array([0.0] * 19 + [1.0]))
+    assert low == -np.inf and high > 0
+
+
 def test_the_bootstrap_interval_leans_with_the_skew():
     """As written in the book, drawn anew: the long tail of the values is on the side where the interval is long."""
     values = np.random.default_rng(7).exponential(1.0, 15)

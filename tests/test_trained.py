@@ -38,6 +38,14 @@ def test_a_model_that_is_not_there(tmp_path):
             open_model(name)
 
 
+def test_a_folder_of_the_name_of_a_model_of_the_package_does_not_hide_it(tmp_path, monkeypatch):
+    shipped = open_model("border").key
+    monkeypatch.chdir(tmp_path)
+    write_model(tmp_path / "border", {"architecture": "test"}, TENSORS)
+    assert open_model("border").key == shipped
+    assert open_model("./border").key == open_model(str(tmp_path / "border")).key != shipped
+
+
 @pytest.mark.parametrize("damage", ["truncated", "changed", "pickle"])
 def test_damaged_weights(folder, damage):
     path = folder / WEIGHTS

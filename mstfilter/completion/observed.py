@@ -95,7 +95,7 @@ def observed_in(
     if len(mine) and not in_mask.any():
         in_mask[np.unravel_index(points.argmax(), shape)] = True
         free = free & ~in_mask
-    height = grid.origin[2] + (np.arange(shape[2]) + 0.5) * grid.voxel_size
+    height = grid.origin[2] + (low[2] + np.arange(shape[2]) + 0.5) * grid.voxel_size
     other = surface & ~inside & ~in_mask
     distance = signed / np.float32(grid.voxel_size)
     return ObservedBox(points, in_mask, other, free, behind & inside, behind & ~inside, distance, height)

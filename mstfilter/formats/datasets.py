@@ -14,8 +14,9 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from mstfilter.errors import InputError, MissingLibraryError, reason
-from mstfilter.formats.video import KnownWorld, RecordingFormat, Video
+from mstfilter.errors import InputError, MissingLibraryError
+from mstfilter.files import reading
+from mstfilter.formats.video import KnownWorld, RecordingFormat, Video, object_numbers
 from mstfilter.scene import (
     Camera,
     Frame,
@@ -98,7 +99,8 @@ class Bop(RecordingFormat):
 
 def _cameras(path: Path) -> dict[int, dict[str, Any]]:
     """Entries of scene_camera.json by image number."""
-    try:
+    hints = "give the folder of one scene, for example test/000048", "depth_scale is in millimetres per unit"
+    with reading(path, "a BOP scene", *hints):
         found = {int(k): dict(v) for k, v in json.loads(path.read_text()).items()}
         for k, entry in found.items():
             where = f"image {k}"
@@ -107,15 +109,6 @@ def _cameras(path: Path) -> dict[int, dict[str, Any]]:
             if "depth_scale" not in entry:
                 raise ValueError(f"{where} has no depth_scale")
             entry["depth_scale"] = float(entry["depth_scale"])
-    except FileNotFoundError:
-        raise InputError(
-            f"not a BOP scene: {path} is missing", "give the folder of one scene, for example test/000048"
-        ) from None
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise InputError(
-            f"{path} does not give cam_K and depth_scale of each image: {reason(error)}",
-            "depth_scale is in millimetres per unit",
-        ) from error
     return found
 
 
@@ -159,7 +152,7 @@ def _instances(path: Path, k: int) -> np.ndarray | None:
         if mask.shape != labels.shape:
             raise InputError(f"mask {file} has shape {mask.shape}, the others {labels.shape}")
         labels[mask] = int(file.stem.rpartition("_")[2]) + 1
-    return labels
+    return None if labels is None else object_numbers(labels)
 
 
 _KEYS = ("tsdf", "mask_3d", "color_heightmap")

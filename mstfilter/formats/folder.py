@@ -25,7 +25,6 @@ import contextlib
 import json
 import math
 import shutil
-import zipfile
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
@@ -35,8 +34,8 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from mstfilter.errors import InputError, reason
-from mstfilter.files import check_output
+from mstfilter.errors import InputError
+from mstfilter.files import check_output, reading
 from mstfilter.formats.video import RecordingFormat
 from mstfilter.scene import (
     Camera,
@@ -145,10 +144,12 @@ class RecordingWriter:
         for part, image in images.items():
             if image is None:
                 continue
-            if image.shape[:2] != (self._camera.height, self._camera.width):
+            size = (self._camera.height, self._camera.width, *((3,) if part == "rgb" else ()))
+            kinds = (np.uint8, np.uint16) if part in ("instance", "depth") else (np.uint8,)
+            if image.shape != size or image.dtype not in kinds:
                 raise InputError(
-                    f"{part} image of frame {index} has shape {image.shape}, "
-                    f"the camera is {self._camera.width} x {self._camera.height}"
+                    f"{part} image of frame {index} has shape {image.shape} and type {image.dtype}, "
+                    f"expected {size} and {' or '.join(np.dtype(kind).name for kind in kinds)}"
                 )
             with self._writing():
                 (self._folder / part).mkdir(exist_ok=True)
@@ -165,7 +166,7 @@ class RecordingWriter:
             raise InputError(
                 f"true labels have shape {labels.shape}, the workspace is {self._grid and self._grid.shape}"
             )
-        self._voxels.append(as_labels(labels))
+        self._voxels.append(as_labels(labels).copy())
         self._voxel_frames.append(len(self._frames) - 1)
 
     def close(self) -> Path:
@@ -301,17 +302,8 @@ class _Manifest(BaseModel):
 
 
 def _load(path: Path, model: type[BaseModel]) -> Any:
-    try:
+    with reading(path, "a recording", "a recording folder holds manifest.json, camera.json, rgb/, depth/"):
         data = json.loads(path.read_text())
-    except FileNotFoundError:
-        raise InputError(
-            f"not a recording: {path} is missing",
-            "a recording folder holds manifest.json, camera.json, rgb/, depth/",
-        ) from None
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{path} is not valid JSON: {error}") from error
-    except OSError as error:
-        raise InputError(f"{path} cannot be read: {error.strerror}") from error
     try:
         return model.model_validate(data), data
     except ValidationError as error:
@@ -443,22 +435,17 @@ def _read_poses(path: Path) -> Any:
 
     @cache
     def load() -> dict[int, dict[int, np.ndarray]]:
-        try:
+        with reading(path, "true poses"):
             entries = {int(e["frame"]): dict(e["T_world_object"]) for e in json.loads(path.read_text())}
             return {i: {int(k): rigid_from_matrix(T).as_matrix() for k, T in e.items()} for i, e in entries.items()}
-        except (OSError, ValueError, KeyError, TypeError) as error:
-            raise InputError(f"true poses cannot be read: {path} ({reason(error)})") from error
 
     return lambda index: load().get(index)
 
 
 def _read_voxels(path: Path, grid: VoxelGrid, pauses: tuple[int, ...]) -> Any:
-    try:
-        with np.load(path, allow_pickle=False) as data:
-            labels, frames = data["labels"], data["frame"]
-            origin, size = data["origin"], float(data["voxel_size"])
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-        raise InputError(f"true volumes cannot be read: {path} ({reason(error)})") from error
+    with reading(path, "true volumes"), np.load(path, allow_pickle=False) as data:
+        labels, frames = data["labels"], data["frame"]
+        origin, size = data["origin"], float(data["voxel_size"])
     if labels.shape[1:] != grid.shape or not np.allclose(origin, grid.origin) or abs(size - grid.voxel_size) > 1e-9:
         raise InputError(
             f"{path}: grid {labels.shape[1:]} at {origin.tolist()} with voxels of {size} m differs from "

@@ -15,8 +15,9 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from mstfilter.errors import InputError, check_number, reason
-from mstfilter.formats.video import RecordingFormat, Video, VideoFormat, pair_stamps
+from mstfilter.errors import InputError, check_number
+from mstfilter.files import reading
+from mstfilter.formats.video import RecordingFormat, Video, VideoFormat, object_numbers, pair_stamps
 from mstfilter.scene import Frame, Recording, read_depth, read_labels, read_rgb, rigid_from_matrix, table_residual
 
 
@@ -31,7 +32,7 @@ class PairedImages(RecordingFormat):
     Parameters
     ----------
     frames : tuple of str
-        Names of the frames in order. Default: all, sorted by name.
+        Names of the frames in order. Default: all, by name; numbers in names count as numbers.
     background : tuple of int
         Labels that are no objects, besides 0. Default: those with most of their readings on the support plane.
     """
@@ -44,20 +45,16 @@ class PairedImages(RecordingFormat):
         return (path / "info.json").is_file() and any(path.glob("*_rgb.png"))
 
     def open(self, path: Path) -> Recording:
-        try:
+        example = 'for example {"K": [525, 525, 319.5, 239.5], "depth_scale_m": 0.001}'
+        with reading(path / "info.json", "pairs of images", example):
             info = json.loads((path / "info.json").read_text())
-            K = np.asarray(info["K"], dtype=float)
-            scale = float(info["depth_scale_m"])
-        except FileNotFoundError:
-            raise InputError(f"{path / 'info.json'} is missing", "it holds K and depth_scale_m") from None
-        except (json.JSONDecodeError, KeyError, TypeError, ValueError) as error:
-            raise InputError(
-                f"{path / 'info.json'} does not give K and depth_scale_m: {reason(error)}",
-                'for example {"K": [525, 525, 319.5, 239.5], "depth_scale_m": 0.001}',
-            ) from error
+            K, scale = np.asarray(info["K"], dtype=float), float(info["depth_scale_m"])
         if K.shape == (4,):
             K = np.array([[K[0], 0, K[2]], [0, K[1], K[3]], [0, 0, 1]])
-        present = sorted(p.name.removesuffix("_rgb.png") for p in path.glob("*_rgb.png"))
+        names = [p.name.removesuffix("_rgb.png") for p in path.glob("*_rgb.png")]
+        present = sorted(
+            names, key=lambda name: [w.zfill(20) if w.isdigit() else w for w in re.split(r"(\d+)", name)]
+        )
         chosen = [str(name) for name in self.frames] or present
         missing = [name for name in chosen if name not in present]
         if missing:
@@ -90,7 +87,7 @@ class PairedImages(RecordingFormat):
                 on_plane = np.abs(table_residual(frame)) < _ON_PLANE
             known = np.unique(labels[frame.valid])
             background = tuple(int(k) for k in known if on_plane[frame.valid & (labels == k)].mean() > 0.5)
-        return np.where(np.isin(labels, background), 0, labels)
+        return object_numbers(np.where(np.isin(labels, background), 0, labels))
 
 
 _ON_PLANE = 2.0  # disparity in 1/8 pixels of a Kinect: 6 mm at 1 m
@@ -165,6 +162,12 @@ class Redwood(VideoFormat):
             motion=_trajectory(logs[0], len(colour)) if logs else None,
             distortion=self.distortion,
         )
+        for name, n in zip(("height", "width"), video.read_rgb(0).shape, strict=False):
+            if not self.K and _stored(path, name, n) != n:
+                raise InputError(
+                    f"{_open3d_file(path)} is for images of another {name}: the images have {n}",
+                    "scale the intrinsics, or give them: K=fx,fy,cx,cy",
+                )
         return self.recording_of(video)
 
 
@@ -189,12 +192,12 @@ def _open3d_file(path: Path) -> Path | None:
 
 
 def _stored(path: Path, name: str, default: float) -> float:
-    """A number of at least 1 from Open3D's file: ``depth_scale`` (units per metre) or ``fps``."""
+    """A number from 1 of Open3D's file: ``depth_scale`` (units per metre), ``fps``, ``width`` or ``height``."""
     file = _open3d_file(path)
-    try:
-        value = default if file is None else json.loads(file.read_text()).get(name, default)
-    except (OSError, ValueError, AttributeError) as error:
-        raise InputError(f"{file} is not a file of Open3D: {error}") from error
+    if file is None:
+        return default
+    with reading(file, "a file of Open3D"):
+        value = json.loads(file.read_text()).get(name, default)
     check_number(f"{file}: {name}", value, f"give it: {name}=VALUE", at_least=1)
     return float(value)
 
@@ -207,10 +210,8 @@ def _intrinsics(path: Path) -> tuple[float, ...]:
             f"{path}: intrinsics are missing, there is no {_INTRINSICS[0]}",
             "give them: K=fx,fy,cx,cy (the default of Redwood is 525,525,319.5,239.5)",
         )
-    try:
+    with reading(file, "a file of Open3D"):
         matrix = np.reshape(np.asarray(json.loads(file.read_text())["intrinsic_matrix"], dtype=float), (3, 3)).T
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(f"{file} does not hold an Open3D intrinsic_matrix: {reason(error)}") from error
     if not np.allclose(matrix[2], (0, 0, 1)):
         raise InputError(
             f"{file}: intrinsic_matrix is {matrix.T.ravel().tolist()}, expected 9 numbers column by column",
@@ -221,10 +222,8 @@ def _intrinsics(path: Path) -> tuple[float, ...]:
 
 def _trajectory(path: Path, n: int) -> list[RigidTransform]:
     """Camera-to-world poses of a .log file, one per frame."""
-    try:
+    with reading(path, "a trajectory", "or ignore it: moving=false"):
         rows = [[float(v) for v in line.split()] for line in path.read_text().splitlines() if line.strip()]
-    except (OSError, ValueError) as error:
-        raise InputError(f"trajectory cannot be read: {path} ({error})", "or ignore it: moving=false") from error
     if len(rows) != 5 * n or any(len(row) != (3 if k % 5 == 0 else 4) for k, row in enumerate(rows)):
         raise InputError(
             f"trajectory {path} has {len(rows)} lines for {n} frames, expected five per frame: 3 numbers, then 4 x 4",
@@ -289,12 +288,8 @@ class Tum(VideoFormat):
 
 def _table(path: Path, columns: int) -> list[list[str]]:
     """Rows of a text file without comments."""
-    try:
+    with reading(path, "a TUM folder", "it holds rgb.txt and depth.txt"):
         lines = path.read_text().splitlines()
-    except FileNotFoundError:
-        raise InputError(f"not a TUM folder: {path} is missing", "it holds rgb.txt and depth.txt") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path} cannot be read: {error}") from error
     rows = []
     for number, line in enumerate(lines, 1):
         words = line.partition("#")[0].replace(",", " ").split()

@@ -251,6 +251,12 @@ class VideoFormat(RecordingFormat):
         return video.between(self.start_s, self.stop_s).recording(self.pauses, self.world)
 
 
+def object_numbers(labels: np.ndarray) -> np.ndarray:
+    """Instance image (H, W) uint16 in which no object has the number 255, which is that of the robot."""
+    free = np.setdiff1d(np.arange(256, 65536), labels)[0]
+    return np.where(labels == 255, free, labels).astype(np.uint16)
+
+
 def pair_stamps(
     colour: Sequence[float], depth: Sequence[float], tolerance_s: float, where: str
 ) -> tuple[tuple[int, int], ...]:

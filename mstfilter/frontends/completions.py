@@ -32,6 +32,7 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 
 from mstfilter.completion import ClipCompleter, Completer, Completion, ObservedBox, observed_box
+from mstfilter.completion.observed import frame_points
 from mstfilter.errors import InputError, check_choice, check_number
 from mstfilter.frontends.mask_files import read_bytes, read_weights
 from mstfilter.open3d_import import import_open3d
@@ -134,8 +135,10 @@ class ExternalCompletion(ClipCompleter, UsesFiles):
 
     def _place(self, rng: np.random.Generator, frame: Frame, mask: np.ndarray, grid: VoxelGrid) -> Completion:
         shapes: tuple[ObjectShapes, ...] = self.__dict__["_shapes"]
-        # The given mask has no pixels without reading, so those of the stored masks do not count.
-        ious = [(mask & s.mask).sum() / max((mask | (s.mask & frame.valid)).sum(), 1) for s in shapes]
+        # The given mask has no pixels without reading in the grid, so those of the stored masks do not count.
+        known = np.zeros(mask.size, bool)
+        known[frame_points(frame, grid)[0]] = True
+        ious = [(mask & s.mask).sum() / max((mask | (s.mask & known.reshape(mask.shape))).sum(), 1) for s in shapes]
         best = int(np.argmax(ious)) if shapes else -1
         if best < 0 or ious[best] < self.min_iou:
             if self.other is None:

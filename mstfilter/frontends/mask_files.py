@@ -40,7 +40,7 @@ from typing import Any
 import numpy as np
 
 from mstfilter.errors import InputError, naming
-from mstfilter.files import atomic_folder, write_text
+from mstfilter.files import atomic_folder, reading, write_text
 from mstfilter.frontends.mask_trees import label_tree, mask_tree
 from mstfilter.scene import content_key, memo, read_labels
 from mstfilter.segmentation import Tree
@@ -321,10 +321,8 @@ def _member(archive: zipfile.ZipFile, name: str, limit: int | None = None) -> np
 
 
 def _json(path: Path, data: bytes) -> Any:
-    try:
+    with reading(path, "masks"):
         return json.loads(data)
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{path} is not valid JSON: {error}") from error
 
 
 def _read_json(path: Path, data: bytes, shape: tuple[int, int], image: str) -> tuple[np.ndarray, np.ndarray]:

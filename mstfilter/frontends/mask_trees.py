@@ -35,7 +35,7 @@ def mask_tree(masks: np.ndarray, scores: Sequence[float] | np.ndarray) -> tuple[
     masks = np.asarray(masks, dtype=bool)
     n = len(masks)
     scores = check_scores(scores, n)
-    areas = masks.reshape(n, -1).sum(axis=1)
+    areas = masks.sum(axis=(1, 2))
     if n and areas.min() == 0:
         raise InputError(f"mask {int(areas.argmin())} is empty", "leave masks without pixels out")
     innermost = np.full(masks.shape[1:], -1)  # the smallest mask of each pixel so far

@@ -10,6 +10,7 @@ supplies package and checkpoint. The adapters were checked with stand-ins of the
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -31,17 +32,13 @@ _SAM2, _CUTIE = "https://github.com/facebookresearch/sam2", "https://github.com/
 
 
 @dataclass(frozen=True)
-class Sam2Tracker(MaskTracker, UsesFiles):
-    """The video predictor of the package ``sam2`` (SAM 2, or EdgeTAM, whose package has the same name).
-
-    All masks are tracked together, with one pass of the image encoder for each frame.
+class PackageTracker(MaskTracker, UsesFiles):
+    """A tracker of another package.
 
     Parameters
     ----------
     checkpoint : str
-        Path of a checkpoint, for example sam2.1_hiera_tiny.pt.
-    config : str
-        Name of the configuration of the checkpoint, as in the package.
+        Path of a checkpoint.
     device : str
         Device of torch.
     step : int
@@ -51,7 +48,6 @@ class Sam2Tracker(MaskTracker, UsesFiles):
     """
 
     checkpoint: str = ""
-    config: str = "configs/sam2.1/sam2.1_hiera_t.yaml"
     device: str = "cpu"
     step: int = 1
     sha256: str = ""
@@ -61,16 +57,31 @@ class Sam2Tracker(MaskTracker, UsesFiles):
 
     def check_files(self, recording: Recording) -> None:
         """Load the checkpoint."""
-        self._predictor()
+        self.loaded()
 
-    def _predictor(self) -> Any:
+    @abstractmethod
+    def loaded(self) -> Any:
+        """What the package makes of the checkpoint."""
+
+
+@dataclass(frozen=True)
+class Sam2Tracker(PackageTracker):
+    """The video predictor of the package ``sam2`` (SAM 2, or EdgeTAM, whose package has the same name).
+
+    All masks are tracked together, with one pass of the image encoder for each frame. `config` is the name of the
+    configuration of the checkpoint in the package. Further parameters: `PackageTracker`.
+    """
+
+    config: str = "configs/sam2.1/sam2.1_hiera_t.yaml"
+
+    def loaded(self) -> Any:
         file = weights_file(self.checkpoint, "SAM 2", _SAM2, self.sha256)
         with loading("sam2", file[0]):
             return _load_sam2(self.config, *file, self.device)
 
     def track(self, clip: Clip, masks: Sequence[np.ndarray]) -> list[np.ndarray]:
         """Masks (H, W) bool of the last frame. Raises InputError if the package or the checkpoint is missing."""
-        predictor, frames = self._predictor(), thinned(clip, self.step)
+        predictor, frames = self.loaded(), thinned(clip, self.step)
         if len(frames) == 1:
             return [mask.astype(bool) for mask in masks]
         found = [np.zeros(mask.shape, dtype=bool) for mask in masks]
@@ -103,41 +114,20 @@ def _write_jpeg(path: Path, rgb: np.ndarray) -> None:
 
 
 @dataclass(frozen=True)
-class CutieTracker(MaskTracker, UsesFiles):
+class CutieTracker(PackageTracker):
     """The package ``cutie``. Masks that do not overlap are tracked together; every frame is encoded once.
 
-    Parameters
-    ----------
-    checkpoint : str
-        Path of a checkpoint, for example cutie-base-mega.pth.
-    device : str
-        Device of torch.
-    step : int
-        Every `step`-th frame is used, and the last one.
-    sha256 : str
-        Expected hash of the file; empty: not compared.
+    Parameters: `PackageTracker`.
     """
 
-    checkpoint: str = ""
-    device: str = "cpu"
-    step: int = 1
-    sha256: str = ""
-
-    def __post_init__(self) -> None:
-        check_integer("step", self.step)
-
-    def check_files(self, recording: Recording) -> None:
-        """Load the checkpoint."""
-        self._network()
-
-    def _network(self) -> tuple[Any, Any]:
+    def loaded(self) -> tuple[Any, Any]:
         file = weights_file(self.checkpoint, "Cutie", _CUTIE, self.sha256)
         with loading("cutie", file[0]):
             return _load_cutie(*file, self.device)
 
     def track(self, clip: Clip, masks: Sequence[np.ndarray]) -> list[np.ndarray]:
         """Masks (H, W) bool of the last frame. Raises InputError if the package or the checkpoint is missing."""
-        (network, config), frames = self._network(), thinned(clip, self.step)
+        (network, config), frames = self.loaded(), thinned(clip, self.step)
         if len(frames) == 1:
             return [mask.astype(bool) for mask in masks]
         import torch

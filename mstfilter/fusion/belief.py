@@ -279,7 +279,8 @@ class Belief:
 
         ``-sum_s P(s) log P(s)``, P(s) the weight of the hypotheses with segmentation s of the region. This is also
         the information of the true segmentation of the region. Without region and tolerance it is an upper bound of
-        every information. The distance for the tolerance is `information.partition_distance`.
+        the information of every outcome that the labels determine. The distance for the tolerance is
+        `information.partition_distance`.
         """
         cells, sizes = self._region(region)
         rows = canonical_rows(self._refined.objects[:, cells])
@@ -347,6 +348,8 @@ class Belief:
         None if no action has `at_least` nats: the hypotheses agree on all outcomes, so none can be preferred.
         """
         values = [information(action) for action in actions]
+        if np.isnan(values).any():
+            raise InputError(f"the information of action {int(np.isnan(values).argmax())} is NaN")
         best = int(np.argmax(values)) if values else 0
         return actions[best] if values and values[best] >= at_least else None
 
@@ -392,9 +395,11 @@ class Belief:
             channel = np.array([p for _, p in pairs], dtype=np.float64)
         except (TypeError, ValueError) as error:
             raise InputError(f"probabilities of outcomes are not k numbers for each hypothesis ({error})") from error
-        if channel.ndim != 2 or not (channel >= 0).all() or not np.allclose(channel.sum(axis=1), 1):
+        if (
+            channel.ndim != 2 or not (channel >= 0).all() or not np.allclose(channel.sum(axis=1), 1, atol=2e-3)
+        ):  # float16
             raise InputError("probabilities of outcomes are negative or do not sum to 1 for a hypothesis")
-        return noisy_information(np.array([w for w, _ in pairs]), channel)
+        return noisy_information(np.array([w for w, _ in pairs]), channel / channel.sum(axis=1, keepdims=True))
 
     def estimate(self, loss: Callable[[Hypothesis, Hypothesis], float] | None = None) -> Hypothesis:
         """The hypothesis of least expected loss: ``argmin_i sum_j w_j loss(h_i, h_j)``.

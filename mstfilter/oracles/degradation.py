@@ -6,8 +6,9 @@ True
 
 The loss 1 - quality has three parts, in this order: splits of objects by random lines (a share `over` of the loss),
 merges of touching objects (a share `under`), and a smooth random displacement of all borders (the rest). The sizes of
-splits and displacements are found by bisection, so the quality is reached for any image. The loss of a merge is
-fixed; merges that cost too much are not made. Pieces of one object are not merged again.
+splits and displacements are found by bisection. The quality is not reached where objects fill the image or have few
+pixels. The loss of a merge is fixed; merges that cost too much are not made. With more than about 30 objects, more of
+the loss is due to displacement. Pieces of one object are not merged again.
 
 Random streams have keys: the objects that a draw is about, and for the displacement the position in the image. So the
 same generator makes similar errors in similar images, and errors can persist while a scene changes.

@@ -99,6 +99,7 @@ def filter_recording(
             "recording": {
                 "name": recording.name,
                 "key": recording.key.hex(),
+                "truth": recording.truth_key.hex(),
                 "pauses": recording.pauses,
                 "times": [recording.times[p] for p in recording.pauses],
                 "generator": recording.manifest.get("generator"),
@@ -172,16 +173,17 @@ def _first_difference(found: Any, wanted: Any, where: str = "") -> str:
 
 def component_files(component: Any) -> dict[str, str]:
     """Hashes of what a component and its parts read: source files of the user, trained weights, other files."""
-    found = {}
+    found: dict[str, str] = {}
     for part in nested_components(component):
         name, source = type(part).__name__, type(part).__dict__
         if "__mst_file__" in source:
             found[source["__mst_file__"]] = source["__mst_source__"]
         if key := str(getattr(part, "weights_key", "")):
-            found[f"weights of {name}"] = key
+            found[f"weights of {name}"] = found.get(f"weights of {name}", "") + key
         elif isinstance(part, UsesFiles):
-            paths = {field: str(getattr(part, field, "")) for field in part.path_fields}
-            found |= {f"{field} of {name}": _hash_of(Path(path)) for field, path in paths.items() if path}
+            for field in part.path_fields:
+                if path := getattr(part, field, ""):
+                    found[f"{field} of {name}"] = found.get(f"{field} of {name}", "") + _hash_of(Path(path))
     return found
 
 

@@ -30,7 +30,7 @@ from typing import Any
 import numpy as np
 
 from mstfilter.errors import InputError
-from mstfilter.files import atomic_folder, write_csv, write_text
+from mstfilter.files import atomic_folder, reading, write_csv, write_text
 from mstfilter.scene import (
     Camera,
     Clip,
@@ -68,12 +68,8 @@ def write_json(path: Path, value: Any) -> None:
 
 
 def _read_json(path: Path) -> Any:
-    try:
+    with reading(path, "a run folder", "a run folder is made by `mstfilter run`"):
         return json.loads(path.read_text())
-    except FileNotFoundError:
-        raise InputError(f"not a run folder: {path} is missing", "a run folder is made by `mstfilter run`") from None
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{path} is not valid JSON: {error}") from error
 
 
 @dataclass(frozen=True)
@@ -211,20 +207,20 @@ class RunFolder:
 
     def truth(self, t: int) -> np.ndarray | None:
         """True labels (X, Y, Z) at a pause; None if unknown."""
-        path = self.pause(t) / "truth.npz"
-        if not path.exists():
-            return None
-        with np.load(path, allow_pickle=False) as data:
-            return data["labels"]
+        return self._truth(t).get("labels")
 
     def questions(self, t: int) -> Questions | None:
         """The questions of a pause with ground truth; None if unknown."""
+        data = self._truth(t)
+        pairs = data.get("questions", np.zeros((2, 0))).astype(np.int64)
+        return Questions(data["labels"].shape, *pairs) if pairs.size else None
+
+    def _truth(self, t: int) -> dict[str, np.ndarray]:
         path = self.pause(t) / "truth.npz"
         if not path.exists():
-            return None
+            return {}
         with np.load(path, allow_pickle=False) as data:
-            pairs = data["questions"].astype(np.int64) if "questions" in data else np.zeros((2, 0), np.int64)
-            return Questions(data["labels"].shape, *pairs) if pairs.size else None
+            return dict(data)
 
     def hypotheses(self, t: int) -> tuple[Hypothesis, ...]:
         """The particles after the step."""

@@ -14,7 +14,6 @@ Brier score, log loss and that of the base rate, calibration error and energy sc
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -23,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from mstfilter.errors import InputError
-from mstfilter.files import write_csv
+from mstfilter.files import reading, write_csv
 from mstfilter.runs.run_folder import RunFolder
 from mstfilter.scene import Camera, Hypothesis, Recording, VoxelGrid, as_labels, render
 from mstfilter.scoring import (
@@ -156,18 +155,12 @@ def _read_volumes(path: Path, what: str) -> tuple[np.ndarray, list[int | None], 
     """Labels (S, X, Y, Z), the frame of each or None, and the grid or None."""
     if not path.exists():
         raise InputError(f"{what}: file does not exist: {path}")
-    try:
+    with reading(path, what, "expected .npz with an array `labels` (S, X, Y, Z), or .npy"):
         loaded = np.load(path, allow_pickle=False)
         data: Mapping[str, np.ndarray] = {"labels": loaded} if isinstance(loaded, np.ndarray) else dict(loaded)
         if "particles/labels" in data:
             raise InputError(f"{path} holds the hypotheses of one pause of a run", "give the run folder")
         labels = data["labels"]
-    except InputError:
-        raise
-    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile) as error:
-        raise InputError(
-            f"{what} cannot be read: {path} ({error})", "expected .npz with an array `labels` (S, X, Y, Z), or .npy"
-        ) from error
     labels = as_labels(labels, f"{path}: labels")
     labels = labels[None] if labels.ndim == 3 else labels
     if labels.ndim != 4 or len(labels) == 0:

@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import hashlib
+import pickle
 from collections.abc import Mapping
+from enum import Enum
+from pathlib import PurePath
+from types import CodeType
+from typing import Any
 
 import numpy as np
 
@@ -29,20 +35,43 @@ def frozen(array: np.ndarray) -> np.ndarray:
 
 
 def component_key(component: object) -> bytes:
-    """Key of a component: its class, its file if it has one, and its fields, arrays included.
+    """Key of a component: its class, its file or code if it is the user's, and its fields, arrays included.
 
-    If a component has a ``bound_key`` (the ground truth of a recording, for oracles), the key includes it.
+    If a component has a ``bound_key`` (the ground truth of a recording, for oracles), the key includes it. Torch
+    modules are known by their weights, other fields by their pickled content.
     """
     if dataclasses.is_dataclass(component) and not isinstance(component, type):
         cls = type(component)
-        source = getattr(cls, "__mst_source__", "")
+        source = getattr(cls, "__mst_source__", "") or _code(cls)
         fields = [component_key(getattr(component, f.name)) for f in dataclasses.fields(component)]
         return content_key(cls.__module__, cls.__qualname__, source, getattr(component, "bound_key", b""), *fields)
     if isinstance(component, (tuple, list)):
         return content_key(type(component).__name__, *(component_key(part) for part in component))
     if isinstance(component, Mapping):
         return content_key(*(part for k, v in component.items() for part in (k, component_key(v))))
+    plain = (str, bytes, int, float, complex, frozenset, np.generic, np.ndarray, PurePath, Enum, type, type(None))
+    if hasattr(component, "state_dict"):
+        tensors = {name: np.asarray(tensor) for name, tensor in component.state_dict().items()}
+        return content_key(repr(component), *(part for item in tensors.items() for part in item))
+    if not isinstance(component, plain):
+        with contextlib.suppress(Exception):  # what cannot be pickled, such as a lambda, is known by its text
+            return content_key(pickle.dumps(component))
     return content_key(component)
+
+
+def _code(cls: type) -> str:
+    """The code of the methods of a class of the user, which can change while its name stays the same."""
+    own = [base for base in cls.__mro__ if base.__module__.split(".")[0] not in ("mstfilter", "builtins", "abc")]
+    values = [value for base in own for value in vars(base).values()]
+    inner = [getattr(v, "fget", None) or getattr(v, "func", None) or getattr(v, "__func__", v) for v in values]
+    return "".join(_text(value.__code__) for value in inner if hasattr(value, "__code__"))
+
+
+def _text(constant: Any) -> str:
+    """A constant of compiled code, or code itself without its place, as text."""
+    if isinstance(constant, CodeType):
+        return repr((constant.co_code, constant.co_names)) + "".join(_text(part) for part in constant.co_consts)
+    return repr(sorted(map(repr, constant)) if isinstance(constant, frozenset) else constant)
 
 
 def content_key(*parts: object) -> bytes:

@@ -69,7 +69,7 @@ def read_rgb(path: Path) -> np.ndarray:
     """Colour image (H, W, 3) uint8, RGB."""
     import cv2
 
-    image = _decode(path, cv2.IMREAD_COLOR)
+    image = _decode(path, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)  # as its depth image
     return np.ascontiguousarray(image[..., ::-1])
 
 

@@ -13,12 +13,14 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
+from numbers import Integral
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from mstfilter.errors import InputError, check_integer, naming, suggestion
+from mstfilter.files import reading
 
 
 class PauseRule(ABC):
@@ -64,7 +66,7 @@ class At(PauseRule):
         n, since = len(times), np.asarray(times) - times[0]
         if not self.frames and not self.seconds:
             raise InputError("no pause is given", "give frames or seconds")
-        wrong = [i for i in self.frames if not -n <= i < n]
+        wrong = [i for i in self.frames if not (isinstance(i, Integral) and -n <= i < n)]
         if wrong:
             raise InputError(f"pause at frame {wrong[0]}: the video has {n} frames, 0 to {n - 1}")
         late = [s for s in self.seconds if not -0.5 <= s <= since[-1] + 0.5]
@@ -81,10 +83,8 @@ class Listed(PauseRule):
     file: str = "pauses.txt"
 
     def find(self, times: tuple[float, ...], read_rgb: Callable[[int], np.ndarray]) -> tuple[int, ...]:
-        try:
+        with reading(Path(self.file), "a file of pauses"):
             lines = Path(self.file).read_text().splitlines()
-        except (OSError, UnicodeDecodeError) as error:
-            raise InputError(f"file of pauses cannot be read: {self.file} ({error})") from error
         words = [word for line in lines for word in line.partition("#")[0].replace(",", " ").split()]
         with naming(self.file):
             rule = At(**_numbers(words))
@@ -106,25 +106,24 @@ def _numbers(words: list[str]) -> dict[str, Any]:
 def pauses_from_text(text: str) -> dict[str, Any]:
     """The configuration of a rule from the text of a user: the name of a rule, numbers, or the path of a file."""
     words = text.replace(",", " ").split()
-    if Path(text).is_file():
-        return {"component": "listed", "file": text}
-    if words and ".py:" not in text and all(w[0].isdigit() or w[0] in "-." for w in words):
+    numbers = words and ".py:" not in text and all(w[0].isdigit() or w[0] in "-." for w in words)
+    if numbers and (len(words) > 1 or not Path(text).is_file()):  # a long list is no path
         return {"component": "at", **{k: v for k, v in _numbers(words).items() if v}}
-    return {"component": text}
+    named = text in _RULES or not Path(text).is_file()
+    return {"component": text} if named else {"component": "listed", "file": text}
 
 
 def pause_rule(text: str) -> PauseRule:
     """The rule of a text: "still", "ends", "every", frames "0,40,85", seconds "0s,4.2s", or the path of a file."""
     config = pauses_from_text(text)
     name = str(config.pop("component"))
-    rules: dict[str, type[PauseRule]] = {"still": Still, "ends": Ends, "every": EveryNth, "at": At, "listed": Listed}
-    if name not in rules:
+    if name not in _RULES:
         raise InputError(
             f"there is no rule of pauses {name!r}",
-            *suggestion(name, rules),
+            *suggestion(name, _RULES),
             "still, ends, every, frames 0,40,85, seconds 0s,4.2s, or the path of a file that lists them",
         )
-    return rules[name](**config)
+    return _RULES[name](**config)
 
 
 _BLOCKS_ACROSS = 80
@@ -177,8 +176,9 @@ class Still(PauseRule):
     region: tuple[float, ...] = (0.0, 0.0, 1.0, 1.0)
 
     def __post_init__(self) -> None:
-        if len(self.region) != 4:
-            raise InputError(f"region has {len(self.region)} numbers, expected left, top, right, bottom from 0 to 1")
+        left, top, right, bottom = self.region if len(self.region) == 4 else (1, 1, 0, 0)
+        if not (0 <= left < right <= 1 and 0 <= top < bottom <= 1):
+            raise InputError(f"region is {self.region}, expected left, top, right, bottom from 0 to 1")
 
     def find(self, times: tuple[float, ...], read_rgb: Callable[[int], np.ndarray]) -> tuple[int, ...]:
         intervals = self.intervals(times, read_rgb)
@@ -214,10 +214,7 @@ class Still(PauseRule):
     def _part(self, blocks: np.ndarray) -> np.ndarray:
         h, w = blocks.shape
         left, top, right, bottom = self.region
-        part = blocks[int(top * h) : int(np.ceil(bottom * h)), int(left * w) : int(np.ceil(right * w))]
-        if part.size == 0:
-            raise InputError(f"region {self.region} of the image is empty", "left, top, right, bottom from 0 to 1")
-        return part
+        return blocks[int(top * h) : int(np.ceil(bottom * h)), int(left * w) : int(np.ceil(right * w))]
 
     def _limit(self, images: list[np.ndarray]) -> np.ndarray:
         """Change (h, w) in grey levels from which a block differs: a multiple of its noise at rest."""
@@ -227,3 +224,6 @@ class Still(PauseRule):
         limit = np.clip(6 * np.maximum(quarter, overall), self.levels, None)
         bounded: np.ndarray = np.minimum(limit, max(_MAX_LEVELS * self.levels, 6 * overall))
         return bounded
+
+
+_RULES: dict[str, type[PauseRule]] = {"still": Still, "ends": Ends, "every": EveryNth, "at": At, "listed": Listed}

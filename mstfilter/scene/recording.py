@@ -23,7 +23,7 @@ from typing import Any, ClassVar, overload
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from mstfilter.errors import InputError, InputWarning
+from mstfilter.errors import InputError, InputWarning, check_integer
 from mstfilter.lazy import late
 from mstfilter.scene.arrays import content_key
 from mstfilter.scene.camera import Camera, rigid_from_matrix
@@ -205,8 +205,10 @@ class Recording:
             pauses = pause_rule(pauses)
         if isinstance(pauses, PauseRule):
             pauses = pauses.find(stamps, lambda index: rgb[index])
+        for pause in pauses:
+            check_integer(f"a pause of {name}", pause, "a frame; for seconds: pauses='0s,4.2s'", at_least=0)
         chosen = tuple(int(p) for p in pauses)
-        if not chosen or min(chosen) < 0 or max(chosen) >= n:
+        if not chosen or max(chosen) >= n:
             raise InputError(f"pauses are {chosen}, expected indices of the {n} frames")
         masks = [None] * n if robot_masks is None else list(np.asarray(robot_masks, dtype=bool))
         if len(masks) != n or any(m is not None and m.shape != (height, width) for m in masks):

@@ -8,8 +8,9 @@
 **Information.** A raw proper score of hypotheses rewards noise: hypotheses of labels alone have no uncertainty of
 shape, so noise at their borders makes forecasts less sure where they are often wrong. Information takes this out. The
 forecasts are recalibrated by isotonic regression, fitted to other scenes, and the score is the mean log loss in nats;
-lower is better. Noise at the border is added where the other scenes say that it helps. So a forecaster gains nothing
-by adding noise itself, and two forecasters are compared by what their forecasts tell apart.
+lower is better. Noise at the border is added where the other scenes say that it helps. So a forecaster that adds such
+noise itself gains nothing (`experiments/information` shows it for all methods), and forecasters are compared by what
+they tell apart. Noise of another kind, or more of it than the largest rate, can still help a little.
 
 **Energy score.** With d the root of the share of questions that are answered differently,
 

@@ -45,6 +45,8 @@ from mstfilter.smc.interfaces import Proposal, Transition, Update
 from mstfilter.smc.population import Population, union
 from mstfilter.smc.state_space import StateSpaceModel
 
+_Map = Callable[[np.ndarray], np.ndarray]  #: of particles (n, d) or (R, n, d)
+
 
 def linear_gaussian(F: Any, Q: Any, H: Any, R: Any, m0: Any, P0: Any) -> StateSpaceModel:
     """x_0 ~ N(m0, P0), x_t = F x_{t-1} + N(0, Q), y_t = H x_t + N(0, R); particles are (n, d).
@@ -61,14 +63,7 @@ def linear_gaussian(F: Any, Q: Any, H: Any, R: Any, m0: Any, P0: Any) -> StateSp
     return nonlinear_gaussian(lambda x: x @ F.T, Q, lambda x: x @ H.T, R, m0, P0)
 
 
-def nonlinear_gaussian(
-    f: Callable[[np.ndarray], np.ndarray],
-    Q: Any,
-    h: Callable[[np.ndarray], np.ndarray],
-    R: Any,
-    m0: Any,
-    P0: Any,
-) -> StateSpaceModel:
+def nonlinear_gaussian(f: _Map, Q: Any, h: _Map, R: Any, m0: Any, P0: Any) -> StateSpaceModel:
     """x_0 ~ N(m0, P0), x_t = f(x_{t-1}) + N(0, Q), y_t = h(x_t) + N(0, R).
 
     `f` and `h` give the next states (n, d), and the observations (n, k) without noise, of particles (n, d). If they
@@ -342,13 +337,7 @@ def rao_blackwellised(model: ConditionallyLinear, n: int, **components: Any) -> 
     )
 
 
-def ekf_proposal(
-    f: Callable[[np.ndarray], np.ndarray],
-    Q: Any,
-    h: Callable[[np.ndarray], np.ndarray],
-    R: Any,
-    jacobian: Callable[[np.ndarray], np.ndarray],
-) -> Callable[[np.ndarray, Any], MultivariateNormal]:
+def ekf_proposal(f: _Map, Q: Any, h: _Map, R: Any, jacobian: _Map) -> Callable[[np.ndarray, Any], MultivariateNormal]:
     """A proposal for `guided`: the update of the extended Kalman filter from each particle.
 
     Given x_{t-1} the state is N(f(x_{t-1}), Q); `h` is linearised at its mean (Doucet, Godsill, Andrieu 2000, section
@@ -367,13 +356,7 @@ def ekf_proposal(
 
 
 def ukf_proposal(
-    f: Callable[[np.ndarray], np.ndarray],
-    Q: Any,
-    h: Callable[[np.ndarray], np.ndarray],
-    R: Any,
-    alpha: float = 1.0,
-    beta: float = 2.0,
-    kappa: float = 0.0,
+    f: _Map, Q: Any, h: _Map, R: Any, alpha: float = 1.0, beta: float = 2.0, kappa: float = 0.0
 ) -> Callable[[np.ndarray, Any], MultivariateNormal]:
     """A proposal for `guided`: the update of the unscented Kalman filter from each particle.
 

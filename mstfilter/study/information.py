@@ -80,13 +80,15 @@ def add_information(
 def fit_information(
     rows: Sequence[Mapping[str, Any]], counts: Counts, arms: Sequence[tuple[str, str]]
 ) -> dict[str, dict[str, Any]]:
-    """Fit each family and arm to all its scenes: family -> arm -> plain values."""
+    """Fit each family and arm to all its scenes: family -> arm -> plain values, with the names of the scenes."""
     found: dict[str, dict[str, Any]] = defaultdict(dict)
     for family, arm in arms:
         own = [row for row in rows if (row["family"], row["arm"]) == (family, arm)]
-        total = sum(_by_scene(counts(family, arm)).values(), np.zeros(1, np.int64))
+        by_scene = _by_scene(counts(family, arm))
+        total = sum(by_scene.values(), np.zeros(1, np.int64))
         if total.any():
-            found[family][arm] = _Fitted(FittedForecasts.fit(total), _energy_rate(own)).as_json()
+            fit = _Fitted(FittedForecasts.fit(total), _energy_rate(own)).as_json()
+            found[family][arm] = fit | {"scenes": sorted(by_scene)}
     return dict(found)
 
 

@@ -28,7 +28,7 @@ from typing import Any
 import numpy as np
 
 from mstfilter.errors import InputError
-from mstfilter.files import write_csv
+from mstfilter.files import reading, write_csv
 from mstfilter.forecasts import ForecastTable
 from mstfilter.runs import write_json
 from mstfilter.scoring import NO_COUNTS, forecast_table
@@ -92,14 +92,8 @@ class StudyFolder:
     @cached_property
     def description(self) -> dict[str, Any]:
         """The content of study.json."""
-        try:
+        with reading(self.path / "study.json", "a study folder", "`mstfilter study` makes one"):
             return dict(json.loads((self.path / "study.json").read_text()))
-        except FileNotFoundError:
-            raise InputError(
-                f"not a study folder: {self.path / 'study.json'} is missing", "`mstfilter study` makes one"
-            ) from None
-        except (OSError, ValueError) as error:
-            raise InputError(f"{self.path / 'study.json'} cannot be read: {error}") from error
 
     @property
     def reported_only(self) -> list[str]:
@@ -175,7 +169,8 @@ class StudyFolder:
 
     def write_tables(self) -> None:
         """Write all tables from the results of the runs."""
-        rows = self.rows()
+        records = self.records()
+        rows = _without_lists(records)
         costs = cost_columns(rows)
         columns = [*(c for c in _columns(rows) if c not in costs), *costs]
         found = self.summary_of(rows)
@@ -188,7 +183,7 @@ class StudyFolder:
         ):
             write_csv(self.path / f"{name}.csv", table, names, float_format=".6g")
         arms = list(dict.fromkeys((row["family"], row["arm"]) for row in rows))
-        write_json(self.path / "recalibration.json", fit_information(rows, self._counts, arms))
+        write_json(self.path / "recalibration.json", fit_information(records, self._counts, arms))
 
 
 def _without_lists(records: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:

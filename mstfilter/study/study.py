@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from mstfilter.errors import InputError
+from mstfilter.files import reading
 from mstfilter.lazy import progress_of
 from mstfilter.runs import library_versions, write_json
 from mstfilter.study.config import StudyConfig
@@ -185,18 +186,19 @@ def _read_recalibration(plan: Plan) -> dict[str, Any] | None:
     if not plan.config.recalibration:
         return None
     path = plan.config.folder / plan.config.recalibration
-    try:
+    with reading(path, "a recalibration", "name the recalibration.json of a study of the same families and arms"):
         found = json.loads(path.read_text())
         groups, arms = {scene.group for scene in plan.scenes}, {arm.name for arm in plan.arms}
         missing = [f"{arm} on {group}" for group in sorted(groups) for arm in sorted(arms) if arm not in found[group]]
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(
-            f"recalibration {path} cannot be used: {type(error).__name__}: {error}",
-            "name the recalibration.json of a study that has the same families and arms",
-        ) from error
+        fitted = {s for group in groups for arm in arms for s in found[group].get(arm, {}).get("scenes", ())}
     if missing:
         raise InputError(
             f"recalibration {path} has no fit of {', '.join(missing[:5])}", "add these arms to that study"
+        )
+    if again := sorted(fitted & {scene.name for scene in plan.scenes}):
+        raise InputError(
+            f"recalibration {path} was fitted to {again[0]}, a scene of this study",
+            "forecasts are recalibrated on other scenes: leave the field out, or name a study of other scenes",
         )
     return {group: {arm: found[group][arm] for arm in arms} for group in groups}
 

@@ -136,15 +136,15 @@ class Summary:
     def is_better(self, family: str, arm: str) -> bool:
         """Whether the reference can be claimed to be better than an arm on a family.
 
-        One endpoint is better after adjustment, on at least 20 scenes, and the interval of the other excludes that it
-        is worse by 0.005 or more.
+        One endpoint is better after adjustment, the interval of the other excludes that it is worse by 0.005 or more,
+        and both have at least 20 scenes.
         """
         found = {}
         for one in self.differences:
             if one.metric in ENDPOINTS and (one.family, one.second) == (family, arm) and one.adjusted:
                 sign, d = ENDPOINTS[one.metric], one.difference
                 low = d.low if sign > 0 else -d.high
-                found[one.metric] = d.n >= CLAIM and low > 0 and d.p_holm < 1 - LEVEL, low > -NOT_WORSE
+                found[one.metric] = low > 0 and d.p_holm < 1 - LEVEL, low > -NOT_WORSE and d.n >= CLAIM
         better, not_worse = zip(*found.values(), strict=True) if found else ((), ())
         return len(found) == len(ENDPOINTS) and any(better) and all(not_worse)
 

@@ -169,3 +169,18 @@ def test_robot_pixels_are_unknown(completer, frame):
     hidden = Frame(frame.rgb, frame.depth, frame.camera, np.ones(frame.depth.shape, bool))
     mask = masks_of(STACK, frame)[0]
     assert completer.complete(np.random.default_rng(0), hidden, [mask], GRID)[0].probability.size == 0
+
+
+@pytest.mark.parametrize("below", [7, 40])
+def test_a_grid_may_start_below_the_table(completer, frame, below):
+    """The same completions as on a grid that starts at the table, and nothing below it."""
+    low = VoxelGrid((-0.3, -0.3, -0.01 * below), 0.01, (60, 60, 30 + below))
+    rule = replace(completer, draw=False)
+    masks, rngs = masks_of(STACK, frame), [np.random.default_rng(0)] * 2
+    for one, other in zip(
+        rule.complete_each(rngs, frame, masks, GRID), rule.complete_each(rngs, frame, masks, low), strict=True
+    ):
+        found = placed(other, low)
+        assert not found[:, :, :below].any()
+        # Readings on the border of two voxels can change sides by rounding.
+        assert (np.abs(found[:, :, below:] - placed(one)) > 1e-3).mean() < 1e-2

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import json
 from unittest import mock
 
 import pytest
 
 from mstfilter.cli import main
+from mstfilter.errors import InputError
 from mstfilter.files import read_csv
 from mstfilter.simulation import FIRST_REPORTED_SEED
 from mstfilter.study import SceneEntry, load_study, make_plan, run_study
@@ -72,13 +74,23 @@ def test_information_of_a_study_in_its_small_form(tmp_path):
     invented = {row["arm"]: row for row in pauses if row["metric"] == "volume_invented"}
     own = [float(row["volume_invented"]) for row in rows if row["pause"] == "1" and row["arm"] == "mst"]
     assert float(invented["mst"]["pause_1"]) == pytest.approx(sum(own) / len(own), abs=1e-4)
+    rates = {
+        arm: fit["energy_rate"]
+        for arm, fit in json.loads((folder / "recalibration.json").read_text())["demo"].items()
+    }
+    assert rates["mst"] > 0
     fitted = load_study(EXPERIMENTS / "information/study.toml", smoke=True).model_copy(
         update={"recalibration": "recalibration.json", "folder": folder, "scenes": ONE_SCENE}
     )
-    result = run_study(fitted, tmp_path / "third", InProcess())
-    third = {(r["arm"], r["pause"]): r["information"] for r in result.folder.rows()}
-    own = {(r["arm"], int(r["pause"])): float(r["information"]) for r in rows if r["scene"] == "demo-0"}
-    assert third.keys() == own.keys() and third != pytest.approx(own)
+    with pytest.raises(InputError, match="was fitted to demo-0, a scene of this study"):
+        run_study(fitted, tmp_path / "same", InProcess())
+    other = tuple(entry.model_copy(update={"seeds": (2,)}) for entry in ONE_SCENE)
+    result = run_study(fitted.model_copy(update={"scenes": other}), tmp_path / "third", InProcess())
+    third = result.folder.rows()
+    assert {(r["arm"], r["pause"]) for r in third} == {
+        (r["arm"], int(r["pause"])) for r in rows if r["scene"] == "demo-0"
+    }
+    assert all(0 < r["information"] < 1 and r["energy_floor"] < r["energy"] for r in third if r["arm"] == "mst")
 
 
 def test_number_of_hypotheses(tmp_path):

@@ -269,6 +269,12 @@ FAULTS = {
         lambda p: (first_file(p, "depth").unlink(), sorted((p / "color").iterdir())[5].unlink()),
         "does not fit depth image",
     ),
+    "redwood, intrinsics of another size": (
+        write_redwood,
+        Redwood(),
+        lambda p: edit(p / "intrinsic.json", lambda d: d.update(width=320, height=240)),
+        "images of another height: the images have 120",
+    ),
     "redwood, no intrinsics": (write_redwood, Redwood(), lambda p: (p / "intrinsic.json").unlink(), "intrinsics are"),
     "redwood, row by row": (
         write_redwood,

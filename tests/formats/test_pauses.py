@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -32,8 +34,9 @@ def test_given_pauses(tmp_path):
     for rule, message in (
         (At(), "no pause"),
         (At(frames=(40,)), "frame 40: the video has 40"),
+        (At(frames=(2.7,)), "frame 2.7: the video has 40"),
         (At(seconds=(9.0,)), "lasts from 0 to 3.9 s"),
-        (Listed(str(tmp_path / "none")), "cannot be read"),
+        (Listed(str(tmp_path / "none")), "is missing"),
     ):
         with pytest.raises(InputError, match=message):
             rule.find(TIMES, none)
@@ -52,6 +55,10 @@ def test_pauses_as_text(tmp_path):
     assert pauses_from_text(str(file)) == {"component": "listed", "file": str(file)}
     with pytest.raises(InputError, match="1.5"):
         pauses_from_text("0,1.5")
+    assert pauses_from_text(",".join(map(str, range(400))))["frames"] == tuple(range(400))  # too long for a path
+    with contextlib.chdir(tmp_path):
+        Path("still").write_text("0")
+        assert pauses_from_text("still") == {"component": "still"}
 
 
 def test_pauses_of_arrays(tmp_path):
@@ -72,6 +79,9 @@ def test_pauses_of_arrays(tmp_path):
     assert pauses(pauses=[2, 5]) == (2, 5)
     for wrong, message in (("evry", "no rule of pauses 'evry'"), ("0,x", "no rule"), ("99", "frame 99")):
         with pytest.raises(InputError, match=message):
+            pauses(pauses=wrong)
+    for wrong in ((0, 4.9), (False, True), (-1, 3)):
+        with pytest.raises(InputError, match="a pause of arrays is .* expected an integer"):
             pauses(pauses=wrong)
     with pytest.raises(InputError, match="3 times for 9 frames"):
         pauses(times=times[:3])

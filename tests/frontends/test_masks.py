@@ -199,7 +199,7 @@ def test_a_mask_of_the_table_hides_no_objects(tmp_path):
 
 
 def test_no_masks_give_no_objects(tmp_path):
-    write_masks(tmp_path, 0, [np.zeros(SHAPE, int)])
+    write_masks(tmp_path, 0, [np.zeros(SHAPE, int), np.zeros((0, *SHAPE), bool)])
     (hypothesis,) = MaskProposal(str(tmp_path)).sample(np.random.default_rng(0), CLIP, 1).particles
     assert hypothesis.n_objects == 0
     regions = read_masks(tmp_path, 0, SHAPE).regions

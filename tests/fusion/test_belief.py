@@ -247,6 +247,8 @@ def test_outcomes_of_the_user():
     chance = {x.key: pi for x, pi in zip(belief.hypotheses, p, strict=True)}
     assert belief.noisy_information(lambda x: (chance[x.key], 1 - chance[x.key])) == pytest.approx(want)
     assert noisy_information(w, np.full((5, 3), 1 / 3)) == pytest.approx(0, abs=1e-12)
+    half = np.float16(0.3333)  # probabilities of hypotheses are stored in half precision
+    assert belief.noisy_information(lambda x: (half, 1 - half)) == pytest.approx(0, abs=1e-6)
 
 
 def test_reweighted_and_sample():

@@ -80,6 +80,7 @@ BAD = {
     "no samples": (lambda b: b.sample(np.random.default_rng(0), 0), "samples"),
     "array outcome": (lambda b: b.information(lambda h: h.labels), "outcome"),
     "ragged": (lambda b: b.noisy_information(lambda h: [1.0] * h.n_objects), "probabilities"),
+    "NaN": (lambda b: b.most_informative("ab", {"a": float("nan"), "b": 1.0}.__getitem__), "action 0 is NaN"),
     "no probabilities": (lambda b: b.noisy_information(lambda h: (0.5, 0.6)), "sum to 1"),
     "NaN likelihood": (lambda b: b.reweighted(lambda h: np.nan), "NaN"),
     "ruled out": (lambda b: b.reweighted(lambda h: -np.inf), "no particle"),

@@ -9,9 +9,9 @@ import pytest
 
 from mstfilter.errors import InputError
 from mstfilter.formats import RecordingWriter, open_recording
-from mstfilter.frontends import write_masks
+from mstfilter.frontends import ExternalCompletion, write_masks
 from mstfilter.presets import build_filter, describe_filter, load_config
-from mstfilter.runs.run import filter_recording
+from mstfilter.runs.run import component_files, filter_recording
 from mstfilter.runs.run_folder import RunFolder
 from mstfilter.scoring import weighted_coverage
 from tests.scene.scenes import CAMERA, GRID, table_scene
@@ -189,6 +189,18 @@ def test_a_run_on_other_masks_is_another_run(recording, tmp_path):
     write(2, 1)
     with pytest.raises(InputError, match="its files differs .folder of MaskProposal: "):
         run()
+
+
+def test_all_folders_of_a_component_count(tmp_path):
+    """Two components of one class, one inside the other."""
+    for name in "ab":
+        (tmp_path / name).mkdir()
+    one = ExternalCompletion(folder=str(tmp_path / "a"), other=ExternalCompletion(folder=str(tmp_path / "b")))
+    seen = [component_files(one)]
+    for name in "ab":
+        (tmp_path / name / "x").write_text(name)
+        seen.append(component_files(one))
+    assert len({tuple(found.values()) for found in seen}) == 3
 
 
 @pytest.mark.parametrize(

@@ -7,14 +7,16 @@ import multiprocessing
 import os
 import pickle
 import threading
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
+from typing import Any
 
 import diskcache
 import numpy as np
 import pytest
 
+from mstfilter.completion import Extrude
 from mstfilter.scene import Cache, DiskCache
-from mstfilter.scene.arrays import content_key
+from mstfilter.scene.arrays import component_key, content_key
 
 
 @dataclass(frozen=True)
@@ -237,3 +239,48 @@ def test_a_full_disk_stores_nothing(tmp_path, monkeypatch):
     assert get(tmp_path, "array", 1, lambda: np.ones(2)).tolist() == [1, 1]
     monkeypatch.undo()
     assert get(tmp_path, "array", 1, lambda: np.zeros(2)).tolist() == [0, 0]
+
+
+CLASS = """
+from dataclasses import dataclass
+from functools import cached_property
+from mstfilter.completion import Extrude
+
+@dataclass(frozen=True)
+class Mine(Extrude):
+    def fill(self, rng, seen):
+        return [FACTOR * v for v in seen.surface if v in {"a", "b"}]
+
+    @cached_property
+    def other(self):
+        return [2 * k for k in range(3)]
+"""
+
+
+def test_a_class_of_the_user_is_known_by_its_code():
+    """As in a notebook, where a class is defined again under the same name; its place in a file does not count."""
+
+    def key(text):
+        given = {"__name__": "__main__"}
+        exec(compile(text, "a cell", "exec"), given)
+        return component_key(given["Mine"]())
+
+    first = key(CLASS.replace("FACTOR", "1.0"))
+    assert first == key("\n\n" + CLASS.replace("FACTOR", "1.0"))
+    assert len({first, key(CLASS.replace("FACTOR", "0.7")), key(CLASS.replace("2 * k", "3 * k"))}) == 3
+    values = [content_key(value) for value in astuple(Extrude())]
+    assert component_key(Extrude()) == content_key("mstfilter.completion.extrude", "Extrude", "", b"", *values)
+
+
+@dataclass(frozen=True)
+class Holder:
+    net: Any
+
+
+def test_fields_without_a_text_of_their_own_are_known_by_their_content():
+    torch = pytest.importorskip("torch")
+    a, b = torch.nn.Linear(2, 1), torch.nn.Linear(2, 1)
+    copy = torch.nn.Linear(2, 1)
+    copy.load_state_dict(a.state_dict())
+    keys = [component_key(Holder(net)) for net in (a, b, copy)]
+    assert keys[0] != keys[1] and keys[0] == keys[2]
