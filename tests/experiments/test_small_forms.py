@@ -122,6 +122,22 @@ def test_decisions(tmp_path):
     assert {r["policy"] for r in read_csv(tmp_path / "summary.csv")} == set(POLICIES) - {"random"}
 
 
+def test_information_of_the_controls(tmp_path):
+    """The differences are those of the means, and nothing is run again."""
+    arguments = ("controls/information.py", "--smoke", "--out", tmp_path)
+    run_script(*arguments)
+    rows = {row["arm"]: row for row in read_csv(tmp_path / "information.csv")}
+    assert list(rows) == ["samples", "mst", "again", "stranger"]
+    mean = {arm: float(row["information"]) for arm, row in rows.items()}
+    for arm, row in rows.items():
+        assert 0 < mean[arm] < math.log(2)
+        assert float(row["minus_samples"]) == pytest.approx(mean[arm] - mean["samples"], abs=2e-4)
+        assert float(row["mst_minus_it"]) == pytest.approx(mean["mst"] - mean[arm], abs=2e-4)
+    before = {path: path.stat().st_mtime_ns for path in (tmp_path / "counts").iterdir()}
+    run_script(*arguments)
+    assert before == {path: path.stat().st_mtime_ns for path in (tmp_path / "counts").iterdir()}
+
+
 def test_candidates_of_decisions(tmp_path):
     """The lead of the largest volume is that of the table; an interval needs two scenes with a preferred push."""
     run_script("decisions/candidates.py", "--smoke", "--out", tmp_path)
