@@ -63,8 +63,8 @@ def crop_box(voxels: np.ndarray, grid: VoxelGrid) -> tuple[np.ndarray, np.ndarra
     ends.
     """
     low, high = np.percentile(voxels, (2, 98), axis=0)
-    table = int(np.floor(-grid.origin[2] / grid.voxel_size + 1e-6))
-    extent = max(*(high - low + 1)[:2] + 4, float(high[2]) - max(table, 0) + 3) * grid.voxel_size / LATTICE
+    table = max(0, int(np.floor(-grid.origin[2] / grid.voxel_size + 1e-6)))
+    extent = max(*(high - low + 1)[:2] + 4, float(high[2]) - table + 3) * grid.voxel_size / LATTICE
     edge = next((n for n in (EDGE, *LARGER) if extent <= n), LARGER[-1])
     edge = int(np.ceil(edge * LATTICE / grid.voxel_size - 1e-6))
     start = np.floor((low + high + 1) / 2).astype(np.int64) - edge // 2

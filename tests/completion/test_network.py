@@ -184,3 +184,11 @@ def test_a_grid_may_start_below_the_table(completer, frame, below):
         assert not found[:, :, :below].any()
         # Readings on the border of two voxels can change sides by rounding.
         assert (np.abs(found[:, :, below:] - placed(one)) > 1e-3).mean() < 1e-2
+
+
+def test_crops_of_grids_that_start_above_or_below_the_table():
+    voxels = np.argwhere(np.ones((10, 10, 12), bool)) + (20, 20, 0)
+    for lowest, first, last in ((0, 0, 32), (6, 0, 32), (-7, 7, 39), (-40, 40, 60)):
+        grid = VoxelGrid((-0.3, -0.3, 0.01 * lowest), 0.01, (60, 60, 60))
+        low, high = crop_box(voxels + (0, 0, first), grid)
+        assert (low[2], high[2]) == (first, last)
