@@ -25,7 +25,7 @@ from mstfilter.files import write_csv
 from mstfilter.formats import open_recording
 from mstfilter.scoring import ask, leave_one_out, score_belief
 from mstfilter.simulation import cached_recording
-from mstfilter.statistics import interval
+from mstfilter.statistics import compare
 
 ARMS = ("samples", "mst", "again", "stranger")
 
@@ -93,13 +93,10 @@ def main() -> None:
             print(name, flush=True)
     found, rows = losses(folder), []
     for arm, by_scene in found.items():
-        d = np.array([value - found["samples"][name] for name, value in by_scene.items()])
-        low, high = interval(d)
-        row = {"arm": arm, "n": len(d), "information": float(np.mean(list(by_scene.values())))}
-        rows.append({**row, "minus_samples": float(d.mean()), "low": low, "high": high})
-        d = np.array([found["mst"][name] - value for name, value in by_scene.items()])
-        low, high = interval(d)
-        rows[-1] |= {"mst_minus_it": float(d.mean()), "mst_low": low, "mst_high": high}
+        over, under = compare(by_scene, found["samples"]), compare(found["mst"], by_scene)
+        row = {"arm": arm, "n": over.n, "information": float(np.mean(list(by_scene.values())))}
+        row |= {"minus_samples": over.mean, "low": over.low, "high": over.high}
+        rows.append({**row, "mst_minus_it": under.mean, "mst_low": under.low, "mst_high": under.high})
     write_csv(chosen.out / "information.csv", rows, float_format=".4f")
     print(*rows, sep="\n")
 

@@ -395,9 +395,8 @@ class Belief:
             channel = np.array([p for _, p in pairs], dtype=np.float64)
         except (TypeError, ValueError) as error:
             raise InputError(f"probabilities of outcomes are not k numbers for each hypothesis ({error})") from error
-        if (
-            channel.ndim != 2 or not (channel >= 0).all() or not np.allclose(channel.sum(axis=1), 1, atol=2e-3)
-        ):  # float16
+        # Probabilities of hypotheses are float16, so their sums are less exact than sums of float64.
+        if channel.ndim != 2 or not (channel >= 0).all() or not np.allclose(channel.sum(axis=1), 1, atol=2e-3):
             raise InputError("probabilities of outcomes are negative or do not sum to 1 for a hypothesis")
         return noisy_information(np.array([w for w, _ in pairs]), channel / channel.sum(axis=1, keepdims=True))
 

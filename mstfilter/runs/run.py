@@ -11,6 +11,7 @@ from __future__ import annotations
 import hashlib
 import json
 import platform
+from collections import defaultdict
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
@@ -173,18 +174,18 @@ def _first_difference(found: Any, wanted: Any, where: str = "") -> str:
 
 def component_files(component: Any) -> dict[str, str]:
     """Hashes of what a component and its parts read: source files of the user, trained weights, other files."""
-    found: dict[str, str] = {}
+    found: defaultdict[str, str] = defaultdict(str)
     for part in nested_components(component):
         name, source = type(part).__name__, type(part).__dict__
         if "__mst_file__" in source:
             found[source["__mst_file__"]] = source["__mst_source__"]
         if key := str(getattr(part, "weights_key", "")):
-            found[f"weights of {name}"] = found.get(f"weights of {name}", "") + key
+            found[f"weights of {name}"] += key
         elif isinstance(part, UsesFiles):
             for field in part.path_fields:
                 if path := getattr(part, field, ""):
-                    found[f"{field} of {name}"] = found.get(f"{field} of {name}", "") + _hash_of(Path(path))
-    return found
+                    found[f"{field} of {name}"] += _hash_of(Path(path))
+    return dict(found)
 
 
 def library_versions() -> dict[str, str]:
