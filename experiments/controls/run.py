@@ -1,4 +1,4 @@
-"""Controls: does the gain of the filter come from the past?
+"""What of its clips does the filter use?
 
     python experiments/controls/run.py [--smoke] [--out FOLDER]
 
@@ -6,9 +6,6 @@ On tuning scenes, primary endpoint (objects quality against the true volumes, me
 
 - still: after each pause a clip of two frames in which no object moves (new sensor noise, the arm perhaps in view)
   must not lower quality;
-- again: the image of pause t alone, processed t + 1 times, gives as many samples without a past; the gain must be
-  lost;
-- stranger: with the hypotheses of another scene as the past of a step, the gain must be lost;
 - shuffled: with the inner frames of every clip in random order, the gain over samples must be smaller. `ends` uses
   only the first and last frame of a clip, and `frozen` never finds a motion. The same for a filter that finds
   motions by optical flow only (`flow`), and, without segmentation, for the objects that moved when the true labels
@@ -35,7 +32,7 @@ from mstfilter.formats import open_recording
 from mstfilter.scene import Clip, Hypothesis, Recording
 from mstfilter.scoring import overlap, weighted_coverage
 from mstfilter.simulation import cached_recording
-from mstfilter.smc import ParticleFilter, Population, State, Transition
+from mstfilter.smc import Population, State, Transition
 from mstfilter.statistics import interval
 
 SCENES = [(family, k) for family in ("s1", "s2") for k in range(6)]
@@ -50,7 +47,7 @@ FILTERS = {
 ORDERS = ("in order", "shuffled", "ends")
 CHAINS = [(name, order) for name in ("mst", "flow") for order in ORDERS] + [("frozen", "in order")]
 FIELDS = [
-    *("scene", "start", "still", "samples", "again", "stranger"),
+    *("scene", "start", "still", "samples"),
     *(f"{name} {order}" for name, order in CHAINS),
     *(f"moved: {name} {order}" for name, order in CHAINS),
 ]
@@ -84,15 +81,6 @@ def in_orders(clip: Clip, rng: np.random.Generator) -> dict[str, Clip]:
     }
 
 
-def again(filter: ParticleFilter, clip: Clip) -> State:
-    """A filter that processed only the last image of a clip, once per pause."""
-    state = filter.start(0)
-    for k in range(clip.index + 1):
-        frames = (clip.after,) * (1 if k == 0 else 2)
-        state, _ = filter.step(state, Clip(frames, clip.grid, k))
-    return state
-
-
 def ious(a: np.ndarray, b: np.ndarray) -> dict[int, float]:
     """IoU of the objects that both label images have, by label."""
     table = overlap(a, b)
@@ -108,7 +96,7 @@ def tracked(transition: Transition, labels: np.ndarray, truth: np.ndarray, clip:
     return [end.get(k, 0.0) for k, own in ious(labels, truth).items() if own < MOVED]
 
 
-def run(scene: tuple[str, int], stranger: Recording, recording: Recording) -> dict[str, object]:
+def run(scene: tuple[str, int], recording: Recording) -> dict[str, object]:
     """Means over the pauses of a scene."""
     filters = {name: mstfilter.preset("mst", *changes) for name, changes in FILTERS.items()}
     mst = filters["mst"]
@@ -116,12 +104,11 @@ def run(scene: tuple[str, int], stranger: Recording, recording: Recording) -> di
     rng = np.random.default_rng(scene[1])
     found: dict[str, list[float]] = {name: [] for name in FIELDS[1:]}
     states = {chain: filters[chain[0]].start(0) for chain in CHAINS}
-    alone, foreign, before = samples.start(0), mst.start(0), None
-    for clip, other in zip(recording.clips(), stranger.clips(), strict=False):
+    alone, before = samples.start(0), None
+    for clip in recording.clips():
         truth = recording.truth(clip.index)
         assert truth is not None
         clips = in_orders(clip, rng)
-        past, (foreign, _) = foreign, mst.step(foreign, other)
         alone, _ = samples.step(alone, clip)
         for name, order in CHAINS:
             states[name, order], _ = filters[name].step(states[name, order], clips[order])
@@ -130,9 +117,6 @@ def run(scene: tuple[str, int], stranger: Recording, recording: Recording) -> di
             found["start"].append(quality(state, truth) - quality(alone, truth))
         else:
             found["samples"].append(quality(alone, truth))
-            found["again"].append(quality(again(mst, clip), truth))
-            lost, _ = mst.step(past, clip)  # another scene's population at the pause before
-            found["stranger"].append(quality(lost, truth))
             for name, order in CHAINS:
                 found[f"{name} {order}"].append(quality(states[name, order], truth))
                 found[f"moved: {name} {order}"] += tracked(filters[name].transition, before, truth, clips[order])
@@ -157,8 +141,8 @@ def summary(rows: list[dict[str, str]]) -> Iterator[dict[str, object]]:
         ("mst in order - samples at the start", column["start"]),
         ("a still clip", column["still"]),
         minus("mst in order", "samples"),
-        *(minus(other, "samples") for other in ("again", "stranger", "frozen in order")),
-        *(minus("mst in order", other) for other in ("again", "stranger", "frozen in order")),
+        minus("frozen in order", "samples"),
+        minus("mst in order", "frozen in order"),
         *(minus(f"{f} {o}", "samples") for f, o in (("mst", "shuffled"), ("flow", "in order"), ("flow", "shuffled"))),
         *(
             minus(f"{m}{f} {a}", f"{m}{f} {b}")
@@ -195,12 +179,8 @@ def main() -> None:
     for k, scene in enumerate(scenes):
         if f"{scene[0]}-{scene[1]}" in {r["scene"] for r in rows}:
             continue
-        # The past of `stranger` comes from another scene of the family.
-        family = [s for s in scenes if s[0] == scene[0]]
-        other = family[(family.index(scene) + 1) % len(family)]
-        change = SMALL if options.smoke else {}
-        here, there = (open_recording(cached_recording(f, s, **change)) for f, s in (scene, other))
-        row = run(scene, there, here)
+        recording = open_recording(cached_recording(*scene, **(SMALL if options.smoke else {})))
+        row = run(scene, recording)
         rows.append({name: str(value) for name, value in row.items()})
         write_csv(path, rows, FIELDS)
         print(k, row, flush=True)

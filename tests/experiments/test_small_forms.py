@@ -96,7 +96,6 @@ def test_controls(tmp_path):
     rows = {row["what"]: row for row in read_csv(tmp_path / "out/summary.csv")}
     assert abs(float(rows["mst in order - samples at the start"]["mean"])) < 0.2
     assert int(rows["a still clip"]["n"]) >= 1
-    assert int(rows["stranger - samples"]["n"]) == int(rows["again - samples"]["n"]) == 2
     # An object moved, and following it is better than leaving it.
     assert float(rows["moved: mst in order"]["mean"]) > float(rows["moved: frozen in order"]["mean"])
     assert "'scene'" not in run_script(*arguments), "finished scenes are not run again"
@@ -122,17 +121,22 @@ def test_decisions(tmp_path):
     assert {r["policy"] for r in read_csv(tmp_path / "summary.csv")} == set(POLICIES) - {"random"}
 
 
-def test_information_of_the_controls(tmp_path):
+def test_past(tmp_path):
     """The differences are those of the means, and nothing is run again."""
-    arguments = ("controls/information.py", "--smoke", "--out", tmp_path)
+    arguments = ("controls/past.py", "--smoke", "--out", tmp_path)
     run_script(*arguments)
-    rows = {row["arm"]: row for row in read_csv(tmp_path / "information.csv")}
-    assert list(rows) == ["samples", "mst", "again", "stranger"]
-    mean = {arm: float(row["information"]) for arm, row in rows.items()}
-    for arm, row in rows.items():
-        assert 0 < mean[arm] < math.log(2)
-        assert float(row["minus_samples"]) == pytest.approx(mean[arm] - mean["samples"], abs=2e-4)
-        assert float(row["mst_minus_it"]) == pytest.approx(mean["mst"] - mean[arm], abs=2e-4)
+    rows = {(row["score"], row["family"], row["arm"]): row for row in read_csv(tmp_path / "past.csv")}
+    arms, most = (
+        ("samples", "mst", "again", "stranger", "shuffled", "frozen"),
+        {"quality": 1, "information": math.log(2)},
+    )
+    assert set(rows) == {(score, family, arm) for score in most for family in ("all", "s1") for arm in arms}
+    mean = {key: float(row["mean"]) for key, row in rows.items()}
+    for (score, family, arm), row in rows.items():
+        assert 0 < mean[score, family, arm] < most[score] and row["n"] == "2"
+        of_samples, of_mst = mean[score, family, "samples"], mean[score, family, "mst"]
+        assert float(row["minus_samples"]) == pytest.approx(mean[score, family, arm] - of_samples, abs=2e-4)
+        assert float(row["mst_minus_it"]) == pytest.approx(of_mst - mean[score, family, arm], abs=2e-4)
     before = {path: path.stat().st_mtime_ns for path in (tmp_path / "counts").iterdir()}
     run_script(*arguments)
     assert before == {path: path.stat().st_mtime_ns for path in (tmp_path / "counts").iterdir()}
