@@ -60,12 +60,12 @@ def crop_box(voxels: np.ndarray, grid: VoxelGrid) -> tuple[np.ndarray, np.ndarra
     """Limits of the crop of an object with readings in `voxels` (k, 3): first voxel (3,), and the one after its last.
 
     The crop is centred on the 2 - 98 % range of the readings, and stands on the table. It is cut off where the grid
-    ends.
+    ends. That of an object which is larger than all crops of the network contains the object.
     """
     low, high = np.percentile(voxels, (2, 98), axis=0)
     table = max(0, int(np.floor(-grid.origin[2] / grid.voxel_size + 1e-6)))
     extent = max(*(high - low + 1)[:2] + 4, float(high[2]) - table + 3) * grid.voxel_size / LATTICE
-    edge = next((n for n in (EDGE, *LARGER) if extent <= n), LARGER[-1])
+    edge = next((n for n in (EDGE, *LARGER) if extent <= n), extent)
     edge = int(np.ceil(edge * LATTICE / grid.voxel_size - 1e-6))
     start = np.floor((low + high + 1) / 2).astype(np.int64) - edge // 2
     start[2] = table

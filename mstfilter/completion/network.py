@@ -6,7 +6,8 @@
 >>> NetworkCompleter(weights="mine.onnx")                                    # needs the extra `onnx`
 
 The network works on a lattice of 1 cm. If the voxels of the workspace have another size, the object is completed on
-that lattice and the result is interpolated.
+that lattice and the result is interpolated. Objects larger than 64 cm are extruded, as by `Extrude`: the network was
+trained on smaller ones.
 """
 
 from __future__ import annotations
@@ -18,8 +19,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mstfilter.completion.completer import Completer, Completion, finish
-from mstfilter.completion.crops import BATCH, EDGE, LARGER, LATTICE, Architecture, crop_box
-from mstfilter.completion.observed import ObservedBox, observed_in
+from mstfilter.completion.crops import BATCH, EDGE, LARGER, LATTICE, Architecture, crop_box, extruded
+from mstfilter.completion.observed import ObservedBox, encode_box, observed_in
 from mstfilter.errors import InputError, MissingLibraryError
 from mstfilter.scene import Frame, ObjectView, Recording, UsesFiles, VoxelGrid
 
@@ -131,7 +132,9 @@ class NetworkCompleter(Completer, UsesFiles):
         noise = [rng.standard_normal(self.network.latent) * self.spread if self.draw else None for rng in rngs]
         by_edge: dict[int, list[int]] = {}
         for k, one in enumerate(seen):
-            if one.surface.size:
+            if max(one.surface.shape) > LARGER[-1]:
+                results[k] = extruded(encode_box(one)[0][None])[0].astype(np.float32)
+            elif one.surface.size:
                 edge = next(n for n in (EDGE, *LARGER) if max(one.surface.shape) <= n)
                 by_edge.setdefault(edge, []).append(k)
         for edge, members in by_edge.items():

@@ -13,7 +13,7 @@ from mstfilter.completion.crops import CHANNELS, channels, crop_box, extruded
 from mstfilter.completion.observed import encode_box
 from mstfilter.completion.unet import ARCHITECTURE, CompletionNet, LatentLaw
 from mstfilter.errors import InputError
-from mstfilter.scene import Frame, VoxelGrid, frame_geometry, scene_cache
+from mstfilter.scene import Camera, Frame, VoxelGrid, frame_geometry, look_at, render, scene_cache
 from mstfilter.trained import write_model
 from tests.completion.test_completion import masks_of, placed
 from tests.segmentation.scenes import GRID, TWO, boxes, frame_of
@@ -143,6 +143,26 @@ def test_empty_masks_and_large_objects(completer):
     wide = frame_of(boxes(((8, 10, 0), (52, 50, 4))), width=320)
     mask = masks_of(boxes(((8, 10, 0), (52, 50, 4))), wide)
     assert arbitrate(completer.complete(np.random.default_rng(0), wide, mask, GRID), GRID).any()
+
+
+@pytest.mark.parametrize("size", [0.01, 0.02])
+def test_objects_larger_than_all_crops_are_extruded_whole(completer, size):
+    """A bar of 84 cm, also where the frame shows nothing of it any more."""
+    rng, grid = np.random.default_rng(0), VoxelGrid((-0.6, -0.3, 0.0), size, (int(1.2 / size), int(0.6 / size), 20))
+    bar = np.zeros(grid.shape, np.uint16)
+    bar[tuple(slice(round(a / size), round(b / size)) for a, b in ((0.18, 1.02), (0.2, 0.4), (0, 0.12)))] = 1
+    view = Camera.from_intrinsics(
+        200, 200, 159.5, 119.5, 320, 240, look_at(np.array([0, -0.75, 0.75]), np.array([0, 0, 0.05]))
+    )
+    seen = render(bar, grid, view)
+    frame = Frame(np.zeros((*seen.depth.shape, 3), np.uint8), seen.depth, view)
+    [(now, seen_now)] = completer.complete_again([rng], frame, [(seen.labels == 1, ())], grid)
+    blind = Frame(frame.rgb, np.full_like(seen.depth, np.nan), view)
+    [(later, _)] = completer.complete_again([rng], blind, [(np.zeros(seen.labels.shape, bool), (seen_now,))], grid)
+    for one in (now, later):
+        full = np.zeros(grid.shape, bool)
+        full[one.box] = one.probability >= 0.5
+        assert (full & (bar > 0)).sum() > 0.85 * (full | (bar > 0)).sum()
 
 
 def test_wrong_models(tmp_path, frame):
