@@ -1,10 +1,8 @@
 """Errors and warnings that a user can mend: what is wrong, where, the value found; then what to do.
 
 >>> from mstfilter.errors import InputError
->>> raise InputError("depth image 000003.png is empty", "record the frame again")
-Traceback (most recent call last):
-...
-mstfilter.errors.InputError: depth image 000003.png is empty
+>>> InputError("depth image 000003.png is empty", "record the frame again").hints
+('record the frame again',)
 
 `check_number`, `check_integer`, `check_choice` and `check_component` check the fields of components with one wording.
 """
@@ -28,6 +26,8 @@ class _WithHints(Exception):
         super().__init__(message)
         self.message = message
         self.hints = hints
+        for hint in hints:
+            self.add_note(f"hint: {hint}")
 
 
 class InputError(_WithHints, ValueError):
@@ -51,6 +51,9 @@ class InputWarning(_WithHints, UserWarning):
 
     The command line shows it as one ``warning:`` line.
     """
+
+    def __str__(self) -> str:
+        return "\n".join((self.message, *(f"hint: {hint}" for hint in self.hints)))
 
 
 @contextmanager

@@ -170,7 +170,10 @@ class Registry:
         Raises InputError if a field or a component is unknown, or a value does not fit its field.
         """
         if not dataclasses.is_dataclass(cls):
-            raise InputError(f"{where}: {cls.__name__} is not a dataclass, so its fields cannot be configured")
+            raise InputError(
+                f"{where}: {cls.__name__} is no dataclass".removeprefix(": "),
+                "write @dataclass(frozen=True) above the class",
+            )
         known = {field.name: field for field in dataclasses.fields(cls) if field.init}
         hints = typing.get_type_hints(cls)
         values = {}
@@ -293,6 +296,8 @@ def _from_file(path: Path, attribute: str) -> type:
     except Exception as error:
         place = place_in_user_file(error)
         hints = [place] if place else []
+        if isinstance(error, ModuleNotFoundError):
+            hints.append("a file beside it is found if its folder is in the environment variable PYTHONPATH")
         raise InputError(f"{path} cannot be loaded: {type(error).__name__}: {error}", *hints) from error
     found = getattr(module, attribute, None)
     if not isinstance(found, type):

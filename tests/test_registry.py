@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import pickle
+import traceback
 from dataclasses import dataclass
 from typing import get_type_hints
 
@@ -10,9 +12,9 @@ import pytest
 
 import mstfilter.registry
 from mstfilter.completion import Completer
-from mstfilter.errors import InputError
+from mstfilter.errors import InputError, InputWarning
 from mstfilter.fusion import Agreement, Evidence, FusionUpdate
-from mstfilter.presets import REGISTRY, build_filter, load_config
+from mstfilter.presets import REGISTRY, build_filter, load_config, preset
 from mstfilter.resources import preset_names
 from mstfilter.segmentation import ObjectRule
 from mstfilter.smc import Resampler, Ssp
@@ -93,6 +95,26 @@ def test_the_kind_of_a_field_follows_from_its_annotation():
     fields = {"one": "ssp", "subclass": {"component": "fusion", "eta": 2}, "optional": None, "several": ["agreement"]}
     made = REGISTRY.make(Holder, fields)
     assert made == Holder(Ssp(), FusionUpdate(eta=2), None, (Agreement(),))
+
+
+def test_what_is_wrong_with_a_file_of_the_user(tmp_path):
+    class Plain:
+        pass
+
+    with pytest.raises(InputError, match=r"^Plain is no dataclass\nhint: write @dataclass"):
+        REGISTRY.make(Plain, {})
+    (tmp_path / "mine.py").write_text("from helper_beside import X")
+    with pytest.raises(InputError, match="No module named 'helper_beside'") as caught:
+        preset("mst", f"resampler={tmp_path / 'mine.py'}:Mine")
+    assert "PYTHONPATH" in caught.value.hints[-1]
+
+
+def test_hints_are_shown_in_python_too():
+    error, warning = InputError("depth is empty", "record again"), InputWarning("depth is odd", "check it", "or not")
+    assert "".join(traceback.format_exception(error)).endswith("depth is empty\nhint: record again\n")
+    assert (str(error), str(warning)) == ("depth is empty", "depth is odd\nhint: check it\nhint: or not")
+    again = pickle.loads(pickle.dumps(error))
+    assert (str(again), again.hints, again.__notes__) == (str(error), error.hints, error.__notes__)
 
 
 def test_entry_points_add_components(monkeypatch):

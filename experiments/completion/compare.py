@@ -14,8 +14,9 @@ import time
 from pathlib import Path
 
 import numpy as np
+from hilbert_map import HilbertMap
 
-from mstfilter.completion import Completer, Extrude, HilbertMap, Hull, NetworkCompleter, SurfaceOnly
+from mstfilter.completion import Completer, Extrude, Hull, NetworkCompleter, SurfaceOnly
 from mstfilter.files import write_csv
 from mstfilter.statistics import interval
 from mstfilter.training import HELD_OUT, Samples, read_samples

@@ -123,8 +123,8 @@ class TableCompleter:
         frame: RowImage,
         objects: Sequence[tuple[np.ndarray, tuple[CellView, ...]]],
         grid: VoxelGrid,
-    ) -> list[tuple[Completion, CellView]]:
-        """Completions of masks (1, X) with views, and what this observation shows of them."""
+    ) -> list[tuple[Completion, tuple[CellView, ...]]]:
+        """Completions of masks (1, X) with views, and the views with what this observation shows."""
         found = []
         for mask, views in objects:
             now, points = self._seen(frame, mask, grid)
@@ -135,7 +135,7 @@ class TableCompleter:
                 self.log.append((mask.ravel(), np.stack([now, past])))
             p = np.where(now == FREE, 0, self.table[now, past]).astype(np.float32)
             view = CellView(np.where(now <= BEHIND, now, NOTHING))
-            found.append((Completion(np.zeros(3, np.int64), p, points, f"{mask.tolist()}"), view))
+            found.append((Completion(np.zeros(3, np.int64), p, points, f"{mask.tolist()}"), (*views, view)))
         return found
 
     @staticmethod

@@ -15,6 +15,5 @@ __components__ = {
         "network": "NetworkCompleter",
         "surface": "SurfaceOnly",
         "hull": "Hull",
-        "hilbert_map": "HilbertMap",
     }
 }

@@ -6,7 +6,6 @@ from mstfilter.completion.completer import (
     occupancy_of as occupancy_of,
 )
 from mstfilter.completion.crops import CHANNELS as CHANNELS, Architecture as Architecture
-from mstfilter.completion.extrude import Extrude as Extrude, SurfaceOnly as SurfaceOnly
-from mstfilter.completion.geometric import HilbertMap as HilbertMap, Hull as Hull
+from mstfilter.completion.extrude import Extrude as Extrude, Hull as Hull, SurfaceOnly as SurfaceOnly
 from mstfilter.completion.network import NetworkCompleter as NetworkCompleter
 from mstfilter.completion.observed import ObservedBox as ObservedBox, observed_box as observed_box

@@ -30,7 +30,7 @@ from typing import ClassVar
 import numpy as np
 from scipy.spatial import cKDTree
 
-from mstfilter.completion.observed import ObservedBox, encode_box, observed_again, observed_box
+from mstfilter.completion.observed import ObservedBox, enclosing_box, encode_box, observed_again, observed_box
 from mstfilter.errors import InputError
 from mstfilter.scene import (
     Clip,
@@ -114,10 +114,7 @@ class Completer(ABC):
     def box(self, voxels: np.ndarray, grid: VoxelGrid) -> tuple[np.ndarray, np.ndarray]:
         """First voxel (3,) of the box of a mask with readings in `voxels` (k, 3), and the one after its last."""
         # The surface may reach `depth` voxels behind the readings.
-        margin = max(self.padding, int(np.ceil(self.depth)))
-        low = np.maximum(voxels.min(axis=0) - margin, 0).astype(np.int64)
-        low[2] = 0
-        return low, np.minimum(voxels.max(axis=0) + 1 + margin, grid.shape).astype(np.int64)
+        return enclosing_box(voxels, grid, max(self.padding, int(np.ceil(self.depth))))
 
     def complete(
         self, rng: np.random.Generator, frame: Frame, masks: Sequence[np.ndarray], grid: VoxelGrid
@@ -170,15 +167,16 @@ class Completer(ABC):
         frame: Frame,
         objects: Sequence[tuple[np.ndarray, tuple[ObjectView, ...]]],
         grid: VoxelGrid,
-    ) -> list[tuple[Completion, ObjectView | None]]:
+    ) -> list[tuple[Completion, tuple[ObjectView, ...]]]:
         """Complete objects from a frame and from earlier views of them.
 
         Each object is its mask (H, W) bool in the frame, which may be empty, and its views, moved to where the
-        object is now. Each result is the completion, and the view of the frame; None if the frame shows nothing. A
-        completer that does not remember gives the completions of the masks, and no views.
+        object is now. Each result is the completion, and the views that it is based on: the earlier ones that the
+        frame does not contradict, and last that of the frame, if it shows the object. A completer that does not
+        remember gives the completions of the masks, and no views.
         """
         if not self.remembers:
-            return [(one, None) for one in self.complete_each(rngs, frame, [mask for mask, _ in objects], grid)]
+            return [(one, ()) for one in self.complete_each(rngs, frame, [mask for mask, _ in objects], grid)]
         component = component_key(self)
         version = (self.weights_key,) if self.weights_key else ()
         names = [
@@ -188,14 +186,14 @@ class Completer(ABC):
             for mask, views in objects
         ]
 
-        def compute(missing: Sequence[int]) -> list[tuple[Completion, ObjectView | None]]:
+        def compute(missing: Sequence[int]) -> list[tuple[Completion, tuple[ObjectView, ...]]]:
             boxes = [observed_again(frame, *objects[k], grid, self) for k in missing]
-            filled = self.fill_many([rngs[k] for k in missing], [seen for *_, seen in boxes])
+            filled = self.fill_many([rngs[k] for k in missing], [seen for _, _, seen, _ in boxes])
             found = []
-            for k, (offset, now, seen), p in zip(missing, boxes, filled, strict=True):
+            for k, (offset, now, seen, views), p in zip(missing, boxes, filled, strict=True):
                 key = names[k].hex()[:16]
-                view = ObjectView(offset, *encode_box(now), key) if now.surface.any() else None
-                found.append((finish(offset, seen, p, key), view))
+                latest = (ObjectView(offset, *encode_box(now), key),) if now.surface.any() else ()
+                found.append((finish(offset, seen, p, key), (*views, *latest)))
             return found
 
         if self.stochastic:
@@ -252,17 +250,18 @@ def occupancy_of(
 
     A voxel is free or belongs to one of the objects that claim it. The odds of an object against free space are those
     of its completion. `labels` (X, Y, Z) are those of `arbitrate`. Objects with fewer readings in a voxel than the
-    labelled one do not claim it, and probabilities below `least` count as 0.
+    labelled one do not claim it, nor do objects without a label, and probabilities below `least` count as 0.
     """
     if all(((one.probability == 0) | (one.probability == 1)).all() for one in completions):
         return None
     owner, best = labels.copy(), np.zeros(grid.shape, np.float32)
     total = np.ones(grid.shape, np.float32)
     readings = np.zeros(grid.shape, np.int32)
-    for k, one in enumerate(completions):
+    present = [(k, one) for k, one in enumerate(completions) if (labels[one.box] == k + 1).any()]
+    for k, one in present:
         own = labels[one.box] == k + 1
         readings[one.box][own] = one.points[own]
-    for k, one in enumerate(completions):
+    for k, one in present:
         box = one.box
         p = np.clip(one.probability, 0, 0.999)
         odds = np.where((p >= least) & (one.points >= readings[box]), p / (1 - p), 0).astype(np.float32)

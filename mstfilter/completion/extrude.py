@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial import ConvexHull, Delaunay, QhullError
 
 from mstfilter.completion.completer import Completer
 from mstfilter.completion.observed import ObservedBox
@@ -48,3 +49,18 @@ class Extrude(Completer):
             p[:, :, k] = np.where(seen.surface[:, :, k], 1.0, np.where(state, self.below, 0.0))
         p[:, :, seen.height < self.floor] = 0
         return p
+
+
+@dataclass(frozen=True)
+class Hull(Extrude):
+    """The convex hull of the extruded surface, without voxels observed as free."""
+
+    def fill(self, rng: np.random.Generator, seen: ObservedBox) -> np.ndarray:
+        p = super().fill(rng, seen)
+        voxels = np.argwhere(p > 0)
+        try:
+            corners = voxels[ConvexHull(voxels).vertices]
+            inside = Delaunay(corners).find_simplex(np.indices(p.shape).reshape(3, -1).T) >= 0
+        except (QhullError, ValueError):  # fewer than four voxels, or all in one plane
+            return p
+        return np.maximum(p, self.below * (inside.reshape(p.shape) & ~seen.other_surface))

@@ -19,8 +19,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mstfilter.completion.completer import Completer, Completion, finish
-from mstfilter.completion.crops import BATCH, EDGE, LARGER, LATTICE, Architecture, crop_box, extruded
-from mstfilter.completion.observed import ObservedBox, encode_box, observed_in
+from mstfilter.completion.crops import BATCH, EDGE, LARGER, LATTICE, Architecture, crop_box
+from mstfilter.completion.extrude import Extrude
+from mstfilter.completion.observed import ObservedBox, observed_in
 from mstfilter.errors import InputError, MissingLibraryError
 from mstfilter.scene import Frame, ObjectView, Recording, UsesFiles, VoxelGrid
 
@@ -97,14 +98,14 @@ class NetworkCompleter(Completer, UsesFiles):
         frame: Frame,
         objects: Sequence[tuple[np.ndarray, tuple[ObjectView, ...]]],
         grid: VoxelGrid,
-    ) -> list[tuple[Completion, ObjectView | None]]:
+    ) -> list[tuple[Completion, tuple[ObjectView, ...]]]:
         if abs(grid.voxel_size - LATTICE) < 1e-6:
             return super().complete_again(rngs, frame, objects, grid)
         lattice = _lattice(grid)  # the boxes of all views are boxes of it
         found = super().complete_again(rngs, frame, objects, lattice)
         return [
-            (self._on_grid(one, frame, mask, grid, lattice), view)
-            for (one, view), (mask, _) in zip(found, objects, strict=True)
+            (self._on_grid(one, frame, mask, grid, lattice), views)
+            for (one, views), (mask, _) in zip(found, objects, strict=True)
         ]
 
     def _on_grid(
@@ -133,7 +134,7 @@ class NetworkCompleter(Completer, UsesFiles):
         by_edge: dict[int, list[int]] = {}
         for k, one in enumerate(seen):
             if max(one.surface.shape) > LARGER[-1]:
-                results[k] = extruded(encode_box(one)[0][None])[0].astype(np.float32)
+                results[k] = Extrude().fill(rngs[k], one)
             elif one.surface.size:
                 edge = next(n for n in (EDGE, *LARGER) if max(one.surface.shape) <= n)
                 by_edge.setdefault(edge, []).append(k)

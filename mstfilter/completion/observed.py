@@ -2,7 +2,7 @@
 
 >>> offset, seen = observed_box(frame, mask, grid, completer)     # of one frame
 >>> bits, signed = encode_box(seen)                               # packed: the contents of an `ObjectView`
->>> seen = recall(seen, offset, grid, views)                      # and of earlier frames
+>>> offset, now, seen, views = observed_again(frame, mask, views, grid, completer)     # and of earlier frames
 
 **Earlier frames.** The views of an object are moved with it, and read at the nearest voxel. Its surface, the space
 behind it and the space that was free around it are evidence about its shape for ever; other objects and the space
@@ -139,65 +139,97 @@ def decode_signed(signed: np.ndarray) -> np.ndarray:
 
 def observed_again(
     frame: Frame, mask: np.ndarray, views: Sequence[ObjectView], grid: VoxelGrid, rule: Completer, refute: bool = True
-) -> tuple[np.ndarray, ObservedBox, ObservedBox]:
+) -> tuple[np.ndarray, ObservedBox, ObservedBox, tuple[ObjectView, ...]]:
     """The box of a mask, which may be empty, and of earlier views of the object.
 
-    Returns its offset (3,), what the frame shows of it, and that together with the views (`recall`). The box is empty
-    if neither shows anything inside the grid.
+    Returns its offset (3,), what the frame shows of it, that together with the views (`recall`), and these views:
+    those that the frame contradicts are left out, unless `refute` is false. The box is empty if nothing of the object
+    lies inside the grid.
     """
-    voxels = np.concatenate([mask_voxels(frame, mask, grid), *(view_surface(view, grid) for view in views)])
-    voxels = voxels[grid.contains(voxels)]
+    if views and refute:
+        voxels = _surface_voxels(frame, mask, views, grid)
+        low, high = enclosing_box(voxels, grid, int(np.ceil(rule.depth)))
+        views = _confirmed(observed_in(frame, mask, grid, rule, low, high), low, grid, views)
+    voxels = _surface_voxels(frame, mask, views, grid)
     low, high = rule.box(voxels, grid) if len(voxels) else (np.zeros(3, np.int64),) * 2
     now = observed_in(frame, mask, grid, rule, low, high)
-    return low, now, recall(now, low, grid, views, refute)
+    return low, now, recall(now, low, grid, views), tuple(views)
 
 
-def recall(
-    seen: ObservedBox, offset: np.ndarray, grid: VoxelGrid, views: Sequence[ObjectView], refute: bool = True
-) -> ObservedBox:
-    """What a frame shows of a box at `offset` (3,), together with earlier views of the object.
+def enclosing_box(voxels: np.ndarray, grid: VoxelGrid, margin: int) -> tuple[np.ndarray, np.ndarray]:
+    """First voxel (3,) of a box around `voxels` (k, 3) down to the grid's floor, and the one after its last."""
+    if not len(voxels):
+        return np.zeros(3, np.int64), np.zeros(3, np.int64)
+    low = np.maximum(voxels.min(axis=0) - margin, 0).astype(np.int64)
+    low[2] = 0
+    return low, np.minimum(voxels.max(axis=0) + 1 + margin, grid.shape).astype(np.int64)
 
-    Views that the frame contradicts are left out, unless `refute` is false: their motions are then known.
-    """
+
+def _surface_voxels(frame: Frame, mask: np.ndarray, views: Sequence[ObjectView], grid: VoxelGrid) -> np.ndarray:
+    """Voxels (k, 3) of the readings of a mask, and, each of them once, of the surfaces of views."""
+    readings = mask_voxels(frame, mask, grid)
+    if not views:
+        return readings
+    voxels = np.unique(np.concatenate([readings, *(view_surface(view, grid) for view in views)]), axis=0)
+    return voxels[grid.contains(voxels)]
+
+
+def recall(seen: ObservedBox, offset: np.ndarray, grid: VoxelGrid, views: Sequence[ObjectView]) -> ObservedBox:
+    """What a frame shows of a box at `offset` (3,), together with earlier views of the object."""
     if not views:
         return seen
     shape = seen.surface.shape
-    near = binary_dilation(seen.surface)  # an earlier surface there is the same one, seen with noise
     centres = grid.centre_of(np.indices(shape).reshape(3, -1).T + offset)
     bits: np.ndarray = np.zeros(len(centres), np.uint8)
     signed = np.full(len(centres), np.nan, np.float32)
     for view in views:
-        index = grid.index_of(view.motion.inv().apply(centres)) - view.offset
-        inside = ((index >= 0) & (index < view.bits.shape)).all(axis=1)
-        at = tuple(index[inside].T)
-        distance = decode_signed(view.signed[at])
-        found = view.bits[at] & _SHAPE
-        clear = np.where(distance > -_CLEAR, found & (_OWN | _BEHIND), found)
-        if refute and _contradicts(clear, seen, near.ravel(), inside):
-            continue
-        bits[inside] |= clear
-        signed[inside] = np.fmin(signed[inside], np.where(found > 0, distance, np.nan))
+        inside, found, distance = _evidence(view, centres, grid)
+        bits[inside] |= found
+        signed[inside] = np.fmin(signed[inside], distance)
     bits = bits.reshape(shape)
+    near = binary_dilation(seen.surface)  # an earlier surface there is the same one, seen with noise
     free = seen.free | (((bits & _FREE) > 0) & ~seen.surface)
-    surface = (seen.surface | (((bits & _OWN) > 0) & ~near)) & ~free
+    surface = (seen.surface | (((bits & _OWN) > 0) & ~near & ~seen.other_surface)) & ~free
     behind = (seen.behind | ((bits & _BEHIND) > 0)) & ~free
-    other, hidden = seen.other_surface & ~free & ~surface, seen.hidden & ~free & ~behind
+    other, hidden = seen.other_surface & ~free, seen.hidden & ~free & ~behind
     return ObservedBox(
         seen.points, surface, other, free, behind, hidden, np.fmin(seen.signed, signed.reshape(shape)), seen.height
     )
 
 
-def _contradicts(found: np.ndarray, seen: ObservedBox, near: np.ndarray, inside: np.ndarray) -> bool:
-    """Whether the latest frame contradicts a view.
+def _evidence(view: ObjectView, centres: np.ndarray, grid: VoxelGrid) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Which centres (n, 3) lie in the box of a view (n,) bool, and what it shows there of the object.
 
-    Its surface is seen free, or its free space is the surface now, or nothing of its surface is near the surface
-    seen now (`near`, (n,) bool). `found` (k,) are its bits at the voxels `inside` (n,) bool of the box.
+    That is bits (k,) and signed distances (k,) in voxels, NaN where it shows nothing.
     """
-    own, free = (found & _OWN) > 0, (found & _FREE) > 0
-    now_free, now_own = seen.free.ravel()[inside], seen.surface.ravel()[inside]
-    n_own, n_now = int(own.sum()), int(seen.surface.sum())
-    cleared, pierced = (own & now_free).sum() > _CLEARED * n_own, (free & now_own).sum() > _PIERCED * n_now
-    return bool(cleared or pierced or (n_now and (own & near[inside]).sum() < _SEEN * n_own))
+    index = grid.index_of(view.motion.inv().apply(centres)) - view.offset
+    inside = ((index >= 0) & (index < view.bits.shape)).all(axis=1)
+    at = tuple(index[inside].T)
+    distance, found = decode_signed(view.signed[at]), view.bits[at] & _SHAPE
+    clear = np.where(distance > -_CLEAR, found & (_OWN | _BEHIND), found)
+    return inside, clear, np.where(found > 0, distance, np.nan)
+
+
+def _confirmed(
+    seen: ObservedBox, offset: np.ndarray, grid: VoxelGrid, views: Sequence[ObjectView]
+) -> tuple[ObjectView, ...]:
+    """The views that the latest frame does not contradict.
+
+    It does if their surface is seen free, or their free space is the surface now, or nothing of their surface is near
+    the surface seen now.
+    """
+    centres = grid.centre_of(np.indices(seen.surface.shape).reshape(3, -1).T + offset)
+    now, near, n_now = seen.surface.ravel(), binary_dilation(seen.surface).ravel(), int(seen.surface.sum())
+    kept = []
+    for view in views:
+        inside, found, _ = _evidence(view, centres, grid)
+        own, free = (found & _OWN) > 0, (found & _FREE) > 0
+        n_own = int(own.sum())
+        cleared = (own & seen.free.ravel()[inside]).sum() > _CLEARED * n_own
+        pierced = (free & now[inside]).sum() > _PIERCED * n_now
+        if not (cleared or pierced or (n_now and (own & near[inside]).sum() < _SEEN * n_own)):
+            kept.append(view)
+    return tuple(kept)
 
 
 def view_surface(view: ObjectView, grid: VoxelGrid) -> np.ndarray:

@@ -14,8 +14,8 @@
 3. An object keeps its views: what earlier frames showed of it (`mstfilter.scene.ObjectView`). It is completed from
    the readings of this frame and from its views together. So evidence is remembered and guesses are not: no voxel
    that was guessed at an earlier pause is carried on. A predicted object without readings stays with probability
-   (Q_j q)^lambda, where q is the share of its own voxels that the frame does not see through. At the first pause, the
-   candidates are the samples.
+   (Q_j q)^lambda, where q is the share of its own voxels that the frame does not see through, unless the frame
+   refutes all its views. At the first pause, the candidates are the samples.
 """
 
 from __future__ import annotations
@@ -262,7 +262,9 @@ class PartitionUpdate(Update):
         before, after = prediction.volumes(), Counter(prediction.labels[refined.labels > 0].tolist())
         kept = {k: (after[k] / max(before[k], 1)) ** self.quality_exponent for k in record_of if k not in seen}
         hidden = [k for k, share in kept.items() if rng.random() < known.right * share]
-        return parts + [_Part(segments < 0, (record_of[k],), _left(prediction, refined, k)) for k in hidden]
+        return parts + [
+            _Part(segments < 0, (record_of[k],), _left(prediction, refined, k, self.threshold)) for k in hidden
+        ]
 
     def _complete(
         self, rng: np.random.Generator, candidates: Sequence[Sequence[_Part]], readings: Readings, clip: Clip
@@ -282,12 +284,12 @@ class PartitionUpdate(Update):
         built, at = [], 0
         for parts in candidates:
             found, records = [], []
+            heir = {record.id: part.continues[0].id for part in parts for record in part.continues}
             for label, part in enumerate(parts, start=1):
-                completion, view = completed.get(at, (part.predicted, None))
+                completion, known = completed.get(at, (part.predicted, ()))
                 assert completion is not None
-                known = views[at] if view is None else self._latest((*views[at], view))
                 found.append(completion)
-                records.append(_record(part, label, clip.index, completion.key, known))
+                records.append(_record(part, label, clip.index, completion.key, self._latest(known), heir))
                 at += 1
             labels = arbitrate(found, clip.grid, self.threshold)
             present = np.bincount(labels.ravel(), minlength=len(found) + 1)
@@ -301,10 +303,10 @@ class PartitionUpdate(Update):
         return tuple(islice(newest, self.n_views))[::-1]
 
 
-def _left(prediction: Hypothesis, refined: Hypothesis, label: int) -> Completion:
-    """What free space leaves of a predicted object."""
+def _left(prediction: Hypothesis, refined: Hypothesis, label: int, threshold: float) -> Completion:
+    """What free space leaves of a predicted object. Its voxels have at least the probability `threshold`."""
     crop, left = prediction.crop(label), refined.shares.probability
-    p = crop.occupied if crop.probability is None else crop.probability
+    p = crop.occupied if crop.probability is None else np.maximum(crop.probability, threshold * crop.occupied)
     p = np.where(left[crop.box] > 0, p, 0).astype(np.float32)
     return Completion(crop.offset, p, np.zeros(p.shape, np.int32), prediction.record(label).completion_key or "")
 
@@ -318,9 +320,14 @@ def _components(common: np.ndarray, sizes: np.ndarray) -> list[tuple[list[int], 
     return [([k for side, k in found if side == 0], [k for side, k in found if side == 1]) for found in components]
 
 
-def _record(part: _Part, label: int, birth: int, key: str, views: tuple[ObjectView, ...]) -> ObjectRecord:
-    """The record of an object: of the predicted object that it continues, or new."""
+def _record(
+    part: _Part, label: int, birth: int, key: str, views: tuple[ObjectView, ...], heir: Mapping[int, int]
+) -> ObjectRecord:
+    """The record of an object: of the predicted object that it continues, or new.
+
+    `heir` has the id of the object that continues each predicted one.
+    """
     if not part.continues:
         return ObjectRecord.born(label, birth, key, views)
-    apart = frozenset().union(*(record.apart for record in part.continues))
-    return replace(part.continues[0].changed(), label=label, views=views, apart=apart)
+    apart = frozenset(heir.get(k, k) for record in part.continues for k in record.apart)
+    return replace(part.continues[0].changed(), label=label, completion_key=key, views=views, apart=apart)

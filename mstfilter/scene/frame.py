@@ -2,7 +2,7 @@
 
 >>> frame = Frame(rgb, depth, camera)          # rgb (H, W, 3) uint8, depth (H, W) metres, NaN = no reading
 >>> frame.points                               # (H, W, 3) world points in metres
->>> clip = Clip([frame, frame_2], grid)        # the frames from one pause to the next
+>>> clip = Clip([frame, frame_2], grid, 1)     # the frames from pause 0 to pause 1
 >>> clip.before, clip.after                    # its first and its last frame
 
 If several cameras observe the scene, the images of one are segmented and tracked. The frames of the others at the

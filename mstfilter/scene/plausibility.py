@@ -103,6 +103,7 @@ def _plane(frame: Frame) -> list[tuple[str, ...]]:
     tilt = float(np.degrees(np.arccos(np.clip(normal[2], -1, 1))))
     hints = (
         "check the pose: z of the world is up, the table is at z = 0; without a pose it is found from the table",
+        "T_world_camera maps points of the camera to the world; is this the inverse?",
         f"check K: its focal length is {frame.camera.K[0, 0]:.4g} pixels for images of {frame.camera.width} pixels",
         "check the depth scale",
     )

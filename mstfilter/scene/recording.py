@@ -17,6 +17,7 @@ from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
+from numbers import Integral
 from pathlib import Path
 from typing import Any, ClassVar, overload
 
@@ -168,7 +169,7 @@ class Recording:
                 "depth is None: hypotheses in 3-D need a depth image for every colour image",
                 "record with an RGB-D camera, or estimate depth in metres with a program of your choice",
             )
-        rgb, depth = np.asarray(rgb), np.asarray(depth)
+        rgb, depth = _stacked(rgb, f"colour images of {name}"), _stacked(depth, f"depth images of {name}")
         if rgb.ndim == 3 and depth.ndim == 2:
             rgb, depth = rgb[None], depth[None]
             robot_masks = None if robot_masks is None else np.asarray(robot_masks)[None]
@@ -205,9 +206,11 @@ class Recording:
             pauses = pause_rule(pauses)
         if isinstance(pauses, PauseRule):
             pauses = pauses.find(stamps, lambda index: rgb[index])
-        for pause in pauses:
-            check_integer(f"a pause of {name}", pause, "a frame; for seconds: pauses='0s,4.2s'", at_least=0)
-        chosen = tuple(int(p) for p in pauses)
+        listed = (pauses,) if isinstance(pauses, Integral) else pauses
+        for pause in listed:
+            hint = "a frame, counted from 0; from the end or in seconds as text: pauses='0,-1' or '0s,4.2s'"
+            check_integer(f"a pause of {name}", pause, hint, at_least=0)
+        chosen = tuple(int(p) for p in listed)
         if not chosen or max(chosen) >= n:
             raise InputError(f"pauses are {chosen}, expected indices of the {n} frames")
         masks = [None] * n if robot_masks is None else list(np.asarray(robot_masks, dtype=bool))
@@ -274,6 +277,15 @@ class UsesFiles(ABC):
     @abstractmethod
     def check_files(self, recording: Recording) -> None:
         """Raise InputError if a file is missing or cannot be used for a recording; called before a run."""
+
+
+def _stacked(images: Any, what: str) -> np.ndarray:
+    """Images as one array; InputError if they have different shapes."""
+    try:
+        return np.asarray(images)
+    except ValueError as error:
+        shapes = sorted({np.shape(image) for image in images})
+        raise InputError(f"{what} have different shapes: {', '.join(map(str, shapes))}") from error
 
 
 def check_depth(depth: np.ndarray, where: str) -> None:

@@ -24,6 +24,7 @@ from mstfilter.scene import BASELINE, Clip, Frame, fit_support_plane, table_resi
 SENSOR_FOCAL = 525.0
 #: Readings up to this much above the table are table, in sensor disparity units.
 TABLE_TOLERANCE = 2.0
+_DENSE = 0.8  # share of readings beside a reading: with less, depth has holes everywhere
 _LIGHTNESS_UNIT, _CHROMA_UNIT = 20.0, 8.0  # differences of L and of a, b (CIE Lab) of colour strength 1
 
 
@@ -88,8 +89,11 @@ class ColourDepthBoundary(BoundaryModel):
             missing = cv2.GaussianBlur((~frame.valid).astype(np.float32), (0, 0), _blur(resize))
             edges = np.maximum(edges, concave * (1 - missing))
         if self.quiet_table >= 0 and frame.valid.any():
+            height = above_table(frame)
+            if _share_beside(frame.valid) < _DENSE:
+                height = fill_from_nearest(height, ~frame.valid)
             with np.errstate(invalid="ignore"):
-                object_like = (above_table(frame) > TABLE_TOLERANCE).astype(np.uint8)
+                object_like = (height > TABLE_TOLERANCE).astype(np.uint8)
             # Single pixels above the table are noise; blocks of 3 x 3 are not.
             object_like = cv2.morphologyEx(object_like, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
             reach = 2 * max(1, round(self.quiet_table * resize)) + 1
@@ -100,6 +104,13 @@ class ColourDepthBoundary(BoundaryModel):
             inside = cv2.erode(robot, np.ones((3, 3), np.uint8), borderValue=1)
             edges = np.where(inside > 0, 0, np.where(robot > 0, 1, edges))
         return np.clip(edges, 0, 1).astype(np.float32)
+
+
+def _share_beside(valid: np.ndarray) -> float:
+    """Mean share of readings in the 3 x 3 pixels around a reading; `valid` (H, W) bool."""
+    import cv2
+
+    return float(cv2.blur(valid.astype(np.float32), (3, 3))[valid].mean())
 
 
 def _colour_edges(rgb: np.ndarray, resize: float) -> np.ndarray:

@@ -28,7 +28,7 @@ from mstfilter.errors import check_choice
 from mstfilter.tracking import rigid
 from mstfilter.tracking.features import SiftMatching
 from mstfilter.tracking.registration import Registration, RegistrationResult, SmallGicp, centroid_shift
-from mstfilter.tracking.residual import MotionResidual, refine_motion
+from mstfilter.tracking.residual import OCCLUDED_COST, MotionResidual, refine_motion
 from mstfilter.tracking.rigid import MotionCluster, jlinkage, rigid_transform
 from mstfilter.tracking.segments import Track
 
@@ -210,7 +210,7 @@ class MstRule(MotionRule):
         check_choice("select", self.select, ("map", "sample"))
 
     def candidates(self, rng: np.random.Generator, track: Track) -> tuple[Candidate, ...]:
-        """Scored motions, the identity first."""
+        """Scored motions that the image does not refute, the identity first."""
         rest = Candidate("identity", IDENTITY.T, score=self.residual.score(track, np.eye(4)) - _REST_BONUS)
         if not len(track.segment.support):
             return (rest,)
@@ -227,7 +227,8 @@ class MstRule(MotionRule):
                 moving.append(self._scored(track, best.kind, T, best.support))
         if self.search_above >= 0 and min(c.score for c in [rest, *moving]) > self.search_above:
             moving.extend(self._search(track, centre))
-        return (rest, *(c for c in moving if np.isfinite(c.score)))
+        # The image refutes a motion under which the points fit no better than if all of them were occluded.
+        return (rest, *(c for c in moving if c.score < OCCLUDED_COST))
 
     def choose(self, rng: np.random.Generator, candidates: tuple[Candidate, ...]) -> Candidate:
         scores = np.array([c.score for c in candidates])

@@ -11,7 +11,7 @@ Flow and features are computed once per clip. A segment that several hypotheses 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import ClassVar, NamedTuple
 
@@ -116,7 +116,7 @@ class Warp:
         dropped = tuple(records[k].id for k in sorted(records) if not present[k])
         occupancy = hypothesis.occupancy
         if occupancy is not None:
-            occupancy = _moved_occupancy(occupancy, labels, [r for r in kept if r.label in moving], grid)
+            occupancy = _moved_occupancy(occupancy, labels, kept, moving, grid)
         return WarpResult(Hypothesis(labels, grid, kept, occupancy), n_outside, contested, dropped)
 
     def _moved_voxels(
@@ -127,7 +127,7 @@ class Warp:
         if self.method == "splat":
             crop = hypothesis.crop(record.label)
             index, depth = _push(crop, T, grid)
-            return index, depth, replace(record, source=None, motion=RigidTransform.identity())
+            return index, depth, record.moved(RigidTransform.from_matrix(T), crop).changed()
         crop = record.source or hypothesis.crop(record.label)
         total = T if record.source is None else T @ record.motion.as_matrix()
         index, depth = (_pull_smooth if self.method == "smooth" else _pull)(crop, total, grid)
@@ -156,19 +156,19 @@ class Warp:
 
 
 def _moved_occupancy(
-    before: Occupancy, labels: np.ndarray, moved: Sequence[ObjectRecord], grid: VoxelGrid
+    before: Occupancy, labels: np.ndarray, kept: Sequence[ObjectRecord], moving: Container[int], grid: VoxelGrid
 ) -> Occupancy:
-    """The occupancy after a motion, for the labels (X, Y, Z) after it; `moved` are the objects that moved.
+    """The occupancy after a motion, for the labels (X, Y, Z) and objects after it; `moving` are those that moved.
 
     The probabilities of an object are those of its source, interpolated. Every object keeps the voxels of its label:
     these have a probability of at least one half, and no other voxel has more.
     """
-    still = np.isin(before.owner, [0, *(r.label for r in moved)], invert=True)
+    still = np.isin(before.owner, [r.label for r in kept if r.label not in moving])
     still &= (labels == 0) | (labels == before.owner)
     owner, p = np.where(still, before.owner, labels), np.where(still, before.probability, labels > 0)
-    for record in moved:
+    for record in kept:
         crop = record.source
-        if crop is None or crop.probability is None:
+        if record.label not in moving or crop is None or crop.probability is None:
             continue
         index, at_source = _moved_box(crop, record.motion.as_matrix(), grid, 1)
         inside = grid.contains(index)

@@ -226,7 +226,7 @@ def _sample(
     whole_mask = all(counts[k] > _WHOLE * whole[k] for k in found)
     views = [_view(rng, rule, one, found) for one in earlier] if whole_mask else []
     known = [view for view in views if view is not None]
-    offset, now, seen = observed_again(frame, mask, known, _GRID, rule, refute=False)
+    offset, now, seen, _ = observed_again(frame, mask, known, _GRID, rule, refute=False)
     if not now.surface.any():
         return None
     box = tuple(slice(int(o), int(o) + n) for o, n in zip(offset, seen.surface.shape, strict=True))

@@ -14,7 +14,6 @@ from mstfilter.completion import (
     Completer,
     Completion,
     Extrude,
-    HilbertMap,
     Hull,
     ObservedBox,
     SurfaceOnly,
@@ -22,7 +21,7 @@ from mstfilter.completion import (
     observed_box,
     occupancy_of,
 )
-from mstfilter.completion.observed import recall, view_surface
+from mstfilter.completion.observed import observed_again, recall, view_surface
 from mstfilter.errors import InputError
 from mstfilter.scene import Frame, VoxelGrid, frame_geometry, render, scene_cache
 from tests.segmentation.scenes import GRID, TWO, boxes, frame_of
@@ -40,7 +39,7 @@ class Greedy(Completer):
         return np.ones(seen.points.shape)
 
 
-COMPLETERS = [Extrude(), SurfaceOnly(), Greedy(), Hull(), HilbertMap()]
+COMPLETERS = [Extrude(), SurfaceOnly(), Greedy(), Hull()]
 STACK = boxes(((22, 22, 0), (38, 38, 6)), ((26, 26, 6), (34, 34, 14)))
 
 
@@ -254,6 +253,15 @@ def test_only_the_object_with_most_readings_claims_a_voxel():
     np.testing.assert_allclose(found.probability.ravel(), [0.6, 9 / (1 + 9 + 1.5)], rtol=1e-3)
 
 
+def test_objects_without_a_voxel_claim_nothing():
+    grid, box = VoxelGrid((0, 0, 0), 0.01, (2, 1, 1)), (2, 1, 1)
+    p = [np.array(v, np.float32).reshape(box) for v in ([0.6, 0.0], [0.4, 0.4])]
+    made = [Completion(np.zeros(3, np.int64), a, np.zeros(box, np.int32), str(k)) for k, a in enumerate(p)]
+    found = occupancy_of(made, arbitrate(made, grid), grid)
+    np.testing.assert_array_equal(found.owner.ravel(), [1, 0])
+    np.testing.assert_allclose(found.probability.ravel(), [0.6, 0], rtol=1e-3)
+
+
 def surface_and_free(seen: ObservedBox) -> tuple[np.ndarray, ...]:
     return seen.surface, seen.free, seen.behind, seen.hidden, seen.other_surface
 
@@ -265,7 +273,7 @@ def test_views_are_recalled_where_the_object_is_now():
     rule = Extrude()
     mask, empty = masks_of(before, frames[0])[0], np.zeros(frames[0].depth.shape, bool)
     rng = [np.random.default_rng(0)]
-    [(_, view)] = rule.complete_again(rng, frames[0], [(mask, ())], GRID)
+    [(_, (view,))] = rule.complete_again(rng, frames[0], [(mask, ())], GRID)
     voxels = view_surface(view, GRID)
     assert len(voxels) > 50 and (before[tuple(voxels.T)] == 1).mean() > 0.9
     moved = view.moved(RigidTransform.from_translation([0, 6 * GRID.voxel_size, 0]))
@@ -277,7 +285,7 @@ def test_views_are_recalled_where_the_object_is_now():
     assert (both.surface >= now.surface).all() and (both.free >= now.free).all()
     assert not (both.free & both.surface).any() and not (both.other_surface > now.other_surface).any()
     # The same view once more, from a motion that is wrong by a voxel, does not make the surface thicker.
-    [(_, latest)] = rule.complete_again(rng, frames[1], [(again, ())], GRID)
+    [(_, (latest,))] = rule.complete_again(rng, frames[1], [(again, ())], GRID)
     off = latest.moved(RigidTransform.from_translation([0, GRID.voxel_size, 0]))
     assert not (view_surface(off, GRID)[:, None] == np.argwhere(now.surface) + low).all(axis=2).any(axis=1).all()
     assert (recall(now, low, GRID, [off]).surface <= now.surface).all()
@@ -290,10 +298,17 @@ def test_views_are_recalled_where_the_object_is_now():
     np.testing.assert_array_equal(found.surface, first.surface & ~found.free)
     assert (found.free <= first.free).all() and found.free.sum() > 0.8 * (first.free & (first.signed < -1)).sum() > 0
     # Out of sight it is completed from its views alone.
-    [(hidden, none)] = rule.complete_again(rng, frames[1], [(empty, (moved,))], GRID)
-    assert none is None and iou(placed(hidden) >= 0.5, after == 1) > 0.5
-    # A view that the frame refutes is not used: the object did not move there.
+    dark = Frame(frames[1].rgb, np.full_like(frames[1].depth, np.nan), frames[1].camera)
+    [(hidden, known)] = rule.complete_again(rng, dark, [(empty, (moved,))], GRID)
+    assert known == (moved,) and iou(placed(hidden) >= 0.5, after == 1) > 0.5
+    # What is measured as the surface of another object now is not its surface.
+    _, other, seen, known = observed_again(frames[1], empty, (moved,), GRID, rule)
+    assert known == (moved,) and other.other_surface.any() and not (seen.surface & other.other_surface).any()
+    # A view that the frame refutes is neither used nor remembered: the object did not move there.
     wrong = view.moved(RigidTransform.from_translation([0, 0, 0.1]))
-    unchanged = recall(now, low, GRID, [wrong])
-    for a, b in zip(surface_and_free(unchanged), surface_and_free(now), strict=True):
+    _, _, seen, known = observed_again(frames[1], again, (wrong, moved), GRID, rule)
+    assert known == (moved,)
+    for a, b in zip(surface_and_free(seen), surface_and_free(both), strict=True):
         np.testing.assert_array_equal(a, b)
+    [(_, known)] = rule.complete_again(rng, frames[1], [(again, (wrong, moved))], GRID)
+    assert len(known) == 2 and known[0] is moved

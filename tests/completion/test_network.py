@@ -10,7 +10,7 @@ import torch
 
 from mstfilter.completion import Extrude, NetworkCompleter, arbitrate, observed_box
 from mstfilter.completion.crops import CHANNELS, channels, crop_box, extruded
-from mstfilter.completion.observed import encode_box
+from mstfilter.completion.observed import encode_box, observed_again, view_surface
 from mstfilter.completion.unet import ARCHITECTURE, CompletionNet, LatentLaw
 from mstfilter.errors import InputError
 from mstfilter.scene import Camera, Frame, VoxelGrid, frame_geometry, look_at, render, scene_cache
@@ -128,11 +128,11 @@ def test_other_voxel_sizes(completer, size):
         fine, coarse = (completer.complete(rng, frame, [mask], grid)[0] for grid in (GRID, other))
         volumes = [(one.probability >= 0.5).sum() * g.voxel_size**3 for one, g in ((fine, GRID), (coarse, other))]
         assert volumes[1] == pytest.approx(volumes[0], rel=0.35)
-        [(same, view)] = completer.complete_again([rng], frame, [(mask, ())], other)
-        assert np.array_equal(same.probability, coarse.probability) and view is not None
+        [(same, views)] = completer.complete_again([rng], frame, [(mask, ())], other)
+        assert np.array_equal(same.probability, coarse.probability) and len(views) == 1
         blind = Frame(frame.rgb, np.full_like(frame.depth, np.nan), frame.camera)
-        [(hidden, none)] = completer.complete_again([rng], blind, [(np.zeros_like(mask), (view,))], other)
-        assert none is None and (hidden.probability >= 0.5).sum() * size**3 == pytest.approx(volumes[0], rel=0.5)
+        [(hidden, known)] = completer.complete_again([rng], blind, [(np.zeros_like(mask), views)], other)
+        assert known == views and (hidden.probability >= 0.5).sum() * size**3 == pytest.approx(volumes[0], rel=0.5)
 
 
 def test_empty_masks_and_large_objects(completer):
@@ -156,13 +156,28 @@ def test_objects_larger_than_all_crops_are_extruded_whole(completer, size):
     )
     seen = render(bar, grid, view)
     frame = Frame(np.zeros((*seen.depth.shape, 3), np.uint8), seen.depth, view)
-    [(now, seen_now)] = completer.complete_again([rng], frame, [(seen.labels == 1, ())], grid)
+    [(now, views)] = completer.complete_again([rng], frame, [(seen.labels == 1, ())], grid)
     blind = Frame(frame.rgb, np.full_like(seen.depth, np.nan), view)
-    [(later, _)] = completer.complete_again([rng], blind, [(np.zeros(seen.labels.shape, bool), (seen_now,))], grid)
+    [(later, _)] = completer.complete_again([rng], blind, [(np.zeros(seen.labels.shape, bool), views)], grid)
     for one in (now, later):
+        assert np.median(one.probability[one.probability >= 0.5]) == pytest.approx(0.8)
         full = np.zeros(grid.shape, bool)
         full[one.box] = one.probability >= 0.5
         assert (full & (bar > 0)).sum() > 0.85 * (full | (bar > 0)).sum()
+
+
+@pytest.mark.parametrize("width", [160, 640])
+def test_crops_hold_what_earlier_frames_showed(completer, width):
+    """A long box whose right part is hidden now: its crop does not depend on the number of pixels that show it."""
+    long, occluder = ((8, 34, 0), (53, 42, 8)), ((26, 22, 0), (56, 25, 24))
+    frames = [frame_of(boxes(long), width), frame_of(boxes(long, occluder), width)]
+    masks = [masks_of(boxes(*seen), one)[0] for seen, one in (((long,), frames[0]), ((long, occluder), frames[1]))]
+    [(_, views)] = completer.complete_again([None], frames[0], [(masks[0], ())], GRID)
+    low, now, seen, known = observed_again(frames[1], masks[1], views, GRID, completer)
+    earlier = view_surface(views[0], GRID)
+    assert len(known) == 1 and (earlier >= low).all() and (earlier < low + now.surface.shape).all()
+    x = np.nonzero(seen.surface.any(axis=(1, 2)))[0] + low[0]
+    assert x.max() > 50 > (np.nonzero(now.surface.any(axis=(1, 2)))[0] + low[0]).max()
 
 
 def test_wrong_models(tmp_path, frame):

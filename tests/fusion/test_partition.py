@@ -128,6 +128,18 @@ def test_objects_without_views_keep_their_voxels_where_the_frame_does_not_see_th
         np.testing.assert_allclose(one.shares.probability[kept], 0.8, atol=2e-3)
 
 
+def test_objects_without_views_keep_their_labels_also_where_they_are_unlikely():
+    update, clip = PartitionUpdate(completer=Forgetful()), clip_of(TWO)
+    labels = np.where(TWO == 2, 1, 0).astype(np.uint16)
+    state = Hypothesis.from_labels(labels, GRID)
+    state = replace(state, occupancy=Occupancy(labels, np.where(labels > 0, 0.45, 0).astype(np.float16)))
+    blind = Clip(
+        [type(clip.after)(clip.after.rgb, np.full_like(clip.after.depth, np.nan), clip.after.camera)], GRID, 1
+    )
+    found = step(update, blind, Hypothesis.from_labels(0 * labels, GRID), state).particles
+    assert all((one.labels > 0).sum() == (labels > 0).sum() for one in found)
+
+
 #: Log odds that leave no doubt, in favour of the image or of the past.
 IMAGE = PairEvidence(constant=0.0, image=100.0, past=0.0, past_constant=0.0)
 PAST = PairEvidence(constant=0.0, image=0.0, past=100.0, past_constant=0.0)
@@ -232,6 +244,23 @@ def test_objects_that_moved_apart_are_not_merged():
     for one in step(PartitionUpdate(pairs=IMAGE), clip_of(TWO, 1), merged, state).particles:
         assert [(r.id, r.apart) for r in one.objects] == [(r.id, r.apart) for r in apart]
         np.testing.assert_array_equal(one.labels, state.labels)
+
+
+def test_objects_that_moved_apart_are_not_merged_by_way_of_others():
+    """Objects 2 and 3 moved apart. They become parts of two objects, which must not become one."""
+    scene = boxes(*(((10 + 8 * k, 20, 0), (18 + 8 * k, 30, 8)) for k in range(4)))
+    clips, update = [clip_of(scene, k) for k in range(3)], PartitionUpdate(pairs=IMAGE)
+    masks = masks_of(scene, clips[0].after)
+    state = step(update, clips[0], sample_of(clips[0], masks)).particles[0]
+    a, b, c, d = state.objects
+    apart = (a, replace(b, apart=frozenset({c.id})), replace(c, apart=frozenset({b.id})), d)
+    state = replace(state, objects=apart)
+    sample = sample_of(clips[1], [masks[0] | masks[1], masks[2] | masks[3]])
+    state = step(update, clips[1], sample, state).particles[0]
+    first, second = state.objects
+    assert (first.apart, second.apart) == ({second.id}, {first.id})
+    sample = sample_of(clips[2], [np.logical_or.reduce(masks)])
+    assert len(step(update, clips[2], sample, state).particles[0].objects) == 2
 
 
 def test_readings_of_an_object_that_moved_apart_go_to_it():

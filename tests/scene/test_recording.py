@@ -181,6 +181,11 @@ def test_invalid_arrays():
             Recording.from_arrays(*arguments)
     with pytest.raises(InputError, match="pauses"):
         Recording.from_arrays(rgb, depth, K, pauses=[3])
+    with pytest.raises(InputError, match="colour images of arrays have different shapes"):
+        Recording.from_arrays([rgb[0], rgb[0][1:]], depth[:2], K)
+    with pytest.raises(InputError, match="from the end or in seconds as text"):
+        Recording.from_arrays(rgb, depth, K, pauses=[0, -1])
+    assert Recording.from_arrays(rgb, depth, K, pauses=0).pauses == (0,)
     with pytest.raises(InputError, match="NaN"):
         Recording.from_arrays(rgb, depth, K, T_world_camera=np.full((4, 4), np.nan))
 

@@ -7,7 +7,7 @@ import numpy as np
 from mstfilter.scene import Camera, Clip, Frame, VoxelGrid, look_at, render
 
 GRID = VoxelGrid((-0.3, -0.3, 0.0), 0.01, (60, 60, 30))
-COLOURS = np.array([[200, 190, 170], [200, 40, 40], [40, 160, 60], [40, 60, 200]], np.uint8)
+COLOURS = np.array([[200, 190, 170], [200, 40, 40], [40, 160, 60], [40, 60, 200], [220, 200, 60]], np.uint8)
 
 
 def boxes(*corners: tuple[tuple[int, int, int], tuple[int, int, int]]) -> np.ndarray:

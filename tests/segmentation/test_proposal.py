@@ -35,6 +35,19 @@ def test_the_optimal_cut_finds_boxes(scene, width, noise):
     assert weighted_coverage(labels, seen(scene, frame)) > 0.85
 
 
+@pytest.mark.parametrize("holes", ["lattice", "random"])
+def test_depth_may_have_holes_everywhere(holes):
+    """A quarter of the readings: every second pixel in both directions, or drawn."""
+    frame = frame_of(TWO, width=640, noise=0.3)
+    kept = np.zeros(frame.depth.shape, bool)
+    kept[::2, ::2] = True
+    if holes == "random":
+        kept = np.random.default_rng(0).random(kept.shape) < 0.3
+    sparse = Frame(frame.rgb, np.where(kept, frame.depth, np.nan), frame.camera)
+    proposal = TreeCutProposal(tree=LearnedTree(), sampler=OptimalCut())
+    assert len(np.unique(proposal.label_image(sparse))) - 1 == 2
+
+
 def test_depth_alone_separates_touching_boxes_of_one_colour():
     frame = frame_of(TOUCHING, width=640, noise=0.3)
     grey = Frame(np.full_like(frame.rgb, 128), frame.depth, frame.camera)

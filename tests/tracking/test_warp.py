@@ -6,7 +6,7 @@ from hypothesis import given, settings, strategies as st
 from scipy.spatial.transform import Rotation
 
 from mstfilter.errors import InputError
-from mstfilter.scene import Hypothesis, Occupancy, VoxelGrid
+from mstfilter.scene import Hypothesis, ObjectView, Occupancy, VoxelGrid
 from mstfilter.tracking.rigid import rigid_transform
 from mstfilter.tracking.transition import Warp
 from tests.tracking.scenes import at, iou
@@ -52,8 +52,11 @@ def test_identity_returns_the_same_bytes(warp):
 )
 def test_whole_voxel_shift_is_exact(shift, method):
     h = hypothesis(BOX)
+    view = ObjectView(np.zeros(3, np.int64), np.ones((1, 1, 1), np.uint8), np.zeros((1, 1, 1), np.int8), "view")
+    h = replace(h, objects=(replace(h.record(1), views=(view,)),))
     moved = move(Warp(method), h, {1: at(*np.array(shift) * 0.01)})
     np.testing.assert_array_equal(moved.hypothesis.labels, np.roll(h.labels, shift, (0, 1, 2)))
+    np.testing.assert_allclose(moved.hypothesis.record(1).views[0].motion.translation, np.array(shift) * 0.01)
 
 
 @pytest.mark.parametrize("method", ["pull", "smooth"])
@@ -80,6 +83,21 @@ def test_probabilities_move_with_their_object(method):
     found, sure = turned.labels, turned.occupancy
     np.testing.assert_array_equal(sure.owner[found > 0], found[found > 0])
     assert (sure.probability[found > 0] >= 0.5).all() and (sure.probability[found == 0] <= 0.5).all()
+
+
+@pytest.mark.parametrize("method", ["pull", "smooth", "splat"])
+def test_objects_that_are_lost_leave_no_probability(method):
+    """One that moves out of the grid, and one at rest that loses all its voxels to another."""
+    h = hypothesis(BOX, OTHER)
+    h = replace(h, occupancy=Occupancy(h.labels, np.where(h.labels > 0, 0.9, 0)))
+    gone = move(Warp(method), h, {1: at(0, 2, 0)})
+    assert gone.dropped and not (gone.hypothesis.occupancy.owner == 1).any()
+    np.testing.assert_array_equal(gone.hypothesis.occupancy.probability > 0, h.labels == 2)
+    small = hypothesis(BOX, ((24, 38, 1), (25, 39, 2)))
+    small = replace(small, occupancy=Occupancy(small.labels, np.where(small.labels > 0, 0.9, 0)))
+    covered = move(Warp(method), small, {1: at(0, 0.14, 0)})
+    owners = {int(k) for k in np.unique(covered.hypothesis.occupancy.owner)} - {0}
+    assert owners == {record.label for record in covered.hypothesis.objects}
 
 
 def test_smooth_is_nearer_to_the_true_voxels_than_pull():

@@ -1,7 +1,6 @@
-"""Completion from geometry alone, to compare with: the convex hull, and a Bayesian Hilbert map.
+"""Completion by a Bayesian Hilbert map, to compare with.
 
->>> Hull().complete(rng, frame, masks, grid)
->>> HilbertMap().complete(rng, frame, masks, grid)
+mstfilter run RECORDING update.completer=./experiments/completion/hilbert_map.py:HilbertMap
 """
 
 from __future__ import annotations
@@ -10,28 +9,10 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
-from scipy.spatial import ConvexHull, Delaunay, QhullError
 from scipy.spatial.distance import cdist
 from scipy.special import expit
 
-from mstfilter.completion.completer import Completer
-from mstfilter.completion.extrude import Extrude
-from mstfilter.completion.observed import ObservedBox
-
-
-@dataclass(frozen=True)
-class Hull(Extrude):
-    """The convex hull of the extruded surface, without voxels observed as free."""
-
-    def fill(self, rng: np.random.Generator, seen: ObservedBox) -> np.ndarray:
-        p = super().fill(rng, seen)
-        voxels = np.argwhere(p > 0)
-        try:
-            corners = voxels[ConvexHull(voxels).vertices]
-            inside = Delaunay(corners).find_simplex(np.indices(p.shape).reshape(3, -1).T) >= 0
-        except (QhullError, ValueError):  # fewer than four voxels, or all in one plane
-            return p
-        return np.maximum(p, self.below * (inside.reshape(p.shape) & ~seen.other_surface))
+from mstfilter.completion import Completer, ObservedBox
 
 
 @dataclass(frozen=True)
