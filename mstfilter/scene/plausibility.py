@@ -27,7 +27,7 @@ _FIELDS = (12.0, 130.0)  # degrees: horizontal field of view
 _VOXELS = (0.001, 0.05)  # metres
 _MAX_TILT, _MAX_HEIGHT = 4.0, 0.025  # degrees and metres between the plane of the readings and z = 0
 _OTHER_PLANE = 30.0  # degrees: a plane that is tilted by more is a wall or the side of a box, not the table
-_MIN_ON_TABLE = 0.02  # share of the readings within `_MAX_HEIGHT` of z = 0
+_MIN_ON_TABLE = 0.1  # share of the readings within `_MAX_HEIGHT` of z = 0, as `fit_support_plane` demands
 
 
 def warn_if_implausible(frames: Iterable[Frame], grid: VoxelGrid, where: str) -> None:
