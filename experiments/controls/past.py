@@ -129,7 +129,8 @@ def main() -> None:
         family = [one for one in scenes if one[0] == scene[0]]
         jobs.append((folder, scene, family[(family.index(scene) + 1) % len(family)], chosen.smoke))
     with ProcessPoolExecutor(chosen.workers) as pool:
-        for name in pool.map(run, jobs):
+        # In a process forked off one with threads of OpenCV, OpenCV waits for these threads for ever.
+        for name in (map if chosen.workers == 1 else pool.map)(run, jobs):
             print(name, flush=True)
     rows = list(table(by_scene(folder)))
     write_csv(chosen.out / "past.csv", rows, float_format=".4f")

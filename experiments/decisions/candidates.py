@@ -120,7 +120,8 @@ def main() -> None:
     families, n_scenes = (["s1"], 2) if chosen.smoke else (chosen.families.split(","), chosen.scenes)
     jobs = [(chosen.out, family, seed, chosen.smoke) for seed in range(n_scenes) for family in families]
     with ProcessPoolExecutor(chosen.workers) as pool:
-        for name in pool.map(run, jobs):
+        # In a process forked off one with threads of OpenCV, OpenCV waits for these threads for ever.
+        for name in (map if chosen.workers == 1 else pool.map)(run, jobs):
             print(name, flush=True)
     scenes = [json.loads(path.read_text()) for path in sorted((chosen.out / "candidates").glob("*.json"))]
     rows = [

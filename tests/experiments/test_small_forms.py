@@ -121,6 +121,13 @@ def test_decisions(tmp_path):
     assert {r["policy"] for r in read_csv(tmp_path / "summary.csv")} == set(POLICIES) - {"random"}
 
 
+def test_crop_sizes(tmp_path):
+    run_script("completion/crop_sizes.py", "--smoke", "--out", tmp_path)
+    rows = read_csv(tmp_path / "crop_sizes.csv")
+    assert [(row["edge"], row["n"]) for row in rows] == [(edge, rows[0]["n"]) for edge in ("32", "48", "64")]
+    assert all(0.2 < float(row["iou"]) < 1 and 0.2 < float(row["volume"]) < 2 for row in rows)
+
+
 def test_past(tmp_path):
     """The differences are those of the means, and nothing is run again."""
     arguments = ("controls/past.py", "--smoke", "--out", tmp_path)
