@@ -166,11 +166,17 @@ def enclosing_box(voxels: np.ndarray, grid: VoxelGrid, margin: int) -> tuple[np.
 
 
 def _surface_voxels(frame: Frame, mask: np.ndarray, views: Sequence[ObjectView], grid: VoxelGrid) -> np.ndarray:
-    """Voxels (k, 3) of the readings of a mask, and, each of them once, of the surfaces of views."""
+    """Voxels (k, 3) of the readings of a mask, and of the surfaces of views.
+
+    Each reading counts as in an image of 640 x 480 pixels: so crops do not depend on the size of the image. They
+    follow the latest frame, as those of the training.
+    """
     readings = mask_voxels(frame, mask, grid)
     if not views:
         return readings
-    voxels = np.unique(np.concatenate([readings, *(view_surface(view, grid) for view in views)]), axis=0)
+    share = frame.depth.size / 307200
+    readings = readings[:: round(share)] if share > 1 else np.repeat(readings, round(1 / share), axis=0)
+    voxels = np.concatenate([readings, *(view_surface(view, grid) for view in views)])
     return voxels[grid.contains(voxels)]
 
 

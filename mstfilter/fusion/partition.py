@@ -134,7 +134,7 @@ class PartitionUpdate(Update):
     division: Division = NoDivision()  # noqa: RUF009 (frozen)
     parts: PartRule = PartRule()  # noqa: RUF009 (frozen)
     pairs: PairOdds = PairEvidence()  # noqa: RUF009 (frozen)
-    occupied_log_odds: float = 0.5
+    occupied_log_odds: float = 0.6
     evidence: tuple[Evidence, ...] = ()
     quality_exponent: float = 3.0
     n_candidates: int = 0

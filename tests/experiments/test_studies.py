@@ -9,7 +9,7 @@ import pytest
 
 from mstfilter.cli import main
 from mstfilter.errors import InputError
-from mstfilter.files import read_csv, write_csv
+from mstfilter.files import read_csv
 from mstfilter.simulation import FIRST_REPORTED_SEED
 from mstfilter.study import SceneEntry, load_study, make_plan, run_study
 from tests.experiments.scripts import EXPERIMENTS, run_script
@@ -126,30 +126,12 @@ def test_reported_seeds_are_no_tuning_seeds(config, first):
     "name",
     [
         *("ablations/study", "main/paper_best", "fusion/study", "error_budget/study", "information/number"),
-        *("completion/study", "completion/tuning", "information/update", "information/present"),
+        *("completion/study", "completion/tuning", "information/update"),
     ],
 )
 def test_tuning_studies_use_tuning_seeds(name):
     plan = make_plan(load_study(EXPERIMENTS / f"{name}.toml"))
     assert all(scene.source["seed"] < 100 for scene in plan.scenes)
-
-
-def test_the_present_mst_is_compared_on_the_scenes_of_the_earlier_study(tmp_path):
-    present, earlier = (make_plan(load_study(EXPERIMENTS / f"information/{n}.toml")) for n in ("present", "update"))
-    assert [scene.name for scene in present.scenes] == [scene.name for scene in earlier.scenes]
-    rows = read_csv(EXPERIMENTS / "information/results/update/update_scenes.csv")
-    better = [{**row, "quality": float(row["quality"]) + 0.25 * (row["arm"] == "mst")} for row in rows]
-    write_csv(tmp_path / "scenes.csv", better)
-    run_script("information/present.py", tmp_path / "scenes.csv")
-    found = {(row["score"], row["arm"]): row for row in read_csv(tmp_path / "present.csv")}
-    assert [found[score, "mst"]["present_mst_minus_it"] for score in ("quality", "information")] == [
-        "0.2500",
-        "0.0000",
-    ]
-    assert found["quality", "union"]["n"] == "60"
-    other = [{**row, "quality": float(row["quality"]) + 0.01} for row in rows]
-    write_csv(tmp_path / "scenes.csv", other)
-    assert "not the same" in run_script("information/present.py", tmp_path / "scenes.csv", expected_exit=2)
 
 
 def test_fusion_study_reports_the_arms_that_were_tuned():
