@@ -160,7 +160,9 @@ def reports_errors(what: str | dict[str, Any]) -> Iterator[None]:
         if _writes_to_read_only(error):
             raise AssertionError("it changes its input in place: make a copy first") from error
         what = what if isinstance(what, str) else _description(what)
-        raise AssertionError(f"{what}: it raises {describe_error(error)}") from error
+        number = isinstance(error, AttributeError) and "'float' object" in str(error)
+        hint = "; the input is a number: for scenes write `example = scene_example` in the file" if number else ""
+        raise AssertionError(f"{what}: it raises {describe_error(error)}{hint}") from error
 
 
 @contextmanager
