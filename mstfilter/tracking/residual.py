@@ -35,7 +35,7 @@ from mstfilter.tracking.segments import Track
 _DEPTH_SCALE = 1.5  # unit of depth differences, in standard deviations of the difference of two readings
 _COLOUR_SCALE = 25.0  # unit of colour differences (Euclidean RGB), grey levels
 _CAP = 4.0  # largest normalised difference
-OCCLUDED_COST, _OUTSIDE_COST = 5.6, 16.0  # of an occluded point and of a point outside the image
+_OCCLUDED_COST, OUTSIDE_COST = 5.6, 16.0  # of an occluded point and of a point outside the image
 _OCCLUDED_MARGIN = 0.015  # metres; points farther behind the measured surface are occluded
 _MIN_COUNTED = 0.3  # smallest fraction of counted points; with fewer the score is infinite
 _N_SCORED, _N_REFINED = 1200, 800  # largest numbers of points of a segment, evenly spaced
@@ -72,10 +72,10 @@ class MotionResidual:
             hidden = behind > _OCCLUDED_MARGIN
             cost = np.minimum(np.abs(behind) / scale, _CAP) ** 2
             cost = cost + np.minimum(colour / _COLOUR_SCALE, _CAP) ** 2
-        cost = np.where(hidden, OCCLUDED_COST, cost)
+        cost = np.where(hidden, _OCCLUDED_COST, cost)
         n_outside = (~inside).sum(axis=-1)
         n = n_outside + counted.sum(axis=-1)
-        total = np.where(counted, cost, 0.0).sum(axis=-1) + _OUTSIDE_COST * n_outside
+        total = np.where(counted, cost, 0.0).sum(axis=-1) + OUTSIDE_COST * n_outside
         # Fraction of the visible points that land on pixels of another object according to the flow.
         source = track.flow.source[v, u]
         with_source = counted & ~hidden & (source >= 0)

@@ -28,7 +28,7 @@ from mstfilter.errors import check_choice
 from mstfilter.tracking import rigid
 from mstfilter.tracking.features import SiftMatching
 from mstfilter.tracking.registration import Registration, RegistrationResult, SmallGicp, centroid_shift
-from mstfilter.tracking.residual import OCCLUDED_COST, MotionResidual, refine_motion
+from mstfilter.tracking.residual import OUTSIDE_COST, MotionResidual, refine_motion
 from mstfilter.tracking.rigid import MotionCluster, jlinkage, rigid_transform
 from mstfilter.tracking.segments import Track
 
@@ -189,6 +189,8 @@ class MstRule(MotionRule):
         Number of best candidates that are refined against the whole last frame and added as further candidates.
     search_above : float
         If every score is larger, the object is searched for around its last position. Negative values disable it.
+    max_score : float
+        The image refutes a motion with this score or a larger one. Default: that of a motion out of the image.
     registration : Registration
         Aligns the surfaces of the segment before and after.
     """
@@ -202,6 +204,7 @@ class MstRule(MotionRule):
     max_angle: float = 2.6
     n_refine: int = 3
     search_above: float = 4.0
+    max_score: float = OUTSIDE_COST
     sift: SiftMatching = field(default_factory=SiftMatching)
     residual: MotionResidual = field(default_factory=MotionResidual)
     registration: Registration = field(default_factory=SmallGicp)
@@ -227,8 +230,7 @@ class MstRule(MotionRule):
                 moving.append(self._scored(track, best.kind, T, best.support))
         if self.search_above >= 0 and min(c.score for c in [rest, *moving]) > self.search_above:
             moving.extend(self._search(track, centre))
-        # The image refutes a motion under which the points fit no better than if all of them were occluded.
-        return (rest, *(c for c in moving if c.score < OCCLUDED_COST))
+        return (rest, *(c for c in moving if c.score < self.max_score))
 
     def choose(self, rng: np.random.Generator, candidates: tuple[Candidate, ...]) -> Candidate:
         scores = np.array([c.score for c in candidates])
