@@ -10,14 +10,14 @@ and log loss of the crop's voxels over the number of true voxels.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from mstfilter.completion import NetworkCompleter, ObservedBox
-from mstfilter.completion.crops import BATCH, EDGE, LARGER
+from mstfilter.completion import NetworkCompleter
+from mstfilter.completion.crops import EDGE, LARGER
 from mstfilter.files import write_csv
 from mstfilter.formats import open_recording
 from mstfilter.scene import Recording, VoxelGrid
@@ -38,15 +38,6 @@ class OneCrop(NetworkCompleter):
         start = np.floor((low + high + 1) / 2).astype(np.int64) - self.edge // 2
         start[2] = 0
         return np.maximum(start, 0), np.minimum(start + self.edge, grid.shape)
-
-    def fill_many(self, rngs: Sequence[np.random.Generator], seen: Sequence[ObservedBox]) -> list[np.ndarray]:
-        found: list[np.ndarray] = []
-        for start in range(0, len(seen), BATCH):
-            part = seen[start : start + BATCH]
-            p = self.network.probabilities(part, [None] * len(part), self.edge)
-            shapes = [one.surface.shape for one in part]
-            found += [one[:a, :b, :c] for one, (a, b, c) in zip(p, shapes, strict=True)]
-        return found
 
 
 def measured(recording: Recording, pause: int, edge: int) -> Iterator[tuple[float, float, float]]:
