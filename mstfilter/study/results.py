@@ -41,7 +41,7 @@ FORECASTS = "forecasts.npz"  # in a run's folder: counts of its forecasts at eac
 _SUMMARY_COLUMNS = ("family", "arm", "metric", "n", "mean", "low", "high")
 _DIFFERENCE_COLUMNS = (
     *("family", "first", "second", "metric", "n", "mean", "low", "high"),
-    *("low_bootstrap", "high_bootstrap", "p", "p_holm", "conclusion"),
+    *("low_bootstrap", "high_bootstrap", "p", "p_bootstrap", "skewness", "p_holm", "conclusion"),
 )
 _FAILURE_COLUMNS = ("run", "error", "hints", "tries", "folder")
 

@@ -75,7 +75,7 @@ class Compared:
     ----------
     family, first, second, metric : str
     difference : Difference
-        For the primary endpoints, p is adjusted over both, all families and arms.
+        For the primary endpoints, `p_claim` is adjusted over both, all families and arms.
     reported_only : bool
         The other arm is not part of the adjustment, and no conclusion is drawn.
     """
@@ -136,14 +136,14 @@ class Summary:
     def is_better(self, family: str, arm: str) -> bool:
         """Whether the reference can be claimed to be better than an arm on a family.
 
-        One endpoint is better after adjustment, the interval of the other excludes that it is worse by 0.005 or more,
-        and both have at least 20 scenes.
+        One endpoint is better after adjustment, the intervals of the other exclude that it is worse by 0.005 or more, and
+        both have at least 20 scenes.
         """
         found = {}
         for one in self.differences:
             if one.metric in ENDPOINTS and (one.family, one.second) == (family, arm) and one.adjusted:
                 sign, d = ENDPOINTS[one.metric], one.difference
-                low = d.low if sign > 0 else -d.high
+                low = np.fmin(d.low, d.low_bootstrap) if sign > 0 else -np.fmax(d.high, d.high_bootstrap)
                 found[one.metric] = low > 0 and d.p_holm < 1 - LEVEL, low > -NOT_WORSE and d.n >= CLAIM
         better, not_worse = zip(*found.values(), strict=True) if found else ((), ())
         return len(found) == len(ENDPOINTS) and any(better) and all(not_worse)
@@ -166,6 +166,7 @@ class Summary:
             row |= {"mean": d.mean, "low": d.low, "high": d.high, "p": d.p}
             row["p_holm"] = d.p_holm if one.adjusted else None
             row |= {"low_bootstrap": d.low_bootstrap, "high_bootstrap": d.high_bootstrap}
+            row |= {"p_bootstrap": d.p_bootstrap, "skewness": d.skewness}
             rows.append({**row, "conclusion": one.words if one.adjusted else ""})
         return rows
 
@@ -228,7 +229,7 @@ def summarise(
         for arm in arms
         if arm != reference and (others := values.get((family, arm, name), {}))
     ]
-    p = holm([one.difference.p if one.adjusted else float("nan") for one in differences])
+    p = holm([one.difference.p_claim if one.adjusted else float("nan") for one in differences])
     differences = [
         replace(one, difference=replace(one.difference, p_holm=float(q))) if one.metric in ENDPOINTS else one
         for one, q in zip(differences, p, strict=True)
