@@ -16,15 +16,19 @@ import json
 import math
 import numbers
 import os
+import re
 import shutil
 import uuid
 import zipfile
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from mstfilter.errors import InputError, naming, reason
+
+if TYPE_CHECKING:
+    import numpy as np
 
 
 @contextmanager
@@ -68,6 +72,36 @@ def reading(path: Path, kind: str, *hints: str) -> Iterator[None]:
         raise InputError(f"{path} is not valid JSON: {error}", *hints) from error
     except (OSError, EOFError, zipfile.BadZipFile, ValueError, KeyError, TypeError, AttributeError) as error:
         raise InputError(f"{path} cannot be read: {reason(error)}", *hints) from error
+
+
+def read_arrays(path: Path, what: str, *hints: str) -> dict[str, np.ndarray]:
+    """All arrays of an .npz file. InputError that names the file if it is missing, damaged or of another kind.
+
+    `what` names the content for the message. numpy and zipfile raise errors of many types for damaged files, and a
+    checksum is compared only when an array is read; therefore all arrays are read here.
+    """
+    import numpy as np
+
+    try:
+        with np.load(path, allow_pickle=False) as data:
+            return {name: data[name] for name in data.files}
+    except FileNotFoundError:
+        raise InputError(f"{what} is missing: {path}") from None
+    except Exception as error:
+        problem = reason(error) or type(error).__name__
+        raise InputError(f"{what} cannot be read: {path} ({problem})", *hints) from error
+
+
+def folder_name(name: str) -> str:
+    """A name of a folder for any text, different for different texts on every file system.
+
+    Lower-case letters, digits, ``_`` and ``-`` stay. Other texts, long ones and names that Windows reserves become
+    such letters, ``~`` and a hash.
+    """
+    plain = re.sub(r"[^a-z0-9_-]+", "_", name.lower())[:60]
+    if plain == name and name and not re.fullmatch(r"con|prn|aux|nul|(com|lpt)[0-9]", name):
+        return name
+    return f"{plain}~{hashlib.sha256(name.encode('utf-8', 'surrogatepass')).hexdigest()[:12]}"
 
 
 def check_output(path: Path, folder: bool = False) -> None:

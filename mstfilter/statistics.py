@@ -9,10 +9,10 @@
 
 Values are paired by unit: a scene, a data set, or a seed that all arms share. Units must be independent, so values of
 several filter seeds on one scene are averaged first. A difference has a t interval, a studentised bootstrap interval,
-and the p values of a sign-flip test and of the studentised bootstrap. The t interval and the sign-flip test assume that
-the differences are symmetric about zero under the null hypothesis; squared errors are skewed, and their differences
-often are. A claim therefore needs both intervals to exclude 0 and a small `Difference.p_claim`, which takes the larger
-p value and multiplies it by 1 + abs(skewness). p values of one table are adjusted by Holm's method.
+and the p values of a sign-flip test and of the studentised bootstrap. The t interval and the sign-flip test assume
+that the differences are symmetric about zero under the null hypothesis; squared errors are skewed, and their
+differences often are. A claim therefore needs both intervals to exclude 0 and a small `Difference.p_claim`, which
+takes the larger p value and multiplies it by 1 + abs(skewness). p values of one table are adjusted by Holm's method.
 `experiments/comparison` has the error rates and the power of this rule.
 """
 
@@ -145,8 +145,8 @@ def studentised(values: np.ndarray, n_resamples: int = N_BOOTSTRAP) -> tuple[flo
 def bootstrap_p(values: np.ndarray, n_resamples: int = N_BOOTSTRAP) -> float:
     """Two-sided p value of a zero mean by the studentised bootstrap; NaN for fewer than five values.
 
-    The larger of two p values: the equal-tailed one, of the interval of `studentised`, which follows the skew, and that
-    of the absolute t ratio, which is larger for symmetric values with heavy tails (Hall 1992, section 3.6).
+    The larger of two p values: the equal-tailed one, which follows the skew like the interval of `studentised`, and
+    that of the absolute t ratio, which is larger for symmetric values with heavy tails (Hall 1992, section 3.6).
     """
     return _p_of(values, _resampled_ratios(values, n_resamples))
 

@@ -26,7 +26,7 @@ POWER = (2.5, 3.5)  # true mean over its standard error
 
 
 def squared_errors(rng: np.random.Generator, n: int, shape: tuple[int, int]) -> np.ndarray:
-    """Squared normal errors minus those of a reference with the same mean and a smaller spread, shared by the arms."""
+    """Squared normal errors minus those of a reference of the same mean and less spread, shared by the arms."""
     reference = (rng.normal(size=(n, shape[0], 4)) ** 2).mean(axis=-1)
     return rng.normal(size=(n, *shape)) ** 2 - reference[..., None]
 
@@ -45,7 +45,7 @@ CASES: dict[str, Draw] = {
 
 
 def p_values(x: np.ndarray) -> dict[str, np.ndarray]:
-    """p values of the columns of (n, k) differences, by test; those of `compare`, for many columns by matrix products.
+    """p values of the columns of (n, k) differences, by test: as in `compare`, by matrix products.
 
     The limits of both intervals are those of the tests `t` and `bootstrap`, so p values below .05 exclude 0.
     """
@@ -80,7 +80,7 @@ def _by_bootstrap(x: np.ndarray) -> np.ndarray:
 
 
 def claims(x: np.ndarray, arms: int) -> dict[str, float]:
-    """Share of the tables (n, table, arm) with a claim, by the t test, by sign flips, and by the rule of `conclusion`."""
+    """Share of the tables (n, table, arm) with a claim, by t tests, sign flips, and the rule of `conclusion`."""
     parts = [p_values(x[:, k : k + CHUNK].reshape(len(x), -1)) for k in range(0, x.shape[1], CHUNK)]
     p = {name: np.concatenate([part[name] for part in parts]).reshape(-1, x.shape[2]) for name in parts[0]}
     both = np.maximum(p["t"], p["bootstrap"])  # both intervals exclude 0

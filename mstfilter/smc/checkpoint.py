@@ -18,8 +18,8 @@ import dataclasses
 import json
 import os
 import sys
-import zipfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from functools import partial
 from hashlib import blake2b
 from pathlib import Path
@@ -28,8 +28,8 @@ from typing import Any
 
 import numpy as np
 
-from mstfilter.errors import InputError
-from mstfilter.files import atomic_path
+from mstfilter.errors import InputError, reason
+from mstfilter.files import atomic_path, read_arrays
 from mstfilter.smc.interfaces import Codec, State
 from mstfilter.smc.population import Population
 from mstfilter.smc.programs.sites import Trace
@@ -74,21 +74,33 @@ def save_state(
 
 
 def load_state(path: Path, codec: Codec | None = None) -> tuple[State, dict[str, Any]]:
-    """The state in a file, and the description stored with it."""
-    try:
-        with np.load(path, allow_pickle=False) as data:
-            arrays = {name: data[name] for name in data.files}
+    """The state in a file, and the description stored with it. InputError if the file is damaged or no checkpoint."""
+    arrays = read_arrays(path, "checkpoint", _DAMAGED)
+    with _stored_state(path):
         head = json.loads(str(arrays["head"]))
-    except FileNotFoundError:
-        raise InputError(f"checkpoint is missing: {path}") from None
-    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile) as error:
-        raise InputError(f"checkpoint cannot be read: {path} ({error})", "remove it to start again") from error
-    if head.get("format") != _FORMAT:
-        raise InputError(f"checkpoint {path} has format {head.get('format')}, expected {_FORMAT}")
-    particles = (codec or ArrayCodec()).decode(_below(arrays, "particles/"))
-    population = Population(particles, arrays["log_weights"], _below(arrays, "parents/"))
-    key = Key(head["seed"], tuple(head["path"]))
-    return State(head["t"], population, key, head["properly_weighted"]), head
+        if head.get("format") != _FORMAT:
+            raise InputError(f"checkpoint {path} has format {head.get('format')}, expected {_FORMAT}")
+        particles = (codec or ArrayCodec()).decode(_below(arrays, "particles/"))
+        population = Population(particles, arrays["log_weights"], _below(arrays, "parents/"))
+        key = Key(head["seed"], tuple(head["path"]))
+        return State(head["t"], population, key, head["properly_weighted"]), head
+
+
+_DAMAGED = "remove it to start again, or choose another file"
+
+
+@contextmanager
+def _stored_state(path: Path) -> Iterator[None]:
+    """Turn errors about missing or wrong content in a block into InputError."""
+    try:
+        yield
+    except InputError as error:
+        message = error.message if str(path) in error.message else f"checkpoint {path}: {error.message}"
+        raise InputError(message, *error.hints) from error
+    except (LookupError, ValueError, TypeError, AttributeError) as error:
+        raise InputError(
+            f"{path} is not a checkpoint of a filter ({type(error).__name__}: {reason(error)})", _DAMAGED
+        ) from error
 
 
 def _below(arrays: dict[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:

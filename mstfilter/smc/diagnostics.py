@@ -23,18 +23,20 @@ runs are stored, and the same call continues after an interruption.
 
 from __future__ import annotations
 
+import json
+import re
 import sys
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from itertools import product
 from pathlib import Path
+from types import FrameType
 from typing import Any
-from urllib.parse import quote
 
 import numpy as np
 
 from mstfilter.errors import InputError, LostRunError, MissingLibraryError, check_integer, naming
-from mstfilter.files import atomic_path
+from mstfilter.files import atomic_path, check_output, folder_name, read_arrays
 from mstfilter.lazy import progress_of
 from mstfilter.smc.batching import batch, batched_slots
 from mstfilter.smc.checkpoint import digest
@@ -240,10 +242,11 @@ def run_many(
         Name -> filter. All filters get the same observations and seeds.
     workers : int
         Number of processes. 1 uses the calling process; more are started by joblib's loky, as new interpreters that
-        get the filters by cloudpickle.
+        get the filters by cloudpickle. InputError if a worker dies, with the arm and the seed.
     folder : path, optional
-        Every finished run is stored there. The same call runs only those that are missing. InputError if a stored run
-        was made by another filter, other observations or other collectors.
+        Every finished run is stored there, as ``arm/seed.npz``; characters of an arm other than lower-case letters,
+        digits, ``_`` and ``-`` are replaced by a hash. The same call runs only those that are missing. InputError if
+        a stored run was made by another filter, other observations or other collectors, or if its file is damaged.
     progress : bool or callable
         True shows a progress bar; a function is called as ``progress(done, total)`` when runs finish.
     **collectors
@@ -259,11 +262,15 @@ def run_many(
     if not arms:
         raise InputError("there are no filters to run")
     check_integer("workers", workers)
+    if workers > 1:
+        _check_caller()
+    if folder is not None:
+        check_output(Path(folder), folder=True)
     observations, collectors = list(observations), collectors or {"log_evidence": log_evidence}
     hashes = {} if folder is None else {arm: digest((arms[arm], observations, collectors)) for arm in arms}
     job = _Job(dict(arms), observations, collectors, folder, hashes)
     seeds = [int(seed) for seed in seeds]
-    found = {task: run for task in product(arms, seeds) if (run := job.load(*task)) is not None}
+    found = job.load_all(seeds)
     total, chunks = len(arms) * len(seeds), []
     for arm in arms:
         missing = [seed for seed in seeds if (arm, seed) not in found]
@@ -342,31 +349,56 @@ class _Job:
         return values.reshape(*shape, *values.shape[2:])
 
     def path(self, arm: str, seed: int) -> Path:
-        return Path(self.folder or ".") / quote(arm, safe="") / f"{seed}.npz"
+        return Path(self.folder or ".") / folder_name(arm) / f"{seed}.npz"
 
     def save(self, arm: str, seed: int, run: _Run) -> None:
         if self.folder is None:
             return
         path = self.path(arm, seed)
-        path.parent.mkdir(parents=True, exist_ok=True)
         arrays: dict[str, Any] = {f"rows/{name}": row for name, row in run.rows.items()}
+        arrays["head"] = json.dumps({"made_by": self.hashes[arm], "seed": seed, "lost": run.lost})
         with atomic_path(path) as partial, partial.open("wb") as file:
-            np.savez(file, head=np.array([self.hashes[arm], run.lost]), **arrays)
+            np.savez(file, **arrays)
 
     def load(self, arm: str, seed: int) -> _Run | None:
-        """A stored run; None if there is none."""
+        """A stored run; None if there is none. InputError if the file is damaged, or of another run."""
         path = self.path(arm, seed)
         if self.folder is None or not path.exists():
             return None
-        with np.load(path, allow_pickle=False) as data:
-            identity, lost = (str(text) for text in data["head"])
-            rows = {name: data[f"rows/{name}"] for name in self.collectors if f"rows/{name}" in data.files}
-        if identity != self.hashes[arm]:
+        arrays = read_arrays(path, "stored run", _DAMAGED)
+        try:
+            head = json.loads(str(arrays.pop("head")))
+            made_by, lost = (head["made_by"], head["seed"]), str(head["lost"])
+        except (KeyError, TypeError, ValueError):
+            raise InputError(f"{path} is not a stored run of run_many", _DAMAGED) from None
+        if made_by != (self.hashes[arm], seed):
             raise InputError(
-                f"run {path} was made by another filter, other observations or other collectors",
+                f"run {path} was made by another filter or seed, other observations or other collectors",
                 "choose another folder, or remove this one",
             )
+        rows = {name.removeprefix("rows/"): row for name, row in arrays.items()}
+        lengths, steps = {np.shape(row)[:1] for row in rows.values()}, len(self.observations)
+        if set(rows) != set(self.collectors) or (not lost and lengths != {(steps,)}):
+            raise InputError(f"stored run {path} is not complete", _DAMAGED)
         return _Run(rows, lost)
+
+    def load_all(self, seeds: list[int]) -> dict[tuple[str, int], _Run]:
+        """All stored runs. The error states how many cannot be used."""
+        found, errors = {}, []
+        for task in product(self.arms, seeds):
+            try:
+                run = self.load(*task)
+            except InputError as error:
+                errors.append(error)
+            else:
+                found.update({} if run is None else {task: run})
+        if errors:
+            more = f"; {len(errors)} stored runs cannot be used" if len(errors) > 1 else ""
+            raise InputError(f"{errors[0].message}{more}", *errors[0].hints) from errors[0]
+        return found
+
+
+_DAMAGED = "remove the file and call run_many again: it runs what is missing, with the same result"
 
 
 def _until_lost(steps: Iterable[tuple[State, Info]], lost: list[str]) -> Iterable[tuple[State, Info]]:
@@ -377,18 +409,73 @@ def _until_lost(steps: Iterable[tuple[State, Info]], lost: list[str]) -> Iterabl
         lost.append(error.message)
 
 
-def _finished_chunks(job: _Job, chunks: list[tuple[str, list[int]]], workers: int) -> Iterable[Any]:
+_Chunk = tuple[str, list[int]]  # an arm and some seeds
+
+
+def _finished_chunks(job: _Job, chunks: list[_Chunk], workers: int) -> Iterator[dict[tuple[str, int], _Run]]:
     """Results of chunks of runs in the order in which they finish.
 
     Workers are new processes: a fork of a process with threads can deadlock.
     """
     if workers == 1:
-        return (job.run(arm, seeds) for arm, seeds in chunks)
+        yield from (job.run(*chunk) for chunk in chunks)
+        return
+    from joblib.externals.loky.process_executor import TerminatedWorkerError
+
+    left = {(arm, seed) for arm, seeds in chunks for seed in seeds}
+    try:
+        for done in _parallel(job, chunks, workers):
+            left -= done.keys()
+            yield done
+    except TerminatedWorkerError:
+        rest = [(arm, [seed for seed in seeds if (arm, seed) in left]) for arm, seeds in chunks]
+        rest = [chunk for chunk in rest if chunk[1]]
+        # Chunks begin in order, so the worker died in one of the first of those that are left.
+        for arm, seeds in rest[:workers]:
+            yield from (_alone(job, arm, seed) for seed in seeds)
+        yield from _finished_chunks(job, rest[workers:], workers)
+
+
+def _parallel(job: _Job, chunks: list[_Chunk], workers: int) -> Iterable[dict[tuple[str, int], _Run]]:
     from joblib import Parallel, delayed, parallel_config
 
     with parallel_config("loky", n_jobs=workers, inner_max_num_threads=1):
         parallel = Parallel(batch_size=1, return_as="generator_unordered")
         return parallel(delayed(_in_worker)(job, *chunk) for chunk in chunks)
+
+
+def _alone(job: _Job, arm: str, seed: int) -> dict[tuple[str, int], _Run]:
+    """Run once more, in a process that does nothing else, what may have ended a worker."""
+    from joblib.externals.loky.process_executor import TerminatedWorkerError
+
+    try:
+        return next(iter(_parallel(job, [(arm, [seed])], 2)))  # one task of two workers; n_jobs=1 starts no process
+    except TerminatedWorkerError as error:
+        code = re.search(r"exit codes of the workers are {(.*?)}", str(error))
+        how = f" ({code[1]})" if code else ""
+        raise InputError(
+            f"arm {arm!r}, seed {seed}: the worker process died{how}",
+            "if memory ran out: use fewer workers or fewer particles",
+            "workers=1 runs in this process and shows a crash of compiled code",
+        ) from None
+
+
+def _check_caller() -> None:
+    """Raise InputError if a module that is being imported calls `run_many` with workers.
+
+    Workers import the modules of the functions that they get. So they would call `run_many` again, or wait for the
+    import to end.
+    """
+    frame: FrameType | None = sys._getframe(2)
+    while frame is not None:
+        name = frame.f_globals.get("__name__")
+        spec = getattr(sys.modules.get(str(name)), "__spec__", None)
+        if frame.f_code.co_name == "<module>" and (name == "__mp_main__" or getattr(spec, "_initializing", False)):
+            raise InputError(
+                f"{frame.f_code.co_filename}, line {frame.f_lineno}: run_many with workers is called in an import",
+                'put the call below `if __name__ == "__main__":`, or into a function',
+            )
+        frame = frame.f_back
 
 
 def _in_worker(job: _Job, arm: str, seeds: list[int]) -> dict[tuple[str, int], _Run]:

@@ -23,6 +23,7 @@ function of a `State`, so a run can be stopped, stored and resumed at any step.
 from __future__ import annotations
 
 import time
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sized
 from dataclasses import dataclass
 from functools import lru_cache
@@ -31,10 +32,11 @@ from typing import Any, Literal
 
 import numpy as np
 
-from mstfilter.errors import InputError, check_choice, check_component, check_integer
+from mstfilter.errors import InputError, InputWarning, check_choice, check_component, check_integer
 from mstfilter.lazy import late, progress_of
 from mstfilter.smc.components import EssBelow
 from mstfilter.smc.interfaces import (
+    ARRAY_BYTES,
     Codec,
     Component,
     Info,
@@ -202,7 +204,7 @@ class ParticleFilter:
         checkpoint: str | Path | None = None,
         codec: Codec | None = None,
         observer: Observer | None = None,
-        keep_arrays: bool = True,
+        keep_arrays: bool | None = None,
         progress: bool | Callable[[int, int | None], None] = False,
     ) -> tuple[State, Infos]:
         """Run all steps; returns the last state and the infos. Parameters as in `iterate`.
@@ -210,19 +212,20 @@ class ParticleFilter:
         ``progress=True`` shows a progress bar; a function is called as ``progress(done, total)``.
 
         If the run continues from a checkpoint, it returns the infos of the later steps only. The infos hold some (n,)
-        arrays of each step, so memory grows with n times the number of steps; with ``keep_arrays=False``, they do not
-        (see `Info.without_arrays`). `collect` keeps only what it is asked for.
+        arrays of each step, so memory grows with n times the number of steps. By default, if these arrays exceed 268
+        MB in total, they are removed from all infos (see `Info.without_arrays`), with an `InputWarning`.
+        ``keep_arrays=True`` always keeps them, ``keep_arrays=False`` never. `collect` keeps what it is asked for.
         """
         total = len(observations) if isinstance(observations, Sized) else None
         observations, state, store = self._begin(observations, seed, checkpoint, codec)
-        infos = Infos()
+        infos = _Kept(keep_arrays)
         with progress_of(progress, "filter") as advance:
             advance(state.t, total)
             for current, info in self._steps(observations, state, store, observer):
                 state = current
-                infos.append(info if keep_arrays else info.without_arrays())
+                infos.add(info)
                 advance(state.t, total)
-        return state, infos
+        return state, infos.infos
 
     def _begin(
         self, observations: Iterable[Any], state: State | int, checkpoint: str | Path | None, codec: Codec | None
@@ -246,6 +249,36 @@ class ParticleFilter:
             if store is not None:
                 store.save(state, observation)
             yield state, info
+
+
+class _Kept:
+    """The infos of a run, and how many bytes their arrays have. Arrays that several infos share count once."""
+
+    def __init__(self, keep: bool | None) -> None:
+        self.keep, self.infos = keep, Infos()
+        self._bytes, self._seen = 0, set[int]()
+
+    def add(self, info: Info) -> None:
+        """Keep an info, with its arrays if they fit."""
+        if self.keep is None:
+            new = {id(a): a.nbytes for a in info.arrays() if id(a) not in self._seen}
+            self._seen.update(new)
+            self._bytes += sum(new.values())
+            if self._bytes > ARRAY_BYTES:
+                self._remove_arrays()
+        self.infos.append(info.without_arrays() if self.keep is False else info)
+
+    def _remove_arrays(self) -> None:
+        self.keep, self.infos.removed = False, self._bytes
+        self.infos[:] = [info.without_arrays() for info in self.infos]
+        warnings.warn(
+            InputWarning(
+                f"the infos of the run do not keep arrays, which exceed {ARRAY_BYTES / 1e6:.0f} MB after "
+                f"{len(self.infos) + 1} steps",
+                "keep_arrays=True keeps them, keep_arrays=False never does; `collect` keeps what you ask for",
+            ),
+            stacklevel=4,
+        )
 
 
 class _Step:

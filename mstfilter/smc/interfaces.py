@@ -414,6 +414,13 @@ class Info:
         light.__dict__["unique_ancestors"] = self.unique_ancestors
         return light
 
+    def arrays(self) -> list[np.ndarray]:
+        """The arrays that `without_arrays` removes."""
+        return [self.ancestors, self.log_weights, *self.parents.values()]
+
+
+ARRAY_BYTES = 1 << 28  #: most bytes of arrays that the infos of a run keep by default
+
 
 class Infos(list[Info]):
     """The records of the steps of a run: a list that can be read as a table.
@@ -421,6 +428,8 @@ class Infos(list[Info]):
     >>> state, infos = filter.run(observations)
     >>> infos.table()                       # a data frame of pandas or polars if one is installed, else text (CSV)
     """
+
+    removed = 0  #: bytes of the arrays that were removed from the infos because they exceeded `ARRAY_BYTES`
 
     def rows(self) -> list[dict[str, Any]]:
         """One row for each step: its numbers, and the wall time in seconds of the step and of each slot."""
@@ -449,6 +458,7 @@ class Infos(list[Info]):
             return "Infos: no steps"
         ess, seconds = [info.ess for info in self], sum(sum(info.seconds.values()) for info in self)
         spread = f"ESS {min(ess):.1f} to {max(ess):.1f}"
-        return f"Infos: steps {len(self)}, resampled {sum(i.resampled for i in self)}, {spread}, {seconds:.3g} s"
+        found = f"Infos: steps {len(self)}, resampled {sum(i.resampled for i in self)}, {spread}, {seconds:.3g} s"
+        return f"{found}, without arrays (above {self.removed / 1e6:.0f} MB)" if self.removed else found
 
     _repr_html_ = late("mstfilter.report.display:to_html", "What a notebook shows.")

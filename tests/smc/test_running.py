@@ -3,18 +3,24 @@
 from __future__ import annotations
 
 import copy
+import io
 import os
+import pickle
+import re
 import signal
 import subprocess
 import sys
 import time
+import tracemalloc
+import warnings
 from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
 import pytest
 
-from mstfilter.errors import InputError, MissingLibraryError
+from mstfilter.errors import InputError, InputWarning, MissingLibraryError
+from mstfilter.files import folder_name
 from mstfilter.smc import (
     ArrayCodec,
     Codec,
@@ -98,6 +104,41 @@ def test_a_run_without_arrays():
         assert len(b.log_weights) == len(b.ancestors) == len(b.parents) == 0
 
 
+def test_the_infos_of_a_long_run_keep_no_arrays(monkeypatch):
+    """The bytes are counted by hand: parents and log weights of 16 numbers; arrays that steps share count once."""
+    monkeypatch.setattr("mstfilter.smc.filter.ARRAY_BYTES", 1000)
+    run = partial(bootstrap(AR1, 16).run, YS, 3)
+    with pytest.warns(InputWarning, match="do not keep arrays, which exceed") as told:
+        infos = run()[1]
+    assert len(told) == 1 and "keep_arrays=True" in told[0].message.hints[0]
+    assert all(not array.size for info in infos for array in info.arrays()) and len(infos) == len(YS)
+    assert infos.removed > 1000 and "without arrays (above 0 MB)" in repr(infos)
+    kept = run(keep_arrays=True)[1]
+    assert {len(info.log_weights) for info in kept} == {16} and kept.removed == 0 and "without" not in repr(kept)
+    assert [i.unique_ancestors for i in infos] == [i.unique_ancestors for i in kept]
+    distinct = {id(array): array.nbytes for info in kept for array in info.arrays()}
+    monkeypatch.setattr("mstfilter.smc.filter.ARRAY_BYTES", sum(distinct.values()))
+    assert len(run()[1][0].log_weights) == 16
+    monkeypatch.setattr("mstfilter.smc.filter.ARRAY_BYTES", sum(distinct.values()) - 1)
+    with pytest.warns(InputWarning):
+        run()
+
+
+def test_the_memory_of_a_long_run_is_bounded(monkeypatch):
+    """Peak of the allocations of 60 steps of 4,000 particles, whose arrays of infos have 2 to 6 MB."""
+    monkeypatch.setattr("mstfilter.smc.filter.ARRAY_BYTES", 500_000)
+    held = {}
+    for keep in (None, True):
+        tracemalloc.start()
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", InputWarning)
+            infos = bootstrap(AR1, 4000).run(np.tile(YS, 6), 3, keep_arrays=keep)[1]
+        held[keep] = tracemalloc.get_traced_memory()[0]
+        tracemalloc.stop()
+        del infos
+    assert held[None] < 500_000 < 2_000_000 < held[True]
+
+
 # --- many runs ----------------------------------------------------------------------------------------------------
 def test_results_do_not_depend_on_workers_or_on_other_arms():
     arms = {"systematic": bootstrap(AR1, 50), "multinomial": bootstrap(AR1, 50, Multinomial())}
@@ -163,7 +204,7 @@ def test_stored_runs_are_not_run_again(tmp_path):
     first = run(range(4), progress=lambda done, total: steps.append((done, total)))
     assert steps == [(1, 4), (2, 4), (3, 4), (4, 4)]
     before = len(CALLS)
-    (tmp_path / "runs" / "a%2Fb" / "2.npz").unlink()
+    (tmp_path / "runs" / folder_name("a/b") / "2.npz").unlink()
     again = run(range(4))
     # Only run 2 was repeated.
     assert len(CALLS) - before == np.isfinite(first["x"][0, 2]).sum()
@@ -173,7 +214,9 @@ def test_stored_runs_are_not_run_again(tmp_path):
         lambda: run(range(4), n=6),
         lambda: run_many({"a/b": bootstrap(FRAGILE, 2)}, YS[:4], [0], folder=tmp_path / "runs", x=counted),
     ):
-        with pytest.raises(InputError, match="was made by another filter, other observations or other collectors"):
+        with pytest.raises(
+            InputError, match="was made by another filter or seed, other observations or other collectors"
+        ):
             other()
 
 
@@ -186,6 +229,137 @@ def test_a_batched_arm_gives_the_numbers_of_single_runs(tmp_path):
         np.testing.assert_array_equal(runs[name][0], runs[name][1])
     two = run_many(arms, YS, range(5), workers=2, **kept)
     np.testing.assert_array_equal(two["z"], runs["z"])
+
+
+ODD_NAMES = (
+    *(
+        "a",
+        "A",
+        "..",
+        ".",
+        "",
+        "a/b",
+        "a\\b",
+        "/etc/x",
+        "CON",
+        "con",
+        "a.",
+        "a ",
+        "a:b",
+        "a\0",
+        "a\n",
+        "\u00e9",
+        "e\u0301",
+    ),
+    *("~", "x" * 5000, "\ud800", "a~ca978112ca1b"),
+)
+
+
+def test_every_name_of_an_arm_has_a_folder_inside(tmp_path):
+    folder = tmp_path / "in" / "runs"
+    arms = {name: bootstrap(AR1, n) for n, name in enumerate(ODD_NAMES, 3)}
+    runs = run_many(arms, YS[:3], [1], folder=folder, x=diagnostics.ess)
+    files = [p for p in tmp_path.rglob("*") if p.is_file()]
+    names = [p.parent.name for p in files]
+    assert len(files) == len(arms) and all(p.parent.parent == folder and p.name == "1.npz" for p in files)
+    assert len({name.lower() for name in names}) == len(arms) and max(map(len, names)) < 100
+    assert all(re.fullmatch("[a-z0-9_~-]+", name) and name != "con" for name in names)
+    np.testing.assert_array_equal(run_many(arms, YS[:3], [1], folder=folder, x=diagnostics.ess)["x"], runs["x"])
+
+
+def test_damaged_stored_runs_are_named(tmp_path):
+    """Cut anywhere, with any byte changed, or other content: never a raw error, never another result."""
+
+    def run(**collectors):
+        return run_many(
+            {"a": bootstrap(AR1, 4)}, YS[:3], [0, 1], folder=tmp_path, **(collectors or {"x": diagnostics.ess})
+        )
+
+    first = run()["x"]
+    path = tmp_path / "a" / "1.npz"
+    whole, rng = path.read_bytes(), np.random.default_rng(0)
+    changed = [bytearray(whole) for _ in range(150)]
+    for content in changed:
+        content[rng.integers(len(whole))] ^= rng.integers(1, 256)
+    other = io.BytesIO()
+    np.savez(other, head=np.array(3.0))
+    single = io.BytesIO()
+    np.save(single, np.zeros(3))
+    cut = [whole[:k] for k in (*range(0, len(whole), 40), len(whole) - 1)]
+    refused = 0
+    for content in (*cut, *changed, other.getvalue(), single.getvalue(), b"no zip at all", pickle.dumps([1])):
+        path.write_bytes(content)
+        try:
+            again = run()["x"]
+        except InputError as error:
+            assert str(path) in error.message and error.hints, error
+            refused += 1
+        else:  # a byte without a meaning, such as a date
+            np.testing.assert_array_equal(again, first)
+    assert refused > len(cut) + 100
+    for content in (b"", (tmp_path / "a" / "0.npz").read_bytes()):
+        path.write_bytes(content)
+        with pytest.raises(InputError, match="1.npz"):
+            run()
+    (tmp_path / "a" / "0.npz").write_bytes(b"")
+    with pytest.raises(InputError, match="0.npz.*2 stored runs cannot be used"):
+        run()
+    for file in tmp_path.rglob("*.npz"):
+        file.unlink()
+    np.testing.assert_array_equal(run()["x"], first)
+    with pytest.raises(InputError, match="is a file"):
+        run_many({"a": bootstrap(AR1, 4)}, YS[:3], [0], folder=path)
+
+
+def ends_the_process(state, info):
+    if state.key.seed == 5:
+        os._exit(3)
+    return info.ess
+
+
+def test_a_worker_that_dies_is_named_with_its_run(tmp_path):
+    arms = {"a": bootstrap(AR1, 4), "b": bootstrap(AR1, 5)}
+    with pytest.raises(InputError, match=r"arm 'a', seed 5: the worker process died \(EXIT\(3\)\)"):
+        run_many(arms, YS[:3], range(4, 8), workers=2, folder=tmp_path, x=ends_the_process)
+
+
+def test_a_worker_that_dies_once_changes_nothing(tmp_path):
+    def dies_once(state, info):
+        if state.key.seed == 2 and not (tmp_path / "died").exists():
+            (tmp_path / "died").touch()
+            os._exit(1)
+        return info.ess
+
+    arms = {"a": bootstrap(AR1, 4), "b": bootstrap(AR1, 5)}
+    runs = run_many(arms, YS[:3], range(5), workers=2, x=dies_once)
+    assert (tmp_path / "died").exists()
+    np.testing.assert_array_equal(runs["x"], run_many(arms, YS[:3], range(5), x=diagnostics.ess)["x"])
+
+
+def test_workers_need_a_script_that_is_not_imported(tmp_path):
+    """On import, workers would import the module again, and wait for the import to end."""
+    lines = (
+        "from mstfilter.smc import bootstrap, linear_gaussian, run_many",
+        "model = linear_gaussian([[0.9]], [[1]], [[1]], [[1]], [0], [[1]])",
+        "def one(state, info): return 1.0",
+        "runs = run_many({'a': bootstrap(model, 5)}, [0.1], range(4), workers=2, x=one)",
+        "print('made', runs['x'].sum())",
+    )
+    (tmp_path / "script.py").write_text("\n".join(lines))
+    environment = {**os.environ, "PYTHONPATH": str(REPOSITORY), "OMP_NUM_THREADS": "1"}
+
+    def python(*arguments):
+        command = [sys.executable, *arguments]
+        return subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=60)
+
+    found = python("-c", "import script")
+    assert "script.py, line 4: run_many with workers is called in an import" in found.stderr
+    assert (
+        found.returncode == 1
+        and found.stderr.count("\nmstfilter.errors.InputError") == 1
+        and "__main__" in found.stderr
+    )
+    assert python("script.py").stdout == "made 4.0\n"
 
 
 # --- codecs -------------------------------------------------------------------------------------------------------
@@ -276,6 +450,25 @@ def test_what_cannot_be_stored_is_one_clear_error(tmp_path):
 
     save((1j, 2j), Halves())
     assert load_state(tmp_path / "s.npz", Halves())[0].population.particles == (1j, 2j)
+    whole = (tmp_path / "s.npz").read_bytes()
+    other, single = io.BytesIO(), io.BytesIO()
+    np.savez(other, x=np.zeros(3))
+    np.save(single, np.zeros(3))
+    for content in (
+        b"",
+        b"no zip",
+        *(whole[:k] for k in range(1, len(whole), 50)),
+        single.getvalue(),
+        other.getvalue(),
+    ):
+        (tmp_path / "s.npz").write_bytes(content)
+        with pytest.raises(InputError, match="s.npz") as found:
+            load_state(tmp_path / "s.npz", Halves())
+        assert found.value.hints
+    for head in ('"text"', "3", "{}", '{"format": 1}', '{"format": 1, "seed": 0, "path": [], "t": 1}', "not json"):
+        np.savez(tmp_path / "s.npz", head=np.array(head), log_weights=np.zeros(2))
+        with pytest.raises(InputError, match="s.npz"):
+            load_state(tmp_path / "s.npz", Halves())
     (tmp_path / "s.npz").write_bytes(b"PK nonsense")
     with pytest.raises(InputError, match="checkpoint cannot be read"):
         load_state(tmp_path / "s.npz")
