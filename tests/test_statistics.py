@@ -125,13 +125,13 @@ def test_a_claim_takes_the_larger_p_value_and_the_skewness():
     assert np.isnan(few.p_bootstrap) and few.p_claim == pytest.approx(min(1, few.p * (1 + abs(few.skewness))))
 
 
-@pytest.mark.parametrize("case", ["normal", "squared errors", "exponential", "chi-square", "lognormal, sd .5"])
+@pytest.mark.parametrize("case", ["squared errors", "chi-square", "lognormal, sd .5"])
 def test_skewed_differences_rarely_lead_to_a_claim(case):
     """A true error rate of .06 fails here in 1 of 10^4: at most 60 + 4 sd of 1000 tables of four arms, n = 20."""
     script = import_script("comparison/run.py")
     found = script.claims(script.CASES[case](np.random.default_rng(4), 20, (1000, 4)), 4)
     assert found["claim"] <= 0.06 + 4 * np.sqrt(0.06 * 0.94 / 1000)
-    assert case in ("normal", "squared errors", "lognormal, sd .5") or found["flip"] > 0.1  # what the rule is for
+    assert case != "chi-square" or found["flip"] > 0.1  # what the rule is for
 
 
 def test_the_simulation_applies_the_rule_of_conclusion():
