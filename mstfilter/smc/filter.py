@@ -212,20 +212,24 @@ class ParticleFilter:
         ``progress=True`` shows a progress bar; a function is called as ``progress(done, total)``.
 
         If the run continues from a checkpoint, it returns the infos of the later steps only. The infos hold some (n,)
-        arrays of each step, so memory grows with n times the number of steps. By default, if these arrays exceed 268
-        MB in total, they are removed from all infos (see `Info.without_arrays`), with an `InputWarning`.
+        arrays of each step, so memory grows with n times the number of steps. By default, if the sum of their sizes
+        exceeds 268 MB, they are removed from all infos (see `Info.without_arrays`), with an `InputWarning`.
         ``keep_arrays=True`` always keeps them, ``keep_arrays=False`` never. `collect` keeps what it is asked for.
         """
         total = len(observations) if isinstance(observations, Sized) else None
         observations, state, store = self._begin(observations, seed, checkpoint, codec)
-        infos = _Kept(keep_arrays)
+        infos, n_bytes = Infos(), 0
         with progress_of(progress, "filter") as advance:
             advance(state.t, total)
             for current, info in self._steps(observations, state, store, observer):
                 state = current
-                infos.add(info)
+                infos.append(info.without_arrays() if keep_arrays is False else info)
+                if keep_arrays is None and (n_bytes := n_bytes + info.n_bytes) > ARRAY_BYTES:
+                    infos.remove_arrays()
+                    keep_arrays = False
+                    warnings.warn(_without_arrays(len(infos)), stacklevel=2)
                 advance(state.t, total)
-        return state, infos.infos
+        return state, infos
 
     def _begin(
         self, observations: Iterable[Any], state: State | int, checkpoint: str | Path | None, codec: Codec | None
@@ -249,36 +253,6 @@ class ParticleFilter:
             if store is not None:
                 store.save(state, observation)
             yield state, info
-
-
-class _Kept:
-    """The infos of a run, and how many bytes their arrays have. Arrays that several infos share count once."""
-
-    def __init__(self, keep: bool | None) -> None:
-        self.keep, self.infos = keep, Infos()
-        self._bytes, self._seen = 0, set[int]()
-
-    def add(self, info: Info) -> None:
-        """Keep an info, with its arrays if they fit."""
-        if self.keep is None:
-            new = {id(a): a.nbytes for a in info.arrays() if id(a) not in self._seen}
-            self._seen.update(new)
-            self._bytes += sum(new.values())
-            if self._bytes > ARRAY_BYTES:
-                self._remove_arrays()
-        self.infos.append(info.without_arrays() if self.keep is False else info)
-
-    def _remove_arrays(self) -> None:
-        self.keep, self.infos.removed = False, self._bytes
-        self.infos[:] = [info.without_arrays() for info in self.infos]
-        warnings.warn(
-            InputWarning(
-                f"the infos of the run do not keep arrays, which exceed {ARRAY_BYTES / 1e6:.0f} MB after "
-                f"{len(self.infos) + 1} steps",
-                "keep_arrays=True keeps them, keep_arrays=False never does; `collect` keeps what you ask for",
-            ),
-            stacklevel=4,
-        )
 
 
 class _Step:
@@ -509,6 +483,13 @@ def _priority(lookahead: Lookahead, population: Population, observation: Any) ->
             "a particle that is never selected would bias the filter: bound the priority from below",
         )
     return priority
+
+
+def _without_arrays(steps: int) -> InputWarning:
+    return InputWarning(
+        f"the infos of the run do not keep arrays, which exceed {ARRAY_BYTES / 1e6:.0f} MB after {steps} steps",
+        "keep_arrays=True keeps them, keep_arrays=False removes them without a warning; `collect` keeps values",
+    )
 
 
 @lru_cache(maxsize=1)

@@ -414,9 +414,10 @@ class Info:
         light.__dict__["unique_ancestors"] = self.unique_ancestors
         return light
 
-    def arrays(self) -> list[np.ndarray]:
-        """The arrays that `without_arrays` removes."""
-        return [self.ancestors, self.log_weights, *self.parents.values()]
+    @property
+    def n_bytes(self) -> int:
+        """Bytes of the arrays that `without_arrays` removes. Infos may share them: then they count for each."""
+        return self.ancestors.nbytes + self.log_weights.nbytes + sum([a.nbytes for a in self.parents.values()])
 
 
 ARRAY_BYTES = 1 << 28  #: most bytes of arrays that the infos of a run keep by default
@@ -429,7 +430,11 @@ class Infos(list[Info]):
     >>> infos.table()                       # a data frame of pandas or polars if one is installed, else text (CSV)
     """
 
-    removed = 0  #: bytes of the arrays that were removed from the infos because they exceeded `ARRAY_BYTES`
+    removed = False  #: whether the arrays of the infos were removed because they exceeded `ARRAY_BYTES`
+
+    def remove_arrays(self) -> None:
+        """Replace all infos by those of `Info.without_arrays`."""
+        self[:], self.removed = [info.without_arrays() for info in self], True
 
     def rows(self) -> list[dict[str, Any]]:
         """One row for each step: its numbers, and the wall time in seconds of the step and of each slot."""
@@ -459,6 +464,6 @@ class Infos(list[Info]):
         ess, seconds = [info.ess for info in self], sum(sum(info.seconds.values()) for info in self)
         spread = f"ESS {min(ess):.1f} to {max(ess):.1f}"
         found = f"Infos: steps {len(self)}, resampled {sum(i.resampled for i in self)}, {spread}, {seconds:.3g} s"
-        return f"{found}, without arrays (above {self.removed / 1e6:.0f} MB)" if self.removed else found
+        return f"{found}, without arrays (above {ARRAY_BYTES / 1e6:.0f} MB)" if self.removed else found
 
     _repr_html_ = late("mstfilter.report.display:to_html", "What a notebook shows.")

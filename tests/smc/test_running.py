@@ -105,23 +105,20 @@ def test_a_run_without_arrays():
 
 
 def test_the_infos_of_a_long_run_keep_no_arrays(monkeypatch):
-    """The bytes are counted by hand: parents and log weights of 16 numbers; arrays that steps share count once."""
-    monkeypatch.setattr("mstfilter.smc.filter.ARRAY_BYTES", 1000)
+    """At 10 steps of 16 log weights, ancestors and parents: 3 * 16 * 8 bytes each."""
     run = partial(bootstrap(AR1, 16).run, YS, 3)
+    monkeypatch.setattr("mstfilter.smc.filter.ARRAY_BYTES", 10 * 384)
+    kept = run()[1]
+    assert {len(info.log_weights) for info in kept} == {16} and "without" not in repr(kept)
+    monkeypatch.setattr("mstfilter.smc.filter.ARRAY_BYTES", 5 * 384)
     with pytest.warns(InputWarning, match="do not keep arrays, which exceed") as told:
         infos = run()[1]
-    assert len(told) == 1 and "keep_arrays=True" in told[0].message.hints[0]
-    assert all(not array.size for info in infos for array in info.arrays()) and len(infos) == len(YS)
-    assert infos.removed > 1000 and "without arrays (above 0 MB)" in repr(infos)
-    kept = run(keep_arrays=True)[1]
-    assert {len(info.log_weights) for info in kept} == {16} and kept.removed == 0 and "without" not in repr(kept)
+    assert len(told) == 1 and "keep_arrays=True" in told[0].message.hints[0] and told[0].filename == __file__
+    assert [info.n_bytes for info in infos] == [0] * 10 and "without arrays (above 268 MB)" in repr(infos)
     assert [i.unique_ancestors for i in infos] == [i.unique_ancestors for i in kept]
-    distinct = {id(array): array.nbytes for info in kept for array in info.arrays()}
-    monkeypatch.setattr("mstfilter.smc.filter.ARRAY_BYTES", sum(distinct.values()))
-    assert len(run()[1][0].log_weights) == 16
-    monkeypatch.setattr("mstfilter.smc.filter.ARRAY_BYTES", sum(distinct.values()) - 1)
-    with pytest.warns(InputWarning):
-        run()
+    for keep in (True, False):
+        found = run(keep_arrays=keep)[1]
+        assert {info.n_bytes > 0 for info in found} == {keep} and "without" not in repr(found)
 
 
 def test_the_memory_of_a_long_run_is_bounded(monkeypatch):
