@@ -69,12 +69,12 @@ class Difference:
 
     @property
     def p_claim(self) -> float:
-        """The larger of `p` and `p_bootstrap` times 1 + abs(skewness), at most 1.
+        """The larger of `p` and `p_bootstrap` times 1 + abs(skewness), at most 1; NaN for fewer than two units.
 
         The factor makes up for the tail that a small sample of skewed differences often lacks. It is not derived but
         chosen by simulation, see `experiments/comparison`.
         """
-        return min(1.0, float(np.fmax(self.p, self.p_bootstrap)) * (1 + abs(self.skewness)))
+        return float(np.minimum(1, np.fmax(self.p, self.p_bootstrap) * (1 + abs(self.skewness))))
 
     @property
     def excludes_zero(self) -> bool:
@@ -192,7 +192,7 @@ def _p_of(values: np.ndarray, ratios: np.ndarray) -> float:
 
 def _all_equal(values: np.ndarray) -> bool:
     """Whether the values are equal up to rounding."""
-    return bool(values.std() <= 1e-12 * max(1.0, np.abs(values).max()))
+    return bool(values.std() <= 1e-12 * np.abs(values).max())
 
 
 def _skewness(values: np.ndarray) -> float:
@@ -288,5 +288,5 @@ def conclusion(difference: Difference, first: str, second: str, where: str = "",
     if d.n < CLAIM:
         return f"{first} minus {second}{at}: {found}. A first look: claims need {CLAIM} {unit}s."
     if not d.p_holm < 1 - LEVEL:
-        return f"{first} minus {second}{at}: {found}. The interval excludes 0, but no claim is left after adjustment."
+        return f"{first} minus {second}{at}: {found}. The intervals exclude 0, but no claim is left after adjustment."
     return f"{first} is {'above' if d.mean > 0 else 'below'} {second}{at} ({found})."

@@ -125,6 +125,21 @@ def test_a_claim_takes_the_larger_p_value_and_the_skewness():
     assert np.isnan(few.p_bootstrap) and few.p_claim == pytest.approx(min(1, few.p * (1 + abs(few.skewness))))
 
 
+def test_the_rule_for_claims_has_no_unit_and_leaves_out_what_is_missing():
+    d, *scaled = (
+        compare(c * np.random.default_rng(2).exponential(1.0, 20), c * np.full(20, 0.5)) for c in (1, 1e-15, 1e9)
+    )
+    for other in scaled:
+        assert (other.p_claim, other.p_bootstrap, other.skewness) == pytest.approx(
+            (d.p_claim, d.p_bootstrap, d.skewness)
+        )
+    table = {"a": [1.0] * 6, "one": [2.0, *[np.nan] * 5], "none": [np.nan] * 6, "b": [1.1, 1.3, 1.2, 1.4, 1.2, 1.3]}
+    found = compare_arms(table, "a")
+    assert np.isnan(found["one"].p_holm) and np.isnan(found["none"].p_holm)
+    assert found["b"].p_holm == found["b"].p_claim < 1
+    assert not found["none"].excludes_zero and not found["one"].excludes_zero
+
+
 @pytest.mark.parametrize("case", ["squared errors", "chi-square", "lognormal, sd .5"])
 def test_skewed_differences_rarely_lead_to_a_claim(case):
     """A true error rate of .06 fails here in 1 of 10^4: at most 60 + 4 sd of 1000 tables of four arms, n = 20."""
