@@ -125,11 +125,11 @@ def test_the_memory_of_a_long_run_is_bounded(monkeypatch):
     """Peak of the allocations of 60 steps of 4,000 particles, whose arrays of infos have 2 to 6 MB."""
     monkeypatch.setattr("mstfilter.smc.filter.ARRAY_BYTES", 500_000)
     held = {}
-    for keep in (None, True):
+    for keep, given in ((None, {}), (True, {"keep_arrays": True})):
         tracemalloc.start()
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", InputWarning)
-            infos = bootstrap(AR1, 4000).run(np.tile(YS, 6), 3, keep_arrays=keep)[1]
+            infos = bootstrap(AR1, 4000).run(np.tile(YS, 6), 3, **given)[1]
         held[keep] = tracemalloc.get_traced_memory()[0]
         tracemalloc.stop()
         del infos
