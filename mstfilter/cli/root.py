@@ -8,12 +8,15 @@ import sys
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from mstfilter import __version__
 from mstfilter.errors import InputWarning
+
+if TYPE_CHECKING:
+    from mstfilter.report import RunNumbers
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -101,18 +104,15 @@ def warnings_as_lines() -> Iterator[None]:
         yield
 
 
-def print_summary(run: Path) -> None:
-    """Print one line per pause: hypotheses, their objects, effective sample size, quality."""
-    from mstfilter.runs import RunFolder
-
-    folder = RunFolder.open(run)
-    for t in range(folder.n_pauses):
-        info, hypotheses = folder.info(t), folder.hypotheses(t)
-        objects = " ".join(str(h.n_objects) for h in hypotheses)
-        n = "1 hypothesis" if len(hypotheses) == 1 else f"{len(hypotheses)} hypotheses"
+def print_summary(numbers: RunNumbers) -> None:
+    """Print what earlier images are worth, and one line per pause: hypotheses, objects, sample size, quality."""
+    for sentence in numbers.value_of_the_past:
+        print(sentence)
+    for t, step in enumerate(numbers.steps):
+        objects = " ".join(map(str, step.objects))
+        n = "1 hypothesis" if len(step.objects) == 1 else f"{len(step.objects)} hypotheses"
         line = f"pause {t}     {n} of {objects} {'object' if objects == '1' else 'objects'}, "
-        line += f"ESS {info['ess']:.1f} of {info['n_candidates']} candidates"
-        if info["quality"] is not None:
-            q = info["quality"]["objects"]
-            line += f", quality {sum(q) / len(q):.3f} (mean), {max(q):.3f} (best)"
+        line += f"ESS {step.info['ess']:.1f} of {step.info['n_candidates']} candidates"
+        if step.mean is not None:
+            line += f", quality {step.mean:.3f} (mean), {step.best:.3f} (best)"
         print(line)

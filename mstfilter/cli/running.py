@@ -66,11 +66,8 @@ def run(
     folder = out or Path("runs") / f"{safe_name(source.name)}-{safe_name(name)}-{seed}"
     if replace and (folder / "run.json").is_file():
         shutil.rmtree(folder)
-    for name, config in configs.items():
-        _execute(source, config, folder / "compare" / name.replace(" ", "-") if name else folder, seed)
-    if report:
-        _report(folder, None)
-    print_summary(folder)
+    _execute_all(source, configs, folder, seed)
+    _summarise(folder, folder / "report.html" if report else None)
 
 
 @app.command()
@@ -80,9 +77,10 @@ def demo(
     ] = Path("demo"),
     seed: Seed = 3,
 ) -> None:
-    """Simulate a robot at a cluttered table, filter the recording, write a report."""
+    """Simulate a robot at a cluttered table, filter the recording with and without its past, write a report."""
     from mstfilter.formats import open_recording
     from mstfilter.presets import load_config
+    from mstfilter.runs import compared_configs
 
     if out.exists() and not out.is_dir():
         raise InputError(f"{out} is a file, expected a folder for the demo")
@@ -94,10 +92,10 @@ def demo(
                 f"{out} holds a file that is not of a demo: {others[0]}", "choose another folder with --out"
             )
         shutil.rmtree(out)
-    _simulate("demo", out / "recording", seed)
-    _execute(open_recording(out / "recording"), load_config("mst"), out / "run", 0)
-    _report(out / "run", out / "report.html")
-    print_summary(out / "run")
+    _simulate("occlusion", out / "recording", seed)
+    recording, config = open_recording(out / "recording"), load_config("mst")
+    _execute_all(recording, {"": config} | compared_configs(config), out / "run", 0)
+    _summarise(out / "run", out / "report.html")
 
 
 @app.command("simulate")
@@ -253,6 +251,12 @@ def _simulate(family: str, out: Path, seed: int, overrides: Sequence[str] = ()) 
     print(f"recording   {out}")
 
 
+def _execute_all(recording: Any, configs: dict[str, dict[str, Any]], folder: Path, seed: int) -> None:
+    """Run the filter without a name in `folder`, those that it is compared with in its folder ``compare``."""
+    for name, config in configs.items():
+        _execute(recording, config, folder / "compare" / name.replace(" ", "-") if name else folder, seed)
+
+
 def _execute(recording: Any, config: dict[str, Any], folder: Path, seed: int) -> None:
     from mstfilter.runs import filter_recording
 
@@ -261,6 +265,18 @@ def _execute(recording: Any, config: dict[str, Any], folder: Path, seed: int) ->
             recording, config, folder, seed, allow_files=True, progress=lambda p: advance(p.done, p.total)
         )
     print(f"run         {folder}")
+
+
+def _summarise(run: Path, report: Path | None) -> None:
+    """Write the report if there is a path for it, and print a summary."""
+    from mstfilter.report import read_numbers, write_report
+    from mstfilter.runs import RunFolder
+
+    folder = RunFolder.open(run)
+    numbers = read_numbers(folder)
+    if report is not None:
+        print(f"report      {write_report(folder, report, numbers)}")
+    print_summary(numbers)
 
 
 def _report(run: Path, out: Path | None) -> None:

@@ -69,6 +69,7 @@ class PauseNumbers:
     metrics: Mapping[str, float] | None  #: of `mstfilter.scoring.pause_metrics`; None without ground truth
     in_image: float | None  #: mean quality of the outlines in the image; None without ground truth
     compared: Mapping[str, float]  #: mean quality of the compared runs, where it is known
+    compared_losses: Mapping[str, float]  #: log loss of the compared runs in nats, where it is known
     belief: BeliefScore | None  #: scores of the weighted set; None without ground truth
     time: float  #: time of the pause in the recording
     clip_seconds: float | None  #: time since the last pause; None for the first pause
@@ -175,8 +176,28 @@ class RunNumbers:
         return list(dict.fromkeys(name for step in self.steps for name in step.compared))
 
     @property
+    def value_of_the_past(self) -> list[str]:
+        """What the filter gains over the latest image alone, in a sentence; empty without such a run or truth."""
+        name = "single frame"
+        known = [step for step in self.steps[1:] if step.belief is not None and name in step.compared_losses]
+        if not known:
+            return []
+        quality = float(np.mean([s.mean for s in known])), float(np.mean([s.compared[name] for s in known]))
+        losses = [s.belief.row["log_loss"] for s in known if s.belief is not None]
+        loss = float(np.mean(losses)), float(np.mean([s.compared_losses[name] for s in known]))
+        verdict = {
+            (True, True): "Earlier images help on this recording",
+            (False, False): "Earlier images do not help on this recording",
+        }.get((quality[0] > quality[1], loss[0] < loss[1]), "Earlier images help in one of two scores here")
+        return [
+            f"{verdict}: over the pauses after the first, mean quality is {quality[0]:.3f} with them and "
+            f"{quality[1]:.3f} from each image alone (higher is better); log loss is {loss[0]:.3f} and {loss[1]:.3f} "
+            "nats (lower is better)."
+        ]
+
+    @property
     def summary(self) -> list[str]:
-        """The run in one to five sentences."""
+        """The run in one to six sentences."""
         planned = len(self.description["recording"]["pauses"])
         done = len(self.steps)
         sentences = []
@@ -185,6 +206,7 @@ class RunNumbers:
             sentences.append(f"The run {verbs[self.status]}: {done} of {planned} pauses are complete.")
         if not done:
             return sentences or ["The run has no pauses."]
+        sentences += self.value_of_the_past
         last = self.steps[-1]
         n = len(last.weights)
         same = "" if last.n_distinct == n else f" ({last.distinct_text})"
@@ -300,11 +322,14 @@ def read_numbers(run: RunFolder) -> RunNumbers:
             }
             metrics = pause_metrics(labels, weights, truth, status)[0]
             in_image = float(np.mean([weighted_coverage(project(h, camera), seen) for h in hypotheses]))
-        beside = {
-            name: float(np.mean(q["objects"]))
-            for name, other in run.compared().items()
-            if t < other.n_pauses and (q := other.info(t)["quality"]) is not None
-        }
+        beside, losses = {}, {}
+        for name, other in run.compared().items():
+            if t >= other.n_pauses or (q := other.info(t)["quality"]) is None:
+                continue
+            beside[name] = float(np.mean(q["objects"]))
+            if questions is not None and truth is not None:
+                score = score_belief(questions, other.hypotheses(t), other.info(t)["weights"], truth)
+                losses[name] = float(score.row["log_loss"])
         steps.append(
             PauseNumbers(
                 info=info,
@@ -314,6 +339,7 @@ def read_numbers(run: RunFolder) -> RunNumbers:
                 metrics=metrics,
                 in_image=in_image,
                 compared=beside,
+                compared_losses=losses,
                 belief=belief,
                 time=float(times[t]),
                 clip_seconds=None if t == 0 else float(times[t]) - float(times[t - 1]),
@@ -322,15 +348,18 @@ def read_numbers(run: RunFolder) -> RunNumbers:
     return RunNumbers(description, tuple(steps))
 
 
-def write_report(run: RunFolder | str | Path, out: str | Path | None = None) -> Path:
+def write_report(
+    run: RunFolder | str | Path, out: str | Path | None = None, numbers: RunNumbers | None = None
+) -> Path:
     """Write the report of a run, finished or not, as HTML. Default: ``report.html`` in the run folder.
 
+    `numbers` are those of `read_numbers`, if they are known already.
     Returns the file. Raises InputError if the folder is no run folder, or the file cannot be written.
     """
     from markupsafe import Markup
 
     run = RunFolder.open(run.path if isinstance(run, RunFolder) else run)
-    numbers = read_numbers(run)
+    numbers = read_numbers(run) if numbers is None else numbers
     filters: dict[str, Callable[..., Any]] = {
         "short_text": short_text,
         "seconds": seconds_text,

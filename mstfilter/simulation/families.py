@@ -182,6 +182,22 @@ SCENE_FAMILIES: dict[str, SceneFamily] = {
         workspace_y=0.8,
         workspace_z=0.3,
     ),
+    # Small objects stand behind tall ones, and three pushes hide and uncover objects: earlier images show more than
+    # the latest one.
+    "occlusion": SceneFamily(
+        name="occlusion",
+        n_objects_min=7,
+        n_objects_max=7,
+        n_hidden=2,
+        frames_per_clip=10,
+        fps=4.0,
+        push_speed=0.12,
+        width=320,
+        height=240,
+        workspace_x=0.8,
+        workspace_y=0.8,
+        workspace_z=0.3,
+    ),
     "table": SceneFamily(name="table"),
     "s1": _STUDIED,
     "s2": replace(

@@ -11,6 +11,7 @@ import numpy as np
 
 from mstfilter.runs import RunFolder
 from mstfilter.scene import Camera, Hypothesis, Recording, VoxelGrid, look_at, render
+from mstfilter.scoring import ask
 from mstfilter.smc import Always, ParticleFilter, Population, Proposal, Transition, Update
 
 GRID = VoxelGrid((-0.2, -0.2, 0.0), 0.02, (20, 20, 10))
@@ -116,7 +117,7 @@ def make_run(path: Path, pauses: int = 3, truth: bool = True, empty: bool = Fals
     state = filter.start(7)
     for clip in film.clips():
         state, info = filter.step(state, clip)
-        run.write_pause(clip, state, info, film.truth(clip.index))
+        run.write_pause(clip, state, info, film.truth(clip.index), ask(film, clip.index) if truth else None)
         (run.pause(clip.index) / "seconds.json").write_text(json.dumps({"transition": 0.5, "proposal": 1.5}))
     if done:
         run.write_metrics()

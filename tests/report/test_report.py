@@ -6,6 +6,7 @@ import functools
 import json
 import re
 import shutil
+from dataclasses import replace
 from html.parser import HTMLParser
 from importlib.resources import files
 
@@ -17,7 +18,7 @@ from mstfilter.report import run_report, viewpoint
 from mstfilter.report.run_report import read_numbers, write_report
 from mstfilter.runs import HypothesisCodec, RunFolder
 from mstfilter.scene import Hypothesis, project
-from mstfilter.scoring import weighted_coverage
+from mstfilter.scoring import BeliefScore, weighted_coverage
 from mstfilter.smc import Key, Population, State, save_state
 from tests.report.runs import labels_of, make_run
 
@@ -304,3 +305,33 @@ def best_overlap(labels, mask):
     """Largest intersection over union of an object with a mask."""
     overlaps = [np.sum((labels == k) & mask) / np.sum((labels == k) | mask) for k in range(1, labels.max() + 1)]
     return max(overlaps, default=0.0)
+
+
+def with_comparison(path, quality, loss):
+    """Numbers of a run whose quality and log loss are 0.5, beside a single frame with the given ones."""
+    numbers = read_numbers(make_run(path, pauses=2))
+    belief = BeliefScore({"log_loss": 0.5}, np.zeros((1, 1001, 7), np.int32))
+    beside = {"compared": {"single frame": quality}, "compared_losses": {"single frame": loss}, "belief": belief}
+    steps = [replace(s, info={**s.info, "quality": {"objects": [0.5]}}, **beside) for s in numbers.steps]
+    return replace(numbers, steps=tuple(steps))
+
+
+@pytest.mark.parametrize(
+    ("quality", "loss", "words"),
+    [(0.4, 0.6, "images help on"), (0.6, 0.4, "do not help"), (0.5, 0.5, "do not help"), (0.6, 0.6, "in one of two")],
+)
+def test_the_first_sentence_says_what_earlier_images_are_worth(quality, loss, words, tmp_path):
+    first = with_comparison(tmp_path / "run", quality, loss).value_of_the_past[0]
+    assert words in first
+    assert f"0.500 with them and {quality:.3f} from each image alone" in first
+    assert f"log loss is 0.500 and {loss:.3f} nats" in first
+
+
+def test_the_log_loss_of_compared_runs_is_that_of_their_hypotheses(tmp_path):
+    """The same hypotheses have the same log loss; without a single frame there is no sentence about it."""
+    run = make_run(tmp_path / "run", pauses=2)
+    assert read_numbers(run).value_of_the_past == []
+    make_run(tmp_path / "run" / "compare" / "single-frame", pauses=2)
+    known = [step for step in read_numbers(run).steps if step.belief is not None]
+    assert known
+    assert all(step.compared_losses == {"single frame": step.belief.row["log_loss"]} for step in known)
