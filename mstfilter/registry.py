@@ -218,7 +218,7 @@ class Registry:
         for close in difflib.get_close_matches(missing[0], written, n=1):
             hint = f"rename {close} to {missing[0]}"
         for other in (other for root in roots for other in _with_abstract_subclasses(root)):
-            methods = getattr(other, "__abstractmethods__", frozenset())
+            methods: frozenset[str] = getattr(other, "__abstractmethods__", frozenset())
             if methods <= written:
                 hint = f"inherit {other.__name__}, which asks for {' and '.join(sorted(methods))}"
                 break
@@ -287,7 +287,8 @@ def _with_abstract_subclasses(cls: type) -> Iterator[type]:
     """An abstract class, and the abstract classes of the package that inherit it."""
     if inspect.isabstract(cls) and cls.__module__.startswith("mstfilter."):
         yield cls
-        for other in cls.__subclasses__():
+        subclasses: list[type] = cls.__subclasses__()
+        for other in subclasses:
             yield from _with_abstract_subclasses(other)
 
 
@@ -378,7 +379,8 @@ def _classes_of(module: ModuleType) -> list[type]:
 
 def _reduce(instance: object, protocol: Any) -> Any:
     """As `object.__reduce_ex__`, with the path of the file, since other processes cannot import its module."""
-    how, arguments, *state = object.__reduce_ex__(instance, max(int(protocol), 2))
+    reduced: Any = object.__reduce_ex__(instance, max(int(protocol), 2))
+    how, arguments, *state = reduced
     cls = type(instance)
     if how is not copyreg.__newobj__ or "__mst_file__" not in vars(cls):  # type: ignore[attr-defined]
         return (how, arguments, *state)
