@@ -69,7 +69,8 @@ def _check_candidates(
         raise InputError("returns no candidate, expected at least one", "rest is mstfilter.tracking.IDENTITY")
     for candidate in found:
         _check_candidate(candidate)
-    _warn_if_far(self, found, track)
+    if fault := fault_of_motions(found, track):
+        warn_once(self, "candidates", fault, "motions are in metres, in the frame of the world")
     return tuple(found)
 
 
@@ -100,20 +101,16 @@ def _check_candidate(one: Candidate) -> None:
         raise InputError(f"returns a candidate whose score is {describe_value(one.score)}, expected a number")
 
 
-def _warn_if_far(rule: MotionRule, candidates: Sequence[Candidate], track: Track) -> None:
-    """Warn if a candidate moves the object farther than the workspace is wide."""
+def fault_of_motions(candidates: Sequence[Candidate], track: Track) -> str | None:
+    """That a candidate moves the object farther than the workspace is wide; None if none does."""
     if not len(track.segment.support):
-        return
+        return None
     grid, centre = track.clip.grid, track.points.mean(axis=0)
     width = float(np.linalg.norm(np.multiply(grid.shape, grid.voxel_size)))
     farthest = max(rigid.displacement(one.T.as_matrix(), centre) for one in candidates)
-    if farthest > width:
-        warn_once(
-            rule,
-            "candidates",
-            f"moves an object too far: by {farthest:.3g} m, the workspace is {width:.3g} m wide",
-            "motions are in metres, in the frame of the world",
-        )
+    if farthest <= width:
+        return None
+    return f"moves an object too far: by {farthest:.3g} m, the workspace is {width:.3g} m wide"
 
 
 class MotionRule(Checked, ABC):

@@ -167,7 +167,9 @@ COMPLETERS: dict[str, tuple[Completer, str]] = {
     "draws": (DrawsUndeclared(), "`stochastic` is False"),
     "own generator": (DrawsFromItsOwn(), "does not come from `rng`"),
     "state": (DependsOnCalls(), "keeps state"),
-    "reversed": (Completes(change=lambda p: p[::-1, ::-1]), "are axes exchanged or reversed?"),
+    "reversed": (Completes(change=lambda p: p[::-1]), "if the axes (0,) of the result are reversed"),
+    "reversed twice": (Completes(change=lambda p: p[::-1, ::-1]), "if the axes (0, 1) of the result are reversed"),
+    "upside down": (Completes(change=lambda p: p[:, :, ::-1]), "if the axes (2,) of the result are reversed"),
     **{name: (Completes(change=change), words) for name, (change, words) in STRANGE_PROBABILITIES.items()},
 }
 
@@ -329,11 +331,10 @@ def faulty(interface: type, method: str, correct: Any, change: Change) -> Any:
     def changed(self, *arguments, **named):
         return change(getattr(correct, method)(*arguments, **named))
 
-    others = {
-        name: (lambda name: lambda self, *arguments: getattr(correct, name)(*arguments))(name)
-        for name in interface.__abstractmethods__
-        if name != method
-    }
+    def unchanged(name):
+        return lambda self, *arguments: getattr(correct, name)(*arguments)
+
+    others = {name: unchanged(name) for name in interface.__abstractmethods__ if name != method}
     return dataclass(frozen=True)(type("Faulty", (interface,), {method: changed, **others}))()
 
 

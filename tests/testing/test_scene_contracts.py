@@ -214,7 +214,7 @@ def test_methods_of_any_form_are_checked():
 
     @dataclass(frozen=True)
     class Cached(Completer):
-        @functools.cache
+        @functools.cache  # noqa: B019 (one instance)
         def fill(self, rng, seen):
             return None
 
