@@ -126,7 +126,7 @@ def check_type(found: Any, kind: type | tuple[type, ...], expected: str, *hints:
     return found
 
 
-def check_list(found: Any, n: int, kind: type, expected: str) -> list[Any]:
+def check_list(found: Any, n: int, kind: type | tuple[type, ...], expected: str) -> list[Any]:
     """A result as a list; InputError unless it is a list or tuple of `n` instances of a type."""
     check_type(found, (list, tuple), f"a list of {expected}")
     if len(found) != n:
@@ -177,12 +177,13 @@ def check_array(
         first = np.unravel_index(int(wrong.argmax()), shape)
         place = f"the first at {tuple(map(int, first))}"
         raise InputError(
-            f"returns {found[first]} in {wrong.sum()} of {found.size} values, {place}", *_bounding(found[first])
+            f"returns {found[first]} in {wrong.sum()} of {found.size} values, {place}",
+            *(_BOUND if found[first] == -math.inf else ()),
         )
     if low >= at_least - _TOLERANCE and high <= at_most + _TOLERANCE:
         return np.clip(found, at_least, at_most)
     raise InputError(
-        f"returns values from {low:.4g} to {high:.4g}, expected {_range(at_least, at_most)}",
+        f"returns values from {low:.4g} to {high:.4g}, expected {at_least:g} to {at_most:g}",
         *(_scaling(float(low), float(high)) if (at_least, at_most) == (0, 1) else ()),
     )
 
@@ -204,12 +205,6 @@ def check_rigid(T: np.ndarray, name: str) -> None:
         raise InputError(f"returns {name} that is no rigid motion: it is a reflection")
 
 
-def _range(at_least: float, at_most: float) -> str:
-    if math.isinf(at_most):
-        return f"at least {at_least:g}"
-    return f"{at_least:g} to {at_most:g}"
-
-
 def _conversion(found: Any) -> list[str]:
     """How to make an array of another type."""
     if found is None:
@@ -229,8 +224,7 @@ def _reshaping(found: np.ndarray, shape: tuple[int, ...]) -> list[str]:
     return []
 
 
-def _bounding(value: float) -> list[str]:
-    return ["a score of -inf rules a hypothesis out: bound it from below"] if value == -math.inf else []
+_BOUND = ("a score of -inf rules a hypothesis out: bound it from below",)
 
 
 def _scaling(low: float, high: float) -> list[str]:

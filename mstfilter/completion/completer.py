@@ -26,7 +26,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -71,41 +71,19 @@ class Completion:
         return replace(self, probability=read_only(odds / (odds + (1 - p))))
 
 
-def _check_filled(
-    self: Completer, found: Sequence[np.ndarray], rngs: Sequence[np.random.Generator], seen: Sequence[ObservedBox]
-) -> list[np.ndarray]:
-    found = check_list(found, len(seen), object, "array")
+def _check_filled(self: Completer, found: Any, rngs: Any, seen: Sequence[ObservedBox]) -> list[np.ndarray]:
+    found = check_list(found, len(seen), object, "arrays")
     return [check_probabilities(p, one.surface.shape) for p, one in zip(found, seen, strict=True)]
 
 
-def _check_completions(
-    self: Completer,
-    found: list[Completion],
-    rngs: Sequence[np.random.Generator],
-    frame: Frame,
-    masks: Sequence[np.ndarray],
-    grid: VoxelGrid,
-) -> list[Completion]:
-    for one in check_list(found, len(masks), Completion, "Completion"):
-        _check_completion(one, grid)
-    return found
-
-
-def _check_again(
-    self: Completer,
-    found: list[tuple[Completion, tuple[ObjectView, ...]]],
-    rngs: Sequence[np.random.Generator],
-    frame: Frame,
-    objects: Sequence[tuple[np.ndarray, tuple[ObjectView, ...]]],
-    grid: VoxelGrid,
-) -> list[tuple[Completion, tuple[ObjectView, ...]]]:
-    for pair in check_list(found, len(objects), tuple, "pair of a Completion and views"):
-        check_type(pair[0], Completion, "a Completion")
-        _check_completion(pair[0], grid)
+def _check_completions(self: Completer, found: Any, rngs: Any, frame: Frame, masks: Any, grid: VoxelGrid) -> Any:
+    for one in check_list(found, len(masks), (Completion, tuple), "Completion"):
+        _check_completion(one[0] if isinstance(one, tuple) else one, grid)  # with views, of `complete_again`
     return found
 
 
 def _check_completion(one: Completion, grid: VoxelGrid) -> None:
+    check_type(one, Completion, "a Completion")
     check_probabilities(one.probability, one.points.shape)
     if one.points.ndim != 3 or (np.add(one.offset, one.points.shape) > grid.shape).any() or np.min(one.offset) < 0:
         raise InputError(f"returns a box of shape {one.points.shape} at {one.offset}, the grid has {grid.shape}")
@@ -160,9 +138,9 @@ class Completer(Checked, ABC):
 
         Raises InputError if it draws random numbers although `stochastic` is False: results would be reused.
         """
-        before = None if self.stochastic else [rng.bit_generator.state for rng in rngs]
+        before = _states(rngs)
         filled = self.fill_many(rngs, seen)
-        if before is not None and before != [rng.bit_generator.state for rng in rngs]:
+        if not self.stochastic and before != _states(rngs):
             raise InputError(
                 f"{type(self).__name__} draws random numbers, but its `stochastic` is False",
                 "add stochastic: ClassVar[bool] = True to the class",
@@ -222,7 +200,7 @@ class Completer(Checked, ABC):
             return compute(range(len(masks)))
         return memo_many("completion", names, compute, Completion)
 
-    @returns(_check_again)
+    @returns(_check_completions)
     def complete_again(
         self,
         rngs: Sequence[np.random.Generator],
@@ -261,6 +239,10 @@ class Completer(Checked, ABC):
         if self.stochastic:
             return compute(range(len(objects)))
         return memo_many("completion_again", names, compute)
+
+
+def _states(rngs: Sequence[np.random.Generator | None]) -> list[Any]:
+    return [rng.bit_generator.state for rng in rngs if rng is not None]
 
 
 _FEW_VOXELS = 20  # of visible surface, in all boxes together; fewer say nothing about a completer

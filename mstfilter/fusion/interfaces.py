@@ -50,13 +50,10 @@ def _check_projected(self: Projection, found: tuple[Any, float], hypothesis: Any
     return projected, float(share)
 
 
-def _check_refined(
-    self: Projection, found: tuple[Any, np.ndarray], hypotheses: Sequence[Any], clip: Clip
-) -> tuple[tuple[Any, ...], np.ndarray]:
+def _check_refined(self: Projection, found: Any, hypotheses: Sequence[Any], clip: Clip) -> Any:
     _check_pair(found, "hypotheses", "shares")
     n = len(hypotheses)
-    kind = type(hypotheses[0]) if n else object
-    return tuple(check_list(found[0], n, kind, kind.__name__)), check_array(found[1], (n,), "iuf", 0, 1)
+    return tuple(check_list(found[0], n, object, "hypotheses")), check_array(found[1], (n,), "iuf", 0, 1)
 
 
 class Projection(Checked, ABC):
@@ -111,7 +108,7 @@ class PairOdds(Checked, ABC):
 
 
 def _check_structure(
-    self: Structure, found: OrderAndEdges, rng: np.random.Generator, graph: nx.Graph, component: Sequence[int]
+    self: Structure, found: Any, rng: Any, graph: nx.Graph, component: Sequence[int]
 ) -> OrderAndEdges:
     _check_pair(found, "an order", "edges")
     order, edges = (check_type(part, (list, tuple), "lists") for part in found)

@@ -162,8 +162,8 @@ def _boxes(completer: Completer, hypothesis: Hypothesis, clip: Clip, cut: bool =
     image, _ = render_hypothesis(hypothesis, clip.before.camera)
     masks = [image == k for k in np.unique(image[image > 0])]
     if cut:
-        v, u = np.indices(image.shape)
-        masks = [mask & (u - u[mask].mean() < v - v[mask].mean()) for mask in masks]
+        v, u = np.mgrid[: image.shape[0], : image.shape[1]]
+        masks = [mask & (u - v < (u - v)[mask].mean()) for mask in masks]
     return [observed_box(clip.before, mask, clip.grid, completer)[1] for mask in masks]
 
 

@@ -43,7 +43,7 @@ class Surface:
     def open3d_cloud(self) -> Any:
         """open3d's cloud, downsampled, with normals and colours; made on first use."""
         o3d = import_open3d()
-        cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(self.raw_points))
+        cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(np.array(self.raw_points)))
         if self.raw_colours is not None:
             cloud.colors = o3d.utility.Vector3dVector(np.asarray(self.raw_colours, dtype=np.float64) / 255)
         cloud = cloud.voxel_down_sample(_SPACING)
