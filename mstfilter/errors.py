@@ -134,7 +134,7 @@ def place_in_user_file(error: BaseException) -> str | None:
     to this package nor to an installed library. A syntax error is in the file that it names.
     """
     if isinstance(error, SyntaxError) and error.filename and Path(error.filename).is_file():
-        return f"{_short(error.filename)}, line {error.lineno}: {(error.text or '').strip()}"
+        return f"{short_path(error.filename)}, line {error.lineno}: {(error.text or '').strip()}"
     found = None
     current: BaseException | None = error
     while current is not None and found is None:
@@ -142,7 +142,7 @@ def place_in_user_file(error: BaseException) -> str | None:
             file = frame.f_code.co_filename
             if _is_of_user(file):
                 linecache.checkcache(file)
-                found = f"{_short(file)}, line {number}: {linecache.getline(file, number).strip()}"
+                found = f"{short_path(file)}, line {number}: {linecache.getline(file, number).strip()}"
         current = current.__cause__
     return found
 
@@ -162,7 +162,7 @@ def _is_of_user(file: str) -> bool:
     return Path(file).is_file() and not any(Path(file).is_relative_to(folder) for folder in folders)
 
 
-def _short(file: str) -> str:
+def short_path(file: str | Path) -> str:
     """A path relative to the working folder if it is below it."""
     path = Path(file).resolve()
     return str(path.relative_to(Path.cwd())) if path.is_relative_to(Path.cwd()) else str(path)

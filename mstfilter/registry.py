@@ -19,16 +19,20 @@ type ``tuple[Evidence, ...]`` a list of evidence.
 
 A component is imported when it is first built; looking up a name imports nothing. Users name their own class as
 ``./file.py:Class`` (if `allow_files` is True), or add it by an entry point ``kind.name`` of the group
-``mstfilter.components``.
+``mstfilter.components``. A relative path is relative to the working folder. A file is executed once per process, and
+again after its content has changed.
 """
 
 from __future__ import annotations
 
+import copyreg
 import dataclasses
+import difflib
 import functools
 import hashlib
 import importlib
 import importlib.util
+import inspect
 import sys
 import typing
 from collections.abc import Iterator, Mapping
@@ -37,7 +41,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from mstfilter.errors import InputError, place_in_user_file, suggestion
+from mstfilter.errors import InputError, place_in_user_file, short_path, suggestion
 
 _ENTRY_POINTS = "mstfilter.components"
 
@@ -107,7 +111,7 @@ class Registry:
         location = self._locate(kind, name, where or kind, allow_files)
         path, _, attribute = location.partition(":")
         if path.endswith(".py"):
-            found = _from_file(Path(path), attribute)
+            found = _from_file(path, attribute)
             if kind in self.kinds and not issubclass(found, self.interface(kind)):
                 interface = self.interface(kind)
                 raise InputError(
@@ -169,10 +173,12 @@ class Registry:
 
         Raises InputError if a field or a component is unknown, or a value does not fit its field.
         """
+        prefix = f"{where}: " if where else ""
+        if inspect.isabstract(cls):
+            raise self._abstract_error(prefix, cls)
         if not dataclasses.is_dataclass(cls):
             raise InputError(
-                f"{where}: {cls.__name__} is no dataclass".removeprefix(": "),
-                "write @dataclass(frozen=True) above the class",
+                f"{prefix}{cls.__name__} is no dataclass", "write @dataclass(frozen=True) above the class"
             )
         known = {field.name: field for field in dataclasses.fields(cls) if field.init}
         hints = typing.get_type_hints(cls)
@@ -192,15 +198,31 @@ class Registry:
         if missing:
             path = f"{where}.{missing[0]}" if where else missing[0]
             raise InputError(
-                f"{f'{where}: ' if where else ''}{cls.__name__} needs {', '.join(missing)}, without a default",
+                f"{prefix}{cls.__name__} needs {', '.join(missing)}, without a default",
                 f"give it a value, {path}=VALUE, or a default in the class",
             )
         try:
             return cls(**values) if base is None else dataclasses.replace(base, **values)
         except InputError as error:
-            raise InputError(f"{where}: {error.message}" if where else error.message, *error.hints) from error
+            raise InputError(f"{prefix}{error.message}", *error.hints) from error
         except TypeError as error:
-            raise InputError(f"{where}: {error}") from error
+            raise InputError(f"{prefix}{cls.__name__} cannot be made: {error}") from error
+
+    def _abstract_error(self, prefix: str, cls: type) -> InputError:
+        """The error for a class without all methods of its interface: which ones, and a base class that fits."""
+        missing = sorted(getattr(cls, "__abstractmethods__", ()))
+        written = {name for name, value in vars(cls).items() if inspect.isfunction(value) and name[0] != "_"}
+        origin = next(base.__name__ for base in reversed(cls.__mro__) if missing[0] in vars(base))
+        roots = [*cls.__mro__[1:], *map(self.interface, self.kinds)]
+        hint = f"define {missing[0]} as {origin}.{missing[0]} describes it"
+        for close in difflib.get_close_matches(missing[0], written, n=1):
+            hint = f"rename {close} to {missing[0]}"
+        for other in (other for root in roots for other in _with_abstract_subclasses(root)):
+            methods: frozenset[str] = getattr(other, "__abstractmethods__", frozenset())
+            if methods <= written:
+                hint = f"inherit {other.__name__}, which asks for {' and '.join(sorted(methods))}"
+                break
+        return InputError(f"{prefix}{cls.__name__} has no method {', '.join(missing)}, which {origin} asks for", hint)
 
     def _value(self, hint: Any, value: Any, current: Any, path: str, allow_files: bool) -> Any:
         """The value of a field with annotation `hint`; `current` is its default or its value in `base`."""
@@ -234,9 +256,9 @@ class Registry:
 
     def name_of(self, cls: type) -> str:
         """The registered name of a class, its file, or its import path."""
-        file = cls.__dict__.get("__mst_file__")
-        if file is not None:
-            return str(file)
+        if "__mst_file__" in vars(cls):
+            path, _, name = cls.__mst_file__.rpartition(":")  # type: ignore[attr-defined]
+            return f"{short_path(path)}:{name}"
         location = _location_of(cls)
         for names in self._components.values():
             for name, where in names.items():
@@ -261,6 +283,15 @@ def default_of(field: dataclasses.Field[Any]) -> Any:
     return field.default if field.default_factory is dataclasses.MISSING else field.default_factory()
 
 
+def _with_abstract_subclasses(cls: type) -> Iterator[type]:
+    """An abstract class, and the abstract classes of the package that inherit it."""
+    if inspect.isabstract(cls) and cls.__module__.startswith("mstfilter."):
+        yield cls
+        subclasses: list[type] = cls.__subclasses__()
+        for other in subclasses:
+            yield from _with_abstract_subclasses(other)
+
+
 def _location(package: str, cls: str) -> str:
     return cls if ":" in cls else f"{package}:{cls}"
 
@@ -283,30 +314,87 @@ def loaded_components() -> list[str]:
 
 
 _LOADED: dict[str, None] = {}
+_MODULES: dict[tuple[Path, str], ModuleType] = {}  # resolved path and hash of the content of a file -> its module
 
 
-def _from_file(path: Path, attribute: str) -> type:
-    name = f"mstfilter_user_{path.stem}"
-    spec = importlib.util.spec_from_file_location(name, path)
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[name] = module  # dataclasses look their module up
+def _from_file(path: str, attribute: str) -> type:
+    module = load_file(path)
+    found = getattr(module, attribute, None)
+    if not isinstance(found, type):
+        classes = ", ".join(cls.__name__ for cls in _classes_of(module))
+        raise InputError(f"{path} has no class {attribute!r}", f"it has: {classes or 'none'}")
+    _LOADED[f"{path}:{attribute}"] = None
+    return found
+
+
+def load_file(path: str | Path) -> ModuleType:
+    """The module of a Python file of the user.
+
+    A file is executed once per process, whatever the spelling of its path, and again after its content has changed.
+    Instances of its classes can be pickled: the process that reads them loads the file.
+
+    Raises InputError if the file cannot be read or executed.
+    """
+    resolved = Path(path).resolve()
     try:
-        spec.loader.exec_module(module)
+        source = resolved.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path} cannot be read: {error.strerror}") from error
+    key = resolved, hashlib.sha256(source).hexdigest()
+    if key not in _MODULES:
+        _MODULES[key] = _executed(path, source, *key)
+    return _MODULES[key]
+
+
+def _executed(path: str | Path, source: bytes, resolved: Path, digest: str) -> ModuleType:
+    """A new module from the source of a file; its name is different for every path and content."""
+    unique = hashlib.sha256(f"{resolved}\0{digest}".encode()).hexdigest()[:12]
+    name = f"mstfilter_user_{resolved.stem}_{unique}"
+    spec = importlib.util.spec_from_file_location(name, resolved)
+    assert spec is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module  # dataclasses and pickle look their module up
+    try:
+        # The loader of `spec` takes stale bytecode for a file that is edited twice in a second.
+        exec(compile(source, str(resolved), "exec"), vars(module))
     except Exception as error:
+        del sys.modules[name]
         place = place_in_user_file(error)
         hints = [place] if place else []
         if isinstance(error, ModuleNotFoundError):
             hints.append("a file beside it is found if its folder is in the environment variable PYTHONPATH")
         raise InputError(f"{path} cannot be loaded: {type(error).__name__}: {error}", *hints) from error
-    found = getattr(module, attribute, None)
-    if not isinstance(found, type):
-        classes = [n for n, value in vars(module).items() if isinstance(value, type) and value.__module__ == name]
-        raise InputError(f"{path} has no class {attribute!r}", f"it has: {', '.join(classes) or 'none'}")
-    _LOADED[f"{path}:{attribute}"] = None
-    found.__mst_file__ = f"{path}:{attribute}"  # type: ignore[attr-defined]
-    found.__mst_source__ = hashlib.sha256(path.read_bytes()).hexdigest()  # type: ignore[attr-defined]
-    return found
+    for cls in _classes_of(module):
+        cls.__mst_file__ = f"{resolved}:{cls.__qualname__}"  # type: ignore[attr-defined]
+        cls.__mst_source__ = digest  # type: ignore[attr-defined]
+        if (cls.__reduce_ex__, cls.__reduce__) == (object.__reduce_ex__, object.__reduce__):
+            cls.__reduce_ex__ = _reduce  # type: ignore[method-assign, assignment]
+    return module
+
+
+def _classes_of(module: ModuleType) -> list[type]:
+    """The classes that a module defines."""
+    return [v for v in vars(module).values() if isinstance(v, type) and v.__module__ == module.__name__]
+
+
+def _reduce(instance: object, protocol: Any) -> Any:
+    """As `object.__reduce_ex__`, with the path of the file, since other processes cannot import its module."""
+    reduced: Any = object.__reduce_ex__(instance, max(int(protocol), 2))
+    how, arguments, *state = reduced
+    cls = type(instance)
+    if how is not copyreg.__newobj__ or "__mst_file__" not in vars(cls):  # type: ignore[attr-defined]
+        return (how, arguments, *state)
+    path, _, name = cls.__mst_file__.rpartition(":")  # type: ignore[attr-defined]
+    return (_new_instance, (path, name, cls.__mst_source__, *arguments[1:]), *state)  # type: ignore[attr-defined]
+
+
+def _new_instance(path: str, name: str, digest: str, *arguments: Any) -> Any:
+    """An instance without its state, of a class of a user's file with this content."""
+    module = _MODULES.get((Path(path), digest)) or load_file(path)
+    cls = getattr(module, name)
+    if cls.__mst_source__ != digest:
+        raise InputError(f"{path} has changed since an instance of {name} was pickled", "make the instance again")
+    return cls.__new__(cls, *arguments)
 
 
 def _plain(hint: Any, value: Any, where: str) -> Any:

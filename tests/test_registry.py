@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import copy
 import json
+import os
 import pickle
+import subprocess
+import sys
 import traceback
 from dataclasses import dataclass
 from typing import get_type_hints
@@ -107,6 +111,151 @@ def test_what_is_wrong_with_a_file_of_the_user(tmp_path):
     with pytest.raises(InputError, match="No module named 'helper_beside'") as caught:
         preset("mst", f"resampler={tmp_path / 'mine.py'}:Mine")
     assert "PYTHONPATH" in caught.value.hints[-1]
+
+
+_RESAMPLER = """
+from dataclasses import dataclass
+from mstfilter.smc import Multinomial, Resampler, Systematic, Transition, WeightResampler
+
+VALUE = {value!r}
+
+
+@dataclass(frozen=True)
+class Part:
+    value: str = VALUE
+
+
+@dataclass(frozen=True)
+class Mine(Systematic):
+    part: Part = Part()
+
+    def value(self):
+        return Part().value + VALUE
+"""
+
+
+def mine(folder, value="a", name="mine.py"):
+    folder.mkdir(exist_ok=True)
+    path = folder / name
+    path.write_text(_RESAMPLER.format(value=value))
+    return path
+
+
+def load(path, name="Mine"):
+    return REGISTRY.build("resampler", f"{path}:{name}", allow_files=True)
+
+
+def test_files_of_one_name_are_different_modules(tmp_path):
+    a, b = load(mine(tmp_path / "a", "a")), load(mine(tmp_path / "b", "b"))
+    assert (a.value(), b.value()) == ("aa", "bb")
+    assert a != b
+    assert sys.modules[type(a).__module__] is not sys.modules[type(b).__module__]
+
+
+def test_a_file_is_executed_once_for_all_spellings_of_its_path(tmp_path, monkeypatch):
+    path = mine(tmp_path / "a")
+    path.write_text(path.read_text() + f"\nwith open({str(tmp_path / 'log')!r}, 'a') as log:\n    log.write('x')\n")
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "link.py").symlink_to(path)
+    (tmp_path / "folder").symlink_to(tmp_path / "a")
+    spellings = [path, "a/mine.py", "./a/mine.py", "a/../a/mine.py", "link.py", "folder/mine.py"]
+    made = [load(spelling) for spelling in spellings]
+    assert all(one == made[0] and type(one) is type(made[0]) for one in made)
+    assert (tmp_path / "log").read_text() == "x"
+    assert {REGISTRY.describe(one)["component"] for one in made} == {"a/mine.py:Mine"}
+    assert REGISTRY.build("resampler", REGISTRY.describe(made[0]), allow_files=True) == made[0]
+
+
+def test_equal_configurations_of_a_file_give_equal_filters(tmp_path):
+    path = tmp_path / "mine.py"
+    path.write_text(
+        "from dataclasses import dataclass\nfrom mstfilter.segmentation import TreeCutProposal\n"
+        "@dataclass(frozen=True)\nclass Mine(TreeCutProposal):\n    pass\n"
+    )
+    arguments = ("mst_rules", f"initial={path}:Mine", f"proposal={path}:Mine")
+    filter = preset(*arguments)
+    assert filter.initial == filter.proposal
+    assert filter == preset(*arguments)
+
+
+def test_an_edited_file_is_loaded_again(tmp_path):
+    path = mine(tmp_path / "a", "a")
+    before = load(path)
+    mine(tmp_path / "a", "b")  # of the same size, and in the same second
+    after = load(path)
+    assert (before.value(), after.value()) == ("aa", "bb")
+    assert before != after
+    assert pickle.loads(pickle.dumps(before)) == before
+    mine(tmp_path / "a", "a")
+    assert load(path) == before
+
+
+def test_instances_of_a_file_are_pickled_and_copied(tmp_path):
+    one = load(mine(tmp_path / "a"))
+    for again in (pickle.loads(pickle.dumps(one)), copy.copy(one), copy.deepcopy(one)):
+        assert again == one and type(again) is type(one)
+    script = "import pickle, sys; print(pickle.load(sys.stdin.buffer).value())"
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    call = [sys.executable, "-c", script]
+    done = subprocess.run(call, input=pickle.dumps(one), capture_output=True, env=environment, check=True)
+    assert done.stdout == b"aa\n"
+    mine(tmp_path / "a", "b")
+    done = subprocess.run(call, input=pickle.dumps(one), capture_output=True, env=environment, check=False)
+    assert b"has changed since an instance of Mine was pickled" in done.stderr
+
+
+def test_a_subclass_of_a_class_of_a_file_is_pickled_as_itself(tmp_path):
+    global Sub
+    Sub = dataclass(frozen=True)(type("Sub", (type(load(mine(tmp_path / "a"))),), {"__module__": __name__}))
+    assert type(pickle.loads(pickle.dumps(Sub()))) is Sub
+
+
+def test_a_file_that_fails_leaves_nothing_behind(tmp_path):
+    path = tmp_path / "mine.py"
+    path.write_text("VALUE = 1\n1 / 0\n")
+    known = set(sys.modules)
+    for _ in range(2):
+        with pytest.raises(InputError, match="ZeroDivisionError") as caught:
+            load(path)
+    assert "mine.py, line 2: 1 / 0" in caught.value.hints[0]
+    assert not [name for name in set(sys.modules) - known if "mine" in name]
+
+
+ABSTRACT = {
+    "class Mine(WeightResampler):\n    def resample(self, rng, population, n):\n        ...": (
+        "Mine has no method select, which WeightResampler asks for",
+        "inherit Resampler, which asks for resample",
+    ),
+    "class Mine(Resampler):\n    def select(self, rng, log_weights, n):\n        ...": (
+        "Mine has no method resample, which Resampler asks for",
+        "inherit WeightResampler, which asks for select",
+    ),
+    "class Mine(Resampler):\n    def resampel(self, rng, population, n):\n        ...": (
+        "Mine has no method resample, which Resampler asks for",
+        "rename resampel to resample",
+    ),
+    "class Mine(Resampler):\n    pass": (
+        "Mine has no method resample, which Resampler asks for",
+        "define resample as Resampler.resample describes it",
+    ),
+    "class Mine(Transition):\n    def update(self, rng, predicted, proposed, observation):\n        ...": (
+        "Mine has no method predict, which Transition asks for",
+        "inherit Update, which asks for update",
+    ),
+}
+
+
+@pytest.mark.parametrize("source", ABSTRACT)
+def test_a_class_that_cannot_be_made(source, tmp_path):
+    path = mine(tmp_path / "a")
+    path.write_text(path.read_text().split("@dataclass")[0] + "@dataclass(frozen=True)\n" + source)
+    cls = REGISTRY.find_class("", f"{path}:Mine", allow_files=True)
+    message, hint = ABSTRACT[source]
+    for where in ("", "resampler"):
+        with pytest.raises(InputError) as caught:
+            REGISTRY.make(cls, {}, where)
+        assert caught.value.message == (f"{where}: " if where else "") + message
+        assert caught.value.hints == (hint,)
 
 
 def test_hints_are_shown_in_python_too():

@@ -9,7 +9,8 @@ share the work.
 
 For a new method, subclass `Completer` and override `fill`: the argument is an `ObservedBox`, a small box of the grid,
 and the result is the probability of each voxel. `complete` clears voxels that are observed as free and keeps the
-visible surface. A method that is faster for many boxes together overrides `fill_many`.
+visible surface. A method that is faster for many boxes together overrides `fill_many`. Results are checked
+(`mstfilter.results`): an array of another shape, or of numbers that are no probabilities, is an error.
 
 `arbitrate` makes the label grid. If several completions claim a voxel:
 
@@ -25,13 +26,14 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from mstfilter.completion.observed import ObservedBox, enclosing_box, encode_box, observed_again, observed_box
 from mstfilter.errors import InputError
+from mstfilter.results import Checked, check_list, check_probabilities, check_type, returns, warn_once
 from mstfilter.scene import (
     Clip,
     Frame,
@@ -69,8 +71,26 @@ class Completion:
         return replace(self, probability=read_only(odds / (odds + (1 - p))))
 
 
+def _check_filled(self: Completer, found: Any, rngs: Any, seen: Sequence[ObservedBox]) -> list[np.ndarray]:
+    found = check_list(found, len(seen), object, "arrays")
+    return [check_probabilities(p, one.surface.shape) for p, one in zip(found, seen, strict=True)]
+
+
+def _check_completions(self: Completer, found: Any, rngs: Any, frame: Frame, masks: Any, grid: VoxelGrid) -> Any:
+    for one in check_list(found, len(masks), (Completion, tuple), "Completion"):
+        _check_completion(one[0] if isinstance(one, tuple) else one, grid)  # with views, of `complete_again`
+    return found
+
+
+def _check_completion(one: Completion, grid: VoxelGrid) -> None:
+    check_type(one, Completion, "a Completion")
+    check_probabilities(one.probability, one.points.shape)
+    if one.points.ndim != 3 or (np.add(one.offset, one.points.shape) > grid.shape).any() or np.min(one.offset) < 0:
+        raise InputError(f"returns a box of shape {one.points.shape} at {one.offset}, the grid has {grid.shape}")
+
+
 @dataclass(frozen=True)
-class Completer(ABC):
+class Completer(Checked, ABC):
     """Estimates the hidden part of objects.
 
     Parameters
@@ -103,13 +123,31 @@ class Completer(ABC):
         """Key of the contents of trained weights; empty if there are none."""
         return ""
 
+    @returns(lambda self, found, rng, seen: check_probabilities(found, seen.surface.shape))
     @abstractmethod
     def fill(self, rng: np.random.Generator, seen: ObservedBox) -> np.ndarray:
         """Probability (a, b, c) of being occupied."""
 
+    @returns(_check_filled)
     def fill_many(self, rngs: Sequence[np.random.Generator], seen: Sequence[ObservedBox]) -> list[np.ndarray]:
         """The probabilities of several boxes."""
         return [self.fill(rng, one) for rng, one in zip(rngs, seen, strict=True)]
+
+    def estimate(self, rngs: Sequence[np.random.Generator], seen: Sequence[ObservedBox]) -> list[np.ndarray]:
+        """`fill_many`, with a warning if it ignores what was seen.
+
+        Raises InputError if it draws random numbers although `stochastic` is False: results would be reused.
+        """
+        before = _states(rngs)
+        filled = self.fill_many(rngs, seen)
+        if not self.stochastic and before != _states(rngs):
+            raise InputError(
+                f"{type(self).__name__} draws random numbers, but its `stochastic` is False",
+                "add stochastic: ClassVar[bool] = True to the class",
+            )
+        if fault := fault_of(seen, filled):
+            warn_once(self, "fill", fault, "`mstfilter check` tests the completer")
+        return filled
 
     def box(self, voxels: np.ndarray, grid: VoxelGrid) -> tuple[np.ndarray, np.ndarray]:
         """First voxel (3,) of the box of a mask with readings in `voxels` (k, 3), and the one after its last."""
@@ -137,6 +175,7 @@ class Completer(ABC):
         streams = [child(rng, "mask", k) if self.stochastic else rng for k in range(len(masks))]
         return self.complete_each(streams, frame, masks, grid)
 
+    @returns(_check_completions)
     def complete_each(
         self, rngs: Sequence[np.random.Generator], frame: Frame, masks: Sequence[np.ndarray], grid: VoxelGrid
     ) -> list[Completion]:
@@ -151,7 +190,7 @@ class Completer(ABC):
 
         def compute(missing: Sequence[int]) -> list[Completion]:
             boxes = [observed_box(frame, masks[k], grid, self) for k in missing]
-            filled = self.fill_many([rngs[k] for k in missing], [seen for _, seen in boxes])
+            filled = self.estimate([rngs[k] for k in missing], [seen for _, seen in boxes])
             return [
                 finish(offset, seen, p, names[k].hex()[:16])
                 for k, (offset, seen), p in zip(missing, boxes, filled, strict=True)
@@ -161,6 +200,7 @@ class Completer(ABC):
             return compute(range(len(masks)))
         return memo_many("completion", names, compute, Completion)
 
+    @returns(_check_completions)
     def complete_again(
         self,
         rngs: Sequence[np.random.Generator],
@@ -188,7 +228,7 @@ class Completer(ABC):
 
         def compute(missing: Sequence[int]) -> list[tuple[Completion, tuple[ObjectView, ...]]]:
             boxes = [observed_again(frame, *objects[k], grid, self) for k in missing]
-            filled = self.fill_many([rngs[k] for k in missing], [seen for _, _, seen, _ in boxes])
+            filled = self.estimate([rngs[k] for k in missing], [seen for _, _, seen, _ in boxes])
             found = []
             for k, (offset, now, seen, views), p in zip(missing, boxes, filled, strict=True):
                 key = names[k].hex()[:16]
@@ -199,6 +239,30 @@ class Completer(ABC):
         if self.stochastic:
             return compute(range(len(objects)))
         return memo_many("completion_again", names, compute)
+
+
+def _states(rngs: Sequence[np.random.Generator | None]) -> list[Any]:
+    return [rng.bit_generator.state for rng in rngs if rng is not None]
+
+
+_FEW_VOXELS = 20  # of visible surface, in all boxes together; fewer say nothing about a completer
+
+
+def fault_of(seen: Sequence[ObservedBox], filled: Sequence[np.ndarray]) -> str | None:
+    """How the probabilities of boxes ignore what was seen in them; None if they do not.
+
+    Either all are one number, or no voxel of the visible surface is probably occupied in any box.
+    """
+    shown = [(p, one.surface) for p, one in zip(filled, seen, strict=True) if one.surface.any()]
+    if sum(np.count_nonzero(surface) for _, surface in shown) < _FEW_VOXELS:
+        return None
+    first = float(shown[0][0].flat[0])
+    if all(p.flat[0] == first and p.min() == p.max() for p, _ in shown):
+        return f"returns a constant: {first:.4g} for all voxels of {len(shown)} boxes"
+    if not any((p[surface] >= 0.5).any() for p, surface in shown):
+        highest = max(float(p[surface].max()) for p, surface in shown)
+        return f"leaves the visible surface empty: its highest probability is {highest:.4g}, at least 0.5 is occupied"
+    return None
 
 
 def finish(offset: np.ndarray, seen: ObservedBox, filled: np.ndarray, key: str) -> Completion:
@@ -213,6 +277,7 @@ def finish(offset: np.ndarray, seen: ObservedBox, filled: np.ndarray, key: str) 
 class ClipCompleter(Completer):
     """A completer that depends on the clip, for example because it reads a folder for each pause."""
 
+    @returns(lambda self, found, clip: check_type(found, Completer, "a Completer"))
     @abstractmethod
     def at(self, clip: Clip) -> Completer:
         """The completer of the clip's last frame."""

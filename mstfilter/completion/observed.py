@@ -12,7 +12,7 @@ that they hid are not, since they may have moved. The latest frame decides where
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -50,6 +50,10 @@ class ObservedBox:
     #: (a, b, c) float32, voxels behind the measured surface along the optical axis; NaN if it is unknown.
     signed: np.ndarray
     height: np.ndarray  #: (c,) height of the voxel centres above the table in metres
+
+    def __post_init__(self) -> None:
+        for f in fields(self):
+            object.__setattr__(self, f.name, read_only(getattr(self, f.name)))
 
 
 def observed_box(frame: Frame, mask: np.ndarray, grid: VoxelGrid, rule: Completer) -> tuple[np.ndarray, ObservedBox]:

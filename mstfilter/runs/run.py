@@ -23,7 +23,7 @@ from mstfilter.errors import InputError
 from mstfilter.files import check_output
 from mstfilter.lazy import progress_of
 from mstfilter.oracles import bind_truth, uses_truth
-from mstfilter.presets import build_filter, describe_filter
+from mstfilter.presets import REGISTRY, build_filter, describe_filter
 from mstfilter.registry import nested_components
 from mstfilter.runs.run_folder import RunFolder, as_json
 from mstfilter.scene import Recording, UsesFiles
@@ -178,7 +178,7 @@ def component_files(component: Any) -> dict[str, str]:
     for part in nested_components(component):
         name, source = type(part).__name__, type(part).__dict__
         if "__mst_file__" in source:
-            found[source["__mst_file__"]] = source["__mst_source__"]
+            found[REGISTRY.name_of(type(part))] = source["__mst_source__"]
         if key := str(getattr(part, "weights_key", "")):
             found[f"weights of {name}"] += key
         elif isinstance(part, UsesFiles):

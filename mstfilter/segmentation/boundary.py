@@ -17,6 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from mstfilter.results import Checked, check_array, check_type, returns
 from mstfilter.scene import BASELINE, Clip, Frame, fit_support_plane, table_residual
 
 #: Focal length in pixels that defines the sensor's disparity unit: 1/8 pixel of a 640 x 480 Kinect, whatever the
@@ -43,9 +44,10 @@ def pixels_above_table(frame: Frame) -> np.ndarray:
         return frame.valid & (above_table(frame) > TABLE_TOLERANCE)
 
 
-class BoundaryModel(ABC):
+class BoundaryModel(Checked, ABC):
     """Estimates where one object ends and another begins."""
 
+    @returns(lambda self, found, frame: check_array(found, frame.depth.shape, "f", 0, 1))
     @abstractmethod
     def boundary(self, frame: Frame) -> np.ndarray:
         """(H, W) float32 in 0 .. 1: boundary strength of each pixel."""
@@ -54,6 +56,7 @@ class BoundaryModel(ABC):
 class ClipBoundary(BoundaryModel):
     """A boundary model that depends on the clip, for example because it reads a file for each pause."""
 
+    @returns(lambda self, found, clip: check_type(found, BoundaryModel, "a BoundaryModel"))
     @abstractmethod
     def at(self, clip: Clip) -> BoundaryModel:
         """The model of the clip's last frame. Its `component_key` includes the content that it uses."""

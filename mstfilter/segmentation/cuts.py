@@ -29,6 +29,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from mstfilter.errors import InputError, check_number
+from mstfilter.results import Checked, check_array, check_list, check_type, returns
 from mstfilter.scene import Frame
 from mstfilter.segmentation.boundary import pixels_above_table
 from mstfilter.segmentation.tree import Tree
@@ -47,9 +48,10 @@ _CLIP = 1e-3  # `MergeLogOdds` clips probabilities to _CLIP .. 1 - _CLIP
 _Value = TypeVar("_Value", float, np.ndarray)
 
 
-class CutValue(ABC):
+class CutValue(Checked, ABC):
     """Rates how well a region fits one object."""
 
+    @returns(lambda self, found, tree, frame: check_array(found, (tree.n_nodes,)))
     @abstractmethod
     def values(self, tree: Tree, frame: Frame) -> np.ndarray:
         """(N,) value w of every node."""
@@ -119,9 +121,25 @@ class CutSample:
     diagnostics: dict[str, Any] = field(default_factory=dict)  #: statistics of the draw; JSON types only
 
 
-class CutSampler(ABC):
+def _check_cuts(
+    self: CutSampler, found: CutSample, rng: np.random.Generator, tree: Tree, w: np.ndarray, n: int
+) -> CutSample:
+    check_type(found, CutSample, "a CutSample")
+    check_array(found.log_p, (n,), at_most=np.inf)
+    for k, cut in enumerate(check_list(found.cuts, n, np.ndarray, "an array of nodes")):
+        covered = tree.area[cut].sum() if cut.dtype.kind in "iu" and cut.max(initial=-1) < tree.n_nodes else 0
+        if covered != tree.leaves.size:
+            raise InputError(
+                f"returns as cut {k} no partition of the image: its nodes cover {covered} of "
+                f"{tree.leaves.size} pixels"
+            )
+    return found
+
+
+class CutSampler(Checked, ABC):
     """Draws segmentations from a tree with node values."""
 
+    @returns(_check_cuts)
     @abstractmethod
     def sample(self, rng: np.random.Generator, tree: Tree, w: np.ndarray, n: int) -> CutSample:
         """Draw `n` cuts of the tree under node values `w` (N,)."""

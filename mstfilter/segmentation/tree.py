@@ -30,6 +30,7 @@ from typing import Any
 import numpy as np
 
 from mstfilter.errors import InputError, check_integer
+from mstfilter.results import Checked, check_type, returns
 from mstfilter.scene import Frame, content_key, read_only
 
 
@@ -176,9 +177,17 @@ class Tree:
         return inside[self.leaves]
 
 
-class TreeBuilder(ABC):
+def _check_tree(self: TreeBuilder, found: Tree, boundary: np.ndarray, frame: Frame | None = None) -> Tree:
+    check_type(found, Tree, "a Tree")
+    if found.leaves.shape != boundary.shape:
+        raise InputError(f"returns a tree of an image of shape {found.leaves.shape}, expected {boundary.shape}")
+    return found
+
+
+class TreeBuilder(Checked, ABC):
     """Builds a hierarchy of regions from a boundary map."""
 
+    @returns(_check_tree)
     @abstractmethod
     def build(self, boundary: np.ndarray, frame: Frame | None = None) -> Tree:
         """The tree of a boundary map (H, W). Some builders also need the frame."""

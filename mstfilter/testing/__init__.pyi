@@ -22,7 +22,12 @@ from mstfilter.testing.resampling import (
     WeightResamplerContract as WeightResamplerContract,
 )
 from mstfilter.testing.scenes import scene_example as scene_example
-from mstfilter.testing.stages import STAGE_OWNERS as STAGE_OWNERS, StageContract as StageContract
+from mstfilter.testing.stages import (
+    STAGE_OWNERS as STAGE_OWNERS,
+    CompleterContract as CompleterContract,
+    MotionRuleContract as MotionRuleContract,
+    StageContract as StageContract,
+)
 from mstfilter.testing.starters import (
     Starter as Starter,
     starter_kinds as starter_kinds,

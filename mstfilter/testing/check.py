@@ -22,6 +22,7 @@ from typing import Any
 
 import pytest
 
+from mstfilter.completion import Completer
 from mstfilter.errors import InputError, describe_error
 from mstfilter.fusion import Evidence
 from mstfilter.smc import (
@@ -43,6 +44,7 @@ from mstfilter.smc import (
 from mstfilter.testing import moves, resampling, stages, values
 from mstfilter.testing.contract import Contract, number_example
 from mstfilter.testing.scenes import scene_example
+from mstfilter.tracking import MotionRule
 
 #: Contract of each interface, the more special interface first.
 _CONTRACTS: dict[type, type[Contract]] = {
@@ -62,6 +64,8 @@ _CONTRACTS: dict[type, type[Contract]] = {
     Codec: values.CodecContract,
     Evidence: values.EvidenceContract,
     **dict.fromkeys(stages.STAGE_OWNERS, stages.StageContract),
+    Completer: stages.CompleterContract,
+    MotionRule: stages.MotionRuleContract,
 }
 
 
@@ -146,7 +150,7 @@ def _function_beside(cls: type, name: str) -> Callable[..., Any] | None:
 
 def _uses_images(cls: type, contract: type[Contract]) -> bool:
     """Whether a class is a stage of MST or an evidence, or belongs to a package of mstfilter other than smc."""
-    if contract in (stages.StageContract, values.EvidenceContract):
+    if issubclass(contract, stages.StageContract | values.EvidenceContract):
         return True
     return cls.__module__.startswith("mstfilter.") and not cls.__module__.startswith("mstfilter.smc.")
 

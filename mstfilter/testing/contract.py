@@ -26,7 +26,7 @@ from typing import Any, TypeVar
 import numpy as np
 import pytest
 
-from mstfilter.errors import describe_error
+from mstfilter.errors import InputError, describe_error
 from mstfilter.smc import Population
 
 #: Largest probability that a statistical test fails for a correct component.
@@ -160,6 +160,8 @@ def reports_errors(what: str | dict[str, Any]) -> Iterator[None]:
         if _writes_to_read_only(error):
             raise AssertionError("it changes its input in place: make a copy first") from error
         what = what if isinstance(what, str) else _description(what)
+        if isinstance(error, InputError):  # says what is wrong and where, as in a run
+            raise AssertionError("; ".join([f"{what}: {error.message}", *error.hints])) from error
         number = isinstance(error, AttributeError) and "'float' object" in str(error)
         hint = "; the input is a number: for scenes write `example = scene_example` in the file" if number else ""
         raise AssertionError(f"{what}: it raises {describe_error(error)}{hint}") from error
@@ -186,7 +188,7 @@ def _description(inputs: dict[str, Any]) -> str:
 
 
 def _writes_to_read_only(error: Exception) -> bool:
-    return isinstance(error, ValueError) and "read-only" in str(error)
+    return isinstance(error, ValueError) and any(word in str(error) for word in ("read-only", "its input in place"))
 
 
 def same(a: Any, b: Any) -> bool:

@@ -2,19 +2,35 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import fields
+from itertools import combinations
 from typing import Any
 
 import numpy as np
 
-from mstfilter.completion import Completer
+from mstfilter.completion import ClipCompleter, Completer, ObservedBox, observed_box
+from mstfilter.completion.completer import fault_of
+from mstfilter.errors import InputWarning
 from mstfilter.fusion import Crossover, Division, FusionUpdate, PairOdds, PartitionUpdate, Projection, Structure
-from mstfilter.scene import Hypothesis
+from mstfilter.scene import Clip, Hypothesis, render_hypothesis
 from mstfilter.segmentation import BoundaryModel, CutSampler, CutValue, TreeBuilder, TreeCutProposal
-from mstfilter.smc import Component, Population, Proposal, Transition
-from mstfilter.testing.contract import RandomContract, prerequisite
+from mstfilter.smc import Component, Population, Proposal, Transition, child
+from mstfilter.testing.contract import RandomContract, prerequisite, reports_errors, same, skips_errors
 from mstfilter.testing.scenes import scene_example
-from mstfilter.tracking import MaskTracker, MotionRule, MstRule, Registration, TrackingTransition
+from mstfilter.tracking import (
+    DenseFlow,
+    MaskTracker,
+    MotionRule,
+    MstRule,
+    Registration,
+    Track,
+    TrackingTransition,
+    segments_of,
+)
+from mstfilter.tracking.rules import fault_of_motions
 
 #: Interface of a stage -> the component of a filter that uses it.
 STAGE_OWNERS: dict[type, Callable[[Any], Component]] = {
@@ -41,6 +57,10 @@ class StageContract(RandomContract):
         return scene_example(rng, n)
 
     def call(self, component: Any, rng: np.random.Generator, inputs: dict[str, Any]) -> Any:
+        return self.step(component, rng, inputs)
+
+    def step(self, component: Any, rng: np.random.Generator, inputs: dict[str, Any]) -> Population:
+        """Use the component in its place in a filter."""
         owner = next(use for interface, use in STAGE_OWNERS.items() if isinstance(component, interface))(component)
         population, clip = inputs["population"], inputs["observation"]
         if isinstance(owner, Proposal):
@@ -54,18 +74,148 @@ class StageContract(RandomContract):
                 found = found.take(np.arange(0, len(found), 5))
         return found.realised()
 
-    def check_result(self, result: Any, inputs: dict[str, Any]) -> None:
+    def checked_step(self, component: Any, inputs: dict[str, Any]) -> None:
+        """Use the component in its place; an exception is reported with a description of the inputs."""
+        with reports_errors(inputs):
+            result = self.step(component, np.random.default_rng(3), inputs)
         assert all(isinstance(h, Hypothesis) for h in result.particles), "the result has no hypotheses"
 
     @prerequisite
     def test_works_in_its_place(self) -> None:
         """It works in a filter: the step that uses it gives hypotheses."""
         for n in (1, 4):
-            self.checked_call(self.make(), self.inputs(n))
+            self.checked_step(self.make(), self.inputs(n))
 
     def test_works_for_an_empty_scene(self) -> None:
         """It works for hypotheses without objects."""
         inputs = self.inputs(2)
         clip = inputs["observation"]
         empty = Hypothesis.from_labels(np.zeros(clip.grid.shape, np.uint16), clip.grid)
-        self.checked_call(self.make(), {**inputs, "population": Population((empty, empty))})
+        self.checked_step(self.make(), {**inputs, "population": Population((empty, empty))})
+
+
+class CompleterContract(StageContract):
+    """The contract of every `Completer`."""
+
+    def call(self, component: Any, rng: np.random.Generator, inputs: dict[str, Any]) -> list[np.ndarray]:
+        """The probabilities of the boxes of three objects; nothing is cached."""
+        seen = _boxes(component, _correct(inputs), inputs["observation"])
+        return [np.array(p) for p in _estimated(component, rng, seen, inputs["observation"])]
+
+    def test_works_for_any_box(self) -> None:
+        """It works for a box with edges of different lengths, and for one without voxels."""
+        component, inputs = self.make(), self.inputs(1)
+        box = _boxes(component, _correct(inputs), inputs["observation"])[0]
+        odd = [_cropped(box, *size) for size in ((7, 6, 5), (0, 0, 0))]
+        with reports_errors("boxes of shape (7, 6, 5) and (0, 0, 0)"):
+            _estimated(component, np.random.default_rng(0), odd, inputs["observation"])
+
+    def test_follows_what_is_seen(self) -> None:
+        """Its probabilities are not constant, and visible surface is probably occupied."""
+        component, inputs = self.make(), self.inputs(1)
+        seen = _boxes(component, _correct(inputs), inputs["observation"])
+        with skips_errors():
+            filled = _estimated(component, np.random.default_rng(0), seen, inputs["observation"])
+        fault = fault_of(seen, filled)
+        assert fault is None, f"{type(component).__name__}.fill {fault}"
+
+    def test_axes_are_those_of_the_grid(self) -> None:
+        """The axes of its result are those of the box: reversed, it fits the visible surface less well."""
+        component, inputs = self.make(), self.inputs(1)
+        seen = _boxes(component, _correct(inputs), inputs["observation"], cut=True)
+        with skips_errors():
+            filled = _estimated(component, np.random.default_rng(0), seen, inputs["observation"])
+        choices = [axes for n in range(4) for axes in combinations(range(3), n)]
+        fit = {axes: _on_surface(filled, seen, axes) for axes in choices}
+        best = max(choices, key=lambda axes: fit[axes])
+        assert fit[()] >= fit[best] - 0.05, (
+            f"the visible surface has a mean probability of {fit[()]:.2f}, and of {fit[best]:.2f} if the axes {best} "
+            "of the result are reversed"
+        )
+
+    def test_objects_do_not_depend_on_others(self) -> None:
+        """The result for an object does not depend on the others, nor on their order."""
+        component, inputs = self.make(), self.inputs(1)
+        seen = _boxes(component, _correct(inputs), inputs["observation"])
+        with skips_errors():
+            every, last = (
+                _estimated(component, np.random.default_rng(0), boxes, inputs["observation"], first)
+                for boxes, first in ((seen, 0), (seen[-1:], len(seen) - 1))
+            )
+        assert same(np.asarray(every[-1]), np.asarray(last[0])), (
+            "an object is completed differently without the others"
+        )
+
+
+def _correct(inputs: dict[str, Any]) -> Hypothesis:
+    """The hypothesis with most objects."""
+    return max(inputs["population"].particles, key=lambda h: h.n_objects)
+
+
+def _on_surface(filled: list[np.ndarray], seen: list[ObservedBox], axes: tuple[int, ...]) -> float:
+    """Mean probability of the visible surface, with some axes of the probabilities reversed."""
+    return float(np.mean([np.flip(p, axes)[one.surface].mean() for p, one in zip(filled, seen, strict=True)]))
+
+
+def _boxes(completer: Completer, hypothesis: Hypothesis, clip: Clip, cut: bool = False) -> list[ObservedBox]:
+    """What the first frame of a clip shows of the objects of a hypothesis; `cut`: of the half above a diagonal."""
+    image, _ = render_hypothesis(hypothesis, clip.before.camera)
+    masks = [image == k for k in np.unique(image[image > 0])]
+    if cut:
+        v, u = np.mgrid[: image.shape[0], : image.shape[1]]
+        masks = [mask & (u - v < (u - v)[mask].mean()) for mask in masks]
+    return [observed_box(clip.before, mask, clip.grid, completer)[1] for mask in masks]
+
+
+def _estimated(
+    completer: Completer, rng: np.random.Generator, seen: list[ObservedBox], clip: Clip, first: int = 0
+) -> list[np.ndarray]:
+    """The probabilities of boxes, with the streams from that of box `first` on."""
+    bound = completer.at(clip) if isinstance(completer, ClipCompleter) else completer
+    with _without_warnings():
+        return bound.estimate([child(rng, "box", first + k) for k in range(len(seen))], seen)
+
+
+@contextmanager
+def _without_warnings() -> Iterator[None]:
+    """Without the warnings of a run, which are properties of their own here."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", InputWarning)
+        yield
+
+
+def _cropped(box: ObservedBox, a: int, b: int, c: int) -> ObservedBox:
+    """The first voxels of a box."""
+    parts = {f.name: getattr(box, f.name)[:a, :b, :c] for f in fields(box) if f.name != "height"}
+    return ObservedBox(**parts, height=box.height[:c])
+
+
+class MotionRuleContract(StageContract):
+    """The contract of every `MotionRule`."""
+
+    def call(self, component: Any, rng: np.random.Generator, inputs: dict[str, Any]) -> list[Any]:
+        """Kind, motion, support and score of all candidates and of a choice, for each visible object."""
+        found = []
+        for label, track in _tracks(inputs):
+            with _without_warnings():
+                candidates = component.candidates(child(rng, "segment", label), track)
+            chosen = component.choose(child(rng, "choice", label), candidates)
+            found += [(c.kind, c.T.as_matrix(), c.support, c.score) for c in (*candidates, chosen)]
+        return found
+
+    def test_motions_stay_in_the_workspace(self) -> None:
+        """No candidate moves an object farther than the workspace is wide."""
+        component, rng = self.make(), np.random.default_rng(0)
+        for label, track in _tracks(self.inputs(1)):
+            with skips_errors(), _without_warnings():
+                candidates = component.candidates(child(rng, "segment", label), track)
+            fault = fault_of_motions(candidates, track)
+            assert fault is None, f"{type(component).__name__}.candidates {fault}"
+
+
+def _tracks(inputs: dict[str, Any]) -> list[tuple[int, Track]]:
+    """The visible objects of a hypothesis in the clip, by label."""
+    clip = inputs["observation"]
+    flow = DenseFlow().track(clip)
+    segments = segments_of(_correct(inputs), clip.before)
+    return [(label, Track(one, clip, flow)) for label, one in segments.items() if len(one.support)]

@@ -12,6 +12,7 @@ from mstfilter.tracking.registration import (
 from mstfilter.tracking.residual import MotionResidual as MotionResidual, refine_motion as refine_motion
 from mstfilter.tracking.rigid import move_points as move_points, rigid_transform as rigid_transform
 from mstfilter.tracking.rules import (
+    IDENTITY as IDENTITY,
     AuthorsRule as AuthorsRule,
     Candidate as Candidate,
     MotionRule as MotionRule,

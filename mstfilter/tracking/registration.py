@@ -21,6 +21,7 @@ import numpy as np
 
 from mstfilter.errors import InputError, check_choice, check_number
 from mstfilter.open3d_import import import_open3d
+from mstfilter.results import Checked, check_array, check_rigid, check_type, returns
 from mstfilter.tracking.rigid import move_points
 
 _MIN_POINTS = 12
@@ -42,7 +43,7 @@ class Surface:
     def open3d_cloud(self) -> Any:
         """open3d's cloud, downsampled, with normals and colours; made on first use."""
         o3d = import_open3d()
-        cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(self.raw_points))
+        cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(np.array(self.raw_points)))
         if self.raw_colours is not None:
             cloud.colors = o3d.utility.Vector3dVector(np.asarray(self.raw_colours, dtype=np.float64) / 255)
         cloud = cloud.voxel_down_sample(_SPACING)
@@ -88,9 +89,18 @@ def prepare(points: np.ndarray, colours: np.ndarray | None = None) -> Surface | 
     return Surface(np.asarray(cloud.points())[:, :3].copy(), cloud, tree, points, colours)
 
 
-class Registration(ABC):
+def _check_registration(self: Registration, found: RegistrationResult | None, *_: Any, **__: Any) -> Any:
+    if found is not None:
+        check_type(found, RegistrationResult, "a RegistrationResult or None")
+        check_rigid(check_array(found.T, (4, 4)), "a motion")
+        check_array(np.array([found.rms, found.overlap], dtype=np.float64), (2,), at_least=0)
+    return found
+
+
+class Registration(Checked, ABC):
     """Aligns two surfaces from an initial motion."""
 
+    @returns(_check_registration)
     @abstractmethod
     def register(self, source: Surface, target: Surface, init: np.ndarray, reach: float) -> RegistrationResult | None:
         """Align source to target; None if the result is not finite.

@@ -18,13 +18,15 @@ rotations of symmetric objects, SIFT without texture.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from numbers import Integral, Real
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from mstfilter.errors import check_choice
+from mstfilter.errors import InputError, check_choice
+from mstfilter.results import Checked, check_rigid, check_type, describe_value, returns, warn_once
 from mstfilter.tracking import rigid
 from mstfilter.tracking.features import SiftMatching
 from mstfilter.tracking.registration import Registration, RegistrationResult, SmallGicp, centroid_shift
@@ -59,13 +61,67 @@ _Estimate = tuple[str, np.ndarray, int, RegistrationResult | None]
 IDENTITY = Candidate("identity", RigidTransform.identity())
 
 
-class MotionRule(ABC):
+def _check_candidates(
+    self: MotionRule, found: Sequence[Candidate], rng: np.random.Generator, track: Track
+) -> tuple[Candidate, ...]:
+    check_type(found, (list, tuple), "a tuple of Candidate", *_HOW_TO_MOVE)
+    if not found:
+        raise InputError("returns no candidate, expected at least one", "rest is mstfilter.tracking.IDENTITY")
+    for candidate in found:
+        _check_candidate(candidate)
+    if fault := fault_of_motions(found, track):
+        warn_once(self, "candidates", fault, "motions are in metres, in the frame of the world")
+    return tuple(found)
+
+
+def _check_choice(
+    self: MotionRule, found: Candidate, rng: np.random.Generator, candidates: tuple[Candidate, ...]
+) -> Candidate:
+    if not any(found is one for one in candidates):
+        _check_candidate(found)
+    return found
+
+
+_HOW_TO_MOVE = ("a motion T (4, 4) is Candidate('mine', RigidTransform.from_matrix(T))",)
+
+
+def _check_candidate(one: Candidate) -> None:
+    """Raise InputError unless a result is a candidate with a rigid motion, a support and a score."""
+    check_type(one, Candidate, "a Candidate", *_HOW_TO_MOVE)
+    if not isinstance(one.T, RigidTransform) or not one.T.single:
+        raise InputError(
+            f"returns a candidate whose T is {describe_value(one.T)}, expected one RigidTransform", *_HOW_TO_MOVE
+        )
+    check_rigid(one.T.as_matrix(), f"a candidate {one.kind!r} with a motion")
+    if not isinstance(one.kind, str):
+        raise InputError(f"returns a candidate whose kind is {describe_value(one.kind)}, expected a str")
+    if not isinstance(one.support, Integral) or one.support < 0:
+        raise InputError(f"returns a candidate whose support is {describe_value(one.support)}, expected an int >= 0")
+    if not isinstance(one.score, Real) or np.isnan(one.score):
+        raise InputError(f"returns a candidate whose score is {describe_value(one.score)}, expected a number")
+
+
+def fault_of_motions(candidates: Sequence[Candidate], track: Track) -> str | None:
+    """That a candidate moves the object farther than the workspace is wide; None if none does."""
+    if not len(track.segment.support):
+        return None
+    grid, centre = track.clip.grid, track.points.mean(axis=0)
+    width = float(np.linalg.norm(np.multiply(grid.shape, grid.voxel_size)))
+    farthest = max(rigid.displacement(one.T.as_matrix(), centre) for one in candidates)
+    if farthest <= width:
+        return None
+    return f"moves an object too far: by {farthest:.3g} m, the workspace is {width:.3g} m wide"
+
+
+class MotionRule(Checked, ABC):
     """Decides the motion of an object."""
 
+    @returns(_check_candidates)
     @abstractmethod
     def candidates(self, rng: np.random.Generator, track: Track) -> tuple[Candidate, ...]:
         """Possible motions of a segment, at least one. Computed once for all hypotheses."""
 
+    @returns(_check_choice)
     @abstractmethod
     def choose(self, rng: np.random.Generator, candidates: tuple[Candidate, ...]) -> Candidate:
         """The motion of the object in one particle; `rng` belongs to this particle."""

@@ -21,7 +21,8 @@ import cv2
 import numpy as np
 from scipy.ndimage import value_indices
 
-from mstfilter.scene import Clip, Frame, Hypothesis, content_key, render_hypothesis
+from mstfilter.results import Checked, check_array, check_list, returns
+from mstfilter.scene import Clip, Frame, Hypothesis, content_key, read_only, render_hypothesis
 from mstfilter.tracking.features import SiftMatching, matched_colour, smooth_colour
 from mstfilter.tracking.flow import ClipTracks
 from mstfilter.tracking.registration import Surface, prepare
@@ -91,7 +92,7 @@ class Track:
         """The support in the first frame, (H, W)."""
         image = np.zeros(self.clip.before.depth.shape, bool)
         image.ravel()[self.segment.support] = True
-        return image
+        return read_only(image)
 
     @cached_property
     def target_mask(self) -> np.ndarray:
@@ -103,7 +104,7 @@ class Track:
     @cached_property
     def points(self) -> np.ndarray:
         """World points of the support in the first frame, (S, 3) metres."""
-        return self.clip.before.points.reshape(-1, 3)[self.segment.support]
+        return read_only(self.clip.before.points.reshape(-1, 3)[self.segment.support])
 
     @cached_property
     def surface(self) -> Surface | None:
@@ -127,7 +128,7 @@ class Track:
         end_u, end_v = np.rint(self.flow.end[chosen]).astype(np.int64).T
         q = after.points[end_v, end_u]
         keep = after.valid[end_v, end_u] & (q[:, 2] > _TABLE_HEIGHT)
-        return before.points[v, u][keep], q[keep]
+        return read_only(before.points[v, u][keep]), read_only(q[keep])
 
     def sift_pairs(self, sift: SiftMatching, in_target: bool) -> tuple[np.ndarray, np.ndarray]:
         """World points of SIFT matches that start in the mask and, if `in_target`, end near the target mask."""
@@ -151,9 +152,17 @@ class Track:
         return matched_colour(self.clip.after, self.clip.before, 5)
 
 
-class MaskTracker(ABC):
+def _check_masks(
+    self: MaskTracker, found: Sequence[np.ndarray], clip: Clip, masks: Sequence[np.ndarray]
+) -> list[np.ndarray]:
+    shape = clip.after.depth.shape
+    return [check_array(mask, shape, "b") for mask in check_list(found, len(masks), object, "masks")]
+
+
+class MaskTracker(Checked, ABC):
     """Follows masks through a clip."""
 
+    @returns(_check_masks)
     @abstractmethod
     def track(self, clip: Clip, masks: Sequence[np.ndarray]) -> list[np.ndarray]:
         """Masks (H, W) bool of the last frame, one for each of the masks (H, W) bool of the first frame.

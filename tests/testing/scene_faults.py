@@ -1,0 +1,438 @@
+"""Completers, motion rules, evidence and other parts of scenes with one fault each.
+
+Each table maps the name of a fault to a faulty component and to words of the error, or of the warning, that names it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any, ClassVar
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+from mstfilter.completion import Completer, Extrude
+from mstfilter.fusion import Division, Evidence, PairOdds, Projection, SpanningTree, Structure
+from mstfilter.segmentation import (
+    BoundaryModel,
+    ColourDepthBoundary,
+    CutSampler,
+    CutValue,
+    ExactCuts,
+    LearnedTree,
+    MergeLogOdds,
+    TreeBuilder,
+)
+from mstfilter.tracking import IDENTITY, Candidate, MaskTracker, MotionRule, MstRule, Registration, SmallGicp
+
+#: What a faulty component does with a correct result.
+Change = Callable[..., Any]
+
+
+def torch_tensor(p: np.ndarray, gradient: bool) -> Any:
+    import torch
+
+    return torch.tensor(np.asarray(p, np.float32), requires_grad=gradient)
+
+
+def with_value(p: np.ndarray, value: float) -> np.ndarray:
+    """An array with another value in one place."""
+    out = np.array(p, dtype=np.float64)
+    out.flat[0] = value
+    return out
+
+
+def logits(p: np.ndarray) -> np.ndarray:
+    p = np.clip(p, 1e-3, 1 - 1e-3)
+    return np.log(p / (1 - p))
+
+
+def one_over_zero(p: np.ndarray) -> Any:
+    raise ZeroDivisionError("my own fault")
+
+
+@dataclass(frozen=True)
+class Completes(Completer):
+    """Extrudes, then changes the result."""
+
+    change: Change = field(default=lambda p: p)
+
+    def fill(self, rng, seen):
+        return self.change(Extrude().fill(rng, seen))
+
+
+@dataclass(frozen=True)
+class CompletesMany(Completes):
+    """The same in the method for several boxes."""
+
+    def fill(self, rng, seen):
+        return Extrude().fill(rng, seen)
+
+    def fill_many(self, rngs, seen):
+        return [self.change(self.fill(rng, one)) for rng, one in zip(rngs, seen, strict=True)]
+
+
+@dataclass(frozen=True)
+class CompletesEach(Completes):
+    """The same in the method for whole masks."""
+
+    def fill(self, rng, seen):
+        return Extrude().fill(rng, seen)
+
+    def complete_each(self, rngs, frame, masks, grid):
+        found = super().complete_each(rngs, frame, masks, grid)
+        return [replace(one, probability=self.change(one.probability)) for one in found]
+
+
+@dataclass(frozen=True)
+class WritesIntoTheBox(Completer):
+    def fill(self, rng, seen):
+        seen.surface[:] = True
+        return seen.surface.astype(float)
+
+
+@dataclass(frozen=True)
+class DrawsUndeclared(Completer):
+    def fill(self, rng, seen):
+        return Extrude().fill(rng, seen) * rng.uniform(0.9, 1.0)
+
+
+@dataclass(frozen=True)
+class DrawsFromItsOwn(Completer):
+    """Its results differ from call to call; a run cannot know."""
+
+    stochastic: ClassVar[bool] = True
+
+    def fill(self, rng, seen):
+        return Extrude().fill(rng, seen) * np.random.default_rng().uniform(0.9, 1.0)
+
+
+@dataclass(frozen=True)
+class DependsOnCalls(Completer):
+    calls: list = field(default_factory=list)
+
+    def fill(self, rng, seen):
+        self.calls.append(1)
+        return Extrude().fill(rng, seen) / len(self.calls)
+
+
+#: Changes of the probabilities (a, b, c) of a box that a run reports.
+PROBABILITIES: dict[str, tuple[Change, str]] = {
+    "logits": (logits, "of logits"),
+    "percent": (lambda p: 100 * p, "divide by 100"),
+    "grey": (lambda p: (255 * p).astype(np.uint8), "divide by 255"),
+    "nan": (lambda p: np.full_like(p, np.nan), "returns nan"),
+    "one nan": (lambda p: with_value(p, np.nan), "returns nan in 1 of"),
+    "inf": (lambda p: with_value(p, np.inf), "returns inf in 1 of"),
+    "too large": (lambda p: with_value(p, 1.2), "to 1.2, expected 0 to 1"),
+    "negative": (lambda p: with_value(p, -0.1), "from -0.1"),
+    "object": (lambda p: p.astype(object), "type object"),
+    "complex": (lambda p: p.astype(complex), "type complex128"),
+    "text": (lambda p: p.astype(str), "expected bool or integers or floats"),
+    "axes": (lambda p: p.transpose(2, 1, 0), "are the axes exchanged?"),
+    "one more axis": (lambda p: p[None], "an axis too many"),
+    "flat": (lambda p: p.ravel(), "is it flattened?"),
+    "one number": (lambda p: p.mean(), "expected an array of shape"),
+    "one for the object": (lambda p: np.array([0.9]), "returns shape (1,)"),
+    "none": (lambda p: None, "does every branch of the method return it?"),
+    "list": (lambda p: p.tolist(), "returns a list"),
+    "word": (lambda p: "full", "returns a str"),
+    "generator": (lambda p: (x for x in p), "returns a generator"),
+    "tensor": (lambda p: torch_tensor(p, False), "tensor.detach().cpu().numpy()"),
+    "tensor with gradient": (lambda p: torch_tensor(p, True), "tensor.detach().cpu().numpy()"),
+    "masked": (lambda p: np.ma.masked_array(p, p > 0.5), "array.filled(value)"),
+    "exception": (one_over_zero, "my own fault"),
+}
+#: Other types of the same numbers, which are correct.
+GOOD_PROBABILITIES: dict[str, Change] = {
+    "float16": lambda p: p.astype(np.float16),
+    "bool": lambda p: p > 0.5,
+    "0 or 1": lambda p: (p > 0.5).astype(np.uint8),
+    "rounded": lambda p: p.astype(np.float32) * np.float32(1.0000002),
+    "fortran": np.asfortranarray,
+    "read-only": lambda p: np.broadcast_to(p, p.shape),
+}
+#: Changes that a run warns about once.
+STRANGE_PROBABILITIES: dict[str, tuple[Change, str]] = {
+    "constant": (lambda p: np.full_like(p, 0.3), "returns a constant: 0.3"),
+    "ones": (np.ones_like, "returns a constant: 1"),
+    "zeros": (np.zeros_like, "returns a constant: 0"),
+    "below a half": (lambda p: 0.45 * p, "leaves the visible surface empty"),
+    "complement": (lambda p: 1 - p, "leaves the visible surface empty"),
+}
+#: Completers, and words of the failure of their contract.
+COMPLETERS: dict[str, tuple[Completer, str]] = {
+    "writes": (WritesIntoTheBox(), "in place"),
+    "draws": (DrawsUndeclared(), "`stochastic` is False"),
+    "own generator": (DrawsFromItsOwn(), "does not come from `rng`"),
+    "state": (DependsOnCalls(), "keeps state"),
+    "reversed": (Completes(change=lambda p: p[::-1]), "if the axes (0,) of the result are reversed"),
+    "reversed twice": (Completes(change=lambda p: p[::-1, ::-1]), "if the axes (0, 1) of the result are reversed"),
+    "upside down": (Completes(change=lambda p: p[:, :, ::-1]), "if the axes (2,) of the result are reversed"),
+    **{name: (Completes(change=change), words) for name, (change, words) in STRANGE_PROBABILITIES.items()},
+}
+
+SHIFT = RigidTransform.from_translation([0.01, 0.0, 0.0])
+
+
+def matrix(scale: float = 1.0, reflect: bool = False) -> RigidTransform:
+    T = np.diag([-scale if reflect else scale, scale, scale, 1.0])
+    T[0, 3] = 0.02
+    return RigidTransform(T, normalize=False)
+
+
+@dataclass(frozen=True)
+class Moves(MotionRule):
+    """Returns what a function of a correct result gives."""
+
+    change: Change = field(default=lambda found: found)
+
+    def candidates(self, rng, track):
+        return self.change((IDENTITY, Candidate("mine", SHIFT, 3, 0.5)))
+
+    def choose(self, rng, candidates):
+        return candidates[-1]
+
+
+@dataclass(frozen=True)
+class Chooses(MotionRule):
+    """Chooses what a function of the candidates gives."""
+
+    change: Change = field(default=lambda found: found[0])
+
+    def candidates(self, rng, track):
+        return IDENTITY, Candidate("mine", SHIFT)
+
+    def choose(self, rng, candidates):
+        return self.change(candidates)
+
+
+def one_with(**fields: Any) -> Change:
+    return lambda found: (replace(found[1], **fields),)
+
+
+def nan_shift() -> RigidTransform:
+    return RigidTransform.from_translation([np.nan, 0, 0])
+
+
+#: Changes of the candidates of a rule.
+MOTIONS: dict[str, tuple[Change, str]] = {
+    "none": (lambda found: None, "returns None, expected a tuple of Candidate"),
+    "empty": (lambda found: (), "returns no candidate"),
+    "matrix": (lambda found: np.eye(4), "expected a tuple of Candidate"),
+    "one candidate": (lambda found: found[0], "expected a tuple of Candidate"),
+    "matrices": (lambda found: (np.eye(4),), "RigidTransform.from_matrix(T)"),
+    "transform": (lambda found: (SHIFT,), "expected a Candidate"),
+    "text": (lambda found: "identity", "returns a str"),
+    "generator": (lambda found: (one for one in found), "returns a generator"),
+    "dict": (lambda found: dict(enumerate(found)), "returns a dict"),
+    "inner none": (lambda found: (found[0], None), "returns None, expected a Candidate"),
+    "candidate of a matrix": (one_with(T=np.eye(4)), "whose T is an array of shape (4, 4)"),
+    "candidate of none": (one_with(T=None), "whose T is None"),
+    "several motions": (one_with(T=RigidTransform.from_translation(np.zeros((3, 3)))), "expected one RigidTransform"),
+    "nan shift": (lambda found: (replace(found[1], T=nan_shift()),), "not finite"),
+    "reflection": (one_with(T=matrix(reflect=True)), "it is a reflection"),
+    "scale": (one_with(T=matrix(1.05)), "its scale is 1.05"),
+    "kind": (one_with(kind=3), "whose kind is 3"),
+    "support": (one_with(support=-2), "whose support is -2"),
+    "share as support": (one_with(support=0.4), "whose support is 0.4"),
+    "nan score": (one_with(score=float("nan")), "whose score is nan"),
+    "no score": (one_with(score=None), "whose score is None"),
+    "scores": (one_with(score=np.zeros(2)), "whose score is an array of shape (2,)"),
+    "exception": (one_over_zero, "my own fault"),
+}
+CHOICES: dict[str, tuple[Change, str]] = {
+    "none": (lambda found: None, "returns None, expected a Candidate"),
+    "index": (lambda found: 0, "returns 0, expected a Candidate"),
+    "all": (lambda found: found, "returns a tuple"),
+    "matrix": (lambda found: np.eye(4), "expected a Candidate"),
+    "reflection": (lambda found: replace(found[0], T=matrix(reflect=True)), "it is a reflection"),
+}
+#: A motion in millimetres, of which a run warns once.
+TOO_FAR = one_with(T=RigidTransform.from_translation([15.0, 0, 0]))
+
+
+@dataclass(frozen=True)
+class WritesIntoTheTrack(MotionRule):
+    def candidates(self, rng, track):
+        track.points[:, 0] += 0.1
+        return (IDENTITY,)
+
+    def choose(self, rng, candidates):
+        return candidates[0]
+
+
+@dataclass(frozen=True)
+class RuleDependsOnCalls(MotionRule):
+    calls: list = field(default_factory=list)
+
+    def candidates(self, rng, track):
+        self.calls.append(1)
+        return (Candidate("mine", RigidTransform.from_translation([1e-4 * len(self.calls), 0, 0])),)
+
+    def choose(self, rng, candidates):
+        return candidates[0]
+
+
+@dataclass(frozen=True)
+class RuleDrawsFromItsOwn(MotionRule):
+    def candidates(self, rng, track):
+        shift = np.random.default_rng().normal(0, 1e-3, 3)
+        return (Candidate("mine", RigidTransform.from_translation(shift)),)
+
+    def choose(self, rng, candidates):
+        return candidates[0]
+
+
+@dataclass(frozen=True)
+class Scores(Evidence):
+    """Prefers hypotheses with many objects; then changes the scores."""
+
+    change: Change = field(default=lambda s: s)
+
+    def log_score(self, hypotheses, clip):
+        return self.change(np.array([float(h.n_objects) for h in hypotheses]))
+
+
+#: Changes of scores (n,).
+SCORES: dict[str, tuple[Change, str]] = {
+    "none": (lambda s: None, "returns None"),
+    "list": (lambda s: s.tolist(), "returns a list"),
+    "text": (lambda s: "good", "returns a str"),
+    "texts": (lambda s: s.astype(str), "expected integers or floats"),
+    "number": (lambda s: s.sum(), "expected an array of shape"),
+    "one": (lambda s: s[:1] if len(s) > 1 else np.zeros(2), "expected shape"),
+    "column": (lambda s: s[:, None], "an axis too many"),
+    "matrix": (lambda s: np.outer(s, s), "expected shape"),
+    "object": (lambda s: s.astype(object), "type object"),
+    "bool": (lambda s: s > 2, "type bool"),
+    "complex": (lambda s: s.astype(complex), "type complex128"),
+    "generator": (lambda s: (x for x in s), "returns a generator"),
+    "tensor": (lambda s: torch_tensor(s, False), "tensor.detach().cpu().numpy()"),
+    "tensor with gradient": (lambda s: torch_tensor(s, True), "tensor.detach().cpu().numpy()"),
+    "nan": (lambda s: with_value(s, np.nan), "returns nan in 1 of"),
+    "inf": (lambda s: with_value(s, np.inf), "returns inf in 1 of"),
+    "-inf": (lambda s: with_value(s, -np.inf), "returns -inf in 1 of"),
+    "all -inf": (lambda s: np.full_like(s, -np.inf), "bound it from below"),
+    "exception": (one_over_zero, "my own fault"),
+}
+GOOD_SCORES: dict[str, Change] = {
+    "int": lambda s: s.astype(int),
+    "float32": lambda s: s.astype(np.float32),
+    "float16": lambda s: s.astype(np.float16),
+    "strided": lambda s: np.repeat(s, 2)[::2],
+}
+
+
+def faulty(interface: type, method: str, correct: Any, change: Change) -> Any:
+    """A component of an interface whose method changes the result of a correct component."""
+
+    def changed(self, *arguments, **named):
+        return change(getattr(correct, method)(*arguments, **named))
+
+    def unchanged(name):
+        return lambda self, *arguments: getattr(correct, name)(*arguments)
+
+    others = {name: unchanged(name) for name in interface.__abstractmethods__ if name != method}
+    return dataclass(frozen=True)(type("Faulty", (interface,), {method: changed, **others}))()
+
+
+class _Known:
+    """Correct parts without behaviour of their own."""
+
+    def track(self, clip, masks):
+        return list(masks)
+
+    def project(self, hypothesis, frame):
+        return hypothesis, 1.0
+
+    def divide(self, clip):
+        return np.zeros(clip.after.depth.shape, np.int32)
+
+    def log_odds(self, cells, weights, clip):
+        return np.zeros(len(cells.pairs))
+
+
+#: Interface, method, correct component, change, words.
+OTHERS: dict[str, tuple[type, str, Any, Change, str]] = {
+    "boundary 0..255": (BoundaryModel, "boundary", ColourDepthBoundary(), lambda b: 255 * b, "expected 0 to 1"),
+    "boundary axes": (BoundaryModel, "boundary", ColourDepthBoundary(), np.transpose, "axes exchanged"),
+    "boundary nan": (
+        BoundaryModel,
+        "boundary",
+        ColourDepthBoundary(),
+        lambda b: with_value(b, np.nan),
+        "returns nan",
+    ),
+    "boundary none": (BoundaryModel, "boundary", ColourDepthBoundary(), lambda b: None, "returns None"),
+    "tree none": (TreeBuilder, "build", LearnedTree(), lambda t: None, "expected a Tree"),
+    "tree parents": (TreeBuilder, "build", LearnedTree(), lambda t: t.parent, "expected a Tree"),
+    "values list": (CutValue, "values", MergeLogOdds(), np.ndarray.tolist, "returns a list"),
+    "values nan": (CutValue, "values", MergeLogOdds(), lambda w: with_value(w, np.nan), "returns nan"),
+    "values short": (CutValue, "values", MergeLogOdds(), lambda w: w[:-1], "expected shape"),
+    "cuts none": (CutSampler, "sample", ExactCuts(), lambda c: None, "expected a CutSample"),
+    "cuts few": (CutSampler, "sample", ExactCuts(), lambda c: replace(c, cuts=c.cuts[:-1]), "expected"),
+    "cuts partial": (
+        CutSampler,
+        "sample",
+        ExactCuts(),
+        lambda c: replace(c, cuts=tuple(cut[:-1] for cut in c.cuts)),
+        "no partition of the image",
+    ),
+    "masks none": (MaskTracker, "track", _Known(), lambda m: None, "returns None"),
+    "masks few": (MaskTracker, "track", _Known(), lambda m: m[:-1], "one for each input"),
+    "masks uint8": (MaskTracker, "track", _Known(), lambda m: [x.astype(np.uint8) for x in m], "expected bool"),
+    "masks axes": (MaskTracker, "track", _Known(), lambda m: [x.T for x in m], "axes exchanged"),
+    "masks stacked": (MaskTracker, "track", _Known(), np.array, "expected a list of masks"),
+    "registration matrix": (
+        Registration,
+        "register",
+        SmallGicp(),
+        lambda r: np.eye(4),
+        "expected a RegistrationResult",
+    ),
+    "registration scale": (
+        Registration,
+        "register",
+        SmallGicp(),
+        lambda r: None if r is None else replace(r, T=np.diag([2.0, 2, 2, 1])),
+        "its scale is 2",
+    ),
+    "projection alone": (Projection, "project", _Known(), lambda p: p[0], "expected a hypothesis and a share"),
+    "projection labels": (Projection, "project", _Known(), lambda p: (p[0].labels, 1.0), "expected a Hypothesis"),
+    "projection percent": (Projection, "project", _Known(), lambda p: (p[0], 98.0), "expected a number from 0 to 1"),
+    "projection nan": (Projection, "project", _Known(), lambda p: (p[0], np.nan), "expected a number from 0 to 1"),
+    "projection none": (Projection, "project", _Known(), lambda p: None, "returns None"),
+    "division floats": (Division, "divide", _Known(), lambda d: d.astype(float), "expected integers"),
+    "division axes": (Division, "divide", _Known(), np.transpose, "axes exchanged"),
+    "division flat": (Division, "divide", _Known(), np.ravel, "flattened"),
+    "pairs nan": (PairOdds, "log_odds", _Known(), lambda o: np.full_like(o, np.nan), "returns nan"),
+    "pairs short": (PairOdds, "log_odds", _Known(), lambda o: o[:-1], "expected shape"),
+    "pairs list": (PairOdds, "log_odds", _Known(), np.ndarray.tolist, "returns a list"),
+    "structure order": (Structure, "draw", SpanningTree(), lambda d: (d[0][:-1], []), "each vertex"),
+    "structure edge": (
+        Structure,
+        "draw",
+        SpanningTree(),
+        lambda d: (d[0], [(d[0][0], d[0][0])]),
+        "no edge of the graph",
+    ),
+    "structure backwards": (
+        Structure,
+        "draw",
+        SpanningTree(),
+        lambda d: (d[0], [(b, a) for a, b in d[1]]),
+        "painted after its parent",
+    ),
+    "structure none": (Structure, "draw", SpanningTree(), lambda d: None, "returns None"),
+}
+
+RULES: dict[str, tuple[MotionRule, str]] = {
+    "writes": (WritesIntoTheTrack(), "in place"),
+    "state": (RuleDependsOnCalls(), "keeps state"),
+    "own generator": (RuleDrawsFromItsOwn(), "does not come from `rng`"),
+    "far": (Moves(change=TOO_FAR), "moves an object too far: by 15 m"),
+}
+
+CORRECT = (Extrude(), MstRule(), Completes(), CompletesMany(), CompletesEach(), Moves(), Chooses(), Scores())
