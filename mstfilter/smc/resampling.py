@@ -128,13 +128,17 @@ def independent_draws(rng: Any, weights: np.ndarray, n: int) -> np.ndarray:
         return _searched(weights, ordered_uniforms(rng, n, weights.shape[:-1]))
     if weights.ndim == 2:
         return np.stack([independent_draws(g, w, n) for g, w in zip(rng.generators(), weights, strict=True)])
-    bits = 62 - max(n.bit_length() - 14, 0)  # strata of width 2^bits and up to 2^14 points, whose tables stay in cache
+    bits = 62 - max(
+        n.bit_length() - 14, 0
+    )  # strata of width 2^bits and up to 2^14 points, whose tables stay in cache
     limits = [k << bits for k in range((1 << (62 - bits)) + 1)]
     cumulative = _fixed_point(weights, limits[-1])
     stops = cumulative.searchsorted(limits, side="right").tolist()
     stops[-1] = int(cumulative.searchsorted(limits[-1]))
     sizes = rng.multinomial(n, np.full(len(limits) - 1, 1 / (len(limits) - 1))).tolist()
-    shift = bits - max(sizes).bit_length()  # log2 of the width of a bin; one to two bins for each point of the largest
+    shift = (
+        bits - max(sizes).bit_length()
+    )  # log2 of the width of a bin; one to two bins for each point of the largest
     below = np.empty((1 << (bits - shift)) + 1, np.int64)
     index, begin = np.empty(n, np.int64), 0
     for k, size in enumerate(sizes):
