@@ -1,4 +1,4 @@
-"""SMC samplers at equal cost, with and without waste_free, on a Gaussian with known evidence; writes waste_free.csv."""
+"""SMC samplers of equal cost, with and without waste_free, for a known evidence; writes waste_free.csv."""
 
 from __future__ import annotations
 

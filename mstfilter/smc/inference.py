@@ -32,6 +32,7 @@ import numpy as np
 from mstfilter.errors import InputError, LostRunError, check_integer, check_number
 from mstfilter.smc.batching import batch, batched_slots
 from mstfilter.smc.distributions import as_distribution
+from mstfilter.smc.export import Table, draws_tree, flat_columns
 from mstfilter.smc.filter import ParticleFilter
 from mstfilter.smc.interfaces import Distribution, Resampler
 from mstfilter.smc.population import Particles, Population
@@ -44,7 +45,7 @@ FilterOf = Callable[[np.ndarray], ParticleFilter]
 
 
 @dataclass(frozen=True, eq=False)
-class Chains:
+class Chains(Table):
     """Markov chains of parameters."""
 
     theta: np.ndarray  #: (n_iterations, n_chains, d) parameters after each iteration
@@ -53,6 +54,43 @@ class Chains:
     log_density: np.ndarray  #: (n_iterations, n_chains) log prior plus `log_evidence`
     accepted: np.ndarray  #: (n_chains,) share of accepted proposals
     paths: tuple[Particles, ...] = ()  #: of `particle_gibbs`: the path of states after each iteration
+
+    def __repr__(self) -> str:
+        n_iterations, n_chains, d = self.theta.shape
+        size = f"{n_iterations} iterations of {n_chains} chains, {d} parameters"
+        return f"Chains: {size}, accepted {self.accepted.min():.2f} to {self.accepted.max():.2f}"
+
+    def columns(self) -> dict[str, np.ndarray]:
+        """Columns of `to_pandas`: chain, draw, parameters, log evidence and log density, chain after chain."""
+        numbers = np.indices(self.log_density.shape)
+        arrays = {"chain": numbers[1], "draw": numbers[0], "theta": self.theta, **self._stats()}
+        return flat_columns({name: np.swapaxes(a, 0, 1) for name, a in arrays.items()}, axes=2)
+
+    def _stats(self) -> dict[str, np.ndarray]:
+        return {"log_evidence": self.log_evidence, "log_density": self.log_density}
+
+    def to_arviz(self, names: Sequence[str] = (), discard: int = 0) -> Any:
+        """The chains as an ``xarray.DataTree`` for ArviZ (see `mstfilter.smc.export`).
+
+        Parameters
+        ----------
+        names : sequence of str
+            One name per parameter. Default: one variable ``theta`` (chain, draw, d).
+        discard : int
+            Iterations left out at the beginning.
+
+        Returns
+        -------
+        xarray.DataTree
+            Groups ``posterior`` and ``sample_stats`` (``log_evidence``, and ``lp`` for the log density; none of
+            `particle_gibbs`, where they are unknown). Draws are equally weighted. Paths are left out.
+        """
+        theta = self.theta[discard:].swapaxes(0, 1)
+        if names and len(names) != theta.shape[2]:
+            raise InputError(f"there are {len(names)} names for {theta.shape[2]} parameters")
+        posterior = {name: theta[..., k] for k, name in enumerate(names)} or {"theta": theta}
+        stats = {name.replace("log_density", "lp"): a[discard:].T for name, a in self._stats().items()}
+        return draws_tree(posterior, {} if np.isnan(self.log_density).all() else stats)
 
     def autocorrelation_times(self, discard: int = 0) -> np.ndarray:
         """(d,) integrated autocorrelation times in iterations, by emcee, without the first `discard` iterations.

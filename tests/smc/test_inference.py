@@ -456,7 +456,7 @@ def test_the_evidence_of_a_fixed_schedule_is_unbiased(more):
 
 
 def test_waste_free_has_less_variance_at_equal_cost():
-    """In ten dimensions. The true ratio of the variances is 3; that of 30 runs each is below 1 with probability .002."""
+    """In ten dimensions. The ratio of the variances is 3; that of 30 runs is below 1 with probability .002."""
     sds, y = np.geomspace(0.1, 1.0, 10), np.linspace(-3.0, 3.0, 10)
     prior, calls, logs = Normal(np.zeros((1, 10)), 2.0), [0, 0], [[], []]
     for k, settings in enumerate(({"n": 100, "steps": 5}, {"n": 500, "steps": 99, "waste_free": True})):
