@@ -68,7 +68,7 @@ def main() -> None:
                 paths = backward_paths(rng, record, Dynamics(MODEL), n, **settings)
                 seconds, means = time.process_time() - start, [p.particles.mean() for p in paths]
                 # Theirs takes O(n^2) calls of Python with this method, so it runs in fewer rounds.
-                answer = peer(theirs, seed, n) if worker and theirs and (theirs != "ON2" or seed < 4) else {}
+                answer = peer(theirs, seed, n) if worker and theirs and (theirs != "ON2" or seed < 2) else {}
                 found[name].append((seconds, means, answer.get("seconds", np.nan), answer.get("means", np.nan)))
         exact = smoothed(ys)
 

@@ -91,7 +91,7 @@ ARMS = {
 
 
 #: Arms of --sizes, and their numbers of particles.
-FEW, SIZES = ("multinomial, always", "systematic"), (30, 100, 300, 1000)
+FEW, SIZES = ("multinomial, always", "systematic"), (30, 100, 300)
 
 
 def rows(n: int, many: int, single: int, arms: Iterable[str] = ARMS) -> Iterator[dict[str, object]]:
@@ -129,14 +129,14 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--smoke", action="store_true", help="few particles and runs")
     parser.add_argument("--out", type=Path, default=HERE / "results.csv")
-    parser.add_argument("--sizes", action="store_true", help="two schemes with 30 to 1000 particles: sizes.csv")
+    parser.add_argument("--sizes", action="store_true", help="two schemes with 30 to 300 particles: sizes.csv")
     options = parser.parse_args()
     if options.sizes and options.out == HERE / "results.csv":
         options.out = HERE / "sizes.csv"
     if options.smoke and options.out.resolve().parent == HERE:
         parser.error("--smoke would overwrite the results: name another file with --out")
     if options.sizes and not options.smoke:
-        found = [row for n in SIZES for row in rows(n, 4000, 400, FEW)]
+        found = [row for n in SIZES for row in rows(n, 3000, 150, FEW)]
     else:
         found = list(rows(*((20, 10, 3) if options.smoke else (400, 3000, 150))))
     write_csv(options.out, found, list(found[0]))
