@@ -128,25 +128,25 @@ def independent_draws(rng: Any, weights: np.ndarray, n: int) -> np.ndarray:
         return _searched(weights, ordered_uniforms(rng, n, weights.shape[:-1]))
     if weights.ndim == 2:
         return np.stack([independent_draws(g, w, n) for g, w in zip(rng.generators(), weights, strict=True)])
-    bits = 62 - max(
-        n.bit_length() - 14, 0
-    )  # strata of width 2^bits and up to 2^14 points, whose tables stay in cache
+    # Strata have width 2^bits and up to 2^14 points, so that their tables stay in cache.
+    bits = 62 - max(n.bit_length() - 14, 0)
     limits = [k << bits for k in range((1 << (62 - bits)) + 1)]
     cumulative = _fixed_point(weights, limits[-1])
     stops = cumulative.searchsorted(limits, side="right").tolist()
     stops[-1] = int(cumulative.searchsorted(limits[-1]))
     sizes = rng.multinomial(n, np.full(len(limits) - 1, 1 / (len(limits) - 1))).tolist()
-    shift = (
-        bits - max(sizes).bit_length()
-    )  # log2 of the width of a bin; one to two bins for each point of the largest
-    below = np.empty((1 << (bits - shift)) + 1, np.int64)
+    # log2 of the width of a bin; the largest stratum has one to two bins for each point.
+    shift = bits - max(sizes).bit_length()
+    n_bins = 1 << (bits - shift)
+    below = np.empty(n_bins + 1, np.int64)
     index, begin = np.empty(n, np.int64), 0
     for k, size in enumerate(sizes):
         points = rng.bit_generator.random_raw(size)  # of 64 bits
         points >>= np.uint64(64 - bits)
         points = points.view(np.int64)
         bins = (cumulative[stops[k] : stops[k + 1]] >> shift) - (limits[k] >> shift)
-        below[0], below[1:] = stops[k], np.bincount(bins, minlength=len(below) - 1)
+        counts = np.bincount(bins, minlength=n_bins)
+        below[0], below[1:] = stops[k], counts[:n_bins]  # an edge at the end of the stratum lies beyond its bins
         np.cumsum(below, out=below)
         found = index[begin : begin + size]
         below.take(points >> shift, out=found, mode="clip")
