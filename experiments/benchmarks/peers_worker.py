@@ -1,7 +1,8 @@
 """Measure `particles` 0.4 in a separate environment; run by speed.py, one command per line on standard input.
 
-Commands: ``filter SEED N`` (bootstrap AR(1)), and ``SCHEME SEED N`` or ``log:SCHEME SEED N`` (resampling N even
-weights, given normalised or as log weights); the answer is JSON. The first calls include compilation.
+Commands: ``filter SEED N`` (bootstrap AR(1)), ``backward:METHOD SEED N`` (N paths of a filter of N particles by the
+method ``backward_sampling_METHOD``), and ``SCHEME SEED N`` or ``log:SCHEME SEED N`` (resampling N even weights, given
+normalised or as log weights); the answer is JSON. The first calls include compilation.
 """
 
 from __future__ import annotations
@@ -30,21 +31,33 @@ class AR1(ssm.StateSpaceModel):
     def PY(self, t, xp, x):
         return dists.Normal(loc=x, scale=model["tau"])
 
+    def upper_bound_log_pt(self, t):
+        return -np.log(model["sigma"] * np.sqrt(2 * np.pi))
 
-def bootstrap(seed: int, n: int) -> tuple[float, float]:
+
+def bootstrap(seed: int, n: int, history: bool = False) -> tuple[float, particles.SMC]:
     np.random.seed(seed)  # noqa: NPY002 (its only generator)
-    data = np.array(model["ys"])
+    fk = ssm.Bootstrap(ssm=AR1(), data=np.array(model["ys"]))
     start = clock()
-    pf = particles.SMC(fk=ssm.Bootstrap(ssm=AR1(), data=data), N=n, resampling="systematic", ESSrmin=0.5)
+    pf = particles.SMC(fk=fk, N=n, resampling="systematic", ESSrmin=0.5, store_history=history)
     pf.run()
-    return clock() - start, float(pf.logLt)
+    return clock() - start, pf
+
+
+def backward(method: str, seed: int, n: int) -> dict:
+    _, pf = bootstrap(seed, n, history=True)
+    start = clock()
+    paths = getattr(pf.hist, f"backward_sampling_{method}")(n)
+    return {"seconds": clock() - start, "means": [float(x.mean()) for x in paths]}
 
 
 for line in sys.stdin:
     what, seed, n = line.split()
     if what == "filter":
-        seconds, log_evidence = bootstrap(int(seed), int(n))
-        answer = {"seconds": seconds, "log_evidence": log_evidence}
+        seconds, pf = bootstrap(int(seed), int(n))
+        answer = {"seconds": seconds, "log_evidence": float(pf.logLt)}
+    elif what.startswith("backward:"):
+        answer = backward(what.removeprefix("backward:"), int(seed), int(n))
     else:
         np.random.seed(int(seed))  # noqa: NPY002
         w = np.random.uniform(0.5, 1.5, int(n))  # noqa: NPY002

@@ -1,12 +1,12 @@
 """Variance of the log evidence and of a mean, estimated from one run, against that over many runs.
 
-python experiments/run_variance/run.py [--smoke] [--out results.csv]
+python experiments/run_variance/run.py [--smoke] [--sizes] [--out results.csv]
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -90,10 +90,15 @@ ARMS = {
 }
 
 
-def rows(n: int, many: int, single: int) -> Iterator[dict[str, object]]:
+#: Arms of --sizes, and their numbers of particles.
+FEW, SIZES = ("multinomial, always", "systematic"), (30, 100, 300)
+
+
+def rows(n: int, many: int, single: int, arms: Iterable[str] = ARMS) -> Iterator[dict[str, object]]:
     """For each model and scheme: the variance over seeds, and mean and spread of the estimates over it."""
     for model_name, (model, ys) in MODELS.items():
-        for arm, (scheme, trigger) in ARMS.items():
+        for arm in arms:
+            scheme, trigger = ARMS[arm]
             filter = bootstrap(model, n, scheme, trigger)
             runs = batch(filter, ys, range(many))
             means = [s.population.weights @ s.population.particles for s in runs.states if s is not None]
@@ -109,6 +114,7 @@ def rows(n: int, many: int, single: int) -> Iterator[dict[str, object]]:
                     yield {
                         "model": model_name,
                         "scheme": arm,
+                        "n": n,
                         "lag": "all" if lag is None else lag,
                         "of": what,
                         "variance": true[what],
@@ -123,10 +129,16 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--smoke", action="store_true", help="few particles and runs")
     parser.add_argument("--out", type=Path, default=HERE / "results.csv")
+    parser.add_argument("--sizes", action="store_true", help="two schemes with 30 to 300 particles: sizes.csv")
     options = parser.parse_args()
-    if options.smoke and options.out.resolve() == HERE / "results.csv":
+    if options.sizes and options.out == HERE / "results.csv":
+        options.out = HERE / "sizes.csv"
+    if options.smoke and options.out.resolve().parent == HERE:
         parser.error("--smoke would overwrite the results: name another file with --out")
-    found = list(rows(*((20, 10, 3) if options.smoke else (400, 3000, 150))))
+    if options.sizes and not options.smoke:
+        found = [row for n in SIZES for row in rows(n, 3000, 150, FEW)]
+    else:
+        found = list(rows(*((20, 10, 3) if options.smoke else (400, 3000, 150))))
     write_csv(options.out, found, list(found[0]))
     for row in found:
         print(*(f"{value:.3g}" if isinstance(value, float) else value for value in row.values()), sep="\t")

@@ -27,6 +27,7 @@
 `inference`             parameters of a model: PMMH, particle Gibbs, emcee, SMC samplers
 `diagnostics`           quantities of a run, energy distances, comparison of filters
 `evaluation`            coalescence and variance of a run
+`export`                tables of pandas, trees of xarray for ArviZ
 ======================  ===================================================================================
 """
 

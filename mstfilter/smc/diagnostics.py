@@ -35,11 +35,12 @@ from typing import Any
 
 import numpy as np
 
-from mstfilter.errors import InputError, LostRunError, MissingLibraryError, check_integer, naming
+from mstfilter.errors import InputError, LostRunError, check_integer, naming
 from mstfilter.files import atomic_path, check_output, folder_name, read_arrays
 from mstfilter.lazy import progress_of
 from mstfilter.smc.batching import batch, batched_slots
 from mstfilter.smc.checkpoint import digest
+from mstfilter.smc.export import Table, flat_columns, library
 from mstfilter.smc.filter import ParticleFilter
 from mstfilter.smc.interfaces import Info, State
 from mstfilter.smc.population import Population, as_matrix, union
@@ -164,7 +165,7 @@ def selection_distance(state: State, info: Info) -> float:
 
 
 @dataclass(frozen=True, eq=False)
-class History(Mapping[str, np.ndarray]):
+class History(Mapping[str, np.ndarray], Table):
     """Collected arrays by name."""
 
     values_: Mapping[str, np.ndarray]  #: name -> array whose first axes are `dims`
@@ -185,19 +186,34 @@ class History(Mapping[str, np.ndarray]):
     def __len__(self) -> int:
         return len(self.values_)
 
+    def __repr__(self) -> str:
+        shape = next(iter(self.values_.values()), np.zeros(0)).shape
+        sizes = ", ".join(f"{name} {size}" for name, size in zip(self.dims, shape, strict=False))
+        lines = [f"History: {sizes}" + f", {len(self.lost)} runs lost" * bool(self.lost)]
+        lines += [_summary(name, a) for name, a in self.values_.items()]
+        return "\n  ".join(lines if len(lines) <= 5 else [*lines[:4], "also " + ", ".join(list(self.values_)[3:])])
+
+    def columns(self) -> dict[str, np.ndarray]:
+        """Columns of `to_pandas`: the labels of the axes and the collected values, one row per step."""
+        shape = next(iter(self.values_.values()), np.zeros(0)).shape[: len(self.dims)]
+        labels = np.meshgrid(*(np.asarray(self.coords[name]) for name in self.dims), indexing="ij")
+        named = dict(zip(self.dims, labels, strict=True))
+        return flat_columns({**named, **self.values_}, axes=len(shape))
+
     def to_xarray(self) -> Any:
         """An ``xarray.Dataset`` with named dimensions; MissingLibraryError if xarray is not installed."""
-        try:
-            import xarray
-        except ImportError:
-            raise MissingLibraryError(
-                "to_xarray needs the library xarray, which is not installed", "pip install 'mstfilter[xarray]'"
-            ) from None
+        xarray = library("xarray")
         data = {
             name: ((*self.dims, *(f"{name}_{k}" for k in range(a.ndim - len(self.dims)))), a)
             for name, a in self.values_.items()
         }
         return xarray.Dataset(data, coords=dict(self.coords or {}))
+
+
+def _summary(name: str, a: np.ndarray) -> str:
+    """One line: name, shape and range of an array."""
+    found = a[np.isfinite(a)] if a.dtype.kind in "fiu" else a[:0]
+    return f"{name} {a.dtype} {a.shape}" + (f", {found.min():.4g} to {found.max():.4g}" if found.size else "")
 
 
 def collect(steps: Iterable[tuple[State, Info]], /, **collectors: Collector) -> History:

@@ -17,7 +17,8 @@ A model with parameters is a function that returns a filter:
   a density, that particle also draws its ancestors (Lindsten, Jordan, Schön 2014), without which the early states
   hardly change.
 - `smc_sampler` moves particles from the prior to the posterior of a likelihood that can be computed, by tempering
-  (Del Moral, Doucet, Jasra 2006). It estimates the evidence, and finds several modes.
+  (Del Moral, Doucet, Jasra 2006). It estimates the evidence, and finds several modes. ``waste_free=True`` uses all
+  states of the moves.
 """
 
 from __future__ import annotations
@@ -31,8 +32,9 @@ import numpy as np
 from mstfilter.errors import InputError, LostRunError, check_integer, check_number
 from mstfilter.smc.batching import batch, batched_slots
 from mstfilter.smc.distributions import as_distribution
+from mstfilter.smc.export import Table, draws_tree, flat_columns
 from mstfilter.smc.filter import ParticleFilter
-from mstfilter.smc.interfaces import Resampler
+from mstfilter.smc.interfaces import Distribution, Resampler
 from mstfilter.smc.population import Particles, Population
 from mstfilter.smc.resampling import Systematic
 from mstfilter.smc.smoothing import conditional_path
@@ -43,7 +45,7 @@ FilterOf = Callable[[np.ndarray], ParticleFilter]
 
 
 @dataclass(frozen=True, eq=False)
-class Chains:
+class Chains(Table):
     """Markov chains of parameters."""
 
     theta: np.ndarray  #: (n_iterations, n_chains, d) parameters after each iteration
@@ -52,6 +54,43 @@ class Chains:
     log_density: np.ndarray  #: (n_iterations, n_chains) log prior plus `log_evidence`
     accepted: np.ndarray  #: (n_chains,) share of accepted proposals
     paths: tuple[Particles, ...] = ()  #: of `particle_gibbs`: the path of states after each iteration
+
+    def __repr__(self) -> str:
+        n_iterations, n_chains, d = self.theta.shape
+        size = f"{n_iterations} iterations of {n_chains} chains, {d} parameters"
+        return f"Chains: {size}, accepted {self.accepted.min():.2f} to {self.accepted.max():.2f}"
+
+    def columns(self) -> dict[str, np.ndarray]:
+        """Columns of `to_pandas`: chain, draw, parameters, log evidence and log density, chain after chain."""
+        numbers = np.indices(self.log_density.shape)
+        arrays = {"chain": numbers[1], "draw": numbers[0], "theta": self.theta, **self._stats()}
+        return flat_columns({name: np.swapaxes(a, 0, 1) for name, a in arrays.items()}, axes=2)
+
+    def _stats(self) -> dict[str, np.ndarray]:
+        return {"log_evidence": self.log_evidence, "log_density": self.log_density}
+
+    def to_arviz(self, names: Sequence[str] = (), discard: int = 0) -> Any:
+        """The chains as an ``xarray.DataTree`` for ArviZ (see `mstfilter.smc.export`).
+
+        Parameters
+        ----------
+        names : sequence of str
+            One name per parameter. Default: one variable ``theta`` (chain, draw, d).
+        discard : int
+            Iterations left out at the beginning.
+
+        Returns
+        -------
+        xarray.DataTree
+            Groups ``posterior`` and ``sample_stats`` (``log_evidence``, and ``lp`` for the log density; none of
+            `particle_gibbs`, where they are unknown). Draws are equally weighted. Paths are left out.
+        """
+        theta = self.theta[discard:].swapaxes(0, 1)
+        if names and len(names) != theta.shape[2]:
+            raise InputError(f"there are {len(names)} names for {theta.shape[2]} parameters")
+        posterior = {name: theta[..., k] for k, name in enumerate(names)} or {"theta": theta}
+        stats = {name.replace("log_density", "lp"): a[discard:].T for name, a in self._stats().items()}
+        return draws_tree(posterior, {} if np.isnan(self.log_density).all() else stats)
 
     def autocorrelation_times(self, discard: int = 0) -> np.ndarray:
         """(d,) integrated autocorrelation times in iterations, by emcee, without the first `discard` iterations.
@@ -299,6 +338,7 @@ def smc_sampler(
     *,
     share: float = 0.5,
     steps: int = 5,
+    waste_free: bool = False,
     temperatures: Sequence[float] | None = None,
     scale: Any = None,
     resampler: Resampler = Systematic(),  # noqa: B008 (frozen)
@@ -319,6 +359,11 @@ def smc_sampler(
         The next temperature is the one at which the effective sample size falls to this share of `n`.
     steps : int
         Metropolis steps per temperature.
+    waste_free : bool
+        Keep all states of the moves (waste-free SMC; Dau and Chopin 2022): n / (`steps` + 1) particles are resampled,
+        and these and their states after each step are the next `n` particles. A temperature takes about `n`
+        evaluations of the likelihood instead of `steps` times `n`, so `n` and `steps` can be larger: for example
+        n = 5000 and steps = 99. `n` must be a multiple of `steps` + 1.
     temperatures : sequence of float, optional
         Increasing numbers above 0 that end with 1.
     scale : float, (d,) or (d, d) array_like, optional
@@ -331,35 +376,65 @@ def smc_sampler(
     planned = None if temperatures is None else [float(v) for v in temperatures]
     if planned is not None and (not planned or planned[-1] != 1 or (np.diff([0.0, *planned]) <= 0).any()):
         raise InputError(f"temperatures are {planned}, expected increasing numbers above 0 that end with 1")
-    prior, key = as_distribution(prior), Key(seed).child("tempering")
-    theta = prior.sample(key.child("initial").generator(), n)
-    population, log_l = Population(theta), _log_values(log_likelihood, theta)
+    if waste_free and n % (steps + 1):
+        raise InputError(f"n is {n}, expected a multiple of steps + 1 = {steps + 1}, as waste_free is True")
+    target, key = _Target(as_distribution(prior), log_likelihood), Key(seed).child("tempering")
+    theta = target.prior.sample(key.child("initial").generator(), n)
+    population, logs = Population(theta), target.logs(theta)
     reached, accepted = [0.0], []
     while reached[-1] < 1:
         streams = key.child(len(reached))
-        now = planned[len(reached) - 1] if planned else _next_temperature(population, log_l, reached[-1], share * n)
-        population = population.reweighted((now - reached[-1]) * log_l)
+        now = planned[len(reached) - 1] if planned else _next_temperature(population, logs[1], reached[-1], share * n)
+        population = population.reweighted((now - reached[-1]) * logs[1])
         root = _spread(population) if scale is None else _step_root(scale, theta[0].size)
-        population = resampler.resample(streams.child("resampler").generator(), population, n)
+        chosen = resampler.resample(
+            streams.child("resampler").generator(), population, n // (steps + 1) if waste_free else n
+        )
+        logs = logs[:, chosen.parents["ancestor"]]
         rng = streams.child("move").generator()
-        theta, log_l = population.particles, log_l[population.parents["ancestor"]]
-        log_prior, taken = prior.log_prob(theta), 0.0
-        for _ in range(steps):
-            step = rng.standard_normal((len(theta), len(root))) @ root.T
-            new = theta + step.reshape(theta.shape)
-            new_prior = np.asarray(prior.log_prob(new), np.float64)
-            new_l = np.full(len(new), -np.inf)
-            inside = new_prior > -np.inf
-            if inside.any():
-                new_l[inside] = _log_values(log_likelihood, new[inside])
-            yes = accept_moves(rng, new_prior - log_prior + now * (new_l - log_l))
-            theta, log_l = choose_rows(yes, new, theta), np.where(yes, new_l, log_l)
-            log_prior = np.where(yes, new_prior, log_prior)
-            taken += yes.mean() / steps
-        population = Population(theta, population.log_weights)
+        states, taken = target.moved(rng, chosen.particles, logs, now, root, steps)
+        kept = states if waste_free else states[-1:]
+        theta, logs = np.concatenate([x for x, _ in kept]), np.concatenate([values for _, values in kept], axis=1)
+        population = Population(theta, np.tile(chosen.log_weights, len(kept)))
         reached.append(now)
         accepted.append(taken)
     return TemperedSample(population, np.array(reached), np.array(accepted))
+
+
+@dataclass(frozen=True)
+class _Target:
+    """Prior times powers of a likelihood."""
+
+    prior: Distribution
+    log_likelihood: Callable[[np.ndarray], np.ndarray]
+
+    def logs(self, theta: np.ndarray) -> np.ndarray:
+        """(2, n) log prior and log likelihood, which is not evaluated where the prior is zero."""
+        log_prior, log_l = np.asarray(self.prior.log_prob(theta), np.float64), np.full(len(theta), -np.inf)
+        inside = log_prior > -np.inf
+        if inside.any():
+            log_l[inside] = _log_values(self.log_likelihood, theta[inside])
+        return np.stack([log_prior, log_l])
+
+    def moved(
+        self,
+        rng: np.random.Generator,
+        theta: np.ndarray,
+        logs: np.ndarray,
+        temperature: float,
+        root: np.ndarray,
+        steps: int,
+    ) -> tuple[list[tuple[np.ndarray, np.ndarray]], float]:
+        """States after 0 to `steps` Metropolis steps with their `logs`, and the share of accepted moves."""
+        states, taken = [(theta, logs)], 0.0
+        for _ in range(steps):
+            new = theta + (rng.standard_normal((len(theta), len(root))) @ root.T).reshape(theta.shape)
+            found = self.logs(new)
+            yes = accept_moves(rng, found[0] - logs[0] + temperature * (found[1] - logs[1]))
+            theta, logs = choose_rows(yes, new, theta), np.where(yes, found, logs)
+            states.append((theta, logs))
+            taken += yes.mean() / steps
+        return states, taken
 
 
 def _log_values(log_likelihood: Callable[[np.ndarray], np.ndarray], theta: np.ndarray) -> np.ndarray:

@@ -26,8 +26,6 @@ another one: `DensityTransition`, `WeightResampler`. Models and programs are mad
 
 from __future__ import annotations
 
-import importlib
-import importlib.util
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
@@ -38,6 +36,7 @@ import numpy as np
 
 from mstfilter.errors import InputError, check_integer
 from mstfilter.lazy import late, short_repr
+from mstfilter.smc.export import Table
 from mstfilter.smc.population import Population
 from mstfilter.smc.streams import Key
 
@@ -423,11 +422,11 @@ class Info:
 ARRAY_BYTES = 1 << 28  #: most bytes of arrays that the infos of a run keep by default
 
 
-class Infos(list[Info]):
+class Infos(list[Info], Table):
     """The records of the steps of a run: a list that can be read as a table.
 
     >>> state, infos = filter.run(observations)
-    >>> infos.table()                       # a data frame of pandas or polars if one is installed, else text (CSV)
+    >>> infos.to_pandas()                   # or polars.DataFrame(infos.columns())
     """
 
     removed = False  #: whether the arrays of the infos were removed because they exceeded `ARRAY_BYTES`
@@ -449,14 +448,10 @@ class Infos(list[Info]):
             for info in self
         ]
 
-    def table(self) -> Any:
-        """The rows as a data frame of pandas, or of polars, whichever is installed; else as text in CSV."""
+    def columns(self) -> dict[str, np.ndarray]:
+        """The `rows` by column."""
         rows = self.rows()
-        for library in ("pandas", "polars"):
-            if importlib.util.find_spec(library) is not None:
-                return importlib.import_module(library).DataFrame(rows)
-        lines = [",".join(rows[0])] if rows else []
-        return "\n".join([*lines, *(",".join(map(str, row.values())) for row in rows)])
+        return {name: np.array([row[name] for row in rows]) for name in (rows[0] if rows else ())}
 
     def __repr__(self) -> str:
         if not self:

@@ -28,6 +28,7 @@ import numpy as np
 
 from mstfilter.errors import InputError, LostRunError
 from mstfilter.lazy import late
+from mstfilter.smc.export import Table, draws_tree, flat_columns
 
 _T = TypeVar("_T")
 _U = TypeVar("_U")
@@ -188,7 +189,7 @@ def _within(index: np.ndarray, n: int) -> np.ndarray:
 
 
 @dataclass(frozen=True, eq=False)
-class Population:
+class Population(Table):
     """Weighted particles and their parents.
 
     Parameters
@@ -239,6 +240,43 @@ class Population:
 
     plot = late("mstfilter.report.display:plot_population", "Hypotheses by weight, or weighted histograms.")
     _repr_html_ = late("mstfilter.report.display:to_html", "What a notebook shows.")
+
+    def columns(self) -> dict[str, np.ndarray]:
+        """Columns of `to_pandas`: the particles, named as their arrays, else "x" or "particle"; weights."""
+        weights, columns = {"weight": self.weights, "log_weight": self.log_weights}, flat_columns(self._arrays())
+        if not weights.keys().isdisjoint(columns):
+            raise InputError(f"particles have arrays called {' and '.join(sorted(weights.keys() & columns))}")
+        return columns | weights
+
+    def _arrays(self) -> dict[str, np.ndarray]:
+        particles = self.realised().particles
+        if isinstance(particles, tuple):
+            objects = np.empty(len(particles), object)
+            objects[:] = particles
+            return {"particle": objects}
+        return dict(particles) if isinstance(particles, Mapping) else {"x": particles}
+
+    def to_arviz(self) -> Any:
+        """The particles as one chain of an ``xarray.DataTree``, with their weights (see `mstfilter.smc.export`)."""
+        if "particle" in self._arrays():
+            as_matrix(self.realised().particles)
+        posterior = {name: a[None] for name, a in self._arrays().items()}
+        named = {"weights": "sample_stats/log_weight"} if np.ptp(self.log_weights) else {}
+        return draws_tree(posterior, {"log_weight": self.log_weights[None]}, **named)
+
+    @classmethod
+    def from_arviz(cls, tree: Any) -> Population:
+        """All draws of a ``DataTree`` or of ArviZ's ``InferenceData``, with the weights of `to_arviz` if it has them.
+
+        Particles are a mapping of arrays; an array if the only variable is called "x".
+        """
+        by_name = {
+            str(name): a.transpose("chain", "draw", ...).values for name, a in tree["posterior"].data_vars.items()
+        }
+        particles = {name: a.reshape(-1, *a.shape[2:]) for name, a in by_name.items()}
+        stats = tree["sample_stats"].data_vars if "sample_stats" in tree else {}
+        population = cls(particles["x"] if set(particles) == {"x"} else particles)
+        return population.reweighted(stats["log_weight"].values.reshape(-1)) if "log_weight" in stats else population
 
     def __len__(self) -> int:
         return len(self.log_weights)

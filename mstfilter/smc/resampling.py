@@ -91,12 +91,12 @@ def ordered_uniforms(rng: np.random.Generator, n: int, rows: tuple[int, ...] = (
 
 
 def _fixed_point(weights: np.ndarray, total: int) -> np.ndarray:
-    """(m,) int64 cumulative weights that end at `total`, at most 2^62; overwrites `weights`.
+    """(m,) int64 cumulative weights that end at `total`, at most 2^62.
 
     Integers are added exactly, and four times as fast as floats.
     """
-    weights *= total / weights.sum()
-    cumulative = weights.astype(np.int64)
+    cumulative = np.empty(len(weights), np.int64)
+    np.multiply(weights, total / weights.sum(), out=cumulative, casting="unsafe")
     np.cumsum(cumulative, out=cumulative)
     if cumulative[-1] > total:
         np.minimum(cumulative, total, out=cumulative)
@@ -118,7 +118,7 @@ def _searched(weights: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 def independent_draws(rng: Any, weights: np.ndarray, n: int) -> np.ndarray:
-    """(n,) indices drawn independently by weight, in O(m + n); may overwrite `weights`.
+    """(n,) indices drawn independently by weight, in O(m + n).
 
     Many draws are distributed to strata of equal weight, and ascend from one stratum to the next only. Inside a
     stratum, the number of cumulative weights in lower bins is a lower bound of the index of a point, which is
@@ -128,23 +128,30 @@ def independent_draws(rng: Any, weights: np.ndarray, n: int) -> np.ndarray:
         return _searched(weights, ordered_uniforms(rng, n, weights.shape[:-1]))
     if weights.ndim == 2:
         return np.stack([independent_draws(g, w, n) for g, w in zip(rng.generators(), weights, strict=True)])
-    total = 1 << 62
-    cumulative = _fixed_point(weights, total)
-    n_strata = -(-n // _BLOCK)
-    limits = [total * k // n_strata for k in range(n_strata + 1)]
+    # Strata have width 2^bits and up to 2^14 points, so that their tables stay in cache.
+    bits = 62 - max(n.bit_length() - 14, 0)
+    limits = [k << bits for k in range((1 << (62 - bits)) + 1)]
+    cumulative = _fixed_point(weights, limits[-1])
     stops = cumulative.searchsorted(limits, side="right").tolist()
-    stops[-1] = int(cumulative.searchsorted(total))
+    stops[-1] = int(cumulative.searchsorted(limits[-1]))
+    sizes = rng.multinomial(n, np.full(len(limits) - 1, 1 / (len(limits) - 1))).tolist()
+    # log2 of the width of a bin; the largest stratum has one to two bins for each point.
+    shift = bits - max(sizes).bit_length()
+    n_bins = 1 << (bits - shift)
+    below = np.empty(n_bins + 1, np.int64)
     index, begin = np.empty(n, np.int64), 0
-    for k, size in enumerate(rng.multinomial(n, np.full(n_strata, 1 / n_strata)).tolist()):
-        width = limits[k + 1] - limits[k]
-        points = (rng.random(size) * width).astype(np.int64)
-        edges = cumulative[stops[k] : stops[k + 1]] - limits[k]
-        bin_width = max(width.bit_length() - size.bit_length() - 1, 0)  # log2; one to four bins for each point
-        below = np.bincount((edges >> bin_width) + 1, minlength=(width >> bin_width) + 2)
-        found = np.cumsum(below, out=below).take(points >> bin_width)
-        _increase(found, np.append(edges, total), points)
-        found += stops[k]
-        index[begin : begin + size] = found
+    for k, size in enumerate(sizes):
+        points = rng.bit_generator.random_raw(size)  # of 64 bits
+        points >>= np.uint64(64 - bits)
+        points = points.view(np.int64)
+        bins = (cumulative[stops[k] : stops[k + 1]] >> shift) - (limits[k] >> shift)
+        counts = np.bincount(bins, minlength=n_bins)
+        below[0], below[1:] = stops[k], counts[:n_bins]  # an edge at the end of the stratum lies beyond its bins
+        np.cumsum(below, out=below)
+        found = index[begin : begin + size]
+        below.take(points >> shift, out=found, mode="clip")
+        points += limits[k]
+        _increase(found, cumulative, points)
         begin += size
     return index
 
@@ -164,7 +171,7 @@ def _increase(index: np.ndarray, edges: np.ndarray, points: np.ndarray) -> None:
 
 
 def stratified_ancestors(weights: np.ndarray, uniforms: np.ndarray) -> np.ndarray:
-    """(n,) ancestors at the points (k + u_k) / n of the cumulative weights; may overwrite `weights`."""
+    """(n,) ancestors at the points (k + u_k) / n of the cumulative weights."""
     n = uniforms.shape[-1]
     if n < 1000:
         return _searched(weights, (np.arange(n) + uniforms) / n)
@@ -321,7 +328,7 @@ class Ssp(WeightResampler):
 
 def _one_particle_per_position(rng: np.random.Generator, m: int, n: int) -> np.ndarray:
     """(n,) particle that each position belongs to: floor(n / m) positions for each, one more for a random subset."""
-    particles = np.tile(np.arange(m), n // m)
+    particles = np.arange(m) if n == m else np.tile(np.arange(m), n // m)
     if n % m:
         particles = np.concatenate([particles, np.sort(rng.choice(m, n % m, replace=False, shuffle=False))])
     return particles

@@ -10,8 +10,8 @@ Three smoothers of a record return a tuple with one population per time:
   resamplings all paths share their beginning.
 - `fixed_lag` follows the ancestors of the particles `lag` steps later (Kitagawa and Sato 2001): more distinct
   particles, and a bias if the state depends on observations more than `lag` steps later.
-- `backward_paths` draws paths backwards by the density of the transition (Godsill, Doucet, West 2004, FFBSi). No path
-  degeneracy, at the cost of n densities per path and step.
+- `backward_paths` draws paths backwards by the density of the transition (Godsill, Doucet, West 2004, FFBSi), without
+  path degeneracy. A step takes N densities per path, or a few with ``method="mcmc"`` or ``"rejection"``.
 
 They are valid for any filter with proper weights: guided, auxiliary, with moves, resampled before or after.
 
@@ -26,11 +26,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal, get_args
 
 import numpy as np
 
-from mstfilter.errors import InputError, check_component, check_integer
+from mstfilter.errors import InputError, check_choice, check_component, check_integer, check_number
 from mstfilter.smc.distributions import as_distribution
 from mstfilter.smc.filter import ParticleFilter
 from mstfilter.smc.interfaces import DensityTransition, State, Transition
@@ -38,10 +38,11 @@ from mstfilter.smc.population import Particles, Population, count_particles, tak
 from mstfilter.smc.programs.filters import ProgramInitial, ProgramTransition, run_program
 from mstfilter.smc.programs.handlers import GuideHandler, ReplayHandler, SampleHandler, ScoreHandler, Site
 from mstfilter.smc.programs.sites import PerParticle
-from mstfilter.smc.resampling import Multinomial
+from mstfilter.smc.resampling import Multinomial, independent_draws
 from mstfilter.smc.state_space import Dynamics, GuidedInitial, GuidedTransition, Prior
 from mstfilter.smc.streams import Key, child
 
+BackwardMethod = Literal["exact", "mcmc", "rejection"]
 #: Pairs of particles per call of `log_prob`.
 _PAIRS = 1_000_000
 
@@ -113,48 +114,146 @@ def _traced(record: Record, end: int, begin: int) -> tuple[Population, ...]:
 
 
 def backward_paths(
-    rng: np.random.Generator, record: Record, transition: DensityTransition, n: int
+    rng: np.random.Generator,
+    record: Record,
+    transition: DensityTransition,
+    n: int,
+    method: BackwardMethod = "exact",
+    *,
+    steps: int = 1,
+    log_bound: float | None = None,
 ) -> tuple[Population, ...]:
     """Draw `n` equally weighted paths from the smoothing distribution: row k of all populations is a path.
 
-    `transition` is that of the model, ``Dynamics(model)``. A guided transition cannot be used: its density is that of
-    its proposal. The parents of the record are not needed.
+    The predecessor of a state x_{t+1} is particle i at time t with probability proportional to w_i f(x_{t+1} | x_i).
+
+    Parameters
+    ----------
+    transition : DensityTransition
+        That of the model, ``Dynamics(model)``. A guided transition cannot be used: its density is that of its
+        proposal.
+    method : "exact", "mcmc" or "rejection"
+        "exact" (Godsill, Doucet, West 2004) evaluates the densities of all N particles for each path: n N per step.
+
+        "rejection" (Douc, Garivier, Moulines, Olsson 2011) draws particles by weight and accepts them with
+        probability f / max f. The law is that of "exact". A path that has accepted none of N particles is drawn as by
+        "exact" (Dau and Chopin 2023), so a step takes at most about 2 n N densities; on average n times the mean of
+        max f / p(x_{t+1} | y_0 .. y_t).
+
+        "mcmc" (Bunch and Godsill 2013) starts at the parent of x_{t+1} in the record and makes independent Metropolis
+        steps, which leave the law of "exact" invariant: (1 + `steps`) n densities. It needs a record with parents.
+        The steps need not converge: a parent has the law of "exact" already, given x_{t+1}, after independent
+        selections of a bootstrap filter, and up to order 1 / N after others, so there is no further bias
+        (Dau and Chopin 2023). Steps reduce the variance: without accepted steps, paths are those of `genealogy`.
+    steps : int
+        Metropolis steps of "mcmc".
+    log_bound : float
+        For "rejection": an upper bound of ``transition.log_prob``. InputError if a density exceeds it.
     """
     check_component("transition", transition, DensityTransition)
     check_integer("n", n)
+    kernel = _Backward(method, steps, log_bound)
     last = record.populations[-1].realised()
-    index = _drawn(rng, np.broadcast_to(last.log_weights, (n, len(last))))
+    index = _by_weight(rng, last, n)
     path = [Population(take(last.particles, index))]
     for t in range(len(record) - 2, -1, -1):
         population, y = record.populations[t].realised(), record.observations[t + 1]
-        index = _predecessors(rng, population, path[-1].particles, transition, y, t)
-        path.append(Population(take(population.particles, index[:, 0])))
+        parents = record.parents(t + 1)[index] if method == "mcmc" else None
+        move = _Move(population, path[-1].particles, transition, y, t)
+        index = kernel.draw(rng, move, parents, 1)[:, 0]
+        path.append(Population(take(population.particles, index)))
     return tuple(reversed(path))
 
 
-def _predecessors(
-    rng: np.random.Generator,
-    population: Population,
-    later: Particles,
-    transition: DensityTransition,
-    y: Any,
-    t: int,
-    n_draws: int = 1,
-) -> np.ndarray:
-    """(n, n_draws) indices in the population at time t, by weight times density of the move to n later particles."""
-    n, m = count_particles(later), len(population)
-    index = np.empty((n, n_draws), np.int64)
-    block = max(1, _PAIRS // m)
-    for begin in range(0, n, block):
-        rows = np.arange(begin, min(begin + block, n))
-        old = take(population.particles, np.tile(np.arange(m), len(rows)))
-        density = np.asarray(transition.log_prob(old, take(later, np.repeat(rows, m)), y), dtype=np.float64)
-        if density.shape != (len(rows) * m,):
-            raise InputError(f"log_prob returned shape {density.shape}, expected ({len(rows) * m},)")
-        log_weights = population.log_weights + density.reshape(len(rows), m)
-        for k in range(n_draws):
-            index[rows, k] = _drawn(rng, log_weights, t)
-    return index
+@dataclass(frozen=True)
+class _Move:
+    """All moves from a population at time t to n later particles."""
+
+    population: Population
+    later: Particles
+    transition: DensityTransition
+    y: Any
+    t: int
+
+    def log_density(self, index: np.ndarray, rows: np.ndarray | None = None) -> np.ndarray:
+        """(k,) log density of the moves from particles `index` to the later ones at `rows` (default: all)."""
+        later = self.later if rows is None else take(self.later, rows)
+        found = self.transition.log_prob(take(self.population.particles, index), later, self.y)
+        density = np.asarray(found, dtype=np.float64)
+        if density.shape != index.shape:
+            raise InputError(f"log_prob returned shape {density.shape}, expected {index.shape}")
+        if not (density < np.inf).all():
+            raise _impossible(self.t)
+        return density
+
+    def exact(self, rng: np.random.Generator, rows: np.ndarray, n_draws: int) -> np.ndarray:
+        """(k, n_draws) indices of predecessors of the later particles at `rows`."""
+        m = len(self.population)
+        index, block = np.empty((len(rows), n_draws), np.int64), max(1, _PAIRS // m)
+        for begin in range(0, len(rows), block):
+            some = rows[begin : begin + block]
+            density = self.log_density(np.tile(np.arange(m), len(some)), np.repeat(some, m))
+            log_weights = self.population.log_weights + density.reshape(-1, m)
+            for k in range(n_draws):
+                index[begin : begin + block, k] = _drawn(rng, log_weights, self.t)
+        return index
+
+    def metropolis(self, rng: np.random.Generator, parents: np.ndarray, steps: int, n_draws: int) -> np.ndarray:
+        """(n, n_draws) states of chains that start at the parents, every `steps` steps."""
+        index, density, draws = parents, self.log_density(parents), []
+        if not (density > -np.inf).all():
+            raise _impossible(self.t)
+        for _ in range(n_draws):
+            for _ in range(steps):
+                new = _by_weight(rng, self.population, len(index))
+                found = self.log_density(new)
+                yes = found - density > -rng.standard_exponential(len(new))  # minus the log of a uniform
+                index, density = np.where(yes, new, index), np.where(yes, found, density)
+            draws.append(index)
+        return np.stack(draws, axis=1)
+
+    def rejected(self, rng: np.random.Generator, n: int, log_bound: float) -> np.ndarray:
+        """(n,) indices of predecessors of the n later particles, by rejection."""
+        index, left, trials = np.empty(n, np.int64), np.arange(n), 0
+        while len(left) and trials < len(self.population):
+            each = max(1, n // len(left))  # a round evaluates at most n densities
+            new = _by_weight(rng, self.population, each * len(left)).reshape(len(left), each)
+            density = self.log_density(new.ravel(), np.repeat(left, each))
+            if density.max() > log_bound + 1e-9 * (1 + abs(log_bound)):
+                raise InputError(
+                    f"step {self.t}: the log density of a move is {density.max()}, more than log_bound = {log_bound}"
+                )
+            accepted = (density - log_bound > -rng.standard_exponential(len(density))).reshape(new.shape)
+            first, some = accepted.argmax(axis=1), accepted.any(axis=1)
+            index[left[some]] = new[some, first[some]]
+            left, trials = left[~some], trials + each
+        if len(left):
+            index[left] = self.exact(rng, left, 1)[:, 0]
+        return index
+
+
+@dataclass(frozen=True)
+class _Backward:
+    """Draws predecessors of later particles; the fields are arguments of `backward_paths`."""
+
+    method: BackwardMethod
+    steps: int
+    log_bound: float | None
+
+    def __post_init__(self) -> None:
+        check_choice("method", self.method, get_args(BackwardMethod))
+        check_integer("steps", self.steps)
+        if self.method == "rejection":
+            check_number("log_bound", self.log_bound)
+
+    def draw(self, rng: np.random.Generator, move: _Move, parents: np.ndarray | None, n_draws: int) -> np.ndarray:
+        """(n, n_draws) indices; `parents` (n,) of the later particles are for "mcmc"."""
+        if parents is not None:
+            return move.metropolis(rng, parents, self.steps, n_draws)
+        n = count_particles(move.later)
+        if self.log_bound is not None and self.method == "rejection":
+            return np.stack([move.rejected(rng, n, self.log_bound) for _ in range(n_draws)], axis=1)
+        return move.exact(rng, np.arange(n), n_draws)
 
 
 def paris(
@@ -164,12 +263,16 @@ def paris(
     transition: DensityTransition,
     seed: int = 0,
     n_draws: int = 2,
+    method: BackwardMethod = "exact",
+    *,
+    steps: int = 1,
+    log_bound: float | None = None,
 ) -> Iterator[np.ndarray]:
     """Smoothed means of an additive functional, online (PaRIS; Olsson and Westerborn 2017, algorithm 2).
 
     After each observation it yields E[h_0(x_0) + h_1(x_0, x_1) + .. + h_t(x_{t-1}, x_t) | y_0 .. y_t]. Only the last
     population is kept, with one statistic per particle: the mean over `n_draws` predecessors drawn backwards. A step
-    takes n^2 densities.
+    takes n^2 densities, with "mcmc" (1 + `steps` `n_draws`) n.
 
     Parameters
     ----------
@@ -181,6 +284,8 @@ def paris(
         The transition of the model, ``Dynamics(model)``.
     n_draws : int
         At least 2: with one the variance grows as that of the genealogy.
+    method, steps, log_bound
+        As in `backward_paths`.
 
     Yields
     ------
@@ -190,6 +295,7 @@ def paris(
     check_integer("n_draws", n_draws)
     if not filter.properly_weighted:
         raise InputError("a component of the filter is not properly weighted: its smoothed means have another limit")
+    kernel = _Backward(method, steps, log_bound)
     past: Population | None = None
     statistic = np.zeros(0)
     state = filter.start(seed)
@@ -201,7 +307,9 @@ def paris(
             statistic = np.asarray(functional(t, None, now.particles), np.float64)
         else:
             rng = Key(seed).child("paris", t).generator()
-            index = _predecessors(rng, past, now.particles, transition, y, t - 1, n_draws).ravel()
+            parents = known_parents(now, t) if method == "mcmc" else None
+            move = _Move(past, now.particles, transition, y, t - 1)
+            index = kernel.draw(rng, move, parents, n_draws).ravel()
             later = take(now.particles, np.repeat(np.arange(len(now)), n_draws))
             statistic = statistic[index] + functional(t, take(past.particles, index), later)
             statistic = statistic.reshape(len(now), n_draws, *statistic.shape[1:]).mean(axis=1)
@@ -209,20 +317,31 @@ def paris(
         yield np.tensordot(now.weights, statistic, axes=1)
 
 
+def _by_weight(rng: np.random.Generator, population: Population, n: int) -> np.ndarray:
+    """(n,) indices drawn independently by weight, in random order: those of `independent_draws` are nearly sorted."""
+    index = independent_draws(rng, population.weights, n)
+    rng.shuffle(index)
+    return index
+
+
 def _drawn(rng: np.random.Generator, log_weights: np.ndarray, t: int | None = None) -> np.ndarray:
     """Draw one index per row of (n, m) log weights."""
     top = log_weights.max(axis=1, keepdims=True)
     if not np.isfinite(top).all():
-        where = "" if t is None else f"from step {t} to {t + 1}: "
-        raise InputError(
-            f"{where}a particle has no possible predecessor, or a density is NaN or +inf",
-            "backward paths need the density of the transition that moved the particles",
-        )
+        raise _impossible(t)
     cumulative = np.cumsum(np.exp(log_weights - top), axis=1)
     points = rng.random((len(cumulative), 1)) * cumulative[:, -1:]
     # The index is the number of entries at or below the point; "at" skips weights of zero.
     index = (cumulative <= points).sum(axis=1)
     return np.minimum(index, (cumulative < cumulative[:, -1:]).sum(axis=1))
+
+
+def _impossible(t: int | None) -> InputError:
+    where = "" if t is None else f"from step {t} to {t + 1}: "
+    return InputError(
+        f"{where}a particle has no possible predecessor, or a density is NaN or +inf",
+        "backward paths need the density of the transition that moved the particles",
+    )
 
 
 def conditional_path(

@@ -61,6 +61,19 @@ def test_benchmark_of_the_networks(tmp_path):
     assert len(rows) == 3 and all(float(row["ms"]) > 0 and float(row["ratio"]) > 0 for row in rows)
 
 
+def test_smoothing(tmp_path):
+    run_script("benchmarks/smoothing.py", "--smoke", "--out", tmp_path / "smoothing.csv")
+    rows = {row["method"]: float(row["rms_error"]) for row in read_csv(tmp_path / "smoothing.csv")}
+    assert list(rows) == ["exact", "rejection", "mcmc", "mcmc, 3 steps", "genealogy"]
+    assert all(0 < error < 0.5 for error in rows.values())
+
+
+def test_waste_free(tmp_path):
+    run_script("benchmarks/waste_free.py", "--smoke", "--out", tmp_path / "waste_free.csv")
+    without, waste_free = read_csv(tmp_path / "waste_free.csv")
+    assert float(waste_free["evaluations"]) > 20 and without["waste_free"] == "False"
+
+
 def test_partition_fit(tmp_path):
     """What is known of a pair beats knowing nothing (log 2), and weighing the past limits what a wrong one costs."""
     run_script("partition_fit/run.py", "--smoke", "--out", tmp_path)

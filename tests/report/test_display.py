@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import re
-import sys
 from html.parser import HTMLParser
-from types import ModuleType
 
 import numpy as np
 import pytest
@@ -151,20 +149,6 @@ def test_plots():
         assert figure._repr_png_().startswith(b"\x89PNG")
     bars = STATE.population.plot().axes[0].patches
     assert sum(bar.get_height() for bar in bars) == pytest.approx(1)
-
-
-def test_infos_as_a_table(monkeypatch):
-    assert isinstance(INFOS, list)
-    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    head, *lines = INFOS.table().splitlines()
-    assert head.startswith("t,n,n_candidates,ess,resampled,unique_ancestors,seconds,")
-    assert [line.split(",")[0] for line in lines] == ["0", "1"]
-    fake = ModuleType("polars")
-    fake.DataFrame = lambda rows: ("frame", rows)
-    monkeypatch.setitem(sys.modules, "polars", fake)
-    monkeypatch.setattr("importlib.util.find_spec", lambda name: name if name == "polars" else None)
-    assert INFOS.table() == ("frame", INFOS.rows())
-    assert Infos().rows() == []
 
 
 def test_progress_is_shown_if_asked(tmp_path, capsys):

@@ -433,8 +433,9 @@ def log_likelihood(theta):
     return -0.5 * ((POINTS - theta[:, None]) ** 2).sum(axis=(1, 2)) - 6 * np.log(2 * np.pi)
 
 
-def test_a_tempered_sampler_finds_posterior_and_evidence():
-    runs = [smc_sampler(NORMAL_PRIOR, log_likelihood, 400, seed) for seed in range(20)]
+@pytest.mark.parametrize("settings", [{"n": 400}, {"n": 2000, "steps": 39, "waste_free": True}])
+def test_a_tempered_sampler_finds_posterior_and_evidence(settings):
+    runs = [smc_sampler(NORMAL_PRIOR, log_likelihood, seed=seed, **settings) for seed in range(20)]
     means = np.array([r.population.weights @ r.population.particles for r in runs])
     spread = np.array([np.cov(r.population.particles.T, aweights=r.population.weights) for r in runs])
     np.testing.assert_allclose(means.mean(axis=0), POINTS.sum(axis=0) / 6.25, atol=5 * 0.4 / np.sqrt(400 * 20 / 4))
@@ -445,12 +446,38 @@ def test_a_tempered_sampler_finds_posterior_and_evidence():
         assert len(run.accepted) == len(run.temperatures) - 1 and (run.accepted > 0.1).all()
 
 
-def test_the_evidence_of_a_fixed_schedule_is_unbiased():
-    settings = {"temperatures": [0.05, 0.25, 1.0], "scale": 0.6, "steps": 2}
-    logs = [smc_sampler(NORMAL_PRIOR, log_likelihood, 50, seed, **settings).log_evidence for seed in range(150)]
+@pytest.mark.parametrize("more", [{"n": 50, "steps": 2}, {"n": 120, "steps": 11, "waste_free": True}])
+def test_the_evidence_of_a_fixed_schedule_is_unbiased(more):
+    settings = {"temperatures": [0.05, 0.25, 1.0], "scale": 0.6, **more}
+    logs = [smc_sampler(NORMAL_PRIOR, log_likelihood, seed=seed, **settings).log_evidence for seed in range(150)]
     ratio = np.exp(np.array(logs) - EVIDENCE)
     assert abs(ratio.mean() - 1) < 5 * ratio.std(ddof=1) / np.sqrt(150)
     assert ratio.std() < 0.6
+
+
+def test_waste_free_has_less_variance_at_equal_cost():
+    """In ten dimensions. The ratio of the variances is 3; that of 30 runs is below 1 with probability .002."""
+    sds, y = np.geomspace(0.1, 1.0, 10), np.linspace(-3.0, 3.0, 10)
+    prior, calls, logs = Normal(np.zeros((1, 10)), 2.0), [0, 0], [[], []]
+    for k, settings in enumerate(({"n": 100, "steps": 5}, {"n": 500, "steps": 99, "waste_free": True})):
+
+        def log_l(theta, k=k):
+            calls[k] += len(theta)
+            return -0.5 * (((y - theta) / sds) ** 2).sum(axis=1)
+
+        logs[k] = [smc_sampler(prior, log_l, seed=seed, **settings).log_evidence for seed in range(30)]
+    assert 0.9 < calls[1] / calls[0] < 1.1
+    assert np.var(logs[0]) > np.var(logs[1])
+
+
+def test_waste_free_keeps_every_state_of_the_chains():
+    """120 particles are 10 chains of 12 states, which differ by accepted steps only."""
+    settings = {"temperatures": [1.0], "scale": 0.3, "steps": 11, "waste_free": True}
+    run = smc_sampler(NORMAL_PRIOR, log_likelihood, 120, 3, **settings)
+    states = run.population.particles.reshape(12, 10, 2)
+    moved = (states[1:] != states[:-1]).all(axis=2)
+    assert moved.mean() == pytest.approx(run.accepted[0]) and 0.2 < run.accepted[0] < 0.95
+    assert np.abs(np.diff(states, axis=0)).max() < 0.3 * 5 and len(set(run.population.log_weights)) == 1
 
 
 def test_a_tempered_sampler_finds_both_modes():
@@ -473,6 +500,7 @@ def test_what_a_tempered_sampler_rejects():
         ({"temperatures": [0.5, 0.5, 1.0]}, "temperatures are"),
         ({"share": 1.5}, "share is 1.5"),
         ({"n": 1}, "n is 1"),
+        ({"waste_free": True}, "n is 20, expected a multiple of steps . 1 = 6"),
         ({"log_likelihood": lambda theta: np.zeros(3)}, r"log likelihood has shape \(3,\)"),
         ({"log_likelihood": lambda theta: np.full(len(theta), np.nan)}, "maximum nan"),
     ):

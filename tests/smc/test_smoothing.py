@@ -1,25 +1,30 @@
 """Smoothers against the exact answers: RTS and the joint Gaussian, and all paths of a hidden chain.
 
-Means over independent runs at 5 standard errors and a bias of order 1 / n: false alarm below 1e-4 for the file.
+Means over independent runs at 5 standard errors and a bias of order 1 / n, chi-square tests at 1e-5: false alarm
+below 1e-3 for the file.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import cache
 from itertools import pairwise, product
 
 import numpy as np
 import pytest
+from scipy import stats
 
 from mstfilter.errors import InputError
 from mstfilter.smc import (
     Always,
+    DensityTransition,
     Dynamics,
     GuidedTransition,
     LargestWeights,
     Population,
     Proposal,
     RandomWalkMove,
+    Record,
     auxiliary,
     backward_paths,
     bootstrap,
@@ -97,6 +102,90 @@ FILTERS = {
 }
 
 
+BOUND = -np.log(SIGMA * np.sqrt(2 * np.pi))
+METHODS = {
+    "exact": {},
+    "rejection": {"method": "rejection", "log_bound": BOUND},
+    "mcmc": {"method": "mcmc"},
+    "mcmc, 4 steps": {"method": "mcmc", "steps": 4},
+}
+
+
+@pytest.mark.parametrize("name", FILTERS)
+@pytest.mark.parametrize("method", list(METHODS)[1:])
+def test_backward_sampling_in_linear_time_agrees_with_the_joint_gaussian(name, method):
+    drawn = []
+    for seed in range(60):
+        paths = backward_paths(
+            np.random.default_rng(seed), recorded(name, seed), Dynamics(AR1), 100, **METHODS[method]
+        )
+        drawn.append(moments(paths))
+    assert agrees(drawn, N)
+
+
+@cache
+def recorded(name, seed):
+    return keep(FILTERS[name], YS, seed)
+
+
+def small_record():
+    """Four particles of a hidden chain over three steps, with unequal weights and a parent that is unlikely."""
+    model, states = hmm("vector"), [[0, 1, 2, 2], [2, 0, 1, 1], [1, 2, 0, 2]]
+    weights, parents = [[0.5, 0.1, 0.3, 0.1], [0.2, 0.4, 0.0, 0.4], [0.1, 0.2, 0.3, 0.4]], [0, 3, 1, 1]
+    with np.errstate(divide="ignore"):
+        populations = [
+            Population(np.array(k), np.log(w), {} if t == 0 else {"previous": np.array(parents)})
+            for t, (k, w) in enumerate(zip(states, weights, strict=True))
+        ]
+    moves = [MOVES[np.ix_(a, b)].T * np.array(w) for (a, b), w in zip(pairwise(states), weights, strict=False)]
+    return Record(tuple(populations), (0, 1, 2)), Dynamics(model), moves, parents
+
+
+def independent_metropolis(target, weights, steps):
+    """(m, m) transition matrix of the chain that proposes by weight."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = target / weights
+        accepted = np.nan_to_num(np.minimum(1.0, ratio[None] / ratio[:, None]))
+    kernel = weights / weights.sum() * accepted
+    kernel += np.diag(1 - kernel.sum(axis=1))
+    return np.linalg.matrix_power(kernel, steps)
+
+
+@pytest.mark.parametrize("method", ["exact", "rejection", "mcmc", "mcmc, 4 steps"])
+def test_the_law_of_a_path_given_the_record(method):
+    """Chi-square over all 64 paths of indices, 20,000 paths; the law of the Markov chain is enumerated."""
+    record, dynamics, moves, parents = small_record()
+    marked = Record(
+        tuple(replace(p, particles=np.arange(4) + 10 * t) for t, p in enumerate(record.populations)), (0, 1, 2)
+    )
+    states = np.concatenate([p.particles for p in record.populations])
+
+    class Marked(DensityTransition):
+        def predict(self, rng, population, observation):
+            raise NotImplementedError
+
+        def log_prob(self, previous, new, observation):
+            return dynamics.log_prob(*(states[4 * (x // 10) + x % 10] for x in (previous, new)), observation)
+
+    rng, n = np.random.default_rng(5), 20_000
+    found = backward_paths(
+        rng, marked, Marked(), n, **METHODS[method] | ({"log_bound": np.log(0.8)} if method == "rejection" else {})
+    )
+    index = np.array([p.particles % 10 for p in found])
+    steps = METHODS[method].get("steps", 1)
+    wanted = record.populations[2].weights
+    for t in (1, 0):
+        weights, back = record.populations[t].weights, moves[t] / moves[t].sum(axis=1, keepdims=True)
+        if "mcmc" in method:
+            back = np.array([independent_metropolis(back[j], weights, steps)[parents[j]] for j in range(4)])
+        wanted = wanted[..., None] * back[(None,) * (wanted.ndim - 1)]
+    counts = np.bincount(16 * index[2] + 4 * index[1] + index[0], minlength=64)
+    expected = n * wanted.ravel()
+    assert counts[expected < 1e-9].sum() == 0
+    some = expected >= 1e-9
+    assert stats.chi2.sf((((counts - expected) ** 2)[some] / expected[some]).sum(), some.sum() - 1) > 1e-5
+
+
 @pytest.mark.parametrize("name", FILTERS)
 def test_smoothers_agree_with_the_joint_gaussian(name):
     traced, drawn = [], []
@@ -130,11 +219,13 @@ def path_sums(t, previous, x):
     return np.stack([x, np.zeros(len(x)) if previous is None else previous * x], axis=1)
 
 
+@pytest.mark.parametrize("method", ["exact", "rejection", "mcmc"])
 @pytest.mark.parametrize("name", ["bootstrap", "after", "guided"])
-def test_paris_agrees_with_the_joint_gaussian(name):
+def test_paris_agrees_with_the_joint_gaussian(name, method):
     """Sums over the whole path, at the end and at an earlier time (given the observations so far)."""
     filter = replace(FILTERS[name], n=60)
-    runs = np.array([list(paris(filter, YS, path_sums, Dynamics(AR1), seed)) for seed in range(30)])
+    runs = [list(paris(filter, YS, path_sums, Dynamics(AR1), seed, **METHODS[method])) for seed in range(30)]
+    runs = np.array(runs)
     assert runs.shape == (30, T, 2)
     mean, _, neighbours = smoothed()
     wanted = np.array([mean.sum(), (neighbours + mean[1:] * mean[:-1]).sum()])
@@ -144,11 +235,12 @@ def test_paris_agrees_with_the_joint_gaussian(name):
     assert abs(first.mean() - kalman_ar1(YS)[0][0, 0]) < 5 * first.std(ddof=1) / np.sqrt(30) + 1 / 60
 
 
-def test_paris_has_less_variance_than_the_genealogy():
+@pytest.mark.parametrize("method", ["exact", "rejection", "mcmc"])
+def test_paris_has_less_variance_than_the_genealogy(method):
     """With resampling at every step over 40 observations."""
     ys, filter, sums = ar1_observations(40), bootstrap(AR1, 30, trigger=Always()), []
     for seed in range(20):
-        *_, (total, _) = paris(filter, ys, path_sums, Dynamics(AR1), seed)
+        *_, (total, _) = paris(filter, ys, path_sums, Dynamics(AR1), seed, **METHODS[method])
         paths = genealogy(keep(filter, ys, seed))
         sums.append([total, sum(p.weights @ p.particles for p in paths)])
     variance = np.var(sums, axis=0)
@@ -181,12 +273,13 @@ def test_a_hidden_chain_of_any_kind_of_particle(kind):
     symbols, n = [*SYMBOLS[:3], None, *SYMBOLS[4:6]], 150
     single, pairs = exact_chain(symbols)
     model = hmm(kind)
-    found: dict[str, list] = {"backward": [], "genealogy": []}
+    found: dict[str, list] = {"backward": [], "mcmc": [], "genealogy": []}
     for seed in range(60):
         record = keep(bootstrap(model, n), symbols, seed)
         rng = np.random.default_rng(seed)
         for name, paths in (
             ("backward", backward_paths(rng, record, Dynamics(model), 40)),
+            ("mcmc", backward_paths(rng, record, Dynamics(model), 40, "mcmc")),
             ("genealogy", genealogy(record)),
         ):
             w, k = paths[0].weights, np.array([states_of(p.particles) for p in paths])
@@ -240,12 +333,14 @@ def test_a_large_run_is_done_in_blocks(monkeypatch):
 
 @dataclass(frozen=True)
 class Listening(Dynamics):
-    """Notes what it is told to have been observed."""
+    """Notes what it is told to have been observed, and how many densities it evaluates."""
 
     heard: list = field(default_factory=list)
+    sizes: list = field(default_factory=list)
 
     def log_prob(self, previous, new, observation):
         self.heard.append(observation)
+        self.sizes.append(len(new))
         return super().log_prob(previous, new, observation)
 
 
@@ -253,6 +348,15 @@ def test_the_density_is_asked_with_the_observation_of_its_move():
     listening = Listening(AR1)
     backward_paths(np.random.default_rng(0), keep(bootstrap(AR1, 20), YS, 1), listening, 5)
     assert listening.heard == YS[:0:-1]
+
+
+@pytest.mark.parametrize(("method", "most"), [("exact", 400), ("mcmc", 2), ("mcmc, 4 steps", 5), ("rejection", 12)])
+def test_the_number_of_densities_per_path_and_step(method, most):
+    """Of 400 particles; by rejection the mean is max f / p(x_{t+1}) = 1.5 to 3 in most steps of this record."""
+    listening, record = Listening(AR1), keep(bootstrap(AR1, 400), YS, 1)
+    backward_paths(np.random.default_rng(0), record, listening, 300, **METHODS[method])
+    number = sum(listening.sizes) / (300 * (T - 1))
+    assert number == most if method != "rejection" else 1.5 < number < most
 
 
 @dataclass(frozen=True)
@@ -269,6 +373,16 @@ def test_what_cannot_be_smoothed():
         genealogy(mixed)
     with pytest.raises(InputError, match="transition is StateSpaceModel"):
         backward_paths(rng, record, AR1, 5)
+    for settings, message in (
+        ({"method": "metropolis"}, "method is 'metropolis', expected exact, mcmc or rejection"),
+        ({"method": "mcmc", "steps": 0}, "steps is 0"),
+        ({"method": "rejection"}, "log_bound is None"),
+        ({"method": "rejection", "log_bound": BOUND - 0.1}, "more than log_bound = "),
+    ):
+        with pytest.raises(InputError, match=message):
+            backward_paths(rng, record, Dynamics(AR1), 200, **settings)
+    with pytest.raises(InputError, match="step 2: not every particle has a known parent"):
+        backward_paths(rng, mixed, Dynamics(AR1), 5, "mcmc")
     with pytest.raises(InputError, match="lag is -1"):
         fixed_lag(record, -1)
     with pytest.raises(InputError, match="no observations"):
@@ -278,5 +392,6 @@ def test_what_cannot_be_smoothed():
         (lambda old, new: np.full(len(old), np.nan), "from step 6 to 7"),
         (lambda old, new: np.zeros(3), r"log_prob returned shape \(3,\)"),
     ):
-        with pytest.raises(InputError, match=message):
-            backward_paths(rng, record, Dynamics(replace(AR1, log_transition=bad)), 5)
+        for method in METHODS:
+            with pytest.raises(InputError, match=message):
+                backward_paths(rng, record, Dynamics(replace(AR1, log_transition=bad)), 5, **METHODS[method])

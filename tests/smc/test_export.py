@@ -1,0 +1,163 @@
+"""Tables and trees: every number is where the documentation says, and comes back."""
+
+from __future__ import annotations
+
+import sys
+
+import numpy as np
+import pytest
+
+from mstfilter.errors import InputError, MissingLibraryError
+from mstfilter.smc import (
+    Always,
+    Chains,
+    Infos,
+    Multinomial,
+    Population,
+    bootstrap,
+    collect,
+    ess,
+    n_particles,
+    resampled,
+    run_many,
+    unique_ancestors,
+    weight_entropy,
+)
+from tests.smc.models import AR1, ar1_observations
+
+RNG = np.random.default_rng(0)
+LOG_WEIGHTS = np.append(RNG.normal(-1000.0, 1.0, 5), -np.inf)
+CHAINS = Chains(RNG.normal(size=(4, 2, 3)), RNG.normal(size=(4, 2)), RNG.normal(size=(4, 2)), np.array([0.25, 0.5]))
+PARTICLES = {
+    "numbers": RNG.normal(size=6),
+    "vectors": RNG.normal(size=(6, 2)).astype(np.float32),
+    "mapping": {"k": np.arange(6), "pose": RNG.normal(size=(6, 2, 3))},
+}
+
+
+def same(a, b):
+    if isinstance(a, dict):
+        return a.keys() == b.keys() and all(same(a[name], b[name]) for name in a)
+    return a.dtype == b.dtype and np.array_equal(a, b)
+
+
+@pytest.mark.parametrize("kind", PARTICLES)
+def test_weighted_particles_come_back_from_a_tree(kind):
+    pytest.importorskip("xarray")
+    population = Population(PARTICLES[kind], LOG_WEIGHTS)
+    tree = population.to_arviz()
+    assert tree["posterior"].attrs["weights"] == "sample_stats/log_weight"
+    assert tree["sample_stats"]["log_weight"].dims == ("chain", "draw")
+    assert all(a.dims[:2] == ("chain", "draw") and a.shape[:2] == (1, 6) for a in tree["posterior"].values())
+    again = Population.from_arviz(tree)
+    assert same(again.particles, population.particles)
+    np.testing.assert_array_equal(again.log_weights, population.log_weights)
+
+
+def test_equally_weighted_draws_are_not_marked():
+    pytest.importorskip("xarray")
+    drawn = Multinomial().resample(RNG, Population(PARTICLES["numbers"], LOG_WEIGHTS), 8)
+    assert "weights" not in drawn.to_arviz()["posterior"].attrs
+    assert Population.from_arviz(drawn.to_arviz()).log_mean_weight == drawn.log_mean_weight
+
+
+def test_chains_as_a_tree():
+    pytest.importorskip("xarray")
+    tree = CHAINS.to_arviz(["a", "b", "c"], discard=1)
+    assert tree["posterior"].sizes == {"chain": 2, "draw": 3} and "weights" not in tree["posterior"].attrs
+    for k, name in enumerate("abc"):
+        np.testing.assert_array_equal(tree["posterior"][name].values, CHAINS.theta[1:, :, k].T)
+    np.testing.assert_array_equal(tree["sample_stats"]["lp"].values, CHAINS.log_density[1:].T)
+    np.testing.assert_array_equal(tree["sample_stats"]["log_evidence"].values, CHAINS.log_evidence[1:].T)
+    draws = Population.from_arviz(CHAINS.to_arviz())
+    np.testing.assert_array_equal(draws.particles["theta"], CHAINS.theta.swapaxes(0, 1).reshape(8, 3))
+    assert draws.ess == 8
+    unknown = Chains(CHAINS.theta, np.full((4, 2), np.nan), np.full((4, 2), np.nan), CHAINS.accepted)
+    assert list(unknown.to_arviz().children) == ["posterior"]
+    with pytest.raises(InputError, match="2 names for 3 parameters"):
+        CHAINS.to_arviz(["a", "b"])
+
+
+def test_arviz_reads_the_trees():
+    """With ArviZ 0.2x as with 1.0: the mean that it reports is that of the draws."""
+    arviz = pytest.importorskip("arviz")
+    data = CHAINS.to_arviz(["a", "b", "c"])
+    convert = getattr(getattr(arviz, "InferenceData", None), "from_datatree", lambda tree: tree)
+    data = convert(data)
+    summary = arviz.summary(data, round_to=6)
+    np.testing.assert_allclose(summary["mean"].to_numpy(float), CHAINS.theta.mean(axis=(0, 1)), atol=1e-5)
+    assert Population.from_arviz(data).particles["b"].tolist() == CHAINS.theta[:, :, 1].T.ravel().tolist()
+
+
+def test_columns_of_particles():
+    assert list(Population(PARTICLES["vectors"]).columns()) == ["x_0", "x_1", "weight", "log_weight"]
+    mapping = Population(PARTICLES["mapping"], LOG_WEIGHTS)
+    columns = mapping.columns()
+    assert list(columns)[:3] == ["k", "pose_0_0", "pose_0_1"] and len(columns) == 9
+    np.testing.assert_array_equal(columns["pose_1_2"], PARTICLES["mapping"]["pose"][:, 1, 2])
+    np.testing.assert_array_equal(columns["weight"], mapping.weights)
+    objects = Population(("a", ("b",)))
+    assert objects.columns()["particle"].tolist() == ["a", ("b",)]
+    with pytest.raises(InputError, match="str objects"):
+        objects.to_arviz()
+    with pytest.raises(InputError, match="arrays called weight"):
+        Population({"weight": np.zeros(2)}).columns()
+
+
+def test_columns_of_chains():
+    columns = CHAINS.columns()
+    assert list(columns) == ["chain", "draw", "theta_0", "theta_1", "theta_2", "log_evidence", "log_density"]
+    for row in range(8):
+        chain, draw = columns["chain"][row], columns["draw"][row]
+        assert (chain, draw) == divmod(row, 4)
+        assert columns["theta_2"][row] == CHAINS.theta[draw, chain, 2]
+        assert columns["log_density"][row] == CHAINS.log_density[draw, chain]
+
+
+def test_data_frames():
+    pandas = pytest.importorskip("pandas")
+    ys = ar1_observations(5)
+    _, infos = bootstrap(AR1, 8).run(ys, 1)
+    history = run_many({"a": bootstrap(AR1, 8), "b": bootstrap(AR1, 9)}, ys, [4, 5], ess=ess, n=n_particles)
+    for table in (infos, history, CHAINS, Population(PARTICLES["mapping"])):
+        frame = table.to_pandas()
+        assert isinstance(frame, pandas.DataFrame)
+        for name, column in table.columns().items():
+            np.testing.assert_array_equal(frame[name].to_numpy(), column)
+    frame = infos.to_pandas()
+    assert frame["ess"].tolist() == [info.ess for info in infos] and frame["resampled"].dtype == bool
+    row = history.to_pandas().query("arm == 'b' and seed == 5 and time == 3").iloc[0]
+    assert (row["ess"], row["n"]) == (history["ess"][1, 1, 3], 9)
+    assert Infos().columns() == {} and len(Infos().to_pandas()) == 0
+
+
+def test_a_missing_library(monkeypatch):
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    monkeypatch.setitem(sys.modules, "xarray", None)
+    with pytest.raises(MissingLibraryError, match="needs the library pandas"):
+        CHAINS.to_pandas()
+    with pytest.raises(MissingLibraryError, match="needs the library xarray"):
+        CHAINS.to_arviz()
+
+
+def test_a_history_shows_itself_in_five_lines():
+    filter, ys = bootstrap(AR1, 8, trigger=Always()), ar1_observations(5)
+    few = collect(filter.iterate(ys, 0), ess=ess, resampled=resampled)
+    low, high = few["ess"].min(), few["ess"].max()
+    assert repr(few) == f"History: time 5\n  ess float64 (5,), {low:.4g} to {high:.4g}\n  resampled bool (5,)"
+    collectors = {
+        "ess": ess,
+        "n": n_particles,
+        "unique": unique_ancestors,
+        "entropy": weight_entropy,
+        "fired": resampled,
+    }
+    many = run_many({"a": filter}, [*ys, 1e200], [1, 2], **collectors)
+    lines = repr(many).splitlines()
+    assert lines[0] == "History: arm 1, seed 2, time 6, 2 runs lost" and len(lines) == 5
+    assert lines[-1] == "  also entropy, fired"
+    assert repr(collect([])) == "History: time 0"
+
+
+def test_chains_show_themselves():
+    assert repr(CHAINS) == "Chains: 4 iterations of 2 chains, 3 parameters, accepted 0.25 to 0.50"
