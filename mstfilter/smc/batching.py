@@ -27,6 +27,7 @@ import numpy as np
 
 from mstfilter.errors import InputError, LostRunError
 from mstfilter.smc.filter import ParticleFilter
+from mstfilter.smc.inputs import WithInput, split_input
 from mstfilter.smc.interfaces import State, WeightResampler
 from mstfilter.smc.population import Population, identity
 from mstfilter.smc.streams import Key, RunGenerators, SlotStreams
@@ -94,7 +95,8 @@ def batch(
         raise InputError(
             f"sequences of observations have lengths {sorted({len(y) for y in ys})}, expected one length"
         )
-    if batched_slots(filter) is not None:
+    own_inputs = paired and any(isinstance(y, WithInput) for run in ys for y in run)
+    if batched_slots(filter) is not None and not own_inputs:
         try:
             return _Sweep(filter, ys, seeds, functions).run()
         except _SizeChanged:
@@ -175,7 +177,10 @@ class _Sweep:
     """The steps of R runs; rows are runs that are not lost."""
 
     def __init__(self, filter: ParticleFilter, ys: list[list[Any]], seeds: list[int], functions: Any) -> None:
-        self.filter, self.ys, self.seeds, self.functions = filter, ys, seeds, functions
+        self.filter = self.given = filter
+        self.inputs = [split_input(y)[1] for y in ys[0]]
+        self.ys = [[split_input(y)[0] for y in run] for run in ys]
+        self.seeds, self.functions = seeds, functions
         self.result = _empty(len(seeds), len(ys[0]))
         self.runs = np.arange(len(seeds))  # the run of each row
         self.streams: dict[str, SlotStreams] = {}
@@ -203,7 +208,8 @@ class _Sweep:
 
     def step(self, t: int, particles: Any, log_weights: Any) -> tuple[Any, np.ndarray, np.ndarray | None]:
         """Particles, log weights and parents after step t; the parents at the last step only."""
-        filter, ancestors = self.filter, None
+        filter = self.filter = self.given.at(t, self.inputs[t])
+        ancestors = None
         if log_weights is None:
             particles, log_weights, ancestors = self.first(t)
         else:

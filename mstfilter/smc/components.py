@@ -50,6 +50,7 @@ class Reweight(Update):
     batched: bool = False
 
     draws: ClassVar[bool] = False
+    step_functions: ClassVar = {"log_likelihood": 2}
 
     def update(
         self, rng: np.random.Generator, predicted: Population | None, proposed: Population | None, observation: Any
@@ -78,6 +79,7 @@ class ProjectOnto(Update):
 
     properly_weighted: ClassVar[bool] = False
     draws: ClassVar[bool] = False
+    step_functions: ClassVar = {"project": 2, "log_likelihood": 2}
 
     def update(
         self, rng: np.random.Generator, predicted: Population | None, proposed: Population | None, observation: Any
@@ -114,6 +116,7 @@ class CrossVectors(Update):
 
     #: The density of children is not known.
     properly_weighted: ClassVar[bool] = False
+    step_functions: ClassVar = {"log_likelihood": 2}
 
     def __post_init__(self) -> None:
         check_number("share", self.share, above=0)
@@ -169,6 +172,7 @@ class Branching(Transition):
 
     inner: Transition
     branches: int = 4
+    step_functions: ClassVar = {"inner": None}
 
     def __post_init__(self) -> None:
         check_component("inner", self.inner, Transition)

@@ -41,6 +41,7 @@ import numpy as np
 from mstfilter.errors import InputError
 from mstfilter.smc.distributions import MultivariateNormal
 from mstfilter.smc.filter import ParticleFilter
+from mstfilter.smc.inputs import AtStep
 from mstfilter.smc.interfaces import Proposal, Transition, Update
 from mstfilter.smc.population import Population, union
 from mstfilter.smc.state_space import StateSpaceModel
@@ -259,11 +260,12 @@ class Linear(NamedTuple):
 
 
 @dataclass(frozen=True)
-class ConditionallyLinear:
+class ConditionallyLinear(AtStep):
     """A model that is linear and Gaussian given the part u, which is drawn.
 
     ``sample_initial(rng, n)`` draws u_0 (n, ...), ``sample_transition(rng, u)`` draws u_t given u_{t-1}, and
-    ``linear(u)`` gives the matrices. `mean` (d,) and `cov` (d, d) are those of z_0, for any u_0.
+    ``linear(u)`` gives the matrices. `mean` (d,) and `cov` (d, d) are those of z_0, for any u_0. The functions may
+    have a further parameter ``t``, the index of the step, or ``u`` after a first one of another name, its input.
     """
 
     sample_initial: Callable[[np.random.Generator, int], np.ndarray]
@@ -272,10 +274,13 @@ class ConditionallyLinear:
     mean: Any
     cov: Any
 
+    step_functions: ClassVar = {"sample_initial": 2, "sample_transition": 2, "linear": 1}
+
 
 @dataclass(frozen=True)
 class _Initial(Proposal):
     model: ConditionallyLinear
+    step_functions: ClassVar = {"model": None}
 
     def sample(self, rng: np.random.Generator, observation: Any, n: int) -> Population:
         mean, cov = np.asarray(self.model.mean, np.float64), np.asarray(self.model.cov, np.float64)
@@ -287,6 +292,7 @@ class _Initial(Proposal):
 @dataclass(frozen=True)
 class _Predict(Transition):
     model: ConditionallyLinear
+    step_functions: ClassVar = {"model": None}
 
     def predict(self, rng: np.random.Generator, population: Population, observation: Any) -> Population:
         """Draw u_t, then predict mean and covariance."""
@@ -303,6 +309,7 @@ class _Predict(Transition):
 class _Correct(Update):
     model: ConditionallyLinear
     draws: ClassVar[bool] = False
+    step_functions: ClassVar = {"model": None}
 
     def update(
         self, rng: np.random.Generator, predicted: Population | None, proposed: Population | None, observation: Any

@@ -27,13 +27,14 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sized
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 
 from mstfilter.errors import InputError, check_choice, check_component, check_integer
 from mstfilter.lazy import late, progress_of
 from mstfilter.smc.components import EssBelow
+from mstfilter.smc.inputs import AtStep, split_input
 from mstfilter.smc.interfaces import (
     Codec,
     Component,
@@ -68,7 +69,7 @@ _INTERFACES: dict[str, type] = {
 
 
 @dataclass(frozen=True)
-class ParticleFilter:
+class ParticleFilter(AtStep):
     """A particle filter made of components.
 
     Parameters
@@ -115,6 +116,8 @@ class ParticleFilter:
     n_proposed: int = 0
     resample: Literal["after", "before"] = "before"
 
+    step_functions: ClassVar = {name: None for name, kind in _INTERFACES.items() if issubclass(kind, Component)}
+
     def __post_init__(self) -> None:
         check_integer("n", self.n)
         check_integer("n_proposed", self.n_proposed, at_least=0)
@@ -154,6 +157,8 @@ class ParticleFilter:
     def step(self, state: State, observation: Any, observer: Observer | None = None) -> tuple[State, Info]:
         """Process one observation; None if it is missing: then without proposal and update.
 
+        A step with an input takes ``WithInput(observation, u)``.
+
         Raises InputError if a component raises it. The message starts with the step and the slot of the component.
         """
         step = _Step(self, state, observation, observer)
@@ -180,7 +185,7 @@ class ParticleFilter:
         Parameters
         ----------
         observations : iterable
-            One observation for each step. An observation that is missing is None.
+            One observation for each step, or `WithInput`. An observation that is missing is None.
         state : State or int
             The state to continue from, or a seed.
         checkpoint : path, optional
@@ -254,7 +259,9 @@ class _Step:
     def __init__(
         self, filter: ParticleFilter, state: State, observation: Any, observer: Observer | None = None
     ) -> None:
-        self.filter, self.state, self.observation = filter, state, observation
+        self.observation, u = split_input(observation)
+        self.filter, self.state = filter.at(state.t, u), state
+        self.given = filter
         self.slot = _Slot(state.t, observer)
 
     def rng(self, slot: str) -> np.random.Generator:
@@ -310,7 +317,7 @@ class _Step:
 
     def _first(self) -> Population | None:
         initial, n = self.filter.initial, self.filter.n
-        if initial is None or initial == self.filter.proposal:
+        if initial is None or self.given.initial == self.given.proposal:
             return None
         with self.slot("initial"):
             population = _checked(initial.sample(self.rng("initial"), self.observation, n), initial)

@@ -38,6 +38,7 @@ import numpy as np
 
 from mstfilter.errors import InputError, check_integer
 from mstfilter.lazy import late, short_repr
+from mstfilter.smc.inputs import AtStep
 from mstfilter.smc.population import Population
 from mstfilter.smc.streams import Key
 
@@ -45,10 +46,11 @@ from mstfilter.smc.streams import Key
 Observer = Callable[[str, bool], None]
 
 
-class Component(ABC):
+class Component(AtStep, ABC):
     """A component that takes part in a step.
 
-    The two properties can be overridden by class attributes: ``properly_weighted = False``.
+    The filter uses ``component.at(t, u)``, the component at step t with its input (see `mstfilter.smc.inputs`).
+    The three properties can be overridden by class attributes: ``properly_weighted = False``.
     """
 
     def __init_subclass__(cls, **named: Any) -> None:
