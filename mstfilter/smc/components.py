@@ -42,12 +42,12 @@ from mstfilter.smc.population import Population, as_matrix, union
 class Reweight(Update):
     """Adds ``log_likelihood(particles, observation)`` (n,) to the log weights: the update of the bootstrap filter.
 
-    Proposed particles, if any, join the predicted ones. `batched` says whether the function also takes particles
-    (R, n, ...) and returns (R, n).
+    Proposed particles, if any, join the predicted ones. `batched` says whether the function treats each
+    particle by itself (see `Component.batched`).
     """
 
     log_likelihood: Callable[[Any, Any], np.ndarray]
-    batched: bool = False
+    batched: bool | None = False  # type: ignore[assignment]
 
     draws: ClassVar[bool] = False
     step_functions: ClassVar = {"log_likelihood": 2}

@@ -84,9 +84,8 @@ def nonlinear_gaussian(f: _Map, Q: Any, h: _Map, R: Any, m0: Any, P0: Any) -> St
 
         return of
 
-    def initial(rng: np.random.Generator, n: int | tuple[int, int]) -> np.ndarray:
-        shape = (n,) if isinstance(n, int) else n
-        return m0 + rng.standard_normal((*shape, len(m0))) @ root_P.T
+    def initial(rng: np.random.Generator, n: int) -> np.ndarray:
+        return m0 + rng.standard_normal((n, len(m0))) @ root_P.T
 
     def transition(rng: np.random.Generator, x: np.ndarray) -> np.ndarray:
         return f(x) + rng.standard_normal(x.shape) @ root_Q.T

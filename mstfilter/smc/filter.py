@@ -116,7 +116,10 @@ class ParticleFilter(AtStep):
     n_proposed: int = 0
     resample: Literal["after", "before"] = "before"
 
-    step_functions: ClassVar = {name: None for name, kind in _INTERFACES.items() if issubclass(kind, Component)}
+    #: A resampler sees weights only: it does not depend on the step.
+    step_functions: ClassVar = {
+        name: None for name, kind in _INTERFACES.items() if issubclass(kind, Component) and kind is not Resampler
+    }
 
     def __post_init__(self) -> None:
         check_integer("n", self.n)

@@ -74,10 +74,11 @@ class Component(AtStep, ABC):
         return True
 
     @property
-    def batched(self) -> bool:
-        """Whether the component also works on R runs at once, with arrays (R, n, ...) instead of (n, ...).
+    def batched(self) -> bool | None:
+        """Whether the component treats each particle by itself, so that those of several runs can be given together.
 
-        See `mstfilter.smc.batching`. Default: False, then it is called once for each run.
+        True states so. With None, a batch tries it, and calls the component once for each run if the results differ
+        (see `mstfilter.smc.batching`). Default: False, then it is called once for each run.
         """
         return False
 

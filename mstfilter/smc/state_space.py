@@ -38,6 +38,7 @@ from mstfilter.smc.interfaces import (
 )
 from mstfilter.smc.population import Particles, Population, count_particles
 from mstfilter.smc.resampling import Systematic
+from mstfilter.smc.streams import Rows
 
 
 @dataclass(frozen=True)
@@ -59,9 +60,9 @@ class StateSpaceModel(AtStep):
         ``(particles) -> (n,)`` log p(x_0). Guided filters and moves need it.
     log_transition : callable, optional
         ``(previous, new) -> (n,)`` log f(x_t | x_{t-1}) of paired rows. Guided filters and moves need it.
-    batched : bool
-        Whether `sample_initial` also takes n = (R, n), and `sample_transition` and `log_likelihood` particles
-        (R, n, ...), the particles of R runs (see `mstfilter.smc.batching`).
+    batched : bool or None
+        Whether the functions treat each particle by itself, so that they can be called with the particles of many
+        runs (see `mstfilter.smc.batching`). None: a batch tries it.
     """
 
     sample_initial: Callable[[np.random.Generator, int], Any]
@@ -69,7 +70,7 @@ class StateSpaceModel(AtStep):
     log_likelihood: Callable[[Any, Any], np.ndarray]
     log_initial: Callable[[Any], np.ndarray] | None = None
     log_transition: Callable[[Any, Any], np.ndarray] | None = None
-    batched: bool = False
+    batched: bool | None = False
 
     step_functions: ClassVar = {
         "sample_initial": 2,
@@ -109,6 +110,7 @@ class StateSpaceModel(AtStep):
             with_step(log_likelihood, observes),
             first.log_prob,
             with_step(log_density, moves),
+            batched=None,
         )
 
     def density(self, which: str) -> Callable[..., np.ndarray]:
@@ -125,6 +127,8 @@ class StateSpaceModel(AtStep):
 def _log_likelihood(distribution: Distribution, y: Any) -> np.ndarray:
     """(n,) log p(y | x). Without the check, entries of a vector would be compared with the particles one by one."""
     found, event = () if isinstance(y, float) else np.shape(y), distribution.event_shape
+    if isinstance(y, Rows) and found[1:] == event:  # one observation for each particle
+        return distribution.log_prob(np.asarray(y))
     if found not in (event, (1, *event)) and (found, event) != ((), (1,)):
         raise InputError(
             f"the observation has shape {found}, expected the event shape {event}",
@@ -141,7 +145,7 @@ class Prior(Proposal):
     step_functions: ClassVar = {"model": None}
 
     @property
-    def batched(self) -> bool:
+    def batched(self) -> bool | None:
         return self.model.batched
 
     def sample(self, rng: np.random.Generator, observation: Any, n: int) -> Population:
@@ -156,7 +160,7 @@ class Dynamics(DensityTransition):
     step_functions: ClassVar = {"model": None}
 
     @property
-    def batched(self) -> bool:
+    def batched(self) -> bool | None:
         return self.model.batched
 
     def predict(self, rng: np.random.Generator, population: Population, observation: Any) -> Population:
