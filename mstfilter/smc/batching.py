@@ -36,7 +36,7 @@ from mstfilter.smc.filter import ParticleFilter
 from mstfilter.smc.inputs import split_input
 from mstfilter.smc.interfaces import State, WeightResampler
 from mstfilter.smc.population import Population, identity
-from mstfilter.smc.streams import Key, Rows, RunGenerators, SlotStreams, rows_of
+from mstfilter.smc.streams import Key, RunGenerators, SlotStreams, rows_of
 
 Function = Callable[[Population], Any]
 
@@ -307,8 +307,12 @@ class _Sweep:
 
     def apply(self, t: int, slot: str) -> None:
         """Call a component for all runs, those with and those without an observation; lost runs are removed."""
-        missing = np.array([self.given(t, row)[0] is None for row in range(len(self.runs))])
-        present, absent = np.flatnonzero(~missing), np.flatnonzero(missing)
+        rows = np.arange(len(self.runs))
+        if len(self.ys) == 1:
+            missing = np.full(len(rows), self.ys[0][t][0] is None)
+        else:
+            missing = np.array([self.given(t, row)[0] is None for row in rows])
+        present, absent = rows[~missing], rows[missing]
         if slot == "update" and not len(present):
             return
         call = self.each if slot in self.single else self.together
@@ -429,11 +433,10 @@ class _Sweep:
         return not t & (t - 1) or self.checked.get(slot, (0, 0))[0] != n_rows
 
     def compare(self, t: int, slot: str, rows: np.ndarray, particles: Any, log_weights: np.ndarray) -> None:
-        """Compare two runs with single runs; at the first time all of them with the runs in another order."""
+        """Compare runs with single runs: the first and the last, or one in turn; at first all with another order."""
         last, count = self.checked.get(slot, (0, 0))
         self.checked[slot] = len(rows), count + 1
-        first = 0 if last != len(rows) else count % len(rows)
-        for k in {first, first - 1 + (len(rows) if first == 0 else 0)}:
+        for k in {count % len(rows)} if last == len(rows) else {0, len(rows) - 1}:
             try:
                 population = self.alone(t, slot, int(rows[k]))
                 single = population.realised().particles, population.log_weights
@@ -443,9 +446,11 @@ class _Sweep:
         if count == 0 and len(rows) > 1:
             order = np.roll(np.arange(len(rows)), 1)
             found = self.of_rows(t, slot, rows[order])
-            for k, row in enumerate(rows[order].tolist()):
-                here = _row(particles, order[k]), log_weights[order[k]]
-                self.agree(t, slot, row, here, (_row(found[0], k), found[1][k]), "with the runs in another order")
+            ours = _row(particles, order), log_weights[order]
+            if _difference(ours[0], found[0]) is not None or _difference(ours[1], found[1]) is not None:
+                for k, row in enumerate(rows[order].tolist()):
+                    one = (_row(ours[0], k), ours[1][k]), (_row(found[0], k), found[1][k])
+                    self.agree(t, slot, row, *one, "with the runs in another order")
 
     def agree(self, t: int, slot: str, row: int, ours: tuple[Any, Any], other: tuple[Any, Any], how: str) -> None:
         """Refuse the component if a run differs."""

@@ -47,7 +47,7 @@ class Reweight(Update):
     """
 
     log_likelihood: Callable[[Any, Any], np.ndarray]
-    batched: bool | None = False  # type: ignore[assignment]
+    batched: bool | None = False
 
     draws: ClassVar[bool] = False
     step_functions: ClassVar = {"log_likelihood": 2}

@@ -120,7 +120,10 @@ class StateSpaceModel(AtStep):
         """
         found = self.log_initial if which == "log_initial" else self.log_transition
         if found is None:
-            raise InputError(f"the model has no {which}", "give StateSpaceModel its log densities, or use .of()")
+            raise InputError(
+                f"the model has no {which}",
+                "give StateSpaceModel its log densities, or use .of(); a singular covariance has none",
+            )
         return found
 
 
