@@ -15,7 +15,7 @@ runs: it treats each row by itself, and takes the shape of its draws from its ar
 inputs that differ between runs are repeated for each row.
 
 The batch checks this. At steps 0, 1, 2, 4, 8, ..., and when the number of runs changes, some runs are compared with a
-call for that run alone; at the first call of a component, all are compared with a call for the runs in another order.
+call for that run alone; at the first call of a component, up to 64 with a call for these runs in another order.
 If they differ, a component that states ``batched=True`` raises InputError. Otherwise, and if they differ by rounding
 only, the component is called once for each run, and `Batch.single` says why.
 """
@@ -32,7 +32,7 @@ from typing import Any
 import numpy as np
 
 from mstfilter.errors import InputError, LostRunError
-from mstfilter.smc.filter import ParticleFilter
+from mstfilter.smc.filter import ParticleFilter, keep_freed_memory
 from mstfilter.smc.inputs import split_input
 from mstfilter.smc.interfaces import State, WeightResampler
 from mstfilter.smc.population import Population, identity
@@ -40,6 +40,8 @@ from mstfilter.smc.streams import Key, RunGenerators, SlotStreams, rows_of
 
 Function = Callable[[Population], Any]
 
+#: Runs that are compared with a call for the runs in another order.
+_MOST_COMPARED = 64
 _SLOTS = ("initial", "transition", "update")
 _RAW = (TypeError, ValueError, LookupError, AttributeError, ArithmeticError)
 
@@ -138,6 +140,7 @@ def run_batch(
     Without `check`, runs are not compared with single runs; with `rounding`, differences by rounding are accepted;
     without `warn`, only `Batch.single` says which components were called once for each run.
     """
+    keep_freed_memory()
     filter = filters.one(0)
     single = _not_batched(filter, seeds)
     while "all" not in single:
@@ -258,6 +261,7 @@ class _Sweep:
         self.checked: dict[str, tuple[int, int]] = {}  # slot -> number of rows at its last check, number of checks
         self.particles: Any = None
         self.log_weights: np.ndarray = np.zeros(0)
+        self.top: tuple[Any, Any] = (None, None)  # log weights, and the largest of each run
         self.ancestors: np.ndarray | None = None  # (R, n) parents, of the last step
         #: Effective sample sizes and log mean weights of the rows after the last update.
         self.summary = (np.zeros(0), np.zeros(0))
@@ -298,7 +302,7 @@ class _Sweep:
                 self.apply(t, "transition")
         if filter.update is not None:
             self.apply(t, "update")
-        self.summary = summaries(self.log_weights)
+        self.summary = summaries(self.log_weights, self.top[1] if self.top[0] is self.log_weights else None)
         self.result.ess[self.runs, t], log_mean = self.summary
         if filter.properly_weighted:
             self.result.log_evidence[self.runs, t] = log_mean
@@ -309,10 +313,10 @@ class _Sweep:
         """Call a component for all runs, those with and those without an observation; lost runs are removed."""
         rows = np.arange(len(self.runs))
         if len(self.ys) == 1:
-            missing = np.full(len(rows), self.ys[0][t][0] is None)
+            present, absent = (rows[:0], rows) if self.ys[0][t][0] is None else (rows, rows[:0])
         else:
-            missing = np.array([self.given(t, row)[0] is None for row in rows])
-        present, absent = rows[~missing], rows[missing]
+            missing = np.array([self.given(t, row)[0] is None for row in rows.tolist()])
+            present, absent = rows[~missing], rows[missing]
         if slot == "update" and not len(present):
             return
         call = self.each if slot in self.single else self.together
@@ -381,8 +385,11 @@ class _Sweep:
             self.refuse(t, slot, f"a call for all runs raises {type(error).__name__}: {error}; single runs do not")
         if self.check and self.is_due(t, slot, len(rows)):
             self.compare(t, slot, rows, particles, log_weights)
+        if log_weights is self.log_weights:
+            return rows, particles, log_weights
         top = log_weights.max(axis=1)
         if top.min() > -np.inf:
+            self.top = log_weights, top
             return rows, particles, log_weights
         for row in rows[top == -np.inf].tolist():
             try:
@@ -398,7 +405,7 @@ class _Sweep:
         y, u = (self.by_row(rows, t, k) for k in (0, 1))
         component = getattr(self.filters.rows(runs).at(t, u), slot)
         rng = RunGenerators(self.states(t, slot, runs), n) if component.draws else None
-        population = None
+        population, log_weights = None, self.log_weights
         if slot != "initial":
             everything = len(rows) == len(self.runs) and rows[0] == 0
             particles = self.particles if everything else _row(self.particles, rows)
@@ -407,7 +414,8 @@ class _Sweep:
         found = _called(slot, component, rng, population, y, len(rows) * n)
         if len(found) != len(rows) * n:
             raise InputError(f"{len(rows) * n} particles became {len(found)}")
-        return _by_run(found.particles, n), found.log_weights.reshape(-1, n)
+        same = population is not None and found.log_weights is population.log_weights
+        return _by_run(found.particles, n), log_weights if same else found.log_weights.reshape(-1, n)
 
     def given(self, t: int, row: int) -> tuple[Any, Any]:
         """Observation and input of one run."""
@@ -444,7 +452,7 @@ class _Sweep:
                 single = _row(particles, k), np.full(self.filter.n, -np.inf)
             self.agree(t, slot, rows[k], (_row(particles, k), log_weights[k]), single, "alone")
         if count == 0 and len(rows) > 1:
-            order = np.roll(np.arange(len(rows)), 1)
+            order = np.roll(np.arange(0, len(rows), math.ceil(len(rows) / _MOST_COMPARED)), 1)
             found = self.of_rows(t, slot, rows[order])
             ours = _row(particles, order), log_weights[order]
             if _difference(ours[0], found[0]) is not None or _difference(ours[1], found[1]) is not None:
@@ -551,9 +559,12 @@ def _difference(ours: Any, other: Any) -> _Found | None:
     return _Found(a[where], b[where], close)
 
 
-def summaries(log_weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Effective sample sizes (R,) and log mean weights (R,) of log weights (R, n); the numbers of `Population`."""
-    top = log_weights.max(axis=1)
+def summaries(log_weights: np.ndarray, top: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """Effective sample sizes (R,) and log mean weights (R,) of log weights (R, n); the numbers of `Population`.
+
+    `top` are the largest log weights (R,), if they are known.
+    """
+    top = log_weights.max(axis=1) if top is None else top
     weights = log_weights - top[:, None]
     np.exp(weights, out=weights)
     totals = weights.sum(axis=1)

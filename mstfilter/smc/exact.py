@@ -68,12 +68,12 @@ def linear_gaussian(F: Any, Q: Any, H: Any, R: Any, m0: Any, P0: Any, B: Any = N
         if np.shape(given)[-2:] != (size, size):
             raise InputError(f"{name} has shape {np.shape(given)}, expected ({size}, {size}) as m0 and H")
 
-    def f(x: np.ndarray, t: int = 0, u: Any = None) -> np.ndarray:
-        moved = x @ _entry("F", F, t).T
-        return moved if B is None else moved + _input_effect(_entry("B", B, t), u)
+    def f(x: np.ndarray, **step: Any) -> np.ndarray:
+        moved = x @ _entry("F", F, **step).T
+        return moved if B is None else moved + _input_effect(_entry("B", B, **step), step["u"])
 
-    def h(x: np.ndarray, t: int = 0) -> np.ndarray:
-        return x @ _entry("H", H, t).T
+    def h(x: np.ndarray, **step: Any) -> np.ndarray:
+        return x @ _entry("H", H, **step).T
 
     of_step = {**_varies(F, B), **({} if B is None else {"u": True})}
     return nonlinear_gaussian(with_step(f, of_step), Q, with_step(h, _varies(H)), R, m0, P0)
@@ -98,7 +98,7 @@ def _varies(*arrays: np.ndarray | None) -> dict[str, bool]:
     return {"t": True} if any(a is not None and a.ndim == 3 for a in arrays) else {}
 
 
-def _entry(name: str, array: np.ndarray, t: int) -> np.ndarray:
+def _entry(name: str, array: np.ndarray, t: int = 0, u: Any = None) -> np.ndarray:
     """The matrix of step t."""
     if array.ndim == 2:
         return array
@@ -140,13 +140,13 @@ class _Noise:
             logs = np.log(np.diagonal(self.whiten, axis1=-2, axis2=-1)).sum(axis=-1)
             self.constant = np.atleast_1d(logs - 0.5 * self.size * np.log(2 * np.pi))
 
-    def draw(self, rng: np.random.Generator, n: int, t: int = 0, **step: Any) -> np.ndarray:
-        return rng.standard_normal((n, self.size)) @ _entry(self.name, self.root, t).T
+    def draw(self, rng: np.random.Generator, n: int, **step: Any) -> np.ndarray:
+        return rng.standard_normal((n, self.size)) @ _entry(self.name, self.root, **step).T
 
-    def log_prob(self, residual: np.ndarray, t: int = 0, **step: Any) -> np.ndarray:
+    def log_prob(self, residual: np.ndarray, **step: Any) -> np.ndarray:
         """(n,) log densities of residuals (n, k)."""
-        z = residual @ _entry(self.name, self.whiten, t).T
-        return self.constant[t if len(self.constant) > 1 else 0] - 0.5 * np.einsum("...j,...j->...", z, z)
+        z = residual @ _entry(self.name, self.whiten, **step).T
+        return self.constant[step["t"] if self.parameters else 0] - 0.5 * np.einsum("...j,...j->...", z, z)
 
 
 def nonlinear_gaussian(
@@ -307,11 +307,11 @@ def hidden_markov(initial: Any, transition: Any, log_likelihood: Callable[..., A
     with np.errstate(divide="ignore"):
         log_start, log_moves = np.log(start), np.log(moves)
 
-    def move(rng: np.random.Generator, x: np.ndarray, t: int = 0) -> np.ndarray:
-        return (_entry("transition", below, t)[x] <= rng.random(len(x))[:, None]).sum(axis=-1)
+    def move(rng: np.random.Generator, x: np.ndarray, **step: Any) -> np.ndarray:
+        return (_entry("transition", below, **step)[x] <= rng.random(len(x))[:, None]).sum(axis=-1)
 
-    def log_move(old: np.ndarray, new: np.ndarray, t: int = 0) -> np.ndarray:
-        return _entry("transition", log_moves, t)[old, new]
+    def log_move(old: np.ndarray, new: np.ndarray, **step: Any) -> np.ndarray:
+        return _entry("transition", log_moves, **step)[old, new]
 
     def weigh(x: np.ndarray, y: Any, **step: Any) -> np.ndarray:
         return np.asarray(log_likelihood(y, **step), dtype=np.float64)[x]

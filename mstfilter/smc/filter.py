@@ -236,7 +236,7 @@ class ParticleFilter(AtStep):
         self, observations: Iterable[Any], state: State | int, checkpoint: str | Path | None, codec: Codec | None
     ) -> tuple[Iterable[Any], State, Any]:
         """The remaining observations, the state to continue from, and the `Checkpoint` or None."""
-        _keep_freed_memory()
+        keep_freed_memory()
         current = state if isinstance(state, State) else self.start(state)
         if checkpoint is None:
             return observations, current, None
@@ -489,7 +489,7 @@ def _priority(lookahead: Lookahead, population: Population, observation: Any) ->
 
 
 @lru_cache(maxsize=1)
-def _keep_freed_memory() -> None:
+def keep_freed_memory() -> None:
     """Free one large block, once per process.
 
     After this, glibc keeps freed arrays of up to 32 MB, its largest value, instead of returning them to the system

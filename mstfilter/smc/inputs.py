@@ -76,7 +76,7 @@ def step_parameters(function: Any, n_arguments: int) -> dict[str, bool]:
 
 
 def with_step(function: Callable[..., Any], parameters: Mapping[str, bool]) -> Callable[..., Any]:
-    """A function ``(*arguments, **step)`` that is given the parameters of another function, if there are any."""
+    """A function ``(*arguments, **step)`` that takes the given parameters by name."""
     return StepFunction(function, parameters) if parameters else function
 
 
