@@ -32,7 +32,7 @@ correct z). Reference: Doucet, de Freitas, Murphy, Russell (2000).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
@@ -76,7 +76,14 @@ def linear_gaussian(F: Any, Q: Any, H: Any, R: Any, m0: Any, P0: Any, B: Any = N
         return x @ _entry("H", H, **step).T
 
     of_step = {**_varies(F, B), **({} if B is None else {"u": True})}
-    return nonlinear_gaussian(with_step(f, of_step), Q, with_step(h, _varies(H)), R, m0, P0)
+    return nonlinear_gaussian(
+        with_step(f, of_step) if of_step else lambda x: x @ F.T,
+        Q,
+        with_step(h, {"t": True}) if H.ndim == 3 else lambda x: x @ H.T,
+        R,
+        m0,
+        P0,
+    )
 
 
 def _linear(F: Any, H: Any, B: Any, d: int) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
@@ -98,13 +105,13 @@ def _varies(*arrays: np.ndarray | None) -> dict[str, bool]:
     return {"t": True} if any(a is not None and a.ndim == 3 for a in arrays) else {}
 
 
-def _entry(name: str, array: np.ndarray, t: int = 0, u: Any = None) -> np.ndarray:
-    """The matrix of step t."""
-    if array.ndim == 2:
-        return array
-    if t >= len(array):
-        raise InputError(f"{name} has {len(array)} entries, and none for step {t}")
-    return array[t]
+def _entry(name: str, given: Any, t: int = 0, u: Any = None) -> Any:
+    """The matrix of step t, or the entry of a list."""
+    if isinstance(given, np.ndarray) and given.ndim == 2:
+        return given
+    if t >= len(given):
+        raise InputError(f"{name} has {len(given)} entries, and none for step {t}")
+    return given[t]
 
 
 def _input_effect(B: np.ndarray, u: Any) -> np.ndarray:
@@ -116,6 +123,8 @@ def _input_effect(B: np.ndarray, u: Any) -> np.ndarray:
 def _vectors(what: str, given: Any, size: int) -> np.ndarray:
     """An observation or input (size,) of all particles, or (m, size) of the rows of a batch."""
     vector = np.asanyarray(given, np.float64)
+    if vector.shape == (size,) and not isinstance(vector, Rows):
+        return vector
     by_row = isinstance(vector, Rows)
     if vector.ndim == by_row:
         vector = vector[..., None]
@@ -125,28 +134,44 @@ def _vectors(what: str, given: Any, size: int) -> np.ndarray:
 
 
 class _Noise:
-    """Normal noise of mean 0 with a covariance (k, k), or (T, k, k) of each step."""
+    """Normal noise of mean 0."""
 
-    def __init__(self, name: str, given: Any, k: int | None = None, semidefinite: bool = False) -> None:
-        cov = np.asarray(given, np.float64)
-        matrices = cov if cov.ndim == 3 else cov[None]
-        checked = [_covariance(name, matrix, k, semidefinite) for matrix in matrices]
-        self.name, self.size = name, cov.shape[-1]
-        self.singular = any(singular for _, singular in checked)
-        self.root = np.reshape([root for root, _ in checked], cov.shape)
-        self.parameters = _varies(cov)
+    def __init__(self, name: str, cov: np.ndarray, k: int | None, semidefinite: bool) -> None:
+        root, self.singular = _covariance(name, cov, k, semidefinite)
+        self.size, self.root = len(root), root.T
         if not self.singular:
-            self.whiten = np.linalg.inv(self.root)
-            logs = np.log(np.diagonal(self.whiten, axis1=-2, axis2=-1)).sum(axis=-1)
-            self.constant = np.atleast_1d(logs - 0.5 * self.size * np.log(2 * np.pi))
+            self.whiten = np.linalg.inv(root).T
+            self.constant = np.log(np.diag(self.whiten)).sum() - 0.5 * self.size * np.log(2 * np.pi)
 
-    def draw(self, rng: np.random.Generator, n: int, **step: Any) -> np.ndarray:
-        return rng.standard_normal((n, self.size)) @ _entry(self.name, self.root, **step).T
+    def draw(self, rng: np.random.Generator, n: int) -> np.ndarray:
+        """(n, k) draws."""
+        return rng.standard_normal((n, self.size)) @ self.root
 
-    def log_prob(self, residual: np.ndarray, **step: Any) -> np.ndarray:
+    def log_prob(self, residual: np.ndarray) -> np.ndarray:
         """(n,) log densities of residuals (n, k)."""
-        z = residual @ _entry(self.name, self.whiten, **step).T
-        return self.constant[step["t"] if self.parameters else 0] - 0.5 * np.einsum("...j,...j->...", z, z)
+        z = residual @ self.whiten
+        return self.constant - 0.5 * np.einsum("...j,...j->...", z, z)
+
+
+def _noises(name: str, given: Any, k: int | None = None, semidefinite: bool = False) -> list[_Noise]:
+    """The noise of all steps, or one for each entry of the first axis of a covariance (T, k, k)."""
+    cov = np.asarray(given, np.float64)
+    return [_Noise(name, matrix, k, semidefinite) for matrix in (cov if cov.ndim == 3 else cov[None])]
+
+
+def _gaussian_functions(f: _Map, h: _Map, q: _Noise, r: _Noise) -> tuple[Callable[..., Any], ...]:
+    """Transition, log likelihood and log density of the transition."""
+
+    def transition(rng: np.random.Generator, x: np.ndarray) -> np.ndarray:
+        return f(x) + q.draw(rng, len(x))
+
+    def log_likelihood(x: np.ndarray, y: Any) -> np.ndarray:
+        return r.log_prob(_vectors("observation", y, r.size) - h(x))
+
+    def log_transition(old: np.ndarray, new: np.ndarray) -> np.ndarray:
+        return q.log_prob(new - f(old))
+
+    return transition, log_likelihood, log_transition
 
 
 def nonlinear_gaussian(
@@ -162,30 +187,27 @@ def nonlinear_gaussian(
     conditional path is then drawn without ancestor sampling.
     """
     m0 = np.asarray(m0, np.float64)
-    of_Q, of_P = _Noise("Q", Q, len(m0), True), _Noise("P0", P0, len(m0), True)
-    of_R = _Noise("R", R)
+    Qs, Rs = _noises("Q", Q, len(m0), True), _noises("R", R)
+    p = _Noise("P0", np.asarray(P0, np.float64), len(m0), True)
     in_f, in_h = step_parameters(f, 1), step_parameters(h, 1)
+    functions = _gaussian_functions(f, h, Qs[0], Rs[0])
+    moves = {**in_f, **({"t": True} if np.ndim(Q) == 3 else {})}
+    sees = {**in_h, **({"t": True} if np.ndim(R) == 3 else {})}
 
-    def moved(x: np.ndarray, step: Mapping[str, Any]) -> np.ndarray:
-        return f(x, **{name: step[name] for name in in_f if name in step})
+    def of_step(which: int, parameters: dict[str, bool]) -> Callable[..., Any]:
+        def function(*args: Any, t: int = 0, u: Any = None) -> Any:
+            q, r = (_entry(name, of, t) if len(of) > 1 else of[0] for name, of in (("Q", Qs), ("R", Rs)))
+            bound = at_step(f, in_f, t, u), at_step(h, in_h, t, u), q, r
+            return _gaussian_functions(*bound)[which](*args)
 
-    def transition(rng: np.random.Generator, x: np.ndarray, **step: Any) -> np.ndarray:
-        return moved(x, step) + of_Q.draw(rng, len(x), **step)
+        return with_step(function, parameters) if parameters else functions[which]
 
-    def log_transition(old: np.ndarray, new: np.ndarray, **step: Any) -> np.ndarray:
-        return of_Q.log_prob(new - moved(old, step), **step)
-
-    def log_likelihood(x: np.ndarray, y: Any, **step: Any) -> np.ndarray:
-        seen = h(x, **{name: step[name] for name in in_h if name in step})
-        return of_R.log_prob(_vectors("observation", y, of_R.size) - seen, **step)
-
-    moves = {**in_f, **of_Q.parameters}
     return StateSpaceModel(
-        lambda rng, n: m0 + of_P.draw(rng, n),
-        with_step(transition, moves),
-        with_step(log_likelihood, {**in_h, **of_R.parameters}),
-        None if of_P.singular else lambda x: of_P.log_prob(x - m0),
-        None if of_Q.singular else with_step(log_transition, moves),
+        lambda rng, n: m0 + p.draw(rng, n),
+        of_step(0, moves),
+        of_step(1, sees),
+        None if p.singular else lambda x: p.log_prob(x - m0),
+        None if any(q.singular for q in Qs) else of_step(2, moves),
         batched=True,
     )
 
