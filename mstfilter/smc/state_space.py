@@ -184,6 +184,10 @@ class GuidedInitial(Proposal):
     proposal: Callable[..., Any]
     step_functions: ClassVar = {"model": None, "proposal": 1}
 
+    @property
+    def batched(self) -> bool | None:
+        return None if self.model.batched else self.model.batched
+
     def sample(self, rng: np.random.Generator, observation: Any, n: int) -> Population:
         if observation is None:
             return Population(self.model.sample_initial(rng, n))
@@ -208,6 +212,10 @@ class GuidedTransition(DensityTransition):
     model: StateSpaceModel
     proposal: Callable[..., Any]
     step_functions: ClassVar = {"model": None, "proposal": 2}
+
+    @property
+    def batched(self) -> bool | None:
+        return None if self.model.batched else self.model.batched
 
     def predict(self, rng: np.random.Generator, population: Population, observation: Any) -> Population:
         old = population.particles
