@@ -283,8 +283,17 @@ def kalman_filter(
         means[t], covariances[t] = kf.x, kf.P
     smoothed = means, covariances
     if T > 1:
-        smoothed = kf.rts_smoother(means, covariances, list(matrices["F"]), list(matrices["Q"]))[:2]
+        moves = list(matrices["F"]), list(matrices["Q"])
+        smoothed = kf.rts_smoother(means, covariances, *moves, inv=_inverse)[:2]
     return Kalman(means + offsets, covariances, smoothed[0] + offsets, smoothed[1], total)
+
+
+def _inverse(cov: np.ndarray) -> np.ndarray:
+    """The inverse of a covariance; the pseudo-inverse if it is singular, as a condition on its range needs."""
+    values = np.linalg.eigvalsh(cov)
+    if values.min() > 1e-12 * values.max():
+        return np.linalg.inv(cov)
+    return np.linalg.pinv(cov, rcond=1e-12, hermitian=True)
 
 
 def _observed(t: int, y: Any, k: int) -> np.ndarray:

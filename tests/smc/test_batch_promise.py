@@ -7,8 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from mstfilter.errors import InputError
 from mstfilter.smc import (
@@ -258,25 +257,25 @@ def flat(theta):
     return 0.0
 
 
+@pytest.mark.parametrize("n", [3, 2, 5])
 @pytest.mark.parametrize("kind", ["scalar", "vectors", "of", "vectors without axis"])
 @pytest.mark.parametrize("paired", [False, True])
-def test_chains_equal_single_chains_or_refuse(kind, paired):
-    """Three chains of three particles: parameters of all chains without an axis fit vectors of no size here."""
+def test_chains_equal_single_chains_or_refuse(kind, paired, n):
+    """Three chains; parameters of all chains without an axis do not fit vectors, whatever the sizes."""
     data = [YS, [None, *YS[1:]], YS[::-1]] if paired else YS
-    for n in (3, 2, 5):
 
-        def chains(batched):
-            return pmmh(
-                lambda theta: chain_model(kind, theta, n), data, flat, START, 0.2, 6, batched=batched, paired=paired
-            )  # noqa: B023
+    def chains(batched):
+        return pmmh(
+            lambda theta: chain_model(kind, theta, n), data, flat, START, 0.2, 6, batched=batched, paired=paired
+        )
 
-        if kind == "vectors without axis":
-            with pytest.raises(InputError, match="step 1, transition"):
-                chains(True)
-            continue
-        one, many = chains(False), chains(True)
-        np.testing.assert_array_equal(one.theta, many.theta)
-        np.testing.assert_array_equal(one.log_evidence, many.log_evidence)
+    if kind == "vectors without axis":
+        with pytest.raises(InputError, match="step 1, transition"):
+            chains(True)
+        return
+    one, many = chains(False), chains(True)
+    np.testing.assert_array_equal(one.theta, many.theta)
+    np.testing.assert_array_equal(one.log_evidence, many.log_evidence)
 
 
 def test_chains_of_which_one_run_is_lost_stay_in_one_sweep():

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 import pytest
+from scipy import stats
 
 from mstfilter.errors import InputError
 from mstfilter.smc import (
@@ -21,12 +23,18 @@ from mstfilter.smc import (
     batch,
     bootstrap,
     conditional_path,
+    forward_backward,
     guided,
+    hidden_markov,
+    kalman_filter,
     keep,
+    linear_gaussian,
+    nonlinear_gaussian,
     paris,
     path_log_prob,
 )
 from mstfilter.smc.inputs import step_parameters
+from tests.smc.models import mean_ratio
 
 YS = [0.3, -0.2, None, 1.1, 0.4]
 US = [0.5, 1.0, -1.0, 0.25, 2.0]
@@ -148,3 +156,141 @@ def test_components_that_override_at_are_bound_also_inside_another():
 def test_components_without_time_are_used_as_they_are():
     filter = bootstrap(by_hand(0, 1.0), 5)
     assert filter.at(3, 1.0) is filter
+
+
+# --- against exact answers ----------------------------------------------------------------------------------------
+DT = np.array([0.0, 0.5, 1.5, 0.2, 1.0, 0.7])
+ODOMETRY = np.random.default_rng(5).standard_normal((6, 2))
+MATRICES = {
+    "F": np.array([[[1.0, dt], [0.0, 0.9]] for dt in DT]),
+    "Q": np.array([0.2 * dt * np.eye(2) + 0.01 * np.eye(2) for dt in DT]),
+    "H": np.array([[1.0, 0.0]]),
+    "R": np.array([[[0.5 + 0.1 * t]] for t in range(6)]),
+    "m0": np.array([0.5, -0.2]),
+    "P0": np.diag([1.0, 0.3]),
+}
+B = np.array([[1.0, 0.0], [0.2, 0.7]])
+POSITIONS = [0.2, 0.7, None, 1.5, 0.3, 0.9]
+DRIVEN = [WithInput(y, u) for y, u in zip(POSITIONS, ODOMETRY, strict=True)]
+
+
+def augmented():
+    """The exact answers of the same model by another state: a third entry that is 1 carries the input."""
+    F = np.zeros((6, 3, 3))
+    F[:, :2, :2], F[:, :2, 2], F[:, 2, 2] = MATRICES["F"], ODOMETRY @ B.T, 1.0
+    Q, P0 = np.zeros((6, 3, 3)), np.zeros((3, 3))
+    Q[:, :2, :2], P0[:2, :2] = MATRICES["Q"], MATRICES["P0"]
+    H, m0 = np.array([[1.0, 0.0, 0.0]]), np.append(MATRICES["m0"], 1.0)
+    return F, Q, H, MATRICES["R"], m0, P0
+
+
+def test_inputs_of_the_kalman_filter_are_a_third_state():
+    ours = kalman_filter(*MATRICES.values(), DRIVEN, B=B)
+    other = kalman_filter(*augmented(), POSITIONS)
+    np.testing.assert_allclose(ours.log_evidence, other.log_evidence, atol=1e-8)
+    np.testing.assert_allclose(ours.means, other.means[:, :2], atol=1e-8)
+    np.testing.assert_allclose(ours.smoothed_means, other.smoothed_means[:, :2], atol=1e-8)
+    np.testing.assert_allclose(ours.covariances, other.covariances[:, :2, :2], atol=1e-8)
+
+
+def test_the_smoother_knows_the_inputs():
+    """Against the joint normal distribution of all states and observations."""
+    T = 6
+    exact = kalman_filter(*MATRICES.values(), DRIVEN, B=B)
+    mean, cov = [MATRICES["m0"]], np.zeros((2 * T, 2 * T))
+    cov[:2, :2] = MATRICES["P0"]
+    for t in range(1, T):
+        F = MATRICES["F"][t]
+        mean.append(F @ mean[-1] + B @ ODOMETRY[t])
+        now, past = slice(2 * t, 2 * t + 2), slice(2 * t - 2, 2 * t)
+        cov[now, : 2 * t] = F @ cov[past, : 2 * t]
+        cov[: 2 * t, now] = cov[now, : 2 * t].T
+        cov[now, now] = F @ cov[past, past] @ F.T + MATRICES["Q"][t]
+    seen = [t for t, y in enumerate(POSITIONS) if y is not None]
+    rows = [2 * t for t in seen]
+    S = cov[np.ix_(rows, rows)] + np.diag([MATRICES["R"][t, 0, 0] for t in seen])
+    residual = np.array([POSITIONS[t] for t in seen]) - np.concatenate(mean)[rows]
+    smoothed = np.concatenate(mean) + cov[:, rows] @ np.linalg.solve(S, residual)
+    np.testing.assert_allclose(exact.smoothed_means.ravel(), smoothed, atol=1e-10)
+    assert stats.multivariate_normal(np.zeros(len(seen)), S).logpdf(residual) == pytest.approx(exact.log_evidence[-1])
+
+
+def test_bootstrap_filters_with_irregular_times_and_odometry_have_the_exact_evidence():
+    """Mean of L_hat / L over 300 runs is 1 within 5 standard errors (false alarm 6e-7)."""
+    exact = kalman_filter(*MATRICES.values(), DRIVEN, B=B)
+    filter = bootstrap(linear_gaussian(*MATRICES.values(), B=B), 300)
+    mean, error, _ = mean_ratio(filter, DRIVEN, exact.log_evidence[-1], range(300))
+    assert abs(mean - 1) < 5 * error < 0.3
+    by_hand = nonlinear_gaussian(
+        lambda x, t, u: np.stack([x[:, 0] + DT[t] * x[:, 1], 0.9 * x[:, 1]], axis=1) + u @ B.T,
+        MATRICES["Q"],
+        lambda x: x[:, :1],
+        MATRICES["R"],
+        MATRICES["m0"],
+        MATRICES["P0"],
+    )
+    same, _ = bootstrap(by_hand, 300).run(DRIVEN, 1)
+    assert same.log_evidence == pytest.approx(filter.run(DRIVEN, 1)[0].log_evidence, abs=1e-9)
+
+
+def test_chains_that_change_with_time_have_the_exact_evidence():
+    """As above; 0.3 bounds the error of the mean."""
+    moves = np.random.default_rng(0).dirichlet(np.ones(3), size=(5, 3))
+    start, table = np.array([0.5, 0.2, 0.3]), np.log([[0.7, 0.2, 0.1], [0.1, 0.3, 0.6]])
+
+    def log_likelihood(y, t, u):
+        return table[y] * (1 + 0.1 * t) + u * np.arange(3)
+
+    ys = [None if y is None else WithInput(y, 0.1 * y) for y in (0, 1, None, 0, 1)]
+    exact = forward_backward(start, moves, log_likelihood, ys)
+    paths = np.array(list(product(range(3), repeat=5)))
+    p = start[paths[:, 0]]
+    for t, y in enumerate(ys):
+        p = p * (moves[t][paths[:, t - 1], paths[:, t]] if t else 1.0)
+        p = p * (1.0 if y is None else np.exp(log_likelihood(y.y, t, y.u)[paths[:, t]]))
+    total = np.array([p[paths[:, 3] == k].sum() for k in range(3)]) / p.sum()
+    assert exact.log_evidence[-1] == pytest.approx(np.log(p.sum()), abs=1e-12)
+    np.testing.assert_allclose(exact.smoothed[3], total, atol=1e-12)
+    filter = bootstrap(hidden_markov(start, moves, log_likelihood), 100)
+    mean, error, _ = mean_ratio(filter, ys, exact.log_evidence[-1], range(300))
+    assert abs(mean - 1) < 5 * error < 0.3
+
+
+def test_singular_noise_of_filterpy_is_accepted():
+    """Noise of an acceleration, of rank one: draws have its covariance, and the evidence is exact (as above)."""
+    Q = pytest.importorskip("filterpy.common").Q_discrete_white_noise(2, dt=0.5, var=0.3)
+    arguments = ([[1.0, 0.5], [0.0, 1.0]], Q, [[1.0, 0.0]], [[0.5]], [0.0, 0.0], np.diag([1.0, 0.0]))
+    model, ys = linear_gaussian(*arguments), [0.2, 0.5, 0.1, 0.9]
+    mean, error, _ = mean_ratio(bootstrap(model, 300), ys, kalman_filter(*arguments, ys).log_evidence[-1], range(300))
+    assert abs(mean - 1) < 5 * error < 0.3
+    noise = model.sample_transition(np.random.default_rng(0), np.zeros((200_000, 2)))
+    np.testing.assert_allclose(np.cov(noise.T), Q, atol=5 * 0.3 * 0.5**2 / np.sqrt(200_000))
+    np.testing.assert_allclose(noise[:, 0], 0.25 * noise[:, 1], atol=1e-7)
+    assert model.log_transition is None and model.log_initial is None
+    with pytest.raises(InputError, match="no log_transition"):
+        backward_paths(np.random.default_rng(0), keep(bootstrap(model, 5), ys), Dynamics(model), 2)
+    assert conditional_path(bootstrap(model, 5), ys, 0).shape == (4, 2)
+    with pytest.raises(InputError, match="symmetric and positive semidefinite"):
+        linear_gaussian(np.eye(2), -np.eye(2), [[1.0, 0.0]], [[1.0]], [0.0, 0.0], np.eye(2))
+
+
+def test_what_exact_models_reject():
+    one = ([[1.0]], [[1.0]], [[1.0]], [[1.0]], [0.0], [[1.0]])
+    for wrong in (np.nan, np.inf):
+        with pytest.raises(InputError, match=r"observation 1 is .* expected finite numbers") as error:
+            kalman_filter(*one, [0.1, wrong])
+        assert "missing is None" in error.value.hints[0]
+    with pytest.raises(InputError, match="observation 1 has no input"):
+        kalman_filter(*one, [0.1, 0.2], B=[[1.0]])
+    with pytest.raises(InputError, match=r"step 1, transition: .* step 1 has no input"):
+        bootstrap(linear_gaussian(*one, B=[[1.0]]), 5).run([0.1, 0.2])
+    with pytest.raises(InputError, match=r"step 2, transition: F has 2 entries, and none for step 2"):
+        bootstrap(linear_gaussian(np.ones((2, 1, 1)), *one[1:]), 5).run([0.1, 0.2, 0.3])
+    with pytest.raises(InputError, match=r"the input has shape \(2,\), expected \(1,\)"):
+        bootstrap(linear_gaussian(*one, B=[[1.0]]), 5).run([0.1, WithInput(0.2, [1.0, 2.0])])
+    with pytest.raises(InputError, match=r"B has shape \(2, 1\), expected \(1, j\)"):
+        linear_gaussian(*one, B=[[1.0], [2.0]])
+    with pytest.raises(InputError, match=r"B has shape \(1,\)"):
+        kalman_filter(*one, [0.1], B=[1.0])
+    with pytest.raises(InputError, match="transition has 2 entries"):
+        forward_backward([1.0], np.ones((2, 1, 1)), lambda y: np.zeros(1), [0])
