@@ -155,12 +155,9 @@ def run_batch(
     stated = [slot for slot in _SLOTS if getattr(getattr(filter, slot), "batched", None) is True]
     asked = [slot for slot in ("all", *stated) if stated and slot in single]
     if asked and warn:
-        warnings.warn(f"{_named(asked[0])} called once for each run: {single[asked[0]]}", stacklevel=3)
+        what = "filter" if asked[0] == "all" else asked[0]
+        warnings.warn(f"the {what} is called once for each run: {single[asked[0]]}", stacklevel=3)
     return replace(result, single=single)
-
-
-def _named(slot: str) -> str:
-    return "the filter is" if slot == "all" else f"the {slot} is"
 
 
 def batched_slots(filter: ParticleFilter) -> tuple[str, ...] | None:
@@ -383,7 +380,8 @@ class _Sweep:
             if isinstance(error, LostRunError):
                 return found
             self.refuse(t, slot, f"a call for all runs raises {type(error).__name__}: {error}; single runs do not")
-        if self.check and self.is_due(t, slot, len(rows)):
+        due = not t & (t - 1) or self.checked.get(slot, (0, 0))[0] != len(rows)
+        if self.check and due:
             self.compare(t, slot, rows, particles, log_weights)
         if log_weights is self.log_weights:
             return rows, particles, log_weights
@@ -437,9 +435,6 @@ class _Sweep:
             raise _Unlike(what)
         return np.repeat(stacked, self.filter.n, axis=0).view(rows_of(self.filter.n))
 
-    def is_due(self, t: int, slot: str, n_rows: int) -> bool:
-        return not t & (t - 1) or self.checked.get(slot, (0, 0))[0] != n_rows
-
     def compare(self, t: int, slot: str, rows: np.ndarray, particles: Any, log_weights: np.ndarray) -> None:
         """Compare runs with single runs: the first and the last, or one in turn; at first all with another order."""
         last, count = self.checked.get(slot, (0, 0))
@@ -464,12 +459,12 @@ class _Sweep:
         """Refuse the component if a run differs."""
         for what, a, b in (("particles", ours[0], other[0]), ("log weights", ours[1], other[1])):
             found = _difference(a, b)
-            if found is None or (found.by_rounding and self.rounding):
+            if found is None or (found[0] and self.rounding):
                 continue
-            if found.by_rounding:
+            if found[0]:
                 raise _CalledSingly(slot, f"step {t}: its {what} differ by rounding from those of single runs")
             run = int(self.runs[row])
-            self.refuse(t, slot, f"the {what} of run {run} are {found.ours} in the batch, {found.other} {how}")
+            self.refuse(t, slot, f"the {what} of run {run} are {found[1]} in the batch, {found[2]} {how}")
 
     def refuse(self, t: int, slot: str, reason: str) -> None:
         """Raise InputError if the component states that it is batched; else call it once for each run."""
@@ -532,31 +527,22 @@ def _called(slot: str, component: Any, rng: Any, population: Population | None, 
     return component.update(rng, population, None, y)
 
 
-@dataclass(frozen=True)
-class _Found:
-    """A difference of two results."""
-
-    ours: Any
-    other: Any
-    by_rounding: bool
-
-
-def _difference(ours: Any, other: Any) -> _Found | None:
-    """The first difference of two arrays or mappings of arrays; None if they have the same bits."""
+def _difference(ours: Any, other: Any) -> tuple[bool, Any, Any] | None:
+    """The first difference of two arrays or mappings of arrays, and whether it is rounding; None if there is none."""
     if isinstance(ours, Mapping) and isinstance(other, Mapping):
         if ours.keys() != other.keys():
-            return _Found(sorted(ours), sorted(other), False)
+            return False, sorted(ours), sorted(other)
         found = [d for d in (_difference(ours[name], other[name]) for name in ours) if d is not None]
-        return min(found, key=lambda d: d.by_rounding, default=None)
+        return min(found, key=lambda d: d[0], default=None)
     a, b = np.asarray(ours), np.asarray(other)
     if a.shape != b.shape or a.dtype != b.dtype:
-        return _Found(f"{a.dtype} {a.shape}", f"{b.dtype} {b.shape}", False)
+        return False, f"{a.dtype} {a.shape}", f"{b.dtype} {b.shape}"
     unequal = (a != b) & ~((a != a) & (b != b))
     if not unequal.any():
         return None
     close = a.dtype.kind in "fc" and np.allclose(a, b, rtol=1e-9, atol=1e-12, equal_nan=True)
     where = tuple(np.argwhere(unequal)[0])
-    return _Found(a[where], b[where], close)
+    return close, a[where], b[where]
 
 
 def summaries(log_weights: np.ndarray, top: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:

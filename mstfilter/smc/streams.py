@@ -23,7 +23,7 @@ import inspect
 import threading
 import zlib
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any, ClassVar
 
 import numpy as np
@@ -298,21 +298,11 @@ class RunGenerators:
     def __len__(self) -> int:
         return len(self._states)
 
-    def standard_normal(self, size: Any = None) -> np.ndarray:
-        """Independent standard normal numbers, of shape `size` = (R, ...)."""
-        return self._filled("standard_normal", size)
-
-    def random(self, size: Any = None) -> np.ndarray:
-        """Independent uniform numbers on [0, 1), of shape `size` = (R, ...)."""
-        return self._filled("random", size)
-
-    def standard_exponential(self, size: Any = None) -> np.ndarray:
-        """Independent exponential numbers, of shape `size` = (R, ...)."""
-        return self._filled("standard_exponential", size)
-
     def __getattr__(self, method: str) -> Any:
         if method.startswith("_") or not hasattr(np.random.Generator, method):
             raise AttributeError(method)
+        if method in ("standard_normal", "random", "standard_exponential"):
+            return partial(self._filled, method)
 
         def draw(*args: Any, **options: Any) -> np.ndarray:
             given = _signature(method).bind(None, *args, **options).arguments
@@ -365,7 +355,7 @@ class RunGenerators:
             return drawn
         return drawn.reshape(self._length, *drawn.shape[2:]).view(rows_of(self._n))
 
-    def _filled(self, method: str, size: Any) -> np.ndarray:
+    def _filled(self, method: str, size: Any = None) -> np.ndarray:
         return self._joined(self._filled_by_run(method, self._inner(size)))
 
     def _filled_by_run(self, method: str, inner: tuple[int, ...]) -> np.ndarray:

@@ -19,6 +19,7 @@ from mstfilter.smc import (
     WithInput,
     batch,
     bootstrap,
+    ensemble,
     guided,
     hidden_markov,
     linear_gaussian,
@@ -346,3 +347,14 @@ def test_the_advice_for_many_data_sets_with_as_many_runs_as_particles():
     assert runs.single == {} and runs.values["mean"].shape == (50, 8, 1)
     for r in (0, 1, 25, 49):
         assert runs.log_evidence[r, -1] == filter.run(data_sets[r], r)[0].log_evidence
+
+
+def test_walkers_of_emcee_are_the_same_in_one_sweep():
+    start = np.linspace(0.1, 0.9, 6)[:, None]
+
+    def walkers(batched):
+        return ensemble(lambda theta: chain_model("of", theta, 5), YS, flat, start, 4, 1, batched=batched)
+
+    one, many = walkers(False), walkers(True)
+    np.testing.assert_array_equal(one.theta, many.theta)
+    np.testing.assert_array_equal(one.log_evidence, many.log_evidence)
