@@ -3,7 +3,9 @@
     python experiments/benchmarks/batch.py [--rounds 15] [--runs 200] [--particles 100] [--steps 100]
 
 All programs filter one AR(1) series, with systematic resampling if the effective sample size is below half of the
-particles. They run in turns; the figures are medians of ratios within a round.
+particles. They run in turns; the figures are medians of ratios within a round. Further lines give the processor time
+of a batch relative to single runs for four resampling schemes and 200 seeds of a model of `StateSpaceModel.of` and of
+a program, and of PMMH in one sweep relative to single chains.
 """
 
 from __future__ import annotations
@@ -13,7 +15,20 @@ import time
 
 import numpy as np
 
-from mstfilter.smc import StateSpaceModel, batch, bootstrap
+from mstfilter.smc import (
+    Multinomial,
+    Normal,
+    Program,
+    Ssp,
+    StateSpaceModel,
+    Stratified,
+    Systematic,
+    batch,
+    bootstrap,
+    observe,
+    pmmh,
+    sample,
+)
 
 RHO, SIGMA, TAU = 0.9, 0.6, 0.4
 MODEL = StateSpaceModel(
@@ -48,6 +63,59 @@ def plain(ys: np.ndarray, n_runs: int, n: int) -> np.ndarray:
     return top + np.log(np.exp(lw - top[:, None]).mean(axis=1))
 
 
+OF = StateSpaceModel.of(Normal(0.0, 1.0), lambda x: Normal(RHO * x, SIGMA), lambda x: Normal(x, TAU))
+
+
+def walk(previous, y):
+    x = sample("x", Normal(0.0, 1.0) if previous is None else Normal(RHO * previous["x"], SIGMA))
+    observe("y", Normal(x, TAU), y)
+
+
+def with_coefficient(theta, n=50):
+    """The AR(1) filter with another coefficient."""
+    (rho,) = theta
+    return bootstrap(
+        StateSpaceModel(
+            MODEL.sample_initial,
+            lambda rng, x: rho * x + SIGMA * rng.standard_normal(x.shape),
+            MODEL.log_likelihood,
+            batched=True,
+        ),
+        n,
+    )
+
+
+def seconds_of(program) -> float:
+    begin = time.process_time()
+    program()
+    return time.process_time() - begin
+
+
+def ratios(ys: np.ndarray, n_runs: int, n: int) -> None:
+    """Print the time of batches and of PMMH in one sweep relative to single runs, in turns."""
+    schemes = (Systematic(), Stratified(), Multinomial(), Ssp())
+    families = {
+        "StateSpaceModel.of, 4 arms": [bootstrap(OF, n, scheme) for scheme in schemes],
+        "program, 4 arms": [Program(walk).bootstrap(n, resampler=scheme) for scheme in schemes],
+    }
+    for name, arms in families.items():
+        assert not any(batch(arm, ys[:2], range(4)).single for arm in arms)
+        found = [
+            seconds_of(lambda arm=arm: batch(arm, ys, range(n_runs)))
+            / (10 * seconds_of(lambda arm=arm: [arm.run(ys, seed) for seed in range(n_runs // 10)]))
+            for arm in arms
+        ]
+        print(f"{name:28} batch / single runs {np.mean(found):.3f} ({', '.join(f'{r:.3f}' for r in found)})")
+
+    def chains(n_chains, batched):
+        start = np.full((n_chains, 1), 0.5)
+        return lambda: pmmh(with_coefficient, ys, lambda theta: 0.0, start, 0.1, 15, batched=batched)
+
+    for n_chains in (10, 20, 40):
+        found = [seconds_of(chains(n_chains, True)) / seconds_of(chains(n_chains, False)) for _ in range(3)]
+        print(f"PMMH, {n_chains} chains, n = 50      one sweep / single chains {np.median(found):.3f}")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--rounds", type=int, default=15)
@@ -73,6 +141,7 @@ def main() -> None:
     base = np.array(seconds["plain"])
     for name, found in seconds.items():
         print(f"{name:24} {np.median(found) * 1e3:8.1f} ms   / plain {np.median(np.array(found) / base):.2f}")
+    ratios(ys, options.runs, options.particles)
 
 
 if __name__ == "__main__":

@@ -11,6 +11,7 @@
 `filter`                `ParticleFilter`; `ParticleFilter.step` is one step of the filter
 `interfaces`            base classes of components (`Transition`, `Proposal`, `Update`, `Resampler`, ...),
                         `State` and `Info`
+`inputs`                time and inputs of models: `WithInput`, an observation with an input
 `population`            `Population`: particles, log weights, parents; `Candidates`, built when accessed
 `resampling`            schemes that need only weights, with equal output weights
 `diverse_resampling`    schemes that keep different particles, with unequal weights

@@ -85,6 +85,7 @@ from mstfilter.smc.inference import (
     pmmh as pmmh,
     smc_sampler as smc_sampler,
 )
+from mstfilter.smc.inputs import WithInput as WithInput
 from mstfilter.smc.interfaces import (
     Codec as Codec,
     Component as Component,

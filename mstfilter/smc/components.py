@@ -42,14 +42,15 @@ from mstfilter.smc.population import Population, as_matrix, union
 class Reweight(Update):
     """Adds ``log_likelihood(particles, observation)`` (n,) to the log weights: the update of the bootstrap filter.
 
-    Proposed particles, if any, join the predicted ones. `batched` says whether the function also takes particles
-    (R, n, ...) and returns (R, n).
+    Proposed particles, if any, join the predicted ones. `batched` says whether the function treats each
+    particle by itself (see `Component.batched`).
     """
 
     log_likelihood: Callable[[Any, Any], np.ndarray]
-    batched: bool = False
+    batched: bool | None = False
 
     draws: ClassVar[bool] = False
+    step_functions: ClassVar = {"log_likelihood": 2}
 
     def update(
         self, rng: np.random.Generator, predicted: Population | None, proposed: Population | None, observation: Any
@@ -78,6 +79,7 @@ class ProjectOnto(Update):
 
     properly_weighted: ClassVar[bool] = False
     draws: ClassVar[bool] = False
+    step_functions: ClassVar = {"project": 2, "log_likelihood": 2}
 
     def update(
         self, rng: np.random.Generator, predicted: Population | None, proposed: Population | None, observation: Any
@@ -114,6 +116,7 @@ class CrossVectors(Update):
 
     #: The density of children is not known.
     properly_weighted: ClassVar[bool] = False
+    step_functions: ClassVar = {"log_likelihood": 2}
 
     def __post_init__(self) -> None:
         check_number("share", self.share, above=0)
@@ -169,6 +172,7 @@ class Branching(Transition):
 
     inner: Transition
     branches: int = 4
+    step_functions: ClassVar = {"inner": None}
 
     def __post_init__(self) -> None:
         check_component("inner", self.inner, Transition)

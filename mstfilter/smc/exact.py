@@ -41,74 +41,198 @@ import numpy as np
 from mstfilter.errors import InputError
 from mstfilter.smc.distributions import MultivariateNormal
 from mstfilter.smc.filter import ParticleFilter
+from mstfilter.smc.inputs import AtStep, at_step, split_input, step_parameters, with_step
 from mstfilter.smc.interfaces import Proposal, Transition, Update
 from mstfilter.smc.population import Population, union
 from mstfilter.smc.state_space import StateSpaceModel
+from mstfilter.smc.streams import Rows
 
-_Map = Callable[[np.ndarray], np.ndarray]  #: of particles (n, d) or (R, n, d)
-
-
-def linear_gaussian(F: Any, Q: Any, H: Any, R: Any, m0: Any, P0: Any) -> StateSpaceModel:
-    """x_0 ~ N(m0, P0), x_t = F x_{t-1} + N(0, Q), y_t = H x_t + N(0, R); particles are (n, d).
-
-    `kalman_filter` has the exact answers.
-    """
-    F, Q, H, R, m0, P0 = (np.asarray(a, dtype=np.float64) for a in (F, Q, H, R, m0, P0))
-    if m0.ndim != 1:
-        raise InputError(f"m0 has shape {m0.shape}, expected one number per entry of the state: (d,)")
-    d, k = m0.shape, H.shape[:1]
-    for name, array, shape in (("F", F, d * 2), ("H", H, k + d), ("R", R, k * 2)):
-        if array.shape != shape:
-            raise InputError(f"{name} has shape {array.shape}, expected {shape} as m0 has {d[0]} entries")
-    return nonlinear_gaussian(lambda x: x @ F.T, Q, lambda x: x @ H.T, R, m0, P0)
+_Map = Callable[[np.ndarray], np.ndarray]  #: of particles (n, d)
 
 
-def nonlinear_gaussian(f: _Map, Q: Any, h: _Map, R: Any, m0: Any, P0: Any) -> StateSpaceModel:
-    """x_0 ~ N(m0, P0), x_t = f(x_{t-1}) + N(0, Q), y_t = h(x_t) + N(0, R).
+def linear_gaussian(F: Any, Q: Any, H: Any, R: Any, m0: Any, P0: Any, B: Any = None) -> StateSpaceModel:
+    """x_0 ~ N(m0, P0), x_t = F x_{t-1} + B u_t + N(0, Q), y_t = H x_t + N(0, R); particles are (n, d).
 
-    `f` and `h` give the next states (n, d), and the observations (n, k) without noise, of particles (n, d). If they
-    also take particles (R, n, d), the model can be run in a batch.
+    The matrices may have a first axis of T entries: entry t of `F`, `B` and `Q` moves x_{t-1} to x_t, entry 0 is not
+    used; entry t of `H` and `R` belongs to y_t. With `B` (d, j), each step after the first needs an input (j,), see
+    `WithInput`. `Q` and `P0` may be singular (see `nonlinear_gaussian`). `kalman_filter` has the exact answers.
+
+    Raises InputError if a shape does not fit, and in a step if there is no entry for it or no input.
     """
     m0 = np.asarray(m0, np.float64)
-    Q, R, P0 = _covariance("Q", Q, len(m0)), _covariance("R", R), _covariance("P0", P0, len(m0))
-    root_Q, root_P = np.linalg.cholesky(Q), np.linalg.cholesky(P0)
+    if m0.ndim != 1:
+        raise InputError(f"m0 has shape {m0.shape}, expected one number per entry of the state: (d,)")
+    F, H, B = _linear(F, H, B, len(m0))
+    k = H.shape[-2]
+    for name, given, size in (("R", R, k), ("Q", Q, len(m0))):
+        if np.shape(given)[-2:] != (size, size):
+            raise InputError(f"{name} has shape {np.shape(given)}, expected ({size}, {size}) as m0 and H")
 
-    def log_normal(cov: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
-        whiten = np.linalg.inv(np.linalg.cholesky(cov))
-        constant = np.log(np.diag(whiten)).sum() - 0.5 * len(cov) * np.log(2 * np.pi)
+    def f(x: np.ndarray, **step: Any) -> np.ndarray:
+        moved = x @ _entry("F", F, **step).T
+        return moved if B is None else moved + _input_effect(_entry("B", B, **step), step["u"])
 
-        def of(residual: np.ndarray) -> np.ndarray:
-            z = residual @ whiten.T
-            return constant - 0.5 * np.einsum("...j,...j->...", z, z)
+    def h(x: np.ndarray, **step: Any) -> np.ndarray:
+        return x @ _entry("H", H, **step).T
 
-        return of
+    of_step = {**_varies(F, B), **({} if B is None else {"u": True})}
+    return nonlinear_gaussian(
+        with_step(f, of_step) if of_step else lambda x: x @ F.T,
+        Q,
+        with_step(h, {"t": True}) if H.ndim == 3 else lambda x: x @ H.T,
+        R,
+        m0,
+        P0,
+    )
 
-    def initial(rng: np.random.Generator, n: int | tuple[int, int]) -> np.ndarray:
-        shape = (n,) if isinstance(n, int) else n
-        return m0 + rng.standard_normal((*shape, len(m0))) @ root_P.T
+
+def _linear(F: Any, H: Any, B: Any, d: int) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+    """Checked matrices of a linear model, possibly with a first axis of times."""
+    matrices = []
+    for name, given, n_rows in (("F", F, d), ("H", H, None), ("B", B, d)):
+        array = None if given is None else np.asarray(given, np.float64)
+        if array is not None:
+            rows, columns = array.shape[-2:] if array.ndim in (2, 3) else (-1, -1)
+            if rows != (n_rows or rows) or (name != "B" and columns != d) or rows < 0:
+                expected = f"({n_rows or 'k'}, {'j' if name == 'B' else d})"
+                raise InputError(f"{name} has shape {array.shape}, expected {expected} as m0 has {d} entries")
+        matrices.append(array)
+    return tuple(matrices)  # type: ignore[return-value]
+
+
+def _varies(*arrays: np.ndarray | None) -> dict[str, bool]:
+    """The parameter t, for a function of matrices of which one changes with time."""
+    return {"t": True} if any(a is not None and a.ndim == 3 for a in arrays) else {}
+
+
+def _entry(name: str, given: Any, t: int = 0, u: Any = None) -> Any:
+    """The matrix of step t, or the entry of a list."""
+    if isinstance(given, np.ndarray) and given.ndim == 2:
+        return given
+    if t >= len(given):
+        raise InputError(f"{name} has {len(given)} entries, and none for step {t}")
+    return given[t]
+
+
+def _input_effect(B: np.ndarray, u: Any) -> np.ndarray:
+    """B u (d,), or (m, d) for one input for each row. Without BLAS, whose rounding depends on the number of rows."""
+    u = _vectors("input", u, B.shape[1])
+    return (B * u[..., None, :]).sum(axis=-1)
+
+
+def _vectors(what: str, given: Any, size: int) -> np.ndarray:
+    """An observation or input (size,) of all particles, or (m, size) of the rows of a batch."""
+    vector = np.asanyarray(given, np.float64)
+    if vector.shape == (size,) and not isinstance(vector, Rows):
+        return vector
+    by_row = isinstance(vector, Rows)
+    if vector.ndim == by_row:
+        vector = vector[..., None]
+    if vector.shape[by_row:] != (size,):
+        raise InputError(f"the {what} has shape {vector.shape[by_row:]}, expected ({size},)")
+    return vector
+
+
+class _Noise:
+    """Normal noise of mean 0."""
+
+    def __init__(self, name: str, cov: np.ndarray, k: int | None, semidefinite: bool) -> None:
+        root, self.singular = _covariance(name, cov, k, semidefinite)
+        self.size, self.root = len(root), root.T
+        if not self.singular:
+            self.whiten = np.linalg.inv(root).T
+            self.constant = np.log(np.diag(self.whiten)).sum() - 0.5 * self.size * np.log(2 * np.pi)
+
+    def draw(self, rng: np.random.Generator, n: int) -> np.ndarray:
+        """(n, k) draws."""
+        return rng.standard_normal((n, self.size)) @ self.root
+
+    def log_prob(self, residual: np.ndarray) -> np.ndarray:
+        """(n,) log densities of residuals (n, k)."""
+        z = residual @ self.whiten
+        return self.constant - 0.5 * np.einsum("...j,...j->...", z, z)
+
+
+def _noises(name: str, given: Any, k: int | None = None, semidefinite: bool = False) -> list[_Noise]:
+    """The noise of all steps, or one for each entry of the first axis of a covariance (T, k, k)."""
+    cov = np.asarray(given, np.float64)
+    return [_Noise(name, matrix, k, semidefinite) for matrix in (cov if cov.ndim == 3 else cov[None])]
+
+
+def _gaussian_functions(f: _Map, h: _Map, q: _Noise, r: _Noise) -> tuple[Callable[..., Any], ...]:
+    """Transition, log likelihood and log density of the transition."""
 
     def transition(rng: np.random.Generator, x: np.ndarray) -> np.ndarray:
-        return f(x) + rng.standard_normal(x.shape) @ root_Q.T
+        return f(x) + q.draw(rng, len(x))
 
-    of_R, of_P, of_Q = log_normal(R), log_normal(P0), log_normal(Q)
+    def log_likelihood(x: np.ndarray, y: Any) -> np.ndarray:
+        return r.log_prob(_vectors("observation", y, r.size) - h(x))
+
+    def log_transition(old: np.ndarray, new: np.ndarray) -> np.ndarray:
+        return q.log_prob(new - f(old))
+
+    return transition, log_likelihood, log_transition
+
+
+def nonlinear_gaussian(
+    f: Callable[..., Any], Q: Any, h: Callable[..., Any], R: Any, m0: Any, P0: Any
+) -> StateSpaceModel:
+    """x_0 ~ N(m0, P0), x_t = f(x_{t-1}) + N(0, Q), y_t = h(x_t) + N(0, R).
+
+    `f` and `h` give the next states (n, d), and the observations (n, k) without noise, of particles (n, d), row by
+    row. They may have the further parameters ``t`` and ``u``; `Q` and `R` may have a first axis of T entries.
+
+    `Q` and `P0` may be singular, as that of noise that acts on the velocity only. x_t then has no density given
+    x_{t-1}: the model has no `log_transition` (for `P0`: no `log_initial`), and what needs it raises InputError. A
+    conditional path is then drawn without ancestor sampling.
+    """
+    m0 = np.asarray(m0, np.float64)
+    Qs, Rs = _noises("Q", Q, len(m0), True), _noises("R", R)
+    p = _Noise("P0", np.asarray(P0, np.float64), len(m0), True)
+    in_f, in_h = step_parameters(f, 1), step_parameters(h, 1)
+    functions = _gaussian_functions(f, h, Qs[0], Rs[0])
+    moves = {**in_f, **({"t": True} if np.ndim(Q) == 3 else {})}
+    sees = {**in_h, **({"t": True} if np.ndim(R) == 3 else {})}
+
+    def of_step(which: int, parameters: dict[str, bool]) -> Callable[..., Any]:
+        def function(*args: Any, t: int = 0, u: Any = None) -> Any:
+            q, r = (_entry(name, of, t) if len(of) > 1 else of[0] for name, of in (("Q", Qs), ("R", Rs)))
+            bound = at_step(f, in_f, t, u), at_step(h, in_h, t, u), q, r
+            return _gaussian_functions(*bound)[which](*args)
+
+        return with_step(function, parameters) if parameters else functions[which]
+
     return StateSpaceModel(
-        initial,
-        transition,
-        lambda x, y: of_R(np.atleast_1d(y) - h(x)),
-        lambda x: of_P(x - m0),
-        lambda old, new: of_Q(new - f(old)),
+        lambda rng, n: m0 + p.draw(rng, n),
+        of_step(0, moves),
+        of_step(1, sees),
+        None if p.singular else lambda x: p.log_prob(x - m0),
+        None if any(q.singular for q in Qs) else of_step(2, moves),
         batched=True,
     )
 
 
-def _covariance(name: str, given: Any, d: int | None = None) -> np.ndarray:
+def _covariance(name: str, given: Any, d: int | None = None, semidefinite: bool = False) -> tuple[np.ndarray, bool]:
+    """A square root of a covariance: the Cholesky factor, or one by eigenvalues if it is singular; whether it is."""
     cov = np.asarray(given, dtype=np.float64)
     if cov.ndim != 2 or cov.shape != (d or len(cov), d or len(cov)):
         expected = "(k, k)" if d is None else f"({d}, {d}) as m0 has {d} entries"
         raise InputError(f"{name} has shape {cov.shape}, expected {expected}")
-    if not np.allclose(cov, cov.T) or not (np.linalg.eigvalsh(cov) > 0).all():
-        raise InputError(f"{name} is {cov.tolist()}, expected a covariance: symmetric and positive definite")
-    return cov
+    if np.allclose(cov, cov.T):
+        values, vectors = np.linalg.eigh(cov)
+        rounding = 1e-14 * max(values.max(), 0.0)
+        if (values > rounding).all():
+            return np.linalg.cholesky(cov), False
+        if semidefinite and (values >= -rounding).all():
+            return vectors * np.sqrt(np.maximum(values, 0.0)), True
+    kind = "semidefinite" if semidefinite else "definite"
+    raise InputError(f"{name} is {cov.tolist()}, expected a covariance: symmetric and positive {kind}")
+
+
+def _definite(name: str, given: Any) -> np.ndarray:
+    """A covariance that must be positive definite."""
+    _covariance(name, given)
+    return np.asarray(given, np.float64)
 
 
 class Kalman(NamedTuple):
@@ -121,51 +245,90 @@ class Kalman(NamedTuple):
     log_evidence: np.ndarray  #: (T,) log p(y_0 .. y_t)
 
 
-def kalman_filter(F: Any, Q: Any, H: Any, R: Any, m0: Any, P0: Any, observations: Iterable[Any]) -> Kalman:
+def kalman_filter(
+    F: Any, Q: Any, H: Any, R: Any, m0: Any, P0: Any, observations: Iterable[Any], B: Any = None
+) -> Kalman:
     """The Kalman filter and the Rauch-Tung-Striebel smoother of filterpy, of (k,) observations; None if missing.
 
-    The arguments are as in `linear_gaussian`. The matrices may have a first axis of T entries: entry t of `F` and `Q`
-    moves x_{t-1} to x_t, entry 0 is not used; entry t of `H` and `R` belongs to y_t. Raises InputError if a shape
-    does not fit.
+    The arguments are as in `linear_gaussian`; matrices that change have T entries. With `B` the inputs are given with
+    the observations, by `WithInput`. Raises InputError if a shape does not fit, an input is not given or an
+    observation is not finite.
     """
     from filterpy.kalman import KalmanFilter
 
-    ys = [None if y is None else np.atleast_1d(np.asarray(y, dtype=np.float64)) for y in observations]
+    given = [split_input(y) for y in observations]
     m0, P0 = np.asarray(m0, dtype=np.float64), np.asarray(P0, dtype=np.float64)
-    T, d, k = len(ys), len(m0), np.shape(H)[-2]
+    T, d, k = len(given), len(m0), np.shape(H)[-2]
     matrices = {}
-    for name, given, shape in (("F", F, (d, d)), ("Q", Q, (d, d)), ("H", H, (k, d)), ("R", R, (k, k))):
-        array = np.asarray(given, dtype=np.float64)
+    for name, value, shape in (("F", F, (d, d)), ("Q", Q, (d, d)), ("H", H, (k, d)), ("R", R, (k, k))):
+        array = np.asarray(value, dtype=np.float64)
         if array.shape not in (shape, (T, *shape)):
             raise InputError(f"{name} has shape {array.shape}, expected {shape} or {(T, *shape)}")
         matrices[name] = np.broadcast_to(array, (T, *shape))
     if P0.shape != (d, d):
         raise InputError(f"P0 has shape {P0.shape}, expected {(d, d)} as m0 has {d} entries")
+    # x_t - offset_t has no input, and the same covariances.
+    offsets = _offsets(matrices["F"], B, [u for _, u in given])
     kf = KalmanFilter(dim_x=d, dim_z=k)
     kf.x, kf.P = m0.copy(), P0.copy()
     means, covariances, total = np.empty((T, d)), np.empty((T, d, d)), np.zeros(T)
-    for t, y in enumerate(ys):
+    for t, (y, _) in enumerate(given):
         total[t] = total[t - 1] if t else 0.0
         kf.F, kf.Q, kf.H, kf.R = (matrices[name][t] for name in "FQHR")
         if t:
             kf.predict()
         if y is not None:
-            if y.shape != (k,):
-                raise InputError(f"observation {t} has shape {y.shape}, expected ({k},)")
-            kf.update(y)
+            kf.update(_observed(t, y, k) - kf.H @ offsets[t])
             total[t] += kf.log_likelihood
         means[t], covariances[t] = kf.x, kf.P
     smoothed = means, covariances
     if T > 1:
-        smoothed = kf.rts_smoother(means, covariances, list(matrices["F"]), list(matrices["Q"]))[:2]
-    return Kalman(means, covariances, *smoothed, total)
+        moves = list(matrices["F"]), list(matrices["Q"])
+        smoothed = kf.rts_smoother(means, covariances, *moves, inv=_inverse)[:2]
+    return Kalman(means + offsets, covariances, smoothed[0] + offsets, smoothed[1], total)
 
 
-def hidden_markov(initial: Any, transition: Any, log_likelihood: Callable[[Any], Any]) -> StateSpaceModel:
+def _inverse(cov: np.ndarray) -> np.ndarray:
+    """The inverse of a covariance; the pseudo-inverse if it is singular, as a condition on its range needs."""
+    values = np.linalg.eigvalsh(cov)
+    if values.min() > 1e-12 * values.max():
+        return np.linalg.inv(cov)
+    return np.linalg.pinv(cov, rcond=1e-12, hermitian=True)
+
+
+def _observed(t: int, y: Any, k: int) -> np.ndarray:
+    vector = np.atleast_1d(np.asarray(y, dtype=np.float64))
+    if vector.shape != (k,):
+        raise InputError(f"observation {t} has shape {vector.shape}, expected ({k},)")
+    if not np.isfinite(vector).all():
+        raise InputError(
+            f"observation {t} is {vector.tolist()}, expected finite numbers", "one that is missing is None"
+        )
+    return vector
+
+
+def _offsets(F: np.ndarray, B: Any, inputs: list[Any]) -> np.ndarray:
+    """(T, d) the effect of all inputs so far on the state."""
+    T, d = F.shape[:2]
+    found = np.zeros((T, d))
+    if B is None:
+        return found
+    B = np.asarray(B, np.float64)
+    if B.ndim not in (2, 3) or B.shape[-2] != d or (B.ndim == 3 and len(B) != T):
+        raise InputError(f"B has shape {B.shape}, expected ({d}, j) or ({T}, {d}, j)")
+    for t in range(1, T):
+        if inputs[t] is None:
+            raise InputError(f"observation {t} has no input", "with B, give WithInput(y, u)")
+        found[t] = F[t] @ found[t - 1] + _input_effect(_entry("B", B, t), inputs[t])
+    return found
+
+
+def hidden_markov(initial: Any, transition: Any, log_likelihood: Callable[..., Any]) -> StateSpaceModel:
     """A model with K states 0 .. K-1; particles are (n,) int. `forward_backward` has the exact answers.
 
-    `initial` (K,) has the probabilities of x_0, row i of `transition` (K, K) those of x_t given x_{t-1} = i.
-    ``log_likelihood(y)`` (K,) is log p(y_t | x_t = 0 .. K-1); -inf if impossible.
+    `initial` (K,) has the probabilities of x_0, row i of `transition` (K, K) those of x_t given x_{t-1} = i. With a
+    first axis of T entries, entry t moves x_{t-1} to x_t; entry 0 is not used. ``log_likelihood(y)`` (K,) is
+    log p(y_t | x_t = 0 .. K-1); -inf if impossible. It may have the further parameters ``t`` and ``u``.
     """
     start, moves = _chain(initial, transition)
     # The last positive entry is 1 exactly, so that u < 1 never selects a state of probability 0.
@@ -175,22 +338,29 @@ def hidden_markov(initial: Any, transition: Any, log_likelihood: Callable[[Any],
     with np.errstate(divide="ignore"):
         log_start, log_moves = np.log(start), np.log(moves)
 
-    def initial_states(rng: np.random.Generator, n: int | tuple[int, int]) -> np.ndarray:
-        return (below_start <= rng.random(n)[..., None]).sum(axis=-1)
+    def move(rng: np.random.Generator, x: np.ndarray, **step: Any) -> np.ndarray:
+        return (_entry("transition", below, **step)[x] <= rng.random(len(x))[:, None]).sum(axis=-1)
+
+    def log_move(old: np.ndarray, new: np.ndarray, **step: Any) -> np.ndarray:
+        return _entry("transition", log_moves, **step)[old, new]
+
+    def weigh(x: np.ndarray, y: Any, **step: Any) -> np.ndarray:
+        return np.asarray(log_likelihood(y, **step), dtype=np.float64)[x]
 
     return StateSpaceModel(
-        initial_states,
-        lambda rng, x: (below[x] <= rng.random(x.shape)[..., None]).sum(axis=-1),
-        lambda x, y: np.asarray(log_likelihood(y), dtype=np.float64)[x],
+        lambda rng, n: (below_start <= rng.random(n)[:, None]).sum(axis=-1),
+        with_step(move, _varies(moves)),
+        with_step(weigh, step_parameters(log_likelihood, 1)),
         lambda x: log_start[x],
-        lambda old, new: log_moves[old, new],
+        with_step(log_move, _varies(moves)),
+        batched=None,
     )
 
 
 def _chain(initial: Any, transition: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Checked probabilities (K,) of the first state and (K, K) of the moves."""
+    """Checked probabilities (K,) of the first state and (K, K), or (T, K, K), of the moves."""
     start, moves = _probabilities("initial", initial, 1), _probabilities("transition", transition, 2)
-    if moves.shape != (len(start),) * 2:
+    if moves.shape[-2:] != (len(start),) * 2:
         raise InputError(f"transition has shape {moves.shape}, expected {(len(start),) * 2} as initial")
     return start, moves
 
@@ -198,7 +368,7 @@ def _chain(initial: Any, transition: Any) -> tuple[np.ndarray, np.ndarray]:
 def _probabilities(name: str, given: Any, ndim: int) -> np.ndarray:
     """Rows of probabilities that sum to one."""
     p = np.asarray(given, dtype=np.float64)
-    if p.ndim != ndim or not p.size:
+    if p.ndim not in ((1,) if ndim == 1 else (2, 3)) or not p.size:
         raise InputError(f"{name} has shape {p.shape}, expected {'(K,)' if ndim == 1 else '(K, K)'}")
     if not ((p >= 0).all() and np.allclose(p.sum(axis=-1), 1.0)):
         raise InputError(f"{name} is {p.tolist()}, expected probabilities that sum to 1 in each row")
@@ -214,23 +384,26 @@ class Marginals(NamedTuple):
 
 
 def forward_backward(
-    initial: Any, transition: Any, log_likelihood: Callable[[Any], Any], observations: Iterable[Any]
+    initial: Any, transition: Any, log_likelihood: Callable[..., Any], observations: Iterable[Any]
 ) -> Marginals:
     """The forward-backward algorithm of a model with K states (Rabiner 1989); arguments as in `hidden_markov`.
 
     Raises InputError if a shape does not fit, or no state explains an observation.
     """
     start, moves = _chain(initial, transition)
-    ys = list(observations)
-    T, K = len(ys), len(start)
+    ys = [split_input(y) for y in observations]
+    T, K, of_step = len(ys), len(start), step_parameters(log_likelihood, 1)
+    if moves.ndim == 3 and len(moves) != T:
+        raise InputError(f"transition has {len(moves)} entries, expected one for each of {T} observations")
+    moves = np.broadcast_to(moves, (T, K, K))
     filtered, likelihood, total = np.empty((T, K)), np.ones((T, K)), np.zeros(T)
-    for t, y in enumerate(ys):
-        predicted = filtered[t - 1] @ moves if t else start
+    for t, (y, u) in enumerate(ys):
+        predicted = filtered[t - 1] @ moves[t] if t else start
         total[t] = total[t - 1] if t else 0.0
         filtered[t] = predicted
         if y is None:
             continue
-        found = np.asarray(log_likelihood(y), dtype=np.float64)
+        found = np.asarray(at_step(log_likelihood, of_step, t, u)(y), dtype=np.float64)
         if found.shape != (K,):
             raise InputError(f"log_likelihood returned shape {found.shape}, expected ({K},): one number per state")
         possible = found[predicted > 0].max()
@@ -242,7 +415,7 @@ def forward_backward(
         filtered[t] = joint / joint.sum()
     smoothed, later = filtered.copy(), np.ones(K)  # later is proportional to p(y_{t+1} .. | x_t)
     for t in range(T - 2, -1, -1):
-        later = moves @ (likelihood[t + 1] * later)
+        later = moves[t + 1] @ (likelihood[t + 1] * later)
         later /= later.max()
         smoothed[t] = filtered[t] * later / (filtered[t] @ later)
     return Marginals(filtered, smoothed, total)
@@ -259,11 +432,12 @@ class Linear(NamedTuple):
 
 
 @dataclass(frozen=True)
-class ConditionallyLinear:
+class ConditionallyLinear(AtStep):
     """A model that is linear and Gaussian given the part u, which is drawn.
 
     ``sample_initial(rng, n)`` draws u_0 (n, ...), ``sample_transition(rng, u)`` draws u_t given u_{t-1}, and
-    ``linear(u)`` gives the matrices. `mean` (d,) and `cov` (d, d) are those of z_0, for any u_0.
+    ``linear(u)`` gives the matrices. `mean` (d,) and `cov` (d, d) are those of z_0, for any u_0. The functions may
+    have a further parameter ``t``, the index of the step, or ``u`` after a first one of another name, its input.
     """
 
     sample_initial: Callable[[np.random.Generator, int], np.ndarray]
@@ -272,10 +446,13 @@ class ConditionallyLinear:
     mean: Any
     cov: Any
 
+    step_functions: ClassVar = {"sample_initial": 2, "sample_transition": 2, "linear": 1}
+
 
 @dataclass(frozen=True)
 class _Initial(Proposal):
     model: ConditionallyLinear
+    step_functions: ClassVar = {"model": None}
 
     def sample(self, rng: np.random.Generator, observation: Any, n: int) -> Population:
         mean, cov = np.asarray(self.model.mean, np.float64), np.asarray(self.model.cov, np.float64)
@@ -287,6 +464,7 @@ class _Initial(Proposal):
 @dataclass(frozen=True)
 class _Predict(Transition):
     model: ConditionallyLinear
+    step_functions: ClassVar = {"model": None}
 
     def predict(self, rng: np.random.Generator, population: Population, observation: Any) -> Population:
         """Draw u_t, then predict mean and covariance."""
@@ -303,6 +481,7 @@ class _Predict(Transition):
 class _Correct(Update):
     model: ConditionallyLinear
     draws: ClassVar[bool] = False
+    step_functions: ClassVar = {"model": None}
 
     def update(
         self, rng: np.random.Generator, predicted: Population | None, proposed: Population | None, observation: Any
@@ -344,7 +523,7 @@ def ekf_proposal(f: _Map, Q: Any, h: _Map, R: Any, jacobian: _Map) -> Callable[[
     II D). The arguments are as in `nonlinear_gaussian`; `jacobian` gives the derivatives of `h`, (n, k, d) or (k, d).
     It is computed for all particles at once; filterpy's ExtendedKalmanFilter holds a single state.
     """
-    Q, R = _covariance("Q", Q), _covariance("R", R)
+    Q, R = (_definite(name, given) for name, given in (("Q", Q), ("R", R)))
 
     def proposal(x: np.ndarray, y: Any) -> MultivariateNormal:
         mean = f(x)
@@ -366,7 +545,7 @@ def ukf_proposal(
     """
     from filterpy.kalman import MerweScaledSigmaPoints
 
-    Q, R = _covariance("Q", Q), _covariance("R", R)
+    Q, R = (_definite(name, given) for name, given in (("Q", Q), ("R", R)))
     points = MerweScaledSigmaPoints(len(Q), alpha, beta, kappa)
     offsets = points.sigma_points(np.zeros(len(Q)), Q)
 

@@ -28,13 +28,14 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sized
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 
 from mstfilter.errors import InputError, InputWarning, check_choice, check_component, check_integer
 from mstfilter.lazy import late, progress_of
 from mstfilter.smc.components import EssBelow
+from mstfilter.smc.inputs import AtStep, split_input
 from mstfilter.smc.interfaces import (
     ARRAY_BYTES,
     Codec,
@@ -70,7 +71,7 @@ _INTERFACES: dict[str, type] = {
 
 
 @dataclass(frozen=True)
-class ParticleFilter:
+class ParticleFilter(AtStep):
     """A particle filter made of components.
 
     Parameters
@@ -117,6 +118,11 @@ class ParticleFilter:
     n_proposed: int = 0
     resample: Literal["after", "before"] = "before"
 
+    #: A resampler sees weights only: it does not depend on the step.
+    step_functions: ClassVar = {
+        name: None for name, kind in _INTERFACES.items() if issubclass(kind, Component) and kind is not Resampler
+    }
+
     def __post_init__(self) -> None:
         check_integer("n", self.n)
         check_integer("n_proposed", self.n_proposed, at_least=0)
@@ -156,6 +162,8 @@ class ParticleFilter:
     def step(self, state: State, observation: Any, observer: Observer | None = None) -> tuple[State, Info]:
         """Process one observation; None if it is missing: then without proposal and update.
 
+        A step with an input takes ``WithInput(observation, u)``.
+
         Raises InputError if a component raises it. The message starts with the step and the slot of the component.
         """
         step = _Step(self, state, observation, observer)
@@ -182,7 +190,7 @@ class ParticleFilter:
         Parameters
         ----------
         observations : iterable
-            One observation for each step. An observation that is missing is None.
+            One observation for each step, or `WithInput`. An observation that is missing is None.
         state : State or int
             The state to continue from, or a seed.
         checkpoint : path, optional
@@ -235,7 +243,7 @@ class ParticleFilter:
         self, observations: Iterable[Any], state: State | int, checkpoint: str | Path | None, codec: Codec | None
     ) -> tuple[Iterable[Any], State, Any]:
         """The remaining observations, the state to continue from, and the `Checkpoint` or None."""
-        _keep_freed_memory()
+        keep_freed_memory()
         current = state if isinstance(state, State) else self.start(state)
         if checkpoint is None:
             return observations, current, None
@@ -261,7 +269,9 @@ class _Step:
     def __init__(
         self, filter: ParticleFilter, state: State, observation: Any, observer: Observer | None = None
     ) -> None:
-        self.filter, self.state, self.observation = filter, state, observation
+        self.observation, u = split_input(observation)
+        self.filter, self.state = filter.at(state.t, u), state
+        self.given = filter
         self.slot = _Slot(state.t, observer)
 
     def rng(self, slot: str) -> np.random.Generator:
@@ -317,7 +327,7 @@ class _Step:
 
     def _first(self) -> Population | None:
         initial, n = self.filter.initial, self.filter.n
-        if initial is None or initial == self.filter.proposal:
+        if initial is None or self.given.initial == self.given.proposal:
             return None
         with self.slot("initial"):
             population = _checked(initial.sample(self.rng("initial"), self.observation, n), initial)
@@ -493,7 +503,7 @@ def _without_arrays(steps: int) -> InputWarning:
 
 
 @lru_cache(maxsize=1)
-def _keep_freed_memory() -> None:
+def keep_freed_memory() -> None:
     """Free one large block, once per process.
 
     After this, glibc keeps freed arrays of up to 32 MB, its largest value, instead of returning them to the system

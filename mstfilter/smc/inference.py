@@ -23,14 +23,16 @@ A model with parameters is a function that returns a filter:
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
 
 from mstfilter.errors import InputError, LostRunError, check_integer, check_number
-from mstfilter.smc.batching import batch, batched_slots
+from mstfilter.smc.batching import RunFilters, batched_slots, run_batch
 from mstfilter.smc.distributions import as_distribution
 from mstfilter.smc.export import Table, draws_tree, flat_columns
 from mstfilter.smc.filter import ParticleFilter
@@ -39,7 +41,7 @@ from mstfilter.smc.population import Particles, Population
 from mstfilter.smc.resampling import Systematic
 from mstfilter.smc.smoothing import conditional_path
 from mstfilter.smc.state_space import accept_moves, choose_rows
-from mstfilter.smc.streams import Key
+from mstfilter.smc.streams import Key, rows_of
 
 FilterOf = Callable[[np.ndarray], ParticleFilter]
 
@@ -107,7 +109,11 @@ class Chains(Table):
         return n_iterations * n_chains / self.autocorrelation_times(discard)
 
 
-@dataclass(frozen=True)
+#: Estimates of the evidence of the start of a chain before `pmmh` gives up.
+_N_STARTS = 20
+
+
+@dataclass
 class _Posterior:
     """Log prior and estimated log evidence of rows of parameters."""
 
@@ -116,9 +122,13 @@ class _Posterior:
     log_prior: Callable[[np.ndarray], float]
     batched: bool = False
     paired: bool = False
+    n_sweeps: int = 0
+    singly: bool = False  #: whether the filters of a sweep differ from single ones
 
-    def __call__(self, rng: np.random.Generator, thetas: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """(R,) log densities and (R,) log evidences of (R, d) parameters."""
+    def __call__(
+        self, rng: np.random.Generator, thetas: np.ndarray, chains: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """(R,) log densities and (R,) log evidences of (R, d) parameters, those of the given chains (default all)."""
         seeds = rng.integers(2**63, size=len(thetas)).tolist()
         log_prior = np.array([float(self.log_prior(theta)) for theta in thetas])
         if np.isnan(log_prior).any():
@@ -126,35 +136,56 @@ class _Posterior:
         evidence = np.full(len(thetas), -np.inf)
         rows = np.flatnonzero(log_prior > -np.inf).tolist()
         if rows:
-            ys = [self.observations[r] for r in rows] if self.paired else self.observations
-            evidence[rows] = self._estimates(thetas[rows], ys, [seeds[r] for r in rows])
+            chains = np.arange(len(thetas)) if chains is None else chains
+            data = [self.observations[chains[r]] for r in rows] if self.paired else [self.observations]
+            evidence[rows] = self._estimates(thetas[rows], [list(ys) for ys in data], [seeds[r] for r in rows])
         return log_prior + evidence, evidence
 
-    def _estimates(self, thetas: np.ndarray, ys: Sequence[Any], seeds: list[int]) -> np.ndarray:
-        if self.batched:
-            filter = self.filter_of(thetas.T[:, :, None])
-            if not {"initial", "transition", "update"} <= set(batched_slots(filter) or ()):
-                raise InputError(
-                    "with batched=True the initial, transition and update of the filter must be batched",
-                    "see mstfilter.smc.batching; StateSpaceModel(..., batched=True) makes them so",
-                )
-            try:
-                runs = batch(filter, ys, seeds, paired=self.paired)
-                if not runs.lost:
-                    return runs.log_evidence[:, -1]
-            except ValueError:  # the arrays of parameters no longer fit after a run is lost
-                pass
+    def _estimates(self, thetas: np.ndarray, data: list[list[Any]], seeds: list[int]) -> np.ndarray:
+        if self.batched and not self.singly:
+            return self._in_one_sweep(thetas, data, seeds)
         found = []
         for r, (theta, seed) in enumerate(zip(thetas, seeds, strict=True)):
             filter = self.filter_of(theta)
             if not filter.properly_weighted:
                 raise InputError("a component of the filter is not properly weighted: it has no unbiased evidence")
             try:
-                state, _ = filter.run(ys[r] if self.paired else ys, seed)
+                state, _ = filter.run(data[r % len(data)], seed, keep_arrays=False)
                 found.append(state.log_evidence)
             except LostRunError:
                 found.append(-np.inf)
         return np.array(found, np.float64)
+
+    def _in_one_sweep(self, thetas: np.ndarray, data: list[list[Any]], seeds: list[int]) -> np.ndarray:
+        """The estimates of a batch whose components hold the parameters of each row.
+
+        Sweeps 0, 1, 2, 4, 8, ... are compared with single runs.
+        """
+        first = self.filter_of(thetas[0])
+        if not first.properly_weighted:
+            raise InputError("a component of the filter is not properly weighted: it has no unbiased evidence")
+        slots = batched_slots(first) or ()
+        if any(
+            getattr(first, slot) is not None and slot not in slots for slot in ("initial", "transition", "update")
+        ):
+            raise InputError(
+                "with batched=True the initial, transition and update of the filter must be batched",
+                "see mstfilter.smc.batching; StateSpaceModel(..., batched=True) makes them so",
+            )
+
+        @lru_cache(maxsize=4)
+        def made(runs: tuple[int, ...]) -> ParticleFilter:
+            return self.filter_of(np.repeat(thetas[list(runs)], first.n, axis=0).T.view(rows_of(first.n)))
+
+        filters = RunFilters(lambda run: self.filter_of(thetas[run]), lambda runs: made(tuple(runs.tolist())))
+        check = not self.n_sweeps & (self.n_sweeps - 1)
+        self.n_sweeps += 1
+        runs = run_batch(filters, data, seeds, check=check, rounding=True, warn=False)
+        if runs.single:
+            self.singly = True
+            slot, reason = next(iter(runs.single.items()))
+            warnings.warn(f"the filters are run one by one: {slot}: {reason}", stacklevel=5)
+        return runs.log_evidence[:, -1]
 
 
 def pmmh(
@@ -185,11 +216,17 @@ def pmmh(
     scale : (d,) or (d, d) array_like
         Standard deviations, or covariance, of a step. 2.4 / sqrt(d) posterior standard deviations are a good choice.
     batched : bool
-        Whether ``filter_of`` also takes an array (d, R, 1) and returns a filter of R runs (see
-        `mstfilter.smc.batching`), the parameters broadcast against particles (R, n). All chains then move in one
-        sweep of filters.
+        Whether ``filter_of`` also takes parameters (d, m), a column for each of m particles of several chains. All
+        chains then move in one sweep of filters, see `mstfilter.smc.batching`. A parameter that is combined with
+        particles (n, k) is ``theta[0][..., None]``. The estimates equal those of single runs up to rounding of the
+        parameters; some are compared. If they differ, InputError, or a warning and single runs.
     paired : bool
-        Chain r gets ``observations[r]``, a data set of its own.
+        Chain r gets the data set ``observations[r]``.
+
+    Raises
+    ------
+    InputError
+        If a chain starts where the prior is zero, or 20 estimates of the evidence at its start are zero.
     """
     theta = np.array(start, np.float64, ndmin=2)
     root = _step_root(scale, theta.shape[1])
@@ -198,12 +235,7 @@ def pmmh(
         raise InputError(f"there are {len(observations)} data sets for {len(theta)} chains")
     posterior = _Posterior(filter_of, observations, log_prior, batched, paired)
     key = Key(seed).child("pmmh")
-    density, evidence = posterior(key.child("start").generator(), theta)
-    if not np.isfinite(density).all():
-        raise InputError(
-            f"the start {theta[~np.isfinite(density)][0].tolist()} has log density {density.min()}",
-            "start where the prior and the likelihood are positive",
-        )
+    density, evidence = _start(posterior, key.child("start"), theta)
     shape = (n_iterations, len(theta))
     thetas, evidences, densities = np.empty((*shape, theta.shape[1])), np.empty(shape), np.empty(shape)
     accepted = np.zeros(len(theta))
@@ -217,6 +249,25 @@ def pmmh(
         thetas[i], evidences[i], densities[i] = theta, evidence, density
         accepted += yes
     return Chains(thetas, evidences, densities, accepted / n_iterations)
+
+
+def _start(posterior: _Posterior, key: Key, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Log densities and evidences of the first parameters; estimates that are lost are drawn again."""
+    density, evidence = posterior(key.generator(), theta)
+    for attempt in range(1, _N_STARTS + 1):
+        lost = np.flatnonzero(~np.isfinite(density))
+        if not len(lost):
+            return density, evidence
+        impossible = [r for r in lost if posterior.log_prior(theta[r]) == -np.inf]
+        if impossible or attempt == _N_STARTS:
+            r = (impossible or lost)[0]
+            what = "the log prior is -inf" if impossible else f"{_N_STARTS} estimates of the evidence are 0"
+            raise InputError(
+                f"the start {theta[r].tolist()} of chain {r} has log density {density[r]}: {what}",
+                "start where the prior and the likelihood are positive, or take more particles",
+            )
+        density[lost], evidence[lost] = posterior(key.child(attempt).generator(), theta[lost], lost)
+    return density, evidence
 
 
 def _step_root(scale: Any, d: int) -> np.ndarray:

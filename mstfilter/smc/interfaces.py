@@ -37,6 +37,7 @@ import numpy as np
 from mstfilter.errors import InputError, check_integer
 from mstfilter.lazy import late, short_repr
 from mstfilter.smc.export import Table
+from mstfilter.smc.inputs import AtStep
 from mstfilter.smc.population import Population
 from mstfilter.smc.streams import Key
 
@@ -44,10 +45,11 @@ from mstfilter.smc.streams import Key
 Observer = Callable[[str, bool], None]
 
 
-class Component(ABC):
+class Component(AtStep, ABC):
     """A component that takes part in a step.
 
-    The two properties can be overridden by class attributes: ``properly_weighted = False``.
+    The filter uses ``component.at(t, u)``, the component at step t with its input (see `mstfilter.smc.inputs`).
+    The three properties can be overridden by class attributes: ``properly_weighted = False``.
     """
 
     def __init_subclass__(cls, **named: Any) -> None:
@@ -71,10 +73,11 @@ class Component(ABC):
         return True
 
     @property
-    def batched(self) -> bool:
-        """Whether the component also works on R runs at once, with arrays (R, n, ...) instead of (n, ...).
+    def batched(self) -> bool | None:
+        """Whether the component treats each particle by itself, so that those of several runs can be given together.
 
-        See `mstfilter.smc.batching`. Default: False, then it is called once for each run.
+        True states so. With None, a batch tries it, and calls the component once for each run if the results differ
+        (see `mstfilter.smc.batching`). Default: False, then it is called once for each run.
         """
         return False
 

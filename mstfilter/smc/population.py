@@ -146,7 +146,7 @@ def _freeze(particles: Particles) -> Particles:
     if isinstance(particles, np.ndarray):
         return frozen_view(particles)
     if isinstance(particles, Mapping):
-        return {name: _freeze(np.asarray(a)) for name, a in particles.items()}
+        return {name: _freeze(np.asanyarray(a)) for name, a in particles.items()}
     if isinstance(particles, Candidates):
         return particles
     return tuple(particles)

@@ -33,6 +33,7 @@ import numpy as np
 from mstfilter.errors import InputError, check_choice, check_component, check_integer, check_number
 from mstfilter.smc.distributions import as_distribution
 from mstfilter.smc.filter import ParticleFilter
+from mstfilter.smc.inputs import split_input
 from mstfilter.smc.interfaces import DensityTransition, State, Transition
 from mstfilter.smc.population import Particles, Population, count_particles, take
 from mstfilter.smc.programs.filters import ProgramInitial, ProgramTransition, run_program
@@ -157,9 +158,9 @@ def backward_paths(
     index = _by_weight(rng, last, n)
     path = [Population(take(last.particles, index))]
     for t in range(len(record) - 2, -1, -1):
-        population, y = record.populations[t].realised(), record.observations[t + 1]
+        population, (y, u) = record.populations[t].realised(), split_input(record.observations[t + 1])
         parents = record.parents(t + 1)[index] if method == "mcmc" else None
-        move = _Move(population, path[-1].particles, transition, y, t)
+        move = _Move(population, path[-1].particles, transition.at(t + 1, u), y, t)
         index = kernel.draw(rng, move, parents, 1)[:, 0]
         path.append(Population(take(population.particles, index)))
     return tuple(reversed(path))
@@ -299,8 +300,9 @@ def paris(
     past: Population | None = None
     statistic = np.zeros(0)
     state = filter.start(seed)
-    for t, y in enumerate(observations):
-        state, _ = filter.step(state, y)
+    for t, observation in enumerate(observations):
+        state, _ = filter.step(state, observation)
+        y, u = split_input(observation)
         assert state.population is not None
         now = state.population.realised()
         if past is None:
@@ -308,7 +310,7 @@ def paris(
         else:
             rng = Key(seed).child("paris", t).generator()
             parents = known_parents(now, t) if method == "mcmc" else None
-            move = _Move(past, now.particles, transition, y, t - 1)
+            move = _Move(past, now.particles, transition.at(t, u), y, t - 1)
             index = kernel.draw(rng, move, parents, n_draws).ravel()
             later = take(now.particles, np.repeat(np.arange(len(now)), n_draws))
             statistic = statistic[index] + functional(t, take(past.particles, index), later)
@@ -375,17 +377,19 @@ def conditional_path(
     populations: list[Population] = []
     parents: list[np.ndarray] = []
     past: Population | None = None
-    for t, y in enumerate(ys):
+    for t, observation in enumerate(ys):
+        y, u = split_input(observation)
+        now = filter.at(t, u)
         given = None if path is None else take(path, np.array([t]))
         if past is not None:
             others, _ = Multinomial().select(rng, past.log_weights, filter.n - 1)
-            index = np.append(_ancestor(rng, filter.transition, past, given, y), others)
+            index = np.append(_ancestor(rng, now.transition, past, given, y), others)
             parents.append(index)
             past = Population(take(past.particles, index))
-        past = _moved(filter, key.child("step", t), past, given, y)
-        if filter.update is not None and y is not None:
-            update_rng = key.child("step", t, "update").generator() if filter.update.draws else rng
-            past = filter.update.update(update_rng, past, None, y)
+        past = _moved(now, key.child("step", t), past, given, y)
+        if now.update is not None and y is not None:
+            update_rng = key.child("step", t, "update").generator() if now.update.draws else rng
+            past = now.update.update(update_rng, past, None, y)
         populations.append(past)
     rows = [int(_drawn(rng, populations[-1].log_weights[None])[0])]
     for index in reversed(parents):
@@ -555,22 +559,27 @@ def path_log_prob(filter: ParticleFilter, observations: Sequence[Any], path: Par
 
     The filter is made from a `StateSpaceModel` with its log densities or from a `Program`.
     """
-    ys, initial = list(observations), filter.initial
-    rows = [take(path, np.array([t])) for t in range(len(ys))]
-    if isinstance(initial, ProgramInitial):
-        total, previous = 0.0, None
-        for row, y in zip(rows, ys, strict=True):
-            values = row if isinstance(row, Mapping) else row[0]
-            if isinstance(initial.model, PerParticle):
-                raise InputError("the density of a path of a per_particle program is not available")
-            _, gain = run_program(initial.model, ScoreHandler(values), previous, y, 1)
-            total, previous = total + float(gain[0]), row
-        return total
-    if not isinstance(initial, Prior | GuidedInitial):
+    total, previous = 0.0, None
+    for t, observation in enumerate(observations):
+        y, u = split_input(observation)
+        row = take(path, np.array([t]))
+        total += _step_log_prob(filter.at(t, u), previous, row, y)
+        previous = row
+    return total
+
+
+def _step_log_prob(filter: ParticleFilter, previous: Particles | None, row: Particles, y: Any) -> float:
+    """log p(x_t, y_t | x_{t-1}) of one particle, by the components of the filter at the step."""
+    component = filter.initial if previous is None else filter.transition
+    if isinstance(component, ProgramInitial | ProgramTransition):
+        if isinstance(component.model, PerParticle):
+            raise InputError("the density of a path of a per_particle program is not available")
+        values = row if isinstance(row, Mapping) else row[0]
+        _, gain = run_program(component.model, ScoreHandler(values), previous, y, 1)
+        return float(gain[0])
+    if not isinstance(component, Prior | GuidedInitial | Dynamics | GuidedTransition):
         raise InputError("the filter is not made from a StateSpaceModel or a Program: its densities are not known")
-    model = initial.model
-    total = float(model.density("log_initial")(rows[0])[0])
-    if len(ys) > 1:
-        later = np.arange(1, len(ys))
-        total += float(model.density("log_transition")(take(path, later - 1), take(path, later)).sum())
-    return total + sum(float(model.log_likelihood(x, y)[0]) for x, y in zip(rows, ys, strict=True) if y is not None)
+    model = component.model
+    density = model.density("log_initial" if previous is None else "log_transition")
+    found = density(row) if previous is None else density(previous, row)
+    return float(found[0]) + (0.0 if y is None else float(model.log_likelihood(row, y)[0]))

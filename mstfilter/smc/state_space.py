@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -26,6 +26,7 @@ from mstfilter.errors import InputError, check_component, check_integer
 from mstfilter.smc.components import EssBelow, Reweight
 from mstfilter.smc.distributions import as_distribution
 from mstfilter.smc.filter import ParticleFilter
+from mstfilter.smc.inputs import AtStep, step_parameters, with_step
 from mstfilter.smc.interfaces import (
     DensityTransition,
     Distribution,
@@ -37,11 +38,15 @@ from mstfilter.smc.interfaces import (
 )
 from mstfilter.smc.population import Particles, Population, count_particles
 from mstfilter.smc.resampling import Systematic
+from mstfilter.smc.streams import Rows
 
 
 @dataclass(frozen=True)
-class StateSpaceModel:
+class StateSpaceModel(AtStep):
     """A hidden Markov model on any state space.
+
+    A function with a further parameter ``t`` gets the index of the step, one with a parameter ``u`` its input (see
+    `mstfilter.smc.inputs`).
 
     Parameters
     ----------
@@ -55,9 +60,9 @@ class StateSpaceModel:
         ``(particles) -> (n,)`` log p(x_0). Guided filters and moves need it.
     log_transition : callable, optional
         ``(previous, new) -> (n,)`` log f(x_t | x_{t-1}) of paired rows. Guided filters and moves need it.
-    batched : bool
-        Whether `sample_initial` also takes n = (R, n), and `sample_transition` and `log_likelihood` particles
-        (R, n, ...), the particles of R runs (see `mstfilter.smc.batching`).
+    batched : bool or None
+        Whether the functions treat each particle by itself, so that they can be called with the particles of many
+        runs (see `mstfilter.smc.batching`). None: a batch tries it.
     """
 
     sample_initial: Callable[[np.random.Generator, int], Any]
@@ -65,14 +70,22 @@ class StateSpaceModel:
     log_likelihood: Callable[[Any, Any], np.ndarray]
     log_initial: Callable[[Any], np.ndarray] | None = None
     log_transition: Callable[[Any, Any], np.ndarray] | None = None
-    batched: bool = False
+    batched: bool | None = False
+
+    step_functions: ClassVar = {
+        "sample_initial": 2,
+        "sample_transition": 2,
+        "log_likelihood": 2,
+        "log_initial": 1,
+        "log_transition": 2,
+    }
 
     @classmethod
-    def of(cls, initial: Any, transition: Callable[[Any], Any], observation: Callable[[Any], Any]) -> StateSpaceModel:
+    def of(cls, initial: Any, transition: Callable[..., Any], observation: Callable[..., Any]) -> StateSpaceModel:
         """A model from distributions of this package, frozen ones of scipy.stats, or those of torch.
 
         `initial` is the distribution of x_0, ``transition(particles)`` that of x_t, and ``observation(particles)``
-        that of y_t, one row per particle.
+        that of y_t, one row per particle. The functions may have the further parameters ``t`` and ``u``.
         """
         first = as_distribution(initial)
         for name, function in (("transition", transition), ("observation", observation)):
@@ -80,12 +93,24 @@ class StateSpaceModel:
                 raise InputError(
                     f"{name} is {function!r}, expected a function of the particles that returns a distribution"
                 )
+
+        def sample(rng: np.random.Generator, x: Any, **step: Any) -> np.ndarray:
+            return as_distribution(transition(x, **step)).sample(rng, count_particles(x))
+
+        def log_density(previous: Any, new: Any, **step: Any) -> np.ndarray:
+            return as_distribution(transition(previous, **step)).log_prob(new)
+
+        def log_likelihood(x: Any, y: Any, **step: Any) -> np.ndarray:
+            return _log_likelihood(as_distribution(observation(x, **step)), y)
+
+        moves, observes = step_parameters(transition, 1), step_parameters(observation, 1)
         return cls(
             first.sample,
-            lambda rng, x: as_distribution(transition(x)).sample(rng, count_particles(x)),
-            lambda x, y: _log_likelihood(as_distribution(observation(x)), y),
+            with_step(sample, moves),
+            with_step(log_likelihood, observes),
             first.log_prob,
-            lambda previous, new: as_distribution(transition(previous)).log_prob(new),
+            with_step(log_density, moves),
+            batched=None,
         )
 
     def density(self, which: str) -> Callable[..., np.ndarray]:
@@ -95,13 +120,18 @@ class StateSpaceModel:
         """
         found = self.log_initial if which == "log_initial" else self.log_transition
         if found is None:
-            raise InputError(f"the model has no {which}", "give StateSpaceModel its log densities, or use .of()")
+            raise InputError(
+                f"the model has no {which}",
+                "give StateSpaceModel its log densities, or use .of(); a singular covariance has none",
+            )
         return found
 
 
 def _log_likelihood(distribution: Distribution, y: Any) -> np.ndarray:
     """(n,) log p(y | x). Without the check, entries of a vector would be compared with the particles one by one."""
     found, event = () if isinstance(y, float) else np.shape(y), distribution.event_shape
+    if isinstance(y, Rows) and found[1:] == event:  # one observation for each particle
+        return distribution.log_prob(np.asarray(y))
     if found not in (event, (1, *event)) and (found, event) != ((), (1,)):
         raise InputError(
             f"the observation has shape {found}, expected the event shape {event}",
@@ -115,9 +145,10 @@ class Prior(Proposal):
     """Draws of the initial state of a model."""
 
     model: StateSpaceModel
+    step_functions: ClassVar = {"model": None}
 
     @property
-    def batched(self) -> bool:
+    def batched(self) -> bool | None:
         return self.model.batched
 
     def sample(self, rng: np.random.Generator, observation: Any, n: int) -> Population:
@@ -129,9 +160,10 @@ class Dynamics(DensityTransition):
     """Moves by the transition of the model."""
 
     model: StateSpaceModel
+    step_functions: ClassVar = {"model": None}
 
     @property
-    def batched(self) -> bool:
+    def batched(self) -> bool | None:
         return self.model.batched
 
     def predict(self, rng: np.random.Generator, population: Population, observation: Any) -> Population:
@@ -149,7 +181,12 @@ class GuidedInitial(Proposal):
     """
 
     model: StateSpaceModel
-    proposal: Callable[[Any], Any]
+    proposal: Callable[..., Any]
+    step_functions: ClassVar = {"model": None, "proposal": 1}
+
+    @property
+    def batched(self) -> bool | None:
+        return None if self.model.batched else self.model.batched
 
     def sample(self, rng: np.random.Generator, observation: Any, n: int) -> Population:
         if observation is None:
@@ -173,7 +210,12 @@ class GuidedTransition(DensityTransition):
     """
 
     model: StateSpaceModel
-    proposal: Callable[[Any, Any], Any]
+    proposal: Callable[..., Any]
+    step_functions: ClassVar = {"model": None, "proposal": 2}
+
+    @property
+    def batched(self) -> bool | None:
+        return None if self.model.batched else self.model.batched
 
     def predict(self, rng: np.random.Generator, population: Population, observation: Any) -> Population:
         old = population.particles
@@ -195,7 +237,8 @@ class GuidedTransition(DensityTransition):
 class PriorityLookahead(Lookahead):
     """Priority given by a function ``(particles, y) -> (n,)`` of x_{t-1} and y_t."""
 
-    function: Callable[[Any, Any], np.ndarray]
+    function: Callable[..., np.ndarray]
+    step_functions: ClassVar = {"function": 2}
 
     def log_priority(self, population: Population, observation: Any) -> np.ndarray:
         return self.function(population.particles, observation)
@@ -221,6 +264,7 @@ class RandomWalkMove(Rejuvenation):
     model: StateSpaceModel
     scale: Any = 1.0
     steps: int = 1
+    step_functions: ClassVar = {"model": None}
 
     def __post_init__(self) -> None:
         check_component("model", self.model, StateSpaceModel)

@@ -19,11 +19,12 @@ share a stream (probability one in a million for a hundred names).
 from __future__ import annotations
 
 import ctypes
+import inspect
 import threading
 import zlib
 from dataclasses import dataclass
-from functools import lru_cache
-from typing import Any
+from functools import lru_cache, partial
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.random.bit_generator import ISpawnableSeedSequence
@@ -261,45 +262,63 @@ class SlotStreams:
         return self.found[position][runs]
 
 
+class Rows(np.ndarray):
+    """Arrays (R n, ...) of the particles of R runs, run by run, in the functions of batched components.
+
+    Products with a matrix are computed for each run, as BLAS rounds an entry by the number of rows of the product.
+    """
+
+    n: ClassVar[int] = 0  #: particles of a run
+
+    def __matmul__(self, other: Any) -> Any:
+        if self.ndim != 2 or np.ndim(other) > 2 or isinstance(other, Rows) or len(self) % self.n:
+            return super().__matmul__(other)
+        by_run = np.asarray(self).reshape(-1, self.n, self.shape[1]) @ other
+        return by_run.reshape(len(self), *by_run.shape[2:]).view(type(self))
+
+
+@lru_cache(maxsize=64)
+def rows_of(n: int) -> type[Rows]:
+    """The class of arrays with `n` rows for each run; numpy gives it to the results of operations."""
+    return type("Rows", (Rows,), {"n": n})
+
+
 class RunGenerators:
     """The generators of R runs, for batched components: row r of every array is drawn by the generator of run r.
 
     ``standard_normal``, ``random`` and ``standard_exponential`` are fast. Any other method of
     `numpy.random.Generator` works if its size, or one of its arguments, has a first axis of length R. `states` (R, 4)
-    are those of `pcg64_states`.
+    are those of `pcg64_states`. With `n`, the arrays have n rows for each run, and a first axis of length R n.
     """
 
-    def __init__(self, states: np.ndarray) -> None:
-        self._states = states
+    def __init__(self, states: np.ndarray, n: int | None = None) -> None:
+        self._states, self._n = states, n
         self._own: list[np.random.Generator] | None = None  # made when another method is called
 
     def __len__(self) -> int:
         return len(self._states)
 
-    def standard_normal(self, size: Any) -> np.ndarray:
-        """Independent standard normal numbers, of shape `size` = (R, ...)."""
-        return self._filled("standard_normal", size)
-
-    def random(self, size: Any) -> np.ndarray:
-        """Independent uniform numbers on [0, 1), of shape `size` = (R, ...)."""
-        return self._filled("random", size)
-
-    def standard_exponential(self, size: Any) -> np.ndarray:
-        """Independent exponential numbers, of shape `size` = (R, ...)."""
-        return self._filled("standard_exponential", size)
-
     def __getattr__(self, method: str) -> Any:
         if method.startswith("_") or not hasattr(np.random.Generator, method):
             raise AttributeError(method)
+        if method in ("standard_normal", "random", "standard_exponential"):
+            return partial(self._filled, method)
 
-        def draw(*args: Any, size: Any = None, **options: Any) -> np.ndarray:
-            rows = [a for a in args if np.ndim(a) and len(a) == len(self)]
-            inner = None if rows and size is None else self._inner(size)
+        def draw(*args: Any, **options: Any) -> np.ndarray:
+            given = _signature(method).bind(None, *args, **options).arguments
+            given.pop("self")
+            split = {
+                name: np.reshape(a, (len(self), -1, *np.shape(a)[1:]))
+                for name, a in given.items()
+                if name != "size" and np.ndim(a) and len(a) == self._length
+            }
+            if given.get("size") is not None or not split:
+                given["size"] = self._inner(given.get("size"))
             drawn = []
             for r, rng in enumerate(self.generators()):
-                row = [a[r] if np.ndim(a) and len(a) == len(self) else a for a in args]
-                drawn.append(getattr(rng, method)(*row, size=inner, **options))
-            return np.stack(drawn)
+                rows = {name: a[r] if self._n else a[r, 0] for name, a in split.items()}
+                drawn.append(getattr(rng, method)(**{**given, **rows}))
+            return self._joined(np.stack(drawn))
 
         return draw
 
@@ -316,15 +335,31 @@ class RunGenerators:
 
     def _inner(self, size: Any) -> tuple[int, ...]:
         """Shape of the numbers of one run."""
-        if not isinstance(size, tuple) or size[:1] != (len(self),):
+        shape = tuple(size) if isinstance(size, (tuple, list)) else (size,)
+        if shape[:1] != (self._length,):
+            what = f"{len(self)} runs" if self._n is None else f"{len(self)} runs of {self._n} particles"
             raise InputError(
-                f"a batched component drew numbers of size {size} for {len(self)} runs",
-                "give size=, the shape of the particles, (R, n, ...); or set batched to False",
+                f"a batched component drew numbers of size {size} for {what}",
+                "give size=, the shape of the particles; or set batched to False",
             )
-        return size[1:]
+        return shape[1:] if self._n is None else (self._n, *shape[1:])
 
-    def _filled(self, method: str, size: Any) -> np.ndarray:
-        out = np.empty((len(self), *self._inner(size)))
+    @property
+    def _length(self) -> int:
+        """Length of the first axis of arrays."""
+        return len(self) * (self._n or 1)
+
+    def _joined(self, drawn: np.ndarray) -> np.ndarray:
+        """The numbers drawn by all runs (R, ...) as one array."""
+        if self._n is None:
+            return drawn
+        return drawn.reshape(self._length, *drawn.shape[2:]).view(rows_of(self._n))
+
+    def _filled(self, method: str, size: Any = None) -> np.ndarray:
+        return self._joined(self._filled_by_run(method, self._inner(size)))
+
+    def _filled_by_run(self, method: str, inner: tuple[int, ...]) -> np.ndarray:
+        out = np.empty((len(self), *inner))
         rows = out.reshape(len(self), -1)
         shared = _reused_generator(threading.get_ident())
         if self._own is not None or shared is None:
@@ -341,6 +376,11 @@ class RunGenerators:
             draw(out=row)
             state[:] = memory
         return out
+
+
+@lru_cache(maxsize=64)
+def _signature(method: str) -> inspect.Signature:
+    return inspect.signature(getattr(np.random.Generator, method))
 
 
 def _next_uniforms(states: np.ndarray) -> np.ndarray:

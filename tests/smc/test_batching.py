@@ -119,7 +119,8 @@ def test_a_model_of_vectors_with_its_own_data_for_each_run():
 
 def test_which_components_are_called_once_per_step():
     assert batched_slots(bootstrap(BATCHED, 5)) == ("initial", "transition", "update", "resampler")
-    assert batched_slots(bootstrap(AR1, 5, Ssp())) == ()
+    assert batched_slots(bootstrap(AR1, 5, Ssp())) == ("initial", "transition", "update")
+    assert batched_slots(bootstrap(replace(AR1, batched=False), 5)) == ("resampler",)
     assert batched_slots(bootstrap(BATCHED, 5, Tempered())) is None
     assert batched_slots(resample_move(AR1, RandomWalkMove(AR1, 0.5), 5)) is None
 

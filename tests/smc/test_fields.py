@@ -109,7 +109,7 @@ def decides(previous, y):
         (lambda: Uniform(1.0, 1.0), "width of a Uniform"),
         (lambda: Program(3), "model is 3, expected a function"),
         (lambda: Program(decides).bootstrap(5).run([0.1], 0), "step 0, initial: the program decides by an array"),
-        (lambda: linear_gaussian(**{**LG, "Q": [[-1.0]]}), "Q is .*positive definite"),
+        (lambda: linear_gaussian(**{**LG, "Q": [[-1.0]]}), "Q is .*positive semidefinite"),
         (lambda: linear_gaussian(**{**LG, "F": np.eye(2)}), r"F has shape \(2, 2\), expected \(1, 1\)"),
         (lambda: linear_gaussian(**{**LG, "m0": 0.0}), "m0 has shape"),
         (lambda: first_steps(log_likelihood=lambda x, y: -1.0), r"log likelihood has shape \(\), expected \(5,\)"),

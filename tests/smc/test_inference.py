@@ -243,7 +243,7 @@ def log_prior(theta):
 
 
 def filter_of(theta, n=30):
-    """Works for one coefficient and, with arrays (1, R, 1), for R runs at once."""
+    """Works for one coefficient and, with arrays (1, m), for the particles of several runs."""
     (rho,) = theta
     model = StateSpaceModel(
         lambda rng, n: SD0 * rng.standard_normal(n),
@@ -324,12 +324,12 @@ def test_emcee_over_the_evidence_has_the_exact_posterior():
     evaluated = []
 
     def counted(theta):
-        evaluated.append(theta.shape[1])
-        return filter_of(theta)
+        evaluated.append(1)
+        return log_prior(theta)
 
     means, squares = [], []
     for seed in range(4):
-        chains = ensemble(counted, YS, log_prior, STARTS[:16], 40, seed, batched=True)
+        chains = ensemble(filter_of, YS, counted, STARTS[:16], 40, seed, batched=True)
         rho = chains.theta[10:, :, 0]
         means.append(rho.mean())
         squares.append(((rho - MEAN) ** 2).mean())
@@ -338,7 +338,7 @@ def test_emcee_over_the_evidence_has_the_exact_posterior():
     assert sum(evaluated) == 4 * 16 * (40 + 1)
     same = (chains.theta[1:] == chains.theta[:-1])[:, :, 0]
     assert same.any() and (same == (chains.log_evidence[1:] == chains.log_evidence[:-1])).all()
-    again = ensemble(counted, YS, log_prior, STARTS[:16], 3, 3, batched=True)
+    again = ensemble(filter_of, YS, log_prior, STARTS[:16], 3, 3, batched=True)
     np.testing.assert_array_equal(again.theta, chains.theta[:3])
 
 
@@ -413,7 +413,7 @@ def test_what_chains_reject():
     with pytest.raises(InputError, match="1 data sets for 2 chains"):
         pmmh(filter_of, [YS], log_prior, [[0.1], [0.2]], 0.5, 5, paired=True)
     with pytest.raises(InputError, match="must be batched"):
-        pmmh(lambda theta: bootstrap(AR1, 5), YS, log_prior, [0.1], 0.5, 5, batched=True)
+        pmmh(lambda theta: bootstrap(replace(AR1, batched=False), 5), YS, log_prior, [0.1], 0.5, 5, batched=True)
     with pytest.raises(InputError, match="not properly weighted"):
         pmmh(lambda theta: bootstrap(AR1, 5, LargestWeights()), YS, log_prior, [0.1], 0.5, 5)
     with pytest.raises(InputError, match=r"start has shape \(1, 1\)"):

@@ -106,6 +106,10 @@ class ProgramInitial(Proposal):
     model: Model
     guide: Model | None = None
 
+    @property
+    def batched(self) -> bool | None:
+        return False if isinstance(self.model, PerParticle) else None
+
     def sample(self, rng: np.random.Generator, observation: Any, n: int) -> Population:
         return _advance(rng, self.model, self.guide, None, observation, n)
 
@@ -116,6 +120,10 @@ class ProgramTransition(Transition):
 
     model: Model
     guide: Model | None = None
+
+    @property
+    def batched(self) -> bool | None:
+        return False if isinstance(self.model, PerParticle) else None
 
     def predict(self, rng: np.random.Generator, population: Population, observation: Any) -> Population:
         return _advance(rng, self.model, self.guide, population, observation, len(population))

@@ -1,0 +1,137 @@
+"""Time and inputs of models: what a step gives to the functions of its components besides the observation.
+
+>>> model = StateSpaceModel.of(
+...     initial=Normal(0.0, 1.0),
+...     transition=lambda x, t, u: Normal(x + u, 0.1 * t),         # the index of the step, and its input
+...     observation=lambda x: Normal(x, 1.0),
+... )
+>>> filter.run([WithInput(y, u) for y, u in zip(observations, odometry)])
+
+A function of a model that has a parameter named ``t`` or ``u`` gets them by keyword. The first observation has t = 0;
+the transition to x_t is called with t >= 1. An observation without input is given as it is.
+
+A filter gives both to a component by `Component.at`, which returns the component at that step. A component or model
+with functions among its fields names them in `step_functions`; others override `at`, or ignore time and inputs.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cached_property, partial
+from typing import Any, ClassVar, Self
+
+from mstfilter.errors import InputError
+
+
+@dataclass(frozen=True, eq=False)
+class WithInput:
+    """An observation with the input of its step, given to a filter in place of the observation.
+
+    The filter gives `y` to its components as the observation. The input is that of the move from x_{t-1} to x_t; at
+    the first step it is available to the initial distribution and the likelihood.
+    """
+
+    y: Any  #: the observation; None if missing
+    u: Any  #: the input: an odometry reading, a control, a time difference; a number, an array or any object
+
+
+def split_input(observation: Any) -> tuple[Any, Any]:
+    """The observation and the input of a step; None for an input that is not given."""
+    if isinstance(observation, WithInput):
+        return observation.y, observation.u
+    return observation, None
+
+
+@dataclass(frozen=True)
+class StepFunction:
+    """A function with keyword parameters ``t`` and ``u`` that its signature does not show."""
+
+    function: Callable[..., Any]
+    parameters: Mapping[str, bool]  #: as `step_parameters` returns them
+
+    def __call__(self, *args: Any, **step: Any) -> Any:
+        return self.function(*args, **step)
+
+
+def step_parameters(function: Any, n_arguments: int) -> dict[str, bool]:
+    """Which of ``t`` and ``u`` a function takes after its first `n_arguments` parameters, and whether it must get it.
+
+    A parameter with a default value need not be given.
+    """
+    if isinstance(function, StepFunction):
+        return dict(function.parameters)
+    try:
+        parameters = list(inspect.signature(function).parameters.values())
+    except (TypeError, ValueError):  # not a function, or one without a signature
+        return {}
+    kinds = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
+    named = {
+        p.name: p.default is p.empty
+        for i, p in enumerate(parameters)
+        if p.name in ("t", "u") and p.kind in kinds and (i >= n_arguments or p.kind is kinds[1])
+    }
+    return named
+
+
+def with_step(function: Callable[..., Any], parameters: Mapping[str, bool]) -> Callable[..., Any]:
+    """A function ``(*arguments, **step)`` that takes the given parameters by name."""
+    return StepFunction(function, parameters) if parameters else function
+
+
+def at_step(function: Callable[..., Any], parameters: Mapping[str, bool], t: int, u: Any) -> Callable[..., Any]:
+    """The function with ``t`` and ``u`` given; a call raises InputError if it needs an input and there is none."""
+    given = {name: value for name, value in (("t", t), ("u", u)) if name in parameters}
+    if u is None and "u" in given:
+        if parameters["u"]:
+            return partial(_no_input, t)
+        del given["u"]
+    return partial(function, **given)
+
+
+def _no_input(t: int, *args: Any, **named: Any) -> Any:
+    raise InputError(
+        f"a function of the model has a parameter u, and step {t} has no input",
+        "give the input with the observation: WithInput(y, u); name the parameter otherwise if it is none",
+    )
+
+
+class AtStep:
+    """Base class of components and models: `at` gives time and input to the functions among the fields."""
+
+    #: Fields that may be functions of the step -> number of their arguments before ``t`` and ``u``; None for a field
+    #: that is a component or a model.
+    step_functions: ClassVar[Mapping[str, int | None]] = {}
+
+    @cached_property
+    def _of_step(self) -> dict[str, dict[str, bool] | None]:
+        """Fields that change with the step -> parameters that they take; None for a component or model."""
+        found: dict[str, dict[str, bool] | None] = {}
+        for name, n_arguments in self.step_functions.items():
+            value = getattr(self, name)
+            if n_arguments is None:
+                if isinstance(value, AtStep) and (type(value).at is not AtStep.at or value._of_step):
+                    found[name] = None
+            elif value is not None and (parameters := step_parameters(value, n_arguments)):
+                found[name] = parameters
+        return found
+
+    def at(self, t: int, u: Any = None) -> Self:
+        """The component or model at step `t` with input `u`; itself if it does not depend on them.
+
+        Parameters
+        ----------
+        t : int
+            Index of the observation, from 0. The transition from x_{t-1} to x_t is that at t.
+        u : optional
+            The input of the step, of any type; None if there is none.
+        """
+        if not self.step_functions or not self._of_step:
+            return self
+        new = object.__new__(type(self))
+        new.__dict__.update(self.__dict__, _of_step={})  # its functions have their step
+        for name, parameters in self._of_step.items():
+            value = getattr(self, name)
+            new.__dict__[name] = value.at(t, u) if parameters is None else at_step(value, parameters, t, u)
+        return new

@@ -1,0 +1,360 @@
+"""A batch equals single runs bit for bit, or raises InputError, or says that it called a component run by run."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings, strategies as st
+
+from mstfilter.errors import InputError
+from mstfilter.smc import (
+    Normal,
+    Poisson,
+    Program,
+    Reweight,
+    StateSpaceModel,
+    WithInput,
+    batch,
+    bootstrap,
+    ensemble,
+    guided,
+    hidden_markov,
+    linear_gaussian,
+    nonlinear_gaussian,
+    observe,
+    pmmh,
+    sample,
+)
+
+T = 5
+
+
+def vectors(d, k):
+    rng = np.random.default_rng(d)
+    F, H = 0.9 * np.linalg.qr(rng.standard_normal((d, d)))[0], rng.standard_normal((k, d))
+    return F, 0.3 * np.eye(d), H, 0.5 * np.eye(k), np.zeros(d), np.eye(d)
+
+
+def raw(d):
+    shape = (d,) if d > 1 else ()
+
+    def log_likelihood(x, y):
+        return -np.square(y - x) if d == 1 else -np.square(y - x).sum(axis=-1)
+
+    return StateSpaceModel(
+        lambda rng, n: rng.standard_normal((n, *shape)),
+        lambda rng, x: 0.9 * x + rng.standard_normal(x.shape),
+        log_likelihood,
+        batched=True,
+    )
+
+
+def of(d):
+    if d == 1:
+        return StateSpaceModel.of(Normal(0.0, 1.0), lambda x: Normal(0.9 * x, 0.5), lambda x: Normal(x, 1.0))
+    F = vectors(d, 1)[0]
+    return StateSpaceModel.of(
+        Normal(np.zeros((1, d)), 1.0), lambda x: Normal(x @ F.T, 0.5), lambda x: Normal(x[:, :1], 1.0)
+    )
+
+
+def walk(previous, y):
+    x = sample("x", Normal(0.0 if previous is None else previous["x"], 1.0))
+    observe("y", Normal(x, 1.0), y)
+
+
+def counts(d):
+    return StateSpaceModel.of(Normal(0.0, 1.0), lambda x: Normal(0.9 * x, 0.5), lambda x: Poisson(np.exp(x)))
+
+
+CHAIN = hidden_markov([0.5, 0.5], [[0.9, 0.1], [0.2, 0.8]], lambda y: -np.square(y - np.arange(2.0)))
+#: name -> filter of (n, d, k), and whether an observation is a vector of k entries.
+MODELS = {
+    "linear": lambda n, d, k: (bootstrap(linear_gaussian(*vectors(d, k)), n), True),
+    "linear scalar": lambda n, d, k: (bootstrap(linear_gaussian(*vectors(d, 1)), n), False),
+    "nonlinear": lambda n, d, k: (
+        bootstrap(nonlinear_gaussian(np.sin, np.eye(d), lambda x: x[:, :1], [[1.0]], np.zeros(d), np.eye(d)), n),
+        False,
+    ),
+    "raw": lambda n, d, k: (bootstrap(raw(1), n), False),
+    "raw vectors": lambda n, d, k: (bootstrap(raw(k), n), k > 1),
+    "of": lambda n, d, k: (bootstrap(of(1), n), False),
+    "of vectors": lambda n, d, k: (bootstrap(of(d), n), d > 1),
+    "counts": lambda n, d, k: (bootstrap(counts(1), n), False),
+    "guided": lambda n, d, k: (guided(of(1), lambda x, y: Normal(0.5 * (x + y), 1.0), n), False),
+    "chain": lambda n, d, k: (bootstrap(CHAIN, n), False),
+    "program": lambda n, d, k: (Program(walk).bootstrap(n), False),
+}
+
+
+def equal(a, b):
+    if isinstance(a, dict):
+        return all(equal(a[name], b[name]) for name in a)
+    return np.array_equal(a, b)
+
+
+def keeps_its_promise(filter, data, seeds, paired):
+    """Compare a batch with its single runs."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            runs = batch(filter, data, seeds, paired)
+    except InputError:
+        return "raised"
+    for r, seed in enumerate(seeds):
+        if r in runs.lost:
+            with pytest.raises(InputError):
+                filter.run(data[r] if paired else data, seed)
+            continue
+        state, _ = filter.run(data[r] if paired else data, seed)
+        last = runs.state(r).population
+        assert runs.log_evidence[r, -1] == state.log_evidence
+        assert equal(last.particles, state.population.particles)
+        np.testing.assert_array_equal(last.log_weights, state.population.log_weights)
+    return "single" if runs.single else "together"
+
+
+def series(rng, name, filter, vector, d, k, missing):
+    size = {"of vectors": 1}.get(name, k)
+    ys = rng.poisson(2, T).tolist() if name == "counts" else list(rng.standard_normal((T, size) if vector else T))
+    return [None if t in missing else (y if vector else float(y)) for t, y in enumerate(ys)]
+
+
+@settings(max_examples=120, deadline=None, derandomize=True)
+@given(
+    name=st.sampled_from(sorted(MODELS)),
+    shape=st.sampled_from(
+        [(3, 3, 1, 1), (2, 2, 2, 2), (4, 2, 4, 1), (3, 5, 3, 3), (5, 7, 5, 2), (6, 3, 2, 3), (1, 4, 1, 1)]
+    ),
+    missing=st.lists(st.sets(st.integers(0, T - 1), max_size=3), min_size=6, max_size=6),
+    paired=st.booleans(),
+)
+def test_correct_models_equal_single_runs(name, shape, missing, paired):
+    """Shapes are (runs, n, d, k): runs == n, runs == d, n == d, one run, and sizes that differ."""
+    n_runs, n, d, k = shape
+    filter, vector = MODELS[name](n, d, k)
+    rng = np.random.default_rng(0)
+    data = [series(rng, name, filter, vector, d, k, missing[r]) for r in range(n_runs)]
+    found = keeps_its_promise(filter, data if paired else data[0], list(range(n_runs)), paired)
+    assert found == "together" or (
+        found == "single" and paired and name in ("program", "chain", "guided", "of vectors")
+    )
+
+
+def first_particle(x):
+    x = np.array(x)
+    x[0] = x.mean()
+    return x
+
+
+def last_run(x):
+    x = np.array(x)
+    x[-1] += len(x)
+    return x
+
+
+GOOD = raw(1)
+FAULTY = {
+    "mean of all": replace(GOOD, sample_transition=lambda rng, x: x - x.mean() + rng.standard_normal(x.shape)),
+    "first particle": replace(
+        GOOD, sample_transition=lambda rng, x: first_particle(x) + rng.standard_normal(x.shape)
+    ),
+    "last run": replace(GOOD, sample_transition=lambda rng, x: last_run(x) + rng.standard_normal(x.shape)),
+    "number of runs": replace(GOOD, sample_initial=lambda rng, n: n + rng.standard_normal(n)),
+    "neighbours": replace(GOOD, sample_transition=lambda rng, x: np.roll(x, 1) + rng.standard_normal(x.shape)),
+    "largest weight": replace(GOOD, log_likelihood=lambda x, y: -np.square(y - x) - np.square(y - x).max()),
+    "first observation": replace(GOOD, log_likelihood=lambda x, y: -np.square(np.ravel(y)[0] - x)),
+    "one number for all": replace(GOOD, sample_transition=lambda rng, x: x + rng.standard_normal()),
+    "other shape": replace(GOOD, sample_transition=lambda rng, x: x + rng.standard_normal(2 * len(x))[: len(x)]),
+    "own generator": replace(GOOD, sample_initial=lambda rng, n: np.random.default_rng(1).standard_normal(n)),
+    "a matrix": replace(GOOD, log_likelihood=lambda x, y: (-np.square(np.ravel(y)[:, None] - x)).sum(axis=0)),
+}
+
+
+@pytest.mark.parametrize("stated", [True, None], ids=["stated", "tried"])
+@pytest.mark.parametrize("name", FAULTY)
+@pytest.mark.parametrize("n_runs, n", [(4, 4), (7, 3)])
+def test_faulty_models_are_never_wrong_in_silence(name, stated, n_runs, n):
+    """A model that mixes runs raises InputError if it states that it is batched, and else is run singly."""
+    filter = bootstrap(replace(FAULTY[name], batched=stated), n)
+    data = [np.random.default_rng(r).standard_normal(T).tolist() for r in range(n_runs)]
+    found = keeps_its_promise(filter, data, list(range(n_runs)), True)
+    assert found == ("raised" if stated else "single")
+
+
+def test_an_error_names_slot_step_run_values_and_what_to_do():
+    with pytest.raises(
+        InputError, match=r"step 1, transition: the particles of run \d are .* in the batch, .* alone"
+    ) as error:
+        batch(bootstrap(FAULTY["first particle"], 4), [0.1] * 4, range(5))
+    assert any("batched" in hint for hint in error.value.hints)
+    with pytest.raises(InputError, match="run 1, step 2, update: log weight of particle 0 is nan"):
+        batch(bootstrap(GOOD, 4), [[0.1] * 4, [0.1, 0.2, float("nan"), 0.1]], range(2), paired=True)
+    with pytest.raises(InputError, match=r"run 1, step 1, update: ValueError"):
+        batch(bootstrap(GOOD, 4), [[0.1] * 3, [0.1, [1.0, 2.0], 0.1]], range(2), paired=True)
+    with pytest.raises(InputError, match=r"the observation has shape \(2,\), expected \(1,\)"):
+        batch(MODELS["linear scalar"](5, 1, 1)[0], [np.zeros(2)], range(2))
+
+
+def test_a_model_that_differs_later_only_is_found_then():
+    def later(rng, x, t):
+        return x + rng.standard_normal(x.shape) + (x.mean() if t >= 3 else 0.0)
+
+    stated = replace(GOOD, sample_transition=later)
+    with pytest.raises(InputError, match="step 4, transition"):
+        batch(bootstrap(stated, 4), [0.1] * 6, range(5))
+    assert keeps_its_promise(bootstrap(replace(stated, batched=None), 4), [0.1] * 6, range(5), False) == "single"
+
+
+def test_a_batch_says_and_warns_that_components_are_called_for_each_run():
+    def rounds(x, y):  # in another order for another number of rows, as matrix products of BLAS
+        return -np.square(y - x) * (1 + 1e-15 * len(x))
+
+    filter = bootstrap(replace(GOOD, log_likelihood=rounds), 4)
+    with pytest.warns(UserWarning, match="the update is called once for each run: .* by rounding"):
+        runs = batch(filter, [0.5] * 3, range(5))
+    assert list(runs.single) == ["update"]
+    assert batch(Program(walk).bootstrap(4), [[0.5]] * 3, range(3), paired=True).single
+    assert batch(bootstrap(GOOD, 4), [0.5] * 3, range(5)).single == {}
+
+
+def test_inputs_of_each_run_are_given_by_row():
+    model = linear_gaussian(*vectors(2, 1), B=np.array([[1.0, 0.5, 0.2], [0.3, 1.0, 0.1]]))
+    rng = np.random.default_rng(0)
+    data = [
+        [WithInput(float(y), u) for y, u in zip(rng.standard_normal(T), rng.standard_normal((T, 3)), strict=True)]
+        for _ in range(4)
+    ]
+    assert keeps_its_promise(bootstrap(model, 6), data, range(4), True) == "together"
+    assert keeps_its_promise(bootstrap(model, 6), data[0], range(4), False) == "together"
+
+
+# --- chains -------------------------------------------------------------------------------------------------------
+def chain_model(kind, theta, n):
+    """A filter of a coefficient, with particles (n,) or (n, 2)."""
+    (rho,) = theta
+    if kind == "of":
+        model = StateSpaceModel.of(Normal(0.0, 1.0), lambda x: Normal(rho * x, 0.5), lambda x: Normal(x, 1.0))
+        return bootstrap(model, n)
+    factor = rho if kind in ("scalar", "vectors without axis") else rho[..., None]
+    size = () if kind == "scalar" else (2,)
+    model = StateSpaceModel(
+        lambda rng, n: rng.standard_normal((n, *size)),
+        lambda rng, x: factor * x + rng.standard_normal(x.shape),
+        lambda x, y: -np.square(y - (x if kind == "scalar" else x[:, 0])),
+        batched=True,
+    )
+    return bootstrap(model, n)
+
+
+YS = [0.3, 1.1, -0.2, None, 0.4]
+START = [[0.1], [0.5], [0.9]]
+
+
+def flat(theta):
+    return 0.0
+
+
+@pytest.mark.parametrize("n", [3, 2, 5])
+@pytest.mark.parametrize("kind", ["scalar", "vectors", "of", "vectors without axis"])
+@pytest.mark.parametrize("paired", [False, True])
+def test_chains_equal_single_chains_or_refuse(kind, paired, n):
+    """Three chains; parameters of all chains without an axis do not fit vectors, whatever the sizes."""
+    data = [YS, [None, *YS[1:]], YS[::-1]] if paired else YS
+
+    def chains(batched):
+        return pmmh(
+            lambda theta: chain_model(kind, theta, n), data, flat, START, 0.2, 6, batched=batched, paired=paired
+        )
+
+    if kind == "vectors without axis":
+        with pytest.raises(InputError, match="step 1, transition"):
+            chains(True)
+        return
+    one, many = chains(False), chains(True)
+    np.testing.assert_array_equal(one.theta, many.theta)
+    np.testing.assert_array_equal(one.log_evidence, many.log_evidence)
+
+
+def test_chains_of_which_one_run_is_lost_stay_in_one_sweep():
+    calls = []
+
+    def fragile(theta):
+        calls.append(np.ndim(theta))
+        filter = chain_model("scalar", theta, 4)
+        return replace(
+            filter, update=Reweight(lambda x, y: np.where(np.abs(x - y) < 1.0, 0.0, -np.inf), batched=True)
+        )
+
+    many = pmmh(fragile, [0.1, 0.2, 0.3], flat, START * 3, 0.2, 20, 1, batched=True)
+    together = len(calls)
+    one = pmmh(fragile, [0.1, 0.2, 0.3], flat, START * 3, 0.2, 20, 1)
+    np.testing.assert_array_equal(one.theta, many.theta)
+    assert (many.accepted < 1).all() and together < 2 * (len(calls) - together)
+
+
+def test_chains_say_that_they_are_run_singly():
+    def mixing(theta):
+        (rho,) = theta
+        model = StateSpaceModel.of(
+            Normal(0.0, 1.0), lambda x: Normal(rho * (x - x.mean()), 0.5), lambda x: Normal(x, 1.0)
+        )
+        return bootstrap(model, 4)
+
+    with pytest.warns(UserWarning, match="run one by one: transition"):
+        many = pmmh(mixing, YS, flat, START, 0.2, 4, batched=True)
+    np.testing.assert_array_equal(many.theta, pmmh(mixing, YS, flat, START, 0.2, 4).theta)
+
+
+def test_a_chain_whose_first_estimate_is_lost_is_drawn_again():
+    """A filter of one particle survives three observations with probability .1 or so: most starts are drawn again."""
+
+    def fragile(theta):
+        filter = chain_model("scalar", theta, 1)
+        return replace(
+            filter, update=Reweight(lambda x, y: np.where(np.abs(x - y) < 0.9, 0.0, -np.inf), batched=True)
+        )
+
+    for batched in (False, True):
+        chains = pmmh(fragile, [0.1, 0.2], flat, START, 0.2, 4, 2, batched=batched)
+        assert np.isfinite(chains.log_evidence).all()
+    with pytest.raises(InputError, match=r"of chain 1 has log density -inf: 20 estimates"):
+        pmmh(
+            lambda theta: chain_model("scalar", theta, 3) if theta[0] < 0.4 else fragile_never(theta),
+            [0.1],
+            flat,
+            [[0.1], [0.5]],
+            0.01,
+            2,
+        )
+    with pytest.raises(InputError, match="of chain 2 .* the log prior is -inf"):
+        pmmh(fragile, [0.1], lambda theta: 0.0 if theta[0] < 0.8 else -np.inf, START, 0.2, 2)
+
+
+def fragile_never(theta):
+    return replace(chain_model("scalar", theta, 3), update=Reweight(lambda x, y: np.full(len(x), -np.inf)))
+
+
+def test_the_advice_for_many_data_sets_with_as_many_runs_as_particles():
+    """As docs/comparing.md has it, with its model: numbers as observations, 50 data sets, 50 particles."""
+    model = ([[0.95]], [[0.02]], [[1.0]], [[0.2]], [0.0], [[0.2]])
+    filter, rng = bootstrap(linear_gaussian(*model), 50), np.random.default_rng(0)
+    data_sets = rng.standard_normal((50, 8)).tolist()
+    runs = batch(filter, data_sets, range(50), paired=True, mean=lambda p: p.weights @ p.particles)
+    assert runs.single == {} and runs.values["mean"].shape == (50, 8, 1)
+    for r in (0, 1, 25, 49):
+        assert runs.log_evidence[r, -1] == filter.run(data_sets[r], r)[0].log_evidence
+
+
+def test_walkers_of_emcee_are_the_same_in_one_sweep():
+    start = np.linspace(0.1, 0.9, 6)[:, None]
+
+    def walkers(batched):
+        return ensemble(lambda theta: chain_model("of", theta, 5), YS, flat, start, 4, 1, batched=batched)
+
+    one, many = walkers(False), walkers(True)
+    np.testing.assert_array_equal(one.theta, many.theta)
+    np.testing.assert_array_equal(one.log_evidence, many.log_evidence)
