@@ -14,12 +14,18 @@ Frozen distributions of scipy.stats and objects of torch.distributions can be us
 (`as_distribution`); they take three to six times as long. Neither library is imported before it is used. torch draws
 from a global generator, so its distributions are drawn by their inverse distribution function at uniforms of our
 generator, or, without an inverse, from their probabilities.
+
+A parameter out of range, in any row, raises InputError when the distribution is made. Moves and lookaheads evaluate
+values that a model may exclude; inside `hypothetical` such a row has the log density NaN, which a move rejects.
 """
 
 from __future__ import annotations
 
 import math
 from abc import abstractmethod
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass
 from typing import Any
 
@@ -29,9 +35,58 @@ from mstfilter.errors import InputError
 from mstfilter.smc.interfaces import Distribution
 
 _HALF_LOG_2PI = 0.5 * math.log(2 * math.pi)
+_HYPOTHETICAL: ContextVar[bool] = ContextVar("parameters may be out of range", default=False)
 
 
-class _Independent(Distribution):
+@contextmanager
+def hypothetical() -> Iterator[None]:
+    """In the block, rows whose parameters are out of range have the log density NaN instead of raising InputError."""
+    token = _HYPOTHETICAL.set(True)
+    try:
+        with np.errstate(invalid="ignore"):
+            yield
+    finally:
+        _HYPOTHETICAL.reset(token)
+
+
+class _Checked(Distribution):
+    """A distribution that checks its parameters, which are fields."""
+
+    def _check(self, name: str, expected: str, inside: Callable[[np.ndarray], np.ndarray]) -> None:
+        """Raise InputError at the first entry of a parameter that is not `inside`; `hypothetical` makes it NaN."""
+        value = getattr(self, name)
+        array = np.asarray(value)
+        if array.dtype.kind not in "fiub":
+            raise InputError(
+                f"{name} of a {type(self).__name__} is {value!r}"[:200] + f", expected {expected}",
+                *(["None stands for a missing observation, or for previous at the first step"] * (value is None)),
+            )
+        wrong = ~inside(array)
+        if not wrong.any():
+            return
+        array = np.broadcast_to(array, wrong.shape)
+        if _HYPOTHETICAL.get() and array.ndim:
+            object.__setattr__(self, name, np.where(wrong, np.nan, array))
+            return
+        first = tuple(int(i) for i in np.argwhere(wrong)[0])
+        row = f" in row {first[0]} ({int(wrong.sum())} of {array.size})" if first else ""
+        raise InputError(f"{name} of a {type(self).__name__} is {array[first]}{row}, expected {expected}")
+
+    def _check_finite(self, name: str) -> None:
+        if not _is_finite(getattr(self, name)):
+            self._check(name, "a finite number", np.isfinite)
+
+    def _check_positive(self, name: str) -> None:
+        value = getattr(self, name)
+        if type(value) is float:
+            inside = 0 < value < math.inf
+        else:
+            inside = type(value) is np.ndarray and value.size > 0 and 0 < value.min() and value.max() < np.inf
+        if not inside:
+            self._check(name, "a positive number", lambda a: (0 < a) & (a < np.inf))
+
+
+class _Independent(_Checked):
     """Independent entries. The fields are the parameters: (), (n,), (1, d) or (n, d)."""
 
     @property
@@ -51,6 +106,18 @@ class _Independent(Distribution):
         return np.broadcast_to(np.asarray(self._moments()[1], np.float64), self.parameter_shape)
 
 
+def _is_finite(value: Any) -> bool:
+    """Whether all numbers of a float or float64 array are finite. False also if the sum of their squares is not."""
+    if type(value) is float:
+        return math.isfinite(value)
+    return type(value) is np.ndarray and value.dtype == np.float64 and math.isfinite(np.vdot(value, value))
+
+
+def _impossible(value: np.ndarray) -> Any:
+    """Log density of a value outside of the support: -inf, or NaN if the value is NaN."""
+    return np.where(np.isnan(value), np.nan, -np.inf) if value.dtype.kind == "f" else -np.inf
+
+
 def _broadcast_shape(*parameters: Any) -> tuple[int, ...]:
     shape: tuple[int, ...] = ()
     for parameter in parameters:
@@ -66,12 +133,6 @@ def _broadcast_shape(*parameters: Any) -> tuple[int, ...]:
                 "with one row per particle they are all (n,), or all (n, d) or (n, 1)",
             ) from None
     return shape
-
-
-def _check_positive(what: str, value: Any) -> None:
-    """Check a parameter that is one number; invalid rows of an array make weights NaN, which is an error later."""
-    if isinstance(value, (int, float)) and not 0 < value < np.inf:
-        raise InputError(f"{what} is {value}, expected a positive number")
 
 
 def _sum_rows(log_prob: Any) -> np.ndarray:
@@ -95,7 +156,8 @@ class Normal(_Independent):
     scale: Any = 1.0
 
     def __post_init__(self) -> None:
-        _check_positive("scale of a Normal", self.scale)
+        self._check_finite("loc")
+        self._check_positive("scale")
 
     def sample(self, rng: np.random.Generator, size: int) -> np.ndarray:
         z = rng.standard_normal(self.value_shape(size))
@@ -128,8 +190,9 @@ class Student(_Independent):
     scale: Any = 1.0
 
     def __post_init__(self) -> None:
-        _check_positive("df of a Student", self.df)
-        _check_positive("scale of a Student", self.scale)
+        self._check_positive("df")
+        self._check_finite("loc")
+        self._check_positive("scale")
 
     def sample(self, rng: np.random.Generator, size: int) -> np.ndarray:
         return self.loc + self.scale * rng.standard_t(self.df, self.value_shape(size))
@@ -153,8 +216,9 @@ class Uniform(_Independent):
     high: Any = 1.0
 
     def __post_init__(self) -> None:
-        if isinstance(self.low, (int, float)) and isinstance(self.high, (int, float)):
-            _check_positive(f"width of a Uniform from {self.low} to {self.high}", self.high - self.low)
+        self._check_finite("low")
+        _broadcast_shape(self.low, self.high)
+        self._check("high", "a finite number above low", lambda a: (np.asarray(self.low) < a) & (a < np.inf))
 
     def sample(self, rng: np.random.Generator, size: int) -> np.ndarray:
         u = rng.random(self.value_shape(size))
@@ -163,7 +227,7 @@ class Uniform(_Independent):
     def log_prob(self, value: Any) -> np.ndarray:
         x = np.asarray(value)
         inside = (x >= self.low) & (x < self.high)
-        return _sum_rows(np.where(inside, -np.log(np.asarray(self.high) - self.low), -np.inf))
+        return _sum_rows(np.where(inside, -np.log(np.asarray(self.high) - self.low), _impossible(x)))
 
     def _moments(self) -> tuple[Any, Any]:
         return (np.asarray(self.low) + self.high) / 2, (np.asarray(self.high) - self.low) / math.sqrt(12)
@@ -177,8 +241,8 @@ class Gamma(_Independent):
     rate: Any = 1.0
 
     def __post_init__(self) -> None:
-        _check_positive("shape of a Gamma", self.shape)
-        _check_positive("rate of a Gamma", self.rate)
+        self._check_positive("shape")
+        self._check_positive("rate")
 
     def sample(self, rng: np.random.Generator, size: int) -> np.ndarray:
         return rng.standard_gamma(self.shape, self.value_shape(size)) / self.rate
@@ -189,14 +253,39 @@ class Gamma(_Independent):
         x, a = np.asarray(value, dtype=np.float64), np.asarray(self.shape, dtype=np.float64)
         safe = np.where(x >= 0, x, 1.0)
         inside = xlogy(a, self.rate) + xlogy(a - 1, safe) - self.rate * safe - gammaln(a)
-        return _sum_rows(np.where(x >= 0, inside, -np.inf))
+        return _sum_rows(np.where(x >= 0, inside, _impossible(x)))
 
     def _moments(self) -> tuple[Any, Any]:
         return np.asarray(self.shape) / self.rate, np.sqrt(self.shape) / self.rate
 
 
+def _cholesky(cov: np.ndarray) -> np.ndarray:
+    """Lower triangular root of each covariance; NaN in `hypothetical` for a row that is not positive definite."""
+    if cov.ndim not in (2, 3) or cov.shape[-1] != cov.shape[-2]:
+        raise InputError(f"covariance has shape {cov.shape}, expected (d, d) or (n, d, d)")
+    difference = cov - np.swapaxes(cov, -1, -2)
+    if (abs(difference) <= 1e-6 * abs(cov).max(initial=0.0)).all():
+        try:
+            return np.linalg.cholesky(cov)
+        except np.linalg.LinAlgError:
+            pass
+    matrices, roots = cov.reshape(-1, *cov.shape[-2:]), []
+    for row, matrix in enumerate(matrices):
+        size = abs(matrix).max()
+        symmetric = bool((abs(matrix - matrix.T) <= 1e-6 * size).all())
+        try:
+            roots.append(np.linalg.cholesky(matrix if symmetric else np.full_like(matrix, -1.0)))
+        except np.linalg.LinAlgError:
+            roots.append(np.full_like(matrix, np.nan))
+            if not (_HYPOTHETICAL.get() and cov.ndim == 3):
+                what = "positive definite" if symmetric else "symmetric"
+                where = f" in row {row}" if cov.ndim == 3 else ""
+                raise InputError(f"covariance is not {what}{where}: {matrix.tolist()}"[:300]) from None
+    return np.reshape(roots, cov.shape)
+
+
 @dataclass(frozen=True, eq=False)
-class MultivariateNormal(Distribution):
+class MultivariateNormal(_Checked):
     """Gaussian vectors.
 
     The mean `loc` is (d,) or (n, d), one for all particles or one for each; the covariance `cov` is (d, d) or (n, d,
@@ -207,10 +296,8 @@ class MultivariateNormal(Distribution):
     cov: Any
 
     def __post_init__(self) -> None:
-        try:
-            root = np.linalg.cholesky(np.asarray(self.cov, dtype=np.float64))
-        except np.linalg.LinAlgError:
-            raise InputError(f"covariance is not positive definite: {np.asarray(self.cov).tolist()}"[:300]) from None
+        self._check_finite("loc")
+        root = _cholesky(np.asarray(self.cov, dtype=np.float64))
         loc = np.shape(self.loc)
         if loc and loc[-1] != root.shape[-1] and (len(loc), loc[-1]) != (2, 1):
             raise InputError(
@@ -258,6 +345,9 @@ class Poisson(_Independent):
     rate: Any
     discrete = True
 
+    def __post_init__(self) -> None:
+        self._check("rate", "a number of at least 0", lambda a: (0 <= a) & (a < np.inf))
+
     def sample(self, rng: np.random.Generator, size: int) -> np.ndarray:
         return rng.poisson(self.rate, self.value_shape(size))
 
@@ -267,7 +357,7 @@ class Poisson(_Independent):
         k = np.asarray(value, dtype=np.float64)
         valid = (k >= 0) & (k == np.floor(k))
         safe = np.where(valid, k, 0.0)
-        return _sum_rows(np.where(valid, xlogy(safe, self.rate) - gammaln(safe + 1) - self.rate, -np.inf))
+        return _sum_rows(np.where(valid, xlogy(safe, self.rate) - gammaln(safe + 1) - self.rate, _impossible(k)))
 
     def _moments(self) -> tuple[Any, Any]:
         return self.rate, np.sqrt(self.rate)
@@ -285,8 +375,7 @@ class Bernoulli(_Independent):
     discrete = True
 
     def __post_init__(self) -> None:
-        if isinstance(self.p, (int, float)) and not 0 <= self.p <= 1:
-            raise InputError(f"probability of a Bernoulli is {self.p}, expected a number from 0 to 1")
+        self._check("p", "a probability from 0 to 1", lambda a: (0 <= a) & (a <= 1))
 
     def sample(self, rng: np.random.Generator, size: int) -> np.ndarray:
         return rng.random(self.value_shape(size)) < self.p
@@ -295,7 +384,7 @@ class Bernoulli(_Independent):
         x = np.asarray(value)
         with np.errstate(divide="ignore"):
             log_p = np.where(x.astype(bool), np.log(self.p), np.log1p(-np.asarray(self.p)))
-        return _sum_rows(np.where((x == 0) | (x == 1), log_p, -np.inf))
+        return _sum_rows(np.where((x == 0) | (x == 1), log_p, _impossible(x)))
 
     def _moments(self) -> tuple[Any, Any]:
         return self.p, np.sqrt(np.asarray(self.p) * (1 - np.asarray(self.p)))
@@ -314,12 +403,19 @@ class Categorical(Distribution):
 
     def __post_init__(self) -> None:
         p = np.asarray(self.probs, dtype=np.float64)
-        total = p.sum(axis=-1, keepdims=True) if p.ndim else np.zeros(1)
-        if p.ndim not in (1, 2) or not (total > 0).all() or not (p >= 0).all() or not np.isfinite(total).all():
-            raise InputError(
-                f"probabilities of a categorical have shape {p.shape} and totals {np.unique(total)[:3].tolist()}, "
-                "expected (k,) or (n, k), none negative, none all zero"
-            )
+        if p.ndim not in (1, 2) or not p.shape[-1]:
+            raise InputError(f"probabilities of a categorical have shape {p.shape}, expected (k,) or (n, k)")
+        total = p.sum(axis=-1, keepdims=True)
+        if p.size and not (p.min() >= 0 and total.min() > 0 and total.max() < np.inf):
+            wrong = ~((p >= 0).all(axis=-1) & (total[..., 0] > 0) & (total[..., 0] < np.inf))
+            if not (_HYPOTHETICAL.get() and p.ndim == 2):
+                row = int(np.argmax(wrong))
+                where = f" in row {row} ({int(wrong.sum())} of {len(p)})" if p.ndim == 2 else ""
+                raise InputError(
+                    f"probabilities of a categorical are {p.reshape(-1, p.shape[-1])[row].tolist()}{where}"[:300]
+                    + ", expected finite numbers, none negative, not all zero"
+                )
+            total = np.where(wrong[:, None], np.nan, total)
         object.__setattr__(self, "probs", p / total)
 
     @property
@@ -340,14 +436,14 @@ class Categorical(Distribution):
 
     def log_prob(self, value: Any) -> np.ndarray:
         k = np.asarray(value)
-        index = np.clip(k, 0, self.probs.shape[-1] - 1).astype(np.int64)
+        index = np.nan_to_num(np.clip(k, 0, self.probs.shape[-1] - 1)).astype(np.int64)
         with np.errstate(divide="ignore"):
             log_p = np.log(self.probs)
         if self.probs.ndim == 1:
             picked = log_p[index]
         else:
             picked = log_p[0 if len(log_p) == 1 and index.ndim else np.arange(len(log_p)), index]
-        return np.where(index == k, picked, -np.inf)
+        return np.where(index == k, picked, _impossible(k))
 
     @property
     def mean(self) -> np.ndarray:

@@ -20,6 +20,7 @@ from mstfilter.smc import (
     as_distribution,
     bootstrap,
 )
+from mstfilter.smc.distributions import hypothetical
 
 COV = np.array([[2.0, 0.6], [0.6, 0.5]])
 CASES = [
@@ -141,10 +142,81 @@ def test_shapes_of_batch_and_event(distribution, batch, event):
             distribution.value_shape(4)
 
 
+NAN, INF = np.nan, np.inf
+BAD_COV = np.array([[1.0, 2.0], [2.0, 1.0]])
+
+
+def with_row(good, bad, row=2):
+    """An array whose rows are `good`, but one."""
+    rows = np.stack([np.asarray(good, np.float64)] * 4)
+    rows[row] = bad
+    return rows
+
+
+@pytest.mark.parametrize(
+    ("make", "named", "value"),
+    [
+        *[(lambda v: Normal(with_row(0.0, v), 1.0), "loc of a Normal", v) for v in (NAN, INF, -INF)],
+        *[(lambda v: Normal(0.0, with_row(1.0, v)), "scale of a Normal", v) for v in (0.0, -1.0, NAN, INF)],
+        (lambda v: Normal(with_row([0.0, 1.0], [0.0, v]), 1.0), "loc of a Normal", NAN),
+        (lambda v: Normal(np.float32(with_row(0.0, v)), 1.0), "loc of a Normal", NAN),
+        *[(lambda v: Student(with_row(3.0, v)), "df of a Student", v) for v in (0.0, -1.0, NAN)],
+        (lambda v: Student(3.0, 0.0, with_row(3.0, v)), "scale of a Student", -0.5),
+        *[(lambda v: Gamma(with_row(1.0, v)), "shape of a Gamma", v) for v in (0.0, -1.0, NAN)],
+        (lambda v: Gamma(1.0, with_row(1.0, v)), "rate of a Gamma", -1.0),
+        *[(lambda v: Uniform(with_row(0.0, v), 1.0), "of a Uniform", v) for v in (1.0, 1.5, NAN)],
+        *[(lambda v: Uniform(0.0, with_row(1.0, v)), "high of a Uniform", v) for v in (0.0, -1.0, NAN, INF)],
+        *[(lambda v: Poisson(with_row(1.0, v)), "rate of a Poisson", v) for v in (-1.0, NAN, INF)],
+        *[(lambda v: Bernoulli(with_row(0.5, v)), "p of a Bernoulli", v) for v in (-0.1, 1.1, NAN)],
+        *[(lambda v: Categorical(with_row([0.5, 0.5], [0.5, v])), "categorical", v) for v in (-0.1, NAN, INF)],
+        (lambda v: Categorical(with_row([0.5, 0.5], v)), "categorical", 0.0),
+        (lambda v: MultivariateNormal(with_row([0.0, 0.0], v), COV), "loc of a MultivariateNormal", NAN),
+        (lambda v: MultivariateNormal([0.0, 0.0], with_row(COV, v)), "not positive definite", BAD_COV),
+        (lambda v: MultivariateNormal([0.0, 0.0], with_row(COV, v)), "not symmetric", [[1.0, 0.5], [0.0, 1.0]]),
+        (lambda v: MultivariateNormal([0.0, 0.0], with_row(COV, v)), "covariance", NAN),
+    ],
+)
+def test_a_parameter_out_of_range_names_its_row(make, named, value):
+    with pytest.raises(InputError, match=named + ".* in row 2"):
+        make(value)
+    with hypothetical():  # as in a move: that row has no density, the others are as they were
+        d = make(value)
+        drawn = np.zeros(d.value_shape(4), dtype=int)
+        with np.errstate(all="ignore"):
+            log_prob = np.broadcast_to(d.log_prob(drawn), 4)
+    assert not log_prob[2] > -INF
+    assert (~np.isnan(log_prob[[0, 1, 3]])).all()
+
+
+@pytest.mark.parametrize("value", [0.0, -1.0, NAN, INF, None, "a", 1j])
+def test_a_number_out_of_range(value):
+    for make in (lambda v: Normal(0.0, v), lambda v: Student(v), lambda v: Gamma(v), lambda v: Uniform(0.0, v)):
+        with pytest.raises(InputError, match="of a (Normal|Student|Gamma|Uniform) is"):
+            make(value)
+    with pytest.raises(InputError, match="of a Poisson is"):
+        Poisson(-1)
+    with pytest.raises(InputError, match="not symmetric"):
+        MultivariateNormal([0.0, 0.0], [[1.0, 0.5], [0.0, 1.0]])
+
+
+def test_large_parameters_and_integers_are_in_range():
+    huge = np.array([1e200, -1e300])  # the sum of their squares overflows
+    assert Normal(huge, 1.0).sample(np.random.default_rng(0), 2).shape == (2,)
+    for d in (Normal(0, 1), Normal(np.arange(3), np.arange(1, 4)), Uniform(0, 2), Poisson(np.arange(3)), Bernoulli(1)):
+        assert np.isfinite(d.sample(np.random.default_rng(0), 3)).all()
+    assert Normal(np.zeros(0), np.zeros(0)).sample(np.random.default_rng(0), 0).shape == (0,)
+
+
+@pytest.mark.parametrize(("ours", "theirs"), CASES, ids=IDS)
+def test_a_value_of_nan_has_no_density(ours, theirs):
+    with np.errstate(all="ignore"):
+        assert np.isnan(ours.log_prob(np.array([NAN, 1.0]))[0])
+
+
 def test_parameters_that_do_not_fit_together():
     with pytest.raises(InputError, match=r"shapes \(4, 2\) and \(4,\) do not fit together"):
         Normal(np.zeros((4, 2)), np.ones(4)).sample(np.random.default_rng(0), 4)
-    with pytest.raises(InputError, match="probability of a Bernoulli is 1.5"):
+    with pytest.raises(InputError, match="p of a Bernoulli is 1.5, expected a probability"):
         Bernoulli(1.5)
     with pytest.raises(InputError, match=r"mean of shape \(1,\) does not fit a covariance of shape \(2, 2\)"):
         MultivariateNormal([0.0], COV)

@@ -106,7 +106,7 @@ def decides(previous, y):
         (lambda: Normal(0.0, -1.0), r"scale of a Normal is -1\.0, expected a positive number"),
         (lambda: Student(0.0), "df of a Student"),
         (lambda: Gamma(1.0, 0), "rate of a Gamma is 0"),
-        (lambda: Uniform(1.0, 1.0), "width of a Uniform"),
+        (lambda: Uniform(1.0, 1.0), r"high of a Uniform is 1\.0, expected a finite number above low"),
         (lambda: Program(3), "model is 3, expected a function"),
         (lambda: Program(decides).bootstrap(5).run([0.1], 0), "step 0, initial: the program decides by an array"),
         (lambda: linear_gaussian(**{**LG, "Q": [[-1.0]]}), "Q is .*positive semidefinite"),
