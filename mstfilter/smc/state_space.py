@@ -24,7 +24,7 @@ import numpy as np
 
 from mstfilter.errors import InputError, check_component, check_integer
 from mstfilter.smc.components import EssBelow, Reweight
-from mstfilter.smc.distributions import as_distribution
+from mstfilter.smc.distributions import as_distribution, hypothetical
 from mstfilter.smc.filter import ParticleFilter
 from mstfilter.smc.inputs import AtStep, step_parameters, with_step
 from mstfilter.smc.interfaces import (
@@ -287,7 +287,8 @@ class RandomWalkMove(Rejuvenation):
         current = log_target(x)
         for _ in range(self.steps):
             new = self._step(rng, x)
-            proposed = log_target(new)
+            with hypothetical():
+                proposed = log_target(new)
             with np.errstate(invalid="ignore"):
                 yes = accept_moves(rng, proposed - current)
             x, current = choose_rows(yes, new, x), np.where(yes, proposed, current)

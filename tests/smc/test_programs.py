@@ -665,7 +665,7 @@ def test_values_of_particles_that_look_like_a_shared_vector():
         sizes.append(len(k))
 
     Program(model).bootstrap(4).run([0.3, 0.2, 0.1], 0)
-    assert sizes == [4, 1, 4, 1, 4]  # the first and the second step are checked by a run with one particle
+    assert sizes == [*[4, 4, 1, 1] * 3]  # every step is checked: it is repeated, and two particles run alone
     a, _ = Program(model).bootstrap(4).run([0.1], 0)
     p = a.population.particles
     expected = (

@@ -6,16 +6,17 @@ import traceback
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
-from weakref import WeakKeyDictionary
 
 import numpy as np
 
 from mstfilter.errors import InputError, check_integer, check_number
-from mstfilter.smc.distributions import Normal
+from mstfilter.smc.distributions import Normal, hypothetical
 from mstfilter.smc.filter import ParticleFilter
 from mstfilter.smc.interfaces import Lookahead, Proposal, Rejuvenation, Transition
-from mstfilter.smc.population import Particles, Population, take
+from mstfilter.smc.population import Particles, Population
+from mstfilter.smc.programs.guard import Guard
 from mstfilter.smc.programs.handlers import (
     CentreHandler,
     GuideHandler,
@@ -81,14 +82,15 @@ def _advance(
 ) -> Population:
     """The population after a step."""
     previous = None if past is None else past.particles
-    if guide is None or observation is None:
-        particles, gain = run_program(model, SampleHandler(rng), previous, observation, n)
-    else:
-        if isinstance(guide, PerParticle) != isinstance(model, PerParticle):
-            raise InputError("model and guide must both be per_particle, or neither")
-        proposed = GuideHandler(rng, n)
-        run_program(guide, proposed, previous, observation, n)
-        particles, gain = run_program(model, ReplayHandler(proposed), previous, observation, n)
+    guide = None if observation is None else guide
+    guard = Guard.due(rng, past, observation, model, guide)
+
+    def step() -> tuple[Particles, np.ndarray]:
+        return _step(rng, model, guide, previous, observation, n)
+
+    particles, gain = step()
+    if guard is not None:
+        guard.check(_run_once, step, particles, gain)
     try:
         if past is None:
             return Population(particles, gain)
@@ -97,6 +99,19 @@ def _advance(
         if np.isnan(gain).any() and not isinstance(model, PerParticle):  # name the site
             run_program(model, ScoreHandler(particles, strict=True), previous, observation, n)
         raise
+
+
+def _step(
+    rng: np.random.Generator, model: Model, guide: Model | None, previous: Particles | None, observation: Any, n: int
+) -> tuple[Particles, np.ndarray]:
+    """Particles, drawn by the guide if there is one, and gains of the log weights."""
+    if guide is None:
+        return run_program(model, SampleHandler(rng), previous, observation, n)
+    if isinstance(guide, PerParticle) != isinstance(model, PerParticle):
+        raise InputError("model and guide must both be per_particle, or neither")
+    proposed = GuideHandler(rng, n)
+    run_program(guide, proposed, previous, observation, n)
+    return run_program(model, ReplayHandler(proposed), previous, observation, n)
 
 
 @dataclass(frozen=True)
@@ -144,7 +159,10 @@ class ProgramLookahead(Lookahead):
 
     def log_priority(self, population: Population, observation: Any) -> np.ndarray:
         """(n,) log probability of the observation, bounded from below."""
-        _, priority = run_program(self.model, CentreHandler(), population.particles, observation, len(population))
+        with hypothetical():
+            _, priority = run_program(
+                self.model, CentreHandler(), population.particles, observation, len(population)
+            )
         # An observation that is impossible at the mean may be possible for a draw: at most 50 below the best.
         top = priority.max()
         if not np.isfinite(top):
@@ -200,7 +218,8 @@ class ProgramMove(Rejuvenation):
 
         def score(values: Mapping[str, Any], no_axis: bool = False) -> tuple[ProgramRun, list[Site]]:
             handler = ScoreHandler(values, no_axis)
-            return _run_once(function, handler, previous, observation, n, single), handler.sites
+            with hypothetical():
+                return _run_once(function, handler, previous, observation, n, single), handler.sites
 
         now, sites = score(x, single)
         taken = 0
@@ -252,7 +271,8 @@ class ProgramMove(Rejuvenation):
             if site.distribution.discrete:
                 step = site.distribution
             else:
-                step = Normal(old[site.name][site.index], self.scale * site.distribution.sd)
+                with hypothetical():
+                    step = Normal(old[site.name][site.index], self.scale * site.distribution.sd)
             total[site.index] += step.log_prob(new[site.name][site.index])
         return total
 
@@ -280,10 +300,18 @@ def run_program(
 
 
 def _run_once(
-    function: Callable[[Any, Any], Any], handler: SiteHandler, previous: Any, observation: Any, n: int, single: bool
+    function: Callable[[Any, Any], Any],
+    handler: SiteHandler,
+    previous: Any,
+    observation: Any,
+    n: int,
+    single: bool = False,
 ) -> ProgramRun:
     """One pass of a function, `single` without the particle axis."""
     run = ProgramRun(handler, n, single)
+    run.function = function
+    if isinstance(previous, dict):
+        previous = MappingProxyType(previous)
     try:
         _call(function, run, previous, observation)
     except (TypeError, ValueError, LookupError, AttributeError, ArithmeticError) as error:
@@ -299,8 +327,6 @@ def _run_once(
             raise InputError(
                 f"the model has no site {unused[0]!r}, which the guide samples", f"it has {sorted(run.values)}"
             )
-    if run.ambiguous and handler.draws:
-        _check_shapes(function, run, previous, observation)
     return run
 
 
@@ -312,39 +338,6 @@ def _call(function: Callable[[Any, Any], Any], run: ProgramRun, previous: Any, o
         active_run.reset(token)
     run.returned = _returned(returned, run)
 
-
-def _check_shapes(function: Callable[[Any, Any], Any], run: ProgramRun, previous: Any, observation: Any) -> None:
-    """Raise if the shape of an event depends on the number of particles, by a second run with one particle.
-
-    A vector with as many entries as there are particles looks like one number for each of them, and an array (n, n)
-    made from (n, 1) and (n,) looks like n vectors. Shapes that passed are not checked again.
-    """
-    ambiguous = {k: shapes for k, shapes in run.shapes.items() if shapes.ambiguous}
-    try:
-        passed = _PASSED.setdefault(function, set())
-        key = (previous is None, np.shape(observation), *(shapes.pattern for shapes in ambiguous.values()))
-    except (TypeError, ValueError):  # no weak references to the function, or an observation without shape
-        passed, key = set(), ()
-    if key in passed:
-        return
-    alone = ProgramRun(SampleHandler(np.random.default_rng(0)), 1)
-    raised = ""
-    try:
-        _call(function, alone, None if previous is None else take(previous, np.zeros(1, dtype=int)), observation)
-    except InputError as error:
-        raised = error.message
-    except Exception:
-        pass
-    for k, found in ambiguous.items():
-        if raised and k == alone.n_calls + 1:
-            raise InputError(f"{found.what}: an error with one particle, and none with {found.size}: {raised}")
-        one = alone.shapes.get(k, found._replace(event=(), value=found.value and ()))
-        if k <= alone.n_calls and not (found.event == one.event and (one.value is None or one.fits)):
-            raise found.error(f"{found.what}: ")
-    passed.add(key)
-
-
-_PASSED: WeakKeyDictionary[Callable[[Any, Any], Any], set[tuple[Any, ...]]] = WeakKeyDictionary()
 
 #: Parts of messages of numpy and Python, what the program did, and what to write instead.
 _RAW_ERRORS = {
@@ -414,8 +407,12 @@ def _returned(returned: Any, run: ProgramRun) -> dict[str, Any]:
         )
     out = {}
     for name, value in returned.items():
+        if name in ("log_weight", "log_weights"):
+            raise InputError(f"a program returned {name!r}, which does not weight the particles", "use observe")
         if not run.single:
             value = np.asarray(value)
+            if value.flags.writeable:
+                value = np.array(value)  # the program may write to its array in the next step
             if value.ndim == 0 or len(value) != run.n:
                 raise InputError(
                     f"a program returned {name!r} of shape {value.shape}, expected one row per particle ({run.n})"

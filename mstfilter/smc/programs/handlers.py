@@ -166,6 +166,25 @@ class CentreHandler(SiteHandler):
         return self
 
 
+class CopyHandler(SiteHandler):
+    """Gives every particle the values that one particle has in `values`."""
+
+    draws = False
+
+    def __init__(self, values: Mapping[str, np.ndarray], row: int) -> None:
+        self.values, self.of = values, row
+
+    def value(self, site: Site) -> tuple[np.ndarray, np.ndarray | None]:
+        if site.name not in self.values:
+            raise InputError("the particle reaches it alone, and not among the others")
+        if self.values[site.name].shape[1:] != site.distribution.event_shape:
+            return np.zeros(site.distribution.value_shape(site.size)), None  # an error later
+        return np.repeat(self.values[site.name][self.of][None], site.size, axis=0), None
+
+    def row(self, index: int) -> CopyHandler:
+        return self
+
+
 class ScoreHandler(SiteHandler):
     """Takes given values of each site, weights them by their density, and keeps the sites.
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -11,10 +13,23 @@ import numpy as np
 
 from mstfilter.errors import InputError
 from mstfilter.smc.distributions import Categorical, as_distribution
+from mstfilter.smc.interfaces import Distribution
 from mstfilter.smc.population import frozen_view, take
 from mstfilter.smc.programs.handlers import Site, SiteHandler, check_shape
 
 active_run: ContextVar[ProgramRun | None] = ContextVar("run of a program", default=None)
+_RECORDED: ContextVar[list[ProgramRun] | None] = ContextVar("runs that record their calls", default=None)
+
+
+@contextmanager
+def recorded() -> Iterator[list[ProgramRun]]:
+    """The runs of programs in the block, each with its `calls`."""
+    runs: list[ProgramRun] = []
+    token = _RECORDED.set(runs)
+    try:
+        yield runs
+    finally:
+        _RECORDED.reset(token)
 
 
 def sample(name: str, distribution: Any) -> Any:
@@ -98,12 +113,15 @@ def per_particle(function: Callable[[Any, Any], Any]) -> PerParticle:
 
 
 class Trace(Mapping[str, Any]):
-    """An immutable mapping from names to numbers, strings or arrays: a particle of a `per_particle` program."""
+    """An immutable mapping from names to numbers, strings or arrays: a particle of a `per_particle` program.
+
+    Arrays, lists, sets and dictionaries in it cannot be changed either, since copies of the particle share them.
+    """
 
     __slots__ = ("_values",)
 
     def __init__(self, values: Mapping[str, Any]) -> None:
-        self._values = {name: frozen_view(v) if isinstance(v, np.ndarray) else v for name, v in values.items()}
+        self._values = {name: _frozen(v) for name, v in values.items()}
 
     def __getitem__(self, name: str) -> Any:
         return self._values[name]
@@ -116,6 +134,60 @@ class Trace(Mapping[str, Any]):
 
     def __repr__(self) -> str:
         return f"Trace({self._values!r})"
+
+
+class FrozenList(list[Any]):
+    """A list in a `Trace`. It cannot be changed; ``items + [new]`` and ``list(items)`` are new lists."""
+
+    def _refuse(self, *_: Any, **__: Any) -> Any:
+        raise TypeError("a list in a particle is read-only: write items + [new], or change list(items)")
+
+    append = extend = insert = remove = pop = clear = sort = reverse = _refuse  # type: ignore[assignment]
+    __setitem__ = __delitem__ = __iadd__ = __imul__ = _refuse  # type: ignore[assignment]
+
+
+def _frozen(value: Any) -> Any:
+    """The value, read-only: copies of arrays and of Python's containers; other objects are shared."""
+    if isinstance(value, np.ndarray):
+        return frozen_view(np.array(value)) if value.flags.writeable else value
+    if type(value) is list:
+        return FrozenList(_frozen(v) for v in value)
+    if type(value) is tuple:
+        return tuple(_frozen(v) for v in value)
+    if type(value) is dict:
+        return Trace(value)
+    return frozenset(value) if type(value) is set else value
+
+
+class Call(NamedTuple):
+    """A call of `sample` or `observe`, or a branch of `switch`, in a run."""
+
+    what: str  #: description, for messages
+    k: int  #: number among the calls of this description
+    rows: np.ndarray | None  #: (size,) indices of the particles, ascending; None stands for all
+    size: int
+    log_prob: Any = 0.0  #: of an observation; (size,), or one for all
+    distribution: Distribution | None = None  #: of a site
+    value: Any = None  #: (size, ...) of a site
+
+    def position(self, row: int) -> int | None:
+        """The position of a particle among those of the call; None if it does not reach the call."""
+        if self.rows is None:
+            return row
+        k = int(np.searchsorted(self.rows, row))
+        return k if k < self.size and self.rows[k] == row else None
+
+    def densities(self, probes: list[Any], own: bool = False) -> np.ndarray:
+        """(p, size) log densities of an observation (p = 1), or of values at a site for all its particles.
+
+        With `own`, a probe has the values of all particles.
+        """
+        found = [self.log_prob]
+        if self.distribution is not None:
+            shape = self.value.shape
+            with np.errstate(all="ignore"):
+                found = [self.distribution.log_prob(v if own else np.broadcast_to(v, shape)) for v in probes]
+        return np.array([np.broadcast_to(np.asarray(lp, np.float64), (self.size,)) for lp in found])
 
 
 class Shapes(NamedTuple):
@@ -136,11 +208,6 @@ class Shapes(NamedTuple):
     def ambiguous(self) -> bool:
         """Whether the axis of the particles may be an axis of the event, or the reverse."""
         return self.size > 1 and (self.size in self.event or self.value == (self.size, *self.event))
-
-    @property
-    def pattern(self) -> tuple[Any, ...]:
-        """The shapes with the size replaced by a letter."""
-        return self.what, *(k if k != self.size else "n" for k in (*self.event, -1, *(self.value or ())))
 
     def error(self, prefix: str = "") -> InputError:
         """The error of a wrong shape."""
@@ -170,8 +237,13 @@ class ProgramRun:
         self.returned: dict[str, Any] = {}
         self.gain = np.zeros(n)
         self.shapes: dict[int, Shapes] = {}  # of the calls that do not have a number for each particle, in order
-        self.n_calls, self.ambiguous = 0, False
+        self.n_calls = 0
         self.what, self.inside = "", False  # the last site or observation, and whether it is being processed
+        runs = _RECORDED.get()
+        self.calls: list[Call] | None = None if runs is None else []  # if they are recorded
+        self.function: Any = None  # of the program
+        if runs is not None:
+            runs.append(self)
         self._rows: np.ndarray | None = None
         self._path: tuple[tuple[str, int], ...] = ()
         self._where = ""  # the branch, for messages
@@ -184,9 +256,13 @@ class ProgramRun:
         self._check_name(name)
         value, gain = self.handler.value(Site(name, distribution, size, rows, branch))
         value = frozen_view(np.asarray(value))
-        if gain is None and value.shape != (size,):
-            check_shape("its draws", value, distribution, size)
+        if gain is None:
+            if value.shape != (size,):
+                check_shape("its draws", value, distribution, size)
+            if self.handler.draws:
+                _check_draws(value, distribution)
         self.record(value.shape[1:], None, size)
+        self._note(rows, size, distribution=distribution, value=value)
         self._store(name, value, rows)
         if gain is not None:
             self._add(gain, size)
@@ -209,7 +285,14 @@ class ProgramRun:
                 if len(found) > 1 and found[0] == size and not distribution.parameter_shape:
                     event = found[1:]  # independent entries with the same parameters
             self.record(event, found, size)
-            self._add(distribution.log_prob(value), size)
+            if found and any(value is v for v in self.values.values()):
+                raise InputError(
+                    "the value is that of a site, which is drawn and not observed",
+                    'a factor is an observation of a constant, such as observe("factor", Normal(x, 1.0), 0.0)',
+                )
+            log_prob = distribution.log_prob(value)
+            self._note(self._rows, size, log_prob)
+            self._add(log_prob, size)
         self.inside = False
 
     def switch(self, name: str, probs: Any, branches: Sequence[Callable[..., Any]], args: tuple[Any, ...]) -> Any:
@@ -229,6 +312,8 @@ class ProgramRun:
             self._rows, self._path = group if outer is None else outer[group], (*path, (name, k))
             self._where = f" in branch {k} of {name!r}"
             groups.append(group)
+            self.what = f"branch {k} of switch {name!r}"
+            self._note(self._rows, len(group))
             try:
                 results.append(branch(*(None if a is None else take(a, group) for a in args)))
             finally:
@@ -243,9 +328,13 @@ class ProgramRun:
         self.n_calls += 1
         if event or value:
             shapes = self.shapes[self.n_calls] = Shapes(self.what, event, value, size)
-            self.ambiguous = self.ambiguous or shapes.ambiguous
             if value is not None and not shapes.fits:
                 raise shapes.error()
+
+    def _note(self, rows: np.ndarray | None, size: int, log_prob: Any = 0.0, **site: Any) -> None:
+        if self.calls is not None:
+            k = sum(call.what == self.what for call in self.calls)
+            self.calls.append(Call(self.what, k, rows, size, log_prob, **site))
 
     def _check_name(self, name: str) -> None:
         """Raise if a particle may reach two sites of this name."""
@@ -300,6 +389,21 @@ class ProgramRun:
             self.gain += log_prob
         else:
             self.gain[self._rows] += log_prob
+
+
+def _check_draws(value: np.ndarray, distribution: Distribution) -> None:
+    """Raise if a draw is NaN, or is an integer of a continuous distribution."""
+    if value.dtype.kind == "f":
+        if not math.isfinite(np.vdot(value, value)) and np.isnan(value).any():
+            rows = np.unique(np.nonzero(np.isnan(value))[0])
+            raise InputError(
+                f"its draw is NaN in row {rows[0]} ({len(rows)} of {len(value)})", "is a parameter out of range?"
+            )
+    elif value.dtype.kind in "iub" and not distribution.discrete:
+        raise InputError(
+            f"its draws are {value.dtype}, and a {type(distribution).__name__} is continuous",
+            "set discrete = True in the class, or draw floats",
+        )
 
 
 def _check_rows(argument: Any, size: int, k: int) -> None:
