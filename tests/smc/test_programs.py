@@ -22,6 +22,8 @@ from mstfilter.smc import (
     Normal,
     Poisson,
     Program,
+    StateSpaceModel,
+    WithInput,
     bootstrap,
     guided,
     log_mean_exp,
@@ -748,3 +750,38 @@ def test_errors_outside_of_steps():
     assert "sampled nothing" in errors_of(lambda previous, y: None)
     assert "returned a ndarray" in errors_of(lambda previous, y: sample("x", Normal()))
     assert "site 'x': expected a distribution, found a builtins.float" in errors_of(lambda p, y: sample("x", 3.0))
+
+
+def test_a_program_with_time_and_inputs_is_the_state_space_model_with_both():
+    """Bit for bit, particles and evidence; also particle by particle, with a guide, a lookahead and moves."""
+
+    def model(previous, y, t, u=0.0):
+        x = sample("x", Normal(0.0, 1.0) if previous is None else Normal(0.9 * previous["x"] + u, 0.5 + 0.1 * t))
+        observe("y", Normal(x, 1.0), y)
+
+    def guide(previous, y, *, u=0.0):
+        sample("x", Normal(0.2 * y, 1.2) if previous is None else Normal(0.7 * previous["x"] + 0.7 * u + 0.2 * y, 1.0))
+
+    exact = StateSpaceModel.of(
+        Normal(0.0, 1.0), lambda x, t, u=0.0: Normal(0.9 * x + u, 0.5 + 0.1 * t), lambda x: Normal(x, 1.0)
+    )
+    ys = [WithInput(0.3, 1.0), WithInput(None, 2.0), WithInput(1.9, -1.0), 0.2]
+    a, _ = bootstrap(exact, 200).run(ys, 3)
+    b, _ = Program(model).bootstrap(200).run(ys, 3)
+    np.testing.assert_array_equal(a.population.particles, b.population.particles["x"])
+    assert a.log_evidence == b.log_evidence
+    reference = bootstrap(exact, 20_000).run(ys, 0)[0].log_evidence
+    one_by_one = Program(per_particle(lambda previous, y, t, u=0.0: model(previous, y, t, u)))
+    for filter in (
+        Program(model).guided(guide, 4000),
+        Program(model).auxiliary(4000, power=0.5),
+        Program(model).resample_move(4000, trigger=Always()),
+        one_by_one.bootstrap(500),
+    ):
+        assert filter.run(ys, 1)[0].log_evidence == pytest.approx(reference, abs=0.25)
+
+    def needs(previous, y, u):
+        sample("x", Normal(u, 1.0))
+
+    with pytest.raises(InputError, match="step 1, transition: a function of the model has a parameter u, and step 1"):
+        Program(needs).bootstrap(5).run([WithInput(0.1, 1.0), 0.2], 0)

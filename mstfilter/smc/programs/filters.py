@@ -14,6 +14,7 @@ import numpy as np
 from mstfilter.errors import InputError, check_integer, check_number
 from mstfilter.smc.distributions import Normal, hypothetical
 from mstfilter.smc.filter import ParticleFilter
+from mstfilter.smc.inputs import AtStep
 from mstfilter.smc.interfaces import Lookahead, Proposal, Rejuvenation, Transition
 from mstfilter.smc.population import Particles, Population
 from mstfilter.smc.programs.guard import Guard
@@ -30,7 +31,7 @@ from mstfilter.smc.programs.sites import PerParticle, ProgramRun, Trace, active_
 from mstfilter.smc.state_space import accept_moves, choose_rows
 from mstfilter.smc.streams import child
 
-Model = Callable[[Any, Any], Any]
+Model = Callable[..., Any]
 _HERE = str(Path(__file__).parent)
 
 
@@ -39,7 +40,8 @@ class Program:
     """A model given as a function, and its filters with `n` particles.
 
     ``model(previous, observation)`` calls `sample` and `observe`, and returns None or a mapping of further values to
-    keep. The methods take further fields of `ParticleFilter` by name, such as ``resampler`` or ``trigger``.
+    keep. A model or guide with a further parameter ``t`` gets the index of the step, one with ``u`` the input that
+    `WithInput` gives. The methods take further fields of `ParticleFilter` by name, such as ``resampler``.
     """
 
     model: Model
@@ -75,6 +77,15 @@ class Program:
     def _filter(self, guide: Model | None, n: int, components: dict[str, Any]) -> ParticleFilter:
         initial, transition = ProgramInitial(self.model, guide), ProgramTransition(self.model, guide)
         return ParticleFilter(initial=initial, transition=transition, n=n, **components)
+
+
+class _OfProgram(AtStep):
+    """A component with a model, and perhaps a guide, that may depend on the step."""
+
+    @property
+    def step_functions(self) -> Mapping[str, int | None]:  # type: ignore[override]
+        functions = {name: value for name, value in vars(self).items() if name in ("model", "guide")}
+        return {name: None if isinstance(value, PerParticle) else 2 for name, value in functions.items()}
 
 
 def _advance(
@@ -115,7 +126,7 @@ def _step(
 
 
 @dataclass(frozen=True)
-class ProgramInitial(Proposal):
+class ProgramInitial(_OfProgram, Proposal):
     """First step of a program: draws, by the guide if there is one, and weights."""
 
     model: Model
@@ -130,7 +141,7 @@ class ProgramInitial(Proposal):
 
 
 @dataclass(frozen=True)
-class ProgramTransition(Transition):
+class ProgramTransition(_OfProgram, Transition):
     """A step of a program: draws, by the guide if there is one, and weights."""
 
     model: Model
@@ -145,7 +156,7 @@ class ProgramTransition(Transition):
 
 
 @dataclass(frozen=True)
-class ProgramLookahead(Lookahead):
+class ProgramLookahead(_OfProgram, Lookahead):
     """Priority from a run with the mean (mode of a discrete site) instead of each draw.
 
     It is raised to `power`; below 1 if the lookahead at the mean is too confident.
@@ -171,7 +182,7 @@ class ProgramLookahead(Lookahead):
 
 
 @dataclass(frozen=True)
-class ProgramMove(Rejuvenation):
+class ProgramMove(_OfProgram, Rejuvenation):
     """Metropolis-Hastings on all sites of a step at once.
 
     Continuous sites take a Gaussian step of `scale` standard deviations of the site's distribution; discrete sites
@@ -278,7 +289,7 @@ class ProgramMove(Rejuvenation):
 
 
 def run_program(
-    model: Callable[[Any, Any], Any], handler: SiteHandler, previous: Particles | None, observation: Any, n: int
+    model: Model, handler: SiteHandler, previous: Particles | None, observation: Any, n: int
 ) -> tuple[Particles, np.ndarray]:
     """Run a program, or its guide, over n particles; the handler decides the values of the sites.
 
@@ -300,7 +311,7 @@ def run_program(
 
 
 def _run_once(
-    function: Callable[[Any, Any], Any],
+    function: Model,
     handler: SiteHandler,
     previous: Any,
     observation: Any,
@@ -330,7 +341,7 @@ def _run_once(
     return run
 
 
-def _call(function: Callable[[Any, Any], Any], run: ProgramRun, previous: Any, observation: Any) -> None:
+def _call(function: Model, run: ProgramRun, previous: Any, observation: Any) -> None:
     token = active_run.set(run)
     try:
         returned = function(previous, observation)

@@ -19,6 +19,7 @@ import pickle
 import warnings
 from collections import Counter
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -198,7 +199,8 @@ def _identity(function: Any) -> Any:
 
     The models of many parameter values, as in PMMH, have the same key.
     """
-    function = getattr(function, "function", function)
+    while isinstance(function, partial | PerParticle):  # of a step
+        function = function.func if isinstance(function, partial) else function.function
     code = getattr(function, "__code__", None)
     if code is None:
         return _key(function)

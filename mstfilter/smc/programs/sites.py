@@ -7,12 +7,13 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
 from mstfilter.errors import InputError
 from mstfilter.smc.distributions import Categorical, as_distribution
+from mstfilter.smc.inputs import AtStep
 from mstfilter.smc.interfaces import Distribution
 from mstfilter.smc.population import frozen_view, take
 from mstfilter.smc.programs.handlers import Site, SiteHandler, check_shape
@@ -95,19 +96,20 @@ def _current() -> ProgramRun:
 
 
 @dataclass(frozen=True)
-class PerParticle:
+class PerParticle(AtStep):
     """A program that runs once for every particle; made by `per_particle`.
 
     ``function(previous, observation)`` gets the particle's `Trace` as `previous`.
     """
 
-    function: Callable[[Any, Any], Any]
+    function: Callable[..., Any]
+    step_functions: ClassVar = {"function": 2}
 
-    def __call__(self, previous: Any, observation: Any) -> Any:
-        return self.function(previous, observation)
+    def __call__(self, previous: Any, observation: Any, **step: Any) -> Any:
+        return self.function(previous, observation, **step)
 
 
-def per_particle(function: Callable[[Any, Any], Any]) -> PerParticle:
+def per_particle(function: Callable[..., Any]) -> PerParticle:
     """Mark a program whose set of sites may differ between particles. It runs once for every particle, so slower."""
     return PerParticle(function)
 
