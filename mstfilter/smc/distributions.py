@@ -383,7 +383,7 @@ class Bernoulli(_Independent):
     def log_prob(self, value: Any) -> np.ndarray:
         x = np.asarray(value)
         with np.errstate(divide="ignore"):
-            log_p = np.where(x.astype(bool), np.log(self.p), np.log1p(-np.asarray(self.p)))
+            log_p = np.where(x.astype(bool), np.log(self.p), np.log1p(-np.asarray(self.p, np.float64)))
         return _sum_rows(np.where((x == 0) | (x == 1), log_p, _impossible(x)))
 
     def _moments(self) -> tuple[Any, Any]:

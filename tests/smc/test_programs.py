@@ -760,7 +760,9 @@ def test_a_program_with_time_and_inputs_is_the_state_space_model_with_both():
         observe("y", Normal(x, 1.0), y)
 
     def guide(previous, y, *, u=0.0):
-        sample("x", Normal(0.2 * y, 1.2) if previous is None else Normal(0.7 * previous["x"] + 0.7 * u + 0.2 * y, 1.0))
+        sample(
+            "x", Normal(0.2 * y, 1.2) if previous is None else Normal(0.7 * previous["x"] + 0.7 * u + 0.2 * y, 1.0)
+        )
 
     exact = StateSpaceModel.of(
         Normal(0.0, 1.0), lambda x, t, u=0.0: Normal(0.9 * x + u, 0.5 + 0.1 * t), lambda x: Normal(x, 1.0)

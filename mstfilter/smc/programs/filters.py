@@ -171,9 +171,7 @@ class ProgramLookahead(_OfProgram, Lookahead):
     def log_priority(self, population: Population, observation: Any) -> np.ndarray:
         """(n,) log probability of the observation, bounded from below."""
         with hypothetical():
-            _, priority = run_program(
-                self.model, CentreHandler(), population.particles, observation, len(population)
-            )
+            _, priority = run_program(self.model, CentreHandler(), population.particles, observation, len(population))
         # An observation that is impossible at the mean may be possible for a draw: at most 50 below the best.
         top = priority.max()
         if not np.isfinite(top):

@@ -247,12 +247,16 @@ def _check_returned(run: ProgramRun) -> None:
 
 
 def _rows(run: ProgramRun) -> list[int]:
-    """Particles to check alone: two, and one for each branch; not the first and the last if there are others."""
-    rows = sorted({run.n // 2, run.n // 3})
+    """Particles to check alone: two by position, the smallest and largest value, and one of each branch."""
+    rows = {run.n // 2, run.n // 3}
+    numbers = next((v for v in run.values.values() if v.dtype.kind == "f"), None)
+    if numbers is not None and numbers.size:
+        column = numbers.reshape(run.n, -1)[:, 0]
+        rows |= {int(np.argmin(column)), int(np.argmax(column))}
     for call in run.calls or ():
-        if call.size and all(call.position(row) is None for row in rows) and len(rows) < 6:
-            rows.append(int(call.rows[call.size // 2]))  # type: ignore[index]
-    return rows
+        if call.size and all(call.position(row) is None for row in rows) and len(rows) < 8:
+            rows.add(int(call.rows[call.size // 2]))  # type: ignore[index]
+    return sorted(rows)
 
 
 def _close(a: Any, b: Any, tolerance: float, scale: Any = 0.0) -> np.ndarray:

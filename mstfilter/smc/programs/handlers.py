@@ -177,8 +177,9 @@ class CopyHandler(SiteHandler):
     def value(self, site: Site) -> tuple[np.ndarray, np.ndarray | None]:
         if site.name not in self.values:
             raise InputError("the particle reaches it alone, and not among the others")
-        if self.values[site.name].shape[1:] != site.distribution.event_shape:
-            return np.zeros(site.distribution.value_shape(site.size)), None  # an error later
+        shape = site.distribution.value_shape(site.size)
+        if self.values[site.name].shape[1:] != shape[1:]:
+            return np.zeros(shape), None  # an error later
         return np.repeat(self.values[site.name][self.of][None], site.size, axis=0), None
 
     def row(self, index: int) -> CopyHandler:

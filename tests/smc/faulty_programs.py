@@ -1,0 +1,1130 @@
+"""Programs with a fault, each with a part of the error that names it, and correct programs beside them.
+
+`FAULTY` holds ``name: (filter, observations, expected part of the message)``, `INHERENT` faults that run without an
+error, each with the reason, and `CORRECT` programs that must run.
+"""
+
+from __future__ import annotations
+
+import itertools
+import random
+import time
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import stats
+
+from mstfilter.smc import (
+    Always,
+    Bernoulli,
+    Categorical,
+    Distribution,
+    Gamma,
+    MultivariateNormal,
+    Normal,
+    Poisson,
+    Program,
+    Student,
+    Uniform,
+    observe,
+    per_particle,
+    sample,
+    switch,
+)
+
+YS = [0.3, -0.2, 0.9, 1.4, 0.8, 0.1]
+FAULTY: dict = {}
+INHERENT: dict = {}
+CORRECT: dict = {}
+ALONE = "alone"
+REPEATED = "when (it|the step) is repeated with the same random numbers"
+
+
+def faulty(expected, ys=YS, n=200, kind="bootstrap", guide=None, **options):
+    """Add a program to the list; the name of the function is that of the fault."""
+
+    def add(model):
+        program, name = Program(model), getattr(model, "function", model).__name__
+        filter = program.guided(guide, n, **options) if guide else getattr(program, kind)(n, **options)
+        assert name not in FAULTY
+        FAULTY[name] = (filter, ys, expected)
+        return model
+
+    return add
+
+
+def inherent(reason, guide, ys=YS, n=200):
+    def add(model):
+        INHERENT[model.__name__] = (Program(model).guided(guide, n), ys, reason)
+        return model
+
+    return add
+
+
+def correct(ys=YS, n=200, kind="bootstrap", guide=None, **options):
+    def add(model):
+        program, name = Program(model), getattr(model, "function", model).__name__
+        filter = program.guided(guide, n, **options) if guide else getattr(program, kind)(n, **options)
+        assert name not in CORRECT
+        CORRECT[name] = (filter, ys)
+        return model
+
+    return add
+
+
+def walk(previous, scale=0.6):
+    return sample("x", Normal(0.0, 1.0) if previous is None else Normal(0.9 * previous["x"], scale))
+
+
+def seen(x, y, scale=0.5):
+    observe("y", Normal(x, scale), y)
+
+
+# --- reductions over the particles ----------------------------------------------------------------------------------
+@faulty(ALONE)
+def the_first_particle_for_all(previous, y):
+    x = sample("x", Normal(0.0, 1.0) if previous is None else Normal(0.9 * previous["x"][0], 0.6))
+    seen(x, y)
+
+
+@faulty(ALONE)
+def the_last_particle_for_all(previous, y):
+    x = sample("x", Normal(0.0, 1.0) if previous is None else Normal(0.9 * previous["x"][-1], 0.6))
+    seen(x, y)
+
+
+@faulty(ALONE)
+def a_sum_without_axis(previous, y):
+    v = sample("v", Normal(np.zeros((1, 2)) if previous is None else previous["v"], 1.0))
+    observe("y", Normal(v.sum(), 1.0), y)
+
+
+@faulty(ALONE)
+def a_mean_in_the_likelihood(previous, y):
+    x = walk(previous)
+    seen(0.5 * x + 0.5 * x.mean(), y)
+
+
+@faulty(ALONE)
+def a_maximum_decides(previous, y):
+    x = walk(previous)
+    seen(x, y, 2.0 if x.max() > 1.5 else 0.5)
+
+
+@faulty(ALONE)
+def any_decides(previous, y):
+    x = walk(previous)
+    seen(x if not (x > 1.0).any() else x - 1.0, y)
+
+
+@faulty(ALONE)
+def a_centred_state(previous, y):
+    x = walk(previous)
+    seen(x, y)
+    return {"centred": x - x.mean()}
+
+
+@faulty(ALONE)
+def a_standardised_state(previous, y):
+    x = walk(previous)
+    z = (x - x.mean()) / x.std()
+    seen(z, y)
+
+
+@faulty(ALONE)
+def the_spread_of_the_particles_as_noise(previous, y):
+    x = sample("x", Normal(0.0, 1.0) if previous is None else Normal(previous["x"], previous["x"].std()))
+    seen(x, y)
+
+
+@faulty(ALONE)
+def sorted_particles(previous, y):
+    x = sample("x", Normal(0.0, 1.0) if previous is None else Normal(np.sort(previous["x"]), 0.6))
+    seen(x, y)
+
+
+@faulty(ALONE)
+def the_neighbour(previous, y):
+    x = sample("x", Normal(0.0, 1.0) if previous is None else Normal(np.roll(previous["x"], 1), 0.6))
+    seen(x, y)
+
+
+@faulty(ALONE)
+def reversed_particles(previous, y):
+    x = walk(previous)
+    seen(x[::-1], y)
+
+
+@faulty(ALONE)
+def a_running_sum_over_particles(previous, y):
+    x = walk(previous)
+    seen(0.01 * np.cumsum(x), y)
+
+
+@faulty(ALONE)
+def ranks(previous, y):
+    x = walk(previous)
+    seen(np.argsort(np.argsort(x)) / len(x), y)
+
+
+@faulty(ALONE)
+def weights_normalised_over_particles(previous, y):
+    x = walk(previous)
+    w = np.exp(x) / np.exp(x).sum()
+    observe("y", Bernoulli(w), 1)
+
+
+@faulty(ALONE)
+def probabilities_normalised_over_particles(previous, y):
+    x = walk(previous)
+    odds = np.exp(np.stack([x, -x], axis=1))
+    k = sample("k", Categorical(odds / odds.sum(axis=0)))
+    seen(k * 1.0, y)
+
+
+@faulty(ALONE)
+def a_dot_product_over_particles(previous, y):
+    x = walk(previous)
+    seen(x, y, 0.5 + 0.001 * (x @ x))
+
+
+@faulty(ALONE)
+def the_covariance_of_the_particles(previous, y):
+    v = sample("v", Normal(np.zeros((1, 2)) if previous is None else previous["v"], 0.5))
+    observe("y", MultivariateNormal(v, np.cov(v.T) + np.eye(2)), [y, y])
+
+
+@faulty(ALONE)
+def the_length_of_the_population(previous, y):
+    x = walk(previous)
+    seen(x.sum() / 200, y)
+
+
+@faulty(ALONE)
+def a_median(previous, y):
+    x = sample("x", Normal(0.0, 1.0) if previous is None else Normal(np.median(previous["x"]), 0.6))
+    seen(x, y)
+
+
+@faulty(ALONE)
+def the_most_frequent_regime(previous, y):
+    k = sample("k", Categorical([0.4, 0.6]))
+    seen(np.full(len(k), np.bincount(k).argmax()), y)
+
+
+@faulty(ALONE)
+def a_mean_at_later_steps_only(previous, y):
+    x = sample("x", Normal(0.0, 1.0) if previous is None else Normal(previous["x"].mean() + 0.0 * previous["x"], 0.6))
+    seen(x, y)
+
+
+@faulty(ALONE, ys=[0.3, None, None, 0.2])
+def a_mean_if_the_observation_is_missing(previous, y):
+    m = 0.0 if previous is None else previous["x"].mean() if y is None else previous["x"]
+    seen(sample("x", Normal(m, 0.6)), y)
+
+
+@faulty(ALONE, kind="auxiliary")
+def a_mean_in_an_auxiliary_filter(previous, y):
+    seen(walk(previous).mean(), y)
+
+
+@faulty(ALONE, kind="resample_move")
+def a_mean_in_a_resample_move_filter(previous, y):
+    seen(walk(previous).mean(), y)
+
+
+@faulty(ALONE)
+def half_of_the_particles_differ(previous, y):
+    x = walk(previous)
+    seen(np.where(np.arange(len(x)) < len(x) // 2, x, -x), y)
+
+
+@faulty(ALONE)
+def a_parameter_by_position(previous, y):
+    x = walk(previous)
+    seen(x, y)
+    return {"scale": np.linspace(0.1, 1.0, len(x))}
+
+
+# --- guides that mix particles ---------------------------------------------------------------------------------------
+def model(previous, y):
+    seen(walk(previous), y)
+
+
+def guide_by(name, m):
+    def guide(previous, y):
+        sample("x", Normal(0.5 * y, 1.0) if previous is None else Normal(m(previous["x"], y), 0.5))
+
+    guide.__name__ = name
+    return guide
+
+
+def guided_by(expected, guide, name, ys=YS, n=200):
+    FAULTY[name] = (Program(model).guided(guide, n), ys, expected)
+
+
+guided_by(ALONE, guide_by("mean", lambda x, y: x.mean()), "a_guide_with_a_mean")
+guided_by(ALONE, guide_by("first", lambda x, y: 0.9 * x[0] + 0.0 * x), "a_guide_with_the_first_particle")
+guided_by(ALONE, guide_by("max", lambda x, y: x if x.max() < 1 else x + y), "a_guide_with_a_maximum")
+guided_by(REPEATED, guide_by("noise", lambda x, y: x + np.random.normal(size=len(x))), "a_guide_with_other_draws")
+
+
+def beyond(previous, y):
+    sample("x", Uniform(5.0, 6.0))
+
+
+def positive(previous, y):
+    sample("x", Gamma(2.0, 2.0))
+
+
+def near(previous, y):
+    sample("x", Uniform(y - 0.5, y + 0.5))
+
+
+guided_by("never draws", positive, "a_guide_of_positive_values")
+guided_by("never draws", near, "a_guide_with_a_bounded_interval")
+guided_by("never draws|no particle explains|estimates", beyond, "a_guide_far_away")
+
+
+def one_branch(previous, y):
+    switch("regime", [1.0, 0.0], [lambda: sample("x", Normal(y, 1.0))] * 2)
+
+
+@faulty("never draws", guide=one_branch)
+def a_guide_of_one_branch(previous, y):
+    x = switch("regime", [0.5, 0.5], [lambda: sample("x", Normal(0.0, 1.0)), lambda: sample("x", Normal(0.5, 1.0))])
+    seen(x, y)
+
+
+# --- draws outside of sample, and kept state --------------------------------------------------------------------------
+@faulty(REPEATED)
+def draws_of_numpy(previous, y):
+    x = np.random.normal(size=200) if previous is None else 0.9 * previous["x"] + np.random.normal(size=200)
+    seen(x, y)
+    return {"x": x}
+
+
+GENERATOR = np.random.default_rng(1)
+
+
+@faulty(REPEATED)
+def draws_of_another_generator(previous, y):
+    x = walk(previous)
+    seen(x + 0.3 * GENERATOR.standard_normal(len(x)), y)
+
+
+@faulty(ALONE)
+def draws_of_a_new_generator(previous, y):
+    x = walk(previous)
+    seen(x + 0.3 * np.random.default_rng(0).standard_normal(len(x)), y)
+
+
+@faulty(REPEATED)
+def draws_of_scipy(previous, y):
+    x = walk(previous)
+    seen(x + stats.norm.rvs(size=len(x)), y)
+
+
+@faulty(REPEATED)
+def draws_of_the_standard_library(previous, y):
+    x = walk(previous)
+    seen(x, y, 0.5 + random.random())
+
+
+@faulty(REPEATED)
+def the_time(previous, y):
+    x = walk(previous)
+    seen(x, y, 0.5 + time.perf_counter() % 1.0)
+
+
+COUNT = itertools.count()
+
+
+@faulty(REPEATED)
+def a_counter(previous, y):
+    x = walk(previous)
+    seen(x, y, 0.5 + 0.1 * next(COUNT))
+
+
+LAST: dict = {"x": 0.0}
+
+
+@faulty(REPEATED)
+def the_last_value_in_a_global(previous, y):
+    x = sample("x", Normal(0.9 * np.mean(LAST["x"]), 0.6))
+    LAST["x"] = x
+    seen(x, y)
+
+
+HISTORY: list = []
+
+
+@faulty(REPEATED)
+def a_growing_list(previous, y):
+    x = walk(previous)
+    HISTORY.append(y)
+    seen(x, y, 0.5 + 0.1 * len(HISTORY))
+
+
+OBSERVATIONS = iter(YS)
+
+
+@faulty(REPEATED)
+def observations_from_an_iterator(previous, y):
+    seen(walk(previous), next(OBSERVATIONS))
+
+
+@faulty(REPEATED, ys=[np.array([0.3, 0.1]), np.array([0.2, 0.5])])
+def a_changed_observation(previous, y):
+    v = sample("v", Normal(np.zeros((1, 2)) if previous is None else previous["v"], 1.0))
+    y += 0.1
+    observe("y", Normal(v, 1.0), y)
+
+
+@faulty(REPEATED)
+def a_mutable_default(previous, y):
+    x = walk(previous)
+    seen(x + 0.1 * len(kept_values(x)), y)
+
+
+def kept_values(x, kept=[]):  # noqa: B006 (the fault)
+    kept.append(x)
+    return kept
+
+
+# --- parameters out of range, in some rows ---------------------------------------------------------------------------
+@faulty(r"p of a Bernoulli is 1\.\d+ in row")
+def a_probability_above_one(previous, y):
+    x = walk(previous)
+    k = sample("k", Bernoulli(0.8 + 0.5 * abs(x)))
+    seen(k * x, y)
+
+
+@faulty(r"p of a Bernoulli is \S+ in row")
+def a_negative_probability(previous, y):
+    observe("y", Bernoulli(walk(previous)), 1)
+
+
+@faulty(r"scale of a Normal is -\S+ in row")
+def a_negative_scale(previous, y):
+    x = walk(previous)
+    z = sample("z", Normal(0.0, x))
+    seen(z, y)
+
+
+@faulty(r"scale of a Normal is 0\.0 in row")
+def a_scale_of_zero(previous, y):
+    x = walk(previous)
+    seen(sample("z", Normal(x, np.maximum(x, 0.0))), y)
+
+
+@faulty(r"loc of a Normal is nan in row")
+def a_location_of_nan(previous, y):
+    x = walk(previous)
+    with np.errstate(invalid="ignore"):
+        z = sample("z", Normal(np.sqrt(x), 1.0))
+    seen(x, y)
+    return {"w": z}
+
+
+@faulty(r"high of a Uniform is \S+ in row")
+def an_empty_interval(previous, y):
+    x = walk(previous)
+    seen(sample("z", Uniform(0.0, x)), y)
+
+
+@faulty("shape of a Gamma is -")
+def a_negative_shape(previous, y):
+    observe("y", Gamma(walk(previous), 1.0), abs(y))
+
+
+@faulty("df of a Student is -")
+def negative_degrees_of_freedom(previous, y):
+    seen(sample("z", Student(walk(previous), 0.0, 1.0)), y)
+
+
+@faulty("rate of a Poisson is -")
+def a_negative_rate(previous, y):
+    observe("y", Poisson(walk(previous)), 0)
+
+
+@faulty("probabilities of a categorical are .* in row")
+def negative_probabilities(previous, y):
+    x = walk(previous)
+    observe("y", Categorical(np.stack([0.5 + x, 0.5 - x], axis=1)), 1)
+
+
+@faulty("covariance is not positive definite in row")
+def a_covariance_of_a_row(previous, y):
+    x = walk(previous)
+    cov = np.eye(2) + x[:, None, None] * np.array([[0.0, 1.0], [1.0, 0.0]])
+    observe("y", MultivariateNormal(np.zeros((1, 2)), cov), [y, y])
+
+
+@faulty("covariance is not symmetric")
+def an_asymmetric_covariance(previous, y):
+    v = sample("v", MultivariateNormal([0.0, 0.0], [[1.0, 0.8], [0.0, 1.0]]))
+    observe("y", Normal(v, 1.0), [y, y])
+
+
+@faulty("Domain error|is NaN|nan")
+def a_negative_scale_of_scipy(previous, y):
+    x = walk(previous)
+    seen(sample("z", stats.norm(0.0, x)), y)
+
+
+@faulty("is NaN")
+def a_negative_scale_of_new_scipy(previous, y):
+    x = walk(previous)
+    z = sample("z", stats.Normal(mu=0.0, sigma=x))
+    seen(x, y)
+    return {"w": z}
+
+
+def draw_jump():
+    sample("jump", Normal(1.0, 0.5))
+
+
+@faulty("loc of a Normal is nan")
+def a_value_of_another_branch(previous, y):
+    x = walk(previous)
+    switch("s", [0.5, 0.5], [lambda: draw_jump(), lambda: None])
+    if previous is not None:
+        sample("z", Normal(previous["jump"], 1.0))
+    seen(x, y)
+
+
+@faulty("nan")
+def an_observed_nan_of_some_particles(previous, y):
+    x = walk(previous)
+    with np.errstate(invalid="ignore"):
+        observe("y", Gamma(2.0, 1.0), np.log(x))
+
+
+@faulty("returned 'root' is NaN")
+def a_returned_nan(previous, y):
+    x = walk(previous)
+    seen(x, y)
+    return {"root": np.sqrt(x)}
+
+
+# --- values that copies share, and changes in place -------------------------------------------------------------------
+@faulty("read-only")
+@per_particle
+def a_shared_list(previous, y):
+    x = walk(previous)
+    items = [] if previous is None else previous["items"]
+    items.append(float(x))
+    seen(np.mean(items), y)
+    return {"items": items}
+
+
+@faulty("does not support item assignment")
+@per_particle
+def a_shared_dictionary(previous, y):
+    x = walk(previous)
+    seen_at = {} if previous is None else previous["seen_at"]
+    seen_at[len(seen_at)] = float(x)
+    seen(np.mean(list(seen_at.values())), y)
+    return {"seen_at": seen_at}
+
+
+@faulty("no attribute 'add'")
+@per_particle
+def a_shared_set(previous, y):
+    x = walk(previous)
+    cells = set() if previous is None else previous["cells"]
+    cells.add(round(float(x)))
+    seen(len(cells), y)
+    return {"cells": cells}
+
+
+@faulty("read-only")
+@per_particle
+def a_list_in_a_tuple(previous, y):
+    x = walk(previous)
+    pair = (1, [0.0]) if previous is None else previous["pair"]
+    pair[1][0] += float(x)
+    seen(pair[1][0], y)
+    return {"pair": pair}
+
+
+@faulty("read-only")
+@per_particle
+def a_shared_array(previous, y):
+    x = walk(previous)
+    track = np.zeros(10) if previous is None else previous["track"]
+    track[0] = x
+    seen(x, y)
+    return {"track": track}
+
+
+@dataclass
+class Map:
+    cells: list
+
+
+@faulty("changes a value of `previous` in place|" + REPEATED)
+@per_particle
+def a_shared_object(previous, y):
+    x = walk(previous)
+    grid = Map([]) if previous is None else previous["grid"]
+    grid.cells.append(float(x))
+    seen(np.mean(grid.cells), y)
+    return {"grid": grid}
+
+
+@faulty(REPEATED)
+@per_particle
+def a_list_of_the_closure(previous, y):
+    x = walk(previous)
+    HISTORY.append(float(x))
+    seen(x + 0.01 * len(HISTORY), y)
+
+
+@faulty(REPEATED)
+@per_particle
+def other_draws_of_a_particle(previous, y):
+    seen(walk(previous) + np.random.normal(), y)
+
+
+@faulty("in place")
+def previous_changed_in_place(previous, y):
+    if previous is not None:
+        previous["x"][:] = 0.9 * previous["x"]
+    seen(walk(previous), y)
+
+
+@faulty("item assignment")
+def an_entry_of_previous_replaced(previous, y):
+    if previous is not None:
+        previous["x"] = previous["x"] + 1.0
+    seen(walk(previous), y)
+
+
+@faulty("in place")
+def a_site_changed_in_place(previous, y):
+    x = walk(previous)
+    x *= 0.5
+    seen(x, y)
+
+
+# --- shapes, names, sites -------------------------------------------------------------------------------------------
+@faulty("the value is that of a site")
+def a_draw_observed_by_accident(previous, y):
+    x = walk(previous)
+    observe("x", Normal(0.0, 1.0), x)
+
+
+@faulty("returned 'x' with other values than site")
+def a_returned_value_over_a_site(previous, y):
+    x = walk(previous)
+    seen(x, y)
+    return {"x": np.round(x)}
+
+
+@faulty("does not weight the particles")
+def weights_by_hand(previous, y):
+    x = walk(previous)
+    return {"log_weights": -0.5 * (x - y) ** 2}
+
+
+@faulty("expected ()", ys=[np.full(200, 0.3)] * 3)
+def an_observation_for_each_particle(previous, y):
+    seen(walk(previous), y)
+
+
+@faulty(r"expected \(200,\)")
+def a_column_and_a_row(previous, y):
+    v = sample("v", MultivariateNormal([0.0], [[1.0]]))
+    x = walk(previous)
+    seen(v + x, y)
+
+
+@faulty("decides by an array")
+def a_decision_by_an_array(previous, y):
+    x = walk(previous)
+    if x > 0:
+        sample("z", Normal(0.0, 1.0))
+    seen(x, y)
+
+
+@faulty("sampled twice")
+def a_site_sampled_twice(previous, y):
+    seen(walk(previous) + walk(previous), y)
+
+
+@faulty("previous has no 'z'")
+def a_site_that_vanishes(previous, y):
+    x = walk(previous)
+    if previous is None:
+        sample("z", Normal(0.0, 1.0))
+    else:
+        seen(x + previous["z"], y)
+
+
+@faulty("one row for each of 200 particles")
+def an_argument_of_other_rows(previous, y):
+    x = walk(previous)
+    switch("s", [0.5, 0.5], [lambda v: seen(v, y), lambda v: seen(-v, y)], x[:50])
+
+
+@faulty(ALONE)
+def an_argument_in_another_order(previous, y):
+    x = walk(previous)
+    switch("s", [0.5, 0.5], [lambda v: seen(v, y), lambda v: seen(-v, y)], x[::-1])
+
+
+@faulty(ALONE)
+def a_branch_reduces_values_of_all(previous, y):
+    x = walk(previous)
+    switch("s", [0.5, 0.5], [lambda v: seen(v, y), lambda v: seen(x.mean() + 0.0 * v, y)], x)
+
+
+@faulty(ALONE)
+def a_branch_takes_the_first_rows_of_all(previous, y):
+    x = walk(previous)
+    switch("s", [0.5, 0.5], [lambda v: seen(v, y), lambda v: seen(x[: len(v)], y)], x)
+
+
+@faulty(ALONE)
+def a_rare_branch_reduces(previous, y):
+    x = walk(previous)
+    switch("s", [0.95, 0.05], [lambda v: seen(v, y), lambda v: seen(v - v.mean(), y)], x)
+
+
+@faulty(ALONE)
+def a_branch_returns_a_reduction(previous, y):
+    x = walk(previous)
+    seen(switch("s", [0.5, 0.5], [lambda v: v, lambda v: np.full(len(v), v.max(initial=-9.0))], x), y)
+
+
+# --- distributions of the user ---------------------------------------------------------------------------------------
+class Mine(Distribution):
+    """A Gaussian around `mean`, whose parts the cases below replace."""
+
+    sd = np.float64(0.6)
+
+    def __init__(self, mean):
+        self.centre_ = np.asarray(mean, np.float64)
+
+    @property
+    def mean(self):
+        return self.centre_
+
+    def sample(self, rng, size):
+        return self.centre_ + 0.6 * rng.standard_normal(size)
+
+    def log_prob(self, value):
+        return stats.norm.logpdf(value, self.centre_, 0.6)
+
+
+class OtherSign(Mine):
+    def log_prob(self, value):
+        return -super().log_prob(value)
+
+
+class Density(Mine):
+    def log_prob(self, value):
+        return np.exp(super().log_prob(value))
+
+
+class Unnormalised(Mine):
+    def log_prob(self, value):
+        return super().log_prob(value) + 0.92
+
+
+class Variance(Mine):
+    def log_prob(self, value):
+        return stats.norm.logpdf(value, self.centre_, 0.36)
+
+
+class GlobalDraws(Mine):
+    def sample(self, rng, size):
+        return self.centre_ + 0.6 * np.random.standard_normal(size)
+
+
+class OneDrawForAll(Mine):
+    def sample(self, rng, size):
+        return np.full(size, self.centre_ + 0.6 * rng.standard_normal())
+
+
+class SumOverParticles(Mine):
+    def log_prob(self, value):
+        return np.full(len(np.atleast_1d(value)), super().log_prob(value).sum())
+
+
+class IntegersOfAContinuousOne(Mine):
+    def sample(self, rng, size):
+        return np.round(super().sample(rng, size)).astype(int)
+
+
+class NanDraws(Mine):
+    def sample(self, rng, size):
+        x = super().sample(rng, size)
+        return np.where(x > 1.0, np.nan, x)
+
+
+def with_distribution(expected, kind):
+    def program(previous, y):
+        seen(sample("x", kind(np.zeros(1) if previous is None else 0.9 * previous["x"])), y)
+
+    FAULTY[f"a_distribution_{kind.__name__}"] = (Program(program).bootstrap(200), YS, expected)
+
+
+for _kind in (OtherSign, Density, Unnormalised, Variance):
+    with_distribution("draws of .* do not have its density", _kind)
+with_distribution(REPEATED, GlobalDraws)
+with_distribution("do not have its density|" + ALONE, OneDrawForAll)
+with_distribution(ALONE + "|density", SumOverParticles)
+with_distribution("continuous", IntegersOfAContinuousOne)
+with_distribution("draw is NaN", NanDraws)
+
+
+# --- faults that no check of a step can see --------------------------------------------------------------------------
+def narrow(previous, y):
+    sample("x", Normal(0.3 if previous is None else 0.9 * previous["x"], 0.4))
+
+
+@inherent("the guide has lighter tails than the posterior: the evidence has infinite variance", narrow)
+def a_guide_with_light_tails(previous, y):
+    seen(walk(previous), y, 2.0)
+
+
+def cut(previous, y):
+    m = 0.0 if previous is None else 0.9 * previous["x"]
+    sample("x", Uniform(m - 5.0, m + 5.0))
+
+
+@inherent("the guide never draws values that hold less than a thousandth of the probability", cut)
+def a_guide_without_far_tails(previous, y):
+    seen(walk(previous, 1.0), y)
+
+
+# --- correct programs ------------------------------------------------------------------------------------------------
+correct()(model)
+
+
+@correct(ys=[0.3, None, None, 0.2])
+def missing_observations(previous, y):
+    seen(walk(previous), y)
+
+
+@correct(n=1)
+def one_particle(previous, y):
+    seen(walk(previous), y)
+
+
+@correct(n=2)
+def two_particles(previous, y):
+    seen(walk(previous), y)
+
+
+@correct(n=3)
+def three_particles_with_vectors_of_three(previous, y):
+    v = sample("v", Normal(np.zeros((1, 3)) if previous is None else previous["v"], 1.0))
+    observe("y", Normal(v, 1.0), [y, y, y])
+    observe("sum", Normal(v.sum(axis=1), 1.0), y)
+
+
+@correct(ys=[np.array([0.1, 0.2])] * 4)
+def vectors_with_a_shared_covariance(previous, y):
+    cov = np.array([[1.0, 0.3], [0.3, 0.5]])
+    v = sample(
+        "v", MultivariateNormal(np.zeros(2), cov) if previous is None else MultivariateNormal(previous["v"], cov)
+    )
+    observe("y", MultivariateNormal(v, 0.5 * cov), y)
+
+
+@correct(ys=[np.array([0.1, 0.2])] * 4)
+def vectors_with_covariances_of_particles(previous, y):
+    s = sample("s", Gamma(3.0, 3.0))
+    v = sample("v", Normal(np.zeros((1, 2)), 1.0))
+    observe("y", MultivariateNormal(v, (0.5 + s)[:, None, None] * np.eye(2)), y)
+
+
+@correct()
+def a_matrix_product(previous, y):
+    A = np.array([[1.0, 0.1], [0.0, 0.9]])
+    v = sample("v", Normal(np.zeros((1, 2)) if previous is None else previous["v"] @ A.T, 0.5))
+    observe("y", Normal(v[:, 0], 0.5), y)
+
+
+WEIGHTS = np.random.default_rng(0).standard_normal((64, 64)).astype(np.float32) / 8
+
+
+@correct(n=1000)
+def a_network_in_single_precision(previous, y):
+    v = sample("v", Normal(np.zeros((1, 64)) if previous is None else previous["v"], 1.0))
+    h = np.tanh(v.astype(np.float32) @ WEIGHTS) @ WEIGHTS
+    observe("y", Normal(10.0 + h[:, 0], 0.05), 10.0 + y)
+    return {"features": h}
+
+
+@correct(n=300)
+def another_network_in_single_precision(previous, y):
+    x = walk(previous)
+    h = np.tanh(np.float32(x)[:, None] @ WEIGHTS[:1] @ WEIGHTS).astype(np.float32)
+    seen(h.mean(axis=1), y, 0.02)
+
+
+@correct()
+def a_switch(previous, y):
+    x = switch(
+        "s",
+        [0.7, 0.3],
+        [lambda v: sample("x", Normal(0.9 * v, 0.3)), lambda v: sample("x", Normal(v + 1.0, 1.0))],
+        np.zeros(200) if previous is None else previous["x"],
+    )
+    seen(x, y)
+
+
+@correct()
+def a_switch_with_probabilities_of_particles(previous, y):
+    x = walk(previous)
+    p = 1 / (1 + np.exp(-x))
+    z = switch("s", np.stack([p, 1 - p], axis=1), [lambda v: {"z": v}, lambda v: {"z": v + sample("j", Normal())}], x)
+    seen(z["z"], y)
+    return z
+
+
+@correct(kind="resample_move", trigger=Always())
+def moves_beyond_the_support(previous, y):
+    s = sample("s", Gamma(1.0, 2.0) if previous is None else Gamma(4.0, 4.0 / previous["s"]))
+    x = sample("x", Normal(0.0, np.sqrt(s)))
+    seen(x, y)
+
+
+@correct(kind="resample_move", trigger=Always())
+def moves_of_probabilities(previous, y):
+    p = sample("p", Uniform(0.0, 1.0))
+    k = sample("k", Bernoulli(p))
+    seen(k.astype(float), y)
+
+
+@correct(kind="auxiliary")
+def a_lookahead_at_a_scale_of_zero(previous, y):
+    x = sample("x", Uniform(-1.0, 1.0))
+    seen(sample("z", Normal(x, abs(x))), y)
+
+
+def wide(previous, y):
+    sample("x", Normal(0.7 * y if previous is None else 0.5 * y + 0.5 * previous["x"], 1.0))
+
+
+@correct(guide=wide, ys=[0.3, None, 0.5])
+def a_guide(previous, y):
+    seen(walk(previous), y)
+
+
+def excludes(previous, y):
+    sample("k", Categorical([0.0, 0.5, 0.5] if y else [1.0, 0.0, 0.0]))
+
+
+@correct(guide=excludes, ys=[1, 0, 1])
+def a_guide_excludes_what_the_observation_excludes(previous, y):
+    k = sample("k", Categorical([0.2, 0.3, 0.5]))
+    observe("y", Bernoulli(k > 0), y)
+
+
+def bounded(previous, y):
+    sample("x", Uniform(y - 0.5, y + 0.5))
+
+
+@correct(guide=bounded)
+def a_bounded_guide_of_a_bounded_likelihood(previous, y):
+    x = walk(previous)
+    observe("y", Uniform(x - 0.5, x + 0.5), y)
+
+
+@correct(guide=wide, kind="guided", resampler=Program(model).bootstrap(2).resampler)
+def a_guide_with_options(previous, y):
+    seen(walk(previous), y)
+
+
+@correct()
+def scipy_distributions(previous, y):
+    x = sample("x", stats.norm(0.0 if previous is None else 0.9 * previous["x"], 0.6))
+    k = sample("k", stats.binom(5, 1 / (1 + np.exp(-x))))
+    v = sample("v", stats.multivariate_normal([0.0, 1.0], np.eye(2)))
+    observe("y", stats.norm(x + 0.1 * k + v[:, 0], 0.5), y)
+
+
+@correct()
+def scipy_distributions_of_the_new_kind(previous, y):
+    x = sample("x", stats.Normal(mu=np.zeros(200) if previous is None else 0.9 * previous["x"], sigma=0.6))
+    observe("y", stats.norm(x, 0.5), y)
+
+
+@correct()
+def torch_distributions(previous, y):
+    import torch
+
+    before = torch.zeros(1) if previous is None else torch.from_numpy(np.array(previous["x"]))
+    x = sample("x", torch.distributions.Normal(0.9 * before, 0.6))
+    observe("y", torch.distributions.Normal(torch.from_numpy(np.array(x)).float(), 0.5), y)
+
+
+@correct(ys=[0, 1, 1, 0])
+def discrete_sites(previous, y):
+    k = sample(
+        "k", Categorical([0.5, 0.5] if previous is None else np.array([[0.9, 0.1], [0.2, 0.8]])[previous["k"]])
+    )
+    n = sample("n", Poisson(1.0 + k))
+    observe("y", Bernoulli(np.array([0.2, 0.8])[k] ** (1 + n)), y)
+    return {"total": n if previous is None else previous["total"] + n}
+
+
+@correct()
+def a_value_that_marks_absence(previous, y):
+    x = walk(previous)
+    seen(x, y)
+    last = np.full(len(x), np.nan) if previous is None else previous["last"]
+    return {"last": np.where(x > 0, x, last)}
+
+
+@correct()
+def logarithms_of_the_valid_only(previous, y):
+    x = walk(previous)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        z = np.where(x > 0, np.log(x), 0.0)
+    seen(z, y)
+    return {"z": z}
+
+
+@correct()
+def a_fast_path(previous, y):
+    x = walk(previous)
+    far = x > 1.0
+    if far.any():
+        x = np.where(far, 2.0 - x, x)
+    seen(x, y)
+
+
+@correct()
+def a_site_that_some_need(previous, y):
+    x = walk(previous)
+    far = x > 1.0
+    if far.any():
+        x = np.where(far, sample("back", Normal(0.0, 0.5)), x)
+    seen(x, y)
+
+
+@correct()
+def equal_values_are_computed_once(previous, y):
+    k = sample("k", Poisson(2.0))
+    distinct, index = np.unique(k, return_inverse=True)
+    seen(np.sqrt(distinct)[index], y)
+
+
+@correct()
+def a_shift_that_cancels(previous, y):
+    v = sample("v", Normal(np.zeros((1, 3)), 1.0))
+    w = np.exp(v - v.max())
+    k = sample("k", Categorical(w))
+    seen(v[np.arange(len(k)), k], y)
+
+
+@correct(n=200)
+def a_number_of_particles_in_the_closure(previous, y):
+    x = sample("x", Normal(np.zeros(200) if previous is None else 0.9 * previous["x"], np.full(200, 0.6)))
+    age = np.zeros(200, int) if previous is None else previous["age"] + 1
+    seen(x, y)
+    return {"age": age}
+
+
+CALLS: list = []
+
+
+@correct()
+def a_log_of_calls(previous, y):
+    CALLS.append(y)
+    seen(walk(previous), y)
+
+
+@correct(n=30)
+@per_particle
+def immutable_use_of_containers(previous, y):
+    x = walk(previous)
+    items = [*([] if previous is None else previous["items"] + [1.0]), float(x)]
+    cells = {round(float(x))} | (set() if previous is None else previous["cells"])
+    at = {**({} if previous is None else previous["at"]), len(items): x}
+    track = np.append(np.zeros(1) if previous is None else previous["track"], x)
+    seen(np.mean(items) + 0.1 * len(cells) + 0.1 * len(at) + track[0], y)
+    return {"items": items, "cells": cells, "at": at, "track": track, "grid": Map([1])}
+
+
+@correct(n=30)
+@per_particle
+def sites_that_come_and_go(previous, y):
+    x = walk(previous)
+    if x > 0:
+        x = x + sample("more", Gamma(2.0))
+    seen(x, y)
+
+
+@correct(n=20, kind="resample_move", trigger=Always())
+@per_particle
+def moves_of_one_particle(previous, y):
+    s = sample("s", Gamma(2.0))
+    seen(sample("x", Normal(0.0, s)), y)
+
+
+@correct()
+def residuals_of_particles(previous, y):
+    x = walk(previous)
+    observe("residual", Normal(0.0, 0.5), y - x)
+    observe("factor", Normal(x, 3.0), 0.0)
+
+
+@correct()
+def a_distribution_of_the_user(previous, y):
+    seen(sample("x", Mine(np.zeros(1) if previous is None else 0.9 * previous["x"])), y)
+
+
+class Clipped(Distribution):
+    """A mixture of a point at 0 and a half normal would have no density; this is a count with a bound."""
+
+    discrete = True
+    mean, sd = np.float64(1.2), np.float64(0.9)
+
+    def sample(self, rng, size):
+        return np.minimum(rng.poisson(1.4, size), 3)
+
+    def log_prob(self, value):
+        p = np.append(stats.poisson.pmf([0, 1, 2], 1.4), stats.poisson.sf(2, 1.4))
+        return np.log(p)[np.asarray(value, int)]
+
+
+@correct()
+def a_discrete_distribution_of_the_user(previous, y):
+    seen(sample("k", Clipped()) * 1.0, y)
+
+
+@correct()
+def time_in_the_model(previous, y, t):
+    m = 0.0 if previous is None else 0.9 * previous["x"] + np.sin(t)
+    seen(sample("x", Normal(m, 0.6)), y)
+
+
+@correct()
+def a_table_of_the_closure(previous, y):
+    table = np.array([0.0, 1.0, 2.0])
+    k = sample("k", Categorical(np.ones(3) / 3))
+    seen(table[k], y)
+
+
+@correct(ys=[{"a": 0.2, "b": None}, {"a": None, "b": 1.0}, None])
+def observations_that_are_mappings(previous, y):
+    x = walk(previous)
+    for name, value in (y or {}).items():
+        observe(name, Normal(x, 0.5), value)
+
+
+@correct(n=1000)
+def an_image_of_each_particle(previous, y):
+    c = sample("c", Normal(np.zeros((1, 2)), 1.0))
+    grid = np.arange(5.0) - 2
+    image = np.exp(-((c[:, :1, None] - grid[None, :, None]) ** 2) - (c[:, 1:, None] - grid[None, None, :]) ** 2)
+    observe("y", Normal(image, 0.3), np.eye(5))
