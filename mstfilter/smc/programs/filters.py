@@ -5,6 +5,7 @@ from __future__ import annotations
 import traceback
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -17,7 +18,7 @@ from mstfilter.smc.filter import ParticleFilter
 from mstfilter.smc.inputs import AtStep
 from mstfilter.smc.interfaces import Lookahead, Proposal, Rejuvenation, Transition
 from mstfilter.smc.population import Particles, Population
-from mstfilter.smc.programs.guard import Guard
+from mstfilter.smc.programs.guard import Schedule
 from mstfilter.smc.programs.handlers import (
     CentreHandler,
     GuideHandler,
@@ -82,6 +83,11 @@ class Program:
 class _OfProgram(AtStep):
     """A component with a model, and perhaps a guide, that may depend on the step."""
 
+    @cached_property
+    def schedule(self) -> Schedule:
+        """Which steps are checked."""
+        return Schedule.of(vars(self)["model"], vars(self).get("guide"))
+
     @property
     def step_functions(self) -> Mapping[str, int | None]:  # type: ignore[override]
         functions = {name: value for name, value in vars(self).items() if name in ("model", "guide")}
@@ -89,19 +95,21 @@ class _OfProgram(AtStep):
 
 
 def _advance(
-    rng: np.random.Generator, model: Model, guide: Model | None, past: Population | None, observation: Any, n: int
+    component: ProgramInitial | ProgramTransition,
+    rng: np.random.Generator,
+    past: Population | None,
+    observation: Any,
+    n: int,
 ) -> Population:
     """The population after a step."""
+    model, guide = component.model, None if observation is None else component.guide
     previous = None if past is None else past.particles
-    guide = None if observation is None else guide
-    guard = Guard.due(rng, past, observation, model, guide)
+    guard = component.schedule.guard(rng, past, observation, model, guide)
 
     def step() -> tuple[Particles, np.ndarray]:
         return _step(rng, model, guide, previous, observation, n)
 
-    particles, gain = step()
-    if guard is not None:
-        guard.check(_run_once, step, particles, gain)
+    particles, gain = step() if guard is None else guard.checked(_run_once, step)
     try:
         if past is None:
             return Population(particles, gain)
@@ -137,7 +145,7 @@ class ProgramInitial(_OfProgram, Proposal):
         return False if isinstance(self.model, PerParticle) else None
 
     def sample(self, rng: np.random.Generator, observation: Any, n: int) -> Population:
-        return _advance(rng, self.model, self.guide, None, observation, n)
+        return _advance(self, rng, None, observation, n)
 
 
 @dataclass(frozen=True)
@@ -152,7 +160,7 @@ class ProgramTransition(_OfProgram, Transition):
         return False if isinstance(self.model, PerParticle) else None
 
     def predict(self, rng: np.random.Generator, population: Population, observation: Any) -> Population:
-        return _advance(rng, self.model, self.guide, population, observation, len(population))
+        return _advance(self, rng, population, observation, len(population))
 
 
 @dataclass(frozen=True)

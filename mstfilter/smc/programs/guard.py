@@ -2,13 +2,13 @@
 
 A program processes all particles in one pass, so it may mix them by mistake (``x.mean()``, ``previous["x"][0]``),
 draw from another generator, or keep values between steps. Such a program runs, and its weights are wrong. `Guard`
-repeats some steps: of each kind the first, the second, the fourth, and then every power of four.
+checks some steps, of each kind the first, the second, the eighth, and then every power of eight:
 
-1. The step with the same random numbers: all values and log weights must be the same.
-2. Single particles, as copies with the values that they had: their distributions and returned values must be those
-   of the step.
-3. With a guide, a step drawn by the model: the guide must be able to draw these values, and the two estimates of the
-   evidence must agree.
+1. The first two run again with the same random numbers: all values and log weights must be the same.
+2. A few particles run alone with the values that they had: their distributions and returned values must be those of
+   the step. They are taken from the smallest and from the largest values, so that a maximum or ``any`` changes too.
+3. With a guide, a step is drawn by the model: the guide must be able to draw these values, and the two estimates of
+   the evidence must agree.
 
 The results of a filter do not depend on these checks.
 """
@@ -32,11 +32,10 @@ from mstfilter.smc.programs.sites import Call, PerParticle, ProgramRun, recorded
 from mstfilter.smc.streams import child
 
 #: Numbers of the steps of one kind that are checked.
-_CHECKED = frozenset({1, 2, *(4**k for k in range(1, 16))})
-_COPIES = 3  # of a particle; one might be broadcast
+_CHECKED = frozenset({1, 2, *(8**k for k in range(1, 12))})
 #: Differences that count as rounding: networks that compute in single precision give other digits for other sizes.
 _LOG_DENSITY, _VALUE = 1e-3, 1e-5
-_LONE = (
+_ALONE = (
     "each particle is processed as if it were alone: reduce over entries with axis=1, not over the particles",
     'previous["x"] has one row for each particle, in a branch of switch as an argument; draw by sample(...) only',
 )
@@ -49,48 +48,37 @@ Run = Callable[[Callable[..., Any], SiteHandler, Any, Any, int], ProgramRun]
 
 
 class Guard:
-    """The checks of one step.
-
-    Made before the step, which is ``step() -> (particles, gain)``; `check` is called after it.
-    """
+    """The checks of one step of a program, made before the step."""
 
     def __init__(
-        self, rng: np.random.Generator, past: Population | None, observation: Any, model: Any, guide: Any
+        self, rng: np.random.Generator, past: Population | None, observation: Any, model: Any, guide: Any, count: int
     ) -> None:
         self.rng, self.past, self.observation, self.model, self.guide = rng, past, observation, model, guide
-        self.previous = None if past is None else past.particles
+        self.previous, self.count = None if past is None else past.particles, count
         self.state, self.content = rng.bit_generator.state, self._content()
 
-    @classmethod
-    def due(
-        cls, rng: np.random.Generator, past: Population | None, observation: Any, model: Any, guide: Any
-    ) -> Guard | None:
-        """A guard if a step of this kind is to be checked now."""
-        kind = (past is None, np.shape(observation) if isinstance(observation, np.ndarray) else observation is None)
-        key = (*kind, _identity(model), None if guide is None else _identity(guide))
-        if len(_COUNTS) > 1000:
-            _COUNTS.clear()
-        _COUNTS[key] += 1
-        return cls(rng, past, observation, model, guide) if _COUNTS[key] in _CHECKED else None
-
-    def check(self, run: Run, step: Callable[[], Any], particles: Any, gain: np.ndarray) -> None:
-        """Raise InputError if a check fails for the step with these particles and gain of the log weights."""
-        runs = self._repeat(step, particles, gain)
+    def checked(self, run: Run, step: Callable[[], Any]) -> Any:
+        """Particles and gain of the log weights, as ``step()`` returns them; InputError if a check fails."""
+        with recorded() as runs:
+            particles, gain = step()
+        if self.count <= 2:
+            self._repeat(step, particles, gain, runs)
         if isinstance(self.model, PerParticle):
             if self._content() != self.content:
                 raise InputError(
                     "the program changes a value of `previous` in place, which copies of the particle share",
                     "copy it first (copy.deepcopy), change the copy and return that",
                 )
-            return
+            return particles, gain
         for whole in runs:
             for call in whole.calls or ():
                 if call.distribution is not None:
                     _check_density(call.what, call.distribution, self.rng)
-            for row in _rows(whole) if whole.n > 1 else ():
-                self._check_alone(run, whole, row)
+            for rows in _groups(whole) if whole.n > 1 else ():
+                self._check_alone(run, whole, rows)
         if self.guide is not None and len(gain) >= 100:
             self._check_guide(run, gain)
+        return particles, gain
 
     def _content(self) -> bytes | None:
         """The objects in the particles of a `per_particle` program, as bytes, which are compared and never read."""
@@ -102,59 +90,61 @@ class Guard:
             return None
 
     # --- the same random numbers ------------------------------------------------------------------------------------
-    def _repeat(self, step: Callable[[], Any], particles: Any, gain: np.ndarray) -> list[ProgramRun]:
-        """Runs of the repeated step."""
-        found = []
-        for attempt in range(2):
-            self.rng.bit_generator.state = self.state
-            with recorded() as runs, np.errstate(invalid="call"), _noting_invalid() as invalid:
-                try:
-                    again, gain_again = step()
-                except Exception as error:
-                    message = f"the step fails when it is repeated with the same random numbers: {error}"
-                    raise InputError(message, *_REPEAT) from error
-            found.append(runs)
-            if attempt == 0:
-                other = _first_difference(particles, again)
-                if other is None and _close(gain, gain_again, 1e-9).all():
-                    if invalid:
-                        _check_returned(runs[-1])
-                    return runs
-        what = other or _first_call_that_differs(*found) or "the log weights"
-        raise InputError(f"{what} differ when the step is repeated with the same random numbers", *_REPEAT)
+    def _repeat(self, step: Callable[[], Any], particles: Any, gain: np.ndarray, runs: list[ProgramRun]) -> None:
+        self.rng.bit_generator.state = self.state
+        with recorded() as repeated, np.errstate(invalid="call"), _noting_invalid() as invalid:
+            try:
+                again, gain_again = step()
+            except Exception as error:
+                message = f"the step fails when it is repeated with the same random numbers: {error}"
+                raise InputError(message, *_REPEAT) from error
+        what = _first_difference(particles, again)
+        if what is None and not _close(gain, gain_again, 1e-9).all():
+            what = _first_call_that_differs(runs, repeated) or "log weights"
+        if what is not None:
+            raise InputError(f"{what} differ when the step is repeated with the same random numbers", *_REPEAT)
+        if invalid:
+            _check_returned(repeated[-1])
 
-    # --- single particles -------------------------------------------------------------------------------------------
-    def _check_alone(self, run: Run, whole: ProgramRun, row: int) -> None:
-        """Compare a particle in a run with copies of it alone."""
-        copies = 1 if any(shapes.ambiguous for shapes in whole.shapes.values()) else _COPIES
+    # --- a few particles alone --------------------------------------------------------------------------------------
+    def _check_alone(self, run: Run, whole: ProgramRun, rows: np.ndarray) -> None:
+        """Compare some particles in a run with the same particles in a run of their own."""
+        if any(shapes.ambiguous for shapes in whole.shapes.values()):
+            rows = rows[:1]
         with recorded() as runs:
             try:
-                alone = self._copied(run, whole, row, copies)
-                _check_shapes(whole, alone, "")
+                few = self._run_again(run, whole, rows)
+                _check_shapes(whole, few, "")
             except Exception as error:
                 _check_shapes(whole, runs[0], str(error))
                 try:  # a program may be written for n particles
-                    alone = self._copied(run, whole, row, whole.n)
+                    rows = np.resize(rows, whole.n)
+                    few = self._run_again(run, whole, rows)
                 except Exception as again:
-                    raise InputError(f"the step fails for copies of particle {row} alone: {again}", *_LONE) from again
-        lone = {(c.what, c.k): c for c in alone.calls or ()}
+                    message = f"the step fails for particles {sorted(set(rows.tolist()))} alone: {again}"
+                    raise InputError(message, *_ALONE) from again
+        alone = {(c.what, c.k): c for c in few.calls or ()}
         for call in whole.calls or ():
-            _compare(call, lone.pop((call.what, call.k), None), row)
-        for call in lone.values():
+            _compare(call, alone.pop((call.what, call.k), None), rows)
+        for call in alone.values():
             if call.size:
-                raise InputError(f"{call.what} is reached by particle {row} alone, and not among the others", *_LONE)
+                raise InputError(f"{call.what} is reached by particle {rows[0]} alone only", *_ALONE)
         for name, values in whole.returned.items():
-            other = np.asarray(alone.returned.get(name, values[row]))
-            if not _close(values[row], other, _VALUE, _spread(values)).all():
+            found = few.returned.get(name, values[rows])
+            if found.shape[1:] != values.shape[1:]:
+                raise InputError(f"returned {name!r} has rows of shape {values.shape[1:]}, alone {found.shape[1:]}")
+            different = ~_close(values[rows], found, _VALUE, _spread(values))
+            if different.any():
+                i = tuple(np.argwhere(different)[0])
                 raise InputError(
-                    f"returned {name!r} of particle {row} is {values[row]} among {whole.n} particles, "
-                    f"{np.ravel(other)[0]} for copies of it alone"[:300],
-                    *_LONE,
+                    f"returned {name!r} of particle {rows[i[0]]} is {values[rows][i]} among {whole.n} particles, "
+                    f"{found[i]} alone",
+                    *_ALONE,
                 )
 
-    def _copied(self, run: Run, whole: ProgramRun, row: int, n: int) -> ProgramRun:
-        previous = None if self.previous is None else take(self.previous, np.full(n, row))
-        return run(whole.function, CopyHandler(whole.values, row), previous, self.observation, n)
+    def _run_again(self, run: Run, whole: ProgramRun, rows: np.ndarray) -> ProgramRun:
+        previous = None if self.previous is None else take(self.previous, rows)
+        return run(whole.function, CopyHandler(whole.values, rows), previous, self.observation, len(rows))
 
     # --- the guide --------------------------------------------------------------------------------------------------
     def _check_guide(self, run: Run, gain: np.ndarray) -> None:
@@ -172,7 +162,7 @@ class Guard:
         weights = normalise(by_model)
         missed = float(weights[log_q == -np.inf].sum())
         if missed > 1e-3:
-            site = next(c.what for c in runs[0].calls or () if (c.densities([c.value], own=True) == -np.inf).any())
+            site = next(c.what for c in runs[0].calls or () if (c.densities(c.value) == -np.inf).any())
             raise InputError(
                 f"{site}: the guide never draws values that hold {missed:.1%} of the probability given the observation",
                 "its distribution must reach wherever that of the model times the likelihood does",
@@ -190,37 +180,47 @@ class Guard:
             )
 
 
-_COUNTS: Counter[Any] = Counter()
-_KEPT: dict[int, Any] = {}
+class Schedule(Counter[Any]):
+    """Numbers of the steps of a model and its guide, by kind; those with the same functions share it."""
+
+    @classmethod
+    def of(cls, model: Any, guide: Any) -> Schedule:
+        if len(_SCHEDULES) > 200:
+            _SCHEDULES.clear()
+        kept, identity = [*_parts(model), *_parts(guide)], []
+        for value in kept:
+            identity.append(value if isinstance(value, str | int | bool | None) else id(value))
+        return _SCHEDULES.setdefault(tuple(identity), (cls(), kept))[0]  # no other object gets the id of a kept one
+
+    def guard(
+        self, rng: np.random.Generator, past: Population | None, observation: Any, model: Any, guide: Any
+    ) -> Guard | None:
+        """A guard if the next step is to be checked."""
+        kind = (past is None, observation is None, guide is None, type(observation) is np.ndarray and observation.shape)
+        count = self[kind] = self.get(kind, 0) + 1
+        return Guard(rng, past, observation, model, guide, count) if count in _CHECKED else None
 
 
-def _identity(function: Any) -> Any:
-    """A key for a function: its code, and the values of its closure and defaults but the numbers.
+_SCHEDULES: dict[tuple[Any, ...], tuple[Schedule, list[Any]]] = {}
 
-    The models of many parameter values, as in PMMH, have the same key.
+
+def _parts(function: Any) -> list[Any]:
+    """The code of a function, and the values of its closure and defaults but the numbers.
+
+    The models of many parameter values, as in PMMH, have the same parts.
     """
-    while isinstance(function, partial | PerParticle):  # of a step
+    while isinstance(function, partial | PerParticle):
         function = function.func if isinstance(function, partial) else function.function
     code = getattr(function, "__code__", None)
     if code is None:
-        return _key(function)
+        return [function]
     values = [*(getattr(function, "__defaults__", None) or ())]
     for cell in getattr(function, "__closure__", None) or ():
         try:
             values.append(cell.cell_contents)
         except ValueError:  # an empty cell
             continue
-    return (_key(code), *(_key(v) for v in values if not isinstance(v, float | np.ndarray)))
-
-
-def _key(value: Any) -> Any:
-    if isinstance(value, str | int | bool | None):
-        return value
-    if len(_KEPT) > 1000:
-        _KEPT.clear()
-        _COUNTS.clear()
-    _KEPT[id(value)] = value  # so that no other object gets its id
-    return id(value)
+    return [code, *(v for v in values if not isinstance(v, float | np.ndarray))]
 
 
 class _noting_invalid(list[str]):  # noqa: N801 (a context manager)
@@ -246,17 +246,22 @@ def _check_returned(run: ProgramRun) -> None:
             )
 
 
-def _rows(run: ProgramRun) -> list[int]:
-    """Particles to check alone: two by position, the smallest and largest value, and one of each branch."""
-    rows = {run.n // 2, run.n // 3}
-    numbers = next((v for v in run.values.values() if v.dtype.kind == "f"), None)
-    if numbers is not None and numbers.size:
-        column = numbers.reshape(run.n, -1)[:, 0]
-        rows |= {int(np.argmin(column)), int(np.argmax(column))}
+def _groups(run: ProgramRun) -> list[np.ndarray]:
+    """Two groups of particles to run alone, of small and of large values, each with some of every branch."""
+    numbers = next((v for v in run.values.values() if v.dtype.kind == "f" and v.size), None)
+    column = np.arange(run.n) if numbers is None else numbers.reshape(run.n, -1)[:, 0]
+    order, size = np.argsort(column), max(run.n // 3, 1)
+    return [_group(run, part) for part in (order[:size], order[:-size - 1 : -1])]
+
+
+def _group(run: ProgramRun, part: np.ndarray) -> np.ndarray:
+    """Some rows of a part of the particles; at least two, since one row might be broadcast."""
+    rows = list(part[[len(part) // 2, 0, len(part) // 4]])
     for call in run.calls or ():
-        if call.size and all(call.position(row) is None for row in rows) and len(rows) < 8:
-            rows.add(int(call.rows[call.size // 2]))  # type: ignore[index]
-    return sorted(rows)
+        if call.rows is not None and len(rows) < 8:
+            reached = part[np.isin(part, call.rows)]
+            rows += [*reached[len(reached) // 2 :][:1]]
+    return np.array(rows)
 
 
 def _close(a: Any, b: Any, tolerance: float, scale: Any = 0.0) -> np.ndarray:
@@ -301,7 +306,7 @@ def _same(a: Any, b: Any) -> bool:
 def _first_call_that_differs(one: list[ProgramRun], two: list[ProgramRun]) -> str | None:
     for a, b in zip(one, two, strict=False):
         for x, y in zip(a.calls or (), b.calls or (), strict=False):
-            if x.what != y.what or not _close(x.densities([x.value]), y.densities([y.value]), 1e-9).all():
+            if x.what != y.what or not _close(x.densities(x.value), y.densities(y.value), 1e-9).all():
                 return f"log densities of {x.what}"
     return None
 
@@ -325,32 +330,39 @@ def _check_shapes(whole: ProgramRun, alone: ProgramRun, raised: str) -> None:
             raise found.error(f"{found.what}: ")
 
 
-def _compare(call: Call, alone: Call | None, row: int) -> None:
-    """Raise unless a particle has the same distribution in a call of all and alone."""
-    k = call.position(row)
-    if k is None:
-        if alone is not None and alone.size:
-            raise InputError(f"{call.what} is reached by particle {row} alone, and not among the others", *_LONE)
+def _compare(call: Call, alone: Call | None, rows: np.ndarray) -> None:
+    """Raise unless particles have the same distributions in a call of all and alone."""
+    position = call.positions(rows)
+    here, there = np.flatnonzero(position >= 0), range(0) if alone is None else alone.reached
+    among = call.densities(call.value)
+    if alone is None or list(here) != list(there):
+        left_out = np.setdiff1d(here, there)
+        if np.setdiff1d(there, here).size or (call.distribution is None and among[position[left_out]].any()):
+            raise InputError(f"{call.what} is not reached by the same particles among the others and alone", *_ALONE)
         return
-    probes = [call.value[i] for i in dict.fromkeys((k, 0, call.size - 1))] if call.distribution is not None else []
-    among = call.densities(probes)[:, k]
-    if alone is None or not alone.size:
-        if call.distribution is None and among.any():
-            raise InputError(f"{call.what} is reached by particle {row} among the others, and not alone", *_LONE)
+    if not len(here):
         return
-    if probes and alone.value.shape[1:] != call.value.shape[1:]:
-        raise InputError(
-            f"{call.what}: an event of particle {row} has shape {call.value.shape[1:]} among the others, "
-            f"{alone.value.shape[1:]} alone",
-            *_LONE,
-        )
-    lone = alone.densities(probes)
-    different = ~_close(among[:, None], lone, _LOG_DENSITY, 1.0)
+    k = position[here]
+    _equal_densities(call, rows[here], among[k], alone.densities(alone.value))
+    if call.distribution is not None:
+        if alone.value.shape[1:] != call.value.shape[1:]:
+            raise InputError(
+                f"{call.what}: an event has shape {call.value.shape[1:]} among the others, {alone.value.shape[1:]} "
+                "alone",
+                *_ALONE,
+            )
+        other = call.value[k[0] - 1]  # the value of another particle
+        among, lone = (c.densities(np.broadcast_to(other, c.value.shape)) for c in (call, alone))
+        _equal_densities(call, rows[here], among[k], lone)
+
+
+def _equal_densities(call: Call, rows: np.ndarray, among: np.ndarray, alone: np.ndarray) -> None:
+    different = ~_close(among, alone, _LOG_DENSITY, 1.0)
     if different.any():
-        i, j = np.argwhere(different)[0]
+        i = int(np.argmax(different))
         raise InputError(
-            f"{call.what}: particle {row} has log density {among[i]:.6g} among the others, {lone[i, j]:.6g} alone",
-            *_LONE,
+            f"{call.what}: particle {rows[i]} has log density {among[i]:.6g} among the others, {alone[i]:.6g} alone",
+            *_ALONE,
         )
 
 

@@ -167,12 +167,12 @@ class CentreHandler(SiteHandler):
 
 
 class CopyHandler(SiteHandler):
-    """Gives every particle the values that one particle has in `values`."""
+    """Gives the particles the values that the particles `rows` have in `values`."""
 
     draws = False
 
-    def __init__(self, values: Mapping[str, np.ndarray], row: int) -> None:
-        self.values, self.of = values, row
+    def __init__(self, values: Mapping[str, np.ndarray], rows: np.ndarray) -> None:
+        self.values, self.rows = values, rows
 
     def value(self, site: Site) -> tuple[np.ndarray, np.ndarray | None]:
         if site.name not in self.values:
@@ -180,7 +180,7 @@ class CopyHandler(SiteHandler):
         shape = site.distribution.value_shape(site.size)
         if self.values[site.name].shape[1:] != shape[1:]:
             return np.zeros(shape), None  # an error later
-        return np.repeat(self.values[site.name][self.of][None], site.size, axis=0), None
+        return self.values[site.name][self.rows[site.index]], None
 
     def row(self, index: int) -> CopyHandler:
         return self

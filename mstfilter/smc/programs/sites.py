@@ -144,8 +144,8 @@ class FrozenList(list[Any]):
     def _refuse(self, *_: Any, **__: Any) -> Any:
         raise TypeError("a list in a particle is read-only: write items + [new], or change list(items)")
 
-    append = extend = insert = remove = pop = clear = sort = reverse = _refuse  # type: ignore[assignment]
-    __setitem__ = __delitem__ = __iadd__ = __imul__ = _refuse  # type: ignore[assignment]
+    append = extend = insert = remove = pop = clear = sort = reverse = _refuse
+    __setitem__ = __delitem__ = __iadd__ = __imul__ = _refuse
 
 
 def _frozen(value: Any) -> Any:
@@ -172,24 +172,27 @@ class Call(NamedTuple):
     distribution: Distribution | None = None  #: of a site
     value: Any = None  #: (size, ...) of a site
 
-    def position(self, row: int) -> int | None:
-        """The position of a particle among those of the call; None if it does not reach the call."""
+    @property
+    def reached(self) -> np.ndarray:
+        """(size,) indices of the particles."""
+        return np.arange(self.size) if self.rows is None else self.rows
+
+    def positions(self, rows: np.ndarray) -> np.ndarray:
+        """(k,) positions of some particles among those of the call; -1 for one that does not reach it."""
         if self.rows is None:
-            return row
-        k = int(np.searchsorted(self.rows, row))
-        return k if k < self.size and self.rows[k] == row else None
+            return rows
+        if not self.size:
+            return np.full(len(rows), -1)
+        k = np.minimum(np.searchsorted(self.rows, rows), self.size - 1)
+        return np.where(self.rows[k] == rows, k, -1)
 
-    def densities(self, probes: list[Any], own: bool = False) -> np.ndarray:
-        """(p, size) log densities of an observation (p = 1), or of values at a site for all its particles.
-
-        With `own`, a probe has the values of all particles.
-        """
-        found = [self.log_prob]
+    def densities(self, values: Any) -> np.ndarray:
+        """(size,) log densities of an observation, or of values (size, ...) at a site."""
+        log_prob = self.log_prob
         if self.distribution is not None:
-            shape = self.value.shape
             with np.errstate(all="ignore"):
-                found = [self.distribution.log_prob(v if own else np.broadcast_to(v, shape)) for v in probes]
-        return np.array([np.broadcast_to(np.asarray(lp, np.float64), (self.size,)) for lp in found])
+                log_prob = self.distribution.log_prob(values)
+        return np.broadcast_to(np.asarray(log_prob, np.float64), (self.size,))
 
 
 class Shapes(NamedTuple):
