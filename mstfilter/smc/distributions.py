@@ -15,8 +15,9 @@ Frozen distributions of scipy.stats and objects of torch.distributions can be us
 from a global generator, so its distributions are drawn by their inverse distribution function at uniforms of our
 generator, or, without an inverse, from their probabilities.
 
-A parameter out of range, in any row, raises InputError when the distribution is made. Moves and lookaheads evaluate
-values that a model may exclude; inside `hypothetical` such a row has the log density NaN, which a move rejects.
+A parameter out of range, in any row, raises InputError when the distribution is made; the arrays of `Normal` and
+`Student`, when it is sampled, since their log density at such a row is NaN. Moves and lookaheads evaluate values that
+a model may exclude: inside `hypothetical` such a row has the log density NaN, which a move rejects.
 """
 
 from __future__ import annotations
@@ -35,6 +36,7 @@ from mstfilter.errors import InputError
 from mstfilter.smc.interfaces import Distribution
 
 _HALF_LOG_2PI = 0.5 * math.log(2 * math.pi)
+_FLOAT64 = np.dtype(np.float64)
 _HYPOTHETICAL: ContextVar[bool] = ContextVar("parameters may be out of range", default=False)
 
 
@@ -51,6 +53,8 @@ def hypothetical() -> Iterator[None]:
 
 class _Checked(Distribution):
     """A distribution that checks its parameters, which are fields."""
+
+    draws_numbers = True
 
     def _check(self, name: str, expected: str, inside: Callable[[np.ndarray], np.ndarray]) -> None:
         """Raise InputError at the first entry of a parameter that is not `inside`; `hypothetical` makes it NaN."""
@@ -78,11 +82,7 @@ class _Checked(Distribution):
 
     def _check_positive(self, name: str) -> None:
         value = getattr(self, name)
-        if type(value) is float:
-            inside = 0 < value < math.inf
-        else:
-            inside = type(value) is np.ndarray and value.size > 0 and 0 < value.min() and value.max() < np.inf
-        if not inside:
+        if not (_is_finite(value) and (value > 0 if type(value) is float else _minimum(value) > 0)):
             self._check(name, "a positive number", lambda a: (0 < a) & (a < np.inf))
 
 
@@ -110,7 +110,13 @@ def _is_finite(value: Any) -> bool:
     """Whether all numbers of a float or float64 array are finite. False also if the sum of their squares is not."""
     if type(value) is float:
         return math.isfinite(value)
-    return type(value) is np.ndarray and value.dtype == np.float64 and math.isfinite(np.vdot(value, value))
+    if type(value) is not np.ndarray or value.dtype is not _FLOAT64:
+        return False
+    return math.isfinite(value.dot(value) if value.ndim == 1 else np.vdot(value, value))
+
+
+def _minimum(value: np.ndarray) -> float:
+    return np.minimum.reduce(value, axis=None, initial=np.inf)
 
 
 def _impossible(value: np.ndarray) -> Any:
@@ -156,10 +162,17 @@ class Normal(_Independent):
     scale: Any = 1.0
 
     def __post_init__(self) -> None:
+        if type(self.loc) is not np.ndarray and type(self.scale) is not np.ndarray:
+            self.check_parameters()
+        elif type(self.scale) is not np.ndarray:
+            self._check_positive("scale")
+
+    def check_parameters(self) -> None:
         self._check_finite("loc")
         self._check_positive("scale")
 
     def sample(self, rng: np.random.Generator, size: int) -> np.ndarray:
+        self.check_parameters()
         z = rng.standard_normal(self.value_shape(size))
         z *= self.scale
         z += self.loc
@@ -190,11 +203,16 @@ class Student(_Independent):
     scale: Any = 1.0
 
     def __post_init__(self) -> None:
+        if not any(type(value) is np.ndarray for value in (self.df, self.loc, self.scale)):
+            self.check_parameters()
+
+    def check_parameters(self) -> None:
         self._check_positive("df")
         self._check_finite("loc")
         self._check_positive("scale")
 
     def sample(self, rng: np.random.Generator, size: int) -> np.ndarray:
+        self.check_parameters()
         return self.loc + self.scale * rng.standard_t(self.df, self.value_shape(size))
 
     def log_prob(self, value: Any) -> np.ndarray:
@@ -400,6 +418,7 @@ class Categorical(Distribution):
 
     probs: Any
     discrete = True
+    draws_numbers = True
 
     def __post_init__(self) -> None:
         p = np.asarray(self.probs, dtype=np.float64)

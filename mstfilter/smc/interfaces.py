@@ -288,9 +288,12 @@ class Distribution(ABC):
     ----------
     discrete : bool
         Whether the values are integers: a lookahead then uses the mode, a move draws new values.
+    draws_numbers : bool
+        Whether draws are known not to be NaN. If False, programs check them.
     """
 
     discrete = False
+    draws_numbers = False
 
     @property
     def parameter_shape(self) -> tuple[int, ...]:
@@ -317,6 +320,9 @@ class Distribution(ABC):
                 "a branch of a program has the particles whose rows it receives as arguments of switch",
             )
         return (size, *shape[1:])
+
+    def check_parameters(self) -> None:
+        """Raise InputError if a parameter is out of range."""
 
     @abstractmethod
     def sample(self, rng: np.random.Generator, size: int) -> np.ndarray:

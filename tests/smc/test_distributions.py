@@ -178,7 +178,9 @@ def with_row(good, bad, row=2):
 )
 def test_a_parameter_out_of_range_names_its_row(make, named, value):
     with pytest.raises(InputError, match=named + ".* in row 2"):
-        make(value)
+        make(value).check_parameters()
+    with pytest.raises(InputError, match=named + ".* in row 2"):
+        make(value).sample(np.random.default_rng(0), 4)
     with hypothetical():  # as in a move: that row has no density, the others are as they were
         d = make(value)
         drawn = np.zeros(d.value_shape(4), dtype=int)

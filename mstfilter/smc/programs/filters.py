@@ -434,8 +434,7 @@ def _returned(returned: Any, run: ProgramRun) -> dict[str, Any]:
                 raise InputError(
                     f"a program returned {name!r} of shape {value.shape}, expected one row per particle ({run.n})"
                 )
-            run.what = f"returned {name!r}"
-            run.record(value.shape[1:], None, run.n)
+            run.returns(name, value)
         if name in run.values and not _equal(value, run.values[name][0] if run.single else run.values[name]):
             raise InputError(
                 f"a program returned {name!r} with other values than site {name!r}",

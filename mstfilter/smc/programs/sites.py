@@ -243,7 +243,7 @@ class ProgramRun:
         self.gain = np.zeros(n)
         self.shapes: dict[int, Shapes] = {}  # of the calls that do not have a number for each particle, in order
         self.n_calls = 0
-        self.what, self.inside = "", False  # the last site or observation, and whether it is being processed
+        self._last, self.inside = ("", "", ""), False  # the last call, and whether it is being processed
         runs = _RECORDED.get()
         self.calls: list[Call] | None = None if runs is None else []  # if they are recorded
         self.function: Any = None  # of the program
@@ -254,8 +254,19 @@ class ProgramRun:
         self._where = ""  # the branch, for messages
         self._paths: dict[str, list[tuple[tuple[str, int], ...]]] = {}
 
+    @property
+    def what(self) -> str:
+        """The last site or observation, for messages."""
+        kind, name, where = self._last
+        return f"{kind} {name!r}{where}" if kind else ""
+
+    def returns(self, name: str, value: np.ndarray) -> None:
+        """Keep the shape of a returned value."""
+        self._last = ("returned", name, "")
+        self.record(value.shape[1:], None, self.n)
+
     def sample(self, name: str, distribution: Any, branch: bool = False) -> Any:
-        self.what, self.inside = f"site {name!r}{self._where}", True
+        self._last, self.inside = ("site", name, self._where), True
         rows, distribution = self._rows, as_distribution(distribution)
         size = self.n if rows is None else len(rows)
         self._check_name(name)
@@ -264,10 +275,11 @@ class ProgramRun:
         if gain is None:
             if value.shape != (size,):
                 check_shape("its draws", value, distribution, size)
-            if self.handler.draws:
+            if self.handler.draws and not distribution.draws_numbers:
                 _check_draws(value, distribution)
         self.record(value.shape[1:], None, size)
-        self._note(rows, size, distribution=distribution, value=value)
+        if self.calls is not None:
+            self._note(rows, size, distribution=distribution, value=value)
         self._store(name, value, rows)
         if gain is not None:
             self._add(gain, size)
@@ -275,7 +287,7 @@ class ProgramRun:
         return value[0] if self.single else value
 
     def observe(self, name: str, distribution: Any, value: Any) -> None:
-        self.what, self.inside = f"observation {name!r}{self._where}", True
+        self._last, self.inside = ("observation", name, self._where), True
         if not self.handler.observes:
             raise InputError("a guide does not observe, the model weights the particles", "remove it from the guide")
         if value is not None:
@@ -295,13 +307,16 @@ class ProgramRun:
                     "the value is that of a site, which is drawn and not observed",
                     'a factor is an observation of a constant, such as observe("factor", Normal(x, 1.0), 0.0)',
                 )
+            if self.calls is not None:
+                distribution.check_parameters()
             log_prob = distribution.log_prob(value)
-            self._note(self._rows, size, log_prob)
+            if self.calls is not None:
+                self._note(self._rows, size, log_prob)
             self._add(log_prob, size)
         self.inside = False
 
     def switch(self, name: str, probs: Any, branches: Sequence[Callable[..., Any]], args: tuple[Any, ...]) -> Any:
-        self.what, self.inside = f"switch {name!r}", True
+        self._last, self.inside = ("switch", name, ""), True
         distribution = Categorical(probs)
         if distribution.probs.shape[-1] != len(branches):
             raise InputError(f"{distribution.probs.shape[-1]} probabilities for {len(branches)} branches")
@@ -317,13 +332,14 @@ class ProgramRun:
             self._rows, self._path = group if outer is None else outer[group], (*path, (name, k))
             self._where = f" in branch {k} of {name!r}"
             groups.append(group)
-            self.what = f"branch {k} of switch {name!r}"
-            self._note(self._rows, len(group))
+            self._last = (f"branch {k} of switch", name, "")
+            if self.calls is not None:
+                self._note(self._rows, len(group))
             try:
                 results.append(branch(*(None if a is None else take(a, group) for a in args)))
             finally:
                 self._rows, self._path, self._where = outer, path, where
-        self.what, self.inside = f"switch {name!r}", True
+        self._last, self.inside = ("switch", name, ""), True
         merged = _merge(results, groups, len(index))
         self.inside = False
         return merged
@@ -337,9 +353,9 @@ class ProgramRun:
                 raise shapes.error()
 
     def _note(self, rows: np.ndarray | None, size: int, log_prob: Any = 0.0, **site: Any) -> None:
-        if self.calls is not None:
-            k = sum(call.what == self.what for call in self.calls)
-            self.calls.append(Call(self.what, k, rows, size, log_prob, **site))
+        assert self.calls is not None
+        k = sum(call.what == self.what for call in self.calls)
+        self.calls.append(Call(self.what, k, rows, size, log_prob, **site))
 
     def _check_name(self, name: str) -> None:
         """Raise if a particle may reach two sites of this name."""
