@@ -83,7 +83,7 @@ class _Checked(Distribution):
     def _check_positive(self, name: str) -> None:
         value = getattr(self, name)
         if not (_is_finite(value) and (value > 0 if type(value) is float else _minimum(value) > 0)):
-            self._check(name, "a positive number", lambda a: (0 < a) & (a < np.inf))
+            self._check(name, "a positive number", lambda a: (a > 0) & (a < np.inf))
 
 
 class _Independent(_Checked):
@@ -162,14 +162,19 @@ class Normal(_Independent):
     scale: Any = 1.0
 
     def __post_init__(self) -> None:
-        if type(self.loc) is not np.ndarray and type(self.scale) is not np.ndarray:
-            self.check_parameters()
-        elif type(self.scale) is not np.ndarray:
+        loc, scale = self.loc, self.scale
+        if type(scale) is float and 0.0 < scale < math.inf and type(loc) is np.ndarray:
+            return  # the usual case
+        if type(loc) is not np.ndarray:
+            self._check_finite("loc")
+        if type(scale) is not np.ndarray:
             self._check_positive("scale")
 
     def check_parameters(self) -> None:
-        self._check_finite("loc")
-        self._check_positive("scale")
+        if not _is_finite(self.loc):
+            self._check_finite("loc")
+        if type(self.scale) is not float:
+            self._check_positive("scale")
 
     def sample(self, rng: np.random.Generator, size: int) -> np.ndarray:
         self.check_parameters()
@@ -364,7 +369,7 @@ class Poisson(_Independent):
     discrete = True
 
     def __post_init__(self) -> None:
-        self._check("rate", "a number of at least 0", lambda a: (0 <= a) & (a < np.inf))
+        self._check("rate", "a number of at least 0", lambda a: (a >= 0) & (a < np.inf))
 
     def sample(self, rng: np.random.Generator, size: int) -> np.ndarray:
         return rng.poisson(self.rate, self.value_shape(size))
@@ -393,7 +398,7 @@ class Bernoulli(_Independent):
     discrete = True
 
     def __post_init__(self) -> None:
-        self._check("p", "a probability from 0 to 1", lambda a: (0 <= a) & (a <= 1))
+        self._check("p", "a probability from 0 to 1", lambda a: (a >= 0) & (a <= 1))
 
     def sample(self, rng: np.random.Generator, size: int) -> np.ndarray:
         return rng.random(self.value_shape(size)) < self.p

@@ -321,7 +321,7 @@ class Distribution(ABC):
             )
         return (size, *shape[1:])
 
-    def check_parameters(self) -> None:
+    def check_parameters(self) -> None:  # noqa: B027 (optional)
         """Raise InputError if a parameter is out of range."""
 
     @abstractmethod

@@ -4,6 +4,7 @@
 error, each with the reason, and `CORRECT` programs that must run.
 """
 
+# ruff: noqa: NPY002, B006 (faults)
 from __future__ import annotations
 
 import itertools
@@ -80,7 +81,7 @@ def seen(x, y, scale=0.5):
     observe("y", Normal(x, scale), y)
 
 
-# --- reductions over the particles ----------------------------------------------------------------------------------
+# --- reductions over the particles --------------------------------------------------------------------------------
 @faulty(ALONE)
 def the_first_particle_for_all(previous, y):
     x = sample("x", Normal(0.0, 1.0) if previous is None else Normal(0.9 * previous["x"][0], 0.6))
@@ -247,7 +248,7 @@ def a_parameter_by_position(previous, y):
     return {"scale": np.linspace(0.1, 1.0, len(x))}
 
 
-# --- guides that mix particles ---------------------------------------------------------------------------------------
+# --- guides that mix particles ------------------------------------------------------------------------------------
 def model(previous, y):
     seen(walk(previous), y)
 
@@ -297,7 +298,7 @@ def a_guide_of_one_branch(previous, y):
     seen(x, y)
 
 
-# --- draws outside of sample, and kept state --------------------------------------------------------------------------
+# --- draws outside of sample, and kept state ----------------------------------------------------------------------
 @faulty(REPEATED)
 def draws_of_numpy(previous, y):
     x = np.random.normal(size=200) if previous is None else 0.9 * previous["x"] + np.random.normal(size=200)
@@ -388,12 +389,12 @@ def a_mutable_default(previous, y):
     seen(x + 0.1 * len(kept_values(x)), y)
 
 
-def kept_values(x, kept=[]):  # noqa: B006 (the fault)
+def kept_values(x, kept=[]):
     kept.append(x)
     return kept
 
 
-# --- parameters out of range, in some rows ---------------------------------------------------------------------------
+# --- parameters out of range, in some rows ------------------------------------------------------------------------
 @faulty(r"p of a Bernoulli is 1\.\d+ in row")
 def a_probability_above_one(previous, y):
     x = walk(previous)
@@ -509,7 +510,7 @@ def a_returned_nan(previous, y):
     return {"root": np.sqrt(x)}
 
 
-# --- values that copies share, and changes in place -------------------------------------------------------------------
+# --- values that copies share, and changes in place ---------------------------------------------------------------
 @faulty("read-only")
 @per_particle
 def a_shared_list(previous, y):
@@ -610,7 +611,7 @@ def a_site_changed_in_place(previous, y):
     seen(x, y)
 
 
-# --- shapes, names, sites -------------------------------------------------------------------------------------------
+# --- shapes, names, sites -----------------------------------------------------------------------------------------
 @faulty("the value is that of a site")
 def a_draw_observed_by_accident(previous, y):
     x = walk(previous)
@@ -700,7 +701,7 @@ def a_branch_returns_a_reduction(previous, y):
     seen(switch("s", [0.5, 0.5], [lambda v: v, lambda v: np.full(len(v), v.max(initial=-9.0))], x), y)
 
 
-# --- distributions of the user ---------------------------------------------------------------------------------------
+# --- distributions of the user ------------------------------------------------------------------------------------
 class Mine(Distribution):
     """A Gaussian around `mean`, whose parts the cases below replace."""
 
@@ -782,7 +783,7 @@ with_distribution("continuous", IntegersOfAContinuousOne)
 with_distribution("draw is NaN", NanDraws)
 
 
-# --- faults that no check of a step can see --------------------------------------------------------------------------
+# --- faults that no check of a step can see -----------------------------------------------------------------------
 def narrow(previous, y):
     sample("x", Normal(0.3 if previous is None else 0.9 * previous["x"], 0.4))
 
@@ -802,7 +803,7 @@ def a_guide_without_far_tails(previous, y):
     seen(walk(previous, 1.0), y)
 
 
-# --- correct programs ------------------------------------------------------------------------------------------------
+# --- correct programs ---------------------------------------------------------------------------------------------
 correct()(model)
 
 

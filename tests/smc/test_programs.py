@@ -398,7 +398,7 @@ def changed(x):
         (
             lambda x, z, v, k, y: observe("o", Normal(0, -z), y),
             0.5,
-            r"scale of a Normal is -[\d.]+ in row 0 \(4 of 4\), expected a positive number \(after site 'k', line",
+            r"observation 'o': scale of a Normal is -[\d.]+ in row 0 \(4 of 4\), expected a positive number",
         ),
         (
             lambda x, z, v, k, y: observe("o", Normal(x, -1), y),

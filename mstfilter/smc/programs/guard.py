@@ -196,7 +196,12 @@ class Schedule(Counter[Any]):
         self, rng: np.random.Generator, past: Population | None, observation: Any, model: Any, guide: Any
     ) -> Guard | None:
         """A guard if the next step is to be checked."""
-        kind = (past is None, observation is None, guide is None, type(observation) is np.ndarray and observation.shape)
+        kind = (
+            past is None,
+            observation is None,
+            guide is None,
+            type(observation) is np.ndarray and observation.shape,
+        )
         count = self[kind] = self.get(kind, 0) + 1
         return Guard(rng, past, observation, model, guide, count) if count in _CHECKED else None
 
@@ -223,7 +228,7 @@ def _parts(function: Any) -> list[Any]:
     return [code, *(v for v in values if not isinstance(v, float | np.ndarray))]
 
 
-class _noting_invalid(list[str]):  # noqa: N801 (a context manager)
+class _noting_invalid(list[str]):
     """The kinds of invalid operations of numpy in a block."""
 
     def __enter__(self) -> _noting_invalid:
@@ -251,7 +256,7 @@ def _groups(run: ProgramRun) -> list[np.ndarray]:
     numbers = next((v for v in run.values.values() if v.dtype.kind == "f" and v.size), None)
     column = np.arange(run.n) if numbers is None else numbers.reshape(run.n, -1)[:, 0]
     order, size = np.argsort(column), max(run.n // 3, 1)
-    return [_group(run, part) for part in (order[:size], order[:-size - 1 : -1])]
+    return [_group(run, part) for part in (order[:size], order[: -size - 1 : -1])]
 
 
 def _group(run: ProgramRun, part: np.ndarray) -> np.ndarray:
