@@ -164,7 +164,7 @@ class Guard:
         if missed > 1e-3:
             site = next(c.what for c in runs[0].calls or () if (c.densities(c.value) == -np.inf).any())
             raise InputError(
-                f"{site}: the guide never draws values that hold {missed:.1%} of the probability given the observation",
+                f"{site}: the guide never draws values that hold {missed:.1%} of the posterior probability",
                 "its distribution must reach wherever that of the model times the likelihood does",
             )
         spread = sum(float((w**2).sum()) - 1 / n for w in (weights, normalise(by_guide)))
@@ -242,9 +242,8 @@ class _noting_invalid(list[str]):
 def _check_returned(run: ProgramRun) -> None:
     """Raise if a returned value is NaN, after an invalid operation; NaN that the program writes is a mark."""
     for name, value in run.returned.items():
-        wrong = np.asarray(value).dtype.kind == "f" and np.isnan(value)
-        if np.any(wrong):
-            n = len(np.unique(np.nonzero(wrong)[0])) if np.ndim(wrong) else 1
+        if np.asarray(value).dtype.kind == "f" and np.isnan(value).any():
+            n = int(np.isnan(value).reshape(run.n, -1).any(axis=1).sum())
             raise InputError(
                 f"returned {name!r} is NaN for {n} of {run.n} particles, by an operation such as log(-1) or 0/0",
                 "write numpy.nan by numpy.where(valid, value, numpy.nan) if it marks a value that is absent",
