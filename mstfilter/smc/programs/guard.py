@@ -71,9 +71,6 @@ class Guard:
                 )
             return particles, gain
         for whole in runs:
-            for call in whole.calls or ():
-                if call.distribution is not None:
-                    _check_density(call.what, call.distribution, self.rng)
             for rows in _groups(whole) if whole.n > 1 else ():
                 self._check_alone(run, whole, rows)
         if self.guide is not None and len(gain) >= 100:
@@ -123,6 +120,9 @@ class Guard:
                 except Exception as again:
                     message = f"the step fails for particles {sorted(set(rows.tolist()))} alone: {again}"
                     raise InputError(message, *_ALONE) from again
+        for call in few.calls or ():
+            if call.distribution is not None:
+                _check_density(call.what, call.distribution, self.rng)
         alone = {(c.what, c.k): c for c in few.calls or ()}
         for call in whole.calls or ():
             _compare(call, alone.pop((call.what, call.k), None), rows)
@@ -384,10 +384,8 @@ def _check_density(what: str, distribution: Distribution, rng: np.random.Generat
     kind = type(distribution)
     if kind.__module__.startswith("mstfilter.") or kind in _KNOWN or distribution.event_shape:
         return
-    _KNOWN.add(kind)
     n = (distribution.batch_shape or (1,))[0]
     if n == 0:
-        _KNOWN.discard(kind)
         return
     generator, row = child(rng, "guard", "density"), n // 2
     per_call = n if n > 1 else 1000
@@ -418,3 +416,4 @@ def _check_density(what: str, distribution: Distribution, rng: np.random.Generat
             "sample and log_prob must be of one normalised distribution; log_prob is the log of the density, <= 0 "
             "for a discrete one",
         )
+    _KNOWN.add(kind)
