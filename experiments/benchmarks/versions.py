@@ -1,12 +1,16 @@
 """Compare the speed of two checkouts of mstfilter in one interleaved run.
 
     python experiments/benchmarks/versions.py OTHER_CHECKOUT --rounds 15 --out versions.csv
+    python experiments/benchmarks/versions.py OTHER_CHECKOUT --only smc --rounds 60
 
 In every round both checkouts run the same tasks in random order, each in a process that stays alive for all rounds.
-Times are processor time. A ratio is the median over the rounds of (this checkout / other checkout) within a round.
-Tasks: a bootstrap filter of a random walk (10,000 particles, 100 steps), a filter of five particles (1,000 steps),
-systematic and multinomial resampling of a million weights, and all steps of the preset ``mst`` on the scene ``demo``
-and on the full-size scene ``table`` (640 x 480 images, 100 x 100 x 50 voxels).
+Times are processor time. A ratio is the median over the rounds of (this checkout / other checkout) within a round;
+`ratio_of_shortest` is the ratio of the shortest times, which other programs on the machine disturb least.
+
+The names of tasks start with their area. `smc`: single filters (a random walk, a model of `StateSpaceModel.of`, a
+hidden Markov model, programs), batches of 200 seeds, the first 200 steps of a program that is new to the package, and
+resampling of a million weights. `mst`: all steps of the preset ``mst`` on the scene ``demo`` and on the full-size scene
+``table`` (640 x 480 images, 100 x 100 x 50 voxels).
 """
 
 from __future__ import annotations
@@ -23,11 +27,13 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from types import FunctionType
 from typing import Any
 
 import numpy as np
 
 import mstfilter
+from mstfilter import smc
 from mstfilter.smc.interfaces import Proposal, Transition, Update
 from mstfilter.smc.population import Population
 
@@ -59,33 +65,97 @@ class Noise(Update):
         return predicted.reweighted(-2.0 * (predicted.particles - observation) ** 2)
 
 
-def tasks(recordings: Path) -> dict[str, Callable[[], Any]]:
-    """What is timed, by name."""
-    walk = np.random.default_rng(0).normal(size=1000).cumsum()
-    log_weights = np.log(np.random.default_rng(1).random(1_000_000))
-    parts = {"initial": Prior(), "transition": Walk(), "update": Noise()}
+def ar1(previous, y):
+    """An AR(1) process as a program."""
+    x = smc.sample("x", smc.Normal(0.0, 1.4) if previous is None else smc.Normal(0.9 * previous["x"], 0.6))
+    smc.observe("y", smc.Normal(x, 0.4), y)
 
-    def filter_walk(n: int, steps: int) -> Callable[[], Any]:
-        filter = mstfilter.ParticleFilter(n=n, **parts)
-        return lambda: [None for _ in filter.iterate(walk[:steps], 1)]
 
-    def resample(name: str) -> Callable[[], Any]:
-        scheme, rng = mstfilter.preset("mst", f"resampler={name}").resampler, np.random.default_rng(2)
+def volatility(previous, y):
+    """A stochastic volatility model with Student noise as a program."""
+    mean = -1.0 if previous is None else -1.0 + 0.97 * (previous["h"] + 1.0)
+    h = smc.sample("h", smc.Normal(mean, 0.8 if previous is None else 0.2))
+    smc.observe("y", smc.Student(8.0, 0.0, np.exp(h / 2)), y)
+
+
+def renewed(program: Any) -> Any:
+    """The same function with another code object, which the package has not met before."""
+    return FunctionType(program.__code__.replace(), program.__globals__)
+
+
+MARKOV = smc.StateSpaceModel(
+    lambda rng, n: rng.integers(0, 3, n),
+    lambda rng, x: (x + (rng.random(x.shape) < 0.2)) % 3,
+    lambda x, y: -0.5 * (y - x) ** 2,
+    batched=True,
+)
+AR1 = smc.StateSpaceModel(
+    lambda rng, n: rng.standard_normal(n),
+    lambda rng, x: 0.9 * x + 0.6 * rng.standard_normal(x.shape),
+    lambda x, y: -0.5 * ((y - x) / 0.4) ** 2,
+    batched=True,
+)
+LINEAR = smc.linear_gaussian([[0.9]], [[0.36]], [[1.0]], [[0.16]], [0.0], [[1.0]])
+OF = smc.StateSpaceModel.of(
+    smc.Normal(0.0, 1.4), lambda x: smc.Normal(0.9 * x, 0.6), lambda x: smc.Normal(x, 0.4)
+)
+
+
+def smc_tasks() -> dict[str, Callable[[], Any]]:
+    """Filters of arrays of numbers, and resampling."""
+    walk, ys = np.random.default_rng(0).normal(size=1000).cumsum(), np.random.default_rng(1).normal(size=200).tolist()
+    vectors = [np.array([y]) for y in ys]
+    log_weights, rng = np.log(np.random.default_rng(1).random(1_000_000)), np.random.default_rng(2)
+
+    def single(filter: Any, observations: Any = ys) -> Callable[[], Any]:
+        return lambda: [None for _ in filter.iterate(observations, 1)]
+
+    def of_parts(n: int) -> Any:
+        return mstfilter.ParticleFilter(n=n, initial=Prior(), transition=Walk(), update=Noise())
+
+    def first_steps(program: Any) -> Callable[[], Any]:
+        return lambda: single(smc.Program(renewed(program)).bootstrap(1000))()
+
+    def sweep(model: Any, observations: Any) -> Callable[[], Any]:
+        filter = smc.bootstrap(model, 100)
+        return lambda: smc.batch(filter, observations[:100], range(200))
+
+    def resample(scheme: Any) -> Callable[[], Any]:
         return lambda: scheme.select(rng, log_weights, len(log_weights))
 
-    def mst(scene: str) -> Callable[[], Any]:
-        opened = getattr(mstfilter, "open_recording", None) or mstfilter.Recording.open
-        clips, filter = opened(recordings / scene).clips(), mstfilter.preset("mst")
-        return lambda: clear_cache() or [None for _ in filter.iterate(clips, 0)]
-
+    schemes = (smc.Systematic(), smc.Stratified(), smc.Multinomial(), smc.Residual(), smc.Killing(), smc.Ssp())
     return {
-        "bootstrap filter, 10,000 particles": filter_walk(10_000, 100),
-        "filter of 5 particles, 1,000 steps": filter_walk(5, 1000),
-        "systematic, 1e6 weights": resample("systematic"),
-        "multinomial, 1e6 weights": resample("multinomial"),
-        "mst, demo": mst("demo"),
-        "mst, full size": mst("table"),
+        "random walk, n = 10,000": single(of_parts(10_000), walk[:100]),
+        "random walk, n = 5": single(of_parts(5), walk),
+        "linear_gaussian, n = 100": single(smc.bootstrap(LINEAR, 100), vectors),
+        "linear_gaussian, n = 10,000": single(smc.bootstrap(LINEAR, 10_000), vectors[:50]),
+        "StateSpaceModel.of, n = 1,000": single(smc.bootstrap(OF, 1000)),
+        "hidden Markov model, n = 1,000": single(smc.bootstrap(MARKOV, 1000)),
+        "program ar1, n = 1,000": single(smc.Program(ar1).bootstrap(1000)),
+        "program volatility, n = 1,000": single(smc.Program(volatility).bootstrap(1000)),
+        "program ar1, first 200 steps": first_steps(ar1),
+        "program volatility, first 200 steps": first_steps(volatility),
+        "batch of linear_gaussian": sweep(LINEAR, vectors),
+        "batch of StateSpaceModel": sweep(AR1, ys),
+        **{f"{type(scheme).__name__}, 1e6 weights": resample(scheme) for scheme in schemes},
     }
+
+
+def tasks(recordings: Path) -> dict[str, Callable[[], Any]]:
+    """What is timed, by name."""
+
+    def mst(scene: str) -> Callable[[], Any]:
+        def steps() -> None:
+            opened = getattr(mstfilter, "open_recording", None) or mstfilter.Recording.open
+            clips = opened(recordings / scene).clips()
+            clear_cache()
+            for _ in mstfilter.preset("mst").iterate(clips, 0):
+                pass
+
+        return steps
+
+    found = {f"smc: {name}": task for name, task in smc_tasks().items()}
+    return {**found, "mst: demo": mst("demo"), "mst: full size": mst("table")}
 
 
 def clear_cache() -> None:
@@ -137,23 +207,15 @@ def main() -> None:
     if options.worker is not None:
         worker(options.worker)
         return
+    names = [name for name in tasks(Path()) if options.only in name]
+    if not names:
+        parser.error(f"no task has {options.only!r} in its name: {', '.join(tasks(Path()))}")
     with tempfile.TemporaryDirectory() as folder:
         recordings = Path(folder)
-        for scene, seed in SCENES.items():
-            command = [
-                sys.executable,
-                "-m",
-                "mstfilter",
-                "simulate",
-                scene,
-                str(recordings / scene),
-                "--seed",
-                str(seed),
-            ]
+        for scene, seed in SCENES.items() if any(name.startswith("mst") for name in names) else ():
+            target = [str(recordings / scene), "--seed", str(seed)]
+            command = [sys.executable, "-m", "mstfilter", "simulate", scene, *target]
             subprocess.run(command, check=True, capture_output=True)
-        names = [name for name in tasks(recordings) if options.only in name]
-        if not names:
-            parser.error(f"no task has {options.only!r} in its name: {', '.join(tasks(recordings))}")
         workers = {"this": start(REPOSITORY, recordings), "other": start(options.other.resolve(), recordings)}
         seconds: dict[tuple[str, str], list[float]] = {(task, side): [] for task in names for side in workers}
         for number in range(options.rounds + 1):
@@ -176,7 +238,7 @@ def main() -> None:
                     "ratio_of_shortest": round(min(this) / min(other), 3),
                 }
             )
-            print(rows[-1])
+            print(f"{task:42} {rows[-1]['ratio']:6.3f} {rows[-1]['ratio_of_shortest']:6.3f}")
         for process in workers.values():
             process.terminate()
     if options.out is not None:
