@@ -107,12 +107,10 @@ class _Independent(_Checked):
 
 
 def _is_finite(value: Any) -> bool:
-    """Whether all numbers of a float or float64 array are finite. False also if the sum of their squares is not."""
-    if type(value) is float:
-        return math.isfinite(value)
-    if type(value) is not np.ndarray or value.dtype is not _FLOAT64:
-        return False
-    return math.isfinite(value.dot(value) if value.ndim == 1 else np.vdot(value, value))
+    """Whether all numbers of a float or float64 array are finite. False also if their sum is not."""
+    if isinstance(value, np.ndarray) and value.dtype is _FLOAT64:
+        return math.isfinite(np.add.reduce(value, axis=None))
+    return type(value) is float and math.isfinite(value)
 
 
 def _minimum(value: np.ndarray) -> float:
@@ -127,7 +125,9 @@ def _impossible(value: np.ndarray) -> Any:
 def _broadcast_shape(*parameters: Any) -> tuple[int, ...]:
     shape: tuple[int, ...] = ()
     for parameter in parameters:
-        other = () if isinstance(parameter, float) else np.shape(parameter)
+        if type(parameter) is float:
+            continue
+        other = parameter.shape if isinstance(parameter, np.ndarray) else np.shape(parameter)
         if not shape or not other or other == shape:  # the usual case
             shape = shape or other
             continue
@@ -149,8 +149,8 @@ def _sum_rows(log_prob: Any) -> np.ndarray:
 
 def _standardised(value: Any, loc: Any, scale: Any) -> np.ndarray:
     """(value - loc) / scale with one temporary array."""
-    z = np.asarray(np.subtract(np.asarray(value), loc), dtype=np.float64)
-    fits = isinstance(scale, float) or np.broadcast_shapes(z.shape, np.shape(scale)) == z.shape
+    z = np.asarray(np.subtract(value, loc), dtype=np.float64)
+    fits = isinstance(scale, float) or np.shape(scale) == z.shape or np.broadcast_shapes(z.shape, np.shape(scale)) == z.shape
     return np.divide(z, scale, out=z if z.ndim and fits else None)
 
 
@@ -177,10 +177,12 @@ class Normal(_Independent):
             self._check_positive("scale")
 
     def sample(self, rng: np.random.Generator, size: int) -> np.ndarray:
-        self.check_parameters()
+        loc, scale = self.loc, self.scale
+        if not (type(scale) is float and _is_finite(loc)):
+            self.check_parameters()
         z = rng.standard_normal(self.value_shape(size))
-        z *= self.scale
-        z += self.loc
+        z *= scale
+        z += loc
         return z
 
     def log_prob(self, value: Any) -> np.ndarray:
@@ -208,7 +210,7 @@ class Student(_Independent):
     scale: Any = 1.0
 
     def __post_init__(self) -> None:
-        if not any(type(value) is np.ndarray for value in (self.df, self.loc, self.scale)):
+        if np.ndarray not in (type(self.df), type(self.loc), type(self.scale)):
             self.check_parameters()
 
     def check_parameters(self) -> None:
@@ -223,7 +225,8 @@ class Student(_Independent):
     def log_prob(self, value: Any) -> np.ndarray:
         from scipy.special import gammaln
 
-        z, df = _standardised(value, self.loc, self.scale), np.asarray(self.df, dtype=np.float64)
+        z = _standardised(value, self.loc, self.scale)
+        df = self.df if type(self.df) is float else np.asarray(self.df, dtype=np.float64)  # a float is faster
         constant = gammaln((df + 1) / 2) - gammaln(df / 2) - 0.5 * np.log(df * np.pi) - np.log(self.scale)
         return _sum_rows(constant - (df + 1) / 2 * np.log1p(z * z / df))
 

@@ -103,7 +103,7 @@ class Candidates(Sequence[_T], Generic[_T]):
 
 def count_particles(particles: Particles) -> int:
     """Number of particles; raises InputError if arrays of a mapping have different lengths."""
-    if isinstance(particles, Mapping):
+    if isinstance(particles, (dict, Mapping)):
         sizes = {name: len(a) for name, a in particles.items()}
         if len(set(sizes.values())) != 1:
             raise InputError(f"arrays of a population have different lengths: {sizes}")
@@ -135,7 +135,9 @@ def as_matrix(particles: Any) -> np.ndarray:
 
 
 def frozen_view(array: np.ndarray) -> np.ndarray:
-    """A read-only view of an array."""
+    """A read-only view of an array; the array if it is read-only."""
+    if not array.flags.writeable:
+        return array
     view = array.view()
     view.flags.writeable = False
     return view
@@ -145,7 +147,7 @@ def _freeze(particles: Particles) -> Particles:
     """Read-only views of arrays, a tuple of objects."""
     if isinstance(particles, np.ndarray):
         return frozen_view(particles)
-    if isinstance(particles, Mapping):
+    if isinstance(particles, (dict, Mapping)):
         return {name: _freeze(np.asanyarray(a)) for name, a in particles.items()}
     if isinstance(particles, Candidates):
         return particles

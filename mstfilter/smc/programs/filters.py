@@ -111,9 +111,7 @@ def _advance(
 
     particles, gain = step() if guard is None else guard.checked(_run_once, step)
     try:
-        if past is None:
-            return Population(particles, gain)
-        return Population(particles, past.log_weights + gain, past.parents)
+        return Population(particles, gain) if past is None else past.moved(particles).reweighted(gain)
     except InputError:
         if np.isnan(gain).any() and not isinstance(model, PerParticle):  # name the site
             run_program(model, ScoreHandler(particles, strict=True), previous, observation, n)
@@ -336,14 +334,7 @@ def _run_once(
         if explained is error:
             raise
         raise explained from error
-    if isinstance(handler, GuideHandler):
-        handler.values = dict(run.values)
-    if isinstance(handler, ReplayHandler):
-        unused = sorted(set(handler.guide.values) - set(run.values))
-        if unused:
-            raise InputError(
-                f"the model has no site {unused[0]!r}, which the guide samples", f"it has {sorted(run.values)}"
-            )
+    handler.finish(run.values)
     return run
 
 

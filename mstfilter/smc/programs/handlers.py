@@ -57,6 +57,9 @@ class SiteHandler(ABC):
     def row(self, index: int) -> SiteHandler:
         """The handler of one particle of a `per_particle` program."""
 
+    def finish(self, values: dict[str, np.ndarray]) -> None:  # noqa: B027 (optional)
+        """End a pass, in which the sites have the given values."""
+
 
 class SampleHandler(SiteHandler):
     """Draws every site."""
@@ -93,6 +96,9 @@ class GuideHandler(SiteHandler):
     def row(self, index: int) -> GuideHandler:
         self.rows.append(GuideHandler(child(self.rng, "particle", index), 1))
         return self.rows[-1]
+
+    def finish(self, values: dict[str, np.ndarray]) -> None:
+        self.values = dict(values)
 
 
 class ReplayHandler(SiteHandler):
@@ -142,6 +148,13 @@ class ReplayHandler(SiteHandler):
 
     def row(self, index: int) -> ReplayHandler:
         return ReplayHandler(self.guide.rows[index])
+
+    def finish(self, values: dict[str, np.ndarray]) -> None:
+        unused = sorted(set(self.guide.values) - set(values))
+        if unused:
+            raise InputError(
+                f"the model has no site {unused[0]!r}, which the guide samples", f"it has {sorted(values)}"
+            )
 
 
 def check_shape(what: str, value: np.ndarray, distribution: Distribution, size: int) -> None:
