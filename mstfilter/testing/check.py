@@ -112,8 +112,8 @@ def run_contract(
     ``example(rng, n)`` returns a population and an observation that the component can handle. Default: the function
     ``example`` in the module of its class; without one, a scene for components of images and numbers for others.
 
-    ``exact(rng, n)`` of a `Transition`, `Proposal`, `Update` or `Rejuvenation` returns exact draws and the observation;
-    see the contract. Default: the function ``exact`` in the module of its class, if any.
+    ``exact(rng, n)`` of a `Transition`, `Proposal`, `Update` or `Rejuvenation` returns exact draws and the
+    observation; see the contract. Default: the function ``exact`` in the module of its class, if any.
     """
     cls, unused = type(component), copied(component)
     contract = contract_of(cls)

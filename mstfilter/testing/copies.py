@@ -61,8 +61,9 @@ CASES = (
     Case(_FIVE, 1),
     Case((0.8, 0.2), 1),
     Case((0.06, 0.7, 0.2, 0.04), 4),
+    Case((0.06, 0.7, 0.2, 0.04), 101),
     Case((0.02, 0.95, 0.03), 3),
-    Case((0.01, 0.02, 0.012, 0.95, 0.008), 9),
+    Case((0.01, 0.02, 0.012, 0.95, 0.008), 401),
     Case(_mixed(32, 0.46), 32),
     Case(_mixed(32, 0.2), 31),
     Case(_mixed(125, 0.2), 5),
@@ -84,17 +85,18 @@ _STAKES = 0.9 * 0.5 ** np.arange(10)
 class Sample:
     """What particles and groups of particles of a case carry, over many calls.
 
-    The mean of each is tested by betting (Waudby-Smith and Ramdas 2024, "Estimating means of bounded random variables
-    by betting"). For calls x_1, x_2, ... in [0, b] with expectation mu, the product of 1 + s (x_k - mu) over the calls
+    The mean of each is tested by betting (Waudby-Smith, Ramdas 2024, "Estimating means of bounded random variables by
+    betting"). For calls x_1, x_2, ... in [0, b] with expectation mu, the product of 1 + s (x_k - mu) over the calls
     has expectation 1 for any stake s from -1 / (b - mu) to 1 / mu. By Ville's inequality its largest value over any
     number of calls exceeds 1 / p with probability at most p. This needs no normal approximation and no variance, so a
-    scheme that gives very many copies in rare calls passes; and more calls may be made where the result is not clear.
+    scheme that gives very many copies in rare calls passes; and calls may be added where the result is not clear.
     """
 
     def __init__(self, case: Case) -> None:
         W = np.asarray(case.weights) / np.sum(case.weights)
         self.case, self.expected, self.calls = case, np.concatenate([W, groups_of(case) @ W]), 0
         self.equal_weights, self.all_n, self.total, self._most = True, True, 1.0, 1.0
+        self._first: float | None = None  # weight of the first particle of the first call
         self._rows: list[np.ndarray] = []
 
     def add(self, ancestors: np.ndarray, weights: np.ndarray) -> None:
@@ -103,7 +105,9 @@ class Sample:
         total = float(weights.sum()) / n
         self._rows.append(np.bincount(ancestors, weights, minlength=len(self.case.weights)) / n)
         self.calls += 1
-        self.equal_weights = self.equal_weights and bool(weights.max() - weights.min() <= 2e-9 * total)
+        first = weights[0] if self._first is None else self._first
+        self._first = first
+        self.equal_weights = self.equal_weights and bool(np.abs(weights - first).max() <= 1e-9 * first)
         self.all_n = self.all_n and n == self.case.n
         self._most = max(self._most, total)
         if abs(total - 1) > abs(self.total - 1):

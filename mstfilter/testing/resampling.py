@@ -26,7 +26,9 @@ from mstfilter.smc import Population, Resampler, TransformResampler, WeightResam
 from mstfilter.testing.contract import (
     FALSE_ALARM,
     RandomContract,
+    check_batched,
     global_state,
+    number_example,
     prerequisite,
     reports_errors,
     restore_global_state,
@@ -56,8 +58,8 @@ _ZEROS = ((0, 0, 1, 2, 3), (1, 2, 3, 0, 0), (1, 0, 2, 0, 3))
 class ResamplerContract(RandomContract):
     """The contract of every `Resampler`. Its three statistical tests have a false-alarm rate of at most 1e-6 each.
 
-    They allow the bias `tolerance` that a component states. They find a deviation of a mean that is about six standard
-    errors in the calls of a `Case`, and at least 0.3 % of the particle's weight.
+    They allow the bias `tolerance` that a component states. They find a deviation of a mean that is about six
+    standard errors in the calls of a `Case`, and at least 0.3 % of the particle's weight.
     """
 
     #: Fewer calls and no case of 300 particles: schemes that compare particles are slower.
@@ -118,7 +120,8 @@ class ResamplerContract(RandomContract):
         """Its `tolerance` is a bias of less than 0.1 of the weight."""
         found = self.make().tolerance
         assert 0 <= found < 0.1, (
-            f"tolerance is {found!r}, expected a number from 0 to 0.1: declare properly_weighted = False if it is larger"
+            f"tolerance is {found!r}, expected a number from 0 to 0.1: for a larger bias declare "
+            "properly_weighted = False"
         )
 
     def test_takes_one_particle(self) -> None:
@@ -126,7 +129,7 @@ class ResamplerContract(RandomContract):
         component = self.make()
         for n in (1, 2, 5):
             chosen = self.resample(component, self.population([np.exp(-3.0)]), n, np.random.default_rng(0))
-            if component.properly_weighted and len(chosen) == n:
+            if component.properly_weighted and component.exact_size:
                 found = chosen.log_mean_weight
                 assert abs(found + 3.0) <= 1e-9, f"the only particle had log weight -3 and has {found:.4g} afterwards"
 
@@ -311,6 +314,10 @@ class WeightResamplerContract(ResamplerContract):
                 f"ancestors are {ancestors.dtype} of shape {ancestors.shape}, expected int ({n},)"
             )
 
+    def test_batched_runs_equal_single_runs(self) -> None:
+        """If it declares ``batched = True``, every run of a batch equals the run alone."""
+        check_batched("resampler", self.make(), number_example)
+
     def test_many_particles(self) -> None:
         """Small weights are not lost by rounding among 100 000 particles."""
         component: WeightResampler = self.make()
@@ -318,7 +325,7 @@ class WeightResamplerContract(ResamplerContract):
         try:
             many = self._light_copies(component, 100_000, 5)
         except AssertionError as error:
-            raise AssertionError(f"cumulated in single precision? {error}") from error
+            raise AssertionError(f"single precision, or too few bits for the indices? {error}") from error
         # If all are draws of one law, the five are above, or below, all sixty with probability 1 / C(65, 5) = 1.2e-7.
         margin = 80 + 100_000 * component.tolerance
         wrong = component.properly_weighted and (many.max() < few.min() - margin or many.min() > few.max() + margin)

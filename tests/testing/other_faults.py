@@ -471,7 +471,7 @@ FAULTS = [
     (MaybeTrigger, "answers", "True or False"),
     (HalfSize, "answers", "at least 1"),
     (Distance, "similarities_are_shares", "to itself"),
-    (RelativeSimilarity, "pairs_do_not_depend_on_others", "five of nine"),
+    (RelativeSimilarity, "pairs_do_not_depend_on_others", "of eleven particles"),
     (OneSided, "is_symmetric", "similarity of particles"),
     (CountsFromOne, "classes_are_numbered", "classes are"),
     (AllDifferent, "copies_are_equal", "copy"),
