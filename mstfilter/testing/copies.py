@@ -206,7 +206,7 @@ def _hint(got: np.ndarray, want: np.ndarray, n: int, calls: int) -> str:
         residual = np.log(got[some]) - power * np.log(want[some]) - shift
         if abs(power - 1) > 0.03 and np.abs(residual).max() < 0.15:
             return f"copies grow as w^{power:.2f}: are the weights {'flattened' if power < 1 else 'sharpened'}?"
-    if 0.3 < excess.max() < 1.1 and excess.max() > 0.8 * np.abs(excess).sum() / 2:
+    if top < 0.6 * n and 0.3 < excess.max() < 1.1 and excess.max() > 0.8 * np.abs(excess).sum() / 2:
         return f"one of {n} positions always goes to particle {int(np.argmax(excess))}"
     if int(np.argmax(np.abs(excess))) == heaviest:
         return f"the heaviest particle gets {100 * excess[heaviest] / top:+.2g} %"

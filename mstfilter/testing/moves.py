@@ -158,7 +158,7 @@ def _weighted_fractions(x: np.ndarray, w: np.ndarray, limits: np.ndarray) -> tup
     p, squares = (np.cumsum(np.bincount(bins, v, len(limits) + 1)) for v in (w, w * w))
     below, total = squares[:-1], squares[-1]
     p = p[:-1]
-    return p, np.sqrt(below * (1 - 2 * p) + total * p * p)
+    return p, np.sqrt(np.maximum(below * (1 - 2 * p) + total * p * p, 0.0))
 
 
 def _rank_correlation(a: np.ndarray, b: np.ndarray) -> float:
