@@ -318,6 +318,7 @@ class WeightResamplerContract(ResamplerContract):
         """If it declares ``batched = True``, every run of a batch equals the run alone."""
         check_batched("resampler", self.make(), number_example)
 
+    @statistical
     def test_many_particles(self) -> None:
         """Small weights are not lost by rounding among 100 000 particles."""
         component: WeightResampler = self.make()

@@ -408,9 +408,15 @@ def pairs(rng, y, n):
 
 
 @proposal
-def mirrored_draws(rng, y, n):
+def one_draw(rng, y, n):
+    return np.full(n, SD0 * rng.standard_normal())
+
+
+@proposal
+def correct_antithetic(rng, y, n):
+    """Less variance than independent draws, sorted."""
     half = rng.standard_normal(-(-n // 2))
-    return SD0 * np.concatenate([half, -half])[:n]
+    return SD0 * np.sort(rng.permutation(np.concatenate([half, -half]))[:n])
 
 
 @proposal
@@ -508,6 +514,48 @@ def greedy(rng, x, previous, y):
     return np.where(better, new, x)
 
 
+@dataclass(frozen=True)
+class RandomStep(DensityTransition):
+    def predict(self, rng, population, observation):
+        return replace(population, particles=population.particles + rng.standard_normal(len(population)))
+
+
+@dataclass(frozen=True)
+class OneDensity(RandomStep):
+    """The density of all moves together."""
+
+    def log_prob(self, previous, new, observation):
+        return -0.5 * np.sum((new - previous) ** 2)
+
+
+@dataclass(frozen=True)
+class NormalisedDensity(RandomStep):
+    def log_prob(self, previous, new, observation):
+        log_f = -0.5 * (new - previous) ** 2
+        return log_f - np.logaddexp.reduce(log_f)
+
+
+@dataclass(frozen=True)
+class WiderDensity(RandomStep):
+    def log_prob(self, previous, new, observation):
+        return Normal(previous, 1.1).log_prob(new)
+
+
+@dataclass(frozen=True)
+class DensityOfAnotherMove(RandomStep):
+    def log_prob(self, previous, new, observation):
+        return Normal(RHO * previous, 1.0).log_prob(new)
+
+
+@dataclass(frozen=True)
+class VarianceForSd(DensityTransition):
+    def predict(self, rng, population, observation):
+        return population.moved(Normal(population.particles, SIGMA).sample(rng, len(population)))
+
+    def log_prob(self, previous, new, observation):
+        return Normal(previous, SIGMA**2).log_prob(new)
+
+
 _MOVES = "weighted_moves_are_those_of_the_model"
 _ORDER = "order_of_particles_is_irrelevant"
 _POSTERIOR = "weights_are_those_of_the_posterior"
@@ -557,12 +605,15 @@ WEIGHTED_FAULTS = [
     (NoisyWeights, _POSTERIOR, "constant factors", exact_evidence),
     (narrow, _DRAWN, "is below", exact_prior),
     (off_centre, _DRAWN, "is below", exact_prior),
-    (pairs, _DRAWN, "between neighbours", exact_prior),
-    (mirrored_draws, _DRAWN, "positions apart", exact_prior),
+    (pairs, _DRAWN, "times the variance", exact_prior),
+    (one_draw, _DRAWN, "is below", exact_prior),
     (mean_if_single, _DRAWN, "n = 1", exact_prior),
     (cut_draws, _DRAWN, "is below", exact_prior),
     (guided_without_weights, _DRAWN, "is below", exact_prior),
     (weights_of_mean_two, _DRAWN, "the mean weight is", exact_prior),
+    (WiderDensity, "log_prob_is_the_density_of_its_moves", "certain which is", None),
+    (DensityOfAnotherMove, "log_prob_is_the_density_of_its_moves", "certain which is", None),
+    (VarianceForSd, "log_prob_is_the_density_of_its_moves", "too certain", None),
     (hot, _KEPT, "no longer exact", None),
     (asymmetric, _KEPT, "no longer exact", None),
     (pairs_of_steps, _KEPT, "between neighbours", None),
@@ -570,6 +621,11 @@ WEIGHTED_FAULTS = [
     (swaps_neighbours, _KEPT, "no longer exact", None),
     (greedy, _KEPT, "no longer exact", None),
 ]
+#: Faults that are not found, and why.
+NOT_FOUND = {
+    one_uniform: "a random number that decides for all particles may also be a choice between two kernels, which is "
+    "valid; the moves of a particle have the right distribution in any number of calls",
+}
 #: Correct components and their exact draws.
 CORRECT = [
     (Guided(), exact_moves),
@@ -578,28 +634,8 @@ CORRECT = [
     (Posterior(), exact_evidence),
     (correct_draws(), exact_prior),
     (correct_weighed(), exact_prior),
+    (correct_antithetic(), exact_prior),
 ]
-
-
-@dataclass(frozen=True)
-class RandomStep(DensityTransition):
-    def predict(self, rng, population, observation):
-        return replace(population, particles=population.particles + rng.standard_normal(len(population)))
-
-
-@dataclass(frozen=True)
-class OneDensity(RandomStep):
-    """The density of all moves together."""
-
-    def log_prob(self, previous, new, observation):
-        return -0.5 * np.sum((new - previous) ** 2)
-
-
-@dataclass(frozen=True)
-class NormalisedDensity(RandomStep):
-    def log_prob(self, previous, new, observation):
-        log_f = -0.5 * (new - previous) ** 2
-        return log_f - np.logaddexp.reduce(log_f)
 
 
 @dataclass(frozen=True)
