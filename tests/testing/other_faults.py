@@ -471,6 +471,16 @@ def correct_kernel(rng, x, previous, y):
 
 
 @kernel
+def gibbs(rng, x, previous, y):
+    return optimal(previous, y).sample(rng, len(x))
+
+
+@kernel
+def nothing(rng, x, previous, y):
+    return x
+
+
+@kernel
 def hot(rng, x, previous, y):
     return _metropolis(rng, x, previous, y, 0.5 * rng.standard_normal(len(x)), 1.1)
 
@@ -518,6 +528,19 @@ def greedy(rng, x, previous, y):
 class RandomStep(DensityTransition):
     def predict(self, rng, population, observation):
         return replace(population, particles=population.particles + rng.standard_normal(len(population)))
+
+
+def exact_density(rng, n):
+    previous = rng.standard_normal(n)
+    return Population(previous), Population(rng.normal(previous, 1.0)), 0.5
+
+
+@dataclass(frozen=True)
+class CorrectDensity(RandomStep):
+    """The density without its constant factor."""
+
+    def log_prob(self, previous, new, observation):
+        return -0.5 * (new - previous) ** 2
 
 
 @dataclass(frozen=True)
@@ -628,6 +651,7 @@ NOT_FOUND = {
 }
 #: Correct components and their exact draws.
 CORRECT = [
+    (CorrectDensity(), exact_density),
     (Guided(), exact_moves),
     (Posterior(), exact_posterior),
     (Posterior(), exact_weights),
