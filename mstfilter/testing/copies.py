@@ -75,9 +75,9 @@ HEAVY_CASES = (Case(_mixed(8, 0.4985), 2001, 1700),)
 HEAVY_CASES_OF_WEIGHTS = (*HEAVY_CASES, Case(_mixed(2000, 0.49983), 2000, 500))
 #: Random numbers that a case may draw; a call of a generator counts as 15 numbers.
 BUDGET = 40_000_000
-#: A case with a deviation of this many standard errors gets more calls, up to MOST_CALLS.
+#: A case with a deviation of this many standard errors gets more calls, up to so many times as many as at first.
 _SUSPICIOUS = 4.0
-MOST_CALLS = 16_000
+MOST_CALLS = 16
 #: Bets of a test, as fractions of the largest stake.
 _STAKES = 0.9 * 0.5 ** np.arange(10)
 

@@ -62,9 +62,9 @@ class ResamplerContract(RandomContract):
     standard errors in the calls of a `Case`, and at least 0.3 % of the particle's weight.
     """
 
-    #: Fewer calls and no case of 300 particles: schemes that compare particles are slower.
+    #: Fewer calls: schemes that compare particles are slower.
     cases: tuple[Case, ...] = tuple(
-        replace(case, calls=case.calls // (2 if len(case.weights) < 100 else 8)) for case in CASES[:-1]
+        replace(case, calls=case.calls // max(2, len(case.weights) // 15)) for case in CASES
     )
     heavy_cases: tuple[Case, ...] = (replace(HEAVY_CASES[0], calls=400),)
 
@@ -286,9 +286,9 @@ class ResamplerContract(RandomContract):
                     pytest.skip(f"{slow}: a call draws {rng.drawn:.3g} random numbers")
                 sample.add(positions[chosen.parents["ancestor"]], np.exp(chosen.log_weights - mean))
             clear = sample.evidence(component.tolerance).max() == 0 or _excess(sample, component, n_cases) > 0
-            if clear or calls >= MOST_CALLS:
+            if clear or calls >= MOST_CALLS * case.calls:
                 return sample
-            calls = min(2 * calls, MOST_CALLS)
+            calls *= 2
 
 
 def _excess(sample: Sample, component: Resampler, n_cases: int) -> float:

@@ -159,8 +159,6 @@ CORRECT = (
     Chopthin(),
     MeansByOrder(),
     RareHeaps(),
-    RareHeaps(0.01),
-    RareHeaps(1.0),
     RareBlocks(),
     RandomNumber(),
     SizeChanging(),
