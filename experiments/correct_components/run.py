@@ -48,6 +48,11 @@ def objects(rng, n):
     return Population(tuple(f"particle {k}" for k in rng.integers(0, 30, n)), rng.standard_normal(n)), None
 
 
+def different(rng, n):
+    """Objects that differ: `Coalesced` gives the copies of equal ones to the first of them."""
+    return Population(tuple(f"particle {k}" for k in range(n)), rng.standard_normal(n)), None
+
+
 EXAMPLES = (numbers, wide, vectors, mapping, objects)
 ARRAYS = (numbers, vectors, mapping)
 
@@ -186,8 +191,8 @@ def resamplers() -> Iterator[tuple[str, Any, Any, Any]]:
         yield f"shuffled {name}", smc.Shuffled(scheme), vectors, None
         yield f"tempered {name}", smc.Tempered(scheme, 0.5), mapping, None
         yield f"sorted {name}", smc.Sorted(scheme), numbers, None
-        yield f"coalesced {name}", smc.Coalesced(scheme), objects, None
-    for example in EXAMPLES:
+        yield f"coalesced {name}", smc.Coalesced(scheme), different, None
+    for example in (numbers, wide, vectors, mapping, different):
         yield f"systematic of {example.__name__}", smc.Systematic(), example, None
         yield f"user: heaps of {example.__name__}", faults.RareHeaps(), example, None
         yield f"largest of {example.__name__}", smc.LargestWeights(), example, None

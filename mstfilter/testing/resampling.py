@@ -56,10 +56,11 @@ _ZEROS = ((0, 0, 1, 2, 3), (1, 2, 3, 0, 0), (1, 0, 2, 0, 3))
 
 
 class ResamplerContract(RandomContract):
-    """The contract of every `Resampler`. Its three statistical tests have a false-alarm rate of at most 1e-6 each.
+    """The contract of every `Resampler`. Its statistical tests have a false-alarm rate of at most 1e-6 each.
 
-    They allow the bias `tolerance` that a component states. They find a deviation of a mean that is about six
-    standard errors in the calls of a `Case`, and at least 0.3 % of the particle's weight.
+    The particles of the example differ. The tests allow the bias `tolerance` that a component states. They find a
+    deviation of a mean that is about six standard errors in the calls of a `Case`, and at least 0.3 % of the
+    particle's weight.
     """
 
     #: Fewer calls: schemes that compare particles are slower.
