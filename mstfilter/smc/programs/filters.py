@@ -109,7 +109,11 @@ def _advance(
     def step() -> tuple[Particles, np.ndarray]:
         return _step(rng, model, guide, previous, observation, n)
 
-    particles, gain = step() if guard is None else guard.checked(_run_once, step)
+    try:
+        particles, gain = step() if guard is None else guard.checked(_run_once, step)
+    except Exception:
+        component.schedule.clear()  # the next run is checked again
+        raise
     try:
         if past is None:
             return Population(particles, gain)
