@@ -15,10 +15,9 @@ runs: it treats each row by itself, and takes the shape of its draws from its ar
 inputs that differ between runs are repeated for each row.
 
 The batch checks this. At steps 0, 1, 2, 5, 12, 29, ..., at the last one, and when the number of runs changes, some
-runs are compared with a call for that run alone; at the first call of a component, up to 64 with a call for these runs
-in another order.
-If they differ, a component that states ``batched=True`` raises InputError. Otherwise, and if they differ by rounding
-only, the component is called once for each run, and `Batch.single` says why.
+runs are compared with a call for that run alone; at the first call of a component, up to 64 runs with a call for them
+in another order. If they differ, a component that states ``batched=True`` raises InputError. Otherwise, and if they
+differ by rounding only, the component is called once for each run, and `Batch.single` says why.
 """
 
 from __future__ import annotations

@@ -595,6 +595,27 @@ def a_dictionary_that_all_particles_fill(previous, y):
     seen(LANDMARKS.setdefault(round(float(x)), float(x)), y)
 
 
+LARGEST = {"x": 1e-3}
+
+
+@faulty(ALONE)
+def a_running_maximum_of_the_closure(previous, y):
+    x = walk(previous)
+    LARGEST["x"] = max(LARGEST["x"], float(np.max(x)))
+    seen(x / LARGEST["x"], y)
+
+
+class Scaled:
+    largest = 1e-3
+
+    def __call__(self, previous, y):
+        x = walk(previous)
+        self.largest = max(self.largest, float(np.max(x)))
+        seen(x / self.largest, y)
+
+
+FAULTY["a_running_maximum_of_an_object"] = (Program(Scaled()).bootstrap(200), YS, ALONE)
+FAULTY["a_running_maximum_of_a_method"] = (Program(Scaled().__call__).bootstrap(200), YS, ALONE)
 TURN = [0]
 
 

@@ -8,7 +8,8 @@ fault of every third step):
 1. The first two run again with the same random numbers: all values and log weights must be the same.
 2. A few particles run alone with the values that they had: their distributions and returned values must be those of
    the step. They are taken from the smallest and from the largest values, so that a maximum or ``any`` changes too.
-3. Particles of a `per_particle` program run alone, with copies of the containers that the function keeps.
+3. Particles of a `per_particle` program run alone, too. In the first two steps, a particle alone sees the lists,
+   dictionaries, sets and arrays in the closure and the global variables of the function as they were before the step.
 4. With a guide, a step is drawn by the model: the guide must be able to draw these values, and the two estimates of
    the evidence must agree.
 
@@ -21,9 +22,9 @@ import pickle
 import warnings
 from collections import Counter
 from collections.abc import Callable, Mapping
-from copy import deepcopy
+from copy import copy
 from functools import partial
-from types import CellType, FunctionType
+from types import CellType, FunctionType, MethodType
 from typing import Any
 
 import numpy as np
@@ -60,8 +61,8 @@ class Guard:
         self.rng, self.past, self.observation, self.model, self.guide = rng, past, observation, model, guide
         self.previous, self.count = None if past is None else past.particles, count
         self.state, self.content = rng.bit_generator.state, self._content()
-        alone = count <= 2 and isinstance(model, PerParticle) and guide is None
-        self.fresh = _with_copies(model.function) if alone else None
+        #: Functions that know nothing of this step.
+        self.fresh = {id(f): _with_copies(f) for f in (model, guide) if f is not None} if count <= 2 else {}
 
     def checked(self, run: Run, step: Callable[[], Any]) -> Any:
         """Particles and gain of the log weights, as ``step()`` returns them; InputError if a check fails."""
@@ -75,7 +76,7 @@ class Guard:
                     "the program changes a value of `previous` in place, which copies of the particle share",
                     "copy it first (copy.deepcopy), change the copy and return that",
                 )
-            if self.fresh is not None:
+            if self.fresh and self.guide is None:
                 self._check_single(run, particles, gain)
             return particles, gain
         for whole in runs:
@@ -156,7 +157,7 @@ class Guard:
         for i in {len(gain) - 1, len(gain) // 2}:
             previous, handler = self.previous and self.previous[i], SampleHandler(self.rng).row(i)
             try:
-                alone = run(_with_copies(self.fresh), handler, previous, self.observation, 1, True)
+                alone = run(_with_copies(self.fresh[id(self.model)]), handler, previous, self.observation, 1, True)
             except Exception:  # a copy may lack what another function keeps: not checked
                 continue
             values = {**{name: a[0] for name, a in alone.values.items()}, **alone.returned}
@@ -169,7 +170,14 @@ class Guard:
 
     def _run_again(self, run: Run, whole: ProgramRun, rows: np.ndarray) -> ProgramRun:
         previous = None if self.previous is None else take(self.previous, rows)
-        return run(whole.function, CopyHandler(whole.values, rows), previous, self.observation, len(rows))
+        handler, arguments = CopyHandler(whole.values, rows), (previous, self.observation, len(rows))
+        fresh = self.fresh.get(id(whole.function))
+        if fresh is not None:
+            try:
+                return run(_with_copies(fresh), handler, *arguments)
+            except Exception:  # a copy may lack what another function keeps
+                fresh = None
+        return run(whole.function, handler, *arguments)
 
     # --- the guide --------------------------------------------------------------------------------------------------
     def _check_guide(self, run: Run, gain: np.ndarray) -> None:
@@ -262,25 +270,45 @@ def _with_copies(function: Any) -> Any:
     """The function with copies of the values that it keeps: containers in its closure, defaults and globals."""
     if isinstance(function, partial):
         return partial(_with_copies(function.func), *function.args, **function.keywords)
+    if isinstance(function, PerParticle):
+        return _with_copies(function.function)
+    if isinstance(function, MethodType):
+        return MethodType(function.__func__, _with_copies(function.__self__))
     if not isinstance(function, FunctionType):
-        return None
-
-    def copied(value: Any) -> Any:
-        return deepcopy(value) if type(value) in (list, dict, set, np.ndarray) else value
-
+        return _object_with_copies(function)
     try:
-        cells = tuple(CellType(copied(cell.cell_contents)) for cell in function.__closure__ or ())
+        cells = tuple(CellType(_copied(cell.cell_contents)) for cell in function.__closure__ or ())
         names = {
-            name: copied(function.__globals__[name])
+            name: _copied(function.__globals__[name])
             for name in function.__code__.co_names
             if name in function.__globals__
         }
-        defaults = tuple(map(copied, function.__defaults__ or ()))
-    except Exception:  # an empty cell, or an object that cannot be copied
-        return None
+        defaults = tuple(map(_copied, function.__defaults__ or ()))
+    except (ValueError, RecursionError):  # an empty cell, or a list in itself
+        return function
     new = FunctionType(function.__code__, {**function.__globals__, **names}, None, defaults, cells)
     new.__kwdefaults__ = function.__kwdefaults__
     return new
+
+
+def _object_with_copies(value: Any) -> Any:
+    """A copy of an object with copies of its attributes; the object itself if it cannot be copied."""
+    try:
+        new = copy(value)
+        if new is not value:
+            new.__dict__.update(_copied(vars(value)))
+    except Exception:  # of the user's class
+        return value
+    return new
+
+
+def _copied(value: Any) -> Any:
+    """A copy of an array of at most 16 MiB or a container, and of those in it; other objects are shared."""
+    if type(value) is np.ndarray and value.nbytes <= 1 << 24:
+        return value.copy()
+    if type(value) is dict:
+        return {key: _copied(v) for key, v in value.items()}
+    return type(value)(map(_copied, value)) if type(value) in (list, set) else value
 
 
 class _noting_invalid(list[str]):
