@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import shutil
+import re
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -22,8 +22,10 @@ from mstfilter.cli.root import (
     safe_name,
 )
 from mstfilter.errors import InputError
-from mstfilter.files import check_output
+from mstfilter.files import atomic_folder, check_output, locked, other_files
 from mstfilter.report.progress import progress_bar
+
+_SIMULATOR = "mstfilter.simulation"  # the generator in the manifest of a simulated recording
 
 
 @app.command()
@@ -44,7 +46,7 @@ def run(
         bool, typer.Option("--compare", help="Also run the filter without past and on single frames, for the report.")
     ] = False,
     replace: Annotated[
-        bool, typer.Option("--replace", help="Remove an earlier run in the run folder first.")
+        bool, typer.Option("--replace", help="Replace an earlier run in the run folder after the first step.")
     ] = False,
 ) -> None:
     """Filter a recording into a run folder, or resume a run that was stopped."""
@@ -60,14 +62,14 @@ def run(
     if out is not None:
         from mstfilter.runs import check_run_folder
 
-        check_run_folder(out)
+        check_run_folder(out, replace)
     source = read_source(recording, format, option, pauses, frames)
     name = Path(preset).stem
     folder = out or Path("runs") / f"{safe_name(source.name)}-{safe_name(name)}-{seed}"
-    if replace and (folder / "run.json").is_file():
-        shutil.rmtree(folder)
     for name, config in configs.items():
-        _execute(source, config, folder / "compare" / name.replace(" ", "-") if name else folder, seed)
+        target = folder / "compare" / name.replace(" ", "-") if name else folder
+        _execute(source, config, target, seed, replace and not name)
+        print(f"run         {target}")
     if report:
         _report(folder, None)
     print_summary(folder)
@@ -83,21 +85,38 @@ def demo(
     """Simulate a robot at a cluttered table, filter the recording, write a report."""
     from mstfilter.formats import open_recording
     from mstfilter.presets import load_config
+    from mstfilter.report import write_report
+    from mstfilter.runs import RunFolder
 
-    if out.exists() and not out.is_dir():
-        raise InputError(f"{out} is a file, expected a folder for the demo")
-    if out.exists() and any(out.iterdir()):
-        known = {"recording", "run", "report.html"}
-        others = sorted(p.name for p in out.iterdir() if p.name not in known and p.suffix != ".partial")
-        if others:
-            raise InputError(
-                f"{out} holds a file that is not of a demo: {others[0]}", "choose another folder with --out"
-            )
-        shutil.rmtree(out)
-    _simulate("demo", out / "recording", seed)
-    _execute(open_recording(out / "recording"), load_config("mst"), out / "run", 0)
-    _report(out / "run", out / "report.html")
+    check_output(out, folder=True)
+    with locked(out), atomic_folder(out, "replace") as work:
+        _check_earlier_demo(out)
+        _simulate("demo", work / "recording", seed)
+        _execute(open_recording(work / "recording"), load_config("mst"), work / "run", 0)
+        write_report(RunFolder.open(work / "run"), work / "report.html")
+    for name, file in (("recording", "recording"), ("run", "run"), ("report", "report.html")):
+        print(f"{name:<12}{out / file}")
     print_summary(out / "run")
+
+
+def _check_earlier_demo(out: Path) -> None:
+    """Raise InputError unless a folder is missing, empty, or of a demo and contains nothing else."""
+    from mstfilter.formats import RECORDING_FILES, open_recording
+    from mstfilter.runs import RUN_FILES, RunFolder
+
+    own = re.compile(rf"recording/({RECORDING_FILES.pattern})|run/({RUN_FILES.pattern})|report\.html")
+    others = other_files(out, own)
+    if not others and out.exists() and any(out.iterdir()):
+        source = open_recording(out / "recording").manifest
+        generators = (source.get("generator"), RunFolder.open(out / "run").description["recording"]["generator"])
+        if generators != (_SIMULATOR, _SIMULATOR) or dict(source.get("family", {})).get("name") != "demo":
+            others.append("recording")
+        elif (page := out / "report.html").exists() and "mstfilter" not in page.read_text(errors="replace"):
+            others.append("report.html")
+    if others:
+        raise InputError(
+            f"{out} holds something that is not of a demo: {others[0]}", "choose another folder with --out"
+        )
 
 
 @app.command("simulate")
@@ -112,6 +131,7 @@ def simulate_(
 ) -> None:
     """Simulate a recording with ground truth."""
     _simulate(family, out, seed, overrides or ())
+    print(f"recording   {out}")
 
 
 @app.command()
@@ -250,17 +270,21 @@ def _simulate(family: str, out: Path, seed: int, overrides: Sequence[str] = ()) 
     check_writable(out)
     with progress_bar("simulate") as advance:
         simulate_recording(chosen, seed, out, progress=lambda done, total, what: advance(done, total))
-    print(f"recording   {out}")
 
 
-def _execute(recording: Any, config: dict[str, Any], folder: Path, seed: int) -> None:
+def _execute(recording: Any, config: dict[str, Any], folder: Path, seed: int, replace: bool = False) -> None:
     from mstfilter.runs import filter_recording
 
     with progress_bar("filter") as advance:
         filter_recording(
-            recording, config, folder, seed, allow_files=True, progress=lambda p: advance(p.done, p.total)
+            recording,
+            config,
+            folder,
+            seed,
+            replace=replace,
+            allow_files=True,
+            progress=lambda p: advance(p.done, p.total),
         )
-    print(f"run         {folder}")
 
 
 def _report(run: Path, out: Path | None) -> None:

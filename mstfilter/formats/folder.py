@@ -13,6 +13,7 @@ The layout::
     instance/000000.png  optional: object number of each pixel      robot/000000.png   optional: robot mask
     voxels.npz           optional ground truth: labels (S, X, Y, Z), frame (S,), origin, voxel_size
     poses.json           optional ground truth: per frame, per object a 4x4 T_world_object
+    SHA256SUMS           hashes of these files
 
 Frames with role ``static`` are the pauses. If camera.json holds no pose, the world is found from the support plane of
 the first pause; without a workspace, a grid is placed around the objects on the table. A recording is written under
@@ -24,7 +25,7 @@ from __future__ import annotations
 import contextlib
 import json
 import math
-import shutil
+import re
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
@@ -35,7 +36,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from mstfilter.errors import InputError
-from mstfilter.files import check_output, reading
+from mstfilter.files import SUMS, atomic_folder, check_output, locked, reading, write_sums
 from mstfilter.formats.video import RecordingFormat
 from mstfilter.scene import (
     Camera,
@@ -57,6 +58,9 @@ from mstfilter.scene import (
 from mstfilter.scene.pauses import PauseRule
 
 VERSION = 1  #: Version of the layout
+RECORDING_FILES = re.compile(  #: paths in a recording folder
+    rf"(manifest|camera|poses)\.json|voxels\.npz|{SUMS}|(rgb|depth|instance|robot)/\d{{6}}\.png"
+)
 
 
 class _Workspace(BaseModel):
@@ -80,12 +84,16 @@ def check_writable(path: Path) -> None:
     check_output(path, folder=True)
 
 
+class _DiscardError(Exception):
+    """Ends the writing of a folder that is not kept."""
+
+
 class RecordingWriter:
     """Writes a recording folder, frame by frame.
 
-    The new folder must not exist, or be empty. The camera has its pose if that is known; `grid` is the workspace.
-    `depth_scale` is in metres per unit of the 16-bit depth images. Further entries of manifest.json, such as
-    generator and seed, are given by name.
+    The new folder must not exist, or be empty, and no other process may be writing it. The camera has its pose if
+    that is known; `grid` is the workspace. `depth_scale` is in metres per unit of the 16-bit depth images. Further
+    entries of manifest.json, such as generator and seed, are given by name.
     """
 
     def __init__(
@@ -105,13 +113,10 @@ class RecordingWriter:
         self._poses: list[dict[str, Any]] = []
         self._voxels: list[np.ndarray] = []
         self._voxel_frames: list[int] = []
-        self._folder = self.path.with_name(f".{self.path.name}.partial")
-        try:
-            if self._folder.exists():
-                shutil.rmtree(self._folder)
-            self._folder.mkdir(parents=True)
-        except OSError as error:
-            raise InputError(f"cannot write recording {self.path}: {error.strerror}") from error
+        with self._writing(), contextlib.ExitStack() as stack:
+            stack.enter_context(locked(self.path))
+            self._folder = stack.enter_context(atomic_folder(self.path))
+            self._open = stack.pop_all()
 
     def add_frame(
         self,
@@ -194,9 +199,8 @@ class RecordingWriter:
                     origin=grid.origin,
                     voxel_size=grid.voxel_size,
                 )
-            if self.path.exists():
-                self.path.rmdir()
-            self._folder.rename(self.path)
+            write_sums(self._folder)
+            self._open.close()
         return self.path
 
     @contextlib.contextmanager
@@ -211,7 +215,8 @@ class RecordingWriter:
 
     def discard(self) -> None:
         """Remove all files written so far."""
-        shutil.rmtree(self._folder, ignore_errors=True)
+        with contextlib.suppress(_DiscardError), self._open:
+            raise _DiscardError
 
     def __enter__(self) -> RecordingWriter:
         return self

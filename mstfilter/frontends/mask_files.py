@@ -418,8 +418,7 @@ def write_masks(
         raise InputError(
             f"there are {len(alternatives)} alternatives and {given} weights, expected at least 1 of each"
         )
-    with atomic_folder(path) as partial:
-        partial.mkdir(parents=True)
+    with atomic_folder(path, "replace") as partial:
         for k, one in enumerate(alternatives):
             masks, scores = one if isinstance(one, tuple) else (one, None)
             masks = np.asarray(masks)

@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import os
 import sys
 import zipfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -67,8 +66,6 @@ def save_state(
     try:
         with atomic_path(path) as partial, partial.open("wb") as file:
             (np.savez_compressed if compress else np.savez)(file, allow_pickle=False, **arrays)
-            file.flush()
-            os.fsync(file.fileno())
     except OSError as error:
         raise InputError(f"cannot write checkpoint {path}: {error.strerror}") from error
 
