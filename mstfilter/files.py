@@ -102,7 +102,7 @@ def locked(path: str | Path) -> Iterator[None]:
     process.
     """
     target = Path(os.path.realpath(path))
-    if _is_temporary(target):  # no other process knows the name
+    if _is_temporary(target.absolute()):  # no other process knows the name
         yield
         return
     file = target.with_name(f".{target.name}.lock")
@@ -112,7 +112,9 @@ def locked(path: str | Path) -> Iterator[None]:
             made += _make_folders(target.parent)
             descriptor = _reserve(file, target)
         except OSError as error:
-            raise InputError(f"cannot write {target}: {error.strerror}", "choose another place") from error
+            raise InputError(
+                f"cannot write {target}: {error.strerror}: {error.filename}", "choose another place"
+            ) from error
         try:
             sweep(target.parent, target.name)
             yield
@@ -170,8 +172,8 @@ def _lock(path: Path, flags: int) -> int | None:
 def sweep(folder: Path, name: str | None = None, older_than_s: float = 0.0) -> None:
     """Remove temporaries in a folder, of all names or of one, whose process has ended.
 
-    If a process was killed while a folder was replaced, the earlier folder gets its name back. Give a least age unless
-    the name is locked: another process may just have made a temporary.
+    If a process was killed while a folder was replaced, the earlier folder gets its name back. Give a least age
+    unless the name is locked: another process may just have made a temporary.
     """
     for path in folder.iterdir() if folder.is_dir() else ():
         match = _TEMPORARY.fullmatch(path.name)
@@ -187,12 +189,9 @@ def sweep(folder: Path, name: str | None = None, older_than_s: float = 0.0) -> N
 
 def other_files(folder: Path, own: re.Pattern[str]) -> list[str]:
     """Files below a folder whose paths in it do not fit `own`; temporaries and locks are left out."""
-    paths = sorted(path.relative_to(folder) for path in folder.rglob("*") if not path.is_dir() or path.is_symlink())
-    lock = re.compile(r"\..+\.lock")
-    kept = [
-        path for path in paths if not any(map(_TEMPORARY.fullmatch, path.parts)) and not lock.fullmatch(path.name)
-    ]
-    return [path.as_posix() for path in kept if not own.fullmatch(path.as_posix())]
+    paths = [path.relative_to(folder) for path in folder.rglob("*") if not path.is_dir() or path.is_symlink()]
+    own = re.compile(rf"{own.pattern}|(.+/)?\.[^/]+\.lock")
+    return sorted(p.as_posix() for p in paths if not own.fullmatch(p.as_posix()) and not _is_temporary(p))
 
 
 def _is_abandoned(path: Path, older_than_s: float) -> bool:
@@ -212,8 +211,8 @@ def _temporary(target: Path, kind: str) -> Path:
 
 
 def _is_temporary(path: Path) -> bool:
-    """Whether a path is a temporary folder, or below one."""
-    return any(_TEMPORARY.fullmatch(part) for part in path.absolute().parts)
+    """Whether a path is a temporary, or below one."""
+    return any(map(_TEMPORARY.fullmatch, path.parts))
 
 
 def _make_folders(folder: Path) -> list[Path]:
@@ -229,7 +228,7 @@ def _sync(target: Path, *paths: Path) -> None:
 
     If `target`, which they are or will be, is in a temporary folder, they are synced when that folder is complete.
     """
-    if os.name != "posix" or _is_temporary(target):
+    if os.name != "posix" or _is_temporary(target.absolute()):
         return
     for path in paths:
         descriptor = os.open(path, os.O_RDONLY)
