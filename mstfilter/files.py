@@ -106,42 +106,37 @@ def locked(path: str | Path) -> Iterator[None]:
         yield
         return
     file = target.with_name(f".{target.name}.lock")
-    made: list[Path] = []
-    try:
+    with contextlib.ExitStack() as stack:
         try:
-            made += _make_folders(target.parent)
+            stack.callback(_remove_empty, _make_folders(target.parent))
             descriptor = _reserve(file, target)
+            stack.callback(os.close, descriptor)
+            stack.callback(file.unlink, missing_ok=True)
+            now = time.strftime("%Y-%m-%d %H:%M:%S")
+            os.ftruncate(descriptor, 0)
+            os.write(descriptor, f": process {os.getpid()} of {socket.gethostname()} since {now}".encode())
         except OSError as error:
-            raise InputError(
-                f"cannot write {target}: {error.strerror}: {error.filename}", "choose another place"
-            ) from error
-        try:
-            sweep(target.parent, target.name)
-            yield
-        finally:
-            with contextlib.suppress(OSError):
-                file.unlink()
-            os.close(descriptor)
-    finally:
-        for folder in made:
-            with contextlib.suppress(OSError):  # something was written there
-                folder.rmdir()
+            raise InputError(f"cannot write {target}: {error}", "choose another place") from error
+        sweep(target.parent, target.name)
+        yield
+
+
+def _remove_empty(folders: list[Path]) -> None:
+    with contextlib.suppress(OSError):  # something was written there
+        for folder in folders:
+            folder.rmdir()
 
 
 def _reserve(file: Path, target: Path) -> int:
-    """Open and lock a lock file that names this process; InputError with the other process if it is locked."""
+    """Open and lock a lock file; InputError with the other process if it is locked."""
     while True:
         descriptor = _lock(file, os.O_RDWR | os.O_CREAT)
         if descriptor is None:
             _refuse(file, target)
         elif file.exists() and os.path.samestat(file.stat(), os.fstat(descriptor)):
-            break
+            return descriptor
         else:  # the process that had the lock has removed the file
             os.close(descriptor)
-    os.ftruncate(descriptor, 0)
-    now = time.strftime("%Y-%m-%d %H:%M:%S")
-    os.write(descriptor, f": process {os.getpid()} of {socket.gethostname()} since {now}".encode())
-    return descriptor
 
 
 def _refuse(file: Path, target: Path) -> None:

@@ -4,9 +4,10 @@
 ...     command()
 >>> disk.lose("unsynced")
 
-Operations are those that change files below a folder: open for writing, write, sync, rename, remove, make a folder. The
-operation `stop_at` raises `Stop` before it happens (a write stops after half of its bytes), and no later one has an
-effect, so that cleaning up in ``finally`` cannot hide what a killed process leaves. After a power failure more is lost:
+Operations are those that change files below a folder: open for writing, write, sync, rename, remove, make a folder.
+The operation `stop_at` raises `Stop` before it happens (a write stops after half of its bytes), and no later one has
+an effect, so that cleaning up in ``finally`` cannot hide what a killed process leaves. After a power failure more is
+lost:
 
 - ``"unsynced"``: all that is not synced. Names are durable when their folder is synced, contents when the file is.
 - ``"contents"``: contents of files that are not synced; names remain. This is how journaling file systems behave.
