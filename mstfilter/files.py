@@ -131,22 +131,17 @@ def _reserve(file: Path, target: Path) -> int:
     """Open and lock a lock file; InputError with the other process if it is locked."""
     while True:
         descriptor = _lock(file, os.O_RDWR | os.O_CREAT)
-        if descriptor is None:
-            _refuse(file, target)
-        elif file.exists() and os.path.samestat(file.stat(), os.fstat(descriptor)):
-            return descriptor
-        else:  # the process that had the lock has removed the file
+        with contextlib.suppress(FileNotFoundError):  # the process that had the lock has removed the file
+            if descriptor is None:
+                holder = file.read_text(errors="replace")[:200]
+                raise InputError(
+                    f"{target} is being written by another process{holder if holder.isprintable() else ''}",
+                    "wait until it has ended, or choose another name",
+                )
+            if os.path.samestat(file.stat(), os.fstat(descriptor)):
+                return descriptor
+        if descriptor is not None:
             os.close(descriptor)
-
-
-def _refuse(file: Path, target: Path) -> None:
-    """Raise InputError with the process that has the lock; return if that has just ended."""
-    with contextlib.suppress(OSError):
-        holder = file.read_text(errors="replace")[:200]
-        named = holder if holder.isprintable() else ""
-        raise InputError(
-            f"{target} is being written by another process{named}", "wait until it has ended, or choose another name"
-        )
 
 
 def _lock(path: Path, flags: int) -> int | None:
@@ -176,10 +171,8 @@ def sweep(folder: Path, name: str | None = None, older_than_s: float = 0.0) -> N
             continue
         if match["kind"] == "replaced" and not (folder / match["name"]).exists():
             path.rename(folder / match["name"])
-        elif path.is_dir():
-            shutil.rmtree(path, ignore_errors=True)
         else:
-            path.unlink(missing_ok=True)
+            shutil.rmtree(path, ignore_errors=True) if path.is_dir() else path.unlink(missing_ok=True)
 
 
 def other_files(folder: Path, own: re.Pattern[str]) -> list[str]:
@@ -190,15 +183,11 @@ def other_files(folder: Path, own: re.Pattern[str]) -> list[str]:
 
 
 def _is_abandoned(path: Path, older_than_s: float) -> bool:
-    try:
-        if time.time() - path.lstat().st_mtime < older_than_s:
-            return False
-        descriptor = _lock(path, os.O_RDONLY) if path.is_dir() else -1
-    except OSError:  # it is gone
-        return False
-    if descriptor is not None and descriptor >= 0:
-        os.close(descriptor)
-    return descriptor is not None
+    with contextlib.suppress(OSError):  # another process may remove it
+        if time.time() - path.lstat().st_mtime >= older_than_s and (descriptor := _lock(path, os.O_RDONLY)):
+            os.close(descriptor)
+            return True
+    return False
 
 
 def _temporary(target: Path, kind: str) -> Path:
