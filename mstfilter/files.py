@@ -264,18 +264,25 @@ def reading(path: Path, kind: str, *hints: str) -> Iterator[None]:
         raise InputError(f"{path} cannot be read: {reason(error)}", *hints) from error
 
 
-def check_output(path: Path, folder: bool = False) -> None:
-    """Raise InputError if a file, or with `folder` a folder, cannot be written at `path`."""
+def check_output(path: Path, folder: bool = False, empty: bool = True) -> None:
+    """Raise InputError if a file, or with `folder` a folder, cannot be written at `path`.
+
+    An existing folder must be empty, unless `empty` is false.
+    """
     if path.is_dir() and not folder:
         raise InputError(f"{path} is a folder, expected the name of a file to write")
-    if folder and path.exists() and (os.path.ismount(path) or Path.cwd().is_relative_to(path.resolve())):
+    if folder and path.is_dir() and (os.path.ismount(path) or Path.cwd().is_relative_to(path.resolve())):
         raise InputError(f"cannot write {path}: it is a mount point or the working folder", "name a folder below it")
-    existing = next(parent for parent in (path.absolute(), *path.absolute().parents) if parent.exists())
-    if existing.is_file() and (folder or existing != path.absolute()):
+    if folder and path.exists() and (not path.is_dir() or (empty and any(path.iterdir()))):
+        raise InputError(
+            f"cannot write {path}: it exists and is not an empty folder", "choose another name, or remove it"
+        )
+    place = path.absolute().parent if folder and path.exists() else path.absolute()  # a folder is renamed
+    existing = next(parent for parent in (place, *place.parents) if parent.exists())
+    if existing.is_file() and (folder or existing != place):
         raise InputError(f"cannot write {path}: {existing} is a file", "choose another place")
-    place = existing.parent if folder and existing == path.absolute() else existing  # a folder is renamed
-    if not os.access(place, os.W_OK):
-        raise InputError(f"cannot write {path}: no permission to write in {place}", "choose another place")
+    if not os.access(existing, os.W_OK):
+        raise InputError(f"cannot write {path}: no permission to write in {existing}", "choose another place")
 
 
 def write_text(path: str | Path, text: str) -> None:

@@ -265,14 +265,14 @@ def test_a_stopped_run_drops_damaged_pauses(recording, tmp_path):
     assert caught[0].message.hints == ("pauses 1 to 2 are computed again",)
     assert content(path) == whole
     shutil.rmtree(path / "pauses" / "000")
-    with pytest.warns(InputWarning, match=r"pause 0 is damaged: it is missing"):
+    with pytest.warns(InputWarning, match=r"pause 0 is damaged: SHA256SUMS is missing"):
         run(recording, path)
     assert content(path) == whole
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
-    [("seed", "seed is 2, that of the run is 1"), ("t", "its t is 2, .* 3"), ("run", "hash of run.json")],
+    [("seed", "seed 2, expected 1"), ("t", "step 2, expected 3"), ("run", "hash of run.json")],
 )
 def test_a_state_of_another_run_is_refused(recording, tmp_path, change, message):
     path = run(recording, tmp_path / "run").path

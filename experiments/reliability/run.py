@@ -95,11 +95,11 @@ def kills(name: str, command: Callable[[Path, int], list[str]], n: int, folder: 
         process.send_signal(signal.SIGKILL)
         process.communicate()
         code, error = finish(start(command(root, 1)))
-        same = files(root / "out") == files(folder / "whole" / "out") and not [
-            p for p in root.iterdir() if p.name != "out"
-        ]
-        if process.returncode == 0 and code == 2 and "not an empty folder" in error:
-            code = 0  # it had ended before it was killed
+        same = files(root / "out") == files(folder / "whole" / "out")
+        if code == 2 and same and "not an empty folder" in error:
+            code = 0  # it was killed after its result had been renamed
+        elif [path for path in root.iterdir() if path.name != "out"]:
+            same = False
         yield {"point": f"{delay:.3f}", "loss": "nothing", "result": verdict(code, error, same)}
         shutil.rmtree(root)
 

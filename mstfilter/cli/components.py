@@ -84,15 +84,15 @@ def _check_folder(path: Path) -> None:
 
     runs = [run.parent for run in sorted(path.glob("**/run.json")) if ".partial/" not in run.as_posix()]
     damaged = [f"{run}: {wrong}" for run in runs for wrong in RunFolder.open(run).damage()]
-    if not runs:
+    noted = bool(runs) or (path / SUMS).exists()
+    if not runs and noted:
+        damaged = [f"{path}: {wrong}" for wrong in damaged_files(path)]
+    if not runs and not damaged:
         open_recording(path).check()
-        damaged = [f"{path}: {wrong}" for wrong in damaged_files(path) if (path / SUMS).exists()]
-    for line in damaged:
-        print(f"damaged     {line}")
+    note = "" if noted else f"; {SUMS} is missing, so changes are not noticed"
+    print("\n".join(f"damaged     {line}" for line in damaged) or f"sound       {path}{note}")
     if damaged:
         raise typer.Exit(1)
-    missing = "" if runs or (path / SUMS).exists() else f"; {SUMS} is missing, so changed files are not noticed"
-    print(f"sound       {path}{missing}")
 
 
 @app.command()

@@ -88,7 +88,7 @@ def demo(
     from mstfilter.report import write_report
     from mstfilter.runs import RunFolder
 
-    check_output(out, folder=True)
+    check_output(out, folder=True, empty=False)
     with locked(out), atomic_folder(out, "replace") as work:
         _check_earlier_demo(out)
         _simulate("demo", work / "recording", seed)
@@ -203,9 +203,9 @@ def convert(
     frames: Annotated[str, typer.Option(help="Frames of a folder of pairs, separated by commas.")] = "",
 ) -> None:
     """Convert data of another format to a recording folder; a stopped or failed conversion leaves no folder."""
-    from mstfilter.formats import check_writable, save_recording
+    from mstfilter.formats import save_recording
 
-    check_writable(out)
+    check_output(out, folder=True)
     recording = read_source(source, format, option, pauses, frames)
     generator = recording.manifest.get("generator") or f"converted from {source.name}"
     try:
@@ -262,12 +262,11 @@ def quality(
 
 
 def _simulate(family: str, out: Path, seed: int, overrides: Sequence[str] = ()) -> None:
-    from mstfilter.formats import check_writable
     from mstfilter.presets import REGISTRY, settings
     from mstfilter.simulation import SceneFamily, scene_family, simulate_recording
 
     chosen = REGISTRY.make(SceneFamily, settings(overrides), base=scene_family(family))
-    check_writable(out)
+    check_output(out, folder=True)
     with progress_bar("simulate") as advance:
         simulate_recording(chosen, seed, out, progress=lambda done, total, what: advance(done, total))
 

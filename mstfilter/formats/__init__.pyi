@@ -4,7 +4,6 @@ from mstfilter.formats.folder import (
     RECORDING_FILES as RECORDING_FILES,
     RecordingFolder as RecordingFolder,
     RecordingWriter as RecordingWriter,
-    check_writable as check_writable,
     open_recording as open_recording,
     save_recording as save_recording,
 )

@@ -74,20 +74,6 @@ class _Workspace(BaseModel):
         return cls(min=tuple(grid.origin.tolist()), max=tuple(grid.upper.tolist()), voxel=grid.voxel_size)
 
 
-def check_writable(path: Path) -> None:
-    """Raise InputError unless the path does not exist or is an empty folder, and a folder can be written there."""
-    if path.exists() and (not path.is_dir() or any(path.iterdir())):
-        raise InputError(
-            f"cannot write a recording to {path}: it exists and is not an empty folder",
-            "choose another name, or remove it",
-        )
-    check_output(path, folder=True)
-
-
-class _DiscardError(Exception):
-    """Ends the writing of a folder that is not kept."""
-
-
 class RecordingWriter:
     """Writes a recording folder, frame by frame.
 
@@ -106,7 +92,7 @@ class RecordingWriter:
         **manifest: Any,
     ) -> None:
         self.path = Path(path)
-        check_writable(self.path)
+        check_output(self.path, folder=True)
         self._camera, self._grid, self._scale = camera, grid, depth_scale
         self._manifest = {"version": VERSION, **manifest}
         self._frames: list[dict[str, Any]] = []
@@ -186,7 +172,7 @@ class RecordingWriter:
             "workspace": None if grid is None else _Workspace.of(grid).model_dump(),
         }
         manifest = {**self._manifest, "frames": self._frames}
-        with self._writing():
+        with self._writing(), self._open:
             (self._folder / "camera.json").write_text(json.dumps(described, indent=1))
             (self._folder / "manifest.json").write_text(json.dumps(manifest, indent=1))
             if self._poses:
@@ -200,7 +186,6 @@ class RecordingWriter:
                     voxel_size=grid.voxel_size,
                 )
             write_sums(self._folder)
-            self._open.close()
         return self.path
 
     @contextlib.contextmanager
@@ -215,8 +200,7 @@ class RecordingWriter:
 
     def discard(self) -> None:
         """Remove all files written so far."""
-        with contextlib.suppress(_DiscardError), self._open:
-            raise _DiscardError
+        self._open.__exit__(InterruptedError, InterruptedError(), None)
 
     def __enter__(self) -> RecordingWriter:
         return self
@@ -224,12 +208,8 @@ class RecordingWriter:
     def __exit__(self, kind: type[BaseException] | None, *error: Any) -> None:
         if kind is not None:
             self.discard()
-            return
-        try:
+        else:
             self.close()
-        except BaseException:
-            self.discard()
-            raise
 
 
 def save_recording(

@@ -26,9 +26,9 @@ from mstfilter.oracles import bind_truth, uses_truth
 from mstfilter.presets import build_filter, describe_filter
 from mstfilter.registry import nested_components
 from mstfilter.runs.run_folder import RunFolder, as_json
-from mstfilter.scene import Clip, Recording, UsesFiles
+from mstfilter.scene import Recording, UsesFiles
 from mstfilter.scoring import ask
-from mstfilter.smc import Info, Observer, ParticleFilter, State
+from mstfilter.smc import Observer, ParticleFilter
 
 _LIBRARIES = ("numpy", "scipy", "networkx", "opencv-python-headless", "higra", "small_gicp", "torch")
 
@@ -106,10 +106,14 @@ def filter_recording(
                 advance(RunProgress(done, len(clips)))
                 for clip in clips[done:]:
                     state, info = bound.step(state, clip, observer)
+                    truth = recording.truth(clip.index)
+                    step = clip, state, info, truth, None if truth is None else ask(recording, clip.index)
                     if folder is None:  # a run that fails in its first step leaves no folder, or an earlier run
-                        folder = _begin(path, description, replace, recording, clip, state, info)
+                        with atomic_folder(path, "replace" if replace else "refuse") as work:
+                            RunFolder.create(work, description).write_pause(*step)
+                        folder = RunFolder(path)
                     else:
-                        _write_pause(folder, recording, clip, state, info)
+                        folder.write_pause(*step)
                     advance(RunProgress(clip.index + 1, len(clips), sum(info.seconds.values())))
             except BaseException as error:
                 if folder is not None:
@@ -144,18 +148,6 @@ def _describe(recording: Recording, config: Mapping[str, Any], filter: ParticleF
     return description
 
 
-def _begin(path: Path, description: Mapping[str, Any], replace: bool, *step: Any) -> RunFolder:
-    """The new run folder with its first pause, which `_write_pause` writes from `step`."""
-    with atomic_folder(path, "replace" if replace else "refuse") as work:
-        _write_pause(RunFolder.create(work, description), *step)
-    return RunFolder(path)
-
-
-def _write_pause(folder: RunFolder, recording: Recording, clip: Clip, state: State, info: Info) -> None:
-    truth = recording.truth(clip.index)
-    folder.write_pause(clip, state, info, truth, None if truth is None else ask(recording, clip.index))
-
-
 def _existing_folder(path: Path, description: dict[str, Any], replace: bool) -> RunFolder | None:
     """The folder of the same run, to be resumed; None if there is none yet, or another that can be replaced."""
     check_run_folder(path, replace)
@@ -178,17 +170,13 @@ def _existing_folder(path: Path, description: dict[str, Any], replace: bool) -> 
 def check_run_folder(path: Path, replace: bool = False) -> None:
     """Raise InputError unless a path is a run folder, an empty folder, or a new folder can be made there.
 
-    With `replace`, a run folder is removed later: files of others must not be in it.
+    With `replace`, a run folder must not contain files that no run writes.
     """
-    if (path / "run.json").is_file():
-        folder = RunFolder.open(path)
-        if replace:
-            folder.check_replaceable()
-            check_output(path, folder=True)
-        return
-    if path.exists() and (not path.is_dir() or any(path.iterdir())):
-        raise InputError(f"cannot write a run to {path}: it exists and is not an empty folder", "choose another name")
-    check_output(path, folder=True)
+    if not (path / "run.json").is_file():
+        check_output(path, folder=True)
+    elif replace:
+        check_output(path, folder=True, empty=False)
+        RunFolder.open(path).check_replaceable()
 
 
 def _first_difference(found: Any, wanted: Any, where: str = "") -> str:

@@ -213,27 +213,21 @@ class RunFolder:
         """What is wrong with files of the run: those that differ from their hashes, and states of another run."""
         found = damaged_files(self.path) if self.description["status"] == "done" else []
         for t in range(self.n_pauses):
-            wrong = damaged_files(self.pause(t))
-            found += [f"pauses/{t:03d}/{fault}" for fault in wrong]
-            try:
-                if not wrong:
-                    self._check_state(t)
-            except InputError as error:
-                found.append(error.message)
+            found += [f"pauses/{t:03d}/{wrong}" for wrong in damaged_files(self.pause(t)) or self._foreign(t)]
         return found
 
-    def _check_state(self, t: int) -> None:
-        """Raise InputError if the state of a pause is not of this run."""
+    def _foreign(self, t: int) -> list[str]:
+        """In what the state of a pause differs from one of this run."""
         path = self.pause(t) / "state.npz"
         with reading(path, "a pause of a run"), np.load(path, allow_pickle=False) as data:
             head = json.loads(str(data["head"]))
-        for name, value in (("t", t + 1), ("seed", self.description["seed"]), ("run", self.key)):
-            if head.get(name) != value:
-                what = "hash of run.json" if name == "run" else name
-                raise InputError(
-                    f"{path} belongs to another run: its {what} is {head.get(name)}, that of the run is {value}",
-                    "choose another folder, or start again (on the command line: --replace)",
-                )
+        expected = {"t": t + 1, "seed": self.description["seed"], "run": self.key}
+        differs = [name for name, value in expected.items() if head.get(name) != value]
+        names = {"t": "step", "run": "hash of run.json"}
+        return [
+            f"state.npz belongs to another run: {names.get(name, name)} {head.get(name)}, expected {expected[name]}"
+            for name in differs
+        ]
 
     def repair(self) -> None:
         """Prepare the folder for resuming: remove what a killed process left, and damaged pauses with a warning.
@@ -242,21 +236,21 @@ class RunFolder:
         """
         sweep(self.path)
         sweep(self.path / "pauses")
-        good, wrong = 0, ["it is missing"]
-        while self.pause(good).is_dir() and not (wrong := damaged_files(self.pause(good))):
-            self._check_state(good)
-            good, wrong = good + 1, ["it is missing"]
+        good = 0
+        while not (wrong := damaged_files(self.pause(good))):
+            if foreign := self._foreign(good):
+                raise InputError(
+                    f"{self.pause(good)}/{foreign[0]}",
+                    "choose another folder, or start again (on the command line: --replace)",
+                )
+            good += 1
         later = sorted(path for path in (self.path / "pauses").glob("[0-9]*") if int(path.name) >= good)
         for path in reversed(later):
             shutil.rmtree(path)
         if later:
-            warnings.warn(
-                InputWarning(
-                    f"run folder {self.path}: pause {good} is damaged: {wrong[0]}",
-                    f"pauses {good} to {int(later[-1].name)} are computed again",
-                ),
-                stacklevel=2,
-            )
+            text = f"run folder {self.path}: pause {good} is damaged: {wrong[0]}"
+            hint = f"pauses {good} to {int(later[-1].name)} are computed again"
+            warnings.warn(InputWarning(text, hint), stacklevel=2)
 
     def info(self, t: int) -> dict[str, Any]:
         """Record of the step that ended at pause `t`."""
