@@ -88,6 +88,12 @@ def test_another_process_that_writes_is_named_and_nothing_is_touched(holder, rec
     assert names(tmp_path) == ["out"]
 
 
+def test_a_run_that_is_compared_is_locked_too(recording, tmp_path):
+    run(recording, tmp_path / "run")
+    with locked(tmp_path / "run"), pytest.raises(InputError, match="run is being written by another process"):
+        run(recording, tmp_path / "run" / "compare" / "without-past")
+
+
 def test_a_lock_is_released_and_leaves_no_files(tmp_path):
     path = tmp_path / "a" / "b" / "run"
     for _ in range(2):

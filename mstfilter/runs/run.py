@@ -95,7 +95,8 @@ def filter_recording(
         if isinstance(part, UsesFiles):
             part.check_files(recording)
     description = _describe(recording, config, filter, int(seed))
-    with locked(path):
+    compared = path.parent.name == "compare" and (path.parent.parent / "run.json").is_file()
+    with locked(path.parent.parent if compared else path):
         folder = _existing_folder(path, description, replace)
         done = 0 if folder is None else folder.n_pauses
         state = folder.state(done - 1) if folder is not None and done else bound.start(int(seed))
