@@ -107,7 +107,7 @@ def locked(path: str | Path) -> Iterator[None]:
         return
     file = target.with_name(f".{target.name}.lock")
     with contextlib.ExitStack() as stack:
-        try:
+        with writing(f"{target} and a lock beside it", "choose another place"):
             stack.callback(_remove_empty, _make_folders(target.parent))
             descriptor = _reserve(file, target)
             stack.callback(os.close, descriptor)
@@ -115,8 +115,6 @@ def locked(path: str | Path) -> Iterator[None]:
             now = time.strftime("%Y-%m-%d %H:%M:%S")
             os.ftruncate(descriptor, 0)
             os.write(descriptor, f": process {os.getpid()} of {socket.gethostname()} since {now}".encode())
-        except OSError as error:
-            raise InputError(f"cannot write {target}: {error}", "choose another place") from error
         sweep(target.parent, target.name)
         yield
 
@@ -262,6 +260,15 @@ def reading(path: Path, kind: str, *hints: str) -> Iterator[None]:
         raise InputError(f"{path} is not valid JSON: {error}", *hints) from error
     except (OSError, EOFError, zipfile.BadZipFile, ValueError, KeyError, TypeError, AttributeError) as error:
         raise InputError(f"{path} cannot be read: {reason(error)}", *hints) from error
+
+
+@contextmanager
+def writing(what: str, *hints: str) -> Iterator[None]:
+    """Turn errors of the disk in a block that writes `what` into InputError."""
+    try:
+        yield
+    except OSError as error:
+        raise InputError(f"cannot write {what}: {error.strerror}", *hints) from error
 
 
 def check_output(path: Path, folder: bool = False, empty: bool = True) -> None:

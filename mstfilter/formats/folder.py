@@ -22,11 +22,11 @@ a temporary name and renamed when it is complete: if writing fails, no file rema
 
 from __future__ import annotations
 
-import contextlib
 import json
 import math
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -36,7 +36,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from mstfilter.errors import InputError
-from mstfilter.files import SUMS, atomic_folder, check_output, locked, reading, write_sums
+from mstfilter.files import SUMS, atomic_folder, check_output, locked, reading, write_sums, writing
 from mstfilter.formats.video import RecordingFormat
 from mstfilter.scene import (
     Camera,
@@ -99,7 +99,7 @@ class RecordingWriter:
         self._poses: list[dict[str, Any]] = []
         self._voxels: list[np.ndarray] = []
         self._voxel_frames: list[int] = []
-        with self._writing(), contextlib.ExitStack() as stack:
+        with self._writing(), ExitStack() as stack:
             stack.enter_context(locked(self.path))
             self._folder = stack.enter_context(atomic_folder(self.path))
             self._open = stack.pop_all()
@@ -188,15 +188,8 @@ class RecordingWriter:
             write_sums(self._folder)
         return self.path
 
-    @contextlib.contextmanager
-    def _writing(self) -> Iterator[None]:
-        """Turn errors of the disk into InputError."""
-        try:
-            yield
-        except OSError as error:
-            raise InputError(
-                f"cannot write recording {self.path}: {error.strerror}", "the unfinished files are removed"
-            ) from error
+    def _writing(self) -> AbstractContextManager[None]:
+        return writing(f"recording {self.path}", "the unfinished files are removed")
 
     def discard(self) -> None:
         """Remove all files written so far."""

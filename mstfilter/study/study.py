@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from mstfilter.errors import InputError
-from mstfilter.files import locked, reading, sweep
+from mstfilter.files import locked, reading, sweep, writing
 from mstfilter.lazy import progress_of
 from mstfilter.runs import library_versions, write_json
 from mstfilter.study.config import StudyConfig
@@ -92,14 +92,10 @@ def run_study(
         for target in (path, cache):
             _check_free_space(target)
         executor = executor or Local(logs=path / "logs")
-        try:
+        with writing(f"study folder {path}", "choose another with --out"):
             write_json(path / "study.json", {**_description(plan), "recalibration": recalibration})
             for part in ("runs", "logs"):
                 (path / part).mkdir(exist_ok=True)
-        except OSError as error:
-            raise InputError(
-                f"cannot write study folder {path}: {error.strerror}", "choose another with --out"
-            ) from error
         _rename_done_runs(plan, folder)
         waiting = [run for run in plan.runs if not _is_done(run, folder)]
         n_before = len(plan.runs) - len(waiting)
@@ -126,12 +122,8 @@ def run_study(
                 failed[run.name] = outcome
                 _write_failure(folder, run, outcome)  # repeated, because the disk may have been full before
         folder = StudyFolder.open(path)
-        try:
+        with writing(f"the tables of {path}", "free disk space and repeat the command"):
             folder.write_tables()
-        except OSError as error:
-            raise InputError(
-                f"cannot write the tables of {path}: {error.strerror}", "free disk space and repeat the command"
-            ) from error
     return StudyResult(folder, len(plan.runs) - len(failed), n_before, tuple(failed.items()))
 
 

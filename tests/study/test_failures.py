@@ -239,7 +239,7 @@ def test_folders_that_will_not_do(folder, tmp_path, monkeypatch):
     (tmp_path / "file").write_text("x")
     with pytest.raises(InputError, match="is not a study folder"):
         run_study(study(folder, "good"), tmp_path / "file", cache=tmp_path)
-    with pytest.raises(InputError, match="cannot write .*below: .*File exists"):
+    with pytest.raises(InputError, match="cannot write .*below and a lock beside it: "):
         run_study(study(folder, "good"), tmp_path / "file" / "below", cache=tmp_path)
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "precious.txt").write_text("x")
