@@ -8,7 +8,7 @@ import pytest
 import mstfilter.files
 from tests.experiments.scripts import EXPERIMENTS, own_modules
 
-POINTS = {"run": 9, "run --replace": 9, "study": 3, "simulate": 2, "save_recording": 9, "demo": 3, "write_masks": 18}
+POINTS = {"run": 6, "run --replace": 6, "study": 2, "simulate": 2, "save_recording": 9, "demo": 3, "write_masks": 18}
 
 
 @pytest.fixture(scope="module")
