@@ -13,6 +13,7 @@ The layout::
     instance/000000.png  optional: object number of each pixel      robot/000000.png   optional: robot mask
     voxels.npz           optional ground truth: labels (S, X, Y, Z), frame (S,), origin, voxel_size
     poses.json           optional ground truth: per frame, per object a 4x4 T_world_object
+    SHA256SUMS           hashes of these files
 
 Frames with role ``static`` are the pauses. If camera.json holds no pose, the world is found from the support plane of
 the first pause; without a workspace, a grid is placed around the objects on the table. A recording is written under
@@ -21,11 +22,11 @@ a temporary name and renamed when it is complete: if writing fails, no file rema
 
 from __future__ import annotations
 
-import contextlib
 import json
 import math
-import shutil
-from collections.abc import Callable, Iterator, Mapping
+import re
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -35,7 +36,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from mstfilter.errors import InputError
-from mstfilter.files import check_output, reading
+from mstfilter.files import SUMS, atomic_folder, check_output, locked, reading, write_sums, writing
 from mstfilter.formats.video import RecordingFormat
 from mstfilter.scene import (
     Camera,
@@ -57,6 +58,9 @@ from mstfilter.scene import (
 from mstfilter.scene.pauses import PauseRule
 
 VERSION = 1  #: Version of the layout
+RECORDING_FILES = re.compile(  #: paths in a recording folder
+    rf"(manifest|camera|poses)\.json|voxels\.npz|{SUMS}|(rgb|depth|instance|robot)/\d{{6}}\.png"
+)
 
 
 class _Workspace(BaseModel):
@@ -70,22 +74,12 @@ class _Workspace(BaseModel):
         return cls(min=tuple(grid.origin.tolist()), max=tuple(grid.upper.tolist()), voxel=grid.voxel_size)
 
 
-def check_writable(path: Path) -> None:
-    """Raise InputError unless the path does not exist or is an empty folder, and a folder can be written there."""
-    if path.exists() and (not path.is_dir() or any(path.iterdir())):
-        raise InputError(
-            f"cannot write a recording to {path}: it exists and is not an empty folder",
-            "choose another name, or remove it",
-        )
-    check_output(path, folder=True)
-
-
 class RecordingWriter:
     """Writes a recording folder, frame by frame.
 
-    The new folder must not exist, or be empty. The camera has its pose if that is known; `grid` is the workspace.
-    `depth_scale` is in metres per unit of the 16-bit depth images. Further entries of manifest.json, such as
-    generator and seed, are given by name.
+    The new folder must not exist, or be empty, and no other process may be writing it. The camera has its pose if
+    that is known; `grid` is the workspace. `depth_scale` is in metres per unit of the 16-bit depth images. Further
+    entries of manifest.json, such as generator and seed, are given by name.
     """
 
     def __init__(
@@ -98,20 +92,17 @@ class RecordingWriter:
         **manifest: Any,
     ) -> None:
         self.path = Path(path)
-        check_writable(self.path)
+        check_output(self.path, folder=True)
         self._camera, self._grid, self._scale = camera, grid, depth_scale
         self._manifest = {"version": VERSION, **manifest}
         self._frames: list[dict[str, Any]] = []
         self._poses: list[dict[str, Any]] = []
         self._voxels: list[np.ndarray] = []
         self._voxel_frames: list[int] = []
-        self._folder = self.path.with_name(f".{self.path.name}.partial")
-        try:
-            if self._folder.exists():
-                shutil.rmtree(self._folder)
-            self._folder.mkdir(parents=True)
-        except OSError as error:
-            raise InputError(f"cannot write recording {self.path}: {error.strerror}") from error
+        with self._writing(), ExitStack() as stack:
+            stack.enter_context(locked(self.path))
+            self._folder = stack.enter_context(atomic_folder(self.path))
+            self._open = stack.pop_all()
 
     def add_frame(
         self,
@@ -181,7 +172,7 @@ class RecordingWriter:
             "workspace": None if grid is None else _Workspace.of(grid).model_dump(),
         }
         manifest = {**self._manifest, "frames": self._frames}
-        with self._writing():
+        with self._writing(), self._open:
             (self._folder / "camera.json").write_text(json.dumps(described, indent=1))
             (self._folder / "manifest.json").write_text(json.dumps(manifest, indent=1))
             if self._poses:
@@ -194,24 +185,15 @@ class RecordingWriter:
                     origin=grid.origin,
                     voxel_size=grid.voxel_size,
                 )
-            if self.path.exists():
-                self.path.rmdir()
-            self._folder.rename(self.path)
+            write_sums(self._folder)
         return self.path
 
-    @contextlib.contextmanager
-    def _writing(self) -> Iterator[None]:
-        """Turn errors of the disk into InputError."""
-        try:
-            yield
-        except OSError as error:
-            raise InputError(
-                f"cannot write recording {self.path}: {error.strerror}", "the unfinished files are removed"
-            ) from error
+    def _writing(self) -> AbstractContextManager[None]:
+        return writing(f"recording {self.path}", "the unfinished files are removed")
 
     def discard(self) -> None:
         """Remove all files written so far."""
-        shutil.rmtree(self._folder, ignore_errors=True)
+        self._open.__exit__(InterruptedError, InterruptedError(), None)
 
     def __enter__(self) -> RecordingWriter:
         return self
@@ -219,12 +201,8 @@ class RecordingWriter:
     def __exit__(self, kind: type[BaseException] | None, *error: Any) -> None:
         if kind is not None:
             self.discard()
-            return
-        try:
+        else:
             self.close()
-        except BaseException:
-            self.discard()
-            raise
 
 
 def save_recording(

@@ -40,7 +40,7 @@ from typing import Any
 import numpy as np
 
 from mstfilter.errors import InputError, naming
-from mstfilter.files import atomic_folder, reading, write_text
+from mstfilter.files import atomic_folder, locked, reading, write_text
 from mstfilter.frontends.mask_trees import label_tree, mask_tree
 from mstfilter.scene import content_key, memo, read_labels
 from mstfilter.segmentation import Tree
@@ -418,8 +418,7 @@ def write_masks(
         raise InputError(
             f"there are {len(alternatives)} alternatives and {given} weights, expected at least 1 of each"
         )
-    with atomic_folder(path) as partial:
-        partial.mkdir(parents=True)
+    with locked(path), atomic_folder(path, "replace") as partial:
         for k, one in enumerate(alternatives):
             masks, scores = one if isinstance(one, tuple) else (one, None)
             masks = np.asarray(masks)

@@ -9,19 +9,24 @@ Layout::
     pauses/000/rgb.png       the image at the pause          pauses/000/state.npz        particles and log weights
     pauses/000/info.json     record of the step              pauses/000/camera.json      pose at the pause
     pauses/000/truth.npz     true labels, if known           pauses/000/seconds.json     wall time by component
-    metrics.csv              one row per pause and hypothesis
+    pauses/000/SHA256SUMS    hashes of these files but seconds.json
+    metrics.csv              one row per pause and hypothesis; SHA256SUMS: its hash
     compare/without-past     run folders of other filters on the same recording, if asked for
 
 A pause is written under a temporary name and renamed when it is complete, so a run that was stopped at any moment
-holds complete pauses only. `filter_recording` resumes from state.npz of the last one. Its arrays ``particles/...``
-are those of `mstfilter.scene.encode_hypotheses`. The same seed gives the same bytes in all files except seconds.json.
+holds complete pauses only. `filter_recording` resumes from state.npz of the last one, which contains the step, the
+seed and a hash of run.json. Its arrays ``particles/...`` are those of `mstfilter.scene.encode_hypotheses`. The same
+seed gives the same bytes in all files except seconds.json.
 """
 
 from __future__ import annotations
 
+import hashlib
 import itertools
 import json
+import re
 import shutil
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,8 +34,18 @@ from typing import Any
 
 import numpy as np
 
-from mstfilter.errors import InputError
-from mstfilter.files import atomic_folder, reading, write_csv, write_text
+from mstfilter.errors import InputError, InputWarning
+from mstfilter.files import (
+    SUMS,
+    atomic_folder,
+    damaged_files,
+    other_files,
+    reading,
+    sweep,
+    write_csv,
+    write_sums,
+    write_text,
+)
 from mstfilter.scene import (
     Camera,
     Clip,
@@ -45,6 +60,9 @@ from mstfilter.scoring import FORMS, Questions, weighted_coverage
 from mstfilter.smc import Codec, Info, State, load_state, save_state
 
 _FORMAT = 2
+_PAUSE_FILES = rf"(rgb\.png|camera\.json|state\.npz|truth\.npz|info\.json|seconds\.json|{SUMS})"
+_TABLES = rf"(run\.json|metrics\.csv|report\.html|result\.json|forecasts\.npz|{SUMS})"
+RUN_FILES = re.compile(rf"(compare/[^/]+/)?(pauses/\d+/{_PAUSE_FILES}|{_TABLES})")  #: paths in a run folder
 
 
 def as_json(value: Any) -> Any:
@@ -106,10 +124,6 @@ class RunFolder:
     @classmethod
     def create(cls, path: Path, description: Mapping[str, Any]) -> RunFolder:
         """A new run folder that holds only its description."""
-        try:
-            path.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise InputError(f"cannot write run folder {path}: {error.strerror}") from error
         write_json(path / "run.json", {"format": _FORMAT, "status": "running", **description})
         return cls(path)
 
@@ -122,6 +136,12 @@ class RunFolder:
     def n_pauses(self) -> int:
         """Number of complete pauses."""
         return next(t for t in itertools.count() if not self.pause(t).is_dir())
+
+    @property
+    def key(self) -> str:
+        """A hash of run.json without the status; the states of the run contain it."""
+        kept = {name: value for name, value in self.description.items() if name != "status"}
+        return hashlib.sha256(json.dumps(kept, sort_keys=True).encode()).hexdigest()[:32]
 
     def pause(self, t: int) -> Path:
         """Folder of a pause."""
@@ -145,9 +165,7 @@ class RunFolder:
         """
         assert state.population is not None
         camera, hypotheses = clip.after.camera, tuple(state.population.particles)
-        (self.path / "pauses").mkdir(exist_ok=True)
         with atomic_folder(self.pause(info.t)) as folder:
-            folder.mkdir()
             write_image(folder / "rgb.png", clip.after.rgb)
             write_json(
                 folder / "camera.json",
@@ -158,7 +176,7 @@ class RunFolder:
                     "T_world_camera": camera.pose.as_matrix(),
                 },
             )
-            save_state(folder / "state.npz", state, HypothesisCodec(), compress=True)
+            save_state(folder / "state.npz", state, HypothesisCodec(), compress=True, run=self.key)
             quality: dict[str, list[float]] | None = None
             if truth is not None:
                 pairs = np.zeros((2, 0)) if questions is None else np.stack([questions.first, questions.second])
@@ -180,12 +198,59 @@ class RunFolder:
                 "notes": info.notes,
             }
             write_json(folder / "info.json", record)
+            write_sums(folder)
             write_json(folder / "seconds.json", info.seconds)
 
-    def remove_partial_pauses(self) -> None:
-        """Remove the incomplete folder of a pause that a killed run left."""
-        for partial in (self.path / "pauses").glob(".*.partial"):
-            shutil.rmtree(partial, ignore_errors=True)
+    def check_replaceable(self) -> None:
+        """Raise InputError if the folder contains files that no run writes."""
+        if others := other_files(self.path, RUN_FILES):
+            raise InputError(
+                f"run folder {self.path} cannot be replaced: it holds {others[0]}, which is not of a run",
+                "move it elsewhere, or choose another folder",
+            )
+
+    def damage(self) -> list[str]:
+        """What is wrong with files of the run: those that differ from their hashes, and states of another run."""
+        found = damaged_files(self.path) if self.description["status"] == "done" else []
+        for t in range(self.n_pauses):
+            found += [f"pauses/{t:03d}/{wrong}" for wrong in damaged_files(self.pause(t)) or self._foreign(t)]
+        return found
+
+    def _foreign(self, t: int) -> list[str]:
+        """In what the state of a pause differs from one of this run."""
+        path = self.pause(t) / "state.npz"
+        with reading(path, "a pause of a run"), np.load(path, allow_pickle=False) as data:
+            head = json.loads(str(data["head"]))
+        expected = {"t": t + 1, "seed": self.description["seed"], "run": self.key}
+        differs = [name for name, value in expected.items() if head.get(name) != value]
+        names = {"t": "step", "run": "hash of run.json"}
+        return [
+            f"state.npz belongs to another run: {names.get(name, name)} {head.get(name)}, expected {expected[name]}"
+            for name in differs
+        ]
+
+    def repair(self) -> None:
+        """Prepare the folder for resuming: remove what a killed process left, and damaged pauses with a warning.
+
+        All pauses after a damaged one are removed. Raises InputError if a pause belongs to another run.
+        """
+        sweep(self.path)
+        sweep(self.path / "pauses")
+        good = 0
+        while not (wrong := damaged_files(self.pause(good))):
+            if foreign := self._foreign(good):
+                raise InputError(
+                    f"{self.pause(good)}/{foreign[0]}",
+                    "choose another folder, or start again (on the command line: --replace)",
+                )
+            good += 1
+        later = sorted(path for path in (self.path / "pauses").glob("[0-9]*") if int(path.name) >= good)
+        for path in reversed(later):
+            shutil.rmtree(path)
+        if later:
+            text = f"run folder {self.path}: pause {good} is damaged: {wrong[0]}"
+            hint = f"pauses {good} to {int(later[-1].name)} are computed again"
+            warnings.warn(InputWarning(text, hint), stacklevel=2)
 
     def info(self, t: int) -> dict[str, Any]:
         """Record of the step that ended at pause `t`."""
@@ -249,3 +314,4 @@ class RunFolder:
                     row[f"quality_{form}"] = "" if info["quality"] is None else f"{info['quality'][form][k]:.6f}"
                 rows.append(row)
         write_csv(self.path / "metrics.csv", rows)
+        write_sums(self.path, ["metrics.csv"])

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from mstfilter.errors import InputError
-from mstfilter.files import reading, write_csv
+from mstfilter.files import reading, write_csv, writing
 from mstfilter.runs.run_folder import RunFolder
 from mstfilter.scene import Camera, Hypothesis, Recording, VoxelGrid, as_labels, render
 from mstfilter.scoring import (
@@ -287,7 +287,5 @@ def write_scores(path: Path, rows: Sequence[PauseScore]) -> None:
     """
     if not path.parent.is_dir():
         raise InputError(f"cannot write {path}: its folder does not exist")
-    try:
+    with writing(str(path)):
         write_csv(path, [asdict(row) for row in rows], float_format=".6f")
-    except OSError as error:
-        raise InputError(f"cannot write {path}: {error.strerror}") from error

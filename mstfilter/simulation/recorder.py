@@ -25,8 +25,6 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import shutil
-import tempfile
 from collections.abc import Callable
 from dataclasses import asdict, fields, replace
 from importlib.metadata import version
@@ -36,7 +34,7 @@ from typing import Any
 import numpy as np
 
 from mstfilter.errors import InputError
-from mstfilter.files import write_text
+from mstfilter.files import atomic_folder, sweep, write_text
 from mstfilter.formats import RecordingWriter, open_recording
 from mstfilter.scene import Recording
 from mstfilter.simulation.arrangement import SceneObjects, arrange_objects, draw_objects
@@ -60,6 +58,7 @@ from mstfilter.simulation.world import (
 #: Metres by which recorded poses (in images, poses and volumes alike) may differ from the physics; see `Stage`.
 POSE_TOLERANCE = 0.0002
 
+_DAY_S = 24 * 3600.0
 _Progress = Callable[[int, int, str], None]  # called with frames done, frames in all, and a description
 
 
@@ -259,19 +258,11 @@ def _simulate_into_cache(family: SceneFamily, seed: int, target: Path) -> None:
         ignore = target.parent / ".gitignore"  # recordings stay out of version control
         if not ignore.exists():
             write_text(ignore, "*\n")
-        work = Path(tempfile.mkdtemp(prefix=f".{target.name}-", dir=target.parent))
+        sweep(target.parent, older_than_s=_DAY_S)  # of simulations that were killed
+        with atomic_folder(target, existing="keep") as work:  # another process may write the same recording
+            simulate_recording(family, seed, work)
     except OSError as error:
         raise InputError(
             f"cannot keep recordings in {target.parent}: {error.strerror}",
             "set MSTFILTER_CACHE to a folder that can be written",
         ) from error
-    try:
-        simulate_recording(family, seed, work / "recording")
-        try:
-            (work / "recording").rename(target)
-        except OSError:
-            if not (target / "manifest.json").is_file():
-                raise
-            # Another process has written the same recording.
-    finally:
-        shutil.rmtree(work, ignore_errors=True)

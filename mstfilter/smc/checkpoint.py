@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import os
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -29,7 +28,7 @@ from typing import Any
 import numpy as np
 
 from mstfilter.errors import InputError, reason
-from mstfilter.files import atomic_path, read_arrays
+from mstfilter.files import atomic_path, read_arrays, writing
 from mstfilter.smc.interfaces import Codec, State
 from mstfilter.smc.population import Population
 from mstfilter.smc.programs.sites import Trace
@@ -64,13 +63,8 @@ def save_state(
         **{f"parents/{name}": index for name, index in population.parents.items()},
         **{f"particles/{name}": a for name, a in (codec or ArrayCodec()).encode(population.particles).items()},
     }
-    try:
-        with atomic_path(path) as partial, partial.open("wb") as file:
-            (np.savez_compressed if compress else np.savez)(file, allow_pickle=False, **arrays)
-            file.flush()
-            os.fsync(file.fileno())
-    except OSError as error:
-        raise InputError(f"cannot write checkpoint {path}: {error.strerror}") from error
+    with writing(f"checkpoint {path}"), atomic_path(path) as partial, partial.open("wb") as file:
+        (np.savez_compressed if compress else np.savez)(file, allow_pickle=False, **arrays)
 
 
 def load_state(path: Path, codec: Codec | None = None) -> tuple[State, dict[str, Any]]:

@@ -281,7 +281,7 @@ def run_many(
     if workers > 1:
         _check_caller()
     if folder is not None:
-        check_output(Path(folder), folder=True)
+        check_output(Path(folder), folder=True, empty=False)
     observations, collectors = list(observations), collectors or {"log_evidence": log_evidence}
     hashes = {} if folder is None else {arm: digest((arms[arm], observations, collectors)) for arm in arms}
     job = _Job(dict(arms), observations, collectors, folder, hashes)

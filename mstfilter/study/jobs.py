@@ -103,7 +103,7 @@ def _run(job: Job, step: _StepCallback) -> None:
         step(p.done, p.total)
 
     recording = open_scene(job["source"], job["recordings"])
-    with atomic_folder(folder) as work:
+    with atomic_folder(folder, "replace") as work:
         with scene_cache.on_disk(**job["work"]) if job["work"] else contextlib.nullcontext():
             began = time.process_time()
             run = filter_recording(
