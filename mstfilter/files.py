@@ -16,15 +16,20 @@ import json
 import math
 import numbers
 import os
+import re
 import shutil
+import struct
 import uuid
 import zipfile
+import zlib
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from mstfilter.errors import InputError, naming, reason
+
+SUMS = "SHA256SUMS"  # in a folder: the hashes of its files
 
 
 @contextmanager
@@ -54,6 +59,29 @@ def atomic_folder(path: str | Path) -> Iterator[Path]:
         shutil.rmtree(partial, ignore_errors=True)
 
 
+def write_sums(folder: Path, names: Iterable[str] = ()) -> None:
+    """Write SHA256SUMS, which ``sha256sum -c`` reads: the hashes of the named files, or of all below the folder."""
+    files = [folder / name for name in names] or sorted(path for path in folder.rglob("*") if path.is_file())
+    write_text(folder / SUMS, "".join(f"{_digest(file)}  {file.relative_to(folder).as_posix()}\n" for file in files))
+
+
+def damaged_files(folder: Path) -> list[str]:
+    """What differs from the SHA256SUMS of a folder: ``state.npz has changed``, ``rgb.png is missing``."""
+    if not (folder / SUMS).is_file():
+        return [f"{SUMS} is missing"]
+    lines = (folder / SUMS).read_text(errors="replace").splitlines()
+    listed = [re.fullmatch(r"([0-9a-f]{64})  (.+)", line) for line in lines if line.isprintable()]
+    if not lines or len(listed) < len(lines) or not all(listed):
+        return [f"{SUMS} has changed"]
+    return [f"{match[2]} {fault}" for match in listed if match and (fault := _fault(folder / match[2], match[1]))]
+
+
+def _fault(file: Path, digest: str) -> str:
+    if not file.is_file():
+        return "is missing"
+    return "" if _digest(file) == digest else "has changed"
+
+
 @contextmanager
 def reading(path: Path, kind: str, *hints: str) -> Iterator[None]:
     """Turn errors in a block that reads a file into InputError; `kind` is what is missing without the file."""
@@ -64,10 +92,21 @@ def reading(path: Path, kind: str, *hints: str) -> Iterator[None]:
         raise
     except FileNotFoundError:
         raise InputError(f"not {kind}: {path} is missing", *hints) from None
-    except (json.JSONDecodeError, RecursionError) as error:
+    except json.JSONDecodeError as error:
         raise InputError(f"{path} is not valid JSON: {error}", *hints) from error
-    except (OSError, EOFError, zipfile.BadZipFile, ValueError, KeyError, TypeError, AttributeError) as error:
+    except RecursionError as error:
+        raise InputError(f"{path} cannot be read: its values are nested too deep", *hints) from error
+    except MemoryError as error:
+        raise InputError(f"{path} cannot be read: memory ran out", *hints) from error
+    except _UNREADABLE as error:
         raise InputError(f"{path} cannot be read: {reason(error)}", *hints) from error
+
+
+# CPython 3.11 raises SystemError if two threads parse the headers of arrays at once (python/cpython#106905).
+_UNREADABLE = (
+    *(OSError, EOFError, ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RuntimeError),
+    *(SystemError, struct.error, zlib.error, zipfile.BadZipFile),
+)
 
 
 def check_output(path: Path, folder: bool = False) -> None:
@@ -137,5 +176,9 @@ def weights_file(given: str, name: str, where: str, sha256: str = "") -> tuple[s
 
 @functools.lru_cache(maxsize=8)
 def _sha256(path: str, modified: int, size: int) -> str:
+    return _digest(path)
+
+
+def _digest(path: str | Path) -> str:
     with open(path, "rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()

@@ -42,6 +42,7 @@ import numpy as np
 from mstfilter.errors import InputError, naming
 from mstfilter.files import atomic_folder, reading, write_text
 from mstfilter.frontends.mask_trees import label_tree, mask_tree
+from mstfilter.reading import array_header, read_bytes, read_json
 from mstfilter.scene import content_key, memo, read_labels
 from mstfilter.segmentation import Tree
 
@@ -92,7 +93,7 @@ def read_masks(folder: str | Path, pause: int, shape: tuple[int, int], rgb: np.n
         )
     groups = {name: [p] if p.is_file() else _alternatives(p) for name, p in parts.items()}
     groups = groups or {"": _alternatives(where)}
-    content = {p: read_bytes(p) for group in groups.values() for p in group}
+    content = {p: read_bytes(p, "masks") for group in groups.values() for p in group}
     weights = {name: read_weights(group[0].parent, group) for name, group in groups.items() if len(group) > 1}
     image = "" if rgb is None else image_key(rgb)
     key = content_key(
@@ -156,20 +157,12 @@ def _alternatives(folder: Path) -> list[Path]:
     return files
 
 
-def read_bytes(path: Path) -> bytes:
-    """The content of a file; raises InputError if it cannot be read."""
-    try:
-        return path.read_bytes()
-    except OSError as error:
-        raise InputError(f"file cannot be read: {path} ({error.strerror})") from error
-
-
 def read_weights(folder: Path, files: list[Path]) -> dict[str, float] | None:
     """The content of weights.json, if there is one."""
     path = folder / _WEIGHTS
     if not path.is_file():
         return None
-    weights = _json(path, read_bytes(path))
+    weights = read_json(path, "weights")
     names = {p.name for p in files}
     if not isinstance(weights, dict) or set(weights) != names:
         raise InputError(f"{path} does not have one weight for each of {', '.join(sorted(names))}")
@@ -264,7 +257,7 @@ def _read_npz(path: Path, data: bytes, shape: tuple[int, int], image: str) -> tu
             kind = "labels" if "labels" in names else "masks"
             if kind not in names:
                 raise InputError(f"{path} has no array labels or masks, only {', '.join(sorted(names)) or 'nothing'}")
-            size, dtype = _header(archive, kind)
+            size, _, dtype = _header(archive, kind)
             # The size is checked before memory is allocated for it.
             if len(size) != (2 if kind == "labels" else 3):
                 raise InputError(
@@ -302,14 +295,10 @@ def _read_npz(path: Path, data: bytes, shape: tuple[int, int], image: str) -> tu
     return masks, scores
 
 
-def _header(archive: zipfile.ZipFile, name: str) -> tuple[tuple[int, ...], np.dtype[Any]]:
-    """Shape and type of an array in an npz file."""
+def _header(archive: zipfile.ZipFile, name: str) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
+    """Shape, order and type of an array in an npz file."""
     with archive.open(f"{name}.npy") as file:
-        read = np.lib.format.read_array_header_1_0
-        if np.lib.format.read_magic(file) != (1, 0):
-            read = np.lib.format.read_array_header_2_0
-        shape, _, dtype = read(file)
-    return shape, dtype
+        return array_header(file)
 
 
 def _member(archive: zipfile.ZipFile, name: str, limit: int | None = None) -> np.ndarray:
@@ -430,7 +419,8 @@ def write_masks(
                 arrays["image"] = np.array(image_key(rgb))
             name = partial / f"{k}.npz"
             np.savez_compressed(name, **arrays)  # type: ignore[arg-type]
-            _region("", [name], {name: read_bytes(name)}, None, masks.shape[-2:], "")  # the checks of the reader
+            content = {name: read_bytes(name, "masks")}
+            _region("", [name], content, None, masks.shape[-2:], "")  # the checks of the reader
         if weights is not None:
             write_text(partial / _WEIGHTS, json.dumps({f"{k}.npz": float(w) for k, w in enumerate(weights)}))
             read_weights(partial, _alternatives(partial))

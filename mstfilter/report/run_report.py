@@ -329,7 +329,7 @@ def write_report(run: RunFolder | str | Path, out: str | Path | None = None) -> 
     """
     from markupsafe import Markup
 
-    run = RunFolder.open(run.path if isinstance(run, RunFolder) else run)
+    run = RunFolder.open(run.path if isinstance(run, RunFolder) else run).check()
     numbers = read_numbers(run)
     filters: dict[str, Callable[..., Any]] = {
         "short_text": short_text,

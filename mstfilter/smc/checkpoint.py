@@ -18,7 +18,6 @@ import dataclasses
 import json
 import os
 import sys
-import zipfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from hashlib import blake2b
@@ -29,7 +28,8 @@ from typing import Any
 import numpy as np
 
 from mstfilter.errors import InputError
-from mstfilter.files import atomic_path
+from mstfilter.files import atomic_path, reading
+from mstfilter.reading import read_arrays
 from mstfilter.smc.interfaces import Codec, State
 from mstfilter.smc.population import Population
 from mstfilter.smc.programs.sites import Trace
@@ -73,22 +73,20 @@ def save_state(
         raise InputError(f"cannot write checkpoint {path}: {error.strerror}") from error
 
 
-def load_state(path: Path, codec: Codec | None = None) -> tuple[State, dict[str, Any]]:
-    """The state in a file, and the description stored with it."""
-    try:
-        with np.load(path, allow_pickle=False) as data:
-            arrays = {name: data[name] for name in data.files}
+def load_state(path: Path, codec: Codec | None = None, *, limit: int = 2**40) -> tuple[State, dict[str, Any]]:
+    """The state in a file, and the description stored with it.
+
+    Raises InputError if the file is missing or damaged, or its arrays need more than `limit` bytes.
+    """
+    arrays = read_arrays(path, "a checkpoint", "remove it to start again", limit=limit)
+    with reading(path, "a checkpoint", "remove it to start again"):
         head = json.loads(str(arrays["head"]))
-    except FileNotFoundError:
-        raise InputError(f"checkpoint is missing: {path}") from None
-    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile) as error:
-        raise InputError(f"checkpoint cannot be read: {path} ({error})", "remove it to start again") from error
-    if head.get("format") != _FORMAT:
-        raise InputError(f"checkpoint {path} has format {head.get('format')}, expected {_FORMAT}")
-    particles = (codec or ArrayCodec()).decode(_below(arrays, "particles/"))
-    population = Population(particles, arrays["log_weights"], _below(arrays, "parents/"))
-    key = Key(head["seed"], tuple(head["path"]))
-    return State(head["t"], population, key, head["properly_weighted"]), head
+        if head.get("format") != _FORMAT:
+            raise InputError(f"checkpoint {path} has format {head.get('format')}, expected {_FORMAT}")
+        particles = (codec or ArrayCodec()).decode(_below(arrays, "particles/"))
+        population = Population(particles, arrays["log_weights"], _below(arrays, "parents/"))
+        key = Key(int(head["seed"]), tuple(int(part) for part in head["path"]))
+        return State(int(head["t"]), population, key, bool(head["properly_weighted"])), head
 
 
 def _below(arrays: dict[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:

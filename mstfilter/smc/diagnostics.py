@@ -24,7 +24,7 @@ runs are stored, and the same call continues after an interruption.
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from itertools import product
 from pathlib import Path
@@ -34,8 +34,10 @@ from urllib.parse import quote
 import numpy as np
 
 from mstfilter.errors import InputError, LostRunError, MissingLibraryError, check_integer, naming
-from mstfilter.files import atomic_path
+from mstfilter.files import atomic_path, reading
 from mstfilter.lazy import progress_of
+from mstfilter.processes import environment
+from mstfilter.reading import read_arrays
 from mstfilter.smc.batching import batch, batched_slots
 from mstfilter.smc.checkpoint import digest
 from mstfilter.smc.filter import ParticleFilter
@@ -358,9 +360,10 @@ class _Job:
         path = self.path(arm, seed)
         if self.folder is None or not path.exists():
             return None
-        with np.load(path, allow_pickle=False) as data:
+        data = read_arrays(path, "a stored run", "remove it to run it again")
+        with reading(path, "a stored run", "remove it to run it again"):
             identity, lost = (str(text) for text in data["head"])
-            rows = {name: data[f"rows/{name}"] for name in self.collectors if f"rows/{name}" in data.files}
+            rows = {name: data[f"rows/{name}"] for name in self.collectors if f"rows/{name}" in data}
         if identity != self.hashes[arm]:
             raise InputError(
                 f"run {path} was made by another filter, other observations or other collectors",
@@ -377,18 +380,19 @@ def _until_lost(steps: Iterable[tuple[State, Info]], lost: list[str]) -> Iterabl
         lost.append(error.message)
 
 
-def _finished_chunks(job: _Job, chunks: list[tuple[str, list[int]]], workers: int) -> Iterable[Any]:
+def _finished_chunks(job: _Job, chunks: list[tuple[str, list[int]]], workers: int) -> Iterator[Any]:
     """Results of chunks of runs in the order in which they finish.
 
     Workers are new processes: a fork of a process with threads can deadlock.
     """
     if workers == 1:
-        return (job.run(arm, seeds) for arm, seeds in chunks)
+        yield from (job.run(arm, seeds) for arm, seeds in chunks)
+        return
     from joblib import Parallel, delayed, parallel_config
 
-    with parallel_config("loky", n_jobs=workers, inner_max_num_threads=1):
+    with environment(), parallel_config("loky", n_jobs=workers, inner_max_num_threads=1):
         parallel = Parallel(batch_size=1, return_as="generator_unordered")
-        return parallel(delayed(_in_worker)(job, *chunk) for chunk in chunks)
+        yield from parallel(delayed(_in_worker)(job, *chunk) for chunk in chunks)
 
 
 def _in_worker(job: _Job, arm: str, seeds: list[int]) -> dict[tuple[str, int], _Run]:
