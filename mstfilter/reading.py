@@ -129,18 +129,12 @@ def unpack_arrays(file: IO[bytes], limit: int = MAX_FILE) -> dict[str, np.ndarra
 
 def _check_array(file: IO[bytes], size: int) -> None:
     """Raise ValueError unless the array of a .npy file of `size` bytes fits into it and has no objects."""
-    shape, _, dtype = array_header(file)
+    first = np.lib.format.read_magic(file) == (1, 0)
+    shape, _, dtype = (np.lib.format.read_array_header_1_0 if first else np.lib.format.read_array_header_2_0)(file)
     if dtype.hasobject:
         raise ValueError("it holds objects (pickle), which are not read")
     if min(shape, default=0) < 0 or math.prod(shape) * dtype.itemsize > size:
         raise ValueError(f"an array of shape {shape} and type {dtype} does not fit into {size} bytes")
-
-
-def array_header(file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
-    """Shape, order and type of an array in the .npy format."""
-    if np.lib.format.read_magic(file) == (1, 0):
-        return np.lib.format.read_array_header_1_0(file)
-    return np.lib.format.read_array_header_2_0(file)
 
 
 def check_private(folder: Path) -> None:

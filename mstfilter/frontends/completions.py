@@ -35,7 +35,7 @@ from mstfilter.errors import InputError, check_choice, check_number
 from mstfilter.files import reading
 from mstfilter.frontends.mask_files import read_weights
 from mstfilter.open3d_import import import_open3d
-from mstfilter.reading import read_bytes, unpack_arrays
+from mstfilter.reading import MAX_FILE, read_bytes, unpack_arrays
 from mstfilter.scene import (
     Camera,
     Clip,
@@ -254,7 +254,7 @@ def _checked(path: Path, points: np.ndarray, T: np.ndarray, grid: VoxelGrid) -> 
 
 def _arrays(path: Path, data: bytes) -> dict[str, np.ndarray]:
     with reading(path, "a shape", "expected arrays of numbers from numpy.savez"):
-        arrays = unpack_arrays(io.BytesIO(data))
+        arrays = unpack_arrays(io.BytesIO(data), MAX_FILE)
     if "points" not in arrays and not {"occupancy", "origin", "voxel_size"} <= set(arrays):
         raise InputError(f"{path} has {', '.join(arrays)}; expected points, or occupancy, origin and voxel_size")
     return arrays

@@ -30,8 +30,6 @@ from __future__ import annotations
 import io
 import json
 import math
-import zipfile
-import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -42,12 +40,11 @@ import numpy as np
 from mstfilter.errors import InputError, naming
 from mstfilter.files import atomic_folder, reading, write_text
 from mstfilter.frontends.mask_trees import label_tree, mask_tree
-from mstfilter.reading import array_header, read_bytes, read_json
+from mstfilter.reading import MAX_FILE, read_bytes, read_json, unpack_arrays
 from mstfilter.scene import content_key, memo, read_labels
 from mstfilter.segmentation import Tree
 
 MAX_MASKS = 65535  #: Largest label, and largest number of masks of a file
-MAX_PIXELS = 2**31  #: Largest number of pixels of all masks of a file
 _SUFFIXES = (".png", ".npz", ".json")
 _WEIGHTS = "weights.json"
 
@@ -240,8 +237,8 @@ def _check_shape(path: Path, found: Sequence[int], shape: tuple[int, int]) -> No
 
 def _check_amount(path: Path, n: int, shape: tuple[int, int]) -> None:
     """Raise InputError if masks need too much memory; a small file can hold many empty ones."""
-    if n * shape[0] * shape[1] > MAX_PIXELS:
-        raise InputError(f"{path} has {n} masks, at most {MAX_PIXELS // (shape[0] * shape[1])} of this size are read")
+    if n * shape[0] * shape[1] > MAX_FILE:
+        raise InputError(f"{path} has {n} masks, at most {MAX_FILE // (shape[0] * shape[1])} of this size are read")
 
 
 def _read_png(path: Path, data: bytes, shape: tuple[int, int], image: str) -> tuple[np.ndarray, np.ndarray]:
@@ -251,62 +248,35 @@ def _read_png(path: Path, data: bytes, shape: tuple[int, int], image: str) -> tu
 
 
 def _read_npz(path: Path, data: bytes, shape: tuple[int, int], image: str) -> tuple[np.ndarray, np.ndarray]:
-    try:
-        with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            names = {name.removesuffix(".npy") for name in archive.namelist()}
-            kind = "labels" if "labels" in names else "masks"
-            if kind not in names:
-                raise InputError(f"{path} has no array labels or masks, only {', '.join(sorted(names)) or 'nothing'}")
-            size, _, dtype = _header(archive, kind)
-            # The size is checked before memory is allocated for it.
-            if len(size) != (2 if kind == "labels" else 3):
-                raise InputError(
-                    f"{path}: {kind} has shape {size}, expected {'(H, W)' if kind == 'labels' else '(n, H, W)'}"
-                )
-            _check_shape(path, size[-2:], shape)
-            if kind == "masks" and (dtype.kind != "b" or size[0] > MAX_MASKS):
-                raise InputError(
-                    f"{path}: masks has type {dtype} and length {size[0]}, expected bool, at most {MAX_MASKS}"
-                )
-            _check_amount(path, int(np.prod(size[:-2], dtype=np.int64)), shape)
-            masks = _member(archive, kind)
-            if kind == "labels":
-                if not np.issubdtype(masks.dtype, np.integer):
-                    raise InputError(f"{path}: labels has type {masks.dtype}, expected integers")
-                if masks.min(initial=0) < 0 or masks.max(initial=0) > MAX_MASKS:
-                    raise InputError(
-                        f"{path}: labels are {masks.min()} to {masks.max()}, expected 0 to {MAX_MASKS}",
-                        "labels have 16 bits; number the masks from 1",
-                    )
-            n = len(masks) if kind == "masks" else len(np.unique(masks[masks > 0]))
-            scores = _member(archive, "scores", MAX_MASKS) if "scores" in names else np.ones(n)
-            made_from = str(_member(archive, "image", 1)) if "image" in names else image
-    except (zipfile.BadZipFile, ValueError, EOFError, OSError, zlib.error, KeyError) as error:
-        if isinstance(error, InputError):
-            raise
+    with reading(path, "masks", "expected arrays of numbers from numpy.savez; objects (pickle) are not read"):
+        arrays = unpack_arrays(io.BytesIO(data), MAX_FILE)
+    kind = "labels" if "labels" in arrays else "masks"
+    if kind not in arrays:
+        raise InputError(f"{path} has no array labels or masks, only {', '.join(sorted(arrays)) or 'nothing'}")
+    masks = arrays[kind]
+    if masks.ndim != (2 if kind == "labels" else 3):
         raise InputError(
-            f"file of masks cannot be read: {path} ({error})",
-            "expected arrays of numbers from numpy.savez; objects (pickle) are not read",
-        ) from error
-    if image and made_from != image:
+            f"{path}: {kind} has shape {masks.shape}, expected {'(H, W)' if kind == 'labels' else '(n, H, W)'}"
+        )
+    _check_shape(path, masks.shape[-2:], shape)
+    if kind == "masks" and (masks.dtype.kind != "b" or len(masks) > MAX_MASKS):
+        raise InputError(
+            f"{path}: masks has type {masks.dtype} and length {len(masks)}, expected bool, at most {MAX_MASKS}"
+        )
+    if kind == "labels" and not np.issubdtype(masks.dtype, np.integer):
+        raise InputError(f"{path}: labels has type {masks.dtype}, expected integers")
+    if kind == "labels" and (masks.min(initial=0) < 0 or masks.max(initial=0) > MAX_MASKS):
+        raise InputError(
+            f"{path}: labels are {masks.min()} to {masks.max()}, expected 0 to {MAX_MASKS}",
+            "labels have 16 bits; number the masks from 1",
+        )
+    n = len(masks) if kind == "masks" else len(np.unique(masks[masks > 0]))
+    scores = arrays.get("scores", np.ones(n))
+    if image and str(arrays.get("image", image)) != image:
         raise InputError(f"masks of {path} were made from another image", "files are numbered by pause, from 0")
     if not np.issubdtype(scores.dtype, np.number):
         raise InputError(f"{path}: scores has type {scores.dtype}, expected numbers")
     return masks, scores
-
-
-def _header(archive: zipfile.ZipFile, name: str) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
-    """Shape, order and type of an array in an npz file."""
-    with archive.open(f"{name}.npy") as file:
-        return array_header(file)
-
-
-def _member(archive: zipfile.ZipFile, name: str, limit: int | None = None) -> np.ndarray:
-    """An array of an npz file, with at most `limit` elements."""
-    if limit is not None and math.prod(_header(archive, name)[0]) > limit:
-        raise ValueError(f"{name} has more than {limit} elements")
-    with archive.open(f"{name}.npy") as file:
-        return np.asarray(np.lib.format.read_array(file, allow_pickle=False))
 
 
 def _json(path: Path, data: bytes) -> Any:

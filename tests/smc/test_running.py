@@ -277,7 +277,7 @@ def test_what_cannot_be_stored_is_one_clear_error(tmp_path):
     save((1j, 2j), Halves())
     assert load_state(tmp_path / "s.npz", Halves())[0].population.particles == (1j, 2j)
     (tmp_path / "s.npz").write_bytes(b"PK nonsense")
-    with pytest.raises(InputError, match="checkpoint cannot be read"):
+    with pytest.raises(InputError, match="s.npz cannot be read"):
         load_state(tmp_path / "s.npz")
     with pytest.raises(InputError, match="checkpoint is missing"):
         load_state(tmp_path / "t.npz")
