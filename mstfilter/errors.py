@@ -68,12 +68,19 @@ def naming(where: str) -> Iterator[None]:
 
 def reason(error: BaseException) -> str:
     """The message of an exception; of a KeyError, which has the name alone, that the name is missing."""
+    if isinstance(error, OSError) and error.strerror:
+        return error.strerror
     return f"{error} is missing" if isinstance(error, KeyError) else str(error)
 
 
 def printable(text: str) -> str:
-    """The text with the control characters of a terminal, which names in files may contain, as escape sequences."""
-    return "".join(c if c.isprintable() or c == "\n" else ascii(c)[1:-1] for c in text)
+    """One line of at most 1500 characters; the control characters of a terminal become escape sequences.
+
+    Names and values in files of strangers may contain them.
+    """
+    line = " ".join(part.strip() for part in text.split("\n"))
+    line = line if len(line) <= 1500 else f"{line[:1400]} ... {line[-80:]}"
+    return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in line)
 
 
 def suggestion(name: str, names: Iterable[str]) -> list[str]:

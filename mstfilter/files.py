@@ -19,6 +19,7 @@ import os
 import re
 import shutil
 import struct
+import tokenize
 import uuid
 import zipfile
 import zlib
@@ -105,7 +106,7 @@ def reading(path: Path, kind: str, *hints: str) -> Iterator[None]:
 # CPython 3.11 raises SystemError if two threads parse the headers of arrays at once (python/cpython#106905).
 _UNREADABLE = (
     *(OSError, EOFError, ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RuntimeError),
-    *(SystemError, struct.error, zlib.error, zipfile.BadZipFile),
+    *(SystemError, SyntaxError, tokenize.TokenError, struct.error, zlib.error, zipfile.BadZipFile),
 )
 
 

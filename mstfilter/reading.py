@@ -77,7 +77,7 @@ def read_toml(path: Path, kind: str, *hints: str) -> dict[str, Any]:
     text = read_text(path, kind, *hints, limit=MAX_TOML)
     try:
         return tomllib.loads(text)
-    except (tomllib.TOMLDecodeError, RecursionError) as error:
+    except (ValueError, RecursionError) as error:
         raise InputError(f"{path} is not valid TOML: {error}", *hints) from error
 
 

@@ -167,7 +167,7 @@ def _write_study_folder(path: Path) -> None:
             "identity": "x",
             "status": "done",
             "rows": rows,
-            "costs": [{"seconds": 1.0, "core_seconds": 1.0}] * 3,
+            "costs": [{"seconds": 1.0, "core_seconds": 1.0, "peak_mb": 9.0}] * 3,
         }
         (folder / "result.json").write_text(json.dumps(result), encoding="utf-8")
         np.savez_compressed(folder / "forecasts.npz", counts=np.zeros((3, 1, *NO_COUNTS.shape), np.int64))

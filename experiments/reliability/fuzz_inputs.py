@@ -2,9 +2,9 @@
 
     python experiments/reliability/fuzz_inputs.py --trials 60    # for each kind; writes fuzz_inputs.csv
 
-A trial copies a valid input, spoils it (`tests/hostile.py`) and reads it in a process of its own kind, with a limit of
-time. Recorded are the outcome, the seconds, the peak of memory above the start, and whether a file outside the input
-was touched or code of the input ran.
+A trial copies a valid input, spoils it (`tests/hostile.py`) and reads it in another process, with a limit of time.
+Recorded are the outcome, the seconds, the peak of memory above the start, and whether a file outside the input was
+touched or code of the input ran.
 """
 
 from __future__ import annotations
@@ -85,7 +85,9 @@ def main() -> None:
             counts = collections.Counter(str(row["outcome"]) for row in mine)
             good = counts["read"] + counts["refused"]
             peak = max(float(str(row.get("peak_mb", 0))) for row in mine)
-            print(f"{name:14s}{len(mine):5d} trials, {counts['refused']} refused, {len(mine) - good} wrong, {peak:.0f} MB")
+            print(
+                f"{name:14s}{len(mine):5d} trials, {counts['refused']} refused, {len(mine) - good} wrong, {peak:.0f} MB"
+            )
     write_csv(given.out, rows)
     wrong = [row for row in rows if row["outcome"] not in ("read", "refused") or row.get("touched")]
     wrong += [row for row in rows if float(str(row.get("peak_mb", 0))) > LIMIT_MB]

@@ -30,7 +30,7 @@ import numpy as np
 from mstfilter.errors import InputError, MissingLibraryError
 from mstfilter.files import reading
 from mstfilter.formats.video import Video, VideoFormat, pair_stamps
-from mstfilter.reading import open_regular
+from mstfilter.reading import MAX_TEXT, open_regular
 from mstfilter.scene import Recording, decode_image
 
 MAX_CHUNK = 2**28  #: Largest chunk of a bag when it is unpacked, in bytes
@@ -65,7 +65,7 @@ class BagFile:
         if not path.exists():
             raise InputError(f"bag does not exist: {path}")
         for file in sorted(path.iterdir()) if path.is_dir() else [path]:
-            with reading(file, "a bag"), open_regular(file, limit=2**63):
+            with reading(file, "a bag"), open_regular(file, MAX_TEXT if file.suffix == ".yaml" else 2**63):
                 pass
         _bound_decompressors()
         with self._reading():

@@ -163,16 +163,16 @@ def _read_volumes(path: Path, what: str) -> tuple[np.ndarray, list[int | None], 
         if "particles/labels" in data:
             raise InputError(f"{path} holds the hypotheses of one pause of a run", "give the run folder")
         labels = data["labels"]
-    labels = as_labels(labels, f"{path}: labels")
-    labels = labels[None] if labels.ndim == 3 else labels
-    if labels.ndim != 4 or len(labels) == 0:
-        raise InputError(f"{path}: labels have shape {labels.shape}, expected (S, X, Y, Z), one volume a pause")
-    frames: list[int | None] = [int(f) for f in data["frame"]] if "frame" in data else [None] * len(labels)
-    if len(frames) != len(labels):
-        raise InputError(f"{path}: there are {len(labels)} label grids for {len(frames)} frames")
-    grid = None
-    if "origin" in data and "voxel_size" in data:
-        grid = VoxelGrid(data["origin"], float(data["voxel_size"]), labels.shape[1:])
+        labels = as_labels(labels, f"{path}: labels")
+        labels = labels[None] if labels.ndim == 3 else labels
+        if labels.ndim != 4 or len(labels) == 0:
+            raise InputError(f"{path}: labels have shape {labels.shape}, expected (S, X, Y, Z), one volume a pause")
+        frames: list[int | None] = [int(f) for f in data["frame"]] if "frame" in data else [None] * len(labels)
+        if len(frames) != len(labels):
+            raise InputError(f"{path}: there are {len(labels)} label grids for {len(frames)} frames")
+        grid = None
+        if "origin" in data and "voxel_size" in data:
+            grid = VoxelGrid(data["origin"], float(data["voxel_size"]), labels.shape[1:])
     return labels, frames, grid
 
 

@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mstfilter.errors import InputError
+from mstfilter.files import reading
 from mstfilter.lazy import late
 from mstfilter.reading import read_bytes
 from mstfilter.scene.arrays import content_key, frozen, read_only
@@ -50,8 +51,9 @@ _PNG_END = b"\x00\x00\x00\x00IEND\xaeB\x60\x82"
 
 
 def _decode(path: Path, flags: int) -> np.ndarray:
-    if not path.exists():
-        raise InputError(f"image is missing: {path}", "record the frame again, or remove it from manifest.json")
+    with reading(path, "an image"):
+        if not path.exists():
+            raise InputError(f"image is missing: {path}", "record the frame again, or remove it from manifest.json")
     data = read_bytes(path, "an image")
     if data.startswith(_PNG_START) and not data.endswith(_PNG_END):
         # The decoder would fill the missing rows with zeros without an error.

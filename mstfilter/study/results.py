@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import BaseModel, Field
+from pydantic import BaseModel, Field, model_validator
 
 from mstfilter.errors import InputError
 from mstfilter.files import write_csv
@@ -63,13 +63,33 @@ class JobOutcome:
     tries: int = 1  #: how many times the job was started
 
 
+class _Row(BaseModel, extra="allow"):
+    pause: int
+    qualities: list[float | None] | None = None
+    energy_noise: list[float] | None = None
+    __pydantic_extra__: dict[str, float | None]
+
+
+class _Cost(BaseModel, extra="allow"):
+    seconds: float
+    core_seconds: float
+    peak_mb: float | None
+    __pydantic_extra__: dict[str, float | None]
+
+
 class _Result(BaseModel):
     """What readers use of result.json; a result without rows is that of a run that failed."""
 
     status: str
     identity: str
-    rows: list[dict[str, Any]] = []
-    costs: list[dict[str, float | None]] = []
+    rows: list[_Row] = []
+    costs: list[_Cost] = []
+
+    @model_validator(mode="after")
+    def _agree(self) -> _Result:
+        if len(self.rows) != len(self.costs) or (self.status == "done" and not self.rows):
+            raise ValueError(f"there are {len(self.rows)} rows and {len(self.costs)} costs")
+        return self
 
 
 class _Arm(BaseModel):
