@@ -1,7 +1,7 @@
 """Writing files so that a reader never sees half of one.
 
 >>> with atomic_path(folder / "metrics.csv") as path:
-...     path.write_text(text)
+...     path.write_text(text, encoding="utf-8")
 
 The file is written under a temporary name in the same folder and renamed when it is complete. If the block raises,
 the temporary file is removed and an earlier file is left as it was.
@@ -70,7 +70,7 @@ def damaged_files(folder: Path) -> list[str]:
     """What differs from the SHA256SUMS of a folder: ``state.npz has changed``, ``rgb.png is missing``."""
     if not (folder / SUMS).is_file():
         return [f"{SUMS} is missing"]
-    lines = (folder / SUMS).read_text(errors="replace").splitlines()
+    lines = (folder / SUMS).read_text(encoding="utf-8", errors="replace").splitlines()
     listed = [re.fullmatch(r"([0-9a-f]{64})  (.+)", line) for line in lines if line.isprintable()]
     if not lines or len(listed) < len(lines) or not all(listed):
         return [f"{SUMS} has changed"]

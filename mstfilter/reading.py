@@ -40,8 +40,11 @@ _Model = TypeVar("_Model", bound="BaseModel")
 
 
 @contextmanager
-def open_regular(path: str | Path, limit: int = MAX_FILE) -> Iterator[io.BufferedReader]:
-    """A regular file of at most `limit` bytes, opened for reading. Raises InputError if it is something else."""
+def open_regular(path: str | Path, limit: int | None = None) -> Iterator[io.BufferedReader]:
+    """A regular file of at most `limit` bytes, opened for reading. Raises InputError if it is something else.
+
+    The default of all limits is `MAX_FILE`.
+    """
     # Without O_NONBLOCK the call waits for the other end of a pipe.
     descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
     with open(descriptor, "rb") as file:
@@ -49,12 +52,13 @@ def open_regular(path: str | Path, limit: int = MAX_FILE) -> Iterator[io.Buffere
         if not stat.S_ISREG(status.st_mode):
             what = "folder" if stat.S_ISDIR(status.st_mode) else "pipe, socket or device"
             raise InputError(f"{path} is a {what}, expected a file")
-        if status.st_size > limit:
-            raise InputError(f"{path} has {status.st_size} bytes, at most {limit} are read")
+        most = MAX_FILE if limit is None else limit
+        if status.st_size > most:
+            raise InputError(f"{path} has {status.st_size} bytes, at most {most} are read")
         yield file
 
 
-def read_bytes(path: Path, kind: str, *hints: str, limit: int = MAX_FILE) -> bytes:
+def read_bytes(path: Path, kind: str, *hints: str, limit: int | None = None) -> bytes:
     """The content of a regular file of at most `limit` bytes. Other parameters and errors: `reading`."""
     with reading(path, kind, *hints), open_regular(path, limit) as file:
         return file.read()
@@ -99,7 +103,7 @@ def read_model(path: Path, model: type[_Model], kind: str, *hints: str) -> tuple
         raise InputError(f"{path}: {where}{message[:1].lower()}{message[1:]}, found {value}", *hints) from error
 
 
-def read_arrays(path: Path, kind: str, *hints: str, limit: int = MAX_FILE) -> dict[str, np.ndarray]:
+def read_arrays(path: Path, kind: str, *hints: str, limit: int | None = None) -> dict[str, np.ndarray]:
     """All arrays of an .npz file that needs at most `limit` bytes of memory; that of an .npy file has the name "".
 
     Other parameters and errors: `reading`.
@@ -112,12 +116,12 @@ def read_arrays(path: Path, kind: str, *hints: str, limit: int = MAX_FILE) -> di
         return unpack_arrays(file, limit)
 
 
-def unpack_arrays(file: IO[bytes], limit: int = MAX_FILE) -> dict[str, np.ndarray]:
+def unpack_arrays(file: IO[bytes], limit: int | None = None) -> dict[str, np.ndarray]:
     """All arrays of an open .npz file. Raises ValueError if the headers are wrong or need more than `limit` bytes."""
     with zipfile.ZipFile(file) as archive:
-        members = archive.infolist()
-        if (total := sum(member.file_size for member in members)) > limit:
-            raise ValueError(f"its arrays need {total} bytes, at most {limit} are read")
+        members, most = archive.infolist(), MAX_FILE if limit is None else limit
+        if (total := sum(member.file_size for member in members)) > most:
+            raise ValueError(f"its arrays need {total} bytes, at most {most} are read")
         found = {}
         for member in members:
             with archive.open(member) as opened:

@@ -110,13 +110,16 @@ def _write_run(path: Path) -> None:
 
 
 def _read_run(path: Path) -> None:
-    from mstfilter.report import run_page, write_report
-    from mstfilter.runs import RunFolder, read_estimate
+    from mstfilter.runs import read_estimate
 
-    RunFolder.open(path).check()
+    read_estimate(path)
+
+
+def _draw_run(path: Path) -> None:
+    from mstfilter.report import run_page, write_report
+
     write_report(path, path.parent / "report.html")
     run_page(path).save(path.parent / "page.html")
-    read_estimate(path)
 
 
 def _write_preset(path: Path) -> None:
@@ -300,6 +303,7 @@ def _read_cache(path: Path) -> None:
 KINDS = {
     "recording": Kind(_write_recording, _read_recording),
     "run": Kind(_write_run, _read_run),
+    "report": Kind(_write_run, _draw_run),
     "preset": Kind(_write_preset, _read_preset),
     "study": Kind(_write_study, _read_study),
     "study folder": Kind(_write_study_folder, _read_study_folder),
@@ -309,7 +313,7 @@ KINDS = {
     "volumes": Kind(_write_volumes, _read_volumes),
     "checkpoint": Kind(_write_checkpoint, _read_checkpoint),
     "cache": Kind(_write_cache, _read_cache),
-    "pairs": Kind(_write_pairs, _reader("paired_images")),
+    "pairs": Kind(_write_pairs, _reader("pairs")),
     "tum": Kind(_layout("tum"), _reader("tum", "K=131,131,79.5,59.5", "pauses=every")),
     "bop": Kind(_layout("bop"), _reader("bop")),
     "redwood": Kind(_layout("redwood"), _reader("redwood", "pauses=every")),

@@ -83,11 +83,9 @@ def main() -> None:
                     rows.append({"kind": name, "seed": seed, "outcome": f"the process died: {error}"})
             mine = [row for row in rows if row["kind"] == name]
             counts = collections.Counter(str(row["outcome"]) for row in mine)
-            good = counts["read"] + counts["refused"]
+            bad = len(mine) - counts["read"] - counts["refused"]
             peak = max(float(str(row.get("peak_mb", 0))) for row in mine)
-            print(
-                f"{name:14s}{len(mine):5d} trials, {counts['refused']} refused, {len(mine) - good} wrong, {peak:.0f} MB"
-            )
+            print(f"{name:14s}{len(mine):5d} trials, {counts['refused']} refused, {bad} wrong, {peak:.0f} MB")
     write_csv(given.out, rows)
     wrong = [row for row in rows if row["outcome"] not in ("read", "refused") or row.get("touched")]
     wrong += [row for row in rows if float(str(row.get("peak_mb", 0))) > LIMIT_MB]

@@ -185,10 +185,10 @@ class RecordingWriter:
         }
         manifest = {**self._manifest, "frames": self._frames}
         with self._writing():
-            (self._folder / "camera.json").write_text(json.dumps(described, indent=1))
-            (self._folder / "manifest.json").write_text(json.dumps(manifest, indent=1))
+            (self._folder / "camera.json").write_text(json.dumps(described, indent=1), encoding="utf-8")
+            (self._folder / "manifest.json").write_text(json.dumps(manifest, indent=1), encoding="utf-8")
             if self._poses:
-                (self._folder / "poses.json").write_text(json.dumps(self._poses))
+                (self._folder / "poses.json").write_text(json.dumps(self._poses), encoding="utf-8")
             if grid is not None and self._voxels:
                 np.savez_compressed(
                     self._folder / "voxels.npz",

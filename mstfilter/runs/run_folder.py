@@ -212,6 +212,10 @@ class RunFolder:
             (len(info["weights"]) != len(hypotheses), f"info.json has {len(info['weights'])} weights"),
             (max(info["parents"].get("previous", [-1])) >= n_before, "info.json has parents that are not there"),
             (image.shape[:2] != (camera.height, camera.width), f"rgb.png has the shape {image.shape}"),
+            (
+                (labels is None) != (info["quality"] is None),
+                "one of truth.npz and the quality in info.json is missing",
+            ),
             (labels is not None and labels.shape != grid.shape, "truth.npz has another grid than state.npz"),
         )
         for is_wrong, message in wrong:
