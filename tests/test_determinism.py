@@ -32,9 +32,9 @@ def completed() -> bytes:
 def test_the_completion_network_uses_one_thread_and_restores_the_number(monkeypatch):
     import torch
 
-    from mstfilter.completion.unet import load_network
+    from mstfilter.completion import NetworkCompleter
 
-    network, used = load_network("completion"), []
+    network, used = NetworkCompleter().network, []
     forward = network.forward
     monkeypatch.setattr(network, "forward", lambda *given: used.append(torch.get_num_threads()) or forward(*given))
     before, found = torch.get_num_threads(), []
