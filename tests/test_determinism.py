@@ -71,7 +71,9 @@ def test_a_matplotlibrc_of_the_user_does_not_change_a_figure():
         return health_figure({"a": [(1.0, 3), None, (2.0, 3)]})
 
     expected = drawn()
-    with matplotlib.rc_context({"font.size": 33, "axes.facecolor": "red", "lines.linewidth": 9, "axes.grid": True}):
+    with matplotlib.rc_context(
+        {"font.size": 33, "axes.facecolor": "red", "lines.linewidth": 9, "path.sketch": (1, 100, 2)}
+    ):
         assert drawn() == expected
 
 

@@ -39,12 +39,16 @@ def examples(tmp_path_factory):
     return folder
 
 
+class Hangs(BaseException):  # no OSError, as TimeoutError is: readers make those an InputError
+    pass
+
+
 @contextlib.contextmanager
 def limits(seconds=20, megabytes=1024):
     """Fail if the block takes longer, or asks for more memory."""
 
     def stop(*_):
-        raise TimeoutError("it hangs")
+        raise Hangs
 
     before = signal.signal(signal.SIGALRM, stop)
     soft, hard = resource.getrlimit(resource.RLIMIT_AS)
@@ -129,6 +133,14 @@ def test_only_regular_files_are_read(tmp_path, name):
         path.symlink_to(path if name == "loop" else name)
     with limits(seconds=5), pytest.raises(InputError, match=r"a\.png"):
         read_rgb(path)
+
+
+def test_names_in_a_list_do_not_leave_the_folder(examples, tmp_path):
+    for name in ("../../secret.png", "/etc/passwd"):
+        path = hostile.copy(examples / "tum", tmp_path / "trial" / "it")
+        (path / "rgb.txt").write_text(f"1305031102.175 {name}\n")
+        with pytest.raises(InputError, match="is outside the folder"):
+            hostile.KINDS["tum"].read(path)
 
 
 def test_weights_that_are_not_finite_are_refused(tmp_path):

@@ -269,6 +269,9 @@ class Tum(VideoFormat):
                 f"{path}: intrinsics are missing, TUM folders do not store them",
                 "give them: K=fx,fy,cx,cy (the default of TUM is 525,525,319.5,239.5)",
             )
+        outside = [row[1] for row in (*colour, *depth) if Path(row[1]).is_absolute() or ".." in Path(row[1]).parts]
+        if outside:
+            raise InputError(f"{path}: image {outside[0]} is outside the folder", "names are relative to the folder")
         stamps = [[float(row[0]) for row in table] for table in (colour, depth)]
         pairs = pair_stamps(stamps[0], stamps[1], self.tolerance_s, str(path))
 
