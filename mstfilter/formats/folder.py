@@ -443,11 +443,15 @@ def _read_voxels(path: Path, grid: VoxelGrid, pauses: tuple[int, ...]) -> Any:
     with reading(path, "true volumes"):
         labels, frames = as_labels(data["labels"], "labels"), [int(frame) for frame in data["frame"]]
         origin, size = data["origin"].astype(float), float(data["voxel_size"])
-    if labels.shape[1:] != grid.shape or not np.allclose(origin, grid.origin) or abs(size - grid.voxel_size) > 1e-9:
-        raise InputError(
-            f"{path}: grid {labels.shape[1:]} at {origin.tolist()} with voxels of {size} m differs from "
-            f"the workspace {grid.shape} at {grid.origin.tolist()} with {grid.voxel_size} m"
-        )
-    if len(labels) != len(frames):
-        raise InputError(f"{path}: there are {len(labels)} label grids for {len(frames)} frames")
+        if (
+            labels.shape[1:] != grid.shape
+            or not np.allclose(origin, grid.origin)
+            or abs(size - grid.voxel_size) > 1e-9
+        ):
+            raise InputError(
+                f"{path}: grid {labels.shape[1:]} at {origin.tolist()} with voxels of {size} m differs from "
+                f"the workspace {grid.shape} at {grid.origin.tolist()} with {grid.voxel_size} m"
+            )
+        if len(labels) != len(frames):
+            raise InputError(f"{path}: there are {len(labels)} label grids for {len(frames)} frames")
     return truth_reader(labels, frames, pauses)
