@@ -65,8 +65,10 @@ class BagFile:
         if not path.exists():
             raise InputError(f"bag does not exist: {path}")
         for file in sorted(path.iterdir()) if path.is_dir() else [path]:
-            with reading(file, "a bag"), open_regular(file, MAX_TEXT if file.suffix == ".yaml" else 2**63):
-                pass
+            limit = MAX_TEXT if file.suffix == ".yaml" else 2**63
+            with reading(file, "a bag"), open_regular(file, limit) as opened:
+                if file.suffix == ".bag" and opened.read(13) != b"#ROSBAG V2.0\n":
+                    raise InputError(f"bag cannot be read: {file} does not begin with #ROSBAG V2.0")
         _bound_decompressors()
         with self._reading():
             self._reader = AnyReader([path], default_typestore=get_typestore(Stores.LATEST))
