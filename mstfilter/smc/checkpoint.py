@@ -78,6 +78,8 @@ def load_state(path: Path, codec: Codec | None = None, *, limit: int = 2**40) ->
 
     Raises InputError if the file is missing or damaged, or its arrays need more than `limit` bytes.
     """
+    if not path.exists():
+        raise InputError(f"checkpoint is missing: {path}")
     arrays = read_arrays(path, "a checkpoint", "remove it to start again", limit=limit)
     with reading(path, "a checkpoint", "remove it to start again"):
         head = json.loads(str(arrays["head"]))
