@@ -1,9 +1,9 @@
 """Writing files and folders so that neither a kill, a power failure nor a second process damages them.
 
 >>> with atomic_path(folder / "metrics.csv") as path:
-...     path.write_text(text)
+...     path.write_text(text, encoding="utf-8")
 >>> with locked("runs/mine"), atomic_folder("runs/mine") as folder:
-...     (folder / "run.json").write_text(text)
+...     (folder / "run.json").write_text(text, encoding="utf-8")
 
 A file or folder is written under a temporary name beside the final one, synced with the disk, and renamed when it is
 complete. If the block raises, the temporary is removed and an earlier file is left as it was. What a killed process
@@ -24,18 +24,18 @@ import os
 import re
 import shutil
 import socket
+import struct
 import time
+import tokenize
 import uuid
 import zipfile
+import zlib
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 from mstfilter.errors import InputError, naming, reason
-
-if TYPE_CHECKING:
-    import numpy as np
 
 SUMS = "SHA256SUMS"  # in a folder: the hashes of its files
 _TEMPORARY = re.compile(r"\.(?P<name>.+)\.[0-9a-f]{8}\.(?P<kind>partial|replaced)", re.DOTALL)
@@ -134,7 +134,7 @@ def _reserve(file: Path, target: Path) -> int:
         descriptor = _lock(file, os.O_RDWR | os.O_CREAT)
         with contextlib.suppress(FileNotFoundError):  # the process that had the lock has removed the file
             if descriptor is None:
-                holder = file.read_text(errors="replace")[:200]
+                holder = file.read_text(encoding="utf-8", errors="replace")[:200]
                 raise InputError(
                     f"{target} is being written by another process{holder if holder.isprintable() else ''}",
                     "wait until it has ended, or choose another name",
@@ -236,7 +236,7 @@ def damaged_files(folder: Path) -> list[str]:
     """What differs from the SHA256SUMS of a folder: ``state.npz has changed``, ``rgb.png is missing``."""
     if not (folder / SUMS).is_file():
         return [f"{SUMS} is missing"]
-    lines = (folder / SUMS).read_text(errors="replace").splitlines()
+    lines = (folder / SUMS).read_text(encoding="utf-8", errors="replace").splitlines()
     listed = [re.fullmatch(r"([0-9a-f]{64})  (.+)", line) for line in lines if line.isprintable()]
     if not lines or len(listed) < len(lines) or not all(listed):
         return [f"{SUMS} has changed"]
@@ -259,28 +259,21 @@ def reading(path: Path, kind: str, *hints: str) -> Iterator[None]:
         raise
     except FileNotFoundError:
         raise InputError(f"not {kind}: {path} is missing", *hints) from None
-    except (json.JSONDecodeError, RecursionError) as error:
+    except json.JSONDecodeError as error:
         raise InputError(f"{path} is not valid JSON: {error}", *hints) from error
-    except (OSError, EOFError, zipfile.BadZipFile, ValueError, KeyError, TypeError, AttributeError) as error:
+    except RecursionError as error:
+        raise InputError(f"{path} cannot be read: its values are nested too deep", *hints) from error
+    except MemoryError as error:
+        raise InputError(f"{path} cannot be read: memory ran out", *hints) from error
+    except _UNREADABLE as error:
         raise InputError(f"{path} cannot be read: {reason(error)}", *hints) from error
 
 
-def read_arrays(path: Path, what: str, *hints: str) -> dict[str, np.ndarray]:
-    """All arrays of an .npz file. InputError that names the file if it is missing, damaged or of another kind.
-
-    `what` names the content for the message. numpy and zipfile raise errors of many types for damaged files, and a
-    checksum is compared only when an array is read; therefore all arrays are read here.
-    """
-    import numpy as np
-
-    try:
-        with np.load(path, allow_pickle=False) as data:
-            return {name: data[name] for name in data.files}
-    except FileNotFoundError:
-        raise InputError(f"{what} is missing: {path}") from None
-    except Exception as error:
-        problem = reason(error) or type(error).__name__
-        raise InputError(f"{what} cannot be read: {path} ({problem})", *hints) from error
+# CPython 3.11 raises SystemError if two threads parse the headers of arrays at once (python/cpython#106905).
+_UNREADABLE = (
+    *(OSError, EOFError, ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RuntimeError),
+    *(SystemError, SyntaxError, tokenize.TokenError, struct.error, zlib.error, zipfile.BadZipFile),
+)
 
 
 def folder_name(name: str) -> str:

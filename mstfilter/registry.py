@@ -125,6 +125,8 @@ class Registry:
             raise InputError(f"{where or kind}: component {name!r} cannot be imported: {error}") from error
 
     def _locate(self, kind: str, name: str, where: str, allow_files: bool) -> str:
+        if not isinstance(name, str):
+            raise InputError(f"{where} is {name!r}, expected the name of a component")
         if ".py:" in name:
             if not allow_files:
                 raise InputError(

@@ -314,7 +314,7 @@ class Grows(Size):
 def test_an_error_in_a_file_of_the_user_is_located(recording, tmp_path, monkeypatch, capsys):
     """The message has the file, the line and its text, or at least names the component."""
     monkeypatch.chdir(tmp_path)
-    Path("mine.py").write_text(USER_FILE)
+    Path("mine.py").write_text(USER_FILE, encoding="utf-8")
     line = USER_FILE.splitlines().index("        return population.particles[99]") + 1
     cases = {
         "transition=./mine.py:Fails": (f"(mine.py, line {line}: return population.particles[99])", "step 1, transi"),
@@ -337,11 +337,11 @@ def test_an_error_in_a_file_of_the_user_is_located(recording, tmp_path, monkeypa
     code, _, err = call("check", "./mine.py:Needs", capsys=capsys)
     assert code == 2
     assert "give it a value, scale=VALUE" in err
-    Path("mine.py").write_text("import numpy\nx = numpy.pie\n")
+    Path("mine.py").write_text("import numpy\nx = numpy.pie\n", encoding="utf-8")
     code, _, err = call("run", recording, "transition=./mine.py:A", capsys=capsys)
     assert code == 2
     assert "mine.py, line 2: x = numpy.pie" in err
-    Path("mine.py").write_text("import numpy\nx = = 3\n")
+    Path("mine.py").write_text("import numpy\nx = = 3\n", encoding="utf-8")
     code, _, err = call("run", recording, "transition=./mine.py:A", capsys=capsys)
     assert code == 2
     assert "mine.py, line 2: x = = 3" in err

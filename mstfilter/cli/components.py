@@ -10,6 +10,7 @@ import typer
 
 from mstfilter.cli.root import app
 from mstfilter.errors import InputError
+from mstfilter.reading import read_toml
 
 
 @app.command("list")
@@ -120,15 +121,13 @@ def new(
 
 def _lines(kind: str) -> Iterator[str]:
     """One line per preset, family or component."""
-    import tomllib
-
     from mstfilter.oracles import UsesTruth
     from mstfilter.presets import REGISTRY
     from mstfilter.resources import find_preset, preset_names
 
     if kind == "presets":
         for name in preset_names():
-            yield f"{name:<20}{tomllib.loads(find_preset(name).read_text()).get('description', '')}"
+            yield f"{name:<20}{read_toml(find_preset(name), 'a preset').get('description', '')}"
         return
     if kind == "families":
         from mstfilter.simulation import SCENE_FAMILIES

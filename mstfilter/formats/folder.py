@@ -30,14 +30,15 @@ from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict
 
-from mstfilter.errors import InputError
+from mstfilter.errors import InputError, naming
 from mstfilter.files import SUMS, atomic_folder, check_output, locked, reading, write_sums, writing
 from mstfilter.formats.video import RecordingFormat
+from mstfilter.reading import read_arrays, read_json, read_model
 from mstfilter.scene import (
     Camera,
     Frame,
@@ -61,6 +62,7 @@ VERSION = 1  #: Version of the layout
 RECORDING_FILES = re.compile(  #: paths in a recording folder
     rf"(manifest|camera|poses)\.json|voxels\.npz|{SUMS}|(rgb|depth|instance|robot)/\d{{6}}\.png"
 )
+_Model = TypeVar("_Model", bound=BaseModel)
 
 
 class _Workspace(BaseModel):
@@ -173,10 +175,10 @@ class RecordingWriter:
         }
         manifest = {**self._manifest, "frames": self._frames}
         with self._writing(), self._open:
-            (self._folder / "camera.json").write_text(json.dumps(described, indent=1))
-            (self._folder / "manifest.json").write_text(json.dumps(manifest, indent=1))
+            (self._folder / "camera.json").write_text(json.dumps(described, indent=1), encoding="utf-8")
+            (self._folder / "manifest.json").write_text(json.dumps(manifest, indent=1), encoding="utf-8")
             if self._poses:
-                (self._folder / "poses.json").write_text(json.dumps(self._poses))
+                (self._folder / "poses.json").write_text(json.dumps(self._poses), encoding="utf-8")
             if grid is not None and self._voxels:
                 np.savez_compressed(
                     self._folder / "voxels.npz",
@@ -258,11 +260,11 @@ def save_recording(
 
 
 class _CameraFile(BaseModel):
-    K: list[list[float]]
+    K: Any  # checked by Camera, as the poses are by rigid_from_matrix
     width: int
     height: int
     depth_scale: float
-    T_world_camera: list[list[float]] | None = None
+    T_world_camera: Any = None
     workspace: _Workspace | None = None
 
 
@@ -270,7 +272,7 @@ class _FrameEntry(BaseModel):
     index: int
     time_s: float
     role: Literal["static", "action"]
-    T_world_camera: list[list[float]] | None = None
+    T_world_camera: Any = None
 
 
 class _Manifest(BaseModel):
@@ -279,22 +281,13 @@ class _Manifest(BaseModel):
     frames: list[_FrameEntry]
 
 
-def _load(path: Path, model: type[BaseModel]) -> Any:
-    with reading(path, "a recording", "a recording folder holds manifest.json, camera.json, rgb/, depth/"):
-        data = json.loads(path.read_text())
+def _load(path: Path, model: type[_Model]) -> tuple[_Model, dict[str, Any]]:
     try:
-        return model.model_validate(data), data
-    except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"])
-        hint = (
-            "metres per unit: 0.001 for millimetres, 0.0002 for TUM images; it has no default"
-            if "depth_scale" in where
-            else "the layout is described in mstfilter.formats.folder"
-        )
-        found = first["input"]
-        value = "nothing" if first["type"] == "missing" else repr(found)[:80]
-        raise InputError(f"{path}: {where}: {first['msg'].lower()}, found {value}", hint) from error
+        return read_model(path, model, "a recording", "the layout is described in mstfilter.formats.folder")
+    except InputError as error:
+        if "depth_scale" in error.message:
+            error.hints = ("metres per unit: 0.001 for millimetres, 0.0002 for TUM images; it has no default",)
+        raise
 
 
 @dataclass(frozen=True)
@@ -342,13 +335,12 @@ def open_recording(path: str | Path, pauses: PauseRule | None = None) -> Recordi
     if not entries:
         raise InputError(f"{path / 'manifest.json'}: there are no frames")
 
-    where = f"{path / 'camera.json'}: T_world_camera"
-    pose = None if camera_file.T_world_camera is None else rigid_from_matrix(camera_file.T_world_camera, where)
-    camera = Camera(camera_file.K, camera_file.width, camera_file.height, pose)
-    grid = None
-    if camera_file.workspace is not None:
+    with reading(path / "camera.json", "a recording"):
+        matrix = camera_file.T_world_camera
+        pose = None if matrix is None else rigid_from_matrix(matrix, "T_world_camera")
+        camera = Camera(camera_file.K, camera_file.width, camera_file.height, pose)
         w = camera_file.workspace
-        grid = VoxelGrid.from_bounds(np.array(w.min), np.array(w.max), w.voxel)
+        grid = None if w is None else VoxelGrid.from_bounds(np.array(w.min), np.array(w.max), w.voxel)
     times = tuple(e.time_s for e in entries)
     marked = tuple(e.index for e in entries if e.role == "static")
     if pauses is not None:
@@ -393,19 +385,21 @@ def open_recording(path: str | Path, pauses: PauseRule | None = None) -> Recordi
         return read_labels(file) if file.exists() else None
 
     truth, true_poses = path / "voxels.npz", path / "poses.json"
-    return Recording(
-        LazyFrames(read_posed, len(entries)),
-        grid,
-        marked,
-        times,
-        name=str(manifest_data.get("name") or path.name),
-        depth_scale=scale,
-        path=path,
-        manifest=manifest_data,
-        truth=_read_voxels(truth, grid, marked) if truth.exists() else lambda t: None,
-        instance=read_instance,
-        poses=_read_poses(true_poses) if true_poses.exists() else lambda index: None,
-    )
+    true_volumes = _read_voxels(truth, grid, marked) if truth.exists() else lambda t: None
+    with naming(str(path / "manifest.json")):
+        return Recording(
+            LazyFrames(read_posed, len(entries)),
+            grid,
+            marked,
+            times,
+            name=str(manifest_data.get("name") or path.name),
+            depth_scale=scale,
+            path=path,
+            manifest=manifest_data,
+            truth=true_volumes,
+            instance=read_instance,
+            poses=_read_poses(true_poses) if true_poses.exists() else lambda index: None,
+        )
 
 
 def _read_poses(path: Path) -> Any:
@@ -414,21 +408,26 @@ def _read_poses(path: Path) -> Any:
     @cache
     def load() -> dict[int, dict[int, np.ndarray]]:
         with reading(path, "true poses"):
-            entries = {int(e["frame"]): dict(e["T_world_object"]) for e in json.loads(path.read_text())}
+            entries = {int(e["frame"]): dict(e["T_world_object"]) for e in read_json(path, "true poses")}
             return {i: {int(k): rigid_from_matrix(T).as_matrix() for k, T in e.items()} for i, e in entries.items()}
 
     return lambda index: load().get(index)
 
 
 def _read_voxels(path: Path, grid: VoxelGrid, pauses: tuple[int, ...]) -> Any:
-    with reading(path, "true volumes"), np.load(path, allow_pickle=False) as data:
-        labels, frames = data["labels"], data["frame"]
-        origin, size = data["origin"], float(data["voxel_size"])
-    if labels.shape[1:] != grid.shape or not np.allclose(origin, grid.origin) or abs(size - grid.voxel_size) > 1e-9:
-        raise InputError(
-            f"{path}: grid {labels.shape[1:]} at {origin.tolist()} with voxels of {size} m differs from "
-            f"the workspace {grid.shape} at {grid.origin.tolist()} with {grid.voxel_size} m"
-        )
-    if len(labels) != len(frames):
-        raise InputError(f"{path}: there are {len(labels)} label grids for {len(frames)} frames")
-    return truth_reader(as_labels(labels, f"{path}: labels"), frames, pauses)
+    data = read_arrays(path, "true volumes")
+    with reading(path, "true volumes"):
+        labels, frames = as_labels(data["labels"], "labels"), [int(frame) for frame in data["frame"]]
+        origin, size = data["origin"].astype(float), float(data["voxel_size"])
+        if (
+            labels.shape[1:] != grid.shape
+            or not np.allclose(origin, grid.origin)
+            or abs(size - grid.voxel_size) > 1e-9
+        ):
+            raise InputError(
+                f"{path}: grid {labels.shape[1:]} at {origin.tolist()} with voxels of {size} m differs from "
+                f"the workspace {grid.shape} at {grid.origin.tolist()} with {grid.voxel_size} m"
+            )
+        if len(labels) != len(frames):
+            raise InputError(f"{path}: there are {len(labels)} label grids for {len(frames)} frames")
+    return truth_reader(labels, frames, pauses)

@@ -7,7 +7,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,6 +17,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from mstfilter.errors import InputError, check_number
 from mstfilter.files import reading
 from mstfilter.formats.video import RecordingFormat, Video, VideoFormat, object_numbers, pair_stamps
+from mstfilter.reading import read_json, read_text
 from mstfilter.scene import Frame, Recording, read_depth, read_labels, read_rgb, rigid_from_matrix, table_residual
 
 
@@ -47,7 +47,7 @@ class PairedImages(RecordingFormat):
     def open(self, path: Path) -> Recording:
         example = 'for example {"K": [525, 525, 319.5, 239.5], "depth_scale_m": 0.001}'
         with reading(path / "info.json", "pairs of images", example):
-            info = json.loads((path / "info.json").read_text())
+            info = read_json(path / "info.json", "pairs of images", example)
             K, scale = np.asarray(info["K"], dtype=float), float(info["depth_scale_m"])
         if K.shape == (4,):
             K = np.array([[K[0], 0, K[2]], [0, K[1], K[3]], [0, 0, 1]])
@@ -197,7 +197,7 @@ def _stored(path: Path, name: str, default: float) -> float:
     if file is None:
         return default
     with reading(file, "a file of Open3D"):
-        value = json.loads(file.read_text()).get(name, default)
+        value = read_json(file, "a file of Open3D").get(name, default)
     check_number(f"{file}: {name}", value, f"give it: {name}=VALUE", at_least=1)
     return float(value)
 
@@ -211,7 +211,8 @@ def _intrinsics(path: Path) -> tuple[float, ...]:
             "give them: K=fx,fy,cx,cy (the default of Redwood is 525,525,319.5,239.5)",
         )
     with reading(file, "a file of Open3D"):
-        matrix = np.reshape(np.asarray(json.loads(file.read_text())["intrinsic_matrix"], dtype=float), (3, 3)).T
+        values = read_json(file, "a file of Open3D")["intrinsic_matrix"]
+        matrix = np.reshape(np.asarray(values, dtype=float), (3, 3)).T
     if not np.allclose(matrix[2], (0, 0, 1)):
         raise InputError(
             f"{file}: intrinsic_matrix is {matrix.T.ravel().tolist()}, expected 9 numbers column by column",
@@ -223,7 +224,8 @@ def _intrinsics(path: Path) -> tuple[float, ...]:
 def _trajectory(path: Path, n: int) -> list[RigidTransform]:
     """Camera-to-world poses of a .log file, one per frame."""
     with reading(path, "a trajectory", "or ignore it: moving=false"):
-        rows = [[float(v) for v in line.split()] for line in path.read_text().splitlines() if line.strip()]
+        lines = read_text(path, "a trajectory").splitlines()
+        rows = [[float(v) for v in line.split()] for line in lines if line.strip()]
     if len(rows) != 5 * n or any(len(row) != (3 if k % 5 == 0 else 4) for k, row in enumerate(rows)):
         raise InputError(
             f"trajectory {path} has {len(rows)} lines for {n} frames, expected five per frame: 3 numbers, then 4 x 4",
@@ -267,6 +269,9 @@ class Tum(VideoFormat):
                 f"{path}: intrinsics are missing, TUM folders do not store them",
                 "give them: K=fx,fy,cx,cy (the default of TUM is 525,525,319.5,239.5)",
             )
+        outside = [row[1] for row in (*colour, *depth) if Path(row[1]).is_absolute() or ".." in Path(row[1]).parts]
+        if outside:
+            raise InputError(f"{path}: image {outside[0]} is outside the folder", "names are relative to the folder")
         stamps = [[float(row[0]) for row in table] for table in (colour, depth)]
         pairs = pair_stamps(stamps[0], stamps[1], self.tolerance_s, str(path))
 
@@ -288,8 +293,7 @@ class Tum(VideoFormat):
 
 def _table(path: Path, columns: int) -> list[list[str]]:
     """Rows of a text file without comments."""
-    with reading(path, "a TUM folder", "it holds rgb.txt and depth.txt"):
-        lines = path.read_text().splitlines()
+    lines = read_text(path, "a TUM folder", "it holds rgb.txt and depth.txt").splitlines()
     rows = []
     for number, line in enumerate(lines, 1):
         words = line.partition("#")[0].replace(",", " ").split()

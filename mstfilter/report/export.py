@@ -136,7 +136,7 @@ def export_run(
     check_choice("mesh_format", mesh_format, MESH_FORMATS)
     check_choice("mesh_style", mesh_style, MESH_STYLES)
     import_open3d()  # a missing library is reported before anything is written
-    run = run if isinstance(run, RunFolder) else RunFolder.open(run)
+    run = (run if isinstance(run, RunFolder) else RunFolder.open(run)).check()
     identities = assign_identities(run)
     paths: list[Path] = []
     rows: list[dict[str, object]] = []

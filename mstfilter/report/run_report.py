@@ -358,7 +358,7 @@ def write_report(
     """
     from markupsafe import Markup
 
-    run = RunFolder.open(run.path if isinstance(run, RunFolder) else run)
+    run = RunFolder.open(run.path if isinstance(run, RunFolder) else run).check()
     numbers = read_numbers(run) if numbers is None else numbers
     filters: dict[str, Callable[..., Any]] = {
         "short_text": short_text,

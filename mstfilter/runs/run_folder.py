@@ -30,9 +30,10 @@ import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
+from pydantic import BaseModel, Field, RootModel, model_validator
 
 from mstfilter.errors import InputError, InputWarning
 from mstfilter.files import (
@@ -46,10 +47,12 @@ from mstfilter.files import (
     write_sums,
     write_text,
 )
+from mstfilter.reading import MAX_FILE, read_arrays, read_model
 from mstfilter.scene import (
     Camera,
     Clip,
     Hypothesis,
+    as_labels,
     decode_hypotheses,
     encode_hypotheses,
     read_rgb,
@@ -85,9 +88,74 @@ def write_json(path: Path, value: Any) -> None:
     write_text(path, json.dumps(as_json(value), indent=1) + "\n")
 
 
-def _read_json(path: Path) -> Any:
-    with reading(path, "a run folder", "a run folder is made by `mstfilter run`"):
-        return json.loads(path.read_text())
+class _RecordingEntry(BaseModel):
+    name: str
+    key: str
+    pauses: list[int]
+    times: list[float]
+
+    @model_validator(mode="after")
+    def _agree(self) -> _RecordingEntry:
+        if len(self.pauses) != len(self.times) or not self.pauses:
+            raise ValueError(f"there are {len(self.pauses)} pauses and {len(self.times)} times")
+        return self
+
+
+class _RunFile(BaseModel):
+    """What readers use of run.json."""
+
+    format: Literal[2]
+    status: str
+    seed: int
+    config: dict[str, Any]
+    uses_truth: list[str]
+    files: dict[str, str]
+    recording: _RecordingEntry
+    versions: dict[str, str]
+    machine: dict[str, str | int]
+
+
+class _InfoFile(BaseModel):
+    """What readers use of info.json."""
+
+    t: int
+    n: int
+    n_frames: int
+    n_candidates: int
+    ess: float
+    resampled: bool
+    unique_ancestors: int | None
+    ancestors: list[int] | None
+    parents: dict[str, list[int]]
+    weights: Annotated[list[Annotated[float, Field(ge=0)]], Field(min_length=1)]
+    quality: dict[str, list[float]] | None
+    notes: dict[str, Any]
+
+    @model_validator(mode="after")
+    def _agree(self) -> _InfoFile:
+        lists: dict[str, list[Any]] = {
+            "parents": list(self.parents.values()),
+            "quality": list((self.quality or {}).values()),
+        }
+        for name, found in lists.items():
+            if any(len(values) != len(self.weights) for values in found):
+                raise ValueError(f"{name} has not one value for each of the {len(self.weights)} weights")
+        if self.quality is not None and set(self.quality) != set(FORMS):
+            raise ValueError(f"quality has {sorted(self.quality)}, expected {list(FORMS)}")
+        if any(not k >= -1 for parents in self.parents.values() for k in parents):
+            raise ValueError("a parent is below -1")
+        return self
+
+
+class _CameraFile(BaseModel):
+    K: Any
+    width: int
+    height: int
+    T_world_camera: Any
+
+
+class _SecondsFile(RootModel[dict[str, float]]):
+    pass
 
 
 @dataclass(frozen=True)
@@ -117,8 +185,7 @@ class RunFolder:
     def open(cls, path: str | Path) -> RunFolder:
         """An existing run folder."""
         folder = cls(Path(path))
-        if folder.description.get("format") != _FORMAT:
-            raise InputError(f"{path}: run folder has format {folder.description.get('format')}, expected {_FORMAT}")
+        _ = folder.description
         return folder
 
     @classmethod
@@ -130,7 +197,45 @@ class RunFolder:
     @property
     def description(self) -> dict[str, Any]:
         """The content of run.json."""
-        return dict(_read_json(self.path / "run.json"))
+        return self._read(self.path / "run.json", _RunFile)
+
+    def _read(self, path: Path, model: type[BaseModel]) -> dict[str, Any]:
+        return read_model(path, model, "a run folder", "a run folder is made by `mstfilter run`")[1]
+
+    def check(self) -> RunFolder:
+        """Read every file of the run and of those that it is compared with, before work with them starts.
+
+        Raises InputError if a file is missing or damaged, or files of a pause do not belong together.
+        """
+        if self.n_pauses > len(self.description["recording"]["pauses"]):
+            raise InputError(f"{self.path}: there are more pauses than run.json lists")
+        before = 0
+        for t in range(self.n_pauses):
+            before = self._check_pause(t, before)
+        for other in self.compared().values():
+            other.check()
+        return self
+
+    def _check_pause(self, t: int, n_before: int) -> int:
+        """Check the files of a pause after one with `n_before` hypotheses; returns the number of hypotheses."""
+        folder, info, hypotheses = self.pause(t), self.info(t), self.hypotheses(t)
+        grid, camera, image, labels = hypotheses[0].grid, self.camera(t), self.rgb(t), self.truth(t)
+        _ = self.seconds(t), self.questions(t)
+        wrong = (
+            (info["t"] != t, f"info.json is of step {info['t']}"),
+            (len(info["weights"]) != len(hypotheses), f"info.json has {len(info['weights'])} weights"),
+            (max(info["parents"].get("previous", [-1])) >= n_before, "info.json has parents that are not there"),
+            (image.shape[:2] != (camera.height, camera.width), f"rgb.png has the shape {image.shape}"),
+            (
+                (labels is None) != (info["quality"] is None),
+                "one of truth.npz and the quality in info.json is missing",
+            ),
+            (labels is not None and labels.shape != grid.shape, "truth.npz has another grid than state.npz"),
+        )
+        for is_wrong, message in wrong:
+            if is_wrong:
+                raise InputError(f"{folder}: {message}; state.npz has {len(hypotheses)} hypotheses in {grid.text}")
+        return len(hypotheses)
 
     @property
     def n_pauses(self) -> int:
@@ -254,11 +359,11 @@ class RunFolder:
 
     def info(self, t: int) -> dict[str, Any]:
         """Record of the step that ended at pause `t`."""
-        return dict(_read_json(self.pause(t) / "info.json"))
+        return self._read(self.pause(t) / "info.json", _InfoFile)
 
     def seconds(self, t: int) -> dict[str, float]:
         """Wall time of the step by component, in seconds."""
-        return dict(_read_json(self.pause(t) / "seconds.json"))
+        return self._read(self.pause(t) / "seconds.json", _SecondsFile)
 
     def rgb(self, t: int) -> np.ndarray:
         """Image (H, W, 3) at a pause."""
@@ -266,9 +371,11 @@ class RunFolder:
 
     def camera(self, t: int) -> Camera:
         """Camera at a pause."""
-        data = _read_json(self.pause(t) / "camera.json")
-        pose = rigid_from_matrix(np.array(data["T_world_camera"]))
-        return Camera(np.array(data["K"]), data["width"], data["height"], pose)
+        path = self.pause(t) / "camera.json"
+        data = self._read(path, _CameraFile)
+        with reading(path, "a run folder"):
+            pose = rigid_from_matrix(data["T_world_camera"])
+            return Camera(data["K"], data["width"], data["height"], pose)
 
     def truth(self, t: int) -> np.ndarray | None:
         """True labels (X, Y, Z) at a pause; None if unknown."""
@@ -276,16 +383,20 @@ class RunFolder:
 
     def questions(self, t: int) -> Questions | None:
         """The questions of a pause with ground truth; None if unknown."""
-        data = self._truth(t)
-        pairs = data.get("questions", np.zeros((2, 0))).astype(np.int64)
-        return Questions(data["labels"].shape, *pairs) if pairs.size else None
+        pairs = self._truth(t).get("questions")
+        return Questions(self._truth(t)["labels"].shape, *pairs) if pairs is not None and pairs.size else None
 
     def _truth(self, t: int) -> dict[str, np.ndarray]:
+        """True labels and questions of a pause, if they are known."""
         path = self.pause(t) / "truth.npz"
         if not path.exists():
             return {}
-        with np.load(path, allow_pickle=False) as data:
-            return dict(data)
+        data = read_arrays(path, "the truth of a pause")
+        with reading(path, "the truth of a pause"):
+            labels, pairs = as_labels(data["labels"], "labels"), data["questions"].astype(np.int64)
+            if labels.ndim != 3 or pairs.shape[:-1] != (2,) or not ((pairs >= 0) & (pairs < labels.size)).all():
+                raise ValueError(f"labels have the shape {labels.shape}, questions {pairs.shape}")
+        return {"labels": labels, "questions": pairs}
 
     def hypotheses(self, t: int) -> tuple[Hypothesis, ...]:
         """The particles after the step."""
@@ -295,7 +406,7 @@ class RunFolder:
 
     def state(self, t: int) -> State:
         """The state after pause `t`, from which the run is resumed."""
-        return load_state(self.pause(t) / "state.npz", HypothesisCodec())[0]
+        return load_state(self.pause(t) / "state.npz", HypothesisCodec(), limit=MAX_FILE)[0]
 
     def write_metrics(self) -> None:
         """Write metrics.csv from the pauses."""

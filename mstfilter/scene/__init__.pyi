@@ -14,6 +14,7 @@ from mstfilter.scene.encoding import (
 from mstfilter.scene.frame import (
     Clip as Clip,
     Frame as Frame,
+    decode_image as decode_image,
     depth_sigma as depth_sigma,
     read_depth as read_depth,
     read_labels as read_labels,

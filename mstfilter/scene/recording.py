@@ -316,7 +316,7 @@ def find_world(first: Frame, grid: VoxelGrid | None) -> tuple[Camera, VoxelGrid]
 
 
 def truth_reader(
-    labels: np.ndarray, frames: np.ndarray, pauses: tuple[int, ...]
+    labels: np.ndarray, frames: Sequence[int], pauses: tuple[int, ...]
 ) -> Callable[[int], np.ndarray | None]:
     """The function `Recording.truth` from labels (S, X, Y, Z) at frame indices (S,)."""
     row = {int(frame): s for s, frame in enumerate(frames)}

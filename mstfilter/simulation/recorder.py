@@ -25,6 +25,8 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import shutil
+import warnings
 from collections.abc import Callable
 from dataclasses import asdict, fields, replace
 from importlib.metadata import version
@@ -33,9 +35,10 @@ from typing import Any
 
 import numpy as np
 
-from mstfilter.errors import InputError
-from mstfilter.files import atomic_folder, sweep, write_text
+from mstfilter.errors import InputError, InputWarning
+from mstfilter.files import atomic_folder, damaged_files, sweep, write_text
 from mstfilter.formats import RecordingWriter, open_recording
+from mstfilter.reading import check_private
 from mstfilter.scene import Recording
 from mstfilter.simulation.arrangement import SceneObjects, arrange_objects, draw_objects
 from mstfilter.simulation.families import GENERATOR_VERSION, SceneFamily, scene_family
@@ -232,7 +235,7 @@ def recipe_key(family: SceneFamily, seed: int) -> str:
 
 
 def cached_recording(family: str | SceneFamily, seed: int, folder: Path | None = None, **overrides: Any) -> Path:
-    """The folder of a simulated recording, which is simulated if it does not exist.
+    """The folder of a simulated recording, which is simulated if it does not exist or has changed on the disk.
 
     `overrides` are fields of the family to change. Recordings are kept in `folder`; by default `recordings` in
     `cache_folder()`. Raises InputError if the family, a field or the seed is invalid, or the folder cannot be
@@ -248,6 +251,10 @@ def cached_recording(family: str | SceneFamily, seed: int, folder: Path | None =
     chosen = replace(chosen, **overrides)
     _check_seed(seed)
     target = (folder or cache_folder() / "recordings") / f"{chosen.name}-{seed}-{recipe_key(chosen, seed)}"
+    check_private(target.parent)
+    if (target / "manifest.json").is_file() and (damage := damaged_files(target)):
+        warnings.warn(InputWarning(f"cached recording {target}: {damage[0]}", "it is simulated again"), stacklevel=2)
+        shutil.rmtree(target)
     if not (target / "manifest.json").is_file():
         _simulate_into_cache(chosen, seed, target)
     return target

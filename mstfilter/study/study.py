@@ -10,7 +10,6 @@ not repeated; the tables are the same as those of an uninterrupted study.
 from __future__ import annotations
 
 import contextlib
-import json
 import shutil
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -20,6 +19,7 @@ from typing import Any
 from mstfilter.errors import InputError
 from mstfilter.files import locked, reading, sweep, writing
 from mstfilter.lazy import progress_of
+from mstfilter.reading import check_private, read_json
 from mstfilter.runs import library_versions, write_json
 from mstfilter.study.config import StudyConfig
 from mstfilter.study.executors import Event, Executor, Local, Tell
@@ -91,6 +91,8 @@ def run_study(
     with _locked(path) as folder, progress_of(progress, bars="study_bars") as report:
         for target in (path, cache):
             _check_free_space(target)
+        for part in ("recordings", "work"):
+            check_private(cache / part)
         executor = executor or Local(logs=path / "logs")
         with writing(f"study folder {path}", "choose another with --out"):
             write_json(path / "study.json", {**_description(plan), "recalibration": recalibration})
@@ -164,7 +166,7 @@ def _read_recalibration(plan: Plan) -> dict[str, Any] | None:
         return None
     path = plan.config.folder / plan.config.recalibration
     with reading(path, "a recalibration", "name the recalibration.json of a study of the same families and arms"):
-        found = json.loads(path.read_text())
+        found = read_json(path, "a recalibration")
         groups, arms = {scene.group for scene in plan.scenes}, {arm.name for arm in plan.arms}
         missing = [f"{arm} on {group}" for group in sorted(groups) for arm in sorted(arms) if arm not in found[group]]
         fitted = {s for group in groups for arm in arms for s in found[group].get(arm, {}).get("scenes", ())}

@@ -207,7 +207,7 @@ def test_dsr_sequences(tmp_path):
     with pytest.raises(InputError, match=r"\[0, 2\]"):
         Dsr(sequence="7").open(path)
     (path / "12_1.hdf5").write_bytes((path / "12_0.hdf5").read_bytes()[:500])
-    with pytest.raises(InputError, match="does not hold"):
+    with pytest.raises(InputError, match="expected the arrays tsdf"):
         Dsr(sequence="12").open(path).check()
 
 

@@ -111,7 +111,9 @@ def make_run(path: Path, pauses: int = 3, truth: bool = True, empty: bool = Fals
             "generator": None,
         },
         "uses_truth": [],
+        "files": {},
         "versions": {"mstfilter": "0", "numpy": np.__version__},
+        "machine": {"cpu": "any", "threads": 1},
     }
     run = RunFolder.create(path, description)
     state = filter.start(7)

@@ -467,7 +467,7 @@ def test_what_cannot_be_stored_is_one_clear_error(tmp_path):
         with pytest.raises(InputError, match="s.npz"):
             load_state(tmp_path / "s.npz", Halves())
     (tmp_path / "s.npz").write_bytes(b"PK nonsense")
-    with pytest.raises(InputError, match="checkpoint cannot be read"):
+    with pytest.raises(InputError, match="s.npz cannot be read"):
         load_state(tmp_path / "s.npz")
     with pytest.raises(InputError, match="checkpoint is missing"):
         load_state(tmp_path / "t.npz")
