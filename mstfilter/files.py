@@ -306,7 +306,9 @@ def check_output(path: Path, folder: bool = False, empty: bool = True) -> None:
         raise InputError(f"{path} is a folder, expected the name of a file to write")
     if folder and path.is_dir() and (os.path.ismount(path) or Path.cwd().is_relative_to(path.resolve())):
         raise InputError(f"cannot write {path}: it is a mount point or the working folder", "name a folder below it")
-    if folder and path.exists() and (not path.is_dir() or (empty and any(path.iterdir()))):
+    if folder and path.exists() and not path.is_dir():
+        raise InputError(f"cannot write {path}: it is a file, expected a folder", "choose another name")
+    if folder and empty and path.exists() and any(path.iterdir()):
         raise InputError(
             f"cannot write {path}: it exists and is not an empty folder", "choose another name, or remove it"
         )

@@ -320,8 +320,11 @@ def test_an_error_in_a_file_of_the_user_is_located(recording, tmp_path, monkeypa
         "transition=./mine.py:Fails": (f"(mine.py, line {line}: return population.particles[99])", "step 1, transi"),
         "transition=./mine.py:Wrong": ("log weights have shape (1,)", "Population(population.particles, [0.0])"),
         "transition=./mine.py:Nothing": ("step 1, transition: Nothing returned NoneType, expected a Popul", "return"),
-        "proposal.boundary=./mine.py:Flat": ("step 0, proposal: boundary map has shape ()",),
-        "proposal.completer=./mine.py:Void": ("in step 0, proposal", "`mstfilter check mine.py:Void`"),
+        "proposal.boundary=./mine.py:Flat": (
+            "step 0, proposal: Flat.boundary (mine.py, line",
+            "returns None, expected an array of shape",
+        ),
+        "proposal.completer=./mine.py:Void": ("step 0, proposal: Void.fill (mine.py, line", "returns None"),
         "size=./mine.py:Grows": ("step 0, resampler: Grows chose 1001 particles from 1, more than 1000", "n_max"),
         "proposal.boundary=./mine.py:Fails": ("Fails of ./mine.py is no boundary", "import BoundaryModel"),
         "transition=./mine.py:Needs": ("transition: Needs needs scale, without a default", "transition.scale=VALUE"),

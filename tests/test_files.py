@@ -242,7 +242,7 @@ def test_a_folder_with_files_of_others_is_not_replaced(recording, tmp_path, caps
     (tmp_path / "run" / foreign).write_text('{"status": "done"}')
     before = content(tmp_path)
     code, _, err = call("run", recording.path, "--out", tmp_path / "run", "--replace", capsys=capsys)
-    assert code == 2 and ("has format None" in err or "notes.txt" in err)
+    assert code == 2 and ("run.json: format: field required" in err or "notes.txt" in err)
     assert content(tmp_path) == before
 
 

@@ -97,14 +97,17 @@ def demo(recording: Recording, root: Path, seed: int) -> None:
     """The command demo with a copied recording, a light preset and without pictures."""
     copied = mock.patch.object(running, "_simulate", lambda family, out, seed: shutil_copy(recording, out, seed))
     light = mock.patch("mstfilter.presets.load_config", lambda name: load_config(PRESET))
-    page = mock.patch("mstfilter.report.write_report", lambda run, path: path.write_text("mstfilter"))
-    with copied, light, page, contextlib.redirect_stdout(io.StringIO()):
+    page = mock.patch("mstfilter.report.write_report", lambda run, path, numbers: path.write_text("mstfilter"))
+    alone = mock.patch("mstfilter.runs.compared_configs", lambda config: {})
+    with copied, light, page, alone, contextlib.redirect_stdout(io.StringIO()):
         running.demo(root / "demo", seed)
 
 
 def shutil_copy(recording: Recording, out: Path, seed: int) -> None:
     """Save a recording as if it had been simulated with another seed."""
-    save_recording(recording, out, **{**recording.manifest, "seed": seed, "frames": None})
+    save_recording(
+        recording, out, **{**recording.manifest, "seed": seed, "frames": None, "family": {"name": running._DEMO}}
+    )
 
 
 def trial(flow: Flow, root: Path, stop_at: int, loss: str, expected: dict[str, bytes], template: Path) -> str:

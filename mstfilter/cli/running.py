@@ -118,7 +118,9 @@ def _check_earlier_demo(out: Path) -> None:
         generators = (source.get("generator"), RunFolder.open(out / "run").description["recording"]["generator"])
         if generators != (_SIMULATOR, _SIMULATOR) or dict(source.get("family", {})).get("name") != _DEMO:
             others.append("recording")
-        elif (page := out / "report.html").exists() and "mstfilter" not in page.read_text(errors="replace"):
+        elif (page := out / "report.html").exists() and "mstfilter" not in page.read_text(
+            encoding="utf-8", errors="replace"
+        ):
             others.append("report.html")
     if others:
         raise InputError(

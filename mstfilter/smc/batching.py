@@ -361,7 +361,7 @@ class _Sweep:
     def alone(self, t: int, slot: str, row: int) -> Population:
         """What a component returns for one run."""
         y, u = self.given(t, row)
-        component = getattr(self.filters.one(int(self.runs[row])).at(t, u), slot)
+        component = getattr(self.filters.one(int(self.runs[row])).at_step(t, u), slot)
         rng = Key(self.seeds[self.runs[row]]).child("step", t).child(slot).generator() if component.draws else None
         population = None
         if slot != "initial":
@@ -401,7 +401,7 @@ class _Sweep:
         """Particles and log weights of a component that is called once for the given rows, in their order."""
         runs, n = self.runs[rows], self.filter.n
         y, u = (self.by_row(rows, t, k) for k in (0, 1))
-        component = getattr(self.filters.rows(runs).at(t, u), slot)
+        component = getattr(self.filters.rows(runs).at_step(t, u), slot)
         rng = RunGenerators(self.states(t, slot, runs), n) if component.draws else None
         population, log_weights = None, self.log_weights
         if slot != "initial":

@@ -41,7 +41,7 @@ import numpy as np
 from mstfilter.errors import InputError
 from mstfilter.smc.distributions import MultivariateNormal
 from mstfilter.smc.filter import ParticleFilter
-from mstfilter.smc.inputs import AtStep, at_step, split_input, step_parameters, with_step
+from mstfilter.smc.inputs import AtStep, bind_step, split_input, step_parameters, with_step
 from mstfilter.smc.interfaces import Proposal, Transition, Update
 from mstfilter.smc.population import Population, union
 from mstfilter.smc.state_space import StateSpaceModel
@@ -197,7 +197,7 @@ def nonlinear_gaussian(
     def of_step(which: int, parameters: dict[str, bool]) -> Callable[..., Any]:
         def function(*args: Any, t: int = 0, u: Any = None) -> Any:
             q, r = (_entry(name, of, t) if len(of) > 1 else of[0] for name, of in (("Q", Qs), ("R", Rs)))
-            bound = at_step(f, in_f, t, u), at_step(h, in_h, t, u), q, r
+            bound = bind_step(f, in_f, t, u), bind_step(h, in_h, t, u), q, r
             return _gaussian_functions(*bound)[which](*args)
 
         return with_step(function, parameters) if parameters else functions[which]
@@ -403,7 +403,7 @@ def forward_backward(
         filtered[t] = predicted
         if y is None:
             continue
-        found = np.asarray(at_step(log_likelihood, of_step, t, u)(y), dtype=np.float64)
+        found = np.asarray(bind_step(log_likelihood, of_step, t, u)(y), dtype=np.float64)
         if found.shape != (K,):
             raise InputError(f"log_likelihood returned shape {found.shape}, expected ({K},): one number per state")
         possible = found[predicted > 0].max()

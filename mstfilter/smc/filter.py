@@ -270,7 +270,7 @@ class _Step:
         self, filter: ParticleFilter, state: State, observation: Any, observer: Observer | None = None
     ) -> None:
         self.observation, u = split_input(observation)
-        self.filter, self.state = filter.at(state.t, u), state
+        self.filter, self.state = filter.at_step(state.t, u), state
         self.given = filter
         self.slot = _Slot(state.t, observer)
 
