@@ -60,7 +60,9 @@ class Scene:
         frames = [recording.frames[p] for p in recording.pauses]
         masks = None
         if frames[0].robot_mask is not None:
-            masks = np.stack([np.zeros(f.depth.shape, bool) if f.robot_mask is None else f.robot_mask for f in frames])
+            masks = np.stack(
+                [np.zeros(f.depth.shape, bool) if f.robot_mask is None else f.robot_mask for f in frames]
+            )
         poses = tuple(frame.camera.pose for frame in frames)
         images = np.stack([f.rgb for f in frames]), np.stack([f.depth for f in frames])
         return cls(*images, frames[0].camera.K, poses, recording.grid, masks)
@@ -240,7 +242,9 @@ INPUTS: dict[str, Callable[[Scene], Scene | None]] = {
     "robot mask everywhere": with_poses(lambda s: replace(s, masks=np.ones(s.depth.shape, bool))),
     "constant depth": with_poses(lambda s: replace(s, depth=np.full_like(s.depth, 0.8))),
     "uniform colour": lambda s: replace(s, rgb=np.full_like(s.rgb, 120)),
-    "pauses all identical": several(lambda s: replace(s, rgb=s.rgb[[0] * len(s.rgb)], depth=s.depth[[0] * len(s.rgb)])),
+    "pauses all identical": several(
+        lambda s: replace(s, rgb=s.rgb[[0] * len(s.rgb)], depth=s.depth[[0] * len(s.rgb)])
+    ),
 }
 
 

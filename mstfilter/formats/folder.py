@@ -50,7 +50,6 @@ from mstfilter.scene import (
     read_depth,
     read_labels,
     read_rgb,
-    report,
     rigid_from_matrix,
     truth_reader,
     write_image,
@@ -240,7 +239,7 @@ def save_recording(
     Depth is stored in units of the recording's `depth_scale`. `progress` is called with the number of frames written
     and the number of all frames. Further entries of manifest.json, such as the generator, are given by name.
     """
-    report(examine(recording.frames, recording.pauses, recording.grid), f"recording {recording.name}")
+    report_findings(examine(recording.frames, recording.pauses, recording.grid), f"recording {recording.name}")
     camera, total = recording.frames[recording.pauses[0]].camera, len(recording)
     manifest = {"name": recording.name, "depth_scale": recording.depth_scale, **manifest}
     with RecordingWriter(path, camera, recording.grid, **manifest) as writer:

@@ -26,7 +26,7 @@ from mstfilter.oracles import bind_truth, uses_truth
 from mstfilter.presets import build_filter, describe_filter
 from mstfilter.registry import nested_components
 from mstfilter.runs.run_folder import RunFolder, as_json
-from mstfilter.scene import Recording, UsesFiles
+from mstfilter.scene import Finding, Recording, UsesFiles, examine_hypotheses, report_findings
 from mstfilter.scoring import ask
 from mstfilter.smc import Observer
 
@@ -112,6 +112,7 @@ def filter_recording(
     clips = recording.clips()
     done = 0 if folder is None else folder.n_pauses
     state = folder.state(done - 1) if folder is not None and done else bound.start(int(seed))
+    doubts: list[Finding] = []
     with progress_of(progress, "filter") as show:
         advance: Callable[[RunProgress], None] = (lambda p: show(p.done, p.total)) if progress is True else show
         advance(RunProgress(done, len(clips)))
@@ -123,6 +124,9 @@ def filter_recording(
                 truth = recording.truth(clip.index)
                 questions = None if truth is None else ask(recording, clip.index)
                 folder.write_pause(clip, state, info, truth, questions)
+                if not doubts and state.population is not None:  # said once
+                    doubts = examine_hypotheses(tuple(state.population.particles), clip.after)
+                    report_findings(doubts, f"pause {clip.index} of recording {recording.name}")
                 advance(RunProgress(clip.index + 1, len(clips), sum(info.seconds.values())))
         except BaseException as error:
             if folder is not None:

@@ -40,7 +40,7 @@ from mstfilter.scene.plausibility import (
     Finding as Finding,
     examine as examine,
     examine_hypotheses as examine_hypotheses,
-    report as report,
+    report_findings as report_findings,
 )
 from mstfilter.scene.recording import (
     LazyFrames as LazyFrames,

@@ -4,9 +4,9 @@
 ...     print(finding.stop, finding.message, finding.hints)
 
 Wrong units, a camera matrix of another image size, a moved camera, or depth that is not registered to colour give
-confident hypotheses of the wrong objects, and no error. `examine` compares the frames at the pauses with what a camera
-over a table gives. Where the result cannot be right, the finding stops the run; the others are warnings. The limits
-and their distance from 44 right recordings are measured in ``experiments/plausibility``.
+confident hypotheses of the wrong objects, and no error. `examine` compares the frames at the pauses with what a
+camera over a table gives. Where the result cannot be right, the finding stops the run; the others are warnings. The
+limits are chosen from the right and wrong recordings of ``experiments/plausibility``.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ _MAX_TILT, _MAX_HEIGHT = 4.0, 0.025  # degrees and metres between the plane of t
 _OTHER_PLANE = 30.0  # degrees: a plane that is tilted by more is a wall or the side of a box, not the table
 _MIN_ON_TABLE = 0.1  # share of the readings on the table, as `fit_support_plane` demands
 _MIN_READINGS = 30  # of an image of 160 columns; fewer are taken for noise
-_TALL, _FACING, _UPRIGHT = 0.35, 0.5, 0.5  # metres; cosines: see `_other_support`
+_TALL, _UPRIGHT = 0.35, 0.5  # metres, cosine: see `_other_support`
 _DRIFT = (
     2.0,
     0.02,
@@ -74,7 +74,7 @@ def examine(frames: Sequence[Frame], pauses: Sequence[int], grid: VoxelGrid) -> 
     return sorted(found, key=lambda finding: not finding.stop)
 
 
-def report(findings: Iterable[Finding], where: str) -> None:
+def report_findings(findings: Iterable[Finding], where: str) -> None:
     """Raise the first finding that stops a run as InputError, or warn of all; `where` names the recording."""
     for finding in findings:
         if finding.stop:
@@ -84,10 +84,10 @@ def report(findings: Iterable[Finding], where: str) -> None:
 
 def examine_hypotheses(hypotheses: Sequence[Hypothesis], frame: Frame) -> list[Finding]:
     """Findings about the hypotheses of a step and the frame at its pause."""
-    grid = hypotheses[0].grid
-    n_raised = int((Look(frame, grid).inside[:, 2] > _MIN_HEIGHT).sum())
-    if n_raised >= 4 * _MIN_READINGS and not any(h.n_objects for h in hypotheses):
-        text = f"no hypothesis has an object, but {n_raised} of the sampled readings are above the table"
+    grid, points = hypotheses[0].grid, _sampled(frame, 160).points
+    raised = grid.contains(grid.index_of(points)) & (points[..., 2] > 2 * _MIN_HEIGHT)
+    if raised.mean() > 0.005 and not any(h.n_objects for h in hypotheses):
+        text = f"no hypothesis has an object, but {raised.mean():.1%} of the pixels show readings above the table"
         hints = "check the depth scale and the pose", "objects of a few voxels need smaller voxels: give a workspace"
         return [Finding(False, text, hints)]
     largest = max((max(h.volumes().values(), default=0) for h in hypotheses), default=0)
@@ -247,8 +247,8 @@ def _support(first: Look) -> Iterator[Finding]:
 def _other_support(first: Look) -> Iterator[Finding]:
     """A wall or the floor at z = 0: a large plane in front of it is the table.
 
-    A table under a floor camera is parallel to the floor and higher than objects are. A table in front of a wall meets
-    it at a right angle, reaches far from it, and its normal points to the top of the image, as that of a wall does not.
+    A table is parallel to the floor and higher above it than objects above a table. A table in front of a wall meets
+    it at a right angle and reaches far from it; its normal points to the top of the image, that of a wall does not.
     """
     raised = first.points[:, 2] > _ON_TABLE
     plane = first.plane(raised) if raised.mean() > 0.2 else None
@@ -274,7 +274,7 @@ def _other_support(first: Look) -> Iterator[Finding]:
 def _scale(first: Look) -> Iterator[Finding]:
     """Distances that are not those of a camera over a table."""
     z, size = first.distance, first.grid.voxel_size
-    hint = "check the depth scale: millimetres need 0.001, TUM images 0.0002, RealSense L515 0.00025; arrays are in metres"
+    hint = "check the depth scale: millimetres need 0.001, TUM images 0.0002, RealSense L515 0.00025"
     if _outside(z, _DISTANCES):
         near, far = z < _VOXELS_IN_DISTANCE * size, depth_sigma(z) > _NOISE_IN_VOXELS * size
         text = f"the table is {z:.3g} m from the camera, expected {_DISTANCES[0]:g} to {_DISTANCES[1]:g} m"
@@ -411,7 +411,7 @@ class _Edges:
         self.rank = (np.searchsorted(levels, gradient) / gradient.size).astype(np.float32)
 
     def under(self, other: _Edges) -> np.ndarray:
-        """(33, 33) sum of the ranks of the colour of `other` below the depth edges, by shift from -16 to 16 pixels."""
+        """(33, 33) sum of the colour ranks of `other` below the depth edges, by shift from -16 to 16 pixels."""
         import cv2
 
         inner = slice(_SHIFTS, -_SHIFTS)
@@ -424,9 +424,9 @@ _BOX = np.ones((3, 3), np.uint8)
 def edge_agreement(looks: Sequence[Look]) -> tuple[float, float, tuple[int, int], float]:
     """How well edges of depth and colour agree at all pauses.
 
-    Returns the height of the best agreement over that of all shifts; the share of it that is lost without a shift; the
-    best shift (rows, columns) of colour in pixels of an image of 320 columns; and by how much the agreement rises if
-    depth belongs to other pauses (in reverse, or one earlier or later).
+    Returns the best agreement minus the median over shifts; the share of it that is lost without a shift; the best
+    shift (rows, columns) of colour in pixels of an image of 320 columns; and by how much the agreement rises if depth
+    belongs to other pauses (in reverse, or one earlier or later).
     """
     edges = [look.edges for look in looks if min(look.frame.depth.shape) > _SHIFTS]
     count = sum(float(edge.depth.sum()) for edge in edges)

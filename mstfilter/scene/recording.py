@@ -31,7 +31,7 @@ from mstfilter.scene.camera import Camera, rigid_from_matrix
 from mstfilter.scene.frame import Clip, Frame
 from mstfilter.scene.geometry import fit_support_plane, workspace
 from mstfilter.scene.pauses import Ends, PauseRule, Still, pause_rule
-from mstfilter.scene.plausibility import examine, report
+from mstfilter.scene.plausibility import examine, report_findings
 from mstfilter.scene.voxels import VoxelGrid, as_labels
 
 _LONG = 20  # frames; more are probably not one clip
@@ -225,9 +225,9 @@ class Recording:
                 "one mask per frame, of the size of the images",
             )
         frames = [Frame(*images) for images in zip(rgb, depth, cameras, masks, strict=True)]
-        found, grid = find_world(frames[chosen[0]], grid)
+        posed, grid = find_world(frames[chosen[0]], grid)
         if T_world_camera is None:
-            frames = [replace(frame, camera=found) for frame in frames]
+            frames = [replace(frame, camera=posed) for frame in frames]
         made = cls(frames, grid, chosen, stamps, name)
         made._examined  # noqa: B018
         return made
@@ -271,7 +271,7 @@ class Recording:
     @cached_property
     def _examined(self) -> None:
         """Evaluated once: warnings and errors about the frames at the pauses."""
-        report(examine(self.frames, self.pauses, self.grid), f"recording {self.name}")
+        report_findings(examine(self.frames, self.pauses, self.grid), f"recording {self.name}")
 
 
 class UsesFiles(ABC):
