@@ -50,6 +50,7 @@ from mstfilter.scene import (
     read_depth,
     read_labels,
     read_rgb,
+    report_findings,
     rigid_from_matrix,
     truth_reader,
     write_image,

@@ -35,7 +35,7 @@ _VOXELS_IN_DISTANCE = 25  # a camera nearer than this many voxels stops the run
 _NOISE_IN_VOXELS = 1.3  # depth noise at the table in voxels beyond which the run stops
 _MIN_HEIGHT = 0.01  # metres above the table beyond which a reading may show an object
 _ON_TABLE, _NEAR_TABLE = 0.025, 0.1  # metres from z = 0: on the table; where the table is searched
-_MAX_TILT, _MAX_HEIGHT = 4.0, 0.025  # degrees and metres between the plane of the readings and z = 0
+_MAX_TILT, _MAX_HEIGHT = 2.5, 0.025  # degrees and metres between the table and z = 0: warning; twice: stop
 _OTHER_PLANE = 30.0  # degrees: a plane that is tilted by more is a wall or the side of a box, not the table
 _MIN_ON_TABLE = 0.1  # share of the readings on the table, as `fit_support_plane` demands
 _MIN_READINGS = 30  # of an image of 160 columns; fewer are taken for noise
@@ -235,7 +235,7 @@ def _support(first: Look) -> Iterator[Finding]:
     if table is not None and (table[0] > _MAX_TILT or abs(table[1]) > _MAX_HEIGHT):
         text = f"the table in the depth image is tilted by {table[0]:.1f} degrees and at z = {table[1]:.3f} m"
         yield Finding(table[0] > 2 * _MAX_TILT or abs(table[1]) > 2 * _MAX_HEIGHT, f"{text}, expected z = 0", hints)
-    elif table is None and first.on_table.mean() < _MIN_ON_TABLE and free is not None:
+    elif table is None and free is not None and (first.on_table.mean() < _MIN_ON_TABLE or free[0] > 150):
         text = (
             f"no table is at z = 0: the largest plane is tilted by {free[0]:.0f} degrees and at z = {free[1]:.3f} m"
         )
