@@ -64,12 +64,12 @@ def examine(frames: Sequence[Frame], pauses: Sequence[int], grid: VoxelGrid) -> 
 
     The frames are read one by one; images of 160 and 320 columns are kept, and corners of images of 640.
     """
-    camera = frames[pauses[0]].camera
-    found = [*_intrinsics(camera), *_voxels(grid)]
+    found = [*_intrinsics(frames[pauses[0]].camera), *_voxels(grid)]
     if not any(finding.stop for finding in found):
         looks = [Look(frames[p], grid, p) for p in pauses]
-        readable = [finding for look in looks for finding in _unreadable(look)]
-        found += readable or [*_support(looks[0]), *_scale(looks[0]), *_workspace(looks), *_moved(looks)]
+        found += [finding for look in looks for finding in unreadable(look.frame, f"frame {look.index}")]
+    if not any(finding.stop for finding in found):
+        found += [*_support(looks[0]), *_scale(looks[0]), *_workspace(looks), *_moved(looks)]
         found += [*_registration(looks), *_repeated(looks), *_one_pause(frames, pauses)]
     return sorted(found, key=lambda finding: not finding.stop)
 
@@ -108,7 +108,6 @@ class Look:
         self.index, self.grid = index, grid
         self.frame, self.edges = _sampled(frame, 160), _Edges(_sampled(frame, 320))
         self.corners = _Corners(_sampled(frame, 640), grid)
-        self.masked = 0.0 if frame.robot_mask is None else float(frame.robot_mask.mean())
         self.points = self.frame.points[self.frame.valid]
 
     @cached_property
@@ -208,17 +207,20 @@ def _voxels(grid: VoxelGrid) -> Iterator[Finding]:
         yield Finding(_outside(size, _POSSIBLE_VOXELS), text, (hint,))
 
 
-def _unreadable(look: Look) -> Iterator[Finding]:
-    """Images that show nothing."""
-    depth = look.frame.depth[np.isfinite(look.frame.depth)]
-    if look.masked > 0.95 or not look.frame.valid.any():
-        text = f"the robot mask of frame {look.index} covers {look.masked:.0%} of the image or of its depth"
+def unreadable(frame: Frame, which: str) -> Iterator[Finding]:
+    """Images that show nothing; `which` names the frame."""
+    depth, masked = (
+        frame.depth[np.isfinite(frame.depth)],
+        0.0 if frame.robot_mask is None else frame.robot_mask.mean(),
+    )
+    if masked > 0.95 or not frame.valid.any():
+        text = f"the robot mask of {which} covers {masked:.0%} of the image, and all or most of its depth"
         yield Finding(True, text, ("is the mask inverted? True is the robot",))
     elif np.ptp(depth) < 1e-6:
-        text = f"all depth readings of frame {look.index} are {depth[0]:.3g} m"
+        text = f"all depth readings of {which} are {depth[0]:.3g} m"
         yield Finding(True, text, ("check that the depth images are those of the camera, in metres",))
-    elif look.frame.rgb.mean(axis=2).std() < 4:
-        text = f"the colour image of frame {look.index} is uniform"
+    elif frame.rgb.mean(axis=2).std() < 4:
+        text = f"the colour image of {which} is uniform"
         yield Finding(False, text, ("check that the colour images are 8-bit RGB, 0 to 255, and not covered",))
 
 
@@ -251,7 +253,7 @@ def _other_support(first: Look) -> Iterator[Finding]:
     it at a right angle and reaches far from it; its normal points to the top of the image, that of a wall does not.
     """
     raised = first.points[:, 2] > _ON_TABLE
-    plane = first.plane(raised) if raised.mean() > 0.2 else None
+    plane = first.plane(raised) if raised.mean() > _MIN_ON_TABLE else None
     if plane is None:
         return
     tilt, height, normal = plane

@@ -31,7 +31,7 @@ from mstfilter.scene.camera import Camera, rigid_from_matrix
 from mstfilter.scene.frame import Clip, Frame
 from mstfilter.scene.geometry import fit_support_plane, workspace
 from mstfilter.scene.pauses import Ends, PauseRule, Still, pause_rule
-from mstfilter.scene.plausibility import examine, report_findings
+from mstfilter.scene.plausibility import examine, report_findings, unreadable
 from mstfilter.scene.voxels import VoxelGrid, as_labels
 
 _LONG = 20  # frames; more are probably not one clip
@@ -330,6 +330,7 @@ def check_depth(depth: np.ndarray, where: str) -> None:
 
 def find_world(first: Frame, grid: VoxelGrid | None) -> tuple[Camera, VoxelGrid]:
     """Camera with a pose, and a workspace; what is not given is found from the frame of the first pause."""
+    report_findings((finding for finding in unreadable(first, "the first pause") if finding.stop), "recording")
     camera = first.camera
     if camera.T_world_camera is None:
         camera = camera.at(fit_support_plane(first).T_world_camera)

@@ -44,7 +44,7 @@ WRONG_DEPTH_OR_CAMERA = {
         "tilted by 6.",
     ),
     "voxels of a metre": (deeper(1), {"grid": VoxelGrid((-2, -2, 0.0), 1.0, (4, 4, 1))}, "edges of 1 m"),
-    "a wall": (np.ones_like, {}, "all depth readings of frame 0 are 1 m"),
+    "a wall": (np.ones_like, {}, "all depth readings of the first pause are 1 m"),
     "a misplaced workspace": (deeper(1), {"grid": ELSEWHERE, "T_world_camera": CAMERA.pose}, "has no reading above"),
     "a workspace above the objects": (
         deeper(1),
