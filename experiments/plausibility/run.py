@@ -1,7 +1,7 @@
 """Right recordings, and wrong ones made from them: what the examination of a recording finds.
 
-    python experiments/plausibility/run.py                 # a few minutes; simulated recordings are cached
-    python experiments/plausibility/run.py --only demo     # recordings whose name begins with this text
+    python experiments/plausibility/run.py     # 12 minutes of one core; simulated recordings are cached
+    python experiments/plausibility/run.py --only demo,s1 --out DIR     # recordings whose names begin with these texts
 
 Needs the real recordings in MSTFILTER_SHARED (default ../shared) under real/, and leaves those out that are absent.
 Writes findings.csv (one row per recording and input) and statistics.csv (range of each statistic per input).
@@ -299,7 +299,7 @@ def main() -> None:
     arguments = parser.parse_args()
     rows: list[dict[str, object]] = []
     for name, scene in recordings():
-        if not name.startswith(arguments.only):
+        if not name.startswith(tuple(arguments.only.split(","))):
             continue
         for title, change in INPUTS.items():
             if title != "right" and name.startswith(RIGHT_ONLY):

@@ -21,6 +21,7 @@ from types import FrameType
 import numpy as np
 
 from mstfilter.errors import InputError, InputWarning
+from mstfilter.scene.arrays import content_key
 from mstfilter.scene.camera import Camera
 from mstfilter.scene.frame import Frame, depth_sigma
 from mstfilter.scene.geometry import SupportPlane, fit_support_plane
@@ -471,7 +472,7 @@ def _registration(looks: Sequence[Look]) -> Iterator[Finding]:
 
 def _repeated(looks: Sequence[Look]) -> Iterator[Finding]:
     """Pauses that all show one image."""
-    if len(looks) > 1 and len({look.frame.key for look in looks}) == 1:
+    if len(looks) > 1 and len({content_key(look.frame.rgb, look.frame.depth) for look in looks}) == 1:
         text = f"the images of all {len(looks)} pauses are identical, which no camera gives"
         yield Finding(False, text, ("check that every frame is read from its own file",))
 
