@@ -1,7 +1,7 @@
 """Right recordings, and wrong ones made from them: what the examination of a recording finds.
 
     python experiments/plausibility/run.py     # 12 minutes of one core; simulated recordings are cached
-    python experiments/plausibility/run.py --only demo,s1 --out DIR     # recordings whose names begin with these texts
+    python experiments/plausibility/run.py --only demo,s1 --out DIR   # recordings whose names begin so
 
 Needs the real recordings in MSTFILTER_SHARED (default ../shared) under real/, and leaves those out that are absent.
 Writes findings.csv (one row per recording and input) and statistics.csv (range of each statistic per input).
