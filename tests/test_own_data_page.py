@@ -1,4 +1,4 @@
-"""Every command of docs/own-data.md runs on data of its layout."""
+"""Every command of docs/own-data.md runs on data of its layout, and every wrong input gives its message."""
 
 from __future__ import annotations
 
@@ -6,16 +6,32 @@ import json
 import re
 import shlex
 import shutil
+import warnings
 
 import numpy as np
 import pytest
 
-from mstfilter.scene import read_depth, read_labels, read_rgb, write_image
+from mstfilter.errors import InputError, InputWarning
+from mstfilter.formats import PairedImages, open_recording
+from mstfilter.scene import (
+    Camera,
+    Frame,
+    Hypothesis,
+    Recording,
+    VoxelGrid,
+    examine_hypotheses,
+    read_depth,
+    read_labels,
+    read_rgb,
+    report_findings,
+    write_image,
+)
 from tests.conftest import REPOSITORY
 from tests.formats import layouts
 from tests.formats.bags import scene_messages, write as write_bag
 from tests.scene.test_recording import write
 from tests.test_cli import call
+from tests.wrong_inputs import WRONG, right
 
 PAGE = (REPOSITORY / "docs" / "own-data.md").read_text()
 COMMANDS = [
@@ -116,3 +132,61 @@ def test_every_format_has_a_command():
     }
     assert set(data) == set(formats.__components__["format"])
     assert all(any(name in command.split() for command in COMMANDS) for name in data.values())
+
+
+TABLE = PAGE.partition("## When the input is wrong")[2]
+ROWS = re.findall(
+    r"^\| (?P<input>[^|]+) \| (?P<kind>error|warning) \| `(?P<text>[^|]+)` \|$", TABLE, flags=re.MULTILINE
+)
+
+
+def test_every_wrong_input_of_the_page_is_tried():
+    assert [name for name, _, _ in ROWS] == list(WRONG)
+
+
+@pytest.mark.parametrize(("name", "kind", "text"), ROWS)
+def test_wrong_input_gives_the_message_of_the_page(name, kind, text):
+    made = WRONG[name]()
+    pattern = ".*".join(map(re.escape, text.split("...")))
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        try:
+            if isinstance(made, dict):
+                Recording.from_arrays(**made)
+            else:
+                arrays, pose = right()
+                camera = Camera(arrays["K"], 320, 240, pose)
+                frame = Frame(arrays["rgb"][0], arrays["depth"][0], camera)
+                report_findings(examine_hypotheses(made, frame), "pause 0")
+            errors = []
+        except InputError as error:
+            errors = [error]
+    found = [one.message for one in caught if isinstance(one.message, InputWarning)]
+    said = errors if kind == "error" else found
+    assert any(re.search(pattern, one.message) for one in said), (errors, found)
+    assert all(one.hints or "no reading" in one.message for one in said)
+    assert bool(errors) == (kind == "error")
+
+
+def test_the_right_recording_of_the_table_is_silent():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        arrays, pose = right()
+        Recording.from_arrays(**arrays)
+        made = Recording.from_arrays(**arrays, T_world_camera=pose)
+    grid = VoxelGrid((-0.4, -0.4, 0.0), 0.01, (80, 80, 30))
+    labels = np.zeros(grid.shape, np.uint16)
+    labels[:8, :20, :20] = 1
+    assert examine_hypotheses((Hypothesis.from_labels(labels, grid),), made.frames[0]) == []
+
+
+@pytest.mark.parametrize(
+    "name", ["jack", "hots/mix_1", "hots/table_7", "hots/office_6", "hots/office_9", "osd_learn"]
+)
+def test_right_real_recordings_are_silent(name, shared_data):
+    path = shared_data(f"real/{name}")
+    frames = ("learn33", "learn34", "learn35") if name == "osd_learn" else ()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        recording = PairedImages(frames=frames).open(path) if name != "jack" else open_recording(path)
+        recording.clips()

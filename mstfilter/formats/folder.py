@@ -47,13 +47,14 @@ from mstfilter.scene import (
     VoxelGrid,
     as_labels,
     check_depth,
+    examine,
     find_world,
     read_depth,
     read_labels,
     read_rgb,
+    report_findings,
     rigid_from_matrix,
     truth_reader,
-    warn_if_implausible,
     write_image,
 )
 from mstfilter.scene.pauses import PauseRule
@@ -219,6 +220,7 @@ def save_recording(
     Depth is stored in units of the recording's `depth_scale`. `progress` is called with the number of frames written
     and the number of all frames. Further entries of manifest.json, such as the generator, are given by name.
     """
+    report_findings(examine(recording.frames, recording.pauses, recording.grid), f"recording {recording.name}")
     camera, total = recording.frames[recording.pauses[0]].camera, len(recording)
     manifest = {"name": recording.name, "depth_scale": recording.depth_scale, **manifest}
     with RecordingWriter(path, camera, recording.grid, **manifest) as writer:
@@ -254,8 +256,6 @@ def save_recording(
             if truth is not None:
                 writer.add_voxels(truth)
             progress(index + 1, total)
-    at_pauses = (recording.frames[p] for p in recording.pauses)
-    warn_if_implausible(at_pauses, recording.grid, f"recording {recording.name}")
     return writer.path
 
 

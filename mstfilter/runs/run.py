@@ -28,7 +28,7 @@ from mstfilter.presets import REGISTRY, build_filter, describe_filter
 from mstfilter.processes import machine, threads
 from mstfilter.registry import nested_components
 from mstfilter.runs.run_folder import RunFolder, as_json
-from mstfilter.scene import Recording, UsesFiles
+from mstfilter.scene import Finding, Recording, UsesFiles, examine_hypotheses, report_findings
 from mstfilter.scoring import ask
 from mstfilter.smc import Observer, ParticleFilter
 
@@ -102,6 +102,7 @@ def filter_recording(
         folder = _existing_folder(path, description, replace)
         done = 0 if folder is None else folder.n_pauses
         state = folder.state(done - 1) if folder is not None and done else bound.start(int(seed))
+        doubts: list[Finding] = []
         with progress_of(progress, "filter") as show:
             advance: Callable[[RunProgress], None] = (lambda p: show(p.done, p.total)) if progress is True else show
             try:
@@ -117,6 +118,9 @@ def filter_recording(
                         folder = RunFolder(path)
                     else:
                         folder.write_pause(*step)
+                    if not doubts and state.population is not None:  # said once
+                        doubts = examine_hypotheses(tuple(state.population.particles), clip.after)
+                        report_findings(doubts, f"pause {clip.index} of recording {recording.name}")
                     advance(RunProgress(clip.index + 1, len(clips), sum(info.seconds.values())))
             except BaseException as error:
                 if folder is not None:
