@@ -10,6 +10,7 @@ the temporary file is removed and an earlier file is left as it was.
 from __future__ import annotations
 
 import csv
+import errno
 import functools
 import hashlib
 import json
@@ -105,14 +106,28 @@ def folder_name(name: str) -> str:
 
 
 def check_output(path: Path, folder: bool = False) -> None:
-    """Raise InputError if a file, or with `folder` a folder, cannot be written at `path`."""
-    if path.is_dir() and not folder:
+    """Raise InputError if a file, or with `folder` a folder, cannot be written at `path`.
+
+    For each name that does not exist a file with that name between other characters, as `atomic_path` has it, is
+    made and removed: permissions do not tell of read-only file systems, long names, or a full disk.
+    """
+    if os.path.isdir(path) and not folder:
         raise InputError(f"{path} is a folder, expected the name of a file to write")
-    existing = next(parent for parent in (path.absolute(), *path.absolute().parents) if parent.exists())
-    if existing.is_file() and (folder or existing != path.absolute()):
+    target = path.absolute()
+    places = [target, *target.parents]
+    existing = next(place for place in places if os.path.exists(place))
+    if existing.is_file() and (folder or existing != target):
         raise InputError(f"cannot write {path}: {existing} is a file", "choose another place")
-    if not os.access(existing, os.W_OK):
-        raise InputError(f"cannot write {path}: no permission to write in {existing}", "choose another place")
+    made_in = existing.parent if existing.is_file() else existing
+    names = [place.name for place in places[: places.index(existing)]]
+    for name in names or [existing.name]:
+        probe = made_in / f".{name}.{uuid.uuid4().hex[:8]}.partial"
+        try:
+            probe.touch()
+            probe.unlink()
+        except OSError as error:
+            problem = "no permission to write" if error.errno in (errno.EACCES, errno.EPERM) else error.strerror
+            raise InputError(f"cannot write {path}: {problem} in {made_in}", "choose another place") from error
 
 
 def write_text(path: str | Path, text: str) -> None:

@@ -61,6 +61,8 @@ def run(
         from mstfilter.runs import check_run_folder
 
         check_run_folder(out)
+    else:
+        check_output(Path("runs"), folder=True)
     source = read_source(recording, format, option, pauses, frames)
     name = Path(preset).stem
     folder = out or Path("runs") / f"{safe_name(source.name)}-{safe_name(name)}-{seed}"
@@ -82,8 +84,7 @@ def demo(
     from mstfilter.presets import load_config
     from mstfilter.runs import compared_configs
 
-    if out.exists() and not out.is_dir():
-        raise InputError(f"{out} is a file, expected a folder for the demo")
+    check_output(out, folder=True)
     if out.exists() and any(out.iterdir()):
         known = {"recording", "run", "report.html"}
         others = sorted(p.name for p in out.iterdir() if p.name not in known and p.suffix != ".partial")
@@ -123,6 +124,8 @@ def report(
     """Write the report of a run or a study, which need not be finished."""
     if out is not None:
         check_output(out)
+    if export is not None:
+        check_output(export, folder=True)
     if (run / "study.json").is_file():
         from mstfilter.report import write_study_report
 

@@ -24,6 +24,7 @@ from __future__ import annotations
 import contextlib
 import json
 import math
+import os
 import shutil
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
@@ -72,7 +73,7 @@ class _Workspace(BaseModel):
 
 def check_writable(path: Path) -> None:
     """Raise InputError unless the path does not exist or is an empty folder, and a folder can be written there."""
-    if path.exists() and (not path.is_dir() or any(path.iterdir())):
+    if os.path.exists(path) and (not path.is_dir() or any(path.iterdir())):
         raise InputError(
             f"cannot write a recording to {path}: it exists and is not an empty folder",
             "choose another name, or remove it",

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import platform
 from collections import defaultdict
 from collections.abc import Callable, Mapping
@@ -155,9 +156,9 @@ def _existing_folder(path: Path, description: dict[str, Any]) -> RunFolder | Non
 
 def check_run_folder(path: Path) -> None:
     """Raise InputError unless a path is a run folder, an empty folder, or a new folder can be made there."""
-    if (path / "run.json").is_file():
+    if os.path.isfile(path / "run.json"):  # False for a name that is too long, where Path.is_file raises
         return
-    if path.exists() and (not path.is_dir() or any(path.iterdir())):
+    if os.path.exists(path) and (not path.is_dir() or any(path.iterdir())):
         raise InputError(f"cannot write a run to {path}: it exists and is not an empty folder", "choose another name")
     check_output(path, folder=True)
 
