@@ -28,7 +28,7 @@ import numpy as np
 from mstfilter.errors import InputError, LostRunError
 from mstfilter.smc.filter import ParticleFilter
 from mstfilter.smc.interfaces import State, WeightResampler
-from mstfilter.smc.population import Population, identity
+from mstfilter.smc.population import Population, check_observations, identity
 from mstfilter.smc.streams import Key, RunGenerators, SlotStreams
 
 Function = Callable[[Population], Any]
@@ -85,7 +85,7 @@ def batch(
         only; its result has the same shape at every step.
     """
     seeds = [int(seed) for seed in seeds]
-    ys = [list(y) for y in observations] if paired else [list(observations)]
+    ys = [list(check_observations(y)) for y in (observations if paired else [observations])]
     if not seeds:
         raise InputError("there are no seeds")
     if paired and len(ys) != len(seeds):

@@ -42,7 +42,7 @@ from mstfilter.errors import InputError
 from mstfilter.smc.distributions import MultivariateNormal
 from mstfilter.smc.filter import ParticleFilter
 from mstfilter.smc.interfaces import Proposal, Transition, Update
-from mstfilter.smc.population import Population, union
+from mstfilter.smc.population import Population, check_observations, union
 from mstfilter.smc.state_space import StateSpaceModel
 
 _Map = Callable[[np.ndarray], np.ndarray]  #: of particles (n, d) or (R, n, d)
@@ -130,7 +130,10 @@ def kalman_filter(F: Any, Q: Any, H: Any, R: Any, m0: Any, P0: Any, observations
     """
     from filterpy.kalman import KalmanFilter
 
-    ys = [None if y is None else np.atleast_1d(np.asarray(y, dtype=np.float64)) for y in observations]
+    ys = [
+        None if y is None else np.atleast_1d(np.asarray(y, dtype=np.float64))
+        for y in check_observations(observations)
+    ]
     m0, P0 = np.asarray(m0, dtype=np.float64), np.asarray(P0, dtype=np.float64)
     T, d, k = len(ys), len(m0), np.shape(H)[-2]
     matrices = {}
@@ -221,7 +224,7 @@ def forward_backward(
     Raises InputError if a shape does not fit, or no state explains an observation.
     """
     start, moves = _chain(initial, transition)
-    ys = list(observations)
+    ys = list(check_observations(observations))
     T, K = len(ys), len(start)
     filtered, likelihood, total = np.empty((T, K)), np.ones((T, K)), np.zeros(T)
     for t, y in enumerate(ys):

@@ -52,7 +52,7 @@ from mstfilter.smc.interfaces import (
     Trigger,
     Update,
 )
-from mstfilter.smc.population import Population, identity
+from mstfilter.smc.population import Population, check_observations, identity
 from mstfilter.smc.resampling import Systematic
 from mstfilter.smc.streams import Key, step_generator
 
@@ -236,6 +236,7 @@ class ParticleFilter:
     ) -> tuple[Iterable[Any], State, Any]:
         """The remaining observations, the state to continue from, and the `Checkpoint` or None."""
         _keep_freed_memory()
+        check_observations(observations)
         current = state if isinstance(state, State) else self.start(state)
         if checkpoint is None:
             return observations, current, None
