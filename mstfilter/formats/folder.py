@@ -60,6 +60,12 @@ from mstfilter.scene.pauses import PauseRule
 VERSION = 1  #: Version of the layout
 
 
+_HINTS = (
+    "a recording folder holds manifest.json, camera.json, rgb/, depth/",
+    "other layouts: mstfilter.runs.open_source(path), or `mstfilter convert`",
+)
+
+
 class _Workspace(BaseModel):
     model_config = ConfigDict(extra="forbid")
     min: tuple[float, float, float]
@@ -303,7 +309,7 @@ class _Manifest(BaseModel):
 
 
 def _load(path: Path, model: type[BaseModel]) -> Any:
-    with reading(path, "a recording", "a recording folder holds manifest.json, camera.json, rgb/, depth/"):
+    with reading(path, "a recording", *_HINTS):
         data = json.loads(path.read_text())
     try:
         return model.model_validate(data), data
@@ -349,7 +355,7 @@ def open_recording(path: str | Path, pauses: PauseRule | None = None) -> Recordi
     if not any(path.iterdir()):
         raise InputError(
             f"recording folder is empty: {path}",
-            "a recording folder holds manifest.json, camera.json, rgb/, depth/",
+            *_HINTS,
         )
     manifest, manifest_data = _load(path / "manifest.json", _Manifest)
     camera_file, _ = _load(path / "camera.json", _CameraFile)
