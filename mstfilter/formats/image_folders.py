@@ -293,8 +293,8 @@ def _stored_matrix(path: Path, file: Path | None, stored: dict[str, Any]) -> tup
     hint = "expected fx, fy, cx, cy, or K row by row, or intrinsic_matrix of Open3D column by column; or give K"
     with reading(file, "a file of intrinsics", hint):
         if "fx" in stored:
-            values = [stored[name] for name in ("fx", "fy")]
-            values += [stored[a] if a in stored else stored[b] for a, b in (("cx", "ppx"), ("cy", "ppy"))]
+            values: Sequence[float] = [stored[name] for name in ("fx", "fy")]
+            values = [*values, *(stored[a] if a in stored else stored[b] for a, b in (("cx", "ppx"), ("cy", "ppy")))]
         else:
             names = ("intrinsic_matrix", "K", "k", "camera_matrix", "cam_K", "intrinsics")
             name = next((name for name in names if name in stored), names[0])

@@ -123,7 +123,8 @@ def filter_recording(
                     folder = RunFolder.create(path, description)
                 truth = recording.truth(clip.index)
                 questions = None if truth is None else ask(recording, clip.index)
-                folder.write_pause(clip, state, info, truth, questions)
+                instance = recording.instance(recording.pauses[clip.index])
+                folder.write_pause(clip, state, info, truth, questions, instance)
                 advance(RunProgress(clip.index + 1, len(clips), sum(info.seconds.values())))
         except BaseException as error:
             if folder is not None:

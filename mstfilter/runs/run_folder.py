@@ -9,6 +9,7 @@ Layout::
     pauses/000/rgb.png       the image at the pause          pauses/000/state.npz        particles and log weights
     pauses/000/info.json     record of the step              pauses/000/camera.json      pose at the pause
     pauses/000/truth.npz     true labels, if known           pauses/000/seconds.json     wall time by component
+    pauses/000/instance.png  true label image, if known
     metrics.csv              one row per pause and hypothesis
     compare/without-past     run folders of other filters on the same recording, if asked for
 
@@ -37,6 +38,7 @@ from mstfilter.scene import (
     Hypothesis,
     decode_hypotheses,
     encode_hypotheses,
+    read_labels,
     read_rgb,
     rigid_from_matrix,
     write_image,
@@ -137,9 +139,15 @@ class RunFolder:
         write_json(self.path / "run.json", {**self.description, "status": status})
 
     def write_pause(
-        self, clip: Clip, state: State, info: Info, truth: np.ndarray | None, questions: Questions | None = None
+        self,
+        clip: Clip,
+        state: State,
+        info: Info,
+        truth: np.ndarray | None,
+        questions: Questions | None = None,
+        instance: np.ndarray | None = None,
     ) -> None:
-        """Write the results of a step, with the true labels and the questions of the pause if they are known.
+        """Write the results of a step, and of the pause, if known: true labels, questions, true label image.
 
         An interrupted call writes nothing.
         """
@@ -149,6 +157,8 @@ class RunFolder:
         with atomic_folder(self.pause(info.t)) as folder:
             folder.mkdir()
             write_image(folder / "rgb.png", clip.after.rgb)
+            if instance is not None:
+                write_image(folder / "instance.png", instance)
             write_json(
                 folder / "camera.json",
                 {
@@ -194,6 +204,11 @@ class RunFolder:
     def seconds(self, t: int) -> dict[str, float]:
         """Wall time of the step by component, in seconds."""
         return dict(_read_json(self.pause(t) / "seconds.json"))
+
+    def instance(self, t: int) -> np.ndarray | None:
+        """True label image (H, W) at a pause, 255 for the robot; None if it is not known."""
+        path = self.pause(t) / "instance.png"
+        return read_labels(path) if path.is_file() else None
 
     def rgb(self, t: int) -> np.ndarray:
         """Image (H, W, 3) at a pause."""
