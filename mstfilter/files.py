@@ -300,24 +300,35 @@ def writing(what: str, *hints: str) -> Iterator[None]:
 def check_output(path: Path, folder: bool = False, empty: bool = True) -> None:
     """Raise InputError if a file, or with `folder` a folder, cannot be written at `path`.
 
-    An existing folder must be empty, unless `empty` is false.
+    An existing folder must be empty, unless `empty` is false. For each name that does not exist a file with that name
+    between other characters, as `atomic_path` has it, is made and removed: permissions do not tell of read-only file
+    systems, long names, or a full disk.
     """
-    if path.is_dir() and not folder:
+    if os.path.isdir(path) and not folder:
         raise InputError(f"{path} is a folder, expected the name of a file to write")
-    if folder and path.is_dir() and (os.path.ismount(path) or Path.cwd().is_relative_to(path.resolve())):
+    if folder and os.path.isdir(path) and (os.path.ismount(path) or Path.cwd().is_relative_to(path.resolve())):
         raise InputError(f"cannot write {path}: it is a mount point or the working folder", "name a folder below it")
-    if folder and path.exists() and not path.is_dir():
+    if folder and os.path.isfile(path):
         raise InputError(f"cannot write {path}: it is a file, expected a folder", "choose another name")
-    if folder and empty and path.exists() and any(path.iterdir()):
+    if folder and empty and os.path.isdir(path) and any(path.iterdir()):
         raise InputError(
             f"cannot write {path}: it exists and is not an empty folder", "choose another name, or remove it"
         )
-    place = path.absolute().parent if folder and path.exists() else path.absolute()  # a folder is renamed
-    existing = next(parent for parent in (place, *place.parents) if parent.exists())
-    if existing.is_file() and (folder or existing != place):
+    target = path.absolute().parent if folder and os.path.exists(path) else path.absolute()  # a folder is renamed
+    places = [target, *target.parents]
+    existing = next(place for place in places if os.path.exists(place))
+    if existing.is_file() and (folder or existing != target):
         raise InputError(f"cannot write {path}: {existing} is a file", "choose another place")
-    if not os.access(existing, os.W_OK):
-        raise InputError(f"cannot write {path}: no permission to write in {existing}", "choose another place")
+    made_in = existing.parent if existing.is_file() else existing
+    names = [place.name for place in places[: places.index(existing)]]
+    for name in names or [existing.name]:
+        probe = made_in / f".{name}.{uuid.uuid4().hex[:8]}.partial"
+        try:
+            probe.touch()
+            probe.unlink()
+        except OSError as error:
+            problem = "no permission to write" if error.errno in (errno.EACCES, errno.EPERM) else error.strerror
+            raise InputError(f"cannot write {path}: {problem} in {made_in}", "choose another place") from error
 
 
 def write_text(path: str | Path, text: str) -> None:

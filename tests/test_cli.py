@@ -14,6 +14,7 @@ import pytest
 from mstfilter.cli import main
 from mstfilter.formats import open_recording
 from mstfilter.runs import RunFolder
+from tests.conftest import REPOSITORY
 from tests.runs.test_run import content
 from tests.scene.test_recording import FAULTS, write
 from tests.study.test_failures import BROKEN, wait_for
@@ -54,6 +55,39 @@ def test_run_and_report(two_pauses, tmp_path, capsys):
     assert "<html" in (tmp_path / "r.html").read_text()
     assert list((tmp_path / "x").rglob("*.ply"))
     assert list((tmp_path / "x").rglob("*.png"))
+
+
+PLACES = {
+    "/proc/x": "/proc",
+    "a file in the way": "is a file",
+    "a long name": "too long",
+}
+WRITERS = {
+    "run": ("none", "--out"),
+    "demo": ("--out",),
+    "simulate": ("demo",),
+    "convert": ("none",),
+    "study": ("none.toml", "--out"),
+    "train": ("border", "--out"),
+    "report": ("none", "--out"),
+    "report, meshes": ("none", "--export"),
+    "view": ("none", "--html"),
+    "quality": ("none", "none", "--csv"),
+}
+
+
+@pytest.mark.parametrize("place", PLACES)
+@pytest.mark.parametrize("command", WRITERS)
+def test_an_output_that_cannot_be_written_is_an_error_before_any_work(tmp_path, capsys, command, place):
+    """Inputs do not exist (but the file of a study): the error about the output comes first."""
+    (tmp_path / "file").write_text("kept")
+    out = {"/proc/x": "/proc/x", "a file in the way": tmp_path / "file" / "x", "a long name": tmp_path / ("x" * 300)}
+    words = [tmp_path / "study.toml" if word == "none.toml" else word for word in WRITERS[command]]
+    (tmp_path / "study.toml").write_text((REPOSITORY / "experiments/fusion/study.toml").read_text())
+    code, printed, err = call(command.partition(",")[0], *words, out[place], capsys=capsys)
+    assert (code, printed) == (2, "") and err.startswith("error: cannot write") and PLACES[place] in err, err
+    assert "hint: choose another place" in err
+    assert {path.name for path in tmp_path.iterdir()} == {"file", "study.toml"}
 
 
 @pytest.mark.parametrize("fault", FAULTS)

@@ -64,6 +64,8 @@ def run(
         from mstfilter.runs import check_run_folder
 
         check_run_folder(out, replace)
+    else:
+        check_output(Path("runs"), folder=True, empty=False)
     source = read_source(recording, format, option, pauses, frames)
     name = Path(preset).stem
     folder = out or Path("runs") / f"{safe_name(source.name)}-{safe_name(name)}-{seed}"
@@ -154,6 +156,8 @@ def report(
     """Write the report of a run or a study, which need not be finished."""
     if out is not None:
         check_output(out)
+    if export is not None:
+        check_output(export, folder=True)
     if (run / "study.json").is_file():
         from mstfilter.report import write_study_report
 

@@ -66,6 +66,12 @@ RECORDING_FILES = re.compile(  #: paths in a recording folder
 _Model = TypeVar("_Model", bound=BaseModel)
 
 
+_HINTS = (
+    "a recording folder holds manifest.json, camera.json, rgb/, depth/",
+    "other layouts: mstfilter.runs.open_source(path), or `mstfilter convert`",
+)
+
+
 class _Workspace(BaseModel):
     model_config = ConfigDict(extra="forbid")
     min: tuple[float, float, float]
@@ -283,7 +289,7 @@ class _Manifest(BaseModel):
 
 def _load(path: Path, model: type[_Model]) -> tuple[_Model, dict[str, Any]]:
     try:
-        return read_model(path, model, "a recording", "the layout is described in mstfilter.formats.folder")
+        return read_model(path, model, "a recording", *_HINTS)
     except InputError as error:
         if "depth_scale" in error.message:
             error.hints = ("metres per unit: 0.001 for millimetres, 0.0002 for TUM images; it has no default",)
@@ -319,7 +325,7 @@ def open_recording(path: str | Path, pauses: PauseRule | None = None) -> Recordi
     if not any(path.iterdir()):
         raise InputError(
             f"recording folder is empty: {path}",
-            "a recording folder holds manifest.json, camera.json, rgb/, depth/",
+            *_HINTS,
         )
     manifest, manifest_data = _load(path / "manifest.json", _Manifest)
     camera_file, _ = _load(path / "camera.json", _CameraFile)

@@ -114,7 +114,8 @@ def run_page(run: RunFolder | str | Path, *, photos: bool = True, head: bool = T
 
 def recording_page(recording: Recording) -> ScenePage:
     """The pauses of a recording as a page: image and truth, or the surface that the camera sees."""
-    note = f"{len(recording)} frames, {len(recording.pauses)} pauses"
+    counts = {"frame": len(recording), "pause": len(recording.pauses)}
+    note = ", ".join(f"{n} {name}{'s' * (n != 1)}" for name, n in counts.items())
     return _page(scenes_of_recording(recording), recording.name, note)
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import platform
 import warnings
 from collections import defaultdict
@@ -111,7 +112,8 @@ def filter_recording(
                 for clip in clips[done:]:
                     state, info = bound.step(state, clip, observer)
                     truth = recording.truth(clip.index)
-                    step = clip, state, info, truth, None if truth is None else ask(recording, clip.index)
+                    questions = None if truth is None else ask(recording, clip.index)
+                    step = clip, state, info, truth, questions, recording.instance(recording.pauses[clip.index])
                     if folder is None:  # a run that fails in its first step leaves no folder, or an earlier run
                         with atomic_folder(path, "replace" if replace else "refuse") as work:
                             RunFolder.create(work, description).write_pause(*step)
@@ -191,7 +193,7 @@ def check_run_folder(path: Path, replace: bool = False) -> None:
 
     With `replace`, a run folder must not contain files that no run writes.
     """
-    if not (path / "run.json").is_file():
+    if not os.path.isfile(path / "run.json"):  # False for a name that is too long, where Path.is_file raises
         check_output(path, folder=True)
     elif replace:
         check_output(path, folder=True, empty=False)

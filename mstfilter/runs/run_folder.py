@@ -9,7 +9,7 @@ Layout::
     pauses/000/rgb.png       the image at the pause          pauses/000/state.npz        particles and log weights
     pauses/000/info.json     record of the step              pauses/000/camera.json      pose at the pause
     pauses/000/truth.npz     true labels, if known           pauses/000/seconds.json     wall time by component
-    pauses/000/SHA256SUMS    hashes of these files but seconds.json
+    pauses/000/instance.png  true label image, if known      pauses/000/SHA256SUMS       hashes, not of seconds.json
     metrics.csv              one row per pause and hypothesis; SHA256SUMS: its hash
     compare/without-past     run folders of other filters on the same recording, if asked for
 
@@ -55,6 +55,7 @@ from mstfilter.scene import (
     as_labels,
     decode_hypotheses,
     encode_hypotheses,
+    read_labels,
     read_rgb,
     rigid_from_matrix,
     write_image,
@@ -63,7 +64,7 @@ from mstfilter.scoring import FORMS, Questions, weighted_coverage
 from mstfilter.smc import Codec, Info, State, load_state, save_state
 
 _FORMAT = 2
-_PAUSE_FILES = rf"(rgb\.png|camera\.json|state\.npz|truth\.npz|info\.json|seconds\.json|{SUMS})"
+_PAUSE_FILES = rf"(rgb\.png|instance\.png|camera\.json|state\.npz|truth\.npz|info\.json|seconds\.json|{SUMS})"
 _TABLES = rf"(run\.json|metrics\.csv|report\.html|result\.json|forecasts\.npz|{SUMS})"
 RUN_FILES = re.compile(rf"(compare/[^/]+/)?(pauses/\d+/{_PAUSE_FILES}|{_TABLES})")  #: paths in a run folder
 
@@ -262,9 +263,15 @@ class RunFolder:
         write_json(self.path / "run.json", {**self.description, "status": status})
 
     def write_pause(
-        self, clip: Clip, state: State, info: Info, truth: np.ndarray | None, questions: Questions | None = None
+        self,
+        clip: Clip,
+        state: State,
+        info: Info,
+        truth: np.ndarray | None,
+        questions: Questions | None = None,
+        instance: np.ndarray | None = None,
     ) -> None:
-        """Write the results of a step, with the true labels and the questions of the pause if they are known.
+        """Write the results of a step, and of the pause, if known: true labels, questions, true label image.
 
         An interrupted call writes nothing.
         """
@@ -272,6 +279,8 @@ class RunFolder:
         camera, hypotheses = clip.after.camera, tuple(state.population.particles)
         with atomic_folder(self.pause(info.t)) as folder:
             write_image(folder / "rgb.png", clip.after.rgb)
+            if instance is not None:
+                write_image(folder / "instance.png", instance)
             write_json(
                 folder / "camera.json",
                 {
@@ -364,6 +373,11 @@ class RunFolder:
     def seconds(self, t: int) -> dict[str, float]:
         """Wall time of the step by component, in seconds."""
         return self._read(self.pause(t) / "seconds.json", _SecondsFile)
+
+    def instance(self, t: int) -> np.ndarray | None:
+        """True label image (H, W) at a pause, 255 for the robot; None if it is not known."""
+        path = self.pause(t) / "instance.png"
+        return read_labels(path) if path.is_file() else None
 
     def rgb(self, t: int) -> np.ndarray:
         """Image (H, W, 3) at a pause."""

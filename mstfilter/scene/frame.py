@@ -131,15 +131,28 @@ def read_rgb(path: Path) -> np.ndarray:
 
 
 def read_depth(path: Path, scale: float) -> np.ndarray:
-    """Depth image (H, W) float32 in metres, NaN where the file has 0; `scale` is in metres per unit."""
+    """Depth image (H, W) float32 in metres, NaN where the file has 0.
+
+    Integers of 16 bits are multiplied by `scale`, metres per unit; float (.npy, .tif) is in metres.
+    """
     import cv2
 
-    image = _decode(path, cv2.IMREAD_UNCHANGED)
-    if image.ndim != 2 or image.dtype != np.uint16:
+    image = _load_array(path) if path.suffix.lower() == ".npy" else _decode(path, cv2.IMREAD_UNCHANGED)
+    if image.ndim != 2 or not (image.dtype in (np.uint16, np.int16) or np.issubdtype(image.dtype, np.floating)):
         raise InputError(
-            f"depth image {path} has shape {image.shape} and type {image.dtype}, expected one channel of 16 bits"
+            f"depth image {path} has shape {image.shape} and type {image.dtype}, expected one channel of 16 bits or "
+            "float"
         )
-    return np.where(image > 0, image * np.float32(scale), np.float32(np.nan)).astype(np.float32)
+    unit = 1 if np.issubdtype(image.dtype, np.floating) else scale
+    return np.where(image > 0, image * np.float32(unit), np.float32(np.nan)).astype(np.float32)
+
+
+def _load_array(path: Path) -> np.ndarray:
+    """The array of a .npy file."""
+    try:
+        return np.asarray(np.load(path, allow_pickle=False))
+    except (OSError, EOFError, ValueError) as error:
+        raise InputError(f"image cannot be read: {path} ({error})", "expected .npy with an array (H, W)") from error
 
 
 def read_labels(path: Path) -> np.ndarray:

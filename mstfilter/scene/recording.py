@@ -262,6 +262,23 @@ class Recording:
             clips.append(Clip(self.frames[span], self.grid, t, tuple(self.times[span])))
         return tuple(clips)
 
+    def in_world_of(self, other: Recording) -> Recording:
+        """This recording with the workspace of another, and its camera pose at the first pause; without true volumes.
+
+        For parts of one session with a camera that stands still, or that is at the same place at both first pauses:
+        ``open_source(path, options=["start_s=30"]).in_world_of(first)``. Hypotheses of one part can then be moved on
+        by the clips of the next.
+        """
+        own = self.frames[self.pauses[0]].camera.pose
+        moved = other.frames[other.pauses[0]].camera.pose * own.inv()
+
+        def read(index: int) -> Frame:
+            frame = self.frames[index]
+            return replace(frame, camera=frame.camera.at(moved * frame.camera.pose))
+
+        frames = LazyFrames(read, len(self))
+        return replace(self, frames=frames, grid=other.grid, truth=lambda t: None, poses=lambda index: None)
+
     def check(self) -> None:
         """Read every image, so that an unreadable one raises InputError before a run, and examine the recording."""
         _ = self.key

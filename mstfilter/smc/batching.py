@@ -35,7 +35,7 @@ from mstfilter.errors import InputError, LostRunError
 from mstfilter.smc.filter import ParticleFilter, keep_freed_memory
 from mstfilter.smc.inputs import split_input
 from mstfilter.smc.interfaces import State, WeightResampler
-from mstfilter.smc.population import Population, identity
+from mstfilter.smc.population import Population, check_observations, identity
 from mstfilter.smc.streams import Key, RunGenerators, SlotStreams, rows_of
 
 Function = Callable[[Population], Any]
@@ -106,7 +106,7 @@ def batch(
         If a component that states ``batched=True`` mixes runs, or a run raises an error.
     """
     seeds = [int(seed) for seed in seeds]
-    ys = [list(y) for y in observations] if paired else [list(observations)]
+    ys = [list(check_observations(y)) for y in (observations if paired else [observations])]
     if not seeds:
         raise InputError("there are no seeds")
     if paired and len(ys) != len(seeds):

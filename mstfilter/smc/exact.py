@@ -43,7 +43,7 @@ from mstfilter.smc.distributions import MultivariateNormal
 from mstfilter.smc.filter import ParticleFilter
 from mstfilter.smc.inputs import AtStep, bind_step, split_input, step_parameters, with_step
 from mstfilter.smc.interfaces import Proposal, Transition, Update
-from mstfilter.smc.population import Population, union
+from mstfilter.smc.population import Population, check_observations, union
 from mstfilter.smc.state_space import StateSpaceModel
 from mstfilter.smc.streams import Rows
 
@@ -256,7 +256,7 @@ def kalman_filter(
     """
     from filterpy.kalman import KalmanFilter
 
-    given = [split_input(y) for y in observations]
+    given = [split_input(y) for y in check_observations(observations)]
     m0, P0 = np.asarray(m0, dtype=np.float64), np.asarray(P0, dtype=np.float64)
     T, d, k = len(given), len(m0), np.shape(H)[-2]
     matrices = {}
@@ -391,7 +391,7 @@ def forward_backward(
     Raises InputError if a shape does not fit, or no state explains an observation.
     """
     start, moves = _chain(initial, transition)
-    ys = [split_input(y) for y in observations]
+    ys = [split_input(y) for y in check_observations(observations)]
     T, K, of_step = len(ys), len(start), step_parameters(log_likelihood, 1)
     if moves.ndim == 3 and len(moves) != T:
         raise InputError(f"transition has {len(moves)} entries, expected one for each of {T} observations")

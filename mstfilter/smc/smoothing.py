@@ -35,7 +35,7 @@ from mstfilter.smc.distributions import as_distribution
 from mstfilter.smc.filter import ParticleFilter
 from mstfilter.smc.inputs import split_input
 from mstfilter.smc.interfaces import DensityTransition, State, Transition
-from mstfilter.smc.population import Particles, Population, count_particles, take
+from mstfilter.smc.population import Particles, Population, check_observations, count_particles, take
 from mstfilter.smc.programs.filters import ProgramInitial, ProgramTransition, run_program
 from mstfilter.smc.programs.handlers import GuideHandler, ReplayHandler, SampleHandler, ScoreHandler, Site
 from mstfilter.smc.programs.sites import PerParticle
@@ -77,7 +77,7 @@ def known_parents(population: Population, t: int) -> np.ndarray:
 
 def keep(filter: ParticleFilter, observations: Iterable[Any], seed: int | State = 0) -> Record:
     """Run a filter and keep every population; memory grows with n times the number of steps."""
-    ys = tuple(observations)
+    ys = tuple(check_observations(observations))
     if not ys:
         raise InputError("there are no observations to smooth over")
     populations = []
