@@ -125,6 +125,8 @@ class Registry:
             raise InputError(f"{where or kind}: component {name!r} cannot be imported: {error}") from error
 
     def _locate(self, kind: str, name: str, where: str, allow_files: bool) -> str:
+        if not isinstance(name, str):
+            raise InputError(f"{where} is {name!r}, expected the name of a component")
         if ".py:" in name:
             if not allow_files:
                 raise InputError(
@@ -398,9 +400,11 @@ def _new_instance(path: str, name: str, digest: str, *arguments: Any) -> Any:
 
 
 def _plain(hint: Any, value: Any, where: str) -> Any:
-    """A plain value checked against a field's annotation."""
+    """A plain value checked against a field's annotation; one value of a ``tuple[X, ...]`` needs no list."""
     from pydantic import TypeAdapter, ValidationError
 
+    if typing.get_args(hint)[1:] == (...,) and isinstance(value, (bool, int, float, str)):
+        value = [value]
     try:
         return TypeAdapter(hint).validate_python(value)
     except ValidationError as error:

@@ -35,7 +35,7 @@ from mstfilter.errors import InputError, LostRunError
 from mstfilter.smc.filter import ParticleFilter, keep_freed_memory
 from mstfilter.smc.inputs import split_input
 from mstfilter.smc.interfaces import State, WeightResampler
-from mstfilter.smc.population import Population, identity
+from mstfilter.smc.population import Population, check_observations, identity
 from mstfilter.smc.streams import Key, RunGenerators, SlotStreams, rows_of
 
 Function = Callable[[Population], Any]
@@ -109,7 +109,7 @@ def batch(
         If a component that states ``batched=True`` mixes runs, or a run raises an error.
     """
     seeds = [int(seed) for seed in seeds]
-    ys = [list(y) for y in observations] if paired else [list(observations)]
+    ys = [list(check_observations(y)) for y in (observations if paired else [observations])]
     if not seeds:
         raise InputError("there are no seeds")
     if paired and len(ys) != len(seeds):
@@ -357,7 +357,7 @@ class _Sweep:
     def alone(self, t: int, slot: str, row: int) -> Population:
         """What a component returns for one run; an error names the run."""
         y, u = self.given(t, row)
-        component = getattr(self.filters.one(int(self.runs[row])).at(t, u), slot)
+        component = getattr(self.filters.one(int(self.runs[row])).at_step(t, u), slot)
         rng = Key(self.seeds[self.runs[row]]).child("step", t).child(slot).generator() if component.draws else None
         population = None
         if slot != "initial":
@@ -408,7 +408,7 @@ class _Sweep:
         """Particles and log weights of a component that is called once for the given rows, in their order."""
         runs, n = self.runs[rows], self.filter.n
         y, u = (self.by_row(rows, t, k) for k in (0, 1))
-        component = getattr(self.filters.rows(runs).at(t, u), slot)
+        component = getattr(self.filters.rows(runs).at_step(t, u), slot)
         rng = RunGenerators(self.states(t, slot, runs), n) if component.draws else None
         population, log_weights = None, self.log_weights
         if slot != "initial":

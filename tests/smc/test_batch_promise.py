@@ -219,15 +219,6 @@ def test_a_model_that_differs_at_every_third_step_is_found():
         batch(bootstrap(replace(GOOD, sample_transition=periodic), 4), [0.1] * 14, range(5))
 
 
-@pytest.mark.parametrize("paired", [False, True])
-def test_a_program_is_called_once_per_step_from_its_first_batch(paired):
-    def program(previous, y):  # a new one: the checks of programs count its steps from 1
-        walk(previous, y)
-
-    data = [[0.5, -0.3, 0.2]] * 5 if paired else [0.5, -0.3, 0.2]
-    assert batch(Program(program).bootstrap(4), data, range(5), paired=paired).single == {}
-
-
 def test_a_program_that_mixes_particles_is_named_by_its_first_batch():
     def program(previous, y):
         x = sample("x", Normal(0.0, 1.0))
@@ -249,6 +240,22 @@ def test_an_error_with_the_runs_in_another_order_is_named():
         batch(filter, [0.5], range(5))
 
 
+def needs_one_number(previous, y):
+    x = sample("x", Normal(0.0, 1.0))
+    observe("y", Normal(x, 1.0 if y > 0 else 2.0), y)
+
+
+@pytest.mark.parametrize("n", [3, 4])
+def test_paired_programs_are_called_together_also_where_their_checks_are_due(n):
+    """The first steps of a program are checked; in a batch, the single runs that it is compared with are."""
+
+    def fresh(previous, y):
+        return walk(previous, y)
+
+    data = np.random.default_rng(0).standard_normal((3, 9)).tolist()
+    assert keeps_its_promise(Program(fresh).bootstrap(n), data, range(3), True) == "together"
+
+
 def test_a_batch_says_and_warns_that_components_are_called_for_each_run():
     def rounds(x, y):  # in another order for another number of rows, as matrix products of BLAS
         return -np.square(y - x) * (1 + 1e-15 * len(x))
@@ -257,6 +264,8 @@ def test_a_batch_says_and_warns_that_components_are_called_for_each_run():
     with pytest.warns(UserWarning, match="the update is called once for each run: .* by rounding"):
         runs = batch(filter, [0.5] * 3, range(5))
     assert list(runs.single) == ["update"]
+    assert batch(Program(walk).bootstrap(4), [[0.5, None]] * 3, range(3), paired=True).single == {}
+    assert batch(Program(needs_one_number).bootstrap(4), [[0.5]] * 3, range(3), paired=True).single
     assert batch(bootstrap(GOOD, 4), [0.5] * 3, range(5)).single == {}
 
 

@@ -34,7 +34,7 @@ from mstfilter.smc.interfaces import Distribution
 from mstfilter.smc.population import Population, log_mean_exp, normalise, take
 from mstfilter.smc.programs.handlers import CopyHandler, SampleHandler, ScoreHandler
 from mstfilter.smc.programs.sites import Call, PerParticle, ProgramRun, recorded
-from mstfilter.smc.streams import RunGenerators, child
+from mstfilter.smc.streams import child
 
 #: Numbers of the steps of one kind that are checked.
 _CHECKED = frozenset({1, 2, *(8**k + k for k in range(1, 12))})
@@ -231,9 +231,7 @@ class Schedule(Counter[Any]):
     def guard(
         self, rng: np.random.Generator, past: Population | None, observation: Any, model: Any, guide: Any
     ) -> Guard | None:
-        """A guard if the next step is to be checked; a batch is compared with single runs, which have a guard."""
-        if isinstance(rng, RunGenerators):
-            return None
+        """A guard if the next step is to be checked."""
         kind = (
             past is None,
             observation is None,
