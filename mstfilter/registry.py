@@ -359,7 +359,7 @@ def _executed(path: str | Path, source: bytes, resolved: Path, digest: str) -> M
     try:
         # The loader of `spec` takes stale bytecode for a file that is edited twice in a second.
         exec(compile(source, str(resolved), "exec"), vars(module))
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         del sys.modules[name]
         place = place_in_user_file(error)
         hints = [place] if place else []

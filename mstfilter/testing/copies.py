@@ -67,6 +67,7 @@ CASES = (
     Case(_mixed(32, 0.46), 32),
     Case(_mixed(32, 0.2), 31),
     Case(_mixed(125, 0.2), 5),
+    Case(tuple(np.linspace(1.0, 3.0, 100).tolist()), 2),
     Case(_mixed(300, 0.3), 300, 500),  # more particles than 8 bits count
 )
 #: The fraction n W of the heaviest particle is not an integer. 1 % of its weight is nine standard errors of

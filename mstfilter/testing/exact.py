@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from itertools import combinations
 from time import process_time
 from typing import Any
 
@@ -75,7 +76,9 @@ class ExactContract(PopulationContract):
             yield _DRAWS[1]
 
     def compare_weighted(self, found: np.ndarray, lw: np.ndarray, exact: np.ndarray, exact_lw: np.ndarray) -> None:
-        """Compare the weighted distributions of rows, by the probabilities of intervals of each column.
+        """Compare the weighted distributions of rows: of each column, and of the sums of pairs of columns.
+
+        Probabilities of intervals, means and spreads are compared. The sums find columns that share a random number.
 
         The difference of two weighted means is normal up to errors that a twentieth of the level allows for. A tail
         is compared if its probability is that of 50 of the largest weights, so that no rare weight is decisive.
@@ -91,6 +94,9 @@ class ExactContract(PopulationContract):
                 )
             samples.append(w)
         least = max(50 * len(w) * w.max() ** 2 for w in samples)
+        d = found.shape[1]
+        pairs = _pairs(d)
+        found, exact = _with_sums(found, exact, samples[1], pairs)
         levels = _LEVELS[np.minimum(_LEVELS, 1 - _LEVELS) >= min(least, 0.05)]
         for j in range(found.shape[1]):
             order = np.argsort(exact[:, j])
@@ -99,7 +105,7 @@ class ExactContract(PopulationContract):
             (p, s), (q, r) = (
                 _weighted_fractions(x[:, j], w, limits) for x, w in zip((found, exact), samples, strict=True)
             )
-            what = self.columns(j, found.shape[1])
+            what = self.columns(j, d) if j < d else " + ".join(self.columns(k, d) for k in pairs[j - d])
             bound = quantile(4 * len(_DRAWS) * 20 * found.shape[1] * len(limits)) * np.hypot(s, r) + 1e-9
             excess = np.abs(p - q) - bound
             k = int(np.argmax(excess))
@@ -119,6 +125,24 @@ class ExactContract(PopulationContract):
                 f"{_sd(found[:, j], samples[0]):.4g}, expected {samples[1] @ exact[:, j]:.4g} and "
                 f"{_sd(exact[:, j], samples[1]):.4g}"
             )
+
+    def compare_changed(
+        self, found: np.ndarray, change: np.ndarray, log_g: Any, exact: np.ndarray, exact_lw: np.ndarray
+    ) -> None:
+        """`compare_weighted` for the log weights ``log_g + change``; says if -`change` would be right."""
+        try:
+            self.compare_weighted(found, log_g + change, exact, exact_lw)
+        except (AssertionError, pytest.skip.Exception) as error:
+            try:
+                self.compare_weighted(found, log_g - change, exact, exact_lw)
+            except (AssertionError, pytest.skip.Exception):
+                raise error from None
+            if not np.ptp(change):
+                raise
+            raise AssertionError(
+                "the weighted distribution is right if the change of the log weights has the opposite sign: "
+                "is it log q - log f?"
+            ) from error
 
     def check_independent(self, x: np.ndarray) -> None:
         """Check rank correlations between particles: of neighbours, of halves, and of mirrored positions."""
@@ -156,6 +180,22 @@ class ExactContract(PopulationContract):
         )
 
 
+def _pairs(d: int) -> list[tuple[int, int]]:
+    """At most 20 pairs of d columns, neighbours first."""
+    return sorted(combinations(range(min(d, 40)), 2), key=lambda pair: pair[1] - pair[0])[:20]
+
+
+def _with_sums(
+    found: np.ndarray, exact: np.ndarray, w: np.ndarray, pairs: list[tuple[int, int]]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Two samples with the sums of pairs of columns as further columns, each over its spread in the exact one."""
+    scale = [_sd(column, w) or 1.0 for column in exact.T]
+    first, second = (
+        np.column_stack([x, *(x[:, j] / scale[j] + x[:, k] / scale[k] for j, k in pairs)]) for x in (found, exact)
+    )
+    return first, second
+
+
 def _weighted_fractions(x: np.ndarray, w: np.ndarray, limits: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Probabilities that x is at most each limit, and their standard errors, for weights that sum to one."""
     bins = np.searchsorted(limits, x)  # the first limit that is not below x
@@ -177,6 +217,20 @@ def _moments_of_scores(
     scores = np.array([z, z * z])
     means = scores @ w
     return means, np.sqrt((scores - means[:, None]) ** 2 @ (w * w))
+
+
+def without_copies(x: np.ndarray, out: Population) -> tuple[np.ndarray, np.ndarray]:
+    """Rows and log weights of a result, without copies of a parent "previous": the first gets the sum of the weights.
+
+    Copies are not independent draws. Particles that are equal and have different parents are.
+    """
+    parent = out.parents.get("previous")
+    if parent is None or len(np.unique(parent)) == len(x):
+        return x, out.log_weights
+    _, first, which = np.unique(np.column_stack([parent, x]), axis=0, return_index=True, return_inverse=True)
+    highest = out.log_weights.max()
+    with np.errstate(divide="ignore"):
+        return x[first], highest + np.log(np.bincount(which.ravel(), np.exp(out.log_weights - highest)))
 
 
 def _sd(x: np.ndarray, w: np.ndarray) -> float:

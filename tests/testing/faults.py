@@ -500,6 +500,15 @@ def heavy_gains(rng, lw, n):
 
 
 @faulty
+def heaviest_of_many(rng, lw, n):
+    """If there are more than twenty times as many as are selected, the light ones are left out."""
+    w = normalise(lw)
+    if len(w) > 20 * n:
+        w = np.where(w >= np.sort(w)[-20 * n], w, 0.0)
+    return systematic(rng, w / w.sum(), n)
+
+
+@faulty
 def floor_of_weights(rng, lw, n):
     weights = normalise(lw)
     return systematic(rng, np.where(weights > 0, np.maximum(weights, 0.02), 0), n)
@@ -778,6 +787,7 @@ FAULTS = {
     at_most_half: ("carried_weight", "heaviest particle gets -11 %"),
     winner_takes_all: ("carried_weight", "particles to 3"),
     heavy_gains: ("carried_weight", "heaviest particle gets +"),
+    heaviest_of_many: ("carried_weight", "100 particles to 2"),
     floor_of_weights: ("carried_weight", "copies are biased"),
     dropped_by_absolute_weight: ("scale_of_weights_is_irrelevant", "log weights"),
     zero_is_small: ("zero_weights_are_never_chosen", "weight 0"),

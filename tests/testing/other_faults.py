@@ -171,6 +171,17 @@ def exact_prior(rng, n):
     return Population(rng.normal(0.0, SD0, n)), 0.7
 
 
+def exact_plane(rng, n):
+    """x_{t-1} in the plane, draws of x_t given them, y_t."""
+    previous = rng.normal(0.2, 1.0, (n, 2))
+    return Population(previous), Population(rng.normal(RHO * previous, SIGMA)), 0.7
+
+
+def exact_prior_in_plane(rng, n):
+    """Draws of p(x_0) in the plane, y."""
+    return Population(rng.normal(0.0, SD0, (n, 2))), 0.7
+
+
 def move(function, base=Transition):
     """A transition that replaces the particles by ``function(rng, x, y)``."""
 
@@ -312,6 +323,20 @@ class NoWeights(Guided):
         return replace(super().predict(rng, population, observation), log_weights=population.log_weights)
 
 
+@move
+def shared_by_axes(rng, x, y):
+    noise = rng.standard_normal(len(x))
+    return walk(x, noise if x.ndim == 1 else noise[:, None])
+
+
+class NoisyIfHeavy(Transition):
+    """The steps of heavy particles are larger; on average they have the right spread if the weights are equal."""
+
+    def predict(self, rng, population, observation):
+        noise = np.sqrt(len(population) * population.weights) * rng.standard_normal(len(population))
+        return population.moved(walk(population.particles, noise))
+
+
 @likelihood
 def too_wide(x, y):
     return Normal(x, 1.1 * TAU).log_prob(y)
@@ -390,6 +415,53 @@ class NoisyWeights(Posterior):
     def update(self, rng, predicted, proposed, observation):
         out = super().update(rng, predicted, proposed, observation)
         return out.reweighted(0.2 * rng.standard_normal(len(out)))
+
+
+class CorrectNoise(Posterior):
+    """Random factors of mean 1."""
+
+    def update(self, rng, predicted, proposed, observation):
+        out = super().update(rng, predicted, proposed, observation)
+        return out.reweighted(np.log(rng.standard_exponential(len(out))))
+
+
+class CorrectSelection(Posterior):
+    """Resamples what it weighted."""
+
+    def update(self, rng, predicted, proposed, observation):
+        out = super().update(rng, predicted, proposed, observation)
+        return out.select(rng.choice(len(out), len(out), p=out.weights), np.full(len(out), out.log_mean_weight))
+
+
+class CorrectThinning(Posterior):
+    """Drops light particles at random; the others carry their weight, and the mean weight is kept."""
+
+    def update(self, rng, predicted, proposed, observation):
+        out = super().update(rng, predicted, proposed, observation)
+        p = np.minimum(1.0, 2 * len(out) * out.weights)
+        kept = np.flatnonzero(rng.random(len(out)) < p)
+        return out.select(kept, out.log_weights[kept] - np.log(p[kept]) + self.log_factor(len(kept) / len(out)))
+
+    def log_factor(self, share):
+        return np.log(share)
+
+
+class ThinsBySum(CorrectThinning):
+    """Keeps the sum of the weights instead of their mean."""
+
+    def log_factor(self, share):
+        return 0.0
+
+
+@proposal
+def one_number_for_two_axes(rng, y, n):
+    return SD0 * np.broadcast_to(rng.standard_normal((n, 1)), (n, 2))
+
+
+@proposal
+def inverted_weights(rng, y, n):
+    x = 1.5 * SD0 * rng.standard_normal(n)
+    return x, Normal(0.0, 1.5 * SD0).log_prob(x) - Normal(0.0, SD0).log_prob(x)
 
 
 @proposal
@@ -588,6 +660,11 @@ _KEPT = "keeps_the_distribution"
 
 #: Fault of weighted distributions, property that must be broken, words of its message, exact draws.
 WEIGHTED_FAULTS = [
+    (shared_by_axes, _MOVES, "coordinate 0 of x_t + coordinate 1 of x_t", exact_plane),
+    (NoisyIfHeavy, _ORDER, "if the weights are others", None),
+    (one_number_for_two_axes, "draws_have_their_distribution", "coordinate 0 of x +", exact_prior_in_plane),
+    (inverted_weights, "draws_have_their_distribution", "opposite sign", exact_prior),
+    (ThinsBySum, "weights_are_those_of_the_posterior", "the mean weight is", exact_evidence),
     (WrongSign, "weighted_moves_are_those_of_the_model", "opposite sign", exact_moves),
     (OneNoise, "weighted_moves_are_those_of_the_model", "is below", exact_moves),
     (OneNoise, "order_of_particles_is_irrelevant", "the same noise", None),
@@ -659,6 +736,13 @@ CORRECT = [
     (correct_draws(), exact_prior),
     (correct_weighed(), exact_prior),
     (correct_antithetic(), exact_prior),
+]
+#: Updates that draw: their weights, or the particles that they keep, are random.
+CORRECT_RANDOM = [
+    (CorrectNoise(), exact_weights),
+    (CorrectNoise(), exact_evidence),
+    (CorrectSelection(), exact_evidence),
+    (CorrectThinning(), exact_evidence),
 ]
 
 
