@@ -109,7 +109,10 @@ def batch(
         If a component that states ``batched=True`` mixes runs, or a run raises an error.
     """
     seeds = [int(seed) for seed in seeds]
-    ys = [list(check_observations(y)) for y in (observations if paired else [observations])]
+    ys = [
+        list(check_observations(y, f"run {run}, " if paired else ""))
+        for run, y in enumerate(observations if paired else [observations])
+    ]
     if not seeds:
         raise InputError("there are no seeds")
     if paired and len(ys) != len(seeds):

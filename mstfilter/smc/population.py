@@ -188,21 +188,21 @@ def _within(index: np.ndarray, n: int) -> np.ndarray:
     return index
 
 
-def check_observations(observations: Iterable[Any]) -> Any:
+def check_observations(observations: Iterable[Any], where: str = "") -> Any:
     """The same observations; InputError for a table, a mapping or a text, and for one that is NaN in every entry.
 
-    Iteration over a data frame or a mapping yields names of columns, not observations.
+    Iteration over a data frame or a mapping yields names of columns, not observations. `where` begins the message.
     """
     if isinstance(observations, (str, bytes, Mapping)) or hasattr(observations, "columns"):
         raise InputError(
-            f"observations are a {type(observations).__name__}, expected one observation for each step",
+            f"{where}observations are a {type(observations).__name__}, expected one observation for each step",
             "rows of a data frame: table.to_numpy(); one column: table['y'].to_numpy()",
         )
     if isinstance(observations, (list, tuple, np.ndarray)):
         for t, y in enumerate(observations):
             if isinstance(y, (float, np.floating, np.ndarray)) and _all_nan(np.asarray(y)):
                 raise InputError(
-                    f"observation {t} is NaN", "one that is missing is None: then the step only predicts"
+                    f"{where}observation {t} is NaN", "one that is missing is None: then the step only predicts"
                 )
     return observations
 

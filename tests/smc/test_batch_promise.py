@@ -193,7 +193,7 @@ def test_an_error_names_slot_step_run_values_and_what_to_do():
     ) as error:
         batch(bootstrap(FAULTY["first particle"], 4), [0.1] * 4, range(5))
     assert any("batched" in hint for hint in error.value.hints)
-    with pytest.raises(InputError, match="run 1, step 2, update: log weight of particle 0 is nan"):
+    with pytest.raises(InputError, match="run 1, observation 2 is NaN"):
         batch(bootstrap(GOOD, 4), [[0.1] * 4, [0.1, 0.2, float("nan"), 0.1]], range(2), paired=True)
     with pytest.raises(InputError, match=r"run 1, step 1, update: ValueError"):
         batch(bootstrap(GOOD, 4), [[0.1] * 3, [0.1, [1.0, 2.0], 0.1]], range(2), paired=True)
