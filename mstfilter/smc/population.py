@@ -200,7 +200,7 @@ def check_observations(observations: Iterable[Any], where: str = "") -> Any:
         )
     if isinstance(observations, (list, tuple, np.ndarray)):
         for t, y in enumerate(observations):
-            if isinstance(y, (float, np.floating, np.ndarray)) and _all_nan(np.asarray(y)):
+            if isinstance(y, float) and y != y or isinstance(y, np.ndarray) and _all_nan(y):
                 raise InputError(
                     f"{where}observation {t} is NaN", "one that is missing is None: then the step only predicts"
                 )
@@ -208,7 +208,7 @@ def check_observations(observations: Iterable[Any], where: str = "") -> Any:
 
 
 def _all_nan(y: np.ndarray) -> bool:
-    return y.size > 0 and np.issubdtype(y.dtype, np.floating) and bool(np.isnan(y).all())
+    return y.size > 0 and y.dtype.kind == "f" and bool(np.isnan(y).all())
 
 
 @dataclass(frozen=True, eq=False)
