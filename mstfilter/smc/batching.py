@@ -418,7 +418,7 @@ class _Sweep:
             everything = len(rows) == len(self.runs) and rows[0] == 0
             particles = self.particles if everything else _row(self.particles, rows)
             log_weights = self.log_weights if everything else self.log_weights[rows]
-            population = Population(_flat(particles, n), log_weights.ravel())
+            population = Population.unchecked(_flat(particles, n), log_weights.ravel())
         found = _called(slot, component, rng, population, y, len(rows) * n)
         if len(found) != len(rows) * n:
             raise InputError(f"{len(rows) * n} particles became {len(found)}")

@@ -338,6 +338,13 @@ class Population(Table):
             return {name: a[index] for name, a in self.particles.items()}
         return self.particles[index]
 
+    @classmethod
+    def unchecked(cls, particles: Particles, log_weights: np.ndarray) -> Population:
+        """A population of particles and log weights that have been checked."""
+        new = object.__new__(cls)
+        new.__dict__.update(particles=_freeze(particles), log_weights=frozen_view(log_weights), parents={}, notes={})
+        return new
+
     def take(self, indices: np.ndarray, log_weights: np.ndarray | None = None) -> Population:
         """Select particles with their parents, and with their log weights unless new ones are given.
 
