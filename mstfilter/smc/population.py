@@ -200,7 +200,7 @@ def check_observations(observations: Iterable[Any], where: str = "") -> Any:
         )
     if isinstance(observations, (list, tuple, np.ndarray)):
         for t, y in enumerate(observations):
-            if isinstance(y, float) and y != y or isinstance(y, np.ndarray) and _all_nan(y):
+            if (isinstance(y, float) and y != y) or (isinstance(y, np.ndarray) and _all_nan(y)):
                 raise InputError(
                     f"{where}observation {t} is NaN", "one that is missing is None: then the step only predicts"
                 )
