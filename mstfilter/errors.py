@@ -10,6 +10,7 @@
 from __future__ import annotations
 
 import difflib
+import errno
 import linecache
 import math
 import sysconfig
@@ -23,10 +24,9 @@ from typing import Any
 
 class _WithHints(Exception):
     def __init__(self, message: str, *hints: str) -> None:
-        super().__init__(message)
-        self.message = message
-        self.hints = hints
-        for hint in hints:
+        self.message, self.hints = printable(message), tuple(map(printable, hints))
+        super().__init__(self.message)
+        for hint in self.hints:
             self.add_note(f"hint: {hint}")
 
 
@@ -68,7 +68,19 @@ def naming(where: str) -> Iterator[None]:
 
 def reason(error: BaseException) -> str:
     """The message of an exception; of a KeyError, which has the name alone, that the name is missing."""
+    if isinstance(error, OSError) and error.strerror:
+        return error.strerror
     return f"{error} is missing" if isinstance(error, KeyError) else str(error)
+
+
+def printable(text: str) -> str:
+    """One line of at most 1500 characters; the control characters of a terminal become escape sequences.
+
+    Names and values in files of strangers may contain them.
+    """
+    line = " ".join(part.strip() for part in text.split("\n"))
+    line = line if len(line) <= 1500 else f"{line[:1400]} ... {line[-80:]}"
+    return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in line)
 
 
 def suggestion(name: str, names: Iterable[str]) -> list[str]:
@@ -147,12 +159,21 @@ def place_in_user_file(error: BaseException) -> str | None:
     return found
 
 
+def exhausted(error: BaseException) -> InputError | None:
+    """What to tell the user if memory or disk space ran out; None for another error."""
+    if isinstance(error, MemoryError) or "allocate" in str(error):  # cv2 and torch have no class for it
+        return InputError("out of memory", "use fewer workers, fewer particles or larger voxels")
+    if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
+        return InputError(f"no space left: {error}", "free disk space and repeat the command")
+    return None
+
+
 def describe_error(error: BaseException) -> str:
     """One line for an exception: type, message, and the line of a user's file in which it was raised, if any."""
     if isinstance(error, InputError):
         return error.message
     place = place_in_user_file(error)
-    return f"{type(error).__name__}: {error}" + (f" ({place})" if place else "")
+    return printable(f"{type(error).__name__}: {error}" + (f" ({place})" if place else ""))
 
 
 def _is_of_user(file: str) -> bool:

@@ -1,15 +1,20 @@
-"""Writing files so that a reader never sees half of one.
+"""Writing files and folders so that neither a kill, a power failure nor a second process damages them.
 
 >>> with atomic_path(folder / "metrics.csv") as path:
-...     path.write_text(text)
+...     path.write_text(text, encoding="utf-8")
+>>> with locked("runs/mine"), atomic_folder("runs/mine") as folder:
+...     (folder / "run.json").write_text(text, encoding="utf-8")
 
-The file is written under a temporary name in the same folder and renamed when it is complete. If the block raises,
-the temporary file is removed and an earlier file is left as it was.
+A file or folder is written under a temporary name beside the final one, synced with the disk, and renamed when it is
+complete. If the block raises, the temporary is removed and an earlier file is left as it was. What a killed process
+leaves is removed by the next `locked` of the same name.
 """
 
 from __future__ import annotations
 
+import contextlib
 import csv
+import errno
 import functools
 import hashlib
 import json
@@ -18,44 +23,230 @@ import numbers
 import os
 import re
 import shutil
+import socket
+import struct
+import time
+import tokenize
 import uuid
 import zipfile
+import zlib
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, Literal
 
 from mstfilter.errors import InputError, naming, reason
 
-if TYPE_CHECKING:
-    import numpy as np
+SUMS = "SHA256SUMS"  # in a folder: the hashes of its files
+_TEMPORARY = re.compile(r"\.(?P<name>.+)\.[0-9a-f]{8}\.(?P<kind>partial|replaced)", re.DOTALL)
 
 
 @contextmanager
 def atomic_path(path: str | Path) -> Iterator[Path]:
     """A temporary path beside `path`, renamed to it at the end of the block; missing folders are made."""
     target = Path(path)
-    target.parent.mkdir(parents=True, exist_ok=True)
-    partial = target.with_name(f".{target.name}.{uuid.uuid4().hex[:8]}.partial")
+    _make_folders(target.parent)
+    partial = _temporary(target, "partial")
     try:
         yield partial
+        _sync(target, partial)
         os.replace(partial, target)
+        _sync(target, target.parent)
     finally:
         partial.unlink(missing_ok=True)
 
 
 @contextmanager
-def atomic_folder(path: str | Path) -> Iterator[Path]:
-    """A temporary path beside `path`, for a folder that the block makes and that replaces `path` at its end."""
-    target = Path(path)
-    partial = target.with_name(f".{target.name}.{uuid.uuid4().hex[:8]}.partial")
+def atomic_folder(path: str | Path, existing: Literal["refuse", "replace", "keep"] = "refuse") -> Iterator[Path]:
+    """An empty temporary folder beside `path`, renamed to it at the end of the block.
+
+    `existing` states what happens to a folder with content that is at `path` then: InputError, the new folder
+    replaces it, or it is kept and the new one is removed. An empty folder is always replaced.
+    """
+    target = Path(os.path.realpath(path))
+    _make_folders(target.parent)
+    partial = _temporary(target, "partial")
+    partial.mkdir()
+    mark = _lock(partial, os.O_RDONLY)  # `sweep` leaves the folder alone
     try:
         yield partial
-        if target.exists():
-            shutil.rmtree(target)
-        os.replace(partial, target)
+        _sync(target, *partial.rglob("*"), partial)
+        _place(partial, target, existing)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
+        if mark is not None:
+            os.close(mark)
+
+
+def _place(partial: Path, target: Path, existing: str) -> None:
+    """Rename a complete folder to its final name."""
+    earlier = _temporary(target, "replaced")
+    if existing == "replace" and target.is_dir():
+        target.rename(earlier)
+    try:
+        partial.rename(target)
+    except OSError as error:
+        if earlier.exists():
+            earlier.rename(target)
+        if error.errno not in (errno.ENOTEMPTY, errno.EEXIST, errno.ENOTDIR):
+            raise
+        if existing != "keep":
+            raise InputError(f"cannot write {target}: it was made meanwhile", "choose another name") from error
+    _sync(target, target.parent)
+    shutil.rmtree(earlier, ignore_errors=True)
+
+
+@contextmanager
+def locked(path: str | Path) -> Iterator[None]:
+    """Reserve a file or folder, which need not exist, for this block; remove what a killed process left of it.
+
+    Raises InputError if another block of this or another process has reserved it. The lock is a file ``.NAME.lock``
+    beside `path`; the system releases it when the process ends. File systems without locks cannot exclude a second
+    process.
+    """
+    target = Path(os.path.realpath(path))
+    if _is_temporary(target.absolute()):  # no other process knows the name
+        yield
+        return
+    file = target.with_name(f".{target.name}.lock")
+    with contextlib.ExitStack() as stack:
+        with writing(f"{target} and a lock beside it", "choose another place"):
+            stack.callback(_remove_empty, _make_folders(target.parent))
+            descriptor = _reserve(file, target)
+            stack.callback(os.close, descriptor)
+            stack.callback(file.unlink, missing_ok=True)
+            now = time.strftime("%Y-%m-%d %H:%M:%S")
+            os.ftruncate(descriptor, 0)
+            os.write(descriptor, f": process {os.getpid()} of {socket.gethostname()} since {now}".encode())
+        sweep(target.parent, target.name)
+        yield
+
+
+def _remove_empty(folders: list[Path]) -> None:
+    with contextlib.suppress(OSError):  # something was written there
+        for folder in folders:
+            folder.rmdir()
+
+
+def _reserve(file: Path, target: Path) -> int:
+    """Open and lock a lock file; InputError with the other process if it is locked."""
+    while True:
+        descriptor = _lock(file, os.O_RDWR | os.O_CREAT)
+        with contextlib.suppress(FileNotFoundError):  # the process that had the lock has removed the file
+            if descriptor is None:
+                holder = file.read_text(encoding="utf-8", errors="replace")[:200]
+                raise InputError(
+                    f"{target} is being written by another process{holder if holder.isprintable() else ''}",
+                    "wait until it has ended, or choose another name",
+                )
+            if os.path.samestat(file.stat(), os.fstat(descriptor)):
+                return descriptor
+        if descriptor is not None:
+            os.close(descriptor)
+
+
+def _lock(path: Path, flags: int) -> int | None:
+    """Open and lock a file or folder; None if it is locked already. Systems without locks only open it."""
+    descriptor = os.open(path, flags, 0o666)
+    try:
+        import fcntl
+
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        os.close(descriptor)
+        return None
+    except (ImportError, OSError):
+        pass
+    return descriptor
+
+
+def sweep(folder: Path, name: str | None = None, older_than_s: float = 0.0) -> None:
+    """Remove temporaries in a folder, of all names or of one, whose process has ended.
+
+    If a process was killed while a folder was replaced, the earlier folder gets its name back. Give a least age
+    unless the name is locked: another process may just have made a temporary.
+    """
+    for path in folder.iterdir() if folder.is_dir() else ():
+        match = _TEMPORARY.fullmatch(path.name)
+        if match is None or name not in (None, match["name"]) or not _is_abandoned(path, older_than_s):
+            continue
+        if match["kind"] == "replaced" and not (folder / match["name"]).exists():
+            path.rename(folder / match["name"])
+        else:
+            shutil.rmtree(path, ignore_errors=True) if path.is_dir() else path.unlink(missing_ok=True)
+
+
+def other_files(folder: Path, own: re.Pattern[str]) -> list[str]:
+    """Files below a folder whose paths in it do not fit `own`; temporaries and locks are left out."""
+    paths = [path.relative_to(folder) for path in folder.rglob("*") if not path.is_dir() or path.is_symlink()]
+    own = re.compile(rf"{own.pattern}|(.+/)?\.[^/]+\.lock")
+    return sorted(p.as_posix() for p in paths if not own.fullmatch(p.as_posix()) and not _is_temporary(p))
+
+
+def _is_abandoned(path: Path, older_than_s: float) -> bool:
+    with contextlib.suppress(OSError):  # another process may remove it
+        if time.time() - path.lstat().st_mtime >= older_than_s and (descriptor := _lock(path, os.O_RDONLY)):
+            os.close(descriptor)
+            return True
+    return False
+
+
+def _temporary(target: Path, kind: str) -> Path:
+    return target.with_name(f".{target.name}.{uuid.uuid4().hex[:8]}.{kind}")
+
+
+def _is_temporary(path: Path) -> bool:
+    """Whether a path is a temporary, or below one."""
+    return any(map(_TEMPORARY.fullmatch, path.parts))
+
+
+def _make_folders(folder: Path) -> list[Path]:
+    """Make a folder and those above it; returns those that were missing, the deepest first."""
+    missing = [path for path in (folder, *folder.parents) if not path.exists()]
+    folder.mkdir(parents=True, exist_ok=True)
+    _sync(folder, *(path.parent for path in missing))
+    return missing
+
+
+def _sync(target: Path, *paths: Path) -> None:
+    """Wait until files, and the names in folders, are on the disk.
+
+    If `target`, which they are or will be, is in a temporary folder, they are synced when that folder is complete.
+    """
+    if os.name != "posix" or _is_temporary(target.absolute()):
+        return
+    for path in paths:
+        descriptor = os.open(path, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        except OSError as error:
+            if error.errno != errno.EINVAL:  # the file system has no such operation
+                raise
+        finally:
+            os.close(descriptor)
+
+
+def write_sums(folder: Path, names: Iterable[str] = ()) -> None:
+    """Write SHA256SUMS, which ``sha256sum -c`` reads: the hashes of the named files, or of all below the folder."""
+    files = [folder / name for name in names] or sorted(path for path in folder.rglob("*") if path.is_file())
+    write_text(folder / SUMS, "".join(f"{_digest(file)}  {file.relative_to(folder).as_posix()}\n" for file in files))
+
+
+def damaged_files(folder: Path) -> list[str]:
+    """What differs from the SHA256SUMS of a folder: ``state.npz has changed``, ``rgb.png is missing``."""
+    if not (folder / SUMS).is_file():
+        return [f"{SUMS} is missing"]
+    lines = (folder / SUMS).read_text(encoding="utf-8", errors="replace").splitlines()
+    listed = [re.fullmatch(r"([0-9a-f]{64})  (.+)", line) for line in lines if line.isprintable()]
+    if not lines or len(listed) < len(lines) or not all(listed):
+        return [f"{SUMS} has changed"]
+    return [f"{match[2]} {fault}" for match in listed if match and (fault := _fault(folder / match[2], match[1]))]
+
+
+def _fault(file: Path, digest: str) -> str:
+    if not file.is_file():
+        return "is missing"
+    return "" if _digest(file) == digest else "has changed"
 
 
 @contextmanager
@@ -68,28 +259,21 @@ def reading(path: Path, kind: str, *hints: str) -> Iterator[None]:
         raise
     except FileNotFoundError:
         raise InputError(f"not {kind}: {path} is missing", *hints) from None
-    except (json.JSONDecodeError, RecursionError) as error:
+    except json.JSONDecodeError as error:
         raise InputError(f"{path} is not valid JSON: {error}", *hints) from error
-    except (OSError, EOFError, zipfile.BadZipFile, ValueError, KeyError, TypeError, AttributeError) as error:
+    except RecursionError as error:
+        raise InputError(f"{path} cannot be read: its values are nested too deep", *hints) from error
+    except MemoryError as error:
+        raise InputError(f"{path} cannot be read: memory ran out", *hints) from error
+    except _UNREADABLE as error:
         raise InputError(f"{path} cannot be read: {reason(error)}", *hints) from error
 
 
-def read_arrays(path: Path, what: str, *hints: str) -> dict[str, np.ndarray]:
-    """All arrays of an .npz file. InputError that names the file if it is missing, damaged or of another kind.
-
-    `what` names the content for the message. numpy and zipfile raise errors of many types for damaged files, and a
-    checksum is compared only when an array is read; therefore all arrays are read here.
-    """
-    import numpy as np
-
-    try:
-        with np.load(path, allow_pickle=False) as data:
-            return {name: data[name] for name in data.files}
-    except FileNotFoundError:
-        raise InputError(f"{what} is missing: {path}") from None
-    except Exception as error:
-        problem = reason(error) or type(error).__name__
-        raise InputError(f"{what} cannot be read: {path} ({problem})", *hints) from error
+# CPython 3.11 raises SystemError if two threads parse the headers of arrays at once (python/cpython#106905).
+_UNREADABLE = (
+    *(OSError, EOFError, ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RuntimeError),
+    *(SystemError, SyntaxError, tokenize.TokenError, struct.error, zlib.error, zipfile.BadZipFile),
+)
 
 
 def folder_name(name: str) -> str:
@@ -104,15 +288,47 @@ def folder_name(name: str) -> str:
     return f"{plain}~{hashlib.sha256(name.encode('utf-8', 'surrogatepass')).hexdigest()[:12]}"
 
 
-def check_output(path: Path, folder: bool = False) -> None:
-    """Raise InputError if a file, or with `folder` a folder, cannot be written at `path`."""
-    if path.is_dir() and not folder:
+@contextmanager
+def writing(what: str, *hints: str) -> Iterator[None]:
+    """Turn errors of the disk in a block that writes `what` into InputError."""
+    try:
+        yield
+    except OSError as error:
+        raise InputError(f"cannot write {what}: {error.strerror}", *hints) from error
+
+
+def check_output(path: Path, folder: bool = False, empty: bool = True) -> None:
+    """Raise InputError if a file, or with `folder` a folder, cannot be written at `path`.
+
+    An existing folder must be empty, unless `empty` is false. For each name that does not exist a file with that name
+    between other characters, as `atomic_path` has it, is made and removed: permissions do not tell of read-only file
+    systems, long names, or a full disk.
+    """
+    if os.path.isdir(path) and not folder:
         raise InputError(f"{path} is a folder, expected the name of a file to write")
-    existing = next(parent for parent in (path.absolute(), *path.absolute().parents) if parent.exists())
-    if existing.is_file() and (folder or existing != path.absolute()):
+    if folder and os.path.isdir(path) and (os.path.ismount(path) or Path.cwd().is_relative_to(path.resolve())):
+        raise InputError(f"cannot write {path}: it is a mount point or the working folder", "name a folder below it")
+    if folder and os.path.isfile(path):
+        raise InputError(f"cannot write {path}: it is a file, expected a folder", "choose another name")
+    if folder and empty and os.path.isdir(path) and any(path.iterdir()):
+        raise InputError(
+            f"cannot write {path}: it exists and is not an empty folder", "choose another name, or remove it"
+        )
+    target = path.absolute().parent if folder and os.path.exists(path) else path.absolute()  # a folder is renamed
+    places = [target, *target.parents]
+    existing = next(place for place in places if os.path.exists(place))
+    if existing.is_file() and (folder or existing != target):
         raise InputError(f"cannot write {path}: {existing} is a file", "choose another place")
-    if not os.access(existing, os.W_OK):
-        raise InputError(f"cannot write {path}: no permission to write in {existing}", "choose another place")
+    made_in = existing.parent if existing.is_file() else existing
+    names = [place.name for place in places[: places.index(existing)]]
+    for name in names or [existing.name]:
+        probe = made_in / f".{name}.{uuid.uuid4().hex[:8]}.partial"
+        try:
+            probe.touch()
+            probe.unlink()
+        except OSError as error:
+            problem = "no permission to write" if error.errno in (errno.EACCES, errno.EPERM) else error.strerror
+            raise InputError(f"cannot write {path}: {problem} in {made_in}", "choose another place") from error
 
 
 def write_text(path: str | Path, text: str) -> None:
@@ -171,5 +387,9 @@ def weights_file(given: str, name: str, where: str, sha256: str = "") -> tuple[s
 
 @functools.lru_cache(maxsize=8)
 def _sha256(path: str, modified: int, size: int) -> str:
+    return _digest(path)
+
+
+def _digest(path: str | Path) -> str:
     with open(path, "rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()

@@ -20,6 +20,7 @@ from typing import Any
 
 from mstfilter import baselines, completion, formats, frontends, fusion, oracles, segmentation, smc, tracking
 from mstfilter.errors import InputError, suggestion
+from mstfilter.reading import read_toml
 from mstfilter.registry import Registry
 from mstfilter.resources import find_preset
 from mstfilter.smc import ParticleFilter
@@ -59,10 +60,7 @@ def load_config(name: str, overrides: Iterable[str] = (), *, allow_files: bool =
 def _read(name: str, parents: tuple[str, ...] = ()) -> dict[str, Any]:
     """The content of a preset's file, added to that of its base."""
     path = find_preset(name)
-    try:
-        config = tomllib.loads(path.read_text())
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"preset {path} is not valid TOML: {error}") from error
+    config = read_toml(path, "a preset")
     base, wraps, changes = config.pop("base", ""), config.pop("wrap", []), config.pop("overrides", [])
     if not isinstance(base, str) or any(not isinstance(v, list) for v in (wraps, changes)):
         raise InputError(f"preset {path}: base must be a name, wrap and overrides lists of path=value")

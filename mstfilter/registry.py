@@ -125,6 +125,8 @@ class Registry:
             raise InputError(f"{where or kind}: component {name!r} cannot be imported: {error}") from error
 
     def _locate(self, kind: str, name: str, where: str, allow_files: bool) -> str:
+        if not isinstance(name, str):
+            raise InputError(f"{where} is {name!r}, expected the name of a component")
         if ".py:" in name:
             if not allow_files:
                 raise InputError(
@@ -357,7 +359,7 @@ def _executed(path: str | Path, source: bytes, resolved: Path, digest: str) -> M
     try:
         # The loader of `spec` takes stale bytecode for a file that is edited twice in a second.
         exec(compile(source, str(resolved), "exec"), vars(module))
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         del sys.modules[name]
         place = place_in_user_file(error)
         hints = [place] if place else []
@@ -398,9 +400,11 @@ def _new_instance(path: str, name: str, digest: str, *arguments: Any) -> Any:
 
 
 def _plain(hint: Any, value: Any, where: str) -> Any:
-    """A plain value checked against a field's annotation."""
+    """A plain value checked against a field's annotation; one value of a ``tuple[X, ...]`` needs no list."""
     from pydantic import TypeAdapter, ValidationError
 
+    if typing.get_args(hint)[1:] == (...,) and isinstance(value, (bool, int, float, str)):
+        value = [value]
     try:
         return TypeAdapter(hint).validate_python(value)
     except ValidationError as error:

@@ -112,7 +112,8 @@ def describe_value(value: Any) -> str:
     if isinstance(value, type):
         return f"the class {value.__name__}"
     if isinstance(value, np.ndarray):
-        return f"an array of shape {value.shape} and type {value.dtype}"
+        masked = "a masked" if isinstance(value, np.ma.MaskedArray) else "an"
+        return f"{masked} array of shape {value.shape} and type {value.dtype}"
     kind = type(value)
     name = kind.__name__ if kind.__module__ in ("builtins", "mstfilter") else f"{kind.__module__}.{kind.__name__}"
     return f"{'an' if name[0] in 'aeiouAEIOU' else 'a'} {name}"
@@ -229,6 +230,8 @@ _BOUND = ("a score of -inf rules a hypothesis out: bound it from below",)
 
 def _scaling(low: float, high: float) -> list[str]:
     """How to make probabilities of other numbers."""
+    if high <= _TOLERANCE:
+        return ["of log probabilities: np.exp(values)"]
     if low < 0:
         return ["of logits: 1 / (1 + np.exp(-logits))"]
     if high <= 100:

@@ -11,7 +11,6 @@ belong together is not opened. Weights are stored in half precision. Nothing is 
 from __future__ import annotations
 
 import hashlib
-import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,6 +20,7 @@ import numpy as np
 
 from mstfilter.errors import InputError
 from mstfilter.files import atomic_path, write_text
+from mstfilter.reading import MAX_WEIGHTS, read_bytes, read_toml
 from mstfilter.resources import models_folder
 
 WEIGHTS, DESCRIPTION = "weights.safetensors", "model.toml"
@@ -60,17 +60,14 @@ def open_model(name: str, architecture: str | None = None) -> TrainedModel:
         if not (folder / file).is_file():
             where = f"in the folder {given}" if folder == given else f"in the package, and no folder {name!r}"
             raise InputError(f"trained model {name!r}: there is no {file} {where}", _HINT)
-    text = (folder / DESCRIPTION).read_bytes()
-    try:
-        description = tomllib.loads(text.decode())
-    except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise InputError(f"{folder / DESCRIPTION} is not a TOML file: {error}", _HINT) from None
+    text = read_bytes(folder / DESCRIPTION, "a trained model", _HINT)
+    description = read_toml(folder / DESCRIPTION, "a trained model", _HINT)
     if architecture is not None and description.get("architecture") != architecture:
         raise InputError(
             f"{folder / DESCRIPTION}: architecture is {description.get('architecture')!r}, expected {architecture!r}",
             "name a model that was trained for this component",
         )
-    data = (folder / WEIGHTS).read_bytes()
+    data = read_bytes(folder / WEIGHTS, "a trained model", _HINT, limit=MAX_WEIGHTS)
     found = hashlib.sha256(data).hexdigest()
     if found != description.get("sha256"):
         raise InputError(
@@ -84,6 +81,9 @@ def open_model(name: str, architecture: str | None = None) -> TrainedModel:
         tensors = {key: value.astype(np.float32) for key, value in load(data).items()}
     except (SafetensorError, ValueError, KeyError, TypeError) as error:
         raise InputError(f"{folder / WEIGHTS} is not a safetensors file: {error}", _HINT) from None
+    for key, value in tensors.items():
+        if not np.isfinite(value).all():
+            raise InputError(f"{folder / WEIGHTS}: tensor {key!r} has a value that is not finite", _HINT)
     return TrainedModel(folder, description, tensors, hashlib.sha256(text + data).hexdigest()[:16])
 
 

@@ -14,6 +14,7 @@ import pytest
 from mstfilter.cli import main
 from mstfilter.formats import open_recording
 from mstfilter.runs import RunFolder
+from tests.conftest import REPOSITORY
 from tests.runs.test_run import content
 from tests.scene.test_recording import FAULTS, write
 from tests.study.test_failures import BROKEN, wait_for
@@ -54,6 +55,39 @@ def test_run_and_report(two_pauses, tmp_path, capsys):
     assert "<html" in (tmp_path / "r.html").read_text()
     assert list((tmp_path / "x").rglob("*.ply"))
     assert list((tmp_path / "x").rglob("*.png"))
+
+
+PLACES = {
+    "/proc/x": "/proc",
+    "a file in the way": "is a file",
+    "a long name": "too long",
+}
+WRITERS = {
+    "run": ("none", "--out"),
+    "demo": ("--out",),
+    "simulate": ("demo",),
+    "convert": ("none",),
+    "study": ("none.toml", "--out"),
+    "train": ("border", "--out"),
+    "report": ("none", "--out"),
+    "report, meshes": ("none", "--export"),
+    "view": ("none", "--html"),
+    "quality": ("none", "none", "--csv"),
+}
+
+
+@pytest.mark.parametrize("place", PLACES)
+@pytest.mark.parametrize("command", WRITERS)
+def test_an_output_that_cannot_be_written_is_an_error_before_any_work(tmp_path, capsys, command, place):
+    """Inputs do not exist (but the file of a study): the error about the output comes first."""
+    (tmp_path / "file").write_text("kept")
+    out = {"/proc/x": "/proc/x", "a file in the way": tmp_path / "file" / "x", "a long name": tmp_path / ("x" * 300)}
+    words = [tmp_path / "study.toml" if word == "none.toml" else word for word in WRITERS[command]]
+    (tmp_path / "study.toml").write_text((REPOSITORY / "experiments/fusion/study.toml").read_text())
+    code, printed, err = call(command.partition(",")[0], *words, out[place], capsys=capsys)
+    assert (code, printed) == (2, "") and err.startswith("error: cannot write") and PLACES[place] in err, err
+    assert "hint: choose another place" in err
+    assert {path.name for path in tmp_path.iterdir()} == {"file", "study.toml"}
 
 
 @pytest.mark.parametrize("fault", FAULTS)
@@ -314,14 +348,17 @@ class Grows(Size):
 def test_an_error_in_a_file_of_the_user_is_located(recording, tmp_path, monkeypatch, capsys):
     """The message has the file, the line and its text, or at least names the component."""
     monkeypatch.chdir(tmp_path)
-    Path("mine.py").write_text(USER_FILE)
+    Path("mine.py").write_text(USER_FILE, encoding="utf-8")
     line = USER_FILE.splitlines().index("        return population.particles[99]") + 1
     cases = {
         "transition=./mine.py:Fails": (f"(mine.py, line {line}: return population.particles[99])", "step 1, transi"),
         "transition=./mine.py:Wrong": ("log weights have shape (1,)", "Population(population.particles, [0.0])"),
         "transition=./mine.py:Nothing": ("step 1, transition: Nothing returned NoneType, expected a Popul", "return"),
-        "proposal.boundary=./mine.py:Flat": ("step 0, proposal: boundary map has shape ()",),
-        "proposal.completer=./mine.py:Void": ("in step 0, proposal", "`mstfilter check mine.py:Void`"),
+        "proposal.boundary=./mine.py:Flat": (
+            "step 0, proposal: Flat.boundary (mine.py, line",
+            "returns None, expected an array of shape",
+        ),
+        "proposal.completer=./mine.py:Void": ("step 0, proposal: Void.fill (mine.py, line", "returns None"),
         "size=./mine.py:Grows": ("step 0, resampler: Grows chose 1001 particles from 1, more than 1000", "n_max"),
         "proposal.boundary=./mine.py:Fails": ("Fails of ./mine.py is no boundary", "import BoundaryModel"),
         "transition=./mine.py:Needs": ("transition: Needs needs scale, without a default", "transition.scale=VALUE"),
@@ -337,11 +374,11 @@ def test_an_error_in_a_file_of_the_user_is_located(recording, tmp_path, monkeypa
     code, _, err = call("check", "./mine.py:Needs", capsys=capsys)
     assert code == 2
     assert "give it a value, scale=VALUE" in err
-    Path("mine.py").write_text("import numpy\nx = numpy.pie\n")
+    Path("mine.py").write_text("import numpy\nx = numpy.pie\n", encoding="utf-8")
     code, _, err = call("run", recording, "transition=./mine.py:A", capsys=capsys)
     assert code == 2
     assert "mine.py, line 2: x = numpy.pie" in err
-    Path("mine.py").write_text("import numpy\nx = = 3\n")
+    Path("mine.py").write_text("import numpy\nx = = 3\n", encoding="utf-8")
     code, _, err = call("run", recording, "transition=./mine.py:A", capsys=capsys)
     assert code == 2
     assert "mine.py, line 2: x = = 3" in err

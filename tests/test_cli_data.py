@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import csv
-import shutil
 
 import numpy as np
 import pytest
 
+from mstfilter.errors import InputError
 from mstfilter.formats import RecordingWriter, open_recording
 from mstfilter.scene import VoxelGrid
 from mstfilter.scoring import ask
@@ -223,17 +223,26 @@ def test_quality(tmp_path, capsys):
         assert message in err
 
 
-def test_a_workspace_that_misses_is_one_warning(tmp_path, capsys):
+def test_a_workspace_that_misses_is_one_error(tmp_path, capsys):
     with RecordingWriter(tmp_path / "r", CAMERA, VoxelGrid((5, 5, 0), 0.01, (30, 30, 20))) as writer:
         rgb, depth, _ = table_scene()
         writer.add_frame(rgb, depth, 0.0, "static")
-    code, out, err = call("run", tmp_path / "r", "n=2", "--out", tmp_path / "run", "--no-report", capsys=capsys)
-    assert code == 0, err
-    told = [line for line in err.splitlines() if line.startswith("warning: ")]
-    assert len(told) == 1
-    assert "has no reading above the table" in told[0]
+    code, _, err = call("run", tmp_path / "r", "n=2", "--out", tmp_path / "run", "--no-report", capsys=capsys)
+    assert code == 2
+    (told,) = [line for line in err.splitlines() if line.startswith("error: ")]
+    assert "has no reading above the table" in told
     assert "hint: give a workspace" in err
-    assert "hypotheses of 0" in out
-    shutil.rmtree(tmp_path / "run")
-    with pytest.warns(UserWarning):
+    assert not (tmp_path / "run").exists()
+    with pytest.raises(InputError, match="has no reading above the table"):
         open_recording(tmp_path / "r").check()
+
+
+def test_a_run_with_an_object_that_fills_the_workspace_says_so_once(tmp_path, capsys):
+    with RecordingWriter(tmp_path / "r", CAMERA, VoxelGrid((-0.16, -0.06, 0.0), 0.01, (12, 12, 14))) as writer:
+        for k in range(2):
+            writer.add_frame(*table_scene(k)[:2], float(k), "static")
+    command = ("run", tmp_path / "r", "--preset", "floor_one_blob", "n=1", "--out", tmp_path / "run", "--no-report")
+    code, _, err = call(*command, capsys=capsys)
+    assert code == 0, err
+    assert err.count("warning: pause 0 of recording r: an object has") == 1
+    assert err.count("an object has") == 1

@@ -1,4 +1,4 @@
-"""Every command of docs/own-data.md runs on data of its layout."""
+"""Every command of docs/own-data.md runs on data of its layout, and every wrong input gives its message."""
 
 from __future__ import annotations
 
@@ -6,16 +6,36 @@ import json
 import re
 import shlex
 import shutil
+import warnings
+from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from mstfilter.scene import read_depth, read_labels, read_rgb, write_image
+import mstfilter
+from mstfilter.errors import InputError, InputWarning
+from mstfilter.formats import PairedImages, open_recording
+from mstfilter.scene import (
+    Camera,
+    Frame,
+    Hypothesis,
+    Recording,
+    VoxelGrid,
+    examine_hypotheses,
+    read_depth,
+    read_labels,
+    read_rgb,
+    report_findings,
+    write_image,
+)
+from mstfilter.smc import bootstrap, linear_gaussian
 from tests.conftest import REPOSITORY
 from tests.formats import layouts
 from tests.formats.bags import scene_messages, write as write_bag
 from tests.scene.test_recording import write
 from tests.test_cli import call
+from tests.wrong_inputs import WRONG, right
 
 PAGE = (REPOSITORY / "docs" / "own-data.md").read_text()
 COMMANDS = [
@@ -116,3 +136,142 @@ def test_every_format_has_a_command():
     }
     assert set(data) == set(formats.__components__["format"])
     assert all(any(name in command.split() for command in COMMANDS) for name in data.values())
+
+
+TABLE = PAGE.partition("## When the input is wrong")[2]
+ROWS = re.findall(
+    r"^\| (?P<input>[^|]+) \| (?P<kind>error|warning) \| `(?P<text>[^|]+)` \|$", TABLE, flags=re.MULTILINE
+)
+
+
+def test_every_wrong_input_of_the_page_is_tried():
+    assert [name for name, _, _ in ROWS] == list(WRONG)
+
+
+@pytest.mark.parametrize(("name", "kind", "text"), ROWS)
+def test_wrong_input_gives_the_message_of_the_page(name, kind, text):
+    made = WRONG[name]()
+    pattern = ".*".join(map(re.escape, text.split("...")))
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        try:
+            if isinstance(made, dict):
+                Recording.from_arrays(**made)
+            else:
+                arrays, pose = right()
+                camera = Camera(arrays["K"], 320, 240, pose)
+                frame = Frame(arrays["rgb"][0], arrays["depth"][0], camera)
+                report_findings(examine_hypotheses(made, frame), "pause 0")
+            errors = []
+        except InputError as error:
+            errors = [error]
+    found = [one.message for one in caught if isinstance(one.message, InputWarning)]
+    said = errors if kind == "error" else found
+    assert any(re.search(pattern, one.message) for one in said), (errors, found)
+    assert all(one.hints or "no reading" in one.message for one in said)
+    assert bool(errors) == (kind == "error")
+
+
+def test_the_right_recording_of_the_table_is_silent():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        arrays, pose = right()
+        Recording.from_arrays(**arrays)
+        made = Recording.from_arrays(**arrays, T_world_camera=pose)
+    grid = VoxelGrid((-0.4, -0.4, 0.0), 0.01, (80, 80, 30))
+    labels = np.zeros(grid.shape, np.uint16)
+    labels[:8, :20, :20] = 1
+    assert examine_hypotheses((Hypothesis.from_labels(labels, grid),), made.frames[0]) == []
+
+
+@pytest.mark.parametrize(
+    "name", ["jack", "hots/mix_1", "hots/table_7", "hots/office_6", "hots/office_9", "osd_learn"]
+)
+def test_right_real_recordings_are_silent(name, shared_data):
+    path = shared_data(f"real/{name}")
+    frames = ("learn33", "learn34", "learn35") if name == "osd_learn" else ()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        recording = PairedImages(frames=frames).open(path) if name != "jack" else open_recording(path)
+        recording.clips()
+
+
+def _shown(words, capsys):
+    code, _, err = call(*words, capsys=capsys)
+    assert code == 2
+    return err
+
+
+def _raised(call_):
+    with pytest.raises(InputError) as caught:
+        call_()
+    return "\n".join((caught.value.message, *caught.value.hints))
+
+
+def _filter(observations):
+    one = np.eye(1)
+    return bootstrap(linear_gaussian(one, one, one, one, np.zeros(1), one), n=5).run(observations, seed=0)
+
+
+def _rename_images(path, name):
+    for part in ("color", "depth"):
+        for k, file in enumerate(sorted((path / part).iterdir())):
+            file.rename(file.with_name(name(k)))
+
+
+def _of_another_workspace(here):
+    recording = open_recording(here / "table-7")
+    grid = VoxelGrid(recording.grid.origin + 0.1, 0.01, (4, 4, 4))
+    filter = mstfilter.preset("mst")
+    state, _ = filter.step(filter.start(0), recording.clips()[0])
+    particles = tuple(Hypothesis.from_labels(np.ones(grid.shape, int), grid) for _ in state.population.particles)
+    return filter.step(
+        replace(state, population=replace(state.population, particles=particles)), recording.clips()[1]
+    )
+
+
+WRONG_FILES = {
+    "`rgb/` and `depth/` without intrinsics": lambda here: (here / "bedroom/intrinsic.json").unlink(),
+    "numbered images, one is missing": lambda here: next((here / "bedroom/depth").iterdir()).unlink(),
+    "names of images without numbers": lambda here: _rename_images(here / "bedroom", lambda k: f"{chr(97 + k)}.png"),
+    "intrinsics file without a camera matrix": lambda here: (here / "bedroom/intrinsic.json").write_text("{}"),
+}
+COMMAND_LINE = {
+    "`-o background=x`": ["convert", "frames", "t", "-o", "background=x"],
+    "`--out /proc/x`": ["run", "table-7", "--out", "/proc/x"],
+    "`--out` below a file": ["run", "table-7", "--out", "mine.py/run"],
+    "`--out` with a name of 300 characters": ["run", "table-7", "--out", "x" * 300],
+}
+PYTHON = {
+    "a data frame as observations of a filter": lambda here: _filter(SimpleNamespace(columns=["y"])),
+    "an observation that is NaN": lambda here: _filter([1.0, np.nan]),
+    "a hypothesis of another workspace": _of_another_workspace,
+}
+SECTION = PAGE.partition("## Files, options and arrays that cannot be used")[2].partition("\n## ")[0]
+FILE_ROWS = [
+    tuple(cell.strip() for cell in line.strip("|").split(" | ")) for line in SECTION.splitlines() if line[:2] == "| "
+]
+
+
+def test_the_table_has_the_inputs_of_the_test():
+    assert [row[0] for row in FILE_ROWS[1:]] == [*WRONG_FILES, *COMMAND_LINE, *PYTHON]
+
+
+@pytest.mark.parametrize(("wrong", "message"), FILE_ROWS[1:])
+def test_what_the_program_says(here, capsys, wrong, message):
+    files = sorted(here.rglob("*"))
+    if wrong in PYTHON:
+        said = _raised(lambda: PYTHON[wrong](here))
+    else:
+        WRONG_FILES.get(wrong, lambda here: None)(here)
+        files = sorted(here.rglob("*"))
+        said = _shown(COMMAND_LINE.get(wrong, ["convert", "bedroom", "t", "-o", "fps=10"]), capsys)
+    assert message.strip("`") in said
+    assert sorted(here.rglob("*")) == files
+
+
+def test_parts_of_a_session(here):
+    (example,) = (b for b in re.findall(r"```python\n(.*?)```", PAGE, flags=re.DOTALL) if "in_world_of" in b)
+    names = {}
+    exec(compile(example, "own-data.md", "exec"), names)
+    assert names["later"].grid == names["first"].grid

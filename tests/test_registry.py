@@ -218,6 +218,9 @@ def test_a_file_that_fails_leaves_nothing_behind(tmp_path):
         with pytest.raises(InputError, match="ZeroDivisionError") as caught:
             load(path)
     assert "mine.py, line 2: 1 / 0" in caught.value.hints[0]
+    path.write_text("import sys\nsys.exit(3)\n")
+    with pytest.raises(InputError, match="SystemExit: 3"):
+        load(path)
     assert not [name for name in set(sys.modules) - known if "mine" in name]
 
 

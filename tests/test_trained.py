@@ -71,5 +71,5 @@ def test_wrong_descriptions(folder):
     with pytest.raises(InputError, match="tensor 'c' is missing"):
         open_model(str(folder)).check_tensors({"a.weight": (2, 3), "b": (1,), "c": (1,)})
     (folder / DESCRIPTION).write_text("architecture = [")
-    with pytest.raises(InputError, match="not a TOML file"):
+    with pytest.raises(InputError, match="not valid TOML"):
         open_model(str(folder))

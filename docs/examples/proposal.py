@@ -43,6 +43,12 @@ def example(rng: np.random.Generator, n: int) -> tuple[Population, Any]:
     return Population(rng.standard_normal((n, 2))), np.array([0.3, -0.1])
 
 
+def exact(rng: np.random.Generator, n: int) -> tuple[Population, Any]:
+    """Exact draws of the distribution of the weighted particles, and y: the contract compares with them."""
+    y = np.array([0.3, -0.1])
+    return Population(rng.normal(y, 1.0, (n, 2))), y
+
+
 if __name__ == "__main__":
     # x_0 ~ N(0, 1), x_t ~ N(0.9 x_{t-1}, 0.5), y_t ~ N(x_t, 1)
     model = linear_gaussian(F=[[0.9]], Q=[[0.5]], H=[[1.0]], R=[[1.0]], m0=[0.0], P0=[[1.0]])

@@ -39,7 +39,9 @@ class MyUpdate(Update):
         """The result may have any number of particles; `predicted` or `proposed` may be None, but not both."""
         population = union(predicted, proposed)
         distance = (population.particles - np.asarray(observation)) / self.noise
-        return population.reweighted(-0.5 * (distance**2).reshape(len(population), -1).sum(axis=1))
+        # Constant factors of the likelihood are part of the evidence.
+        log_densities = -0.5 * distance**2 - np.log(np.sqrt(2 * np.pi) * self.noise)
+        return population.reweighted(log_densities.reshape(len(population), -1).sum(axis=1))
 
 
 def example(rng: np.random.Generator, n: int) -> tuple[Population, Any]:
@@ -47,12 +49,13 @@ def example(rng: np.random.Generator, n: int) -> tuple[Population, Any]:
     return Population(rng.standard_normal((n, 2)), rng.standard_normal(n)), np.array([0.3, -0.1])
 
 
-def exact(rng: np.random.Generator, n: int) -> tuple[Population, Population, Any]:
-    """Draws of p(x), exact draws of p(x | y), and y: the contract tests the weights with them."""
+def exact(rng: np.random.Generator, n: int) -> tuple[Population, Population, Any, float]:
+    """Draws of p(x), exact draws of p(x | y), y and log p(y): the contract tests the weights with them."""
     y = np.array([0.3, -0.1])
-    # x ~ N(0, 1) and y ~ N(x, 0.5^2) give x | y ~ N(0.8 y, 0.2).
+    # x ~ N(0, 1) and y ~ N(x, 0.5^2) give x | y ~ N(0.8 y, 0.2) and y ~ N(0, 1.25), in each of two dimensions.
     posterior = rng.normal(0.8 * y, np.sqrt(0.2), (n, 2))
-    return Population(rng.standard_normal((n, 2))), Population(posterior), y
+    log_evidence = float(-0.5 * (y**2).sum() / 1.25 - np.log(2 * np.pi * 1.25))
+    return Population(rng.standard_normal((n, 2))), Population(posterior), y, log_evidence
 
 
 if __name__ == "__main__":

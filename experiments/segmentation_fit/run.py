@@ -113,9 +113,9 @@ def logistic(pairs: Pairs) -> np.ndarray:
 
 def write(weights: np.ndarray, path: Path) -> None:
     """Write the module of weights with the new table."""
-    head = PACKAGED.read_text().split("JOIN_WEIGHTS", 1)[0]
+    head = PACKAGED.read_text(encoding="utf-8").split("JOIN_WEIGHTS", 1)[0]
     rows = "".join(f'    "{name}": {value:.4g},\n' for name, value in zip(PAIR_FEATURES, weights, strict=True))
-    path.write_text(f"{head}JOIN_WEIGHTS: dict[str, float] = {{\n{rows}}}\n")
+    path.write_text(f"{head}JOIN_WEIGHTS: dict[str, float] = {{\n{rows}}}\n", encoding="utf-8")
 
 
 def write_into_model(weights: np.ndarray, folder: str) -> None:

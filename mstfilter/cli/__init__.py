@@ -10,7 +10,7 @@ import sys
 
 from mstfilter.cli import running, studying, training, components  # isort: skip (the order of the help page)
 from mstfilter.cli.root import app, warnings_as_lines
-from mstfilter.errors import InputError, describe_error, place_in_user_file
+from mstfilter.errors import InputError, describe_error, exhausted, place_in_user_file
 from mstfilter.registry import loaded_components
 
 __all__ = ["app", "components", "main", "running", "studying", "training"]
@@ -27,11 +27,8 @@ def main(arguments: list[str] | None = None) -> None:
     except InputError as error:
         if debug:
             raise
-        print(f"error: {error.message}", file=sys.stderr)
         place = place_in_user_file(error) or ""
-        inside = [] if not place or ": raise " in place or place in error.hints else [place]
-        for hint in (*error.hints, *inside):
-            print(f"hint: {hint}", file=sys.stderr)
+        _print_error(error, *([] if not place or ": raise " in place or place in error.hints else [place]))
         sys.exit(2)
     except SystemExit as end:
         if end.code == 130:  # Ctrl-C
@@ -43,6 +40,9 @@ def main(arguments: list[str] | None = None) -> None:
     except Exception as error:
         if debug:
             raise
+        if known := exhausted(error):
+            _print_error(known)
+            sys.exit(1)
         print(f"error: {describe_error(error)}", file=sys.stderr)
         for note in getattr(error, "__notes__", ()):
             print(f"hint: {note}", file=sys.stderr)
@@ -51,6 +51,12 @@ def main(arguments: list[str] | None = None) -> None:
                 print(f"hint: `mstfilter check {component}` tests the component of this command", file=sys.stderr)
         print("hint: --debug shows the traceback", file=sys.stderr)
         sys.exit(1)
+
+
+def _print_error(error: InputError, *hints: str) -> None:
+    print(f"error: {error.message}", file=sys.stderr)
+    for hint in (*error.hints, *hints):
+        print(f"hint: {hint}", file=sys.stderr)
 
 
 def _interrupted(given: list[str]) -> str:

@@ -10,6 +10,7 @@ import typer
 
 from mstfilter.cli.root import app
 from mstfilter.errors import InputError
+from mstfilter.reading import read_toml
 
 
 @app.command("list")
@@ -31,12 +32,21 @@ def list_(
 
 @app.command()
 def check(
-    component: Annotated[str, typer.Argument(help="./file.py:Class, or KIND.NAME such as resampler.systematic.")],
+    component: Annotated[
+        str,
+        typer.Argument(
+            help="./file.py:Class, KIND.NAME such as resampler.systematic, or the folder of a run, "
+            "a study or a recording."
+        ),
+    ],
     overrides: Annotated[
         list[str] | None, typer.Argument(metavar="[FIELD=VALUE]...", help="Values of fields.")
     ] = None,
 ) -> None:
-    """Test whether a component keeps the contract of its interface, and state which properties are broken."""
+    """Test whether a component keeps the contract of its interface, or whether files in a folder are damaged."""
+    if Path(component).is_dir():
+        _check_folder(Path(component))
+        return
     from mstfilter.presets import REGISTRY, settings
 
     try:
@@ -67,6 +77,25 @@ def check(
         raise typer.Exit(1)
 
 
+def _check_folder(path: Path) -> None:
+    """Print which files of a run, of the runs of a study, or of a recording are damaged; then exit with code 1."""
+    from mstfilter.files import SUMS, damaged_files
+    from mstfilter.formats import open_recording
+    from mstfilter.runs import RunFolder
+
+    runs = [run.parent for run in sorted(path.glob("**/run.json")) if ".partial/" not in run.as_posix()]
+    damaged = [f"{run}: {wrong}" for run in runs for wrong in RunFolder.open(run).damage()]
+    noted = bool(runs) or (path / SUMS).exists()
+    if not runs and noted:
+        damaged = [f"{path}: {wrong}" for wrong in damaged_files(path)]
+    if not runs and not damaged:
+        open_recording(path).check()
+    note = "" if noted else f"; {SUMS} is missing, so changes are not noticed"
+    print("\n".join(f"damaged     {line}" for line in damaged) or f"sound       {path}{note}")
+    if damaged:
+        raise typer.Exit(1)
+
+
 @app.command()
 def new(
     kind: Annotated[
@@ -92,15 +121,13 @@ def new(
 
 def _lines(kind: str) -> Iterator[str]:
     """One line per preset, family or component."""
-    import tomllib
-
     from mstfilter.oracles import UsesTruth
     from mstfilter.presets import REGISTRY
     from mstfilter.resources import find_preset, preset_names
 
     if kind == "presets":
         for name in preset_names():
-            yield f"{name:<20}{tomllib.loads(find_preset(name).read_text()).get('description', '')}"
+            yield f"{name:<20}{read_toml(find_preset(name), 'a preset').get('description', '')}"
         return
     if kind == "families":
         from mstfilter.simulation import SCENE_FAMILIES

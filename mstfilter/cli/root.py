@@ -115,4 +115,6 @@ def print_summary(numbers: RunNumbers) -> None:
         line += f"ESS {step.info['ess']:.1f} of {step.info['n_candidates']} candidates"
         if step.mean is not None:
             line += f", quality {step.mean:.3f} (mean), {step.best:.3f} (best)"
+        if step.image_score is not None:
+            line += f", quality in the image {step.image_score.mean:.3f} (mean), {step.image_score.best:.3f} (best)"
         print(line)

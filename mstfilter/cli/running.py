@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import shutil
+import re
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -22,8 +22,11 @@ from mstfilter.cli.root import (
     safe_name,
 )
 from mstfilter.errors import InputError
-from mstfilter.files import check_output
+from mstfilter.files import atomic_folder, check_output, locked, other_files
 from mstfilter.report.progress import progress_bar
+
+_DEMO = "occlusion"  # the family of the demo
+_SIMULATOR = "mstfilter.simulation"  # the generator in the manifest of a simulated recording
 
 
 @app.command()
@@ -44,7 +47,7 @@ def run(
         bool, typer.Option("--compare", help="Also run the filter without past and on single frames, for the report.")
     ] = False,
     replace: Annotated[
-        bool, typer.Option("--replace", help="Remove an earlier run in the run folder first.")
+        bool, typer.Option("--replace", help="Replace an earlier run in the run folder after the first step.")
     ] = False,
 ) -> None:
     """Filter a recording into a run folder, or resume a run that was stopped."""
@@ -60,14 +63,22 @@ def run(
     if out is not None:
         from mstfilter.runs import check_run_folder
 
-        check_run_folder(out)
+        check_run_folder(out, replace)
+    else:
+        check_output(Path("runs"), folder=True, empty=False)
     source = read_source(recording, format, option, pauses, frames)
     name = Path(preset).stem
     folder = out or Path("runs") / f"{safe_name(source.name)}-{safe_name(name)}-{seed}"
-    if replace and (folder / "run.json").is_file():
-        shutil.rmtree(folder)
-    _execute_all(source, configs, folder, seed)
-    _summarise(folder, folder / "report.html" if report else None)
+    _execute_all(source, configs, folder, seed, replace)
+    for name in configs:
+        print(f"run         {_compared(folder, name)}")
+    from mstfilter.report import read_numbers, write_report
+    from mstfilter.runs import RunFolder
+
+    numbers = read_numbers(RunFolder.open(folder))
+    if report:
+        print(f"report      {write_report(folder, None, numbers)}")
+    print_summary(numbers)
 
 
 @app.command()
@@ -80,22 +91,43 @@ def demo(
     """Simulate a robot at a cluttered table, filter the recording with and without its past, write a report."""
     from mstfilter.formats import open_recording
     from mstfilter.presets import load_config
-    from mstfilter.runs import compared_configs
+    from mstfilter.report import read_numbers, write_report
+    from mstfilter.runs import RunFolder, compared_configs
 
-    if out.exists() and not out.is_dir():
-        raise InputError(f"{out} is a file, expected a folder for the demo")
-    if out.exists() and any(out.iterdir()):
-        known = {"recording", "run", "report.html"}
-        others = sorted(p.name for p in out.iterdir() if p.name not in known and p.suffix != ".partial")
-        if others:
-            raise InputError(
-                f"{out} holds a file that is not of a demo: {others[0]}", "choose another folder with --out"
-            )
-        shutil.rmtree(out)
-    _simulate("occlusion", out / "recording", seed)
-    recording, config = open_recording(out / "recording"), load_config("mst")
-    _execute_all(recording, {"": config} | compared_configs(config), out / "run", 0)
-    _summarise(out / "run", out / "report.html")
+    check_output(out, folder=True, empty=False)
+    with locked(out), atomic_folder(out, "replace") as work:
+        _check_earlier_demo(out)
+        _simulate(_DEMO, work / "recording", seed)
+        recording, config = open_recording(work / "recording"), load_config("mst")
+        _execute_all(recording, {"": config} | compared_configs(config), work / "run", 0)
+        run = RunFolder.open(work / "run")
+        numbers = read_numbers(run)
+        write_report(run, work / "report.html", numbers)
+    for name, file in (("recording", "recording"), ("run", "run"), ("report", "report.html")):
+        print(f"{name:<12}{out / file}")
+    print_summary(numbers)
+
+
+def _check_earlier_demo(out: Path) -> None:
+    """Raise InputError unless a folder is missing, empty, or of a demo and contains nothing else."""
+    from mstfilter.formats import RECORDING_FILES, open_recording
+    from mstfilter.runs import RUN_FILES, RunFolder
+
+    own = re.compile(rf"recording/({RECORDING_FILES.pattern})|run/({RUN_FILES.pattern})|report\.html")
+    others = other_files(out, own)
+    if not others and out.exists() and any(out.iterdir()):
+        source = open_recording(out / "recording").manifest
+        generators = (source.get("generator"), RunFolder.open(out / "run").description["recording"]["generator"])
+        if generators != (_SIMULATOR, _SIMULATOR) or dict(source.get("family", {})).get("name") != _DEMO:
+            others.append("recording")
+        elif (page := out / "report.html").exists() and "mstfilter" not in page.read_text(
+            encoding="utf-8", errors="replace"
+        ):
+            others.append("report.html")
+    if others:
+        raise InputError(
+            f"{out} holds something that is not of a demo: {others[0]}", "choose another folder with --out"
+        )
 
 
 @app.command("simulate")
@@ -110,6 +142,7 @@ def simulate_(
 ) -> None:
     """Simulate a recording with ground truth."""
     _simulate(family, out, seed, overrides or ())
+    print(f"recording   {out}")
 
 
 @app.command()
@@ -123,6 +156,8 @@ def report(
     """Write the report of a run or a study, which need not be finished."""
     if out is not None:
         check_output(out)
+    if export is not None:
+        check_output(export, folder=True)
     if (run / "study.json").is_file():
         from mstfilter.report import write_study_report
 
@@ -181,9 +216,9 @@ def convert(
     frames: Annotated[str, typer.Option(help="Frames of a folder of pairs, separated by commas.")] = "",
 ) -> None:
     """Convert data of another format to a recording folder; a stopped or failed conversion leaves no folder."""
-    from mstfilter.formats import check_writable, save_recording
+    from mstfilter.formats import save_recording
 
-    check_writable(out)
+    check_output(out, folder=True)
     recording = read_source(source, format, option, pauses, frames)
     generator = recording.manifest.get("generator") or f"converted from {source.name}"
     try:
@@ -240,43 +275,41 @@ def quality(
 
 
 def _simulate(family: str, out: Path, seed: int, overrides: Sequence[str] = ()) -> None:
-    from mstfilter.formats import check_writable
     from mstfilter.presets import REGISTRY, settings
     from mstfilter.simulation import SceneFamily, scene_family, simulate_recording
 
     chosen = REGISTRY.make(SceneFamily, settings(overrides), base=scene_family(family))
-    check_writable(out)
+    check_output(out, folder=True)
     with progress_bar("simulate") as advance:
         simulate_recording(chosen, seed, out, progress=lambda done, total, what: advance(done, total))
-    print(f"recording   {out}")
 
 
-def _execute_all(recording: Any, configs: dict[str, dict[str, Any]], folder: Path, seed: int) -> None:
+def _execute_all(
+    recording: Any, configs: dict[str, dict[str, Any]], folder: Path, seed: int, replace: bool = False
+) -> None:
     """Run the filter without a name in `folder`, those that it is compared with in its folder ``compare``."""
     for name, config in configs.items():
-        _execute(recording, config, folder / "compare" / name.replace(" ", "-") if name else folder, seed)
+        _execute(recording, config, _compared(folder, name), seed, replace and not name)
 
 
-def _execute(recording: Any, config: dict[str, Any], folder: Path, seed: int) -> None:
+def _compared(folder: Path, name: str) -> Path:
+    """The folder of a run that the run in `folder` is compared with; `folder` itself for no name."""
+    return folder / "compare" / name.replace(" ", "-") if name else folder
+
+
+def _execute(recording: Any, config: dict[str, Any], folder: Path, seed: int, replace: bool = False) -> None:
     from mstfilter.runs import filter_recording
 
     with progress_bar("filter") as advance:
         filter_recording(
-            recording, config, folder, seed, allow_files=True, progress=lambda p: advance(p.done, p.total)
+            recording,
+            config,
+            folder,
+            seed,
+            replace=replace,
+            allow_files=True,
+            progress=lambda p: advance(p.done, p.total),
         )
-    print(f"run         {folder}")
-
-
-def _summarise(run: Path, report: Path | None) -> None:
-    """Write the report if there is a path for it, and print a summary."""
-    from mstfilter.report import read_numbers, write_report
-    from mstfilter.runs import RunFolder
-
-    folder = RunFolder.open(run)
-    numbers = read_numbers(folder)
-    if report is not None:
-        print(f"report      {write_report(folder, report, numbers)}")
-    print_summary(numbers)
 
 
 def _report(run: Path, out: Path | None) -> None:

@@ -9,6 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from mstfilter.cli.root import app
+from mstfilter.files import check_output
 from mstfilter.report.progress import study_bars
 
 
@@ -36,6 +37,7 @@ def study(
     from mstfilter.study import Executor, Local, run_study
 
     folder = out or Path("studies") / f"{wanted.name}{'-smoke' if smoke else ''}"
+    check_output(folder, folder=True)
     executor: Executor = Local(workers, folder / "logs")
     if scheduler:
         from mstfilter.study import Cluster

@@ -23,6 +23,7 @@ def train(
 ) -> None:
     """Train a learned part on simulated scenes; the same command resumes a training that was stopped."""
     from mstfilter.errors import check_choice
+    from mstfilter.files import check_output
 
     check_choice("part", part, ("completion", "border"))
     from mstfilter.training import BorderTraining, CompletionTraining, run_training
@@ -30,6 +31,7 @@ def train(
     trained = CompletionTraining if part == "completion" else BorderTraining
     settings = trained.recipe(recipe, overrides or ())
     folder = out or Path("trained") / part
+    check_output(folder, folder=True)
 
     def report(done: int, total: int, text: str) -> None:
         print(f"{done:7d} of {total}  {text}", flush=True)

@@ -251,7 +251,7 @@ _FEW_VOXELS = 20  # of visible surface, in all boxes together; fewer say nothing
 def fault_of(seen: Sequence[ObservedBox], filled: Sequence[np.ndarray]) -> str | None:
     """How the probabilities of boxes ignore what was seen in them; None if they do not.
 
-    Either all are one number, or no voxel of the visible surface is probably occupied in any box.
+    Either all are one number, or less than 2 % of the visible surface in all boxes is occupied (0.5 or more).
     """
     shown = [(p, one.surface) for p, one in zip(filled, seen, strict=True) if one.surface.any()]
     if sum(np.count_nonzero(surface) for _, surface in shown) < _FEW_VOXELS:
@@ -259,9 +259,13 @@ def fault_of(seen: Sequence[ObservedBox], filled: Sequence[np.ndarray]) -> str |
     first = float(shown[0][0].flat[0])
     if all(p.flat[0] == first and p.min() == p.max() for p, _ in shown):
         return f"returns a constant: {first:.4g} for all voxels of {len(shown)} boxes"
-    if not any((p[surface] >= 0.5).any() for p, surface in shown):
-        highest = max(float(p[surface].max()) for p, surface in shown)
-        return f"leaves the visible surface empty: its highest probability is {highest:.4g}, at least 0.5 is occupied"
+    surface = np.concatenate([p[surface] for p, surface in shown])
+    n_occupied = int(np.count_nonzero(surface >= 0.5))
+    if n_occupied < 0.02 * len(surface):
+        return (
+            f"leaves the visible surface empty: {n_occupied} of its {len(surface)} voxels have a probability of 0.5 "
+            f"or more, the mean is {surface.mean():.3g}"
+        )
     return None
 
 

@@ -16,9 +16,10 @@ models", NeurIPS 2015).
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -30,6 +31,7 @@ from torch.nn import functional
 from mstfilter.completion.crops import BATCH, CHANNELS, EDGE, LARGER, Architecture, channels
 from mstfilter.completion.observed import ObservedBox, encode_box
 from mstfilter.errors import InputError, MissingLibraryError, describe_error
+from mstfilter.reading import MAX_WEIGHTS, read_bytes
 from mstfilter.trained import calibrated_network, open_model
 
 ARCHITECTURE = "completion-unet"
@@ -201,10 +203,21 @@ class TrainedNetwork:
         for k, values in enumerate(noise):
             if values is not None:
                 drawn[k] = values
-        with torch.inference_mode():
+        with torch.inference_mode(), _one_thread():
             x = channels(torch.from_numpy(bits), torch.from_numpy(signed), torch.from_numpy(height).float())
             p = torch.sigmoid(self.scale * self.forward(x, torch.from_numpy(drawn)) + self.shift)
         return np.asarray(p.numpy()[: len(seen)])
+
+
+@contextlib.contextmanager
+def _one_thread() -> Iterator[None]:
+    """One thread of torch in the block: the sums of convolutions depend on the number of threads."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 @functools.lru_cache(maxsize=4)
@@ -268,7 +281,7 @@ def _open_onnx(path: Path) -> TrainedNetwork:
         ) from error
     if not path.is_file():
         raise InputError(f"file of a network does not exist: {path}")
-    data = path.read_bytes()
+    data = read_bytes(path, "a network", limit=MAX_WEIGHTS)
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = 1  # results must not depend on the number of cores
     options.log_severity_level = 4

@@ -1,9 +1,9 @@
 from mstfilter.formats.bag import Bag as Bag
 from mstfilter.formats.datasets import Bop as Bop, Dsr as Dsr
 from mstfilter.formats.folder import (
+    RECORDING_FILES as RECORDING_FILES,
     RecordingFolder as RecordingFolder,
     RecordingWriter as RecordingWriter,
-    check_writable as check_writable,
     open_recording as open_recording,
     save_recording as save_recording,
 )

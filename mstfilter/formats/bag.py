@@ -16,10 +16,11 @@ a PNG. The files are read with rosbags (extra ``bags``), without ROS.
 from __future__ import annotations
 
 import contextlib
+import functools
 import struct
 import weakref
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -27,8 +28,12 @@ from typing import Any
 import numpy as np
 
 from mstfilter.errors import InputError, MissingLibraryError
+from mstfilter.files import reading
 from mstfilter.formats.video import Video, VideoFormat, pair_stamps
-from mstfilter.scene import Recording
+from mstfilter.reading import MAX_TEXT, open_regular
+from mstfilter.scene import Recording, decode_image
+
+MAX_CHUNK = 2**28  #: Largest chunk of a bag when it is unpacked, in bytes
 
 
 @dataclass(frozen=True)
@@ -59,6 +64,12 @@ class BagFile:
         self.path = path
         if not path.exists():
             raise InputError(f"bag does not exist: {path}")
+        for file in sorted(path.iterdir()) if path.is_dir() else [path]:
+            limit = MAX_TEXT if file.suffix == ".yaml" else 2**63
+            with reading(file, "a bag"), open_regular(file, limit) as opened:
+                if file.suffix == ".bag" and opened.read(13) != b"#ROSBAG V2.0\n":
+                    raise InputError(f"bag cannot be read: {file} does not begin with #ROSBAG V2.0")
+        _bound_decompressors()
         with self._reading():
             self._reader = AnyReader([path], default_typestore=get_typestore(Stores.LATEST))
             self._reader.open()
@@ -116,6 +127,35 @@ class BagFile:
         raise InputError(f"bag {self.path} changed while it was read: a message of {topic} is missing")
 
 
+@functools.cache
+def _bound_decompressors() -> None:
+    """Let rosbags unpack chunks of at most `MAX_CHUNK` bytes: it unpacks them before it compares their size."""
+    import bz2
+
+    import lz4.frame
+    from rosbags.rosbag1 import reader
+    from rosbags.rosbag2 import storage_mcap
+
+    bounded = {
+        "bz2": _bounded(bz2.BZ2Decompressor),
+        "lz4": _bounded(lz4.frame.LZ4FrameDecompressor),
+        "zstd": _bounded(storage_mcap.zstd.ZstdDecompressor),
+    }
+    for table in (reader.decompressors, storage_mcap.DECOMPRESSORS):
+        table.update({name: bounded[name] for name in table if name in bounded})
+
+
+def _bounded(decompressor: Callable[[], Any]) -> Callable[..., bytes]:
+    def decompress(data: bytes, *size: int) -> bytes:
+        engine = decompressor()
+        found: bytes = engine.decompress(data, max_length=MAX_CHUNK)
+        if len(found) == MAX_CHUNK and not engine.eof:
+            raise ValueError(f"a chunk needs more than {MAX_CHUNK} bytes when it is unpacked")
+        return found
+
+    return decompress
+
+
 def _close(reader: Any) -> None:
     with contextlib.suppress(Exception):
         reader.close()
@@ -142,9 +182,8 @@ def colour_image(message: Any, compressed: bool, where: str) -> np.ndarray:
     import cv2
 
     if compressed:
-        image = cv2.imdecode(np.frombuffer(bytes(message.data), np.uint8), cv2.IMREAD_COLOR)
-        if image is None:
-            raise InputError(f"{where} cannot be decoded: {message.format!r}, {len(message.data)} bytes")
+        problem = f"{where} cannot be decoded: {message.format!r}, {len(message.data)} bytes"
+        image = decode_image(bytes(message.data), cv2.IMREAD_COLOR, problem)
         return np.ascontiguousarray(image[..., ::-1])
     encoding = str(message.encoding)
     if encoding not in _COLOUR:
@@ -196,14 +235,13 @@ def _compressed_depth(data: bytes, encoding: str, depth_scale: float, where: str
     import cv2
 
     start = data.find(_PNG, 0, 64)
-    image = None
-    if start >= 0:
-        image = cv2.imdecode(np.frombuffer(data[start:], np.uint8), cv2.IMREAD_UNCHANGED)
-    if image is None or image.ndim != 2 or image.dtype != np.uint16:
-        raise InputError(
-            f"{where} is not a 16-bit PNG ({len(data)} bytes)",
-            "compressed depth must be PNG, not RVL or JPEG",
-        )
+    problem, hint = (
+        f"{where} is not a 16-bit PNG ({len(data)} bytes)",
+        "compressed depth must be PNG, not RVL or JPEG",
+    )
+    image = decode_image(data[start:] if start >= 0 else b"", cv2.IMREAD_UNCHANGED, problem, hint)
+    if image.ndim != 2 or image.dtype != np.uint16:
+        raise InputError(problem, hint)
     if encoding != "32FC1":
         return image * np.float32(depth_scale)
     if start != 12:

@@ -6,7 +6,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -17,6 +16,7 @@ from scipy.spatial.transform import RigidTransform
 from mstfilter.errors import InputError, MissingLibraryError
 from mstfilter.files import reading
 from mstfilter.formats.video import KnownWorld, RecordingFormat, Video, object_numbers
+from mstfilter.reading import MAX_FILE, open_regular, read_json
 from mstfilter.scene import (
     Camera,
     Frame,
@@ -101,7 +101,7 @@ def _cameras(path: Path) -> dict[int, dict[str, Any]]:
     """Entries of scene_camera.json by image number."""
     hints = "give the folder of one scene, for example test/000048", "depth_scale is in millimetres per unit"
     with reading(path, "a BOP scene", *hints):
-        found = {int(k): dict(v) for k, v in json.loads(path.read_text()).items()}
+        found = {int(k): dict(v) for k, v in read_json(path, "a BOP scene", *hints).items()}
         for k, entry in found.items():
             where = f"image {k}"
             if len(entry["cam_K"]) != 9 or not np.isfinite(entry["cam_K"]).all():
@@ -248,18 +248,18 @@ def _read(path: Path) -> dict[str, np.ndarray]:
         raise MissingLibraryError(
             "DSR-Net data need h5py, which is not installed", "pip install 'mstfilter[h5py]'"
         ) from error
-    try:
+    with reading(path, "a DSR-Net step", f"expected the arrays {', '.join(_KEYS)}"), open_regular(path):
         with h5py.File(path, "r") as file:
+            if (size := sum(file[key].nbytes for key in _KEYS)) > MAX_FILE:
+                raise ValueError(f"its arrays need {size} bytes, at most {MAX_FILE} are read")
             data: dict[str, Any] = {key: np.asarray(file[key]) for key in _KEYS}
-    except (OSError, KeyError, RuntimeError) as error:
-        raise InputError(f"{path} does not hold {', '.join(_KEYS)}: {error}") from error
+        data["mask_3d"] = data["mask_3d"].astype(np.int64)
     volume, top = data["tsdf"].shape, data["color_heightmap"].shape
     if len(volume) != 3 or data["mask_3d"].shape != volume or top != (*volume[:2], 3):
         raise InputError(
             f"{path}: tsdf, mask_3d and color_heightmap have shapes {volume}, {data['mask_3d'].shape}, {top}",
             "expected (y, x, z), (y, x, z), (y, x, 3)",
         )
-    data["mask_3d"] = data["mask_3d"].astype(np.int64)
     return data
 
 

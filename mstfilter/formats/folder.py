@@ -13,6 +13,7 @@ The layout::
     instance/000000.png  optional: object number of each pixel      robot/000000.png   optional: robot mask
     voxels.npz           optional ground truth: labels (S, X, Y, Z), frame (S,), origin, voxel_size
     poses.json           optional ground truth: per frame, per object a 4x4 T_world_object
+    SHA256SUMS           hashes of these files
 
 Frames with role ``static`` are the pauses. If camera.json holds no pose, the world is found from the support plane of
 the first pause; without a workspace, a grid is placed around the objects on the table. A recording is written under
@@ -21,22 +22,23 @@ a temporary name and renamed when it is complete: if writing fails, no file rema
 
 from __future__ import annotations
 
-import contextlib
 import json
 import math
-import shutil
-from collections.abc import Callable, Iterator, Mapping
+import re
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict
 
-from mstfilter.errors import InputError
-from mstfilter.files import check_output, reading
+from mstfilter.errors import InputError, naming
+from mstfilter.files import SUMS, atomic_folder, check_output, locked, reading, write_sums, writing
 from mstfilter.formats.video import RecordingFormat
+from mstfilter.reading import read_arrays, read_json, read_model
 from mstfilter.scene import (
     Camera,
     Frame,
@@ -45,18 +47,29 @@ from mstfilter.scene import (
     VoxelGrid,
     as_labels,
     check_depth,
+    examine,
     find_world,
     read_depth,
     read_labels,
     read_rgb,
+    report_findings,
     rigid_from_matrix,
     truth_reader,
-    warn_if_implausible,
     write_image,
 )
 from mstfilter.scene.pauses import PauseRule
 
 VERSION = 1  #: Version of the layout
+RECORDING_FILES = re.compile(  #: paths in a recording folder
+    rf"(manifest|camera|poses)\.json|voxels\.npz|{SUMS}|(rgb|depth|instance|robot)/\d{{6}}\.png"
+)
+_Model = TypeVar("_Model", bound=BaseModel)
+
+
+_HINTS = (
+    "a recording folder holds manifest.json, camera.json, rgb/, depth/",
+    "other layouts: mstfilter.runs.open_source(path), or `mstfilter convert`",
+)
 
 
 class _Workspace(BaseModel):
@@ -70,22 +83,12 @@ class _Workspace(BaseModel):
         return cls(min=tuple(grid.origin.tolist()), max=tuple(grid.upper.tolist()), voxel=grid.voxel_size)
 
 
-def check_writable(path: Path) -> None:
-    """Raise InputError unless the path does not exist or is an empty folder, and a folder can be written there."""
-    if path.exists() and (not path.is_dir() or any(path.iterdir())):
-        raise InputError(
-            f"cannot write a recording to {path}: it exists and is not an empty folder",
-            "choose another name, or remove it",
-        )
-    check_output(path, folder=True)
-
-
 class RecordingWriter:
     """Writes a recording folder, frame by frame.
 
-    The new folder must not exist, or be empty. The camera has its pose if that is known; `grid` is the workspace.
-    `depth_scale` is in metres per unit of the 16-bit depth images. Further entries of manifest.json, such as
-    generator and seed, are given by name.
+    The new folder must not exist, or be empty, and no other process may be writing it. The camera has its pose if
+    that is known; `grid` is the workspace. `depth_scale` is in metres per unit of the 16-bit depth images. Further
+    entries of manifest.json, such as generator and seed, are given by name.
     """
 
     def __init__(
@@ -98,20 +101,17 @@ class RecordingWriter:
         **manifest: Any,
     ) -> None:
         self.path = Path(path)
-        check_writable(self.path)
+        check_output(self.path, folder=True)
         self._camera, self._grid, self._scale = camera, grid, depth_scale
         self._manifest = {"version": VERSION, **manifest}
         self._frames: list[dict[str, Any]] = []
         self._poses: list[dict[str, Any]] = []
         self._voxels: list[np.ndarray] = []
         self._voxel_frames: list[int] = []
-        self._folder = self.path.with_name(f".{self.path.name}.partial")
-        try:
-            if self._folder.exists():
-                shutil.rmtree(self._folder)
-            self._folder.mkdir(parents=True)
-        except OSError as error:
-            raise InputError(f"cannot write recording {self.path}: {error.strerror}") from error
+        with self._writing(), ExitStack() as stack:
+            stack.enter_context(locked(self.path))
+            self._folder = stack.enter_context(atomic_folder(self.path))
+            self._open = stack.pop_all()
 
     def add_frame(
         self,
@@ -181,11 +181,11 @@ class RecordingWriter:
             "workspace": None if grid is None else _Workspace.of(grid).model_dump(),
         }
         manifest = {**self._manifest, "frames": self._frames}
-        with self._writing():
-            (self._folder / "camera.json").write_text(json.dumps(described, indent=1))
-            (self._folder / "manifest.json").write_text(json.dumps(manifest, indent=1))
+        with self._writing(), self._open:
+            (self._folder / "camera.json").write_text(json.dumps(described, indent=1), encoding="utf-8")
+            (self._folder / "manifest.json").write_text(json.dumps(manifest, indent=1), encoding="utf-8")
             if self._poses:
-                (self._folder / "poses.json").write_text(json.dumps(self._poses))
+                (self._folder / "poses.json").write_text(json.dumps(self._poses), encoding="utf-8")
             if grid is not None and self._voxels:
                 np.savez_compressed(
                     self._folder / "voxels.npz",
@@ -194,24 +194,15 @@ class RecordingWriter:
                     origin=grid.origin,
                     voxel_size=grid.voxel_size,
                 )
-            if self.path.exists():
-                self.path.rmdir()
-            self._folder.rename(self.path)
+            write_sums(self._folder)
         return self.path
 
-    @contextlib.contextmanager
-    def _writing(self) -> Iterator[None]:
-        """Turn errors of the disk into InputError."""
-        try:
-            yield
-        except OSError as error:
-            raise InputError(
-                f"cannot write recording {self.path}: {error.strerror}", "the unfinished files are removed"
-            ) from error
+    def _writing(self) -> AbstractContextManager[None]:
+        return writing(f"recording {self.path}", "the unfinished files are removed")
 
     def discard(self) -> None:
         """Remove all files written so far."""
-        shutil.rmtree(self._folder, ignore_errors=True)
+        self._open.__exit__(InterruptedError, InterruptedError(), None)
 
     def __enter__(self) -> RecordingWriter:
         return self
@@ -219,12 +210,8 @@ class RecordingWriter:
     def __exit__(self, kind: type[BaseException] | None, *error: Any) -> None:
         if kind is not None:
             self.discard()
-            return
-        try:
+        else:
             self.close()
-        except BaseException:
-            self.discard()
-            raise
 
 
 def save_recording(
@@ -239,6 +226,7 @@ def save_recording(
     Depth is stored in units of the recording's `depth_scale`. `progress` is called with the number of frames written
     and the number of all frames. Further entries of manifest.json, such as the generator, are given by name.
     """
+    report_findings(examine(recording.frames, recording.pauses, recording.grid), f"recording {recording.name}")
     camera, total = recording.frames[recording.pauses[0]].camera, len(recording)
     manifest = {"name": recording.name, "depth_scale": recording.depth_scale, **manifest}
     with RecordingWriter(path, camera, recording.grid, **manifest) as writer:
@@ -274,17 +262,15 @@ def save_recording(
             if truth is not None:
                 writer.add_voxels(truth)
             progress(index + 1, total)
-    at_pauses = (recording.frames[p] for p in recording.pauses)
-    warn_if_implausible(at_pauses, recording.grid, f"recording {recording.name}")
     return writer.path
 
 
 class _CameraFile(BaseModel):
-    K: list[list[float]]
+    K: Any  # checked by Camera, as the poses are by rigid_from_matrix
     width: int
     height: int
     depth_scale: float
-    T_world_camera: list[list[float]] | None = None
+    T_world_camera: Any = None
     workspace: _Workspace | None = None
 
 
@@ -292,7 +278,7 @@ class _FrameEntry(BaseModel):
     index: int
     time_s: float
     role: Literal["static", "action"]
-    T_world_camera: list[list[float]] | None = None
+    T_world_camera: Any = None
 
 
 class _Manifest(BaseModel):
@@ -301,22 +287,13 @@ class _Manifest(BaseModel):
     frames: list[_FrameEntry]
 
 
-def _load(path: Path, model: type[BaseModel]) -> Any:
-    with reading(path, "a recording", "a recording folder holds manifest.json, camera.json, rgb/, depth/"):
-        data = json.loads(path.read_text())
+def _load(path: Path, model: type[_Model]) -> tuple[_Model, dict[str, Any]]:
     try:
-        return model.model_validate(data), data
-    except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"])
-        hint = (
-            "metres per unit: 0.001 for millimetres, 0.0002 for TUM images; it has no default"
-            if "depth_scale" in where
-            else "the layout is described in mstfilter.formats.folder"
-        )
-        found = first["input"]
-        value = "nothing" if first["type"] == "missing" else repr(found)[:80]
-        raise InputError(f"{path}: {where}: {first['msg'].lower()}, found {value}", hint) from error
+        return read_model(path, model, "a recording", *_HINTS)
+    except InputError as error:
+        if "depth_scale" in error.message:
+            error.hints = ("metres per unit: 0.001 for millimetres, 0.0002 for TUM images; it has no default",)
+        raise
 
 
 @dataclass(frozen=True)
@@ -348,7 +325,7 @@ def open_recording(path: str | Path, pauses: PauseRule | None = None) -> Recordi
     if not any(path.iterdir()):
         raise InputError(
             f"recording folder is empty: {path}",
-            "a recording folder holds manifest.json, camera.json, rgb/, depth/",
+            *_HINTS,
         )
     manifest, manifest_data = _load(path / "manifest.json", _Manifest)
     camera_file, _ = _load(path / "camera.json", _CameraFile)
@@ -364,13 +341,12 @@ def open_recording(path: str | Path, pauses: PauseRule | None = None) -> Recordi
     if not entries:
         raise InputError(f"{path / 'manifest.json'}: there are no frames")
 
-    where = f"{path / 'camera.json'}: T_world_camera"
-    pose = None if camera_file.T_world_camera is None else rigid_from_matrix(camera_file.T_world_camera, where)
-    camera = Camera(camera_file.K, camera_file.width, camera_file.height, pose)
-    grid = None
-    if camera_file.workspace is not None:
+    with reading(path / "camera.json", "a recording"):
+        matrix = camera_file.T_world_camera
+        pose = None if matrix is None else rigid_from_matrix(matrix, "T_world_camera")
+        camera = Camera(camera_file.K, camera_file.width, camera_file.height, pose)
         w = camera_file.workspace
-        grid = VoxelGrid.from_bounds(np.array(w.min), np.array(w.max), w.voxel)
+        grid = None if w is None else VoxelGrid.from_bounds(np.array(w.min), np.array(w.max), w.voxel)
     times = tuple(e.time_s for e in entries)
     marked = tuple(e.index for e in entries if e.role == "static")
     if pauses is not None:
@@ -415,19 +391,21 @@ def open_recording(path: str | Path, pauses: PauseRule | None = None) -> Recordi
         return read_labels(file) if file.exists() else None
 
     truth, true_poses = path / "voxels.npz", path / "poses.json"
-    return Recording(
-        LazyFrames(read_posed, len(entries)),
-        grid,
-        marked,
-        times,
-        name=str(manifest_data.get("name") or path.name),
-        depth_scale=scale,
-        path=path,
-        manifest=manifest_data,
-        truth=_read_voxels(truth, grid, marked) if truth.exists() else lambda t: None,
-        instance=read_instance,
-        poses=_read_poses(true_poses) if true_poses.exists() else lambda index: None,
-    )
+    true_volumes = _read_voxels(truth, grid, marked) if truth.exists() else lambda t: None
+    with naming(str(path / "manifest.json")):
+        return Recording(
+            LazyFrames(read_posed, len(entries)),
+            grid,
+            marked,
+            times,
+            name=str(manifest_data.get("name") or path.name),
+            depth_scale=scale,
+            path=path,
+            manifest=manifest_data,
+            truth=true_volumes,
+            instance=read_instance,
+            poses=_read_poses(true_poses) if true_poses.exists() else lambda index: None,
+        )
 
 
 def _read_poses(path: Path) -> Any:
@@ -436,21 +414,26 @@ def _read_poses(path: Path) -> Any:
     @cache
     def load() -> dict[int, dict[int, np.ndarray]]:
         with reading(path, "true poses"):
-            entries = {int(e["frame"]): dict(e["T_world_object"]) for e in json.loads(path.read_text())}
+            entries = {int(e["frame"]): dict(e["T_world_object"]) for e in read_json(path, "true poses")}
             return {i: {int(k): rigid_from_matrix(T).as_matrix() for k, T in e.items()} for i, e in entries.items()}
 
     return lambda index: load().get(index)
 
 
 def _read_voxels(path: Path, grid: VoxelGrid, pauses: tuple[int, ...]) -> Any:
-    with reading(path, "true volumes"), np.load(path, allow_pickle=False) as data:
-        labels, frames = data["labels"], data["frame"]
-        origin, size = data["origin"], float(data["voxel_size"])
-    if labels.shape[1:] != grid.shape or not np.allclose(origin, grid.origin) or abs(size - grid.voxel_size) > 1e-9:
-        raise InputError(
-            f"{path}: grid {labels.shape[1:]} at {origin.tolist()} with voxels of {size} m differs from "
-            f"the workspace {grid.shape} at {grid.origin.tolist()} with {grid.voxel_size} m"
-        )
-    if len(labels) != len(frames):
-        raise InputError(f"{path}: there are {len(labels)} label grids for {len(frames)} frames")
-    return truth_reader(as_labels(labels, f"{path}: labels"), frames, pauses)
+    data = read_arrays(path, "true volumes")
+    with reading(path, "true volumes"):
+        labels, frames = as_labels(data["labels"], "labels"), [int(frame) for frame in data["frame"]]
+        origin, size = data["origin"].astype(float), float(data["voxel_size"])
+        if (
+            labels.shape[1:] != grid.shape
+            or not np.allclose(origin, grid.origin)
+            or abs(size - grid.voxel_size) > 1e-9
+        ):
+            raise InputError(
+                f"{path}: grid {labels.shape[1:]} at {origin.tolist()} with voxels of {size} m differs from "
+                f"the workspace {grid.shape} at {grid.origin.tolist()} with {grid.voxel_size} m"
+            )
+        if len(labels) != len(frames):
+            raise InputError(f"{path}: there are {len(labels)} label grids for {len(frames)} frames")
+    return truth_reader(labels, frames, pauses)

@@ -1,4 +1,4 @@
-"""Folders of colour and depth images: pairs of images, Redwood / Open3D, TUM RGB-D.
+"""Folders of colour and depth images: pairs of images, rgb/ and depth/ (Redwood, Open3D), TUM RGB-D.
 
 >>> PairedImages(frames=("learn2", "learn3", "learn4")).open(Path("frames"))
 >>> Redwood().open(Path("bedroom"))
@@ -7,10 +7,12 @@
 
 from __future__ import annotations
 
-import json
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from decimal import Decimal
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
@@ -18,6 +20,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from mstfilter.errors import InputError, check_number
 from mstfilter.files import reading
 from mstfilter.formats.video import RecordingFormat, Video, VideoFormat, object_numbers, pair_stamps
+from mstfilter.reading import read_json, read_text
 from mstfilter.scene import Frame, Recording, read_depth, read_labels, read_rgb, rigid_from_matrix, table_residual
 
 
@@ -47,7 +50,7 @@ class PairedImages(RecordingFormat):
     def open(self, path: Path) -> Recording:
         example = 'for example {"K": [525, 525, 319.5, 239.5], "depth_scale_m": 0.001}'
         with reading(path / "info.json", "pairs of images", example):
-            info = json.loads((path / "info.json").read_text())
+            info = read_json(path / "info.json", "pairs of images", example)
             K, scale = np.asarray(info["K"], dtype=float), float(info["depth_scale_m"])
         if K.shape == (4,):
             K = np.array([[K[0], 0, K[2]], [0, K[1], K[3]], [0, 0, 1]])
@@ -92,28 +95,41 @@ class PairedImages(RecordingFormat):
 
 _ON_PLANE = 2.0  # disparity in 1/8 pixels of a Kinect: 6 mm at 1 m
 _COLOUR, _SUFFIXES = ("color", "image", "rgb", "colour"), (".png", ".jpg", ".jpeg")
-_INTRINSICS = ("intrinsic.json", "camera_intrinsic.json", "intrinsics.json")
+_DEPTH_SUFFIXES = (".png", ".npy", ".tif", ".tiff")
+_INTRINSICS = tuple(
+    f"{name}{suffix}"
+    for name in (
+        *("intrinsic", "camera_intrinsic", "intrinsics", "camera_intrinsics", "intrinsic_color", "camera_info"),
+        *("camera", "camera_matrix", "calibration", "calib", "cam_K", "K"),
+    )
+    for suffix in (".json", ".txt", ".yaml", ".yml")
+)
 
 
 @dataclass(frozen=True)
 class Redwood(VideoFormat):
-    """Redwood / Open3D: color/, depth/, intrinsic.json, and a trajectory .log if the camera moves.
+    """Folders rgb/ (or color/, colour/, image/) and depth/ with intrinsics: Redwood, Open3D, many recorders.
 
-    ``intrinsic.json`` (or ``camera_intrinsic.json``) is the file of Open3D: width, height, ``intrinsic_matrix``
-    column by column, and from its recorders ``depth_scale`` (units per metre) and ``fps``. A trajectory has five
-    lines per frame: three numbers, then a 4x4 camera-to-world matrix. Images are paired by the first number in their
-    names. Format: http://redwood-data.org/indoor/fileformat.html.
+    Intrinsics are read from a file beside the folders, such as ``intrinsics.json``, ``camera_info.yaml`` or
+    ``K.txt``, or given as ``K``. JSON holds ``fx``, ``fy``, ``cx`` (``ppx``), ``cy`` (``ppy``), or ``K``,
+    ``camera_matrix`` or ``cam_K`` (4 or 9 numbers row by row, or 3 x 3), or Open3D's ``intrinsic_matrix`` column by
+    column. YAML is that of ROS ``camera_info``. Text holds fx fy cx cy, or a 3 x 3 or 4 x 4 matrix. Images are paired
+    by the first number in their names, or by time if these are time stamps. Depth is PNG or TIFF of 16 bits, or
+    float in metres (.npy, .tif). A trajectory ``.log`` of a moving camera has five lines per frame: three numbers,
+    then a 4 x 4 camera-to-world matrix. Format of Redwood: http://redwood-data.org/indoor/fileformat.html.
 
     Further parameters: `VideoFormat`.
 
     Parameters
     ----------
     depth_scale : float
-        Metres per unit of 16-bit depth. Default: from ``intrinsic.json``, else 0.001.
+        Metres per unit of integer depth. Default: from the file of intrinsics, else 0.001.
     distortion : tuple of float
-        OpenCV's k1, k2, p1, p2, k3.
+        OpenCV's k1, k2, p1, p2, k3. Default: from YAML or JSON of ROS, else none.
     fps : float
-        Frames per second. Default: from ``intrinsic.json``, else 30; the layout stores no times.
+        Frames per second, if names are no time stamps. Default: from the file of intrinsics, else 30.
+    tolerance_s : float
+        Largest difference of the time stamps of a colour and a depth image of one frame.
     moving : bool
         Use the trajectory, if there is one.
     """
@@ -121,109 +137,195 @@ class Redwood(VideoFormat):
     depth_scale: float = 0.0
     distortion: tuple[float, ...] = ()
     fps: float = 0.0
+    tolerance_s: float = 0.02
     moving: bool = True
 
     @classmethod
     def detects(cls, path: Path) -> bool:
-        known = any((path / name).is_file() for name in _INTRINSICS) or any(path.glob("*.log"))
-        folders = _COLOUR if known else _COLOUR[:2]  # rgb/ and depth/ occur in other layouts, too
-        return (path / "depth").is_dir() and any((path / name).is_dir() for name in folders)
+        if not (path / "depth").is_dir() or _is_recording(path) or (path / "scene_camera.json").is_file():
+            return False
+        folders = tuple(name for name in _COLOUR if name != "rgb" or not (path / "rgb.txt").is_file())
+        return any((path / name).is_dir() for name in folders)
 
     def open(self, path: Path) -> Recording:
         folder = next((path / name for name in _COLOUR if (path / name).is_dir()), path / _COLOUR[0])
-        colour, depth = _numbered(folder), _numbered(path / "depth")
-        if len(colour) != len(depth):
-            raise InputError(
-                f"{path}: there are {len(colour)} colour images and {len(depth)} depth images",
-                f"each frame needs both; {folder.name}/ ends with {colour[-1].name}, depth/ with {depth[-1].name}",
-            )
-        for a, b in zip(colour, depth, strict=True):
-            if _number(a) != _number(b):
-                raise InputError(
-                    f"{path}: colour image {a.name} does not fit depth image {b.name}",
-                    "an image is missing, or the two are numbered differently; rename one side to match",
-                )
-
+        colour, depth = _images(folder, _SUFFIXES), _images(path / "depth", _DEPTH_SUFFIXES)
+        pairs, stamps = _paired(path, colour, depth, self.tolerance_s)
         logs = sorted(path.glob("*.log")) if self.moving else []
         if len(logs) > 1:
             raise InputError(
                 f"{path} has {len(logs)} trajectories: {', '.join(p.name for p in logs)}", "remove all but one"
             )
-        scale = self.depth_scale or 1 / _stored(path, "depth_scale", 1000)
-        fps = self.fps or _stored(path, "fps", 30)
+        file, stored = _read_intrinsics(path)
+        K = self.K or _stored_matrix(path, file, stored)
+        scale = self.depth_scale or 1 / _stored(file, stored, "depth_scale", 1000)
+        fps = self.fps or _stored(file, stored, "fps", 30)
         video = Video(
             path.resolve().name,
-            tuple(k / fps for k in range(len(colour))),
-            lambda index: read_rgb(colour[index]),
-            lambda index: read_depth(depth[index], scale),
-            self.K or _intrinsics(path),
+            stamps or tuple(k / fps for k in range(len(pairs))),
+            lambda index: read_rgb(pairs[index][0]),
+            lambda index: read_depth(pairs[index][1], scale),
+            K,
             path,
             scale,
-            motion=_trajectory(logs[0], len(colour)) if logs else None,
-            distortion=self.distortion,
+            motion=_trajectory(logs[0], len(pairs)) if logs else None,
+            distortion=self.distortion or tuple(stored.get("distortion", ())),
         )
         for name, n in zip(("height", "width"), video.read_rgb(0).shape, strict=False):
-            if not self.K and _stored(path, name, n) != n:
+            if not self.K and _stored(file, stored, name, n) != n:
                 raise InputError(
-                    f"{_open3d_file(path)} is for images of another {name}: the images have {n}",
+                    f"{file} is for images of another {name}: the images have {n}",
                     "scale the intrinsics, or give them: K=fx,fy,cx,cy",
                 )
         return self.recording_of(video)
 
 
-def _numbered(folder: Path) -> list[Path]:
-    """Images of a folder, ordered by the first number in their names."""
+def _is_recording(path: Path) -> bool:
+    """Whether a folder has the files of a recording folder, whose camera.json holds more than intrinsics."""
+    camera = path / "camera.json"
+    ours = camera.is_file() and '"workspace"' in camera.read_text(encoding="utf-8", errors="ignore")
+    return ours or (path / "manifest.json").is_file()
+
+
+def _images(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
+    """Images of a folder, ordered by the numbers in their names."""
     if not folder.is_dir():
-        raise InputError(f"not a Redwood folder: {folder} is missing", "it holds color/ and depth/")
-    files = [p for p in folder.iterdir() if p.suffix.lower() in _SUFFIXES and not p.name.startswith(".")]
+        raise InputError(f"not a folder of colour and depth images: {folder} is missing", "it holds rgb/ and depth/")
+    files = [p for p in folder.iterdir() if p.suffix.lower() in suffixes and not p.name.startswith(".")]
     if not files:
-        raise InputError(f"{folder} has no image", f"expected {', '.join(_SUFFIXES)}")
-    return sorted(files, key=lambda file: (_number(file), file.name))
+        raise InputError(f"{folder} has no image", f"expected {', '.join(suffixes)}")
+    for position in (0, -1):
+        numbers = {file: _number(file, position) for file in files}
+        if len(set(numbers.values())) == len(files):
+            return sorted(files, key=numbers.__getitem__)
+    raise InputError(
+        f"{folder}: names of images have no numbers that differ: {', '.join(sorted(p.name for p in files)[:3])}",
+        "name them 000000, 000001, ..., or by time in seconds",
+    )
 
 
-def _number(file: Path) -> int:
-    """The first number in the name; -1 if there is none."""
-    found = re.search(r"\d+", file.stem)
-    return int(found.group()) if found else -1
+def _number(file: Path, position: int) -> Decimal:
+    """The first (0) or the last (-1) number in a name; -1 if there is none."""
+    found = re.findall(r"\d+(?:\.\d+)?", file.stem)
+    return Decimal(found[position] if found else -1)
 
 
-def _open3d_file(path: Path) -> Path | None:
-    return next((path / name for name in _INTRINSICS if (path / name).is_file()), None)
+def _paired(
+    path: Path, colour: list[Path], depth: list[Path], tolerance_s: float
+) -> tuple[list[tuple[Path, Path]], tuple[float, ...]]:
+    """Pairs of files, and the time of each in seconds; no times if names are frame numbers."""
+    numbers = [[_number(file, 0) for file in files] for files in (colour, depth)]
+    seconds = [[_seconds(number) for number in side] for side in numbers]
+    if all(value is not None for side in seconds for value in side):
+        stamps = [[float(value - seconds[0][0]) for value in side] for side in seconds]  # type: ignore[operator]
+        chosen = pair_stamps(stamps[0], stamps[1], tolerance_s, str(path))
+        return [(colour[i], depth[j]) for i, j in chosen], tuple(stamps[0][i] for i, _ in chosen)
+    if len(colour) != len(depth):
+        raise InputError(
+            f"{path}: there are {len(colour)} colour images and {len(depth)} depth images",
+            f"each frame needs both; colour ends with {colour[-1].name}, depth with {depth[-1].name}",
+        )
+    for a, b, first, second in zip(colour, depth, *numbers, strict=True):
+        if first != second:
+            raise InputError(
+                f"{path}: colour image {a.name} does not fit depth image {b.name}",
+                "an image is missing, or the two are numbered differently; rename one side to match",
+            )
+    return list(zip(colour, depth, strict=True)), ()
 
 
-def _stored(path: Path, name: str, default: float) -> float:
-    """A number from 1 of Open3D's file: ``depth_scale`` (units per metre), ``fps``, ``width`` or ``height``."""
-    file = _open3d_file(path)
+def _seconds(number: Decimal) -> Decimal | None:
+    """A time stamp in seconds: a fraction, or an integer of the present time in s, ms, us or ns; else None."""
+    if number != number.to_integral_value() or number.as_tuple().exponent != 0:
+        return number
+    unit = next((unit for unit in (1, 10**3, 10**6, 10**9) if 10**9 <= number / unit < 10**10), None)
+    return None if unit is None else number / unit
+
+
+def _read_intrinsics(path: Path) -> tuple[Path | None, dict[str, Any]]:
+    """The file of intrinsics and its entries; a file of text or YAML has ``K`` (and ``distortion``)."""
+    file = next((path / name for name in _INTRINSICS if (path / name).is_file()), None)
     if file is None:
-        return default
-    with reading(file, "a file of Open3D"):
-        value = json.loads(file.read_text()).get(name, default)
+        return None, {}
+    with reading(file, "a file of intrinsics"):
+        if file.suffix == ".json":
+            stored = read_json(file, "a file of intrinsics")
+            if not isinstance(stored, dict):
+                stored = {"K": stored}
+            for name in ("color", "colour", "rgb", "intrinsics"):
+                inner = stored.get(name)
+                stored = {**stored, **inner} if isinstance(inner, dict) else stored
+            return file, stored
+        text = re.sub(r"(#|%).*", "", read_text(file, "a file of intrinsics"))
+        return file, {"K": _numbers(text)} if file.suffix == ".txt" else _camera_info(text)
+
+
+def _numbers(text: str) -> list[float]:
+    return [float(word) for word in re.findall(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?", text)]
+
+
+def _camera_info(text: str) -> dict[str, Any]:
+    """``K``, size and ``distortion`` of YAML as ROS and OpenCV write it, in ``camera_matrix``, ``K`` or ``k``."""
+
+    def entry(names: str) -> list[float]:
+        found = re.search(rf"(?ms)^(?:{names})\s*:(.*?)(?=^[A-Za-z_]|\Z)", text)
+        return _numbers(re.sub(r"(?s).*data\s*:", "", found.group(1))) if found else []
+
+    sizes = {name: entry(f"image_{name}|{name}") for name in ("width", "height")}
+    found: dict[str, Any] = {name: value[0] for name, value in sizes.items() if value}
+    return found | {"K": entry("camera_matrix|K|k"), "distortion": entry("distortion_coefficients|D|d")}
+
+
+def _stored(file: Path | None, stored: dict[str, Any], name: str, default: float) -> float:
+    """A number from 1 of the file of intrinsics."""
+    value = stored.get(name, default)
     check_number(f"{file}: {name}", value, f"give it: {name}=VALUE", at_least=1)
     return float(value)
 
 
-def _intrinsics(path: Path) -> tuple[float, ...]:
-    """fx, fy, cx, cy from Open3D's file."""
-    file = _open3d_file(path)
+def _stored_matrix(path: Path, file: Path | None, stored: dict[str, Any]) -> tuple[float, ...]:
+    """fx, fy, cx, cy of the file of intrinsics."""
     if file is None:
         raise InputError(
-            f"{path}: intrinsics are missing, there is no {_INTRINSICS[0]}",
-            "give them: K=fx,fy,cx,cy (the default of Redwood is 525,525,319.5,239.5)",
+            f"{path}: intrinsics are missing, there is no intrinsics.json, camera_info.yaml or K.txt",
+            "give them: -o K=fx,fy,cx,cy (the default of Redwood is 525,525,319.5,239.5)",
         )
-    with reading(file, "a file of Open3D"):
-        matrix = np.reshape(np.asarray(json.loads(file.read_text())["intrinsic_matrix"], dtype=float), (3, 3)).T
+    hint = "expected fx, fy, cx, cy, or K row by row, or intrinsic_matrix of Open3D column by column; or give K"
+    with reading(file, "a file of intrinsics", hint):
+        if "fx" in stored:
+            values: Sequence[float] = [stored[name] for name in ("fx", "fy")]
+            values = [*values, *(stored[a] if a in stored else stored[b] for a, b in (("cx", "ppx"), ("cy", "ppy")))]
+        else:
+            names = ("intrinsic_matrix", "K", "k", "camera_matrix", "cam_K", "intrinsics")
+            name = next((name for name in names if name in stored), names[0])
+            found = stored[name]["data"] if isinstance(stored[name], dict) else stored[name]
+            values = _four(np.asarray(found, float), name == "intrinsic_matrix")
+        K = tuple(float(value) for value in values)
+    for name, value in zip(("fx", "fy", "cx", "cy"), K, strict=True):
+        check_number(f"{file}: {name}", value, hint, above=0)
+    return K
+
+
+def _four(K: np.ndarray, by_columns: bool) -> Sequence[float]:
+    """fx, fy, cx, cy of 4 numbers, or of a 3 x 3 or 4 x 4 matrix, flat or not; `by_columns`: flat ones by columns."""
+    if K.size == 4:
+        return [float(v) for v in K.ravel()]
+    side = {9: 3, 16: 4}.get(K.size)
+    if side is None:
+        raise ValueError(f"the matrix has {K.size} numbers, expected 4, 9 or 16")
+    matrix = K.reshape(side, side)
+    matrix = (matrix.T if by_columns and K.ndim == 1 else matrix)[:3, :3]
     if not np.allclose(matrix[2], (0, 0, 1)):
-        raise InputError(
-            f"{file}: intrinsic_matrix is {matrix.T.ravel().tolist()}, expected 9 numbers column by column",
-            "fx 0 0 0 fy 0 cx cy 1",
-        )
-    return float(matrix[0, 0]), float(matrix[1, 1]), float(matrix[0, 2]), float(matrix[1, 2])
+        order = "column by column" if by_columns else "row by row: fx 0 cx, 0 fy cy, 0 0 1"
+        raise ValueError(f"the matrix is {K.tolist()}, expected {order}")
+    return [float(matrix[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2))]
 
 
 def _trajectory(path: Path, n: int) -> list[RigidTransform]:
     """Camera-to-world poses of a .log file, one per frame."""
     with reading(path, "a trajectory", "or ignore it: moving=false"):
-        rows = [[float(v) for v in line.split()] for line in path.read_text().splitlines() if line.strip()]
+        lines = read_text(path, "a trajectory").splitlines()
+        rows = [[float(v) for v in line.split()] for line in lines if line.strip()]
     if len(rows) != 5 * n or any(len(row) != (3 if k % 5 == 0 else 4) for k, row in enumerate(rows)):
         raise InputError(
             f"trajectory {path} has {len(rows)} lines for {n} frames, expected five per frame: 3 numbers, then 4 x 4",
@@ -267,6 +369,9 @@ class Tum(VideoFormat):
                 f"{path}: intrinsics are missing, TUM folders do not store them",
                 "give them: K=fx,fy,cx,cy (the default of TUM is 525,525,319.5,239.5)",
             )
+        outside = [row[1] for row in (*colour, *depth) if Path(row[1]).is_absolute() or ".." in Path(row[1]).parts]
+        if outside:
+            raise InputError(f"{path}: image {outside[0]} is outside the folder", "names are relative to the folder")
         stamps = [[float(row[0]) for row in table] for table in (colour, depth)]
         pairs = pair_stamps(stamps[0], stamps[1], self.tolerance_s, str(path))
 
@@ -288,8 +393,7 @@ class Tum(VideoFormat):
 
 def _table(path: Path, columns: int) -> list[list[str]]:
     """Rows of a text file without comments."""
-    with reading(path, "a TUM folder", "it holds rgb.txt and depth.txt"):
-        lines = path.read_text().splitlines()
+    lines = read_text(path, "a TUM folder", "it holds rgb.txt and depth.txt").splitlines()
     rows = []
     for number, line in enumerate(lines, 1):
         words = line.partition("#")[0].replace(",", " ").split()

@@ -19,6 +19,7 @@ from typing import NoReturn
 import numpy as np
 
 from mstfilter.errors import InputError
+from mstfilter.reading import MAX_WEIGHTS, read_bytes
 
 _VARINT, _FIXED64, _BYTES, _FIXED32 = 0, 1, 2, 5  # wire types
 _MAX_AXES = 32  # Caffe's own limit
@@ -34,10 +35,7 @@ def read_caffemodel(path: str | Path) -> dict[str, tuple[np.ndarray, ...]]:
     Raises InputError if the file is missing, truncated or no Caffe model.
     """
     path = Path(path)
-    try:
-        data = memoryview(path.read_bytes())
-    except OSError as error:
-        raise InputError(f"weights cannot be read: {path} ({error.strerror})", "give the path of a file") from error
+    data = memoryview(read_bytes(path, "weights", "give the path of a file", limit=MAX_WEIGHTS))
     found: dict[str, tuple[np.ndarray, ...]] = {}
     try:
         for number, value in _fields(data):

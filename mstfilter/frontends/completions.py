@@ -22,8 +22,6 @@ from __future__ import annotations
 
 import copy
 import io
-import zipfile
-import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -34,8 +32,10 @@ import numpy as np
 from mstfilter.completion import ClipCompleter, Completer, Completion, ObservedBox, observed_box
 from mstfilter.completion.observed import frame_points
 from mstfilter.errors import InputError, check_choice, check_number
-from mstfilter.frontends.mask_files import read_bytes, read_weights
+from mstfilter.files import reading
+from mstfilter.frontends.mask_files import read_weights
 from mstfilter.open3d_import import import_open3d
+from mstfilter.reading import MAX_FILE, read_bytes, unpack_arrays
 from mstfilter.scene import (
     Camera,
     Clip,
@@ -53,7 +53,6 @@ from mstfilter.scene import (
 _MESHES = (".ply", ".obj", ".stl", ".off")
 _MASK = "mask.png"
 _WEIGHTS = "weights.json"
-_MAX_BYTES = 2**31  # of an unpacked npz file
 #: Directions of the rays of the inside test; not along the axes, so that they miss edges of axis-parallel meshes.
 _RAYS = np.array([[1.0, 1.1e-4, 1.7e-4], [1.3e-4, 1.0, 0.7e-4], [0.9e-4, 1.9e-4, 1.0]], np.float32)
 
@@ -164,7 +163,7 @@ class ExternalCompletion(ClipCompleter, UsesFiles):
 
     def _volume(self, path: Path, camera: Camera, grid: VoxelGrid) -> np.ndarray:
         """Occupancy (X, Y, Z) float32 of a shape in the grid, placed once."""
-        data = read_bytes(path)
+        data = read_bytes(path, "a shape")
         T = camera.pose.as_matrix() if self.axes == "camera" else np.eye(4)
         key = (content_key(path.suffix, data, T), grid.key)
         return memo("external_shape", key, lambda: place_shape(path, data, T, grid))
@@ -254,17 +253,8 @@ def _checked(path: Path, points: np.ndarray, T: np.ndarray, grid: VoxelGrid) -> 
 
 
 def _arrays(path: Path, data: bytes) -> dict[str, np.ndarray]:
-    try:
-        with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            size = sum(entry.file_size for entry in archive.infolist())
-        if size > _MAX_BYTES:
-            raise ValueError(f"{size} bytes when unpacked, at most {_MAX_BYTES} are read")
-        with np.load(io.BytesIO(data), allow_pickle=False) as archive:
-            arrays = {name: archive[name] for name in archive.files}
-    except (zipfile.BadZipFile, ValueError, EOFError, OSError, zlib.error, AttributeError) as error:
-        raise InputError(
-            f"file of a shape cannot be read: {path} ({error})", "expected arrays of numbers from numpy.savez"
-        ) from error
+    with reading(path, "a shape", "expected arrays of numbers from numpy.savez"):
+        arrays = unpack_arrays(io.BytesIO(data), MAX_FILE)
     if "points" not in arrays and not {"occupancy", "origin", "voxel_size"} <= set(arrays):
         raise InputError(f"{path} has {', '.join(arrays)}; expected points, or occupancy, origin and voxel_size")
     return arrays

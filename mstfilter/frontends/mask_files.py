@@ -30,8 +30,6 @@ from __future__ import annotations
 import io
 import json
 import math
-import zipfile
-import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -40,13 +38,13 @@ from typing import Any
 import numpy as np
 
 from mstfilter.errors import InputError, naming
-from mstfilter.files import atomic_folder, reading, write_text
+from mstfilter.files import atomic_folder, locked, reading, write_text
 from mstfilter.frontends.mask_trees import label_tree, mask_tree
+from mstfilter.reading import MAX_FILE, read_bytes, read_json, unpack_arrays
 from mstfilter.scene import content_key, memo, read_labels
 from mstfilter.segmentation import Tree
 
 MAX_MASKS = 65535  #: Largest label, and largest number of masks of a file
-MAX_PIXELS = 2**31  #: Largest number of pixels of all masks of a file
 _SUFFIXES = (".png", ".npz", ".json")
 _WEIGHTS = "weights.json"
 
@@ -92,7 +90,7 @@ def read_masks(folder: str | Path, pause: int, shape: tuple[int, int], rgb: np.n
         )
     groups = {name: [p] if p.is_file() else _alternatives(p) for name, p in parts.items()}
     groups = groups or {"": _alternatives(where)}
-    content = {p: read_bytes(p) for group in groups.values() for p in group}
+    content = {p: read_bytes(p, "masks") for group in groups.values() for p in group}
     weights = {name: read_weights(group[0].parent, group) for name, group in groups.items() if len(group) > 1}
     image = "" if rgb is None else image_key(rgb)
     key = content_key(
@@ -156,20 +154,12 @@ def _alternatives(folder: Path) -> list[Path]:
     return files
 
 
-def read_bytes(path: Path) -> bytes:
-    """The content of a file; raises InputError if it cannot be read."""
-    try:
-        return path.read_bytes()
-    except OSError as error:
-        raise InputError(f"file cannot be read: {path} ({error.strerror})") from error
-
-
 def read_weights(folder: Path, files: list[Path]) -> dict[str, float] | None:
     """The content of weights.json, if there is one."""
     path = folder / _WEIGHTS
     if not path.is_file():
         return None
-    weights = _json(path, read_bytes(path))
+    weights = read_json(path, "weights")
     names = {p.name for p in files}
     if not isinstance(weights, dict) or set(weights) != names:
         raise InputError(f"{path} does not have one weight for each of {', '.join(sorted(names))}")
@@ -247,8 +237,8 @@ def _check_shape(path: Path, found: Sequence[int], shape: tuple[int, int]) -> No
 
 def _check_amount(path: Path, n: int, shape: tuple[int, int]) -> None:
     """Raise InputError if masks need too much memory; a small file can hold many empty ones."""
-    if n * shape[0] * shape[1] > MAX_PIXELS:
-        raise InputError(f"{path} has {n} masks, at most {MAX_PIXELS // (shape[0] * shape[1])} of this size are read")
+    if n * shape[0] * shape[1] > MAX_FILE:
+        raise InputError(f"{path} has {n} masks, at most {MAX_FILE // (shape[0] * shape[1])} of this size are read")
 
 
 def _read_png(path: Path, data: bytes, shape: tuple[int, int], image: str) -> tuple[np.ndarray, np.ndarray]:
@@ -258,66 +248,35 @@ def _read_png(path: Path, data: bytes, shape: tuple[int, int], image: str) -> tu
 
 
 def _read_npz(path: Path, data: bytes, shape: tuple[int, int], image: str) -> tuple[np.ndarray, np.ndarray]:
-    try:
-        with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            names = {name.removesuffix(".npy") for name in archive.namelist()}
-            kind = "labels" if "labels" in names else "masks"
-            if kind not in names:
-                raise InputError(f"{path} has no array labels or masks, only {', '.join(sorted(names)) or 'nothing'}")
-            size, dtype = _header(archive, kind)
-            # The size is checked before memory is allocated for it.
-            if len(size) != (2 if kind == "labels" else 3):
-                raise InputError(
-                    f"{path}: {kind} has shape {size}, expected {'(H, W)' if kind == 'labels' else '(n, H, W)'}"
-                )
-            _check_shape(path, size[-2:], shape)
-            if kind == "masks" and (dtype.kind != "b" or size[0] > MAX_MASKS):
-                raise InputError(
-                    f"{path}: masks has type {dtype} and length {size[0]}, expected bool, at most {MAX_MASKS}"
-                )
-            _check_amount(path, int(np.prod(size[:-2], dtype=np.int64)), shape)
-            masks = _member(archive, kind)
-            if kind == "labels":
-                if not np.issubdtype(masks.dtype, np.integer):
-                    raise InputError(f"{path}: labels has type {masks.dtype}, expected integers")
-                if masks.min(initial=0) < 0 or masks.max(initial=0) > MAX_MASKS:
-                    raise InputError(
-                        f"{path}: labels are {masks.min()} to {masks.max()}, expected 0 to {MAX_MASKS}",
-                        "labels have 16 bits; number the masks from 1",
-                    )
-            n = len(masks) if kind == "masks" else len(np.unique(masks[masks > 0]))
-            scores = _member(archive, "scores", MAX_MASKS) if "scores" in names else np.ones(n)
-            made_from = str(_member(archive, "image", 1)) if "image" in names else image
-    except (zipfile.BadZipFile, ValueError, EOFError, OSError, zlib.error, KeyError) as error:
-        if isinstance(error, InputError):
-            raise
+    with reading(path, "masks", "expected arrays of numbers from numpy.savez; objects (pickle) are not read"):
+        arrays = unpack_arrays(io.BytesIO(data), MAX_FILE)
+    kind = "labels" if "labels" in arrays else "masks"
+    if kind not in arrays:
+        raise InputError(f"{path} has no array labels or masks, only {', '.join(sorted(arrays)) or 'nothing'}")
+    masks = arrays[kind]
+    if masks.ndim != (2 if kind == "labels" else 3):
         raise InputError(
-            f"file of masks cannot be read: {path} ({error})",
-            "expected arrays of numbers from numpy.savez; objects (pickle) are not read",
-        ) from error
-    if image and made_from != image:
+            f"{path}: {kind} has shape {masks.shape}, expected {'(H, W)' if kind == 'labels' else '(n, H, W)'}"
+        )
+    _check_shape(path, masks.shape[-2:], shape)
+    if kind == "masks" and (masks.dtype.kind != "b" or len(masks) > MAX_MASKS):
+        raise InputError(
+            f"{path}: masks has type {masks.dtype} and length {len(masks)}, expected bool, at most {MAX_MASKS}"
+        )
+    if kind == "labels" and not np.issubdtype(masks.dtype, np.integer):
+        raise InputError(f"{path}: labels has type {masks.dtype}, expected integers")
+    if kind == "labels" and (masks.min(initial=0) < 0 or masks.max(initial=0) > MAX_MASKS):
+        raise InputError(
+            f"{path}: labels are {masks.min()} to {masks.max()}, expected 0 to {MAX_MASKS}",
+            "labels have 16 bits; number the masks from 1",
+        )
+    n = len(masks) if kind == "masks" else len(np.unique(masks[masks > 0]))
+    scores = arrays.get("scores", np.ones(n))
+    if image and str(arrays.get("image", image)) != image:
         raise InputError(f"masks of {path} were made from another image", "files are numbered by pause, from 0")
     if not np.issubdtype(scores.dtype, np.number):
         raise InputError(f"{path}: scores has type {scores.dtype}, expected numbers")
     return masks, scores
-
-
-def _header(archive: zipfile.ZipFile, name: str) -> tuple[tuple[int, ...], np.dtype[Any]]:
-    """Shape and type of an array in an npz file."""
-    with archive.open(f"{name}.npy") as file:
-        read = np.lib.format.read_array_header_1_0
-        if np.lib.format.read_magic(file) != (1, 0):
-            read = np.lib.format.read_array_header_2_0
-        shape, _, dtype = read(file)
-    return shape, dtype
-
-
-def _member(archive: zipfile.ZipFile, name: str, limit: int | None = None) -> np.ndarray:
-    """An array of an npz file, with at most `limit` elements."""
-    if limit is not None and math.prod(_header(archive, name)[0]) > limit:
-        raise ValueError(f"{name} has more than {limit} elements")
-    with archive.open(f"{name}.npy") as file:
-        return np.asarray(np.lib.format.read_array(file, allow_pickle=False))
 
 
 def _json(path: Path, data: bytes) -> Any:
@@ -418,8 +377,7 @@ def write_masks(
         raise InputError(
             f"there are {len(alternatives)} alternatives and {given} weights, expected at least 1 of each"
         )
-    with atomic_folder(path) as partial:
-        partial.mkdir(parents=True)
+    with locked(path), atomic_folder(path, "replace") as partial:
         for k, one in enumerate(alternatives):
             masks, scores = one if isinstance(one, tuple) else (one, None)
             masks = np.asarray(masks)
@@ -430,7 +388,8 @@ def write_masks(
                 arrays["image"] = np.array(image_key(rgb))
             name = partial / f"{k}.npz"
             np.savez_compressed(name, **arrays)  # type: ignore[arg-type]
-            _region("", [name], {name: read_bytes(name)}, None, masks.shape[-2:], "")  # the checks of the reader
+            content = {name: read_bytes(name, "masks")}
+            _region("", [name], content, None, masks.shape[-2:], "")  # the checks of the reader
         if weights is not None:
             write_text(partial / _WEIGHTS, json.dumps({f"{k}.npz": float(w) for k, w in enumerate(weights)}))
             read_weights(partial, _alternatives(partial))

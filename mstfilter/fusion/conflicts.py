@@ -119,6 +119,7 @@ def check_grid(name: str, hypothesis: Hypothesis, grid: VoxelGrid) -> None:
         raise InputError(
             f"grid of {name} is {found}, expected {expected}",
             "all hypotheses of a run share the workspace of its clips",
+            "parts of one session: open the later part with later.in_world_of(first)",
         )
 
 

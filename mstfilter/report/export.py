@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 
 from mstfilter.errors import InputError, check_choice
-from mstfilter.files import atomic_path, write_csv
+from mstfilter.files import atomic_path, write_csv, writing
 from mstfilter.open3d_import import import_open3d
 from mstfilter.report.identities import assign_identities
 from mstfilter.report.pictures import UNASSIGNED_COLOUR, Colour, colour, hexadecimal
@@ -136,16 +136,14 @@ def export_run(
     check_choice("mesh_format", mesh_format, MESH_FORMATS)
     check_choice("mesh_style", mesh_style, MESH_STYLES)
     import_open3d()  # a missing library is reported before anything is written
-    run = run if isinstance(run, RunFolder) else RunFolder.open(run)
+    run = (run if isinstance(run, RunFolder) else RunFolder.open(run)).check()
     identities = assign_identities(run)
     paths: list[Path] = []
     rows: list[dict[str, object]] = []
     for t in range(run.n_pauses):
         folder, camera, weights = Path(out) / f"pause_{t:03d}", run.camera(t), run.info(t)["weights"]
-        try:
+        with writing(f"exports to {out}", "choose another folder"):
             folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise InputError(f"cannot write exports to {out}: {error.strerror}", "choose another folder") from error
         for k, hypothesis in enumerate(run.hypotheses(t)):
             colours, volumes = identities.colours(t, k), hypothesis.volumes()
             image = folder / f"hypothesis_{k:03d}.png"

@@ -51,7 +51,8 @@ def _style(name: str) -> Iterator[None]:
     """The style of the project; `name` makes the ids of the elements of a figure unique in a page."""
     import matplotlib.style
 
-    with matplotlib.style.context("mstfilter.report.figures"), matplotlib.rc_context({"svg.hashsalt": name}):
+    style = matplotlib.style.context("mstfilter.report.figures", after_reset=True)  # without the user's matplotlibrc
+    with style, matplotlib.rc_context({"svg.hashsalt": name}):
         yield
 
 

@@ -16,8 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from mstfilter.errors import InputError
-from mstfilter.files import write_text
+from mstfilter.files import write_text, writing
 
 _LONGEST = 6  # lists up to this length are written in full
 
@@ -41,10 +40,8 @@ def fill_template(template: str, filters: Mapping[str, Callable[..., Any]], **co
 
 def write_page(path: Path, text: str) -> Path:
     """Write a page; raises InputError if the file cannot be written."""
-    try:
+    with writing(f"report {path}", "choose another file"):
         write_text(path, text)
-    except OSError as error:
-        raise InputError(f"cannot write report {path}: {error.strerror}", "choose another file") from error
     return path
 
 

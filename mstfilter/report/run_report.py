@@ -37,6 +37,7 @@ from mstfilter.report.page import (
 from mstfilter.report.pictures import close_up, data_uri, jpeg_bytes, viewpoint
 from mstfilter.report.viewer import run_page
 from mstfilter.runs import RunFolder
+from mstfilter.runs.scoring import PauseEstimate, PauseScore, PauseTruth, score_pauses
 from mstfilter.scene import project, render
 from mstfilter.scoring import (
     MIN_PIXELS,
@@ -68,6 +69,7 @@ class PauseNumbers:
     n_distinct: int  #: number of distinct hypotheses
     metrics: Mapping[str, float] | None  #: of `mstfilter.scoring.pause_metrics`; None without ground truth
     in_image: float | None  #: mean quality of the outlines in the image; None without ground truth
+    image_score: PauseScore | None  #: scores in the image, with floors; None with true volumes or without true image
     compared: Mapping[str, float]  #: mean quality of the compared runs, where it is known
     compared_losses: Mapping[str, float]  #: log loss of the compared runs in nats, where it is known
     belief: BeliefScore | None  #: scores of the weighted set; None without ground truth
@@ -171,6 +173,11 @@ class RunNumbers:
         return [t for t, step in enumerate(self.steps) if step.quality is not None]
 
     @property
+    def with_images(self) -> list[int]:
+        """Pauses whose quality is known in the image only."""
+        return [t for t, step in enumerate(self.steps) if step.image_score is not None]
+
+    @property
     def compared(self) -> list[str]:
         """Names of the compared runs whose quality is known."""
         return list(dict.fromkeys(name for step in self.steps for name in step.compared))
@@ -224,6 +231,12 @@ class RunNumbers:
             )
             if last.mean <= max(last.baselines.values()) + 0.005:
                 sentences.append("That is no better than the baselines.")
+        if last.image_score is not None:
+            one = last.image_score
+            sentences.append(
+                f"In the image, where hidden parts do not count, their mean quality is {one.mean:.2f} of 1. Trivial "
+                f"baselines: one blob {one.one_blob:.2f}, connected components {one.components:.2f}."
+            )
         if last.belief is not None:
             sentences.append(
                 "Asked whether two voxels belong to one object, the weighted set has a log loss of "
@@ -276,6 +289,9 @@ class RunNumbers:
             tiles.append(
                 ("mean quality", f"{last.mean:.3f}", f"best {last.best:.3f}, in the image {last.in_image:.3f}")
             )
+        if last.image_score is not None:
+            one = last.image_score
+            tiles.append(("quality in the image", f"{one.mean:.3f}", f"best {one.best:.3f}"))
         if last.belief is not None:
             row = last.belief.row
             remark = (
@@ -338,6 +354,7 @@ def read_numbers(run: RunFolder) -> RunNumbers:
                 n_distinct=len({h.key for h in hypotheses}),
                 metrics=metrics,
                 in_image=in_image,
+                image_score=None if truth is not None else _image_score(run, t),
                 compared=beside,
                 compared_losses=losses,
                 belief=belief,
@@ -346,6 +363,17 @@ def read_numbers(run: RunFolder) -> RunNumbers:
             )
         )
     return RunNumbers(description, tuple(steps))
+
+
+def _image_score(run: RunFolder, t: int) -> PauseScore | None:
+    """Scores of pause `t` in the image, in the form ``objects``; None without a true label image."""
+    image = run.instance(t)
+    if image is None:
+        return None
+    hypotheses, weights = run.hypotheses(t), np.asarray(run.info(t)["weights"], dtype=float)
+    estimate = PauseEstimate([h.labels for h in hypotheses], weights, t, hypotheses[0].grid)
+    scores = score_pauses([estimate], [PauseTruth(image, t, camera=run.camera(t))])
+    return next(score for score in scores if score.form == "objects")
 
 
 def write_report(
@@ -358,7 +386,7 @@ def write_report(
     """
     from markupsafe import Markup
 
-    run = RunFolder.open(run.path if isinstance(run, RunFolder) else run)
+    run = RunFolder.open(run.path if isinstance(run, RunFolder) else run).check()
     numbers = read_numbers(run) if numbers is None else numbers
     filters: dict[str, Callable[..., Any]] = {
         "short_text": short_text,

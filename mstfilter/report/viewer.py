@@ -106,7 +106,7 @@ def show_hypothesis(hypothesis: Hypothesis, title: str = "") -> ScenePage:
 
 def run_page(run: RunFolder | str | Path, *, photos: bool = True, head: bool = True) -> ScenePage:
     """All pauses of a run as a page; without `photos` voxels only, without `head` no title."""
-    run = run if isinstance(run, RunFolder) else RunFolder.open(run)
+    run = (run if isinstance(run, RunFolder) else RunFolder.open(run)).check()
     description = run.description
     title = str(description["recording"]["name"])
     return _page(scenes_of_run(run), title, str(description["description"]), photos=photos, head=head)
@@ -114,7 +114,8 @@ def run_page(run: RunFolder | str | Path, *, photos: bool = True, head: bool = T
 
 def recording_page(recording: Recording) -> ScenePage:
     """The pauses of a recording as a page: image and truth, or the surface that the camera sees."""
-    note = f"{len(recording)} frames, {len(recording.pauses)} pauses"
+    counts = {"frame": len(recording), "pause": len(recording.pauses)}
+    note = ", ".join(f"{n} {name}{'s' * (n != 1)}" for name, n in counts.items())
     return _page(scenes_of_recording(recording), recording.name, note)
 
 
@@ -252,7 +253,7 @@ def save_rerun(source: RunFolder | Recording, path: str | Path) -> Path:
     """
     rr = import_rerun()
     check_output(Path(path))
-    scenes = scenes_of_run(source) if isinstance(source, RunFolder) else scenes_of_recording(source)
+    scenes = scenes_of_run(source.check()) if isinstance(source, RunFolder) else scenes_of_recording(source)
     with atomic_path(path) as partial:
         name = source.description["recording"]["name"] if isinstance(source, RunFolder) else source.name
         with rr.RecordingStream(f"mstfilter {name}", recording_id=uuid.uuid4(), send_properties=False) as stream:
@@ -273,7 +274,8 @@ def show_rerun(path: str | Path) -> None:
     """
     import_rerun()
     environment = {k: v for k, v in os.environ.items() if k != "FORCE_RERUN_ANALYTICS"} | {"CI": "1"}
-    command = [sys.executable, "-m", "rerun_cli", str(path), "--bind", "127.0.0.1", "--port", "auto"]
+    # -P: the module is not searched in the working folder, which may be that of a stranger.
+    command = [sys.executable, "-P", "-m", "rerun_cli", str(path), "--bind", "127.0.0.1", "--port", "auto"]
     done = subprocess.run(command, env=environment)
     if done.returncode:
         raise InputError(
@@ -286,7 +288,7 @@ def import_rerun() -> Any:
     """The library rerun."""
     try:
         import rerun
-        import rerun.blueprint
+        import rerun.blueprint  # noqa: F401
     except ImportError as error:
         raise MissingLibraryError(
             f"the viewer needs the library rerun-sdk, which cannot be imported ({error})",

@@ -8,6 +8,7 @@ from mstfilter.runs.run import (
     library_versions as library_versions,
 )
 from mstfilter.runs.run_folder import (
+    RUN_FILES as RUN_FILES,
     HypothesisCodec as HypothesisCodec,
     RunFolder as RunFolder,
     as_json as as_json,

@@ -10,7 +10,9 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import platform
+import warnings
 from collections import defaultdict
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -19,16 +21,17 @@ from pathlib import Path
 from typing import Any
 
 import mstfilter
-from mstfilter.errors import InputError
-from mstfilter.files import check_output
+from mstfilter.errors import InputError, InputWarning
+from mstfilter.files import atomic_folder, check_output, locked
 from mstfilter.lazy import progress_of
 from mstfilter.oracles import bind_truth, uses_truth
 from mstfilter.presets import REGISTRY, build_filter, describe_filter
+from mstfilter.processes import machine, threads
 from mstfilter.registry import nested_components
 from mstfilter.runs.run_folder import RunFolder, as_json
-from mstfilter.scene import Recording, UsesFiles
+from mstfilter.scene import Finding, Recording, UsesFiles, examine_hypotheses, report_findings
 from mstfilter.scoring import ask
-from mstfilter.smc import Observer
+from mstfilter.smc import Observer, ParticleFilter
 
 _LIBRARIES = ("numpy", "scipy", "networkx", "opencv-python-headless", "higra", "small_gicp", "torch")
 
@@ -57,6 +60,7 @@ def filter_recording(
     path: Path,
     seed: int = 0,
     *,
+    replace: bool = False,
     allow_files: bool = False,
     progress: bool | Callable[[RunProgress], None] = False,
     observer: Observer | None = None,
@@ -72,6 +76,8 @@ def filter_recording(
         The run folder: new, empty, or of the same run that was stopped.
     seed : int
         Seed of all random streams.
+    replace : bool
+        Whether an earlier run in the folder is removed, as soon as the first step has succeeded.
     allow_files : bool
         Whether components may come from ``./file.py:Class``.
     progress : bool or callable
@@ -82,7 +88,8 @@ def filter_recording(
     Raises
     ------
     InputError
-        If the configuration or the recording is invalid, or the folder belongs to another run.
+        If the configuration or the recording is invalid, or the folder belongs to another run, or another process
+        is writing it.
     """
     filter = build_filter(config, allow_files=allow_files)
     recording.check()
@@ -90,9 +97,48 @@ def filter_recording(
     for part in nested_components(filter):
         if isinstance(part, UsesFiles):
             part.check_files(recording)
-    description = as_json(
+    description = _describe(recording, config, filter, int(seed))
+    compared = path.parent.name == "compare" and (path.parent.parent / "run.json").is_file()
+    with locked(path.parent.parent if compared else path):
+        folder = _existing_folder(path, description, replace)
+        done = 0 if folder is None else folder.n_pauses
+        state = folder.state(done - 1) if folder is not None and done else bound.start(int(seed))
+        doubts: list[Finding] = []
+        with progress_of(progress, "filter") as show:
+            advance: Callable[[RunProgress], None] = (lambda p: show(p.done, p.total)) if progress is True else show
+            try:
+                clips = recording.clips()
+                advance(RunProgress(done, len(clips)))
+                for clip in clips[done:]:
+                    state, info = bound.step(state, clip, observer)
+                    truth = recording.truth(clip.index)
+                    questions = None if truth is None else ask(recording, clip.index)
+                    step = clip, state, info, truth, questions, recording.instance(recording.pauses[clip.index])
+                    if folder is None:  # a run that fails in its first step leaves no folder, or an earlier run
+                        with atomic_folder(path, "replace" if replace else "refuse") as work:
+                            RunFolder.create(work, description).write_pause(*step)
+                        folder = RunFolder(path)
+                    else:
+                        folder.write_pause(*step)
+                    if not doubts and state.population is not None:  # said once
+                        doubts = examine_hypotheses(tuple(state.population.particles), clip.after)
+                        report_findings(doubts, f"pause {clip.index} of recording {recording.name}")
+                    advance(RunProgress(clip.index + 1, len(clips), sum(info.seconds.values())))
+            except BaseException as error:
+                if folder is not None:
+                    folder.set_status("interrupted" if isinstance(error, KeyboardInterrupt) else "failed")
+                raise
+        assert folder is not None
+        folder.write_metrics()
+        folder.set_status("done")
+    return folder
+
+
+def _describe(recording: Recording, config: Mapping[str, Any], filter: ParticleFilter, seed: int) -> dict[str, Any]:
+    """The content of run.json but for its format and status."""
+    description: dict[str, Any] = as_json(
         {
-            "seed": int(seed),
+            "seed": seed,
             "description": config.get("description", ""),
             "config": describe_filter(filter),
             "uses_truth": uses_truth(filter),
@@ -106,60 +152,52 @@ def filter_recording(
                 "generator": recording.manifest.get("generator"),
             },
             "versions": library_versions(),
+            "machine": {**machine(), "threads": threads()},
         }
     )
-    folder = _existing_folder(path, description)
-    clips = recording.clips()
-    done = 0 if folder is None else folder.n_pauses
-    state = folder.state(done - 1) if folder is not None and done else bound.start(int(seed))
-    with progress_of(progress, "filter") as show:
-        advance: Callable[[RunProgress], None] = (lambda p: show(p.done, p.total)) if progress is True else show
-        advance(RunProgress(done, len(clips)))
-        try:
-            for clip in clips[done:]:
-                state, info = bound.step(state, clip, observer)
-                if folder is None:  # a run that fails in its first step leaves no folder
-                    folder = RunFolder.create(path, description)
-                truth = recording.truth(clip.index)
-                questions = None if truth is None else ask(recording, clip.index)
-                folder.write_pause(clip, state, info, truth, questions)
-                advance(RunProgress(clip.index + 1, len(clips), sum(info.seconds.values())))
-        except BaseException as error:
-            if folder is not None:
-                folder.set_status("interrupted" if isinstance(error, KeyboardInterrupt) else "failed")
-            raise
-    assert folder is not None
-    folder.write_metrics()
-    folder.set_status("done")
+    return description
+
+
+def _existing_folder(path: Path, description: dict[str, Any], replace: bool) -> RunFolder | None:
+    """The folder of the same run, to be resumed; None if there is none yet, or another that can be replaced."""
+    check_run_folder(path, replace)
+    if replace or not (path / "run.json").is_file():
+        return None
+    folder = RunFolder.open(path)
+    for key in ("seed", "config", "files", "recording", "versions"):
+        found = folder.description.get(key)
+        if found != description[key]:
+            raise InputError(
+                f"run folder {path} holds another run: its {key} differs"
+                + _first_difference(found, description[key]),
+                "choose another folder, or remove this one (on the command line: --replace)",
+            )
+    _warn_of_another_machine(folder, description["machine"])
+    folder.repair()
+    folder.set_status("running")
     return folder
 
 
-def _existing_folder(path: Path, description: dict[str, Any]) -> RunFolder | None:
-    """The folder of the same run, to be resumed; None if there is none yet."""
-    if (path / "run.json").is_file():
-        folder = RunFolder.open(path)
-        for key in ("seed", "config", "files", "recording", "versions"):
-            found = folder.description.get(key)
-            if found != description[key]:
-                raise InputError(
-                    f"run folder {path} holds another run: its {key} differs"
-                    + _first_difference(found, description[key]),
-                    "choose another folder, or remove this one (on the command line: --replace)",
-                )
-        folder.remove_partial_pauses()
-        folder.set_status("running")
-        return folder
-    check_run_folder(path)
-    return None
+def _warn_of_another_machine(folder: RunFolder, now: dict[str, Any]) -> None:
+    """Warn if the run was begun on another kind of machine; the number of threads changes no result."""
+    found = {key: value for key, value in folder.description["machine"].items() if key != "threads"}
+    wanted = {key: value for key, value in now.items() if key != "threads"}
+    if found != wanted:
+        message = f"run folder {folder.path} was begun on another machine{_first_difference(found, wanted)}"
+        hint = "the last bits of the results can differ; start again with --replace to have all pauses of one machine"
+        warnings.warn(InputWarning(message, hint), stacklevel=4)
 
 
-def check_run_folder(path: Path) -> None:
-    """Raise InputError unless a path is a run folder, an empty folder, or a new folder can be made there."""
-    if (path / "run.json").is_file():
-        return
-    if path.exists() and (not path.is_dir() or any(path.iterdir())):
-        raise InputError(f"cannot write a run to {path}: it exists and is not an empty folder", "choose another name")
-    check_output(path, folder=True)
+def check_run_folder(path: Path, replace: bool = False) -> None:
+    """Raise InputError unless a path is a run folder, an empty folder, or a new folder can be made there.
+
+    With `replace`, a run folder must not contain files that no run writes.
+    """
+    if not os.path.isfile(path / "run.json"):  # False for a name that is too long, where Path.is_file raises
+        check_output(path, folder=True)
+    elif replace:
+        check_output(path, folder=True, empty=False)
+        RunFolder.open(path).check_replaceable()
 
 
 def _first_difference(found: Any, wanted: Any, where: str = "") -> str:

@@ -9,34 +9,53 @@ Layout::
     pauses/000/rgb.png       the image at the pause          pauses/000/state.npz        particles and log weights
     pauses/000/info.json     record of the step              pauses/000/camera.json      pose at the pause
     pauses/000/truth.npz     true labels, if known           pauses/000/seconds.json     wall time by component
-    metrics.csv              one row per pause and hypothesis
+    pauses/000/instance.png  true label image, if known      pauses/000/SHA256SUMS       hashes, not of seconds.json
+    metrics.csv              one row per pause and hypothesis; SHA256SUMS: its hash
     compare/without-past     run folders of other filters on the same recording, if asked for
 
 A pause is written under a temporary name and renamed when it is complete, so a run that was stopped at any moment
-holds complete pauses only. `filter_recording` resumes from state.npz of the last one. Its arrays ``particles/...``
-are those of `mstfilter.scene.encode_hypotheses`. The same seed gives the same bytes in all files except seconds.json.
+holds complete pauses only. `filter_recording` resumes from state.npz of the last one, which contains the step, the
+seed and a hash of run.json. Its arrays ``particles/...`` are those of `mstfilter.scene.encode_hypotheses`. The same
+seed gives the same bytes in all files except seconds.json.
 """
 
 from __future__ import annotations
 
+import hashlib
 import itertools
 import json
+import re
 import shutil
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
+from pydantic import BaseModel, Field, RootModel, model_validator
 
-from mstfilter.errors import InputError
-from mstfilter.files import atomic_folder, reading, write_csv, write_text
+from mstfilter.errors import InputError, InputWarning
+from mstfilter.files import (
+    SUMS,
+    atomic_folder,
+    damaged_files,
+    other_files,
+    reading,
+    sweep,
+    write_csv,
+    write_sums,
+    write_text,
+)
+from mstfilter.reading import MAX_FILE, read_arrays, read_model
 from mstfilter.scene import (
     Camera,
     Clip,
     Hypothesis,
+    as_labels,
     decode_hypotheses,
     encode_hypotheses,
+    read_labels,
     read_rgb,
     rigid_from_matrix,
     write_image,
@@ -45,6 +64,9 @@ from mstfilter.scoring import FORMS, Questions, weighted_coverage
 from mstfilter.smc import Codec, Info, State, load_state, save_state
 
 _FORMAT = 2
+_PAUSE_FILES = rf"(rgb\.png|instance\.png|camera\.json|state\.npz|truth\.npz|info\.json|seconds\.json|{SUMS})"
+_TABLES = rf"(run\.json|metrics\.csv|report\.html|result\.json|forecasts\.npz|{SUMS})"
+RUN_FILES = re.compile(rf"(compare/[^/]+/)?(pauses/\d+/{_PAUSE_FILES}|{_TABLES})")  #: paths in a run folder
 
 
 def as_json(value: Any) -> Any:
@@ -67,9 +89,74 @@ def write_json(path: Path, value: Any) -> None:
     write_text(path, json.dumps(as_json(value), indent=1) + "\n")
 
 
-def _read_json(path: Path) -> Any:
-    with reading(path, "a run folder", "a run folder is made by `mstfilter run`"):
-        return json.loads(path.read_text())
+class _RecordingEntry(BaseModel):
+    name: str
+    key: str
+    pauses: list[int]
+    times: list[float]
+
+    @model_validator(mode="after")
+    def _agree(self) -> _RecordingEntry:
+        if len(self.pauses) != len(self.times) or not self.pauses:
+            raise ValueError(f"there are {len(self.pauses)} pauses and {len(self.times)} times")
+        return self
+
+
+class _RunFile(BaseModel):
+    """What readers use of run.json."""
+
+    format: Literal[2]
+    status: str
+    seed: int
+    config: dict[str, Any]
+    uses_truth: list[str]
+    files: dict[str, str]
+    recording: _RecordingEntry
+    versions: dict[str, str]
+    machine: dict[str, str | int]
+
+
+class _InfoFile(BaseModel):
+    """What readers use of info.json."""
+
+    t: int
+    n: int
+    n_frames: int
+    n_candidates: int
+    ess: float
+    resampled: bool
+    unique_ancestors: int | None
+    ancestors: list[int] | None
+    parents: dict[str, list[int]]
+    weights: Annotated[list[Annotated[float, Field(ge=0)]], Field(min_length=1)]
+    quality: dict[str, list[float]] | None
+    notes: dict[str, Any]
+
+    @model_validator(mode="after")
+    def _agree(self) -> _InfoFile:
+        lists: dict[str, list[Any]] = {
+            "parents": list(self.parents.values()),
+            "quality": list((self.quality or {}).values()),
+        }
+        for name, found in lists.items():
+            if any(len(values) != len(self.weights) for values in found):
+                raise ValueError(f"{name} has not one value for each of the {len(self.weights)} weights")
+        if self.quality is not None and set(self.quality) != set(FORMS):
+            raise ValueError(f"quality has {sorted(self.quality)}, expected {list(FORMS)}")
+        if any(not k >= -1 for parents in self.parents.values() for k in parents):
+            raise ValueError("a parent is below -1")
+        return self
+
+
+class _CameraFile(BaseModel):
+    K: Any
+    width: int
+    height: int
+    T_world_camera: Any
+
+
+class _SecondsFile(RootModel[dict[str, float]]):
+    pass
 
 
 @dataclass(frozen=True)
@@ -99,29 +186,68 @@ class RunFolder:
     def open(cls, path: str | Path) -> RunFolder:
         """An existing run folder."""
         folder = cls(Path(path))
-        if folder.description.get("format") != _FORMAT:
-            raise InputError(f"{path}: run folder has format {folder.description.get('format')}, expected {_FORMAT}")
+        _ = folder.description
         return folder
 
     @classmethod
     def create(cls, path: Path, description: Mapping[str, Any]) -> RunFolder:
         """A new run folder that holds only its description."""
-        try:
-            path.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise InputError(f"cannot write run folder {path}: {error.strerror}") from error
         write_json(path / "run.json", {"format": _FORMAT, "status": "running", **description})
         return cls(path)
 
     @property
     def description(self) -> dict[str, Any]:
         """The content of run.json."""
-        return dict(_read_json(self.path / "run.json"))
+        return self._read(self.path / "run.json", _RunFile)
+
+    def _read(self, path: Path, model: type[BaseModel]) -> dict[str, Any]:
+        return read_model(path, model, "a run folder", "a run folder is made by `mstfilter run`")[1]
+
+    def check(self) -> RunFolder:
+        """Read every file of the run and of those that it is compared with, before work with them starts.
+
+        Raises InputError if a file is missing or damaged, or files of a pause do not belong together.
+        """
+        if self.n_pauses > len(self.description["recording"]["pauses"]):
+            raise InputError(f"{self.path}: there are more pauses than run.json lists")
+        before = 0
+        for t in range(self.n_pauses):
+            before = self._check_pause(t, before)
+        for other in self.compared().values():
+            other.check()
+        return self
+
+    def _check_pause(self, t: int, n_before: int) -> int:
+        """Check the files of a pause after one with `n_before` hypotheses; returns the number of hypotheses."""
+        folder, info, hypotheses = self.pause(t), self.info(t), self.hypotheses(t)
+        grid, camera, image, labels = hypotheses[0].grid, self.camera(t), self.rgb(t), self.truth(t)
+        _ = self.seconds(t), self.questions(t)
+        wrong = (
+            (info["t"] != t, f"info.json is of step {info['t']}"),
+            (len(info["weights"]) != len(hypotheses), f"info.json has {len(info['weights'])} weights"),
+            (max(info["parents"].get("previous", [-1])) >= n_before, "info.json has parents that are not there"),
+            (image.shape[:2] != (camera.height, camera.width), f"rgb.png has the shape {image.shape}"),
+            (
+                (labels is None) != (info["quality"] is None),
+                "one of truth.npz and the quality in info.json is missing",
+            ),
+            (labels is not None and labels.shape != grid.shape, "truth.npz has another grid than state.npz"),
+        )
+        for is_wrong, message in wrong:
+            if is_wrong:
+                raise InputError(f"{folder}: {message}; state.npz has {len(hypotheses)} hypotheses in {grid.text}")
+        return len(hypotheses)
 
     @property
     def n_pauses(self) -> int:
         """Number of complete pauses."""
         return next(t for t in itertools.count() if not self.pause(t).is_dir())
+
+    @property
+    def key(self) -> str:
+        """A hash of run.json without the status; the states of the run contain it."""
+        kept = {name: value for name, value in self.description.items() if name != "status"}
+        return hashlib.sha256(json.dumps(kept, sort_keys=True).encode()).hexdigest()[:32]
 
     def pause(self, t: int) -> Path:
         """Folder of a pause."""
@@ -137,18 +263,24 @@ class RunFolder:
         write_json(self.path / "run.json", {**self.description, "status": status})
 
     def write_pause(
-        self, clip: Clip, state: State, info: Info, truth: np.ndarray | None, questions: Questions | None = None
+        self,
+        clip: Clip,
+        state: State,
+        info: Info,
+        truth: np.ndarray | None,
+        questions: Questions | None = None,
+        instance: np.ndarray | None = None,
     ) -> None:
-        """Write the results of a step, with the true labels and the questions of the pause if they are known.
+        """Write the results of a step, and of the pause, if known: true labels, questions, true label image.
 
         An interrupted call writes nothing.
         """
         assert state.population is not None
         camera, hypotheses = clip.after.camera, tuple(state.population.particles)
-        (self.path / "pauses").mkdir(exist_ok=True)
         with atomic_folder(self.pause(info.t)) as folder:
-            folder.mkdir()
             write_image(folder / "rgb.png", clip.after.rgb)
+            if instance is not None:
+                write_image(folder / "instance.png", instance)
             write_json(
                 folder / "camera.json",
                 {
@@ -158,7 +290,7 @@ class RunFolder:
                     "T_world_camera": camera.pose.as_matrix(),
                 },
             )
-            save_state(folder / "state.npz", state, HypothesisCodec(), compress=True)
+            save_state(folder / "state.npz", state, HypothesisCodec(), compress=True, run=self.key)
             quality: dict[str, list[float]] | None = None
             if truth is not None:
                 pairs = np.zeros((2, 0)) if questions is None else np.stack([questions.first, questions.second])
@@ -180,20 +312,72 @@ class RunFolder:
                 "notes": info.notes,
             }
             write_json(folder / "info.json", record)
+            write_sums(folder)
             write_json(folder / "seconds.json", info.seconds)
 
-    def remove_partial_pauses(self) -> None:
-        """Remove the incomplete folder of a pause that a killed run left."""
-        for partial in (self.path / "pauses").glob(".*.partial"):
-            shutil.rmtree(partial, ignore_errors=True)
+    def check_replaceable(self) -> None:
+        """Raise InputError if the folder contains files that no run writes."""
+        if others := other_files(self.path, RUN_FILES):
+            raise InputError(
+                f"run folder {self.path} cannot be replaced: it holds {others[0]}, which is not of a run",
+                "move it elsewhere, or choose another folder",
+            )
+
+    def damage(self) -> list[str]:
+        """What is wrong with files of the run: those that differ from their hashes, and states of another run."""
+        found = damaged_files(self.path) if self.description["status"] == "done" else []
+        for t in range(self.n_pauses):
+            found += [f"pauses/{t:03d}/{wrong}" for wrong in damaged_files(self.pause(t)) or self._foreign(t)]
+        return found
+
+    def _foreign(self, t: int) -> list[str]:
+        """In what the state of a pause differs from one of this run."""
+        path = self.pause(t) / "state.npz"
+        with reading(path, "a pause of a run"), np.load(path, allow_pickle=False) as data:
+            head = json.loads(str(data["head"]))
+        expected = {"t": t + 1, "seed": self.description["seed"], "run": self.key}
+        differs = [name for name, value in expected.items() if head.get(name) != value]
+        names = {"t": "step", "run": "hash of run.json"}
+        return [
+            f"state.npz belongs to another run: {names.get(name, name)} {head.get(name)}, expected {expected[name]}"
+            for name in differs
+        ]
+
+    def repair(self) -> None:
+        """Prepare the folder for resuming: remove what a killed process left, and damaged pauses with a warning.
+
+        All pauses after a damaged one are removed. Raises InputError if a pause belongs to another run.
+        """
+        sweep(self.path)
+        sweep(self.path / "pauses")
+        good = 0
+        while not (wrong := damaged_files(self.pause(good))):
+            if foreign := self._foreign(good):
+                raise InputError(
+                    f"{self.pause(good)}/{foreign[0]}",
+                    "choose another folder, or start again (on the command line: --replace)",
+                )
+            good += 1
+        later = sorted(path for path in (self.path / "pauses").glob("[0-9]*") if int(path.name) >= good)
+        for path in reversed(later):
+            shutil.rmtree(path)
+        if later:
+            text = f"run folder {self.path}: pause {good} is damaged: {wrong[0]}"
+            hint = f"pauses {good} to {int(later[-1].name)} are computed again"
+            warnings.warn(InputWarning(text, hint), stacklevel=2)
 
     def info(self, t: int) -> dict[str, Any]:
         """Record of the step that ended at pause `t`."""
-        return dict(_read_json(self.pause(t) / "info.json"))
+        return self._read(self.pause(t) / "info.json", _InfoFile)
 
     def seconds(self, t: int) -> dict[str, float]:
         """Wall time of the step by component, in seconds."""
-        return dict(_read_json(self.pause(t) / "seconds.json"))
+        return self._read(self.pause(t) / "seconds.json", _SecondsFile)
+
+    def instance(self, t: int) -> np.ndarray | None:
+        """True label image (H, W) at a pause, 255 for the robot; None if it is not known."""
+        path = self.pause(t) / "instance.png"
+        return read_labels(path) if path.is_file() else None
 
     def rgb(self, t: int) -> np.ndarray:
         """Image (H, W, 3) at a pause."""
@@ -201,9 +385,11 @@ class RunFolder:
 
     def camera(self, t: int) -> Camera:
         """Camera at a pause."""
-        data = _read_json(self.pause(t) / "camera.json")
-        pose = rigid_from_matrix(np.array(data["T_world_camera"]))
-        return Camera(np.array(data["K"]), data["width"], data["height"], pose)
+        path = self.pause(t) / "camera.json"
+        data = self._read(path, _CameraFile)
+        with reading(path, "a run folder"):
+            pose = rigid_from_matrix(data["T_world_camera"])
+            return Camera(data["K"], data["width"], data["height"], pose)
 
     def truth(self, t: int) -> np.ndarray | None:
         """True labels (X, Y, Z) at a pause; None if unknown."""
@@ -211,16 +397,20 @@ class RunFolder:
 
     def questions(self, t: int) -> Questions | None:
         """The questions of a pause with ground truth; None if unknown."""
-        data = self._truth(t)
-        pairs = data.get("questions", np.zeros((2, 0))).astype(np.int64)
-        return Questions(data["labels"].shape, *pairs) if pairs.size else None
+        pairs = self._truth(t).get("questions")
+        return Questions(self._truth(t)["labels"].shape, *pairs) if pairs is not None and pairs.size else None
 
     def _truth(self, t: int) -> dict[str, np.ndarray]:
+        """True labels and questions of a pause, if they are known."""
         path = self.pause(t) / "truth.npz"
         if not path.exists():
             return {}
-        with np.load(path, allow_pickle=False) as data:
-            return dict(data)
+        data = read_arrays(path, "the truth of a pause")
+        with reading(path, "the truth of a pause"):
+            labels, pairs = as_labels(data["labels"], "labels"), data["questions"].astype(np.int64)
+            if labels.ndim != 3 or pairs.shape[:-1] != (2,) or not ((pairs >= 0) & (pairs < labels.size)).all():
+                raise ValueError(f"labels have the shape {labels.shape}, questions {pairs.shape}")
+        return {"labels": labels, "questions": pairs}
 
     def hypotheses(self, t: int) -> tuple[Hypothesis, ...]:
         """The particles after the step."""
@@ -230,7 +420,7 @@ class RunFolder:
 
     def state(self, t: int) -> State:
         """The state after pause `t`, from which the run is resumed."""
-        return load_state(self.pause(t) / "state.npz", HypothesisCodec())[0]
+        return load_state(self.pause(t) / "state.npz", HypothesisCodec(), limit=MAX_FILE)[0]
 
     def write_metrics(self) -> None:
         """Write metrics.csv from the pauses."""
@@ -249,3 +439,4 @@ class RunFolder:
                     row[f"quality_{form}"] = "" if info["quality"] is None else f"{info['quality'][form][k]:.6f}"
                 rows.append(row)
         write_csv(self.path / "metrics.csv", rows)
+        write_sums(self.path, ["metrics.csv"])

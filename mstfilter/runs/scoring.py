@@ -14,7 +14,7 @@ Brier score, log loss and that of the base rate, calibration error and energy sc
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -22,7 +22,8 @@ from typing import Any
 import numpy as np
 
 from mstfilter.errors import InputError
-from mstfilter.files import reading, write_csv
+from mstfilter.files import reading, write_csv, writing
+from mstfilter.reading import read_arrays
 from mstfilter.runs.run_folder import RunFolder
 from mstfilter.scene import Camera, Hypothesis, Recording, VoxelGrid, as_labels, render
 from mstfilter.scoring import (
@@ -119,10 +120,10 @@ def read_estimate(path: Path) -> list[PauseEstimate]:
     if not path.is_dir():
         volumes, frames, grid = _read_volumes(path, "label volumes")
         return [PauseEstimate([one], np.ones(1), frame, grid) for one, frame in zip(volumes, frames, strict=True)]
-    run = RunFolder.open(path)
+    run = RunFolder.open(path).check()
     if run.n_pauses == 0:
         raise InputError(f"{path}: the run has no complete pause yet")
-    frames = list(run.description.get("recording", {}).get("pauses", [])) or [None] * run.n_pauses
+    frames = run.description["recording"]["pauses"]
     found = []
     for t in range(run.n_pauses):
         hypotheses, weights = run.hypotheses(t), np.asarray(run.info(t)["weights"], dtype=float)
@@ -155,22 +156,23 @@ def _read_volumes(path: Path, what: str) -> tuple[np.ndarray, list[int | None], 
     """Labels (S, X, Y, Z), the frame of each or None, and the grid or None."""
     if not path.exists():
         raise InputError(f"{what}: file does not exist: {path}")
-    with reading(path, what, "expected .npz with an array `labels` (S, X, Y, Z), or .npy"):
-        loaded = np.load(path, allow_pickle=False)
-        data: Mapping[str, np.ndarray] = {"labels": loaded} if isinstance(loaded, np.ndarray) else dict(loaded)
+    hint = "expected .npz with an array `labels` (S, X, Y, Z), or .npy"
+    data = read_arrays(path, what, hint)
+    with reading(path, what, hint):
+        data = {"labels": data[""]} if "" in data else data
         if "particles/labels" in data:
             raise InputError(f"{path} holds the hypotheses of one pause of a run", "give the run folder")
         labels = data["labels"]
-    labels = as_labels(labels, f"{path}: labels")
-    labels = labels[None] if labels.ndim == 3 else labels
-    if labels.ndim != 4 or len(labels) == 0:
-        raise InputError(f"{path}: labels have shape {labels.shape}, expected (S, X, Y, Z), one volume a pause")
-    frames: list[int | None] = [int(f) for f in data["frame"]] if "frame" in data else [None] * len(labels)
-    if len(frames) != len(labels):
-        raise InputError(f"{path}: there are {len(labels)} label grids for {len(frames)} frames")
-    grid = None
-    if "origin" in data and "voxel_size" in data:
-        grid = VoxelGrid(data["origin"], float(data["voxel_size"]), labels.shape[1:])
+        labels = as_labels(labels, f"{path}: labels")
+        labels = labels[None] if labels.ndim == 3 else labels
+        if labels.ndim != 4 or len(labels) == 0:
+            raise InputError(f"{path}: labels have shape {labels.shape}, expected (S, X, Y, Z), one volume a pause")
+        frames: list[int | None] = [int(f) for f in data["frame"]] if "frame" in data else [None] * len(labels)
+        if len(frames) != len(labels):
+            raise InputError(f"{path}: there are {len(labels)} label grids for {len(frames)} frames")
+        grid = None
+        if "origin" in data and "voxel_size" in data:
+            grid = VoxelGrid(data["origin"], float(data["voxel_size"]), labels.shape[1:])
     return labels, frames, grid
 
 
@@ -287,7 +289,5 @@ def write_scores(path: Path, rows: Sequence[PauseScore]) -> None:
     """
     if not path.parent.is_dir():
         raise InputError(f"cannot write {path}: its folder does not exist")
-    try:
+    with writing(str(path)):
         write_csv(path, [asdict(row) for row in rows], float_format=".6f")
-    except OSError as error:
-        raise InputError(f"cannot write {path}: {error.strerror}") from error

@@ -14,6 +14,7 @@ from mstfilter.scene.encoding import (
 from mstfilter.scene.frame import (
     Clip as Clip,
     Frame as Frame,
+    decode_image as decode_image,
     depth_sigma as depth_sigma,
     read_depth as read_depth,
     read_labels as read_labels,
@@ -36,7 +37,12 @@ from mstfilter.scene.pauses import (
     pause_rule as pause_rule,
     pauses_from_text as pauses_from_text,
 )
-from mstfilter.scene.plausibility import warn_if_implausible as warn_if_implausible
+from mstfilter.scene.plausibility import (
+    Finding as Finding,
+    examine as examine,
+    examine_hypotheses as examine_hypotheses,
+    report_findings as report_findings,
+)
 from mstfilter.scene.recording import (
     LazyFrames as LazyFrames,
     Recording as Recording,

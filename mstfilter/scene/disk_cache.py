@@ -10,8 +10,12 @@ is unpickled.
 
 from __future__ import annotations
 
+import contextlib
 import io
+import os
+import re
 import sqlite3
+import warnings
 import zipfile
 from collections.abc import Hashable, Mapping
 from dataclasses import fields, is_dataclass
@@ -21,10 +25,16 @@ from typing import Any
 import diskcache
 import numpy as np
 
+from mstfilter.errors import InputWarning
+from mstfilter.reading import check_private, read_bytes, unpack_arrays
 from mstfilter.scene.arrays import content_key
 
 # CPython 3.11 raises SystemError if two threads parse the headers of arrays at once (python/cpython#106905).
 _UNREADABLE = (OSError, ValueError, TypeError, KeyError, EOFError, SystemError, zipfile.BadZipFile, sqlite3.Error)
+
+
+_LOCK_S = 5  # for which a process waits for another one that writes
+_FILE = re.compile(r"[0-9a-f]{2}/[0-9a-f]{2}/[0-9a-f]{28}\.val".replace("/", re.escape(os.sep)))
 
 
 class _BytesDisk(diskcache.Disk):
@@ -39,23 +49,46 @@ class _BytesDisk(diskcache.Disk):
     def fetch(self, mode: int, filename: Any, value: Any, read: bool) -> Any:
         if mode not in (diskcache.core.MODE_RAW, diskcache.core.MODE_BINARY):
             raise ValueError(f"entry has mode {mode}, expected bytes")
-        return super().fetch(mode, filename, value, read)
+        if mode == diskcache.core.MODE_RAW:
+            return bytes(value)
+        self._check_file(filename)
+        return read_bytes(Path(self._directory, filename), "an entry")
+
+    def remove(self, file_path: Any) -> None:
+        with contextlib.suppress(ValueError):
+            self._check_file(file_path)
+            super().remove(file_path)
+
+    def _check_file(self, name: Any) -> None:
+        """Raise ValueError unless a name of the data base is that of a file that diskcache makes in the folder."""
+        inside = Path(self._directory).resolve() / str(name)
+        if not _FILE.fullmatch(str(name)) or inside.parent.resolve() != inside.parent:
+            raise ValueError(f"entry has the file {name!r}")
 
 
 class DiskCache:
     """Values in a folder, which is made if it does not exist. `version` is part of the key of every entry.
 
     Several processes may use the folder at the same time. An entry that cannot be read counts as missing. If the
-    folder cannot be written or the disk is full, nothing is stored and no error is raised.
+    folder cannot be written, the disk is full or another process keeps the folder locked, nothing is stored and no
+    error is raised; a locked folder is reported by an InputWarning.
+
+    A new folder is for this user only. Raises InputError if the folder belongs to somebody else or others may write
+    into it: its entries become results.
     """
 
     def __init__(self, folder: str | Path, limit_bytes: int, version: str) -> None:
         self.version, self.limit_bytes = version, limit_bytes
-        self._entries: diskcache.Cache | None
+        self._entries: diskcache.Cache | None = None
+        self.folder = Path(folder)
+        check_private(self.folder)
         try:
+            self.folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+            if not self._can_lock():
+                return
             self._entries = diskcache.Cache(
                 str(folder),
-                timeout=10,
+                timeout=_LOCK_S,
                 disk=_BytesDisk,
                 size_limit=limit_bytes,
                 cull_limit=3,  # entries removed per entry that is written beyond the limit
@@ -65,8 +98,27 @@ class DiskCache:
                 sqlite_mmap_size=0,
                 sqlite_synchronous=0,  # entries carry checksums, so a lost write is only a missing entry
             )
-        except (OSError, sqlite3.Error, diskcache.Timeout):
+        except Exception:  # the settings in the data base become attributes of the cache: any error
             self._entries = None
+
+    def _can_lock(self) -> bool:
+        """Whether the data base can be written now; diskcache itself waits for a minute."""
+        with contextlib.closing(sqlite3.connect(self.folder / "cache.db", timeout=_LOCK_S)) as probe:
+            try:
+                probe.execute("BEGIN IMMEDIATE")
+            except sqlite3.OperationalError as error:
+                if "locked" not in str(error):
+                    raise
+                self._give_up()
+                return False
+            probe.rollback()
+        return True
+
+    def _give_up(self) -> None:
+        """Use the folder no longer: every further entry would wait again."""
+        self._entries = None
+        message = f"the cache {self.folder} is locked by another process for more than {_LOCK_S} s"
+        warnings.warn(InputWarning(message, "this process continues without it"), stacklevel=4)
 
     def find(self, name: str, key: Hashable, stored_as: Any) -> Any:
         """The value of an entry, its arrays read-only; None if there is none that can be read."""
@@ -76,9 +128,13 @@ class DiskCache:
             data = self._entries.get(self._key(name, key))
             if data is None:
                 return None
-            with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
-                return _unpack(stored_as, {k: arrays[k] for k in arrays.files}, "")
-        except (*_UNREADABLE, diskcache.Timeout):
+            return _unpack(stored_as, unpack_arrays(io.BytesIO(data)), "")
+        except diskcache.Timeout:
+            self._give_up()
+            return None
+        except _UNREADABLE as error:
+            if isinstance(error, sqlite3.OperationalError) and "locked" in str(error):
+                self._give_up()
             return None
 
     def store(self, name: str, key: Hashable, value: Any) -> None:
@@ -91,7 +147,9 @@ class DiskCache:
         if data.tell() <= self.limit_bytes:
             try:
                 self._entries.set(self._key(name, key), data.getvalue(), tag=name)
-            except (OSError, sqlite3.Error, diskcache.Timeout):
+            except diskcache.Timeout:
+                self._give_up()
+            except (OSError, sqlite3.Error):
                 return
 
     def close(self) -> None:

@@ -13,6 +13,8 @@ same time are its `views`. Free space is computed from all of them:
 
 from __future__ import annotations
 
+import contextlib
+import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -22,12 +24,15 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mstfilter.errors import InputError
+from mstfilter.files import reading
 from mstfilter.lazy import late
+from mstfilter.reading import read_bytes
 from mstfilter.scene.arrays import content_key, frozen, read_only
 from mstfilter.scene.camera import Camera
 from mstfilter.scene.voxels import VoxelGrid
 
 _SIGMA_AT_ONE_METRE = 0.00185
+MAX_PIXELS = 2**25  #: Largest image that is decoded; 8K video has fewer pixels
 
 
 def depth_sigma(z: ArrayLike) -> np.ndarray:
@@ -46,23 +51,75 @@ _PNG_END = b"\x00\x00\x00\x00IEND\xaeB\x60\x82"
 
 
 def _decode(path: Path, flags: int) -> np.ndarray:
-    import cv2
-
-    try:
-        data = path.read_bytes()
-    except FileNotFoundError:
-        raise InputError(
-            f"image is missing: {path}", "record the frame again, or remove it from manifest.json"
-        ) from None
-    except OSError as error:
-        raise InputError(f"image cannot be read: {path} ({error.strerror})") from error
+    with reading(path, "an image"):
+        if not path.exists():
+            raise InputError(f"image is missing: {path}", "record the frame again, or remove it from manifest.json")
+    data = read_bytes(path, "an image")
     if data.startswith(_PNG_START) and not data.endswith(_PNG_END):
         # The decoder would fill the missing rows with zeros without an error.
         raise InputError(f"image is truncated: {path} ({len(data)} bytes, no end of PNG)", "copy the file again")
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data else None
-    if image is None:
-        raise InputError(f"image cannot be decoded: {path} ({len(data)} bytes)", "expected a PNG or JPEG file")
+    return decode_image(data, flags, f"image cannot be decoded: {path} ({len(data)} bytes)")
+
+
+def decode_image(data: bytes, flags: int, problem: str, *hints: str) -> np.ndarray:
+    """The image that the bytes of a PNG, JPEG or TIFF file hold, decoded with the `flags` of ``cv2.imdecode``.
+
+    Raises InputError with the message `problem` if they hold none, or one of more than `MAX_PIXELS` pixels, which is
+    not decoded.
+    """
+    import cv2
+
+    size = image_size(data)
+    if size is None:
+        raise InputError(problem, *(hints or ("expected a PNG or JPEG file",)))
+    if size[0] * size[1] > MAX_PIXELS:
+        raise InputError(f"{problem}: it is {size[0]} x {size[1]}, at most {MAX_PIXELS} pixels are read", *hints)
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    except cv2.error as error:
+        raise InputError(f"{problem}: {str(error).splitlines()[0]}", *hints) from error
+    if image is None or image.shape[:2] not in (size[::-1], size):  # turned, if its orientation is used
+        raise InputError(problem, *(hints or ("expected a PNG or JPEG file",)))
     return image
+
+
+def image_size(data: bytes) -> tuple[int, int] | None:
+    """Width and height in the header of a PNG, JPEG or TIFF file; None if it is none of these."""
+    if data.startswith(_PNG_START) and len(data) >= 24:
+        return int.from_bytes(data[16:20]), int.from_bytes(data[20:24])
+    with contextlib.suppress(struct.error):
+        if data.startswith(b"\xff\xd8"):
+            return _jpeg_size(data)
+        if data[:4] in (b"II*\0", b"MM\0*"):
+            return _tiff_size(data, "<" if data[:1] == b"I" else ">")
+    return None
+
+
+def _jpeg_size(data: bytes) -> tuple[int, int] | None:
+    """Width and height in the first frame header; struct.error if there is none."""
+    at = 2
+    while True:
+        mark, kind, length = struct.unpack_from(">BBH", data, at)
+        if mark != 0xFF:
+            return None
+        if kind == 0xFF:  # a fill byte
+            at += 1
+        elif 0xC0 <= kind <= 0xCF and kind not in (0xC4, 0xC8, 0xCC):
+            height, width = struct.unpack_from(">HH", data, at + 5)
+            return width, height
+        else:
+            at += 2 + length
+
+
+def _tiff_size(data: bytes, order: str) -> tuple[int, int] | None:
+    """Width and height in the first directory; struct.error if it is not complete."""
+    (at,) = struct.unpack_from(f"{order}I", data, 4)
+    (n,) = struct.unpack_from(f"{order}H", data, at)
+    found = {}
+    for k in range(n):
+        tag, kind = struct.unpack_from(f"{order}HH", data, at + 2 + 12 * k)
+        (found[tag],) = struct.unpack_from(f"{order}{'H' if kind == 3 else 'I'}", data, at + 10 + 12 * k)
+    return (found[256], found[257]) if {256, 257} <= set(found) else None
 
 
 def read_rgb(path: Path) -> np.ndarray:
@@ -74,15 +131,28 @@ def read_rgb(path: Path) -> np.ndarray:
 
 
 def read_depth(path: Path, scale: float) -> np.ndarray:
-    """Depth image (H, W) float32 in metres, NaN where the file has 0; `scale` is in metres per unit."""
+    """Depth image (H, W) float32 in metres, NaN where the file has 0.
+
+    Integers of 16 bits are multiplied by `scale`, metres per unit; float (.npy, .tif) is in metres.
+    """
     import cv2
 
-    image = _decode(path, cv2.IMREAD_UNCHANGED)
-    if image.ndim != 2 or image.dtype != np.uint16:
+    image = _load_array(path) if path.suffix.lower() == ".npy" else _decode(path, cv2.IMREAD_UNCHANGED)
+    if image.ndim != 2 or not (image.dtype in (np.uint16, np.int16) or np.issubdtype(image.dtype, np.floating)):
         raise InputError(
-            f"depth image {path} has shape {image.shape} and type {image.dtype}, expected one channel of 16 bits"
+            f"depth image {path} has shape {image.shape} and type {image.dtype}, expected one channel of 16 bits or "
+            "float"
         )
-    return np.where(image > 0, image * np.float32(scale), np.float32(np.nan)).astype(np.float32)
+    unit = 1 if np.issubdtype(image.dtype, np.floating) else scale
+    return np.where(image > 0, image * np.float32(unit), np.float32(np.nan)).astype(np.float32)
+
+
+def _load_array(path: Path) -> np.ndarray:
+    """The array of a .npy file."""
+    try:
+        return np.asarray(np.load(path, allow_pickle=False))
+    except (OSError, EOFError, ValueError) as error:
+        raise InputError(f"image cannot be read: {path} ({error})", "expected .npy with an array (H, W)") from error
 
 
 def read_labels(path: Path) -> np.ndarray:

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from mstfilter.errors import InputError, check_integer, naming, suggestion
-from mstfilter.files import reading
+from mstfilter.reading import read_text
 
 
 class PauseRule(ABC):
@@ -83,8 +83,7 @@ class Listed(PauseRule):
     file: str = "pauses.txt"
 
     def find(self, times: tuple[float, ...], read_rgb: Callable[[int], np.ndarray]) -> tuple[int, ...]:
-        with reading(Path(self.file), "a file of pauses"):
-            lines = Path(self.file).read_text().splitlines()
+        lines = read_text(Path(self.file), "a file of pauses").splitlines()
         words = [word for line in lines for word in line.partition("#")[0].replace(",", " ").split()]
         with naming(self.file):
             rule = At(**_numbers(words))

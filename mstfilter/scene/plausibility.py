@@ -1,155 +1,490 @@
-"""Warnings about input that can be used but is probably not what was meant.
+"""One examination of a recording before time is spent on it, and one of the first hypotheses.
 
->>> warn_if_implausible(frames, grid, "recording table-7")
+>>> for finding in examine(recording.frames, recording.pauses, recording.grid):
+...     print(finding.stop, finding.message, finding.hints)
 
-Wrong units, a camera matrix of another image size, or a pose of another camera give hypotheses without objects, or
-with objects of wrong shapes, and no error. The warnings say what to check.
+Wrong units, a camera matrix of another image size, a moved camera, or depth that is not registered to colour give
+confident hypotheses of the wrong objects, and no error. `examine` compares the frames at the pauses with what a
+camera over a table gives. Where the result cannot be right, the finding stops the run; the others are warnings. The
+limits are chosen from the right and wrong recordings of ``experiments/plausibility``.
 """
 
 from __future__ import annotations
 
 import sys
 import warnings
-from collections.abc import Iterable
-from itertools import chain
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from types import FrameType
 
 import numpy as np
 
 from mstfilter.errors import InputError, InputWarning
-from mstfilter.scene.frame import Frame
-from mstfilter.scene.geometry import fit_support_plane
-from mstfilter.scene.voxels import VoxelGrid
+from mstfilter.scene.arrays import content_key
+from mstfilter.scene.camera import Camera
+from mstfilter.scene.frame import Frame, depth_sigma
+from mstfilter.scene.geometry import SupportPlane, fit_support_plane
+from mstfilter.scene.pauses import grey_blocks
+from mstfilter.scene.voxels import Hypothesis, VoxelGrid
 
+_FIELDS, _POSSIBLE_FIELDS = (12.0, 130.0), (3.0, 160.0)  # degrees: horizontal field of view; warning and stop
+_OFF_CENTRE = (0.2, 0.4)  # of the image size: principal point from the middle; warning and stop
+_VOXELS, _POSSIBLE_VOXELS = (0.001, 0.05), (0.0002, 0.3)  # metres; warning and stop
+_DISTANCES = (0.25, 2.0)  # metres from the camera to the table; warning
+_VOXELS_IN_DISTANCE = 25  # a camera nearer than this many voxels stops the run
+_NOISE_IN_VOXELS = 1.3  # depth noise at the table in voxels beyond which the run stops
 _MIN_HEIGHT = 0.01  # metres above the table beyond which a reading may show an object
-_DISTANCES = (0.2, 4.0)  # metres: median depth of the readings
-_FIELDS = (12.0, 130.0)  # degrees: horizontal field of view
-_VOXELS = (0.001, 0.05)  # metres
-_MAX_TILT, _MAX_HEIGHT = 4.0, 0.025  # degrees and metres between the plane of the readings and z = 0
+_ON_TABLE, _NEAR_TABLE = 0.025, 0.1  # metres from z = 0: on the table; where the table is searched
+_MAX_TILT, _MAX_HEIGHT = 2.5, 0.025  # degrees and metres between the table and z = 0: warning; twice: stop
 _OTHER_PLANE = 30.0  # degrees: a plane that is tilted by more is a wall or the side of a box, not the table
-_MIN_ON_TABLE = 0.1  # share of the readings within `_MAX_HEIGHT` of z = 0, as `fit_support_plane` demands
+_MIN_ON_TABLE = 0.1  # share of the readings on the table, as `fit_support_plane` demands
+_MIN_READINGS = 30  # of an image of 160 columns; fewer are taken for noise
+_TALL, _UPRIGHT = 0.35, 0.5  # metres, cosine: see `_other_support`
+_DRIFT = (
+    2.0,
+    0.02,
+    0.015,
+)  # degrees, metres, metres: tilt, height and shift of the camera between pauses; twice: stop
+_MIN_MOVED = 15  # matched corners that agree with a moved camera
+_PEAK, _EXCESS, _ORDER = 0.15, 0.2, 0.015  # of the rank of colour edges below depth edges: see `_registration`
+_SHIFTS = 16  # pixels of an image of 320 columns
 
 
-def warn_if_implausible(frames: Iterable[Frame], grid: VoxelGrid, where: str) -> None:
-    """Warn if the first frame does not fit its camera, or if no frame has readings above the table in the grid.
+@dataclass(frozen=True)
+class Finding:
+    """Something about the input that is probably not what was meant."""
 
-    The frames are those at the pauses, with poses; they are read as needed. `where` names the recording.
+    stop: bool  #: whether the result cannot be right
+    message: str
+    hints: tuple[str, ...]
+
+
+def examine(frames: Sequence[Frame], pauses: Sequence[int], grid: VoxelGrid) -> list[Finding]:
+    """Findings about the frames of a recording at its pauses, and their workspace; those that stop a run first.
+
+    The frames are read one by one; images of 160 and 320 columns are kept, and corners of images of 640.
     """
-    frames = iter(frames)
-    first = next(frames, None)
-    if first is None or not first.valid.any():
-        return
-    for message, *hints in (*_scale(first, grid), *_intrinsics(first), *_plane(first)):
-        _warn(f"{where}: {message}", *hints)
-    _warn_if_empty(chain((first,), frames), grid, where)
+    found = [*_intrinsics(frames[pauses[0]].camera), *_voxels(grid)]
+    if not any(finding.stop for finding in found):
+        looks = [Look(frames[p], grid, p) for p in pauses]
+        found += [finding for look in looks for finding in unreadable(look.frame, f"frame {look.index}")]
+    if not any(finding.stop for finding in found):
+        found += [*_support(looks[0]), *_scale(looks[0]), *_workspace(looks), *_moved(looks)]
+        found += [*_registration(looks), *_repeated(looks), *_one_pause(frames, pauses)]
+    return sorted(found, key=lambda finding: not finding.stop)
 
 
-def _scale(frame: Frame, grid: VoxelGrid) -> list[tuple[str, ...]]:
-    """Depth and voxels that are not those of objects on a table."""
-    found: list[tuple[str, ...]] = []
-    median = float(np.median(frame.depth[frame.valid]))
-    if not _DISTANCES[0] <= median <= _DISTANCES[1]:
-        found.append(
-            (
-                f"the median depth is {median:.3g} m, expected {_DISTANCES[0]:g} to {_DISTANCES[1]:g} m",
-                "check the depth scale: millimetres need 0.001, TUM images 0.0002; arrays are in metres",
-            )
+def report_findings(findings: Iterable[Finding], where: str) -> None:
+    """Raise the first finding that stops a run as InputError, or warn of all; `where` names the recording."""
+    for finding in findings:
+        if finding.stop:
+            raise InputError(f"{where}: {finding.message}", *finding.hints)
+        _warn(f"{where}: {finding.message}", *finding.hints)
+
+
+def examine_hypotheses(hypotheses: Sequence[Hypothesis], frame: Frame) -> list[Finding]:
+    """Findings about the hypotheses of a step and the frame at its pause."""
+    grid, points = hypotheses[0].grid, _sampled(frame, 160).points
+    raised = grid.contains(grid.index_of(points)) & (points[..., 2] > 2 * _MIN_HEIGHT)
+    if raised.mean() > 0.005 and not any(h.n_objects for h in hypotheses):
+        text = f"no hypothesis has an object, but {raised.mean():.1%} of the pixels show readings above the table"
+        hints = "check the depth scale and the pose", "objects of a few voxels need smaller voxels: give a workspace"
+        return [Finding(False, text, hints)]
+    largest = max((max(h.volumes().values(), default=0) for h in hypotheses), default=0)
+    if largest > 0.1 * np.prod(grid.shape):
+        text = f"an object has {largest} voxels, {largest / np.prod(grid.shape):.0%} of the workspace"
+        hints = (
+            "is it the table? check that the camera stands still and that the table is at z = 0",
+            "is it a wall or a person? give a workspace around the objects",
         )
-    if not _VOXELS[0] <= grid.voxel_size <= _VOXELS[1]:
-        found.append(
-            (
-                f"the voxels have edges of {grid.voxel_size:g} m, expected {_VOXELS[0]} to {_VOXELS[1]} m",
-                "check the workspace: its bounds and its voxel size are in metres",
-            )
-        )
-    points = frame.points[frame.valid]
-    index = grid.index_of(points)
-    beside = ((index[:, :2] >= 0) & (index[:, :2] < np.array(grid.shape[:2]))).all(axis=1)
-    raised = beside & (points[:, 2] > _MIN_HEIGHT)
-    if raised.sum() >= 200 and (index[raised, 2] >= grid.shape[2]).mean() > 0.5:
-        found.append(
-            (
-                f"most readings above the table are above the workspace, which ends at z = {grid.upper[2]:.2f} m",
-                "check the depth scale: objects on a table are not metres high; or give a higher workspace",
-                "is the plane of the table found on the floor or on a wall? then give the pose T_world_camera",
-            )
-        )
-    return found
-
-
-def _intrinsics(frame: Frame) -> list[tuple[str, ...]]:
-    """Focal lengths that no usual camera has."""
-    camera = frame.camera
-    fx, fy = float(camera.K[0, 0]), float(camera.K[1, 1])
-    angle = float(np.degrees(2 * np.arctan(camera.width / (2 * fx))))
-    hint = "check K: it is in pixels of these images; scale it if they were resized"
-    if not _FIELDS[0] <= angle <= _FIELDS[1]:
-        text = f"a focal length of {fx:.4g} pixels gives images of {camera.width} pixels"
-        return [(f"{text} a field of view of {angle:.3g} degrees", hint)]
-    if not 0.8 <= fx / fy <= 1.25:
-        return [(f"the focal lengths are {fx:.4g} and {fy:.4g} pixels, expected nearly equal ones", hint)]
+        return [Finding(False, text, hints)]
     return []
 
 
-def _plane(frame: Frame) -> list[tuple[str, ...]]:
-    """A pose and intrinsics that contradict the plane of the readings."""
-    try:
-        plane = fit_support_plane(frame)
-    except InputError:
-        return []
-    fitted, given = plane.T_world_camera.inv(), frame.camera.pose
-    normal = given.rotation.apply(fitted.rotation.apply([0.0, 0.0, 1.0]))
-    height = float((given * fitted).apply(np.zeros(3))[2])
-    tilt = float(np.degrees(np.arccos(np.clip(normal[2], -1, 1))))
+class Look:
+    """What the checks measure in the frame at a pause."""
+
+    def __init__(self, frame: Frame, grid: VoxelGrid, index: int = 0) -> None:
+        self.index, self.grid = index, grid
+        self.frame, self.edges = _sampled(frame, 160), _Edges(_sampled(frame, 320))
+        self.corners = _Corners(_sampled(frame, 640), grid)
+        self.points = self.frame.points[self.frame.valid]
+
+    @cached_property
+    def on_table(self) -> np.ndarray:
+        """(n,) bool: readings on the table."""
+        return np.asarray(np.abs(self.points[:, 2]) < _ON_TABLE)
+
+    @cached_property
+    def in_columns(self) -> np.ndarray:
+        """(n,) bool: readings in the workspace or above or below it."""
+        return _in_columns(self.grid, self.points)
+
+    @cached_property
+    def inside(self) -> np.ndarray:
+        """(m, 3) readings inside the workspace."""
+        return self.points[self.grid.contains(self.grid.index_of(self.points))]
+
+    @cached_property
+    def distance(self) -> float:
+        """Median depth of the readings on the table in metres; of all readings if they are few."""
+        depth = self.frame.depth[self.frame.valid]
+        return float(np.median(depth[self.on_table] if self.on_table.mean() > _MIN_ON_TABLE else depth))
+
+    def plane(self, chosen: np.ndarray) -> tuple[float, float, np.ndarray] | None:
+        """Tilt (degrees) and height (m) of the plane of chosen readings (n,), and its normal (3,) in camera axes."""
+        valid = np.zeros_like(self.frame.valid)
+        valid[self.frame.valid] = chosen
+        depth = np.where(valid, self.frame.depth, np.nan)
+        try:
+            plane: SupportPlane = fit_support_plane(Frame(self.frame.rgb, depth, self.frame.camera))
+        except InputError:
+            return None
+        fitted, given = plane.T_world_camera.inv(), self.frame.camera.pose
+        normal = fitted.rotation.apply([0.0, 0.0, 1.0])
+        tilt = np.degrees(np.arccos(np.clip(given.rotation.apply(normal)[2], -1, 1)))
+        return float(tilt), float((given * fitted).apply(np.zeros(3))[2]), normal
+
+    @cached_property
+    def table(self) -> tuple[float, float] | None:
+        """Tilt (degrees) and height (m) of the table near z = 0; None if there is no plane."""
+        near = np.abs(self.points[:, 2]) < _NEAR_TABLE
+        plane = self.plane(near) if near.mean() > 0.03 else None
+        return None if plane is None or plane[0] > _OTHER_PLANE else plane[:2]
+
+
+def _sampled(frame: Frame, width: int) -> Frame:
+    """Every k-th pixel of a frame, about `width` columns."""
+    step = max(1, round(frame.camera.width / width))
+    part = slice(step // 2, None, step)
+    rgb, depth = frame.rgb[part, part], frame.depth[part, part]
+    K = frame.camera.K.copy()
+    K[:2, 2] -= step // 2
+    K[:2] /= step
+    mask = None if frame.robot_mask is None else frame.robot_mask[part, part]
+    return Frame(rgb, depth, Camera(K, depth.shape[1], depth.shape[0], frame.camera.T_world_camera), mask)
+
+
+def _in_columns(grid: VoxelGrid, points: np.ndarray) -> np.ndarray:
+    """(...) bool: points (..., 3) whose x and y are in the grid."""
+    index = grid.index_of(points)[..., :2]
+    return np.asarray(((index >= 0) & (index < np.array(grid.shape[:2]))).all(axis=-1))
+
+
+def _outside(value: float, limits: tuple[float, float]) -> bool:
+    return not limits[0] <= value <= limits[1]
+
+
+def _intrinsics(camera: Camera) -> Iterator[Finding]:
+    """Focal lengths and principal points that no usual camera has."""
+    (fx, _, cx), (_, fy, cy), _ = camera.K.tolist()
+    width, height = camera.width, camera.height
+    hint = "check K: it is in pixels of these images; scale it if they were resized"
+    angle = float(np.degrees(2 * np.arctan(width / (2 * fx))))
+    if _outside(angle, _FIELDS):
+        text = (
+            f"a focal length of {fx:.4g} pixels gives images of {width} pixels a field of view of {angle:.3g} degrees"
+        )
+        yield Finding(_outside(angle, _POSSIBLE_FIELDS), text, (hint,))
+    elif _outside(fx / fy, (0.8, 1.25)):
+        yield Finding(
+            False, f"the focal lengths are {fx:.4g} and {fy:.4g} pixels, expected nearly equal ones", (hint,)
+        )
+    x, y = cx / width - 0.5, cy / height - 0.5
+    off = max(abs(x), abs(y))
+    if off > _OFF_CENTRE[0]:
+        text = f"the principal point ({cx:.4g}, {cy:.4g}) is far from the middle of images of {width} x {height}"
+        fits = f"K fits images of about {2 * cx:.0f} x {2 * cy:.0f} pixels"
+        crop = "K is that of the whole image and these are a part? subtract the left and upper border from cx and cy"
+        yield Finding(off > _OFF_CENTRE[1] or abs(x - y) < 0.03, text, (hint, fits, crop))
+
+
+def _voxels(grid: VoxelGrid) -> Iterator[Finding]:
+    size = grid.voxel_size
+    if _outside(size, _VOXELS):
+        text = f"the voxels have edges of {size:g} m, expected {_VOXELS[0]} to {_VOXELS[1]} m"
+        hint = "check the workspace: its bounds and its voxel size are in metres"
+        yield Finding(_outside(size, _POSSIBLE_VOXELS), text, (hint,))
+
+
+def unreadable(frame: Frame, which: str) -> Iterator[Finding]:
+    """Images that show nothing; `which` names the frame."""
+    depth, masked = (
+        frame.depth[np.isfinite(frame.depth)],
+        0.0 if frame.robot_mask is None else frame.robot_mask.mean(),
+    )
+    if masked > 0.95 or not frame.valid.any():
+        text = f"the robot mask of {which} covers {masked:.0%} of the image, and all or most of its depth"
+        yield Finding(True, text, ("is the mask inverted? True is the robot",))
+    elif np.ptp(depth) < 1e-6:
+        text = f"all depth readings of {which} are {depth[0]:.3g} m"
+        yield Finding(True, text, ("check that the depth images are those of the camera, in metres",))
+    elif frame.rgb.mean(axis=2).std() < 4:
+        text = f"the colour image of {which} is uniform"
+        yield Finding(False, text, ("check that the colour images are 8-bit RGB, 0 to 255, and not covered",))
+
+
+def _support(first: Look) -> Iterator[Finding]:
+    """A pose, intrinsics or a support plane that contradict the readings at the first pause."""
+    free, camera = first.plane(np.ones(len(first.points), bool)), first.frame.camera
     hints = (
         "check the pose: z of the world is up, the table is at z = 0; without a pose it is found from the table",
         "T_world_camera maps points of the camera to the world; is this the inverse?",
-        f"check K: its focal length is {frame.camera.K[0, 0]:.4g} pixels for images of {frame.camera.width} pixels",
+        f"check K: its focal length is {camera.K[0, 0] / camera.width:.3g} of the width of the images",
         "check the depth scale",
     )
-    if tilt < _OTHER_PLANE:
-        if tilt > _MAX_TILT or abs(height) > _MAX_HEIGHT:
-            text = f"the table in the depth image is tilted by {tilt:.1f} degrees and at z = {height:.3f} m"
-            return [(f"{text}, expected z = 0", *hints)]
-        return []
-    z = frame.points[frame.valid][:, 2]
-    if (np.abs(z) < _MAX_HEIGHT).mean() < _MIN_ON_TABLE:
-        return [(f"no table is at z = 0: the largest plane is tilted by {tilt:.0f} degrees", *hints)]
-    return []
+    table = first.table
+    if table is not None and (table[0] > _MAX_TILT or abs(table[1]) > _MAX_HEIGHT):
+        text = f"the table in the depth image is tilted by {table[0]:.1f} degrees and at z = {table[1]:.3f} m"
+        yield Finding(table[0] > 2 * _MAX_TILT or abs(table[1]) > 2 * _MAX_HEIGHT, f"{text}, expected z = 0", hints)
+    elif table is None and free is not None and (first.on_table.mean() < _MIN_ON_TABLE or free[0] > 150):
+        text = (
+            f"no table is at z = 0: the largest plane is tilted by {free[0]:.0f} degrees and at z = {free[1]:.3f} m"
+        )
+        yield Finding(True, f"{text}, expected z = 0", hints)
+    else:
+        yield from _other_support(first)
 
 
-_MIN_READINGS = 30  # fewer are taken for noise
+def _other_support(first: Look) -> Iterator[Finding]:
+    """A wall or the floor at z = 0: a large plane in front of it is the table.
 
-
-def _warn_if_empty(frames: Iterable[Frame], grid: VoxelGrid, where: str) -> None:
-    """Warn if no frame has readings inside the grid and above the table.
-
-    Objects are searched inside the voxel grid only. A grid in other units, at another place, or below a pose that is
-    upside down gives hypotheses without objects and no error. The frames are those at the pauses; they are read until
-    one has such readings. `where` names the recording in the message.
+    A table is parallel to the floor and higher above it than objects above a table. A table in front of a wall meets
+    it at a right angle and reaches far from it; its normal points to the top of the image, that of a wall does not.
     """
-    spans = []
-    for frame in frames:
-        points = frame.points[frame.valid]
-        inside = points[grid.contains(grid.index_of(points))]
-        if (inside[:, 2] > _MIN_HEIGHT).sum() >= _MIN_READINGS:
-            return
-        if len(points):
-            spans.append(np.percentile(points, (2, 98), axis=0))
-    if not spans:
+    raised = first.points[:, 2] > _ON_TABLE
+    plane = first.plane(raised) if raised.mean() > _MIN_ON_TABLE else None
+    if plane is None:
         return
-    low, high = np.min(spans, axis=0)[0], np.max(spans, axis=0)[1]
-    seen = ", ".join(f"{axis} {a:.2f} to {b:.2f}" for axis, a, b in zip("xyz", low, high, strict=True))
-    spanned = ", ".join(
-        f"{axis} {a:.2f} to {b:.2f}" for axis, a, b in zip("xyz", grid.origin, grid.upper, strict=True)
+    tilt, height, normal = plane
+    heights = first.points[raised, 2]
+    hints = (
+        "give the pose T_world_camera of the camera over the table",
+        "or remove the depth readings beyond the table (NaN or 0), or turn the camera towards the table",
     )
-    _warn(
-        f"the workspace of {where} has no reading above the table, so no object can be found: "
-        f"it spans {spanned} m, depth readings span {seen} m",
-        "give a workspace around the objects, or none: it is then placed around the objects on the table",
-        "check the pose: z of the world is up, the table is at z = 0",
-        "check the depth scale, and that the images show objects on a table and not only a wall",
+    if tilt < 15 and height > _TALL:
+        share = float(raised.mean() * (np.abs(heights - height) < _ON_TABLE).mean())
+        if share > _MIN_ON_TABLE:
+            yield Finding(
+                True, f"the floor is taken for the table: a second plane is {height:.2f} m above z = 0", hints
+            )
+    up = first.frame.camera.pose.rotation.inv().apply([0.0, 0.0, 1.0])
+    if 60 < tilt < 120 and np.percentile(heights, 98) > _TALL and up[1] > -0.1 and -normal[1] > _UPRIGHT:
+        yield Finding(True, f"a wall is taken for the table: another plane is tilted by {tilt:.0f} degrees", hints)
+
+
+def _scale(first: Look) -> Iterator[Finding]:
+    """Distances that are not those of a camera over a table."""
+    z, size = first.distance, first.grid.voxel_size
+    hint = "check the depth scale: millimetres need 0.001, TUM images 0.0002, RealSense L515 0.00025"
+    if _outside(z, _DISTANCES):
+        near, far = z < _VOXELS_IN_DISTANCE * size, depth_sigma(z) > _NOISE_IN_VOXELS * size
+        text = f"the table is {z:.3g} m from the camera, expected {_DISTANCES[0]:g} to {_DISTANCES[1]:g} m"
+        right = f"if the distance is right, give a workspace with {'larger' if far else 'smaller'} voxels"
+        yield Finding(bool(near or far), text, (hint, right))
+    raised = first.in_columns & (first.points[:, 2] > _MIN_HEIGHT)
+    above = first.points[raised, 2] > first.grid.upper[2]
+    if raised.sum() >= _MIN_READINGS and above.mean() > 0.5:
+        text = f"most readings above the table are above the workspace, which ends at z = {first.grid.upper[2]:.2f} m"
+        yield Finding(
+            False,
+            text,
+            (
+                "check the depth scale: objects on a table are not metres high; or give a higher workspace",
+                "is the plane of the table found on the floor or on a wall? then give the pose T_world_camera",
+            ),
+        )
+
+
+def _workspace(looks: Sequence[Look]) -> Iterator[Finding]:
+    """A workspace without the table, or below or above the objects."""
+    if any((look.inside[:, 2] > _MIN_HEIGHT).sum() >= _MIN_READINGS for look in looks):
+        return
+    raised = max(int((look.in_columns & (look.points[:, 2] > _MIN_HEIGHT)).sum()) for look in looks)
+    on_table = max(int((look.in_columns & look.on_table).sum()) for look in looks)
+    if raised < _MIN_READINGS and on_table >= _MIN_READINGS:
+        return  # an empty table
+    spans = np.array([np.percentile(look.points, (2, 98), axis=0) for look in looks])
+    grid, texts = looks[0].grid, []
+    for low, high in ((grid.origin, grid.upper), (spans[:, 0].min(axis=0), spans[:, 1].max(axis=0))):
+        texts.append(", ".join(f"{axis} {a:.2f} to {b:.2f}" for axis, a, b in zip("xyz", low, high, strict=True)))
+    yield Finding(
+        True,
+        "the workspace has no reading above the table, so no object can be found: "
+        f"it spans {texts[0]} m, depth readings span {texts[1]} m",
+        (
+            "give a workspace around the objects, or none: it is then placed around the objects on the table",
+            "check the pose: z of the world is up, the table is at z = 0",
+            "check the depth scale, and that the images show objects on a table and not only a wall",
+        ),
     )
+
+
+class _Corners:
+    """Corners of the image (ORB) on the table and outside the workspace: what stands still."""
+
+    def __init__(self, frame: Frame, grid: VoxelGrid) -> None:
+        import cv2
+
+        points = frame.points
+        with np.errstate(invalid="ignore"):
+            still = (np.abs(points[..., 2]) < _MIN_HEIGHT) | ~_in_columns(grid, points)
+        mask = cv2.erode((still & frame.valid).astype(np.uint8), np.ones((9, 9), np.uint8))
+        grey = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
+        corners, self.features = cv2.ORB_create(1000, fastThreshold=4).detectAndCompute(grey, mask)  # type: ignore[attr-defined]
+        self.pixels = np.array([corner.pt for corner in corners]).reshape(-1, 2)
+        column, row = np.rint(self.pixels).astype(int).T
+        self.points, self.camera = points[row, column], frame.camera
+
+    def moved(self, other: _Corners) -> tuple[int, int, float]:
+        """How many corners are where the poses of two cameras put them, how many agree on another camera, and by how
+        many metres these are displaced."""
+        import cv2
+
+        if self.features is None or other.features is None:
+            return 0, 0, 0.0
+        matches = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(self.features, other.features)
+        pairs = np.array([(m.queryIdx, m.trainIdx) for m in matches if m.distance < 50], int).reshape(-1, 2)
+        expected, z = other.camera.project(self.points[pairs[:, 0]])
+        pairs, expected, z = (part[np.isfinite(expected[:, 0])] for part in (pairs, expected, z))
+        found, tolerance = other.pixels[pairs[:, 1]], other.camera.width / 160
+        if len(pairs) < _MIN_MOVED:
+            return len(pairs), 0, 0.0
+        distance = np.linalg.norm(found - expected, axis=1)
+        inlier = cv2.findHomography(expected, found, cv2.RANSAC, tolerance / 2, maxIters=500)[1]
+        away = (np.zeros(len(pairs), bool) if inlier is None else inlier.ravel() > 0) & (distance > tolerance)
+        metres = distance[away] * z[away] / other.camera.K[0, 0]
+        return int((distance <= tolerance).sum()), int(away.sum()), float(np.median(metres)) if away.any() else 0.0
+
+
+def drift(first: Look, look: Look) -> tuple[float, float, float]:
+    """Tilt (degrees), height (m) and shift (m) of the camera against its pose, from the first pause to another.
+
+    Tilt and height are those of the table, where few readings are left at z = 0; the shift is that of corners of the
+    image on the table and outside the workspace.
+    """
+    tilt = height = shift = 0.0
+    left = look.on_table.mean() / max(first.on_table.mean(), 1e-9)
+    if first.table is not None and look.table is not None:
+        tilt, height = look.table[0] - first.table[0], abs(look.table[1] - first.table[1])
+        tilt, height = tilt if left < 0.8 else 0.0, height if left < 0.3 or tilt > 1 else 0.0
+    still, moved, metres = first.corners.moved(look.corners)
+    if moved >= _MIN_MOVED and moved > 2 * still:
+        shift = metres
+    return tilt, height, shift
+
+
+def _moved(looks: Sequence[Look]) -> Iterator[Finding]:
+    """A camera that is not where its pose says; the first such pause."""
+    for look in looks[1:]:
+        found = drift(looks[0], look)
+        size = max(value / limit for value, limit in zip(found, _DRIFT, strict=True))
+        if size > 1:
+            text = f"the camera moves from frame {looks[0].index} to {look.index}, but not its pose: the table is "
+            text += "tilted by {:.1f} degrees and {:.3f} m higher, still corners are shifted by {:.3f} m".format(
+                *found
+            )
+            hints = (
+                "fix the camera, or give its pose in every frame: T_world_camera of shape (T, 4, 4)",
+                "poses of the camera map its points to the world, in metres; check that they belong to these frames",
+            )
+            yield Finding(size > 2, text, hints)
+            return
+
+
+class _Edges:
+    """Edges of depth (H, W) float32 0 or 1, and ranks (H, W) from 0 to 1 of the gradients of colour."""
+
+    def __init__(self, frame: Frame) -> None:
+        import cv2
+
+        depth = np.where(frame.valid, frame.depth, np.nan)
+        near, far = cv2.erode(np.nan_to_num(depth, nan=9.0), _BOX), cv2.dilate(np.nan_to_num(depth, nan=0.0), _BOX)
+        known = cv2.erode(frame.valid.astype(np.uint8), _BOX) > 0
+        self.depth = (known & (far - near > 0.03 + 0.02 * near)).astype(np.float32)
+        margin = np.zeros_like(self.depth)
+        inner = slice(_SHIFTS, -_SHIFTS)
+        margin[inner, inner] = self.depth[inner, inner]
+        self.depth = margin
+        rgb = cv2.GaussianBlur(frame.rgb, (3, 3), 0).astype(np.float32)
+        across, down = np.abs(np.diff(rgb, axis=1, append=rgb[:, -1:])), np.abs(np.diff(rgb, axis=0, append=rgb[-1:]))
+        gradient = np.maximum(across, down).max(axis=2)
+        levels = np.sort(gradient, axis=None)
+        self.rank = (np.searchsorted(levels, gradient) / gradient.size).astype(np.float32)
+
+    def under(self, other: _Edges) -> np.ndarray:
+        """(33, 33) sum of the colour ranks of `other` below the depth edges, by shift from -16 to 16 pixels."""
+        import cv2
+
+        inner = slice(_SHIFTS, -_SHIFTS)
+        return np.asarray(cv2.matchTemplate(other.rank, self.depth[inner, inner], cv2.TM_CCORR))
+
+
+_BOX = np.ones((3, 3), np.uint8)
+
+
+def edge_agreement(looks: Sequence[Look]) -> tuple[float, float, tuple[int, int], float]:
+    """How well edges of depth and colour agree at all pauses.
+
+    Returns the best agreement minus the median over shifts; the share of it that is lost without a shift; the best
+    shift (rows, columns) of colour in pixels of an image of 320 columns; and by how much the agreement rises if depth
+    belongs to other pauses (in reverse, or one earlier or later).
+    """
+    edges = [look.edges for look in looks if min(look.frame.depth.shape) > _SHIFTS]
+    count = sum(float(edge.depth.sum()) for edge in edges)
+    if count < 4 * _MIN_READINGS or min(edges[0].depth.shape) < 4 * _SHIFTS:
+        return 0.0, 0.0, (0, 0), 0.0
+
+    def agreement(order: Sequence[int]) -> np.ndarray:
+        return np.sum([edges[i].under(edges[j]) for i, j in enumerate(order)], axis=0) / count
+
+    def unshifted(scores: np.ndarray) -> float:
+        return float(scores[_SHIFTS - 1 : _SHIFTS + 2, _SHIFTS - 1 : _SHIFTS + 2].max())
+
+    n, scores = len(edges), agreement(range(len(edges)))
+    row, column = np.unravel_index(scores.argmax(), scores.shape)
+    base, top = float(np.median(scores)), float(scores.max())
+    lost = (top - unshifted(scores)) / max(top - base, 1e-9)
+    orders = [range(n - 1, -1, -1), [*range(1, n), 0], [n - 1, *range(n - 1)]] if n > 1 else []
+    best = max((unshifted(agreement(order)) for order in orders), default=0.0)
+    top = max(top, best)
+    return top - base, lost, (int(row) - _SHIFTS, int(column) - _SHIFTS), best - unshifted(scores)
+
+
+def _registration(looks: Sequence[Look]) -> Iterator[Finding]:
+    """Depth that does not belong to the colour at the same pixel or the same pause."""
+    peak, lost, shift, rise = edge_agreement(looks)
+    if peak < _PEAK:
+        return
+    if rise > _ORDER:
+        text = "edges of the depth images agree better with the colour images of other pauses than with their own"
+        yield Finding(False, text, ("check that colour and depth have the same order, and the same clock",))
+    elif lost > _EXCESS and max(map(abs, shift)) > 2:
+        scale = 100 / looks[0].edges.depth.shape[1]
+        text = (
+            f"depth is not registered to colour: edges agree best {scale * shift[1]:.1f} % of the image width further"
+        )
+        text += f" right and {scale * shift[0]:.1f} % further down in colour"
+        hints = ("align depth to colour when recording: each depth pixel belongs to the colour pixel above it",)
+        yield Finding(False, text, hints)
+
+
+def _repeated(looks: Sequence[Look]) -> Iterator[Finding]:
+    """Pauses that all show one image."""
+    if len(looks) > 1 and len({content_key(look.frame.rgb, look.frame.depth) for look in looks}) == 1:
+        text = f"the images of all {len(looks)} pauses are identical, which no camera gives"
+        yield Finding(False, text, ("check that every frame is read from its own file",))
+
+
+def _one_pause(frames: Sequence[Frame], pauses: Sequence[int]) -> Iterator[Finding]:
+    """A video of a change with one pause: the past is not used."""
+    if len(pauses) > 1 or len(frames) == 1:
+        return
+    change = np.abs(grey_blocks(frames[0].rgb) - grey_blocks(frames[len(frames) - 1].rgb))
+    if (np.abs(change - np.median(change)) > 20).mean() > 0.01:
+        text = f"there is one pause in {len(frames)} frames, but the scene changes: the video is not used"
+        yield Finding(False, text, ("give a pause before and after each action: pauses=(0, 40, 85)",))
 
 
 def _warn(message: str, *hints: str) -> None:

@@ -15,7 +15,7 @@ import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from copy import copy
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from numbers import Integral
 from pathlib import Path
@@ -31,7 +31,7 @@ from mstfilter.scene.camera import Camera, rigid_from_matrix
 from mstfilter.scene.frame import Clip, Frame
 from mstfilter.scene.geometry import fit_support_plane, workspace
 from mstfilter.scene.pauses import Ends, PauseRule, Still, pause_rule
-from mstfilter.scene.plausibility import warn_if_implausible
+from mstfilter.scene.plausibility import examine, report_findings, unreadable
 from mstfilter.scene.voxels import VoxelGrid, as_labels
 
 _LONG = 20  # frames; more are probably not one clip
@@ -134,7 +134,7 @@ class Recording:
         K: np.ndarray,
         *,
         pauses: Sequence[int] | str | PauseRule | None = None,
-        T_world_camera: np.ndarray | RigidTransform | None = None,
+        T_world_camera: np.ndarray | RigidTransform | Sequence[RigidTransform] | None = None,
         grid: VoxelGrid | None = None,
         robot_masks: np.ndarray | None = None,
         times: Sequence[float] | None = None,
@@ -153,8 +153,9 @@ class Recording:
         pauses : sequence of int, str or PauseRule, optional
             Frames at which nothing moves; a hypothesis is estimated at each. A rule or its text finds them: "still",
             "ends", "every", or "0s,4.2s". Default: "still" if `times` are given, as on the command line; else "ends".
-        T_world_camera : (4, 4) array or RigidTransform, optional
-            Camera pose; the table must be at z = 0. Default: from the support plane of the first pause.
+        T_world_camera : (4, 4) or (T, 4, 4) array, RigidTransform or T of them, optional
+            Pose of the camera, or its pose in every frame if it moves; the table must be at z = 0. Default: from the
+            support plane of the first pause.
         grid : VoxelGrid, optional
             Workspace. Default: 1 x 1 x 0.5 m in voxels of 1 cm around the objects on the table.
         robot_masks : (T, H, W) bool, optional
@@ -163,6 +164,11 @@ class Recording:
             Seconds. Default: 0, 1, 2, ...
         name : str
             For messages and reports.
+
+        Raises
+        ------
+        InputError
+            If the arrays cannot be used, or `examine` finds that hypotheses cannot be right.
         """
         if depth is None:
             raise InputError(
@@ -186,9 +192,7 @@ class Recording:
         n, height, width = depth.shape
         for index, image in enumerate(depth):
             check_depth(image, f"depth image of frame {index} of {name}")
-        if T_world_camera is not None and not isinstance(T_world_camera, RigidTransform):
-            T_world_camera = rigid_from_matrix(T_world_camera, "T_world_camera")
-        camera = Camera(K, width, height, T_world_camera)
+        cameras = _cameras(Camera(K, width, height), T_world_camera, n)
         stamps = tuple(float(t) for t in (times if times is not None else range(n)))
         if len(stamps) != n:
             raise InputError(f"there are {len(stamps)} times for {n} frames of {name}")
@@ -220,11 +224,12 @@ class Recording:
                 f"there are {len(masks)} robot masks of shape {found}, expected {n} of {(height, width)}",
                 "one mask per frame, of the size of the images",
             )
-        first = Frame(rgb[chosen[0]], depth[chosen[0]], camera, masks[chosen[0]])
-        camera, grid = find_world(first, grid)
-        frames = [Frame(rgb[i], depth[i], camera, masks[i]) for i in range(n)]
+        frames = [Frame(*images) for images in zip(rgb, depth, cameras, masks, strict=True)]
+        posed, grid = find_world(frames[chosen[0]], grid)
+        if T_world_camera is None:
+            frames = [replace(frame, camera=posed) for frame in frames]
         made = cls(frames, grid, chosen, stamps, name)
-        made._warn_once  # noqa: B018
+        made._examined  # noqa: B018
         return made
 
     @cached_property
@@ -247,25 +252,43 @@ class Recording:
     def clips(self) -> tuple[Clip, ...]:
         """One clip per pause: the first pause alone, then from each pause to the next.
 
-        Warns if the input is not plausible (`mstfilter.scene.warn_if_implausible`), unless it was done before.
+        Warns if the input is not plausible, and raises InputError if no hypothesis can be right
+        (`mstfilter.scene.examine`), unless it was done before.
         """
-        self._warn_once  # noqa: B018
+        self._examined  # noqa: B018
         clips = []
         for t, end in enumerate(self.pauses):
             span = slice(self.pauses[max(t - 1, 0)], end + 1)
             clips.append(Clip(self.frames[span], self.grid, t, tuple(self.times[span])))
         return tuple(clips)
 
+    def in_world_of(self, other: Recording) -> Recording:
+        """This recording with the workspace of another, and its camera pose at the first pause; without true volumes.
+
+        For parts of one session with a camera that stands still, or that is at the same place at both first pauses:
+        ``open_source(path, options=["start_s=30"]).in_world_of(first)``. Hypotheses of one part can then be moved on
+        by the clips of the next.
+        """
+        own = self.frames[self.pauses[0]].camera.pose
+        moved = other.frames[other.pauses[0]].camera.pose * own.inv()
+
+        def read(index: int) -> Frame:
+            frame = self.frames[index]
+            return replace(frame, camera=frame.camera.at(moved * frame.camera.pose))
+
+        frames = LazyFrames(read, len(self))
+        return replace(self, frames=frames, grid=other.grid, truth=lambda t: None, poses=lambda index: None)
+
     def check(self) -> None:
-        """Read every image, so that an unreadable one raises InputError before a run; warn of implausible input."""
+        """Read every image, so that an unreadable one raises InputError before a run, and examine the recording."""
         _ = self.key
-        self.__dict__.pop("_warn_once", None)
-        self._warn_once  # noqa: B018
+        self.__dict__.pop("_examined", None)
+        self._examined  # noqa: B018
 
     @cached_property
-    def _warn_once(self) -> None:
-        """Evaluated once: warnings about the frames at the pauses."""
-        warn_if_implausible((self.frames[p] for p in self.pauses), self.grid, f"recording {self.name}")
+    def _examined(self) -> None:
+        """Evaluated once: warnings and errors about the frames at the pauses."""
+        report_findings(examine(self.frames, self.pauses, self.grid), f"recording {self.name}")
 
 
 class UsesFiles(ABC):
@@ -277,6 +300,23 @@ class UsesFiles(ABC):
     @abstractmethod
     def check_files(self, recording: Recording) -> None:
         """Raise InputError if a file is missing or cannot be used for a recording; called before a run."""
+
+
+def _cameras(camera: Camera, poses: Any, n: int) -> list[Camera]:
+    """The camera of each of `n` frames: of one pose, of none, or of one for each frame."""
+    if poses is None:
+        return [camera] * n
+    listed = list(poses) if np.ndim(poses) in (1, 3) else [poses]
+    if len(listed) not in (1, n):
+        raise InputError(
+            f"T_world_camera has {len(listed)} poses for {n} frames",
+            "give one pose (4, 4), or one for each frame (T, 4, 4)",
+        )
+    rigid = [
+        pose if isinstance(pose, RigidTransform) else rigid_from_matrix(pose, f"T_world_camera of frame {k}")
+        for k, pose in enumerate(listed)
+    ]
+    return [camera.at(rigid[0])] * n if len(rigid) == 1 else [camera.at(pose) for pose in rigid]
 
 
 def _stacked(images: Any, what: str) -> np.ndarray:
@@ -307,6 +347,7 @@ def check_depth(depth: np.ndarray, where: str) -> None:
 
 def find_world(first: Frame, grid: VoxelGrid | None) -> tuple[Camera, VoxelGrid]:
     """Camera with a pose, and a workspace; what is not given is found from the frame of the first pause."""
+    report_findings((finding for finding in unreadable(first, "the first pause") if finding.stop), "recording")
     camera = first.camera
     if camera.T_world_camera is None:
         camera = camera.at(fit_support_plane(first).T_world_camera)
@@ -316,7 +357,7 @@ def find_world(first: Frame, grid: VoxelGrid | None) -> tuple[Camera, VoxelGrid]
 
 
 def truth_reader(
-    labels: np.ndarray, frames: np.ndarray, pauses: tuple[int, ...]
+    labels: np.ndarray, frames: Sequence[int], pauses: tuple[int, ...]
 ) -> Callable[[int], np.ndarray | None]:
     """The function `Recording.truth` from labels (S, X, Y, Z) at frame indices (S,)."""
     row = {int(frame): s for s, frame in enumerate(frames)}

@@ -26,7 +26,7 @@ import hashlib
 import json
 import os
 import shutil
-import tempfile
+import warnings
 from collections.abc import Callable
 from dataclasses import asdict, fields, replace
 from importlib.metadata import version
@@ -35,9 +35,10 @@ from typing import Any
 
 import numpy as np
 
-from mstfilter.errors import InputError
-from mstfilter.files import write_text
+from mstfilter.errors import InputError, InputWarning
+from mstfilter.files import atomic_folder, damaged_files, sweep, write_text
 from mstfilter.formats import RecordingWriter, open_recording
+from mstfilter.reading import check_private
 from mstfilter.scene import Recording
 from mstfilter.simulation.arrangement import SceneObjects, arrange_objects, draw_objects
 from mstfilter.simulation.families import GENERATOR_VERSION, SceneFamily, scene_family
@@ -60,6 +61,7 @@ from mstfilter.simulation.world import (
 #: Metres by which recorded poses (in images, poses and volumes alike) may differ from the physics; see `Stage`.
 POSE_TOLERANCE = 0.0002
 
+_DAY_S = 24 * 3600.0
 _Progress = Callable[[int, int, str], None]  # called with frames done, frames in all, and a description
 
 
@@ -233,7 +235,7 @@ def recipe_key(family: SceneFamily, seed: int) -> str:
 
 
 def cached_recording(family: str | SceneFamily, seed: int, folder: Path | None = None, **overrides: Any) -> Path:
-    """The folder of a simulated recording, which is simulated if it does not exist.
+    """The folder of a simulated recording, which is simulated if it does not exist or has changed on the disk.
 
     `overrides` are fields of the family to change. Recordings are kept in `folder`; by default `recordings` in
     `cache_folder()`. Raises InputError if the family, a field or the seed is invalid, or the folder cannot be
@@ -249,6 +251,10 @@ def cached_recording(family: str | SceneFamily, seed: int, folder: Path | None =
     chosen = replace(chosen, **overrides)
     _check_seed(seed)
     target = (folder or cache_folder() / "recordings") / f"{chosen.name}-{seed}-{recipe_key(chosen, seed)}"
+    check_private(target.parent)
+    if (target / "manifest.json").is_file() and (damage := damaged_files(target)):
+        warnings.warn(InputWarning(f"cached recording {target}: {damage[0]}", "it is simulated again"), stacklevel=2)
+        shutil.rmtree(target)
     if not (target / "manifest.json").is_file():
         _simulate_into_cache(chosen, seed, target)
     return target
@@ -259,19 +265,11 @@ def _simulate_into_cache(family: SceneFamily, seed: int, target: Path) -> None:
         ignore = target.parent / ".gitignore"  # recordings stay out of version control
         if not ignore.exists():
             write_text(ignore, "*\n")
-        work = Path(tempfile.mkdtemp(prefix=f".{target.name}-", dir=target.parent))
+        sweep(target.parent, older_than_s=_DAY_S)  # of simulations that were killed
+        with atomic_folder(target, existing="keep") as work:  # another process may write the same recording
+            simulate_recording(family, seed, work)
     except OSError as error:
         raise InputError(
             f"cannot keep recordings in {target.parent}: {error.strerror}",
             "set MSTFILTER_CACHE to a folder that can be written",
         ) from error
-    try:
-        simulate_recording(family, seed, work / "recording")
-        try:
-            (work / "recording").rename(target)
-        except OSError:
-            if not (target / "manifest.json").is_file():
-                raise
-            # Another process has written the same recording.
-    finally:
-        shutil.rmtree(work, ignore_errors=True)

@@ -14,10 +14,10 @@ runs: it treats each row by itself, and takes the shape of its draws from its ar
 ``x + rng.standard_normal(x.shape)``. `RunGenerators` draws the rows of each run from its stream. Observations and
 inputs that differ between runs are repeated for each row.
 
-The batch checks this. At steps 0, 1, 2, 4, 8, ..., and when the number of runs changes, some runs are compared with a
-call for that run alone; at the first call of a component, up to 64 with a call for these runs in another order.
-If they differ, a component that states ``batched=True`` raises InputError. Otherwise, and if they differ by rounding
-only, the component is called once for each run, and `Batch.single` says why.
+The batch checks this. At steps 0, 1, 2, 5, 12, 29, ..., at the last one, and when the number of runs changes, some
+runs are compared with a call for that run alone; at the first call of a component, up to 64 runs with a call for them
+in another order. If they differ, a component that states ``batched=True`` raises InputError. Otherwise, and if they
+differ by rounding only, the component is called once for each run, and `Batch.single` says why.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 
@@ -35,13 +35,16 @@ from mstfilter.errors import InputError, LostRunError
 from mstfilter.smc.filter import ParticleFilter, keep_freed_memory
 from mstfilter.smc.inputs import split_input
 from mstfilter.smc.interfaces import State, WeightResampler
-from mstfilter.smc.population import Population, identity
+from mstfilter.smc.population import Population, check_observations, identity
 from mstfilter.smc.streams import Key, RunGenerators, SlotStreams, rows_of
 
 Function = Callable[[Population], Any]
 
 #: Runs that are compared with a call for the runs in another order.
 _MOST_COMPARED = 64
+#: Steps at which runs are compared: the Pell numbers 0, 1, 2, 5, 12, 29, 70, ... Unlike powers of two, they also find
+#: a fault of every third step.
+_COMPARED_STEPS = frozenset(round((1 + math.sqrt(2)) ** k / math.sqrt(8)) for k in range(40))
 _SLOTS = ("initial", "transition", "update")
 _RAW = (TypeError, ValueError, LookupError, AttributeError, ArithmeticError)
 
@@ -106,7 +109,10 @@ def batch(
         If a component that states ``batched=True`` mixes runs, or a run raises an error.
     """
     seeds = [int(seed) for seed in seeds]
-    ys = [list(y) for y in observations] if paired else [list(observations)]
+    ys = [
+        list(check_observations(y, f"run {run}, " if paired else ""))
+        for run, y in enumerate(observations if paired else [observations])
+    ]
     if not seeds:
         raise InputError("there are no seeds")
     if paired and len(ys) != len(seeds):
@@ -343,13 +349,6 @@ class _Sweep:
             except LostRunError as error:
                 self.result.lost[run] = f"step {t}, {slot}: {error.message}"
                 continue
-            except InputError as error:
-                raise InputError(f"run {run}, step {t}, {slot}: {error.message}", *error.hints) from error
-            except _RAW as error:
-                raise InputError(
-                    f"run {run}, step {t}, {slot}: {type(error).__name__}: {error}",
-                    "the run alone, filter.run(observations, seed), raises the same error with its place",
-                ) from error
             if len(population) != self.filter.n:
                 raise _CalledSingly("all", f"the {slot} returns another number of particles")
             kept.append(row)
@@ -359,14 +358,25 @@ class _Sweep:
         return np.array(kept), _stacked([p.particles for p in found]), np.stack([p.log_weights for p in found])
 
     def alone(self, t: int, slot: str, row: int) -> Population:
-        """What a component returns for one run."""
+        """What a component returns for one run; an error names the run."""
         y, u = self.given(t, row)
-        component = getattr(self.filters.one(int(self.runs[row])).at(t, u), slot)
+        component = getattr(self.filters.one(int(self.runs[row])).at_step(t, u), slot)
         rng = Key(self.seeds[self.runs[row]]).child("step", t).child(slot).generator() if component.draws else None
         population = None
         if slot != "initial":
             population = Population(*self.row(row), {"previous": identity(self.filter.n)})
-        return _called(slot, component, rng, population, y, self.filter.n)
+        where = f"run {self.runs[row]}, step {t}, {slot}"
+        try:
+            return _called(slot, component, rng, population, y, self.filter.n)
+        except LostRunError:
+            raise
+        except InputError as error:
+            raise InputError(f"{where}: {error.message}", *error.hints) from error
+        except _RAW as error:
+            raise InputError(
+                f"{where}: {type(error).__name__}: {error}",
+                "the run alone, filter.run(observations, seed), raises the same error with its place",
+            ) from error
 
     def together(self, t: int, slot: str, rows: np.ndarray) -> tuple[np.ndarray, Any, np.ndarray]:
         """As `each`, of a component that is called once."""
@@ -380,7 +390,7 @@ class _Sweep:
             if isinstance(error, LostRunError):
                 return found
             self.refuse(t, slot, f"a call for all runs raises {type(error).__name__}: {error}; single runs do not")
-        due = not t & (t - 1) or self.checked.get(slot, (0, 0))[0] != len(rows)
+        due = t in _COMPARED_STEPS or t == len(self.ys[0]) - 1 or self.checked.get(slot, (0, 0))[0] != len(rows)
         if self.check and due:
             self.compare(t, slot, rows, particles, log_weights)
         if log_weights is self.log_weights:
@@ -401,14 +411,14 @@ class _Sweep:
         """Particles and log weights of a component that is called once for the given rows, in their order."""
         runs, n = self.runs[rows], self.filter.n
         y, u = (self.by_row(rows, t, k) for k in (0, 1))
-        component = getattr(self.filters.rows(runs).at(t, u), slot)
+        component = getattr(self.filters.rows(runs).at_step(t, u), slot)
         rng = RunGenerators(self.states(t, slot, runs), n) if component.draws else None
         population, log_weights = None, self.log_weights
         if slot != "initial":
             everything = len(rows) == len(self.runs) and rows[0] == 0
             particles = self.particles if everything else _row(self.particles, rows)
             log_weights = self.log_weights if everything else self.log_weights[rows]
-            population = Population(_flat(particles, n), log_weights.ravel())
+            population = Population.unchecked(_flat(particles, n), log_weights.ravel())
         found = _called(slot, component, rng, population, y, len(rows) * n)
         if len(found) != len(rows) * n:
             raise InputError(f"{len(rows) * n} particles became {len(found)}")
@@ -440,6 +450,7 @@ class _Sweep:
         last, count = self.checked.get(slot, (0, 0))
         self.checked[slot] = len(rows), count + 1
         for k in {count % len(rows)} if last == len(rows) else {0, len(rows) - 1}:
+            self.same_scheme(self.filters.one(int(self.runs[rows[k]])))
             try:
                 population = self.alone(t, slot, int(rows[k]))
                 single = population.realised().particles, population.log_weights
@@ -448,12 +459,21 @@ class _Sweep:
             self.agree(t, slot, rows[k], (_row(particles, k), log_weights[k]), single, "alone")
         if count == 0 and len(rows) > 1:
             order = np.roll(np.arange(0, len(rows), math.ceil(len(rows) / _MOST_COMPARED)), 1)
-            found = self.of_rows(t, slot, rows[order])
+            try:
+                found = self.of_rows(t, slot, rows[order])
+            except Exception as error:
+                self.refuse(t, slot, f"a call for the runs in another order raises {type(error).__name__}: {error}")
             ours = _row(particles, order), log_weights[order]
             if _difference(ours[0], found[0]) is not None or _difference(ours[1], found[1]) is not None:
                 for k, row in enumerate(rows[order].tolist()):
                     one = (_row(ours[0], k), ours[1][k]), (_row(found[0], k), found[1][k])
                     self.agree(t, slot, row, *one, "with the runs in another order")
+
+    def same_scheme(self, other: ParticleFilter) -> None:
+        """Make single runs if the filter of a run has another number of particles, resampler or trigger."""
+        for name in ("n", "resample", "resampler", "trigger"):
+            if other is not self.filter and getattr(other, name) != getattr(self.filter, name):
+                raise _CalledSingly("all", f"the filters of the runs differ in {name}")
 
     def agree(self, t: int, slot: str, row: int, ours: tuple[Any, Any], other: tuple[Any, Any], how: str) -> None:
         """Refuse the component if a run differs."""
@@ -466,7 +486,7 @@ class _Sweep:
             run = int(self.runs[row])
             self.refuse(t, slot, f"the {what} of run {run} are {found[1]} in the batch, {found[2]} {how}")
 
-    def refuse(self, t: int, slot: str, reason: str) -> None:
+    def refuse(self, t: int, slot: str, reason: str) -> NoReturn:
         """Raise InputError if the component states that it is batched; else call it once for each run."""
         if getattr(self.filter, slot).batched is True:
             raise InputError(

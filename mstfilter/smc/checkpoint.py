@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import os
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -29,7 +28,8 @@ from typing import Any
 import numpy as np
 
 from mstfilter.errors import InputError, reason
-from mstfilter.files import atomic_path, read_arrays
+from mstfilter.files import atomic_path, writing
+from mstfilter.reading import read_arrays
 from mstfilter.smc.interfaces import Codec, State
 from mstfilter.smc.population import Population
 from mstfilter.smc.programs.sites import Trace
@@ -64,26 +64,26 @@ def save_state(
         **{f"parents/{name}": index for name, index in population.parents.items()},
         **{f"particles/{name}": a for name, a in (codec or ArrayCodec()).encode(population.particles).items()},
     }
-    try:
-        with atomic_path(path) as partial, partial.open("wb") as file:
-            (np.savez_compressed if compress else np.savez)(file, allow_pickle=False, **arrays)
-            file.flush()
-            os.fsync(file.fileno())
-    except OSError as error:
-        raise InputError(f"cannot write checkpoint {path}: {error.strerror}") from error
+    with writing(f"checkpoint {path}"), atomic_path(path) as partial, partial.open("wb") as file:
+        (np.savez_compressed if compress else np.savez)(file, allow_pickle=False, **arrays)
 
 
-def load_state(path: Path, codec: Codec | None = None) -> tuple[State, dict[str, Any]]:
-    """The state in a file, and the description stored with it. InputError if the file is damaged or no checkpoint."""
-    arrays = read_arrays(path, "checkpoint", _DAMAGED)
+def load_state(path: Path, codec: Codec | None = None, *, limit: int = 2**40) -> tuple[State, dict[str, Any]]:
+    """The state in a file, and the description stored with it.
+
+    Raises InputError if the file is missing or damaged, is no checkpoint, or its arrays need more than `limit` bytes.
+    """
+    if not path.exists():
+        raise InputError(f"checkpoint is missing: {path}")
+    arrays = read_arrays(path, "a checkpoint", _DAMAGED, limit=limit)
     with _stored_state(path):
         head = json.loads(str(arrays["head"]))
         if head.get("format") != _FORMAT:
             raise InputError(f"checkpoint {path} has format {head.get('format')}, expected {_FORMAT}")
         particles = (codec or ArrayCodec()).decode(_below(arrays, "particles/"))
         population = Population(particles, arrays["log_weights"], _below(arrays, "parents/"))
-        key = Key(head["seed"], tuple(head["path"]))
-        return State(head["t"], population, key, head["properly_weighted"]), head
+        key = Key(int(head["seed"]), tuple(int(part) for part in head["path"]))
+        return State(int(head["t"]), population, key, bool(head["properly_weighted"])), head
 
 
 _DAMAGED = "remove it to start again, or choose another file"

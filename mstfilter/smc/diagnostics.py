@@ -36,8 +36,10 @@ from typing import Any
 import numpy as np
 
 from mstfilter.errors import InputError, LostRunError, check_integer, naming
-from mstfilter.files import atomic_path, check_output, folder_name, read_arrays
+from mstfilter.files import atomic_path, check_output, folder_name
 from mstfilter.lazy import progress_of
+from mstfilter.processes import environment
+from mstfilter.reading import read_arrays
 from mstfilter.smc.batching import batch, batched_slots
 from mstfilter.smc.checkpoint import digest
 from mstfilter.smc.export import Table, flat_columns, library
@@ -281,7 +283,7 @@ def run_many(
     if workers > 1:
         _check_caller()
     if folder is not None:
-        check_output(Path(folder), folder=True)
+        check_output(Path(folder), folder=True, empty=False)
     observations, collectors = list(observations), collectors or {"log_evidence": log_evidence}
     hashes = {} if folder is None else {arm: digest((arms[arm], observations, collectors)) for arm in arms}
     job = _Job(dict(arms), observations, collectors, folder, hashes)
@@ -381,7 +383,7 @@ class _Job:
         path = self.path(arm, seed)
         if self.folder is None or not path.exists():
             return None
-        arrays = read_arrays(path, "stored run", _DAMAGED)
+        arrays = read_arrays(path, "a stored run", _DAMAGED)
         try:
             head = json.loads(str(arrays.pop("head")))
             made_by, lost = (head["made_by"], head["seed"]), str(head["lost"])
@@ -455,9 +457,9 @@ def _finished_chunks(job: _Job, chunks: list[_Chunk], workers: int) -> Iterator[
 def _parallel(job: _Job, chunks: list[_Chunk], workers: int) -> Iterable[dict[tuple[str, int], _Run]]:
     from joblib import Parallel, delayed, parallel_config
 
-    with parallel_config("loky", n_jobs=workers, inner_max_num_threads=1):
+    with environment(), parallel_config("loky", n_jobs=workers, inner_max_num_threads=1):
         parallel = Parallel(batch_size=1, return_as="generator_unordered")
-        return parallel(delayed(_in_worker)(job, *chunk) for chunk in chunks)
+        yield from parallel(delayed(_in_worker)(job, *chunk) for chunk in chunks)
 
 
 def _alone(job: _Job, arm: str, seed: int) -> dict[tuple[str, int], _Run]:

@@ -170,6 +170,12 @@ class Normal(_Independent):
         if type(scale) is not np.ndarray:
             self._check_positive("scale")
 
+    @property
+    def parameter_shape(self) -> tuple[int, ...]:
+        if type(self.scale) is float and type(self.loc) is np.ndarray:  # the usual case
+            return self.loc.shape
+        return super().parameter_shape
+
     def check_parameters(self) -> None:
         if not _is_finite(self.loc):
             self._check_finite("loc")

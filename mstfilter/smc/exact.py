@@ -41,9 +41,9 @@ import numpy as np
 from mstfilter.errors import InputError
 from mstfilter.smc.distributions import MultivariateNormal
 from mstfilter.smc.filter import ParticleFilter
-from mstfilter.smc.inputs import AtStep, at_step, split_input, step_parameters, with_step
+from mstfilter.smc.inputs import AtStep, bind_step, split_input, step_parameters, with_step
 from mstfilter.smc.interfaces import Proposal, Transition, Update
-from mstfilter.smc.population import Population, union
+from mstfilter.smc.population import Population, check_observations, union
 from mstfilter.smc.state_space import StateSpaceModel
 from mstfilter.smc.streams import Rows
 
@@ -197,7 +197,7 @@ def nonlinear_gaussian(
     def of_step(which: int, parameters: dict[str, bool]) -> Callable[..., Any]:
         def function(*args: Any, t: int = 0, u: Any = None) -> Any:
             q, r = (_entry(name, of, t) if len(of) > 1 else of[0] for name, of in (("Q", Qs), ("R", Rs)))
-            bound = at_step(f, in_f, t, u), at_step(h, in_h, t, u), q, r
+            bound = bind_step(f, in_f, t, u), bind_step(h, in_h, t, u), q, r
             return _gaussian_functions(*bound)[which](*args)
 
         return with_step(function, parameters) if parameters else functions[which]
@@ -256,7 +256,7 @@ def kalman_filter(
     """
     from filterpy.kalman import KalmanFilter
 
-    given = [split_input(y) for y in observations]
+    given = [split_input(y) for y in check_observations(observations)]
     m0, P0 = np.asarray(m0, dtype=np.float64), np.asarray(P0, dtype=np.float64)
     T, d, k = len(given), len(m0), np.shape(H)[-2]
     matrices = {}
@@ -391,7 +391,7 @@ def forward_backward(
     Raises InputError if a shape does not fit, or no state explains an observation.
     """
     start, moves = _chain(initial, transition)
-    ys = [split_input(y) for y in observations]
+    ys = [split_input(y) for y in check_observations(observations)]
     T, K, of_step = len(ys), len(start), step_parameters(log_likelihood, 1)
     if moves.ndim == 3 and len(moves) != T:
         raise InputError(f"transition has {len(moves)} entries, expected one for each of {T} observations")
@@ -403,7 +403,7 @@ def forward_backward(
         filtered[t] = predicted
         if y is None:
             continue
-        found = np.asarray(at_step(log_likelihood, of_step, t, u)(y), dtype=np.float64)
+        found = np.asarray(bind_step(log_likelihood, of_step, t, u)(y), dtype=np.float64)
         if found.shape != (K,):
             raise InputError(f"log_likelihood returned shape {found.shape}, expected ({K},): one number per state")
         possible = found[predicted > 0].max()

@@ -53,7 +53,7 @@ from mstfilter.smc.interfaces import (
     Trigger,
     Update,
 )
-from mstfilter.smc.population import Population, identity
+from mstfilter.smc.population import Population, check_observations, identity
 from mstfilter.smc.resampling import Systematic
 from mstfilter.smc.streams import Key, step_generator
 
@@ -244,6 +244,7 @@ class ParticleFilter(AtStep):
     ) -> tuple[Iterable[Any], State, Any]:
         """The remaining observations, the state to continue from, and the `Checkpoint` or None."""
         keep_freed_memory()
+        check_observations(observations)
         current = state if isinstance(state, State) else self.start(state)
         if checkpoint is None:
             return observations, current, None
@@ -270,7 +271,7 @@ class _Step:
         self, filter: ParticleFilter, state: State, observation: Any, observer: Observer | None = None
     ) -> None:
         self.observation, u = split_input(observation)
-        self.filter, self.state = filter.at(state.t, u), state
+        self.filter, self.state = filter.at_step(state.t, u), state
         self.given = filter
         self.slot = _Slot(state.t, observer)
 

@@ -10,8 +10,9 @@
 A function of a model that has a parameter named ``t`` or ``u`` gets them by keyword. The first observation has t = 0;
 the transition to x_t is called with t >= 1. An observation without input is given as it is.
 
-A filter gives both to a component by `Component.at`, which returns the component at that step. A component or model
-with functions among its fields names them in `step_functions`; others override `at`, or ignore time and inputs.
+A filter gives both to a component by `Component.at_step`, which returns the component at that step. A component or
+model with functions among its fields names them in `step_functions`; others override `at_step`, or ignore time and
+inputs.
 """
 
 from __future__ import annotations
@@ -80,7 +81,7 @@ def with_step(function: Callable[..., Any], parameters: Mapping[str, bool]) -> C
     return StepFunction(function, parameters) if parameters else function
 
 
-def at_step(function: Callable[..., Any], parameters: Mapping[str, bool], t: int, u: Any) -> Callable[..., Any]:
+def bind_step(function: Callable[..., Any], parameters: Mapping[str, bool], t: int, u: Any) -> Callable[..., Any]:
     """The function with ``t`` and ``u`` given; a call raises InputError if it needs an input and there is none."""
     given = {name: value for name, value in (("t", t), ("u", u)) if name in parameters}
     if u is None and "u" in given:
@@ -98,7 +99,7 @@ def _no_input(t: int, *args: Any, **named: Any) -> Any:
 
 
 class AtStep:
-    """Base class of components and models: `at` gives time and input to the functions among the fields."""
+    """Base class of components and models: `at_step` gives time and input to the functions among the fields."""
 
     #: Fields that may be functions of the step -> number of their arguments before ``t`` and ``u``; None for a field
     #: that is a component or a model.
@@ -111,13 +112,13 @@ class AtStep:
         for name, n_arguments in self.step_functions.items():
             value = getattr(self, name)
             if n_arguments is None:
-                if isinstance(value, AtStep) and (type(value).at is not AtStep.at or value._of_step):
+                if isinstance(value, AtStep) and (type(value).at_step is not AtStep.at_step or value._of_step):
                     found[name] = None
             elif value is not None and (parameters := step_parameters(value, n_arguments)):
                 found[name] = parameters
         return found
 
-    def at(self, t: int, u: Any = None) -> Self:
+    def at_step(self, t: int, u: Any = None) -> Self:
         """The component or model at step `t` with input `u`; itself if it does not depend on them.
 
         Parameters
@@ -133,5 +134,5 @@ class AtStep:
         new.__dict__.update(self.__dict__, _of_step={})  # its functions have their step
         for name, parameters in self._of_step.items():
             value = getattr(self, name)
-            new.__dict__[name] = value.at(t, u) if parameters is None else at_step(value, parameters, t, u)
+            new.__dict__[name] = value.at_step(t, u) if parameters is None else bind_step(value, parameters, t, u)
         return new

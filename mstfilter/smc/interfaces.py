@@ -48,7 +48,7 @@ Observer = Callable[[str, bool], None]
 class Component(AtStep, ABC):
     """A component that takes part in a step.
 
-    The filter uses ``component.at(t, u)``, the component at step t with its input (see `mstfilter.smc.inputs`).
+    The filter uses ``component.at_step(t, u)``, the component at step t with its input (see `mstfilter.smc.inputs`).
     The three properties can be overridden by class attributes: ``properly_weighted = False``.
     """
 

@@ -19,7 +19,7 @@ write to an array after a population was made from it; pass ``array.copy()`` if 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import Any, Generic, TypeVar
@@ -190,6 +190,29 @@ def _within(index: np.ndarray, n: int) -> np.ndarray:
     return index
 
 
+def check_observations(observations: Iterable[Any], where: str = "") -> Any:
+    """The same observations; InputError for a table, a mapping or a text, and for one that is NaN in every entry.
+
+    Iteration over a data frame or a mapping yields names of columns, not observations. `where` begins the message.
+    """
+    if isinstance(observations, (str, bytes, Mapping)) or hasattr(observations, "columns"):
+        raise InputError(
+            f"{where}observations are a {type(observations).__name__}, expected one observation for each step",
+            "rows of a data frame: table.to_numpy(); one column: table['y'].to_numpy()",
+        )
+    if isinstance(observations, (list, tuple, np.ndarray)):
+        for t, y in enumerate(observations):
+            if (isinstance(y, float) and y != y) or (isinstance(y, np.ndarray) and _all_nan(y)):
+                raise InputError(
+                    f"{where}observation {t} is NaN", "one that is missing is None: then the step only predicts"
+                )
+    return observations
+
+
+def _all_nan(y: np.ndarray) -> bool:
+    return y.size > 0 and y.dtype.kind == "f" and bool(np.isnan(y).all())
+
+
 @dataclass(frozen=True, eq=False)
 class Population(Table):
     """Weighted particles and their parents.
@@ -316,6 +339,13 @@ class Population(Table):
         if isinstance(self.particles, Mapping):
             return {name: a[index] for name, a in self.particles.items()}
         return self.particles[index]
+
+    @classmethod
+    def unchecked(cls, particles: Particles, log_weights: np.ndarray) -> Population:
+        """A population of particles and log weights that have been checked."""
+        new = object.__new__(cls)
+        new.__dict__.update(particles=_freeze(particles), log_weights=frozen_view(log_weights), parents={}, notes={})
+        return new
 
     def take(self, indices: np.ndarray, log_weights: np.ndarray | None = None) -> Population:
         """Select particles with their parents, and with their log weights unless new ones are given.

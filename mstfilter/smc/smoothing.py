@@ -35,7 +35,7 @@ from mstfilter.smc.distributions import as_distribution
 from mstfilter.smc.filter import ParticleFilter
 from mstfilter.smc.inputs import split_input
 from mstfilter.smc.interfaces import DensityTransition, State, Transition
-from mstfilter.smc.population import Particles, Population, count_particles, take
+from mstfilter.smc.population import Particles, Population, check_observations, count_particles, take
 from mstfilter.smc.programs.filters import ProgramInitial, ProgramTransition, run_program
 from mstfilter.smc.programs.handlers import GuideHandler, ReplayHandler, SampleHandler, ScoreHandler, Site
 from mstfilter.smc.programs.sites import PerParticle
@@ -77,7 +77,7 @@ def known_parents(population: Population, t: int) -> np.ndarray:
 
 def keep(filter: ParticleFilter, observations: Iterable[Any], seed: int | State = 0) -> Record:
     """Run a filter and keep every population; memory grows with n times the number of steps."""
-    ys = tuple(observations)
+    ys = tuple(check_observations(observations))
     if not ys:
         raise InputError("there are no observations to smooth over")
     populations = []
@@ -160,7 +160,7 @@ def backward_paths(
     for t in range(len(record) - 2, -1, -1):
         population, (y, u) = record.populations[t].realised(), split_input(record.observations[t + 1])
         parents = record.parents(t + 1)[index] if method == "mcmc" else None
-        move = _Move(population, path[-1].particles, transition.at(t + 1, u), y, t)
+        move = _Move(population, path[-1].particles, transition.at_step(t + 1, u), y, t)
         index = kernel.draw(rng, move, parents, 1)[:, 0]
         path.append(Population(take(population.particles, index)))
     return tuple(reversed(path))
@@ -310,7 +310,7 @@ def paris(
         else:
             rng = Key(seed).child("paris", t).generator()
             parents = known_parents(now, t) if method == "mcmc" else None
-            move = _Move(past, now.particles, transition.at(t, u), y, t - 1)
+            move = _Move(past, now.particles, transition.at_step(t, u), y, t - 1)
             index = kernel.draw(rng, move, parents, n_draws).ravel()
             later = take(now.particles, np.repeat(np.arange(len(now)), n_draws))
             statistic = statistic[index] + functional(t, take(past.particles, index), later)
@@ -379,7 +379,7 @@ def conditional_path(
     past: Population | None = None
     for t, observation in enumerate(ys):
         y, u = split_input(observation)
-        now = filter.at(t, u)
+        now = filter.at_step(t, u)
         given = None if path is None else take(path, np.array([t]))
         if past is not None:
             others, _ = Multinomial().select(rng, past.log_weights, filter.n - 1)
@@ -563,7 +563,7 @@ def path_log_prob(filter: ParticleFilter, observations: Sequence[Any], path: Par
     for t, observation in enumerate(observations):
         y, u = split_input(observation)
         row = take(path, np.array([t]))
-        total += _step_log_prob(filter.at(t, u), previous, row, y)
+        total += _step_log_prob(filter.at_step(t, u), previous, row, y)
         previous = row
     return total
 

@@ -17,11 +17,12 @@ import contextlib
 import queue
 import time
 import uuid
+import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from mstfilter.errors import InputError, MissingLibraryError
+from mstfilter.errors import InputError, InputWarning, MissingLibraryError
 from mstfilter.study.executors import Event, Executor, Tell, times
 from mstfilter.study.jobs import perform
 from mstfilter.study.results import Job, JobOutcome
@@ -50,9 +51,24 @@ class Cluster(Executor):
     def run(self, jobs: Sequence[Job], tell: Tell) -> list[JobOutcome]:
         if not jobs:
             return []
+        self._warn_without_tls()
         with self._client() as client:
             _check_workers(client, self.connect_s)
             return _ClusterRun(client, jobs, tell, self.without_workers_s).run()
+
+    def _warn_without_tls(self) -> None:
+        """Warn if the scheduler is on another host and the connection has no TLS: who reaches it can run code."""
+        protocol, _, rest = self.address.rpartition("://")
+        host = rest.rpartition(":")[0].strip("[]")
+        if protocol not in ("tls", "wss", "inproc") and host not in ("localhost", "::1") and host[:4] != "127.":
+            warnings.warn(
+                InputWarning(
+                    f"the connection to the Dask scheduler at {self.address} has no TLS: everyone in its network can "
+                    "run code on its workers and on this machine",
+                    "use tls://HOST:PORT with certificates, or a network of trusted machines",
+                ),
+                stacklevel=3,
+            )
 
     @contextlib.contextmanager
     def _client(self) -> Iterator[Any]:

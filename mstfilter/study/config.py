@@ -29,7 +29,6 @@ The file::
 from __future__ import annotations
 
 import itertools
-import tomllib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -39,6 +38,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationEr
 
 from mstfilter.errors import InputError, naming
 from mstfilter.presets import load_config
+from mstfilter.reading import read_toml
 
 
 def _seeds(value: Any) -> Any:
@@ -133,12 +133,7 @@ def load_study(path: str | Path, *, smoke: bool = False) -> StudyConfig:
     file is missing, is not valid TOML, or has an unknown or invalid entry.
     """
     path = Path(path)
-    try:
-        data = tomllib.loads(path.read_text())
-    except OSError as error:
-        raise InputError(f"study {path} cannot be read: {error.strerror}") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"study {path} is not valid TOML: {error}") from error
+    data = read_toml(path, "a study")
     if smoke:
         small = data.get("smoke")
         if not small:

@@ -8,14 +8,13 @@ job, a worker that dies and a time limit that is exceeded do not stop the other 
 
 from __future__ import annotations
 
-import contextlib
 import multiprocessing
 import os
 import queue
 import sys
 import threading
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, replace
 from multiprocessing.connection import Connection
@@ -23,6 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from mstfilter.errors import check_integer
+from mstfilter.processes import available_cores, environment
 from mstfilter.study.jobs import perform
 from mstfilter.study.results import Job, JobOutcome
 
@@ -88,10 +88,10 @@ class Local(Executor):
             return []
         jobs_left = _JobQueue(jobs)
         events: queue.SimpleQueue[Event | BaseException] = queue.SimpleQueue()
-        n_workers = min(self.workers or _available_cores(), len(jobs))
+        n_workers = min(self.workers or available_cores(), len(jobs))
         workers = [_Worker(k, jobs_left, events, self.logs) for k in range(n_workers)]
         outcomes: dict[int, JobOutcome] = {}
-        with _environment(_ONE_THREAD):  # processes inherit it when they start
+        with environment(**_ONE_THREAD):  # processes inherit it when they start
             for worker in workers:
                 worker.start()
             try:
@@ -232,25 +232,6 @@ class _Worker(threading.Thread):
 def times(n: int) -> str:
     """``1 time``, ``2 times``."""
     return f"{n} time{'s' if n > 1 else ''}"
-
-
-@contextlib.contextmanager
-def _environment(variables: Mapping[str, str]) -> Iterator[None]:
-    """Set environment variables inside the block."""
-    before = {name: os.environ.get(name) for name in variables}
-    os.environ.update(variables)
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                os.environ.pop(name, None)
-            else:
-                os.environ[name] = value
-
-
-def _available_cores() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 # In the worker process:

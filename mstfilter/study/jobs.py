@@ -11,7 +11,6 @@ killed worker are never taken for a result.
 from __future__ import annotations
 
 import contextlib
-import errno
 import functools
 import shutil
 import sys
@@ -23,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from mstfilter.errors import InputError, describe_error
+from mstfilter.errors import InputError, describe_error, exhausted
 from mstfilter.files import atomic_folder
 from mstfilter.formats import open_recording
 from mstfilter.presets import PACKAGES
@@ -52,13 +51,9 @@ def perform(job: Job, step: _StepCallback = lambda done, total: None) -> JobOutc
 
 def _failure(error: BaseException) -> JobOutcome:
     trace = "".join(traceback.format_exception(error))
-    if isinstance(error, InputError):
-        return JobOutcome("failed", error.message, error.hints, trace)
-    if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
-        hints = ("free disk space; the same command repeats this run",)
-        return JobOutcome("failed", f"no space left: {error}", hints, trace)
-    if isinstance(error, MemoryError):
-        return JobOutcome("failed", "out of memory", ("use fewer workers",), trace)
+    known = error if isinstance(error, InputError) else exhausted(error)
+    if known is not None:
+        return JobOutcome("failed", known.message, known.hints, trace)
     hints = tuple(getattr(error, "__notes__", ()))
     hints = hints or ("result.json in the folder of the run has the traceback",)
     return JobOutcome("failed", describe_error(error), hints, trace)
@@ -103,7 +98,7 @@ def _run(job: Job, step: _StepCallback) -> None:
         step(p.done, p.total)
 
     recording = open_scene(job["source"], job["recordings"])
-    with atomic_folder(folder) as work:
+    with atomic_folder(folder, "replace") as work:
         with scene_cache.on_disk(**job["work"]) if job["work"] else contextlib.nullcontext():
             began = time.process_time()
             run = filter_recording(
@@ -165,7 +160,7 @@ class StagePeaks:
 def reset_peak() -> bool:
     """Reset the peak memory of this process; False if the system cannot (other than Linux)."""
     with contextlib.suppress(OSError):
-        Path("/proc/self/clear_refs").write_text("5")
+        Path("/proc/self/clear_refs").write_text("5", encoding="utf-8")
         return True
     return False
 
@@ -173,7 +168,7 @@ def reset_peak() -> bool:
 def peak_megabytes() -> float:
     """Peak resident memory of this process in MB since the last `reset_peak`; NaN if the system cannot tell."""
     with contextlib.suppress(OSError):
-        for line in Path("/proc/self/status").read_text().splitlines():
+        for line in Path("/proc/self/status").read_text(encoding="utf-8").splitlines():
             if line.startswith("VmHWM:"):
                 return int(line.split()[1]) / 1024
     try:

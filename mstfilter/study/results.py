@@ -18,18 +18,19 @@ Layout::
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from pydantic import BaseModel, Field, model_validator
 
 from mstfilter.errors import InputError
-from mstfilter.files import reading, write_csv
+from mstfilter.files import write_csv
 from mstfilter.forecasts import ForecastTable
+from mstfilter.reading import read_arrays, read_model
 from mstfilter.runs import write_json
 from mstfilter.scoring import NO_COUNTS, forecast_table
 from mstfilter.study.information import add_information, fit_information
@@ -62,11 +63,76 @@ class JobOutcome:
     tries: int = 1  #: how many times the job was started
 
 
+class _Row(BaseModel, extra="allow"):
+    pause: int
+    qualities: list[float | None] | None = None
+    energy_noise: list[float] | None = None
+    __pydantic_extra__: dict[str, float | None]
+
+
+class _Cost(BaseModel, extra="allow"):
+    seconds: float
+    core_seconds: float
+    peak_mb: float | None
+    __pydantic_extra__: dict[str, float | None]
+
+
+class _Result(BaseModel):
+    """What readers use of result.json; a result without rows is that of a run that failed."""
+
+    status: str
+    identity: str
+    rows: list[_Row] = []
+    costs: list[_Cost] = []
+
+    @model_validator(mode="after")
+    def _agree(self) -> _Result:
+        if len(self.rows) != len(self.costs) or (self.status == "done" and not self.rows):
+            raise ValueError(f"there are {len(self.rows)} rows and {len(self.costs)} costs")
+        return self
+
+
+class _Arm(BaseModel):
+    name: str
+    reported_only: bool
+    uses_truth: list[str]
+    config: dict[str, Any]
+
+
+class _Scene(BaseModel):
+    name: str
+    group: str
+    source: dict[str, Any]
+
+
+class _StudyRun(BaseModel):
+    name: str
+    folder: Annotated[str, Field(pattern=r"^[^/\\\x00-\x1f]+$")]  # a name in the folder of the study
+    identity: str
+    arm: str
+    scene: str
+    group: str
+    seed: int
+
+
+class _Study(BaseModel):
+    """What readers use of study.json."""
+
+    format: int
+    name: str
+    description: str
+    reference: str
+    arms: list[_Arm]
+    scenes: list[_Scene]
+    seeds: list[int]
+    runs: list[_StudyRun]
+
+
 def read_result(folder: Path) -> dict[str, Any]:
     """The content of result.json in a run's folder; empty if it is missing or damaged."""
     try:
-        return dict(json.loads((folder / RESULT).read_text()))
-    except (OSError, ValueError):
+        return read_model(folder / RESULT, _Result, "a result")[1]
+    except InputError:
         return {}
 
 
@@ -92,8 +158,7 @@ class StudyFolder:
     @cached_property
     def description(self) -> dict[str, Any]:
         """The content of study.json."""
-        with reading(self.path / "study.json", "a study folder", "`mstfilter study` makes one"):
-            return dict(json.loads((self.path / "study.json").read_text()))
+        return read_model(self.path / "study.json", _Study, "a study folder", "`mstfilter study` makes one")[1]
 
     @property
     def reported_only(self) -> list[str]:
@@ -143,8 +208,12 @@ class StudyFolder:
         for run in self.description["runs"]:
             path = self.run(run["folder"]) / FORECASTS
             if (run["group"], run["arm"]) == (family, arm) and path.is_file():
-                with np.load(path, allow_pickle=False) as data:
-                    found[run["scene"], run["seed"]] = data["counts"]
+                counts = read_arrays(path, "forecasts").get("counts", NO_COUNTS[None, None, :0])
+                if counts.ndim != 4 or counts.shape[2:] != NO_COUNTS.shape or counts.dtype.kind not in "iu":
+                    raise InputError(
+                        f"{path}: counts has shape {counts.shape}", "repeat the study: it makes it again"
+                    )
+                found[run["scene"], run["seed"]] = counts
         return found
 
     def forecasts(self, family: str, arm: str) -> ForecastTable:

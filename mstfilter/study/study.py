@@ -10,7 +10,6 @@ not repeated; the tables are the same as those of an uninterrupted study.
 from __future__ import annotations
 
 import contextlib
-import json
 import shutil
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -18,8 +17,9 @@ from pathlib import Path
 from typing import Any
 
 from mstfilter.errors import InputError
-from mstfilter.files import reading
+from mstfilter.files import locked, reading, sweep, writing
 from mstfilter.lazy import progress_of
+from mstfilter.reading import check_private, read_json
 from mstfilter.runs import library_versions, write_json
 from mstfilter.study.config import StudyConfig
 from mstfilter.study.executors import Event, Executor, Local, Tell
@@ -91,8 +91,13 @@ def run_study(
     with _locked(path) as folder, progress_of(progress, bars="study_bars") as report:
         for target in (path, cache):
             _check_free_space(target)
+        for part in ("recordings", "work"):
+            check_private(cache / part)
         executor = executor or Local(logs=path / "logs")
-        write_json(path / "study.json", {**_description(plan), "recalibration": recalibration})
+        with writing(f"study folder {path}", "choose another with --out"):
+            write_json(path / "study.json", {**_description(plan), "recalibration": recalibration})
+            for part in ("runs", "logs"):
+                (path / part).mkdir(exist_ok=True)
         _rename_done_runs(plan, folder)
         waiting = [run for run in plan.runs if not _is_done(run, folder)]
         n_before = len(plan.runs) - len(waiting)
@@ -108,7 +113,7 @@ def run_study(
         def tell(event: Event) -> None:
             run = waiting[event.job]
             if event.kind == "lost":
-                _remove_partial_runs(path, run.folder)
+                sweep(path / "runs", run.folder)
             if event.outcome is not None and event.outcome.status != "done":
                 _write_failure(folder, run, event.outcome)
             count(event)
@@ -119,53 +124,27 @@ def run_study(
                 failed[run.name] = outcome
                 _write_failure(folder, run, outcome)  # repeated, because the disk may have been full before
         folder = StudyFolder.open(path)
-        try:
+        with writing(f"the tables of {path}", "free disk space and repeat the command"):
             folder.write_tables()
-        except OSError as error:
-            raise InputError(
-                f"cannot write the tables of {path}: {error.strerror}", "free disk space and repeat the command"
-            ) from error
     return StudyResult(folder, len(plan.runs) - len(failed), n_before, tuple(failed.items()))
 
 
 @contextlib.contextmanager
 def _locked(path: Path) -> Iterator[StudyFolder]:
-    """The study folder, made if it is missing and locked for this process."""
-    made_first = {".lock", "logs", "runs"}  # what a study makes before study.json
-    is_study = path.is_dir() and ((path / "study.json").exists() or {p.name for p in path.iterdir()} <= made_first)
-    if path.exists() and not is_study:
-        raise InputError(
-            f"cannot run a study in {path}: it exists and is not a study folder", "choose another with --out"
-        )
-    try:
-        (path / "runs").mkdir(parents=True, exist_ok=True)
-        (path / "logs").mkdir(exist_ok=True)
-        lock = (path / ".lock").open("w")
-    except OSError as error:
-        raise InputError(
-            f"cannot write study folder {path}: {error.strerror}", "choose another with --out"
-        ) from error
-    with lock:
+    """The study folder, which need not exist, reserved for this process, without the remains of killed processes."""
+    with locked(path):
         try:
-            import fcntl
-
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except ImportError:
-            pass  # this system has no such locks
-        except OSError:
-            raise InputError(
-                f"another process is running the study in {path}", "wait for it, or choose --out"
-            ) from None
-        _remove_partial_runs(path, "*")  # of workers that were killed with their study
-        try:
+            sweep(path)
+            sweep(path / "runs")
+            if (path / "study.json").is_file():
+                StudyFolder.open(path)  # checks the format
+            elif path.exists() and (not path.is_dir() or any(path.iterdir())):
+                raise InputError(
+                    f"cannot run a study in {path}: it exists and is not a study folder", "choose another with --out"
+                )
             yield StudyFolder(path)
         finally:
-            _remove_partial_runs(path, "*")
-
-
-def _remove_partial_runs(path: Path, folder: str) -> None:
-    for partial in (path / "runs").glob(f".{folder}.*.partial"):
-        shutil.rmtree(partial, ignore_errors=True)
+            sweep(path / "runs")
 
 
 def _check_free_space(folder: Path) -> None:
@@ -187,7 +166,7 @@ def _read_recalibration(plan: Plan) -> dict[str, Any] | None:
         return None
     path = plan.config.folder / plan.config.recalibration
     with reading(path, "a recalibration", "name the recalibration.json of a study of the same families and arms"):
-        found = json.loads(path.read_text())
+        found = read_json(path, "a recalibration")
         groups, arms = {scene.group for scene in plan.scenes}, {arm.name for arm in plan.arms}
         missing = [f"{arm} on {group}" for group in sorted(groups) for arm in sorted(arms) if arm not in found[group]]
         fitted = {s for group in groups for arm in arms for s in found[group].get(arm, {}).get("scenes", ())}

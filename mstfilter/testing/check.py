@@ -42,7 +42,7 @@ from mstfilter.smc import (
     WeightResampler,
 )
 from mstfilter.testing import moves, resampling, stages, values
-from mstfilter.testing.contract import Contract, number_example
+from mstfilter.testing.contract import Contract, copied, number_example
 from mstfilter.testing.scenes import scene_example
 from mstfilter.tracking import MotionRule
 
@@ -116,16 +116,17 @@ def run_contract(
     ``example(rng, n)`` returns a population and an observation that the component can handle. Default: the function
     ``example`` in the module of its class; without one, a scene for components of images and numbers for others.
 
-    ``exact(rng, n)`` of a `Transition`, `Update` or `Rejuvenation` returns `n` particles, exact draws of what they
-    become, and the observation; see the contract. Default: the function ``exact`` in the module of its class, if any.
+    ``exact(rng, n)`` of a `Transition`, `Proposal`, `Update` or `Rejuvenation` returns exact draws and the
+    observation; see the contract. Default: the function ``exact`` in the module of its class, if any.
     """
-    cls = type(component)
+    cls, unused = type(component), copied(component)
     contract = contract_of(cls)
     example = example or _function_beside(cls, "example") or (scene_example if _uses_images(cls, contract) else None)
-    if isinstance(component, Resampler) and resampling.makes_particles(component, example or number_example):
+    if isinstance(component, Resampler) and resampling.makes_particles(copied(unused), example or number_example):
         contract = resampling.TransformResamplerContract
     functions = {
         "make": lambda: component,
+        "fresh": lambda: copied(unused),
         "example": example,
         "exact": exact or _function_beside(cls, "exact"),
     }
@@ -183,8 +184,10 @@ class _Plugin:
     def pytest_runtest_makereport(self, item: Any, call: Any) -> None:
         """Keep the outcome; a failure with the same message as an earlier one is reported once."""
         error = None if call.excinfo is None else call.excinfo.value
-        if call.when == "teardown" or (call.when == "setup" and error is None):
+        if call.when != "call" and error is None:
             return
+        if call.when == "teardown":  # a fault that every test looks for replaces the outcome of the test
+            self.results.pop()
         failure = skipped = None
         if isinstance(error, pytest.skip.Exception):
             skipped = str(error)
@@ -194,7 +197,7 @@ class _Plugin:
             failure = describe_error(error)
         test = item.function
         if failure is not None:
-            self._stopped = getattr(test, "prerequisite", False)
+            self._stopped = self._stopped or call.when == "teardown" or getattr(test, "prerequisite", False)
             if any(result.failure == failure for result in self.results):
                 failure, skipped = None, "same failure as above"
         statement = (inspect.getdoc(test) or item.name).split("\n")[0]

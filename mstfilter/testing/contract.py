@@ -20,14 +20,23 @@ import copy
 import random
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from typing import Any, TypeVar
 
 import numpy as np
 import pytest
 
 from mstfilter.errors import InputError, describe_error
-from mstfilter.smc import Population
+from mstfilter.smc import (
+    Always,
+    ParticleFilter,
+    Population,
+    Proposal,
+    Reweight,
+    Systematic,
+    as_matrix,
+    batch,
+)
 
 #: Largest probability that a statistical test fails for a correct component.
 FALSE_ALARM = 1e-6
@@ -85,61 +94,132 @@ class Contract:
         self.check_result(result, inputs)
         return result
 
+    def variants(self) -> list[dict[str, Any]]:
+        """Arguments of several calls, for properties that hold for any: six particles; for arrays also one."""
+        few = self.inputs(6)
+        objects = isinstance(getattr(few.get("population"), "particles", None), tuple)
+        return [few] if objects else [few, self.inputs(1)]
+
+    def fresh(self) -> Any:
+        """A component that has not been used: a copy of what `make` returns, if it can be copied."""
+        return copied(self.make())
+
     def setup_method(self) -> None:
         self._global_state = global_state()
 
     def teardown_method(self) -> None:
+        """After every test, report and undo draws from global generators."""
+        fault = _global_draws(self._global_state, global_state())
         restore_global_state(self._global_state)
+        assert fault is None, fault
+
+    @prerequisite
+    def test_does_not_use_global_generators(self) -> None:
+        """It does not use the global generators of numpy and Python."""
+        for inputs in self.variants():
+            with skips_errors():
+                self.call(self.make(), np.random.default_rng(7), inputs)
+        self.teardown_method()
 
     @prerequisite
     def test_does_not_change_input(self) -> None:
         """It leaves its input unchanged."""
-        inputs = self.inputs(6)
-        before = copy.deepcopy(_plain(inputs))
-        try:
-            self.call(self.make(), np.random.default_rng(3), inputs)
-        except Exception as error:  # other tests report other errors
-            assert not _writes_to_read_only(error), "it changes its input in place: make a copy first"
-        for name, value in _plain(inputs).items():
-            assert same(value, before[name]), f"it changes its input in place ({name}): make a copy first"
+        for inputs in self.variants():
+            before = copy.deepcopy(_plain(inputs))
+            try:
+                self.call(self.make(), np.random.default_rng(3), inputs)
+            except Exception as error:  # other tests report other errors
+                assert not _writes_to_read_only(error), "it changes its input in place: make a copy first"
+            for name, value in _plain(inputs).items():
+                assert same(value, before[name]), f"it changes its input in place ({name}): make a copy first"
 
+    @prerequisite
+    def test_repeats_with_the_same_generator(self) -> None:
+        """Equal generators give equal results."""
+        for inputs in self.variants():
+            for seed in (7, 8):
+                with skips_errors():
+                    a, b = (_plain(self.call(self.fresh(), np.random.default_rng(seed), inputs)) for _ in range(2))
+                assert same(a, b), "two runs with equal generators differ: a random number does not come from `rng`"
+
+    @prerequisite
     def test_keeps_no_state(self) -> None:
         """A call does not change the result of later calls."""
-        component = self.make()
+        arguments = [(9, 1), (6, 0), (6, 2)]
+        used = self.fresh()
         with skips_errors():
-            first = self.call(component, np.random.default_rng(1), self.inputs(6))
-            self.call(component, np.random.default_rng(2), self.inputs(9, seed=1))
-            again = self.call(component, np.random.default_rng(1), self.inputs(6))
-        assert same(_plain(first), _plain(again)), (
-            "a repeated call gives another result after a call in between: it keeps state, or draws numbers"
-        )
+            expected = [self._plain_call(self.fresh(), *a) for a in arguments]
+            found = [self._plain_call(used, *arguments[k]) for k in (0, 1, 2, 1)]
+        for k, result in zip((0, 1, 2, 1), found, strict=True):
+            assert same(result, expected[k]), (
+                "a component that was used before gives another result than a new one: it keeps state, for example "
+                "values of its first call"
+            )
+
+    def _plain_call(self, component: Any, n: int, seed: int) -> Any:
+        return _plain(self.call(component, np.random.default_rng(1), self.inputs(n, seed=seed)))
 
 
 class RandomContract(Contract):
     """Base class of contracts for components that draw random numbers."""
 
     @prerequisite
-    def test_repeats_with_the_same_generator(self) -> None:
-        """Equal generators give equal results."""
-        results = []
-        component, inputs = self.make(), self.inputs(6)
-        with skips_errors():
-            for seed in (7, 7, 8, 8, 9, 9):
-                np.random.seed(seed)  # noqa: NPY002 (draws from global generators are the subject of another test)
-                random.seed(seed)
-                results.append(_plain(self.call(component, np.random.default_rng(seed), inputs)))
-        for a, b in zip(results[::2], results[1::2], strict=True):
-            assert same(a, b), "two runs with equal generators differ: a random number does not come from `rng`"
+    def test_draws_only_if_declared(self) -> None:
+        """It does not use its generator if it declares ``draws = False``."""
+        component = self.make()
+        if getattr(component, "draws", True) is not False:
+            return
+        for inputs in self.variants():
+            rng = np.random.default_rng(7)
+            with skips_errors():
+                self.call(component, rng, inputs)
+            unused = rng.bit_generator.state == np.random.default_rng(7).bit_generator.state
+            assert unused, "it declares draws = False and draws from its generator"
 
-    @prerequisite
-    def test_does_not_use_global_generators(self) -> None:
-        """It does not use the global generators of numpy and Python."""
-        before = global_state()
-        with skips_errors():
-            self.call(self.make(), np.random.default_rng(7), self.inputs(6))
-        after = global_state()
-        assert same(before[0], after[0]), "it draws from numpy's global generator (np.random.*): draw from `rng`"
-        assert before[1] == after[1], "it draws from Python's global generator (random.*): draw from `rng`"
+
+@dataclass(frozen=True)
+class _Examples(Proposal):
+    """The particles of an example, as the first ones of a filter."""
+
+    example: Callable[..., Any]
+
+    def sample(self, rng: np.random.Generator, observation: Any, n: int) -> Population:
+        return Population(self.example(rng, n)[0].particles)
+
+
+def check_batched(slot: str, component: Any, example: Callable[..., Any]) -> None:
+    """Check in a filter that runs of a batch equal single runs; nothing if the component is not `batched`.
+
+    The numbers of runs include that of the particles, since arrays of another axis fit then.
+    """
+    if not component.batched:
+        return
+    y = example(np.random.default_rng(0), 2)[1]
+    slots = {"initial": _Examples(example), "update": Reweight(_row_sums), "resampler": Systematic(), slot: component}
+    for n, n_runs in ((5, 3), (5, 5), (1, 4), (4, 1)):
+        filter = ParticleFilter(n=n, **{"trigger": Always(), **slots})
+        with reports_errors(f"a batch of {n_runs} runs of {n} particles"):
+            runs = batch(filter, [y] * 3, seeds=range(n_runs))
+            alone = [filter.run([y] * 3, seed)[0].population for seed in range(n_runs)]
+        for r, expected in enumerate(alone):
+            found = runs.state(r).population
+            equal = found is not None and expected is not None and same(_plain(found)[:2], _plain(expected)[:2])
+            assert equal, (
+                f"run {r} of {n_runs} runs of {n} particles in a batch is not the run alone: are runs mixed?"
+            )
+
+
+def _row_sums(particles: Any, observation: Any) -> np.ndarray:
+    """Unequal log weights."""
+    return 3 * np.sin(as_matrix(particles)).sum(axis=1)
+
+
+def copied(component: Any) -> Any:
+    """A deep copy of a component, or the component if it cannot be copied."""
+    try:
+        return copy.deepcopy(component)
+    except Exception:  # for example a lock or a module in a field
+        return component
 
 
 def skip_unless_properly_weighted(component: Any) -> Any:
@@ -226,6 +306,15 @@ def _plain(value: Any) -> Any:
 def global_state() -> tuple[Any, Any]:
     """States of the global generators of numpy and Python."""
     return np.random.get_state(), random.getstate()  # noqa: NPY002
+
+
+def _global_draws(before: tuple[Any, Any], after: tuple[Any, Any]) -> str | None:
+    """The fault if a global generator has another state than before."""
+    if not same(before[0], after[0]):
+        return "it draws from numpy's global generator (np.random.*): draw from `rng`"
+    if before[1] != after[1]:
+        return "it draws from Python's global generator (random.*): draw from `rng`"
+    return None
 
 
 def restore_global_state(state: tuple[Any, Any]) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 
 from mstfilter.scene import Hypothesis
 from mstfilter.smc import Population
-from mstfilter.testing.contract import Contract, prerequisite, reports_errors, same
+from mstfilter.testing.contract import Contract, check_batched, prerequisite, reports_errors, same
 from mstfilter.testing.scenes import scene_example
 
 _SIZES = (1, 2, 9)
@@ -28,19 +28,32 @@ class _DecisionContract(Contract):
         return {"population": self.example(_rng(seed), n)[0], "t": 2}
 
     def populations(self) -> list[Population]:
-        """1, 2 and 12 particles with unequal weights; 12 with equal weights, and with a single dominant one."""
+        """1, 2 and 12 particles with unequal weights; 12 with equal ones, a dominant one, zeros, and copies."""
         rng = _rng()
         populations = [self.example(rng, n)[0] for n in (1, 2, 12)]
         particles = populations[-1].particles
         peaked = np.where(np.arange(12) == 5, 0.0, -80.0)
-        return [*populations, Population(particles, np.zeros(12)), Population(particles, peaked)]
+        zeros = np.where(np.arange(12) < 5, -np.inf, 0.0)
+        weighted = [Population(particles, lw) for lw in (np.zeros(12), peaked, zeros)]
+        copies = populations[-1].take(np.repeat(np.arange(4), 3))
+        return [*populations, *weighted, copies]
 
     def test_answers(self) -> None:
         """It answers for any population and time: a trigger True or False, a size an integer of at least 1."""
         component = self.make()
         for population in self.populations():
-            for t in (0, 1, 7):
+            for t in (0, 1, 7, 10_000):
                 self.checked_call(component, {"population": population, "t": t})
+
+    def test_keeps_no_count(self) -> None:
+        """Its answer does not change when it is asked again."""
+        component = self.make()
+        for population in self.populations():
+            for t in (0, 3):
+                answers = [self.checked_call(component, {"population": population, "t": t}) for _ in range(12)]
+                assert all(answer == answers[0] for answer in answers), (
+                    f"asked twelve times about the same particles it answers {answers}: it keeps state, or draws"
+                )
 
     def test_ignores_scale_and_order(self) -> None:
         """It does not depend on a common factor of the weights, nor on the order of the particles."""
@@ -48,19 +61,24 @@ class _DecisionContract(Contract):
         for population in self.populations():
             n = len(population)
             answer = self.checked_call(component, {"population": population, "t": 3})
-            for shift in (1000.0, -1000.0):
+            for shift in (3.0, -3.0, 1000.0, -1000.0, 1e5, -1e5):
                 shifted = population.reweighted(np.full(n, shift))
                 assert self.checked_call(component, {"population": shifted, "t": 3}) == answer, (
                     f"adding {shift:g} to all log weights changes its answer"
                 )
-            reordered = population.take(np.arange(n)[::-1])
-            assert self.checked_call(component, {"population": reordered, "t": 3}) == answer, (
-                "another order of the particles changes its answer"
-            )
+            for order in (np.arange(n)[::-1], np.roll(np.arange(n), 1), _rng(1).permutation(n)):
+                reordered = population.take(order)
+                assert self.checked_call(component, {"population": reordered, "t": 3}) == answer, (
+                    "another order of the particles changes its answer"
+                )
 
 
 class TriggerContract(_DecisionContract):
     """The contract of every `Trigger`."""
+
+    def test_batched_runs_equal_single_runs(self) -> None:
+        """If it declares ``batched = True``, every run of a batch equals the run alone."""
+        check_batched("trigger", self.make(), self.example)
 
     def call(self, component: Any, rng: np.random.Generator, inputs: dict[str, Any]) -> Any:
         return component.wants(inputs["population"], inputs["t"])
@@ -78,6 +96,13 @@ class SizeContract(_DecisionContract):
     def check_result(self, result: Any, inputs: dict[str, Any]) -> None:
         valid = isinstance(result, (int, np.integer)) and not isinstance(result, bool) and result >= 1
         assert valid, f"its answer is {result!r}, expected an int of at least 1"
+
+    def test_keeps_its_largest_number(self) -> None:
+        """A filter accepts its answer: it is at most `n_max`, or the largest number for such particles."""
+        component = self.make()
+        for population in self.populations():
+            with reports_errors("the size is checked by the filter"):
+                component.checked(population)
 
 
 class _ScoreContract(Contract):
@@ -112,15 +137,42 @@ class LookaheadContract(_ScoreContract):
     def call(self, component: Any, rng: np.random.Generator, inputs: dict[str, Any]) -> np.ndarray:
         return np.asarray(component.log_priority(inputs["population"], inputs["observation"]), dtype=np.float64)
 
+    def test_copies_have_one_score(self) -> None:
+        """A particle and its copy have the same score."""
+        component, inputs = self.make(), self.inputs(5)
+        twice = inputs["population"].take(np.repeat(np.arange(5), 2))
+        scores = self.checked_call(component, {**inputs, "population": twice})
+        assert _close(scores[::2], scores[1::2]), "a particle and its copy have different scores"
+
     def test_ignores_scale(self) -> None:
         """It does not depend on a common factor of the weights."""
         component, inputs = self.make(), self.inputs(6)
         scores = self.checked_call(component, inputs)
-        for shift in (1000.0, -1000.0):
+        for shift in (3.0, 1000.0, -1000.0):
             shifted = inputs["population"].reweighted(np.full(6, shift))
             assert _close(self.checked_call(component, {**inputs, "population": shifted}), scores), (
                 f"adding {shift:g} to all log weights changes the priorities"
             )
+
+    def test_ignores_weights(self) -> None:
+        """It does not depend on the weights, which the filter multiplies by the priorities."""
+        component, inputs = self.make(), self.inputs(6)
+        other = inputs["population"].reweighted(np.linspace(0, 2, 6))
+        scores = self.checked_call(component, inputs)
+        assert _close(self.checked_call(component, {**inputs, "population": other}), scores), (
+            "other log weights of the same particles change the priorities: the weights would count twice"
+        )
+
+    def test_uses_the_observation(self) -> None:
+        """Priorities that differ between particles depend on the observation, if that is an array of numbers."""
+        component, inputs = self.make(), self.inputs(9)
+        y, scores = np.asarray(inputs["observation"]), self.checked_call(component, inputs)
+        if y.dtype.kind != "f" or np.ptp(scores) < 1e-9:
+            return
+        others = [self.checked_call(component, {**inputs, "observation": y + step}) for step in (1.0, -1.0, 0.1)]
+        assert not all(_close(scores, other) for other in others), (
+            "the priorities are the same for other observations: it ignores the observation"
+        )
 
 
 class EvidenceContract(_ScoreContract):
@@ -175,13 +227,16 @@ class _PairsContract(_ParticlesContract):
 
     def test_pairs_do_not_depend_on_others(self) -> None:
         """The relation of two particles does not depend on the others, nor on their order."""
-        component, inputs = self.make(), self.inputs(9)
-        rows = np.array([8, 1, 5, 2, 0])
-        every = self.relation(self.checked_call(component, inputs))
-        some = self.relation(self.checked_call(component, {"population": inputs["population"].take(rows)}))
-        assert np.allclose(some, every[np.ix_(rows, rows)], atol=1e-9), (
-            "five of nine particles have another similarity or other classes if only these are given"
-        )
+        component, rng = self.make(), _rng(4)
+        for seed in range(4):
+            population = self.inputs(9, seed)["population"].take(np.array([0, 1, 2, 3, 4, 5, 6, 7, 8, 3, 0]))
+            every = self.relation(self.checked_call(component, {"population": population}))
+            for k in (5, 2, 11):
+                rows = rng.permutation(11)[:k]
+                some = self.relation(self.checked_call(component, {"population": population.take(rows)}))
+                assert np.allclose(some, every[np.ix_(rows, rows)], atol=1e-9), (
+                    f"{k} of eleven particles have other similarities or classes if only these are given"
+                )
 
 
 class SimilarityContract(_PairsContract):
@@ -208,6 +263,16 @@ class SimilarityContract(_PairsContract):
             assert np.allclose(np.diag(S), 1.0, atol=1e-9), (
                 f"a particle has similarity {np.diag(S).min():.3g} to itself, expected 1"
             )
+
+    def test_copies_are_equal(self) -> None:
+        """A particle and its copy have similarity 1, and the same similarity to others."""
+        twice = self.inputs(5)["population"].take(np.repeat(np.arange(5), 2))
+        S = self.checked_call(self.make(), {"population": twice})
+        own = np.diag(S[::2, 1::2])
+        assert np.allclose(own, 1.0, atol=1e-6), f"a particle has similarity {own.min():.4g} to its copy, expected 1"
+        assert np.allclose(S[::2], S[1::2], atol=1e-6), (
+            "a particle and its copy have other similarities to a third one"
+        )
 
     def test_is_symmetric(self) -> None:
         """It is symmetric."""
@@ -273,10 +338,10 @@ class CodecContract(_ParticlesContract):
     def test_decoded_particles_are_equal(self) -> None:
         """Particles read from a file equal the stored ones bit by bit."""
         component = self.make()
-        for n in _SIZES:
+        for n in (*_SIZES, 300):
             population = self.inputs(n)["population"]
             with_copy = population.take(np.repeat(np.arange(n), 2)[: n + 1])  # a resampling leaves copies
-            for stored in (population, with_copy):
+            for stored in (population, with_copy, Population(_with_special_values(population.particles))):
                 fresh = copy.deepcopy(component)  # as in a new process, which has encoded nothing
                 arrays = _from_file(self.checked_call(component, {"population": stored}))
                 with reports_errors(f"decode {n} particles"):
@@ -285,6 +350,19 @@ class CodecContract(_ParticlesContract):
                 assert same(found.particles, stored.particles) and same(dict(again), arrays), (
                     f"{n} particles that were encoded and decoded are not the same"
                 )
+
+
+def _with_special_values(particles: Any) -> Any:
+    """The same particles with NaN, infinity, -0.0 and the smallest number in arrays of floats."""
+    if isinstance(particles, Mapping):
+        return {name: _with_special_values(array) for name, array in particles.items()}
+    if not isinstance(particles, np.ndarray) or particles.dtype.kind != "f":
+        return particles
+    changed = particles.copy()
+    special = np.array([np.nan, -0.0, np.inf, -np.inf, np.finfo(changed.dtype).smallest_subnormal], changed.dtype)
+    flat = changed.reshape(-1)
+    flat[: len(special)] = special[: len(flat)]
+    return changed
 
 
 def _from_file(arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:

@@ -64,7 +64,8 @@ IDENTITY = Candidate("identity", RigidTransform.identity())
 def _check_candidates(
     self: MotionRule, found: Sequence[Candidate], rng: np.random.Generator, track: Track
 ) -> tuple[Candidate, ...]:
-    check_type(found, (list, tuple), "a tuple of Candidate", *_HOW_TO_MOVE)
+    hints = ("return (candidate,)",) if isinstance(found, Candidate) else _HOW_TO_MOVE
+    check_type(found, (list, tuple), "a tuple of Candidate", *hints)
     if not found:
         raise InputError("returns no candidate, expected at least one", "rest is mstfilter.tracking.IDENTITY")
     for candidate in found:
@@ -88,7 +89,9 @@ _HOW_TO_MOVE = ("a motion T (4, 4) is Candidate('mine', RigidTransform.from_matr
 def _check_candidate(one: Candidate) -> None:
     """Raise InputError unless a result is a candidate with a rigid motion, a support and a score."""
     check_type(one, Candidate, "a Candidate", *_HOW_TO_MOVE)
-    if not isinstance(one.T, RigidTransform) or not one.T.single:
+    if isinstance(one.T, RigidTransform) and not one.T.single:
+        raise InputError(f"returns a candidate with {len(one.T)} motions, expected one", "make a candidate for each")
+    if not isinstance(one.T, RigidTransform):
         raise InputError(
             f"returns a candidate whose T is {describe_value(one.T)}, expected one RigidTransform", *_HOW_TO_MOVE
         )

@@ -27,6 +27,7 @@ from torch.nn import functional
 
 from mstfilter.errors import InputError, check_choice
 from mstfilter.files import atomic_path, read_csv, write_csv, write_text
+from mstfilter.reading import read_text
 from mstfilter.trained import DESCRIPTION, open_model, write_model
 from mstfilter.training.shapes import HELD_OUT, TRAINED
 
@@ -179,7 +180,7 @@ def run_training(
 def _check_settings(settings: Training, folder: Path) -> None:
     lines = [f"{name} = {value}" for name, value in asdict(settings).items()]
     path = folder / "settings.txt"
-    if path.exists() and sorted(path.read_text().splitlines()) != sorted(lines):
+    if path.exists() and sorted(read_text(path, "a training").splitlines()) != sorted(lines):
         raise InputError(f"{folder} holds a training with other settings", "name another folder with --out")
     write_text(path, "\n".join(lines) + "\n")
 

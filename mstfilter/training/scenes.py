@@ -19,6 +19,8 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from mstfilter.errors import InputError
 from mstfilter.files import atomic_path
+from mstfilter.processes import environment
+from mstfilter.reading import MAX_WEIGHTS, read_arrays
 from mstfilter.scene import Camera, look_at
 from mstfilter.simulation.arrangement import arrange_objects
 from mstfilter.simulation.families import SceneFamily
@@ -152,7 +154,7 @@ def write_shards(
         for start in range(0, n_scenes, per_file)
     ]
     if workers > 1:
-        with ProcessPoolExecutor(workers) as pool:
+        with environment(), ProcessPoolExecutor(workers) as pool:
             list(pool.map(_write_shard, jobs))
     else:
         for job in jobs:
@@ -170,5 +172,4 @@ def _write_shard(job: tuple[Path, Callable[[int, int], dict[str, np.ndarray]], i
 
 def read_shard(path: Path) -> dict[str, np.ndarray]:
     """The arrays of a file by name."""
-    with np.load(path, allow_pickle=False) as file:
-        return dict(file)
+    return read_arrays(path, "samples of a training", limit=MAX_WEIGHTS)

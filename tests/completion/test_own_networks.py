@@ -211,7 +211,7 @@ def test_onnx_files_that_cannot_be_used(onnx_page, tmp_path, monkeypatch):
     onnx_page(net)
     x = torch.zeros(1, len(CHANNELS), 32, 32, 32)
     torch.onnx.export(net, (x,), "fixed.onnx", external_data=False, verbose=False)
-    Path("text.onnx").write_text("x")
+    Path("text.onnx").write_text("x", encoding="utf-8")
     for name, message in (
         ("none", "does not exist"),
         ("text", "is no network that onnxruntime"),

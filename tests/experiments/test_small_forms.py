@@ -355,3 +355,9 @@ def test_study_runner(tmp_path, script, table):
     if script == "trials":
         assert all(row["done"] == row["runs"] for row in rows)
         assert [row["killed"] for row in rows] == ["0", "0", "1"]
+
+
+def test_correct_components(tmp_path):
+    found = run_script("correct_components/run.py", "--only", "rejuvenations", "--out", tmp_path / "checks.csv")
+    assert "7 checks, 0 rejected" in found
+    assert [row["broken"] for row in read_csv(tmp_path / "checks.csv")] == [""] * 7

@@ -7,6 +7,7 @@ import shutil
 import warnings
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
@@ -17,7 +18,9 @@ from mstfilter.formats.datasets import Bop, Dsr
 from mstfilter.formats.folder import save_recording
 from mstfilter.formats.image_folders import Redwood, Tum
 from mstfilter.formats.video import KnownWorld, _undistort, pair_stamps, undistortion_map
-from mstfilter.scene import Recording, write_image
+from mstfilter.runs import open_source
+from mstfilter.runs.sources import detect_format
+from mstfilter.scene import Recording, read_depth, read_rgb, write_image
 from mstfilter.scene.pauses import Ends, EveryNth
 from tests.formats.layouts import (
     FPS,
@@ -74,7 +77,11 @@ def test_the_pose_is_found_and_the_workspace_can_be_given(tmp_path):
 
 
 def camera_to_world(k):
-    """The true pose at frame k of a moving camera, in another world than that of the table."""
+    """The pose at frame k of a trajectory in another world than that of the table.
+
+    The images are those of a still camera, so the poses at the two pauses are equal.
+    """
+    k = k if k < PAUSES[1] else PAUSES[0]
     return RigidTransform.from_components([1 + 0.01 * k, -2, 0.9], Rotation.from_rotvec([0.3, -0.2, 0.02 * k]))
 
 
@@ -83,7 +90,7 @@ def check_motion(recording):
     home = recording.pauses[0]
     # At the first pause the pose is the one that the table gives, not the trajectory's.
     assert abs(recording.frames[home].camera.position[2] - CAMERA.position[2]) < 5e-3
-    for k in (0, 5, len(recording) - 1):
+    for k in (0, 5, 11, len(recording) - 1):
         expected = camera_to_world(home).inv() * camera_to_world(k)
         found = recording.frames[home].camera.pose.inv() * recording.frames[k].camera.pose
         np.testing.assert_allclose(found.as_matrix(), expected.as_matrix(), atol=1e-9)
@@ -141,6 +148,116 @@ def test_redwood_trajectory(tmp_path):
     (path / "trajectory.log").write_text("\n".join(blocks[:-1]))
     with pytest.raises(InputError, match="80 lines for 17 frames"):
         Redwood(fps=FPS).open(path)
+
+
+def write_rgb_and_depth(path, names=lambda part, k: f"{k:06d}", intrinsics=("intrinsics.json", None), kind="png"):
+    """The frames of `write_redwood` as rgb/ and depth/ with other names, intrinsics and kind of depth file."""
+    write_redwood(path)
+    (path / "color").rename(path / "rgb")
+    (path / "intrinsic.json").unlink()
+    for part in ("rgb", "depth"):
+        for k, file in enumerate(sorted((path / part).iterdir())):
+            image = read_depth(file, 0.001) if part == "depth" else read_rgb(file)
+            target = file.with_name(names(part, k))
+            file.unlink()
+            if part == "depth" and kind == "npy":
+                np.save(target.with_name(f"{target.name}.npy"), image)
+            elif part == "depth":
+                write_image(target.with_name(f"{target.name}.png"), np.rint(np.nan_to_num(image) * 1000).astype("u2"))
+            else:
+                suffix = ".jpg" if kind == "jpg" else ".png"
+                cv2.imwrite(str(target.with_name(f"{target.name}{suffix}")), image[..., ::-1])
+    if intrinsics is not None:
+        name, text = intrinsics
+        (path / name).write_text(text or json.dumps(dict(zip(("fx", "fy", "cx", "cy"), K, strict=True))))
+    return path
+
+
+ROWS = CAMERA.K.ravel().tolist()
+INTRINSICS = {
+    "RealSense": (
+        "intrinsics.json",
+        json.dumps({"fx": K[0], "fy": K[1], "ppx": K[2], "ppy": K[3], "coeffs": [0] * 5}),
+    ),
+    "rows": ("camera_info.json", json.dumps({"K": ROWS, "width": 160, "height": 120})),
+    "matrix": ("calibration.json", json.dumps({"camera_matrix": CAMERA.K.tolist()})),
+    "BOP": ("camera.json", json.dumps({"fx": K[0], "fy": K[1], "cx": K[2], "cy": K[3]})),
+    "nested": ("camera.json", json.dumps({"color": dict(zip(("fx", "fy", "cx", "cy"), K, strict=True))})),
+    "list": ("K.json", json.dumps(CAMERA.K.tolist())),
+    "3 x 3": ("K.txt", "\n".join(" ".join(f"{v:.6e}" for v in row) for row in CAMERA.K)),
+    "4 x 4": ("intrinsic_color.txt", "131 0 79.5 0\n0 131 59.5 0\n0 0 1 0\n0 0 0 1\n"),
+    "one line": ("intrinsics.txt", "# fx, fy, cx, cy\n131, 131, 79.5, 59.5\n"),
+    "ROS calibration": (
+        "camera_info.yaml",
+        f"image_width: 160\nimage_height: 120\ncamera_name: c\ncamera_matrix:\n  rows: 3\n  cols: 3\n  data: {ROWS}\n"
+        "distortion_model: plumb_bob\ndistortion_coefficients:\n  rows: 1\n  cols: 5\n  data: [0, 0, 0, 0, 0]\n",
+    ),
+    "ROS 1 message": (
+        "camera_info.yaml",
+        f"height: 120\nwidth: 160\nD: [0.0, 0.0, 0.0, 0.0, 0.0]\nK: {ROWS}\nP: [1]\n",
+    ),
+    "ROS 2 message": ("camera_info.yml", "width: 160\nk:\n" + "".join(f"- {v}\n" for v in ROWS) + "r:\n- 1.0\n"),
+    "OpenCV": (
+        "calib.yml",
+        "%YAML:1.0\n---\ncamera_matrix: !!opencv-matrix\n   rows: 3\n   cols: 3\n   dt: d\n"
+        "   data: [ 131., 0., 7.95e+01, 0.,\n       131., 59.5, 0., 0., 1. ]\n",
+    ),
+}
+
+
+@pytest.mark.parametrize("spelling", INTRINSICS)
+def test_rgb_and_depth_with_intrinsics_in_common_spellings(tmp_path, spelling):
+    path = write_rgb_and_depth(tmp_path / "mine", intrinsics=INTRINSICS[spelling])
+    assert detect_format(path) == "redwood"
+    recording = Redwood(fps=FPS, world=WORLD).open(path)
+    np.testing.assert_allclose(recording.frames[0].camera.K, CAMERA.K)
+    assert recording.pauses == PAUSES
+
+
+STAMP = 1_700_000_000
+NAMES = {
+    "numbers": lambda part, k: str(k),
+    "prefix": lambda part, k: f"cam0_{part}_{k:04d}",
+    "seconds": lambda part, k: f"{STAMP + k / FPS + (part == 'depth') * 0.004:.6f}",
+    "nanoseconds": lambda part, k: str(STAMP * 10**9 + k * 10**8 + (part == "depth") * 4_000_000),
+}
+
+
+@pytest.mark.parametrize("names", NAMES)
+@pytest.mark.parametrize("kind", ["png", "npy", "jpg"])
+def test_rgb_and_depth_by_number_or_time(tmp_path, names, kind):
+    path = write_rgb_and_depth(tmp_path / "mine", NAMES[names], kind=kind)
+    recording = Redwood(fps=FPS, world=WORLD).open(path)
+    np.testing.assert_allclose(recording.times, np.arange(len(SHIFTS)) / FPS, atol=1e-6)
+    assert recording.pauses == PAUSES
+    if kind != "jpg":
+        same_frames(recording, SHIFTS)
+
+
+def test_images_without_a_partner_are_omitted_by_time_and_refused_by_number(tmp_path):
+    stamped = write_rgb_and_depth(tmp_path / "stamped", NAMES["seconds"])
+    first_file(stamped, "depth").unlink()
+    assert len(Redwood(world=WORLD).open(stamped)) == len(SHIFTS) - 1
+    numbered = write_rgb_and_depth(tmp_path / "numbered")
+    first_file(numbered, "depth").unlink()
+    with pytest.raises(InputError, match="17 colour images and 16 depth images"):
+        Redwood(world=WORLD).open(numbered)
+    same = write_rgb_and_depth(tmp_path / "same", lambda part, k: f"frame_{chr(97 + k)}")
+    with pytest.raises(InputError, match="no numbers that differ"):
+        Redwood(world=WORLD).open(same)
+
+
+def test_rgb_and_depth_without_a_file_of_intrinsics(tmp_path):
+    path = write_rgb_and_depth(tmp_path / "mine", intrinsics=None)
+    with pytest.raises(InputError, match="intrinsics are missing") as caught:
+        open_source(path)
+    assert "-o K=fx,fy,cx,cy" in caught.value.hints[0]
+    given = open_source(path, options=["K=131,131,79.5,59.5", "fps=10"])
+    np.testing.assert_allclose(given.frames[0].camera.K, CAMERA.K)
+    for wrong in ("{}", "[1, 2]", '{"fx": 1}', '{"K": "x"}', '{"fx": 0, "fy": 1, "cx": 2, "cy": 3}', "{"):
+        (path / "intrinsics.json").write_text(wrong)
+        with pytest.raises(InputError, match="intrinsics.json"):
+            open_source(path)
 
 
 def test_bop(tmp_path):
@@ -207,7 +324,7 @@ def test_dsr_sequences(tmp_path):
     with pytest.raises(InputError, match=r"\[0, 2\]"):
         Dsr(sequence="7").open(path)
     (path / "12_1.hdf5").write_bytes((path / "12_0.hdf5").read_bytes()[:500])
-    with pytest.raises(InputError, match="does not hold"):
+    with pytest.raises(InputError, match="expected the arrays tsdf"):
         Dsr(sequence="12").open(path).check()
 
 

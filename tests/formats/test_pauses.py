@@ -57,7 +57,7 @@ def test_pauses_as_text(tmp_path):
         pauses_from_text("0,1.5")
     assert pauses_from_text(",".join(map(str, range(400))))["frames"] == tuple(range(400))  # too long for a path
     with contextlib.chdir(tmp_path):
-        Path("still").write_text("0")
+        Path("still").write_text("0", encoding="utf-8")
         assert pauses_from_text("still") == {"component": "still"}
 
 

@@ -234,9 +234,9 @@ def test_files_that_cannot_be_used_are_one_clear_error(tmp_path, o3d, case):
 
 
 def test_the_memory_of_a_file_is_bounded(tmp_path, monkeypatch):
-    monkeypatch.setattr("mstfilter.frontends.completions._MAX_BYTES", 1000)
+    monkeypatch.setattr("mstfilter.frontends.completions.MAX_FILE", 1000)
     np.savez_compressed(folder_of(tmp_path, 1) / "a.npz", points=np.zeros((1000, 3)))
-    with pytest.raises(InputError, match="bytes when unpacked, at most 1000"):
+    with pytest.raises(InputError, match="at most 1000 are read"):
         occupied(ExternalCompletion(folder=str(tmp_path), axes="world"), 1)
 
 

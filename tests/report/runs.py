@@ -93,12 +93,19 @@ def recording(pauses: int = 3, truth: bool = True) -> Recording:
     return replace(arrays, truth=truth_at) if truth else arrays
 
 
-def make_run(path: Path, pauses: int = 3, truth: bool = True, empty: bool = False, done: bool = True) -> RunFolder:
+def make_run(
+    path: Path,
+    pauses: int = 3,
+    truth: bool = True,
+    empty: bool = False,
+    done: bool = True,
+    film: Recording | None = None,
+) -> RunFolder:
     """A run folder of three hypotheses a pause."""
     filter = ParticleFilter(
         proposal=Boxes(empty), transition=Stay(), update=Either(), trigger=Always(), n=3, resample="after"
     )
-    film = recording(pauses, truth)
+    film = film or recording(pauses, truth)
     description = {
         "seed": 7,
         "description": "boxes & tests",
@@ -111,13 +118,17 @@ def make_run(path: Path, pauses: int = 3, truth: bool = True, empty: bool = Fals
             "generator": None,
         },
         "uses_truth": [],
+        "files": {},
         "versions": {"mstfilter": "0", "numpy": np.__version__},
+        "machine": {"cpu": "any", "threads": 1},
     }
     run = RunFolder.create(path, description)
     state = filter.start(7)
     for clip in film.clips():
         state, info = filter.step(state, clip)
-        run.write_pause(clip, state, info, film.truth(clip.index), ask(film, clip.index) if truth else None)
+        volume = film.truth(clip.index)
+        questions = None if volume is None else ask(film, clip.index)
+        run.write_pause(clip, state, info, volume, questions, film.instance(film.pauses[clip.index]))
         (run.pause(clip.index) / "seconds.json").write_text(json.dumps({"transition": 0.5, "proposal": 1.5}))
     if done:
         run.write_metrics()

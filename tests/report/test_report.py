@@ -16,11 +16,11 @@ import pytest
 from mstfilter.errors import InputError
 from mstfilter.report import run_report, viewpoint
 from mstfilter.report.run_report import read_numbers, write_report
-from mstfilter.runs import HypothesisCodec, RunFolder
-from mstfilter.scene import Hypothesis, project
+from mstfilter.runs import HypothesisCodec, RunFolder, read_estimate, read_truth, score_pauses
+from mstfilter.scene import Hypothesis, project, render
 from mstfilter.scoring import BeliefScore, weighted_coverage
 from mstfilter.smc import Key, Population, State, save_state
-from tests.report.runs import labels_of, make_run
+from tests.report.runs import CAMERA, GRID, labels_of, make_run, recording, truth_at
 
 
 class Page(HTMLParser):
@@ -78,6 +78,22 @@ def small_pictures():
 def finished(tmp_path_factory):
     run = make_run(tmp_path_factory.mktemp("report") / "run")
     return run, write_report(run)
+
+
+def test_label_images_without_volumes_give_the_quality_in_the_image(tmp_path):
+    """The numbers are those of `mstfilter.runs.score_pauses`, beside both floors."""
+    film = replace(recording(2, truth=False), instance=lambda i: render(truth_at(i), GRID, CAMERA).labels)
+    run = make_run(tmp_path / "run", 2, film=film)
+    expected = [row for row in score_pauses(read_estimate(run.path), read_truth(film)) if row.form == "objects"]
+    numbers = read_numbers(run)
+    found = [step.image_score for step in numbers.steps]
+    assert [(s.mean, s.best, s.one_blob, s.components) for s in found] == [
+        (s.mean, s.best, s.one_blob, s.components) for s in expected
+    ]
+    assert f"their mean quality is {expected[1].mean:.2f} of 1" in " ".join(numbers.summary)
+    page = write_report(run).read_text()
+    assert "Quality in the image" in page and "no quality is shown" not in page
+    assert all(f"{row.mean:.3f}" in page for row in expected)
 
 
 def test_the_page_is_self_contained(finished):

@@ -165,6 +165,21 @@ def test_a_browser_draws_a_run(run, tmp_path, capsys):
         assert pixels_of(tmp_path / "run.png", rgb) > 200
 
 
+def help_of(page, tmp_path) -> str:
+    text = browse(page.save(tmp_path / "page.html"), tmp_path, "--dump-dom")
+    return re.search(r'id="help">(.*?)</p>', text)[1]
+
+
+@needs_browser
+@pytest.mark.parametrize("truth", [True, False])
+def test_the_help_names_what_the_time_line_has(tmp_path, truth):
+    text = help_of(run_page(make_run(tmp_path / "run", truth=truth)), tmp_path)
+    assert "Each disc is a hypothesis" in text
+    assert ("Each ring is the truth." in text) is truth and ("ring" in text) is truth
+    text = help_of(recording_page(recording(truth=truth)), tmp_path)
+    assert f"Each ring is the {'truth' if truth else 'surface'}." in text and "disc" not in text
+
+
 def test_files_of_rerun_hold_every_entity(run, tmp_path, capsys):
     rerun = pytest.importorskip("rerun")
     rerun.set_strict_mode(True)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from mstfilter.errors import InputError
+from mstfilter.formats.image_folders import PairedImages
 from mstfilter.presets import REGISTRY
 from mstfilter.runs.sources import detect_format, format_settings, open_source
 from mstfilter.scene import Recording, render, write_image
@@ -61,6 +62,14 @@ def test_options_as_text():
         "frames": ["a", "007", 8],
         "moving": False,
     }
+
+
+@pytest.mark.parametrize(("option", "background"), [("background=0", (0,)), ("background=0,1", (0, 1))])
+def test_a_single_number_is_a_list_of_one(tmp_path, option, background):
+    reader = REGISTRY.make(PairedImages, format_settings([option]))
+    assert reader.background == background
+    with pytest.raises(InputError, match="background is"):
+        REGISTRY.make(PairedImages, format_settings(["background=x"]))
 
 
 def test_options_reach_the_reader(tmp_path):

@@ -10,7 +10,8 @@ import pytest
 
 from mstfilter.errors import InputError
 from mstfilter.formats import PairedImages, RecordingWriter, open_recording, save_recording
-from mstfilter.scene import write_image
+from mstfilter.fusion.conflicts import check_grid
+from mstfilter.scene import Hypothesis, write_image
 from mstfilter.scene.camera import Camera, look_at
 from mstfilter.scene.geometry import fit_support_plane, table_residual, workspace
 from mstfilter.scene.recording import Recording
@@ -380,3 +381,19 @@ def test_true_volumes_may_change_after_they_were_added(tmp_path):
             writer.add_voxels(truth)
     again = open_recording(tmp_path / "r")
     assert [int(again.truth(t).max()) for t in range(3)] == [1, 2, 3]
+
+
+def test_parts_of_a_session_share_a_world(tmp_path):
+    """A part with another pose and workspace gets those of the first: the same pixel is at the same place."""
+    first = open_recording(write(tmp_path / "first"))
+    other = Recording.from_arrays(
+        np.stack([f.rgb for f in first.frames]), np.stack([f.depth for f in first.frames]), first.frames[0].camera.K
+    )
+    assert other.grid != first.grid
+    joined = other.in_world_of(first)
+    assert joined.grid == first.grid and joined.pauses == other.pauses
+    np.testing.assert_allclose(joined.frames[1].points, first.frames[1].points, atol=1e-9)
+    hypothesis = Hypothesis.from_labels(np.ones(other.grid.shape, int), other.grid)
+    with pytest.raises(InputError, match="grid of prediction") as caught:
+        check_grid("prediction", hypothesis, first.grid)
+    assert "in_world_of(first)" in caught.value.hints[1]

@@ -245,7 +245,7 @@ def test_a_recording_that_another_process_wrote_meanwhile_is_kept(tmp_path, monk
 
 def test_a_failed_simulation_leaves_no_files(tmp_path, monkeypatch):
     def broken(family, seed, path, progress=None):
-        (path.parent / "half").write_text("")
+        (path / "half").write_text("")
         raise InputError("no")
 
     monkeypatch.setattr(recorder, "simulate_recording", broken)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import itertools
 import random
 import time
+from copy import deepcopy
 from dataclasses import dataclass
 
 import numpy as np
@@ -584,6 +585,48 @@ def a_list_of_the_closure(previous, y):
     seen(x + 0.01 * len(HISTORY), y)
 
 
+LANDMARKS: dict = {}
+
+
+@faulty("after the particles before it than alone", n=40)
+@per_particle
+def a_dictionary_that_all_particles_fill(previous, y):
+    x = walk(previous)
+    seen(LANDMARKS.setdefault(round(float(x)), float(x)), y)
+
+
+LARGEST = {"x": 1e-3}
+
+
+@faulty(ALONE)
+def a_running_maximum_of_the_closure(previous, y):
+    x = walk(previous)
+    LARGEST["x"] = max(LARGEST["x"], float(np.max(x)))
+    seen(x / LARGEST["x"], y)
+
+
+class Scaled:
+    largest = 1e-3
+
+    def __call__(self, previous, y):
+        x = walk(previous)
+        self.largest = max(self.largest, float(np.max(x)))
+        seen(x / self.largest, y)
+
+
+FAULTY["a_running_maximum_of_an_object"] = (Program(Scaled()).bootstrap(200), YS, ALONE)
+FAULTY["a_running_maximum_of_a_method"] = (Program(Scaled().__call__).bootstrap(200), YS, ALONE)
+TURN = [0]
+
+
+@faulty("after the particles before it than alone", n=40)
+@per_particle
+def every_second_particle(previous, y):
+    x = walk(previous)
+    TURN[0] = (TURN[0] + 1) % 2
+    observe("y", Normal(x, 1.0 + TURN[0]), y)
+
+
 @faulty(REPEATED)
 @per_particle
 def other_draws_of_a_particle(previous, y):
@@ -1054,6 +1097,30 @@ def immutable_use_of_containers(previous, y):
     track = np.append(np.zeros(1) if previous is None else previous["track"], x)
     seen(np.mean(items) + 0.1 * len(cells) + 0.1 * len(at) + track[0], y)
     return {"items": items, "cells": cells, "at": at, "track": track, "grid": Map([1])}
+
+
+@correct(n=30)
+@per_particle
+def copies_of_containers(previous, y):
+    x = walk(previous)
+    items, at = ([[]], {}) if previous is None else (deepcopy(previous["items"]), deepcopy(previous["at"]))
+    items[0].append(float(x))
+    at[len(at)] = [float(x)]
+    seen(np.mean(items[0]) + 0.1 * len(at), y)
+    return {"items": items, "at": at}
+
+
+SCALES: dict = {}
+
+
+@correct(n=30)
+@per_particle
+def a_cache_of_all_particles(previous, y):
+    x = walk(previous)
+    k = round(float(x))
+    if k not in SCALES:
+        SCALES[k] = 1.0 + abs(k)
+    observe("y", Normal(x, SCALES[k]), y)
 
 
 @correct(n=30)

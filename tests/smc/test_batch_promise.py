@@ -11,6 +11,8 @@ from hypothesis import given, settings, strategies as st
 
 from mstfilter.errors import InputError
 from mstfilter.smc import (
+    Always,
+    Multinomial,
     Normal,
     Poisson,
     Program,
@@ -191,7 +193,7 @@ def test_an_error_names_slot_step_run_values_and_what_to_do():
     ) as error:
         batch(bootstrap(FAULTY["first particle"], 4), [0.1] * 4, range(5))
     assert any("batched" in hint for hint in error.value.hints)
-    with pytest.raises(InputError, match="run 1, step 2, update: log weight of particle 0 is nan"):
+    with pytest.raises(InputError, match="run 1, observation 2 is NaN"):
         batch(bootstrap(GOOD, 4), [[0.1] * 4, [0.1, 0.2, float("nan"), 0.1]], range(2), paired=True)
     with pytest.raises(InputError, match=r"run 1, step 1, update: ValueError"):
         batch(bootstrap(GOOD, 4), [[0.1] * 3, [0.1, [1.0, 2.0], 0.1]], range(2), paired=True)
@@ -204,9 +206,54 @@ def test_a_model_that_differs_later_only_is_found_then():
         return x + rng.standard_normal(x.shape) + (x.mean() if t >= 3 else 0.0)
 
     stated = replace(GOOD, sample_transition=later)
-    with pytest.raises(InputError, match="step 4, transition"):
+    with pytest.raises(InputError, match="step 5, transition"):
         batch(bootstrap(stated, 4), [0.1] * 6, range(5))
     assert keeps_its_promise(bootstrap(replace(stated, batched=None), 4), [0.1] * 6, range(5), False) == "single"
+
+
+def test_a_model_that_differs_at_every_third_step_is_found():
+    def periodic(rng, x, t):
+        return x + rng.standard_normal(x.shape) + (x.mean() if t % 3 == 0 else 0.0)
+
+    with pytest.raises(InputError, match="step 12, transition"):
+        batch(bootstrap(replace(GOOD, sample_transition=periodic), 4), [0.1] * 14, range(5))
+
+
+def test_a_program_that_mixes_particles_is_named_by_its_first_batch():
+    def program(previous, y):
+        x = sample("x", Normal(0.0, 1.0))
+        observe("y", Normal(x - x.mean(), 1.0), y)
+
+    with pytest.raises(InputError, match="run 0, step 0, initial: observation 'y': particle .* alone"):
+        batch(Program(program).bootstrap(30), [0.5, -0.3], range(5))
+
+
+def test_an_error_with_the_runs_in_another_order_is_named():
+    def ordered(x, y):  # the first run alone and first in the batch
+        if len(x) > 4 and x[0] != FIRST[0]:
+            raise ArithmeticError("order")
+        return -np.square(y - x)
+
+    filter = bootstrap(replace(GOOD, log_likelihood=ordered), 4)
+    FIRST = filter.run([None], 0)[0].population.particles
+    with pytest.raises(InputError, match="update: a call for the runs in another order raises ArithmeticError"):
+        batch(filter, [0.5], range(5))
+
+
+def needs_one_number(previous, y):
+    x = sample("x", Normal(0.0, 1.0))
+    observe("y", Normal(x, 1.0 if y > 0 else 2.0), y)
+
+
+@pytest.mark.parametrize("n", [3, 4])
+def test_paired_programs_are_called_together_also_where_their_checks_are_due(n):
+    """The first steps of a program are checked; in a batch, the single runs that it is compared with are."""
+
+    def fresh(previous, y):
+        return walk(previous, y)
+
+    data = np.random.default_rng(0).standard_normal((3, 9)).tolist()
+    assert keeps_its_promise(Program(fresh).bootstrap(n), data, range(3), True) == "together"
 
 
 def test_a_batch_says_and_warns_that_components_are_called_for_each_run():
@@ -217,7 +264,8 @@ def test_a_batch_says_and_warns_that_components_are_called_for_each_run():
     with pytest.warns(UserWarning, match="the update is called once for each run: .* by rounding"):
         runs = batch(filter, [0.5] * 3, range(5))
     assert list(runs.single) == ["update"]
-    assert batch(Program(walk).bootstrap(4), [[0.5]] * 3, range(3), paired=True).single
+    assert batch(Program(walk).bootstrap(4), [[0.5, None]] * 3, range(3), paired=True).single == {}
+    assert batch(Program(needs_one_number).bootstrap(4), [[0.5]] * 3, range(3), paired=True).single
     assert batch(bootstrap(GOOD, 4), [0.5] * 3, range(5)).single == {}
 
 
@@ -307,6 +355,18 @@ def test_chains_say_that_they_are_run_singly():
     with pytest.warns(UserWarning, match="run one by one: transition"):
         many = pmmh(mixing, YS, flat, START, 0.2, 4, batched=True)
     np.testing.assert_array_equal(many.theta, pmmh(mixing, YS, flat, START, 0.2, 4).theta)
+
+
+@pytest.mark.parametrize("field", ["n", "resampler", "trigger"])
+def test_chains_whose_filters_differ_in_more_than_numbers_are_run_singly(field):
+    def filter_of(theta):
+        high = bool(np.max(theta) > 0.55)
+        other = {"n": 7, "resampler": Multinomial(), "trigger": Always()}[field]
+        return replace(bootstrap(of(1), 4), **({field: other} if high else {}))
+
+    with pytest.warns(UserWarning, match=f"one by one: all: the filters of the runs differ in {field}"):
+        many = pmmh(filter_of, YS, flat, [[0.3], [0.8]], 0.1, 4, batched=True)
+    np.testing.assert_array_equal(many.theta, pmmh(filter_of, YS, flat, [[0.3], [0.8]], 0.1, 4).theta)
 
 
 def test_a_chain_whose_first_estimate_is_lost_is_drawn_again():

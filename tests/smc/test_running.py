@@ -34,9 +34,12 @@ from mstfilter.smc import (
     StateSpaceModel,
     Tempered,
     Trace,
+    batch,
     bootstrap,
     collect,
     diagnostics,
+    kalman_filter,
+    keep as keep_record,
     linear_gaussian,
     observe,
     per_particle,
@@ -467,7 +470,7 @@ def test_what_cannot_be_stored_is_one_clear_error(tmp_path):
         with pytest.raises(InputError, match="s.npz"):
             load_state(tmp_path / "s.npz", Halves())
     (tmp_path / "s.npz").write_bytes(b"PK nonsense")
-    with pytest.raises(InputError, match="checkpoint cannot be read"):
+    with pytest.raises(InputError, match="s.npz cannot be read"):
         load_state(tmp_path / "s.npz")
     with pytest.raises(InputError, match="checkpoint is missing"):
         load_state(tmp_path / "t.npz")
@@ -597,3 +600,38 @@ def test_a_killed_run_ends_as_one_that_was_not(kind, n_kills, tmp_path):
             assert a.files == b.files
             for name in a.files:
                 np.testing.assert_array_equal(a[name], b[name])
+
+
+class Table:
+    """What a data frame does: it iterates over the names of its columns."""
+
+    columns = ("y",)
+
+    def __iter__(self):
+        return iter(self.columns)
+
+
+@pytest.mark.parametrize(
+    ("observations", "message", "hint"),
+    [
+        (Table(), "observations are a Table", "to_numpy"),
+        ({"y": [1.0]}, "observations are a dict", "to_numpy"),
+        ("ab", "observations are a str", "to_numpy"),
+        ([np.ones(1), np.array([np.nan])], "observation 1 is NaN", "None"),
+        (np.array([1.0, 2.0, np.nan]), "observation 2 is NaN", "None"),
+    ],
+)
+def test_observations_that_cannot_be_meant_are_refused_before_the_first_step(observations, message, hint):
+    one = [np.eye(1)] * 4
+    filter = bootstrap(linear_gaussian(*one, np.zeros(1), np.eye(1)), n=5)
+    calls = (
+        lambda: filter.run(observations, seed=0),
+        lambda: next(iter(filter.iterate(observations, filter.start(0)))),
+        lambda: batch(filter, observations, range(2)),
+        lambda: keep_record(filter, observations),
+        lambda: kalman_filter(*one, np.zeros(1), np.eye(1), observations),
+    )
+    for call in calls:
+        with pytest.raises(InputError, match=message) as caught:
+            call()
+        assert hint in caught.value.hints[0]

@@ -15,6 +15,7 @@ from types import SimpleNamespace
 import pytest
 
 from mstfilter.errors import InputError
+from mstfilter.files import locked
 from mstfilter.study.config import load_study, study_of
 from mstfilter.study.executors import Executor, Local
 from mstfilter.study.results import StudyFolder
@@ -186,13 +187,10 @@ def test_killing_the_study_and_resuming_ends_with_the_same_table(folder, tmp_pat
 
 
 def test_one_process_a_study(folder, tmp_path):
-    fcntl = pytest.importorskip("fcntl")
     out = tmp_path / "out"
     run_study(study(folder, "good", seeds=[0]), out, InProcess(), cache=tmp_path)
-    with (out / ".lock").open("w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        with pytest.raises(InputError, match="another process"):
-            run_study(study(folder, "good", seeds=[0]), out, InProcess(), cache=tmp_path)
+    with locked(out), pytest.raises(InputError, match="another process"):
+        run_study(study(folder, "good", seeds=[0]), out, InProcess(), cache=tmp_path)
 
 
 WRONG = {
@@ -241,7 +239,7 @@ def test_folders_that_will_not_do(folder, tmp_path, monkeypatch):
     (tmp_path / "file").write_text("x")
     with pytest.raises(InputError, match="is not a study folder"):
         run_study(study(folder, "good"), tmp_path / "file", cache=tmp_path)
-    with pytest.raises(InputError, match="cannot write study folder"):
+    with pytest.raises(InputError, match="cannot write .*below and a lock beside it: "):
         run_study(study(folder, "good"), tmp_path / "file" / "below", cache=tmp_path)
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "precious.txt").write_text("x")

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import copy
+import random
+import time
+from dataclasses import dataclass, field
+from typing import ClassVar
 
 import numpy as np
 from scipy.optimize import brentq
@@ -103,7 +107,62 @@ class MeansByOrder(Resampler):
         return Population(made, np.full(n, population.log_mean_weight))
 
 
-CORRECT = (Metropolis(), Chopthin(), MeansByOrder())
+@dataclass(frozen=True)
+class RareHeaps(WeightResampler):
+    """In a call of a thousand, all copies are of one particle drawn by weight."""
+
+    rate: float = 0.001
+
+    def select(self, rng, log_weights, n):
+        weights = normalise(log_weights)
+        if rng.random() < self.rate:
+            return np.repeat(multinomial(rng, weights, 1), n), None
+        return systematic(rng, weights, n), None
+
+
+@dataclass(frozen=True)
+class RareBlocks(WeightResampler):
+    """In a call of 500, blocks of a third of the positions get one draw."""
+
+    def select(self, rng, log_weights, n):
+        weights = normalise(log_weights)
+        if rng.random() < 0.002 and n >= 3:
+            return np.resize(np.repeat(multinomial(rng, weights, 3), -(-n // 3)), n), None
+        return multinomial(rng, weights, n), None
+
+
+@dataclass(frozen=True)
+class RandomNumber(WeightResampler):
+    """Every position is filled with probability 0.9; the weight of the others is kept on average."""
+
+    exact_size: ClassVar[bool] = False
+
+    def select(self, rng, log_weights, n):
+        filled = np.flatnonzero(rng.random(n) < 0.9)
+        filled = filled if len(filled) else np.array([0])
+        share = 0.9 + (0.1**n) / n  # expected number of filled positions / n
+        ancestors = rng.permutation(multinomial(rng, normalise(log_weights), n))[filled]
+        return ancestors, np.full(len(filled), log_mean_exp(log_weights) + np.log(len(filled) / n / share))
+
+
+@dataclass(frozen=True)
+class SizeChanging(WeightResampler):
+    """Even draws that carry their weight: the total weight is kept on average only."""
+
+    def select(self, rng, log_weights, n):
+        ancestors = rng.choice(np.flatnonzero(log_weights > -np.inf), n)
+        return ancestors, log_weights[ancestors] + np.log((log_weights > -np.inf).mean())
+
+
+CORRECT = (
+    Metropolis(),
+    Chopthin(),
+    MeansByOrder(),
+    RareHeaps(),
+    RareBlocks(),
+    RandomNumber(),
+    SizeChanging(),
+)
 
 
 class ForgetsAncestors(Resampler):
@@ -352,6 +411,342 @@ class OnePercent(WeightResampler):
         return multinomial(rng, weights, n), None
 
 
+def faulty(function):
+    """A resampler class ``function(rng, log_weights, n) -> ancestors, log_weights``."""
+
+    def select(self, rng, log_weights, n):
+        found = function(rng, log_weights, n)
+        return found if isinstance(found, tuple) else (found, None)
+
+    return type(function.__name__, (WeightResampler,), {"select": select, "__doc__": function.__doc__})
+
+
+# --- faults at some sizes ---
+
+
+@faulty
+def single_is_heaviest(rng, lw, n):
+    return np.array([np.argmax(lw)]) if n == 1 else systematic(rng, normalise(lw), n)
+
+
+@faulty
+def thins_first(rng, lw, n):
+    """From many particles to few, the lightest half is dropped first."""
+    weights = normalise(lw)
+    if len(lw) > 20 * n:
+        weights[weights < np.median(weights)] = 0.0
+    return multinomial(rng, weights, n)
+
+
+@faulty
+def odd_is_special(rng, lw, n):
+    found = systematic(rng, normalise(lw), n)
+    if n % 2 and n > 1:
+        found[-1] = found[0]
+    return found
+
+
+@faulty
+def more_than_there_are(rng, lw, n):
+    """If n > m every particle is kept once, and the rest is drawn."""
+    weights, m = normalise(lw), len(lw)
+    if n <= m or (weights == 0).any():
+        return systematic(rng, weights, n)
+    return np.concatenate([np.arange(m), systematic(rng, weights, n - m)])
+
+
+@faulty
+def eight_bits(rng, lw, n):
+    return systematic(rng, normalise(lw), n).astype(np.uint8).astype(int)
+
+
+@faulty
+def sixteen_bits(rng, lw, n):
+    return systematic(rng, normalise(lw), n).astype(np.int16).astype(int)
+
+
+@faulty
+def block_of_256(rng, lw, n):
+    """Particles from number 256 on are never selected."""
+    return systematic(rng, normalise(lw)[:256], n)
+
+
+@faulty
+def last_is_forgotten(rng, lw, n):
+    weights = normalise(lw)
+    found = systematic(rng, weights, n)
+    return np.where((found == len(lw) - 1) & (weights[0] > 0), 0, found) if n == len(lw) else found
+
+
+# --- faults at some weights ---
+
+
+@faulty
+def at_most_half(rng, lw, n):
+    return systematic(rng, np.minimum(normalise(lw), 0.5), n)
+
+
+@faulty
+def winner_takes_all(rng, lw, n):
+    weights = normalise(lw)
+    return np.full(n, np.argmax(weights)) if weights.max() > 0.9 else systematic(rng, weights, n)
+
+
+@faulty
+def heavy_gains(rng, lw, n):
+    """A particle of more than 0.6 of the weight gets 5 % too much."""
+    weights = normalise(lw)
+    return multinomial(rng, np.where(weights > 0.6, 1.05, 1.0) * weights, n)
+
+
+@faulty
+def heaviest_of_many(rng, lw, n):
+    """If there are more than twenty times as many as are selected, the light ones are left out."""
+    w = normalise(lw)
+    if len(w) > 20 * n:
+        w = np.where(w >= np.sort(w)[-20 * n], w, 0.0)
+    return systematic(rng, w / w.sum(), n)
+
+
+@faulty
+def floor_of_weights(rng, lw, n):
+    weights = normalise(lw)
+    return systematic(rng, np.where(weights > 0, np.maximum(weights, 0.02), 0), n)
+
+
+@faulty
+def dropped_by_absolute_weight(rng, lw, n):
+    return systematic(rng, np.where(lw > -50, np.exp(lw), 0.0), n)
+
+
+@faulty
+def zero_is_small(rng, lw, n):
+    return systematic(rng, normalise(np.nan_to_num(lw, neginf=-3.0)), n)
+
+
+@faulty
+def rounds_up(rng, lw, n):
+    """Residual resampling that rounds instead of taking the floor."""
+    copies = np.rint(n * normalise(lw)).astype(int)
+    kept = np.repeat(np.arange(len(lw)), copies)
+    return kept[:n] if len(kept) >= n else np.concatenate([kept, systematic(rng, normalise(lw), n - len(kept))])
+
+
+@faulty
+def offset_of_half(rng, lw, n):
+    """The systematic offset lies in the first half of a stratum."""
+    points = (np.arange(n) + 0.5 * rng.random()) / n
+    weights = normalise(lw)
+    return np.minimum(np.searchsorted(np.cumsum(weights), points, side="right"), np.flatnonzero(weights)[-1])
+
+
+@faulty
+def last_stratum(rng, lw, n):
+    """Strata of width 1 / (n - 1)."""
+    points = np.minimum((np.arange(n) + rng.random(n)) / max(n - 1, 1), 1 - 1e-12)
+    weights = normalise(lw)
+    return np.minimum(np.searchsorted(np.cumsum(weights), points, side="right"), np.flatnonzero(weights)[-1])
+
+
+@faulty
+def sharpens_many(rng, lw, n):
+    """A power of the weights, if there are more than a hundred."""
+    power = 1.1 if len(lw) > 100 else 1.0
+    return systematic(rng, normalise(power * lw), n)
+
+
+# --- random numbers and state ---
+
+
+@faulty
+def global_if_more(rng, lw, n):
+    source = np.random if n > len(lw) else rng
+    return systematic(source, normalise(lw), n)
+
+
+@faulty
+def python_generator(rng, lw, n):
+    found = systematic(rng, normalise(lw), n)
+    random.shuffle(found)
+    return found
+
+
+@faulty
+def reseeds_the_global(rng, lw, n):
+    np.random.seed(int(rng.integers(1000)))  # noqa: NPY002
+    return systematic(rng, normalise(lw), n)
+
+
+_OWN = np.random.default_rng(5)
+
+
+@faulty
+def module_generator(rng, lw, n):
+    return systematic(_OWN, normalise(lw), n)
+
+
+@faulty
+def seeded_by_time(rng, lw, n):
+    return systematic(np.random.default_rng(time.time_ns()), normalise(lw), n)
+
+
+@faulty
+def copies_the_generator(rng, lw, n):
+    """Draws from a copy of the generator, which is not advanced."""
+    return systematic(copy.deepcopy(rng), normalise(lw), n)
+
+
+@dataclass(frozen=True)
+class FirstCallCached(WeightResampler):
+    """The weights of the first call are used for ever, if there are as many."""
+
+    cache: dict = field(default_factory=dict)
+
+    def select(self, rng, log_weights, n):
+        weights = self.cache.setdefault(len(log_weights), normalise(log_weights))
+        return systematic(rng, weights, n), None
+
+
+@dataclass(frozen=True)
+class ResultCached(FirstCallCached):
+    """The result of a call of the same sizes is returned again."""
+
+    def select(self, rng, log_weights, n):
+        key = (len(log_weights), n)
+        if key not in self.cache:
+            self.cache[key] = systematic(rng, normalise(log_weights), n)
+        return self.cache[key], None
+
+
+_CACHE: dict = {}
+
+
+@faulty
+def module_cache(rng, lw, n):
+    """Cached by the sizes, beside the class."""
+    return systematic(rng, _CACHE.setdefault((len(lw), n), normalise(lw)), n)
+
+
+@dataclass(frozen=True)
+class EverySecondCall(FirstCallCached):
+    def select(self, rng, log_weights, n):
+        self.cache["calls"] = self.cache.get("calls", 0) + 1
+        weights = normalise(log_weights if self.cache["calls"] % 2 else 0.5 * log_weights)
+        return systematic(rng, weights, n), None
+
+
+@faulty
+def in_place_if_equal(rng, lw, n):
+    if n == len(lw):
+        lw -= lw.max()
+    return systematic(rng, normalise(lw), n)
+
+
+# --- output ---
+
+
+@faulty
+def sum_for_mean(rng, lw, n):
+    return systematic(rng, normalise(lw), n), np.full(n, np.logaddexp.reduce(lw))
+
+
+@faulty
+def single_precision_output(rng, lw, n):
+    return systematic(rng, normalise(lw), n), np.full(n, log_mean_exp(lw)).astype(np.float32)
+
+
+@faulty
+def weights_of_neighbours(rng, lw, n):
+    """Even draws that carry the weight of another particle."""
+    even = (lw > -np.inf) / 1.0
+    ancestors = systematic(rng, even, n)
+    return ancestors, lw[np.sort(ancestors)[::-1]] + np.log(even.mean())
+
+
+@faulty
+def as_floats(rng, lw, n):
+    return systematic(rng, normalise(lw), n).astype(float)
+
+
+@dataclass(frozen=True)
+class StatesALargeBias(GreedyCalledProper):
+    tolerance: ClassVar[float] = 0.9
+
+
+@dataclass(frozen=True)
+class NoDuplicates(WeightResampler):
+    """Returns fewer than n without saying so."""
+
+    def select(self, rng, log_weights, n):
+        return np.unique(systematic(rng, normalise(log_weights), n)), None
+
+
+@dataclass(frozen=True)
+class MoreThanAsked(WeightResampler):
+    exact_size: ClassVar[bool] = False
+
+    def select(self, rng, log_weights, n):
+        return systematic(rng, normalise(log_weights), n + 1), None
+
+
+@dataclass(frozen=True)
+class CallsItDrawless(WeightResampler):
+    draws: ClassVar[bool] = False
+
+    def select(self, rng, log_weights, n):
+        return systematic(rng, normalise(log_weights), n), None
+
+
+@dataclass(frozen=True)
+class MixesRuns(WeightResampler):
+    batched: ClassVar[bool] = True
+
+    def select(self, rng, log_weights, n):
+        if log_weights.ndim == 1:
+            return systematic(rng, normalise(log_weights), n), None
+        generators = rng.generators()
+        return np.array([systematic(g, normalise(log_weights.mean(axis=0)), n) for g in generators]), None
+
+
+@dataclass(frozen=True)
+class LosesMates(Resampler):
+    def resample(self, rng, population, n):
+        ancestors = systematic(rng, population.weights, n)
+        chosen = population.select(ancestors, np.full(n, population.log_mean_weight))
+        return chosen.labelled({k: v for k, v in chosen.parents.items() if k != "mate"})
+
+
+@dataclass(frozen=True)
+class OldParents(Resampler):
+    """The parents "previous" are those of the first n particles."""
+
+    def resample(self, rng, population, n):
+        ancestors = systematic(rng, population.weights, n)
+        chosen = population.select(ancestors, np.full(n, population.log_mean_weight))
+        previous = np.resize(population.parents.get("previous", np.arange(len(population))), n)
+        return chosen.labelled({**chosen.parents, "previous": previous})
+
+
+@dataclass(frozen=True)
+class MovesSelected(Resampler):
+    """Jitters what it selects."""
+
+    def resample(self, rng, population, n):
+        ancestors = systematic(rng, population.weights, n)
+        chosen = population.select(ancestors, np.full(n, population.log_mean_weight))
+        return chosen.moved(chosen.particles + 0.01 * rng.standard_normal(n))
+
+
+@dataclass(frozen=True)
+class SortsAncestors(Resampler):
+    """The ancestors are sorted after the particles were taken."""
+
+    def resample(self, rng, population, n):
+        ancestors = rng.permutation(systematic(rng, population.weights, n))
+        chosen = population.select(ancestors, np.full(n, population.log_mean_weight))
+        return chosen.with_ancestors(np.sort(ancestors))
+
+
 #: Fault -> a property that it breaks, and words that the message says.
 FAULTS = {
     BiasedResidual: ("carried_weight", "copies are biased"),
@@ -381,4 +776,47 @@ FAULTS = {
     Halves: ("carried_weight", "resampled apart"),
     OnePercent: ("largest_weight", "heaviest particle gets +"),
     ForgetsAncestors: ("ancestors_in_range", 'no parents "ancestor"'),
+    single_is_heaviest: ("carried_weight", "5 particles to 1"),
+    thins_first: ("carried_weight", "125 particles to 5"),
+    odd_is_special: ("carried_weight", "copies are biased"),
+    more_than_there_are: ("carried_weight", "copies are biased"),
+    eight_bits: ("carried_weight", "300 particles to 300"),
+    sixteen_bits: ("many_particles", "too few bits"),
+    block_of_256: ("carried_weight", "300 particles to 300"),
+    last_is_forgotten: ("carried_weight", "copies are biased"),
+    at_most_half: ("carried_weight", "heaviest particle gets -11 %"),
+    winner_takes_all: ("carried_weight", "particles to 3"),
+    heavy_gains: ("carried_weight", "heaviest particle gets +"),
+    heaviest_of_many: ("carried_weight", "100 particles to 2"),
+    floor_of_weights: ("carried_weight", "copies are biased"),
+    dropped_by_absolute_weight: ("scale_of_weights_is_irrelevant", "log weights"),
+    zero_is_small: ("zero_weights_are_never_chosen", "weight 0"),
+    rounds_up: ("carried_weight", "copies are biased"),
+    offset_of_half: ("carried_weight", "copies are biased"),
+    last_stratum: ("carried_weight", "copies are biased"),
+    sharpens_many: ("carried_weight", "125 particles to 5"),
+    global_if_more: ("does_not_use_global_generators", "numpy's global generator"),
+    python_generator: ("does_not_use_global_generators", "Python's global generator"),
+    reseeds_the_global: ("does_not_use_global_generators", "numpy's global generator"),
+    module_generator: ("repeats_with_the_same_generator", "does not come from `rng`"),
+    seeded_by_time: ("repeats_with_the_same_generator", "does not come from `rng`"),
+    copies_the_generator: ("depends_on_the_generator", "does not advance"),
+    FirstCallCached: ("keeps_no_state", "keeps state"),
+    ResultCached: ("keeps_no_state", "keeps state"),
+    module_cache: ("carried_weight", "copies are biased"),
+    EverySecondCall: ("keeps_no_state", "keeps state"),
+    in_place_if_equal: ("does_not_change_input", "in place"),
+    sum_for_mean: ("carried_weight", "mean weight after selection"),
+    single_precision_output: ("scale_of_weights_is_irrelevant", "does not add"),
+    weights_of_neighbours: ("carried_weight", "output weights are wrong"),
+    as_floats: ("ancestors_in_range", "float64, expected integers"),
+    StatesALargeBias: ("states_a_small_tolerance", "tolerance is 0.9"),
+    NoDuplicates: ("gives_n_particles", "asked to make"),
+    MoreThanAsked: ("gives_n_particles", "asked to make"),
+    CallsItDrawless: ("draws_only_if_declared", "draws = False"),
+    MixesRuns: ("batched_runs_equal_single_runs", "are runs mixed"),
+    LosesMates: ("keeps_parents", '"mate"'),
+    OldParents: ("keeps_parents", '"previous"'),
+    MovesSelected: ("keeps_parents", "not those of the ancestors"),
+    SortsAncestors: ("keeps_parents", "not those of the ancestors"),
 }

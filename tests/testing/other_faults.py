@@ -149,22 +149,470 @@ def exact_posterior(rng, n):
     return Population(prior), Population(posterior), 0.7
 
 
-#: Fault of weighted distributions, property that must be broken, words of its message, exact draws.
-WEIGHTED_FAULTS = [
-    (WrongSign, "weighted_moves_are_those_of_the_model", "opposite sign", exact_moves),
-    (OneNoise, "weighted_moves_are_those_of_the_model", "is below", exact_moves),
-    (OneNoise, "order_of_particles_is_irrelevant", "the same noise", None),
-    (Permutes, "weighted_moves_are_those_of_the_model", "x_t - x_{t-1}", exact_moves),
-    (PermutesAll, "weights_stay_with_their_particles", "another order", None),
-    (Squared, "weights_are_those_of_the_posterior", "is below", exact_posterior),
-    (PermutesUpdate, "parents_belong_to_their_particles", "parent", None),
-]
+def exact_walk(rng, n):
+    """x_{t-1}, draws of x_t given them by the AR(1) model, y_t; the move does not use y_t."""
+    previous = rng.normal(0.2, 1.0, n)
+    return Population(previous), Population(rng.normal(RHO * previous, SIGMA)), 0.7
+
+
+def exact_weights(rng, n):
+    """Draws of p(x), the same with weights p(y | x), y."""
+    prior = Population(rng.normal(0.0, SD0, n))
+    return prior, prior.reweighted(Normal(prior.particles, TAU).log_prob(0.7)), 0.7
+
+
+def exact_evidence(rng, n):
+    """Draws of p(x), of p(x | y), y, log p(y)."""
+    return *exact_posterior(rng, n), float(Normal(0.0, float(np.hypot(SD0, TAU))).log_prob(0.7))
+
+
+def exact_prior(rng, n):
+    """Draws of p(x_0), y."""
+    return Population(rng.normal(0.0, SD0, n)), 0.7
+
+
+def exact_plane(rng, n):
+    """x_{t-1} in the plane, draws of x_t given them, y_t."""
+    previous = rng.normal(0.2, 1.0, (n, 2))
+    return Population(previous), Population(rng.normal(RHO * previous, SIGMA)), 0.7
+
+
+def exact_prior_in_plane(rng, n):
+    """Draws of p(x_0) in the plane, y."""
+    return Population(rng.normal(0.0, SD0, (n, 2))), 0.7
+
+
+def move(function, base=Transition):
+    """A transition that replaces the particles by ``function(rng, x, y)``."""
+
+    def predict(self, rng, population, observation):
+        return population.moved(function(rng, population.particles, observation))
+
+    return type(function.__name__, (base,), {"predict": predict, "__doc__": function.__doc__})
+
+
+def likelihood(function):
+    """An update that adds ``function(x, y)`` to the log weights."""
+
+    def update(self, rng, predicted, proposed, observation):
+        population = union(predicted, proposed)
+        return population.reweighted(function(population.particles, observation))
+
+    return type(function.__name__, (Update,), {"update": update, "__doc__": function.__doc__})
+
+
+def proposal(function):
+    """A proposal of ``function(rng, y, n)``: particles, or particles and log weights."""
+
+    def sample(self, rng, observation, n):
+        found = function(rng, observation, n)
+        return Population(*found) if isinstance(found, tuple) else Population(found)
+
+    return type(function.__name__, (Proposal,), {"sample": sample, "__doc__": function.__doc__})
+
+
+def kernel(function):
+    """A rejuvenation ``function(rng, x, x_{t-1}, y)``; nothing moves if one of the last two is missing."""
+
+    def move(self, rng, population, previous, observation):
+        if previous is None or observation is None:
+            return population
+        return population.moved(function(rng, population.particles, previous.particles, observation))
+
+    return type(function.__name__, (Rejuvenation,), {"move": move, "__doc__": function.__doc__})
+
+
+def walk(x, noise):
+    return RHO * x + SIGMA * noise
+
+
+@move
+def shared_by_pairs(rng, x, y):
+    noise = rng.standard_normal(-(-len(x) // 2))
+    return walk(x, np.repeat(noise, 2)[: len(x)])
+
+
+@move
+def antithetic_halves(rng, x, y):
+    noise = rng.standard_normal(-(-len(x) // 2))
+    return walk(x, np.concatenate([noise, -noise])[: len(x)])
+
+
+@move
+def mirrored(rng, x, y):
+    """Antithetic pairs of the first and the last particle, if there are many."""
+    noise = rng.standard_normal(len(x))
+    if len(x) > 100:
+        noise[len(x) // 2 :] = -noise[: len(x) - len(x) // 2][::-1]
+    return walk(x, noise)
+
+
+@move
+def shared_by_blocks(rng, x, y):
+    """One random number for every eight particles."""
+    return walk(x, np.repeat(rng.standard_normal(-(-len(x) // 8)), 8)[: len(x)])
+
+
+@move
+def still_alone(rng, x, y):
+    return walk(x, rng.standard_normal(len(x)) if len(x) > 1 else 0.0)
+
+
+@move
+def still_without_observation(rng, x, y):
+    return x if y is None else walk(x, rng.standard_normal(len(x)))
+
+
+@move
+def wide_step(rng, x, y):
+    return RHO * x + 1.05 * SIGMA * rng.standard_normal(len(x))
+
+
+@move
+def uniform_noise(rng, x, y):
+    return walk(x, rng.uniform(-np.sqrt(3), np.sqrt(3), len(x)))
+
+
+@move
+def cut_noise(rng, x, y):
+    return walk(x, np.clip(rng.standard_normal(len(x)), -2.8, 2.8))
+
+
+@move
+def small_drift(rng, x, y):
+    return walk(x, rng.standard_normal(len(x))) + 0.02
+
+
+@move
+def last_is_still(rng, x, y):
+    noise = rng.standard_normal(len(x))
+    noise[-1] = 0.0 if len(x) > 1 else noise[-1]
+    return walk(x, noise)
+
+
+@move
+def depends_on_first(rng, x, y):
+    """The noise of the first particle is added to all."""
+    noise = rng.standard_normal(len(x))
+    return walk(x, np.where(np.arange(len(x)) > 0, np.sqrt(0.5) * (noise + noise[0]), noise))
+
+
+@move
+def after_a_thousand(rng, x, y):
+    """Wider steps from the thousandth particle on."""
+    noise = rng.standard_normal(len(x))
+    noise[1000:] = noise[1000:] * 1.1
+    return walk(x, noise)
+
+
+class WideWithoutObservation(Guided):
+    """A guided move whose steps are too wide without an observation."""
+
+    def predict(self, rng, population, observation):
+        if observation is not None:
+            return super().predict(rng, population, observation)
+        return population.moved(Normal(RHO * population.particles, 1.2 * SIGMA).sample(rng, len(population)))
+
+
+class NoWeights(Guided):
+    """Draws from the optimal proposal without weights."""
+
+    sign: float = 0.0
+
+    def predict(self, rng, population, observation):
+        return replace(super().predict(rng, population, observation), log_weights=population.log_weights)
+
+
+@move
+def shared_by_axes(rng, x, y):
+    noise = rng.standard_normal(len(x))
+    return walk(x, noise if x.ndim == 1 else noise[:, None])
+
+
+class NoisyIfHeavy(Transition):
+    """The steps of heavy particles are larger; on average they have the right spread if the weights are equal."""
+
+    def predict(self, rng, population, observation):
+        noise = np.sqrt(len(population) * population.weights) * rng.standard_normal(len(population))
+        return population.moved(walk(population.particles, noise))
+
+
+@likelihood
+def too_wide(x, y):
+    return Normal(x, 1.1 * TAU).log_prob(y)
+
+
+@likelihood
+def twice(x, y):
+    return Normal(x, TAU).log_prob(y) + np.log(2)
+
+
+@likelihood
+def without_constant(x, y):
+    return -0.5 * ((x - y) / TAU) ** 2
+
+
+@likelihood
+def divided_by_mean(x, y):
+    log_g = Normal(x, TAU).log_prob(y)
+    return log_g - np.log(np.mean(np.exp(log_g)))
+
+
+@likelihood
+def divided_by_largest(x, y):
+    log_g = Normal(x, TAU).log_prob(y)
+    return log_g - log_g.max()
+
+
+@likelihood
+def bounded_relative(x, y):
+    """Bounded at 8 nats below the best particle."""
+    log_g = Normal(x, TAU).log_prob(y)
+    return np.maximum(log_g, log_g.max() - 3)
+
+
+@likelihood
+def cut_tails(x, y):
+    log_g = Normal(x, TAU).log_prob(y)
+    return np.where(np.abs(x - y) > 2.5 * TAU, -700.0, log_g)
+
+
+@likelihood
+def flat_tails(x, y):
+    return np.maximum(Normal(x, TAU).log_prob(y), -3.0)
+
+
+@likelihood
+def ranks(x, y):
+    log_g = Normal(x, TAU).log_prob(y)
+    return np.log1p(np.argsort(np.argsort(log_g)))
+
+
+@likelihood
+def tempered(x, y):
+    return 0.95 * Normal(x, TAU).log_prob(y)
+
+
+@likelihood
+def shifted(x, y):
+    return Normal(x + 0.02, TAU).log_prob(y)
+
+
+@likelihood
+def cauchy(x, y):
+    return -np.log1p(((x - y) / TAU) ** 2) - np.log(np.pi * TAU)
+
+
+class ForgetsOldWeights(Posterior):
+    def update(self, rng, predicted, proposed, observation):
+        out = super().update(rng, predicted, proposed, observation)
+        return out if proposed is not None else out.reweighted(-predicted.log_weights)
+
+
+class NoisyWeights(Posterior):
+    """Random factors of mean 1 would be correct; these have mean exp(0.02)."""
+
+    def update(self, rng, predicted, proposed, observation):
+        out = super().update(rng, predicted, proposed, observation)
+        return out.reweighted(0.2 * rng.standard_normal(len(out)))
+
+
+class CorrectNoise(Posterior):
+    """Random factors of mean 1."""
+
+    def update(self, rng, predicted, proposed, observation):
+        out = super().update(rng, predicted, proposed, observation)
+        return out.reweighted(np.log(rng.standard_exponential(len(out))))
+
+
+class CorrectSelection(Posterior):
+    """Resamples what it weighted."""
+
+    def update(self, rng, predicted, proposed, observation):
+        out = super().update(rng, predicted, proposed, observation)
+        return out.select(rng.choice(len(out), len(out), p=out.weights), np.full(len(out), out.log_mean_weight))
+
+
+class CorrectThinning(Posterior):
+    """Drops light particles at random; the others carry their weight, and the mean weight is kept."""
+
+    def update(self, rng, predicted, proposed, observation):
+        out = super().update(rng, predicted, proposed, observation)
+        p = np.minimum(1.0, 2 * len(out) * out.weights)
+        kept = np.flatnonzero(rng.random(len(out)) < p)
+        return out.select(kept, out.log_weights[kept] - np.log(p[kept]) + self.log_factor(len(kept) / len(out)))
+
+    def log_factor(self, share):
+        return np.log(share)
+
+
+class ThinsBySum(CorrectThinning):
+    """Keeps the sum of the weights instead of their mean."""
+
+    def log_factor(self, share):
+        return 0.0
+
+
+@proposal
+def one_number_for_two_axes(rng, y, n):
+    return SD0 * np.broadcast_to(rng.standard_normal((n, 1)), (n, 2))
+
+
+@proposal
+def inverted_weights(rng, y, n):
+    x = 1.5 * SD0 * rng.standard_normal(n)
+    return x, Normal(0.0, 1.5 * SD0).log_prob(x) - Normal(0.0, SD0).log_prob(x)
+
+
+@proposal
+def narrow(rng, y, n):
+    return 0.97 * SD0 * rng.standard_normal(n)
+
+
+@proposal
+def off_centre(rng, y, n):
+    return 0.05 + SD0 * rng.standard_normal(n)
+
+
+@proposal
+def pairs(rng, y, n):
+    return SD0 * np.repeat(rng.standard_normal(-(-n // 2)), 2)[:n]
+
+
+@proposal
+def one_draw(rng, y, n):
+    return np.full(n, SD0 * rng.standard_normal())
+
+
+@proposal
+def correct_antithetic(rng, y, n):
+    """Less variance than independent draws, sorted."""
+    half = rng.standard_normal(-(-n // 2))
+    return SD0 * np.sort(rng.permutation(np.concatenate([half, -half]))[:n])
+
+
+@proposal
+def mean_if_single(rng, y, n):
+    return np.zeros(1) if n == 1 else SD0 * rng.standard_normal(n)
+
+
+@proposal
+def cut_draws(rng, y, n):
+    return SD0 * np.clip(rng.standard_normal(n), -2.9, 2.9)
+
+
+@proposal
+def guided_without_weights(rng, y, n):
+    return np.asarray(optimal_initial(y).sample(rng, n))
+
+
+def _weighed(rng, y, n, factor):
+    q = Normal(0.0, 1.2 * SD0)
+    x = q.sample(rng, n)
+    return x, Normal(0.0, SD0).log_prob(x) - q.log_prob(x) + np.log(factor)
+
+
+@proposal
+def weights_of_mean_two(rng, y, n):
+    return _weighed(rng, y, n, 2.0)
+
+
+@proposal
+def correct_draws(rng, y, n):
+    return SD0 * rng.standard_normal(n)
+
+
+@proposal
+def correct_weighed(rng, y, n):
+    return _weighed(rng, y, n, 1.0)
+
+
+def _metropolis(rng, x, previous, y, step, scale=1.0):
+    """A Metropolis step for p(x_t | x_{t-1}, y_t), at a temperature."""
+
+    def log_p(v):
+        return (Normal(RHO * previous, SIGMA).log_prob(v) + Normal(v, TAU).log_prob(y)) / scale
+
+    new = x + step
+    return np.where(np.log1p(-rng.random(len(x))) < log_p(new) - log_p(x), new, x)
+
+
+@kernel
+def correct_kernel(rng, x, previous, y):
+    return _metropolis(rng, x, previous, y, 0.5 * rng.standard_normal(len(x)))
+
+
+@kernel
+def gibbs(rng, x, previous, y):
+    return optimal(previous, y).sample(rng, len(x))
+
+
+@kernel
+def nothing(rng, x, previous, y):
+    return x
+
+
+@kernel
+def hot(rng, x, previous, y):
+    return _metropolis(rng, x, previous, y, 0.5 * rng.standard_normal(len(x)), 1.1)
+
+
+@kernel
+def asymmetric(rng, x, previous, y):
+    return _metropolis(rng, x, previous, y, 0.5 * rng.standard_normal(len(x)) + 0.1)
+
+
+@kernel
+def one_uniform(rng, x, previous, y):
+    """One uniform number decides for all particles."""
+    new = x + 0.5 * rng.standard_normal(len(x))
+
+    def log_p(v):
+        return Normal(RHO * previous, SIGMA).log_prob(v) + Normal(v, TAU).log_prob(y)
+
+    return np.where(np.log1p(-rng.random()) < log_p(new) - log_p(x), new, x)
+
+
+@kernel
+def pairs_of_steps(rng, x, previous, y):
+    step = np.repeat(rng.standard_normal(-(-len(x) // 2)), 2)[: len(x)]
+    return np.asarray(optimal(previous, y).mean) + float(np.asarray(optimal(0.0, y).sd)) * step
+
+
+@kernel
+def forgets_the_observation(rng, x, previous, y):
+    return RHO * previous + SIGMA * rng.standard_normal(len(x))
+
+
+@kernel
+def swaps_neighbours(rng, x, previous, y):
+    return rng.permutation(x)
+
+
+@kernel
+def greedy(rng, x, previous, y):
+    new = x + 0.2 * rng.standard_normal(len(x))
+    better = np.abs(new - y) < np.abs(x - y)
+    return np.where(better, new, x)
 
 
 @dataclass(frozen=True)
 class RandomStep(DensityTransition):
     def predict(self, rng, population, observation):
         return replace(population, particles=population.particles + rng.standard_normal(len(population)))
+
+
+def exact_density(rng, n):
+    previous = rng.standard_normal(n)
+    return Population(previous), Population(rng.normal(previous, 1.0)), 0.5
+
+
+@dataclass(frozen=True)
+class CorrectDensity(RandomStep):
+    """The density without its constant factor."""
+
+    def log_prob(self, previous, new, observation):
+        return -0.5 * (new - previous) ** 2
 
 
 @dataclass(frozen=True)
@@ -180,6 +628,122 @@ class NormalisedDensity(RandomStep):
     def log_prob(self, previous, new, observation):
         log_f = -0.5 * (new - previous) ** 2
         return log_f - np.logaddexp.reduce(log_f)
+
+
+@dataclass(frozen=True)
+class WiderDensity(RandomStep):
+    def log_prob(self, previous, new, observation):
+        return Normal(previous, 1.1).log_prob(new)
+
+
+@dataclass(frozen=True)
+class DensityOfAnotherMove(RandomStep):
+    def log_prob(self, previous, new, observation):
+        return Normal(RHO * previous, 1.0).log_prob(new)
+
+
+@dataclass(frozen=True)
+class VarianceForSd(DensityTransition):
+    def predict(self, rng, population, observation):
+        return population.moved(Normal(population.particles, SIGMA).sample(rng, len(population)))
+
+    def log_prob(self, previous, new, observation):
+        return Normal(previous, SIGMA**2).log_prob(new)
+
+
+_MOVES = "weighted_moves_are_those_of_the_model"
+_ORDER = "order_of_particles_is_irrelevant"
+_POSTERIOR = "weights_are_those_of_the_posterior"
+_OTHERS = "weight_of_a_particle_does_not_depend_on_others"
+_DRAWN = "draws_have_their_distribution"
+_KEPT = "keeps_the_distribution"
+
+#: Fault of weighted distributions, property that must be broken, words of its message, exact draws.
+WEIGHTED_FAULTS = [
+    (shared_by_axes, _MOVES, "coordinate 0 of x_t + coordinate 1 of x_t", exact_plane),
+    (NoisyIfHeavy, _ORDER, "if the weights are others", None),
+    (one_number_for_two_axes, "draws_have_their_distribution", "coordinate 0 of x +", exact_prior_in_plane),
+    (inverted_weights, "draws_have_their_distribution", "opposite sign", exact_prior),
+    (ThinsBySum, "weights_are_those_of_the_posterior", "the mean weight is", exact_evidence),
+    (WrongSign, "weighted_moves_are_those_of_the_model", "opposite sign", exact_moves),
+    (OneNoise, "weighted_moves_are_those_of_the_model", "is below", exact_moves),
+    (OneNoise, "order_of_particles_is_irrelevant", "the same noise", None),
+    (Permutes, "weighted_moves_are_those_of_the_model", "x_t - x_{t-1}", exact_moves),
+    (PermutesAll, "weights_stay_with_their_particles", "another order", None),
+    (Squared, "weights_are_those_of_the_posterior", "is below", exact_posterior),
+    (PermutesUpdate, "parents_belong_to_their_particles", "parent", None),
+    (shared_by_pairs, _ORDER, "do not move independently", None),
+    (antithetic_halves, _ORDER, "do not move independently", None),
+    (shared_by_blocks, _MOVES, "between neighbours", exact_walk),
+    (mirrored, _MOVES, "mirrored positions", exact_walk),
+    (still_alone, _ORDER, "alone (n = 1)", None),
+    (still_without_observation, _ORDER, "observation=None", None),
+    (wide_step, _MOVES, "and sd", exact_walk),
+    (uniform_noise, _MOVES, "is below", exact_walk),
+    (cut_noise, _MOVES, "is below", exact_walk),
+    (small_drift, _MOVES, "is below", exact_walk),
+    (last_is_still, _ORDER, "moves differently", None),
+    (depends_on_first, _ORDER, "do not move independently", None),
+    (after_a_thousand, _MOVES, "is below", exact_walk),
+    (WideWithoutObservation, _MOVES, "and sd", exact_moves),
+    (NoWeights, _MOVES, "is below", exact_moves),
+    (too_wide, _POSTERIOR, "is below", exact_posterior),
+    (too_wide, _POSTERIOR, "the log weight of a particle is", exact_weights),
+    (twice, _POSTERIOR, "2 times the exact ones", exact_weights),
+    (twice, _POSTERIOR, "constant factors", exact_evidence),
+    (without_constant, _POSTERIOR, "constant factors", exact_weights),
+    (divided_by_mean, _OTHERS, "not normalised or ranked", None),
+    (divided_by_largest, _OTHERS, "not normalised or ranked", None),
+    (bounded_relative, _POSTERIOR, "is below", exact_posterior),
+    (cut_tails, _POSTERIOR, "is below", exact_posterior),
+    (flat_tails, _POSTERIOR, "is below", exact_posterior),
+    (ranks, _OTHERS, "not normalised or ranked", None),
+    (tempered, _POSTERIOR, "is below", exact_posterior),
+    (shifted, _POSTERIOR, "is below", exact_posterior),
+    (cauchy, _POSTERIOR, "is below", exact_posterior),
+    (ForgetsOldWeights, "scale_of_weights_is_irrelevant", "log weights + 50", None),
+    (NoisyWeights, _POSTERIOR, "constant factors", exact_evidence),
+    (narrow, _DRAWN, "is below", exact_prior),
+    (off_centre, _DRAWN, "is below", exact_prior),
+    (pairs, _DRAWN, "times the variance", exact_prior),
+    (one_draw, _DRAWN, "is below", exact_prior),
+    (mean_if_single, _DRAWN, "n = 1", exact_prior),
+    (cut_draws, _DRAWN, "is below", exact_prior),
+    (guided_without_weights, _DRAWN, "is below", exact_prior),
+    (weights_of_mean_two, _DRAWN, "the mean weight is", exact_prior),
+    (WiderDensity, "log_prob_is_the_density_of_its_moves", "certain which is", None),
+    (DensityOfAnotherMove, "log_prob_is_the_density_of_its_moves", "certain which is", None),
+    (VarianceForSd, "log_prob_is_the_density_of_its_moves", "too certain", None),
+    (hot, _KEPT, "no longer exact", None),
+    (asymmetric, _KEPT, "no longer exact", None),
+    (pairs_of_steps, _KEPT, "between neighbours", None),
+    (forgets_the_observation, _KEPT, "no longer exact", None),
+    (swaps_neighbours, _KEPT, "no longer exact", None),
+    (greedy, _KEPT, "no longer exact", None),
+]
+#: Faults that are not found, and why.
+NOT_FOUND = {
+    one_uniform: "a random number that decides for all particles may also be a choice between two kernels, which is "
+    "valid; the moves of a particle have the right distribution in any number of calls",
+}
+#: Correct components and their exact draws.
+CORRECT = [
+    (CorrectDensity(), exact_density),
+    (Guided(), exact_moves),
+    (Posterior(), exact_posterior),
+    (Posterior(), exact_weights),
+    (Posterior(), exact_evidence),
+    (correct_draws(), exact_prior),
+    (correct_weighed(), exact_prior),
+    (correct_antithetic(), exact_prior),
+]
+#: Updates that draw: their weights, or the particles that they keep, are random.
+CORRECT_RANDOM = [
+    (CorrectNoise(), exact_weights),
+    (CorrectNoise(), exact_evidence),
+    (CorrectSelection(), exact_evidence),
+    (CorrectThinning(), exact_evidence),
+]
 
 
 @dataclass(frozen=True)
@@ -471,7 +1035,7 @@ FAULTS = [
     (MaybeTrigger, "answers", "True or False"),
     (HalfSize, "answers", "at least 1"),
     (Distance, "similarities_are_shares", "to itself"),
-    (RelativeSimilarity, "pairs_do_not_depend_on_others", "five of nine"),
+    (RelativeSimilarity, "pairs_do_not_depend_on_others", "of eleven particles"),
     (OneSided, "is_symmetric", "similarity of particles"),
     (CountsFromOne, "classes_are_numbered", "classes are"),
     (AllDifferent, "copies_are_equal", "copy"),

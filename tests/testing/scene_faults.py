@@ -120,6 +120,7 @@ class DependsOnCalls(Completer):
 #: Changes of the probabilities (a, b, c) of a box that a run reports.
 PROBABILITIES: dict[str, tuple[Change, str]] = {
     "logits": (logits, "of logits"),
+    "log probabilities": (lambda p: np.log(np.maximum(p, 1e-9)), "of log probabilities"),
     "percent": (lambda p: 100 * p, "divide by 100"),
     "grey": (lambda p: (255 * p).astype(np.uint8), "divide by 255"),
     "nan": (lambda p: np.full_like(p, np.nan), "returns nan"),
@@ -141,7 +142,7 @@ PROBABILITIES: dict[str, tuple[Change, str]] = {
     "generator": (lambda p: (x for x in p), "returns a generator"),
     "tensor": (lambda p: torch_tensor(p, False), "tensor.detach().cpu().numpy()"),
     "tensor with gradient": (lambda p: torch_tensor(p, True), "tensor.detach().cpu().numpy()"),
-    "masked": (lambda p: np.ma.masked_array(p, p > 0.5), "array.filled(value)"),
+    "masked": (lambda p: np.ma.masked_array(p, p > 0.5), "returns a masked array"),
     "exception": (one_over_zero, "my own fault"),
 }
 #: Other types of the same numbers, which are correct.
@@ -159,6 +160,7 @@ STRANGE_PROBABILITIES: dict[str, tuple[Change, str]] = {
     "ones": (np.ones_like, "returns a constant: 1"),
     "zeros": (np.zeros_like, "returns a constant: 0"),
     "below a half": (lambda p: 0.45 * p, "leaves the visible surface empty"),
+    "shares of the box": (lambda p: p / max(p.sum(), 1.0), "leaves the visible surface empty"),
     "complement": (lambda p: 1 - p, "leaves the visible surface empty"),
 }
 #: Completers, and words of the failure of their contract.
@@ -221,7 +223,7 @@ MOTIONS: dict[str, tuple[Change, str]] = {
     "none": (lambda found: None, "returns None, expected a tuple of Candidate"),
     "empty": (lambda found: (), "returns no candidate"),
     "matrix": (lambda found: np.eye(4), "expected a tuple of Candidate"),
-    "one candidate": (lambda found: found[0], "expected a tuple of Candidate"),
+    "one candidate": (lambda found: found[0], "return (candidate,)"),
     "matrices": (lambda found: (np.eye(4),), "RigidTransform.from_matrix(T)"),
     "transform": (lambda found: (SHIFT,), "expected a Candidate"),
     "text": (lambda found: "identity", "returns a str"),
@@ -230,7 +232,7 @@ MOTIONS: dict[str, tuple[Change, str]] = {
     "inner none": (lambda found: (found[0], None), "returns None, expected a Candidate"),
     "candidate of a matrix": (one_with(T=np.eye(4)), "whose T is an array of shape (4, 4)"),
     "candidate of none": (one_with(T=None), "whose T is None"),
-    "several motions": (one_with(T=RigidTransform.from_translation(np.zeros((3, 3)))), "expected one RigidTransform"),
+    "several motions": (one_with(T=RigidTransform.from_translation(np.zeros((3, 3)))), "a candidate with 3 motions"),
     "nan shift": (lambda found: (replace(found[1], T=nan_shift()),), "not finite"),
     "reflection": (one_with(T=matrix(reflect=True)), "it is a reflection"),
     "scale": (one_with(T=matrix(1.05)), "its scale is 1.05"),

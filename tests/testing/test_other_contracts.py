@@ -18,6 +18,7 @@ from mstfilter.smc import (
     ProgramLookahead,
     ProgramMove,
     RandomWalkMove,
+    Rejuvenation,
     Reweight,
     linear_gaussian,
     observe,
@@ -34,7 +35,7 @@ from mstfilter.testing import (
     scene_example,
 )
 from tests.smc.models import AR1, RHO, SD0, SIGMA, TAU, Box, optimal, predictive
-from tests.testing.other_faults import FAULTS, WEIGHTED_FAULTS, Guided, Posterior, exact_moves, exact_posterior
+from tests.testing.other_faults import CORRECT, CORRECT_RANDOM, FAULTS, WEIGHTED_FAULTS, correct_kernel
 
 MODEL = linear_gaussian(F=[[0.9]], Q=[[0.5]], H=[[1.0]], R=[[1.0]], m0=[0.0], P0=[[1.0]])
 
@@ -166,14 +167,22 @@ def test_planted_faults_are_reported(fault, name, words):
 
 @pytest.mark.parametrize(("fault", "name", "words", "exact"), WEIGHTED_FAULTS)
 def test_faults_of_weighted_distributions_are_reported(fault, name, words, exact):
+    exact = exact or (exact_ar1 if issubclass(fault, Rejuvenation) else None)
     broken = {r.name: r.failure for r in run_contract(fault(), exact=exact) if r.failure}
     assert words in broken.get(name, ""), broken
 
 
-@pytest.mark.parametrize(("component", "exact"), [(Guided(), exact_moves), (Posterior(), exact_posterior)])
+@pytest.mark.parametrize(("component", "exact"), [*CORRECT, (correct_kernel(), exact_ar1)])
 def test_correct_weighted_distributions_pass(component, exact):
     results = run_contract(component, exact=exact)
     assert [r for r in results if r.failure or r.skipped] == []
+
+
+@pytest.mark.parametrize(("component", "exact"), CORRECT_RANDOM)
+def test_correct_updates_that_draw_pass(component, exact):
+    results = run_contract(component, exact=exact)
+    assert [r for r in results if r.failure] == []
+    assert [r.name for r in results if r.skipped] == ["weight_of_a_particle_does_not_depend_on_others"]
 
 
 def test_a_distribution_without_exact_draws_is_not_tested():

@@ -33,6 +33,7 @@ from mstfilter.testing import (
     number_example,
     run_contract,
 )
+from mstfilter.testing.contract import restore_global_state
 from mstfilter.testing.resampling import makes_particles
 from tests.testing.faults import (
     CORRECT,
@@ -77,7 +78,7 @@ def failure_of(component, name):
     contract.setup_method()
     with pytest.raises(AssertionError) as error:
         getattr(contract, f"test_{name}")()
-    contract.teardown_method()
+    restore_global_state(contract._global_state)
     return str(error.value)
 
 

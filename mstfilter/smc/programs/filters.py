@@ -30,7 +30,7 @@ from mstfilter.smc.programs.handlers import (
 )
 from mstfilter.smc.programs.sites import PerParticle, ProgramRun, Trace, active_run
 from mstfilter.smc.state_space import accept_moves, choose_rows
-from mstfilter.smc.streams import child
+from mstfilter.smc.streams import RunGenerators, child
 
 Model = Callable[..., Any]
 _HERE = str(Path(__file__).parent)
@@ -104,12 +104,19 @@ def _advance(
     """The population after a step."""
     model, guide = component.model, None if observation is None else component.guide
     previous = None if past is None else past.particles
-    guard = component.schedule.guard(rng, past, observation, model, guide)
+    # A batch compares some of its runs with single runs, which are guarded.
+    in_batch = isinstance(rng, RunGenerators)
+    guard = None if in_batch else component.schedule.guard(rng, past, observation, model, guide)
 
     def step() -> tuple[Particles, np.ndarray]:
         return _step(rng, model, guide, previous, observation, n)
 
-    particles, gain = step() if guard is None else guard.checked(_run_once, step)
+    try:
+        particles, gain = step() if guard is None else guard.checked(_run_once, step)
+    except Exception:
+        if guard is not None:
+            component.schedule.clear()  # the next run is checked again
+        raise
     try:
         return Population(particles, gain) if past is None else past.moved(particles).reweighted(gain)
     except InputError:

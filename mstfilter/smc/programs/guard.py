@@ -2,12 +2,15 @@
 
 A program processes all particles in one pass, so it may mix them by mistake (``x.mean()``, ``previous["x"][0]``),
 draw from another generator, or keep values between steps. Such a program runs, and its weights are wrong. `Guard`
-checks some steps, of each kind the first, the second, the eighth, and then every power of eight:
+checks some steps, of each kind the first and the second, then the 9th, 66th, 515th, ... (8^k + k, which also finds a
+fault of every third step):
 
 1. The first two run again with the same random numbers: all values and log weights must be the same.
 2. A few particles run alone with the values that they had: their distributions and returned values must be those of
    the step. They are taken from the smallest and from the largest values, so that a maximum or ``any`` changes too.
-3. With a guide, a step is drawn by the model: the guide must be able to draw these values, and the two estimates of
+3. Particles of a `per_particle` program run alone, too. In the first two steps, a particle alone sees the lists,
+   dictionaries, sets and arrays in the closure and the global variables of the function as they were before the step.
+4. With a guide, a step is drawn by the model: the guide must be able to draw these values, and the two estimates of
    the evidence must agree.
 
 The results of a filter do not depend on these checks.
@@ -19,7 +22,9 @@ import pickle
 import warnings
 from collections import Counter
 from collections.abc import Callable, Mapping
+from copy import copy
 from functools import partial
+from types import CellType, FunctionType, MethodType
 from typing import Any
 
 import numpy as np
@@ -27,12 +32,12 @@ import numpy as np
 from mstfilter.errors import InputError, InputWarning
 from mstfilter.smc.interfaces import Distribution
 from mstfilter.smc.population import Population, log_mean_exp, normalise, take
-from mstfilter.smc.programs.handlers import CopyHandler, SampleHandler, ScoreHandler, SiteHandler
+from mstfilter.smc.programs.handlers import CopyHandler, SampleHandler, ScoreHandler
 from mstfilter.smc.programs.sites import Call, PerParticle, ProgramRun, recorded
 from mstfilter.smc.streams import child
 
 #: Numbers of the steps of one kind that are checked.
-_CHECKED = frozenset({1, 2, *(8**k for k in range(1, 12))})
+_CHECKED = frozenset({1, 2, *(8**k + k for k in range(1, 12))})
 #: Differences that count as rounding: networks that compute in single precision give other digits for other sizes.
 _LOG_DENSITY, _VALUE = 1e-3, 1e-5
 _ALONE = (
@@ -44,7 +49,7 @@ _REPEAT = (
     "return values that the next step needs; do not keep them in global variables, closures or the observation",
 )
 
-Run = Callable[[Callable[..., Any], SiteHandler, Any, Any, int], ProgramRun]
+Run = Callable[..., ProgramRun]  #: of a function, a handler, the previous particles, an observation and n
 
 
 class Guard:
@@ -56,6 +61,8 @@ class Guard:
         self.rng, self.past, self.observation, self.model, self.guide = rng, past, observation, model, guide
         self.previous, self.count = None if past is None else past.particles, count
         self.state, self.content = rng.bit_generator.state, self._content()
+        #: Functions that know nothing of this step.
+        self.fresh = {id(f): _with_copies(f) for f in (model, guide) if f is not None} if count <= 2 else {}
 
     def checked(self, run: Run, step: Callable[[], Any]) -> Any:
         """Particles and gain of the log weights, as ``step()`` returns them; InputError if a check fails."""
@@ -69,6 +76,8 @@ class Guard:
                     "the program changes a value of `previous` in place, which copies of the particle share",
                     "copy it first (copy.deepcopy), change the copy and return that",
                 )
+            if self.fresh and self.guide is None:
+                self._check_single(run, particles, gain)
             return particles, gain
         for whole in runs:
             for rows in _groups(whole) if whole.n > 1 else ():
@@ -142,9 +151,33 @@ class Guard:
                     *_ALONE,
                 )
 
+    def _check_single(self, run: Run, particles: Any, gain: np.ndarray) -> None:
+        """Compare two particles of a `per_particle` program with runs that keep nothing of the other particles."""
+        self.rng.bit_generator.state, after = self.state, self.rng.bit_generator.state
+        for i in {len(gain) - 1, len(gain) // 2}:
+            previous, handler = self.previous and self.previous[i], SampleHandler(self.rng).row(i)
+            try:
+                alone = run(_with_copies(self.fresh[id(self.model)]), handler, previous, self.observation, 1, True)
+            except Exception:  # a copy may lack what another function keeps: not checked
+                continue
+            values = {**{name: a[0] for name, a in alone.values.items()}, **alone.returned}
+            if not _close(gain[i], alone.gain[0], 1e-9) or _first_difference(particles[i], values) is not None:
+                raise InputError(
+                    f"particle {i} has other values or weights after the particles before it than alone",
+                    "keep values of a particle in the particle, not in global variables or closures",
+                )
+        self.rng.bit_generator.state = after
+
     def _run_again(self, run: Run, whole: ProgramRun, rows: np.ndarray) -> ProgramRun:
         previous = None if self.previous is None else take(self.previous, rows)
-        return run(whole.function, CopyHandler(whole.values, rows), previous, self.observation, len(rows))
+        handler, arguments = CopyHandler(whole.values, rows), (previous, self.observation, len(rows))
+        fresh = self.fresh.get(id(whole.function))
+        if fresh is not None:
+            try:
+                return run(_with_copies(fresh), handler, *arguments)
+            except Exception:  # a copy may lack what another function keeps
+                fresh = None
+        return run(whole.function, handler, *arguments)
 
     # --- the guide --------------------------------------------------------------------------------------------------
     def _check_guide(self, run: Run, gain: np.ndarray) -> None:
@@ -167,9 +200,12 @@ class Guard:
                 f"{site}: the guide never draws values that hold {missed:.1%} of the posterior probability",
                 "its distribution must reach wherever that of the model times the likelihood does",
             )
-        spread = sum(float((w**2).sum()) - 1 / n for w in (weights, normalise(by_guide)))
+        spread, spread_guide = (float((w**2).sum()) - 1 / n for w in (weights, normalise(by_guide)))
         gap = log_mean_exp(by_guide) - log_mean_exp(by_model)
-        if spread < 0.02 and abs(gap) > 0.1 + 10 * np.sqrt(spread):
+        both = spread + spread_guide
+        if (both < 0.02 and abs(gap) > 0.1 + 10 * np.sqrt(both)) or (
+            spread < 0.02 and gap < -1 - 10 * np.sqrt(spread)
+        ):
             warnings.warn(
                 InputWarning(
                     f"the guide and the model give estimates of the evidence that differ by {gap:.2f} nats",
@@ -226,6 +262,51 @@ def _parts(function: Any) -> list[Any]:
         except ValueError:  # an empty cell
             continue
     return [code, *(v for v in values if not isinstance(v, float | np.ndarray))]
+
+
+def _with_copies(function: Any) -> Any:
+    """The function with copies of the values that it keeps: containers in its closure, defaults and globals."""
+    if isinstance(function, partial):
+        return partial(_with_copies(function.func), *function.args, **function.keywords)
+    if isinstance(function, PerParticle):
+        return _with_copies(function.function)
+    if isinstance(function, MethodType):
+        return MethodType(function.__func__, _with_copies(function.__self__))
+    if not isinstance(function, FunctionType):
+        return _object_with_copies(function)
+    try:
+        cells = tuple(CellType(_copied(cell.cell_contents)) for cell in function.__closure__ or ())
+        names = {
+            name: _copied(function.__globals__[name])
+            for name in function.__code__.co_names
+            if name in function.__globals__
+        }
+        defaults = tuple(map(_copied, function.__defaults__ or ()))
+    except (ValueError, RecursionError):  # an empty cell, or a list in itself
+        return function
+    new = FunctionType(function.__code__, {**function.__globals__, **names}, None, defaults, cells)
+    new.__kwdefaults__ = function.__kwdefaults__
+    return new
+
+
+def _object_with_copies(value: Any) -> Any:
+    """A copy of an object with copies of its attributes; the object itself if it cannot be copied."""
+    try:
+        new = copy(value)
+        if new is not value:
+            new.__dict__.update(_copied(vars(value)))
+    except Exception:  # of the user's class
+        return value
+    return new
+
+
+def _copied(value: Any) -> Any:
+    """A copy of an array of at most 16 MiB or a container, and of those in it; other objects are shared."""
+    if type(value) is np.ndarray and value.nbytes <= 1 << 24:
+        return value.copy()
+    if type(value) is dict:
+        return {key: _copied(v) for key, v in value.items()}
+    return type(value)(map(_copied, value)) if type(value) in (list, set) else value
 
 
 class _noting_invalid(list[str]):

@@ -137,12 +137,18 @@ class Trace(Mapping[str, Any]):
     def __repr__(self) -> str:
         return f"Trace({self._values!r})"
 
+    def __reduce__(self) -> tuple[Any, ...]:  # a copy is a dict, which can be changed
+        return dict, (self._values,)
+
 
 class FrozenList(list[Any]):
     """A list in a `Trace`. It cannot be changed; ``items + [new]`` and ``list(items)`` are new lists."""
 
     def _refuse(self, *_: Any, **__: Any) -> Any:
         raise TypeError("a list in a particle is read-only: write items + [new], or change list(items)")
+
+    def __reduce__(self) -> tuple[Any, ...]:  # a copy is a list, which can be changed
+        return list, (list(self),)
 
     append = extend = insert = remove = pop = clear = sort = reverse = _refuse
     __setitem__ = __delitem__ = __iadd__ = __imul__ = _refuse

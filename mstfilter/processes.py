@@ -1,0 +1,63 @@
+"""Processes that this package starts, and the machine that they run on.
+
+>>> with environment(OMP_NUM_THREADS="1"):
+...     pool = ProcessPoolExecutor(2)
+
+New interpreters put the working folder in front of the path of modules. In a folder that a stranger has filled, a
+file ``multiprocessing.py`` would run there. Processes that are started in the block do not search the working folder
+first; the modules of the caller are found, because `multiprocessing` and joblib pass the path of modules on.
+"""
+
+from __future__ import annotations
+
+import functools
+import os
+import platform
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+
+@contextmanager
+def environment(**variables: str) -> Iterator[None]:
+    """Set environment variables in the block, and PYTHONSAFEPATH for the processes that are started there."""
+    variables = {"PYTHONSAFEPATH": "1", **variables}
+    before = {name: os.environ.get(name) for name in variables}
+    os.environ.update(variables)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value
+
+
+@functools.cache
+def machine() -> dict[str, Any]:
+    """What the last bits of results depend on besides versions: model of the CPU and BLAS library of numpy."""
+    blas = np.show_config(mode="dicts")["Build Dependencies"]["blas"]
+    return {"cpu": _cpu(), "system": platform.system(), "blas": f"{blas.get('name')} {blas.get('version')}"}
+
+
+def threads() -> int:
+    """Threads that libraries may use: OMP_NUM_THREADS, else the cores that this process may use."""
+    given = os.environ.get("OMP_NUM_THREADS", "")
+    return int(given) if given.isdecimal() else available_cores()
+
+
+def available_cores() -> int:
+    """Number of cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _cpu() -> str:
+    with suppress(OSError):
+        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    return platform.processor() or platform.machine()

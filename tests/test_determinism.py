@@ -1,0 +1,114 @@
+"""What results depend on: not on threads or on settings of the user; a resumed run says if the machine is another."""
+
+from __future__ import annotations
+
+import ast
+import json
+
+import numpy as np
+import pytest
+
+from mstfilter.errors import InputError, InputWarning
+from mstfilter.formats import open_recording
+from mstfilter.presets import load_config
+from mstfilter.runs import filter_recording
+from mstfilter.scene import Frame, render, scene_cache
+from tests import hostile
+from tests.conftest import REPOSITORY
+from tests.report.runs import recording
+from tests.scene.scenes import CAMERA, GRID, table_scene
+
+
+def completed() -> bytes:
+    """What the completion network makes of an object."""
+    from mstfilter.completion import NetworkCompleter
+
+    rgb, depth, labels = table_scene()
+    frame, mask = Frame(rgb, depth, CAMERA), render(labels, GRID, CAMERA).labels == 1
+    scene_cache.clear()
+    return NetworkCompleter().complete(np.random.default_rng(0), frame, [mask], GRID)[0].probability.tobytes()
+
+
+def test_the_completion_network_uses_one_thread_and_restores_the_number(monkeypatch):
+    import torch
+
+    from mstfilter.completion import NetworkCompleter
+
+    network, used = NetworkCompleter().network, []
+    forward = network.forward
+    monkeypatch.setattr(network, "forward", lambda *given: used.append(torch.get_num_threads()) or forward(*given))
+    before, found = torch.get_num_threads(), []
+    try:
+        for n in (1, 2, 5):
+            torch.set_num_threads(n)
+            found.append(completed())
+            assert torch.get_num_threads() == n
+    finally:
+        torch.set_num_threads(before)
+    assert used == [1] * len(used) and len(used) >= 3
+    assert found[0] == found[1] == found[2]
+
+
+def test_a_run_states_its_machine_and_warns_if_it_is_resumed_on_another(tmp_path, monkeypatch):
+    film, config = recording(2), load_config("mst_rules", ["n=2"])
+    run = filter_recording(film, config, tmp_path / "run")
+    machine = run.description["machine"]
+    assert set(machine) == {"cpu", "system", "blas", "threads"} and all(machine.values())
+    monkeypatch.setattr("mstfilter.runs.run.threads", lambda: 99)  # changes no result
+    filter_recording(film, config, tmp_path / "run")
+    monkeypatch.setattr("mstfilter.runs.run.machine", lambda: {**machine, "cpu": "another"})
+    with pytest.warns(InputWarning, match=r"begun on another machine \(cpu: .* there, \"another\" now\)"):
+        filter_recording(film, config, tmp_path / "run")
+    assert run.description["machine"] == machine
+
+
+def test_a_matplotlibrc_of_the_user_does_not_change_a_figure():
+    import matplotlib
+
+    from mstfilter.report.figures import health_figure
+
+    def drawn() -> str:
+        return health_figure({"a": [(1.0, 3), None, (2.0, 3)]})
+
+    expected = drawn()
+    with matplotlib.rc_context(
+        {"font.size": 33, "axes.facecolor": "red", "lines.linewidth": 9, "path.sketch": (1, 100, 2)}
+    ):
+        assert drawn() == expected
+
+
+def test_text_is_read_and_written_with_an_encoding():
+    """Ruff's rule PLW1514 finds `open`; it does not know the type of most paths."""
+    calls = [
+        f"{file.name}:{node.lineno}"
+        for file in (REPOSITORY / "mstfilter").rglob("*.py")
+        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8")))
+        if isinstance(node, ast.Call)
+        and getattr(node.func, "attr", "") in ("read_text", "write_text")
+        and len(node.args) < 2
+        and "encoding" not in [keyword.arg for keyword in node.keywords]
+    ]
+    assert calls == []
+
+
+@pytest.mark.parametrize(
+    ("file", "change"),
+    [
+        ("camera.json", {"width": 0}),
+        ("camera.json", {"K": [[1, 2], [3]]}),
+        ("camera.json", {"T_world_camera": [[1.0] * 4] * 4}),
+        ("camera.json", {"workspace": {"min": [0, 0, 0], "max": [0, 1, 1], "voxel": 0.01}}),
+        ("camera.json", {"workspace": {"min": [0, 0, 0], "max": [1e6, 1e6, 1e6], "voxel": 1e-9}}),
+        ("manifest.json", {"times": "descending"}),
+    ],
+)
+def test_errors_name_the_file(tmp_path, file, change):
+    hostile.KINDS["recording"].write(tmp_path / "recording")
+    path = tmp_path / "recording" / file
+    data = json.loads(path.read_text())
+    if "times" in change:
+        data["frames"][1]["time_s"] = -5.0
+    path.write_text(json.dumps({**data, **change}))
+    with pytest.raises(InputError, match=rf"recording/{file}") as caught:
+        open_recording(tmp_path / "recording")
+    assert caught.value.message.count(file) == 1

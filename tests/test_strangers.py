@@ -1,0 +1,329 @@
+"""Files of strangers: whatever they hold is read or refused by one clear error, in time and memory; no code runs."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import resource
+import signal
+import sqlite3
+import subprocess
+import sys
+import time
+import warnings
+import zlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mstfilter.cli import main
+from mstfilter.errors import InputError, InputWarning
+from mstfilter.scene import DiskCache, read_rgb
+from mstfilter.smc import run_many
+from tests import hostile
+from tests.conftest import REPOSITORY
+
+SPOILED_ON_EACH_RUN = 3  # of each kind; experiments/reliability/fuzz_inputs.py does more
+NAMES = ("recording", "run", "preset", "study", "study folder", "weights", "masks", "shapes", "volumes", "checkpoint")
+NAMES += ("cache", "pairs", "tum", "bop", "redwood", "dsr", "bag", "db3", "mcap")
+
+
+@pytest.fixture(scope="module")
+def examples(tmp_path_factory):
+    """A valid input of each kind."""
+    folder = tmp_path_factory.mktemp("examples")
+    for name in NAMES:
+        hostile.KINDS[name].write(folder / name)
+    return folder
+
+
+class Hangs(BaseException):  # no OSError, as TimeoutError is: readers make those an InputError
+    pass
+
+
+@contextlib.contextmanager
+def limits(seconds=20, megabytes=1024):
+    """Fail if the block takes longer, or asks for more memory."""
+
+    def stop(*_):
+        raise Hangs
+
+    before = signal.signal(signal.SIGALRM, stop)
+    soft, hard = resource.getrlimit(resource.RLIMIT_AS)
+    pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0])
+    resource.setrlimit(resource.RLIMIT_AS, (pages * resource.getpagesize() + megabytes * 2**20, hard))
+    signal.alarm(seconds)
+    try:
+        yield
+    finally:
+        signal.alarm(0)
+        signal.signal(signal.SIGALRM, before)
+        resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_spoiled_inputs_are_read_or_refused(examples, tmp_path, name):
+    kind = hostile.KINDS[name]
+    assert hostile.outcome(kind, hostile.copy(examples / name, tmp_path / "trial" / "it")) == "read"
+    for seed in range(1 if name in ("weights", "study folder") else SPOILED_ON_EACH_RUN):
+        path = hostile.copy(examples / name, tmp_path / "trial" / "it")
+        what = hostile.spoil(np.random.default_rng(seed), path)
+        with limits(), warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            found = hostile.outcome(kind, path)
+        assert found in ("read", "refused"), what
+        assert (path.parent / "canary").read_text() == "untouched"
+
+
+SPOILED_RUNS = {
+    "run.json": [("config", None), ("recording", {"name": "x"}), ("seed", "x"), ("versions", [])],
+    "pauses/000/info.json": [
+        ("weights", "x"),
+        ("weights", [0.5]),
+        ("parents", {"previous": [7] * 6}),
+        ("quality", {}),
+    ],
+    "pauses/001/camera.json": [("K", [[1]]), ("T_world_camera", None), ("width", "x"), ("height", 3)],
+    "pauses/001/seconds.json": [("transition", "x")],
+}
+
+
+@pytest.mark.parametrize("file", SPOILED_RUNS)
+def test_a_run_folder_is_checked_before_a_report_is_drawn(examples, tmp_path, file, monkeypatch):
+    import json
+
+    monkeypatch.setattr("mstfilter.report.run_report.read_numbers", lambda run: pytest.fail("it is drawn"))
+    from mstfilter.report import write_report
+
+    for key, value in SPOILED_RUNS[file]:
+        path = hostile.copy(examples / "run", tmp_path / "trial" / "it")
+        data = json.loads((path / file).read_text())
+        (path / file).write_text(json.dumps({**data, key: value}))
+        with pytest.raises(InputError, match=r"run\.json|pauses/00[01]"):
+            write_report(path)
+
+
+def test_an_image_is_not_decoded_if_its_header_announces_too_much(tmp_path):
+    (tmp_path / "a.png").write_bytes(hostile.png_header(30_000, 30_000))
+    with limits(megabytes=200), pytest.raises(InputError, match="30000 x 30000"):
+        read_rgb(tmp_path / "a.png")
+
+
+@pytest.mark.parametrize("way", ["announced", "unpacked"])
+def test_an_array_is_not_unpacked_if_it_is_too_large(tmp_path, monkeypatch, way):
+    from mstfilter.runs import read_truth
+
+    monkeypatch.setattr("mstfilter.reading.MAX_FILE", 2**20)
+    data = hostile.bomb((10**6, 10**6)) if way == "announced" else hostile.bomb((2**23,), gigabytes=1 / 64)
+    (tmp_path / "a.npz").write_bytes(data)
+    with limits(megabytes=200), pytest.raises(InputError, match="does not fit|at most 1048576 are read"):
+        read_truth(tmp_path / "a.npz")
+
+
+@pytest.mark.parametrize("name", ["pipe", "/dev/zero", "loop", "folder"])
+def test_only_regular_files_are_read(tmp_path, name):
+    path = tmp_path / "a.png"
+    if name == "pipe":
+        os.mkfifo(path)
+    elif name == "folder":
+        path.mkdir()
+    else:
+        path.symlink_to(path if name == "loop" else name)
+    with limits(seconds=5), pytest.raises(InputError, match=r"a\.png"):
+        read_rgb(path)
+
+
+def test_names_in_a_list_do_not_leave_the_folder(examples, tmp_path):
+    for name in ("../../secret.png", "/etc/passwd"):
+        path = hostile.copy(examples / "tum", tmp_path / "trial" / "it")
+        (path / "rgb.txt").write_text(f"1305031102.175 {name}\n")
+        with pytest.raises(InputError, match="is outside the folder"):
+            hostile.KINDS["tum"].read(path)
+
+
+def test_weights_that_are_not_finite_are_refused(tmp_path):
+    from mstfilter.trained import open_model, write_model
+
+    write_model(tmp_path / "model", {"architecture": "test"}, {"a": np.array([1.0, np.nan], np.float32)})
+    with pytest.raises(InputError, match="tensor 'a' has a value that is not finite"):
+        open_model(str(tmp_path / "model"))
+
+
+def test_control_characters_do_not_reach_the_terminal(tmp_path, capsys):
+    with pytest.raises(SystemExit):
+        main(["report", str(tmp_path / "\x1b[2Jred\u202e")])
+    error = capsys.readouterr().err
+    assert "\\x1b[2Jred\\u202e" in error and "\x1b" not in error
+
+
+def test_out_of_memory_and_disk_in_plain_words(monkeypatch, capsys):
+    full = OSError(errno.ENOSPC, "No space left on device", "x")
+    for error, words in ((MemoryError("x"), "out of memory"), (full, "no space left")):
+        monkeypatch.setattr("mstfilter.study.load_study", lambda *_, error=error, **__: (_ for _ in ()).throw(error))
+        with pytest.raises(SystemExit) as end:
+            main(["study", "x.toml"])
+        assert end.value.code == 1
+        assert capsys.readouterr().err.startswith(f"error: {words}")
+
+
+def test_a_damaged_chunk_of_mcap_is_refused(tmp_path):
+    kind = hostile.KINDS["mcap"]
+    kind.write(tmp_path / "it")
+    file = tmp_path / "it" / "it" / "it.mcap"
+    data = bytearray(file.read_bytes())
+    chunk = (
+        8 + 9 + 26
+    )  # after the magic number and the header: opcode, length, times, size, checksum, compression, size
+    assert data[chunk] == 6
+    begin = chunk + 9 + 28 + 4 + 8
+    size = int.from_bytes(data[begin - 8 : begin], "little")
+    data[chunk + 9 + 24 : chunk + 9 + 28] = zlib.crc32(data[begin : begin + size]).to_bytes(4, "little")
+    file.write_bytes(bytes(data))
+    kind.read(tmp_path / "it")
+    data[begin + size // 3] ^= 4  # a pixel
+    file.write_bytes(bytes(data))
+    with pytest.raises(InputError, match="hecksum"):
+        kind.read(tmp_path / "it")
+
+
+# Code in the working folder
+
+
+def _plant(folder: Path) -> Path:
+    """Modules that leave a mark when they are imported; returns the mark."""
+    mark = folder.parent / "pwned"
+    for name in ("multiprocessing", "joblib", "rerun_cli", "loky", "numpy", "pickle", "mstfilter"):
+        (folder / f"{name}.py").write_text(f"open({str(mark)!r}, 'w').close()\nraise SystemExit(7)\n")
+    return mark
+
+
+def _one(arm: str, seed: int) -> float:
+    return float(seed)
+
+
+PROGRAM = """
+import sys
+from pathlib import Path
+def main():
+    from tests.test_strangers import start
+    start(sys.argv[1])
+if __name__ == "__main__":
+    main()
+"""
+
+
+def start(what: str) -> None:
+    """Start the processes of a kind; called in a process whose working folder is that of a stranger."""
+    from mstfilter.smc import bootstrap, linear_gaussian
+
+    if what == "run_many":
+        model = linear_gaussian(*[[[1.0]]] * 4, m0=[0.0], P0=[[1.0]])
+        run_many({"a": bootstrap(model, n=10)}, [[0.0], [1.0]], seeds=[0, 1], workers=2)
+    elif what == "study":
+        from mstfilter.study import Local
+
+        outcomes = Local(workers=1).run([{"kind": "none"}], print)
+        assert outcomes[0].status == "failed" and "kind" not in outcomes[0].error, outcomes
+    else:
+        from mstfilter.report import viewer
+
+        with contextlib.suppress(InputError):
+            viewer.show_rerun("missing.rrd")
+
+
+@pytest.mark.parametrize("what", ["run_many", "study", "view"])
+def test_modules_in_the_working_folder_are_not_imported(tmp_path, what):
+    folder = tmp_path / "received"
+    folder.mkdir()
+    mark = _plant(folder)
+    (tmp_path / "program.py").write_text(PROGRAM)
+    environment = {k: v for k, v in os.environ.items() if k != "PYTHONSAFEPATH"} | {"PYTHONPATH": str(REPOSITORY)}
+    command = [sys.executable, str(tmp_path / "program.py"), what]
+    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, timeout=120)
+    assert not mark.exists()
+    assert done.returncode == 0, done.stderr
+
+
+# Caches
+
+
+def _filled(folder):
+    cache = DiskCache(folder, 10**8, "1")
+    cache.store("x", 1, np.zeros(10**5))
+    cache.close()
+    return folder / "cache.db"
+
+
+def test_a_cache_removes_and_reads_files_of_its_own_only(tmp_path):
+    outside = tmp_path / "precious"
+    outside.write_text("mine")
+    for name in (str(outside), "../precious"):
+        with sqlite3.connect(_filled(tmp_path / "cache")) as data:
+            data.execute("UPDATE Cache SET filename = ?", (name,))
+        cache = DiskCache(tmp_path / "cache", 10**8, "1")
+        assert cache.find("x", 1, np.ndarray) is None
+        cache.store("x", 1, np.ones(10**5))  # removes the file of the earlier entry
+        cache.close()
+        assert outside.read_text() == "mine"
+
+
+def test_a_cache_is_private(tmp_path):
+    _filled(tmp_path / "cache")
+    assert (tmp_path / "cache").stat().st_mode & 0o077 == 0
+    for mode in (0o770, 0o707):
+        (tmp_path / "cache").chmod(mode)
+        with pytest.raises(InputError, match=f"its mode is {mode:o}"):
+            DiskCache(tmp_path / "cache", 10**8, "1")
+
+
+def test_a_cache_of_another_user_is_refused(tmp_path, monkeypatch):
+    (tmp_path / "cache").mkdir(mode=0o700)
+    monkeypatch.setattr(os, "getuid", lambda: (tmp_path / "cache").stat().st_uid + 1)
+    with pytest.raises(InputError, match="belongs to another user"):
+        DiskCache(tmp_path / "cache", 10**8, "1")
+
+
+@pytest.mark.parametrize("begun", [False, True])
+def test_a_locked_cache_does_not_stop_a_run(tmp_path, monkeypatch, begun):
+    monkeypatch.setattr("mstfilter.scene.disk_cache._LOCK_S", 0.2)
+    file = _filled(tmp_path / "cache")
+    cache = DiskCache(tmp_path / "cache", 10**8, "1") if begun else None
+    with contextlib.closing(sqlite3.connect(file, isolation_level=None)) as other:
+        other.execute("BEGIN EXCLUSIVE")
+        began = time.monotonic()
+        with pytest.warns(InputWarning, match="is locked by another process"):
+            cache = cache or DiskCache(tmp_path / "cache", 10**8, "1")
+            for key in range(50):
+                assert cache.find("x", key, np.ndarray) is None
+                cache.store("x", key, np.zeros(3))
+        assert time.monotonic() - began < 10  # 50 entries that wait would need 20 s
+    cache.close()
+
+
+def test_a_cached_recording_that_was_edited_is_simulated_again(tmp_path):
+    from mstfilter.simulation import cached_recording
+
+    small = {"width": 80, "height": 60, "n_actions": 1, "frames_per_clip": 3, "fps": 1.0, "supersample": False}
+    folder = cached_recording("s1", 0, tmp_path, **small)
+    depth = folder / "depth" / "000000.png"
+    before, stamp = depth.read_bytes(), depth.stat().st_mtime_ns
+    edited = bytearray(before)
+    edited[len(before) // 2] ^= 1
+    depth.write_bytes(bytes(edited))
+    os.utime(depth, ns=(stamp, stamp))
+    with pytest.warns(InputWarning, match=r"depth/000000\.png has changed"):
+        assert cached_recording("s1", 0, tmp_path, **small) == folder
+    assert depth.read_bytes() == before
+
+
+def test_a_scheduler_on_another_host_needs_tls():
+    pytest.importorskip("distributed")
+    from mstfilter.study import Cluster
+
+    for address, warned in (("tcp://head:8786", True), ("tls://head:8786", False), ("tcp://127.0.0.1:1", False)):
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            Cluster(address)._warn_without_tls()
+        assert [("TLS" in str(w.message)) for w in caught] == [True] * warned
