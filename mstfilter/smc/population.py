@@ -210,7 +210,9 @@ def check_observations(observations: Iterable[Any], where: str = "") -> Any:
 
 
 def _all_nan(y: np.ndarray) -> bool:
-    return y.size > 0 and y.dtype.kind == "f" and bool(np.isnan(y).all())
+    if not y.size or y.dtype.kind != "f" or not math.isnan(y.item(0)):  # the usual case
+        return False
+    return bool(np.isnan(y).all())
 
 
 @dataclass(frozen=True, eq=False)
