@@ -292,7 +292,7 @@ class RunGenerators:
     """
 
     def __init__(self, states: np.ndarray, n: int | None = None) -> None:
-        self._states, self._n = states, n
+        self._states, self._n = np.ascontiguousarray(states), n
         self._own: list[np.random.Generator] | None = None  # made when another method is called
 
     def __len__(self) -> int:
@@ -371,8 +371,9 @@ class RunGenerators:
         if method == "random" and rows.shape[1] == 1:
             rows[:, 0] = _next_uniforms(self._states)
             return out
-        for state, row in zip(self._states, rows, strict=True):
-            memory[:] = state
+        data = self._states.data.cast("B")
+        for state, row in zip([data[k : k + 32] for k in range(0, len(data), 32)], rows, strict=True):
+            memory[:] = state  # bytes are copied in less time than arrays
             draw(out=row)
             state[:] = memory
         return out
@@ -398,8 +399,8 @@ def _next_uniforms(states: np.ndarray) -> np.ndarray:
 
 
 @lru_cache(maxsize=16)
-def _reused_generator(thread: int) -> tuple[np.random.Generator, np.ndarray] | None:
-    """A generator of a thread, and its state as an array of 4 words; None if its memory is not as expected.
+def _reused_generator(thread: int) -> tuple[np.random.Generator, memoryview] | None:
+    """A generator of a thread, and its state as 32 bytes; None if its memory is not as expected.
 
     Writing the state takes a tenth of the time of setting ``bit_generator.state``.
     """
@@ -414,4 +415,4 @@ def _reused_generator(thread: int) -> tuple[np.random.Generator, np.ndarray] | N
         if memory.tolist() != expected:
             return None
         rng.random()
-    return rng, memory
+    return rng, memory.data.cast("B")
