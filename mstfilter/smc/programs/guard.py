@@ -352,11 +352,14 @@ def _group(run: ProgramRun, part: np.ndarray) -> np.ndarray:
 def _close(a: Any, b: Any, tolerance: float, scale: Any = 0.0) -> np.ndarray:
     """Whether entries are equal up to a relative tolerance; NaN equals NaN."""
     a, b = np.asarray(a), np.asarray(b)
+    equal = np.asarray(a == b)
+    if equal.all():  # the usual case
+        return equal
+    equal |= (a != a) & (b != b)
     if a.dtype.kind not in "fc" or b.dtype.kind not in "fc":
-        return np.asarray(a == b) | np.asarray((a != a) & (b != b))
+        return equal
     with np.errstate(invalid="ignore", over="ignore"):
-        near = abs(a - b) <= tolerance * (scale + np.maximum(abs(a), abs(b)))
-        return (a == b) | near | (np.isnan(a) & np.isnan(b))
+        return equal | (abs(a - b) <= tolerance * (scale + np.maximum(abs(a), abs(b))))
 
 
 def _spread(values: np.ndarray) -> Any:
@@ -437,7 +440,7 @@ def _compare(call: Call, alone: Call | None, rows: np.ndarray) -> None:
                 *_ALONE,
             )
         other = call.value[k[0] - 1]  # the value of another particle
-        among, lone = (c.densities(np.broadcast_to(other, c.value.shape)) for c in (call, alone))
+        among, lone = (c.densities(np.full(c.value.shape, other, c.value.dtype)) for c in (call, alone))
         _equal_densities(call, rows[here], among[k], lone)
 
 

@@ -198,7 +198,8 @@ class Call(NamedTuple):
         if self.distribution is not None:
             with np.errstate(all="ignore"):
                 log_prob = self.distribution.log_prob(values)
-        return np.broadcast_to(np.asarray(log_prob, np.float64), (self.size,))
+        log_prob = np.asarray(log_prob, np.float64)
+        return log_prob if log_prob.shape == (self.size,) else np.broadcast_to(log_prob, (self.size,))
 
 
 class Shapes(NamedTuple):
