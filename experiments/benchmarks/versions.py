@@ -96,9 +96,7 @@ AR1 = smc.StateSpaceModel(
     batched=True,
 )
 LINEAR = smc.linear_gaussian([[0.9]], [[0.36]], [[1.0]], [[0.16]], [0.0], [[1.0]])
-OF = smc.StateSpaceModel.of(
-    smc.Normal(0.0, 1.4), lambda x: smc.Normal(0.9 * x, 0.6), lambda x: smc.Normal(x, 0.4)
-)
+OF = smc.StateSpaceModel.of(smc.Normal(0.0, 1.4), lambda x: smc.Normal(0.9 * x, 0.6), lambda x: smc.Normal(x, 0.4))
 
 
 def smc_tasks() -> dict[str, Callable[[], Any]]:
