@@ -300,9 +300,8 @@ def writing(what: str, *hints: str) -> Iterator[None]:
 def check_output(path: Path, folder: bool = False, empty: bool = True) -> None:
     """Raise InputError if a file, or with `folder` a folder, cannot be written at `path`.
 
-    An existing folder must be empty, unless `empty` is false. For each name that does not exist a file with that name
-    between other characters, as `atomic_path` has it, is made and removed: permissions do not tell of read-only file
-    systems, long names, or a full disk.
+    An existing folder must be empty, unless `empty` is false. A file is made and removed for each name that does not
+    exist: permissions do not tell of read-only file systems, long names, or a full disk.
     """
     if os.path.isdir(path) and not folder:
         raise InputError(f"{path} is a folder, expected the name of a file to write")
@@ -320,15 +319,25 @@ def check_output(path: Path, folder: bool = False, empty: bool = True) -> None:
     if existing.is_file() and (folder or existing != target):
         raise InputError(f"cannot write {path}: {existing} is a file", "choose another place")
     made_in = existing.parent if existing.is_file() else existing
-    names = [place.name for place in places[: places.index(existing)]]
-    for name in names or [existing.name]:
-        probe = made_in / f".{name}.{uuid.uuid4().hex[:8]}.partial"
+    for name in [place.name for place in places[: places.index(existing)]] or [existing.name]:
         try:
-            probe.touch()
-            probe.unlink()
+            _try_to_write(made_in, _temporary(made_in / name, "partial"))
         except OSError as error:
             problem = "no permission to write" if error.errno in (errno.EACCES, errno.EPERM) else error.strerror
             raise InputError(f"cannot write {path}: {problem} in {made_in}", "choose another place") from error
+
+
+def _try_to_write(folder: Path, temporary: Path) -> None:
+    """Make a file in a folder and remove it, without a name where that is possible: a kill then leaves nothing."""
+    if hasattr(os, "pathconf") and len(os.fsencode(temporary.name)) > os.pathconf(folder, "PC_NAME_MAX"):
+        raise OSError(errno.ENAMETOOLONG, os.strerror(errno.ENAMETOOLONG))
+    try:
+        os.close(os.open(folder, os.O_WRONLY | os.O_TMPFILE))
+    except (AttributeError, OSError) as error:
+        if getattr(error, "errno", None) not in (None, errno.EOPNOTSUPP, errno.EISDIR, errno.EINVAL, errno.ENOENT):
+            raise
+        temporary.touch()
+        temporary.unlink()
 
 
 def write_text(path: str | Path, text: str) -> None:

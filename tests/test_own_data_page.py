@@ -268,10 +268,3 @@ def test_what_the_program_says(here, capsys, wrong, message):
         said = _shown(COMMAND_LINE.get(wrong, ["convert", "bedroom", "t", "-o", "fps=10"]), capsys)
     assert message.strip("`") in said
     assert sorted(here.rglob("*")) == files
-
-
-def test_parts_of_a_session(here):
-    (example,) = (b for b in re.findall(r"```python\n(.*?)```", PAGE, flags=re.DOTALL) if "in_world_of" in b)
-    names = {}
-    exec(compile(example, "own-data.md", "exec"), names)
-    assert names["later"].grid == names["first"].grid

@@ -8,9 +8,9 @@ Times are processor time. A ratio is the median over the rounds of (this checkou
 `ratio_of_shortest` is the ratio of the shortest times, which other programs on the machine disturb least.
 
 The names of tasks start with their area. `smc`: single filters (a random walk, a model of `StateSpaceModel.of`, a
-hidden Markov model, programs), batches of 200 seeds, the first 200 steps of a program that is new to the package, and
-resampling of a million weights. `mst`: all steps of the preset ``mst`` on the scene ``demo`` and on the full-size scene
-``table`` (640 x 480 images, 100 x 100 x 50 voxels).
+hidden Markov model, programs), batches of 200 seeds, the first 200 steps of a program that is new to the package,
+and resampling of a million weights. `mst`: all steps of the preset ``mst`` on the scene ``demo`` and on the full-size
+scene ``table`` (640 x 480 images, 100 x 100 x 50 voxels).
 """
 
 from __future__ import annotations
@@ -96,9 +96,7 @@ AR1 = smc.StateSpaceModel(
     batched=True,
 )
 LINEAR = smc.linear_gaussian([[0.9]], [[0.36]], [[1.0]], [[0.16]], [0.0], [[1.0]])
-OF = smc.StateSpaceModel.of(
-    smc.Normal(0.0, 1.4), lambda x: smc.Normal(0.9 * x, 0.6), lambda x: smc.Normal(x, 0.4)
-)
+OF = smc.StateSpaceModel.of(smc.Normal(0.0, 1.4), lambda x: smc.Normal(0.9 * x, 0.6), lambda x: smc.Normal(x, 0.4))
 
 
 def smc_tasks() -> dict[str, Callable[[], Any]]:

@@ -157,7 +157,7 @@ def report(
     if out is not None:
         check_output(out)
     if export is not None:
-        check_output(export, folder=True)
+        check_output(export, folder=True, empty=False)
     if (run / "study.json").is_file():
         from mstfilter.report import write_study_report
 

@@ -37,7 +37,7 @@ def study(
     from mstfilter.study import Executor, Local, run_study
 
     folder = out or Path("studies") / f"{wanted.name}{'-smoke' if smoke else ''}"
-    check_output(folder, folder=True)
+    check_output(folder, folder=True, empty=False)
     executor: Executor = Local(workers, folder / "logs")
     if scheduler:
         from mstfilter.study import Cluster

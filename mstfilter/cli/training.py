@@ -31,7 +31,7 @@ def train(
     trained = CompletionTraining if part == "completion" else BorderTraining
     settings = trained.recipe(recipe, overrides or ())
     folder = out or Path("trained") / part
-    check_output(folder, folder=True)
+    check_output(folder, folder=True, empty=False)
 
     def report(done: int, total: int, text: str) -> None:
         print(f"{done:7d} of {total}  {text}", flush=True)

@@ -150,7 +150,11 @@ def _sum_rows(log_prob: Any) -> np.ndarray:
 def _standardised(value: Any, loc: Any, scale: Any) -> np.ndarray:
     """(value - loc) / scale with one temporary array."""
     z = np.asarray(np.subtract(value, loc), dtype=np.float64)
-    fits = isinstance(scale, float) or np.shape(scale) == z.shape or np.broadcast_shapes(z.shape, np.shape(scale)) == z.shape
+    fits = (
+        isinstance(scale, float)
+        or np.shape(scale) == z.shape
+        or np.broadcast_shapes(z.shape, np.shape(scale)) == z.shape
+    )
     return np.divide(z, scale, out=z if z.ndim and fits else None)
 
 

@@ -23,6 +23,7 @@ from mstfilter.smc import (
     Kld,
     Normal,
     ParticleFilter,
+    Population,
     Program,
     ProgramLookahead,
     ProgramMove,
@@ -129,7 +130,7 @@ def test_faults_of_models_are_named(make, message):
 
 def test_hints_say_what_was_meant():
     with pytest.raises(InputError) as raised:
-        bootstrap(AR1, 5).run([0.1, np.nan], 0)
+        Population(np.zeros(2), np.full(2, np.nan))
     assert raised.value.hints == ("is the observation NaN? one that is missing is None",)
 
     with pytest.raises(InputError) as raised:

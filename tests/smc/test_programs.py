@@ -406,7 +406,11 @@ def changed(x):
             0.5,
             r"scale of a Normal is -1,.*after site 'k', line \d+",
         ),
-        (lambda x, z, v, k, y: observe("o", Normal(x, 1), y), np.nan, "'o': log density is nan.*missing is None"),
+        (
+            lambda x, z, v, k, y: observe("o", Normal(x, 1), np.nan * y),
+            0.5,
+            "'o': log density is nan.*missing is None",
+        ),
         (lambda x, z, v, k, y: observe("o", Normal(x, 1), y), "a", "the program fails .observation 'o'"),
     ],
 )
