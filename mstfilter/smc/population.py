@@ -103,6 +103,8 @@ class Candidates(Sequence[_T], Generic[_T]):
 
 def count_particles(particles: Particles) -> int:
     """Number of particles; raises InputError if arrays of a mapping have different lengths."""
+    if isinstance(particles, np.ndarray):
+        return len(particles)
     if isinstance(particles, (dict, Mapping)):
         sizes = {name: len(a) for name, a in particles.items()}
         if len(set(sizes.values())) != 1:
