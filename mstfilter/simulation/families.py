@@ -166,37 +166,28 @@ _STUDIED = SceneFamily(
     n_actions=4,
 )
 
+_DEMO = SceneFamily(
+    name="demo",
+    n_objects_min=5,
+    n_objects_max=5,
+    n_actions=2,
+    frames_per_clip=8,
+    fps=4.0,
+    push_speed=0.12,
+    width=320,
+    height=240,
+    workspace_x=0.8,
+    workspace_y=0.8,
+    workspace_z=0.3,
+)
+
 #: The named families.
 SCENE_FAMILIES: dict[str, SceneFamily] = {
-    "demo": SceneFamily(
-        name="demo",
-        n_objects_min=5,
-        n_objects_max=5,
-        n_actions=2,
-        frames_per_clip=8,
-        fps=4.0,
-        push_speed=0.12,
-        width=320,
-        height=240,
-        workspace_x=0.8,
-        workspace_y=0.8,
-        workspace_z=0.3,
-    ),
+    "demo": _DEMO,
     # Small objects stand behind tall ones, and three pushes hide and uncover objects: earlier images show more than
     # the latest one.
-    "occlusion": SceneFamily(
-        name="occlusion",
-        n_objects_min=7,
-        n_objects_max=7,
-        n_hidden=2,
-        frames_per_clip=10,
-        fps=4.0,
-        push_speed=0.12,
-        width=320,
-        height=240,
-        workspace_x=0.8,
-        workspace_y=0.8,
-        workspace_z=0.3,
+    "occlusion": replace(
+        _DEMO, name="occlusion", n_objects_min=7, n_objects_max=7, n_hidden=2, n_actions=3, frames_per_clip=10
     ),
     "table": SceneFamily(name="table"),
     "s1": _STUDIED,
