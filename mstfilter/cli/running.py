@@ -75,7 +75,7 @@ def run(
     from mstfilter.report import read_numbers, write_report
     from mstfilter.runs import RunFolder
 
-    numbers = read_numbers(RunFolder.open(folder))
+    numbers = read_numbers(RunFolder.open(folder), beliefs=report or compare)
     if report:
         print(f"report      {write_report(folder, None, numbers)}")
     print_summary(numbers)

@@ -312,15 +312,15 @@ def _count(n: int, one: str, several: str = "") -> str:
     return f"{n} {one if n == 1 else several or one + 's'}"
 
 
-def read_numbers(run: RunFolder) -> RunNumbers:
-    """Numbers of a run folder."""
+def read_numbers(run: RunFolder, beliefs: bool = True) -> RunNumbers:
+    """Numbers of a run folder; without `beliefs`, the log losses are left out, which take the most time."""
     description = run.description
     times = description["recording"]["times"]
     steps = []
     shown: set[int] = set()  # true objects that an image has shown
     for t in range(run.n_pauses):
         info, hypotheses, truth = run.info(t), run.hypotheses(t), run.truth(t)
-        questions = run.questions(t)
+        questions = run.questions(t) if beliefs else None
         belief = None
         if questions is not None and truth is not None:
             belief = score_belief(questions, hypotheses, info["weights"], truth)
