@@ -12,10 +12,11 @@ import numpy as np
 import pytest
 
 from mstfilter.errors import InputError, MissingLibraryError
-from mstfilter.frontends import CutieTracker, Sam2Tracker, SiamMaskTracker
-from mstfilter.frontends.mask_trackers import anchor_boxes, crop_around, follow
-from mstfilter.frontends.package_trackers import disjoint_groups
+from mstfilter.frontends import CutieTracker, Sam2Tracker
+from mstfilter.frontends.mask_trackers import disjoint_groups
 from mstfilter.presets import preset
+from mstfilter.registry import load_file
+from mstfilter.resources import models_folder
 from mstfilter.scene import Camera, Clip, Frame, Hypothesis, read_rgb, render
 from mstfilter.smc import Population
 from mstfilter.testing import scene_example
@@ -25,11 +26,10 @@ from tests.segmentation.scenes import GRID
 
 torch = pytest.importorskip("torch")
 
-from mstfilter.frontends.siammask_network import (  # noqa: E402 (needs torch)
-    SiamMaskNetwork,
-    depthwise_correlation,
-    read_checkpoint,
+siammask, network_file = (
+    load_file(models_folder() / "published" / name) for name in ("siammask.py", "siammask_network.py")
 )
+SiamMaskTracker, SiamMaskNetwork = siammask.SiamMaskTracker, network_file.SiamMaskNetwork
 
 
 def published() -> dict[str, tuple[int, ...]]:
@@ -116,7 +116,7 @@ def test_names_and_shapes_are_the_published_ones(tensors, checkpoint):
     assert own == expected
     n_parameters = sum(p.numel() for p in network.parameters())
     assert n_parameters == sum(int(np.prod(s)) for n, s in expected.items() if "running" not in n)
-    network.load_state(read_checkpoint(checkpoint))
+    network.load_state(network_file.read_checkpoint(checkpoint))
     for name, tensor in tensors.items():
         assert torch.equal(network.state_dict()[name], tensor)
 
@@ -153,7 +153,7 @@ def test_depthwise_correlation():
         for i in range(7):
             for j in range(7):
                 expected[c, i, j] = (x[c, i : i + 3, j : j + 4] * kernel[c]).sum()
-    found = depthwise_correlation(torch.from_numpy(x)[None], torch.from_numpy(kernel)[None])
+    found = network_file.depthwise_correlation(torch.from_numpy(x)[None], torch.from_numpy(kernel)[None])
     np.testing.assert_allclose(found[0].numpy(), expected, atol=1e-5)
 
 
@@ -243,7 +243,7 @@ def test_features_and_masks_equal_a_plain_reference(tensors):
 
 def test_anchors():
     """The five published shapes, centred on a grid with a step of 8 pixels."""
-    anchors = anchor_boxes().reshape(4, 5, 25, 25)
+    anchors = siammask.anchor_boxes().reshape(4, 5, 25, 25)
     sizes = [tuple(anchors[2:, k, 0, 0].astype(int).tolist()) for k in range(5)]
     assert sizes == [(104, 32), (88, 40), (64, 64), (40, 80), (32, 96)]
     assert (anchors[:2, :, 12, 12] == 0).all()
@@ -256,7 +256,7 @@ def test_crops_are_filled_with_the_mean_colour(position):
     rng = np.random.default_rng(0)
     image = rng.integers(0, 256, (60, 80, 3)).astype(np.uint8)
     colour = np.array([10.7, 20.2, 30.9])
-    crop = crop_around(image, np.array(position), 21, 21, colour)
+    crop = siammask.crop_around(image, np.array(position), 21, 21, colour)
     low = [int(np.round(p - 11)) for p in position]
     for i in range(21):
         for j in range(21):
@@ -306,10 +306,10 @@ def video(n: int) -> tuple[list[np.ndarray], list[np.ndarray]]:
 def test_the_mask_follows_a_moving_box(rule):
     """With an ideal network the pasted mask is the true one, displaced by at most a pixel as in the original."""
     images, masks = video(8)
-    found = follow(rule, Ideal(), images, masks[0])
+    found = siammask.follow(rule, Ideal(), images, masks[0])
     assert (found & masks[-1]).sum() / (found | masks[-1]).sum() > 0.85
-    assert (follow(rule, Ideal(), images[:1], masks[0]) == masks[0]).all()
-    assert not follow(rule, Ideal(), images, masks[0] & False).any()
+    assert (siammask.follow(rule, Ideal(), images[:1], masks[0]) == masks[0]).all()
+    assert not siammask.follow(rule, Ideal(), images, masks[0] & False).any()
 
 
 def clip_of(images: list[np.ndarray]) -> Clip:
