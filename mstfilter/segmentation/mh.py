@@ -5,8 +5,8 @@ The chain starts at the optimal cut c*. Its target is ``p(c) = exp(-(v(c*) - v(c
 for values that are log odds (`MergeLogOdds`), which need no scale.
 
 - ``mst``: ``MetropolisHastingsCuts(temperature=1)``: one chain, MoveNode mixed with subtree redraws.
-- ``paper``: ``MetropolisHastingsCuts(0.25, burn_in=0, thinning=20, redraw_share=0)``.
-- ``authors``: ``MetropolisHastingsCuts(0.25, burn_in=0, thinning=20, moves="authors", redraw_share=0, restart=True,
+- ``paper``: ``MetropolisHastingsCuts(0.25, burn_in=0, thinning=20)``.
+- ``authors``: ``MetropolisHastingsCuts(0.25, burn_in=0, thinning=20, moves="authors", restart=True,
   include_optimal=True, redraw_repeated=True)``.
 
 >>> sample = MetropolisHastingsCuts().sample(np.random.default_rng(0), tree, w, 5)
@@ -30,22 +30,15 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from math import exp, inf, log
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
 from mstfilter.errors import check_choice, check_integer, check_number
-from mstfilter.segmentation.cuts import (
-    CutSample,
-    CutSampler,
-    Gibbs,
-    check_target_law,
-    check_values,
-    log_target,
-    optimal_cut,
-    proposal_law,
-)
+from mstfilter.segmentation.cuts import CutSample, CutSampler, Gibbs, check_values, gibbs, optimal_cut
 from mstfilter.segmentation.tree import Tree
+
+_Value = TypeVar("_Value", float, np.ndarray)
 
 
 class Move(NamedTuple):
@@ -212,7 +205,7 @@ class AuthorsMoves(MoveRule):
 
 @dataclass(frozen=True, eq=False)
 class SubtreeRedraw(MoveRule):
-    """Redraw the part of the cut inside a random subtree from the Gibbs law `law`.
+    """Redraw the part of the cut inside a random subtree from the Gibbs law `law`, the target of a temperature.
 
     The subtree's node is uniform over the inner nodes, for any state; if an ancestor of it is in the cut, the chain
     stays. A choice is (inner node, new nodes).
@@ -239,6 +232,13 @@ class SubtreeRedraw(MoveRule):
         w = self.law.w
         old, new = sum(w[x] for x in removed), sum(w[x] for x in added)
         return Move(removed, added, self.law.b * (old - new))  # log of exp(b v(old)) / exp(b v(new))
+
+
+def log_target(value: _Value, best: float, s2: float, temperature: float) -> _Value:
+    """Log probability of cuts with these values relative to the optimal cut."""
+    if temperature > 0:
+        return (value - best) / temperature
+    return -((best - value) ** 2) / s2
 
 
 LOCAL_MOVES: dict[str, type[MoveRule]] = {"node": NodeMoves, "authors": AuthorsMoves}
@@ -306,7 +306,7 @@ class MetropolisHastingsCuts(CutSampler):
     moves : {"node", "authors"}
         Local moves: the paper's (exact), or the authors' program's, whose forward probability is wrong.
     redraw_share : float
-        Fraction of the steps that redraw a random subtree instead of making a local move.
+        Fraction of the steps that redraw a random subtree instead of making a local move; only with a temperature.
     restart : bool
         Start a new chain at the optimal cut for each sample.
     include_optimal : bool
@@ -329,7 +329,8 @@ class MetropolisHastingsCuts(CutSampler):
 
     def __post_init__(self) -> None:
         check_choice("moves", self.moves, tuple(LOCAL_MOVES))
-        check_target_law(self.sigma2, self.temperature)
+        check_number("sigma2", self.sigma2, above=0)
+        check_number("temperature", self.temperature, at_least=0)
         check_integer("burn_in", self.burn_in, at_least=0)
         check_integer("thinning", self.thinning)
         check_number("redraw_share", self.redraw_share, at_least=0, at_most=1)
@@ -341,8 +342,8 @@ class MetropolisHastingsCuts(CutSampler):
         s2 = max(self.sigma2 * best**2, 1e-300)
         local = LOCAL_MOVES[self.moves]()
         redraw = None
-        if self.redraw_share > 0:
-            redraw = SubtreeRedraw(proposal_law(tree, w, best, s2, self.temperature))
+        if self.redraw_share > 0 and self.temperature > 0:
+            redraw = SubtreeRedraw(gibbs(tree, w, 1 / self.temperature))
         random = _uniforms(rng).__next__
 
         chain = CutChain(tree, w, best, s2, optimal, self.temperature)
@@ -394,15 +395,10 @@ def _uniforms(rng: np.random.Generator) -> Iterator[float]:
 def _autocorrelation(trace: np.ndarray) -> float | None:
     """Integrated autocorrelation time of a trace in steps; None if it is shorter than 100 steps or constant.
 
-    ``tau(M) = 1 + 2 (rho(1) + ... + rho(M))`` at the first window with ``M >= 5 tau(M)`` (Sokal 1989; emcee,
-    with the same result, is slow to import). A chain shorter than about 50 such times underestimates it, so
-    a low value does not prove convergence.
+    A chain shorter than about 50 such times underestimates it, so a low value does not prove convergence.
     """
     if len(trace) < 100 or np.ptp(trace) == 0:
         return None
-    padded = 2 << (len(trace) - 1).bit_length()  # so that the cyclic correlation does not wrap around
-    spectrum = np.fft.fft(trace - np.mean(trace), n=padded)
-    rho = np.fft.ifft(spectrum * np.conjugate(spectrum))[: len(trace)].real
-    rho /= rho[0]
-    tau = 2 * np.cumsum(rho) - 1
-    return float(tau[np.argmin(np.arange(len(tau)) < 5 * tau)])
+    from emcee.autocorr import integrated_time
+
+    return float(integrated_time(trace, tol=0, quiet=True)[0])

@@ -128,7 +128,7 @@ def test_each_object_shows_in_its_own_mask():
 )
 @pytest.mark.parametrize("rule", ["equal", "p"])
 def test_components_are_interchangeable(tree, value, rule):
-    sampler = MetropolisHastingsCuts(0.25, 0, 20, "authors", 0.0, True, True, True)
+    sampler = MetropolisHastingsCuts(0.25, 0, 20, "authors", restart=True, include_optimal=True, redraw_repeated=True)
     proposal = TreeCutProposal(tree=tree, value=value, sampler=sampler, completer=SurfaceOnly(), weight_rule=rule)
     population = proposal.sample(np.random.default_rng(0), clip_of(TOUCHING, width=640, noise=0.6), 5)
     assert population.log_weights[0] == 0
