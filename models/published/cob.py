@@ -15,11 +15,12 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 
-from mstfilter.errors import InputError, check_choice, check_integer, check_number, naming
+from mstfilter.errors import InputError, naming
+from mstfilter.fields import Bounds, NonNegativeFloat, PositiveInt
 from mstfilter.files import weights_file
 from mstfilter.registry import load_file
 from mstfilter.scene import Frame, Recording, UsesFiles, memo, scaled_length
@@ -56,12 +57,7 @@ class CobBoundary(BoundaryModel, UsesFiles):
     input: Literal["rgb", "rgbhha"] = "rgb"
     scale: Literal["fine", "coarse", "mean"] = "fine"
     sha256: str = ""
-    table_height: float = 0.7
-
-    def __post_init__(self) -> None:
-        check_choice("input", self.input, ("rgb", "rgbhha"))
-        check_choice("scale", self.scale, ("fine", "coarse", "mean"))
-        check_number("table_height", self.table_height, at_least=0, unit="number of metres")
+    table_height: Annotated[float, Bounds(at_least=0, unit="number of metres")] = 0.7
 
     @property
     def bound_key(self) -> bytes:
@@ -187,15 +183,11 @@ class CobTree(TreeBuilder):
     """
 
     contours: CobBoundary = field(default_factory=CobBoundary)
-    align: float = 0.05
+    align: NonNegativeFloat = 0.05
     centre: float = 0.8
     slope: float = 4.0
     tolerance: float = 1.5
-    max_leaves: int = 501
-
-    def __post_init__(self) -> None:
-        check_integer("max_leaves", self.max_leaves)
-        check_number("align", self.align, at_least=0)
+    max_leaves: PositiveInt = 501
 
     def build(self, boundary: np.ndarray, frame: Frame | None = None) -> Tree:
         """The tree of a frame; raises InputError without a frame or weights."""

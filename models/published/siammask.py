@@ -18,7 +18,8 @@ from typing import Any
 
 import numpy as np
 
-from mstfilter.errors import check_integer, check_number, naming
+from mstfilter.errors import naming
+from mstfilter.fields import NonNegativeFloat, PositiveInt, Share
 from mstfilter.files import weights_file
 from mstfilter.frontends.mask_trackers import thinned
 from mstfilter.registry import load_file
@@ -53,18 +54,12 @@ class SiamMaskTracker(MaskTracker, UsesFiles):
     """
 
     weights: str = ""
-    threshold: float = 0.4
-    penalty: float = 0.04
-    window: float = 0.4
-    rate: float = 1.0
-    step: int = 1
+    threshold: Share = 0.4
+    penalty: NonNegativeFloat = 0.04
+    window: Share = 0.4
+    rate: Share = 1.0
+    step: PositiveInt = 1
     sha256: str = ""
-
-    def __post_init__(self) -> None:
-        check_integer("step", self.step)
-        for name in ("threshold", "window", "rate"):
-            check_number(name, getattr(self, name), at_least=0, at_most=1)
-        check_number("penalty", self.penalty, at_least=0)
 
     def check_files(self, recording: Recording) -> None:
         """Load the weights."""

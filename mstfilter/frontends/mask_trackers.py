@@ -25,7 +25,8 @@ from typing import Any
 
 import numpy as np
 
-from mstfilter.errors import InputError, MissingLibraryError, check_integer, describe_error
+from mstfilter.errors import InputError, MissingLibraryError, describe_error
+from mstfilter.fields import PositiveInt
 from mstfilter.files import weights_file
 from mstfilter.scene import Clip, Frame, Recording, UsesFiles
 from mstfilter.tracking import MaskTracker
@@ -56,11 +57,8 @@ class PackageTracker(MaskTracker, UsesFiles):
 
     checkpoint: str = ""
     device: str = "cpu"
-    step: int = 1
+    step: PositiveInt = 1
     sha256: str = ""
-
-    def __post_init__(self) -> None:
-        check_integer("step", self.step)
 
     def check_files(self, recording: Recording) -> None:
         """Load the checkpoint."""

@@ -22,7 +22,8 @@ from typing import Any
 
 import numpy as np
 
-from mstfilter.errors import InputError, check_number
+from mstfilter.errors import InputError
+from mstfilter.fields import PositiveFloat
 from mstfilter.results import Checked, check_array, check_list, check_type, returns
 from mstfilter.scene import Frame
 from mstfilter.segmentation.boundary import pixels_above_table
@@ -220,10 +221,7 @@ def gibbs(tree: Tree, w: np.ndarray, b: float) -> Gibbs:
 class ExactCuts(CutSampler):
     """Independent exact draws from the Gibbs law exp(v / temperature); `temperature` is in units of value."""
 
-    temperature: float = 1.0
-
-    def __post_init__(self) -> None:
-        check_number("temperature", self.temperature, above=0)
+    temperature: PositiveFloat = 1.0
 
     def sample(self, rng: np.random.Generator, tree: Tree, w: np.ndarray, n: int) -> CutSample:
         w = check_values(tree, w)

@@ -30,11 +30,11 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from math import exp, inf, log
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, Literal, NamedTuple, TypeVar
 
 import numpy as np
 
-from mstfilter.errors import check_choice, check_integer, check_number
+from mstfilter.fields import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, Share
 from mstfilter.segmentation.cuts import CutSample, CutSampler, Gibbs, check_values, gibbs, optimal_cut
 from mstfilter.segmentation.tree import Tree
 
@@ -317,23 +317,15 @@ class MetropolisHastingsCuts(CutSampler):
         0: the law of the paper. > 0: the Gibbs law exp(v / temperature), in units of value.
     """
 
-    sigma2: float = 1e-3
-    burn_in: int = 1000
-    thinning: int = 500
-    moves: str = "node"
-    redraw_share: float = 0.3
+    sigma2: PositiveFloat = 1e-3
+    burn_in: NonNegativeInt = 1000
+    thinning: PositiveInt = 500
+    moves: Literal["node", "authors"] = "node"
+    redraw_share: Share = 0.3
     restart: bool = False
     include_optimal: bool = False
     redraw_repeated: bool = False
-    temperature: float = 0.0
-
-    def __post_init__(self) -> None:
-        check_choice("moves", self.moves, tuple(LOCAL_MOVES))
-        check_number("sigma2", self.sigma2, above=0)
-        check_number("temperature", self.temperature, at_least=0)
-        check_integer("burn_in", self.burn_in, at_least=0)
-        check_integer("thinning", self.thinning)
-        check_number("redraw_share", self.redraw_share, at_least=0, at_most=1)
+    temperature: NonNegativeFloat = 0.0
 
     def sample(self, rng: np.random.Generator, tree: Tree, w: np.ndarray, n: int) -> CutSample:
         w = check_values(tree, w)

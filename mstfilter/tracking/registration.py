@@ -13,11 +13,11 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
-from mstfilter.errors import check_choice
+from mstfilter.fields import PositiveInt
 from mstfilter.results import Checked, check_array, check_rigid, check_type, returns
 from mstfilter.tracking.rigid import move_points
 
@@ -95,14 +95,11 @@ class Registration(Checked, ABC):
 class SmallGicp(Registration):
     """small_gicp (Koide 2024), one thread, at most `iterations` iterations.
 
-    `method` is "GICP", "PLANE_ICP" or "ICP": generalised, point-to-plane or point-to-point ICP.
+    `method` is generalised, point-to-plane or point-to-point ICP.
     """
 
-    method: str = "GICP"
-    iterations: int = 30
-
-    def __post_init__(self) -> None:
-        check_choice("method", self.method, ("GICP", "PLANE_ICP", "ICP"))
+    method: Literal["GICP", "PLANE_ICP", "ICP"] = "GICP"
+    iterations: PositiveInt = 30
 
     def register(self, source: Surface, target: Surface, init: np.ndarray, reach: float) -> RegistrationResult | None:
         import small_gicp
