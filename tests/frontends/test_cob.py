@@ -7,13 +7,11 @@ import struct
 import subprocess
 import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from mstfilter.errors import InputError
-from mstfilter.presets import preset
 from mstfilter.registry import load_file
 from mstfilter.resources import models_folder
 from mstfilter.scene import Camera, Frame, look_at
@@ -277,22 +275,14 @@ def test_the_component_runs_on_a_frame(model):
 def test_large_images_are_resized_as_published(model, monkeypatch):
     monkeypatch.setattr(cob, "_MAX_PIXELS", 2000)
     shapes = []
-    forward = CobNetwork.forward
 
     def watched(self, image):
         shapes.append(tuple(image.shape))
-        return forward(self, torch.nn.functional.interpolate(image[None], (50, 50))[0])._replace()
+        return network_file.CobOutput(image[0].sigmoid(), image[1].sigmoid(), image[:1].repeat(8, 1, 1))
 
     monkeypatch.setattr(CobNetwork, "forward", watched)
-    frame = frame_of(TWO, width=80)
-    resized = torch.nn.functional.interpolate
-    monkeypatch.setattr(
-        torch.nn.functional,
-        "interpolate",
-        lambda x, size, **options: resized(x, (50, 50) if size == (500, 500) else size, **options),
-    )
-    assert CobBoundary(str(model)).boundary(frame).shape == (60, 80)
-    assert shapes == [(3, 50, 50)]
+    assert CobBoundary(str(model)).boundary(frame_of(TWO, width=80)).shape == (60, 80)
+    assert shapes == [(3, 500, 500)]
 
 
 def discs(size: int = 64) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -377,10 +367,13 @@ def test_rgb_hha(blobs, tmp_path, monkeypatch):
     assert "other input" in caught.value.hints[0]
 
 
-def test_torch_is_imported_when_the_network_is_used():
+def test_presets_name_the_components_without_importing_torch():
     code = (
-        "import sys, mstfilter; from mstfilter.presets import REGISTRY\n"
-        "mstfilter.preset('mst', 'proposal.boundary=cob', 'proposal.tree=cob'); assert 'torch' not in sys.modules"
+        "import sys, mstfilter\n"
+        "f = mstfilter.preset('mst', 'proposal.boundary=cob', 'proposal.boundary.weights=a', 'proposal.tree=cob',\n"
+        "    'transition.tracker=siammask', 'transition.tracker.weights=b')\n"
+        "assert (f.proposal.boundary.weights, f.transition.tracker.weights) == ('a', 'b')\n"
+        "assert 'torch' not in sys.modules"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
 
@@ -438,8 +431,3 @@ def test_weights_of_other_networks_are_one_clear_error(blobs):
         with pytest.raises(InputError) as caught:
             network.load_caffe(changed)
         assert message in caught.value.message
-
-
-def test_a_preset_names_it(model):
-    mst = preset("mst", "proposal.boundary=cob", f"proposal.boundary.weights={Path(model)}", "proposal.tree=ucm")
-    assert mst.proposal.boundary == CobBoundary(str(model))

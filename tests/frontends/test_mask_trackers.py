@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
 import sys
 import types
 from dataclasses import dataclass, field, replace
@@ -14,7 +13,6 @@ import pytest
 from mstfilter.errors import InputError, MissingLibraryError
 from mstfilter.frontends import CutieTracker, Sam2Tracker
 from mstfilter.frontends.mask_trackers import disjoint_groups
-from mstfilter.presets import preset
 from mstfilter.registry import load_file
 from mstfilter.resources import models_folder
 from mstfilter.scene import Camera, Clip, Frame, Hypothesis, read_rgb, render
@@ -126,17 +124,9 @@ def test_outputs_have_the_published_sizes(tensors):
     network.load_state(tensors)
     rng = torch.Generator().manual_seed(1)
     with torch.inference_mode():
-        stages, reduced = network.features(torch.rand(1, 3, 127, 127, generator=rng))
-        assert [tuple(x.shape[1:]) for x in stages] == [(64, 61, 61), (256, 31, 31), (512, 15, 15), (1024, 15, 15)]
-        assert reduced.shape == (1, 256, 7, 7)
         template = network.template(255 * torch.rand(1, 3, 127, 127, generator=rng))
         score, boxes, features = network.search(template, 255 * torch.rand(1, 3, 255, 255, generator=rng))
-        assert [tuple(x.shape[1:]) for x in features[0]] == [
-            (64, 125, 125),
-            (256, 63, 63),
-            (512, 31, 31),
-            (1024, 31, 31),
-        ]
+        assert template.shape == (1, 256, 7, 7)
         assert score.shape == (2, 5, 25, 25)
         assert boxes.shape == (4, 5, 25, 25)
         for at in ((0, 0), (12, 7), (24, 24)):
@@ -422,18 +412,6 @@ def test_checkpoints_that_cannot_be_used_are_one_clear_error(checkpoint, tensors
     ):
         with pytest.raises(InputError, match=message):
             tracker.track(clip, masks[:1])
-
-
-def test_a_preset_names_it_without_importing_torch():
-    code = (
-        "import sys, mstfilter\n"
-        "f = mstfilter.preset('paper', 'transition.tracker=siammask', 'transition.tracker.weights=x.pth')\n"
-        "assert f.transition.tracker.weights == 'x.pth' and 'torch' not in sys.modules"
-    )
-    subprocess.run([sys.executable, "-c", code], check=True)
-    paper = preset("paper")
-    assert paper.transition.tracker is None
-    assert replace(paper.transition, tracker=SiamMaskTracker("x.pth")).tracker.step == 1
 
 
 class Predictor:
