@@ -107,7 +107,6 @@ class CutSample:
     """Cuts drawn from a tree."""
 
     cuts: tuple[np.ndarray, ...]  #: ascending nodes of each cut
-    values: np.ndarray  #: (n,) v(c) of each cut
     log_p: np.ndarray  #: (n,) log of the sampler's target law relative to the optimal cut
     diagnostics: dict[str, Any] = field(default_factory=dict)  #: statistics of the draw; JSON types only
 
@@ -174,8 +173,7 @@ class OptimalCut(CutSampler):
 
     def sample(self, rng: np.random.Generator, tree: Tree, w: np.ndarray, n: int) -> CutSample:
         cut = optimal_cut(tree, w)
-        value = float(np.asarray(w, dtype=np.float64)[cut].sum())
-        return CutSample((cut,) * n, np.full(n, value), np.zeros(n), {"size_of_best": len(cut)})
+        return CutSample((cut,) * n, np.zeros(n), {"size_of_best": len(cut)})
 
 
 @dataclass(frozen=True, eq=False)
@@ -227,8 +225,7 @@ class ExactCuts(CutSampler):
         w = check_values(tree, w)
         law = gibbs(tree, w, 1 / self.temperature)
         cuts = [np.sort(np.array(law.draw(rng.random, tree.root), dtype=np.int64)) for _ in range(n)]
-        v = np.array([w[cut].sum() for cut in cuts])
+        best = w[optimal_cut(tree, w)].sum()
+        log_p = np.array([w[cut].sum() - best for cut in cuts]) / self.temperature
         distinct = len({cut.tobytes() for cut in cuts}) / max(n, 1)
-        return CutSample(
-            tuple(cuts), v, (v - w[optimal_cut(tree, w)].sum()) / self.temperature, {"distinct": distinct}
-        )
+        return CutSample(tuple(cuts), log_p, {"distinct": distinct})

@@ -30,15 +30,13 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from math import exp, inf, log
-from typing import Any, Literal, NamedTuple, TypeVar
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
 from mstfilter.fields import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, Share
 from mstfilter.segmentation.cuts import CutSample, CutSampler, Gibbs, check_values, gibbs, optimal_cut
 from mstfilter.segmentation.tree import Tree
-
-_Value = TypeVar("_Value", float, np.ndarray)
 
 
 class Move(NamedTuple):
@@ -234,28 +232,17 @@ class SubtreeRedraw(MoveRule):
         return Move(removed, added, self.law.b * (old - new))  # log of exp(b v(old)) / exp(b v(new))
 
 
-def log_target(value: _Value, best: float, s2: float, temperature: float) -> _Value:
-    """Log probability of cuts with these values relative to the optimal cut."""
-    if temperature > 0:
-        return (value - best) / temperature
-    return -((best - value) ** 2) / s2
-
-
 LOCAL_MOVES: dict[str, type[MoveRule]] = {"node": NodeMoves, "authors": AuthorsMoves}
 
 
 class CutChain:
     """A Metropolis-Hastings chain over cuts from an initial cut, one step at a time.
 
-    `best` is v(c*). The target is the law of the paper with scale `s2`, in squared units of value, or with a
-    `temperature` the Gibbs law.
+    The target is the law with ``log_p(value)``, the log probability of a cut with this value, up to a constant.
     """
 
-    def __init__(
-        self, tree: Tree, w: np.ndarray, best: float, s2: float, cut: np.ndarray, temperature: float = 0.0
-    ) -> None:
-        self.tree, self.w = tree, w.tolist()
-        self.best, self.s2, self.temperature = best, s2, temperature
+    def __init__(self, tree: Tree, w: np.ndarray, log_p: Callable[[float], float], cut: np.ndarray) -> None:
+        self.tree, self.w, self.log_p = tree, w.tolist(), log_p
         self.steps = self.accepted = 0
         self.restart(cut)
 
@@ -274,8 +261,7 @@ class CutChain:
             value -= self.w[x]
         for x in move.added:
             value += self.w[x]
-        law = self.best, self.s2, self.temperature
-        return move, value, log_target(value, *law) - log_target(self.value, *law) + move.log_ratio
+        return move, value, self.log_p(value) - self.log_p(self.value) + move.log_ratio
 
     def step(self, random: Callable[[], float], rule: MoveRule) -> None:
         """One step under a rule."""
@@ -332,13 +318,18 @@ class MetropolisHastingsCuts(CutSampler):
         optimal = optimal_cut(tree, w)
         best = float(w[optimal].sum())
         s2 = max(self.sigma2 * best**2, 1e-300)
+
+        def log_p(value: float) -> float:
+            """Log probability of a cut relative to the optimal cut."""
+            return (value - best) / self.temperature if self.temperature > 0 else -((best - value) ** 2) / s2
+
         local = LOCAL_MOVES[self.moves]()
         redraw = None
         if self.redraw_share > 0 and self.temperature > 0:
             redraw = SubtreeRedraw(gibbs(tree, w, 1 / self.temperature))
         random = _uniforms(rng).__next__
 
-        chain = CutChain(tree, w, best, s2, optimal, self.temperature)
+        chain = CutChain(tree, w, log_p, optimal)
         trace: list[float] = []
 
         def advance(n_steps: int) -> None:
@@ -366,7 +357,6 @@ class MetropolisHastingsCuts(CutSampler):
                 cut = draw()
             seen.add(cut.tobytes())
             cuts.append(cut)
-        v = np.array([w[cut].sum() for cut in cuts])
         diagnostics: dict[str, Any] = {
             "steps": chain.steps,
             "acceptance": chain.accepted / chain.steps if chain.steps else 0.0,
@@ -375,7 +365,7 @@ class MetropolisHastingsCuts(CutSampler):
         }
         if not self.restart:
             diagnostics["autocorrelation_steps"] = _autocorrelation(np.array(trace[self.burn_in :]))
-        return CutSample(tuple(cuts), v, log_target(v, best, s2, self.temperature), diagnostics)
+        return CutSample(tuple(cuts), np.array([log_p(float(w[cut].sum())) for cut in cuts]), diagnostics)
 
 
 def _uniforms(rng: np.random.Generator) -> Iterator[float]:

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from mstfilter import preset
-from mstfilter.errors import InputError
 from mstfilter.smc import Population
 from mstfilter.tracking.registration import SmallGicp, centroid_shift, prepare
 from mstfilter.tracking.rigid import move_points
@@ -55,8 +54,3 @@ def test_registration_from_the_centroid_reaches_far_motions():
 @pytest.mark.parametrize("n", [0, 1, 11])
 def test_too_few_points_cannot_be_registered(n):
     assert prepare(np.random.default_rng(0).normal(size=(n, 3))) is None
-
-
-def test_an_unknown_method_raises_an_error():
-    with pytest.raises(InputError, match="method is 'icp', expected GICP, PLANE_ICP or ICP"):
-        SmallGicp("icp")

@@ -5,7 +5,6 @@ import pytest
 from hypothesis import given, settings, strategies as st
 from scipy.spatial.transform import Rotation
 
-from mstfilter.errors import InputError
 from mstfilter.scene import Hypothesis, ObjectView, Occupancy, VoxelGrid
 from mstfilter.tracking.rigid import rigid_transform
 from mstfilter.tracking.transition import Warp
@@ -197,10 +196,3 @@ def test_single_voxels_survive_any_turn():
     h = hypothesis(((10, 10, 3), (11, 11, 4)))
     for deg in range(0, 90, 7):
         assert move(Warp(), h, {1: turn(deg, (0.0132, 0.0047, 0))}).hypothesis.n_objects == 1
-
-
-def test_unknown_options_raise_an_error():
-    with pytest.raises(InputError):
-        Warp("push")
-    with pytest.raises(InputError):
-        Warp(collisions="random")
