@@ -7,11 +7,8 @@ from functools import cache
 from xml.etree import ElementTree
 
 import numpy as np
-import pytest
-from hypothesis import given, settings, strategies as st
 
 from mstfilter.files import read_csv
-from mstfilter.segmentation import MergeLogOdds, optimal_cut
 from tests.experiments.scripts import EXPERIMENTS, own_modules, run_script
 from tests.report.test_study_report import make_study
 from tests.segmentation.trees import all_cuts, random_tree
