@@ -5,7 +5,8 @@
     python experiments/paper_figures/make.py quality_over_time --study studies/main
     python experiments/paper_figures/make.py --smoke --out DIR     # all at small size, a minute
 
-`merging` needs the authors' particles (r1.py) and is left out, with a message, if these are missing; `quality_over_time` needs the folder of a study.
+`merging` needs the authors' particles (r1.py) and is left out, with a message, if these are missing;
+`quality_over_time` needs the folder of a study.
 """
 
 from __future__ import annotations

@@ -180,21 +180,6 @@ def test_tracking_rules(tmp_path):
     assert float(rows["identity"]["iou_moved"]) < 0.9
 
 
-def test_resamplers_of_other_libraries(tmp_path):
-    """The table names the faults of filterpy: residual resampling that drops light particles, and n to n only."""
-    run_script("peer_resamplers/run.py", "--smoke", "--only", "filterpy", "--out", tmp_path)
-    rows = {(r["kind"], r["test"]): r for r in read_csv(tmp_path / "table.csv")}
-    assert {r["scheme"] for r in rows.values()} == {"residual"}
-    fault = rows["contract", "carried_weight"]
-    assert (
-        fault["outcome"] == "wrong" and "copies are biased" in fault["why"] and "are never selected" in fault["why"]
-    )
-    assert rows["direct call", "any_size"]["outcome"] == "error"
-    assert rows["contract", "ancestors_in_range"]["outcome"] == "holds"
-    filters = {(r["library"], r["scheme"]) for r in read_csv(tmp_path / "filters.csv")}
-    assert filters >= {("mstfilter", "systematic"), ("filterpy", "residual")}
-
-
 def test_miniature(tmp_path):
     run_script("miniature/run.py", "--smoke", "--out", tmp_path)
     rows = {(r["world"], r["n"], r["arm"]): float(r["tv"]) for r in read_csv(tmp_path / "distances.csv")}
