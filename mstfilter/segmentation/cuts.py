@@ -25,7 +25,7 @@ import numpy as np
 from mstfilter.errors import InputError
 from mstfilter.fields import PositiveFloat
 from mstfilter.results import Checked, check_array, check_list, check_type, returns
-from mstfilter.scene import Frame
+from mstfilter.scene import Frame, scaled_area
 from mstfilter.segmentation.boundary import pixels_above_table
 from mstfilter.segmentation.tree import Tree
 
@@ -34,7 +34,7 @@ _START_SCALE = 0.3  # tolerance for boundaries inside the region, in P(boundary)
 _END_SCALE = 0.7  # tolerance for a weak outer boundary, in P(boundary)
 _POWER = 0.95  # exponent of the area; below 1 favours larger regions
 _FLOOR = 1e-3  # objectness of a region outside the area limits
-_MIN_AREA, _MAX_AREA = 1000 / 307200, 150000 / 307200  # fractions of the image
+_MIN_AREA, _MAX_AREA = 1000, 150000  # pixels of a 640 x 480 image
 
 _CLIP = 1e-3  # `MergeLogOdds` clips probabilities to _CLIP .. 1 - _CLIP
 
@@ -75,9 +75,9 @@ class SceneCutObjectness(CutValue):
             area = foreground + background
         else:
             limited = np.ones(len(area), dtype=bool)
-        fraction = area / tree.leaves.size
+        smallest, largest = (scaled_area(limit, tree.leaves.size) for limit in (_MIN_AREA, _MAX_AREA))
         log_s = np.log(0.5) - (tree.start / _START_SCALE) ** 2 - ((1 - tree.end) / _END_SCALE) ** 2
-        outside = limited & ((fraction < _MIN_AREA) | (fraction > _MAX_AREA))
+        outside = limited & ((area < smallest) | (area > largest))
         return np.where(outside, np.log(_FLOOR), log_s) * area**_POWER
 
 

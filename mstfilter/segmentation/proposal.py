@@ -22,7 +22,17 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 
 from mstfilter.completion import ClipCompleter, Completer, Completion, Extrude, arbitrate, occupancy_of
-from mstfilter.scene import Clip, Frame, Hypothesis, ObjectRecord, VoxelGrid, component_key, memo
+from mstfilter.scene import (
+    Clip,
+    Frame,
+    Hypothesis,
+    ObjectRecord,
+    VoxelGrid,
+    component_key,
+    memo,
+    scaled_area,
+    scaled_length,
+)
 from mstfilter.segmentation.boundary import BoundaryModel, ClipBoundary, ColourDepthBoundary, pixels_above_table
 from mstfilter.segmentation.cuts import CutSampler, CutValue, MergeLogOdds, optimal_cut
 from mstfilter.segmentation.learned_tree import LearnedTree
@@ -72,11 +82,10 @@ class ObjectRule:
         pixels = self.object_pixels(frame, grid)
         readings = tree.accumulate_pixels(frame.valid)
         points = tree.accumulate_pixels(pixels)
-        core = _core(tree, pixels, max(1, round(_CORE_RADIUS * frame.camera.width / 640)))
-        resize = pixels.size / 307200
+        core = _core(tree, pixels, max(1, round(scaled_length(_CORE_RADIUS, frame.camera.width))))
         is_object = (
-            (points >= max(1.0, self.min_points * resize))
-            & (core >= _MIN_CORE * resize)
+            (points >= max(1.0, scaled_area(self.min_points, pixels.size)))
+            & (core >= scaled_area(_MIN_CORE, pixels.size))
             & (points >= _MIN_RAISED * readings)
             & (readings >= _MIN_READINGS * tree.area)
         )

@@ -95,13 +95,6 @@ def test_a_stochastic_rule_moves_copies_differently_and_repeats_with_the_seed(te
     assert grids != [p.labels.tobytes() for p in c.particles]
 
 
-def test_equal_hypotheses_are_tracked_once(textured):
-    scene, clip = textured
-    moved = predict(clip, *[scene.hypothesis()] * 100)
-    assert len(moved) == 100 and moved.notes["segments"] == 6
-    assert len({p.labels.tobytes() for p in moved.particles}) == 1
-
-
 def test_without_video_no_object_moves(textured):
     scene, clip = textured
     h = scene.hypothesis()
