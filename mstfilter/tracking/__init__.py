@@ -13,7 +13,6 @@
 `registration`         ICP by small_gicp
 `residual`             comparison of a motion with the last frame, refinement
 `rigid`                rigid motions from point pairs, J-Linkage
-`motion_segmentation`  pixels of the last frame grouped by rigid motion
 =====================  ====================================================================
 """
 

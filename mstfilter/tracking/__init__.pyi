@@ -1,6 +1,5 @@
 from mstfilter.tracking.features import Matches as Matches, SiftMatching as SiftMatching
 from mstfilter.tracking.flow import ClipTracks as ClipTracks, DenseFlow as DenseFlow
-from mstfilter.tracking.motion_segmentation import MotionSegmentation as MotionSegmentation
 from mstfilter.tracking.registration import (
     Registration as Registration,
     RegistrationResult as RegistrationResult,

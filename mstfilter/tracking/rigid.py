@@ -10,9 +10,6 @@ Components exchange single motions as scipy `RigidTransform`; `rigid_transform` 
 >>> bool(np.allclose(T[:3, 3], [0.1, 0.0, 0.0]))
 True
 
-A least-squares fit depends on 18 sums over the point pairs. The sums of a union of groups are the sums of its parts,
-so `pair_sums` and `fit_sums` fit unions without reading the points again.
-
 J-Linkage (Toldo and Fusiello, ECCV 2008) finds all rigid motions among point matches when their number is unknown.
 The preference set of a match contains the sampled motions that explain it. Matches are merged bottom-up by the
 Jaccard distance of their sets, and a merged cluster keeps the intersection, so at least one motion explains all its
@@ -30,7 +27,6 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-_N_SUMS = 18  # n, sum p (3), sum q (3), sum p q^T (9), sum |p|^2, sum |q|^2
 _MAX_CLUSTERED = 300  # J-Linkage clusters a random subset of more matches: its cost grows with N^2
 
 
@@ -77,12 +73,7 @@ def kabsch(p: np.ndarray, q: np.ndarray, weights: np.ndarray | None = None) -> n
     mean_p = np.einsum("...n,...ni->...i", w, p)
     mean_q = np.einsum("...n,...ni->...i", w, q)
     covariance = np.einsum("...n,...ni,...nj->...ij", w, p - mean_p[..., None, :], q - mean_q[..., None, :])
-    return _from_covariance(covariance, mean_p, mean_q)[0]
-
-
-def _from_covariance(covariance: np.ndarray, mean_p: np.ndarray, mean_q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Motion and the sum s1 + s2 + d s3 from C = sum (p - mean p)(q - mean q)^T."""
-    U, s, Vt = np.linalg.svd(covariance)
+    U, _, Vt = np.linalg.svd(covariance)
     d = np.where(np.linalg.det(U) * np.linalg.det(Vt) < 0.0, -1.0, 1.0)
     signs = np.ones(covariance.shape[:-1])
     signs[..., 2] = d
@@ -91,45 +82,7 @@ def _from_covariance(covariance: np.ndarray, mean_p: np.ndarray, mean_q: np.ndar
     T[..., :3, :3] = R
     T[..., :3, 3] = mean_q - np.einsum("...ij,...j->...i", R, mean_p)
     T[..., 3, 3] = 1.0
-    return T, (s * signs).sum(axis=-1)
-
-
-def pair_sums(p: np.ndarray, q: np.ndarray, group: np.ndarray, n_groups: int) -> np.ndarray:
-    """The 18 additive sums (n_groups, 18) of each group of point pairs.
-
-    `p` and `q` (N, 3) are relative to one common origin near them, against cancellation; `group` (N,) is the number
-    of the group of each pair.
-    """
-    columns = np.empty((len(p), _N_SUMS))
-    columns[:, 0] = 1.0
-    columns[:, 1:4] = p
-    columns[:, 4:7] = q
-    columns[:, 7:16] = (p[:, :, None] * q[:, None, :]).reshape(len(p), 9)
-    columns[:, 16] = np.einsum("ni,ni->n", p, p)
-    columns[:, 17] = np.einsum("ni,ni->n", q, q)
-    out = np.empty((n_groups, _N_SUMS))
-    for c in range(_N_SUMS):
-        out[:, c] = np.bincount(group, weights=columns[:, c], minlength=n_groups)
-    return out
-
-
-def fit_sums(sums: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Least-squares motions T (..., 4, 4) and squared residuals (...) from the sums (..., 18) of `pair_sums`.
-
-    T is the identity if the weight is zero. A residual is the sum of weighted squared distances
-    ``|R p + t - q|^2``, clipped at 0.
-    """
-    sums = np.asarray(sums, dtype=np.float64)
-    n = sums[..., 0]
-    safe = np.where(n > 0, n, 1.0)
-    mean_p = sums[..., 1:4] / safe[..., None]
-    mean_q = sums[..., 4:7] / safe[..., None]
-    cross = sums[..., 7:16].reshape(*sums.shape[:-1], 3, 3)
-    covariance = cross - n[..., None, None] * mean_p[..., :, None] * mean_q[..., None, :]
-    T, trace = _from_covariance(covariance, mean_p, mean_q)
-    spread = sums[..., 16] - n * (mean_p**2).sum(-1) + sums[..., 17] - n * (mean_q**2).sum(-1)
-    T[n <= 0] = np.eye(4)
-    return T, np.maximum(spread - 2.0 * trace, 0.0) * (n > 0)
+    return T
 
 
 def minimal_models(rng: np.random.Generator, p: np.ndarray, q: np.ndarray, eps: float, n_models: int) -> np.ndarray:
