@@ -14,13 +14,14 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from mstfilter.scene import Frame, fit_support_plane, scaled_length
+from mstfilter.scene import Frame, scaled_length
 from mstfilter.segmentation.boundary import (
     TABLE_TOLERANCE,
     above_table,
     curvature,
     filled_disparity,
     pixels_above_table,
+    posed_camera,
 )
 
 #: Bin width of the height histogram in metres; the last bin has no upper limit.
@@ -150,7 +151,7 @@ def _region_sums(region: np.ndarray, n: int, frame: Frame, bend: np.ndarray, see
     put("gram", *(a * b for a in terms for b in terms))
     put("moment", *(terms * d))
     put("square", d * d)
-    points = _in_world(frame)[at]
+    points = posed_camera(frame).unproject(frame.depth)[at]
     put("ground", points[:, 0], points[:, 1])
     put("spread", points[:, 0] ** 2 + points[:, 1] ** 2)
     put("bend", bend[at])
@@ -159,14 +160,6 @@ def _region_sums(region: np.ndarray, n: int, frame: Frame, bend: np.ndarray, see
     bins = np.clip(points[:, 2] / HEIGHT_BIN, 0, _BINS - 1).astype(np.int64)
     sums[:, REGION["heights"]] = np.bincount(which * _BINS + bins, minlength=n * _BINS).reshape(n, _BINS)
     return sums
-
-
-def _in_world(frame: Frame) -> np.ndarray:
-    """Points (H, W, 3) of all readings, world metres; without a camera pose, the table is fitted."""
-    camera = frame.camera
-    if camera.T_world_camera is None:
-        camera = camera.at(fit_support_plane(frame).T_world_camera)
-    return camera.unproject(frame.depth)
 
 
 def _raised(flat: np.ndarray, above: np.ndarray, mask: np.ndarray, areas: np.ndarray, fraction: float) -> np.ndarray:
