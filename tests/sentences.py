@@ -32,7 +32,7 @@ _BLOCKS = (
     r"<[^>\n]+>",
 )
 _ITEM = re.compile(r"^[ ]*(?:[-*] |\d+\. |: |[\w*, .]+ : )", re.MULTILINE)
-_END = re.compile(r"(?<=[.!?:])[\"')*]*\s+(?=[\"'(*`\[$]*[A-Z])")
+_END = re.compile(r"(?<=[.!?:])[\"')*]*\s+(?=[\"'(*\[$]*[A-Z`])")
 
 
 def sentences(text: str) -> Iterator[str]:
