@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
+from mstfilter.belief import Belief
 from mstfilter.files import write_csv
-from mstfilter.fusion import Belief
 from mstfilter.scene import Camera, Hypothesis, VoxelGrid, look_at, scene_cache
 from mstfilter.smc import Population
 

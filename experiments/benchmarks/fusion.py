@@ -19,9 +19,10 @@ import numpy as np
 from fusion_parents import GRID, N_OBJECTS, parents, table, table_labels
 
 from mstfilter import preset
+from mstfilter.crossover import Crossover, CrossoverUpdate, RandomOrder, conflict_graph
 from mstfilter.files import write_csv
-from mstfilter.fusion import Crossover, FusionUpdate, NoDivision, NoFreeSpace, RandomOrder, canonical, conflict_graph
-from mstfilter.scene import Camera, Clip, Frame, Hypothesis, look_at, render, scene_cache
+from mstfilter.partition import NoDivision
+from mstfilter.scene import Camera, Clip, Frame, Hypothesis, NoFreeSpace, canonical, look_at, render, scene_cache
 from mstfilter.smc import Population, Systematic
 from mstfilter.study import peak_megabytes
 
@@ -30,10 +31,10 @@ CAMERA = Camera.from_intrinsics(525, 525, 319.5, 239.5, 640, 480, look_at((0.0, 
 N, ETA, KEPT = 5, 5, 5
 
 
-def fusion_update(name: str) -> FusionUpdate:
+def fusion_update(name: str) -> CrossoverUpdate:
     """The update of a preset without division, which needs motion: the clip has one frame."""
     update = preset(name).update
-    assert isinstance(update, FusionUpdate)
+    assert isinstance(update, CrossoverUpdate)
     return replace(update, division=NoDivision(), eta=ETA)
 
 
@@ -116,7 +117,7 @@ def one_round(seed: int, n: int, order: np.random.Generator) -> dict[str, float]
         for i, j in pairs:
             crossover.cross(np.random.default_rng([seed, i, j]), proposed.particles[i], predicted.particles[j])
 
-    def step(update: FusionUpdate, lazy: bool) -> None:
+    def step(update: CrossoverUpdate, lazy: bool) -> None:
         fused = update.update(np.random.default_rng(seed), predicted, proposed, clip)
         candidates = fused.particles
         fused = fused if lazy else fused.realised()

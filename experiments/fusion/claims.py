@@ -22,9 +22,9 @@ from pathlib import Path
 import numpy as np
 
 import mstfilter
+from mstfilter.crossover import Claims
 from mstfilter.files import write_csv
 from mstfilter.formats import open_recording
-from mstfilter.fusion import Claims
 from mstfilter.simulation import cached_recording
 
 CLEARED = (0.01, 0.03, 0.06, 1.0)

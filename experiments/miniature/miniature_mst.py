@@ -27,8 +27,9 @@ import numpy as np
 from miniature_filters import PriorProposal, PushTransition, state_weights
 from miniature_world import Miniature, Observation, draw_states
 
-from mstfilter.fusion import Claims, Evidence, FusionUpdate, NoDivision, Projection
-from mstfilter.scene import Hypothesis
+from mstfilter.crossover import Claims, CrossoverUpdate
+from mstfilter.partition import NoDivision
+from mstfilter.scene import Evidence, Hypothesis, Projection
 from mstfilter.smc import (
     Multinomial,
     ParticleFilter,
@@ -168,7 +169,7 @@ def adapt_to_miniature(
 ) -> ParticleFilter:
     """A filter of MST on the miniature world, with `n` particles and `n` samples per step.
 
-    The update of `filter` must be a `FusionUpdate`. `weight_rule` and `include_optimal` are fields of `CutProposal`;
+    The update of `filter` must be a `CrossoverUpdate`. `weight_rule` and `include_optimal` are fields of `CutProposal`;
     give those of the preset's proposal.
     """
     crossover = filter.update.crossover
@@ -207,7 +208,7 @@ class ScoredFusion(Update):
     Parameters
     ----------
     world : Miniature
-    fusion : FusionUpdate
+    fusion : CrossoverUpdate
         Makes the candidates.
     built_per_particle : int
         Number of candidates that are built per predicted particle. 0: no crossover; needs `include_parents`.
@@ -220,7 +221,7 @@ class ScoredFusion(Update):
     """
 
     world: Miniature
-    fusion: FusionUpdate
+    fusion: CrossoverUpdate
     built_per_particle: int = 4
     distinct: bool = False
     predictive: bool = False

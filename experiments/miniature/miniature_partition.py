@@ -26,8 +26,8 @@ from scipy.optimize import minimize
 from scipy.special import expit
 
 from mstfilter.completion import Completion
-from mstfilter.fusion import Cells, Evidence, PairEvidence, PairOdds, PartitionUpdate
-from mstfilter.scene import Hypothesis, Occupancy, VoxelGrid
+from mstfilter.partition import Cells, PairEvidence, PairOdds, PartitionUpdate
+from mstfilter.scene import Evidence, Hypothesis, Occupancy, VoxelGrid
 from mstfilter.smc import ParticleFilter, Population, Systematic, Transition, Update
 
 OWN, FREE, BEHIND, OTHER, HIDDEN = range(5)  # what an observation shows of a cell; a view has the first three

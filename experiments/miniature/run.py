@@ -42,7 +42,7 @@ from scipy import stats
 
 import mstfilter
 from mstfilter.files import write_csv
-from mstfilter.fusion import PairEvidence
+from mstfilter.partition import PairEvidence
 from mstfilter.smc import FearnheadClifford, KeepWeights, Multinomial, ParticleFilter, Systematic
 
 HERE = Path(__file__).resolve().parent

@@ -16,7 +16,7 @@ from canvas import INK, MUTED, page, save, show, voxels, write_rows
 from matplotlib.axes import Axes
 from r1 import NOTICE, Particles, folder
 
-from mstfilter.fusion import (
+from mstfilter.crossover import (
     PREDICTED,
     PROPOSED,
     ConflictGraph,

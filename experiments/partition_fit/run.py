@@ -1,4 +1,4 @@
-"""How much do samples and predictions say about two cells? Fits `mstfilter.fusion.cells.PairEvidence`.
+"""How much do samples and predictions say about two cells? Fits `mstfilter.partition.PairEvidence`.
 
     python experiments/partition_fit/run.py [--seeds 3] [--smoke --out FOLDER]
 
@@ -26,8 +26,8 @@ from scipy.optimize import minimize
 import mstfilter
 from mstfilter.completion import SurfaceOnly
 from mstfilter.files import write_csv
-from mstfilter.fusion import Cells, PairEvidence, PairOdds
 from mstfilter.oracles.truth import RecordingTruth
+from mstfilter.partition import Cells, PairEvidence, PairOdds
 from mstfilter.scene import Clip
 from mstfilter.simulation import cached_recording
 from mstfilter.smc import Key

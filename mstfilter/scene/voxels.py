@@ -420,3 +420,16 @@ class Hypothesis:
     def mask(self, label: int) -> np.ndarray:
         """(X, Y, Z) bool: the voxels of an object."""
         return self.labels == label
+
+
+def check_grid(name: str, hypothesis: Hypothesis, grid: VoxelGrid) -> None:
+    """Raise InputError if a hypothesis has another grid."""
+    if hypothesis.grid != grid:
+        found, expected = (
+            f"{g.shape} voxels of {g.voxel_size:g} m at {g.origin.tolist()}" for g in (hypothesis.grid, grid)
+        )
+        raise InputError(
+            f"grid of {name} is {found}, expected {expected}",
+            "all hypotheses of a run share the workspace of its clips",
+            "parts of one session: open the later part with later.in_world_of(first)",
+        )

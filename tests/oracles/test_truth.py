@@ -10,7 +10,6 @@ import pytest
 from scipy.ndimage import distance_transform_edt
 
 from mstfilter.errors import InputError
-from mstfilter.fusion import Cells, PartitionUpdate
 from mstfilter.oracles import (
     TrueBoundary,
     TrueCompletion,
@@ -25,6 +24,7 @@ from mstfilter.oracles import (
     uses_truth,
 )
 from mstfilter.oracles.truth import RecordingTruth
+from mstfilter.partition import Cells, PartitionUpdate
 from mstfilter.presets import build_filter, describe_filter, load_config
 from mstfilter.runs import filter_recording
 from mstfilter.scene import Hypothesis

@@ -13,7 +13,9 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from mstfilter.completion import Completer, Extrude
-from mstfilter.fusion import Division, Evidence, PairOdds, Projection, SpanningTree, Structure
+from mstfilter.crossover import SpanningTree, Structure
+from mstfilter.partition import Division, PairOdds
+from mstfilter.scene import Evidence, Projection
 from mstfilter.segmentation import (
     BoundaryModel,
     ColourDepthBoundary,

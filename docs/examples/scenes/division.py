@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
-from mstfilter.fusion import Division
+from mstfilter.partition import Division
 from mstfilter.scene import Clip
 
 

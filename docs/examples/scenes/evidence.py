@@ -11,8 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mstfilter.fusion import Evidence
-from mstfilter.scene import Clip, Hypothesis
+from mstfilter.scene import Clip, Evidence, Hypothesis
 from mstfilter.testing import scene_example
 
 

@@ -1,0 +1,22 @@
+"""The published measurement update: every sample is crossed with every prediction (paper, section IV-D).
+
+>>> fused = CrossoverUpdate().update(rng, predicted, proposed, clip)     # candidates, with weights
+
+============  ==========================================================================================
+`update`      `CrossoverUpdate`: free-space projection, pairs of hypotheses, and their weights
+`conflicts`   the conflict graph of two hypotheses (networkx), painting orders, merge probabilities
+`cross`       makes one hypothesis of two, and smooths the result by a mode filter
+============  ==========================================================================================
+"""
+
+from mstfilter.lazy import attach
+
+__getattr__, __dir__, __all__ = attach(__name__, __file__)
+
+__interfaces__ = {"crossover": "Crossover", "structure": "Structure", "mode_filter": "ModeFilter"}
+__components__ = {
+    "update": {"crossover": "CrossoverUpdate"},
+    "crossover": {"conflict_graph": "Crossover"},
+    "structure": {"one_side_last": "OneSideLast", "random_order": "RandomOrder", "spanning_tree": "SpanningTree"},
+    "mode_filter": {"majority": "ModeFilter"},
+}

@@ -1,0 +1,88 @@
+"""Similarity of hypotheses: all pairs at once against one pair at a time; equality up to the names of labels."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from mstfilter.belief import SameSegmentation, WeightedCoverage
+from mstfilter.errors import InputError
+from mstfilter.presets import REGISTRY
+from mstfilter.scene import Hypothesis, VoxelGrid, canonical
+from mstfilter.scoring import weighted_coverage
+from mstfilter.smc import Coalesced, KDpp, Population
+from mstfilter.testing import scene_example
+
+GRID = VoxelGrid(np.zeros(3), 0.01, (6, 5, 4))
+
+
+def hypotheses(n, seed=0):
+    rng = np.random.default_rng(seed)
+    grids = [rng.integers(0, rng.integers(1, 6), GRID.shape) * rng.integers(0, 2, GRID.shape) for _ in range(n)]
+    grids[1] = np.zeros(GRID.shape, int)  # two without objects, one with gaps, one without free space
+    grids[2] = np.zeros(GRID.shape, int)
+    grids[3] = grids[3] * 7
+    grids[4] = np.ones(GRID.shape, int)
+    return [Hypothesis.from_labels(g, GRID) for g in grids]
+
+
+def test_all_pairs_equal_one_pair_at_a_time():
+    particles = hypotheses(9)
+    found = WeightedCoverage().matrix(particles)
+    want = [[weighted_coverage(a.labels, b.labels) for b in particles] for a in particles]
+    np.testing.assert_allclose(found, want, atol=1e-12)
+    coarse = WeightedCoverage(stride=2).matrix(particles)
+    want = [
+        [weighted_coverage(a.labels[::2, ::2, ::2], b.labels[::2, ::2, ::2]) for b in particles] for a in particles
+    ]
+    np.testing.assert_allclose(coarse, want, atol=1e-12)
+
+
+def test_hypotheses_without_any_object():
+    empty = Hypothesis.from_labels(np.zeros(GRID.shape, int), GRID)
+    np.testing.assert_array_equal(WeightedCoverage().matrix([empty, empty]), np.ones((2, 2)))
+    with pytest.raises(InputError, match="stride"):
+        WeightedCoverage(stride=0)
+    other = VoxelGrid(np.zeros(3), 0.01, (2, 2, 2))
+    with pytest.raises(InputError, match="shapes"):
+        WeightedCoverage().matrix([empty, Hypothesis.from_labels(np.zeros((2, 2, 2), int), other)])
+
+
+def test_renamed_labels_are_equal():
+    a = np.array([[[0, 5, 5, 2]]])
+    b = np.array([[[0, 1, 1, 9]]])
+    c = np.array([[[3, 1, 1, 9]]])
+    np.testing.assert_array_equal(canonical(a), [[[0, 1, 1, 2]]])
+    np.testing.assert_array_equal(canonical(c), [[[1, 2, 2, 3]]])
+    grid = VoxelGrid(np.zeros(3), 0.01, (1, 1, 4))
+    particles = [Hypothesis.from_labels(x, grid) for x in (a, b, c, a)]
+    np.testing.assert_array_equal(SameSegmentation().classes(particles), [0, 0, 1, 0])
+
+
+def test_resamplers_of_hypotheses():
+    particles = hypotheses(8)
+    population = Population((*particles, particles[0], particles[5]), np.log(np.arange(1.0, 11)))
+    rng = np.random.default_rng(0)
+    merged = Coalesced(equivalence=SameSegmentation()).resample(rng, population, 4)
+    assert merged.notes["distinct"] == 7
+    classes = SameSegmentation().classes(merged.particles)
+    assert len(set(classes.tolist())) == len(merged) == 4
+    chosen = KDpp(similarity=WeightedCoverage()).resample(rng, population, 3)
+    assert len(set(SameSegmentation().classes(chosen.particles).tolist())) == 3
+    assert chosen.notes["kdpp"].endswith("of 3")
+
+
+def test_diverse_resampling_from_configuration():
+    """As a preset file names it."""
+    config = {
+        "component": "coalesced",
+        "equivalence": "same_segmentation",
+        "scheme": {"component": "kdpp", "similarity": {"component": "weighted_coverage", "stride": 2}},
+    }
+    scheme = REGISTRY.build("resampler", config)
+    assert scheme == Coalesced(KDpp(WeightedCoverage(2)), SameSegmentation())
+    assert REGISTRY.build("resampler", REGISTRY.describe(scheme)) == scheme
+    population, _ = scene_example(np.random.default_rng(0), 40)
+    chosen = scheme.resample(np.random.default_rng(1), population, 3)
+    assert chosen.notes["distinct"] == len(set(SameSegmentation().classes(population.particles).tolist()))
+    assert len(set(SameSegmentation().classes(chosen.particles).tolist())) == 3

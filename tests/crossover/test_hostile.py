@@ -1,0 +1,293 @@
+"""Unusual input to fusion: it is fused correctly or raises one clear error."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mstfilter.belief import Agreement
+from mstfilter.crossover import (
+    Claims,
+    Crossover,
+    CrossoverUpdate,
+    ModeFilter,
+    OneSideLast,
+    RandomOrder,
+    SpanningTree,
+    conflict_graph,
+)
+from mstfilter.errors import InputError
+from mstfilter.scene import MAX_LABEL, Clip, Frame, FreeSpace, Hypothesis, VoxelGrid
+from mstfilter.smc import Population
+from tests.scene.scenes import CAMERA, GRID, table_scene
+
+SMALL = VoxelGrid((0, 0, 0), 0.01, (9, 8, 7))
+A, B = (np.random.default_rng(k).choice([0, 0, 1, 2, 3], SMALL.shape).astype(np.uint16) for k in (1, 2))
+FILTERS = [ModeFilter(3, 2, 24, scope=scope) for scope in ("everywhere", "disputed")]
+RGB, DEPTH, LABELS = table_scene()
+CLIP = Clip((Frame(RGB, DEPTH, CAMERA),), GRID, 1)
+
+
+def on(labels, grid=SMALL, birth=0):
+    return Hypothesis.from_labels(labels, grid, birth)
+
+
+def mixed(proposed, predicted, seed=0, **fields):
+    return Crossover(**{"mode_filter": FILTERS[0], **fields}).cross(np.random.default_rng(seed), proposed, predicted)
+
+
+@pytest.mark.parametrize(
+    ("grid", "found"),
+    [
+        (VoxelGrid((0, 0, 0), 0.01, (9, 8, 6)), r"\(9, 8, 6\)"),
+        (VoxelGrid((0, 0, 0), 0.02, SMALL.shape), "0.02 m"),
+        (VoxelGrid((0, 0, 0.07), 0.01, SMALL.shape), "0.07"),
+    ],
+    ids=["shape", "voxel size", "origin"],
+)
+def test_grids_that_differ(grid, found):
+    other = on(np.ones(grid.shape, int), grid)
+    for parents in ((on(A), other), (other, on(A)), (on(0 * A), other)):  # an empty one too
+        with pytest.raises(InputError, match=f"grid of the proposed hypothesis is .*{found}") as caught:
+            mixed(*parents)
+        assert caught.value.hints
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (((0, 0, 0), 0.01, (0, 8, 7)), r"shape is \(0, 8, 7\)"),
+        (((0, 0, 0), 0.01, (9, 8, 0)), r"shape is \(9, 8, 0\)"),
+        (((0, 0, 0), 0.01, (9.5, 8, 7)), r"shape is \(9.5, 8, 7\)"),
+        (((0, 0, 0), 0.01, 9), "shape is 9"),
+        (((0, 0, 0), "fine", (9, 8, 7)), "voxel size is 'fine'"),
+        (((0, 0, 0), [0.01, 0.02], (9, 8, 7)), "voxel size is .0.01, 0.02."),
+        (((0, 0, "low"), 0.01, (9, 8, 7)), "origin is .*low"),
+    ],
+)
+def test_invalid_grids_raise_an_error(arguments, message):
+    with pytest.raises(InputError, match=message):
+        VoxelGrid(*arguments)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        (-A.astype(int), "from -3 to 0"),
+        (A.astype(float), "type float64"),
+        (np.where(A > 0, np.nan, 0), "type float64"),
+        (A.astype(object), "type object"),
+        (A.astype(np.int64) + MAX_LABEL, "65538"),
+    ],
+    ids=["negative", "float", "nan", "object", "too large"],
+)
+def test_invalid_labels_raise_an_error(wrong, message):
+    good = on(A)
+    for call in (
+        lambda: on(wrong),
+        lambda: Hypothesis(wrong, SMALL, good.objects),
+        lambda: good.with_labels(wrong),
+        lambda: conflict_graph(wrong, B),
+        lambda: conflict_graph(B, wrong),
+        lambda: ModeFilter().apply(wrong),
+    ):
+        with pytest.raises(InputError, match=message) as caught:
+            call()
+        assert caught.value.hints
+
+
+def test_shapes_that_differ():
+    few = A[:3]
+    for call in (
+        lambda: on(few),
+        lambda: on(A).with_labels(few),
+        lambda: on(A).with_labels(np.zeros((1, 1, 1), int)),  # would broadcast
+        lambda: conflict_graph(A, few),
+        lambda: ModeFilter().apply(A[0]),
+        lambda: ModeFilter(scope="disputed").apply(A, few > 0),
+    ):
+        with pytest.raises(InputError, match="shape") as caught:
+            call()
+        assert (
+            str(few.shape) in str(caught.value) or "(1, 1, 1)" in str(caught.value) or "(8, 7)" in str(caught.value)
+        )
+
+
+def test_disputed_must_be_boolean():
+    with pytest.raises(InputError, match="disputed is float64"):
+        ModeFilter(scope="disputed").apply(A, np.ones(A.shape))
+
+
+def test_labels_without_a_record():
+    good = on(A)
+    with pytest.raises(InputError, match=r"no record for 1 labels \[2\], no voxel for 0 \[\]") as caught:
+        Hypothesis(A, SMALL, tuple(o for o in good.objects if o.label != 2))
+    assert caught.value.hints
+    with pytest.raises(InputError, match=r"no record for 0 labels \[\], no voxel for 1 \[2\]"):
+        Hypothesis(np.where(A == 2, 0, A), SMALL, good.objects)
+    with pytest.raises(InputError, match=r"no record for 1 labels \[77\]"):
+        good.with_labels(np.where(A == 2, 77, A))
+    many = np.arange(A.size).reshape(A.shape)
+    with pytest.raises(InputError, match=r"no record for 503 labels \[1, 2, 3, 4, 5\]"):
+        Hypothesis(many, SMALL)
+
+
+@pytest.mark.parametrize("structure", [RandomOrder(), SpanningTree(), OneSideLast()])
+def test_parents_without_objects(structure):
+    nothing, something = on(0 * A), on(A)
+    assert mixed(nothing, something, structure=structure) is something
+    assert mixed(something, nothing, structure=structure) is something
+    assert mixed(nothing, nothing, structure=structure).n_objects == 0
+    for n in (0, 3):
+        free = np.zeros((n, 4, 5), np.uint16)
+        graph = conflict_graph(free, free)
+        assert (len(graph), graph.edges.shape, graph.components()) == (0, (0, 2), [])
+        assert ModeFilter().apply(free).shape == free.shape
+
+
+LAYOUTS = {
+    "fortran": np.asfortranarray,
+    "reversed": lambda a: np.ascontiguousarray(a[::-1, :, ::-1])[::-1, :, ::-1],
+    "strided": lambda a: a.repeat(2, axis=1)[:, ::2],
+    "transposed": lambda a: np.ascontiguousarray(a.transpose(2, 0, 1)).transpose(1, 2, 0),
+    "big endian": lambda a: a.astype(">u2"),
+    "int64": lambda a: a.astype(np.int64),
+    "list": lambda a: a.tolist(),
+}
+
+
+@pytest.mark.parametrize("layout", LAYOUTS.values(), ids=LAYOUTS)
+@pytest.mark.parametrize("writeable", [True, False])
+def test_memory_layout_changes_nothing(layout, writeable):
+    a, b = layout(A), layout(B)
+    before = [np.array(a), np.array(b)]
+    if isinstance(a, np.ndarray):
+        a.flags.writeable = b.flags.writeable = writeable
+        plain, other = conflict_graph(A, B), conflict_graph(a, b)
+        for name in ("side", "label", "size", "edges", "intersection"):
+            np.testing.assert_array_equal(getattr(plain, name), getattr(other, name))
+        for filter in FILTERS:
+            expected = filter.apply(A, B > 0)
+            np.testing.assert_array_equal(
+                filter.apply(a, layout(B > 0) if layout is np.asfortranarray else B > 0), expected
+            )
+            assert not np.array_equal(expected, A), "the filter has work to do"
+    for filter in FILTERS:
+        child = mixed(on(a, birth=1), on(b), mode_filter=filter)
+        expected = mixed(on(A, birth=1), on(B), mode_filter=filter)
+        np.testing.assert_array_equal(child.labels, expected.labels)
+        assert child.key == expected.key and [o.id for o in child.objects] == [o.id for o in expected.objects]
+        assert not child.labels.flags.writeable
+    np.testing.assert_array_equal(before, [np.array(a), np.array(b)])
+
+
+def test_a_caller_s_array_written_later_changes_nothing():
+    own = A.copy()
+    hypothesis = on(own[:, :, :])
+    own[:] = 0
+    np.testing.assert_array_equal(hypothesis.labels, A)
+
+
+def full(grid):
+    """65,535 objects of a voxel each."""
+    labels = np.zeros(grid.shape, np.uint16)
+    labels.reshape(-1)[:MAX_LABEL] = np.arange(1, MAX_LABEL + 1)
+    return labels
+
+
+def test_the_largest_number_of_labels():
+    """A table of all pairs of labels would take 34 GB; more objects than labels are refused, not wrapped around."""
+    grid = VoxelGrid((0, 0, 0), 0.01, (41, 40, 40))
+    labels = full(grid)
+    many, same = on(labels, grid, 1), on(np.where(labels > 0, MAX_LABEL + 1 - labels.astype(int), 0), grid)
+    off = ModeFilter(window=1)
+    child = mixed(many, same, merge="never", mode_filter=off, structure=RandomOrder())
+    assert child.n_objects == MAX_LABEL == len({o.id for o in child.objects})
+    np.testing.assert_array_equal(child.labels > 0, labels > 0)
+    child = mixed(many, on(labels > 0, grid), merge="always", mode_filter=off, structure=SpanningTree())
+    np.testing.assert_array_equal(child.labels, labels > 0)
+    labels[:] = 0
+    labels.reshape(-1)[-3:] = 1, 2, 3
+    with pytest.raises(InputError, match="of 65535 proposed and 3 predicted objects gives 65538, at most 65535"):
+        mixed(many, on(labels, grid), merge="never", mode_filter=off, structure=RandomOrder())
+
+
+def test_the_mode_filter_with_the_largest_number_of_labels():
+    labels = full(VoxelGrid((0, 0, 0), 0.01, (41, 40, 40)))
+    np.testing.assert_array_equal(ModeFilter(3, 3, 27).apply(labels), labels)  # none leads by three
+    doubled = np.where(np.arange(labels.shape[2]) < 20, labels, MAX_LABEL)
+    out = ModeFilter(3, 3, 27, max_sweeps=1).apply(doubled)
+    assert (out[:, :, 19] == MAX_LABEL).sum() > 0.99 * out[:, :, 19].size
+    np.testing.assert_array_equal(out[:, :, :19], doubled[:, :, :19])
+
+
+@pytest.mark.parametrize(
+    "fields", [{"window": 5.0}, {"margin": float("nan")}, {"isolation": "many"}, {"max_sweeps": None}]
+)
+def test_fields_of_the_mode_filter(fields):
+    with pytest.raises(InputError, match=f"{next(iter(fields))} is .*expected"):
+        ModeFilter(**fields)
+
+
+def test_free_space_of_unusual_grids():
+    """Free space uses the grid of the hypothesis. Empty hypotheses and hypotheses of single voxels are allowed."""
+    project = FreeSpace().project
+    frame = CLIP.after
+    whole = np.ones(GRID.shape, np.uint16)
+    expected = FreeSpace().known_free(frame, GRID)
+    for layout in (np.asfortranarray, LAYOUTS["reversed"]):
+        refined, _ = project(on(layout(whole), GRID), frame)
+        np.testing.assert_array_equal(refined.labels == 0, expected)
+    part = VoxelGrid(GRID.origin + 0.1, 0.01, (20, 20, 10))
+    refined, quality = project(on(np.ones(part.shape, int), part), frame)
+    np.testing.assert_array_equal(refined.labels == 0, expected[10:30, 10:30, 10:20])
+    assert quality == pytest.approx(1 - expected[10:30, 10:30, 10:20].mean())
+    away = VoxelGrid((100.0, 0, 0), 0.01, (3, 3, 3))
+    assert project(on(np.ones(away.shape, int), away), frame)[1] == 1.0
+    labels = np.zeros(GRID.shape, np.uint16)
+    labels.reshape(-1)[-MAX_LABEL:] = np.arange(1, MAX_LABEL + 1)
+    refined, quality = project(on(labels, GRID), frame)
+    assert refined.n_objects == round(quality * MAX_LABEL) < MAX_LABEL
+    nothing = on(0 * labels, GRID)
+    assert project(nothing, frame) == (nothing, 1.0)
+
+
+@pytest.mark.parametrize("claims", [Claims(), Claims("sample", 0.03)])
+@pytest.mark.parametrize("evidence", [(), (Agreement(),)])
+def test_an_update_of_parents_without_objects(claims, evidence):
+    """If a parent is empty, all candidates can be built, weighted and scored."""
+    nothing, something = on(0 * LABELS, GRID), on(LABELS, GRID, 1)
+    update = CrossoverUpdate(eta=2, claims=claims, evidence=evidence)
+    for predicted, proposed in ((nothing, something), (something, nothing), (nothing, nothing)):
+        fused = update.update(
+            np.random.default_rng(0), Population((predicted,)), Population((proposed,)), CLIP
+        ).realised()
+        assert np.isfinite(fused.log_weights).all()
+        wanted = something if something in (predicted, proposed) else nothing
+        for child in fused.particles:
+            np.testing.assert_array_equal(child.labels, wanted.labels)
+
+
+SURFACE = Claims("sample", 0.03)  # uses the grid of the clip
+
+
+@pytest.mark.parametrize(
+    ("claims", "wrong", "found"),
+    [
+        (Claims(), ("predicted",), "predicted hypothesis 1"),
+        (Claims(), ("proposed",), "proposed hypothesis 1"),
+        (SURFACE, ("predicted",), "predicted hypothesis 1"),
+        (SURFACE, ("proposed",), "proposed hypothesis 1"),
+        (SURFACE, ("predicted", "proposed", "all"), "predicted hypothesis 0"),
+    ],
+)
+def test_an_update_of_hypotheses_on_another_grid(claims, wrong, found):
+    """Grids of the same shape with another origin raise an error as well."""
+    good, moved = on(LABELS, GRID), on(LABELS, replace(GRID, origin=GRID.origin + 0.05))
+    first = moved if "all" in wrong else good
+    sides = {name: Population((first, moved if name in wrong else good)) for name in ("predicted", "proposed")}
+    with pytest.raises(InputError, match=f"grid of {found} is .* at .-0.25.* expected .* at .-0.3,") as caught:
+        CrossoverUpdate(claims=claims).update(np.random.default_rng(0), **sides, observation=CLIP)
+    assert caught.value.hints
