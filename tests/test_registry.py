@@ -15,10 +15,10 @@ from typing import get_type_hints
 import pytest
 
 import mstfilter.registry
-from mstfilter.belief import Agreement
 from mstfilter.completion import Completer
 from mstfilter.crossover import CrossoverUpdate
 from mstfilter.errors import InputError, InputWarning
+from mstfilter.oracles import TrueQuality
 from mstfilter.presets import REGISTRY, build_filter, load_config, preset
 from mstfilter.resources import preset_names
 from mstfilter.scene import Evidence
@@ -102,10 +102,10 @@ def test_the_kind_of_a_field_follows_from_its_annotation():
         "one": "ssp",
         "subclass": {"component": "crossover", "eta": 2},
         "optional": None,
-        "several": ["agreement"],
+        "several": ["true_quality"],
     }
     made = REGISTRY.make(Holder, fields)
-    assert made == Holder(Ssp(), CrossoverUpdate(eta=2), None, (Agreement(),))
+    assert made == Holder(Ssp(), CrossoverUpdate(eta=2), None, (TrueQuality(),))
 
 
 def test_what_is_wrong_with_a_file_of_the_user(tmp_path):

@@ -2,11 +2,13 @@
 
 >>> fused = CrossoverUpdate().update(rng, predicted, proposed, clip)     # candidates, with weights
 
-============  ==========================================================================================
-`update`      `CrossoverUpdate`: free-space projection, pairs of hypotheses, and their weights
-`conflicts`   the conflict graph of two hypotheses (networkx), painting orders, merge probabilities
-`cross`       makes one hypothesis of two, and smooths the result by a mode filter
-============  ==========================================================================================
+=============  =========================================================================================
+`update`       `CrossoverUpdate`: free-space projection, pairs of hypotheses, and their weights
+`cross`        `Crossover`: makes one hypothesis of two
+`conflicts`    the conflict graph of two hypotheses (networkx)
+`resolution`   painting orders and merge probabilities
+`mode_filter`  `ModeFilter`: smooths the result
+=============  =========================================================================================
 """
 
 from mstfilter.lazy import attach
@@ -17,6 +19,6 @@ __interfaces__ = {"crossover": "Crossover", "structure": "Structure", "mode_filt
 __components__ = {
     "update": {"crossover": "CrossoverUpdate"},
     "crossover": {"conflict_graph": "Crossover"},
-    "structure": {"one_side_last": "OneSideLast", "random_order": "RandomOrder", "spanning_tree": "SpanningTree"},
+    "structure": {"random_order": "RandomOrder", "spanning_tree": "SpanningTree"},
     "mode_filter": {"majority": "ModeFilter"},
 }

@@ -1,50 +1,27 @@
-"""The conflict graph of two hypotheses, and the random choices that resolve it (paper, section IV-D, figure 5).
+"""The conflict graph of two hypotheses (paper, section IV-D, figure 5).
 
 >>> graph = conflict_graph(proposed.labels, predicted.labels)
 >>> graph.edges, graph.components()
 >>> networkx.draw(graph.networkx(), with_labels=True)
 
 A vertex is an object of one of the two hypotheses; an edge joins a proposed and a predicted object that overlap. The
-graph is bipartite, because objects of one hypothesis never overlap.
-
-For each connected component a `Structure` draws a painting order, and directed edges from a child to its parent,
-which is painted later. `merge_probability` is the probability that a child with n1 voxels is merged into its parent
-with n2 voxels, if they have I voxels in common:
-
-=============  =============================  ========================================================
-rule           probability                    source
-=============  =============================  ========================================================
-``share``      min(1, I n2 / n1^2)            the authors' program: (covered share of the child) x (size
-                                              ratio); about even odds on real conflicts
-``printed``    min(1, IoU n2 / n1^2)          the formula as printed (paper, section IV-D); its dimension
-                                              is 1 / voxels, so it practically never merges
-``iou``        IoU                            a plain alternative
-``match``      1 if IoU > 1/2, else 0         an object has at most one such overlap: both hypotheses
-                                              contain the same object
-``covered``    1 if I / n1 >= 3/4, else 0     the rest of the child would be a sliver
-``always``     1                              a control
-``never``      0                              a control
-=============  =============================  ========================================================
+graph is bipartite, because objects of one hypothesis never overlap. `mstfilter.crossover.resolution` draws how the
+conflicts are resolved.
 """
 
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple, get_args
 
 import networkx as nx
 import numpy as np
 
 from mstfilter.errors import InputError
-from mstfilter.results import Checked, check_pair, check_type, returns
 from mstfilter.scene import MAX_LABEL, as_labels
 
 PROPOSED, PREDICTED = 0, 1
-MergeRule = Literal["share", "printed", "iou", "match", "covered", "always", "never"]
-MERGE_RULES: tuple[MergeRule, ...] = get_args(MergeRule)
+SIDES = (PROPOSED, PREDICTED)
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +38,7 @@ class ConflictGraph:
     label: np.ndarray  #: (n,) int, label of the object in its hypothesis
     size: np.ndarray  #: (n,) int, voxels of the object
     edges: np.ndarray  #: (m, 2) int, vertex numbers of overlapping pairs
-    intersection: np.ndarray  #: (m,) int, voxels that both objects claim
+    intersection: np.ndarray  #: (m,) int, voxels that both objects occupy
 
     def __len__(self) -> int:
         return len(self.label)
@@ -84,25 +61,38 @@ class ConflictGraph:
         """Connected components with at least one edge, as ascending vertex numbers."""
         return components_in_conflict(self.networkx())
 
+    def by_label(self, side: int, values: np.ndarray) -> np.ndarray:
+        """Values (n,) of the vertices as a table (65536,) over the labels of a side; 0 for labels without object."""
+        table = np.zeros(MAX_LABEL + 1, values.dtype)
+        of_side = self.side == side
+        table[self.label[of_side]] = values[of_side]
+        return table
+
 
 def components_in_conflict(graph: nx.Graph) -> list[list[int]]:
     """Connected components of a graph with at least one edge, as ascending vertices."""
     return sorted(sorted(c) for c in nx.connected_components(graph) if len(c) > 1)
 
 
-# The graph of two label grids ---------------------------------------------------------------------------------------
+@dataclass(frozen=True, eq=False)
+class OccupiedVoxels:
+    """The voxels that a proposed or a predicted hypothesis occupies: a few percent of a grid."""
 
+    at: np.ndarray  #: (n,) flat indices
+    labels: tuple[np.ndarray, np.ndarray]  #: (n,) uint16 of the proposed and of the predicted hypothesis, 0 free
+    shape: tuple[int, ...]  #: of the grid
 
-class ClaimedVoxels(NamedTuple):
-    """The occupied voxels of a proposed or a predicted hypothesis: a few percent of a grid.
-
-    at : (n,) flat indices; proposed, predicted : (n,) uint16 labels there, 0 free; shape : of the grid.
-    """
-
-    at: np.ndarray
-    proposed: np.ndarray
-    predicted: np.ndarray
-    shape: tuple[int, ...]
+    @classmethod
+    def of(cls, proposed: np.ndarray, predicted: np.ndarray) -> OccupiedVoxels:
+        """Of two label grids (X, Y, Z) of one shape."""
+        a, b = as_labels(proposed, "proposed label grid"), as_labels(predicted, "predicted label grid")
+        if a.shape != b.shape:
+            raise InputError(
+                f"proposed and predicted label grids have shapes {a.shape} and {b.shape}, expected the same shape",
+                "all hypotheses of a run share one workspace",
+            )
+        at = np.flatnonzero((a | b) != 0)
+        return cls(at, (a.reshape(-1)[at], b.reshape(-1)[at]), a.shape)
 
     def spread(self, values: np.ndarray) -> np.ndarray:
         """Values (n,) in the shape of the grid, 0 elsewhere."""
@@ -110,211 +100,38 @@ class ClaimedVoxels(NamedTuple):
         out.reshape(-1)[self.at] = values
         return out
 
+    def objects(self, side: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Label, voxels and position of the first voxel (k,) of the objects of a side; x is fastest in a position."""
+        position = np.ravel_multi_index(np.unravel_index(self.at, self.shape), self.shape, order="F")
+        labels = self.labels[side]
+        sizes = np.bincount(labels, minlength=1)
+        first = np.full(len(sizes), math.prod(self.shape))
+        np.minimum.at(first, labels.astype(np.intp), position)
+        present = np.flatnonzero(sizes[1:]) + 1
+        return present, sizes[present], first[present]
 
-def claimed_voxels(proposed: np.ndarray, predicted: np.ndarray) -> ClaimedVoxels:
-    """The voxels that either of two label grids (X, Y, Z) occupies."""
-    a, b = as_labels(proposed, "proposed label grid"), as_labels(predicted, "predicted label grid")
-    if a.shape != b.shape:
-        raise InputError(
-            f"proposed and predicted label grids have shapes {a.shape} and {b.shape}, expected the same shape",
-            "all hypotheses of a run share one workspace",
-        )
-    at = np.flatnonzero((a | b) != 0)
-    return ClaimedVoxels(at, a.reshape(-1)[at], b.reshape(-1)[at], a.shape)
+    def overlaps(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Proposed label, predicted label and common voxels (m,) of each overlapping pair, labels ascending."""
+        proposed, predicted = self.labels
+        both = (proposed != 0) & (predicted != 0)
+        pair = proposed[both].astype(np.int64) * (MAX_LABEL + 1) + predicted[both]
+        found, common = np.unique(pair, return_counts=True)
+        return *np.divmod(found, MAX_LABEL + 1), common
 
 
 def conflict_graph(proposed: np.ndarray, predicted: np.ndarray) -> ConflictGraph:
     """The conflict graph of two label grids (X, Y, Z) of the same shape."""
-    return graph_of(claimed_voxels(proposed, predicted))
+    return graph_of(OccupiedVoxels.of(proposed, predicted))
 
 
-def graph_of(voxels: ClaimedVoxels) -> ConflictGraph:
-    """The conflict graph of two hypotheses, from the voxels that they claim."""
-    position = np.ravel_multi_index(np.unravel_index(voxels.at, voxels.shape), voxels.shape, order="F")
-    side, label, size, begin = [], [], [], []
-    for which, labels in ((PROPOSED, voxels.proposed), (PREDICTED, voxels.predicted)):
-        sizes = np.bincount(labels, minlength=1)
-        first = np.full(len(sizes), math.prod(voxels.shape))
-        np.minimum.at(first, labels.astype(np.intp), position)
-        sizes[0] = 0
-        present = np.flatnonzero(sizes)
-        label.append(present)
-        size.append(sizes[present])
-        begin.append(first[present])
-        side.append(np.full(len(present), which))
-    sides, labels = np.concatenate(side), np.concatenate(label)
-    order = np.lexsort((sides, np.concatenate(begin)))
+def graph_of(voxels: OccupiedVoxels) -> ConflictGraph:
+    """The conflict graph of two hypotheses, from the voxels that they occupy."""
+    objects = [voxels.objects(side) for side in SIDES]
+    label, size, first = (np.concatenate(column) for column in zip(*objects, strict=True))
+    side = np.repeat(SIDES, [len(labels) for labels, _, _ in objects])
+    order = np.lexsort((side, first))
     number = np.zeros((2, MAX_LABEL + 1), np.int64)
-    number[sides[order], labels[order]] = np.arange(len(order))
-
-    a, b, common = overlapping_pairs(voxels)
-    edges = np.stack([number[PROPOSED, a], number[PREDICTED, b]], axis=1)
-    return ConflictGraph(sides[order], labels[order], np.concatenate(size)[order], edges, common)
-
-
-def overlapping_pairs(voxels: ClaimedVoxels) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Proposed label, predicted label and common voxels (m,) of each overlapping pair, labels ascending."""
-    both = (voxels.proposed != 0) & (voxels.predicted != 0)
-    pair = voxels.proposed[both].astype(np.int64) * (MAX_LABEL + 1) + voxels.predicted[both]
-    found, common = np.unique(pair, return_counts=True)
-    a, b = np.divmod(found, MAX_LABEL + 1)
-    return a, b, common
-
-
-# Painting orders and merges -----------------------------------------------------------------------------------------
-
-#: Vertices in painting order, and edges (child, parent); see `Structure.draw`.
-OrderAndEdges = tuple[list[int], list[tuple[int, int]]]
-
-
-def _check_structure(
-    self: Structure, found: Any, rng: Any, graph: nx.Graph, component: Sequence[int]
-) -> OrderAndEdges:
-    check_pair(found, "an order", "edges")
-    order, edges = (check_type(part, (list, tuple), "lists") for part in found)
-    if sorted(order) != sorted(component):
-        raise InputError(f"returns the order {list(order)}, expected each vertex of {list(component)} once")
-    place = {v: k for k, v in enumerate(order)}
-    for edge in edges:
-        if len(edge) != 2 or not graph.has_edge(*edge):
-            raise InputError(f"returns the edge {edge}, which is no edge of the graph")
-        if place[edge[0]] > place[edge[1]]:
-            raise InputError(f"returns the edge {edge}: the child {edge[0]} is painted after its parent {edge[1]}")
-    return list(order), list(edges)
-
-
-class Structure(Checked, ABC):
-    """Draws the order in which objects in conflict are painted, and the conflicts that may end in a merge."""
-
-    @returns(_check_structure)
-    @abstractmethod
-    def draw(self, rng: np.random.Generator, graph: nx.Graph, component: Sequence[int]) -> OrderAndEdges:
-        """Draw an order and directed edges for one component of the conflict graph.
-
-        Parameters
-        ----------
-        graph : networkx.Graph
-            The conflict graph (`ConflictGraph.networkx`). The neighbours of a vertex, ``graph[v]``, ascend.
-        component : sequence of int
-            Vertices of one connected component, ascending.
-
-        Returns
-        -------
-        order : list of int
-            All vertices of the component, first to last painted; later ones paint over earlier ones.
-        edges : list of (child, parent)
-            Edges of the graph along which the child may be merged into the parent, which is painted after it.
-        """
-
-
-@dataclass(frozen=True)
-class RandomOrder(Structure):
-    """The paper's text: edges get a random acyclic orientation, vertices a topological order of it.
-
-    A uniformly random order of the vertices gives both. Every conflict may end in a merge.
-    """
-
-    def draw(self, rng: np.random.Generator, graph: nx.Graph, component: Sequence[int]) -> OrderAndEdges:
-        order = [component[k] for k in rng.permutation(len(component))]
-        place = {v: k for k, v in enumerate(order)}
-        return order, [(v, w) for v in order for w in graph[v] if place[v] < place[w]]
-
-
-@dataclass(frozen=True)
-class OneSideLast(Structure):
-    """Paints all objects of one hypothesis over those of the other; a fair coin for each component decides which.
-
-    In a random order of all vertices the hypothesis with more objects wins more often: if one parent has an object
-    in one piece and the other has it in k pieces, the object in one piece is painted last in 1 of k + 1 cases only,
-    and an object that was cut stays cut. Every conflict may end in a merge.
-    """
-
-    def draw(self, rng: np.random.Generator, graph: nx.Graph, component: Sequence[int]) -> OrderAndEdges:
-        side = {v: graph.nodes[v]["side"] for v in component}
-        first_is_last = bool(rng.random() < 0.5)
-        last = {v: (side[v] == side[component[0]]) == first_is_last for v in component}
-        shuffled = [component[k] for k in rng.permutation(len(component))]
-        order = [v for v in shuffled if not last[v]] + [v for v in shuffled if last[v]]
-        return order, [(v, w) for v in order if not last[v] for w in graph[v]]
-
-
-@dataclass(frozen=True)
-class SpanningTree(Structure):
-    """The authors' program: a uniform random spanning tree from a uniform random root.
-
-    Only edges of the tree may end in a merge. Children are painted before their parent, the root last.
-    """
-
-    def draw(self, rng: np.random.Generator, graph: nx.Graph, component: Sequence[int]) -> OrderAndEdges:
-        root, parent = random_spanning_tree(rng, graph, component)
-        children: dict[int, list[int]] = {v: [] for v in component}
-        for v in component:
-            if v != root:
-                children[parent[v]].append(v)
-        order, stack = [], [root]
-        while stack:  # parents first; the reverse has every child before its parent
-            v = stack.pop()
-            order.append(v)
-            stack.extend(children[v])
-        order.reverse()
-        return order, [(v, parent[v]) for v in order if v != root]
-
-
-def random_spanning_tree(
-    rng: np.random.Generator, graph: nx.Graph, component: Sequence[int]
-) -> tuple[int, dict[int, int]]:
-    """Draw a uniformly random spanning tree of a connected component by Wilson's algorithm (1996).
-
-    Loop-erased random walks run from each vertex to the tree so far. `networkx.random_spanning_tree` has the same
-    law, but computes a determinant for every edge.
-
-    Returns
-    -------
-    root : int
-        Uniformly random.
-    parent : dict
-        Parent of every other vertex.
-    """
-    neighbours = {v: list(graph[v]) for v in component}
-    root = component[int(rng.integers(len(component)))]
-    inside = {root}
-    parent: dict[int, int] = {}
-    for start in component:
-        v = start
-        while v not in inside:
-            # The last exit from v counts, which erases the loops of the walk.
-            parent[v] = neighbours[v][int(rng.integers(len(neighbours[v])))]
-            v = parent[v]
-        v = start
-        while v not in inside:
-            inside.add(v)
-            v = parent[v]
-    return root, parent
-
-
-def merge_probability(
-    rule: MergeRule, intersection: np.ndarray | int, child: np.ndarray | int, parent: np.ndarray | int
-) -> np.ndarray:
-    """Probability that a child object is merged into its parent, elementwise.
-
-    The table of the module has the formulas. `intersection`, `child` and `parent` are the voxels in common, of the
-    child, and of the parent.
-    """
-    common, n1, n2 = (np.asarray(a, dtype=np.float64) for a in (intersection, child, parent))
-    iou = common / (n1 + n2 - common)
-    match rule:
-        case "share":
-            return np.minimum(1.0, common * n2 / n1**2)
-        case "printed":
-            return np.minimum(1.0, iou * n2 / n1**2)
-        case "iou":
-            return iou
-        case "match":
-            return (iou > 0.5).astype(np.float64)
-        case "covered":
-            return (common >= 0.75 * n1).astype(np.float64)
-        case "always":
-            return np.ones_like(iou)
-        case "never":
-            return np.zeros_like(iou)
-    raise InputError(f"there is no merge rule {rule!r}", f"there are: {', '.join(MERGE_RULES)}")
+    number[side[order], label[order]] = np.arange(len(order))
+    proposed, predicted, common = voxels.overlaps()
+    edges = np.stack([number[PROPOSED, proposed], number[PREDICTED, predicted]], axis=1)
+    return ConflictGraph(side[order], label[order], size[order], edges, common)

@@ -1,4 +1,4 @@
-"""The published measurement update: predicted and proposed hypotheses in, weighted candidates out (paper, IV-D, IV-E).
+"""The published measurement update: predicted and proposed hypotheses in, weighted candidates out.
 
 >>> fused = CrossoverUpdate().update(rng, predicted, proposed, clip)
 

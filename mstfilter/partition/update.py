@@ -1,21 +1,29 @@
-"""A measurement update that partitions the image, and completes every object from all that was seen of it.
+"""The measurement update: partitions of the image are drawn, and every object is completed from all its views.
 
 >>> update = PartitionUpdate(completer=NetworkCompleter())
 >>> fused = update.update(rng, predicted, proposed, clip)       # a candidate for each predicted hypothesis
 
-1. Every sample and every prediction is a partition of the readings of the last frame: a sample by its segments, a
-   prediction by the objects that lie at the readings. All of them together say how likely two cells of their common
-   refinement belong to one object. The past is right with probability sum_j w_j Q_j^lambda, where Q_j is
-   the share of the voxels of prediction j that the frame does not see through. Partitions are drawn by these odds
-   (`mstfilter.partition.cells`).
-2. Each drawn partition is combined with a prediction j, drawn with probability proportional to w_j Q_j^lambda. A
-   segment continues the predicted objects that lie mostly in it; an object has at most one. Objects that were seen to
-   move apart are divided as in the prediction.
-3. An object keeps its views: what earlier frames showed of it (`mstfilter.scene.ObjectView`). It is completed from
-   the readings of this frame and from its views together. So evidence is remembered and guesses are not: no voxel
-   that was guessed at an earlier pause is carried on. A predicted object without readings stays with probability
-   (Q_j q)^lambda, where q is the share of its own voxels that the frame does not see through, unless the frame
-   refutes all its views. At the first pause, the candidates are the samples.
+It takes the place of section IV-D of the paper. There, a sample of the image and a prediction are two sets of voxels,
+which are crossed. Here, both are partitions of the depth readings of the last frame, and the voxels of an object are
+estimated anew from all that was seen of it.
+
+1. **Free-space projection** (as in the paper). Q_j is the share of the voxels of prediction j that the frame does not
+   observe as free. Prediction j *holds* with probability Q_j^lambda.
+2. **Partitions.** A sample partitions the readings by its segments, a prediction by the objects that lie at the
+   readings. All of them together say how likely two readings belong to one object, and partitions of the image are
+   drawn by these odds (`mstfilter.partition.cells`, `pairs`). So segments of different samples can occur in one
+   partition, and no pair (sample, prediction) is formed as in the paper.
+3. **Association.** Each partition is combined with a prediction j, drawn in proportion to w_j Q_j^lambda. Segments and
+   predicted objects form a *conflict graph*; in each of its *components*, segments continue objects
+   (`mstfilter.partition.association`). The paper draws which conflicts end in a merge; here the partition decides.
+4. **Occluded objects.** A predicted object without conflict, to which practically no reading belongs, stays with
+   probability (Q_j q)^lambda; q is the share of its own voxels that the frame does not observe as free.
+5. **Completion.** An object keeps its views: what earlier frames showed of it (`mstfilter.scene.ObjectView`). It is
+   completed from its readings in this frame and from the views of the objects that it continues. Evidence is
+   remembered, guesses are not: no voxel that was guessed at an earlier pause is carried on.
+
+At the first pause the candidates are the samples: every segment is a new object. An object that no frame has shown is
+in no hypothesis.
 """
 
 from __future__ import annotations
@@ -23,88 +31,60 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from itertools import islice, zip_longest
 from typing import ClassVar, NamedTuple
 
-import networkx as nx
 import numpy as np
-from scipy.spatial import cKDTree
 
 from mstfilter.completion import ClipCompleter, Completer, Completion, Extrude, arbitrate, occupancy_of
-from mstfilter.completion.observed import frame_points
 from mstfilter.errors import check_integer, check_number
-from mstfilter.partition import Cells, Division, NoDivision, PairEvidence, PairOdds, PartRule
-from mstfilter.partition.cells import LEAST
-from mstfilter.partition.division import divided, split_segments
+from mstfilter.partition.association import Overlaps
+from mstfilter.partition.cells import Cells, Readings
+from mstfilter.partition.pairs import PairEvidence, PairOdds
 from mstfilter.scene import (
     Clip,
     Evidence,
-    Frame,
     FreeSpace,
     Hypothesis,
     ObjectRecord,
     ObjectView,
     Projection,
-    VoxelGrid,
     check_grid,
     log_quality,
     scored,
 )
 from mstfilter.smc import Population, Systematic, Update, child
 
-_EDGE = 0.1  # a segment and a predicted object with more than this share of the smaller in common are in conflict
-_SAME = 0.5  # share of a predicted object's readings in the segment that continues it, if both have no other conflict
-_CONTAINED = 0.8  # the same, if they have other conflicts
+
+class Prediction(NamedTuple):
+    """A predicted hypothesis and what the last frame says about it."""
+
+    hypothesis: Hypothesis
+    refined: Hypothesis  #: without the voxels that the frame observes as free
+    weight: float  #: w_j, normalised
+    holds: float  #: probability that it holds, Q^lambda
+    objects: np.ndarray  #: (m,) its object at each reading, 0 is none
 
 
-@dataclass(frozen=True, eq=False)
-class Readings:
-    """The depth readings of a frame inside the grid."""
+class SceneObject(NamedTuple):
+    """An object of a candidate, before its completion."""
 
-    pixels: np.ndarray  #: (m,) flat pixels
-    voxels: np.ndarray  #: (m, 3) voxels
+    readings: np.ndarray  #: (m,) bool, its readings in the last frame
+    tracks: tuple[ObjectRecord, ...] = ()  #: the predicted objects that it continues, that with most readings first
+    occluded: Completion | None = None  #: what is left of the voxels of an occluded object; None for a segment
+
+
+class _Completed(NamedTuple):
+    """An object after its completion."""
+
+    completion: Completion
+    views: tuple[ObjectView, ...]  #: the views that it is completed from, the oldest first
 
     @classmethod
-    def of(cls, frame: Frame, grid: VoxelGrid) -> Readings:
-        """Of a frame."""
-        return cls(*frame_points(frame, grid))
-
-    def mask(self, chosen: np.ndarray, frame: Frame) -> np.ndarray:
-        """Pixels (H, W) bool of the chosen readings (m,) bool."""
-        mask = np.zeros(frame.depth.size, bool)
-        mask[self.pixels[chosen]] = True
-        return mask.reshape(frame.depth.shape)
-
-    def labels(self, labels: np.ndarray, reach: float) -> np.ndarray:
-        """Label (m,) of each reading: of its voxel, or of the nearest object within `reach` voxels; 0 is none."""
-        occupied, (voxels, of_reading) = np.argwhere(labels), self._distinct
-        _, nearest = cKDTree(occupied).query(voxels, distance_upper_bound=reach + 1e-6)
-        found = np.append(labels[tuple(occupied.T)], 0).astype(np.int64)  # the last one is that of no neighbour
-        return found[nearest][of_reading]
-
-    @cached_property
-    def _distinct(self) -> tuple[np.ndarray, np.ndarray]:
-        """The voxels (k, 3) with readings, and that of each reading (m,)."""
-        voxels, of_reading = np.unique(self.voxels, axis=0, return_inverse=True)
-        return voxels, of_reading.ravel()
-
-
-class _Part(NamedTuple):
-    """An object of a candidate."""
-
-    readings: np.ndarray  #: (m,) bool, its readings
-    continues: tuple[ObjectRecord, ...]  #: the predicted objects that it continues, the largest first
-    predicted: Completion | None = None  #: the voxels of a predicted object without readings
-
-
-class _Past(NamedTuple):
-    """A prediction."""
-
-    objects: np.ndarray  #: (m,) its object of each reading, 0 is none
-    prediction: Hypothesis
-    refined: Hypothesis  #: without what the frame sees through
-    right: float  #: the probability that it is right
+    def of_occluded(cls, one: SceneObject) -> _Completed:
+        """An occluded object that keeps what is left of its predicted voxels."""
+        assert one.occluded is not None
+        return cls(one.occluded, ())
 
 
 @dataclass(frozen=True)
@@ -116,9 +96,7 @@ class PartitionUpdate(Update):
     completer : Completer
         Completes the objects. That of the proposal is then of no use, and may be `SurfaceOnly`.
     free_space : Projection
-        Gives the share Q of a prediction that the frame does not see through, and the objects that are left.
-    division, parts : Division, PartRule
-        Objects of both sides whose parts move apart in the clip are split first, if `parts` says so.
+        Gives the share Q of a prediction that the frame does not observe as free, and the voxels that are left.
     pairs : PairOdds
         The log odds that two cells belong to one object.
     occupied_log_odds : float
@@ -128,7 +106,7 @@ class PartitionUpdate(Update):
         Terms whose sum is the log weight of a candidate. Without them all candidates have equal weights, as they are
         drawn from what they approximate.
     quality_exponent : float
-        lambda. With 0 the past is always taken to be right, and every hidden object stays.
+        lambda. With 0 every prediction holds, and every occluded object stays.
     n_candidates : int
         Candidates after the first pause; 0 means one for each predicted hypothesis, or four if there is evidence.
     reach : float
@@ -141,8 +119,6 @@ class PartitionUpdate(Update):
 
     completer: Completer = field(default_factory=Extrude)
     free_space: Projection = FreeSpace()  # noqa: RUF009 (frozen)
-    division: Division = NoDivision()  # noqa: RUF009 (frozen)
-    parts: PartRule = PartRule()  # noqa: RUF009 (frozen)
     pairs: PairOdds = PairEvidence()  # noqa: RUF009 (frozen)
     occupied_log_odds: float = 0.6
     evidence: tuple[Evidence, ...] = ()
@@ -165,179 +141,182 @@ class PartitionUpdate(Update):
     def update(
         self, rng: np.random.Generator, predicted: Population | None, proposed: Population | None, observation: Clip
     ) -> Population:
-        """Candidates. Without a proposal the refined predictions pass."""
-        grid = observation.grid
-        sides = (("predicted", predicted), ("proposed", proposed))
-        for name, k, hypothesis in ((n, k, h) for n, p in sides if p is not None for k, h in enumerate(p.particles)):
-            check_grid(f"{name} hypothesis {k}", hypothesis, grid)
-        readings = Readings.of(observation.after, grid)
+        """Candidates. Without a proposal, the predictions after free-space projection."""
+        _check_grids(predicted, proposed, observation)
+        readings = Readings.of(observation.after, observation.grid)
         if predicted is None:
             assert proposed is not None
-            candidates = [
-                [_Part(segments == k, ()) for k in np.unique(segments[segments > 0])]
-                for segments in self._segments(proposed, readings, observation)
-            ]
-            return self._candidates(
-                rng, candidates, readings, observation, proposed.log_weights, proposed.parents, {}
-            )
-        refined, quality = self.free_space.refine(predicted.particles, observation)
-        log_right = self.quality_exponent * log_quality(quality)
-        log_weights = predicted.log_weights + log_right
-        notes = {"quality": quality.tolist()}
+            candidates = [_new_objects(segments) for segments in _segments(proposed, readings)]
+            built = self._complete(rng, candidates, readings, observation)
+            return self._weigh(built, observation, proposed.log_weights, proposed.parents, {})
+        projected = self._project(predicted, observation)
         if proposed is None:
-            return Population(refined, log_weights, predicted.parents, notes)
+            return projected
+        predictions = self._predictions(predicted, projected, readings)
         n = self.n_candidates or (4 if self.evidence else 1) * len(predicted)
-        j = Systematic().select(child(rng, "predicted"), log_weights, n)[0]
-        predictions = divided(self.division, self.parts, tuple(predicted.particles), observation, proposed=False)
-        past = [readings.labels(h.labels, self.reach) for h in predictions]
-        segments = self._segments(proposed, readings, observation)
-        cells = Cells.of(readings.pixels, observation.after.depth.shape, segments, past)
-        right = np.exp(log_right)
-        log_odds = self.pairs.log_odds(cells, predicted.weights * right, observation)
-        known = [_Past(*one) for one in zip(past, predictions, refined, right.tolist(), strict=True)]
-        drawn = cells.draw(child(rng, "partition"), log_odds, n)
-        chosen = np.pad(drawn, ((0, 0), (0, 1)))[:, cells.of_reading]  # the last column is no object
-        few = LEAST * observation.after.depth.size / 307200
+        drawn = Systematic().select(child(rng, "predicted"), projected.log_weights, n)[0]
+        partitions = self._draw_partitions(child(rng, "partition"), predictions, proposed, readings, observation, n)
         candidates = [
-            self._parts(child(rng, "hidden", c), segment, known[b], few)
-            for c, (segment, b) in enumerate(zip(chosen, j.tolist(), strict=True))
+            self._associate(child(rng, "hidden", c), segments, predictions[j])
+            for c, (segments, j) in enumerate(zip(partitions, drawn.tolist(), strict=True))
         ]
-        parents = {"previous": predicted.parents.get("previous", np.full(len(predicted), -1))[j]}
-        return self._candidates(rng, candidates, readings, observation, np.zeros(n), parents, notes)
+        built = self._complete(rng, candidates, readings, observation)
+        parents = {"previous": predicted.parents.get("previous", np.full(len(predicted), -1))[drawn]}
+        return self._weigh(built, observation, np.zeros(n), parents, projected.notes)
 
-    def _segments(self, proposed: Population, readings: Readings, clip: Clip) -> list[np.ndarray]:
-        """The segment (m,) of each reading in each sample, 0 is none.
+    # 1. Free-space projection -----------------------------------------------------------------------------------
 
-        A reading belongs to the segment of its voxel, or of the nearest within a voxel: at the borders of objects,
-        pixels of one object have readings of another.
-        """
-        motions = self.division.divide(clip)
-        distinct = {id(h): h for h in proposed.particles}
-        found = {}
-        for name, h in distinct.items():
-            own = readings.labels(h.labels, 1.0)
-            if motions is not None:
-                own = split_segments(own, motions.ravel()[readings.pixels], readings.voxels, self.parts)
-            found[name] = own
-        return [found[id(h)] for h in proposed.particles]
+    def _project(self, predicted: Population, clip: Clip) -> Population:
+        """The predictions without the voxels that the frame observes as free, weighted by w_j Q_j^lambda."""
+        refined, quality = self.free_space.refine(predicted.particles, clip)
+        log_weights = predicted.log_weights + self.quality_exponent * log_quality(quality)
+        return Population(refined, log_weights, predicted.parents, {"quality": quality.tolist()})
 
-    def _candidates(
+    def _predictions(self, predicted: Population, projected: Population, readings: Readings) -> list[Prediction]:
+        """What the last frame says about each prediction."""
+        holds = np.exp(self.quality_exponent * log_quality(np.array(projected.notes["quality"])))
+        columns = predicted.particles, projected.particles, predicted.weights.tolist(), holds.tolist()
+        return [
+            Prediction(hypothesis, refined, weight, p, readings.labels(hypothesis.labels, self.reach))
+            for hypothesis, refined, weight, p in zip(*columns, strict=True)
+        ]
+
+    # 2. Partitions of the image ---------------------------------------------------------------------------------
+
+    def _draw_partitions(
         self,
         rng: np.random.Generator,
-        candidates: Sequence[Sequence[_Part]],
+        predictions: Sequence[Prediction],
+        proposed: Population,
         readings: Readings,
         clip: Clip,
-        log_weights: np.ndarray,
-        parents: Mapping[str, np.ndarray],
-        notes: dict,
-    ) -> Population:
-        """The candidates, built and weighted by evidence."""
-        built = self._complete(rng, candidates, readings, clip)
-        total, scores = scored(self.evidence, built, clip)
-        return Population(built, log_weights + total, parents, {**notes, "scores": scores})
+        n: int,
+    ) -> np.ndarray:
+        """n partitions of the readings: the segment (n, m) of each reading, 0 is none."""
+        cells = Cells.of(readings, _segments(proposed, readings), [one.objects for one in predictions])
+        weights = np.array([one.weight * one.holds for one in predictions])
+        return cells.to_readings(cells.draw(rng, self.pairs.log_odds(cells, weights, clip), n))
 
-    def _parts(self, rng: np.random.Generator, segments: np.ndarray, known: _Past, few: float) -> list[_Part]:
-        """The objects of a candidate, from the segment (m,) of each reading, 0 is none, and from a prediction."""
-        prediction, refined = known.prediction, known.refined
-        past = np.where(segments > 0, known.objects, 0)
-        shape = int(segments.max(initial=0)) + 1, int(past.max(initial=0)) + 1
-        shared = np.bincount(segments * shape[1] + past, minlength=shape[0] * shape[1]).reshape(shape)
-        main = np.append(0, shared[1:, 1:].argmax(axis=1) + 1) if shape[1] > 1 else np.zeros(shape[0], int)
-        rivals = np.array([shared[main == b, b].sum() for b in range(shape[1])])  # in segments that are mainly b
-        sizes, past_sizes = shared.sum(axis=1), shared.sum(axis=0)
-        common = np.where(shared > _EDGE * np.minimum.outer(sizes, past_sizes), shared, 0)
-        common[:, (rivals == 0) & (past_sizes < few)] = 0  # readings of others that lie at a hidden object
-        record_of = {record.label: record for record in prediction.objects}
-        parts: list[_Part] = []
-        seen: set[int] = set()
-        for of_sample, of_past in _components(common, sizes):
-            seen.update(of_past)
-            least = _SAME if len(of_sample) == len(of_past) == 1 else _CONTAINED
-            owner = np.zeros(len(segments), np.int64)  # of the readings of which the prediction gives the partition
-            heir = {main[a]: a for a in of_sample if common[a, main[a]] > least * rivals[main[a]]}
-            whole: list[tuple[np.ndarray, list[int]]] = []
-            for a in of_sample:  # an object with an heir has no other one
-                held = {b: heir[b] == a if b in heir else common[a, b] > least * past_sizes[b] for b in of_past}
-                own = sorted((b for b in of_past if held[b]), key=lambda b: -shared[a, b])
-                inside = segments == a
-                within = [b for b in of_past if common[a, b]]
-                if any(record_of[b].apart & {record_of[c].id for c in within} for b in within):
-                    usual = max(within, key=lambda b: shared[a, b])
-                    owner[inside] = np.where(np.isin(past, within), past, usual)[inside]
-                else:
-                    whole.append((inside, own))
-            parts += [_Part(inside | np.isin(owner, own), tuple(record_of[b] for b in own)) for inside, own in whole]
-            rest = [b for b in of_past if not any(b in own for _, own in whole) and (owner == b).any()]
-            parts += [_Part(owner == b, (record_of[b],)) for b in rest]
-        before, after = prediction.volumes(), Counter(prediction.labels[refined.labels > 0].tolist())
-        kept = {k: (after[k] / max(before[k], 1)) ** self.quality_exponent for k in record_of if k not in seen}
-        hidden = [k for k, share in kept.items() if rng.random() < known.right * share]
-        return parts + [
-            _Part(segments < 0, (record_of[k],), _left(prediction, refined, k, self.threshold)) for k in hidden
+    # 3. Association, 4. occluded objects ------------------------------------------------------------------------
+
+    def _associate(
+        self, rng: np.random.Generator, segments: np.ndarray, prediction: Prediction
+    ) -> list[SceneObject]:
+        """The objects of a candidate: the segments (m,) of a partition, and occluded objects of a prediction."""
+        overlaps = Overlaps.of(segments, prediction.objects)
+        record_of = {record.label: record for record in prediction.hypothesis.objects}
+        visible = [
+            SceneObject(segments == segment, tuple(record_of[k] for k in tracks))
+            for component in overlaps.components()
+            for segment, tracks in overlaps.tracks(component).items()
         ]
+        return visible + self._occluded(rng, prediction, overlaps)
+
+    def _occluded(self, rng: np.random.Generator, prediction: Prediction, overlaps: Overlaps) -> list[SceneObject]:
+        """The occluded objects of a prediction that stay, each with probability (Q q)^lambda."""
+        volume = prediction.hypothesis.volumes()
+        left = Counter(prediction.hypothesis.labels[prediction.refined.labels > 0].tolist())
+        no_readings = np.zeros(len(prediction.objects), bool)
+        found = []
+        for record in prediction.hypothesis.objects:
+            if record.label in overlaps.visible:
+                continue
+            q = left[record.label] / max(volume[record.label], 1)
+            if rng.random() < prediction.holds * q**self.quality_exponent:
+                found.append(SceneObject(no_readings, (record,), _remaining(prediction, record.label, self.threshold)))
+        return found
+
+    # 5. Completion ----------------------------------------------------------------------------------------------
 
     def _complete(
-        self, rng: np.random.Generator, candidates: Sequence[Sequence[_Part]], readings: Readings, clip: Clip
+        self, rng: np.random.Generator, candidates: Sequence[Sequence[SceneObject]], readings: Readings, clip: Clip
     ) -> tuple[Hypothesis, ...]:
-        """The hypotheses. Each distinct object is completed once, all together.
+        """The hypotheses of the candidates. The objects of all candidates are completed together."""
+        objects = [one for candidate in candidates for one in candidate]
+        completed = iter(self._completions(rng, objects, readings, clip))
+        return tuple(self._hypothesis(one, list(islice(completed, len(one))), clip) for one in candidates)
 
-        Objects without readings and views keep their predicted voxels.
+    def _completions(
+        self, rng: np.random.Generator, objects: Sequence[SceneObject], readings: Readings, clip: Clip
+    ) -> list[_Completed]:
+        """Each object, completed from its readings and from the views of its tracks.
+
+        An object without readings and views keeps what is left of its predicted voxels.
         """
         completer = self.completer.at(clip) if isinstance(self.completer, ClipCompleter) else self.completer
-        every = [part for parts in candidates for part in parts]
-        views = [self._latest(*(record.views for record in part.continues)) for part in every]
-        seen = [k for k, part in enumerate(every) if part.readings.any() or (completer.remembers and views[k])]
+        views = [self._latest(*(track.views for track in one.tracks)) for one in objects]
+        seen = [k for k, one in enumerate(objects) if one.readings.any() or (completer.remembers and views[k])]
         streams = [child(rng, "completion", k) for k in seen]
-        objects = [(readings.mask(every[k].readings, clip.after), views[k]) for k in seen]
-        again = completer.complete_again(streams, clip.after, objects, clip.grid)
-        completed = dict(zip(seen, ((c.shifted(self.occupied_log_odds), v) for c, v in again), strict=True))
-        built, at = [], 0
-        for parts in candidates:
-            found, records = [], []
-            heir = {record.id: part.continues[0].id for part in parts for record in part.continues}
-            for label, part in enumerate(parts, start=1):
-                completion, known = completed.get(at, (part.predicted, ()))
-                assert completion is not None
-                found.append(completion)
-                records.append(_record(part, label, clip.index, completion.key, self._latest(known), heir))
-                at += 1
-            labels = arbitrate(found, clip.grid, self.threshold)
-            present = np.bincount(labels.ravel(), minlength=len(found) + 1)
-            kept = tuple(record for record in records if present[record.label])
-            built.append(Hypothesis(labels, clip.grid, kept, occupancy_of(found, labels, clip.grid)))
-        return tuple(built)
+        shown = [(readings.mask(objects[k].readings), views[k]) for k in seen]
+        completions = completer.complete_again(streams, clip.after, shown, clip.grid)
+        found = {k: _Completed(c.shifted(self.occupied_log_odds), v) for k, (c, v) in zip(seen, completions, strict=True)}
+        return [found.get(k) or _Completed.of_occluded(one) for k, one in enumerate(objects)]
+
+    def _hypothesis(self, objects: Sequence[SceneObject], completed: Sequence[_Completed], clip: Clip) -> Hypothesis:
+        """A candidate. An object whose voxels all belong to other objects is dropped."""
+        completions = [one.completion for one in completed]
+        labels = arbitrate(completions, clip.grid, self.threshold)
+        present = set(np.unique(labels).tolist())
+        records = [
+            self._record(label, *one, clip.index)
+            for label, one in enumerate(zip(objects, completed, strict=True), start=1)
+            if label in present
+        ]
+        return Hypothesis(labels, clip.grid, tuple(records), occupancy_of(completions, labels, clip.grid))
+
+    def _record(self, label: int, one: SceneObject, completed: _Completed, birth: int) -> ObjectRecord:
+        """The record of an object: that of the first object that it continues, or a new one."""
+        key, views = completed.completion.key, self._latest(completed.views)
+        if not one.tracks:
+            return ObjectRecord.born(label, birth, key, views)
+        return replace(one.tracks[0].changed(), label=label, completion_key=key, views=views)
 
     def _latest(self, *histories: tuple[ObjectView, ...]) -> tuple[ObjectView, ...]:
         """The latest views of several objects, each with its oldest view first."""
         newest = (view for level in zip_longest(*map(reversed, histories)) for view in level if view is not None)
         return tuple(islice(newest, self.n_views))[::-1]
 
+    # Weights ----------------------------------------------------------------------------------------------------
 
-def _left(prediction: Hypothesis, refined: Hypothesis, label: int, threshold: float) -> Completion:
+    def _weigh(
+        self,
+        built: tuple[Hypothesis, ...],
+        clip: Clip,
+        log_weights: np.ndarray,
+        parents: Mapping[str, np.ndarray],
+        notes: Mapping[str, object],
+    ) -> Population:
+        """The candidates, weighted by evidence."""
+        total, scores = scored(self.evidence, built, clip)
+        return Population(built, log_weights + total, parents, {**notes, "scores": scores})
+
+
+def _check_grids(predicted: Population | None, proposed: Population | None, clip: Clip) -> None:
+    """Raise InputError unless all hypotheses are on the grid of the clip."""
+    for name, population in (("predicted", predicted), ("proposed", proposed)):
+        for k, hypothesis in enumerate(population.particles if population else ()):
+            check_grid(f"{name} hypothesis {k}", hypothesis, clip.grid)
+
+
+def _segments(proposed: Population, readings: Readings) -> list[np.ndarray]:
+    """The segment (m,) of each reading in each sample, 0 is none.
+
+    A reading belongs to the segment of its voxel, or of the nearest within a voxel: at the borders of objects,
+    pixels of one object have readings of another.
+    """
+    found = {id(h): readings.labels(h.labels, 1.0) for h in {id(h): h for h in proposed.particles}.values()}
+    return [found[id(h)] for h in proposed.particles]
+
+
+def _new_objects(segments: np.ndarray) -> list[SceneObject]:
+    """The segments (m,) of a partition as objects that continue none."""
+    return [SceneObject(segments == k) for k in np.unique(segments[segments > 0])]
+
+
+def _remaining(prediction: Prediction, label: int, threshold: float) -> Completion:
     """What free space leaves of a predicted object. Its voxels have at least the probability `threshold`."""
-    crop, left = prediction.crop(label), refined.shares.probability
+    crop, left = prediction.hypothesis.crop(label), prediction.refined.shares.probability
     p = crop.occupied if crop.probability is None else np.maximum(crop.probability, threshold * crop.occupied)
     p = np.where(left[crop.box] > 0, p, 0).astype(np.float32)
-    return Completion(crop.offset, p, np.zeros(p.shape, np.int32), prediction.record(label).completion_key or "")
-
-
-def _components(common: np.ndarray, sizes: np.ndarray) -> list[tuple[list[int], list[int]]]:
-    """Segments and predicted objects of each component, from their conflicts (s + 1, p + 1) and sizes (s + 1,)."""
-    graph = nx.Graph()
-    graph.add_nodes_from((0, a) for a in np.flatnonzero(sizes).tolist() if a)
-    graph.add_edges_from(((0, a), (1, b)) for a, b in np.argwhere(common).tolist() if a and b)
-    components = sorted(sorted(found) for found in nx.connected_components(graph))
-    return [([k for side, k in found if side == 0], [k for side, k in found if side == 1]) for found in components]
-
-
-def _record(
-    part: _Part, label: int, birth: int, key: str, views: tuple[ObjectView, ...], heir: Mapping[int, int]
-) -> ObjectRecord:
-    """The record of an object: of the predicted object that it continues, or new.
-
-    `heir` has the id of the object that continues each predicted one.
-    """
-    if not part.continues:
-        return ObjectRecord.born(label, birth, key, views)
-    apart = frozenset(heir.get(k, k) for record in part.continues for k in record.apart)
-    return replace(part.continues[0].changed(), label=label, completion_key=key, views=views, apart=apart)
+    key = prediction.hypothesis.record(label).completion_key or ""
+    return Completion(crop.offset, p, np.zeros(p.shape, np.int32), key)

@@ -15,7 +15,7 @@ from mstfilter.completion import ClipCompleter, Completer, ObservedBox, observed
 from mstfilter.completion.completer import fault_of
 from mstfilter.crossover import Crossover, CrossoverUpdate, Structure
 from mstfilter.errors import InputWarning
-from mstfilter.partition import Division, PairOdds, PartitionUpdate
+from mstfilter.partition import PairOdds, PartitionUpdate
 from mstfilter.scene import Clip, Hypothesis, Projection, render_hypothesis
 from mstfilter.segmentation import BoundaryModel, CutSampler, CutValue, TreeBuilder, TreeCutProposal
 from mstfilter.smc import Component, Population, Proposal, Transition, child
@@ -45,7 +45,6 @@ STAGE_OWNERS: dict[type, Callable[[Any], Component]] = {
     Registration: lambda stage: TrackingTransition(rule=MstRule(registration=stage)),
     Projection: lambda stage: CrossoverUpdate(free_space=stage),
     Structure: lambda stage: CrossoverUpdate(crossover=Crossover(structure=stage)),
-    Division: lambda stage: PartitionUpdate(division=stage),
     PairOdds: lambda stage: PartitionUpdate(pairs=stage),
 }
 

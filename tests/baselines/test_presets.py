@@ -74,7 +74,7 @@ def _in_update(config):
     [
         (["update.crossover.merge=always"], ["update.crossover.merge"]),
         (["update.crossover.merge=never"], ["update.crossover.merge"]),
-        (["update.quality_exponent=0", "update.evidence=[]"], ["update.evidence", "update.quality_exponent"]),
+        (["update.quality_exponent=0"], ["update.quality_exponent"]),
         (["n=1", "update.eta=25"], ["n", "update.eta"]),
     ],
 )

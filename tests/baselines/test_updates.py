@@ -9,9 +9,8 @@ import pytest
 
 from mstfilter.baselines.updates import SamplesOnly, TrackingOnly, Union
 from mstfilter.crossover import CrossoverUpdate
-from mstfilter.partition import Division
 from mstfilter.presets import build_filter, load_config
-from mstfilter.scene import Evidence, FreeSpace, Hypothesis, NoFreeSpace
+from mstfilter.scene import FreeSpace, Hypothesis, NoFreeSpace
 from mstfilter.scoring import weighted_coverage
 from mstfilter.smc import Population
 from mstfilter.testing import UpdateContract, scene_example
@@ -129,36 +128,6 @@ def test_a_union_holds_both_populations_weighted_as_fusion_weighs():
     np.testing.assert_allclose(both.log_weights, np.log([0.5 * q[0] ** 2, 1.5 * q[1] ** 2, 1, 1, 1]), atol=1e-12)
     assert both.parents["previous"].tolist() == [0, 1, -1, -1, -1]
     assert both.parents["proposed"].tolist() == [-1, -1, 0, 1, 2]
-
-    class Objects(Evidence):
-        def log_score(self, hypotheses, clip):
-            return np.array([float(h.n_objects) for h in hypotheses])
-
-    judged = Union(CrossoverUpdate(quality_exponent=2.0, evidence=(Objects(),))).update(
-        rng, predicted, proposed, clip
-    )
-    n = np.array([h.n_objects for h in both.particles])
-    np.testing.assert_allclose(judged.log_weights - both.log_weights, n)
-
-
-def test_a_union_takes_apart_what_fusion_takes_apart():
-    """All of fusion but its crossover: the left and the right half of the image are said to be different things."""
-
-    class Halves(Division):
-        def divide(self, clip):
-            motions = np.zeros(clip.after.depth.shape, np.int32)
-            motions[:, motions.shape[1] // 2 :] = 1
-            return motions
-
-    predicted, proposed, clip = two()
-    merged = np.where(predicted.particles[0].labels > 0, 1, 0).astype(np.uint16)
-    predicted = Population((Hypothesis.from_labels(merged, clip.grid),))
-    rng = np.random.default_rng(0)
-    plain = Union(CrossoverUpdate()).update(rng, predicted, proposed, clip)
-    parted = Union(CrossoverUpdate(division=Halves())).update(rng, predicted, proposed, clip)
-    assert plain.particles[0].n_objects == 1
-    assert parted.particles[0].n_objects == 2
-    assert len(parted) == len(plain)
 
 
 @pytest.mark.parametrize("update", [CrossoverUpdate(), SamplesOnly(), Union()])
