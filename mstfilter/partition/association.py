@@ -1,12 +1,13 @@
 """Associates the segments of an image partition with the objects of a prediction.
 
->>> overlaps = Overlaps.of(segments, objects)       # labels (m,) of the readings; 0 is none
+>>> overlaps = Overlaps.of(segments, objects, 60)   # labels (m,) of the readings; 0 is none
 >>> for component in overlaps.components():         # of the conflict graph
 ...     overlaps.tracks(component)                  # segment -> predicted objects that it continues
 
 A segment and a predicted object are *in conflict* if they share more than a tenth of the readings of the smaller one:
-an edge of the conflict graph (paper, section IV-D, where edges join objects that share voxels). In each connected
-component, a predicted object is continued by at most one segment:
+an edge of the conflict graph (paper, section IV-D, where edges join objects that share voxels). An object to which
+no segment belongs mainly is in no conflict if it has very few readings: those are readings of other objects that lie
+at it. In each connected component, a predicted object is continued by at most one segment:
 
 - An object that overlaps one segment only, which overlaps no other object, is continued by it if they share more than
   half of the readings.
@@ -16,12 +17,11 @@ component, a predicted object is continued by at most one segment:
   the segments are new objects.
 - A segment that continues several objects is their *merge*. A segment that continues none is a new object.
 
-An object without conflict is *occluded*: practically none of the readings are its.
+An object without conflict is *occluded*: practically no reading belongs to it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -46,20 +46,23 @@ class Overlaps:
     """The number of readings that each segment shares with each predicted object."""
 
     shared: np.ndarray  #: (segments + 1, objects + 1) int; row 0 is no segment, column 0 is no object
+    least: float  #: readings of an object in conflict, at least, if it is the main object of no segment
 
     @classmethod
-    def of(cls, segments: np.ndarray, objects: np.ndarray) -> Overlaps:
-        """From the segment (m,) and the predicted object (m,) of each reading; readings of no segment do not count."""
+    def of(cls, segments: np.ndarray, objects: np.ndarray, least: float) -> Overlaps:
+        """From the segment and the predicted object (m,) of each reading. Readings of no segment do not count."""
         inside = segments > 0
         shared = np.zeros((int(segments.max(initial=0)) + 1, int(objects[inside].max(initial=0)) + 1), np.int64)
         np.add.at(shared, (segments[inside], objects[inside]), 1)
-        return cls(shared)
+        return cls(shared, least)
 
     @cached_property
     def in_conflict(self) -> np.ndarray:
         """Whether each segment is in conflict with each object, bool in the shape of `shared`."""
-        smaller = np.minimum.outer(self.shared.sum(axis=1), self.shared.sum(axis=0))
-        conflict = self.shared > _CONFLICT * smaller
+        segments, objects = self.shared.sum(axis=1), self.shared.sum(axis=0)
+        conflict = self.shared > _CONFLICT * np.minimum.outer(segments, objects)
+        is_main = np.isin(np.arange(len(objects)), self.main_object)
+        conflict[:, ~is_main & (objects < self.least)] = False
         conflict[0], conflict[:, 0] = False, False
         return conflict
 
@@ -74,7 +77,7 @@ class Overlaps:
         """The predicted objects that are in conflict with a segment. All others are occluded."""
         return set(np.flatnonzero(self.in_conflict.any(axis=0)).tolist())
 
-    def components(self) -> Iterator[Component]:
+    def components(self) -> list[Component]:
         """Connected components of the conflict graph, in the order of their first segment."""
         graph = nx.Graph()
         graph.add_nodes_from(("segment", a) for a in np.flatnonzero(self.shared.any(axis=1)).tolist())
@@ -83,7 +86,7 @@ class Overlaps:
         for vertices in nx.connected_components(graph):
             labels = [sorted(k for kind, k in vertices if kind == wanted) for wanted in ("segment", "object")]
             found.append(Component(*labels))
-        yield from sorted(found)
+        return sorted(found)
 
     def tracks(self, component: Component) -> dict[int, list[int]]:
         """The predicted objects that each segment of a component continues, that with most readings first."""

@@ -16,7 +16,7 @@ those whose probabilities of pairs are nearest to the given ones (least cross en
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -31,7 +31,7 @@ from mstfilter.completion.observed import frame_points
 from mstfilter.scene import Frame, VoxelGrid, canonical, common_refinement, scaled_area
 from mstfilter.smc import Systematic
 
-_LEAST_READINGS = 60  # of a cell in an image of 640 x 480 pixels, as `ObjectRule.min_points`
+_LEAST_READINGS = 60  # of a region in an image of 640 x 480 pixels, as `ObjectRule.min_points`
 _LEAST_SHARE, _TOLERANCE, _STEPS = 1e-9, 1e-3, 200
 
 
@@ -47,6 +47,11 @@ class Readings:
     def of(cls, frame: Frame, grid: VoxelGrid) -> Readings:
         """Of a frame."""
         return cls(*frame_points(frame, grid), frame.depth.shape)
+
+    @property
+    def smallest_region(self) -> float:
+        """Readings of the smallest region of this image that counts as one."""
+        return scaled_area(_LEAST_READINGS, self.shape[0] * self.shape[1])
 
     def mask(self, chosen: np.ndarray) -> np.ndarray:
         """Pixels (H, W) bool of the chosen readings (m,) bool."""
@@ -95,7 +100,7 @@ class Cells:
         in_segments = common_refinement(segments).cells
         objects = [_extended(in_segments, labels[kept]) for labels in predictions]
         exact = common_refinement([in_segments, *objects]).cells
-        cell = _without_slivers(exact, readings.pixels[kept], readings.shape)
+        cell = _without_slivers(exact, readings, kept)
         of_reading = np.full(len(kept), -1)
         of_reading[kept] = np.unique(cell, return_inverse=True)[1]
         example = _examples(cell, exact)
@@ -126,13 +131,15 @@ class Cells:
         np.add.at(found, (self.of_reading[inside], image.ravel()[self.readings.pixels[inside]]), 1)
         return found
 
-    def alternatives(self) -> Iterator[Alternatives]:
+    def alternatives(self) -> list[Alternatives]:
         """The distinct partitions of each component."""
+        found = []
         for c in range(int(self.component.max(initial=-1)) + 1):
             cells = np.flatnonzero(self.component == c)
             rows = self._partitions_of(cells)
             named = np.array([canonical(np.unique(row, return_inverse=True)[1] + 1) for row in rows])
-            yield Alternatives(cells, np.unique(named, axis=0).astype(np.int64))
+            found.append(Alternatives(cells, np.unique(named, axis=0).astype(np.int64)))
+        return found
 
     def _partitions_of(self, cells: np.ndarray) -> list[np.ndarray]:
         """Partitions (k,) of some cells (k,) by the samples, and by the predictions, completed by each sample."""
@@ -190,13 +197,13 @@ def _extended(cells: np.ndarray, labels: np.ndarray) -> np.ndarray:
     return np.where(labels > 0, labels, usual[cells])
 
 
-def _without_slivers(cell: np.ndarray, pixels: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """Cells (m,) after the readings of small ones have joined the nearest large cell, if one is near."""
-    least = scaled_area(_LEAST_READINGS, shape[0] * shape[1])
+def _without_slivers(cell: np.ndarray, readings: Readings, kept: np.ndarray) -> np.ndarray:
+    """Cells of the kept readings, after those of small cells have joined the nearest large cell, if one is near."""
+    pixels, least = readings.pixels[kept], readings.smallest_region
     large = np.bincount(cell, minlength=1)[cell] >= least
     if not large.any():
         return cell
-    image = np.full(shape, -1)
+    image = np.full(readings.shape, -1)
     image.ravel()[pixels[large]] = cell[large]
     distance, nearest = distance_transform_edt(image < 0, return_indices=True)
     return np.where(distance.ravel()[pixels] <= np.sqrt(least), image[tuple(nearest)].ravel()[pixels], cell)

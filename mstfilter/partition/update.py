@@ -10,11 +10,11 @@ estimated anew from all that was seen of it.
 1. **Free-space projection** (as in the paper). Q_j is the share of the voxels of prediction j that the frame does not
    observe as free. Prediction j *holds* with probability Q_j^lambda.
 2. **Partitions.** A sample partitions the readings by its segments, a prediction by the objects that lie at the
-   readings. All of them together say how likely two readings belong to one object, and partitions of the image are
-   drawn by these odds (`mstfilter.partition.cells`, `pairs`). So segments of different samples can occur in one
-   partition, and no pair (sample, prediction) is formed as in the paper.
+   readings. All of them together say how likely two readings belong to one object. Partitions of the image are drawn
+   by these odds (`mstfilter.partition.cells`), so segments of different samples can occur in one partition. The
+   paper crosses each sample with each prediction.
 3. **Association.** Each partition is combined with a prediction j, drawn in proportion to w_j Q_j^lambda. Segments and
-   predicted objects form a *conflict graph*; in each of its *components*, segments continue objects
+   predicted objects form a *conflict graph*. In each of its *components*, segments continue predicted objects
    (`mstfilter.partition.association`). The paper draws which conflicts end in a merge; here the partition decides.
 4. **Occluded objects.** A predicted object without conflict, to which practically no reading belongs, stays with
    probability (Q_j q)^lambda; q is the share of its own voxels that the frame does not observe as free.
@@ -56,7 +56,8 @@ from mstfilter.scene import (
 from mstfilter.smc import Population, Systematic, Update, child
 
 
-class Prediction(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Prediction:
     """A predicted hypothesis and what the last frame says about it."""
 
     hypothesis: Hypothesis
@@ -64,6 +65,18 @@ class Prediction(NamedTuple):
     weight: float  #: w_j, normalised
     holds: float  #: probability that it holds, Q^lambda
     objects: np.ndarray  #: (m,) its object at each reading, 0 is none
+
+    def shares_left(self) -> dict[int, float]:
+        """The share q of each object's voxels that the frame does not observe as free, by label."""
+        left = Counter(self.hypothesis.labels[self.refined.labels > 0].tolist())
+        return {label: left[label] / n for label, n in self.hypothesis.volumes().items()}
+
+    def remaining(self, record: ObjectRecord, threshold: float) -> Completion:
+        """What free space leaves of an object. Its voxels have at least the probability `threshold`."""
+        crop, left = self.hypothesis.crop(record.label), self.refined.shares.probability
+        p = crop.occupied if crop.probability is None else np.maximum(crop.probability, threshold * crop.occupied)
+        p = np.where(left[crop.box] > 0, p, 0).astype(np.float32)
+        return Completion(crop.offset, p, np.zeros(p.shape, np.int32), record.completion_key or "")
 
 
 class SceneObject(NamedTuple):
@@ -157,7 +170,7 @@ class PartitionUpdate(Update):
         drawn = Systematic().select(child(rng, "predicted"), projected.log_weights, n)[0]
         partitions = self._draw_partitions(child(rng, "partition"), predictions, proposed, readings, observation, n)
         candidates = [
-            self._associate(child(rng, "hidden", c), segments, predictions[j])
+            self._associate(child(rng, "hidden", c), segments, predictions[j], readings)
             for c, (segments, j) in enumerate(zip(partitions, drawn.tolist(), strict=True))
         ]
         built = self._complete(rng, candidates, readings, observation)
@@ -200,10 +213,10 @@ class PartitionUpdate(Update):
     # 3. Association, 4. occluded objects ------------------------------------------------------------------------
 
     def _associate(
-        self, rng: np.random.Generator, segments: np.ndarray, prediction: Prediction
+        self, rng: np.random.Generator, segments: np.ndarray, prediction: Prediction, readings: Readings
     ) -> list[SceneObject]:
         """The objects of a candidate: the segments (m,) of a partition, and occluded objects of a prediction."""
-        overlaps = Overlaps.of(segments, prediction.objects)
+        overlaps = Overlaps.of(segments, prediction.objects, readings.smallest_region)
         record_of = {record.label: record for record in prediction.hypothesis.objects}
         visible = [
             SceneObject(segments == segment, tuple(record_of[k] for k in tracks))
@@ -214,17 +227,14 @@ class PartitionUpdate(Update):
 
     def _occluded(self, rng: np.random.Generator, prediction: Prediction, overlaps: Overlaps) -> list[SceneObject]:
         """The occluded objects of a prediction that stay, each with probability (Q q)^lambda."""
-        volume = prediction.hypothesis.volumes()
-        left = Counter(prediction.hypothesis.labels[prediction.refined.labels > 0].tolist())
+        q = prediction.shares_left()
         no_readings = np.zeros(len(prediction.objects), bool)
-        found = []
-        for record in prediction.hypothesis.objects:
-            if record.label in overlaps.visible:
-                continue
-            q = left[record.label] / max(volume[record.label], 1)
-            if rng.random() < prediction.holds * q**self.quality_exponent:
-                found.append(SceneObject(no_readings, (record,), _remaining(prediction, record.label, self.threshold)))
-        return found
+        return [
+            SceneObject(no_readings, (record,), prediction.remaining(record, self.threshold))
+            for record in prediction.hypothesis.objects
+            if record.label not in overlaps.visible
+            and rng.random() < prediction.holds * q[record.label] ** self.quality_exponent
+        ]
 
     # 5. Completion ----------------------------------------------------------------------------------------------
 
@@ -249,7 +259,9 @@ class PartitionUpdate(Update):
         streams = [child(rng, "completion", k) for k in seen]
         shown = [(readings.mask(objects[k].readings), views[k]) for k in seen]
         completions = completer.complete_again(streams, clip.after, shown, clip.grid)
-        found = {k: _Completed(c.shifted(self.occupied_log_odds), v) for k, (c, v) in zip(seen, completions, strict=True)}
+        found = {
+            k: _Completed(c.shifted(self.occupied_log_odds), v) for k, (c, v) in zip(seen, completions, strict=True)
+        }
         return [found.get(k) or _Completed.of_occluded(one) for k, one in enumerate(objects)]
 
     def _hypothesis(self, objects: Sequence[SceneObject], completed: Sequence[_Completed], clip: Clip) -> Hypothesis:
@@ -311,12 +323,3 @@ def _segments(proposed: Population, readings: Readings) -> list[np.ndarray]:
 def _new_objects(segments: np.ndarray) -> list[SceneObject]:
     """The segments (m,) of a partition as objects that continue none."""
     return [SceneObject(segments == k) for k in np.unique(segments[segments > 0])]
-
-
-def _remaining(prediction: Prediction, label: int, threshold: float) -> Completion:
-    """What free space leaves of a predicted object. Its voxels have at least the probability `threshold`."""
-    crop, left = prediction.hypothesis.crop(label), prediction.refined.shares.probability
-    p = crop.occupied if crop.probability is None else np.maximum(crop.probability, threshold * crop.occupied)
-    p = np.where(left[crop.box] > 0, p, 0).astype(np.float32)
-    key = prediction.hypothesis.record(label).completion_key or ""
-    return Completion(crop.offset, p, np.zeros(p.shape, np.int32), key)

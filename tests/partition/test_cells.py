@@ -11,10 +11,11 @@ from hypothesis.extra import numpy as hnp
 from scipy.optimize import minimize
 from scipy.special import softmax
 
-from mstfilter.partition import Cells, PairEvidence, cells as module
+from mstfilter.partition import Cells, PairEvidence, Readings, cells as module
 
 SHAPE = (5, 6)
 PIXELS = np.arange(30)
+READINGS = Readings(PIXELS, np.zeros((30, 3), int), SHAPE)
 images = hnp.arrays(np.int64, SHAPE, elements=st.integers(0, 2))
 
 
@@ -35,7 +36,7 @@ def explained(samples, row, kept):
 @given(st.lists(images, min_size=1, max_size=3), st.lists(images, max_size=2))
 def test_cells_are_what_all_partitions_treat_alike(samples, predictions):
     rows = [one.ravel() for one in (*samples, *predictions)]
-    found = Cells.of(PIXELS, SHAPE, rows[: len(samples)], rows[len(samples) :])
+    found = Cells.of(READINGS, rows[: len(samples)], rows[len(samples) :])
     kept = np.mean([one.ravel() > 0 for one in samples], axis=0) >= 0.5
     np.testing.assert_array_equal(found.of_reading >= 0, kept)
     rows = rows[: len(samples)] + [explained(rows[: len(samples)], row, kept) for row in rows[len(samples) :]]
@@ -89,9 +90,14 @@ def two_halves():
 def test_log_odds_by_hand():
     one, two = two_halves()
     nothing = np.zeros_like(one)
-    found = Cells.of(PIXELS, SHAPE, [one, two, two, two], [one, two, nothing])
+    found = Cells.of(READINGS, [one, two, two, two], [one, two, nothing])
     evidence = PairEvidence(
-        alone_constant=0.1, alone_image=0.9, constant=-0.2, image=0.7, past=0.4, past_constant=0.3
+        image_only_constant=0.1,
+        image_only=0.9,
+        constant=-0.2,
+        image=0.7,
+        prediction=0.4,
+        prediction_constant=0.3,
     )
 
     def logit(p):
@@ -103,7 +109,7 @@ def test_log_odds_by_hand():
     wrong = 0.1 + 0.9 * logit(0.25)  # with probability 3/4
     odds = evidence.log_odds(found, np.array([0.6, 0.2, 0.2]) / 4, None)
     assert odds == pytest.approx([right / 4 + wrong * 3 / 4])
-    alone = Cells.of(PIXELS, SHAPE, [one, two], [])
+    alone = Cells.of(READINGS, [one, two], [])
     assert evidence.log_odds(alone, np.zeros(0), None) == pytest.approx([0.1])
 
 
@@ -122,7 +128,7 @@ def test_the_mixture_forecasts_pairs_best():
         def of(x, loss=loss):
             return loss(softmax(x))
 
-        found = module._matched(joined, same, weights)
+        found = module._fitted_mixture(joined, same, weights)
         assert found.sum() == pytest.approx(1) and (found >= 0).all()
         best = min(minimize(of, rng.normal(size=p)).fun for _ in range(3))
         assert loss(found) <= best + 2e-3
@@ -130,9 +136,9 @@ def test_the_mixture_forecasts_pairs_best():
 
 def test_a_pair_that_is_free_gets_its_own_probability():
     one, two = two_halves()
-    found = Cells.of(PIXELS, SHAPE, [one, two], [])
-    ((cells, partitions),) = found.alternatives()
-    p = found.probabilities(np.array([1.3]), cells, partitions)
+    found = Cells.of(READINGS, [one, two], [])
+    (component,) = found.alternatives()
+    p, partitions = found.probabilities(np.array([1.3]), component), component.partitions
     joined = (partitions[:, 0] == partitions[:, 1]).astype(float)
     assert p @ joined == pytest.approx(1 / (1 + np.exp(-1.3)), abs=2e-3)
 
@@ -141,7 +147,7 @@ def test_an_object_on_both_sides_of_another_can_be_one():
     """The samples cannot join its parts, as they do not touch; the predictions do."""
     strips = np.repeat([1, 2, 3], 2)[None].repeat(SHAPE[0], 0).ravel()
     behind = np.where(strips == 3, 1, strips)
-    found = Cells.of(PIXELS, SHAPE, [strips] * 3, [behind] * 2)
+    found = Cells.of(READINGS, [strips] * 3, [behind] * 2)
     odds = np.where((found.samples[0, found.pairs] != 2).all(axis=1), 3.0, -3.0)
     drawn = found.draw(np.random.default_rng(0), odds, 100)
     left, right, middle = (drawn[:, found.of_reading[k]] for k in (0, 5, 2))
@@ -152,12 +158,13 @@ def test_partitions_are_drawn_with_their_probabilities():
     rng = np.random.default_rng(0)
     rows = [rng.integers(1, 3, (2, 2)).repeat(3, 0)[:5].repeat(3, 1).ravel() for _ in range(4)]
     rows.append(np.arange(1, 5).reshape(2, 2).repeat(3, 0)[:5].repeat(3, 1).ravel())
-    found = Cells.of(PIXELS, SHAPE, rows[:3], rows[3:])
+    found = Cells.of(READINGS, rows[:3], rows[3:])
     log_odds = rng.normal(size=len(found.pairs))
     n = 20_000
     drawn = found.draw(np.random.default_rng(1), log_odds, n)
-    for cells, partitions in found.alternatives():
-        p = found.probabilities(log_odds, cells, partitions)
+    for component in found.alternatives():
+        cells, partitions = component
+        p = found.probabilities(log_odds, component)
         for partition, expected in zip(partitions, p, strict=True):
             same = (drawn[:, cells][:, :, None] == drawn[:, cells][:, None]) == (
                 partition[:, None] == partition[None]
@@ -174,29 +181,32 @@ def test_partitions_are_drawn_with_their_probabilities():
 
 
 def test_slivers_join_a_neighbour(monkeypatch):
-    monkeypatch.setattr(module, "LEAST", 20 * 307200 / (SHAPE[0] * SHAPE[1] * 6))  # cells of less than 3.3 readings
+    monkeypatch.setattr(
+        module, "_LEAST_READINGS", 20 * 307200 / (SHAPE[0] * SHAPE[1] * 6)
+    )  # cells of less than 3.3 readings
     one, two = two_halves()
     thin = two.reshape(SHAPE).copy()
     thin[:3, 3] = 1  # a border that is one pixel off
-    found = Cells.of(PIXELS, SHAPE, [two, two, thin.ravel()], [one])
+    found = Cells.of(READINGS, [two, two, thin.ravel()], [one])
     assert found.samples.shape[1] == 2
     assert (found.of_reading.reshape(SHAPE)[:, :3] == found.of_reading[0]).all()
 
 
 def test_small_objects_far_from_others_are_not_slivers(monkeypatch):
     monkeypatch.setattr(
-        module, "LEAST", 4 * 307200 / 40
+        module, "_LEAST_READINGS", 4 * 307200 / 40
     )  # cells of less than four readings join others within two pixels
     one = np.zeros((1, 40), int)
     one[0, :10], one[0, 30:32] = 1, 2
     two = one.copy()
     two[0, 9] = 3
-    found = Cells.of(np.arange(40), (1, 40), [one.ravel(), two.ravel()], [])
+    readings = Readings(np.arange(40), np.zeros((40, 3), int), (1, 40))
+    found = Cells.of(readings, [one.ravel(), two.ravel()], [])
     assert found.of_reading[0] == found.of_reading[9] != found.of_reading[30] >= 0
     assert found.samples[:, found.of_reading[30]].tolist() == [2, 2]
     np.testing.assert_array_equal(np.sort(found.sizes), [2, 10])
 
 
 def test_no_objects():
-    found = Cells.of(PIXELS, SHAPE, [np.zeros(30, int)], [np.ones(30, int)])
+    found = Cells.of(READINGS, [np.zeros(30, int)], [np.ones(30, int)])
     assert (found.of_reading == -1).all() and found.draw(np.random.default_rng(0), np.zeros(0), 3).shape == (3, 0)

@@ -11,8 +11,7 @@ from scipy.special import expit
 
 from mstfilter.completion import Completion, Extrude, SurfaceOnly
 from mstfilter.errors import InputError
-from mstfilter.partition import Cells, PairEvidence, PartitionUpdate
-from mstfilter.partition.update import Readings, _Past
+from mstfilter.partition import PairEvidence, PartitionUpdate, Readings
 from mstfilter.scene import Clip, Hypothesis, Occupancy
 from mstfilter.segmentation import hypothesis_of
 from mstfilter.smc import Population
@@ -139,9 +138,9 @@ def test_objects_without_views_keep_their_labels_also_where_they_are_unlikely():
     assert all((one.labels > 0).sum() == (labels > 0).sum() for one in found)
 
 
-#: Log odds that leave no doubt, in favour of the image or of the past.
-IMAGE = PairEvidence(constant=0.0, image=100.0, past=0.0, past_constant=0.0)
-PAST = PairEvidence(constant=0.0, image=0.0, past=100.0, past_constant=0.0)
+#: Log odds that leave no doubt, in favour of the image or of the prediction.
+IMAGE = PairEvidence(constant=0.0, image=100.0, prediction=0.0, prediction_constant=0.0)
+PREDICTION = PairEvidence(constant=0.0, image=0.0, prediction=100.0, prediction_constant=0.0)
 
 
 def test_objects_continue_what_lies_in_them():
@@ -152,13 +151,13 @@ def test_objects_continue_what_lies_in_them():
     merged = sample_of(later, [masks[0] | masks[1]])
     (one,) = step(PartitionUpdate(pairs=IMAGE), later, merged, state).particles
     assert one.n_objects == 1 and len(one.objects[0].views) == 3  # the views of both
-    (one,) = step(PartitionUpdate(pairs=PAST), later, merged, state).particles
+    (one,) = step(PartitionUpdate(pairs=PREDICTION), later, merged, state).particles
     assert [record.id for record in one.objects] == [record.id for record in state.objects]
     half = masks[0] & (np.arange(masks[0].shape[1]) < np.nonzero(masks[0])[1].mean())
     cut = sample_of(later, [half, masks[0] & ~half, masks[1]])
     (one,) = step(PartitionUpdate(pairs=IMAGE), later, cut, state).particles
     assert one.n_objects == 3 and state.record(2).id in {record.id for record in one.objects}
-    (one,) = step(PartitionUpdate(pairs=PAST), later, cut, state).particles
+    (one,) = step(PartitionUpdate(pairs=PREDICTION), later, cut, state).particles
     assert [record.id for record in one.objects] == [record.id for record in state.objects]
 
 
@@ -167,7 +166,9 @@ def test_a_past_that_the_frame_sees_through_says_nothing_about_pairs():
     clip, later = clip_of(TOUCHING), clip_of(TOUCHING, 1)
     masks = masks_of(TOUCHING, clip.after)
     state = step(PartitionUpdate(), clip, sample_of(clip, [masks[0] | masks[1]])).particles[0]
-    pairs = PairEvidence(alone_constant=0.0, alone_image=1.0, constant=0.0, image=0.0, past=100.0, past_constant=0.0)
+    pairs = PairEvidence(
+        image_only_constant=0.0, image_only=1.0, constant=0.0, image=0.0, prediction=100.0, prediction_constant=0.0
+    )
     proposed = sample_of(later, masks)
 
     def objects(past, **changes):
@@ -182,99 +183,12 @@ def test_a_past_that_the_frame_sees_through_says_nothing_about_pairs():
     assert objects(wrong, quality_exponent=0.0) == 1
 
 
-@pytest.mark.parametrize(
-    ("segments", "past", "continued"),
-    [
-        ([1] * 60 + [2] * 240, [1] * 100 + [2] * 200, [[1], [2]]),  # the second comes to stand before the first
-        ([1] * 20 + [2] * 280, [1] * 100 + [2] * 200, [[1], [2]]),
-        ([1] * 15 + [2] * 285, [1] * 100 + [2] * 200, [[1], [2]]),  # identity and views go to one segment only
-        ([1] * 15 + [2] * 285 + [3] * 100, [1] * 100 + [2] * 300, [[1], [], []]),
-        ([1] * 60 + [2] * 40, [1] * 100, [[], []]),  # one object is cut in two
-        ([1] * 90 + [2] * 10, [1] * 100, [[1], []]),
-        ([1] * 300, [1] * 100 + [2] * 200, [[2, 1]]),  # two are one
-        ([1] * 300, [1] * 10 + [2] * 290, [[2]]),  # the first is hidden: readings of the second lie near it
-        ([1] * 10 + [2] * 290, [1] * 10 + [2] * 290, [[1], [2]]),
-        ([1] * 100, [0] * 100, [[]]),
-    ],
-)
-def test_which_objects_a_segment_continues(segments, past, continued):
-    labels = np.zeros(GRID.shape, np.uint16)
-    labels[2:4, 2:4, :2], labels[6:8, 6:8, :2] = 1, 2
-    prediction = Hypothesis.from_labels(labels, GRID)
-    past = np.array(past + [0] * (len(segments) - len(past)))
-    parts = PartitionUpdate()._parts(
-        np.random.default_rng(0), np.array(segments), _Past(past, prediction, prediction, 1.0), few=20
-    )
-    seen = [part for part in parts if part.readings.any()]
-    assert [[record.label for record in part.continues] for part in seen] == continued
-    if continued == [[2]]:
-        assert [part.continues[0].label for part in parts if part.predicted is not None] == [1]
-
-
 @pytest.mark.parametrize("log_odds", [-200.0, -20.0, -2.0, 0.0, 0.2, 0.5, 100.0])
 def test_added_log_odds_leave_certain_voxels(log_odds):
     p = np.array([0, 0.25, 0.5, 1], np.float32).reshape(1, 1, 4)
     found = Completion(np.zeros(3, int), p, np.zeros(p.shape, np.int32), "key").shifted(log_odds).probability.ravel()
     assert found.dtype == np.float32 and found[0] == 0 and found[-1] == 1
     np.testing.assert_allclose(found[1:3], expit(np.log([1 / 3, 1]) + log_odds), rtol=1e-5, atol=1e-30)
-
-
-def test_cells_that_a_sample_gives_to_no_object_are_not_one_object_there():
-    cells = Cells(
-        np.arange(2),
-        np.arange(2),
-        np.array([[1, 1], [0, 0]]),
-        np.zeros((0, 2), int),
-        np.zeros(2, int),
-        np.array([[0, 1]]),
-    )
-    found = PairEvidence(alone_constant=0.0).log_odds(cells, np.zeros(0), clip_of(ALONE))
-    np.testing.assert_allclose(found, 0.0, atol=1e-12)  # one of two samples
-
-
-def test_objects_that_moved_apart_are_not_merged():
-    clip = clip_of(TWO)
-    masks = masks_of(TWO, clip.after)
-    state = step(PartitionUpdate(), clip, sample_of(clip, masks)).particles[0]
-    a, b = state.objects
-    apart = (replace(a, apart=frozenset({b.id})), replace(b, apart=frozenset({a.id})))
-    state = replace(state, objects=apart)
-    merged = sample_of(clip_of(TWO, 1), [masks[0] | masks[1]])
-    for one in step(PartitionUpdate(pairs=IMAGE), clip_of(TWO, 1), merged, state).particles:
-        assert [(r.id, r.apart) for r in one.objects] == [(r.id, r.apart) for r in apart]
-        np.testing.assert_array_equal(one.labels, state.labels)
-
-
-def test_objects_that_moved_apart_are_not_merged_by_way_of_others():
-    """Objects 2 and 3 moved apart. They become parts of two objects, which must not become one."""
-    scene = boxes(*(((10 + 8 * k, 20, 0), (18 + 8 * k, 30, 8)) for k in range(4)))
-    clips, update = [clip_of(scene, k) for k in range(3)], PartitionUpdate(pairs=IMAGE)
-    masks = masks_of(scene, clips[0].after)
-    state = step(update, clips[0], sample_of(clips[0], masks)).particles[0]
-    a, b, c, d = state.objects
-    apart = (a, replace(b, apart=frozenset({c.id})), replace(c, apart=frozenset({b.id})), d)
-    state = replace(state, objects=apart)
-    sample = sample_of(clips[1], [masks[0] | masks[1], masks[2] | masks[3]])
-    state = step(update, clips[1], sample, state).particles[0]
-    first, second = state.objects
-    assert (first.apart, second.apart) == ({second.id}, {first.id})
-    sample = sample_of(clips[2], [np.logical_or.reduce(masks)])
-    assert len(step(update, clips[2], sample, state).particles[0].objects) == 2
-
-
-def test_readings_of_an_object_that_moved_apart_go_to_it():
-    """A segment with few readings of an object that has its own segment, and has moved apart from the main one."""
-    labels = np.zeros(GRID.shape, np.uint16)
-    labels[2:4, 2:4, :2], labels[6:8, 6:8, :2] = 1, 2
-    prediction = Hypothesis.from_labels(labels, GRID)
-    a, b = prediction.objects
-    apart = replace(prediction, objects=(replace(a, apart=frozenset({b.id})), replace(b, apart=frozenset({a.id}))))
-    segments, past = np.array([1] * 375 + [2] * 25), np.array([1] * 300 + [2] * 100)
-    for known, sizes in ((prediction, [375, 25]), (apart, [300, 100])):
-        parts = PartitionUpdate()._parts(np.random.default_rng(0), segments, _Past(past, known, known, 1.0), few=20)
-        found = sorted((part for part in parts), key=lambda part: -part.readings.sum())
-        assert [int(part.readings.sum()) for part in found] == sizes
-        assert [part.continues[0].label for part in found] == [1, 2]
 
 
 def test_a_merged_object_keeps_the_latest_views_of_both():
@@ -291,7 +205,7 @@ def test_partitions_by_pairs_follow_image_and_past():
     masks = masks_of(TOUCHING, clip.after)
     apart, merged = sample_of(clip, masks), sample_of(clip, [masks[0] | masks[1]])
     state = step(PartitionUpdate(), clip, apart).particles[0]
-    n, pairs = 300, PairEvidence(constant=0.0, image=1.0, past=0.3, past_constant=0.0)
+    n, pairs = 300, PairEvidence(constant=0.0, image=1.0, prediction=0.3, prediction_constant=0.0)
     update = PartitionUpdate(pairs=pairs, n_candidates=n, completer=SurfaceOnly())
     proposed = Population((apart, merged))
     later = clip_of(TOUCHING, 1)
@@ -306,7 +220,7 @@ def test_partitions_by_pairs_follow_image_and_past():
 
 def test_labels_of_readings_by_brute_force():
     rng = np.random.default_rng(0)
-    readings = Readings(np.arange(300), rng.integers(10, 30, (300, 3)))
+    readings = Readings(np.arange(300), rng.integers(10, 30, (300, 3)), (20, 15))
     labels = np.zeros(GRID.shape, np.uint16)
     for k in range(1, 40):
         labels[tuple(rng.integers(10, 30, 3))] = k

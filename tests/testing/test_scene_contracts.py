@@ -12,8 +12,8 @@ import pytest
 
 from mstfilter import results
 from mstfilter.completion import Completer
-from mstfilter.partition import PartitionUpdate
 from mstfilter.errors import InputError, InputWarning
+from mstfilter.partition import PartitionUpdate
 from mstfilter.presets import REGISTRY
 from mstfilter.scene import component_key, scene_cache
 from mstfilter.segmentation import TreeCutProposal
