@@ -13,8 +13,8 @@ estimated anew from all that was seen of it.
    readings. All of them together say how likely two readings belong to one object. Partitions of the image are drawn
    by these odds (`mstfilter.partition.cells`), so segments of different samples can occur in one partition. The
    paper crosses each sample with each prediction.
-3. **Association.** Each partition is combined with a prediction j, drawn in proportion to w_j Q_j^lambda. Segments and
-   predicted objects form a *conflict graph*. In each of its *components*, segments continue predicted objects
+3. **Association.** Each partition is combined with a prediction j, drawn in proportion to w_j Q_j^lambda. Segments
+   and predicted objects form a *conflict graph*. In each of its *components*, segments continue predicted objects
    (`mstfilter.partition.association`). The paper draws which conflicts end in a merge; here the partition decides.
 4. **Occluded objects.** A predicted object without conflict, to which practically no reading belongs, stays with
    probability (Q_j q)^lambda; q is the share of its own voxels that the frame does not observe as free.

@@ -216,9 +216,6 @@ class ObjectRecord:
     #: Rigid motion in world metres since `source`; the identity if `source` is None.
     motion: RigidTransform = field(default_factory=lambda: _NO_MOTION)
     completion_key: str | None = None  #: key of the segment that it was completed from
-    #: Ids of objects of the same hypothesis that were observed to move apart from it, so that they are not the
-    #: same object.
-    apart: frozenset[int] = frozenset()
     views: tuple[ObjectView, ...] = ()  #: what the frames so far showed of it, oldest first
 
     def __repr__(self) -> str:
