@@ -15,7 +15,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from mstfilter.errors import InputError, check_integer
+from mstfilter.errors import InputError
+from mstfilter.fields import PositiveInt
 from mstfilter.scene import Hypothesis
 from mstfilter.scene.partitions import canonical, common_refinement
 from mstfilter.smc import Equivalence, Similarity, first_seen
@@ -38,10 +39,7 @@ class WeightedCoverage(Similarity):
     `stride` is the step between the voxels that are used, along each axis. The time falls with stride^3.
     """
 
-    stride: int = 1
-
-    def __post_init__(self) -> None:
-        check_integer("stride in voxels", self.stride)
+    stride: PositiveInt = 1
 
     def matrix(self, particles: Sequence[Hypothesis]) -> np.ndarray:
         step = slice(None, None, self.stride)

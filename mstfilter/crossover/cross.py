@@ -19,11 +19,12 @@ from mstfilter.crossover.conflicts import PREDICTED, PROPOSED, SIDES, ConflictGr
 from mstfilter.crossover.mode_filter import ModeFilter
 from mstfilter.crossover.resolution import ConflictResolution, MergeRule, SpanningTree, Structure, resolve
 from mstfilter.errors import InputError
+from mstfilter.fields import Bounded
 from mstfilter.scene import MAX_LABEL, Hypothesis, ObjectRecord, Occupancy, as_labels, check_grid
 
 
 @dataclass(frozen=True)
-class Crossover:
+class Crossover(Bounded):
     """Conflict-graph crossover.
 
     Parameters

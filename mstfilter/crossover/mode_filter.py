@@ -7,16 +7,18 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import reduce
+from typing import Annotated
 
 import numpy as np
 from scipy import ndimage
 
-from mstfilter.errors import InputError, check_integer, check_number
+from mstfilter.errors import InputError
+from mstfilter.fields import Bounded, Bounds, NonNegativeInt, PositiveInt
 from mstfilter.scene import as_labels, occupied_box
 
 
 @dataclass(frozen=True)
-class ModeFilter:
+class ModeFilter(Bounded):
     """Majority filter over label grids.
 
     The label of an occupied voxel is replaced by the most frequent other label in its window, if the count of this
@@ -29,7 +31,7 @@ class ModeFilter:
     ----------
     window : int
         Edge of the cubic window in voxels, odd. 1 switches the filter off.
-    margin : int
+    margin : float
         Least difference of the counts of the other label and the voxel's own label.
     isolation : int
         Largest number of free cells in the window of an occupied voxel; with more it becomes free. No effect if at
@@ -38,16 +40,12 @@ class ModeFilter:
         Largest number of sweeps.
     """
 
-    window: int = 5
-    margin: int = 3
-    isolation: int = 120
-    max_sweeps: int = 100
+    window: PositiveInt = 5
+    margin: Annotated[float, Bounds()] = 3
+    isolation: NonNegativeInt = 120
+    max_sweeps: PositiveInt = 100
 
     def __post_init__(self) -> None:
-        check_integer("mode filter window", self.window)
-        check_integer("mode filter isolation", self.isolation, at_least=0)
-        check_integer("mode filter max_sweeps", self.max_sweeps)
-        check_number("mode filter margin", self.margin)
         if self.window % 2 == 0:
             raise InputError(f"mode filter window is {self.window}, expected an odd number of voxels")
 
@@ -56,19 +54,29 @@ class ModeFilter:
         labels = as_labels(labels)
         if labels.ndim != 3:
             raise InputError(f"label grid has shape {labels.shape}, the mode filter expects three axes")
-        box = occupied_box(labels != 0)
-        if self.window == 1 or box is None:
+        reach = occupied_box(labels != 0)  # voxels that may change
+        if self.window == 1 or reach is None:
             return labels
         # Windows at the faces of the grid have fewer cells.
-        along = [_window_sums(np.ones(n, np.int32), self.window, 0) for n in labels.shape]
-        cells = reduce(np.multiply.outer, (cells[s] for cells, s in zip(along, box, strict=True)))
+        cells = reduce(np.multiply.outer, (_window_sums(np.ones(n, np.int32), self.window) for n in labels.shape))
         out = labels.copy()
         for _ in range(self.max_sweeps):
-            swept = self._swept(out[box], cells)
-            if np.array_equal(swept, out[box]):
+            around = self._grown(reach, labels.shape)
+            inside = tuple(slice(r.start - a.start, r.stop - a.start) for r, a in zip(reach, around, strict=True))
+            swept = self._swept(out[around], cells[around])[inside]
+            changed = occupied_box(swept != out[reach])
+            out[reach] = swept
+            if changed is None:
                 break
-            out[box] = swept
+            # A voxel can change again only if a cell in its window has changed.
+            changed = tuple(slice(r.start + c.start, r.start + c.stop) for r, c in zip(reach, changed, strict=True))
+            reach = self._grown(changed, labels.shape)
         return out
+
+    def _grown(self, box: tuple[slice, ...], shape: tuple[int, ...]) -> tuple[slice, ...]:
+        """A box with the cells that have a cell of it in their window."""
+        half = self.window // 2
+        return tuple(slice(max(s.start - half, 0), min(s.stop + half, n)) for s, n in zip(box, shape, strict=True))
 
     def _swept(self, labels: np.ndarray, cells: np.ndarray) -> np.ndarray:
         """Labels after one sweep; `cells` is the number of grid cells in the window of each voxel."""
@@ -77,7 +85,7 @@ class ModeFilter:
         for label, box in enumerate(ndimage.find_objects(labels), start=1):
             if box is None:
                 continue
-            near = tuple(slice(max(s.start - self.window // 2, 0), s.stop + self.window // 2) for s in box)
+            near = self._grown(box, labels.shape)
             inside = labels[near] == label
             count = self._window_counts(inside)
             own[near][inside] = count[inside]
@@ -90,9 +98,16 @@ class ModeFilter:
 
     def _window_counts(self, hit: np.ndarray) -> np.ndarray:
         """Number (X, Y, Z) int32 of True cells in the window of each cell; none lie beyond the array."""
-        return reduce(lambda count, axis: _window_sums(count, self.window, axis), range(3), hit.astype(np.int32))
+        count = hit.astype(np.int32)
+        for axis in range(3):
+            count = _window_sums(count.swapaxes(0, axis), self.window).swapaxes(0, axis)
+        return count
 
 
-def _window_sums(values: np.ndarray, window: int, axis: int) -> np.ndarray:
-    """Sums over windows along an axis."""
-    return ndimage.correlate1d(values, np.ones(window), axis, mode="constant")
+def _window_sums(values: np.ndarray, window: int) -> np.ndarray:
+    """Sums over centred windows along the first axis."""
+    total = values.copy()
+    for k in range(1, window // 2 + 1):
+        total[k:] += values[:-k]
+        total[:-k] += values[k:]
+    return total

@@ -23,7 +23,7 @@ from typing import ClassVar
 import numpy as np
 
 from mstfilter.crossover.cross import Crossover
-from mstfilter.errors import check_component, check_integer, check_number
+from mstfilter.fields import NonNegativeFloat, PositiveInt
 from mstfilter.scene import Clip, FreeSpace, Hypothesis, Projection, check_grid, log_quality
 from mstfilter.smc import Candidates, Population, Update, child, key_of, union
 
@@ -46,15 +46,10 @@ class CrossoverUpdate(Update):
 
     free_space: Projection = FreeSpace()  # noqa: RUF009 (frozen)
     crossover: Crossover = Crossover()  # noqa: RUF009 (frozen)
-    eta: int = 5
-    quality_exponent: float = 3.0
+    eta: PositiveInt = 5
+    quality_exponent: NonNegativeFloat = 3.0
 
     properly_weighted: ClassVar[bool] = False
-
-    def __post_init__(self) -> None:
-        check_component("free_space", self.free_space, Projection)
-        check_integer("eta", self.eta)
-        check_number("quality_exponent", self.quality_exponent, at_least=0)
 
     def update(
         self, rng: np.random.Generator, predicted: Population | None, proposed: Population | None, observation: Clip

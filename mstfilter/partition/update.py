@@ -32,12 +32,12 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import islice, zip_longest
-from typing import ClassVar, NamedTuple
+from typing import Annotated, ClassVar, NamedTuple
 
 import numpy as np
 
 from mstfilter.completion import ClipCompleter, Completer, Completion, Extrude, arbitrate, occupancy_of
-from mstfilter.errors import check_integer, check_number
+from mstfilter.fields import Bounds, NonNegativeFloat, NonNegativeInt, Share
 from mstfilter.partition.association import Overlaps
 from mstfilter.partition.cells import Cells, Readings
 from mstfilter.partition.pairs import PairEvidence, PairOdds
@@ -133,23 +133,15 @@ class PartitionUpdate(Update):
     completer: Completer = field(default_factory=Extrude)
     free_space: Projection = FreeSpace()  # noqa: RUF009 (frozen)
     pairs: PairOdds = PairEvidence()  # noqa: RUF009 (frozen)
-    occupied_log_odds: float = 0.6
+    occupied_log_odds: Annotated[float, Bounds()] = 0.6
     evidence: tuple[Evidence, ...] = ()
-    quality_exponent: float = 3.0
-    n_candidates: int = 0
-    reach: float = 1.5
-    n_views: int = 4
-    threshold: float = 0.5
+    quality_exponent: NonNegativeFloat = 3.0
+    n_candidates: NonNegativeInt = 0
+    reach: NonNegativeFloat = 1.5
+    n_views: NonNegativeInt = 4
+    threshold: Share = 0.5
 
     properly_weighted: ClassVar[bool] = False
-
-    def __post_init__(self) -> None:
-        check_integer("n_candidates", self.n_candidates, at_least=0)
-        check_integer("n_views", self.n_views, at_least=0)
-        check_number("threshold", self.threshold, at_least=0, at_most=1)
-        check_number("quality_exponent", self.quality_exponent, at_least=0)
-        check_number("occupied_log_odds", self.occupied_log_odds)
-        check_number("reach", self.reach, at_least=0)
 
     def update(
         self, rng: np.random.Generator, predicted: Population | None, proposed: Population | None, observation: Clip

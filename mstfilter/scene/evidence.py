@@ -15,11 +15,12 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, is_dataclass, replace
 from numbers import Real
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
-from mstfilter.errors import InputError, check_number
+from mstfilter.errors import InputError
+from mstfilter.fields import Bounds, NonNegativeFloat
 from mstfilter.results import Checked, check_array, check_list, check_pair, check_type, describe_value, returns
 from mstfilter.scene.arrays import component_key, read_only
 from mstfilter.scene.cache import memo
@@ -90,14 +91,9 @@ class FreeSpace(Projection):
         Voxels with centres below this height (metres above the table) are cleared as well, whatever was measured.
     """
 
-    margin_voxels: float = 0.5
-    margin_sigmas: float = 3.0
-    table_height: float = 0.0
-
-    def __post_init__(self) -> None:
-        check_number("margin_voxels", self.margin_voxels, at_least=0)
-        check_number("margin_sigmas", self.margin_sigmas, at_least=0)
-        check_number("table_height", self.table_height)
+    margin_voxels: NonNegativeFloat = 0.5
+    margin_sigmas: NonNegativeFloat = 3.0
+    table_height: Annotated[float, Bounds()] = 0.0
 
     def known_free(self, frame: Frame, grid: VoxelGrid) -> np.ndarray:
         """Voxels (X, Y, Z) bool that a frame observes as free. Cached by content."""
