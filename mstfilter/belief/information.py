@@ -1,12 +1,8 @@
 """Entropies and mutual information of weighted hypotheses, in nats.
 
 An action has one outcome under each hypothesis. Its expected information is the mutual information between the
-hypothesis I and the outcome O,
-
-    I(I; O) = H(O) - sum_i w_i H(O | I = i),
-
-which is at most H(I). If the hypothesis determines the outcome, the second term is 0 and the information is the
-entropy of the weights summed over equal outcomes.
+hypothesis and the outcome. Since the hypothesis determines the outcome, this is the entropy of the weights summed
+over equal outcomes, which is at most the entropy of the weights.
 
 >>> import numpy as np
 >>> rows = np.array([[1, 1, 0], [1, 1, 0], [0, 0, 0]])    # outcomes of three hypotheses in three groups of cells
@@ -48,15 +44,6 @@ def binary_entropy(p: np.ndarray) -> np.ndarray:
     """``-p log p - (1 - p) log(1 - p)`` of each probability; at most log 2."""
     p = np.clip(p, 0.0, 1.0)  # sums of weights may exceed 1 by rounding
     return np.asarray(entr(p) + entr(1 - p))
-
-
-def noisy_information(weights: np.ndarray, channel: np.ndarray) -> float:
-    """Mutual information with a noisy outcome.
-
-    `weights` (n,) sum to 1; `channel` (n, k) has the probability of each of k outcomes under each hypothesis.
-    """
-    conditional = sum(w * entropy(row) for w, row in zip(weights, channel, strict=True))
-    return max(0.0, entropy(weights @ channel) - conditional)
 
 
 def outcome_information(

@@ -24,11 +24,10 @@ With `tolerance` (in voxels or pixels), outcomes that differ by much less than i
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Literal, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -37,7 +36,6 @@ from mstfilter.belief.information import (
     canonical_rows,
     entropy,
     hamming,
-    noisy_information,
     outcome_information,
     partition_distance,
 )
@@ -189,7 +187,7 @@ class Belief:
         ``sum_i w_i [k_i(a) = k_i(b) > 0] min(o_i(a), o_i(b))``, with k_i the most probable object of a voxel in
         hypothesis i and o_i its probability (`Hypothesis.shares`). An object is a level set of its probabilities: a
         voxel is in it whenever a less probable one is. `a` and `b` (..., 3) are broadcast against each other. For a
-        = b the result is the occupancy.
+        = b the result is the occupancy, and for all voxels b it is the extent of the object at a.
         """
         at_a, at_b = np.broadcast_arrays(_flat_voxels(self.grid, a), _flat_voxels(self.grid, b))
         found = np.zeros(at_a.shape)
@@ -202,11 +200,6 @@ class Belief:
         shares = [h.shares for h in self._merged[0]]
         return [(one.owner.ravel(), one.probability.ravel().astype(np.float64)) for one in shares]
 
-    def object_at(self, voxel: Any) -> np.ndarray:
-        """Extent (X, Y, Z) of the object at a voxel (3,): ``same_object(voxel, v)`` for every voxel v."""
-        every = np.stack(np.unravel_index(np.arange(math.prod(self.grid.shape)), self.grid.shape), axis=-1)
-        return self.same_object(_one_index(voxel, 3), every).reshape(self.grid.shape)
-
     def same_object_at_pixels(self, camera: Camera, a: Any, b: Any) -> np.ndarray:
         """Probability (...) that two pixels show the same object: ``sum_i w_i [R_i(a) = R_i(b) > 0]``.
 
@@ -217,14 +210,6 @@ class Belief:
         same = [(image[a] == image[b]) & (image[a] > 0) for image in images]
         return np.tensordot(self._mass, np.stack(same), axes=1)
 
-    def object_at_pixel(self, camera: Camera, pixel: Any) -> np.ndarray:
-        """Probability (H, W) that each pixel shows the same object as `pixel`, (column, row)."""
-        images = self._images(camera)
-        row, column = _rows_and_columns(camera, _one_index(pixel, 2))
-        return sum(
-            w * ((r == r[row, column]) & (r[row, column] > 0)) for w, r in zip(self._mass, images, strict=True)
-        )
-
     def object_count(self, region: Any = None) -> np.ndarray:
         """Probability (K + 1,) of k = 0 .. K objects: ``sum_i w_i [hypothesis i has k objects]``.
 
@@ -233,36 +218,7 @@ class Belief:
         count = np.cumsum(self._refined.objects_in(self._region(region)[0]))
         return np.bincount(np.diff(count[self._refined.first]), self._mass)
 
-    def mean_object_count(self, region: Any = None) -> float:
-        """Expected number of objects: ``sum_k k p(k)``, p as in `object_count`."""
-        p = self.object_count(region)
-        return float(np.arange(len(p)) @ p)
-
     # Boundaries and entropy -----------------------------------------------------------------------------------
-
-    def _faces(self, axis: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Faces between different cells: (X, Y, Z) bool of the lower voxel, P(both occupied), P(same object)."""
-        cells = np.moveaxis(self._refined.cells, axis, 0)
-        where = np.zeros(cells.shape, bool)
-        where[:-1] = (cells[:-1] != cells[1:]) & (cells[:-1] > 0) & (cells[1:] > 0)
-        lower, upper = cells[:-1][where[:-1]], cells[1:][where[:-1]]
-        both, same = np.zeros(len(lower)), np.zeros(len(lower))
-        for w, row in zip(self._mass, self._refined.objects, strict=True):
-            both += w * ((row[lower] > 0) & (row[upper] > 0))
-            same += w * ((row[lower] > 0) & (row[lower] == row[upper]))
-        return where, both, same
-
-    def boundary(self) -> np.ndarray:
-        """Probability (3, X, Y, Z) that two objects meet at a face.
-
-        ``[a, v] = sum_i w_i [L_i(v) > 0, L_i(v') > 0, L_i(v) != L_i(v')]``, v' the next voxel along axis a; 0 at
-        the end of the grid.
-        """
-        probability = np.zeros((3, *self.grid.shape))
-        for axis in range(3):
-            where, both, same = self._faces(axis)
-            np.moveaxis(probability[axis], axis, 0)[where] = np.maximum(both - same, 0.0)
-        return probability
 
     def boundary_entropy(self) -> np.ndarray:
         """Entropy (X, Y, Z) of the segmentation at a voxel: the largest of its six faces, at most log 2.
@@ -273,13 +229,21 @@ class Belief:
         """
         largest = np.zeros(self.grid.shape)
         for axis in range(3):
-            where, both, same = self._faces(axis)
-            face = np.zeros(where.shape)
-            face[where] = both * binary_entropy(np.divide(same, both, out=np.zeros_like(same), where=both > 0))
-            out = np.moveaxis(largest, axis, 0)
-            np.maximum(out, face, out=out)
-            np.maximum(out[1:], face[:-1], out=out[1:])
+            out, face = np.moveaxis(largest, axis, 0), self._entropy_of_faces(axis)
+            np.maximum(out[:-1], face, out=out[:-1])
+            np.maximum(out[1:], face, out=out[1:])
         return largest
+
+    def _entropy_of_faces(self, axis: int) -> np.ndarray:
+        """H(S | B) of the faces between voxels and the next ones along an axis, which comes first."""
+        cells = np.moveaxis(self._refined.cells, axis, 0)
+        lower, upper = cells[:-1], cells[1:]
+        differ = (lower != upper) & (lower > 0) & (upper > 0)  # inside a cell, both are always one object
+        a, b = self._refined.objects[:, lower[differ]], self._refined.objects[:, upper[differ]]
+        both, same = self._mass @ ((a > 0) & (b > 0)), self._mass @ ((a > 0) & (a == b))
+        entropy = np.zeros(differ.shape)
+        entropy[differ] = both * binary_entropy(np.divide(same, both, out=np.zeros_like(same), where=both > 0))
+        return entropy
 
     def partition_entropy(self, region: Any = None, tolerance: float = 0.0) -> float:
         """Entropy of the segmentation of a region (default: the whole grid).
@@ -303,20 +267,11 @@ class Belief:
         cells, sizes = self._region(region)
         return outcome_information(self._mass, self._refined.objects[:, cells] > 0, hamming, sizes, tolerance)
 
-    def view_information(
-        self, camera: Camera, tolerance: float = 0.0, sees: Literal["depth", "objects"] = "depth"
-    ) -> float:
+    def view_information(self, camera: Camera, tolerance: float = 0.0) -> float:
         """Information of an image from a camera; `tolerance` in pixels. ``camera.scaled(0.25)`` is faster.
 
-        The outcome is the depth image of the objects (rounded to a hundredth of a voxel, without the table), or the
-        true segmentation of the image.
+        The outcome is the depth image of the objects (rounded to a hundredth of a voxel, without the table).
         """
-        if sees == "objects":
-            image = common_refinement(self._images(camera))
-            rows = canonical_rows(image.objects)
-            return outcome_information(self._mass, rows, partition_distance, image.sizes, tolerance)
-        if sees != "depth":
-            raise InputError(f'sees is {sees!r}, expected "depth" or "objects"')
         step = _DEPTH_STEP * self.grid.voxel_size
         check_component("camera", camera, Camera)
         depths = (render_hypothesis(h, camera).depth.ravel() for h in self._merged[0])
@@ -392,21 +347,6 @@ class Belief:
             raise InputError(f"outcomes cannot be compared ({error})", "for arrays: array.tobytes()") from error
         return entropy(np.bincount(which, [w for _, w in outcomes]))
 
-    def noisy_information(self, probabilities: Callable[[Hypothesis], Any]) -> float:
-        """Information of an action with a noisy outcome.
-
-        ``H(O) - sum_i w_i H(O | i)``, exact; ``probabilities(h_i)`` gives (k,) ``P(O = o | i)`` for k outcomes.
-        """
-        pairs = [(w, probabilities(h)) for w, h in zip(self.weights, self.hypotheses, strict=True) if w > 0]
-        try:
-            channel = np.array([p for _, p in pairs], dtype=np.float64)
-        except (TypeError, ValueError) as error:
-            raise InputError(f"probabilities of outcomes are not k numbers for each hypothesis ({error})") from error
-        # Probabilities of hypotheses are float16, so their sums are less exact than sums of float64.
-        if channel.ndim != 2 or not (channel >= 0).all() or not np.allclose(channel.sum(axis=1), 1, atol=2e-3):
-            raise InputError("probabilities of outcomes are negative or do not sum to 1 for a hypothesis")
-        return noisy_information(np.array([w for w, _ in pairs]), channel / channel.sum(axis=1, keepdims=True))
-
     def estimate(self, loss: Callable[[Hypothesis, Hypothesis], float] | None = None) -> Hypothesis:
         """The hypothesis of least expected loss: ``argmin_i sum_j w_j loss(h_i, h_j)``.
 
@@ -431,14 +371,6 @@ class Belief:
     def _images(self, camera: Camera) -> list[np.ndarray]:
         check_component("camera", camera, Camera)
         return [project(h, camera) for h in self._merged[0]]
-
-
-def _one_index(index: Any, k: int) -> np.ndarray:
-    """The index of one voxel (3,) or pixel (2,)."""
-    index = np.asarray(index)
-    if index.shape != (k,):
-        raise InputError(f"expected one {'voxel' if k == 3 else 'pixel'}, {k} integers, not shape {index.shape}")
-    return index
 
 
 def _check_indices(name: str, index: np.ndarray, shape: tuple[int, ...], hint: str) -> None:

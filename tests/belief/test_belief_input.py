@@ -1,8 +1,6 @@
-"""Common refinement, distance of partitions, voxels in metres, and the errors of wrong input to a belief."""
+"""Distance of partitions, voxels in metres, and the errors of wrong input to a belief."""
 
 from __future__ import annotations
-
-import itertools
 
 import numpy as np
 import pytest
@@ -10,29 +8,9 @@ import pytest
 from mstfilter.belief import Belief
 from mstfilter.belief.information import partition_distance
 from mstfilter.errors import InputError
-from mstfilter.scene import Hypothesis, VoxelGrid, common_refinement
+from mstfilter.scene import Hypothesis, VoxelGrid
 from mstfilter.smc import Population
 from tests.belief.test_belief import CAMERA, GRID, SHAPE, belief_of, scenes, voxels_of
-
-
-def test_refinement():
-    """Two places share a cell exactly when all segmentations agree about both."""
-    grids = scenes(3)[0]
-    found = common_refinement(grids)
-    columns = np.stack([g.ravel() for g in grids])
-    cells = found.cells.ravel()
-    for a, b in itertools.combinations(range(columns.shape[1]), 2):
-        assert (cells[a] == cells[b]) == (columns[:, a] == columns[:, b]).all()
-    np.testing.assert_array_equal(cells == 0, (columns == 0).all(axis=0))
-    assert found.sizes.sum() == columns.shape[1]
-    np.testing.assert_array_equal(found.objects[:, cells] > 0, columns > 0)
-    members = [found.objects[:, cells] == k for k in range(1, found.n_objects + 1)]
-    own = {frozenset(np.flatnonzero(row == k)) for row in columns for k in set(row.tolist()) - {0}}
-    assert {frozenset(np.flatnonzero(m.any(axis=0))) for m in members} == own
-    want = [[(a.any(axis=0) & b.any(axis=0)).sum() for b in members] for a in members]
-    np.testing.assert_array_equal(found.overlaps()[1:, 1:], want)
-    sparse = common_refinement([np.array([0, 65535, 9]), np.array([0, 65535, 65534])])
-    np.testing.assert_array_equal(sparse.cells, [0, 2, 1])
 
 
 def test_distance_of_partitions():
@@ -61,26 +39,21 @@ BAD = {
     "box outside": (lambda b: b.box((5, 5, 5), (6, 6, 6)), "box"),
     "half a box": (lambda b: b.box((0, 0), (1, 1, 1)), "corners"),
     "voxel outside": (lambda b: b.same_object((0, 0, 0), (4, 0, 0)), r"\[4, 0, 0\].*outside"),
-    "negative voxel": (lambda b: b.object_at((0, 0, -1)), "outside"),
-    "metres for voxels": (lambda b: b.object_at((0.0, 0.01, 0.0)), "integers"),
-    "two voxels for one": (lambda b: b.object_at([(0, 0, 0), (1, 0, 0)]), "one voxel"),
-    "voxel for a pixel": (lambda b: b.object_at_pixel(CAMERA, (0, 0, 0)), "one pixel"),
+    "negative voxel": (lambda b: b.same_object((0, 0, 0), (0, 0, -1)), "outside"),
+    "metres for voxels": (lambda b: b.same_object((0, 0, 0), (0.0, 0.01, 0.0)), "integers"),
     "region of another grid": (lambda b: b.look_information(np.ones((2, 2, 2), bool)), "region has shape"),
     "region outside": (lambda b: b.push_information([(0, 0, 0), (9, 9, 9)]), "outside"),
-    "pixel outside": (lambda b: b.object_at_pixel(CAMERA, (20, 0)), r"\[20, 0\].*20 x 16"),
-    "negative pixel": (lambda b: b.object_at_pixel(CAMERA, (3, -1)), "outside"),
-    "pixel in floats": (lambda b: b.object_at_pixel(CAMERA, (1.5, 0)), "integers"),
+    "pixel outside": (lambda b: b.same_object_at_pixels(CAMERA, (0, 0), (20, 0)), r"\[20, 0\].*20 x 16"),
+    "negative pixel": (lambda b: b.same_object_at_pixels(CAMERA, (0, 0), (3, -1)), "outside"),
+    "pixel in floats": (lambda b: b.same_object_at_pixels(CAMERA, (0, 0), (1.5, 0)), "integers"),
     "no camera": (lambda b: b.view_information("left"), "Camera"),
-    "no camera for pixels": (lambda b: b.object_at_pixel(None, (0, 0)), "Camera"),
-    "sees": (lambda b: b.view_information(CAMERA, sees="colour"), "colour"),
+    "no camera for pixels": (lambda b: b.same_object_at_pixels(None, (0, 0), (0, 0)), "Camera"),
     "negative tolerance": (lambda b: b.push_map(-1), "tolerance is -1"),
     "NaN tolerance": (lambda b: b.look_information((0, 0, 0), np.nan), "tolerance"),
     "no tolerance": (lambda b: b.partition_entropy(tolerance="a"), "tolerance"),
     "no samples": (lambda b: b.sample(np.random.default_rng(0), 0), "samples"),
     "array outcome": (lambda b: b.information(lambda h: h.labels), "outcome"),
-    "ragged": (lambda b: b.noisy_information(lambda h: [1.0] * h.n_objects), "probabilities"),
     "NaN": (lambda b: b.most_informative("ab", {"a": float("nan"), "b": 1.0}.__getitem__), "action 0 is NaN"),
-    "no probabilities": (lambda b: b.noisy_information(lambda h: (0.5, 0.6)), "sum to 1"),
     "NaN likelihood": (lambda b: b.reweighted(lambda h: np.nan), "NaN"),
     "ruled out": (lambda b: b.reweighted(lambda h: -np.inf), "no particle"),
 }

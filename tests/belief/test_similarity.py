@@ -8,10 +8,9 @@ import pytest
 from mstfilter.belief import SameSegmentation, WeightedCoverage
 from mstfilter.errors import InputError
 from mstfilter.presets import REGISTRY
-from mstfilter.scene import Hypothesis, VoxelGrid, canonical
+from mstfilter.scene import Hypothesis, VoxelGrid
 from mstfilter.scoring import weighted_coverage
-from mstfilter.smc import Coalesced, KDpp, Population
-from mstfilter.testing import scene_example
+from mstfilter.smc import ClusterStratified, Coalesced, Population
 
 GRID = VoxelGrid(np.zeros(3), 0.01, (6, 5, 4))
 
@@ -49,40 +48,20 @@ def test_hypotheses_without_any_object():
 
 
 def test_renamed_labels_are_equal():
-    a = np.array([[[0, 5, 5, 2]]])
-    b = np.array([[[0, 1, 1, 9]]])
-    c = np.array([[[3, 1, 1, 9]]])
-    np.testing.assert_array_equal(canonical(a), [[[0, 1, 1, 2]]])
-    np.testing.assert_array_equal(canonical(c), [[[1, 2, 2, 3]]])
+    a, b, c = np.array([[[0, 5, 5, 2]]]), np.array([[[0, 1, 1, 9]]]), np.array([[[3, 1, 1, 9]]])
     grid = VoxelGrid(np.zeros(3), 0.01, (1, 1, 4))
     particles = [Hypothesis.from_labels(x, grid) for x in (a, b, c, a)]
     np.testing.assert_array_equal(SameSegmentation().classes(particles), [0, 0, 1, 0])
 
 
-def test_resamplers_of_hypotheses():
+def test_resamplers_of_hypotheses_as_a_preset_file_names_them():
+    clusters = {"component": "clusters", "similarity": {"component": "weighted_coverage", "stride": 2}}
+    config = {"component": "coalesced", "equivalence": "same_segmentation", "scheme": clusters}
+    scheme = REGISTRY.build("resampler", config)
+    assert scheme == Coalesced(ClusterStratified(WeightedCoverage(2)), SameSegmentation())
+    assert REGISTRY.build("resampler", REGISTRY.describe(scheme)) == scheme
     particles = hypotheses(8)
     population = Population((*particles, particles[0], particles[5]), np.log(np.arange(1.0, 11)))
-    rng = np.random.default_rng(0)
-    merged = Coalesced(equivalence=SameSegmentation()).resample(rng, population, 4)
-    assert merged.notes["distinct"] == 7
-    classes = SameSegmentation().classes(merged.particles)
-    assert len(set(classes.tolist())) == len(merged) == 4
-    chosen = KDpp(similarity=WeightedCoverage()).resample(rng, population, 3)
-    assert len(set(SameSegmentation().classes(chosen.particles).tolist())) == 3
-    assert chosen.notes["kdpp"].endswith("of 3")
-
-
-def test_diverse_resampling_from_configuration():
-    """As a preset file names it."""
-    config = {
-        "component": "coalesced",
-        "equivalence": "same_segmentation",
-        "scheme": {"component": "kdpp", "similarity": {"component": "weighted_coverage", "stride": 2}},
-    }
-    scheme = REGISTRY.build("resampler", config)
-    assert scheme == Coalesced(KDpp(WeightedCoverage(2)), SameSegmentation())
-    assert REGISTRY.build("resampler", REGISTRY.describe(scheme)) == scheme
-    population, _ = scene_example(np.random.default_rng(0), 40)
-    chosen = scheme.resample(np.random.default_rng(1), population, 3)
-    assert chosen.notes["distinct"] == len(set(SameSegmentation().classes(population.particles).tolist()))
-    assert len(set(SameSegmentation().classes(chosen.particles).tolist())) == 3
+    chosen = scheme.resample(np.random.default_rng(0), population, 3)
+    assert chosen.notes["distinct"] == 7
+    assert len(set(SameSegmentation().classes(chosen.particles).tolist())) == len(chosen) == 3
