@@ -9,7 +9,7 @@ from hypothesis import given, settings, strategies as st
 import mstfilter
 from mstfilter.errors import InputError
 from mstfilter.formats import save_recording
-from mstfilter.scene import Camera, Clip, Frame, FreeSpace, Hypothesis, NoFreeSpace, Recording, look_at, render
+from mstfilter.scene import Camera, Clip, Frame, FreeSpace, Hypothesis, NoFreeSpace, Recording
 from mstfilter.scoring import weighted_coverage
 from mstfilter.smc import Population
 from tests.scene.free_space_reference import CAMERAS, SMALL, frame_of, observe, shelf, views
@@ -41,23 +41,6 @@ def test_a_false_object_in_free_space_is_cleared_and_lowers_the_quality():
     assert quality == pytest.approx(1 - removed.sum() / (labels > 0).sum())
 
 
-def test_no_known_free_voxel_survives_and_measured_ones_do():
-    everything = Hypothesis.from_labels(np.ones(GRID.shape, np.uint16), GRID)
-    refined, _ = FreeSpace().project(everything, FRAME)
-    assert not (refined.labels[FreeSpace().known_free(FRAME, GRID)] > 0).any()
-    seen = GRID.index_of(FRAME.points[FRAME.valid])
-    seen = seen[GRID.contains(seen)]
-    assert (refined.labels[tuple(seen.T)] > 0).all()
-
-
-def test_unobserved_voxels_are_not_free():
-    robot = Frame(RGB, DEPTH, CAMERA, np.ones(DEPTH.shape, bool))
-    holes = Frame(RGB, np.full_like(DEPTH, np.nan), CAMERA)
-    everything = Hypothesis.from_labels(np.ones(GRID.shape, np.uint16), GRID)
-    for frame in (robot, holes):
-        assert FreeSpace().project(everything, frame)[1] == 1.0
-
-
 def test_table_and_none():
     refined, _ = FreeSpace(table_height=0.03).project(TRUTH, FRAME)
     assert not refined.labels[:, :, :3].any()
@@ -65,17 +48,6 @@ def test_table_and_none():
     assert NoFreeSpace().project(TRUTH, FRAME) == (TRUTH, 1.0)
     nothing = Hypothesis.from_labels(np.zeros(GRID.shape, np.uint16), GRID)
     assert FreeSpace().project(nothing, FRAME) == (nothing, 1.0)
-
-
-def test_the_margin_covers_the_noise():
-    """Without the margin for noise, a noisy image eats into what stands there; with it, hardly."""
-    noisy = Frame(RGB, table_scene(noise=np.random.default_rng(1))[1], CAMERA)
-    labels = LABELS.copy()
-    labels[:, :, 0][labels[:, :, 0] == 0] = 9  # a mat one voxel thick: most of its centres lie just above the reading
-    mat = Hypothesis.from_labels(labels, GRID)
-    strict = FreeSpace(margin_voxels=0.45, margin_sigmas=0.0).project(mat, noisy)[1]
-    kind = FreeSpace(margin_voxels=0.45, margin_sigmas=3.0).project(mat, noisy)[1]
-    assert strict < kind - 0.02
 
 
 @pytest.mark.parametrize(
@@ -112,71 +84,6 @@ def test_known_free_voxels_match_the_reference(frame, margin, table):
     above = SMALL.centres()[..., 2] >= table
     assert not (found & expected.hit & above).any(), "what has depth support stays"
     assert found[~above].all()
-
-
-@settings(max_examples=40, deadline=None)
-@given(st.integers(1, 3).flatmap(views), margins, margins)
-def test_more_margin_clears_no_more(frame, a, b):
-    wide = tuple(np.maximum(a, b))
-    assert not (cleared_of(frame, *wide) & ~cleared_of(frame, *a)).any()
-
-
-@settings(max_examples=40, deadline=None)
-@given(views(2))
-def test_two_cameras_clear_what_either_does_and_support_of_either_protects(frame):
-    other = frame.views[0]
-    alone = [frame_of(v.depth, v.camera, v.robot_mask) for v in (frame, other)]
-    looks = [observe(v, SMALL, 0.5, 3.0, -1.0) for v in alone]
-    sure = ~(looks[0].unsure | looks[1].unsure)
-    either = cleared_of(alone[0], table=-1.0) | cleared_of(alone[1], table=-1.0)
-    both = cleared_of(frame, table=-1.0)
-    np.testing.assert_array_equal(both[sure], (either & ~looks[0].hit & ~looks[1].hit)[sure])
-    swapped = frame_of(other.depth, other.camera, other.robot_mask, (alone[0],))
-    np.testing.assert_array_equal(cleared_of(swapped, table=-1.0), both)
-
-
-@settings(max_examples=40, deadline=None)
-@given(views(1), st.booleans())
-def test_robot_and_missing_readings_clear_nothing(frame, as_robot):
-    """Blind the left half of the image: no voxel whose centre it shows is cleared any more."""
-    left = np.zeros(frame.depth.shape, bool)
-    left[:, : frame.camera.width // 2] = True
-    if as_robot:
-        blinded = frame_of(frame.depth, frame.camera, frame.robot_mask | left)
-    else:
-        blinded = frame_of(np.where(left, np.nan, frame.depth).astype(np.float32), frame.camera, frame.robot_mask)
-    uv, _ = frame.camera.project(SMALL.centres())
-    shown = uv[..., 0] < frame.camera.width // 2 - 0.5
-    assert not (cleared_of(blinded, table=-1.0) & shown).any()
-    np.testing.assert_array_equal(
-        cleared_of(blinded, table=-1.0)[~shown] & cleared_of(frame, table=-1.0)[~shown],
-        cleared_of(frame, table=-1.0)[~shown],
-    )
-
-
-# -- several cameras -------------------------------------------------------------------------------------------------
-
-
-def test_a_second_camera_sees_what_the_first_cannot():
-    behind = LABELS.copy()
-    behind[16:24, 40:46, :6] = 4  # behind box 1
-    invented = Hypothesis.from_labels(behind, GRID)
-    opposite = CAMERA.at(look_at((0.0, 0.6, 0.5), (0, 0, 0.03)))
-    second = Frame(RGB, _depth(LABELS, opposite), opposite)
-    one, _ = FreeSpace().project(invented, FRAME)
-    two, quality = FreeSpace().project(invented, Frame(RGB, DEPTH, CAMERA, None, (second,)))
-    assert (one.labels == 4).sum() > 50
-    assert (two.labels == 4).sum() < 0.2 * (one.labels == 4).sum()
-    np.testing.assert_array_equal(two.labels[LABELS > 0], LABELS[LABELS > 0])
-    assert quality < FreeSpace().project(invented, FRAME)[1]
-
-
-def _depth(labels, camera):
-    seen = render(labels, GRID, camera)
-    directions = camera.rays() @ camera.pose.as_matrix()[:3, :3].T
-    return np.where(seen.labels > 0, seen.depth, -camera.position[2] / np.minimum(directions[..., 2], -1e-6)).astype(
-        np.float32
-    )
 
 
 def test_views_belong_to_the_content_of_a_frame_and_are_checked(tmp_path, monkeypatch):
