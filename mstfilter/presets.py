@@ -18,7 +18,20 @@ import tomllib
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from mstfilter import baselines, completion, formats, frontends, fusion, oracles, segmentation, smc, tracking
+from mstfilter import (
+    baselines,
+    belief,
+    completion,
+    crossover,
+    formats,
+    frontends,
+    oracles,
+    partition,
+    scene,
+    segmentation,
+    smc,
+    tracking,
+)
 from mstfilter.errors import InputError, suggestion
 from mstfilter.reading import read_toml
 from mstfilter.registry import Registry
@@ -26,7 +39,10 @@ from mstfilter.resources import find_preset
 from mstfilter.smc import ParticleFilter
 
 #: Packages that declare components.
-PACKAGES = (smc, segmentation, completion, tracking, fusion, frontends, formats, baselines, oracles)
+PACKAGES = (
+    *(smc, scene, segmentation, completion, tracking, partition, crossover, belief),
+    *(frontends, formats, baselines, oracles),
+)
 #: All components that presets and overrides can name.
 REGISTRY = Registry(*PACKAGES)
 

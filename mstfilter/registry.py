@@ -11,7 +11,7 @@ A `Registry` joins the declarations of several packages. `mstfilter.presets.REGI
 >>> from mstfilter.presets import REGISTRY
 >>> REGISTRY.build("resampler", "systematic")
 Systematic()
->>> REGISTRY.build("update", {"component": "fusion", "eta": 3, "free_space": "none"})
+>>> REGISTRY.build("update", {"component": "crossover", "eta": 3, "free_space": "none"})
 
 A configuration is a nested mapping. A component is its name, or a mapping with ``component`` and fields. The kind of
 a field follows from its annotation: a field of type ``Resampler`` or ``Resampler | None`` holds a resampler, one of

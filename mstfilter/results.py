@@ -28,6 +28,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from mstfilter.errors import InputError, InputWarning, short_path
+from mstfilter.fields import Bounded
 
 _Method = TypeVar("_Method", bound=Callable[..., Any])
 
@@ -48,8 +49,8 @@ def returns(check: Callable[..., Any]) -> Callable[[_Method], _Method]:
     return mark
 
 
-class Checked:
-    """Base class of interfaces with methods that are marked by `returns`."""
+class Checked(Bounded):
+    """Base class of interfaces with methods that are marked by `returns`, and of components with bounded fields."""
 
     def __init_subclass__(cls, **arguments: Any) -> None:
         super().__init_subclass__(**arguments)
@@ -136,6 +137,14 @@ def check_list(found: Any, n: int, kind: type | tuple[type, ...], expected: str)
         if not isinstance(one, kind):
             raise InputError(f"returns {describe_value(one)} as result {k}, expected {expected}")
     return list(found)
+
+
+def check_pair(found: Any, first: str, second: str) -> tuple[Any, Any]:
+    """A result of two values; InputError unless it is a tuple or list of two."""
+    check_type(found, (tuple, list), f"{first} and {second}")
+    if len(found) != 2:
+        raise InputError(f"returns {len(found)} values, expected {first} and {second}")
+    return found[0], found[1]
 
 
 def check_array(

@@ -1,6 +1,6 @@
 """Updates without crossover: samples alone, predictions alone, or the union of both.
 
-They replace `FusionUpdate` and leave all other parts of the filter, with their random streams, unchanged:
+They replace `CrossoverUpdate` and leave all other parts of the filter, with their random streams, unchanged:
 
 >>> mstfilter.preset("samples_only"), mstfilter.preset("tracking_only"), mstfilter.preset("union")
 
@@ -14,11 +14,9 @@ from typing import ClassVar
 
 import numpy as np
 
+from mstfilter.crossover import CrossoverUpdate
 from mstfilter.errors import InputError
-from mstfilter.fusion import FreeSpace, FusionUpdate, Projection, log_quality
-from mstfilter.fusion.division import divided
-from mstfilter.fusion.update import scored
-from mstfilter.scene import Clip
+from mstfilter.scene import Clip, FreeSpace, Projection, log_quality
 from mstfilter.smc import Population, Update, union
 
 
@@ -63,18 +61,17 @@ class Union(Update):
     """Predicted and proposed hypotheses together, with the weights of fusion but without crossover.
 
     A prediction has log weight ``log w + lambda log Q``, a sample ``log w``; both populations are first scaled to
-    mean weight 1. Free space, division, weights and evidence are those of `fusion`; the evidence scores all
-    hypotheses.
+    mean weight 1. Free space and weights are those of `fusion`.
     """
 
-    fusion: FusionUpdate = field(default_factory=FusionUpdate)
+    fusion: CrossoverUpdate = field(default_factory=CrossoverUpdate)
 
     properly_weighted: ClassVar[bool] = False
     draws: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
-        if not isinstance(self.fusion, FusionUpdate):
-            raise InputError(f"union.fusion is a {type(self.fusion).__name__}, expected a FusionUpdate")
+        if not isinstance(self.fusion, CrossoverUpdate):
+            raise InputError(f"union.fusion is a {type(self.fusion).__name__}, expected a CrossoverUpdate")
 
     def update(
         self, rng: np.random.Generator, predicted: Population | None, proposed: Population | None, observation: Clip
@@ -82,16 +79,10 @@ class Union(Update):
         if predicted is None or proposed is None:
             return self.fusion.update(rng, predicted, proposed, observation)
         refined, quality = self.fusion.free_space.refine(predicted.particles, observation)
-        refined = divided(self.fusion.division, self.fusion.parts, refined, observation, proposed=False)
-        samples = divided(
-            self.fusion.division, self.fusion.parts, tuple(proposed.particles), observation, proposed=True
-        )
         log_q = self.fusion.quality_exponent * log_quality(quality)
         weighed = predicted.log_weights - predicted.log_mean_weight + log_q
         both = union(
             Population(refined, weighed, predicted.parents),
-            Population(samples, proposed.log_weights - proposed.log_mean_weight, proposed.parents),
+            Population(tuple(proposed.particles), proposed.log_weights - proposed.log_mean_weight, proposed.parents),
         )
-        total, scores = scored(self.fusion.evidence, tuple(both.particles), observation)
-        notes = {"quality": quality.tolist(), "scores": scores}
-        return Population(both.particles, both.log_weights + total, both.parents, notes)
+        return Population(both.particles, both.log_weights, both.parents, {"quality": quality.tolist()})

@@ -5,7 +5,7 @@
 >>> hypothesis.show().save("scene.html")
 >>> state.population.plot()                 # hypotheses by weight, or the distribution of each coordinate
 
-The classes in `mstfilter.scene`, `mstfilter.smc` and `mstfilter.fusion` have methods with these names, which import
+The classes in `mstfilter.scene`, `mstfilter.smc` and `mstfilter.belief` have methods with these names, which import
 this module when they are called (`mstfilter.lazy.late`). Pages are self-contained: nothing is loaded from a network.
 """
 
@@ -20,7 +20,7 @@ import matplotlib.style
 import numpy as np
 from matplotlib.figure import Figure
 
-from mstfilter.fusion import Belief
+from mstfilter.belief import Belief
 from mstfilter.report.identities import match_objects
 from mstfilter.report.pictures import (
     Colour,

@@ -5,11 +5,25 @@ from mstfilter.scene.cache import (
     memo_many as memo_many,
     scene_cache as scene_cache,
 )
-from mstfilter.scene.camera import Camera as Camera, look_at as look_at, rigid_from_matrix as rigid_from_matrix
+from mstfilter.scene.camera import (
+    Camera as Camera,
+    look_at as look_at,
+    rigid_from_matrix as rigid_from_matrix,
+    scaled_area as scaled_area,
+    scaled_length as scaled_length,
+)
 from mstfilter.scene.disk_cache import DiskCache as DiskCache
 from mstfilter.scene.encoding import (
     decode_hypotheses as decode_hypotheses,
     encode_hypotheses as encode_hypotheses,
+)
+from mstfilter.scene.evidence import (
+    Evidence as Evidence,
+    FreeSpace as FreeSpace,
+    NoFreeSpace as NoFreeSpace,
+    Projection as Projection,
+    log_quality as log_quality,
+    scored as scored,
 )
 from mstfilter.scene.frame import (
     Clip as Clip,
@@ -26,6 +40,11 @@ from mstfilter.scene.geometry import (
     fit_support_plane as fit_support_plane,
     frame_geometry as frame_geometry,
     table_residual as table_residual,
+)
+from mstfilter.scene.partitions import (
+    CommonRefinement as CommonRefinement,
+    canonical as canonical,
+    common_refinement as common_refinement,
 )
 from mstfilter.scene.pauses import (
     At as At,
@@ -66,5 +85,6 @@ from mstfilter.scene.voxels import (
     Occupancy as Occupancy,
     VoxelGrid as VoxelGrid,
     as_labels as as_labels,
+    check_grid as check_grid,
     occupied_box as occupied_box,
 )

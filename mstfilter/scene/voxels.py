@@ -216,9 +216,6 @@ class ObjectRecord:
     #: Rigid motion in world metres since `source`; the identity if `source` is None.
     motion: RigidTransform = field(default_factory=lambda: _NO_MOTION)
     completion_key: str | None = None  #: key of the segment that it was completed from
-    #: Ids of objects of the same hypothesis that were observed to move apart from it, so that they are not the
-    #: same object.
-    apart: frozenset[int] = frozenset()
     views: tuple[ObjectView, ...] = ()  #: what the frames so far showed of it, oldest first
 
     def __repr__(self) -> str:
@@ -420,3 +417,16 @@ class Hypothesis:
     def mask(self, label: int) -> np.ndarray:
         """(X, Y, Z) bool: the voxels of an object."""
         return self.labels == label
+
+
+def check_grid(name: str, hypothesis: Hypothesis, grid: VoxelGrid) -> None:
+    """Raise InputError if a hypothesis has another grid."""
+    if hypothesis.grid != grid:
+        found, expected = (
+            f"{g.shape} voxels of {g.voxel_size:g} m at {g.origin.tolist()}" for g in (hypothesis.grid, grid)
+        )
+        raise InputError(
+            f"grid of {name} is {found}, expected {expected}",
+            "all hypotheses of a run share the workspace of its clips",
+            "parts of one session: open the later part with later.in_world_of(first)",
+        )

@@ -74,7 +74,7 @@ def _in_update(config):
     [
         (["update.crossover.merge=always"], ["update.crossover.merge"]),
         (["update.crossover.merge=never"], ["update.crossover.merge"]),
-        (["update.quality_exponent=0", "update.evidence=[]"], ["update.evidence", "update.quality_exponent"]),
+        (["update.quality_exponent=0"], ["update.quality_exponent"]),
         (["n=1", "update.eta=25"], ["n", "update.eta"]),
     ],
 )
@@ -110,7 +110,7 @@ def test_changes_to_a_preset_reach_the_baselines(tmp_path, monkeypatch):
         ('base = "mst"\nwrap = ["update.fusion=unoin"]', "there is no update 'unoin'"),
         (
             'base = "mst_rules"\nwrap = ["update.fusion=union", "update.fusion=union"]',
-            "is a Union, expected a FusionUpdate",
+            "is a Union, expected a CrossoverUpdate",
         ),
     ],
 )

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from mstfilter.baselines.updates import SamplesOnly, TrackingOnly, Union
-from mstfilter.fusion import Division, Evidence, FreeSpace, FusionUpdate, NoFreeSpace
+from mstfilter.crossover import CrossoverUpdate
 from mstfilter.presets import build_filter, load_config
-from mstfilter.scene import Hypothesis
+from mstfilter.scene import FreeSpace, Hypothesis, NoFreeSpace
 from mstfilter.scoring import weighted_coverage
 from mstfilter.smc import Population
 from mstfilter.testing import UpdateContract, scene_example
@@ -119,7 +119,7 @@ def test_refinement_of_tracked_objects_is_a_field():
 def test_a_union_holds_both_populations_weighted_as_fusion_weighs():
     predicted, proposed, clip = two()
     rng = np.random.default_rng(0)
-    fusion = FusionUpdate(quality_exponent=2.0, free_space=FreeSpace())
+    fusion = CrossoverUpdate(quality_exponent=2.0, free_space=FreeSpace())
     both = Union(fusion).update(rng, predicted, proposed, clip)
     assert len(both) == 5
     refined = [fusion.free_space.project(h, clip.after) for h in predicted.particles]
@@ -129,36 +129,8 @@ def test_a_union_holds_both_populations_weighted_as_fusion_weighs():
     assert both.parents["previous"].tolist() == [0, 1, -1, -1, -1]
     assert both.parents["proposed"].tolist() == [-1, -1, 0, 1, 2]
 
-    class Objects(Evidence):
-        def log_score(self, hypotheses, clip):
-            return np.array([float(h.n_objects) for h in hypotheses])
 
-    judged = Union(FusionUpdate(quality_exponent=2.0, evidence=(Objects(),))).update(rng, predicted, proposed, clip)
-    n = np.array([h.n_objects for h in both.particles])
-    np.testing.assert_allclose(judged.log_weights - both.log_weights, n)
-
-
-def test_a_union_takes_apart_what_fusion_takes_apart():
-    """All of fusion but its crossover: the left and the right half of the image are said to be different things."""
-
-    class Halves(Division):
-        def divide(self, clip):
-            motions = np.zeros(clip.after.depth.shape, np.int32)
-            motions[:, motions.shape[1] // 2 :] = 1
-            return motions
-
-    predicted, proposed, clip = two()
-    merged = np.where(predicted.particles[0].labels > 0, 1, 0).astype(np.uint16)
-    predicted = Population((Hypothesis.from_labels(merged, clip.grid),))
-    rng = np.random.default_rng(0)
-    plain = Union(FusionUpdate()).update(rng, predicted, proposed, clip)
-    parted = Union(FusionUpdate(division=Halves())).update(rng, predicted, proposed, clip)
-    assert plain.particles[0].n_objects == 1
-    assert parted.particles[0].n_objects == 2
-    assert len(parted) == len(plain)
-
-
-@pytest.mark.parametrize("update", [FusionUpdate(), SamplesOnly(), Union()])
+@pytest.mark.parametrize("update", [CrossoverUpdate(), SamplesOnly(), Union()])
 def test_with_an_empty_prediction_the_samples_come_back(update):
     """Hypotheses without objects know nothing: fusion of them with samples is the samples."""
     _, proposed, clip = two()

@@ -10,7 +10,6 @@ import pytest
 from scipy.ndimage import distance_transform_edt
 
 from mstfilter.errors import InputError
-from mstfilter.fusion import Cells, PartitionUpdate
 from mstfilter.oracles import (
     TrueBoundary,
     TrueCompletion,
@@ -25,6 +24,7 @@ from mstfilter.oracles import (
     uses_truth,
 )
 from mstfilter.oracles.truth import RecordingTruth
+from mstfilter.partition import Cells, PartitionUpdate, Readings
 from mstfilter.presets import build_filter, describe_filter, load_config
 from mstfilter.runs import filter_recording
 from mstfilter.scene import Hypothesis
@@ -316,7 +316,8 @@ def test_true_pairs_choose_what_agrees_with_the_truth(recording):
     owner = true.ravel()[pixels].astype(np.int64)
     column = pixels % true.shape[1]
     half = np.where(owner == 1, np.where(column > np.median(column[owner == 1]), 1, 3), owner)
-    cells = Cells.of(pixels, true.shape, [half, np.ones_like(owner)], [owner])
+    readings = Readings(pixels, np.zeros((len(pixels), 3), int), true.shape)
+    cells = Cells.of(readings, [half, np.ones_like(owner)], [owner])
     odds = bound(TruePairs(), recording).log_odds(cells, np.ones(1), clip)
     label = np.array([np.bincount(owner[cells.of_reading == c]).argmax() for c in range(cells.samples.shape[1])])
     same = label[cells.pairs[:, 0]] == label[cells.pairs[:, 1]]
