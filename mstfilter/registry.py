@@ -1,7 +1,7 @@
 """Components by name, and components from configuration.
 
 A package declares its components in its ``__init__.py``: ``__interfaces__`` maps a kind to the class that components
-of this kind inherit, ``__components__`` maps the names of a kind to classes::
+of this kind inherit, ``__components__`` maps the names of a kind to classes, or to ``/path/of/file.py:Class``::
 
     __interfaces__ = {"resampler": "Resampler"}
     __components__ = {"resampler": {"systematic": "Systematic", "residual": "Residual"}}
@@ -258,14 +258,14 @@ class Registry:
 
     def name_of(self, cls: type) -> str:
         """The registered name of a class, its file, or its import path."""
-        if "__mst_file__" in vars(cls):
-            path, _, name = cls.__mst_file__.rpartition(":")  # type: ignore[attr-defined]
-            return f"{short_path(path)}:{name}"
         location = _location_of(cls)
         for names in self._components.values():
             for name, where in names.items():
                 if where == location:
                     return name
+        if "__mst_file__" in vars(cls):
+            path, _, name = location.rpartition(":")
+            return f"{short_path(path)}:{name}"
         return f"{cls.__module__}:{cls.__qualname__}"
 
 
@@ -299,7 +299,9 @@ def _location(package: str, cls: str) -> str:
 
 
 def _location_of(cls: type) -> str:
-    """``package:Class``, where classes of mstfilter count as classes of their top package."""
+    """``package:Class``, where classes of mstfilter count as classes of their top package, or ``file.py:Class``."""
+    if "__mst_file__" in vars(cls):
+        return str(cls.__mst_file__)  # type: ignore[attr-defined]
     package = ".".join(cls.__module__.split(".")[:2])
     return f"{package}:{cls.__qualname__}"
 

@@ -1,4 +1,4 @@
-"""Fit the weights of `mstfilter.segmentation.join_weights` on simulated scenes; no real image is used.
+"""Fit the weights of the learned trees, `models/tree/weights.json`, on simulated scenes; no real image is used.
 
     python experiments/segmentation_fit/run.py
     python experiments/segmentation_fit/run.py --border FOLDER       # of a border model, with its evidence
@@ -13,25 +13,26 @@ Three rounds; each fits a logistic regression to the pairs of all rounds so far.
 from __future__ import annotations
 
 import argparse
+import json
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
 from scenes import FITTED, FITTED_SEEDS, first_pause, small
 from scipy.optimize import minimize
 
+from mstfilter.resources import models_folder
 from mstfilter.segmentation import (
-    EVIDENCE_FEATURES,
+    FEATURES,
     PAIR_FEATURES,
     REGION,
     Agglomeration,
     BorderTree,
     ColourDepthBoundary,
     LearnedTree,
+    MergedTree,
     Regions,
-    all_features,
-    join_weights,
     pair_features,
 )
 from mstfilter.simulation import SceneFamily
@@ -40,14 +41,13 @@ from mstfilter.trained import open_model, write_model
 ROUNDS = 3
 PURE = 0.8  # smallest share of one object in a region that is used
 RIDGE = 1.0
-PACKAGED = Path(join_weights.__file__)
+PACKAGED = models_folder() / "tree" / "weights.json"
 
-Features = Callable[..., np.ndarray]
 Pairs = tuple[list[np.ndarray], list[bool], list[float]]
 
 
 def measured(
-    families: Iterable[SceneFamily], seeds: Iterable[int], builder: LearnedTree | BorderTree
+    families: Iterable[SceneFamily], seeds: Iterable[int], builder: MergedTree
 ) -> list[tuple[Regions, np.ndarray, float]]:
     """Regions of every scene, their pixels of each true object (R, K), and the image scale."""
     found = []
@@ -68,17 +68,16 @@ def measured(
     return found
 
 
-def episode(
-    regions: Regions, pixels: np.ndarray, scale: float, weights: np.ndarray, pairs: Pairs, features: Features
-) -> None:
+def episode(regions: Regions, pixels: np.ndarray, scale: float, weights: dict[str, float], pairs: Pairs) -> None:
     """Merge the regions of one scene by the ground truth and record the pairs that come up."""
-    growing = Agglomeration(regions, lambda *pair: features(*pair, scale) @ weights)
+    w = np.array(list(weights.values()))
+    growing = Agglomeration(regions, lambda *pair: pair_features(*pair, scale, weights) @ w)
     true = np.zeros((2 * len(pixels), pixels.shape[1]))
     true[: len(pixels)] = pixels
     while (pair := growing.pop()) is not None:
         odds, i, j = pair
         rows = growing.sums[[i]], growing.sums[[j]], growing.borders[i][j][None]
-        x = features(*rows, growing.table[i][None], growing.table[j][None], scale)[0]
+        x = pair_features(*rows, growing.table[i][None], growing.table[j][None], scale, weights)[0]
         first, second = (int(true[r].argmax()) for r in (i, j))
         if all(true[r].max() >= PURE * true[r].sum() for r in (i, j)):
             size = growing.sums[[i, j], REGION["pixels"].start].min() / scale**2
@@ -111,53 +110,45 @@ def logistic(pairs: Pairs) -> np.ndarray:
     return b
 
 
-def write(weights: np.ndarray, path: Path) -> None:
-    """Write the module of weights with the new table."""
-    head = PACKAGED.read_text(encoding="utf-8").split("JOIN_WEIGHTS", 1)[0]
-    rows = "".join(f'    "{name}": {value:.4g},\n' for name, value in zip(PAIR_FEATURES, weights, strict=True))
-    path.write_text(f"{head}JOIN_WEIGHTS: dict[str, float] = {{\n{rows}}}\n", encoding="utf-8")
-
-
-def write_into_model(weights: np.ndarray, folder: str) -> None:
-    """Write the weights into the description of a border model."""
-    model = open_model(folder)
-    names = [*PAIR_FEATURES, *EVIDENCE_FEATURES]
-    evidence = {"features": names, "weights": [float(f"{w:.4g}") for w in weights]}
-    write_model(folder, {**model.description, "evidence": evidence}, model.tensors)
+def write(weights: dict[str, float], path: Path, border: str) -> None:
+    """Write the weights into a file, or into the description of a border model."""
+    rounded = {name: float(f"{value:.4g}") for name, value in weights.items()}
+    if not border:
+        path.write_text(json.dumps(rounded, indent=2) + "\n", encoding="utf-8")
+        return
+    model = open_model(border)
+    evidence = {"features": list(rounded), "weights": list(rounded.values())}
+    write_model(border, {**model.description, "evidence": evidence}, model.tensors)
 
 
 def main(path: Path, smoke: bool, border: str = "", n_scenes: int = len(FITTED_SEEDS)) -> None:
-    """Fit the weights and write the module, or the description of a border model."""
+    """Fit the weights and write them."""
     began = time.time()
     families = [small(family) for family in FITTED.values()] if smoke else FITTED.values()
-    builder: LearnedTree | BorderTree = BorderTree(weights=border) if border else LearnedTree()
-    features = all_features if border else pair_features
+    builder = BorderTree(weights=border) if border else LearnedTree()
     scenes = measured(families, FITTED_SEEDS[: 2 if smoke else n_scenes], builder)
     print(f"{len(scenes)} scenes measured, {time.time() - began:.0f} s")
-    weights = np.zeros(len(PAIR_FEATURES) + (len(EVIDENCE_FEATURES) if border else 0))
-    weights[:2] = -6.0, 12.0  # initial weights: bias and strength of the border
+    weights = dict.fromkeys(FEATURES if border else PAIR_FEATURES, 0.0) | {"bias": -6.0, "strength": 12.0}
     pairs: Pairs = ([], [], [])
     for _ in range(1 if smoke else ROUNDS):
         before = len(pairs[0])
         for regions, pixels, scale in scenes:
-            episode(regions, pixels, scale, weights, pairs, features)
-        weights = logistic(pairs)
+            episode(regions, pixels, scale, weights, pairs)
+        fitted = logistic(pairs)
+        weights = dict(zip(weights, fitted.tolist(), strict=True))
         X, different = np.array(pairs[0][before:]), np.array(pairs[1][before:])
-        wrong = ((X @ weights > 0) != different).mean()
+        wrong = ((X @ fitted > 0) != different).mean()
         print(
             f"{len(X)} pairs, {different.mean():.3f} different, {wrong:.4f} misclassified, "
             f"{time.time() - began:.0f} s"
         )
-    if border:
-        write_into_model(weights, border)
-    else:
-        write(weights, path)
+    write(weights, path, border)
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--smoke", action="store_true", help="a few scenes, one round; needs --out")
-    parser.add_argument("--out", type=Path, default=PACKAGED, help="the module to write")
+    parser.add_argument("--out", type=Path, default=PACKAGED, help="the file to write")
     parser.add_argument("--border", default="", help="folder of a border model: fit with its evidence, write into it")
     parser.add_argument("--scenes", type=int, default=len(FITTED_SEEDS), help="scenes of each family")
     options = parser.parse_args()

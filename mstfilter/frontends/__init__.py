@@ -8,23 +8,23 @@
 `mask_trees`        nested masks as a tree whose cuts are levels
 `mask_proposal`     the proposal, the boundary model, and the recipe for SAM
 `completions`       meshes, point clouds and voxels of others as completions
-`cob`               COB: boundary maps and trees; `cob_network`: its network in torch
-`caffe`             a reader of Caffe's files of weights
-`mask_trackers`     SiamMask as a tracker of masks; `siammask_network`: its network in torch
-`package_trackers`  SAM 2, EdgeTAM and Cutie through their packages
+`mask_trackers`     SAM 2, EdgeTAM and Cutie through their packages
 ==================  ===================================================================
 
-No weights are part of the package, and none are downloaded.
+The networks of the published system, COB and SiamMask, are files in ``models/published`` that the registry loads like
+components of users. No weights are part of the package, and none are downloaded.
 """
 
 from mstfilter.lazy import attach
+from mstfilter.resources import models_folder
 
 __getattr__, __dir__, __all__ = attach(__name__, __file__)
 
+_COB, _SIAMMASK = (f"{models_folder()}/published/{name}.py" for name in ("cob", "siammask"))
 __components__ = {
     "proposal": {"mask_folder": "MaskProposal"},
-    "boundary": {"mask_folder": "MaskBoundary", "cob": "CobBoundary"},
-    "tree": {"cob": "CobTree"},
+    "boundary": {"mask_folder": "MaskBoundary", "cob": f"{_COB}:CobBoundary"},
+    "tree": {"cob": f"{_COB}:CobTree"},
     "completer": {"external": "ExternalCompletion"},
-    "tracker": {"siammask": "SiamMaskTracker", "sam2": "Sam2Tracker", "cutie": "CutieTracker"},
+    "tracker": {"siammask": f"{_SIAMMASK}:SiamMaskTracker", "sam2": "Sam2Tracker", "cutie": "CutieTracker"},
 }

@@ -1,5 +1,3 @@
-from mstfilter.frontends.caffe import read_caffemodel as read_caffemodel
-from mstfilter.frontends.cob import CobBoundary as CobBoundary, CobTree as CobTree
 from mstfilter.frontends.completions import ExternalCompletion as ExternalCompletion, read_shapes as read_shapes
 from mstfilter.frontends.mask_files import (
     MaskRegion as MaskRegion,
@@ -13,10 +11,9 @@ from mstfilter.frontends.mask_proposal import (
     border_probability as border_probability,
     write_automatic_masks as write_automatic_masks,
 )
-from mstfilter.frontends.mask_trackers import SiamMaskTracker as SiamMaskTracker
+from mstfilter.frontends.mask_trackers import CutieTracker as CutieTracker, Sam2Tracker as Sam2Tracker
 from mstfilter.frontends.mask_trees import (
     mask_tree as mask_tree,
     nested_masks as nested_masks,
     node_values as node_values,
 )
-from mstfilter.frontends.package_trackers import CutieTracker as CutieTracker, Sam2Tracker as Sam2Tracker

@@ -25,13 +25,14 @@ import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 
 from mstfilter.completion import ClipCompleter, Completer, Completion, ObservedBox, observed_box
 from mstfilter.completion.observed import frame_points
-from mstfilter.errors import InputError, check_choice, check_number
+from mstfilter.errors import InputError
+from mstfilter.fields import Bounds
 from mstfilter.files import reading
 from mstfilter.frontends.mask_files import read_weights
 from mstfilter.open3d_import import import_open3d
@@ -91,16 +92,11 @@ class ExternalCompletion(ClipCompleter, UsesFiles):
     folder: str = ""
     axes: Literal["camera", "world"] = "camera"
     draws: Literal["sample", "mean"] = "sample"
-    min_iou: float = 0.5
+    min_iou: Annotated[float, Bounds(above=0, at_most=1)] = 0.5
     other: Completer | None = None
 
     stochastic: ClassVar[bool] = True
     remembers: ClassVar[bool] = False
-
-    def __post_init__(self) -> None:
-        check_choice("axes", self.axes, ("camera", "world"))
-        check_choice("draws", self.draws, ("sample", "mean"))
-        check_number("min_iou", self.min_iou, above=0, at_most=1)
 
     def check_files(self, recording: Recording) -> None:
         """Read the masks of all pauses, and place all shapes."""

@@ -24,7 +24,8 @@ from typing import Any, ClassVar, Protocol
 import numpy as np
 
 from mstfilter.completion import Completer, Extrude
-from mstfilter.errors import InputError, check_number
+from mstfilter.errors import InputError
+from mstfilter.fields import Share
 from mstfilter.frontends.mask_files import MaskRegion, PauseMasks, read_masks, write_masks
 from mstfilter.frontends.mask_trees import nested_masks, node_values
 from mstfilter.scene import Clip, Frame, Recording, UsesFiles, component_key, content_key, memo
@@ -143,12 +144,9 @@ class MaskBoundary(ClipBoundary, UsesFiles):
     """
 
     folder: str = ""
-    weight: float = 1.0
+    weight: Share = 1.0
     objects: ObjectRule = field(default_factory=ObjectRule)
     other: BoundaryModel | None = None
-
-    def __post_init__(self) -> None:
-        check_number("weight", self.weight, at_least=0, at_most=1)
 
     def check_files(self, recording: Recording) -> None:
         """Read the masks of all pauses."""

@@ -1,98 +1,37 @@
-"""SiamMask, a tracker of masks for the motion rules.
+"""Trackers of masks for the motion rules, through packages of their authors: SAM 2, EdgeTAM and Cutie.
 
->>> overrides = "transition.tracker=siammask", "transition.tracker.weights=SiamMask_DAVIS.pth"
->>> filter = mstfilter.preset("paper", *overrides)
+>>> overrides = "transition.tracker=sam2", "transition.tracker.checkpoint=sam2.1_hiera_tiny.pt"
+>>> filter = mstfilter.preset("mst", *overrides)
 
 A tracker follows the masks of all distinct segments to the last frame of a clip. The motion rules then look for the
 object there, in place of where the optical flow leads (paper, section IV-C).
 
-SiamMask: Wang, Zhang, Bertinetto, Hu, Torr: Fast Online Object Tracking and Segmentation, CVPR 2019. Its authors
-distribute code and checkpoints at https://github.com/foolwood/SiamMask (MIT). The code here was checked with random
-weights. It was never run with the published ones.
+SAM 2: Ravi et al., 2024, https://github.com/facebookresearch/sam2 (Apache-2.0, weights too). EdgeTAM has a package of
+the same name and interface. Cutie: Cheng et al., CVPR 2024, https://github.com/hkchengrex/Cutie (MIT). The user
+supplies package and checkpoint. The adapters were checked with stand-ins of the packages, not with the packages.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from abc import abstractmethod
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import lru_cache, partial
+from functools import lru_cache
+from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING
+from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
 
-from mstfilter.errors import MissingLibraryError, check_integer, check_number, naming
+from mstfilter.errors import InputError, MissingLibraryError, describe_error
+from mstfilter.fields import PositiveInt
 from mstfilter.files import weights_file
-from mstfilter.scene import Clip, Frame, Recording, UsesFiles, component_key, content_key, memo
+from mstfilter.scene import Clip, Frame, Recording, UsesFiles
 from mstfilter.tracking import MaskTracker
 
-if TYPE_CHECKING:
-    from mstfilter.frontends.siammask_network import SiamMaskNetwork
-
-_TEMPLATE, _SEARCH = 127, 255  # pixels of the crops
-_STRIDE, _BASE, _POSITIONS = 8, 8, 25
-_CONTEXT = 0.5  # context around a box, in half its circumference
-_RATIOS = (0.33, 0.5, 1, 2, 3)
-_SMALLEST = 10  # pixels of a side of a box
-_MAX_LOG = 10.0  # log of the ratio of a box to its anchor; only untrained networks exceed it
-
-
-@dataclass(frozen=True)
-class SiamMaskTracker(MaskTracker, UsesFiles):
-    """SiamMask with refinement. Each mask starts a tracker of its own; equal masks are tracked once.
-
-    Parameters
-    ----------
-    weights : str
-        Path of a checkpoint, for example SiamMask_DAVIS.pth.
-    threshold : float
-        Smallest probability of a pixel of the mask.
-    penalty, window, rate : float
-        Penalty of a change of size, weight of the cosine window, and rate of change of the size. The defaults of
-        `threshold` and of these are those of the configuration for DAVIS; for VOT they are 0.3, 0.04, 0.42 and 0.25.
-    step : int
-        Every `step`-th frame is used, and the last one; 3 in the authors' program of MST.
-    sha256 : str
-        Expected hash of the file; empty: not compared.
-    """
-
-    weights: str = ""
-    threshold: float = 0.4
-    penalty: float = 0.04
-    window: float = 0.4
-    rate: float = 1.0
-    step: int = 1
-    sha256: str = ""
-
-    def __post_init__(self) -> None:
-        check_integer("step", self.step)
-        for name in ("threshold", "window", "rate"):
-            check_number(name, getattr(self, name), at_least=0, at_most=1)
-        check_number("penalty", self.penalty, at_least=0)
-
-    def check_files(self, recording: Recording) -> None:
-        """Load the weights."""
-        self._network()
-
-    def track(self, clip: Clip, masks: Sequence[np.ndarray]) -> list[np.ndarray]:
-        """Masks (H, W) bool of the last frame. Raises InputError if the weights are missing or of another network."""
-        network, digest = self._network()
-        frames = thinned(clip, self.step)
-        images = [np.ascontiguousarray(frame.rgb[..., ::-1]) for frame in frames]  # BGR, as it was trained
-        clip_key = content_key("frames", *(frame.key for frame in frames))
-        return [
-            memo(
-                "siammask",
-                (clip_key, digest, component_key(self), np.packbits(mask).tobytes()),
-                partial(follow, self, network, images, mask),
-            )
-            for mask in masks
-        ]
-
-    def _network(self) -> tuple[SiamMaskNetwork, str]:
-        where = "https://github.com/foolwood/SiamMask"
-        path, digest = weights_file(self.weights, "SiamMask", where, self.sha256)
-        return _load(path, digest), digest
+_SAM2, _CUTIE = "https://github.com/facebookresearch/sam2", "https://github.com/hkchengrex/Cutie"
 
 
 def thinned(clip: Clip, step: int) -> list[Frame]:
@@ -100,131 +39,180 @@ def thinned(clip: Clip, step: int) -> list[Frame]:
     return [*list(clip.frames)[: len(clip.frames) - 1 : step], clip.after]
 
 
+@dataclass(frozen=True)
+class PackageTracker(MaskTracker, UsesFiles):
+    """A tracker of another package.
+
+    Parameters
+    ----------
+    checkpoint : str
+        Path of a checkpoint.
+    device : str
+        Device of torch.
+    step : int
+        Every `step`-th frame is used, and the last one.
+    sha256 : str
+        Expected hash of the file; empty: not compared.
+    """
+
+    checkpoint: str = ""
+    device: str = "cpu"
+    step: PositiveInt = 1
+    sha256: str = ""
+
+    def check_files(self, recording: Recording) -> None:
+        """Load the checkpoint."""
+        self.loaded()
+
+    @abstractmethod
+    def loaded(self) -> Any:
+        """What the package makes of the checkpoint."""
+
+
+@dataclass(frozen=True)
+class Sam2Tracker(PackageTracker):
+    """The video predictor of the package ``sam2`` (SAM 2, or EdgeTAM, whose package has the same name).
+
+    All masks are tracked together, with one pass of the image encoder for each frame. `config` is the name of the
+    configuration of the checkpoint in the package. Further parameters: `PackageTracker`.
+    """
+
+    config: str = "configs/sam2.1/sam2.1_hiera_t.yaml"
+
+    def loaded(self) -> Any:
+        file = weights_file(self.checkpoint, "SAM 2", _SAM2, self.sha256)
+        with loading("sam2", file[0]):
+            return _load_sam2(self.config, *file, self.device)
+
+    def track(self, clip: Clip, masks: Sequence[np.ndarray]) -> list[np.ndarray]:
+        """Masks (H, W) bool of the last frame. Raises InputError if the package or the checkpoint is missing."""
+        predictor, frames = self.loaded(), thinned(clip, self.step)
+        if len(frames) == 1:
+            return [mask.astype(bool) for mask in masks]
+        found = [np.zeros(mask.shape, dtype=bool) for mask in masks]
+        with TemporaryDirectory() as folder:
+            for k, frame in enumerate(frames):  # the predictor reads numbered JPEG files
+                _write_jpeg(Path(folder) / f"{k:05d}.jpg", frame.rgb)
+            state = predictor.init_state(video_path=folder)
+            numbers = [k for k, mask in enumerate(masks) if mask.any()]
+            for k in numbers:
+                predictor.add_new_mask(inference_state=state, frame_idx=0, obj_id=k, mask=masks[k].astype(bool))
+            for index, objects, logits in predictor.propagate_in_video(state) if numbers else ():
+                if index == len(frames) - 1:
+                    for k, logit in zip(objects, logits, strict=True):
+                        found[k] = (logit[0] > 0).cpu().numpy()
+        return found
+
+
 @lru_cache(maxsize=1)
-def _load(path: str, digest: str) -> SiamMaskNetwork:
-    """The network with the weights of a file; the last one is kept."""
-    try:
-        from mstfilter.frontends.siammask_network import SiamMaskNetwork, read_checkpoint
-    except ImportError as error:
-        raise MissingLibraryError(f"torch cannot be imported: {error}", "pip install torch") from error
-    network = SiamMaskNetwork()
-    with naming(path):
-        network.load_state(read_checkpoint(Path(path)))
-    return network
+def _load_sam2(config: str, checkpoint: str, digest: str, device: str) -> Any:
+    """The video predictor; the last one is kept."""
+    build = imported("sam2.build_sam", _SAM2).build_sam2_video_predictor
+    return build(config, checkpoint, device=device)
 
 
-def follow(
-    rule: SiamMaskTracker, network: SiamMaskNetwork, images: Sequence[np.ndarray], mask: np.ndarray
-) -> np.ndarray:
-    """The mask (H, W) bool in the last of several BGR images of an object with a mask (H, W) in the first."""
+def _write_jpeg(path: Path, rgb: np.ndarray) -> None:
+    import cv2
+
+    if not cv2.imwrite(str(path), rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 100]):
+        raise InputError(f"image cannot be written: {path}")
+
+
+@dataclass(frozen=True)
+class CutieTracker(PackageTracker):
+    """The package ``cutie``. Masks that do not overlap are tracked together; every frame is encoded once.
+
+    Parameters: `PackageTracker`.
+    """
+
+    def loaded(self) -> tuple[Any, Any]:
+        file = weights_file(self.checkpoint, "Cutie", _CUTIE, self.sha256)
+        with loading("cutie", file[0]):
+            return _load_cutie(*file, self.device)
+
+    def track(self, clip: Clip, masks: Sequence[np.ndarray]) -> list[np.ndarray]:
+        """Masks (H, W) bool of the last frame. Raises InputError if the package or the checkpoint is missing."""
+        (network, config), frames = self.loaded(), thinned(clip, self.step)
+        if len(frames) == 1:
+            return [mask.astype(bool) for mask in masks]
+        import torch
+
+        core = import_module("cutie.inference.inference_core").InferenceCore
+        store = import_module("cutie.inference.image_feature_store").ImageFeatureStore(network)
+        images = [
+            torch.from_numpy(frame.rgb.transpose(2, 0, 1).copy()).float().to(self.device) / 255 for frame in frames
+        ]
+        found = [np.zeros(mask.shape, dtype=bool) for mask in masks]
+        groups = disjoint_groups(masks)
+        with torch.inference_mode():
+            for number, group in enumerate(groups):
+                last = {"delete_buffer": number == len(groups) - 1}  # else the features serve the next group
+                tracker = core(network, cfg=config, image_feature_store=store)
+                labels = np.zeros(clip.before.depth.shape, np.int64)
+                for label, k in enumerate(group, start=1):
+                    labels[masks[k]] = label
+                objects = list(range(1, len(group) + 1))
+                chance = tracker.step(images[0], torch.from_numpy(labels).to(self.device), objects=objects, **last)
+                for image in images[1:]:
+                    chance = tracker.step(image, **last)
+                best = chance.argmax(dim=0).cpu().numpy()  # 0 is the background
+                for label, k in enumerate(group, start=1):
+                    found[k] = best == label
+        return found
+
+
+@lru_cache(maxsize=1)
+def _load_cutie(checkpoint: str, digest: str, device: str) -> tuple[Any, Any]:
+    """Network and configuration as the package's own default, without its download; the last one is kept."""
+    module = imported("cutie.model.cutie", _CUTIE)
+    hydra, omegaconf = imported("hydra", _CUTIE), imported("omegaconf", _CUTIE)
     import torch
 
-    if not mask.any() or len(images) == 1:
-        return mask.astype(bool)
-    rows, columns = np.nonzero(mask)
-    size = np.array([np.ptp(columns) + 1, np.ptp(rows) + 1], dtype=np.float64)
-    position = np.array([columns.min(), rows.min()]) + size / 2
-    colour = images[0].mean(axis=(0, 1))
-    limits = np.array(mask.shape[::-1], dtype=np.float64)
-    found = mask.astype(np.float64)
-
-    def tensor(crop: np.ndarray) -> torch.Tensor:
-        return torch.from_numpy(np.ascontiguousarray(crop.transpose(2, 0, 1), dtype=np.float32))[None]
-
-    with torch.inference_mode():
-        side = round(float(_context_side(*size)))
-        template = network.template(tensor(crop_around(images[0], position, side, _TEMPLATE, colour)))
-        for image in images[1:]:
-            scale = _TEMPLATE / float(_context_side(*size))
-            side = round(_SEARCH / scale)
-            score, offsets, features = network.search(
-                template, tensor(crop_around(image, position, side, _SEARCH, colour))
-            )
-            k, boxes, value = _best(rule, score.softmax(dim=0)[1].numpy(), offsets.numpy(), size * scale)
-            row, column = divmod(k % _POSITIONS**2, _POSITIONS)
-            found = _paste(network.refine(features, row, column).numpy(), position, side, row, column, limits)
-            box = boxes[:, k] / scale
-            rate = value * rule.rate
-            position = np.clip(position + box[:2], 0, limits)
-            size = np.clip(size * (1 - rate) + box[2:] * rate, _SMALLEST, limits)
-    return found > rule.threshold
+    folder = Path(module.__file__).resolve().parents[1] / "config"
+    with hydra.initialize_config_dir(version_base="1.3.2", config_dir=str(folder)):
+        config = hydra.compose(config_name="eval_config")
+    with omegaconf.open_dict(config):
+        config["weights"] = checkpoint
+    imported("cutie.inference.utils.args_utils", _CUTIE).get_dataset_cfg(config)
+    network = module.CUTIE(config).to(device).eval()
+    network.load_weights(torch.load(checkpoint, map_location=device, weights_only=True))
+    return network, config
 
 
-def _context_side(width: np.ndarray | float, height: np.ndarray | float) -> np.ndarray:
-    """Side of the square around a box and its context."""
-    context = _CONTEXT * (width + height)
-    return np.sqrt((width + context) * (height + context))
+def disjoint_groups(masks: Sequence[np.ndarray]) -> list[list[int]]:
+    """Numbers of the masks that have pixels, in groups without common pixels; each mask joins the first that fits."""
+    groups: list[list[int]] = []
+    unions: list[np.ndarray] = []
+    for k, mask in enumerate(masks):
+        if not mask.any():
+            continue
+        fits = next((g for g, union in enumerate(unions) if not (union & mask).any()), None)
+        if fits is None:
+            groups.append([k])
+            unions.append(mask.astype(bool))
+        else:
+            groups[fits].append(k)
+            unions[fits] = unions[fits] | mask
+    return groups
 
 
-def crop_around(image: np.ndarray, position: np.ndarray, side: int, size: int, colour: np.ndarray) -> np.ndarray:
-    """The square of `side` pixels around a position (x, y), resized to `size` pixels; `colour` outside the image."""
-    import cv2
-
-    low = np.round(position - (side + 1) / 2).astype(int)
-    high = low + side
-    inner = np.clip(low, 0, None), np.minimum(high, image.shape[1::-1])
-    out = np.empty((side, side, 3), np.uint8)
-    out[:] = colour.astype(np.uint8)
-    if (inner[1] > inner[0]).all():
-        (x0, y0), (x1, y1) = inner[0] - low, inner[1] - low
-        out[y0:y1, x0:x1] = image[inner[0][1] : inner[1][1], inner[0][0] : inner[1][0]]
-    return cv2.resize(out, (size, size)) if side != size else out
-
-
-@lru_cache(maxsize=1)
-def anchor_boxes() -> np.ndarray:
-    """Anchors (4, 5 * 25 * 25): centre x, y relative to the middle of the crop, width, height."""
-    area = _STRIDE * _STRIDE
-    widths = [int(np.sqrt(area / ratio)) for ratio in _RATIOS]
-    sizes = np.array([(w, int(w * ratio)) for w, ratio in zip(widths, _RATIOS, strict=True)]) * 8.0
-    at = (np.arange(_POSITIONS) - _POSITIONS // 2) * float(_STRIDE)
-    shape = (len(_RATIOS), _POSITIONS, _POSITIONS)
-    x, y = np.broadcast_to(at, shape), np.broadcast_to(at[:, None], shape)
-    w, h = (np.broadcast_to(sizes[:, k, None, None], shape) for k in (0, 1))
-    return np.stack([x, y, w, h]).reshape(4, -1)
+@contextmanager
+def loading(package: str, checkpoint: str) -> Iterator[None]:
+    """Raise InputError if a package fails to load a checkpoint in the block."""
+    try:
+        yield
+    except InputError:
+        raise
+    except Exception as error:  # of the package: any
+        cause = f"{describe_error(error)}\n".splitlines()[0]
+        raise InputError(
+            f"the package {package} cannot load {checkpoint}: {cause}", "is it a checkpoint of this network and size?"
+        ) from error
 
 
-def _best(
-    rule: SiamMaskTracker, score: np.ndarray, offsets: np.ndarray, size: np.ndarray
-) -> tuple[int, np.ndarray, float]:
-    """The best anchor, all boxes (4, n) in the crop, and the penalised score of the best one.
-
-    `score` (5, 25, 25) is P(object), `offsets` (4, 5, 25, 25) the boxes relative to the anchors, `size` (2,) the
-    size of the object in the crop.
-    """
-    anchors, offsets = anchor_boxes(), offsets.reshape(4, -1).astype(np.float64)
-    sizes = np.exp(np.clip(offsets[2:], -_MAX_LOG, _MAX_LOG)) * anchors[2:]
-    boxes = np.concatenate([offsets[:2] * anchors[2:] + anchors[:2], sizes])
-
-    def change(ratio: np.ndarray) -> np.ndarray:
-        return np.maximum(ratio, 1 / ratio)
-
-    scale = change(_context_side(boxes[2], boxes[3]) / _context_side(*size))
-    shape = change((size[0] / size[1]) / (boxes[2] / boxes[3]))
-    penalised = np.exp(-(scale * shape - 1) * rule.penalty) * score.ravel()
-    hanning = np.outer(np.hanning(_POSITIONS), np.hanning(_POSITIONS)).ravel()
-    k = int(np.argmax(penalised * (1 - rule.window) + np.tile(hanning, len(_RATIOS)) * rule.window))
-    return k, boxes, float(penalised[k])
-
-
-def _paste(
-    mask: np.ndarray, position: np.ndarray, side: int, row: int, column: int, limits: np.ndarray
-) -> np.ndarray:
-    """A mask (127, 127) of a position of the search region, in the image; -1 outside of it."""
-    import cv2
-
-    scale = side / _SEARCH
-    corner = position - side / 2 + (np.array([column, row]) - _BASE / 2) * _STRIDE * scale
-    # The original program maps the image to 127 x 127 pixels of the box, with corners of the image on pixel centres.
-    width, height = limits
-    box = scale * _TEMPLATE
-    a, b = (width - 1) / (width * len(mask) / box), (height - 1) / (height * len(mask) / box)
-    mapping = np.array([[a, 0, a * corner[0] * len(mask) / box], [0, b, b * corner[1] * len(mask) / box]])
-    return cv2.warpAffine(
-        mask.astype(np.float32),
-        mapping,
-        (int(width), int(height)),
-        flags=cv2.INTER_LINEAR,
-        borderMode=cv2.BORDER_CONSTANT,
-        borderValue=-1,
-    )
+def imported(module: str, where: str) -> Any:
+    """A module of another package; raises MissingLibraryError if it cannot be imported."""
+    try:
+        return import_module(module)
+    except ImportError as error:
+        raise MissingLibraryError(f"{module} cannot be imported: {error}", f"install it as {where} says") from error

@@ -11,9 +11,8 @@
 ================  ====================================================================
 `boundary`        boundary maps from colour and depth
 `tree`            the tree and its helpers; the ultrametric contour map
-`regions`         measurements of regions and features of pairs of regions
-`learned_tree`    a tree from learned log odds; `join_weights`: the fitted weights
-`border_tree`     the same with the evidence of a trained network, `border_network`
+`regions`         measurements of regions and of their borders
+`learned_tree`    trees from learned log odds, also with the evidence of a trained network, `border_network`
 `cuts`            node values, the optimal cut, exact samples
 `mh`              Metropolis-Hastings samples
 `proposal`        which regions are objects; the proposal of the filter

@@ -1,9 +1,3 @@
-from mstfilter.segmentation.border_tree import (
-    EVIDENCE_FEATURES as EVIDENCE_FEATURES,
-    BorderTree as BorderTree,
-    all_features as all_features,
-    evidence_features as evidence_features,
-)
 from mstfilter.segmentation.boundary import (
     BoundaryModel as BoundaryModel,
     ClipBoundary as ClipBoundary,
@@ -19,7 +13,16 @@ from mstfilter.segmentation.cuts import (
     SceneCutObjectness as SceneCutObjectness,
     optimal_cut as optimal_cut,
 )
-from mstfilter.segmentation.learned_tree import Agglomeration as Agglomeration, LearnedTree as LearnedTree
+from mstfilter.segmentation.learned_tree import (
+    EVIDENCE_FEATURES as EVIDENCE_FEATURES,
+    FEATURES as FEATURES,
+    PAIR_FEATURES as PAIR_FEATURES,
+    Agglomeration as Agglomeration,
+    BorderTree as BorderTree,
+    LearnedTree as LearnedTree,
+    MergedTree as MergedTree,
+    pair_features as pair_features,
+)
 from mstfilter.segmentation.mh import MetropolisHastingsCuts as MetropolisHastingsCuts
 from mstfilter.segmentation.proposal import (
     ObjectRule as ObjectRule,
@@ -29,10 +32,8 @@ from mstfilter.segmentation.proposal import (
     hypothesis_of as hypothesis_of,
 )
 from mstfilter.segmentation.regions import (
-    PAIR_FEATURES as PAIR_FEATURES,
     REGION as REGION,
     Regions as Regions,
     SeenBorders as SeenBorders,
-    pair_features as pair_features,
 )
 from mstfilter.segmentation.tree import Tree as Tree, TreeBuilder as TreeBuilder, UcmTree as UcmTree

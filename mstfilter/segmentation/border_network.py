@@ -139,7 +139,7 @@ class BorderNetwork:
             model, IMAGE_CHANNELS, lambda values: BorderNet(int(values["width"]))
         )
         evidence = model.description.get("evidence", {})
-        #: Weights of the features of `mstfilter.segmentation.border_tree`; empty if they were not fitted.
+        #: Weights of the features of the tree `border`; empty if they were not fitted.
         self.evidence = dict(zip(evidence.get("features", ()), evidence.get("weights", ()), strict=True))
         self.key = model.key
 

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mstfilter.results import Checked, check_array, check_type, returns
-from mstfilter.scene import BASELINE, Clip, Frame, fit_support_plane, table_residual
+from mstfilter.scene import BASELINE, Clip, Frame, fit_support_plane, scaled_length, table_residual
 
 #: Focal length in pixels that defines the sensor's disparity unit: 1/8 pixel of a 640 x 480 Kinect, whatever the
 #: size of the image. The noise (0.58 units) and all thresholds then stay the same when an image is resized.
@@ -82,7 +82,7 @@ class ColourDepthBoundary(BoundaryModel):
         """Boundary strength (H, W). Robot pixels are 1 at their rim and 0 inside, so that they separate regions."""
         import cv2
 
-        resize = frame.camera.width / 640
+        resize = scaled_length(1, frame.camera.width)
         edges: np.ndarray = np.zeros(frame.depth.shape, np.float32)
         if self.colour_weight > 0:
             edges = self.colour_weight * _colour_edges(frame.rgb, resize)

@@ -10,12 +10,6 @@ maximises it, a `CutSampler` draws cuts at random.
 Under a Gibbs law with inverse temperature b, a cut has probability proportional to exp(b v(c)). One pass up the tree
 gives the probability ``stop[n]`` that a cut which reaches node n contains n itself. A walk down from the root with
 these probabilities draws a cut exactly.
-
-The law of the paper is exp(-d^2 / s2), where d = v* - v(c) is the difference to the value v* of the optimal cut.
-`ExactCuts` draws from it by rejection, because a scaled Gibbs law bounds it for any b:
-``exp(-d^2 / s2) <= exp(-b d + b^2 s2 / 4)``. A Gibbs draw is accepted with probability
-``exp(-(d - b s2 / 2)^2 / s2)``; accepted draws are exact and independent. The acceptance rate is highest for the b
-that solves ``b = 2 E_b[d] / s2``, with E_b the mean under the Gibbs law.
 """
 
 from __future__ import annotations
@@ -24,28 +18,25 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from math import exp, log1p
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
-from mstfilter.errors import InputError, check_number
+from mstfilter.errors import InputError
+from mstfilter.fields import PositiveFloat
 from mstfilter.results import Checked, check_array, check_list, check_type, returns
-from mstfilter.scene import Frame
+from mstfilter.scene import Frame, scaled_area
 from mstfilter.segmentation.boundary import pixels_above_table
 from mstfilter.segmentation.tree import Tree
-
-_MAX_TRIES = 100000  # Gibbs draws of `ExactCuts` for each cut
 
 # Constants of `SceneCutObjectness`.
 _START_SCALE = 0.3  # tolerance for boundaries inside the region, in P(boundary)
 _END_SCALE = 0.7  # tolerance for a weak outer boundary, in P(boundary)
 _POWER = 0.95  # exponent of the area; below 1 favours larger regions
 _FLOOR = 1e-3  # objectness of a region outside the area limits
-_MIN_AREA, _MAX_AREA = 1000 / 307200, 150000 / 307200  # fractions of the image
+_MIN_AREA, _MAX_AREA = 1000, 150000  # pixels of a 640 x 480 image
 
 _CLIP = 1e-3  # `MergeLogOdds` clips probabilities to _CLIP .. 1 - _CLIP
-
-_Value = TypeVar("_Value", float, np.ndarray)
 
 
 class CutValue(Checked, ABC):
@@ -84,9 +75,9 @@ class SceneCutObjectness(CutValue):
             area = foreground + background
         else:
             limited = np.ones(len(area), dtype=bool)
-        fraction = area / tree.leaves.size
+        smallest, largest = (scaled_area(limit, tree.leaves.size) for limit in (_MIN_AREA, _MAX_AREA))
         log_s = np.log(0.5) - (tree.start / _START_SCALE) ** 2 - ((1 - tree.end) / _END_SCALE) ** 2
-        outside = limited & ((fraction < _MIN_AREA) | (fraction > _MAX_AREA))
+        outside = limited & ((area < smallest) | (area > largest))
         return np.where(outside, np.log(_FLOOR), log_s) * area**_POWER
 
 
@@ -116,7 +107,6 @@ class CutSample:
     """Cuts drawn from a tree."""
 
     cuts: tuple[np.ndarray, ...]  #: ascending nodes of each cut
-    values: np.ndarray  #: (n,) v(c) of each cut
     log_p: np.ndarray  #: (n,) log of the sampler's target law relative to the optimal cut
     diagnostics: dict[str, Any] = field(default_factory=dict)  #: statistics of the draw; JSON types only
 
@@ -155,12 +145,6 @@ def check_values(tree: Tree, w: np.ndarray) -> np.ndarray:
     return w
 
 
-def check_target_law(sigma2: float, temperature: float) -> None:
-    """Raise InputError unless sigma2 > 0 and temperature >= 0."""
-    check_number("sigma2", sigma2, above=0)
-    check_number("temperature", temperature, at_least=0)
-
-
 def optimal_cut(tree: Tree, w: np.ndarray) -> np.ndarray:
     """Ascending nodes (n,) of the cut of largest value, for node values `w` (N,), by one pass up the tree.
 
@@ -189,8 +173,7 @@ class OptimalCut(CutSampler):
 
     def sample(self, rng: np.random.Generator, tree: Tree, w: np.ndarray, n: int) -> CutSample:
         cut = optimal_cut(tree, w)
-        value = float(np.asarray(w, dtype=np.float64)[cut].sum())
-        return CutSample((cut,) * n, np.full(n, value), np.zeros(n), {"size_of_best": len(cut)})
+        return CutSample((cut,) * n, np.zeros(n), {"size_of_best": len(cut)})
 
 
 @dataclass(frozen=True, eq=False)
@@ -202,7 +185,6 @@ class Gibbs:
     w: list[float]  #: node values
     log_z: list[float]  #: log normaliser of the subtree
     stop: list[float]  #: probability that a cut which reaches the node contains the node itself
-    mean: list[float]  #: expected value of the part of a cut inside the subtree
 
     def draw(self, random: Callable[[], float], node: int) -> list[int]:
         """Draw a cut of the subtree of `node`, unordered; `random` returns uniform numbers in [0, 1)."""
@@ -224,97 +206,26 @@ class Gibbs:
 def gibbs(tree: Tree, w: np.ndarray, b: float) -> Gibbs:
     """The Gibbs law with inverse temperature `b` under node values `w` (N,)."""
     values, n = w.tolist(), tree.n_nodes
-    log_z, stop, mean = [0.0] * n, [1.0] * n, [0.0] * n
-    for node, children in enumerate(tree.children):
-        keep = b * values[node]
-        if not children:
-            log_z[node], mean[node] = keep, values[node]
-            continue
-        split = inner = 0.0
-        for child in children:
-            split += log_z[child]
-            inner += mean[child]
+    log_z, stop = [b * value for value in values], [1.0] * n
+    for node in range(tree.n_leaves, n):
+        keep, split = log_z[node], sum(log_z[child] for child in tree.children[node])
         # log Z = log(exp(keep) + exp(split)), stable for either order of magnitude.
-        if keep >= split:
-            log_z[node] = keep + log1p(exp(split - keep))
-        else:
-            log_z[node] = split + log1p(exp(keep - split))
-        stop[node] = p = exp(keep - log_z[node])
-        mean[node] = p * values[node] + (1 - p) * inner
-    return Gibbs(tree, b, values, log_z, stop, mean)
-
-
-def best_envelope(tree: Tree, w: np.ndarray, best: float, s2: float) -> Gibbs:
-    """The Gibbs law with the highest acceptance rate: b = 2 E_b[best - v] / s2, by bisection in log b."""
-    low = 0.0
-    high = 2 * (best - gibbs(tree, w, 0.0).mean[-1]) / s2
-    law = gibbs(tree, w, high)
-    for _ in range(60):
-        middle = (low * high) ** 0.5 if low > 0 else high / 64
-        law = gibbs(tree, w, middle)
-        if middle * s2 > 2 * (best - law.mean[-1]):
-            high = middle
-        else:
-            low = middle
-        # The sampler is exact for any b; a tolerance of 1 % does not change the acceptance rate.
-        if high <= 0 or (low > 0 and high / low < 1.01):
-            break
-    return law
-
-
-def proposal_law(tree: Tree, w: np.ndarray, best: float, s2: float, temperature: float) -> Gibbs:
-    """The target itself if it is a Gibbs law (temperature > 0), else the best envelope of the law of the paper."""
-    return gibbs(tree, w, 1 / temperature) if temperature > 0 else best_envelope(tree, w, best, s2)
-
-
-def log_target(value: _Value, best: float, s2: float, temperature: float) -> _Value:
-    """Log probability of cuts with these values relative to the optimal cut."""
-    if temperature > 0:
-        return (value - best) / temperature
-    return -((best - value) ** 2) / s2
+        log_z[node] = max(keep, split) + log1p(exp(-abs(keep - split)))
+        stop[node] = exp(keep - log_z[node])
+    return Gibbs(tree, b, values, log_z, stop)
 
 
 @dataclass(frozen=True)
 class ExactCuts(CutSampler):
-    """Independent exact draws from exp(-(v* - v)^2 / s2), or from exp(v / temperature).
+    """Independent exact draws from the Gibbs law exp(v / temperature); `temperature` is in units of value."""
 
-    Parameters
-    ----------
-    sigma2 : float
-        s2 relative to the squared value of the optimal cut: ``s2 = sigma2 v*^2``. No unit.
-    temperature : float
-        0: the law of the paper. > 0: the Gibbs law at this temperature, in units of value; no draw is rejected and
-        sigma2 is not used.
-    """
-
-    sigma2: float = 1e-3
-    temperature: float = 0.0
-
-    def __post_init__(self) -> None:
-        check_target_law(self.sigma2, self.temperature)
+    temperature: PositiveFloat = 1.0
 
     def sample(self, rng: np.random.Generator, tree: Tree, w: np.ndarray, n: int) -> CutSample:
-        best = float(check_values(tree, w)[optimal_cut(tree, w)].sum())
-        s2 = max(self.sigma2 * best**2, 1e-300)
-        law = proposal_law(tree, w, best, s2, self.temperature)
-        cuts: list[np.ndarray] = []
-        values: list[float] = []
-        tries = 0
-        while len(cuts) < n:
-            tries += 1
-            if tries > _MAX_TRIES * n:
-                raise InputError(
-                    f"exact cut sampler accepted {len(cuts)} of {tries - 1} draws, {n} are needed",
-                    "use the `mh` sampler for this tree",
-                )
-            cut = law.draw(rng.random, tree.root)
-            d = best - sum(law.w[x] for x in cut)
-            if self.temperature > 0 or rng.random() < exp(-((d - law.b * s2 / 2) ** 2) / s2):
-                cuts.append(np.sort(np.array(cut, dtype=np.int64)))
-                values.append(best - d)
-        v = np.array(values)
-        diagnostics = {
-            "acceptance": n / tries if tries else 1.0,
-            "distinct": len({c.tobytes() for c in cuts}) / max(n, 1),
-        }
-        return CutSample(tuple(cuts), v, log_target(v, best, s2, self.temperature), diagnostics)
+        w = check_values(tree, w)
+        law = gibbs(tree, w, 1 / self.temperature)
+        cuts = [np.sort(np.array(law.draw(rng.random, tree.root), dtype=np.int64)) for _ in range(n)]
+        best = w[optimal_cut(tree, w)].sum()
+        log_p = np.array([w[cut].sum() - best for cut in cuts]) / self.temperature
+        distinct = len({cut.tobytes() for cut in cuts}) / max(n, 1)
+        return CutSample(tuple(cuts), log_p, {"distinct": distinct})

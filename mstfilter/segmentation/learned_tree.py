@@ -1,26 +1,40 @@
-"""A segmentation tree whose merges are decided by learned log odds: same object or not.
+"""Segmentation trees whose merges are decided by learned log odds: same object or not.
 
 Watershed regions of a boundary map are merged, the pair with the lowest log odds first. The log odds that two regions
-are different objects are linear in features of their border and of their union (`PAIR_FEATURES`), which are
-recomputed when a region grows. The weights were fitted on simulated scenes only.
+are different objects are linear in `FEATURES` of their border and of their union, which are recomputed when a region
+grows. A file of the model names the features and their weights, which were fitted on simulated scenes only.
 
 >>> tree = LearnedTree().build(boundary, frame)
+>>> tree = BorderTree().build(boundary, frame)         # also with what a trained border network sees
 >>> w = MergeLogOdds().values(tree, frame)
+
+Features of the size of a region are in pixels of a 640 px wide image, disparity is in sensor units (1/8 px at f = 525
+px), lengths are in metres. "Front" is the region that is nearer to the camera at the border.
 """
 
 from __future__ import annotations
 
+import functools
+import hashlib
 import heapq
-from collections.abc import Callable
+import math
+from abc import abstractmethod
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from mstfilter.errors import InputError
-from mstfilter.scene import Frame
-from mstfilter.segmentation.join_weights import JOIN_WEIGHTS
-from mstfilter.segmentation.regions import BORDER, PAIR_FEATURES, REGION, Regions, measure_regions, pair_features
+from mstfilter.reading import read_json
+from mstfilter.resources import models_folder
+from mstfilter.scene import Frame, scaled_length
+from mstfilter.segmentation.regions import BORDER, HEIGHT_BIN, REGION, Regions, SeenBorders, measure_regions
 from mstfilter.segmentation.tree import Tree, TreeBuilder, UcmTree
+
+if TYPE_CHECKING:
+    from mstfilter.segmentation.border_network import BorderNetwork
 
 #: Log odds (k,) that the regions of k pairs belong to different objects:
 #: (rows of a, rows of b, borders, table borders of a, of b).
@@ -28,6 +42,159 @@ PairLogOdds = Callable[[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarr
 
 _NO_BORDER = np.zeros(len(BORDER))
 _ROOT_ODDS = 30.0  # the root joins the table and regions that never touched
+_MOST_GAP = 4.0
+_FIT = "python experiments/segmentation_fit/run.py"
+
+
+def quadric_residual(sums: np.ndarray) -> np.ndarray:
+    """Squared residual (k,) of the least-squares quadric of disparity of each region (k, C), sensor units squared."""
+    gram = sums[:, REGION["gram"]].reshape(-1, 6, 6)
+    moment = sums[:, REGION["moment"]]
+    n = sums[:, REGION["pixels"].start]
+    ridge = (1e-9 * n + 1e-9)[:, None, None] * np.eye(6)
+    fit = np.linalg.solve(gram + ridge, moment[..., None])[..., 0]
+    return np.maximum(sums[:, REGION["square"].start] - (moment * fit).sum(axis=1), 0)
+
+
+class _RegionMeans:
+    """Measurements of k regions from rows of `Regions.sums` (k, C) and their borders with the table (k, B)."""
+
+    def __init__(self, sums: np.ndarray, table: np.ndarray) -> None:
+        self.n = np.maximum(sums[:, REGION["pixels"].start], 1)
+        lab, lab2, self.ground, self.centre = (
+            sums[:, REGION[name]] / self.n[:, None] for name in ("lab", "lab2", "ground", "centre")
+        )
+        self.lab, self.lab_variance = lab, np.maximum(lab2 - lab**2, 0) + 4
+        # Standard deviation of the ground coordinates, metres.
+        spread = sums[:, REGION["spread"].start] / self.n
+        self.extent = np.sqrt(np.maximum(spread - (self.ground**2).sum(axis=1), 0))
+        self.bend = sums[:, REGION["bend"].start] / self.n
+        # 3rd and 97th percentile of the heights, metres.
+        share = np.cumsum(sums[:, REGION["heights"]], axis=1) / self.n[:, None]
+        self.bottom = (share < 0.03).sum(axis=1) * HEIGHT_BIN
+        self.top = ((share < 0.97).sum(axis=1) + 1) * HEIGHT_BIN
+        # Shares of the outline that touch the table, and that border on it with a clear step.
+        clear = table[:, BORDER["clear"]]
+        self.outline = np.maximum(sums[:, REGION["perimeter"].start], 1)
+        self.on_table, self.drop = (table[:, 0] - clear) / self.outline, clear / self.outline
+        self.free = self.outline - table[:, 0]
+
+
+class _PairMeasures:
+    """Measurements of k pairs of regions; parameters as in `pair_features`."""
+
+    def __init__(
+        self, a: np.ndarray, b: np.ndarray, border: np.ndarray, table_a: np.ndarray, table_b: np.ndarray, scale: float
+    ) -> None:
+        flip = (border[:, BORDER["step"]] < 0)[:, None]
+        sums_front, sums_back = np.where(flip, b, a), np.where(flip, a, b)
+        self.front = front = _RegionMeans(sums_front, np.where(flip, table_b, table_a))
+        self.back = back = _RegionMeans(sums_back, np.where(flip, table_a, table_b))
+        small = np.minimum(front.n, back.n)
+        self.log_small = np.log(small / scale**2)
+        self.lab = front.lab - back.lab
+        joint = quadric_residual(sums_front + sums_back)
+        excess = joint - quadric_residual(sums_front) - quadric_residual(sums_back)
+        self.misfit = np.log1p(np.maximum(excess, 0) / small)
+        self.residual = np.log1p(joint / (front.n + back.n))
+        self.higher = np.clip((front.top - back.top) * 10, -1, 1)
+        self.rim = np.exp(-(((front.top - back.top) / 0.015) ** 2))
+        gap = front.ground - back.ground
+        self.distance = np.minimum(np.hypot(gap[:, 0], gap[:, 1]) / (front.extent + back.extent + 1e-3), 4)
+        self.length = np.maximum(border[:, BORDER["length"]], 1)
+        mean = border / self.length[:, None]
+        self.strength, self.hollow, self.convex, self.clear, self.seen = (
+            mean[:, BORDER[name]] for name in ("strength", "hollow", "convex", "clear", "seen")
+        )
+        self.step = np.log1p(np.abs(mean[:, BORDER["step"]]))
+        # Distance of the centres of the objects that a network sees, relative to the size of the smaller region.
+        self.centre_gap = np.linalg.norm(front.centre - back.centre, axis=1)
+        self.centre_gap = np.minimum(self.centre_gap / np.sqrt(small), _MOST_GAP)
+
+    def texture(self) -> np.ndarray:
+        """Bhattacharyya distance of normal distributions of Lab colour, summed over the channels, at most 4."""
+        a, b = self.front, self.back
+        total = a.lab_variance + b.lab_variance
+        distance = (a.lab - b.lab) ** 2 / (4 * total)
+        distance += 0.5 * np.log(total / (2 * np.sqrt(a.lab_variance * b.lab_variance)))
+        return np.minimum(distance.sum(axis=1), 4)
+
+
+#: Features of pairs of regions by name, (k,) each. Those of `EVIDENCE_FEATURES` are 0 without a border network.
+FEATURES: dict[str, Callable[[_PairMeasures], np.ndarray]] = {
+    "bias": lambda p: np.ones(len(p.length)),
+    "strength": lambda p: p.strength,
+    "strength^2": lambda p: p.strength**2,
+    "hollow": lambda p: p.hollow,
+    "convex": lambda p: p.convex,
+    "step": lambda p: p.step,
+    "clear step share": lambda p: p.clear,
+    "lightness": lambda p: np.minimum(np.abs(p.lab[:, 0]) / 20, 3),
+    "chroma": lambda p: np.minimum(np.hypot(p.lab[:, 1], p.lab[:, 2]) / 10, 4),
+    "texture": _PairMeasures.texture,
+    "misfit": lambda p: p.misfit,
+    "residual": lambda p: p.residual,
+    "border share": lambda p: np.minimum(p.length / np.minimum(p.front.outline, p.back.outline), 1),
+    "free border share": lambda p: np.minimum(p.length / np.maximum(np.minimum(p.front.free, p.back.free), 1), 1),
+    "log pixels": lambda p: p.log_small,
+    "log ratio": lambda p: np.abs(np.log(p.front.n / p.back.n)),
+    "front higher": lambda p: np.maximum(p.higher, 0),
+    "back higher": lambda p: np.maximum(-p.higher, 0),
+    "front bottom": lambda p: np.minimum(p.front.bottom * 10, 2),
+    "back bottom": lambda p: np.minimum(p.back.bottom * 10, 2),
+    "front bend": lambda p: p.front.bend,
+    "back bend": lambda p: p.back.bend,
+    "ground distance": lambda p: p.distance,
+    "front on table": lambda p: p.front.on_table,
+    "back on table": lambda p: p.back.on_table,
+    "front drop": lambda p: p.front.drop,
+    "back drop": lambda p: p.back.drop,
+    "rim": lambda p: p.rim,
+    "rim * back bend": lambda p: p.rim * p.back.bend,
+    "rim * step": lambda p: p.rim * p.step,
+    "rim * inside": lambda p: p.rim * np.exp(-(p.distance**2)) * p.step,
+    "step * misfit": lambda p: p.step * p.misfit,
+    "hollow * misfit": lambda p: p.hollow * p.misfit,
+    "strength * log pixels": lambda p: p.strength * p.log_small,
+    "hollow * log pixels": lambda p: p.hollow * p.log_small,
+    "convex * strength": lambda p: p.convex * p.strength,
+    "seen": lambda p: p.seen,
+    "seen * log pixels": lambda p: p.seen * p.log_small,
+    "centre gap": lambda p: p.centre_gap,
+    "centre gap * seen": lambda p: p.centre_gap * p.seen,
+}
+EVIDENCE_FEATURES = tuple(FEATURES)[-4:]  #: Features of what a border network sees.
+PAIR_FEATURES = tuple(FEATURES)[:-4]  #: The other features.
+
+
+def pair_features(
+    a: np.ndarray,
+    b: np.ndarray,
+    border: np.ndarray,
+    table_a: np.ndarray,
+    table_b: np.ndarray,
+    scale: float,
+    names: Iterable[str] = PAIR_FEATURES,
+) -> np.ndarray:
+    """The named features (k, f) of k pairs of regions, from their rows `a` and `b` (k, C) of `Regions.sums`.
+
+    `border` (k, B) are their common borders, seen from `a`; `table_a` and `table_b` (k, B) their borders with the
+    table, zeros if there is none. `scale` is the image width / 640.
+    """
+    pair = _PairMeasures(a, b, border, table_a, table_b, scale)
+    return np.stack([FEATURES[name](pair) for name in names], axis=1)
+
+
+def check_weights(weights: Mapping[str, float], names: Iterable[str], where: object, hint: str) -> None:
+    """Raise InputError unless there is one finite weight for each of the features `names`."""
+    if not isinstance(weights, Mapping):
+        raise InputError(f"{where} is no mapping from features to weights", f"fit them with: {hint}")
+    for name in sorted(set(weights) ^ set(names)):
+        found = "has a weight" if name in weights else "has no weight"
+        raise InputError(f"{where} {found} of the feature {name!r}, unlike this version", f"fit them with: {hint}")
+    for name, value in weights.items():
+        if type(value) not in (int, float) or not math.isfinite(value):
+            raise InputError(f"{where}: the weight of {name!r} is {value!r}, expected a finite number")
 
 
 class Agglomeration:
@@ -93,7 +260,7 @@ class Agglomeration:
 
 
 @dataclass(frozen=True)
-class LearnedTree(TreeBuilder):
+class MergedTree(TreeBuilder):
     """Best-first merging of watershed regions, the leaves of the tree of `leaves`, by learned log odds.
 
     The table is one leaf. Only the root merges it with other regions.
@@ -101,21 +268,104 @@ class LearnedTree(TreeBuilder):
 
     leaves: TreeBuilder = field(default_factory=UcmTree)
 
+    @abstractmethod
+    def model(self) -> tuple[Mapping[str, float], str]:
+        """Weights of the features, and the key of the files of the model. Raises InputError if they do not fit."""
+
+    @abstractmethod
+    def look(self, frame: Frame) -> SeenBorders | None:
+        """What a network sees in the frame; None without a network."""
+
+    @property
+    def weights_key(self) -> str:
+        """Key of the contents of the files of the model."""
+        return self.model()[1]
+
+    @property
+    def bound_key(self) -> bytes:
+        """What is cached depends on the weights."""
+        return self.weights_key.encode()
+
     def regions(self, boundary: np.ndarray, frame: Frame) -> tuple[Tree, Regions]:
         """The initial tree and its measured leaves."""
         tree = self.leaves.build(boundary, frame)
-        return tree, measure_regions(tree.leaves, frame, boundary)
+        return tree, measure_regions(tree.leaves, frame, boundary, self.look(frame))
 
     def build(self, boundary: np.ndarray, frame: Frame | None = None) -> Tree:
         """Build the tree. `odds` are the log odds of each merge, `start` the maximum of their probabilities below."""
         if frame is None:
-            raise InputError("LearnedTree needs the frame of the boundary map", "tree.build(boundary, frame)")
+            raise InputError(
+                f"{type(self).__name__} needs the frame of the boundary map", "tree.build(boundary, frame)"
+            )
+        named, _ = self.model()
         tree, regions = self.regions(boundary, frame)
-        scale = frame.camera.width / 640
-        weights = np.array([JOIN_WEIGHTS[name] for name in PAIR_FEATURES])
-        growing = Agglomeration(regions, lambda a, b, ab, at, bt: pair_features(a, b, ab, at, bt, scale) @ weights)
+        weights, scale = np.array(list(named.values())), scaled_length(1, frame.camera.width)
+        growing = Agglomeration(
+            regions, lambda a, b, ab, at, bt: pair_features(a, b, ab, at, bt, scale, named) @ weights
+        )
         growing.merge_all()
         return tree_of_merges(regions.of_leaf[tree.leaves], len(regions.sums), growing.merges)
+
+
+@dataclass(frozen=True)
+class LearnedTree(MergedTree):
+    """`MergedTree` by the measurements of the image.
+
+    Parameters
+    ----------
+    leaves : TreeBuilder
+        Its leaves are merged.
+    weights : str
+        Name of a model of the package, or the path of a JSON file with one weight for each of `PAIR_FEATURES`.
+    """
+
+    weights: str = "tree"
+
+    def model(self) -> tuple[Mapping[str, float], str]:
+        return read_tree_weights(self.weights)
+
+    def look(self, frame: Frame) -> SeenBorders | None:
+        return None
+
+
+@functools.lru_cache(maxsize=4)
+def read_tree_weights(name: str) -> tuple[Mapping[str, float], str]:
+    """Weights of `PAIR_FEATURES` by name, and the hash of their file. A file is read once per process."""
+    path = Path(name) if name.endswith(".json") else models_folder() / name / "weights.json"
+    weights = read_json(path, "weights of a tree", f"fit them with: {_FIT}")
+    check_weights(weights, PAIR_FEATURES, path, _FIT)
+    return weights, hashlib.sha256(path.read_bytes()).hexdigest()[:16]
+
+
+@dataclass(frozen=True)
+class BorderTree(MergedTree):
+    """`MergedTree` by the measurements of the image and the evidence of a border network.
+
+    The evidence is the log odds that the network gives to a border between two regions, and how far apart it sees the
+    centres of their objects. All weights were fitted together, on scenes that the network was not trained on.
+
+    Parameters
+    ----------
+    leaves : TreeBuilder
+        Its leaves are merged.
+    weights : str
+        Name of a trained model of the package, or the path of its folder.
+    """
+
+    weights: str = "border"
+
+    def model(self) -> tuple[Mapping[str, float], str]:
+        network = self._network()
+        check_weights(network.evidence, FEATURES, f"border model {self.weights!r}", f"{_FIT} --border FOLDER")
+        return network.evidence, network.key
+
+    def look(self, frame: Frame) -> SeenBorders | None:
+        return self._network().look(frame)
+
+    def _network(self) -> BorderNetwork:
+        from mstfilter.segmentation.border_network import load_border_network
+
+        return load_border_network(self.weights)
 
 
 def tree_of_merges(image: np.ndarray, n_regions: int, merges: list[tuple[int, int, float]]) -> Tree:

@@ -5,8 +5,8 @@ The chain starts at the optimal cut c*. Its target is ``p(c) = exp(-(v(c*) - v(c
 for values that are log odds (`MergeLogOdds`), which need no scale.
 
 - ``mst``: ``MetropolisHastingsCuts(temperature=1)``: one chain, MoveNode mixed with subtree redraws.
-- ``paper``: ``MetropolisHastingsCuts(0.25, burn_in=0, thinning=20, redraw_share=0)``.
-- ``authors``: ``MetropolisHastingsCuts(0.25, burn_in=0, thinning=20, moves="authors", redraw_share=0, restart=True,
+- ``paper``: ``MetropolisHastingsCuts(0.25, burn_in=0, thinning=20)``.
+- ``authors``: ``MetropolisHastingsCuts(0.25, burn_in=0, thinning=20, moves="authors", restart=True,
   include_optimal=True, redraw_repeated=True)``.
 
 >>> sample = MetropolisHastingsCuts().sample(np.random.default_rng(0), tree, w, 5)
@@ -30,21 +30,12 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from math import exp, inf, log
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from mstfilter.errors import check_choice, check_integer, check_number
-from mstfilter.segmentation.cuts import (
-    CutSample,
-    CutSampler,
-    Gibbs,
-    check_target_law,
-    check_values,
-    log_target,
-    optimal_cut,
-    proposal_law,
-)
+from mstfilter.fields import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, Share
+from mstfilter.segmentation.cuts import CutSample, CutSampler, Gibbs, check_values, gibbs, optimal_cut
 from mstfilter.segmentation.tree import Tree
 
 
@@ -212,7 +203,7 @@ class AuthorsMoves(MoveRule):
 
 @dataclass(frozen=True, eq=False)
 class SubtreeRedraw(MoveRule):
-    """Redraw the part of the cut inside a random subtree from the Gibbs law `law`.
+    """Redraw the part of the cut inside a random subtree from the Gibbs law `law`, the target of a temperature.
 
     The subtree's node is uniform over the inner nodes, for any state; if an ancestor of it is in the cut, the chain
     stays. A choice is (inner node, new nodes).
@@ -247,15 +238,11 @@ LOCAL_MOVES: dict[str, type[MoveRule]] = {"node": NodeMoves, "authors": AuthorsM
 class CutChain:
     """A Metropolis-Hastings chain over cuts from an initial cut, one step at a time.
 
-    `best` is v(c*). The target is the law of the paper with scale `s2`, in squared units of value, or with a
-    `temperature` the Gibbs law.
+    The target is the law with ``log_p(value)``, the log probability of a cut with this value, up to a constant.
     """
 
-    def __init__(
-        self, tree: Tree, w: np.ndarray, best: float, s2: float, cut: np.ndarray, temperature: float = 0.0
-    ) -> None:
-        self.tree, self.w = tree, w.tolist()
-        self.best, self.s2, self.temperature = best, s2, temperature
+    def __init__(self, tree: Tree, w: np.ndarray, log_p: Callable[[float], float], cut: np.ndarray) -> None:
+        self.tree, self.w, self.log_p = tree, w.tolist(), log_p
         self.steps = self.accepted = 0
         self.restart(cut)
 
@@ -274,8 +261,7 @@ class CutChain:
             value -= self.w[x]
         for x in move.added:
             value += self.w[x]
-        law = self.best, self.s2, self.temperature
-        return move, value, log_target(value, *law) - log_target(self.value, *law) + move.log_ratio
+        return move, value, self.log_p(value) - self.log_p(self.value) + move.log_ratio
 
     def step(self, random: Callable[[], float], rule: MoveRule) -> None:
         """One step under a rule."""
@@ -306,7 +292,7 @@ class MetropolisHastingsCuts(CutSampler):
     moves : {"node", "authors"}
         Local moves: the paper's (exact), or the authors' program's, whose forward probability is wrong.
     redraw_share : float
-        Fraction of the steps that redraw a random subtree instead of making a local move.
+        Fraction of the steps that redraw a random subtree instead of making a local move; only with a temperature.
     restart : bool
         Start a new chain at the optimal cut for each sample.
     include_optimal : bool
@@ -317,35 +303,33 @@ class MetropolisHastingsCuts(CutSampler):
         0: the law of the paper. > 0: the Gibbs law exp(v / temperature), in units of value.
     """
 
-    sigma2: float = 1e-3
-    burn_in: int = 1000
-    thinning: int = 500
-    moves: str = "node"
-    redraw_share: float = 0.3
+    sigma2: PositiveFloat = 1e-3
+    burn_in: NonNegativeInt = 1000
+    thinning: PositiveInt = 500
+    moves: Literal["node", "authors"] = "node"
+    redraw_share: Share = 0.3
     restart: bool = False
     include_optimal: bool = False
     redraw_repeated: bool = False
-    temperature: float = 0.0
-
-    def __post_init__(self) -> None:
-        check_choice("moves", self.moves, tuple(LOCAL_MOVES))
-        check_target_law(self.sigma2, self.temperature)
-        check_integer("burn_in", self.burn_in, at_least=0)
-        check_integer("thinning", self.thinning)
-        check_number("redraw_share", self.redraw_share, at_least=0, at_most=1)
+    temperature: NonNegativeFloat = 0.0
 
     def sample(self, rng: np.random.Generator, tree: Tree, w: np.ndarray, n: int) -> CutSample:
         w = check_values(tree, w)
         optimal = optimal_cut(tree, w)
         best = float(w[optimal].sum())
         s2 = max(self.sigma2 * best**2, 1e-300)
+
+        def log_p(value: float) -> float:
+            """Log probability of a cut relative to the optimal cut."""
+            return (value - best) / self.temperature if self.temperature > 0 else -((best - value) ** 2) / s2
+
         local = LOCAL_MOVES[self.moves]()
         redraw = None
-        if self.redraw_share > 0:
-            redraw = SubtreeRedraw(proposal_law(tree, w, best, s2, self.temperature))
+        if self.redraw_share > 0 and self.temperature > 0:
+            redraw = SubtreeRedraw(gibbs(tree, w, 1 / self.temperature))
         random = _uniforms(rng).__next__
 
-        chain = CutChain(tree, w, best, s2, optimal, self.temperature)
+        chain = CutChain(tree, w, log_p, optimal)
         trace: list[float] = []
 
         def advance(n_steps: int) -> None:
@@ -373,7 +357,6 @@ class MetropolisHastingsCuts(CutSampler):
                 cut = draw()
             seen.add(cut.tobytes())
             cuts.append(cut)
-        v = np.array([w[cut].sum() for cut in cuts])
         diagnostics: dict[str, Any] = {
             "steps": chain.steps,
             "acceptance": chain.accepted / chain.steps if chain.steps else 0.0,
@@ -382,7 +365,7 @@ class MetropolisHastingsCuts(CutSampler):
         }
         if not self.restart:
             diagnostics["autocorrelation_steps"] = _autocorrelation(np.array(trace[self.burn_in :]))
-        return CutSample(tuple(cuts), v, log_target(v, best, s2, self.temperature), diagnostics)
+        return CutSample(tuple(cuts), np.array([log_p(float(w[cut].sum())) for cut in cuts]), diagnostics)
 
 
 def _uniforms(rng: np.random.Generator) -> Iterator[float]:
@@ -394,15 +377,10 @@ def _uniforms(rng: np.random.Generator) -> Iterator[float]:
 def _autocorrelation(trace: np.ndarray) -> float | None:
     """Integrated autocorrelation time of a trace in steps; None if it is shorter than 100 steps or constant.
 
-    ``tau(M) = 1 + 2 (rho(1) + ... + rho(M))`` at the first window with ``M >= 5 tau(M)`` (Sokal 1989; emcee,
-    with the same result, is slow to import). A chain shorter than about 50 such times underestimates it, so
-    a low value does not prove convergence.
+    A chain shorter than about 50 such times underestimates it, so a low value does not prove convergence.
     """
     if len(trace) < 100 or np.ptp(trace) == 0:
         return None
-    padded = 2 << (len(trace) - 1).bit_length()  # so that the cyclic correlation does not wrap around
-    spectrum = np.fft.fft(trace - np.mean(trace), n=padded)
-    rho = np.fft.ifft(spectrum * np.conjugate(spectrum))[: len(trace)].real
-    rho /= rho[0]
-    tau = 2 * np.cumsum(rho) - 1
-    return float(tau[np.argmin(np.arange(len(tau)) < 5 * tau)])
+    from emcee.autocorr import integrated_time
+
+    return float(integrated_time(trace, tol=0, quiet=True)[0])

@@ -17,13 +17,22 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 
 from mstfilter.completion import ClipCompleter, Completer, Completion, Extrude, arbitrate, occupancy_of
-from mstfilter.errors import check_choice
-from mstfilter.scene import Clip, Frame, Hypothesis, ObjectRecord, VoxelGrid, component_key, memo
+from mstfilter.scene import (
+    Clip,
+    Frame,
+    Hypothesis,
+    ObjectRecord,
+    VoxelGrid,
+    component_key,
+    memo,
+    scaled_area,
+    scaled_length,
+)
 from mstfilter.segmentation.boundary import BoundaryModel, ClipBoundary, ColourDepthBoundary, pixels_above_table
 from mstfilter.segmentation.cuts import CutSampler, CutValue, MergeLogOdds, optimal_cut
 from mstfilter.segmentation.learned_tree import LearnedTree
@@ -73,11 +82,10 @@ class ObjectRule:
         pixels = self.object_pixels(frame, grid)
         readings = tree.accumulate_pixels(frame.valid)
         points = tree.accumulate_pixels(pixels)
-        core = _core(tree, pixels, max(1, round(_CORE_RADIUS * frame.camera.width / 640)))
-        resize = pixels.size / 307200
+        core = _core(tree, pixels, max(1, round(scaled_length(_CORE_RADIUS, frame.camera.width))))
         is_object = (
-            (points >= max(1.0, self.min_points * resize))
-            & (core >= _MIN_CORE * resize)
+            (points >= max(1.0, scaled_area(self.min_points, pixels.size)))
+            & (core >= scaled_area(_MIN_CORE, pixels.size))
             & (points >= _MIN_RAISED * readings)
             & (readings >= _MIN_READINGS * tree.area)
         )
@@ -135,13 +143,10 @@ class TreeCutProposal(Proposal):
     sampler: CutSampler = field(default_factory=lambda: MetropolisHastingsCuts(temperature=1.0))
     objects: ObjectRule = field(default_factory=ObjectRule)
     completer: Completer = field(default_factory=Extrude)
-    weight_rule: str = "equal"
+    weight_rule: Literal["equal", "p"] = "equal"
     threshold: float = 0.5
 
     properly_weighted: ClassVar[bool] = False
-
-    def __post_init__(self) -> None:
-        check_choice("weight_rule", self.weight_rule, ("equal", "p"))
 
     def tree_of(self, frame: Frame) -> tuple[Tree, np.ndarray]:
         """The tree of a frame and its node values (N,). Cached by content."""

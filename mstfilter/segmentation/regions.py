@@ -1,14 +1,10 @@
-"""Measurements of image regions and of their common borders, and features of pairs of regions.
+"""Measurements of image regions and of their common borders.
 
-Regions and borders are measured as sums over pixels, so the row of a merged region is the sum of two rows.
+Regions and borders are measured as sums over pixels, so the row of a merged region is the sum of two rows. Disparity
+is in sensor units (1/8 px at f = 525 px), lengths are in metres.
 
 >>> regions = measure_regions(leaves, frame, boundary)
 >>> regions.of_leaf[leaf], regions.sums.shape, regions.borders[0]              # region 0 is the table
->>> x = pair_features(sums[a], sums[b], border, table_a, table_b, scale)       # (k, len(PAIR_FEATURES))
-
-The features are inputs of the log odds that two regions are different objects. Sizes are in pixels of a 640 px wide
-image, disparity in sensor units (1/8 px at f = 525 px), lengths in metres. "Front" is the region that is nearer to
-the camera at the border.
 """
 
 from __future__ import annotations
@@ -17,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mstfilter.scene import Frame, fit_support_plane
+from mstfilter.scene import Frame, fit_support_plane, scaled_length
 from mstfilter.segmentation.boundary import (
     TABLE_TOLERANCE,
     above_table,
@@ -25,10 +21,9 @@ from mstfilter.segmentation.boundary import (
     filled_disparity,
     pixels_above_table,
 )
-from mstfilter.segmentation.join_weights import JOIN_WEIGHTS
 
 #: Bin width of the height histogram in metres; the last bin has no upper limit.
-_HEIGHT_BIN = 0.01
+HEIGHT_BIN = 0.01
 _BINS = 32
 _QUADRIC = 6
 #: Smallest share of pixels above the table of a leaf that is part of an object.
@@ -116,15 +111,14 @@ def measure_regions(
     n = int(of_leaf.max()) + 1
 
     D = filled_disparity(frame)
-    hollow, convex = curvature(D, width / 640)
+    hollow, convex = curvature(D, scaled_length(1, width))
     sums = np.zeros((n, sum(_WIDTHS.values())))
     at = np.nonzero(raised & (region > 0))
     which = region[at]
 
     def put(name: str, *values: np.ndarray) -> None:
-        block = REGION[name]
-        for k, value in enumerate(values):
-            sums[:, block.start + k] = np.bincount(which, weights=value, minlength=n)
+        for k, value in enumerate(values, start=REGION[name].start):
+            sums[:, k] = np.bincount(which, weights=value, minlength=n)
 
     import cv2
 
@@ -148,15 +142,15 @@ def measure_regions(
     put("bend", (hollow - convex)[at])
     if seen is not None:
         put("centre", *seen.centre[at].T)
-    bins = np.clip(points[:, 2] / _HEIGHT_BIN, 0, _BINS - 1).astype(np.int64)
+    bins = np.clip(points[:, 2] / HEIGHT_BIN, 0, _BINS - 1).astype(np.int64)
     sums[:, REGION["heights"]] = np.bincount(which * _BINS + bins, minlength=n * _BINS).reshape(n, _BINS)
 
-    smooth = cv2.GaussianBlur(D, (0, 0), max(0.7, 1.5 * width / 640))
+    smooth = cv2.GaussianBlur(D, (0, 0), max(0.7, scaled_length(1.5, width)))
     # The border that the network sees can be beside that of the leaves: the largest log odds in the surroundings.
-    reach = 2 * max(1, round(2 * width / 640)) + 1
+    reach = 2 * max(1, round(scaled_length(2, width))) + 1
     odds = np.zeros(leaves.shape, np.float32) if seen is None else seen.border
     odds = np.clip(cv2.dilate(odds, np.ones((reach, reach), np.uint8)), -_MOST_LOG_ODDS, _MOST_LOG_ODDS)
-    borders = _borders(region, n, boundary, hollow, convex, smooth, odds)
+    borders = _borders(region, n, np.stack([boundary, hollow, convex, odds], axis=-1), smooth)
     sums[:, REGION["perimeter"].start] = [sum(row[0] for row in near.values()) for near in borders]
     return Regions(of_leaf, sums, borders)
 
@@ -169,21 +163,16 @@ def _raised(flat: np.ndarray, above: np.ndarray, mask: np.ndarray, areas: np.nda
     return raised
 
 
-def _borders(
-    region: np.ndarray,
-    n: int,
-    boundary: np.ndarray,
-    hollow: np.ndarray,
-    convex: np.ndarray,
-    disparity: np.ndarray,
-    odds: np.ndarray,
-) -> list[dict[int, np.ndarray]]:
-    """For every region its neighbours and the border rows (columns `BORDER`)."""
-    reach = max(1, round(3 * region.shape[1] / 640))
+def _borders(region: np.ndarray, n: int, maps: np.ndarray, disparity: np.ndarray) -> list[dict[int, np.ndarray]]:
+    """For every region its neighbours and the border rows (columns `BORDER`).
+
+    `maps` (H, W, 4) are the boundary strength, the concave and the convex curvature, and the log odds of a border.
+    """
+    reach = max(1, round(scaled_length(3, region.shape[1])))
     first, second, rows = [], [], []
     for axis in (0, 1):
-        size = region.shape[axis]
-        pair_a, pair_b = np.take(region, np.arange(size - 1), axis), np.take(region, np.arange(1, size), axis)
+        last = region.shape[axis] - 1
+        pair_a, pair_b = np.take(region, np.arange(last), axis), np.take(region, np.arange(1, last + 1), axis)
         at = np.nonzero(pair_a != pair_b)
         i, j = pair_a[at], pair_b[at]
         # Step of disparity, measured `reach` pixels away from the border on both sides, minus the change that the
@@ -199,19 +188,8 @@ def _borders(
         other = list(at)
         other[axis] = at[axis] + 1
         here, there = at, tuple(other)
-        row = np.stack(
-            [
-                np.ones(len(i)),
-                (boundary[here] + boundary[there]) / 2,
-                (hollow[here] + hollow[there]) / 2,
-                (convex[here] + convex[there]) / 2,
-                step,
-                np.abs(step),
-                np.abs(step) > _CLEAR_STEP,
-                (odds[here] + odds[there]) / 2,
-            ],
-            axis=1,
-        )
+        edge, size = (maps[here] + maps[there]) / 2, np.abs(step)
+        row = np.column_stack([np.ones(len(i)), edge[:, :3], step, size, size > _CLEAR_STEP, edge[:, 3]])
         turned = i > j
         row[turned] *= _SIGN
         first.append(np.minimum(i, j))
@@ -235,112 +213,3 @@ def _shifted(image: np.ndarray, at: tuple[np.ndarray, ...], axis: int, shift: in
     index = list(at)
     index[axis] = np.clip(at[axis] + shift, 0, image.shape[axis] - 1)
     return image[tuple(index)]
-
-
-PAIR_FEATURES = tuple(JOIN_WEIGHTS)  #: Names of the columns of `pair_features`
-
-
-def quadric_residual(sums: np.ndarray) -> np.ndarray:
-    """Squared residual (k,) of the least-squares quadric of disparity of each region (k, C), sensor units squared."""
-    gram = sums[:, REGION["gram"]].reshape(-1, 6, 6)
-    moment = sums[:, REGION["moment"]]
-    n = sums[:, REGION["pixels"].start]
-    ridge = (1e-9 * n + 1e-9)[:, None, None] * np.eye(6)
-    fit = np.linalg.solve(gram + ridge, moment[..., None])[..., 0]
-    return np.maximum(sums[:, REGION["square"].start] - (moment * fit).sum(axis=1), 0)
-
-
-def pair_features(
-    a: np.ndarray, b: np.ndarray, border: np.ndarray, table_a: np.ndarray, table_b: np.ndarray, scale: float
-) -> np.ndarray:
-    """Features of k pairs of regions, from their rows `a` and `b` (k, C) of `Regions.sums`.
-
-    `border` (k, B) are their common borders, seen from `a`; `table_a` and `table_b` (k, B) their borders with the
-    table, zeros if there is none. `scale` is the image width / 640.
-    """
-    flip = (border[:, BORDER["step"]] < 0)[:, None]
-    sums_front, sums_back = np.where(flip, b, a), np.where(flip, a, b)
-    front = _RegionMeans(sums_front, np.where(flip, table_b, table_a))
-    back = _RegionMeans(sums_back, np.where(flip, table_a, table_b))
-    small = np.minimum(front.n, back.n)
-    log_small = np.log(small / scale**2)
-    lab, gap = front.lab - back.lab, front.ground - back.ground
-    joint = quadric_residual(sums_front + sums_back)
-    excess = joint - quadric_residual(sums_front) - quadric_residual(sums_back)
-    misfit = np.log1p(np.maximum(excess, 0) / small)
-    higher = np.clip((front.top - back.top) * 10, -1, 1)
-    rim = np.exp(-(((front.top - back.top) / 0.015) ** 2))
-    distance = np.minimum(np.hypot(gap[:, 0], gap[:, 1]) / (front.extent + back.extent + 1e-3), 4)
-    length = np.maximum(border[:, BORDER["length"]], 1)
-    mean = border / length[:, None]
-    strength, hollow, convex = (mean[:, BORDER[name]] for name in ("strength", "hollow", "convex"))
-    step = np.log1p(np.abs(mean[:, BORDER["step"]]))
-    columns = {
-        "bias": np.ones(len(small)),
-        "strength": strength,
-        "strength^2": strength**2,
-        "hollow": hollow,
-        "convex": convex,
-        "step": step,
-        "clear step share": mean[:, BORDER["clear"]],
-        "lightness": np.minimum(np.abs(lab[:, 0]) / 20, 3),
-        "chroma": np.minimum(np.hypot(lab[:, 1], lab[:, 2]) / 10, 4),
-        "texture": _texture(front, back),
-        "misfit": misfit,
-        "residual": np.log1p(joint / (front.n + back.n)),
-        "border share": np.minimum(length / np.minimum(front.outline, back.outline), 1),
-        "free border share": np.minimum(length / np.maximum(np.minimum(front.free, back.free), 1), 1),
-        "log pixels": log_small,
-        "log ratio": np.abs(np.log(front.n / back.n)),
-        "front higher": np.maximum(higher, 0),
-        "back higher": np.maximum(-higher, 0),
-        "front bottom": np.minimum(front.bottom * 10, 2),
-        "back bottom": np.minimum(back.bottom * 10, 2),
-        "front bend": front.bend,
-        "back bend": back.bend,
-        "ground distance": distance,
-        "front on table": front.on_table,
-        "back on table": back.on_table,
-        "front drop": front.drop,
-        "back drop": back.drop,
-        "rim": rim,
-        "rim * back bend": rim * back.bend,
-        "rim * step": rim * step,
-        "rim * inside": rim * np.exp(-(distance**2)) * step,
-        "step * misfit": step * misfit,
-        "hollow * misfit": hollow * misfit,
-        "strength * log pixels": strength * log_small,
-        "hollow * log pixels": hollow * log_small,
-        "convex * strength": convex * strength,
-    }
-    return np.stack([columns[name] for name in PAIR_FEATURES], axis=1)
-
-
-class _RegionMeans:
-    """Measurements of k regions from rows of `Regions.sums` (k, C) and their borders with the table (k, B)."""
-
-    def __init__(self, sums: np.ndarray, table: np.ndarray) -> None:
-        self.n = np.maximum(sums[:, REGION["pixels"].start], 1)
-        lab, lab2, self.ground = (sums[:, REGION[name]] / self.n[:, None] for name in ("lab", "lab2", "ground"))
-        self.lab, self.lab_variance = lab, np.maximum(lab2 - lab**2, 0) + 4
-        # Standard deviation of the ground coordinates, metres.
-        spread = sums[:, REGION["spread"].start] / self.n
-        self.extent = np.sqrt(np.maximum(spread - (self.ground**2).sum(axis=1), 0))
-        self.bend = sums[:, REGION["bend"].start] / self.n
-        # 3rd and 97th percentile of the heights, metres.
-        share = np.cumsum(sums[:, REGION["heights"]], axis=1) / self.n[:, None]
-        self.bottom = (share < 0.03).sum(axis=1) * _HEIGHT_BIN
-        self.top = ((share < 0.97).sum(axis=1) + 1) * _HEIGHT_BIN
-        # Shares of the outline that touch the table, and that border on it with a clear step.
-        clear = table[:, BORDER["clear"]]
-        self.outline = np.maximum(sums[:, REGION["perimeter"].start], 1)
-        self.on_table, self.drop = (table[:, 0] - clear) / self.outline, clear / self.outline
-        self.free = self.outline - table[:, 0]
-
-
-def _texture(a: _RegionMeans, b: _RegionMeans) -> np.ndarray:
-    """Bhattacharyya distance of normal distributions of Lab colour, summed over the channels, at most 4."""
-    total = a.lab_variance + b.lab_variance
-    distance = (a.lab - b.lab) ** 2 / (4 * total)
-    distance += 0.5 * np.log(total / (2 * np.sqrt(a.lab_variance * b.lab_variance)))
-    return np.minimum(distance.sum(axis=1), 4)

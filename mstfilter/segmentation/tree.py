@@ -29,7 +29,8 @@ from typing import Any
 
 import numpy as np
 
-from mstfilter.errors import InputError, check_integer
+from mstfilter.errors import InputError
+from mstfilter.fields import PositiveInt
 from mstfilter.results import Checked, check_type, returns
 from mstfilter.scene import Frame, content_key, read_only
 
@@ -212,13 +213,10 @@ class UcmTree(TreeBuilder):
         If False, `start` is the merge height.
     """
 
-    max_leaves: int = 501
+    max_leaves: PositiveInt = 501
     centre: float = 0.55
     slope: float = 12.0
     calibrate: bool = True
-
-    def __post_init__(self) -> None:
-        check_integer("max_leaves", self.max_leaves)
 
     def build(self, boundary: np.ndarray, frame: Frame | None = None) -> Tree:
         boundary = np.asarray(boundary)

@@ -10,7 +10,7 @@
 `segments`             tracked segments and their data; the test for rest
 `flow`                 dense flow through the clip
 `features`             SIFT matches, exposure matching
-`registration`         ICP by small_gicp or open3d
+`registration`         ICP by small_gicp
 `residual`             comparison of a motion with the last frame, refinement
 `rigid`                rigid motions from point pairs, J-Linkage
 `motion_segmentation`  pixels of the last frame grouped by rigid motion
@@ -25,5 +25,5 @@ __interfaces__ = {"rule": "MotionRule", "registration": "Registration", "tracker
 __components__ = {
     "transition": {"tracking": "TrackingTransition", "identity": "IdentityTransition"},
     "rule": {"authors": "AuthorsRule", "mst": "MstRule", "paper": "PaperRule"},
-    "registration": {"small_gicp": "SmallGicp", "colored_icp": "ColouredIcp", "point_to_plane": "PointToPlaneIcp"},
+    "registration": {"small_gicp": "SmallGicp"},
 }

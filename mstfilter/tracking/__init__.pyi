@@ -2,8 +2,6 @@ from mstfilter.tracking.features import Matches as Matches, SiftMatching as Sift
 from mstfilter.tracking.flow import ClipTracks as ClipTracks, DenseFlow as DenseFlow
 from mstfilter.tracking.motion_segmentation import MotionSegmentation as MotionSegmentation
 from mstfilter.tracking.registration import (
-    ColouredIcp as ColouredIcp,
-    PointToPlaneIcp as PointToPlaneIcp,
     Registration as Registration,
     RegistrationResult as RegistrationResult,
     SmallGicp as SmallGicp,

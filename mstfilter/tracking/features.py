@@ -17,7 +17,7 @@ from dataclasses import astuple, dataclass
 import cv2
 import numpy as np
 
-from mstfilter.errors import check_number
+from mstfilter.fields import Bounded, PositiveFloat
 from mstfilter.scene import Frame, depth_sigma, memo
 
 _N_EXPOSURE_PIXELS = 20000
@@ -94,7 +94,7 @@ class Matches:
 
 
 @dataclass(frozen=True)
-class SiftMatching:
+class SiftMatching(Bounded):
     """Matches SIFT features of two frames (Lowe, IJCV 2004; OpenCV's defaults).
 
     Parameters
@@ -114,13 +114,9 @@ class SiftMatching:
 
     mutual: bool = True
     ratio: float = 0.85
-    descriptor_radius: float = 250.0
-    search_share: float = 0.35
-    search_distance: float = 0.40
-
-    def __post_init__(self) -> None:
-        for name in ("descriptor_radius", "search_share", "search_distance"):
-            check_number(name, getattr(self, name), above=0)
+    descriptor_radius: PositiveFloat = 250.0
+    search_share: PositiveFloat = 0.35
+    search_distance: PositiveFloat = 0.40
 
     def match(self, before: Frame, after: Frame) -> Matches:
         """Matches of two frames. Cached by content."""

@@ -20,13 +20,14 @@ from contextlib import contextmanager
 from dataclasses import astuple, dataclass
 from functools import cached_property
 from itertools import pairwise
+from typing import Literal
 
 import cv2
 import numpy as np
 from scipy.ndimage import distance_transform_edt
 from scipy.spatial import cKDTree
 
-from mstfilter.errors import check_choice
+from mstfilter.fields import Bounded
 from mstfilter.scene import Clip, Frame, memo
 from mstfilter.tracking.features import matched_colour, same_depth, smooth_colour
 
@@ -69,16 +70,10 @@ class ClipTracks:
 
 
 @dataclass(frozen=True)
-class DenseFlow:
-    """Dense inverse search flow (Kroeger et al., ECCV 2016; OpenCV's DIS), forward and backward.
+class DenseFlow(Bounded):
+    """Dense inverse search flow (Kroeger et al., ECCV 2016; OpenCV's DIS), forward and backward."""
 
-    `preset` is "ultrafast", "fast" or "medium".
-    """
-
-    preset: str = "medium"
-
-    def __post_init__(self) -> None:
-        check_choice("preset", self.preset, _PRESETS)
+    preset: Literal["ultrafast", "fast", "medium"] = "medium"
 
     def track(self, clip: Clip) -> ClipTracks:
         """Follow points and pixels through the clip. Cached by content."""

@@ -21,11 +21,12 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from numbers import Integral, Real
+from typing import Literal
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from mstfilter.errors import InputError, check_choice
+from mstfilter.errors import InputError
 from mstfilter.results import Checked, check_rigid, check_type, describe_value, returns, warn_once
 from mstfilter.tracking import rigid
 from mstfilter.tracking.features import SiftMatching
@@ -254,7 +255,7 @@ class MstRule(MotionRule):
         Aligns the surfaces of the segment before and after.
     """
 
-    select: str = "map"
+    select: Literal["map", "sample"] = "map"
     n_eff: float = 20.0
     use_flow: bool = True
     use_icp: bool = True
@@ -267,9 +268,6 @@ class MstRule(MotionRule):
     sift: SiftMatching = field(default_factory=SiftMatching)
     residual: MotionResidual = field(default_factory=MotionResidual)
     registration: Registration = field(default_factory=SmallGicp)
-
-    def __post_init__(self) -> None:
-        check_choice("select", self.select, ("map", "sample"))
 
     def candidates(self, rng: np.random.Generator, track: Track) -> tuple[Candidate, ...]:
         """Scored motions that the image does not refute, the identity first."""

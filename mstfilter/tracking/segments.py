@@ -109,7 +109,7 @@ class Track:
     @cached_property
     def surface(self) -> Surface | None:
         """The visible surface in the first frame; None if it has too few points."""
-        return prepare(self.points, smooth_colour(self.clip.before, 5).reshape(-1, 3)[self.segment.support])
+        return prepare(self.points)
 
     @cached_property
     def target_surface(self) -> Surface | None:
@@ -117,7 +117,7 @@ class Track:
         after = self.clip.after
         with np.errstate(invalid="ignore"):
             pixels = self.target_mask & after.valid & (after.points[..., 2] > _TABLE_HEIGHT)
-        return prepare(after.points[pixels], self.colour_after[pixels])
+        return prepare(after.points[pixels])
 
     @cached_property
     def flow_pairs(self) -> tuple[np.ndarray, np.ndarray]:

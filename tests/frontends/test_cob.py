@@ -7,28 +7,23 @@ import struct
 import subprocess
 import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from mstfilter.errors import InputError
-from mstfilter.frontends import CobBoundary, CobTree, read_caffemodel
-from mstfilter.frontends.cob import _segments, combine_scales, decode_orientation, hha
-from mstfilter.presets import preset
+from mstfilter.registry import load_file
+from mstfilter.resources import models_folder
 from mstfilter.scene import Camera, Frame, look_at
 from mstfilter.segmentation import OptimalCut, SceneCutObjectness, TreeCutProposal
 from tests.segmentation.scenes import TWO, clip_of, frame_of
 
 torch = pytest.importorskip("torch")
 
-from mstfilter.frontends.cob_network import (  # noqa: E402 (needs torch)
-    CobNetwork,
-    bilinear_kernel,
-    cob_convolutions,
-    cob_input,
-    enlarge,
+cob, caffe, network_file = (
+    load_file(models_folder() / "published" / name) for name in ("cob.py", "caffe.py", "cob_network.py")
 )
+CobBoundary, CobTree, CobNetwork = cob.CobBoundary, cob.CobTree, network_file.CobNetwork
 
 LEVELS = {"conv1": (64, 1), "res2c": (256, 2), "res3d": (512, 4), "res4f": (1024, 8), "res5c": (2048, 16)}
 
@@ -69,7 +64,7 @@ def blobs():
     """Weights of all layers, small enough that outputs are neither 0 nor 1."""
     rng = np.random.default_rng(0)
     blobs = {}
-    for c in cob_convolutions():
+    for c in network_file.cob_convolutions():
         size = (c.outputs, c.inputs, c.kernel, c.kernel)
         scale = 1.2 / np.sqrt(c.inputs * c.kernel**2) * (0.02 if c.name.startswith("conv1") and c.kernel == 7 else 1)
         blobs[c.name] = [np.float32(scale) * rng.standard_normal(size, np.float32)]
@@ -158,30 +153,13 @@ def reference(layers: dict[str, list[np.ndarray]], x: np.ndarray) -> tuple[np.nd
     return sigmoid(fine)[0], sigmoid(coarse)[0], sigmoid(np.concatenate(bins))
 
 
-def test_the_layers_are_the_published_ones():
-    """148 convolutions; the ResNet has the parameters of a ResNet-50 without classifier and batch normalisation."""
-    layers = {c.name: c for c in cob_convolutions()}
-    assert len(layers) == 148
-    trunk = [c for c in layers.values() if c.name == "conv1" or "branch" in c.name]
-    assert len(trunk) == 53
-    assert sum(c.inputs * c.outputs * c.kernel**2 for c in trunk) == 25_557_032 - 2_049_000 - 53_120
-    heads = [c for c in layers.values() if "or8" in c.name]
-    assert len(heads) == 88
-    one = 9 * 32 * sum(width for width, _ in LEVELS.values()) + 5 * (32 + 9 * 32 * 4 + 4) + 9 * 20 + 1
-    assert sum(c.outputs * (c.inputs * c.kernel**2 + 1) for c in heads) == 8 * one
-    network = CobNetwork()
-    total = sum(p.numel() for p in network.parameters())
-    assert total == 23_454_912 + 64 + 8 * one + (3904 + 5) + 2 * 5
-    assert len(list(cob_convolutions(6))) == 148
-    assert next(iter(cob_convolutions(6))).name == "conv1_rgbHHA"
-
-
 @pytest.mark.parametrize("size", [(37, 45), (32, 48)])
 def test_the_network_equals_a_plain_reference(blobs, size):
     image = np.random.default_rng(1).integers(0, 256, (*size, 3)).astype(np.uint8)
     network = CobNetwork().eval()
+    assert len(network.layers) == 148
     network.load_caffe({name: tuple(b) for name, b in blobs.items()})
-    data = cob_input(image)
+    data = network_file.cob_input(image)
     means = np.array([104.00698793, 116.66876762, 122.67891434])
     expected_input = image[..., ::-1].astype(np.float64) - means
     np.testing.assert_allclose(data.numpy(), expected_input.transpose(2, 0, 1), atol=1e-4)
@@ -203,14 +181,14 @@ def test_bilinear_deconvolution(stride):
     rng = np.random.default_rng(0)
     x = rng.standard_normal((4, 5, 6)).astype(np.float32)
     size = torch.Size((4 * stride + 1, 5 * stride + stride // 2))
-    found = enlarge(torch.from_numpy(x)[None], stride, size)[0]
+    found = network_file.enlarge(torch.from_numpy(x)[None], stride, size)[0]
     np.testing.assert_allclose(found.numpy(), deconv(x, stride, tuple(size)), atol=1e-5)
     ramp = np.broadcast_to(np.arange(8.0, dtype=np.float32), (1, 1, 8, 8)).copy()
-    grown = enlarge(torch.from_numpy(ramp), stride, torch.Size((8 * stride, 8 * stride)))[0, 0].numpy()
+    grown = network_file.enlarge(torch.from_numpy(ramp), stride, torch.Size((8 * stride, 8 * stride)))[0, 0].numpy()
     middle = slice(stride, 7 * stride)  # a ramp stays a ramp: the enlargement is bilinear and not shifted
     expected = (np.arange(8 * stride) - 0.5) / stride  # pixel i of a level lies at s i + 0.5
     np.testing.assert_allclose(grown[middle, middle], np.broadcast_to(expected[middle], (6 * stride,) * 2), atol=1e-4)
-    assert bilinear_kernel(stride).sum() == pytest.approx(stride**2)
+    assert network_file.bilinear_kernel(stride).sum() == pytest.approx(stride**2)
 
 
 def angle_of(confidence: list[float]) -> float:
@@ -234,14 +212,14 @@ def test_orientation_bins():
     confidence[:, 0, :5] = np.eye(8)[:, :5]
     confidence[[0, 7], 1, 1] = 0.9, 0.8
     confidence[[0, 7], 1, 2] = 0.7, 0.8
-    found = decode_orientation(confidence.astype(np.float32))
+    found = cob.decode_orientation(confidence.astype(np.float32))
     expected = [[angle_of(confidence.astype(np.float32)[:, i, j].tolist()) for j in range(40)] for i in range(30)]
     np.testing.assert_allclose(np.mod(found, np.pi), np.mod(expected, np.pi), atol=1e-5)
     assert 0.2 < np.isnan(found).mean() < 0.9
 
 
 def test_a_file_is_read_name_by_name_and_shape_by_shape(model, blobs, tmp_path):
-    found = read_caffemodel(model)
+    found = caffe.read_caffemodel(model)
     for name, expected in blobs.items():
         for one, other in zip(found[name], expected, strict=True):
             assert one.dtype == np.float32
@@ -249,53 +227,45 @@ def test_a_file_is_read_name_by_name_and_shape_by_shape(model, blobs, tmp_path):
     old = tmp_path / "old.caffemodel"
     chosen = {name: blobs[name] for name in ("conv1", "res2a_branch1")}
     old.write_bytes(encode(chosen, old=True))
-    assert read_caffemodel(old)["conv1"][0].shape == (64, 3, 7, 7)
-    assert read_caffemodel(old)["conv1"][1].shape == (1, 1, 1, 64)
+    assert caffe.read_caffemodel(old)["conv1"][0].shape == (64, 3, 7, 7)
+    assert caffe.read_caffemodel(old)["conv1"][1].shape == (1, 1, 1, 64)
     single = field(100, field(1, b"a") + field(7, b"".join(varint(5 << 3 | 5) + struct.pack("<f", v) for v in (1, 2))
                                                + field(7, varint(1 << 3) + varint(2))))  # fmt: skip
     old.write_bytes(varint(3 << 3) + varint(7) + varint(9 << 3 | 1) + bytes(8) + single)
-    assert read_caffemodel(old)["a"][0].tolist() == [1, 2]
+    assert caffe.read_caffemodel(old)["a"][0].tolist() == [1, 2]
 
 
 def test_the_component_runs_on_a_frame(model):
     frame = frame_of(TWO, width=96)
-    cob = CobBoundary(str(model))
-    fine, coarse, angle = cob.contours(frame)
-    assert cob.boundary(frame).shape == frame.depth.shape
+    boundary = CobBoundary(str(model))
+    fine, coarse, angle = boundary.contours(frame)
+    assert boundary.boundary(frame).shape == frame.depth.shape
     for one in (fine, coarse):
         assert 0 < one.min() <= one.max() < 1
     assert np.nanmin(angle) >= 0
     assert np.nanmax(angle) <= np.pi
-    assert (replace(cob, scale="mean").boundary(frame) == (fine + coarse) / 2).all()
-    assert (replace(cob, scale="coarse").boundary(frame) == coarse).all()
-    proposal = TreeCutProposal(tree=CobTree(cob), value=SceneCutObjectness(), sampler=OptimalCut())
+    assert (replace(boundary, scale="mean").boundary(frame) == (fine + coarse) / 2).all()
+    assert (replace(boundary, scale="coarse").boundary(frame) == coarse).all()
+    proposal = TreeCutProposal(tree=CobTree(boundary), value=SceneCutObjectness(), sampler=OptimalCut())
     tree, _ = proposal.tree_of(frame)
     assert (tree.start[: tree.n_leaves] == 0).all()
     assert (tree.start <= tree.start[tree.parent]).all()
     assert len(proposal.sample(np.random.default_rng(0), clip_of(TWO, width=96), 2)) == 2
     with pytest.raises(InputError, match="needs the frame"):
-        CobTree(cob).build(fine)
+        CobTree(boundary).build(fine)
 
 
 def test_large_images_are_resized_as_published(model, monkeypatch):
-    monkeypatch.setattr("mstfilter.frontends.cob._MAX_PIXELS", 2000)
+    monkeypatch.setattr(cob, "_MAX_PIXELS", 2000)
     shapes = []
-    forward = CobNetwork.forward
 
     def watched(self, image):
         shapes.append(tuple(image.shape))
-        return forward(self, torch.nn.functional.interpolate(image[None], (50, 50))[0])._replace()
+        return network_file.CobOutput(image[0].sigmoid(), image[1].sigmoid(), image[:1].repeat(8, 1, 1))
 
     monkeypatch.setattr(CobNetwork, "forward", watched)
-    frame = frame_of(TWO, width=80)
-    resized = torch.nn.functional.interpolate
-    monkeypatch.setattr(
-        torch.nn.functional,
-        "interpolate",
-        lambda x, size, **options: resized(x, (50, 50) if size == (500, 500) else size, **options),
-    )
-    assert CobBoundary(str(model)).boundary(frame).shape == (60, 80)
-    assert shapes == [(3, 50, 50)]
+    assert CobBoundary(str(model)).boundary(frame_of(TWO, width=80)).shape == (60, 80)
+    assert shapes == [(3, 500, 500)]
 
 
 def discs(size: int = 64) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -314,7 +284,7 @@ def test_the_oriented_watershed_keeps_borders_of_the_right_orientation():
     contours = np.maximum(circle, chord)
     heights = {}
     for name, turned in (("true", angle), ("turned", angle + np.pi / 2), ("unknown", np.full_like(angle, np.nan))):
-        parent, height, leaves = combine_scales(contours, contours, turned, 0.05, 1.5)
+        parent, height, leaves = cob.combine_scales(contours, contours, turned, 0.05, 1.5)
         heights[name] = height.max()
         assert leaves.shape == contours.shape
         assert (height[parent] >= height - 1e-12).all()
@@ -326,11 +296,13 @@ def test_the_oriented_watershed_keeps_borders_of_the_right_orientation():
 def test_the_combined_tree_has_the_regions_of_both_scales():
     """The circle is seen at both scales, the chord at the fine one only: it is merged first, at half its height."""
     circle, chord, angle = discs()
-    parent, height, leaves = combine_scales(np.maximum(circle, chord), circle, angle, 0.05, 1.5)
+    parent, height, leaves = cob.combine_scales(np.maximum(circle, chord), circle, angle, 0.05, 1.5)
     inner = height[height > 0]
     both = height.max()
     fine_only = inner[inner < 0.8 * both].max()
-    single, single_height, _ = combine_scales(np.maximum(circle, chord), np.maximum(circle, chord), angle, 0.05, 1.5)
+    single, single_height, _ = cob.combine_scales(
+        np.maximum(circle, chord), np.maximum(circle, chord), angle, 0.05, 1.5
+    )
     assert len(single) >= 5
     alone = single_height[(single_height > 0) & (single_height < 0.8 * single_height.max())].max()
     assert fine_only == pytest.approx(alone / 2, rel=0.1)
@@ -341,9 +313,9 @@ def test_the_combined_tree_has_the_regions_of_both_scales():
 
 def test_polygons_of_a_chain():
     points = np.array([(0, k) for k in range(10)] + [(k, 9) for k in range(1, 10)], float)
-    assert sorted(_segments(points, 1.5)) == [(0, 9), (9, 18)]
+    assert sorted(cob._segments(points, 1.5)) == [(0, 9), (9, 18)]
     stairs = np.array([(k // 2, (k + 1) // 2) for k in range(20)], float)
-    assert _segments(stairs, 1.5) == [(0, 19)]
+    assert cob._segments(stairs, 1.5) == [(0, 19)]
 
 
 def test_hha_of_a_plane():
@@ -352,13 +324,13 @@ def test_hha_of_a_plane():
     camera = Camera.from_intrinsics(100, 100, 31.5, 23.5, 64, 48, pose)
     depth = np.full((48, 64), 1.5, np.float32)
     depth[20:24, 30:34] = np.nan
-    found = hha(Frame(np.zeros((48, 64, 3), np.uint8), depth, camera), 0.7)
+    found = cob.hha(Frame(np.zeros((48, 64, 3), np.uint8), depth, camera), 0.7)
     assert (found[..., 0] == 207).all()
     assert (found[..., 1] == 70).all()
     assert (found[..., 2] == 38).all()
     blank = Frame(np.zeros((48, 64, 3), np.uint8), depth * np.nan, camera)
     with pytest.raises(InputError, match="no depth"):
-        hha(blank, 0.7)
+        cob.hha(blank, 0.7)
 
 
 def test_rgb_hha(blobs, tmp_path, monkeypatch):
@@ -366,22 +338,25 @@ def test_rgb_hha(blobs, tmp_path, monkeypatch):
     del blobs["conv1"]
     path = tmp_path / "hha.caffemodel"
     path.write_bytes(b"read below")
-    monkeypatch.setattr("mstfilter.frontends.cob.read_caffemodel", lambda path: blobs)
+    monkeypatch.setattr(caffe, "read_caffemodel", lambda path: blobs)
     frame = frame_of(TWO, width=48)
-    cob = CobBoundary(str(path), input="rgbhha")
-    image = np.concatenate([frame.rgb, hha(frame, 0.7)], axis=2)
+    boundary = CobBoundary(str(path), input="rgbhha")
+    image = np.concatenate([frame.rgb, cob.hha(frame, 0.7)], axis=2)
     means = np.array([122.67891434, 116.66876762, 104.00698793, 134.0313, 92.0228, 117.3808])
     data = (image - means)[..., [2, 1, 0, 5, 4, 3]].transpose(2, 0, 1)
-    np.testing.assert_allclose(cob.boundary(frame), reference(blobs, data)[0], atol=1e-4)
+    np.testing.assert_allclose(boundary.boundary(frame), reference(blobs, data)[0], atol=1e-4)
     with pytest.raises(InputError, match="lacks 1 of 148 layers, the first is 'conv1'") as caught:
         CobBoundary(str(path)).boundary(frame)
     assert "other input" in caught.value.hints[0]
 
 
-def test_torch_is_imported_when_the_network_is_used():
+def test_presets_name_the_components_without_importing_torch():
     code = (
-        "import sys, mstfilter; from mstfilter.presets import REGISTRY\n"
-        "mstfilter.preset('mst', 'proposal.boundary=cob', 'proposal.tree=cob'); assert 'torch' not in sys.modules"
+        "import sys, mstfilter\n"
+        "f = mstfilter.preset('mst', 'proposal.boundary=cob', 'proposal.boundary.weights=a', 'proposal.tree=cob',\n"
+        "    'transition.tracker=siammask', 'transition.tracker.weights=b')\n"
+        "assert (f.proposal.boundary.weights, f.transition.tracker.weights) == ('a', 'b')\n"
+        "assert 'torch' not in sys.modules"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
 
@@ -439,8 +414,3 @@ def test_weights_of_other_networks_are_one_clear_error(blobs):
         with pytest.raises(InputError) as caught:
             network.load_caffe(changed)
         assert message in caught.value.message
-
-
-def test_a_preset_names_it(model):
-    mst = preset("mst", "proposal.boundary=cob", f"proposal.boundary.weights={Path(model)}", "proposal.tree=ucm")
-    assert mst.proposal.boundary == CobBoundary(str(model))

@@ -13,7 +13,6 @@ from mstfilter.errors import InputError, MissingLibraryError
 from mstfilter.frontends import ExternalCompletion, MaskProposal, write_masks
 from mstfilter.frontends.completions import place_shape
 from mstfilter.open3d_import import import_open3d
-from mstfilter.presets import preset
 from mstfilter.scene import render, write_image
 from tests.segmentation.scenes import GRID, boxes, clip_of
 
@@ -179,14 +178,6 @@ def test_the_measurement_has_priority(tmp_path):
     np.savez(folder / "a.npz", occupancy=np.zeros((1, 1, 1)), origin=GRID.origin, voxel_size=0.01)
     with pytest.raises(InputError, match="occupies no voxel of the workspace"):
         occupied(ExternalCompletion(folder=str(tmp_path), axes="world"), 1)
-
-
-def test_a_preset_names_it(tmp_path):
-    two_draws(tmp_path)
-    overrides = ("proposal.completer=external", f"proposal.completer.folder={tmp_path}")
-    mst = preset("mst", *overrides, "proposal.completer.axes=world", "proposal.completer.other=extrude")
-    assert isinstance(mst.proposal.completer.other, Extrude)
-    assert len(mst.proposal.sample(np.random.default_rng(0), CLIP, 3)) == 3
 
 
 def broken(name: str, **arrays):

@@ -23,7 +23,7 @@ WAYS = [(1.0, 0.0), (0.0, 1.0), (0.0, 0.0)]
 
 def test_all_pauses_are_checked_before_a_run(tmp_path):
     """A missing file of a later pause is found before the folder of the run is made."""
-    recording = mstfilter.open_recording(cached_recording("demo", 0))
+    recording = mstfilter.open_recording(cached_recording("demo", 0, n_actions=1))
     write_masks(tmp_path / "masks", 0, [recording.instance(0) * 0])
     folder = f"folder={tmp_path / 'masks'}"
     for overrides, message in (
@@ -43,7 +43,7 @@ def test_all_pauses_are_checked_before_a_run(tmp_path):
 def test_the_estimate_is_better_than_the_best_alternative(tmp_path, monkeypatch, capsys):
     """Quality of the estimate at the last pause, against each alternative alone, completed in the same way."""
     monkeypatch.chdir(tmp_path)
-    recording = mstfilter.open_recording(cached_recording("demo", 0))
+    recording = mstfilter.open_recording(cached_recording("demo", 0, n_actions=1))
     true = bind_truth(TrueMasks(), recording)
     masks = {}
     for clip in recording.clips():

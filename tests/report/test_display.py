@@ -120,7 +120,7 @@ def test_the_texts_of_components_name_changed_fields():
         made = mstfilter.preset(name)
         for slot in ("transition", "proposal", "update", "resampler"):
             assert len(repr(getattr(made, slot))) <= 300
-    assert repr(mstfilter.preset("mst").transition) == "TrackingTransition(warp=Warp(method='smooth'))"
+    assert repr(mstfilter.preset("mst").transition) == "TrackingTransition()"
     assert repr(Tempered()) == "Tempered()"
 
     class Plain(Transition):

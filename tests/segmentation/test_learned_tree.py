@@ -1,24 +1,32 @@
-"""Regions, joins and the tree that merges them, on rendered scenes with known truth."""
+"""Regions, features of pairs, and the trees that merge them, on rendered scenes with known truth."""
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
+import torch
 
 from mstfilter.errors import InputError
-from mstfilter.scene import Camera, Frame
-from mstfilter.segmentation.boundary import ColourDepthBoundary
-from mstfilter.segmentation.cuts import MergeLogOdds
-from mstfilter.segmentation.learned_tree import Agglomeration, LearnedTree, tree_of_merges
-from mstfilter.segmentation.regions import (
-    BORDER,
+from mstfilter.scene import Camera, Frame, render
+from mstfilter.segmentation import (
+    EVIDENCE_FEATURES,
+    FEATURES,
     PAIR_FEATURES,
-    REGION,
-    measure_regions,
+    BorderTree,
+    ColourDepthBoundary,
+    LearnedTree,
+    MergeLogOdds,
+    SeenBorders,
+    UcmTree,
     pair_features,
-    quadric_residual,
 )
-from tests.segmentation.scenes import GRID, TOUCHING, TWO, frame_of
+from mstfilter.segmentation.border_network import BORDER_ARCHITECTURE, IMAGE_CHANNELS, BorderNet
+from mstfilter.segmentation.learned_tree import Agglomeration, quadric_residual, tree_of_merges
+from mstfilter.segmentation.regions import BORDER, REGION, measure_regions
+from mstfilter.trained import write_model
+from tests.segmentation.scenes import GRID, TOUCHING, TWO, camera, frame_of
 
 
 def measured(n: int = 6, seed: int = 0):
@@ -46,6 +54,12 @@ def test_sums_of_merged_regions_are_the_sums_of_the_merged_image():
     assert np.allclose(sum(growing.borders[new].values()), sum(v for j, v in merged.borders[k].items() if j))
 
 
+def features_of(regions, a, b, names):
+    """The features of the regions a and b."""
+    table = [regions.borders[r].get(0, np.zeros(len(BORDER)))[None] for r in (a, b)]
+    return pair_features(regions.sums[[a]], regions.sums[[b]], regions.borders[a][b][None], *table, 0.5, names)[0]
+
+
 def test_borders_turn_with_the_point_of_view():
     _, regions, _, _ = measured()
     for i, near in enumerate(regions.borders):
@@ -58,13 +72,10 @@ def test_borders_turn_with_the_point_of_view():
 def test_features_do_not_depend_on_which_region_comes_first():
     _, regions, _, _ = measured()
     a, b = next((i, j) for i in range(1, len(regions.sums)) for j in regions.borders[i] if j > i)
-    empty = np.zeros((1, len(BORDER)))
-    table = [regions.borders[r].get(0, empty[0])[None] for r in (a, b)]
-    one = pair_features(regions.sums[[a]], regions.sums[[b]], regions.borders[a][b][None], *table, 0.5)
-    other = pair_features(regions.sums[[b]], regions.sums[[a]], regions.borders[b][a][None], *table[::-1], 0.5)
-    assert one.shape == (1, len(PAIR_FEATURES))
+    one, other = features_of(regions, a, b, FEATURES), features_of(regions, b, a, FEATURES)
     assert np.isfinite(one).all()
     assert np.allclose(one, other)
+    assert not one[-len(EVIDENCE_FEATURES) :].any()  # without a network nothing is seen
 
 
 def test_the_residual_of_a_quadric_matches_least_squares():
@@ -115,6 +126,82 @@ def test_the_tree_of_merges():
     assert (np.diff(tree.start[4:]) > 0).all()
 
 
-def test_a_builder_that_needs_the_frame_says_so():
+def test_perfect_evidence_tells_pairs_of_objects_from_parts():
+    frame = frame_of(TOUCHING, width=320, noise=0.4)
+    truth = render(TOUCHING, GRID, camera(320)).labels.astype(np.int64)
+    rows, columns = np.indices(truth.shape)
+    centre = np.zeros((*truth.shape, 2), np.float32)
+    edge = np.zeros(truth.shape, bool)
+    for axis in (0, 1):
+        edge |= np.roll(truth, 1, axis) != truth
+    for k in (1, 2):
+        centre[truth == k] = columns[truth == k].mean(), rows[truth == k].mean()
+    seen = SeenBorders(np.where(edge, 9, -9).astype(np.float32), truth > 0, centre)
+    boundary = ColourDepthBoundary().boundary(frame)
+    h, w = truth.shape
+    blocks = (np.arange(h) // 12)[:, None] * 40 + np.arange(w) // 12 + 2000 * truth
+    leaves = np.unique(blocks, return_inverse=True)[1].reshape(truth.shape)
+    regions = measure_regions(leaves, frame, boundary, seen)
+    object_of = np.zeros(len(regions.sums), np.int64)
+    object_of[regions.of_leaf[leaves]] = truth
+    found = {True: [], False: []}
+    for i in range(1, len(regions.sums)):
+        for j in regions.borders[i]:
+            if j > i and min(object_of[i], object_of[j]) > 0:
+                found[bool(object_of[i] != object_of[j])].append(features_of(regions, i, j, EVIDENCE_FEATURES))
+    seen_by, gap = EVIDENCE_FEATURES.index("seen"), EVIDENCE_FEATURES.index("centre gap")
+    different, same = np.array(found[True]), np.array(found[False])
+    assert len(different) > 3 and len(same) > 10
+    assert np.allclose(different[:, seen_by], 6) and np.median(same[:, seen_by]) < -4
+    assert different[:, gap].min() > 1 and np.allclose(same[:, gap], 0, atol=1e-3)
+
+
+def write_network(folder, evidence: dict[str, float]) -> str:
+    torch.manual_seed(0)
+    net = BorderNet(8)
+    torch.nn.init.normal_(net.head.weight, std=0.5)
+    description = {
+        "architecture": BORDER_ARCHITECTURE,
+        "network": {"channels": list(IMAGE_CHANNELS), "width": 8},
+        "calibration": {"scale": 1.0, "shift": 0.0},
+        "evidence": {"features": list(evidence), "weights": list(evidence.values())},
+    }
+    write_model(folder, description, {name: t.numpy() for name, t in net.state_dict().items()})
+    return str(folder)
+
+
+def test_weights_of_zero_for_the_evidence_give_the_learned_tree(tmp_path):
+    learned, _ = LearnedTree().model()
+    name = write_network(tmp_path / "plain", {**learned, **dict.fromkeys(EVIDENCE_FEATURES, 0.0)})
+    frame = frame_of(TOUCHING, noise=0.4)
+    boundary = ColourDepthBoundary().boundary(frame)
+    leaves = UcmTree(max_leaves=100)
+    one, other = BorderTree(leaves, name).build(boundary, frame), LearnedTree(leaves).build(boundary, frame)
+    assert np.array_equal(one.parent, other.parent) and np.allclose(one.odds, other.odds)
+    used = write_network(tmp_path / "used", {**learned, **dict.fromkeys(EVIDENCE_FEATURES, 0.5)})
+    assert not np.allclose(BorderTree(leaves, used).build(boundary, frame).odds[-9:], one.odds[-9:])
     with pytest.raises(InputError, match="needs the frame"):
-        LearnedTree().build(np.zeros((4, 4)))
+        BorderTree(weights=name).build(boundary)
+
+
+def test_weights_of_other_features_are_an_error(tmp_path):
+    learned, key = LearnedTree().model()
+    path = tmp_path / "weights.json"
+    few = {name: value for name, value in learned.items() if name != "rim"}
+    for number, (content, message) in enumerate(
+        (
+            (few, "has no weight of the feature 'rim'"),
+            ({**learned, "seen": 1.0}, "has a weight of the feature 'seen'"),
+            ({**learned, "bias": "1"}, "the weight of 'bias' is '1', expected a finite number"),
+            ([1.0], "is no mapping"),
+        )
+    ):
+        path = tmp_path / f"{number}.json"
+        path.write_text(json.dumps(content))
+        with pytest.raises(InputError, match=message):
+            LearnedTree(weights=str(path)).model()
+    with pytest.raises(InputError, match="has no weight of the feature"):
+        BorderTree(weights=write_network(tmp_path / "bare", {})).model()
+    path.write_text(json.dumps({**learned, "bias": -11.0}))
+    assert LearnedTree(weights=str(path)).weights_key != key
+    assert set(learned) == set(PAIR_FEATURES)

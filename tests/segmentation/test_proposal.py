@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from mstfilter.completion import SurfaceOnly
-from mstfilter.errors import InputError
 from mstfilter.scene import Camera, Frame, render
 from mstfilter.scoring import weighted_coverage
 from mstfilter.segmentation.boundary import ColourDepthBoundary
@@ -128,7 +127,7 @@ def test_each_object_shows_in_its_own_mask():
 )
 @pytest.mark.parametrize("rule", ["equal", "p"])
 def test_components_are_interchangeable(tree, value, rule):
-    sampler = MetropolisHastingsCuts(0.25, 0, 20, "authors", 0.0, True, True, True)
+    sampler = MetropolisHastingsCuts(0.25, 0, 20, "authors", restart=True, include_optimal=True, redraw_repeated=True)
     proposal = TreeCutProposal(tree=tree, value=value, sampler=sampler, completer=SurfaceOnly(), weight_rule=rule)
     population = proposal.sample(np.random.default_rng(0), clip_of(TOUCHING, width=640, noise=0.6), 5)
     assert population.log_weights[0] == 0
@@ -140,16 +139,6 @@ def test_an_empty_table_gives_hypotheses_without_objects():
     clip = clip_of(np.zeros(GRID.shape, np.uint16), noise=0.3)
     population = TreeCutProposal().sample(np.random.default_rng(0), clip, 4)
     assert [h.n_objects for h in population.particles] == [0] * 4
-
-
-def test_more_samples_than_cuts():
-    clip = clip_of(np.zeros(GRID.shape, np.uint16))
-    assert len(TreeCutProposal(sampler=OptimalCut()).sample(np.random.default_rng(0), clip, 7)) == 7
-
-
-def test_bad_weight_rule():
-    with pytest.raises(InputError, match="weight_rule is 'x'"):
-        TreeCutProposal(weight_rule="x")
 
 
 def test_core_matches_erosion():

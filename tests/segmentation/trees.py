@@ -91,7 +91,7 @@ def transition_matrix(tree: Tree, w: np.ndarray, best: float, s2: float, rule) -
     index = {c: i for i, c in enumerate(cuts)}
     T = np.zeros((len(cuts), len(cuts)))
     for i, cut in enumerate(cuts):
-        chain = CutChain(tree, w, best, s2, np.array(cut))
+        chain = CutChain(tree, w, lambda v: -((best - v) ** 2) / s2, np.array(cut))
         for probability, choice in choices(rule, chain.state):
             move, _, log_ratio = chain.judge(rule, choice)
             accept = 0.0 if move is None else exp(min(0.0, log_ratio))

@@ -1,7 +1,6 @@
 import numpy as np
 import pytest
 
-from mstfilter.errors import InputError
 from mstfilter.scene import Clip, Frame, scene_cache
 from mstfilter.tracking.flow import DenseFlow
 from tests.tracking.scenes import Box, Scene, at, iou, slide
@@ -107,8 +106,3 @@ def test_the_result_is_equal_after_the_cache_is_cleared(textured):
     assert first is not again
     np.testing.assert_array_equal(first.source, again.source)
     np.testing.assert_array_equal(first.end, again.end)
-
-
-def test_an_unknown_preset_raises_an_error():
-    with pytest.raises(InputError):
-        DenseFlow("slow")

@@ -3,11 +3,22 @@ import json
 import numpy as np
 import pytest
 
+from mstfilter.errors import InputError
 from mstfilter.scene import Clip, Frame, Hypothesis
+from mstfilter.segmentation import TreeCutProposal, UcmTree
 from mstfilter.smc import Population
-from mstfilter.tracking.rules import AuthorsRule, MstRule, PaperRule
-from mstfilter.tracking.segments import StaticTest
-from mstfilter.tracking.transition import IdentityTransition, TrackingTransition, Warp
+from mstfilter.tracking import (
+    AuthorsRule,
+    DenseFlow,
+    IdentityTransition,
+    MstRule,
+    PaperRule,
+    SiftMatching,
+    SmallGicp,
+    StaticTest,
+    TrackingTransition,
+    Warp,
+)
 from tests.tracking.scenes import Box, Cylinder, Scene, at, errors, iou, slide
 
 RULES = {"mst": MstRule(), "paper": PaperRule(), "authors": AuthorsRule()}
@@ -82,13 +93,6 @@ def test_a_stochastic_rule_moves_copies_differently_and_repeats_with_the_seed(te
     assert len(set(grids)) > 1
     assert grids == [p.labels.tobytes() for p in b.particles]
     assert grids != [p.labels.tobytes() for p in c.particles]
-
-
-def test_equal_hypotheses_are_tracked_once(textured):
-    scene, clip = textured
-    moved = predict(clip, *[scene.hypothesis()] * 100)
-    assert len(moved) == 100 and moved.notes["segments"] == 6
-    assert len({p.labels.tobytes() for p in moved.particles}) == 1
 
 
 def test_without_video_no_object_moves(textured):
@@ -217,3 +221,21 @@ def test_splat_removes_the_source(textured):
     transition = TrackingTransition(warp=Warp("splat", "label"))
     moved = predict(clip, scene.hypothesis(), transition=transition).particles[0]
     assert all(r.source is None for r in moved.objects)
+
+
+@pytest.mark.parametrize(
+    ("component", "field", "value"),
+    [
+        (DenseFlow, "preset", "slow"),
+        (SiftMatching, "search_distance", 0),
+        (SmallGicp, "method", "icp"),
+        (MstRule, "select", "all"),
+        (Warp, "method", "push"),
+        (Warp, "collisions", "random"),
+        (TreeCutProposal, "weight_rule", "x"),
+        (UcmTree, "max_leaves", 0),
+    ],
+)
+def test_wrong_options_raise_an_error(component, field, value):
+    with pytest.raises(InputError, match=f"{field} is {value!r}"):
+        component(**{field: value})

@@ -5,7 +5,6 @@ import pytest
 from hypothesis import given, settings, strategies as st
 from scipy.spatial.transform import Rotation
 
-from mstfilter.errors import InputError
 from mstfilter.scene import Hypothesis, ObjectView, Occupancy, VoxelGrid
 from mstfilter.tracking.rigid import rigid_transform
 from mstfilter.tracking.transition import Warp
@@ -38,7 +37,7 @@ def turn(deg, shift=(0, 0, 0), centre=(-0.05, -0.06, 0.0)):
     return T
 
 
-@pytest.mark.parametrize("warp", [Warp(), Warp("smooth"), Warp("splat", "label")])
+@pytest.mark.parametrize("warp", [Warp(), Warp("splat", "label")])
 def test_identity_returns_the_same_bytes(warp):
     h = hypothesis(BOX, OTHER)
     moved = move(warp, h, {1: np.eye(4), 2: np.eye(4)})
@@ -47,9 +46,7 @@ def test_identity_returns_the_same_bytes(warp):
 
 
 @settings(max_examples=40, deadline=None)
-@given(
-    shift=st.tuples(*[st.integers(-8, 8)] * 2, st.integers(0, 8)), method=st.sampled_from(["pull", "smooth", "splat"])
-)
+@given(shift=st.tuples(*[st.integers(-8, 8)] * 2, st.integers(0, 8)), method=st.sampled_from(["smooth", "splat"]))
 def test_whole_voxel_shift_is_exact(shift, method):
     h = hypothesis(BOX)
     view = ObjectView(np.zeros(3, np.int64), np.ones((1, 1, 1), np.uint8), np.zeros((1, 1, 1), np.int8), "view")
@@ -59,8 +56,7 @@ def test_whole_voxel_shift_is_exact(shift, method):
     np.testing.assert_allclose(moved.hypothesis.record(1).views[0].motion.translation, np.array(shift) * 0.01)
 
 
-@pytest.mark.parametrize("method", ["pull", "smooth"])
-def test_probabilities_move_with_their_object(method):
+def test_probabilities_move_with_their_object():
     """Exactly by whole voxels; what rests keeps its probabilities, and labels are at least as probable as not."""
     h = hypothesis(BOX, OTHER)
     owner = np.where(h.labels > 0, h.labels, np.where(np.arange(60)[:, None, None] < 35, 1, 2))
@@ -70,22 +66,22 @@ def test_probabilities_move_with_their_object(method):
     p = np.where(h.labels > 0, 1 - p, p) * near
     h = replace(h, occupancy=Occupancy(np.where(near, owner, 0), p))
     shift = (0, 20, 3)
-    moved = move(Warp(method), h, {1: at(*np.array(shift) * 0.01)}).hypothesis
+    moved = move(Warp(), h, {1: at(*np.array(shift) * 0.01)}).hypothesis
     own = np.where(h.occupancy.owner == 1, h.occupancy.probability, 0)
     expected = np.where(h.occupancy.owner == 2, h.occupancy.probability, np.roll(own, shift, (0, 1, 2)))
     known = expected > 0.02  # smaller ones are not moved
     np.testing.assert_allclose(moved.occupancy.probability[known], expected[known], atol=2e-3)
     assert (moved.occupancy.probability[~known] <= 0.02).all()
     np.testing.assert_array_equal(moved.occupancy.owner[known & (expected == np.roll(own, shift, (0, 1, 2)))], 1)
-    back = move(Warp(method), moved, {1: at(*np.array(shift) * -0.01)}).hypothesis
+    back = move(Warp(), moved, {1: at(*np.array(shift) * -0.01)}).hypothesis
     np.testing.assert_allclose(back.occupancy.probability, h.occupancy.probability, atol=0.021)
-    turned = move(Warp(method), h, {1: turn(30)}).hypothesis
+    turned = move(Warp(), h, {1: turn(30)}).hypothesis
     found, sure = turned.labels, turned.occupancy
     np.testing.assert_array_equal(sure.owner[found > 0], found[found > 0])
     assert (sure.probability[found > 0] >= 0.5).all() and (sure.probability[found == 0] <= 0.5).all()
 
 
-@pytest.mark.parametrize("method", ["pull", "smooth", "splat"])
+@pytest.mark.parametrize("method", ["smooth", "splat"])
 def test_objects_that_are_lost_leave_no_probability(method):
     """One that moves out of the grid, and one at rest that loses all its voxels to another."""
     h = hypothesis(BOX, OTHER)
@@ -100,9 +96,9 @@ def test_objects_that_are_lost_leave_no_probability(method):
     assert owners == {record.label for record in covered.hypothesis.objects}
 
 
-def test_smooth_is_nearer_to_the_true_voxels_than_pull():
+def test_smooth_is_nearer_to_the_true_voxels_than_splat():
     """Turned and shifted boxes against the voxels whose centres they hold."""
-    rng, found = np.random.default_rng(0), {"pull": [], "smooth": []}
+    rng, found = np.random.default_rng(0), {"splat": [], "smooth": []}
     centres = GRID.centres()
     for _ in range(12):
         half = np.array([*rng.uniform(0.02, 0.045, 2), rng.uniform(0.02, 0.06)])
@@ -120,7 +116,7 @@ def test_smooth_is_nearer_to_the_true_voxels_than_pull():
             values.append(iou(moved.labels == 1, true))
             if method == "smooth":
                 assert moved.volumes() == source.volumes()
-    assert np.mean(found["smooth"]) > np.mean(found["pull"]) + 0.02, found
+    assert np.mean(found["smooth"]) > np.mean(found["splat"]) + 0.02, found
     assert np.mean(found["smooth"]) > 0.86
 
 
@@ -135,22 +131,11 @@ def test_many_small_turns_keep_the_volume_and_equal_one_turn(seed):
         T = turn(rng.uniform(-15, 15), (*rng.uniform(-0.01, 0.01, 2), 0))
         total = T @ total
         h = move(Warp(), h, {1: T}).hypothesis
-    assert abs(h.volumes()[1] / volume - 1) < 0.1  # one resampling's rounding, not six
+    assert h.volumes()[1] == volume
     once = move(Warp(), hypothesis(BOX), {1: total}).hypothesis
     np.testing.assert_array_equal(h.labels, once.labels)
     np.testing.assert_allclose(h.record(1).motion.as_matrix(), total, atol=1e-9)
     assert h.record(1).source.occupied.sum() == volume
-
-
-def test_pull_matches_the_exactly_voxelised_box_better_than_splat():
-    T = turn(27, (0.013, 0.006, 0))
-    centres = GRID.centres()
-    local = (centres - T[:3, 3]) @ T[:3, :3]
-    low, high = GRID.origin + np.array(BOX[0]) * 0.01, GRID.origin + np.array(BOX[1]) * 0.01
-    truth = ((local >= low) & (local < high)).all(-1)
-    pull, splat = (move(Warp(m), hypothesis(BOX), {1: T}).hypothesis.labels == 1 for m in ("pull", "splat"))
-    assert iou(pull, truth) == 1.0  # one pull of a solid box IS its voxelisation
-    assert iou(splat, truth) < 0.95
 
 
 def test_voxels_that_leave_are_counted_and_empty_objects_removed():
@@ -211,10 +196,3 @@ def test_single_voxels_survive_any_turn():
     h = hypothesis(((10, 10, 3), (11, 11, 4)))
     for deg in range(0, 90, 7):
         assert move(Warp(), h, {1: turn(deg, (0.0132, 0.0047, 0))}).hypothesis.n_objects == 1
-
-
-def test_unknown_options_raise_an_error():
-    with pytest.raises(InputError):
-        Warp("push")
-    with pytest.raises(InputError):
-        Warp(collisions="random")

@@ -29,6 +29,5 @@ class MySampler(CutSampler):
         """Draw n cuts; a cut is an ascending array of nodes that covers every leaf once."""
         # Random numbers come from rng only.
         cuts = tuple(optimal_cut(tree, w + self.noise * rng.gumbel(size=len(w))) for _ in range(n))
-        values = np.array([w[cut].sum() for cut in cuts])
         # log_p is the log probability relative to the best cut, as far as it is known.
-        return CutSample(cuts, values, np.zeros(n))
+        return CutSample(cuts, np.zeros(n))

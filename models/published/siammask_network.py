@@ -13,8 +13,7 @@ features of the mask, at 25 x 25 positions. A mask is grown from one position to
 earlier stages.
 
 Names of modules and shapes are those of the published checkpoints (https://github.com/foolwood/SiamMask, MIT), so
-that they load name by name. This module imports torch; `mstfilter.frontends.mask_trackers` imports it when it is
-used.
+that they load name by name. This file imports torch; siammask.py loads it when it is used.
 """
 
 from __future__ import annotations

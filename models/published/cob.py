@@ -15,21 +15,20 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 
-from mstfilter.errors import InputError, MissingLibraryError, check_choice, check_integer, check_number, naming
+from mstfilter.errors import InputError, naming
+from mstfilter.fields import Bounds, NonNegativeFloat, PositiveInt
 from mstfilter.files import weights_file
-from mstfilter.frontends.caffe import read_caffemodel
+from mstfilter.registry import load_file
 from mstfilter.scene import Frame, Recording, UsesFiles, memo, scaled_length
 from mstfilter.segmentation import BoundaryModel, Tree, TreeBuilder
 from mstfilter.segmentation.boundary import fill_from_nearest
 from mstfilter.segmentation.tree import linkage_tree, prune
 
-if TYPE_CHECKING:
-    from mstfilter.frontends.cob_network import CobNetwork
-
+_HERE = Path(__file__).parent
 _SOURCE = "COB", "https://github.com/kmaninis/COB"
 _MAX_PIXELS = 500 * 500  # larger images are resized to 500 x 500 (`cob_detect.m`)
 _LEAST_CONFIDENCE, _LEAST_SECOND = 0.5, 0.01  # of the best and of the second bin (`trainedOrientation.m`)
@@ -58,12 +57,7 @@ class CobBoundary(BoundaryModel, UsesFiles):
     input: Literal["rgb", "rgbhha"] = "rgb"
     scale: Literal["fine", "coarse", "mean"] = "fine"
     sha256: str = ""
-    table_height: float = 0.7
-
-    def __post_init__(self) -> None:
-        check_choice("input", self.input, ("rgb", "rgbhha"))
-        check_choice("scale", self.scale, ("fine", "coarse", "mean"))
-        check_number("table_height", self.table_height, at_least=0, unit="number of metres")
+    table_height: Annotated[float, Bounds(at_least=0, unit="number of metres")] = 0.7
 
     @property
     def bound_key(self) -> bytes:
@@ -92,12 +86,10 @@ class CobBoundary(BoundaryModel, UsesFiles):
         import torch
         from torch.nn import functional
 
-        from mstfilter.frontends.cob_network import cob_input
-
         image = frame.rgb
         if self.input == "rgbhha":
             image = np.concatenate([image, hha(frame, self.table_height)], axis=2)
-        data, size = cob_input(image), frame.depth.shape
+        data, size = load_file(_HERE / "cob_network.py").cob_input(image), frame.depth.shape
         with torch.inference_mode():
             if size[0] * size[1] > _MAX_PIXELS:
                 data = functional.interpolate(data[None], (500, 500), mode="bicubic", antialias=True)[0]
@@ -107,21 +99,17 @@ class CobBoundary(BoundaryModel, UsesFiles):
         maps = found.numpy()
         return maps[0], maps[1], decode_orientation(maps[2:])
 
-    def _network(self) -> CobNetwork:
+    def _network(self) -> Any:
         path, digest = weights_file(self.weights, *_SOURCE, self.sha256)
         return _load(digest, path, self.input)
 
 
 @lru_cache(maxsize=1)
-def _load(digest: str, path: str, kind: str) -> CobNetwork:
+def _load(digest: str, path: str, kind: str) -> Any:
     """The network with the weights of a file; the last one is kept."""
-    try:
-        from mstfilter.frontends.cob_network import CobNetwork
-    except ImportError as error:
-        raise MissingLibraryError(f"torch cannot be imported: {error}", "pip install torch") from error
-    network = CobNetwork(3 if kind == "rgb" else 6)
+    network = load_file(_HERE / "cob_network.py").CobNetwork(3 if kind == "rgb" else 6)
     with naming(path):
-        network.load_caffe(read_caffemodel(path))
+        network.load_caffe(load_file(_HERE / "caffe.py").read_caffemodel(path))
     return network.eval()
 
 
@@ -195,15 +183,11 @@ class CobTree(TreeBuilder):
     """
 
     contours: CobBoundary = field(default_factory=CobBoundary)
-    align: float = 0.05
+    align: NonNegativeFloat = 0.05
     centre: float = 0.8
     slope: float = 4.0
     tolerance: float = 1.5
-    max_leaves: int = 501
-
-    def __post_init__(self) -> None:
-        check_integer("max_leaves", self.max_leaves)
-        check_number("align", self.align, at_least=0)
+    max_leaves: PositiveInt = 501
 
     def build(self, boundary: np.ndarray, frame: Frame | None = None) -> Tree:
         """The tree of a frame; raises InputError without a frame or weights."""

@@ -14,7 +14,7 @@ an activation between them, the deconvolutions, and a 3 x 3 convolution of all 2
 Modules have the names of the layers in Caffe. There are 148 convolutions; models that were trained with the output
 ``new-score-weighting`` have one more, which is not used. Deconvolutions are not stored, because they are fixed.
 
-This module imports torch; `mstfilter.frontends.cob` imports it when the network is used.
+This file imports torch; cob.py loads it when the network is used.
 """
 
 from __future__ import annotations
