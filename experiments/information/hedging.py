@@ -4,8 +4,8 @@
 
 For every run of a study (`keep = "all"`), each hypothesis is replaced by `COPIES` copies with noise at the border: a
 voxel takes the label of one of its six neighbours with probability `RATE`. Original and noisy sets are scored alike.
-Writes hedging.csv, one row per arm: energy score and information without and with noise, means over scenes of all
-families, and the paired difference in information with its 95 % interval over scenes.
+Writes hedging.csv, one row per arm: energy score and recalibrated log loss without and with noise, means over scenes
+of all families, and the paired difference in log loss with its 95 % interval over scenes.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import numpy as np
 from mstfilter.files import write_csv
 from mstfilter.runs import RunFolder
 from mstfilter.scene import Recording
-from mstfilter.scoring import ask, leave_one_out, score_belief
+from mstfilter.scoring import LOG_LOSS, ask, leave_one_out, score_belief
 from mstfilter.simulation import cache_folder
 from mstfilter.statistics import compare
 from mstfilter.study import RESULT, StudyFolder, open_scene
@@ -70,17 +70,17 @@ def main(study: Path, out: Path) -> None:
             energies.setdefault((arm, noisy), {})[name] = float(np.mean(energy))
     rows = []
     for arm in dict.fromkeys(arm for arm, _ in energies):
-        information: list[dict[str, float]] = []
+        losses: list[dict[str, float]] = []
         for noisy in (False, True):
             families = [found for (_, a, kind), found in counts.items() if (a, kind) == (arm, noisy)]
-            information.append(
+            losses.append(
                 {s: fit.log_loss(found[s]) for found in families for s, fit in leave_one_out(found).items()}
             )
-        d = compare(information[1], information[0])
+        d = compare(losses[1], losses[0])
         row = {"arm": arm, "n": d.n}
         for k, name in enumerate(("", "_noisy")):
             row[f"energy{name}"] = float(np.mean(list(energies[arm, bool(k)].values())))
-            row[f"information{name}"] = float(np.mean(list(information[k].values())))
+            row[f"{LOG_LOSS}{name}"] = float(np.mean(list(losses[k].values())))
         rows.append(row | {"noisy_minus_plain": d.mean, "low": d.low, "high": d.high})
         print(rows[-1], flush=True)
     write_csv(out / "hedging.csv", rows, float_format=".4f")

@@ -15,13 +15,14 @@ from typing import Any
 
 from mstfilter.report.figures import differences_figure, figure_groups, reliability_figure, time_figure
 from mstfilter.report.page import fill_template, flatten, seconds_text, short_text, write_page
+from mstfilter.scoring import LOG_LOSS
 from mstfilter.statistics import CLAIM
-from mstfilter.study import ENDPOINT, ENDPOINTS, SLOPES, StudyFolder, Summary
+from mstfilter.study import ENDPOINTS, SLOPES, StudyFolder, Summary, title_of
 
 # Columns of the tables of results: name in the study, heading.
 _TABLES = {
     "Quality": (
-        (ENDPOINT, "quality"),
+        ("quality", "quality"),
         (SLOPES["quality"], "slope"),
         ("quality_top", "heaviest"),
         ("quality_best", "best of n"),
@@ -32,10 +33,10 @@ _TABLES = {
         ("quality_one_blob", "baseline: one blob"),
         ("quality_components", "baseline: components"),
     ),
-    "Information": (
-        ("information", "information"),
-        (SLOPES["information"], "slope"),
-        ("log_loss", "log loss"),
+    "Log loss": (
+        (LOG_LOSS, "recalibrated"),
+        (SLOPES[LOG_LOSS], "slope"),
+        ("log_loss", "as it comes"),
         ("calibration_error", "calibration error"),
         ("brier", "Brier"),
         ("energy", "energy score"),
@@ -68,7 +69,9 @@ def write_study_report(study: StudyFolder | str | Path, out: str | Path | None =
 
 
 def _page(study: StudyFolder) -> str:
-    filters = dict(seconds=seconds_text, number=_number, signed=lambda x: _number(x, "+"), range=_range)
+    filters = dict(
+        metric_title=title_of, seconds=seconds_text, number=_number, signed=lambda x: _number(x, "+"), range=_range
+    )
     records, failures = study.records(), study.failures()
     summary = study.summary_of(records)
     scenes: dict[str, list[str]] = defaultdict(list)

@@ -1,5 +1,6 @@
-from mstfilter.scoring.information import (
+from mstfilter.scoring.log_loss import (
     CATEGORIES as CATEGORIES,
+    LOG_LOSS as LOG_LOSS,
     NO_COUNTS as NO_COUNTS,
     SPLITS as SPLITS,
     BeliefScore as BeliefScore,
