@@ -37,14 +37,18 @@ from mstfilter.report.page import (
 from mstfilter.report.pictures import close_up, data_uri, jpeg_bytes, viewpoint
 from mstfilter.report.viewer import run_page
 from mstfilter.runs import RunFolder
-from mstfilter.runs.scoring import PauseEstimate, PauseScore, PauseTruth, score_pauses
 from mstfilter.scene import project, render
 from mstfilter.scoring import (
-    MIN_PIXELS,
     BeliefScore,
+    PauseEstimate,
+    PauseScore,
+    PauseTruth,
     forecast_table,
     pause_metrics,
     score_belief,
+    score_pauses,
+    shown_objects,
+    status_of,
     weighted_coverage,
 )
 
@@ -329,14 +333,9 @@ def read_numbers(run: RunFolder, beliefs: bool = True) -> RunNumbers:
             labels, weights = [h.labels for h in hypotheses], np.array(info["weights"], float)
             grid, camera = hypotheses[0].grid, run.camera(t)
             seen = render(truth, grid, camera).labels
-            enough = np.bincount(seen.ravel()) >= max(1.0, MIN_PIXELS * seen.size / 307200)
-            visible = set(np.flatnonzero(enough).tolist())
+            visible = shown_objects(seen)
+            metrics = pause_metrics(labels, weights, truth, status_of(truth, visible, shown))[0]
             shown |= visible
-            status = {
-                k: "visible" if k in visible else "hidden" if k in shown else "unseen"
-                for k in np.unique(truth[truth > 0]).tolist()
-            }
-            metrics = pause_metrics(labels, weights, truth, status)[0]
             in_image = float(np.mean([weighted_coverage(project(h, camera), seen) for h in hypotheses]))
         beside, losses = {}, {}
         for name, other in run.compared().items():
@@ -371,7 +370,7 @@ def _image_score(run: RunFolder, t: int) -> PauseScore | None:
     if image is None:
         return None
     hypotheses, weights = run.hypotheses(t), np.asarray(run.info(t)["weights"], dtype=float)
-    estimate = PauseEstimate([h.labels for h in hypotheses], weights, t, hypotheses[0].grid)
+    estimate = PauseEstimate(hypotheses, weights, t, hypotheses[0].grid)
     scores = score_pauses([estimate], [PauseTruth(image, t, camera=run.camera(t))])
     return next(score for score in scores if score.form == "objects")
 
