@@ -14,7 +14,7 @@ import mstfilter.report
 from mstfilter.errors import InputError
 from mstfilter.report import SERIES, colour, figure_groups, hexadecimal, time_figure
 from mstfilter.scoring import LOG_LOSS
-from mstfilter.study import StudyFolder
+from mstfilter.study import StudyFolder, title_of
 
 PAGE = 'xmlns="http://www.w3.org/2000/svg" style="background:var(--paper);font-family:sans-serif"'
 
@@ -46,7 +46,7 @@ def make(out: Path, study: Path, chosen: Sequence[str] = ()) -> list[Path]:
         titled = {f"{family}, n = {len(scenes[family])} scenes": of_arms for family, of_arms in values.items()}
         for k, group in enumerate(figure_groups(arms, folder.description["reference"])):
             paths.append(out / f"{measure}_over_time{f'_{k + 1}' if k else ''}.svg")
-            paths[-1].write_text(standalone(time_figure(titled, group, measure)))
+            paths[-1].write_text(standalone(time_figure(titled, group, title_of(measure))))
     return paths
 
 

@@ -25,7 +25,6 @@ from typing import Any
 import numpy as np
 
 from mstfilter.report.figures import genealogy_figure, health_figure, quality_figure, reliability_figure
-from mstfilter.report.identities import assign_identities, cards_of_pause, further_cards
 from mstfilter.report.page import (
     fill_template,
     flatten,
@@ -35,9 +34,10 @@ from mstfilter.report.page import (
     write_page,
 )
 from mstfilter.report.pictures import close_up, data_uri, jpeg_bytes, viewpoint
+from mstfilter.report.scenes import ShownHypothesis, scenes_of_run
 from mstfilter.report.viewer import run_page
 from mstfilter.runs import RunFolder
-from mstfilter.scene import project, render
+from mstfilter.scene import Camera, project, render
 from mstfilter.scoring import (
     BeliefScore,
     PauseEstimate,
@@ -407,34 +407,64 @@ def write_report(
 
 
 def _pauses(run: RunFolder, numbers: RunNumbers) -> list[dict[str, Any]]:
-    if not numbers.steps:
-        return []
-    identities = assign_identities(run)
-    volumes: list[tuple[Any, Any]] = []
-    for t in range(len(numbers.steps)):
-        hypotheses, truth = run.hypotheses(t), run.truth(t)
-        volumes.extend((h.labels, h.grid) for h in hypotheses)
-        if truth is not None:
-            volumes.append((truth, hypotheses[0].grid))
-    view = viewpoint(volumes, run.camera(0))
+    """Photo and cards of each pause."""
+    scenes = scenes_of_run(run) if numbers.steps else []
+    volumes = [view.hypothesis for scene in scenes for view in scene.views]
+    view = viewpoint(volumes, run.camera(0)) if scenes else None
     pauses = []
-    for t, step in enumerate(numbers.steps):
-        camera = run.camera(t)
-        cards, hidden = cards_of_pause(run, t, identities, view)
+    for t, (step, scene) in enumerate(zip(numbers.steps, scenes, strict=True)):
+        assert scene.camera is not None and scene.image is not None and view is not None
+        cards = [_card(one, scene.camera, view) for one in (*scene.views, *scene.others)]
         pauses.append(
             {
                 "t": t,
                 "step": step,
-                "photo": data_uri(jpeg_bytes(run.rgb(t)), "jpeg"),
-                "width": camera.width,
-                "height": camera.height,
-                "close_up": close_up(volumes, camera),
-                "cards": cards,
-                "hidden": hidden,
-                "further": further_cards(run, t, identities, view),
+                "photo": data_uri(jpeg_bytes(scene.image), "jpeg"),
+                "width": scene.camera.width,
+                "height": scene.camera.height,
+                "close_up": close_up(volumes, scene.camera),
+                "cards": [card for card in cards if card["weight"] is not None],
+                "hidden": scene.hidden,
+                "further": [card for card in cards if card["weight"] is None],
             }
         )
     return pauses
+
+
+def _card(one: ShownHypothesis, camera: Camera, view: Camera) -> dict[str, Any]:
+    """Pictures and numbers of equal hypotheses, of the ground truth, or of another run, for the template."""
+    # Small images are enlarged, so that contours are about as fine as on large ones.
+    scale = max(1, round(960 / camera.width))
+    return {
+        "name": one.name.capitalize(),
+        "weight": one.weight,
+        "n_objects": one.hypothesis.n_objects,
+        "voxels_occupied": sum(one.volumes.values()),
+        "quality": one.quality,
+        "overlay": one.overlay(camera, scale, max(2, round(scale * camera.width / 340))),
+        "voxels": one.voxels(view),
+        "tags": _place_tags(project(one.hypothesis, camera), one.identity),
+    }
+
+
+def _place_tags(image: np.ndarray, identity: Mapping[int, int]) -> list[dict[str, Any]]:
+    """Numbers at the widest place of each object that is large enough in the image, in pixels; large ones first."""
+    from scipy.ndimage import distance_transform_edt, find_objects
+
+    min_radius, min_distance = 0.009 * image.shape[1], 0.03 * image.shape[1]
+    places = []
+    for label, box in enumerate(find_objects(image.astype(np.int32)), 1):
+        if box is None or label not in identity:
+            continue
+        inside = distance_transform_edt(np.pad(image[box] == label, 1))[1:-1, 1:-1]
+        row, column = np.unravel_index(int(inside.argmax()), inside.shape)
+        places.append((float(inside[row, column]), label, float(column + box[1].start), float(row + box[0].start)))
+    tags: list[dict[str, Any]] = []
+    for radius, label, x, y in sorted(places, reverse=True):
+        apart = all(np.hypot(tag["x"] - 0.5 - x, tag["y"] - 0.5 - y) > min_distance for tag in tags)
+        if radius >= min_radius and apart:
+            tags.append({"text": str(identity[label] + 1), "x": x + 0.5, "y": y + 0.5})
+    return tags
 
 
 def _figures(numbers: RunNumbers) -> dict[str, Any]:
