@@ -115,9 +115,10 @@ def compare(first: Values, second: Values) -> Difference:
     if len(d) == 0:
         nan = float("nan")
         return Difference(nan, nan, nan, nan, nan, nan, 0)
-    *limits, p_bootstrap = bootstrap(d)
-    found = Difference(float(d.mean()), *interval(d), *limits, sign_flip(d), len(d))
-    found = replace(found, p_bootstrap=p_bootstrap, skewness=_skewness(d))
+    low, high, p = bootstrap(d)
+    found = Difference(
+        float(d.mean()), *interval(d), low, high, sign_flip(d), len(d), p_bootstrap=p, skewness=_skewness(d)
+    )
     return replace(found, p_holm=found.p_claim)
 
 

@@ -8,7 +8,6 @@ import re
 import shutil
 from dataclasses import replace
 from html.parser import HTMLParser
-from importlib.resources import files
 
 import numpy as np
 import pytest
@@ -239,11 +238,6 @@ def test_errors(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match="cannot write report"):
         write_report(RunFolder.open(run.path), tmp_path / "file" / "report.html")
-
-
-def test_templates_are_part_of_the_package():
-    folder = files("mstfilter.report") / "templates"
-    assert {p.name for p in folder.iterdir()} >= {"report.html", "style.css"}
 
 
 def test_a_run_that_uses_the_ground_truth_is_marked(finished, tmp_path):
