@@ -51,7 +51,7 @@ class Difference:
     p_holm : float
         `p_claim` adjusted for all comparisons of the table; equals `p_claim` for a single comparison.
     p_bootstrap : float
-        Two-sided p value of the studentised bootstrap, see `bootstrap`; NaN for fewer than five units.
+        Two-sided p value of the studentised bootstrap, see `studentised_bootstrap`; NaN for fewer than five units.
     skewness : float
         Sample skewness of the differences; 0 if they are equal.
     """
@@ -115,7 +115,7 @@ def compare(first: Values, second: Values) -> Difference:
     if len(d) == 0:
         nan = float("nan")
         return Difference(nan, nan, nan, nan, nan, nan, 0)
-    low, high, p = bootstrap(d)
+    low, high, p = studentised_bootstrap(d)
     found = Difference(
         float(d.mean()), *interval(d), low, high, sign_flip(d), len(d), p_bootstrap=p, skewness=_skewness(d)
     )
@@ -133,7 +133,7 @@ def interval(values: np.ndarray) -> tuple[float, float]:
     return float(values.mean() - half), float(values.mean() + half)
 
 
-def bootstrap(values: np.ndarray, n_resamples: int = N_BOOTSTRAP) -> tuple[float, float, float]:
+def studentised_bootstrap(values: np.ndarray, n_resamples: int = N_BOOTSTRAP) -> tuple[float, float, float]:
     """Studentised bootstrap: interval of the mean, and two-sided p value of a zero mean.
 
     NaN for fewer than five values. The random generator is fixed, so the same values give the same result. A resample

@@ -14,7 +14,8 @@ import pytest
 
 from mstfilter.errors import InputError
 from mstfilter.report import run_report, viewpoint
-from mstfilter.report.run_report import read_numbers, write_report
+from mstfilter.report.run_numbers import read_numbers
+from mstfilter.report.run_report import write_report
 from mstfilter.runs import HypothesisCodec, RunFolder
 from mstfilter.scene import Hypothesis, project, render
 from mstfilter.scoring import BeliefScore, read_truth, score_pauses, weighted_coverage
