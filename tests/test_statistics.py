@@ -66,9 +66,7 @@ def test_coverage_by_simulation():
     missed = sum(not low <= 0.3 <= high for low, high in few)
     assert missed <= 40 + 4 * np.sqrt(500 * 0.08 * 0.92)
     skewed = rng.exponential(1.0, (500, 12)) - 1
-    missed = sum(
-        not low <= 0 <= high for low, high in (studentised_bootstrap(s, n_resamples=599)[:2] for s in skewed)
-    )
+    missed = sum(not low <= 0 <= high for low, high in (studentised_bootstrap(s, 599)[:2] for s in skewed))
     plain = sum(not low <= 0 <= high for low, high in map(interval, skewed))
     assert missed < plain  # what it is for: t intervals miss too often where values are skewed
 

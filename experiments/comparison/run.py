@@ -47,7 +47,7 @@ CASES: dict[str, Draw] = {
 def p_values(x: np.ndarray) -> dict[str, np.ndarray]:
     """p values of the columns of (n, k) differences, by test: as in `compare`, by matrix products.
 
-    The limits of both intervals are those of the tests `t` and `studentised_bootstrap`, so p values below .05 exclude 0.
+    The limits of both intervals are those of the tests `t` and `bootstrap`, so p values below .05 exclude 0.
     """
     n = len(x)
     mean, sd = x.mean(axis=0), x.std(axis=0, ddof=1)

@@ -171,7 +171,7 @@ def _over_time(records: Sequence[Mapping[str, Any]], endpoint: str) -> dict[str,
 
 
 def _costs(summary: Summary) -> dict[str, Any]:
-    """Seconds, core seconds and memory by stage, family and arm; means over pauses."""
+    """Seconds by stage, core seconds and memory by family and arm; means over pauses."""
     stages = [n.removeprefix("seconds_") for n in summary.names if n.startswith("seconds_")]
     rows: list[dict[str, Any]] = []
     per = ("seconds_", "peak_mb")
@@ -185,8 +185,7 @@ def _costs(summary: Summary) -> dict[str, Any]:
             if cells:
                 rows.append({"family": family, "arm": arm, **cells})
     most = max((sum(float(r.get(f"seconds_{s}", 0.0)) for s in stages) for r in rows), default=1.0)
-    held = [s for s in stages if f"peak_mb_{s}" in summary.names]
-    return {"stages": stages, "rows": rows, "most": most or 1.0, "held": held}
+    return {"stages": stages, "rows": rows, "most": most or 1.0}
 
 
 def _arms(description: Mapping[str, Any]) -> list[tuple[str, list[tuple[str, str]]]]:

@@ -88,13 +88,14 @@ def _run(job: Job, step: _StepCallback) -> None:
     _check_code(job["code"])
     folder = Path(job["folder"])
     costs: list[dict[str, float]] = []
-    began, peaks = time.process_time(), StagePeaks()
+    began = time.process_time()
 
     def progress(p: RunProgress) -> None:
         nonlocal began
         if p.done:
-            costs.append({"seconds": p.seconds, "core_seconds": time.process_time() - began, **peaks.megabytes()})
-            peaks.begin()
+            spent = time.process_time() - began
+            costs.append({"seconds": p.seconds, "core_seconds": spent, "peak_mb": peak_megabytes()})
+        reset_peak()
         began = time.process_time()
         step(p.done, p.total)
 
@@ -109,7 +110,6 @@ def _run(job: Job, step: _StepCallback) -> None:
                 job["seed"],
                 allow_files=job["allow_files"],
                 progress=progress,
-                observer=peaks,
             )
         for t, cost in enumerate(costs):
             cost.update({f"seconds_{stage}": seconds for stage, seconds in run.seconds(t).items()})
@@ -131,36 +131,6 @@ def write_measures(run: RunFolder, recording: Recording) -> list[dict[str, Any]]
     if len(counts) == len(measured):
         np.savez_compressed(run.path / FORECASTS, counts=np.stack(counts))
     return [row for row, _ in measured]
-
-
-class StagePeaks:
-    """Peak memory of a step and of each of its stages; an observer of `ParticleFilter.step`.
-
-    >>> peaks = StagePeaks()
-    >>> state, info = filter.step(state, clip, observer=peaks)
-    >>> peaks.megabytes()["peak_mb"]
-    """
-
-    def __init__(self) -> None:
-        self.begin()
-
-    def begin(self) -> None:
-        """Start to measure a step."""
-        self._step, self._stages = 0.0, dict[str, float]()
-        self._by_stage = reset_peak()
-
-    def __call__(self, stage: str, begins: bool) -> None:
-        """A stage begins or ends."""
-        peak = peak_megabytes()
-        self._step = max(self._step, peak)
-        if not begins:
-            self._stages[stage] = max(peak, self._stages.get(stage, 0.0))
-        self._by_stage = reset_peak() and self._by_stage
-
-    def megabytes(self) -> dict[str, float]:
-        """``peak_mb`` of the step, and ``peak_mb_STAGE`` if the system can reset the peak (Linux)."""
-        stages = {f"peak_mb_{stage}": peak for stage, peak in self._stages.items()} if self._by_stage else {}
-        return {"peak_mb": max(self._step, peak_megabytes()), **stages}
 
 
 def reset_peak() -> bool:
