@@ -41,7 +41,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from mstfilter.errors import InputError, place_in_user_file, short_path, suggestion
+from mstfilter.errors import InputError, missing_library, place_in_user_file, short_path, suggestion
 
 _ENTRY_POINTS = "mstfilter.components"
 
@@ -122,7 +122,7 @@ class Registry:
         try:
             return _import(location)
         except ImportError as error:
-            raise InputError(f"{where or kind}: component {name!r} cannot be imported: {error}") from error
+            raise missing_library(error, f"{where or kind}: component {name!r}") from error
 
     def _locate(self, kind: str, name: str, where: str, allow_files: bool) -> str:
         if not isinstance(name, str):

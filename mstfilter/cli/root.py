@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-import contextlib
 import re
-import sys
-import warnings
-from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from mstfilter import __version__
-from mstfilter.errors import InputWarning
 
 if TYPE_CHECKING:
     from mstfilter.report import RunNumbers
@@ -80,28 +75,6 @@ def read_source(path: Path, format: str, options: list[str] | None, pauses: str,
 
     with Console(stderr=True).status(f"reading {path.name}"):  # shown on a terminal only
         return open_source(path, format, chosen, pauses)
-
-
-@contextlib.contextmanager
-def warnings_as_lines() -> Iterator[None]:
-    """Print an `InputWarning` as one ``warning:`` line with its hints; other warnings are unchanged."""
-    with warnings.catch_warnings():
-        show_other, shown = warnings.showwarning, set()
-        warnings.simplefilter("always", InputWarning)
-
-        def show(message: Warning | str, *place: Any, **named: Any) -> None:
-            if not isinstance(message, InputWarning):
-                show_other(message, *place, **named)
-                return
-            if message.message in shown:
-                return
-            shown.add(message.message)
-            print(f"warning: {message.message}", file=sys.stderr)
-            for hint in message.hints:
-                print(f"hint: {hint}", file=sys.stderr)
-
-        warnings.showwarning = show
-        yield
 
 
 def print_summary(numbers: RunNumbers) -> None:
