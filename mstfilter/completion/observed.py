@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.ndimage import binary_dilation
 
-from mstfilter.scene import Frame, ObjectView, VoxelGrid, depth_sigma, frame_geometry, memo, read_only
+from mstfilter.scene import Frame, ObjectView, VoxelGrid, depth_sigma, frame_geometry, memo, read_only, scaled_area
 
 if TYPE_CHECKING:
     from mstfilter.completion.completer import Completer
@@ -178,7 +178,7 @@ def _surface_voxels(frame: Frame, mask: np.ndarray, views: Sequence[ObjectView],
     readings = mask_voxels(frame, mask, grid)
     if not views:
         return readings
-    share = frame.depth.size / 307200
+    share = scaled_area(1, frame.depth.size)
     readings = readings[:: round(share)] if share > 1 else np.repeat(readings, round(1 / share), axis=0)
     voxels = np.concatenate([readings, *(view_surface(view, grid) for view in views)])
     return voxels[grid.contains(voxels)]

@@ -5,7 +5,13 @@ from mstfilter.scene.cache import (
     memo_many as memo_many,
     scene_cache as scene_cache,
 )
-from mstfilter.scene.camera import Camera as Camera, look_at as look_at, rigid_from_matrix as rigid_from_matrix
+from mstfilter.scene.camera import (
+    Camera as Camera,
+    look_at as look_at,
+    rigid_from_matrix as rigid_from_matrix,
+    scaled_area as scaled_area,
+    scaled_length as scaled_length,
+)
 from mstfilter.scene.disk_cache import DiskCache as DiskCache
 from mstfilter.scene.encoding import (
     decode_hypotheses as decode_hypotheses,
