@@ -23,7 +23,17 @@ from mstfilter.completion import Completer, Completion, Extrude, ObservedBox, ob
 from mstfilter.errors import InputError, check_choice, check_number
 from mstfilter.oracles.degradation import degrade
 from mstfilter.oracles.truth import Need, UsesTruth
-from mstfilter.scene import Clip, Frame, VoxelGrid, content_key, memo, read_only, scaled_area, scaled_length
+from mstfilter.scene import (
+    Clip,
+    Frame,
+    ObjectView,
+    VoxelGrid,
+    content_key,
+    memo,
+    read_only,
+    scaled_area,
+    scaled_length,
+)
 from mstfilter.scoring import MIN_PIXELS, weighted_coverage
 from mstfilter.segmentation import BoundaryModel, ColourDepthBoundary, ObjectRule, complete_segments
 from mstfilter.smc import Key, Population, Proposal, child
@@ -164,16 +174,20 @@ class TrueCompletion(UsesTruth, Completer):
     objects: ObjectRule = ObjectRule()  # noqa: RUF009 (frozen)
 
     needs: ClassVar[tuple[Need, ...]] = ("voxels", "instance")
-    remembers: ClassVar[bool] = False
 
     def fill(self, rng: np.random.Generator, seen: ObservedBox) -> np.ndarray:
         """1 on the visible surface, for masks that show no true object."""
         return seen.surface.astype(np.float32)
 
     def complete_each(
-        self, rngs: Sequence[np.random.Generator], frame: Frame, masks: Sequence[np.ndarray], grid: VoxelGrid
+        self,
+        rngs: Sequence[np.random.Generator],
+        frame: Frame,
+        masks: Sequence[np.ndarray],
+        grid: VoxelGrid,
+        views: Sequence[tuple[ObjectView, ...]] | None = None,
     ) -> list[Completion]:
-        """Complete several masks of a frame at a pause."""
+        """Complete several masks of a frame at a pause; views are not used."""
         t = self.truth.pause_of(frame)
         owner = np.where(self.objects.object_pixels(frame, grid), self.truth.instance(t), 0).ravel()
         voxels, pixel = memo(

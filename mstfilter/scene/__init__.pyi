@@ -70,6 +70,7 @@ from mstfilter.scene.voxels import (
     ObjectRecord as ObjectRecord,
     ObjectView as ObjectView,
     Occupancy as Occupancy,
+    Seen as Seen,
     VoxelGrid as VoxelGrid,
     as_labels as as_labels,
     occupied_box as occupied_box,
