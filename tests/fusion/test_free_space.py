@@ -210,7 +210,8 @@ def test_a_perfect_prediction_and_a_perfect_measurement_leave_the_scene_unchange
     clip = Clip((frame, frame, frame), grid, 1, (0.0, 0.2, 0.4))
     predicted = Population((truth, truth), np.zeros(2), {"previous": np.arange(2)})
     proposed = Population((Hypothesis.from_labels(labels, grid, 1),), np.zeros(1), {"proposed": np.zeros(1, int)})
-    fused = mstfilter.preset("mst_rules").update.update(np.random.default_rng(0), predicted, proposed, clip)
+    update = mstfilter.preset("mst_rules", "update.crossover.mode_filter.window=1").update
+    fused = update.update(np.random.default_rng(0), predicted, proposed, clip)
     assert fused.notes["quality"] == [1.0, 1.0]
     for child in fused.particles:
         np.testing.assert_array_equal(child.labels > 0, labels > 0)
