@@ -18,15 +18,13 @@ file with the fields of `ParticleFilter`, one table for each component. It may e
 
 from __future__ import annotations
 
-import functools
-import tomllib
 from collections.abc import Iterable, Mapping
 from typing import Any
 
 from mstfilter import baselines, completion, formats, frontends, fusion, oracles, segmentation, smc, tracking
 from mstfilter.errors import InputError, suggestion
 from mstfilter.reading import read_toml
-from mstfilter.registry import Registry
+from mstfilter.registry import Registry, merged, settings
 from mstfilter.resources import find_preset
 from mstfilter.smc import ParticleFilter
 
@@ -49,7 +47,7 @@ def preset(name: str = "mst", *overrides: str, allow_files: bool = True) -> Part
 
 def load_config(name: str, overrides: Iterable[str] = (), *, allow_files: bool = True) -> dict[str, Any]:
     """The configuration of a preset with overrides. Unknown names raise InputError; no component is imported."""
-    config = _merged(_read(name), *map(_nested, overrides))
+    config = settings(overrides, _read(name))
     unknown = set(config) - {*_META, *_FIELDS}
     if unknown:
         name = min(unknown)
@@ -74,7 +72,7 @@ def _read(name: str, parents: tuple[str, ...] = ()) -> dict[str, Any]:
         if slot not in extended:
             raise InputError(f"preset {path}: wrap.{slot} names no slot that its base sets")
         extended[slot] = {"component": component, slot: extended[slot]}
-    return _merged(extended, config)
+    return merged(extended, config)
 
 
 def build_filter(config: Mapping[str, Any], *, allow_files: bool = False) -> ParticleFilter:
@@ -88,41 +86,3 @@ def describe_filter(filter: ParticleFilter) -> dict[str, Any]:
     config = REGISTRY.describe(filter)
     config.pop("component")
     return config
-
-
-def settings(overrides: Iterable[str]) -> dict[str, Any]:
-    """Nested settings from ``path=value`` texts."""
-    return _merged({}, *map(_nested, overrides))
-
-
-def _merged(config: Mapping[str, Any], *changes: Mapping[str, Any]) -> dict[str, Any]:
-    """A configuration with changes. Naming a component resets its fields; naming a field keeps the others."""
-    merged = dict(config)
-    for name, value in (item for change in changes for item in change.items()):
-        before = merged.get(name)
-        if before is not None and isinstance(value, Mapping) and "component" not in value:
-            if not isinstance(before, (str, Mapping)):
-                raise InputError(f"{name} is {before!r}, which has no fields")
-            value = _merged({"component": before} if isinstance(before, str) else before, value)
-        merged[name] = value
-    return merged
-
-
-def _nested(override: str) -> dict[str, Any]:
-    """The change that ``path=value`` describes."""
-    path, equals, text = override.partition("=")
-    parts = path.strip().split(".")
-    if not equals or not all(parts) or not text.strip():
-        raise InputError(
-            f"override {override!r} is not of the form path=value",
-            "for example resampler=systematic or transition.rule=paper",
-        )
-    return functools.reduce(lambda value, part: {part: value}, reversed(parts), _value(text.strip()))
-
-
-def _value(text: str) -> Any:
-    """The value of a text in TOML syntax, or the text itself if it is not valid TOML."""
-    try:
-        return tomllib.loads(f"v = {text}")["v"]
-    except tomllib.TOMLDecodeError:
-        return text

@@ -50,18 +50,18 @@ def _write_recording(path: Path) -> None:
 
 
 def _read_recording(path: Path) -> None:
-    from mstfilter.runs import open_source
+    from mstfilter.formats import open_recording
 
-    recording = open_source(path)
+    recording = open_recording(path)
     recording.check()
     _ = recording.truth_key
 
 
 def _reader(name: str, *options: str) -> Callable[[Path], None]:
     def read(path: Path) -> None:
-        from mstfilter.runs import open_source
+        from mstfilter.formats import open_recording
 
-        recording = open_source(path, name, options)
+        recording = open_recording(path, name, options)
         recording.check()
         _ = recording.truth_key
 

@@ -136,7 +136,7 @@ def test_outputs_are_checked_before_the_work(recording, tmp_path, monkeypatch, c
     full = tmp_path / "full"
     full.mkdir()
     (full / "thesis.tex").write_text("x")
-    monkeypatch.setattr("mstfilter.runs.open_source", None)
+    monkeypatch.setattr("mstfilter.formats.open_recording", None)
     monkeypatch.setattr("mstfilter.simulation.simulate_recording", None)
     monkeypatch.setattr("mstfilter.report.write_report", None)
     for arguments in (
@@ -169,7 +169,7 @@ def test_an_interrupted_command_says_what_it_keeps(command, message, tmp_path, m
 
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("mstfilter.simulation.simulate_recording", interrupt)
-    monkeypatch.setattr("mstfilter.runs.open_source", interrupt)
+    monkeypatch.setattr("mstfilter.formats.open_recording", interrupt)
     arguments = {"run": ("run", "x"), "simulate": ("simulate", "demo", "out"), "demo": ("demo",)}[command]
     code, _, err = call(*arguments, capsys=capsys)
     assert code == 130

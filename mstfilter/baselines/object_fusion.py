@@ -29,7 +29,7 @@ import numpy as np
 from scipy.ndimage import distance_transform_edt
 
 from mstfilter.fusion import FreeSpace, Projection
-from mstfilter.scene import Clip, Frame, Hypothesis, ObjectRecord, VoxelGrid, depth_sigma, project
+from mstfilter.scene import Clip, Frame, Hypothesis, ObjectRecord, VoxelGrid, depth_sigma, project, scaled_area
 from mstfilter.scoring import overlap
 from mstfilter.smc import Population, Update, union
 from mstfilter.tracking import DenseFlow, Segment, Track, move_points, refine_motion, segments_of
@@ -125,7 +125,7 @@ class ObjectFusion(Update):
             unmatched.discard(int(table.labels_a[a]))
             iou[a], iou[:, b] = 0, 0
         new, free = [], max((r.label for r in old.objects), default=0)
-        smallest = max(1.0, _MIN_PIXELS * frame.depth.size / 307200)
+        smallest = scaled_area(_MIN_PIXELS, frame.depth.size)
         for k in sorted(unmatched):
             row = int(np.searchsorted(table.labels_a, k))
             size = int(table.sizes_a[row])

@@ -17,7 +17,7 @@ from typing import ClassVar
 import numpy as np
 
 from mstfilter.completion import Completer, Extrude
-from mstfilter.scene import Clip, Frame, Hypothesis
+from mstfilter.scene import Clip, Frame, Hypothesis, scaled_area
 from mstfilter.scoring import connected_components, one_blob
 from mstfilter.segmentation import ObjectRule, TreeCutProposal, complete_segments, hypothesis_of
 from mstfilter.smc import Population, Proposal, child
@@ -117,7 +117,7 @@ class ImageComponents(Proposal):
         graph = coo_array((np.ones(len(edges[0]), bool), edges), shape=(own.size, own.size))
         part = connected_components(graph, directed=False)[1].reshape(own.shape)
         sizes = np.bincount(part[own], minlength=int(part.max()) + 1)
-        kept = sizes >= max(1.0, self.objects.min_points * own.size / 307200)
+        kept = sizes >= max(1.0, scaled_area(self.objects.min_points, own.size))
         numbers = np.where(kept, np.cumsum(kept), 0)
         return np.where(own, numbers[part], 0).astype(np.int32)
 

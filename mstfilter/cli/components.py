@@ -38,7 +38,8 @@ def check(
     if Path(component).is_dir():
         _check_folder(Path(component))
         return
-    from mstfilter.presets import REGISTRY, settings
+    from mstfilter.presets import REGISTRY
+    from mstfilter.registry import settings
 
     try:
         from mstfilter.testing import FALSE_ALARM, run_contract

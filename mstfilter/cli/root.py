@@ -67,14 +67,14 @@ def safe_name(name: str) -> str:
 
 def read_source(path: Path, format: str, options: list[str] | None, pauses: str, frames: str = "") -> Any:
     """Open a recording of any format."""
-    from mstfilter.runs import open_source
+    from mstfilter.formats import open_recording
 
     names = ",".join(name.strip() for name in frames.split(",") if name.strip())
     chosen = [*(options or []), *([f"frames={names},"] if names else [])]
     from rich.console import Console
 
     with Console(stderr=True).status(f"reading {path.name}"):  # shown on a terminal only
-        return open_source(path, format, chosen, pauses)
+        return open_recording(path, format, chosen, pauses)
 
 
 def print_summary(numbers: RunNumbers) -> None:

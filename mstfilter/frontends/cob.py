@@ -22,7 +22,7 @@ import numpy as np
 from mstfilter.errors import InputError, MissingLibraryError, check_choice, check_integer, check_number, naming
 from mstfilter.files import weights_file
 from mstfilter.frontends.caffe import read_caffemodel
-from mstfilter.scene import Frame, Recording, UsesFiles, memo
+from mstfilter.scene import Frame, Recording, UsesFiles, memo, scaled_length
 from mstfilter.segmentation import BoundaryModel, Tree, TreeBuilder
 from mstfilter.segmentation.boundary import fill_from_nearest
 from mstfilter.segmentation.tree import linkage_tree, prune
@@ -160,7 +160,7 @@ def hha(frame: Frame, table_height: float) -> np.ndarray:
         missing = "depth" if frame.camera.T_world_camera is not None else "pose of the camera"
         raise InputError(f"a frame has no {missing}, which HHA needs", "use a model with input=rgb")
     depth = fill_from_nearest(frame.depth, ~frame.valid)
-    points = frame.camera.unproject(cv2.GaussianBlur(depth, (0, 0), max(1.0, 2 * frame.camera.width / 640)))
+    points = frame.camera.unproject(cv2.GaussianBlur(depth, (0, 0), max(1.0, scaled_length(2, frame.camera.width))))
     rows, columns = np.gradient(points, axis=0), np.gradient(points, axis=1)
     normal = np.cross(columns, rows)
     normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)

@@ -40,6 +40,7 @@ from mstfilter.scene import (
     Camera,
     Clip,
     Frame,
+    ObjectView,
     Recording,
     UsesFiles,
     VoxelGrid,
@@ -95,7 +96,6 @@ class ExternalCompletion(ClipCompleter, UsesFiles):
     other: Completer | None = None
 
     stochastic: ClassVar[bool] = True
-    remembers: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         check_choice("axes", self.axes, ("camera", "world"))
@@ -123,9 +123,17 @@ class ExternalCompletion(ClipCompleter, UsesFiles):
         return seen.surface.astype(np.float32)
 
     def complete_each(
-        self, rngs: Sequence[np.random.Generator], frame: Frame, masks: Sequence[np.ndarray], grid: VoxelGrid
+        self,
+        rngs: Sequence[np.random.Generator],
+        frame: Frame,
+        masks: Sequence[np.ndarray],
+        grid: VoxelGrid,
+        views: Sequence[tuple[ObjectView, ...]] | None = None,
     ) -> list[Completion]:
-        """Place the shapes of several masks; raises InputError before `at`, or if a mask has no shapes."""
+        """Place the shapes of several masks; views are not used.
+
+        Raises InputError before `at`, or if a mask has no shapes.
+        """
         if "_shapes" not in self.__dict__:
             raise InputError("ExternalCompletion does not know the pause of a frame", "call at(clip) first")
         return [

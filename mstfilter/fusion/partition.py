@@ -276,20 +276,20 @@ class PartitionUpdate(Update):
         completer = self.completer.at(clip) if isinstance(self.completer, ClipCompleter) else self.completer
         every = [part for parts in candidates for part in parts]
         views = [self._latest(*(record.views for record in part.continues)) for part in every]
-        seen = [k for k, part in enumerate(every) if part.readings.any() or (completer.remembers and views[k])]
+        seen = [k for k, part in enumerate(every) if part.readings.any() or views[k]]
         streams = [child(rng, "completion", k) for k in seen]
-        objects = [(readings.mask(every[k].readings, clip.after), views[k]) for k in seen]
-        again = completer.complete_again(streams, clip.after, objects, clip.grid)
-        completed = dict(zip(seen, ((c.shifted(self.occupied_log_odds), v) for c, v in again), strict=True))
+        masks = [readings.mask(every[k].readings, clip.after) for k in seen]
+        again = completer.complete_each(streams, clip.after, masks, clip.grid, [views[k] for k in seen])
+        completed = dict(zip(seen, (c.shifted(self.occupied_log_odds) for c in again), strict=True))
         built, at = [], 0
         for parts in candidates:
             found, records = [], []
             heir = {record.id: part.continues[0].id for part in parts for record in part.continues}
             for label, part in enumerate(parts, start=1):
-                completion, known = completed.get(at, (part.predicted, ()))
+                completion = completed.get(at, part.predicted)
                 assert completion is not None
                 found.append(completion)
-                records.append(_record(part, label, clip.index, completion.key, self._latest(known), heir))
+                records.append(_record(part, label, clip.index, completion.key, self._latest(completion.views), heir))
                 at += 1
             labels = arbitrate(found, clip.grid, self.threshold)
             present = np.bincount(labels.ravel(), minlength=len(found) + 1)

@@ -21,6 +21,7 @@ from functools import cache, partial
 
 import numpy as np
 
+from mstfilter.scene import scaled_length
 from mstfilter.scoring import weighted_coverage
 from mstfilter.smc import child
 
@@ -158,9 +159,8 @@ def _displace(
     """Move the label of every pixel along a smooth random field, as far as the target quality requires."""
     from scipy.ndimage import gaussian_filter
 
-    resize = image[1] / 640
     noise = child(rng, "displace").standard_normal((2, *image))
-    field = np.stack([gaussian_filter(one, max(1.0, _SMOOTH * resize))[box] for one in noise])
+    field = np.stack([gaussian_filter(one, max(1.0, scaled_length(_SMOOTH, image[1])))[box] for one in noise])
     field /= field.std()
     rows, columns = np.indices(true.shape)
     objects = true > 0
@@ -170,7 +170,7 @@ def _displace(
         c = np.clip(np.rint(columns + reach * field[1]), 0, true.shape[1] - 1).astype(int)
         return np.where(objects, labels[r, c], 0)  # only these pixels can belong to an object
 
-    return moved(_bisect(moved, true, 0.0, _REACH * resize, target))
+    return moved(_bisect(moved, true, 0.0, scaled_length(_REACH, image[1]), target))
 
 
 def _bisect(

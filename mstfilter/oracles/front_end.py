@@ -23,7 +23,17 @@ from mstfilter.completion import Completer, Completion, Extrude, ObservedBox, ob
 from mstfilter.errors import InputError, check_choice, check_number
 from mstfilter.oracles.degradation import degrade
 from mstfilter.oracles.truth import Need, UsesTruth
-from mstfilter.scene import Clip, Frame, VoxelGrid, content_key, memo, read_only
+from mstfilter.scene import (
+    Clip,
+    Frame,
+    ObjectView,
+    VoxelGrid,
+    content_key,
+    memo,
+    read_only,
+    scaled_area,
+    scaled_length,
+)
 from mstfilter.scoring import MIN_PIXELS, weighted_coverage
 from mstfilter.segmentation import BoundaryModel, ColourDepthBoundary, ObjectRule, complete_segments
 from mstfilter.smc import Key, Population, Proposal, child
@@ -74,7 +84,7 @@ class TrueMasks(UsesTruth, Proposal):
         """(H, W) int32 true objects of the clip's last frame with enough pixels, 0 elsewhere."""
         image = self.truth.instance(clip.index)
         counts = np.bincount(image.ravel())
-        enough = counts >= max(1.0, MIN_PIXELS * image.size / 307200)
+        enough = counts >= scaled_area(MIN_PIXELS, image.size)
         enough[0] = False
         return np.where(enough[image] & self.objects.object_pixels(frame, clip.grid), image, 0).astype(np.int32)
 
@@ -144,7 +154,7 @@ class TrueBoundary(UsesTruth, BoundaryModel):
             return edge
         import cv2
 
-        size = 2 * max(1, round(_REACH * frame.camera.width / 640)) + 1
+        size = 2 * max(1, round(scaled_length(_REACH, frame.camera.width))) + 1
         near = cv2.dilate(edge, np.ones((size, size), np.uint8)) > 0
         return np.where(near, self.measured.boundary(frame), 0).astype(np.float32)
 
@@ -164,16 +174,20 @@ class TrueCompletion(UsesTruth, Completer):
     objects: ObjectRule = ObjectRule()  # noqa: RUF009 (frozen)
 
     needs: ClassVar[tuple[Need, ...]] = ("voxels", "instance")
-    remembers: ClassVar[bool] = False
 
     def fill(self, rng: np.random.Generator, seen: ObservedBox) -> np.ndarray:
         """1 on the visible surface, for masks that show no true object."""
         return seen.surface.astype(np.float32)
 
     def complete_each(
-        self, rngs: Sequence[np.random.Generator], frame: Frame, masks: Sequence[np.ndarray], grid: VoxelGrid
+        self,
+        rngs: Sequence[np.random.Generator],
+        frame: Frame,
+        masks: Sequence[np.ndarray],
+        grid: VoxelGrid,
+        views: Sequence[tuple[ObjectView, ...]] | None = None,
     ) -> list[Completion]:
-        """Complete several masks of a frame at a pause."""
+        """Complete several masks of a frame at a pause; views are not used."""
         t = self.truth.pause_of(frame)
         owner = np.where(self.objects.object_pixels(frame, grid), self.truth.instance(t), 0).ravel()
         voxels, pixel = memo(

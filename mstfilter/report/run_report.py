@@ -38,7 +38,7 @@ from mstfilter.report.pictures import close_up, data_uri, jpeg_bytes, viewpoint
 from mstfilter.report.viewer import run_page
 from mstfilter.runs import RunFolder
 from mstfilter.runs.scoring import PauseEstimate, PauseScore, PauseTruth, score_pauses
-from mstfilter.scene import project, render
+from mstfilter.scene import project, render, scaled_area
 from mstfilter.scoring import (
     MIN_PIXELS,
     BeliefScore,
@@ -329,7 +329,7 @@ def read_numbers(run: RunFolder, beliefs: bool = True) -> RunNumbers:
             labels, weights = [h.labels for h in hypotheses], np.array(info["weights"], float)
             grid, camera = hypotheses[0].grid, run.camera(t)
             seen = render(truth, grid, camera).labels
-            enough = np.bincount(seen.ravel()) >= max(1.0, MIN_PIXELS * seen.size / 307200)
+            enough = np.bincount(seen.ravel()) >= scaled_area(MIN_PIXELS, seen.size)
             visible = set(np.flatnonzero(enough).tolist())
             shown |= visible
             status = {

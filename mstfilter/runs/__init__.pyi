@@ -24,4 +24,3 @@ from mstfilter.runs.scoring import (
     score_pauses as score_pauses,
     write_scores as write_scores,
 )
-from mstfilter.runs.sources import open_source as open_source

@@ -5,7 +5,13 @@ from mstfilter.scene.cache import (
     memo_many as memo_many,
     scene_cache as scene_cache,
 )
-from mstfilter.scene.camera import Camera as Camera, look_at as look_at, rigid_from_matrix as rigid_from_matrix
+from mstfilter.scene.camera import (
+    Camera as Camera,
+    look_at as look_at,
+    rigid_from_matrix as rigid_from_matrix,
+    scaled_area as scaled_area,
+    scaled_length as scaled_length,
+)
 from mstfilter.scene.disk_cache import DiskCache as DiskCache
 from mstfilter.scene.encoding import (
     decode_hypotheses as decode_hypotheses,
@@ -16,6 +22,7 @@ from mstfilter.scene.frame import (
     Frame as Frame,
     decode_image as decode_image,
     depth_sigma as depth_sigma,
+    grey_blocks as grey_blocks,
     read_depth as read_depth,
     read_labels as read_labels,
     read_rgb as read_rgb,
@@ -27,16 +34,6 @@ from mstfilter.scene.geometry import (
     frame_geometry as frame_geometry,
     table_residual as table_residual,
 )
-from mstfilter.scene.pauses import (
-    At as At,
-    Ends as Ends,
-    EveryNth as EveryNth,
-    Listed as Listed,
-    PauseRule as PauseRule,
-    Still as Still,
-    pause_rule as pause_rule,
-    pauses_from_text as pauses_from_text,
-)
 from mstfilter.scene.plausibility import (
     Finding as Finding,
     examine as examine,
@@ -45,6 +42,7 @@ from mstfilter.scene.plausibility import (
 )
 from mstfilter.scene.recording import (
     LazyFrames as LazyFrames,
+    PauseRule as PauseRule,
     Recording as Recording,
     UsesFiles as UsesFiles,
     check_depth as check_depth,
@@ -64,6 +62,7 @@ from mstfilter.scene.voxels import (
     ObjectRecord as ObjectRecord,
     ObjectView as ObjectView,
     Occupancy as Occupancy,
+    Seen as Seen,
     VoxelGrid as VoxelGrid,
     as_labels as as_labels,
     occupied_box as occupied_box,

@@ -177,6 +177,19 @@ class Camera:
         return replace(self, T_world_camera=T_world_camera)
 
 
+_WIDTH, _HEIGHT = 640, 480  # pixels: the image size in which numbers of pixels are given
+
+
+def scaled_length(pixels: float, width: int) -> float:
+    """Scale a length in pixels from an image of 640 columns to one of `width` columns."""
+    return pixels * width / _WIDTH
+
+
+def scaled_area(pixels: float, n_pixels: int) -> float:
+    """Scale an area in pixels from an image of 640 x 480 pixels to one of `n_pixels` pixels."""
+    return pixels * n_pixels / (_WIDTH * _HEIGHT)
+
+
 def look_at(position: np.ndarray, target: np.ndarray, up: tuple[float, float, float] = (0, 0, 1)) -> RigidTransform:
     """Pose `T_world_camera` of a camera at `position` (m) that looks at `target` (m), `up` at the image's top."""
     position = np.asarray(position, dtype=np.float64)

@@ -41,7 +41,7 @@ from typing import Literal, get_args
 import numpy as np
 
 from mstfilter.errors import InputError
-from mstfilter.scene import Recording, as_labels
+from mstfilter.scene import Recording, as_labels, scaled_area
 
 Form = Literal["objects", "paper", "authors"]
 FORMS: tuple[Form, ...] = get_args(Form)
@@ -197,4 +197,4 @@ def _shown(recording: Recording, t: int, min_pixels: float) -> set[int]:
     if image is None:
         raise InputError(f"recording {recording.name} has no instance image at pause {t}")
     counts = np.bincount(image.ravel())
-    return set(np.flatnonzero(counts >= max(1.0, min_pixels * image.size / 307200)).tolist())
+    return set(np.flatnonzero(counts >= max(1.0, scaled_area(min_pixels, image.size))).tolist())

@@ -8,7 +8,7 @@ from hypothesis import given, settings, strategies as st
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from mstfilter.errors import InputError
-from mstfilter.scene.camera import Camera, look_at, rigid_from_matrix
+from mstfilter.scene.camera import Camera, look_at, rigid_from_matrix, scaled_area, scaled_length
 from mstfilter.scene.frame import Frame
 
 K = np.array([[525.0, 0, 319.5], [0, 525.0, 239.5], [0, 0, 1]])
@@ -49,6 +49,11 @@ def test_scaling_keeps_rays():
     point = np.array([0.1, 0.1, 0.05])
     big, small = CAMERA.project(point)[0], half.project(point)[0]
     np.testing.assert_allclose((big + 0.5) / 2 - 0.5, small, atol=1e-9)
+
+
+def test_numbers_of_pixels_scale_with_the_image():
+    assert (scaled_length(3, 640), scaled_length(3, 1280), scaled_length(3, 320)) == (3, 6, 1.5)
+    assert (scaled_area(60, 640 * 480), scaled_area(60, 320 * 240)) == (60, 15)
 
 
 @pytest.mark.parametrize(

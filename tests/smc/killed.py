@@ -1,4 +1,4 @@
-"""The run that trials.py kills: ``victim.py KIND PATH``. It continues from what PATH holds.
+"""The run that `test_running` kills: ``killed.py KIND PATH``. It continues from what PATH holds.
 
 `checkpoint` is one run with a checkpoint file; `run_many` stores finished runs of two filters in a folder; `batch` is
 `run_many` where it runs many seeds at once.
