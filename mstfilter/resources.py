@@ -15,6 +15,8 @@ from types import ModuleType
 
 from mstfilter.errors import InputError, suggestion
 
+BASE = "base"  #: What `mst` and its baselines share; not a preset, since it has no update
+
 
 def models_folder() -> Path:
     """The folder that holds presets and weights."""
@@ -48,22 +50,22 @@ def _folder_with(file: str, installed: str, in_checkout: str) -> Path:
 
 
 def preset_names() -> list[str]:
-    """Presets that come with the package."""
-    return sorted(path.stem for path in models_folder().glob("*.toml"))
+    """Presets that come with the package; `base`, which they extend, is none."""
+    return sorted({path.stem for path in models_folder().glob("*.toml")} - {BASE})
 
 
-def find_preset(name: str) -> Path:
-    """The TOML file of a preset, by name or path."""
+def find_preset(name: str, to_extend: bool = False) -> Path:
+    """The TOML file of a preset, by name or path; of `base` only if it is to be extended."""
     given = Path(name)
     if given.suffix == ".toml":
         if given.is_file():
             return given
         raise InputError(f"preset file does not exist: {name}")
-    path = models_folder() / f"{name}.toml"
-    if name not in preset_names():
+    known = [*preset_names(), *([BASE] if to_extend else [])]
+    if name not in known:
         raise InputError(
             f"there is no preset {name!r}",
-            *suggestion(name, preset_names()),
-            f"there are: {', '.join(preset_names())}, or the path of a .toml file",
+            *suggestion(name, known),
+            f"there are: {', '.join(known)}, or the path of a .toml file",
         )
-    return path
+    return models_folder() / f"{name}.toml"

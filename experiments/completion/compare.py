@@ -51,7 +51,6 @@ def main() -> None:
         "hull": Hull(),
         "hilbert_map": HilbertMap(),
         "network": NetworkCompleter(weights=str(chosen.trained)),
-        "network, one draw": NetworkCompleter(weights=str(chosen.trained), draw=True),
     }
     everything = np.ones(len(samples), bool)
     groups = {"all": everything}

@@ -26,11 +26,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from degradation import degrade
 
 import mstfilter
 from mstfilter.files import write_csv, write_text
 from mstfilter.frontends import write_masks
-from mstfilter.oracles import TrueMasks, bind_truth, degrade
+from mstfilter.oracles import TrueMasks, bind_truth
 from mstfilter.scene import Recording, scene_cache
 from mstfilter.scoring import LOG_LOSS, ask, leave_one_out, pause_metrics, score_belief
 from mstfilter.simulation import scene_family, simulate_recording

@@ -115,27 +115,26 @@ class TableCompleter:
     table: np.ndarray
     log: list[tuple[np.ndarray, np.ndarray]] | None = None
 
-    remembers: ClassVar[bool] = True
-
-    def complete_again(
+    def complete_each(
         self,
         rngs: Sequence[np.random.Generator],
         frame: RowImage,
-        objects: Sequence[tuple[np.ndarray, tuple[CellView, ...]]],
+        masks: Sequence[np.ndarray],
         grid: VoxelGrid,
-    ) -> list[tuple[Completion, tuple[CellView, ...]]]:
-        """Completions of masks (1, X) with views, and the views with what this observation shows."""
+        views: Sequence[tuple[CellView, ...]],
+    ) -> list[Completion]:
+        """Completions of masks (1, X), and the views with what this observation shows."""
         found = []
-        for mask, views in objects:
+        for mask, earlier in zip(masks, views, strict=True):
             now, points = self._seen(frame, mask, grid)
             past = np.full(grid.shape, NOTHING)
-            for view in views:
+            for view in earlier:
                 past = np.where(view.cells == NOTHING, past, view.cells)
             if self.log is not None:
                 self.log.append((mask.ravel(), np.stack([now, past])))
             p = np.where(now == FREE, 0, self.table[now, past]).astype(np.float32)
-            view = CellView(np.where(now <= BEHIND, now, NOTHING))
-            found.append((Completion(np.zeros(3, np.int64), p, points, f"{mask.tolist()}"), (*views, view)))
+            known: Any = (*earlier, CellView(np.where(now <= BEHIND, now, NOTHING)))
+            found.append(Completion(np.zeros(3, np.int64), p, points, f"{mask.tolist()}", known))
         return found
 
     @staticmethod

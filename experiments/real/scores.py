@@ -27,8 +27,8 @@ def image_scores(image: np.ndarray, truth: Truth, frame: Frame, grid: VoxelGrid)
     """Scores of the projection (H, W) of a hypothesis. Pixels that are unknown or outside the workspace do not count.
 
     `quality` is the symmetric weighted coverage of objects, `quality_readable` that without true objects that have
-    readings on fewer than a quarter of their pixels. `pieces` are further pieces of true objects, `merged` further true
-    objects in an object; `missed` and `invented` are objects without a counterpart. `tall_missed` of
+    readings on fewer than a quarter of their pixels. `pieces` are further pieces of true objects, `merged` further
+    true objects in an object; `missed` and `invented` are objects without a counterpart. `tall_missed` of
     `tall` counts true objects above 4 cm with readings on most of their pixels. `found` is the mean over true objects
     of the share of their pixels in the object that has most of them.
     """

@@ -277,7 +277,8 @@ def quality(
 
 
 def _simulate(family: str, out: Path, seed: int, overrides: Sequence[str] = ()) -> None:
-    from mstfilter.presets import REGISTRY, settings
+    from mstfilter.presets import REGISTRY
+    from mstfilter.registry import settings
     from mstfilter.simulation import SceneFamily, scene_family, simulate_recording
 
     chosen = REGISTRY.make(SceneFamily, settings(overrides), base=scene_family(family))

@@ -87,19 +87,6 @@ class SceneObject(NamedTuple):
     occluded: Completion | None = None  #: what is left of the voxels of an occluded object; None for a segment
 
 
-class _Completed(NamedTuple):
-    """An object after its completion."""
-
-    completion: Completion
-    views: tuple[ObjectView, ...]  #: the views that it is completed from, the oldest first
-
-    @classmethod
-    def of_occluded(cls, one: SceneObject) -> _Completed:
-        """An occluded object that keeps what is left of its predicted voxels."""
-        assert one.occluded is not None
-        return cls(one.occluded, ())
-
-
 @dataclass(frozen=True)
 class PartitionUpdate(Update):
     """Partition of the readings, and completion from all views.
@@ -240,37 +227,37 @@ class PartitionUpdate(Update):
 
     def _completions(
         self, rng: np.random.Generator, objects: Sequence[SceneObject], readings: Readings, clip: Clip
-    ) -> list[_Completed]:
+    ) -> list[Completion]:
         """Each object, completed from its readings and from the views of its tracks.
 
         An object without readings and views keeps what is left of its predicted voxels.
         """
         completer = self.completer.at(clip) if isinstance(self.completer, ClipCompleter) else self.completer
         views = [self._latest(*(track.views for track in one.tracks)) for one in objects]
-        seen = [k for k, one in enumerate(objects) if one.readings.any() or (completer.remembers and views[k])]
+        seen = [k for k, one in enumerate(objects) if one.readings.any() or views[k]]
         streams = [child(rng, "completion", k) for k in seen]
-        shown = [(readings.mask(objects[k].readings), views[k]) for k in seen]
-        completions = completer.complete_again(streams, clip.after, shown, clip.grid)
-        found = {
-            k: _Completed(c.shifted(self.occupied_log_odds), v) for k, (c, v) in zip(seen, completions, strict=True)
-        }
-        return [found.get(k) or _Completed.of_occluded(one) for k, one in enumerate(objects)]
+        masks = [readings.mask(objects[k].readings) for k in seen]
+        found = completer.complete_each(streams, clip.after, masks, clip.grid, [views[k] for k in seen])
+        completed = {k: one.shifted(self.occupied_log_odds) for k, one in zip(seen, found, strict=True)}
+        completed |= {k: one.occluded for k, one in enumerate(objects) if k not in completed and one.occluded}
+        return [completed[k] for k in range(len(objects))]
 
-    def _hypothesis(self, objects: Sequence[SceneObject], completed: Sequence[_Completed], clip: Clip) -> Hypothesis:
+    def _hypothesis(
+        self, objects: Sequence[SceneObject], completions: Sequence[Completion], clip: Clip
+    ) -> Hypothesis:
         """A candidate. An object whose voxels all belong to other objects is dropped."""
-        completions = [one.completion for one in completed]
         labels = arbitrate(completions, clip.grid, self.threshold)
         present = set(np.unique(labels).tolist())
         records = [
             self._record(label, *one, clip.index)
-            for label, one in enumerate(zip(objects, completed, strict=True), start=1)
+            for label, one in enumerate(zip(objects, completions, strict=True), start=1)
             if label in present
         ]
         return Hypothesis(labels, clip.grid, tuple(records), occupancy_of(completions, labels, clip.grid))
 
-    def _record(self, label: int, one: SceneObject, completed: _Completed, birth: int) -> ObjectRecord:
+    def _record(self, label: int, one: SceneObject, completion: Completion, birth: int) -> ObjectRecord:
         """The record of an object: that of the first object that it continues, or a new one."""
-        key, views = completed.completion.key, self._latest(completed.views)
+        key, views = completion.key, self._latest(completion.views)
         if not one.tracks:
             return ObjectRecord.born(label, birth, key, views)
         return replace(one.tracks[0].changed(), label=label, completion_key=key, views=views)

@@ -14,4 +14,3 @@ from mstfilter.runs.run_folder import (
     as_json as as_json,
     write_json as write_json,
 )
-from mstfilter.runs.sources import open_source as open_source

@@ -30,6 +30,7 @@ from mstfilter.scene.frame import (
     Frame as Frame,
     decode_image as decode_image,
     depth_sigma as depth_sigma,
+    grey_blocks as grey_blocks,
     read_depth as read_depth,
     read_labels as read_labels,
     read_rgb as read_rgb,
@@ -46,16 +47,6 @@ from mstfilter.scene.partitions import (
     canonical as canonical,
     common_refinement as common_refinement,
 )
-from mstfilter.scene.pauses import (
-    At as At,
-    Ends as Ends,
-    EveryNth as EveryNth,
-    Listed as Listed,
-    PauseRule as PauseRule,
-    Still as Still,
-    pause_rule as pause_rule,
-    pauses_from_text as pauses_from_text,
-)
 from mstfilter.scene.plausibility import (
     Finding as Finding,
     examine as examine,
@@ -64,6 +55,7 @@ from mstfilter.scene.plausibility import (
 )
 from mstfilter.scene.recording import (
     LazyFrames as LazyFrames,
+    PauseRule as PauseRule,
     Recording as Recording,
     UsesFiles as UsesFiles,
     check_depth as check_depth,
@@ -83,6 +75,7 @@ from mstfilter.scene.voxels import (
     ObjectRecord as ObjectRecord,
     ObjectView as ObjectView,
     Occupancy as Occupancy,
+    Seen as Seen,
     VoxelGrid as VoxelGrid,
     as_labels as as_labels,
     check_grid as check_grid,

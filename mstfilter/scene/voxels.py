@@ -16,8 +16,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from enum import IntFlag
 from functools import cached_property
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
@@ -181,14 +183,26 @@ class Crop:
         return a, b, c
 
 
+class Seen(IntFlag):
+    """What a frame shows of a voxel, for one object: the bits of `ObjectView.bits`."""
+
+    SURFACE = 1  #: visible surface of the object
+    OTHER_SURFACE = 2  #: visible surface of something else
+    FREE = 4  #: in front of the measured surface
+    BEHIND = 8  #: behind the surface of the object
+    HIDDEN = 16  #: behind the surface of something else
+
+    def among(self, bits: Any) -> Any:
+        """Where at least one of these bits is set: bool, for an array or a torch tensor of uint8."""
+        return (bits & int(self)) > 0
+
+
 @dataclass(frozen=True, eq=False)
 class ObjectView:
     """What one frame showed of an object, in a box of the grid, and where the object moved since then."""
 
     offset: np.ndarray  #: (3,) int, index of the box's first voxel in the grid
-    #: (a, b, c) uint8: 1 visible surface of the object, 2 another surface, 4 free, 8 behind the surface of the
-    #: object, 16 behind another surface
-    bits: np.ndarray
+    bits: np.ndarray  #: (a, b, c) uint8, flags of `Seen`
     signed: np.ndarray  #: (a, b, c) int8, signed distance behind the measured surface (`encode_box`)
     key: str  #: key of the contents
     #: Rigid motion of the object in world metres since the frame.

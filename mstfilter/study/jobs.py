@@ -26,7 +26,7 @@ from mstfilter.errors import InputError, describe_error, exhausted
 from mstfilter.files import atomic_folder
 from mstfilter.formats import open_recording
 from mstfilter.presets import PACKAGES
-from mstfilter.runs import RunFolder, RunProgress, code_version, filter_recording, open_source
+from mstfilter.runs import RunFolder, RunProgress, code_version, filter_recording
 from mstfilter.scene import Recording, scene_cache
 from mstfilter.scoring import measure_pause
 from mstfilter.study.results import FORECASTS, Job, JobOutcome, write_result
@@ -63,7 +63,7 @@ def _failure(error: BaseException) -> JobOutcome:
 def open_scene(source: Mapping[str, Any], recordings: str) -> Recording:
     """The recording of a scene; a simulated one is made if it is missing."""
     if "path" in source:
-        return open_source(Path(source["path"]), source["format"], source["options"], source["pauses"])
+        return open_recording(Path(source["path"]), source["format"], source["options"], source["pauses"])
     from mstfilter.simulation import cached_recording
 
     return open_recording(cached_recording(source["family"], source["seed"], Path(recordings), **source["set"]))

@@ -77,7 +77,8 @@ def test_the_table_is_asked_about_what_the_observation_and_the_latest_view_show(
     frame = type("Frame", (), {"observation": observation})()
     old = CellView(np.full(grid.shape, FREE))
     views = (old, CellView(np.where(np.arange(3)[:, None, None] == 0, OWN, 3) * np.ones(grid.shape, int)))
-    [(completion, (*_, view))] = completer.complete_again([], frame, [(np.array([[True, True, False]]), views)], grid)
+    [completion] = completer.complete_each([], frame, [np.array([[True, True, False]])], grid, [views])
+    view = completion.views[-1]
     now = np.array([[OWN, BEHIND], [FREE, OWN], [OTHER, HIDDEN]])[:, :, None]
     past = np.array([[OWN, OWN], [FREE, FREE], [FREE, FREE]])[:, :, None]
     expected = np.where(now == FREE, 0, completer.table[now, past])

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import ClassVar
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -102,16 +101,9 @@ def test_hidden_objects_of_a_prediction_that_the_frame_refutes_stay_less_often()
     assert abs(share - expected) < 4 * np.sqrt(expected * (1 - expected) / n)  # 1 false alarm in 16,000
 
 
-@dataclass(frozen=True)
-class Forgetful(Extrude):
-    """Does not use earlier views."""
-
-    remembers: ClassVar[bool] = False
-
-
 def test_objects_without_views_keep_their_voxels_where_the_frame_does_not_see_through():
-    """Objects of a completer that does not remember, with their probabilities."""
-    update, clip = PartitionUpdate(completer=Forgetful()), clip_of(TWO)
+    """Objects with their probabilities."""
+    update, clip = PartitionUpdate(n_views=0), clip_of(TWO)
     state = step(update, clip, sample_of(clip, masks_of(TWO, clip.after))).particles[0]
     assert not any(record.views for record in state.objects)
     p = np.where(state.labels > 0, 0.8, 0).astype(np.float16)
@@ -127,7 +119,7 @@ def test_objects_without_views_keep_their_voxels_where_the_frame_does_not_see_th
 
 
 def test_objects_without_views_keep_their_labels_also_where_they_are_unlikely():
-    update, clip = PartitionUpdate(completer=Forgetful()), clip_of(TWO)
+    update, clip = PartitionUpdate(n_views=0), clip_of(TWO)
     labels = np.where(TWO == 2, 1, 0).astype(np.uint16)
     state = Hypothesis.from_labels(labels, GRID)
     state = replace(state, occupancy=Occupancy(labels, np.where(labels > 0, 0.45, 0).astype(np.float16)))

@@ -82,8 +82,8 @@ class CompletesEach(Completes):
     def fill(self, rng, seen):
         return Extrude().fill(rng, seen)
 
-    def complete_each(self, rngs, frame, masks, grid):
-        found = super().complete_each(rngs, frame, masks, grid)
+    def complete_each(self, rngs, frame, masks, grid, views=None):
+        found = super().complete_each(rngs, frame, masks, grid, views)
         return [replace(one, probability=self.change(one.probability)) for one in found]
 
 

@@ -1,11 +1,12 @@
 """Opens recordings of any format.
 
->>> open_source(Path("session.mcap"))
->>> open_source(Path("rgbd_dataset"), options=["K=525,525,319.5,239.5"], pauses="0s,4.2s")
+>>> open_recording("recordings/mine")
+>>> open_recording("session.mcap")
+>>> open_recording("rgbd_dataset", options=["K=525,525,319.5,239.5"], pauses="0s,4.2s")
 
 Options are fields of the format (``mstfilter list format`` shows them), as ``FIELD=VALUE``; commas make a list. The
-format ``./file.py:Class`` is a reader that the user wrote. Each format is a class of `mstfilter.formats`; a ROS bag
-is read by ``formats/bag.py``, and a rule of ``scene/pauses.py`` decides where the pauses are.
+format ``./file.py:Class`` is a reader that the user wrote. Each format is a class of `mstfilter.formats`, and a rule
+of ``formats/pauses.py`` decides where the pauses are.
 """
 
 from __future__ import annotations
@@ -14,30 +15,35 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from mstfilter import formats
 from mstfilter.errors import InputError
-from mstfilter.formats import RecordingFormat, pauses_from_text
-from mstfilter.presets import REGISTRY, settings
+from mstfilter.formats.pauses import pauses_from_text
+from mstfilter.formats.video import RecordingFormat
+from mstfilter.registry import Registry, settings
 from mstfilter.scene import Recording
 
+_REGISTRY = Registry(formats)
 
-def open_source(
-    path: Path, format: str = "", options: Sequence[str] = (), pauses: str = "", *, allow_files: bool = True
+
+def open_recording(
+    path: str | Path, format: str = "", options: Sequence[str] = (), pauses: str = "", *, allow_files: bool = True
 ) -> Recording:
     """A recording of any format.
 
     Parameters
     ----------
-    path : Path
+    path : str or Path
         File or folder.
     format : str
         Name of a format, or ``./file.py:Class``. Empty: detected.
     options : sequence of str
         ``FIELD=VALUE`` of the format.
     pauses : str
-        Where a video is cut: see `mstfilter.scene.pauses.pauses_from_text`. Empty: the format's default.
+        Where a video is cut: see `mstfilter.formats.pauses.pauses_from_text`. Empty: the format's default.
     allow_files : bool
         Whether ``./file.py:Class`` is loaded.
     """
+    path = Path(path)
     fields = format_settings(options)
     if pauses:
         rule = pauses_from_text(pauses)
@@ -47,12 +53,12 @@ def open_source(
     cls = _reader(name, allow_files)
     if not path.exists():
         raise InputError(f"recording does not exist: {path}")
-    reader: RecordingFormat = REGISTRY.make(cls, fields, "", allow_files)
+    reader: RecordingFormat = _REGISTRY.make(cls, fields, "", allow_files)
     return reader.open(path)
 
 
 def _reader(name: str, allow_files: bool = False) -> type[RecordingFormat]:
-    cls = REGISTRY.find_class("format", name, "format", allow_files)
+    cls = _REGISTRY.find_class("format", name, "format", allow_files)
     if not issubclass(cls, RecordingFormat):
         raise InputError(f"{name} is not a reader of recordings", "subclass mstfilter.formats.RecordingFormat")
     return cls
@@ -62,7 +68,7 @@ def detect_format(path: Path) -> str:
     """The name of the format of a file or folder."""
     if not path.exists():
         raise InputError(f"recording folder or file does not exist: {path}")
-    names = REGISTRY.known("format")
+    names = _REGISTRY.known("format")
     found = [name for name in names if _reader(name).detects(path)]
     if len(found) == 1:
         return found[0]

@@ -1,18 +1,16 @@
-"""Degraded masks have the given quality, by splits, merges and displacements as requested."""
+"""Degraded masks of experiments/front_ends have the given quality, by splits, merges and displacements."""
 
 from __future__ import annotations
-
-from dataclasses import replace
 
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
-from mstfilter.errors import InputError
-from mstfilter.oracles import TrueBoundary, TrueMasks, bind_truth, degradation, degrade
-from mstfilter.scene import component_key
 from mstfilter.scoring import overlap, weighted_coverage
-from tests.baselines.scenes import slide
+from tests.experiments.scripts import import_script
+
+degradation = import_script("front_ends/degradation.py")
+degrade = degradation.degrade
 
 
 def picture(rng, n=6):
@@ -92,52 +90,3 @@ def test_the_same_stream_makes_the_same_masks():
     true = picture(np.random.default_rng(0))
     a, b, c = (degrade(np.random.default_rng(s), true, 0.7) for s in (1, 1, 2))
     assert (a == b).all() and (a != c).any()
-
-
-def test_samples_have_different_errors_and_the_given_quality(tmp_path):
-    recording = slide(tmp_path / "r")
-    clip = recording.clips()[0]
-    found = {}
-    for quality in (0.9, 0.6):
-        proposal = bind_truth(TrueMasks(quality=quality), recording)
-        population = proposal.sample(np.random.default_rng(0), clip, 4)
-        assert len({h.key for h in population.particles}) > 1
-        np.testing.assert_allclose(population.notes["mask_quality"], quality, atol=0.011)
-        true = recording.truth(0)
-        found[quality] = np.mean([weighted_coverage(h.labels, true) for h in population.particles])
-        # A sample does not depend on how many are drawn.
-        fewer = proposal.sample(np.random.default_rng(0), clip, 2)
-        assert [h.key for h in fewer.particles] == [h.key for h in population.particles[:2]]
-    assert found[0.9] > found[0.6] + 0.1
-
-
-def test_lasting_errors_are_the_same_in_all_samples_and_pauses(tmp_path):
-    recording = slide(tmp_path / "r")
-    one, two, *_ = recording.clips()
-    proposal = bind_truth(TrueMasks(quality=0.6, errors="lasting"), recording)
-    populations = [proposal.sample(np.random.default_rng(s), clip, 3) for s, clip in ((0, one), (1, one), (0, two))]
-    keys = [{h.key for h in p.particles} for p in populations]
-    assert len(keys[0]) == 1 and keys[0] == keys[1]
-    for population in populations:
-        np.testing.assert_allclose(population.notes["mask_quality"], 0.6, atol=0.011)
-
-
-def test_component_key_depends_on_the_truth(tmp_path):
-    first, second = slide(tmp_path / "a"), slide(tmp_path / "b")
-    second = replace(second, truth=lambda t: first.truth(t) * 2)
-    keys = {component_key(bind_truth(TrueBoundary(), r)) for r in (first, second)} | {component_key(TrueBoundary())}
-    assert len(keys) == 3
-    assert component_key(bind_truth(TrueBoundary(), first)) in keys
-
-
-@pytest.mark.parametrize(
-    "fields, says",
-    [
-        ({"quality": 1.2}, "quality of masks is 1.2"),
-        ({"over": 0.7, "under": 0.5}, "shares"),
-        ({"errors": "often"}, "errors is 'often'"),
-    ],
-)
-def test_invalid_fields_are_an_error(fields, says):
-    with pytest.raises(InputError, match=says):
-        TrueMasks(**fields)

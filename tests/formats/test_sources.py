@@ -9,8 +9,8 @@ import pytest
 
 from mstfilter.errors import InputError
 from mstfilter.formats.image_folders import PairedImages
+from mstfilter.formats.sources import detect_format, format_settings, open_recording
 from mstfilter.presets import REGISTRY
-from mstfilter.runs.sources import detect_format, format_settings, open_source
 from mstfilter.scene import Recording, render, write_image
 from tests.formats import layouts
 from tests.scene.scenes import CAMERA, GRID, table_scene
@@ -39,18 +39,18 @@ def test_unknown_and_ambiguous(tmp_path):
     (tmp_path / "data.bin").write_bytes(b"x")
     for name in ("notes", "data.bin"):
         with pytest.raises(InputError, match="has no known format") as caught:
-            open_source(tmp_path / name)
+            open_recording(tmp_path / name)
         assert "tum, bop, redwood, dsr, bag" in caught.value.hints[0]
     path = layouts.write_redwood(layouts.write_tum(tmp_path / "both") / "x").rename(tmp_path / "both2")
     for part in ("rgb.txt", "depth.txt"):
         (path / part).write_text("0 a.png\n")
     with pytest.raises(InputError, match="looks like tum and like redwood"):
-        open_source(path)
-    assert len(open_source(path, "redwood", ["fps=10"])) == len(layouts.SHIFTS)
+        open_recording(path)
+    assert len(open_recording(path, "redwood", ["fps=10"])) == len(layouts.SHIFTS)
     with pytest.raises(InputError, match="there is no format 'tom'"):
-        open_source(path, "tom")
+        open_recording(path, "tom")
     with pytest.raises(InputError, match="does not exist"):
-        open_source(tmp_path / "none")
+        open_recording(tmp_path / "none")
 
 
 def test_options_as_text():
@@ -75,12 +75,12 @@ def test_a_single_number_is_a_list_of_one(tmp_path, option, background):
 def test_options_reach_the_reader(tmp_path):
     path = layouts.write_tum(tmp_path / "tum")
     options = ["K=131,131,79.5,59.5", "world.workspace=-0.3,-0.3,0,0.3,0.3,0.2", "world.voxel_size=0.02"]
-    recording = open_source(path, options=options, pauses="0,8,16")
+    recording = open_recording(path, options=options, pauses="0,8,16")
     assert recording.pauses == (0, 8, 16)
     assert recording.grid.shape == (30, 30, 10)
-    assert open_source(path, options=options, pauses="0s,0.52s").pauses == (0, 5)
-    assert open_source(path, options=[*options, "pauses.hold_s=0.6"], pauses="still").pauses == (13,)
-    assert open_source(path, options=[*options, "pauses.hold_s=0.6"]).pauses == (13,)
+    assert open_recording(path, options=options, pauses="0s,0.52s").pauses == (0, 5)
+    assert open_recording(path, options=[*options, "pauses.hold_s=0.6"], pauses="still").pauses == (13,)
+    assert open_recording(path, options=[*options, "pauses.hold_s=0.6"]).pauses == (13,)
     for wrong, message in (
         (["K=1,2,x,4"], "K is"),
         (["k=1,2,3,4"], "no field 'k'"),
@@ -88,7 +88,7 @@ def test_options_reach_the_reader(tmp_path):
         (["depth_scale"], "path=value"),
     ):
         with pytest.raises(InputError, match=message):
-            open_source(path, options=wrong)
+            open_recording(path, options=wrong)
 
 
 def test_a_reader_of_ones_own(tmp_path):
@@ -112,10 +112,10 @@ def test_a_reader_of_ones_own(tmp_path):
         "        K = np.array([[self.f, 0, 79.5], [0, self.f, 59.5], [0, 0, 1]])\n"
         "        return Recording.from_arrays(data['rgb'], data['depth'], K, name='mine')\n"
     )
-    recording = open_source(tmp_path / "mine.npz", f"{tmp_path}/mine.py:Mine", ["f=131"])
+    recording = open_recording(tmp_path / "mine.npz", f"{tmp_path}/mine.py:Mine", ["f=131"])
     assert (recording.name, len(recording)) == ("mine", 2)
     with pytest.raises(InputError, match="which is not loaded here"):
-        open_source(tmp_path / "mine.npz", f"{tmp_path}/mine.py:Mine", allow_files=False)
+        open_recording(tmp_path / "mine.npz", f"{tmp_path}/mine.py:Mine", allow_files=False)
 
 
 @pytest.mark.parametrize("layout", ["video.mp4", "image.png", "rgb/000.png", "frames/0.jpg"])
@@ -125,7 +125,7 @@ def test_colour_alone_is_one_error(layout, tmp_path):
     file.write_bytes(b"")
     path = file if "/" not in layout else tmp_path / "data"
     with pytest.raises(InputError, match="holds colour images only: hypotheses in 3-D need a depth image") as caught:
-        open_source(path)
+        open_recording(path)
     assert "RGB-D camera" in caught.value.hints[0]
     with pytest.raises(InputError, match="depth is None"):
         Recording.from_arrays(np.zeros((4, 5, 3), np.uint8), None, np.eye(3))
@@ -141,24 +141,24 @@ def test_label_images_beside_pairs_are_true_instances(tmp_path):
     info = {"K": [131, 131, 79.5, 59.5], "depth_scale_m": 0.001}
     (tmp_path / "info.json").write_text(json.dumps(info))
     expected = np.where((objects > 0) & (np.arange(160) >= 5), objects + 1, 0)
-    np.testing.assert_array_equal(open_source(tmp_path).instance(0), expected)
-    assert set(np.unique(open_source(tmp_path, options=["background=0,3"]).instance(0))) == {0, 1, 2}
+    np.testing.assert_array_equal(open_recording(tmp_path).instance(0), expected)
+    assert set(np.unique(open_recording(tmp_path, options=["background=0,3"]).instance(0))) == {0, 1, 2}
     write_image(tmp_path / "a_label.png", objects[:50].astype(np.uint8))
     with pytest.raises(InputError, match=r"a_label.png has shape \(50, 160\)"):
-        open_source(tmp_path).instance(0)
+        open_recording(tmp_path).instance(0)
     (tmp_path / "a_label.png").unlink()
-    assert open_source(tmp_path).instance(0) is None
+    assert open_recording(tmp_path).instance(0) is None
     (tmp_path / "info.json").write_text('{"depth_scale_m": 0.001}')
     with pytest.raises(InputError, match="'K' is missing"):
-        open_source(tmp_path)
+        open_recording(tmp_path)
 
 
 def test_a_missing_entry_is_named(tmp_path):
     layouts.write_bop(tmp_path / "bop")
     (tmp_path / "bop" / "scene_camera.json").write_text('{"1": {"depth_scale": 1.0}}')
     with pytest.raises(InputError, match="'cam_K' is missing"):
-        open_source(tmp_path / "bop")
+        open_recording(tmp_path / "bop")
     layouts.write_redwood(tmp_path / "redwood")
     (tmp_path / "redwood" / "intrinsic.json").write_text("{}")
     with pytest.raises(InputError, match="'intrinsic_matrix' is missing"):
-        open_source(tmp_path / "redwood")
+        open_recording(tmp_path / "redwood")

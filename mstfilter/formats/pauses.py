@@ -9,7 +9,6 @@ below.
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
@@ -21,17 +20,7 @@ import numpy as np
 
 from mstfilter.errors import InputError, check_integer, naming, suggestion
 from mstfilter.reading import read_text
-
-
-class PauseRule(ABC):
-    """Finds the pauses of a video."""
-
-    @abstractmethod
-    def find(self, times: tuple[float, ...], read_rgb: Callable[[int], np.ndarray]) -> tuple[int, ...]:
-        """Ascending frame indices of the pauses.
-
-        `times` are seconds, one per frame; ``read_rgb(index)`` is the colour image (H, W, 3) uint8 of a frame.
-        """
+from mstfilter.scene import PauseRule, grey_blocks
 
 
 @dataclass(frozen=True)
@@ -125,16 +114,7 @@ def pause_rule(text: str) -> PauseRule:
     return _RULES[name](**config)
 
 
-_BLOCKS_ACROSS = 80
 _MAX_LEVELS = 4.0  # largest threshold of a block in units of `levels`, also if the block never rests
-
-
-def grey_blocks(rgb: np.ndarray) -> np.ndarray:
-    """Mean grey level of square blocks, about 80 across: (h, w) float32 of an image (H, W, 3)."""
-    grey = np.asarray(rgb, dtype=np.float32).mean(axis=2)
-    side = max(1, grey.shape[1] // _BLOCKS_ACROSS)
-    h, w = grey.shape[0] // side, grey.shape[1] // side
-    return grey[: h * side, : w * side].reshape(h, side, w, side).mean(axis=(1, 3))
 
 
 def _changes(a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -1,5 +1,6 @@
 """Masks degraded to a given quality: objects split, touching objects merged, borders displaced.
 
+>>> from degradation import degrade
 >>> worse = degrade(rng, labels, quality=0.8, over=0.35, under=0.35)
 >>> abs(weighted_coverage(worse, labels) - 0.8) < 0.01
 True
