@@ -139,6 +139,20 @@ def check_component(name: str, value: Any, interface: type, optional: bool = Fal
     raise InputError(f"{name} is {found}, expected {article} {interface.__name__}", *hints)
 
 
+def missing_library(error: ImportError, what: str, *hints: str) -> MissingLibraryError:
+    """The error for a library that cannot be imported: `what` needs it, and how to install it."""
+    library = (error.name or str(error)).partition(".")[0]
+    return MissingLibraryError(
+        f"{what} needs {library}, which cannot be imported: {reason(error)}",
+        f"pip install {_PACKAGES.get(library, library)}",
+        *hints,
+    )
+
+
+#: Packages of libraries whose names differ, and extras of this package for those that it does not install by itself.
+_PACKAGES = {"cv2": "opencv-python-headless", "pytest": "'mstfilter[check]'"}
+
+
 def place_in_user_file(error: BaseException) -> str | None:
     """``FILE, line N: TEXT`` of the line of a user's file in which an exception was raised; None if there is none.
 

@@ -188,9 +188,7 @@ class Recalibration:
         return table.with_forecasts(self(table.p)).log_loss()
 
 
-def energy_score(
-    to_outcome: ArrayLike, between: ArrayLike, weights: ArrayLike | None = None, fair: bool = False
-) -> float:
+def energy_score(to_outcome: ArrayLike, between: ArrayLike, weights: ArrayLike | None = None) -> float:
     """Energy score of a weighted set (Gneiting and Raftery 2007, section 4.3); lower is better.
 
     ``ES = sum_i w_i d(x_i, y) - 1/2 sum_ij w_i w_j d(x_i, x_j)``
@@ -203,9 +201,6 @@ def energy_score(
         Distances d(x_i, x_j).
     weights : (n,) float, optional
         Sum 1. Default: equal.
-    fair : bool
-        Divide the second sum by n (n - 1) instead of n^2: unbiased for the score of the distribution that the
-        members are independent, equally weighted draws of (Ferro 2014). Needs equal weights and n of at least 2.
 
     Notes
     -----
@@ -218,15 +213,10 @@ def energy_score(
     w = np.full(n, 1 / n) if weights is None else np.asarray(weights, dtype=np.float64)
     if w.shape != (n,) or (w < 0).any() or not np.isclose(w.sum(), 1):
         raise InputError(f"weights have shape {w.shape} and sum {w.sum():g}, expected ({n},) and sum 1")
-    spread = 0.5 * float(w @ D @ w)
-    if fair:
-        if n < 2 or not np.allclose(w, 1 / n):
-            raise InputError("the fair energy score needs at least two members of equal weight")
-        spread *= n / (n - 1)
-    return float(w @ d) - spread
+    return float(w @ d) - 0.5 * float(w @ D @ w)
 
 
-def is_negative_type(distances: ArrayLike, tolerance: float = 1e-9) -> bool:
+def is_negative_type(distances: ArrayLike) -> bool:
     """Whether a distance is of negative type on n points.
 
     ``sum_ij c_i c_j d_ij <= 0`` for all c with ``sum_i c_i = 0`` (Schoenberg 1938). If this holds for all points, the
@@ -237,8 +227,6 @@ def is_negative_type(distances: ArrayLike, tolerance: float = 1e-9) -> bool:
     ----------
     distances : (n, n) float
         Symmetric, zero on the diagonal.
-    tolerance : float
-        Largest eigenvalue that counts as 0, relative to n times the largest distance.
     """
     D = np.asarray(distances, dtype=np.float64)
     if D.ndim != 2 or D.shape[0] != D.shape[1]:
@@ -249,4 +237,4 @@ def is_negative_type(distances: ArrayLike, tolerance: float = 1e-9) -> bool:
     if largest == 0:
         return True
     centred = D - D.mean(axis=0) - D.mean(axis=1)[:, None] + D.mean()
-    return bool(np.linalg.eigvalsh(centred)[-1] <= tolerance * largest * len(D))
+    return bool(np.linalg.eigvalsh(centred)[-1] <= 1e-9 * largest * len(D))

@@ -68,8 +68,8 @@ def _equal(a: Any, b: Any) -> bool:
 def late(location: str, summary: str) -> Callable[..., Any]:
     """A method that calls ``module:function``, which is imported at the first call.
 
-    For methods that draw: the classes of `mstfilter.scene` and `mstfilter.smc` do not depend on `mstfilter.report`,
-    and work without it.
+    For methods that draw, and for the rules of pauses: the classes of `mstfilter.scene` and `mstfilter.smc` do not
+    depend on `mstfilter.report` and `mstfilter.formats`, and work without them.
     """
     module, _, name = location.partition(":")
 

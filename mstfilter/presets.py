@@ -5,28 +5,47 @@
 >>> mst = mstfilter.preset("mst", "n=10", "resampler=multinomial", "transition.rule=paper")
 
 ``mst`` is the default, ``paper`` the published algorithm, ``authors`` the program of its authors. A preset is a TOML
-file with the fields of `ParticleFilter`, one table for each component. It may extend another preset:
+file with the fields of `ParticleFilter`, one table for each component. It may extend another preset, or
+``models/base.toml``, which holds what `mst` and its baselines share:
 
-    base = "mst"                            # all other fields are those of mst
-    wrap = ["update.fusion=union"]          # the update of mst becomes the field `fusion` of the component `union`
-    overrides = ["transition=identity"]     # changes, as on the command line
+    base = "base"                           # fields that are not named here are those of the base
+    transition = "identity"                 # naming a component resets its fields
+    proposal.completer = "extrude"          # naming a field keeps the others
+    wrap = { proposal = "first_pause" }     # the base's proposal becomes the field `proposal` of this component
+
+``base`` itself has no update: it can be extended but is no preset.
 """
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from mstfilter import baselines, completion, formats, frontends, fusion, oracles, segmentation, smc, tracking
+from mstfilter import (
+    baselines,
+    belief,
+    completion,
+    crossover,
+    formats,
+    frontends,
+    oracles,
+    partition,
+    scene,
+    segmentation,
+    smc,
+    tracking,
+)
 from mstfilter.errors import InputError, suggestion
 from mstfilter.reading import read_toml
-from mstfilter.registry import Registry
+from mstfilter.registry import Registry, merged, settings
 from mstfilter.resources import find_preset
 from mstfilter.smc import ParticleFilter
 
 #: Packages that declare components.
-PACKAGES = (smc, segmentation, completion, tracking, fusion, frontends, formats, baselines, oracles)
+PACKAGES = (
+    *(smc, scene, segmentation, completion, tracking, partition, crossover, belief),
+    *(frontends, formats, baselines, oracles),
+)
 #: All components that presets and overrides can name.
 REGISTRY = Registry(*PACKAGES)
 
@@ -44,9 +63,7 @@ def preset(name: str = "mst", *overrides: str, allow_files: bool = True) -> Part
 
 def load_config(name: str, overrides: Iterable[str] = (), *, allow_files: bool = True) -> dict[str, Any]:
     """The configuration of a preset with overrides. Unknown names raise InputError; no component is imported."""
-    config = _read(name)
-    for override in overrides:
-        _override(config, override)
+    config = settings(overrides, _read(name))
     unknown = set(config) - {*_META, *_FIELDS}
     if unknown:
         name = min(unknown)
@@ -59,27 +76,19 @@ def load_config(name: str, overrides: Iterable[str] = (), *, allow_files: bool =
 
 def _read(name: str, parents: tuple[str, ...] = ()) -> dict[str, Any]:
     """The content of a preset's file, added to that of its base."""
-    path = find_preset(name)
+    path = find_preset(name, to_extend=bool(parents))
     config = read_toml(path, "a preset")
-    base, wraps, changes = config.pop("base", ""), config.pop("wrap", []), config.pop("overrides", [])
-    if not isinstance(base, str) or any(not isinstance(v, list) for v in (wraps, changes)):
-        raise InputError(f"preset {path}: base must be a name, wrap and overrides lists of path=value")
+    base, wraps = config.pop("base", ""), config.pop("wrap", {})
+    if not isinstance(base, str) or not isinstance(wraps, Mapping):
+        raise InputError(f"preset {path}: base must be a name, and wrap a table of components by slot")
     if base in (*parents, name):
         raise InputError(f"preset {path} extends itself: {' -> '.join((*parents, name, base))}")
-    if base:
-        config = {**_read(base, (*parents, name)), **config}
-    for wrap in wraps:
-        path_text, _, component = str(wrap).partition("=")
-        slot, _, field = path_text.partition(".")
-        if slot not in config or not field or not component:
-            raise InputError(
-                f"preset {path}: wrap {wrap!r} is not slot.field=component of a slot that is set",
-                "for example update.fusion=union",
-            )
-        config[slot] = {"component": component, field: config[slot]}
-    for change in changes:
-        _override(config, str(change))
-    return config
+    extended = _read(base, (*parents, name)) if base else {}
+    for slot, component in wraps.items():
+        if slot not in extended:
+            raise InputError(f"preset {path}: wrap.{slot} names no slot that its base sets")
+        extended[slot] = {"component": component, slot: extended[slot]}
+    return merged(extended, config)
 
 
 def build_filter(config: Mapping[str, Any], *, allow_files: bool = False) -> ParticleFilter:
@@ -93,38 +102,3 @@ def describe_filter(filter: ParticleFilter) -> dict[str, Any]:
     config = REGISTRY.describe(filter)
     config.pop("component")
     return config
-
-
-def settings(overrides: Iterable[str]) -> dict[str, Any]:
-    """Nested settings from ``path=value`` texts."""
-    config: dict[str, Any] = {}
-    for override in overrides:
-        _override(config, override)
-    return config
-
-
-def _override(config: dict[str, Any], text: str) -> None:
-    """Apply ``path=value``. Naming a component resets its fields; naming a field keeps the others."""
-    path, equals, value = text.partition("=")
-    parts = path.strip().split(".")
-    if not equals or not all(parts) or not value.strip():
-        raise InputError(
-            f"override {text!r} is not of the form path=value",
-            "for example resampler=systematic or transition.rule=paper",
-        )
-    table = config
-    for part in parts[:-1]:
-        inner = table.get(part, {})
-        if not isinstance(inner, (str, Mapping)):
-            raise InputError(f"override {text!r}: {part} is {inner!r}, which has no fields")
-        table[part] = {"component": inner} if isinstance(inner, str) else dict(inner)
-        table = table[part]
-    table[parts[-1]] = _value(value.strip())
-
-
-def _value(text: str) -> Any:
-    """The value of a text in TOML syntax, or the text itself if it is not valid TOML."""
-    try:
-        return tomllib.loads(f"v = {text}")["v"]
-    except tomllib.TOMLDecodeError:
-        return text

@@ -11,7 +11,7 @@ A `Registry` joins the declarations of several packages. `mstfilter.presets.REGI
 >>> from mstfilter.presets import REGISTRY
 >>> REGISTRY.build("resampler", "systematic")
 Systematic()
->>> REGISTRY.build("update", {"component": "fusion", "eta": 3, "free_space": "none"})
+>>> REGISTRY.build("update", {"component": "crossover", "eta": 3, "free_space": "none"})
 
 A configuration is a nested mapping. A component is its name, or a mapping with ``component`` and fields. The kind of
 a field follows from its annotation: a field of type ``Resampler`` or ``Resampler | None`` holds a resampler, one of
@@ -34,14 +34,15 @@ import importlib
 import importlib.util
 import inspect
 import sys
+import tomllib
 import typing
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from importlib.metadata import entry_points
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from mstfilter.errors import InputError, place_in_user_file, short_path, suggestion
+from mstfilter.errors import InputError, missing_library, place_in_user_file, short_path, suggestion
 
 _ENTRY_POINTS = "mstfilter.components"
 
@@ -122,7 +123,7 @@ class Registry:
         try:
             return _import(location)
         except ImportError as error:
-            raise InputError(f"{where or kind}: component {name!r} cannot be imported: {error}") from error
+            raise missing_library(error, f"{where or kind}: component {name!r}") from error
 
     def _locate(self, kind: str, name: str, where: str, allow_files: bool) -> str:
         if not isinstance(name, str):
@@ -267,6 +268,44 @@ class Registry:
             path, _, name = location.rpartition(":")
             return f"{short_path(path)}:{name}"
         return f"{cls.__module__}:{cls.__qualname__}"
+
+
+def settings(overrides: Iterable[str], config: Mapping[str, Any] | None = None) -> dict[str, Any]:
+    """A configuration with the changes of ``path=value`` texts; nested settings if no configuration is given."""
+    return merged(config or {}, *map(_nested, overrides))
+
+
+def merged(config: Mapping[str, Any], *changes: Mapping[str, Any]) -> dict[str, Any]:
+    """A configuration with changes. Naming a component resets its fields; naming a field keeps the others."""
+    found = dict(config)
+    for name, value in (item for change in changes for item in change.items()):
+        before = found.get(name)
+        if before is not None and isinstance(value, Mapping) and "component" not in value:
+            if not isinstance(before, (str, Mapping)):
+                raise InputError(f"{name} is {before!r}, which has no fields")
+            value = merged({"component": before} if isinstance(before, str) else before, value)
+        found[name] = value
+    return found
+
+
+def _nested(override: str) -> dict[str, Any]:
+    """The change that ``path=value`` describes."""
+    path, equals, text = override.partition("=")
+    parts = path.strip().split(".")
+    if not equals or not all(parts) or not text.strip():
+        raise InputError(
+            f"override {override!r} is not of the form path=value",
+            "for example resampler=systematic or transition.rule=paper",
+        )
+    return functools.reduce(lambda value, part: {part: value}, reversed(parts), _toml_value(text.strip()))
+
+
+def _toml_value(text: str) -> Any:
+    """The value of a text in TOML syntax, or the text itself if it is not valid TOML."""
+    try:
+        return tomllib.loads(f"v = {text}")["v"]
+    except tomllib.TOMLDecodeError:
+        return text
 
 
 def nested_components(component: Any) -> Iterator[Any]:

@@ -1,4 +1,4 @@
-"""Files that come with the package: presets and weights (`models/`), example components (`docs/examples/`).
+"""Files that come with the package: presets, weights and their training (`models/`), example components.
 
 >>> models_folder() / "mst.toml"
 >>> examples_folder() / "resampler.py"
@@ -8,9 +8,14 @@ A wheel holds both inside the package; in a checkout or an editable install they
 
 from __future__ import annotations
 
+import sys
+from importlib import import_module
 from pathlib import Path
+from types import ModuleType
 
 from mstfilter.errors import InputError, suggestion
+
+BASE = "base"  #: What `mst` and its baselines share; not a preset, since it has no update
 
 
 def models_folder() -> Path:
@@ -21,6 +26,17 @@ def models_folder() -> Path:
 def examples_folder() -> Path:
     """The folder that holds the example components of the documentation, and their tests."""
     return _folder_with("resampler.py", "_examples", "docs/examples")
+
+
+def training_program(name: str) -> ModuleType:
+    """A module of `models/mst_training`, the programs that trained the weights.
+
+    The folder stays in `sys.path`, so that processes which a training starts find the module.
+    """
+    folder = str(models_folder())
+    if folder not in sys.path:
+        sys.path.append(folder)
+    return import_module(f"mst_training.{name}")
 
 
 def _folder_with(file: str, installed: str, in_checkout: str) -> Path:
@@ -34,22 +50,22 @@ def _folder_with(file: str, installed: str, in_checkout: str) -> Path:
 
 
 def preset_names() -> list[str]:
-    """Presets that come with the package."""
-    return sorted(path.stem for path in models_folder().glob("*.toml"))
+    """Presets that come with the package; `base`, which they extend, is none."""
+    return sorted({path.stem for path in models_folder().glob("*.toml")} - {BASE})
 
 
-def find_preset(name: str) -> Path:
-    """The TOML file of a preset, by name or path."""
+def find_preset(name: str, to_extend: bool = False) -> Path:
+    """The TOML file of a preset, by name or path; of `base` only if it is to be extended."""
     given = Path(name)
     if given.suffix == ".toml":
         if given.is_file():
             return given
         raise InputError(f"preset file does not exist: {name}")
-    path = models_folder() / f"{name}.toml"
-    if name not in preset_names():
+    known = [*preset_names(), *([BASE] if to_extend else [])]
+    if name not in known:
         raise InputError(
             f"there is no preset {name!r}",
-            *suggestion(name, preset_names()),
-            f"there are: {', '.join(preset_names())}, or the path of a .toml file",
+            *suggestion(name, known),
+            f"there are: {', '.join(known)}, or the path of a .toml file",
         )
-    return path
+    return models_folder() / f"{name}.toml"

@@ -139,6 +139,14 @@ def check_list(found: Any, n: int, kind: type | tuple[type, ...], expected: str)
     return list(found)
 
 
+def check_pair(found: Any, first: str, second: str) -> tuple[Any, Any]:
+    """A result of two values; InputError unless it is a tuple or list of two."""
+    check_type(found, (tuple, list), f"{first} and {second}")
+    if len(found) != 2:
+        raise InputError(f"returns {len(found)} values, expected {first} and {second}")
+    return found[0], found[1]
+
+
 def check_array(
     found: Any,
     shape: Sequence[int],

@@ -50,18 +50,18 @@ def _write_recording(path: Path) -> None:
 
 
 def _read_recording(path: Path) -> None:
-    from mstfilter.runs import open_source
+    from mstfilter.formats import open_recording
 
-    recording = open_source(path)
+    recording = open_recording(path)
     recording.check()
     _ = recording.truth_key
 
 
 def _reader(name: str, *options: str) -> Callable[[Path], None]:
     def read(path: Path) -> None:
-        from mstfilter.runs import open_source
+        from mstfilter.formats import open_recording
 
-        recording = open_source(path, name, options)
+        recording = open_recording(path, name, options)
         recording.check()
         _ = recording.truth_key
 
@@ -110,9 +110,9 @@ def _write_run(path: Path) -> None:
 
 
 def _read_run(path: Path) -> None:
-    from mstfilter.runs import read_estimate
+    from mstfilter.runs import RunFolder
 
-    read_estimate(path)
+    RunFolder.open(path).estimates()
 
 
 def _draw_run(path: Path) -> None:
@@ -124,7 +124,7 @@ def _draw_run(path: Path) -> None:
 
 def _write_preset(path: Path) -> None:
     path.mkdir()
-    text = 'base = "mst"\nn = 5\noverrides = ["resampler=systematic"]\n[update]\ncomponent = "partition"\n'
+    text = 'base = "mst"\nn = 5\nresampler = "systematic"\n[update]\ncomponent = "partition"\n'
     (path / "mine.toml").write_text(text, encoding="utf-8")
 
 
@@ -262,7 +262,7 @@ def _write_volumes(path: Path) -> None:
 
 
 def _read_volumes(path: Path) -> None:
-    from mstfilter.runs import read_truth
+    from mstfilter.scoring import read_truth
 
     read_truth(path / "voxels.npz")
 
@@ -365,24 +365,8 @@ def _truncate(rng: np.random.Generator, file: Path, files: list[Path]) -> None:
     os.truncate(file, int(rng.integers(0, file.stat().st_size + 1)))
 
 
-def _overwrite(rng: np.random.Generator, file: Path, files: list[Path]) -> None:
-    data = bytearray(file.read_bytes())
-    at = int(rng.integers(0, len(data) + 1))
-    data[at : at + 64] = rng.bytes(64) if rng.random() < 0.5 else b"\xff" * 64
-    file.write_bytes(bytes(data))
-
-
 def _garbage(rng: np.random.Generator, file: Path, files: list[Path]) -> None:
-    starts = (
-        b"",
-        b"\x89PNG\r\n\x1a\n",
-        b"PK\x03\x04",
-        b"\x93NUMPY\x01\x00",
-        b"\xff\xd8\xff",
-        b"{",
-        b"[",
-        b"\x80\x04",
-    )
+    starts = (b"", b"\x89PNG\r\n\x1a\n", b"PK\x03\x04", b"\x93NUMPY\x01\x00", b"\xff\xd8\xff", b"{", b"\x80\x04")
     file.write_bytes(starts[rng.integers(len(starts))] + rng.bytes(int(rng.integers(0, 300))))
 
 
@@ -459,18 +443,7 @@ def _toml(rng: np.random.Generator, file: Path, files: list[Path]) -> None:
 def _words(rng: np.random.Generator, file: Path, files: list[Path]) -> None:
     """A word of a text file is replaced."""
     words = file.read_text(encoding="utf-8").split(" ")
-    given = (
-        "nan",
-        "inf",
-        "-1",
-        "1e308",
-        "../../../../etc/passwd",
-        "/dev/zero",
-        "\x1b[2J",
-        "",
-        "x\n" * 100,
-        "9" * 5000,
-    )
+    given = ("nan", "-1", "1e308", "../../../../etc/passwd", "/dev/zero", "\x1b[2J", "", "x\n" * 100, "9" * 5000)
     words[rng.integers(len(words))] = given[rng.integers(len(given))]
     file.write_text(" ".join(words), encoding="utf-8")
 
@@ -508,73 +481,34 @@ def _npz(rng: np.random.Generator, file: Path, files: list[Path]) -> None:
     """An array gets another shape or type, announces too much, is a bomb, or is missing."""
     with np.load(file) as data:
         arrays = {name: data[name] for name in data.files}
-    names = sorted(arrays)
-    name = names[rng.integers(len(names))]
-    way, old = int(rng.integers(9)), arrays[name]
-    if way == 0:
-        file.write_bytes(bomb((10**6, 10**6), name=name))
-    elif way == 1:
-        file.write_bytes(bomb((2**29,), gigabytes=0.99, name=name))
-    elif way == 2:
-        del arrays[name]
-    elif way < 8:
-        changed = (
-            np.zeros((3, 4, 5, 6), old.dtype),
-            np.array("text\x1b[2J"),
-            np.full(old.shape, np.nan),
-            np.array([{"a": 1}], dtype=object),
-            np.full(old.shape, -(2**40)),
-        )
-        arrays[name] = changed[way - 3]
-    else:
-        arrays[name] = old.ravel()[: old.size // 2]
-    if way > 1:
-        np.savez_compressed(file, **arrays)
-
-
-def _weights(rng: np.random.Generator, file: Path, files: list[Path]) -> None:
-    """Weights with a matching hash that are not finite, of another shape, or no safetensors at all."""
-    import hashlib
-
-    from mstfilter.trained import DESCRIPTION, WEIGHTS, write_model
-
-    description, tensors = _tensors()
-    if rng.random() < 0.5:
-        values = (np.nan, np.inf, -np.inf)
-        name = sorted(tensors)[rng.integers(len(tensors))]
-        spoiled = tensors[name].copy().ravel()
-        spoiled[0] = values[rng.integers(3)]
-        shape = tensors[name].shape if rng.random() < 0.7 else (-1,)
-        write_model(file.parent, description, {**tensors, name: spoiled.reshape(shape)})
+    name = sorted(arrays)[rng.integers(len(arrays))]
+    old, way = arrays.pop(name), int(rng.integers(9))
+    if way < 2:
+        shape, gigabytes = ((10**6, 10**6), 0.0) if way == 0 else ((2**29,), 0.99)
+        file.write_bytes(bomb(shape, gigabytes=gigabytes, name=name))
         return
-    data = b"\x80\x04cos\nsystem\n(S'touch pwned'\ntR." if rng.random() < 0.5 else struct.pack("<Q", 2**62) + b"{}"
-    (file.parent / WEIGHTS).write_bytes(data)
-    text = (file.parent / DESCRIPTION).read_text(encoding="utf-8")
-    digest = hashlib.sha256(data).hexdigest()
-    (file.parent / DESCRIPTION).write_text(text.replace(description["sha256"], digest), encoding="utf-8")
-
-
-def _cache_names(rng: np.random.Generator, file: Path, files: list[Path]) -> None:
-    """The data base of a cache names a file outside its folder."""
-    import sqlite3
-
-    outside = file.parent.parent / "canary"
-    names = (str(outside), "../canary", "ab/cd/../../../canary", "/dev/zero", 7, None)
-    with sqlite3.connect(file) as data:
-        data.execute("UPDATE Cache SET filename = ?, mode = 2", (names[rng.integers(len(names))],))
+    changed = (
+        np.zeros((3, 4, 5, 6), old.dtype),
+        np.array("text\x1b[2J"),
+        np.full(old.shape, np.nan),
+        np.array([{"a": 1}], dtype=object),
+        np.full(old.shape, -(2**40)),
+        old.ravel()[: old.size // 2],
+    )
+    if way < 8:
+        arrays[name] = changed[way - 2]
+    np.savez_compressed(file, **arrays)
 
 
 _Way = Callable[[np.random.Generator, Path, list[Path]], None]
 #: Ways to spoil a file -> its suffixes; () is any.
 _WAYS: dict[_Way, tuple[str, ...]] = {
-    **dict.fromkeys((_flip, _truncate, _overwrite, _garbage, _grow, _swap, _remove, _replace, _rename), ()),
+    **dict.fromkeys((_flip, _truncate, _garbage, _grow, _swap, _remove, _replace, _rename), ()),
     _json: (".json",),
     _toml: (".toml",),
     _words: (".txt", ".yaml"),
     _png: (".png",),
     _npz: (".npz",),
-    _weights: (".safetensors",),
-    _cache_names: (".db",),
 }
 
 

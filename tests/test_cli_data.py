@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import shutil
 
 import numpy as np
 import pytest
@@ -29,7 +30,19 @@ def clear_error(err):
     assert "Traceback" not in err
 
 
+def pairs(path):
+    """The first and the last frame of a recording, as pairs of images."""
+    source = write(path.with_name("source"))
+    path.mkdir()
+    for index in (0, 4):
+        for part in ("rgb", "depth"):
+            shutil.copy(source / part / f"{index:06d}.png", path / f"v{index}_{part}.png")
+    (path / "info.json").write_text('{"K": [131, 131, 79.5, 59.5], "depth_scale_m": 0.001}')
+    return path
+
+
 CASES = {
+    "pairs": (pairs, ["--frames", "v4,v0"], (0, 1)),
     "tum": (lambda p: layouts.write_tum(p), ["-o", K], layouts.PAUSES),
     "redwood": (lambda p: layouts.write_redwood(p), ["-o", "fps=10"], layouts.PAUSES),
     "bop": (lambda p: layouts.write_bop(p), [], (0, 1, 2)),
@@ -114,8 +127,7 @@ ERRORS = {
 }
 
 
-@pytest.mark.parametrize("fault", ERRORS)
-@pytest.mark.parametrize("command", ["convert", "run"])
+@pytest.mark.parametrize(("command", "fault"), [*(("convert", fault) for fault in ERRORS), ("run", "no pause")])
 def test_errors_leave_no_files(tmp_path, capsys, command, fault):
     make, options, message = ERRORS[fault]
     path = make(tmp_path / "data")
@@ -137,15 +149,6 @@ def test_topics_are_listed(tmp_path, capsys):
     clear_error(err)
     assert f"/left{COLOUR} (2 x rgb8, 160 x 120" in err
     assert "choose one: colour=TOPIC" in err
-
-
-def test_an_occupied_name_is_known_before_anything_is_read(tmp_path, capsys):
-    (tmp_path / "out").mkdir()
-    (tmp_path / "out" / "thesis.tex").write_text("x")
-    code, _, err = call("convert", truncated(tmp_path / "data"), tmp_path / "out", capsys=capsys)
-    assert code == 2
-    assert "not an empty folder" in err
-    assert (tmp_path / "out" / "thesis.tex").exists()
 
 
 @pytest.mark.parametrize(

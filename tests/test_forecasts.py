@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
-
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
@@ -90,7 +88,7 @@ def test_recalibration_is_the_best_monotone_map(pairs):
 
 
 def test_recalibration_of_a_monotone_transform_is_the_same():
-    """Information does not depend on how sure the forecasts are, only on what they tell apart."""
+    """The recalibrated log loss does not depend on how sure the forecasts are, only on what they tell apart."""
     rng = np.random.default_rng(2)
     p = rng.integers(1, 20, 5000) / 20
     y = rng.random(len(p)) < p
@@ -112,19 +110,6 @@ def test_energy_score_of_numbers():
     F = np.array([w[x <= e].sum() for e in edges])
     integral = ((F - (edges >= y)) ** 2)[:-1] @ np.diff(edges)
     assert energy_score(np.abs(x - y), np.abs(x[:, None] - x), w) == pytest.approx(integral)
-
-
-def test_the_fair_score_is_unbiased():
-    """Of draws from a distribution on three points, by enumeration of all samples of size 3."""
-    D = np.abs(np.subtract.outer([0.0, 1.0, 3.0], [0.0, 1.0, 3.0]))
-    p, outcome = np.array([0.2, 0.5, 0.3]), 2
-    mean = sum(
-        np.prod(p[list(draw)]) * energy_score(D[list(draw), outcome], D[np.ix_(draw, draw)], fair=True)
-        for draw in itertools.product(range(3), repeat=3)
-    )
-    assert mean == pytest.approx(energy_score(D[:, outcome], D, p))
-    with pytest.raises(InputError, match="equal weight"):
-        energy_score([0.0, 1.0], [[0, 1], [1, 0]], [0.3, 0.7], fair=True)
 
 
 def test_negative_type_decides_whether_the_score_is_proper():

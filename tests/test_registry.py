@@ -16,10 +16,12 @@ import pytest
 
 import mstfilter.registry
 from mstfilter.completion import Completer
+from mstfilter.crossover import CrossoverUpdate
 from mstfilter.errors import InputError, InputWarning
-from mstfilter.fusion import Agreement, Evidence, FusionUpdate
+from mstfilter.oracles import TrueQuality
 from mstfilter.presets import REGISTRY, build_filter, load_config, preset
 from mstfilter.resources import preset_names
+from mstfilter.scene import Evidence
 from mstfilter.segmentation import ObjectRule
 from mstfilter.smc import Resampler, Ssp
 
@@ -78,7 +80,7 @@ def test_every_registered_component_can_be_built_and_described(kind):
 @dataclass(frozen=True)
 class Holder:
     one: Resampler
-    subclass: FusionUpdate
+    subclass: CrossoverUpdate
     optional: Completer | None = None
     several: tuple[Evidence, ...] = ()
     plain: float = 1.0
@@ -96,9 +98,14 @@ def test_the_kind_of_a_field_follows_from_its_annotation():
         "plain": None,
         "settings": None,
     }
-    fields = {"one": "ssp", "subclass": {"component": "fusion", "eta": 2}, "optional": None, "several": ["agreement"]}
+    fields = {
+        "one": "ssp",
+        "subclass": {"component": "crossover", "eta": 2},
+        "optional": None,
+        "several": ["true_quality"],
+    }
     made = REGISTRY.make(Holder, fields)
-    assert made == Holder(Ssp(), FusionUpdate(eta=2), None, (Agreement(),))
+    assert made == Holder(Ssp(), CrossoverUpdate(eta=2), None, (TrueQuality(),))
 
 
 def test_what_is_wrong_with_a_file_of_the_user(tmp_path):

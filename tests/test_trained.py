@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import struct
 
 import numpy as np
 import pytest
@@ -46,11 +47,12 @@ def test_a_folder_of_the_name_of_a_model_of_the_package_does_not_hide_it(tmp_pat
     assert open_model("./border").key == open_model(str(tmp_path / "border")).key != shipped
 
 
-@pytest.mark.parametrize("damage", ["truncated", "changed", "pickle"])
+@pytest.mark.parametrize("damage", ["truncated", "changed", "pickle", "huge header"])
 def test_damaged_weights(folder, damage):
     path = folder / WEIGHTS
     data = path.read_bytes()
-    broken = {"truncated": data[:-5], "changed": data[:-1] + b"\x01", "pickle": b"\x80\x04cos\nsystem\n."}[damage]
+    changes = {"truncated": data[:-5], "changed": data[:-1] + b"\x01", "pickle": b"\x80\x04cos\nsystem\n."}
+    broken = changes.get(damage, struct.pack("<Q", 2**62) + b"{}")
     path.write_bytes(broken)
     with pytest.raises(InputError, match="SHA-256"):
         open_model(str(folder))

@@ -65,7 +65,7 @@ def _by_flips(x: np.ndarray) -> np.ndarray:
 
 
 def _by_bootstrap(x: np.ndarray) -> np.ndarray:
-    """`bootstrap_p` of each column, with the same resamples."""
+    """The p value of `studentised_bootstrap` of each column, with the same resamples."""
     n, mean, sd = len(x), x.mean(axis=0), x.std(axis=0, ddof=1)
     drawn = np.random.default_rng(20210).integers(0, n, (N_BOOTSTRAP, n))
     counts = np.stack([(drawn == k).sum(axis=1) for k in range(n)], axis=1) / n

@@ -23,11 +23,11 @@ import numpy as np
 
 import mstfilter
 from mstfilter.presets import REGISTRY
+from mstfilter.resources import preset_names
 from mstfilter.smc import Population, Proposal, Transition, Update
 
 #: Scene families and seeds. Three small scenes: 5 objects, 9 objects, and the demo.
 SCENES = (("demo", 3), ("s1", 7), ("s2", 4))
-REPOSITORY = Path(__file__).resolve().parent.parent.parent
 SCHEMES = ("multinomial", "stratified", "systematic", "residual", "ssp", "killing", "fearnhead_clifford")
 SCHEMES += ("clusters", "kdpp", "greedy_diverse", "coalesced", "tempered", "shuffled")
 
@@ -64,11 +64,6 @@ def digest(*values: Any) -> str:
         hasher.update(f"{array.dtype.str}{array.shape}".encode())
         hasher.update(array.tobytes())
     return hasher.hexdigest()[:16]
-
-
-def presets() -> list[str]:
-    """Names of all presets."""
-    return sorted(path.stem for path in (REPOSITORY / "models").glob("*.toml"))
 
 
 def of_recording(recording: Any) -> dict[str, str]:
@@ -129,7 +124,7 @@ def main() -> int:
                     return int(end.code)
             recording = mstfilter.open_recording(path)
             found[f"{family}-{seed}"] = of_recording(recording)
-            for preset in options.presets or presets():
+            for preset in options.presets or preset_names():
                 found[f"{family}-{seed} {preset}"] = of_run(recording, preset)
                 options.out.write_text(json.dumps(found, indent=1) + "\n")
     options.out.write_text(json.dumps(found, indent=1) + "\n")

@@ -6,9 +6,8 @@
 >>> state, infos = filter.run(observations, seed=0)
 
 The parts that need images are replaced: tracking by the motion model, tree cuts by cuts of the reported
-segmentation, free space by the cells in front of the depth reading, and evidence (if the preset has any) by the
-likelihood of the observation. Crossover, weights and resampler are those of the preset; the mode filter is sized to
-the grid, and what needs a video (division by motion, measured surfaces) is left out.
+segmentation, and free space by the cells in front of the depth reading. Crossover, weights and resampler are those of
+the preset; the mode filter is sized to the grid.
 
 The weights of MST depend on the parents of a candidate, not on the candidate. `ScoredFusion` repairs this
 (docs/exactness.md). With all its options, and candidates that cover the probable states, the weights are those of the
@@ -17,7 +16,6 @@ exact filter.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
 from itertools import product
@@ -27,8 +25,8 @@ import numpy as np
 from miniature_filters import PriorProposal, PushTransition, state_weights
 from miniature_world import Miniature, Observation, draw_states
 
-from mstfilter.fusion import Claims, Evidence, FusionUpdate, NoDivision, Projection
-from mstfilter.scene import Hypothesis
+from mstfilter.crossover import CrossoverUpdate
+from mstfilter.scene import Hypothesis, Projection
 from mstfilter.smc import (
     Multinomial,
     ParticleFilter,
@@ -53,16 +51,6 @@ class DepthFreeSpace(Projection):
             return hypothesis, 1.0
         occupied = hypothesis.labels != 0
         return hypothesis.without(free), 1.0 - float((occupied & free).sum() / max(occupied.sum(), 1))
-
-
-@dataclass(frozen=True)
-class LikelihoodEvidence(Evidence):
-    """Scores a candidate by the exact log likelihood of depth and segmentation."""
-
-    world: Miniature
-
-    def log_score(self, hypotheses: Sequence[Hypothesis], clip: Any) -> np.ndarray:
-        return self.world.log_likelihood(clip)[self.world.states.index(hypotheses)]
 
 
 class Cuts(NamedTuple):
@@ -168,20 +156,15 @@ def adapt_to_miniature(
 ) -> ParticleFilter:
     """A filter of MST on the miniature world, with `n` particles and `n` samples per step.
 
-    The update of `filter` must be a `FusionUpdate`. `weight_rule` and `include_optimal` are fields of `CutProposal`;
-    give those of the preset's proposal.
+    The update of `filter` must be a `CrossoverUpdate`. `weight_rule` and `include_optimal` are fields of
+    `CutProposal`; give those of the preset's proposal.
     """
     crossover = filter.update.crossover
     small = replace(crossover.mode_filter, window=3, isolation=27)  # the window holds 27 cells: none is isolated
-    evidence = (LikelihoodEvidence(world),) if filter.update.evidence else ()
     update = replace(
         filter.update,
         free_space=DepthFreeSpace(),
-        division=NoDivision(),
-        claims=Claims(),
         crossover=replace(crossover, mode_filter=small),
-        evidence=evidence,
-        n_scored=0,
     )
     return replace(
         filter,
@@ -207,7 +190,7 @@ class ScoredFusion(Update):
     Parameters
     ----------
     world : Miniature
-    fusion : FusionUpdate
+    fusion : CrossoverUpdate
         Makes the candidates.
     built_per_particle : int
         Number of candidates that are built per predicted particle. 0: no crossover; needs `include_parents`.
@@ -220,7 +203,7 @@ class ScoredFusion(Update):
     """
 
     world: Miniature
-    fusion: FusionUpdate
+    fusion: CrossoverUpdate
     built_per_particle: int = 4
     distinct: bool = False
     predictive: bool = False
@@ -242,7 +225,7 @@ class ScoredFusion(Update):
             populations = []
             if self.built_per_particle > 0:
                 # The score uses the same observation as Q, so Q is omitted from the pair weights.
-                fusion = replace(self.fusion, quality_exponent=0.0, evidence=())
+                fusion = replace(self.fusion, quality_exponent=0.0)
                 candidates = fusion.update(rng, predicted, proposed, observation)  # type: ignore[arg-type]
                 m = self.built_per_particle * len(predicted)
                 chosen, _ = Multinomial().select(child(rng, "first stage"), candidates.log_weights, m)

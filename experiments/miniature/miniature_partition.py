@@ -26,8 +26,8 @@ from scipy.optimize import minimize
 from scipy.special import expit
 
 from mstfilter.completion import Completion
-from mstfilter.fusion import Cells, Evidence, PairEvidence, PairOdds, PartitionUpdate
-from mstfilter.scene import Hypothesis, Occupancy, VoxelGrid
+from mstfilter.partition import Cells, PairEvidence, PairOdds, PartitionUpdate
+from mstfilter.scene import Evidence, Hypothesis, Occupancy, VoxelGrid
 from mstfilter.smc import ParticleFilter, Population, Systematic, Transition, Update
 
 OWN, FREE, BEHIND, OTHER, HIDDEN = range(5)  # what an observation shows of a cell; a view has the first three
@@ -115,27 +115,26 @@ class TableCompleter:
     table: np.ndarray
     log: list[tuple[np.ndarray, np.ndarray]] | None = None
 
-    remembers: ClassVar[bool] = True
-
-    def complete_again(
+    def complete_each(
         self,
         rngs: Sequence[np.random.Generator],
         frame: RowImage,
-        objects: Sequence[tuple[np.ndarray, tuple[CellView, ...]]],
+        masks: Sequence[np.ndarray],
         grid: VoxelGrid,
-    ) -> list[tuple[Completion, tuple[CellView, ...]]]:
-        """Completions of masks (1, X) with views, and the views with what this observation shows."""
+        views: Sequence[tuple[CellView, ...]],
+    ) -> list[Completion]:
+        """Completions of masks (1, X), and the views with what this observation shows."""
         found = []
-        for mask, views in objects:
+        for mask, earlier in zip(masks, views, strict=True):
             now, points = self._seen(frame, mask, grid)
             past = np.full(grid.shape, NOTHING)
-            for view in views:
+            for view in earlier:
                 past = np.where(view.cells == NOTHING, past, view.cells)
             if self.log is not None:
                 self.log.append((mask.ravel(), np.stack([now, past])))
             p = np.where(now == FREE, 0, self.table[now, past]).astype(np.float32)
-            view = CellView(np.where(now <= BEHIND, now, NOTHING))
-            found.append((Completion(np.zeros(3, np.int64), p, points, f"{mask.tolist()}"), (*views, view)))
+            known: Any = (*earlier, CellView(np.where(now <= BEHIND, now, NOTHING)))
+            found.append(Completion(np.zeros(3, np.int64), p, points, f"{mask.tolist()}", known))
         return found
 
     @staticmethod
@@ -281,7 +280,7 @@ def fit(
 
 def components_apart(world: Miniature, exact: np.ndarray, cells: Cells, observation: Observation) -> float:
     """Total variation between the exact law (S,) of the partition of the readings, and its components drawn apart."""
-    x = cells.pixels[cells.of_reading >= 0]
+    x = cells.readings.pixels[cells.of_reading >= 0]
     labels = world.states.labels.reshape(-1, *world.shape)[:, x, observation.depth[x]]
     component = cells.component[cells.of_reading[cells.of_reading >= 0]]
     apart: dict[tuple[int, ...], float] = {(): 1.0}
@@ -325,11 +324,11 @@ def _answered(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Terms (e, 6), answers (e,) and pairs of readings (e,) of the pairs of cells."""
     first = np.array([np.flatnonzero(cells.of_reading == k)[0] for k in range(len(cells.sizes))], int)
-    x = cells.pixels[first]
+    x = cells.readings.pixels[first]
     owner = labels[x, observation.depth[x]]
     a, b = cells.pairs.T
     same = (owner[a] == owner[b]) & (owner[a] > 0)
-    return PairEvidence().terms(cells, weights), same, cells.sizes[cells.pairs].prod(axis=1)
+    return np.column_stack(PairEvidence().terms(cells, weights)), same, cells.sizes[cells.pairs].prod(axis=1)
 
 
 def _logistic(terms: np.ndarray, same: np.ndarray, weights: np.ndarray) -> PairEvidence:

@@ -42,7 +42,7 @@ from scipy import stats
 
 import mstfilter
 from mstfilter.files import write_csv
-from mstfilter.fusion import PairEvidence
+from mstfilter.partition import PairEvidence
 from mstfilter.smc import FearnheadClifford, KeepWeights, Multinomial, ParticleFilter, Systematic
 
 HERE = Path(__file__).resolve().parent
@@ -55,7 +55,6 @@ CHANGES = (
     "mst_rules, p twice",
     "mst_rules, weights kept",
     "mst_rules, no Q",
-    "mst_rules, no score",
     "mst_rules, systematic",
 )
 UNIONS = {"union, optimal": "+ optimal", "union, cover": "+ cover"}  # the same without crossover
@@ -91,8 +90,6 @@ def arm(name: str, world: Miniature, n: int, n_fit: int = N_FIT) -> ParticleFilt
         return replace(rules, resampler=KeepWeights(Multinomial()))
     if name == "mst_rules, no Q":
         return replace(rules, update=replace(rules.update, quality_exponent=0.0))
-    if name == "mst_rules, no score":  # candidates are not scored
-        return replace(rules, update=replace(rules.update, evidence=()))
     if name == "mst_rules, systematic":
         return replace(rules, resampler=Systematic())
     if name in UNIONS:

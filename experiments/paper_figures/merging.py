@@ -16,16 +16,16 @@ from canvas import INK, MUTED, page, save, show, voxels, write_rows
 from matplotlib.axes import Axes
 from r1 import NOTICE, Particles, folder
 
-from mstfilter.fusion import (
+from mstfilter.crossover import (
     PREDICTED,
     PROPOSED,
     ConflictGraph,
     ConflictResolution,
     Crossover,
-    OneSideLast,
     RandomOrder,
     SpanningTree,
     Structure,
+    assign_labels,
     conflict_graph,
     merge_probability,
 )
@@ -87,8 +87,8 @@ def picture(particles: Particles, path: Path, smoke: bool) -> Path:
     directed = [edge for _, edges in drawn.values() for edge in edges]
     for row, draw in enumerate((first, second), start=1):
         own = {v + 1: colours[v] for v in range(len(graph))}
-        labels, disputed = fixed.assign_labels(graph, draw, sample.labels, prediction.labels)
-        smooth = fixed.mode_filter.apply(labels, disputed)
+        labels = assign_labels(graph, draw, sample.labels, prediction.labels)
+        smooth = fixed.mode_filter.apply(labels)
         draw_graph(axes[row, 0], graph, places, [colours[g] for g in draw.group], directed, draw)
         axes[row, 0].set_title(("A random order; bold: merged", "The same order, other merges")[row - 1])
         show(axes[row, 1], voxels(labels, sample.grid, view, own), f"Painted: {count(labels)} objects")
@@ -183,16 +183,13 @@ FORMS: tuple[tuple[str, str, Chance], ...] = (
         "min(1, IoU n2 / n1)",
         lambda i, a, b: np.minimum(1, i / (a + b - i) * b / a),
     ),
-    ("IoU", "IoU", lambda i, a, b: merge_probability("iou", i, a, b)),
+    ("IoU", "IoU", lambda i, a, b: i / (a + b - i)),
     ("containment", "I / n1", lambda i, a, b: i / a),
     ("containment of the smaller", "I / min(n1, n2)", lambda i, a, b: i / np.minimum(a, b)),
-    ("mst_rules: covered", "1 if I / n1 >= 3/4", lambda i, a, b: merge_probability("covered", i, a, b)),
-    ("match", "1 if IoU > 1/2", lambda i, a, b: merge_probability("match", i, a, b)),
 )
 STRUCTURES: tuple[tuple[str, Structure], ...] = (
     ("random order", RandomOrder()),
     ("spanning tree", SpanningTree()),
-    ("one side last", OneSideLast()),
 )
 
 

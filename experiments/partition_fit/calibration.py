@@ -23,7 +23,7 @@ from scipy.special import expit, logit
 import mstfilter
 from mstfilter.files import write_csv
 from mstfilter.forecasts import SOFTENING, ForecastTable
-from mstfilter.fusion import PartitionUpdate
+from mstfilter.partition import PartitionUpdate
 from mstfilter.scoring import ask
 from mstfilter.simulation import cached_recording
 

@@ -1,4 +1,4 @@
-"""How much do samples and predictions say about two cells? Fits `mstfilter.fusion.cells.PairEvidence`.
+"""How much do samples and predictions say about two cells? Fits `mstfilter.partition.PairEvidence`.
 
     python experiments/partition_fit/run.py [--seeds 3] [--smoke --out FOLDER]
 
@@ -26,15 +26,15 @@ from scipy.optimize import minimize
 import mstfilter
 from mstfilter.completion import SurfaceOnly
 from mstfilter.files import write_csv
-from mstfilter.fusion import Cells, PairEvidence, PairOdds
 from mstfilter.oracles.truth import RecordingTruth
+from mstfilter.partition import Cells, PairEvidence, PairOdds, PairTerms
 from mstfilter.scene import Clip
 from mstfilter.simulation import cached_recording
 from mstfilter.smc import Key
 
 SMALL = {"width": 160, "height": 120, "n_actions": 1}
 PASTS = ("video", "two frames", "stranger")
-NAMES = ("alone_constant", "alone_image", "constant", "image", "past", "past_constant")
+NAMES = PairTerms._fields
 #: Columns of the regression that each model fits, and the probability that the past is right (None: as measured). The
 #: last model has the coefficients of the first for a wrong past.
 MODELS: dict[str, tuple[Sequence[int], float | None]] = {
@@ -58,7 +58,7 @@ class Recorder(PairOdds):
         a, b = cells.pairs.T
         of_pair = counts[a].sum(axis=1) * counts[b].sum(axis=1)
         same = np.divide((counts[a] * counts[b]).sum(axis=1), of_pair, out=np.zeros(len(a)), where=of_pair > 0)
-        self.kept.append(np.column_stack([terms, same, of_pair / max(of_pair.sum(), 1)]))
+        self.kept.append(np.column_stack([*terms, same, of_pair / max(of_pair.sum(), 1)]))
         return np.zeros(len(a))
 
 

@@ -28,8 +28,18 @@ import cv2
 import numpy as np
 from scipy.ndimage import distance_transform_edt
 
-from mstfilter.fusion import FreeSpace, Projection
-from mstfilter.scene import Clip, Frame, Hypothesis, ObjectRecord, VoxelGrid, depth_sigma, project, scaled_area
+from mstfilter.scene import (
+    Clip,
+    Frame,
+    FreeSpace,
+    Hypothesis,
+    ObjectRecord,
+    Projection,
+    VoxelGrid,
+    depth_sigma,
+    project,
+    scaled_area,
+)
 from mstfilter.scoring import overlap
 from mstfilter.smc import Population, Update, union
 from mstfilter.tracking import DenseFlow, Segment, Track, move_points, refine_motion, segments_of

@@ -1,24 +1,21 @@
 """Updates without crossover: samples alone, predictions alone, or the union of both.
 
-They replace `FusionUpdate` and leave all other parts of the filter, with their random streams, unchanged:
+They replace the update of `mst` and leave all other parts of the filter, with their random streams, unchanged:
 
 >>> mstfilter.preset("samples_only"), mstfilter.preset("tracking_only"), mstfilter.preset("union")
 
-At the first pause there is no prediction, and all of them return the proposed samples, as fusion does.
+At the first pause there is no prediction, and all of them return the proposed samples, as `mst` does.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
 import numpy as np
 
-from mstfilter.errors import InputError
-from mstfilter.fusion import FreeSpace, FusionUpdate, Projection, log_quality
-from mstfilter.fusion.division import divided
-from mstfilter.fusion.update import scored
-from mstfilter.scene import Clip
+from mstfilter.errors import check_number
+from mstfilter.scene import Clip, FreeSpace, Projection, log_quality
 from mstfilter.smc import Population, Update, union
 
 
@@ -60,38 +57,30 @@ class TrackingOnly(Update):
 
 @dataclass(frozen=True)
 class Union(Update):
-    """Predicted and proposed hypotheses together, with the weights of fusion but without crossover.
+    """Predicted and proposed hypotheses together, with the weights of the crossover but without crossing them.
 
     A prediction has log weight ``log w + lambda log Q``, a sample ``log w``; both populations are first scaled to
-    mean weight 1. Free space, division, weights and evidence are those of `fusion`; the evidence scores all
-    hypotheses.
+    mean weight 1. `free_space` projects the predictions and yields Q; `quality_exponent` is lambda.
     """
 
-    fusion: FusionUpdate = field(default_factory=FusionUpdate)
+    free_space: Projection = field(default_factory=FreeSpace)
+    quality_exponent: float = 3.0
 
     properly_weighted: ClassVar[bool] = False
     draws: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
-        if not isinstance(self.fusion, FusionUpdate):
-            raise InputError(f"union.fusion is a {type(self.fusion).__name__}, expected a FusionUpdate")
+        check_number("quality_exponent", self.quality_exponent, at_least=0)
 
     def update(
         self, rng: np.random.Generator, predicted: Population | None, proposed: Population | None, observation: Clip
     ) -> Population:
-        if predicted is None or proposed is None:
-            return self.fusion.update(rng, predicted, proposed, observation)
-        refined, quality = self.fusion.free_space.refine(predicted.particles, observation)
-        refined = divided(self.fusion.division, self.fusion.parts, refined, observation, proposed=False)
-        samples = divided(
-            self.fusion.division, self.fusion.parts, tuple(proposed.particles), observation, proposed=True
-        )
-        log_q = self.fusion.quality_exponent * log_quality(quality)
-        weighed = predicted.log_weights - predicted.log_mean_weight + log_q
-        both = union(
-            Population(refined, weighed, predicted.parents),
-            Population(samples, proposed.log_weights - proposed.log_mean_weight, proposed.parents),
-        )
-        total, scores = scored(self.fusion.evidence, tuple(both.particles), observation)
-        notes = {"quality": quality.tolist(), "scores": scores}
-        return Population(both.particles, both.log_weights + total, both.parents, notes)
+        """Both populations; at the first pause the proposed samples with their weights."""
+        if predicted is None:
+            return union(None, proposed)
+        refined, quality = self.free_space.refine(predicted.particles, observation)
+        weights = predicted.log_weights - predicted.log_mean_weight + self.quality_exponent * log_quality(quality)
+        if proposed is not None:
+            proposed = replace(proposed, log_weights=proposed.log_weights - proposed.log_mean_weight)
+        both = union(Population(refined, weights, predicted.parents), proposed)
+        return replace(both, notes={"quality": quality.tolist()})

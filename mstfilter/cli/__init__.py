@@ -6,14 +6,26 @@ Each module holds one group of commands; importing it registers them with `mstfi
 
 from __future__ import annotations
 
+import contextlib
 import sys
+import warnings
+from collections.abc import Iterator
+from typing import Any
 
-from mstfilter.cli import running, studying, training, components  # isort: skip (the order of the help page)
-from mstfilter.cli.root import app, warnings_as_lines
-from mstfilter.errors import InputError, describe_error, exhausted, place_in_user_file
+from mstfilter import __version__
+from mstfilter.errors import (
+    InputError,
+    InputWarning,
+    describe_error,
+    exhausted,
+    missing_library,
+    place_in_user_file,
+)
 from mstfilter.registry import loaded_components
 
-__all__ = ["app", "components", "main", "running", "studying", "training"]
+_WITHOUT_TYPER = """Usage: mstfilter list [KIND]
+
+Without typer, only `list`, --help and --version are available. For all commands: pip install mstfilter"""
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -22,8 +34,8 @@ def main(arguments: list[str] | None = None) -> None:
     debug = "--debug" in given
     given = [a for a in given if a != "--debug"]
     try:
-        with warnings_as_lines():
-            app(given, prog_name="mstfilter")
+        with _warnings_as_lines():
+            _execute(given)
     except InputError as error:
         if debug:
             raise
@@ -40,6 +52,9 @@ def main(arguments: list[str] | None = None) -> None:
     except Exception as error:
         if debug:
             raise
+        if isinstance(error, ModuleNotFoundError) and place_in_user_file(error) is None:
+            _print_error(missing_library(error, " ".join(["mstfilter", *given[:1]])))
+            sys.exit(2)
         if known := exhausted(error):
             _print_error(known)
             sys.exit(1)
@@ -51,6 +66,47 @@ def main(arguments: list[str] | None = None) -> None:
                 print(f"hint: `mstfilter check {component}` tests the component of this command", file=sys.stderr)
         print("hint: --debug shows the traceback", file=sys.stderr)
         sys.exit(1)
+
+
+def _execute(given: list[str]) -> None:
+    """Execute a command. Without typer, `list` and help answer all the same."""
+    try:
+        from mstfilter.cli import running, studying, training, components  # noqa: F401, I001 (in the order of the help)
+        from mstfilter.cli.root import app
+    except ModuleNotFoundError as error:
+        command = [word for word in given if not word.startswith("-")]
+        if command[:1] == ["list"]:
+            from mstfilter.cli.listing import print_list
+
+            print_list("".join(command[1:2]))
+        elif command:
+            raise missing_library(error, f"mstfilter {command[0]}") from error
+        else:
+            print(f"mstfilter {__version__}" if "--version" in given else _WITHOUT_TYPER)
+        return
+    app(given, prog_name="mstfilter")
+
+
+@contextlib.contextmanager
+def _warnings_as_lines() -> Iterator[None]:
+    """Print an `InputWarning` as one ``warning:`` line with its hints; other warnings are unchanged."""
+    with warnings.catch_warnings():
+        show_other, shown = warnings.showwarning, set()
+        warnings.simplefilter("always", InputWarning)
+
+        def show(message: Warning | str, *place: Any, **named: Any) -> None:
+            if not isinstance(message, InputWarning):
+                show_other(message, *place, **named)
+                return
+            if message.message in shown:
+                return
+            shown.add(message.message)
+            print(f"warning: {message.message}", file=sys.stderr)
+            for hint in message.hints:
+                print(f"hint: {hint}", file=sys.stderr)
+
+        warnings.showwarning = show
+        yield
 
 
 def _print_error(error: InputError, *hints: str) -> None:

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
 from mstfilter.cli.root import app
-from mstfilter.errors import InputError
-from mstfilter.reading import read_toml
+from mstfilter.errors import InputError, missing_library
 
 
 @app.command("list")
@@ -18,16 +16,9 @@ def list_(
     kind: Annotated[str, typer.Argument(help="One kind only: resampler, rule, ..., presets or families.")] = "",
 ) -> None:
     """List presets, scene families and components with their fields."""
-    from mstfilter.presets import REGISTRY
+    from mstfilter.cli.listing import print_list
 
-    kinds = ["presets", "families", *REGISTRY.kinds]
-    wanted = kind.removesuffix("s") if kind.removesuffix("s") in REGISTRY.kinds else kind
-    if wanted and wanted not in kinds:
-        raise InputError(f"there is no kind of component {kind!r}", f"there are: {', '.join(kinds)}")
-    for name in [wanted] if wanted else kinds:
-        print(f"{name}:")
-        for line in _lines(name):
-            print(f"  {line}")
+    print_list(kind)
 
 
 @app.command()
@@ -47,14 +38,13 @@ def check(
     if Path(component).is_dir():
         _check_folder(Path(component))
         return
-    from mstfilter.presets import REGISTRY, settings
+    from mstfilter.presets import REGISTRY
+    from mstfilter.registry import settings
 
     try:
         from mstfilter.testing import FALSE_ALARM, run_contract
     except ModuleNotFoundError as error:
-        if error.name != "pytest":
-            raise
-        raise InputError("check needs pytest, which is not installed", "pip install 'mstfilter[check]'") from error
+        raise missing_library(error, "mstfilter check") from error
     kind, _, name = ("", "", component) if ".py:" in component else component.partition(".")
     if ".py:" not in component and kind not in REGISTRY.kinds:
         raise InputError(
@@ -117,51 +107,3 @@ def new(
         print("first       mstfilter demo")
     for command in made.commands:
         print(f"next        {command}")
-
-
-def _lines(kind: str) -> Iterator[str]:
-    """One line per preset, family or component."""
-    from mstfilter.oracles import UsesTruth
-    from mstfilter.presets import REGISTRY
-    from mstfilter.resources import find_preset, preset_names
-
-    if kind == "presets":
-        for name in preset_names():
-            yield f"{name:<20}{read_toml(find_preset(name), 'a preset').get('description', '')}"
-        return
-    if kind == "families":
-        from mstfilter.simulation import SCENE_FAMILIES
-
-        for name, f in SCENE_FAMILIES.items():
-            objects = f"{f.n_objects_min}-{f.n_objects_max}" if f.n_objects_min < f.n_objects_max else f.n_objects_max
-            yield (
-                f"{name:<20}{objects} objects, {f.n_actions} actions of {f.frames_per_clip} frames, "
-                f"{f.width} x {f.height}, voxels {' x '.join(map(str, f.grid().shape))}"
-            )
-        return
-    if not REGISTRY.known(kind):
-        yield f"no component of this kind has a name; `mstfilter new {kind} mine.py` writes one"
-    for name in REGISTRY.known(kind):
-        cls = REGISTRY.find_class(kind, name)
-        truth = " (uses the ground truth)" if issubclass(cls, UsesTruth) else ""
-        summary = (cls.__doc__ or "").strip().split("\n")[0].rstrip(".")
-        yield f"{name:<20}{summary}{truth}  [{_fields(cls)}]"
-
-
-def _fields(cls: type) -> str:
-    """Fields of a component and their defaults."""
-    import dataclasses
-
-    from mstfilter.presets import REGISTRY
-    from mstfilter.registry import default_of
-
-    parts = []
-    for field in dataclasses.fields(cls):
-        value: Any = default_of(field)
-        if value is dataclasses.MISSING:
-            parts.append(field.name)
-        elif dataclasses.is_dataclass(value):
-            parts.append(f"{field.name}={REGISTRY.name_of(type(value))}")
-        else:
-            parts.append(f"{field.name}={value}")
-    return ", ".join(parts)

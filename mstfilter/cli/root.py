@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-import contextlib
 import re
-import sys
-import warnings
-from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from mstfilter import __version__
-from mstfilter.errors import InputWarning
 
 if TYPE_CHECKING:
     from mstfilter.report import RunNumbers
@@ -72,36 +67,14 @@ def safe_name(name: str) -> str:
 
 def read_source(path: Path, format: str, options: list[str] | None, pauses: str, frames: str = "") -> Any:
     """Open a recording of any format."""
-    from mstfilter.runs import open_source
+    from mstfilter.formats import open_recording
 
     names = ",".join(name.strip() for name in frames.split(",") if name.strip())
     chosen = [*(options or []), *([f"frames={names},"] if names else [])]
     from rich.console import Console
 
     with Console(stderr=True).status(f"reading {path.name}"):  # shown on a terminal only
-        return open_source(path, format, chosen, pauses)
-
-
-@contextlib.contextmanager
-def warnings_as_lines() -> Iterator[None]:
-    """Print an `InputWarning` as one ``warning:`` line with its hints; other warnings are unchanged."""
-    with warnings.catch_warnings():
-        show_other, shown = warnings.showwarning, set()
-        warnings.simplefilter("always", InputWarning)
-
-        def show(message: Warning | str, *place: Any, **named: Any) -> None:
-            if not isinstance(message, InputWarning):
-                show_other(message, *place, **named)
-                return
-            if message.message in shown:
-                return
-            shown.add(message.message)
-            print(f"warning: {message.message}", file=sys.stderr)
-            for hint in message.hints:
-                print(f"hint: {hint}", file=sys.stderr)
-
-        warnings.showwarning = show
-        yield
+        return open_recording(path, format, chosen, pauses)
 
 
 def print_summary(numbers: RunNumbers) -> None:

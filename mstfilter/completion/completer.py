@@ -31,7 +31,7 @@ from typing import Any, ClassVar
 import numpy as np
 from scipy.spatial import cKDTree
 
-from mstfilter.completion.observed import ObservedBox, enclosing_box, encode_box, observed_again, observed_box
+from mstfilter.completion.observed import ObservedBox, enclosing_box, encode_box, observed_again
 from mstfilter.errors import InputError
 from mstfilter.results import Checked, check_list, check_probabilities, check_type, returns, warn_once
 from mstfilter.scene import (
@@ -56,7 +56,10 @@ class Completion:
     #: (a, b, c) float32, probability of being occupied by the object; empty if the mask has no reading in the grid.
     probability: np.ndarray
     points: np.ndarray  #: (a, b, c) int32: depth readings of the mask in each voxel: the visible surface
-    key: str  #: key of the contents of frame, mask, grid and completer
+    key: str  #: key of the contents of frame, mask, views, grid and completer
+    #: What the completion is based on, oldest first, if views were given: those that the frame does not contradict,
+    #: and last that of the frame, if it shows the object.
+    views: tuple[ObjectView, ...] = ()
 
     @property
     def box(self) -> tuple[slice, slice, slice]:
@@ -76,9 +79,11 @@ def _check_filled(self: Completer, found: Any, rngs: Any, seen: Sequence[Observe
     return [check_probabilities(p, one.surface.shape) for p, one in zip(found, seen, strict=True)]
 
 
-def _check_completions(self: Completer, found: Any, rngs: Any, frame: Frame, masks: Any, grid: VoxelGrid) -> Any:
-    for one in check_list(found, len(masks), (Completion, tuple), "Completion"):
-        _check_completion(one[0] if isinstance(one, tuple) else one, grid)  # with views, of `complete_again`
+def _check_completions(
+    self: Completer, found: Any, rngs: Any, frame: Frame, masks: Any, grid: VoxelGrid, views: Any = None
+) -> Any:
+    for one in check_list(found, len(masks), Completion, "Completion"):
+        _check_completion(one, grid)
     return found
 
 
@@ -113,8 +118,6 @@ class Completer(Checked, ABC):
 
     #: Voxels around the visible part that `fill` may use, besides all those below it.
     padding: ClassVar[int] = 0
-    #: Whether earlier views of an object are used (`complete_again`).
-    remembers: ClassVar[bool] = True
     #: Whether `fill` draws random numbers. The result is then not reused for the next hypothesis.
     stochastic: ClassVar[bool] = False
 
@@ -177,68 +180,52 @@ class Completer(Checked, ABC):
 
     @returns(_check_completions)
     def complete_each(
-        self, rngs: Sequence[np.random.Generator], frame: Frame, masks: Sequence[np.ndarray], grid: VoxelGrid
+        self,
+        rngs: Sequence[np.random.Generator],
+        frame: Frame,
+        masks: Sequence[np.ndarray],
+        grid: VoxelGrid,
+        views: Sequence[tuple[ObjectView, ...]] | None = None,
     ) -> list[Completion]:
-        """`complete` with a given stream for each mask. The result of a mask does not depend on the other masks."""
+        """`complete` with a given stream for each mask, and with earlier views of each object.
+
+        The result of a mask does not depend on the other masks. With views, a mask (H, W) may be empty. The views are
+        those of the object, moved to where it is now; `Completion.views` has those that were used. A completer that
+        uses no views returns completions without views.
+        """
         masks = [np.asarray(mask, dtype=bool) for mask in masks]
         for mask in masks:
             if mask.shape != frame.depth.shape:
                 raise InputError(f"mask has shape {mask.shape}, the frame is {frame.depth.shape}")
-        version = (self.weights_key,) if self.weights_key else ()
-        component = component_key(self)
-        names = [content_key("mask", np.packbits(m), frame.key, grid.key, component, *version) for m in masks]
-
-        def compute(missing: Sequence[int]) -> list[Completion]:
-            boxes = [observed_box(frame, masks[k], grid, self) for k in missing]
-            filled = self.estimate([rngs[k] for k in missing], [seen for _, seen in boxes])
-            return [
-                finish(offset, seen, p, names[k].hex()[:16])
-                for k, (offset, seen), p in zip(missing, boxes, filled, strict=True)
-            ]
-
-        if self.stochastic:
-            return compute(range(len(masks)))
-        return memo_many("completion", names, compute, Completion)
-
-    @returns(_check_completions)
-    def complete_again(
-        self,
-        rngs: Sequence[np.random.Generator],
-        frame: Frame,
-        objects: Sequence[tuple[np.ndarray, tuple[ObjectView, ...]]],
-        grid: VoxelGrid,
-    ) -> list[tuple[Completion, tuple[ObjectView, ...]]]:
-        """Complete objects from a frame and from earlier views of them.
-
-        Each object is its mask (H, W) bool in the frame, which may be empty, and its views, moved to where the
-        object is now. Each result is the completion, and the views that it is based on: the earlier ones that the
-        frame does not contradict, and last that of the frame, if it shows the object. A completer that does not
-        remember gives the completions of the masks, and no views.
-        """
-        if not self.remembers:
-            return [(one, ()) for one in self.complete_each(rngs, frame, [mask for mask, _ in objects], grid)]
-        component = component_key(self)
-        version = (self.weights_key,) if self.weights_key else ()
+        given = [()] * len(masks) if views is None else views
+        kind, of_completer = "mask" if views is None else "again", component_key(self)
         names = [
             content_key(
-                "again", np.packbits(mask), frame.key, grid.key, component, *version, *(v.name for v in views)
+                kind, np.packbits(mask), frame.key, grid.key, of_completer, *self._version, *(v.name for v in past)
             )
-            for mask, views in objects
+            for mask, past in zip(masks, given, strict=True)
         ]
 
-        def compute(missing: Sequence[int]) -> list[tuple[Completion, tuple[ObjectView, ...]]]:
-            boxes = [observed_again(frame, *objects[k], grid, self) for k in missing]
+        def compute(missing: Sequence[int]) -> list[Completion]:
+            boxes = [observed_again(frame, masks[k], given[k], grid, self) for k in missing]
             filled = self.estimate([rngs[k] for k in missing], [seen for _, _, seen, _ in boxes])
             found = []
-            for k, (offset, now, seen, views), p in zip(missing, boxes, filled, strict=True):
-                key = names[k].hex()[:16]
-                latest = (ObjectView(offset, *encode_box(now), key),) if now.surface.any() else ()
-                found.append((finish(offset, seen, p, key), (*views, *latest)))
+            for k, (offset, now, seen, used), p in zip(missing, boxes, filled, strict=True):
+                one = finish(offset, seen, p, names[k].hex()[:16])
+                if views is not None:
+                    latest = (ObjectView(offset, *encode_box(now), one.key),) if now.surface.any() else ()
+                    one = replace(one, views=(*used, *latest))
+                found.append(one)
             return found
 
         if self.stochastic:
-            return compute(range(len(objects)))
-        return memo_many("completion_again", names, compute)
+            return compute(range(len(masks)))
+        # Views are not stored on disk: an object is rarely seen again with the same motions.
+        return memo_many("completion", names, compute, Completion if views is None else None)
+
+    @property
+    def _version(self) -> tuple[str, ...]:
+        return (self.weights_key,) if self.weights_key else ()
 
 
 def _states(rngs: Sequence[np.random.Generator | None]) -> list[Any]:

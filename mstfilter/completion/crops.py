@@ -8,11 +8,12 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mstfilter.scene import VoxelGrid
+from mstfilter.completion.extrude import extruded_down
+from mstfilter.scene import Seen, VoxelGrid
 
 if TYPE_CHECKING:
     from torch import nn
@@ -45,14 +46,12 @@ class Architecture(ABC):
     ``model.toml`` of the folder has the name of the class as `architecture`.
     """
 
-    latent: ClassVar[int] = 0  #: length of the vector of standard normal noise that the network takes; 0 for none
-
     @abstractmethod
     def build(self) -> nn.Module:
         """The network, with any weights.
 
-        Its input is (b, 8, X, Y, Z) float32, with the channels of `CHANNELS`, and, if
-        `latent` is not 0, (b, latent) float32. Its output are logits, (b, X, Y, Z) or (b, 1, X, Y, Z).
+        Its input is (b, 8, X, Y, Z) float32, with the channels of `CHANNELS`. Its output are logits, (b, X, Y, Z) or
+        (b, 1, X, Y, Z).
         """
 
 
@@ -78,15 +77,15 @@ def channels(bits: Any, signed: Any, height: Any) -> Any:
     Parameters
     ----------
     bits, signed : (b, X, Y, Z) tensors of uint8 and int8
-        Of `encode_box`, padded with zeros.
+        Flags and distances of `encode_box`, padded with zeros.
     height : (Z,) float tensor
         Heights of the layers above the table in metres.
     """
     import torch
 
     x = torch.empty((len(bits), len(CHANNELS), *bits.shape[1:]), dtype=torch.float32)
-    for k in range(5):
-        x[:, k] = (bits >> k) & 1
+    for k, flag in enumerate(Seen):
+        x[:, k] = flag.among(bits)
     x[:, 5] = signed.float() / 127
     x[:, 6] = height / 0.25
     x[:, 7] = extruded(bits)
@@ -95,8 +94,5 @@ def channels(bits: Any, signed: Any, height: Any) -> Any:
 
 def extruded(bits: Any) -> Any:
     """What `Extrude` gives for packed crops (b, X, Y, Z), a torch tensor or an array; bool, free space cleared."""
-    own, other, free = (((bits >> k) & 1) > 0 for k in range(3))
-    filled = own.copy() if isinstance(own, np.ndarray) else own.clone()
-    for k in range(own.shape[3] - 2, -1, -1):
-        filled[..., k] |= filled[..., k + 1] & ~other[..., k]
-    return filled & ~free
+    filled = extruded_down(Seen.SURFACE.among(bits), Seen.OTHER_SURFACE.among(bits))
+    return filled & ~Seen.FREE.among(bits)

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.spatial import ConvexHull, Delaunay, QhullError
@@ -41,14 +42,18 @@ class Extrude(Completer):
 
     def fill(self, rng: np.random.Generator, seen: ObservedBox) -> np.ndarray:
         """Probability 1 on the visible surface and `below` under it."""
-        state = np.zeros(seen.surface.shape[:2], dtype=bool)
-        p = np.zeros(seen.surface.shape, dtype=np.float32)
-        for k in range(seen.surface.shape[2] - 1, -1, -1):
-            # From the top down: the surface of another object ends a column, the own surface starts it (again).
-            state = (state & ~seen.other_surface[:, :, k]) | seen.surface[:, :, k]
-            p[:, :, k] = np.where(seen.surface[:, :, k], 1.0, np.where(state, self.below, 0.0))
+        filled = extruded_down(seen.surface, seen.other_surface)
+        p = np.where(seen.surface, 1.0, np.where(filled, self.below, 0.0)).astype(np.float32)
         p[:, :, seen.height < self.floor] = 0
         return p
+
+
+def extruded_down(surface: Any, other_surface: Any) -> Any:
+    """A surface (..., Z) bool and what is below it, down to another surface; an array or a torch tensor."""
+    filled = surface | False  # a copy
+    for k in range(surface.shape[-1] - 2, -1, -1):
+        filled[..., k] |= filled[..., k + 1] & ~other_surface[..., k]
+    return filled
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,6 @@
 """Completion by a trained network: that of this package (`mstfilter.completion.unet`), or one of the user.
 
->>> NetworkCompleter().complete(rng, frame, masks, grid)                     # the most probable extent
->>> NetworkCompleter(draw=True).complete(rng, frame, masks, grid)            # a different extent for every hypothesis
+>>> NetworkCompleter().complete(rng, frame, masks, grid)                     # the weights of the package
 >>> NetworkCompleter(weights="trained/mine", architecture=MyArchitecture())  # an `Architecture` of the user
 >>> NetworkCompleter(weights="mine.onnx")                                    # needs the extra `onnx`
 
@@ -13,7 +12,7 @@ trained on smaller ones.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -22,7 +21,7 @@ from mstfilter.completion.completer import Completer, Completion, finish
 from mstfilter.completion.crops import BATCH, EDGE, LARGER, LATTICE, Architecture, crop_box
 from mstfilter.completion.extrude import Extrude
 from mstfilter.completion.observed import ObservedBox, observed_in
-from mstfilter.errors import InputError, MissingLibraryError
+from mstfilter.errors import MissingLibraryError
 from mstfilter.scene import Frame, ObjectView, Recording, UsesFiles, VoxelGrid
 
 if TYPE_CHECKING:
@@ -39,20 +38,10 @@ class NetworkCompleter(Completer, UsesFiles):
         Name of a trained model of the package, or the folder of one (`mstfilter.trained`), or an ONNX file.
     architecture : Architecture, optional
         The architecture of a folder. Default: that of this package.
-    draw : bool
-        Draw the hidden extent for each hypothesis from the network's law, instead of taking its mode.
-    spread : float
-        Factor of the standard deviation of that law.
     """
 
     weights: str = "completion"
     architecture: Architecture | None = None
-    draw: bool = False
-    spread: float = 1.0
-
-    @property
-    def stochastic(self) -> bool:  # type: ignore[override]
-        return self.draw
 
     @property
     def network(self) -> TrainedNetwork:
@@ -65,10 +54,7 @@ class NetworkCompleter(Completer, UsesFiles):
                 "pip install torch",
                 "or complete by a rule: the preset mst_rules",
             ) from error
-        network = load_network(self.weights, self.architecture)
-        if self.draw and not network.latent:
-            raise InputError(f"{self.weights}: the network takes no noise, so it cannot draw", "set draw=false")
-        return network
+        return load_network(self.weights, self.architecture)
 
     def check_files(self, recording: Recording) -> None:
         """Load the network."""
@@ -82,30 +68,20 @@ class NetworkCompleter(Completer, UsesFiles):
         return crop_box(voxels, grid)
 
     def complete_each(
-        self, rngs: Sequence[np.random.Generator], frame: Frame, masks: Sequence[np.ndarray], grid: VoxelGrid
-    ) -> list[Completion]:
-        if abs(grid.voxel_size - LATTICE) < 1e-6:
-            return super().complete_each(rngs, frame, masks, grid)
-        lattice = _lattice(grid)
-        return [
-            self._on_grid(one, frame, np.asarray(mask, dtype=bool), grid, lattice)
-            for one, mask in zip(super().complete_each(rngs, frame, masks, lattice), masks, strict=True)
-        ]
-
-    def complete_again(
         self,
         rngs: Sequence[np.random.Generator],
         frame: Frame,
-        objects: Sequence[tuple[np.ndarray, tuple[ObjectView, ...]]],
+        masks: Sequence[np.ndarray],
         grid: VoxelGrid,
-    ) -> list[tuple[Completion, tuple[ObjectView, ...]]]:
+        views: Sequence[tuple[ObjectView, ...]] | None = None,
+    ) -> list[Completion]:
         if abs(grid.voxel_size - LATTICE) < 1e-6:
-            return super().complete_again(rngs, frame, objects, grid)
+            return super().complete_each(rngs, frame, masks, grid, views)
         lattice = _lattice(grid)  # the boxes of all views are boxes of it
-        found = super().complete_again(rngs, frame, objects, lattice)
+        found = super().complete_each(rngs, frame, masks, lattice, views)
         return [
-            (self._on_grid(one, frame, mask, grid, lattice), views)
-            for (one, views), (mask, _) in zip(found, objects, strict=True)
+            self._on_grid(one, frame, np.asarray(mask, dtype=bool), grid, lattice)
+            for one, mask in zip(found, masks, strict=True)
         ]
 
     def _on_grid(
@@ -123,14 +99,13 @@ class NetworkCompleter(Completer, UsesFiles):
             index = np.indices(p.shape).reshape(3, -1).T + low
             at = (grid.centre_of(index) - np.asarray(lattice.origin)) / LATTICE - 0.5 - one.offset
             p = map_coordinates(one.probability, at.T, order=1, mode="nearest").reshape(p.shape)
-        return finish(low, seen, p, one.key)
+        return replace(finish(low, seen, p, one.key), views=one.views)
 
     def fill(self, rng: np.random.Generator, seen: ObservedBox) -> np.ndarray:
         return self.fill_many([rng], [seen])[0]
 
     def fill_many(self, rngs: Sequence[np.random.Generator], seen: Sequence[ObservedBox]) -> list[np.ndarray]:
         results: list[np.ndarray] = [np.zeros(one.surface.shape, np.float32) for one in seen]
-        noise = [rng.standard_normal(self.network.latent) * self.spread if self.draw else None for rng in rngs]
         by_edge: dict[int, list[int]] = {}
         for k, one in enumerate(seen):
             if max(one.surface.shape) > LARGER[-1]:
@@ -141,7 +116,7 @@ class NetworkCompleter(Completer, UsesFiles):
         for edge, members in by_edge.items():
             for start in range(0, len(members), BATCH):
                 chosen = members[start : start + BATCH]
-                p = self.network.probabilities([seen[k] for k in chosen], [noise[k] for k in chosen], edge)
+                p = self.network.probabilities([seen[k] for k in chosen], edge)
                 for k, one in zip(chosen, p, strict=True):
                     a, b, c = seen[k].surface.shape
                     results[k] = one[:a, :b, :c]

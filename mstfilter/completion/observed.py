@@ -18,14 +18,23 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.ndimage import binary_dilation
 
-from mstfilter.scene import Frame, ObjectView, VoxelGrid, depth_sigma, frame_geometry, memo, read_only, scaled_area
+from mstfilter.scene import (
+    Frame,
+    ObjectView,
+    Seen,
+    VoxelGrid,
+    depth_sigma,
+    frame_geometry,
+    memo,
+    read_only,
+    scaled_area,
+)
 
 if TYPE_CHECKING:
     from mstfilter.completion.completer import Completer
 
 _REACH = 4.0  # voxels, distance from the surface at which `signed` saturates
-_OWN, _FREE, _BEHIND = np.uint8(1), np.uint8(4), np.uint8(8)  # bits of a view
-_SHAPE = _OWN | _FREE | _BEHIND  # those that are evidence about the object's shape
+_SHAPE = Seen.SURFACE | Seen.FREE | Seen.BEHIND  # what is evidence about the object's shape
 
 # Shares at which the latest frame refutes a view: of its surface that is seen free, of the surface seen now that was
 # free in it, and of its surface that is seen now.
@@ -61,14 +70,8 @@ def observed_box(frame: Frame, mask: np.ndarray, grid: VoxelGrid, rule: Complete
 
     `rule` says how large the box is, and what counts as visible surface and as free space.
     """
-    mine = mask_voxels(frame, mask, grid)
-    if len(mine) == 0:
-        empty = np.zeros((0, 0, 0))
-        no = empty.astype(bool)
-        unknown = empty.astype(np.float32)
-        return np.zeros(3, np.int64), ObservedBox(empty.astype(np.int32), no, no, no, no, no, unknown, np.zeros(0))
-    low, high = rule.box(mine, grid)
-    return low, observed_in(frame, mask, grid, rule, low, high)
+    offset, seen, _, _ = observed_again(frame, mask, (), grid, rule)
+    return offset, seen
 
 
 def mask_voxels(frame: Frame, mask: np.ndarray, grid: VoxelGrid) -> np.ndarray:
@@ -128,10 +131,11 @@ def _free(frame: Frame, grid: VoxelGrid, margin: float, sigmas: float) -> np.nda
 
 
 def encode_box(seen: ObservedBox) -> tuple[np.ndarray, np.ndarray]:
-    """What a box shows as bits (a, b, c) uint8, and its signed distances (a, b, c) int8 in `_REACH` / 127."""
+    """What a box shows: flags of `Seen` (a, b, c) uint8, and signed distances (a, b, c) int8 in `_REACH` / 127."""
     bits = np.zeros(seen.surface.shape, np.uint8)
-    for k, one in enumerate((seen.surface, seen.other_surface, seen.free, seen.behind, seen.hidden)):
-        bits |= one.astype(np.uint8) << k
+    shown = (seen.surface, seen.other_surface, seen.free, seen.behind, seen.hidden)
+    for flag, one in zip(Seen, shown, strict=True):
+        bits |= np.uint8(flag) * one
     signed = np.clip(np.nan_to_num(seen.signed, nan=0.0) / _REACH, -1, 1)
     return bits, np.rint(signed * 127).astype(np.int8)
 
@@ -198,9 +202,9 @@ def recall(seen: ObservedBox, offset: np.ndarray, grid: VoxelGrid, views: Sequen
         signed[inside] = np.fmin(signed[inside], distance)
     bits = bits.reshape(shape)
     near = binary_dilation(seen.surface)  # an earlier surface there is the same one, seen with noise
-    free = seen.free | (((bits & _FREE) > 0) & ~seen.surface)
-    surface = (seen.surface | (((bits & _OWN) > 0) & ~near & ~seen.other_surface)) & ~free
-    behind = (seen.behind | ((bits & _BEHIND) > 0)) & ~free
+    free = seen.free | (Seen.FREE.among(bits) & ~seen.surface)
+    surface = (seen.surface | (Seen.SURFACE.among(bits) & ~near & ~seen.other_surface)) & ~free
+    behind = (seen.behind | Seen.BEHIND.among(bits)) & ~free
     other, hidden = seen.other_surface & ~free, seen.hidden & ~free & ~behind
     return ObservedBox(
         seen.points, surface, other, free, behind, hidden, np.fmin(seen.signed, signed.reshape(shape)), seen.height
@@ -210,13 +214,13 @@ def recall(seen: ObservedBox, offset: np.ndarray, grid: VoxelGrid, views: Sequen
 def _evidence(view: ObjectView, centres: np.ndarray, grid: VoxelGrid) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Which centres (n, 3) lie in the box of a view (n,) bool, and what it shows there of the object.
 
-    That is bits (k,) and signed distances (k,) in voxels, NaN where it shows nothing.
+    That is flags of `Seen` (k,) and signed distances (k,) in voxels, NaN where it shows nothing.
     """
     index = grid.index_of(view.motion.inv().apply(centres)) - view.offset
     inside = ((index >= 0) & (index < view.bits.shape)).all(axis=1)
     at = tuple(index[inside].T)
-    distance, found = decode_signed(view.signed[at]), view.bits[at] & _SHAPE
-    clear = np.where(distance > -_CLEAR, found & (_OWN | _BEHIND), found)
+    distance, found = decode_signed(view.signed[at]), view.bits[at] & np.uint8(_SHAPE)
+    clear = np.where(distance > -_CLEAR, found & np.uint8(Seen.SURFACE | Seen.BEHIND), found)
     return inside, clear, np.where(found > 0, distance, np.nan)
 
 
@@ -233,7 +237,7 @@ def _confirmed(
     kept = []
     for view in views:
         inside, found, _ = _evidence(view, centres, grid)
-        own, free = (found & _OWN) > 0, (found & _FREE) > 0
+        own, free = Seen.SURFACE.among(found), Seen.FREE.among(found)
         n_own = int(own.sum())
         cleared = (own & seen.free.ravel()[inside]).sum() > _CLEARED * n_own
         pierced = (free & now[inside]).sum() > _PIERCED * n_now
@@ -244,5 +248,5 @@ def _confirmed(
 
 def view_surface(view: ObjectView, grid: VoxelGrid) -> np.ndarray:
     """Voxels (k, 3), also outside the grid, that the surface of a view has moved to."""
-    centres = grid.centre_of(np.argwhere(view.bits & _OWN) + view.offset)
+    centres = grid.centre_of(np.argwhere(Seen.SURFACE.among(view.bits)) + view.offset)
     return grid.index_of(view.motion.apply(centres)) if len(centres) else np.zeros((0, 3), np.int64)

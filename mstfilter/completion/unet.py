@@ -1,15 +1,15 @@
 """The completion network: a small 3-D U-Net with a latent variable for the hidden extent. Imports torch.
 
 >>> network = load_network("completion")
->>> p = network.probabilities([seen], [None], edge=32)      # (1, 32, 32, 32), the mode of the hidden extent
+>>> p = network.probabilities([seen], edge=32)      # (1, 32, 32, 32)
 
 The input is a crop of the workspace's voxel lattice (`mstfilter.completion.crops`); the output is a logit for each
 voxel. Blocks work at a half, a quarter and an eighth of the resolution; 2 x 2 x 2 voxels enter and leave as channels.
 A latent vector z scales and shifts the features at the two coarse levels (FiLM; E. Perez, F. Strub, H. de Vries,
-V. Dumoulin, A. Courville, "FiLM: visual reasoning with a general conditioning layer", AAAI 2018). It is drawn from a
-prior that depends on the input; in training from a posterior that also sees the true shape (conditional variational
-autoencoder; K. Sohn, H. Lee, X. Yan, "Learning structured output representation using deep conditional generative
-models", NeurIPS 2015).
+V. Dumoulin, A. Courville, "FiLM: visual reasoning with a general conditioning layer", AAAI 2018). It is the mode of a
+prior that depends on the input; in training it is drawn from a posterior that also sees the true shape (conditional
+variational autoencoder; K. Sohn, H. Lee, X. Yan, "Learning structured output representation using deep conditional
+generative models", NeurIPS 2015).
 
 `load_network` also opens networks of users: an `Architecture` with weights in a folder, or an ONNX file.
 """
@@ -140,10 +140,10 @@ class CompletionNet(nn.Module):
         logits = _to_voxels(self.head(functional.silu(x)).float())
         return logits + self.rule[0] + self.rule[1] * extruded.float()
 
-    def forward(self, x: Tensor, noise: Tensor) -> Tensor:
-        """Logits (b, X, Y, Z) of an input (b, channels, X, Y, Z), with standard normal noise (b, latent) for z."""
+    def forward(self, x: Tensor) -> Tensor:
+        """Logits (b, X, Y, Z) of an input (b, channels, X, Y, Z), with the mode of z."""
         features, prior = self.encode(x)
-        return self.decode(features, prior.draw(noise))
+        return self.decode(features, prior.mean)
 
 
 class ShapePosterior(nn.Module):
@@ -172,25 +172,18 @@ class TrainedNetwork:
     Parameters
     ----------
     forward : callable
-        From the input (b, channels, X, Y, Z) and standard normal noise (b, latent) to logits (b, X, Y, Z).
-    latent : int
-        Length of the noise; 0 if the network does not draw.
+        From the input (b, channels, X, Y, Z) to logits (b, X, Y, Z).
     key : str
         Key of the contents of the weights.
     scale, shift : float
         Calibration of the logits.
     """
 
-    def __init__(
-        self, forward: Callable[[Tensor, Tensor], Tensor], latent: int, key: str, scale: float = 1, shift: float = 0
-    ) -> None:
-        self.forward, self.latent, self.key, self.scale, self.shift = forward, latent, key, scale, shift
+    def __init__(self, forward: Callable[[Tensor], Tensor], key: str, scale: float = 1, shift: float = 0) -> None:
+        self.forward, self.key, self.scale, self.shift = forward, key, scale, shift
 
-    def probabilities(self, seen: Sequence[ObservedBox], noise: Sequence[np.ndarray | None], edge: int) -> np.ndarray:
-        """Calibrated probabilities (n, edge, edge, edge) float32 of at most `BATCH` boxes.
-
-        `noise` is standard normal (latent,) for a draw of the hidden extent, None for the mode.
-        """
+    def probabilities(self, seen: Sequence[ObservedBox], edge: int) -> np.ndarray:
+        """Calibrated probabilities (n, edge, edge, edge) float32 of at most `BATCH` boxes."""
         bits = np.zeros((BATCH, edge, edge, edge), np.uint8)
         signed = np.zeros(bits.shape, np.int8)
         height = np.zeros(edge)
@@ -199,13 +192,9 @@ class TrainedNetwork:
             bits[k, :a, :b, :c], signed[k, :a, :b, :c] = encode_box(one)
             step = one.height[1] - one.height[0] if c > 1 else 0.01
             height = one.height[0] + step * np.arange(edge)
-        drawn = np.zeros((BATCH, self.latent), np.float32)
-        for k, values in enumerate(noise):
-            if values is not None:
-                drawn[k] = values
         with torch.inference_mode(), _one_thread():
             x = channels(torch.from_numpy(bits), torch.from_numpy(signed), torch.from_numpy(height).float())
-            p = torch.sigmoid(self.scale * self.forward(x, torch.from_numpy(drawn)) + self.shift)
+            p = torch.sigmoid(self.scale * self.forward(x) + self.shift)
         return np.asarray(p.numpy()[: len(seen)])
 
 
@@ -231,7 +220,7 @@ def load_network(name: str, architecture: Architecture | None = None) -> Trained
         net, scale, shift = calibrated_network(
             model, CHANNELS, lambda values: CompletionNet(len(CHANNELS), int(values["width"]), int(values["latent"]))
         )
-        return TrainedNetwork(net, net.prior.out_features // 2, model.key, scale, shift)
+        return TrainedNetwork(net, model.key, scale, shift)
     if name.endswith(".onnx"):
         if architecture is not None:
             raise InputError(f"{name} contains its architecture", "leave the field architecture out")
@@ -239,25 +228,24 @@ def load_network(name: str, architecture: Architecture | None = None) -> Trained
     else:
         assert architecture is not None
         model = open_model(name, type(architecture).__name__)
-        built, latent = architecture.build(), architecture.latent
+        built = architecture.build()
         if not isinstance(built, nn.Module):
             raise InputError(
                 f"build of {type(architecture).__name__} returns {type(built).__name__}, no torch.nn.Module"
             )
         net, scale, shift = calibrated_network(model, CHANNELS, lambda values: built)
-        forward = net if latent else lambda x, noise: net(x)
-        opened = TrainedNetwork(forward, latent, model.key, scale, shift)
+        opened = TrainedNetwork(net, model.key, scale, shift)
     opened.forward = functools.partial(_checked, name, opened.forward)
     with torch.inference_mode():
         for edge in (EDGE, *LARGER):
-            opened.forward(torch.zeros(1, len(CHANNELS), edge, edge, edge), torch.zeros(1, opened.latent))
+            opened.forward(torch.zeros(1, len(CHANNELS), edge, edge, edge))
     return opened
 
 
-def _checked(name: str, forward: Callable[[Tensor, Tensor], Tensor], x: Tensor, noise: Tensor) -> Tensor:
+def _checked(name: str, forward: Callable[[Tensor], Tensor], x: Tensor) -> Tensor:
     """The logits (b, X, Y, Z) of a network of the user; InputError if it fails or its output cannot be used."""
     try:
-        out = forward(x, noise)
+        out = forward(x)
     except Exception as error:  # of the user's code or of the runtime: any
         cause = describe_error(error).splitlines()[0]
         raise InputError(f"{name}: the network fails on an input of shape {tuple(x.shape)}: {cause}") from error
@@ -295,16 +283,14 @@ def _open_onnx(path: Path) -> TrainedNetwork:
     inputs = session.get_inputs()
     x = inputs[0].shape if inputs else []
     fixed = [n for k, n in enumerate(x) if k != 1 and isinstance(n, int)]
-    noise = inputs[1].shape if len(inputs) == 2 else [None, 0]
-    if len(x) != 5 or x[1] != len(CHANNELS) or fixed or len(inputs) > 2 or not isinstance(noise[-1], int):
+    if len(x) != 5 or x[1] != len(CHANNELS) or fixed or len(inputs) != 1:
         raise InputError(
             f"{path}: the inputs of the network are {[one.shape for one in inputs]}, expected "
-            f"[n, {len(CHANNELS)}, x, y, z], and [n, latent] for one that draws",
-            "export it with dynamic axes: all but the second of the first input, the first of the second",
+            f"[[n, {len(CHANNELS)}, x, y, z]]",
+            "export it with one input whose axes are all dynamic but the second",
         )
 
-    def forward(x: Tensor, drawn: Tensor) -> Tensor:
-        given = {one.name: value.numpy() for one, value in zip(inputs, (x, drawn), strict=False)}
-        return torch.from_numpy(session.run(None, given)[0])
+    def forward(x: Tensor) -> Tensor:
+        return torch.from_numpy(session.run(None, {inputs[0].name: x.numpy()})[0])
 
-    return TrainedNetwork(forward, noise[-1], hashlib.sha256(data).hexdigest()[:16])
+    return TrainedNetwork(forward, hashlib.sha256(data).hexdigest()[:16])

@@ -3,7 +3,7 @@
 >>> from mstfilter.formats import Tum, open_recording, save_recording
 >>> recording = Tum(K=(525, 525, 319.5, 239.5)).open(path)  # doctest: +SKIP
 >>> save_recording(recording, "recordings/mine")  # doctest: +SKIP
->>> recording = open_recording("recordings/mine")  # doctest: +SKIP
+>>> recording = open_recording("recordings/mine")  # any format  # doctest: +SKIP
 
 A reader is a `RecordingFormat`, a frozen dataclass with ``detects(path)`` and ``open(path)``. A `PauseRule` divides a
 long video into clips.
@@ -25,10 +25,10 @@ __components__ = {
         "bag": "Bag",
     },
     "pauses": {
-        "still": "mstfilter.scene:Still",
-        "at": "mstfilter.scene:At",
-        "listed": "mstfilter.scene:Listed",
-        "ends": "mstfilter.scene:Ends",
-        "every": "mstfilter.scene:EveryNth",
+        "still": "Still",
+        "at": "At",
+        "listed": "Listed",
+        "ends": "Ends",
+        "every": "EveryNth",
     },
 }

@@ -4,22 +4,21 @@ from mstfilter.formats.folder import (
     RECORDING_FILES as RECORDING_FILES,
     RecordingFolder as RecordingFolder,
     RecordingWriter as RecordingWriter,
-    open_recording as open_recording,
     save_recording as save_recording,
 )
 from mstfilter.formats.image_folders import PairedImages as PairedImages, Redwood as Redwood, Tum as Tum
+from mstfilter.formats.pauses import (
+    At as At,
+    Ends as Ends,
+    EveryNth as EveryNth,
+    Listed as Listed,
+    Still as Still,
+)
+from mstfilter.formats.sources import detect_format as detect_format, open_recording as open_recording
 from mstfilter.formats.video import (
     KnownWorld as KnownWorld,
     RecordingFormat as RecordingFormat,
     Video as Video,
     VideoFormat as VideoFormat,
 )
-from mstfilter.scene.pauses import (
-    At as At,
-    Ends as Ends,
-    EveryNth as EveryNth,
-    Listed as Listed,
-    PauseRule as PauseRule,
-    Still as Still,
-    pauses_from_text as pauses_from_text,
-)
+from mstfilter.scene import PauseRule as PauseRule

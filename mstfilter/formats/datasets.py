@@ -15,12 +15,14 @@ from scipy.spatial.transform import RigidTransform
 
 from mstfilter.errors import InputError, MissingLibraryError
 from mstfilter.files import reading
+from mstfilter.formats.pauses import EveryNth
 from mstfilter.formats.video import KnownWorld, RecordingFormat, Video, object_numbers
 from mstfilter.reading import MAX_FILE, open_regular, read_json
 from mstfilter.scene import (
     Camera,
     Frame,
     LazyFrames,
+    PauseRule,
     Recording,
     VoxelGrid,
     as_labels,
@@ -31,7 +33,6 @@ from mstfilter.scene import (
     render,
     rigid_from_matrix,
 )
-from mstfilter.scene.pauses import EveryNth, PauseRule
 
 
 @dataclass(frozen=True)

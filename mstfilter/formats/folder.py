@@ -2,7 +2,7 @@
 
 >>> with RecordingWriter("recordings/mine", camera, grid) as writer:
 ...     writer.add_frame(rgb, depth, time_s=0.0, role="static")
->>> recording = open_recording("recordings/mine")
+>>> recording = RecordingFolder().open(Path("recordings/mine"))
 >>> save_recording(recording, "recordings/copy")
 
 The layout::
@@ -43,6 +43,7 @@ from mstfilter.scene import (
     Camera,
     Frame,
     LazyFrames,
+    PauseRule,
     Recording,
     VoxelGrid,
     as_labels,
@@ -57,7 +58,6 @@ from mstfilter.scene import (
     truth_reader,
     write_image,
 )
-from mstfilter.scene.pauses import PauseRule
 
 VERSION = 1  #: Version of the layout
 RECORDING_FILES = re.compile(  #: paths in a recording folder
@@ -68,7 +68,7 @@ _Model = TypeVar("_Model", bound=BaseModel)
 
 _HINTS = (
     "a recording folder holds manifest.json, camera.json, rgb/, depth/",
-    "other layouts: mstfilter.runs.open_source(path), or `mstfilter convert`",
+    "other layouts: mstfilter.open_recording(path), or `mstfilter convert`",
 )
 
 
@@ -300,7 +300,8 @@ def _load(path: Path, model: type[_Model]) -> tuple[_Model, dict[str, Any]]:
 class RecordingFolder(RecordingFormat):
     """The recording folder of mstfilter: manifest.json, camera.json, rgb/, depth/.
 
-    `pauses` replaces the pauses that the manifest lists.
+    Images are read when they are used; everything else is checked when the folder is opened. A rule `pauses` replaces
+    the pauses that the manifest lists; true volumes are known at the listed ones only.
     """
 
     pauses: PauseRule | None = None
@@ -310,16 +311,10 @@ class RecordingFolder(RecordingFormat):
         return (path / "manifest.json").is_file()
 
     def open(self, path: Path) -> Recording:
-        return open_recording(path, self.pauses)
+        return _open(path, self.pauses)
 
 
-def open_recording(path: str | Path, pauses: PauseRule | None = None) -> Recording:
-    """Read a recording folder. Images are read when they are used; everything else is checked now.
-
-    `Recording.check` reads all images. A rule `pauses` replaces the pauses that the manifest lists; true volumes are
-    known at the listed ones only.
-    """
-    path = Path(path)
+def _open(path: Path, pauses: PauseRule | None) -> Recording:
     if not path.is_dir():
         raise InputError(f"recording folder does not exist: {path}")
     if not any(path.iterdir()):

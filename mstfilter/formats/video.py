@@ -33,17 +33,18 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from mstfilter.errors import InputError, InputWarning
+from mstfilter.formats.pauses import Still
 from mstfilter.scene import (
     Camera,
     Frame,
     LazyFrames,
+    PauseRule,
     Recording,
     VoxelGrid,
     check_depth,
     find_world,
     rigid_from_matrix,
 )
-from mstfilter.scene.pauses import PauseRule, Still
 
 
 class RecordingFormat(ABC):

@@ -41,6 +41,7 @@ from mstfilter.scene import (
     Camera,
     Clip,
     Frame,
+    ObjectView,
     Recording,
     UsesFiles,
     VoxelGrid,
@@ -96,7 +97,6 @@ class ExternalCompletion(ClipCompleter, UsesFiles):
     other: Completer | None = None
 
     stochastic: ClassVar[bool] = True
-    remembers: ClassVar[bool] = False
 
     def check_files(self, recording: Recording) -> None:
         """Read the masks of all pauses, and place all shapes."""
@@ -119,9 +119,17 @@ class ExternalCompletion(ClipCompleter, UsesFiles):
         return seen.surface.astype(np.float32)
 
     def complete_each(
-        self, rngs: Sequence[np.random.Generator], frame: Frame, masks: Sequence[np.ndarray], grid: VoxelGrid
+        self,
+        rngs: Sequence[np.random.Generator],
+        frame: Frame,
+        masks: Sequence[np.ndarray],
+        grid: VoxelGrid,
+        views: Sequence[tuple[ObjectView, ...]] | None = None,
     ) -> list[Completion]:
-        """Place the shapes of several masks; raises InputError before `at`, or if a mask has no shapes."""
+        """Place the shapes of several masks; views are not used.
+
+        Raises InputError before `at`, or if a mask has no shapes.
+        """
         if "_shapes" not in self.__dict__:
             raise InputError("ExternalCompletion does not know the pause of a frame", "call at(clip) first")
         return [

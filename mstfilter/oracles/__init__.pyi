@@ -1,4 +1,3 @@
-from mstfilter.oracles.degradation import degrade as degrade
 from mstfilter.oracles.front_end import (
     TrueBoundary as TrueBoundary,
     TrueCompletion as TrueCompletion,

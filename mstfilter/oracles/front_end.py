@@ -2,8 +2,6 @@
 
 >>> boundary = TrueBoundary()                    # the boundary map, below an ordinary tree
 >>> proposal = TrueMasks()                       # every sample is the true segmentation of the image
->>> proposal = TrueMasks(quality=0.8)            # every sample has different errors and quality 0.8
->>> proposal = TrueMasks(quality=0.8, errors="lasting")    # all samples have the same errors at every pause
 >>> completer = TrueCompletion()                 # the true voxels of what a mask shows
 
 A mask that shows exactly one object is completed to all voxels of that object, including hidden ones. In general a
@@ -20,55 +18,40 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from mstfilter.completion import Completer, Completion, Extrude, ObservedBox, observed_box
-from mstfilter.errors import InputError, check_choice, check_number
-from mstfilter.oracles.degradation import degrade
+from mstfilter.errors import check_choice
 from mstfilter.oracles.truth import Need, UsesTruth
-from mstfilter.scene import Clip, Frame, VoxelGrid, content_key, memo, read_only, scaled_area, scaled_length
-from mstfilter.scoring import MIN_PIXELS, weighted_coverage
+from mstfilter.scene import (
+    Clip,
+    Frame,
+    ObjectView,
+    VoxelGrid,
+    content_key,
+    memo,
+    read_only,
+    scaled_area,
+    scaled_length,
+)
+from mstfilter.scoring import MIN_PIXELS
 from mstfilter.segmentation import BoundaryModel, ColourDepthBoundary, ObjectRule, complete_segments
-from mstfilter.smc import Key, Population, Proposal, child
+from mstfilter.smc import Population, Proposal
 
 _REACH = 4.0  # distance to a true border up to which strength is kept, in pixels of an image of 640 px width
-_SEGMENTS = 65536  # segments of a sample have numbers from i * _SEGMENTS on
 
 
 @dataclass(frozen=True)
 class TrueMasks(UsesTruth, Proposal):
-    """Hypotheses from the true masks of the clip's last frame.
+    """Hypotheses from the true masks of the clip's last frame, all equal.
 
-    Parameters
-    ----------
-    quality : float
-        2-D quality (form ``objects``) of the masks of each sample, 0.3 to 1.
-    errors : {"independent", "lasting"}
-        Errors if `quality` is below 1. *independent*: each sample of each pause has different errors, which average
-        out over samples and pauses. *lasting*: all samples have the same masks, and an object is split and merged in
-        the same way at every pause, like the systematic errors of a real front end.
-    over, under : float
-        Shares of the lost quality that come from splitting and from merging objects; their sum is at most 1. The
-        rest comes from displaced borders, as does any loss that splitting and merging could not reach.
-    objects : ObjectRule
-        Which pixels can belong to an object (only its `object_pixels` is used).
-    threshold : float
-        Probability from which a completed voxel is occupied.
+    `objects` says which pixels can belong to an object (only its `object_pixels` is used); completed voxels of
+    probability `threshold` or more are occupied.
     """
 
     completer: Completer = field(default_factory=Extrude)
-    quality: float = 1.0
-    errors: Literal["independent", "lasting"] = "independent"
-    over: float = 0.35
-    under: float = 0.35
     objects: ObjectRule = field(default_factory=ObjectRule)
     threshold: float = 0.5
 
     properly_weighted: ClassVar[bool] = False
     needs: ClassVar[tuple[Need, ...]] = ("voxels", "instance")
-
-    def __post_init__(self) -> None:
-        check_number("quality of masks", self.quality, at_least=0.3, at_most=1)
-        check_choice("errors", self.errors, ("independent", "lasting"))
-        if min(self.over, self.under) < 0 or self.over + self.under > 1:
-            raise InputError(f"over is {self.over} and under {self.under}, expected shares that sum to at most 1")
 
     def masks(self, frame: Frame, clip: Clip) -> np.ndarray:
         """(H, W) int32 true objects of the clip's last frame with enough pixels, 0 elsewhere."""
@@ -79,33 +62,13 @@ class TrueMasks(UsesTruth, Proposal):
         return np.where(enough[image] & self.objects.object_pixels(frame, clip.grid), image, 0).astype(np.int32)
 
     def sample(self, rng: np.random.Generator, observation: Clip, n: int) -> Population:
-        """`n` hypotheses about the scene at the end of the clip; equal ones where their masks are."""
+        """`n` equal hypotheses about the scene at the end of the clip."""
         true = self.masks(observation.after, observation)
-        same_masks = self.quality == 1 or self.errors == "lasting"
-        images: list[np.ndarray] = []
-        samples: list[np.ndarray] = []
-        for i in range(1 if same_masks else n):
-            images.append(degrade(self._errors(rng, i), true, self.quality, self.over, self.under))
-            numbers = np.unique(images[-1])
-            samples.append(i * _SEGMENTS + numbers[numbers > 0].astype(np.int64))
-        qualities = [round(weighted_coverage(image, true), 4) for image in images]
-        if same_masks:
-            samples, qualities = samples * n, qualities * n
+        shown = np.unique(true[true > 0]).astype(np.int64)
         particles, counts = complete_segments(
-            rng,
-            observation,
-            samples,
-            lambda segment: images[segment // _SEGMENTS] == segment % _SEGMENTS,
-            self.completer,
-            self.threshold,
+            rng, observation, [shown] * n, lambda segment: true == segment, self.completer, self.threshold
         )
-        return Population(particles, notes={"mask_quality": qualities, "objects": counts["objects"]})
-
-    def _errors(self, rng: np.random.Generator, i: int) -> np.random.Generator:
-        """The stream that the errors of sample `i` are drawn from."""
-        if self.errors == "lasting":
-            return Key(int.from_bytes(self.bound_key[:8], "big")).child("lasting masks").generator()
-        return child(rng, "masks", i)
+        return Population(particles, notes={"objects": counts["objects"]})
 
 
 @dataclass(frozen=True)
@@ -164,16 +127,20 @@ class TrueCompletion(UsesTruth, Completer):
     objects: ObjectRule = ObjectRule()  # noqa: RUF009 (frozen)
 
     needs: ClassVar[tuple[Need, ...]] = ("voxels", "instance")
-    remembers: ClassVar[bool] = False
 
     def fill(self, rng: np.random.Generator, seen: ObservedBox) -> np.ndarray:
         """1 on the visible surface, for masks that show no true object."""
         return seen.surface.astype(np.float32)
 
     def complete_each(
-        self, rngs: Sequence[np.random.Generator], frame: Frame, masks: Sequence[np.ndarray], grid: VoxelGrid
+        self,
+        rngs: Sequence[np.random.Generator],
+        frame: Frame,
+        masks: Sequence[np.ndarray],
+        grid: VoxelGrid,
+        views: Sequence[tuple[ObjectView, ...]] | None = None,
     ) -> list[Completion]:
-        """Complete several masks of a frame at a pause."""
+        """Complete several masks of a frame at a pause; views are not used."""
         t = self.truth.pause_of(frame)
         owner = np.where(self.objects.object_pixels(frame, grid), self.truth.instance(t), 0).ravel()
         voxels, pixel = memo(

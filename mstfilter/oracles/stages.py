@@ -21,9 +21,9 @@ from typing import ClassVar
 
 import numpy as np
 
-from mstfilter.fusion import Cells, Evidence, PairOdds, Projection
 from mstfilter.oracles.truth import Need, UsesTruth
-from mstfilter.scene import Clip, Frame, Hypothesis, frame_geometry, render
+from mstfilter.partition import Cells, PairOdds
+from mstfilter.scene import Clip, Evidence, Frame, Hypothesis, Projection, frame_geometry, render
 from mstfilter.scoring import overlap, weighted_coverage
 from mstfilter.smc import Population, Transition
 from mstfilter.tracking import Warp, move_points, rigid_transform

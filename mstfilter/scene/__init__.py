@@ -7,9 +7,12 @@
 >>> project(hypothesis, clip.after.camera)            # label image of the hypothesis  # doctest: +SKIP
 
 Units are metres, radians and seconds; rigid motions are scipy `RigidTransform` objects named ``T_to_from``. The
-package does not depend on filters, components or file formats.
+package does not depend on filters or file formats.
 """
 
 from mstfilter.lazy import attach
 
 __getattr__, __dir__, __all__ = attach(__name__, __file__)
+
+__interfaces__ = {"free_space": "Projection", "evidence": "Evidence"}
+__components__ = {"free_space": {"projective": "FreeSpace", "none": "NoFreeSpace"}}

@@ -17,11 +17,20 @@ from mstfilter.scene.encoding import (
     decode_hypotheses as decode_hypotheses,
     encode_hypotheses as encode_hypotheses,
 )
+from mstfilter.scene.evidence import (
+    Evidence as Evidence,
+    FreeSpace as FreeSpace,
+    NoFreeSpace as NoFreeSpace,
+    Projection as Projection,
+    log_quality as log_quality,
+    scored as scored,
+)
 from mstfilter.scene.frame import (
     Clip as Clip,
     Frame as Frame,
     decode_image as decode_image,
     depth_sigma as depth_sigma,
+    grey_blocks as grey_blocks,
     read_depth as read_depth,
     read_labels as read_labels,
     read_rgb as read_rgb,
@@ -33,15 +42,10 @@ from mstfilter.scene.geometry import (
     frame_geometry as frame_geometry,
     table_residual as table_residual,
 )
-from mstfilter.scene.pauses import (
-    At as At,
-    Ends as Ends,
-    EveryNth as EveryNth,
-    Listed as Listed,
-    PauseRule as PauseRule,
-    Still as Still,
-    pause_rule as pause_rule,
-    pauses_from_text as pauses_from_text,
+from mstfilter.scene.partitions import (
+    CommonRefinement as CommonRefinement,
+    canonical as canonical,
+    common_refinement as common_refinement,
 )
 from mstfilter.scene.plausibility import (
     Finding as Finding,
@@ -51,6 +55,7 @@ from mstfilter.scene.plausibility import (
 )
 from mstfilter.scene.recording import (
     LazyFrames as LazyFrames,
+    PauseRule as PauseRule,
     Recording as Recording,
     UsesFiles as UsesFiles,
     check_depth as check_depth,
@@ -70,7 +75,9 @@ from mstfilter.scene.voxels import (
     ObjectRecord as ObjectRecord,
     ObjectView as ObjectView,
     Occupancy as Occupancy,
+    Seen as Seen,
     VoxelGrid as VoxelGrid,
     as_labels as as_labels,
+    check_grid as check_grid,
     occupied_box as occupied_box,
 )

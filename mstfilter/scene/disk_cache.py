@@ -18,7 +18,7 @@ import sqlite3
 import warnings
 import zipfile
 from collections.abc import Hashable, Mapping
-from dataclasses import fields, is_dataclass
+from dataclasses import MISSING, fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
@@ -182,7 +182,9 @@ def _unpack(of: Any, arrays: Mapping[str, np.ndarray], path: str) -> Any:
         return tuple(_unpack(part, arrays, _joined(path, str(k))) for k, part in enumerate(of))
     if is_dataclass(of):
         assert isinstance(of, type)
-        return of(**{f.name: _leaf(arrays.get(_joined(path, f.name))) for f in fields(of)})
+        stored = {f: arrays.get(_joined(path, f.name)) for f in fields(of)}
+        given = {f.name: _leaf(a) for f, a in stored.items() if a is not None or f.default is MISSING}
+        return of(**given)
     return _leaf(arrays[path or "value"])
 
 

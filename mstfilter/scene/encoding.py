@@ -19,8 +19,8 @@ def encode_hypotheses(hypotheses: Sequence[Hypothesis]) -> dict[str, np.ndarray]
     """Hypotheses on one grid as named arrays.
 
     The arrays are ``labels`` (n, X, Y, Z) uint16, ``origin`` (3,), ``voxel_size`` (), and one row per object:
-    ``owner`` (index of the hypothesis), ``label``, ``id``, ``birth``, ``motion`` (4, 4), ``completion_key``,
-    ``apart`` (ids, comma separated). The source crops are stored as ``has_source``, ``source_offset`` (3,),
+    ``owner`` (index of the hypothesis), ``label``, ``id``, ``birth``, ``motion`` (4, 4), ``completion_key``.
+    The source crops are stored as ``has_source``, ``source_offset`` (3,),
     ``source_shape`` (3,) and ``source_bits``, the packed bits of all crops in order.
 
     If a hypothesis is not certain, ``voxel_owner`` and ``probability`` (n, X, Y, Z) are its occupancy, and
@@ -44,7 +44,6 @@ def encode_hypotheses(hypotheses: Sequence[Hypothesis]) -> dict[str, np.ndarray]
         "birth": np.array([r.birth for _, r in rows], np.int64),
         "motion": _matrices(r.motion for _, r in rows),
         "completion_key": np.array([r.completion_key or "" for _, r in rows], np.str_),
-        "apart": np.array([",".join(map(str, sorted(r.apart))) for _, r in rows], np.str_),
         "has_source": np.array([c is not None for c in crops], bool),
         "source_offset": np.array([(0, 0, 0) if c is None else c.offset for c in crops], np.int64).reshape(-1, 3),
         "source_shape": np.array([(0, 0, 0) if c is None else c.occupied.shape for c in crops], np.int64).reshape(
@@ -122,7 +121,6 @@ def decode_hypotheses(arrays: Mapping[str, np.ndarray]) -> tuple[Hypothesis, ...
                 crop,
                 RigidTransform(arrays["motion"][row], normalize=False),  # bit-identical
                 str(arrays["completion_key"][row]) or None,
-                frozenset(int(other) for other in str(arrays["apart"][row]).split(",") if other),
                 tuple(views.get(row, ())),
             )
         )

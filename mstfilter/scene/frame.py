@@ -176,6 +176,17 @@ def write_image(path: Path, image: np.ndarray) -> None:
     path.write_bytes(encoded.tobytes())
 
 
+_BLOCKS_ACROSS = 80
+
+
+def grey_blocks(rgb: np.ndarray) -> np.ndarray:
+    """Mean grey level of square blocks, about 80 across: (h, w) float32 of an image (H, W, 3)."""
+    grey = np.asarray(rgb, dtype=np.float32).mean(axis=2)
+    side = max(1, grey.shape[1] // _BLOCKS_ACROSS)
+    h, w = grey.shape[0] // side, grey.shape[1] // side
+    return grey[: h * side, : w * side].reshape(h, side, w, side).mean(axis=(1, 3))
+
+
 @dataclass(frozen=True, eq=False)
 class Frame:
     """One RGB-D image with its camera.

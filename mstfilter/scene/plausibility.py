@@ -23,9 +23,8 @@ import numpy as np
 from mstfilter.errors import InputError, InputWarning
 from mstfilter.scene.arrays import content_key
 from mstfilter.scene.camera import Camera
-from mstfilter.scene.frame import Frame, depth_sigma
+from mstfilter.scene.frame import Frame, depth_sigma, grey_blocks
 from mstfilter.scene.geometry import SupportPlane, fit_support_plane
-from mstfilter.scene.pauses import grey_blocks
 from mstfilter.scene.voxels import Hypothesis, VoxelGrid
 
 _FIELDS, _POSSIBLE_FIELDS = (12.0, 130.0), (3.0, 160.0)  # degrees: horizontal field of view; warning and stop

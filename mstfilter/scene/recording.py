@@ -30,11 +30,24 @@ from mstfilter.scene.arrays import content_key
 from mstfilter.scene.camera import Camera, rigid_from_matrix
 from mstfilter.scene.frame import Clip, Frame
 from mstfilter.scene.geometry import fit_support_plane, workspace
-from mstfilter.scene.pauses import Ends, PauseRule, Still, pause_rule
 from mstfilter.scene.plausibility import examine, report_findings, unreadable
 from mstfilter.scene.voxels import VoxelGrid, as_labels
 
 _LONG = 20  # frames; more are probably not one clip
+
+
+class PauseRule(ABC):
+    """Finds the pauses of a video; the rules are in `mstfilter.formats`."""
+
+    @abstractmethod
+    def find(self, times: tuple[float, ...], read_rgb: Callable[[int], np.ndarray]) -> tuple[int, ...]:
+        """Ascending frame indices of the pauses.
+
+        `times` are seconds, one per frame; ``read_rgb(index)`` is the colour image (H, W, 3) uint8 of a frame.
+        """
+
+
+_rule_of_text = late("mstfilter.formats.pauses:pause_rule", "The rule of a text.")
 
 
 class LazyFrames(Sequence[Frame]):
@@ -205,9 +218,9 @@ class Recording:
                 stacklevel=2,
             )
         if pauses is None:
-            pauses = Still() if times is not None and n > 2 else Ends()
+            pauses = "still" if times is not None and n > 2 else "ends"
         if isinstance(pauses, str):
-            pauses = pause_rule(pauses)
+            pauses = _rule_of_text(pauses)
         if isinstance(pauses, PauseRule):
             pauses = pauses.find(stamps, lambda index: rgb[index])
         listed = (pauses,) if isinstance(pauses, Integral) else pauses
@@ -266,8 +279,8 @@ class Recording:
         """This recording with the workspace of another, and its camera pose at the first pause; without true volumes.
 
         For parts of one session with a camera that stands still, or that is at the same place at both first pauses:
-        ``open_source(path, options=["start_s=30"]).in_world_of(first)``. Hypotheses of one part can then be moved on
-        by the clips of the next.
+        ``open_recording(path, options=["start_s=30"]).in_world_of(first)``. Hypotheses of one part can then be moved
+        on by the clips of the next.
         """
         own = self.frames[self.pauses[0]].camera.pose
         moved = other.frames[other.pauses[0]].camera.pose * own.inv()

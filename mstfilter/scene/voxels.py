@@ -16,8 +16,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from enum import IntFlag
 from functools import cached_property
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
@@ -181,14 +183,26 @@ class Crop:
         return a, b, c
 
 
+class Seen(IntFlag):
+    """What a frame shows of a voxel, for one object: the bits of `ObjectView.bits`."""
+
+    SURFACE = 1  #: visible surface of the object
+    OTHER_SURFACE = 2  #: visible surface of something else
+    FREE = 4  #: in front of the measured surface
+    BEHIND = 8  #: behind the surface of the object
+    HIDDEN = 16  #: behind the surface of something else
+
+    def among(self, bits: Any) -> Any:
+        """Where at least one of these bits is set: bool, for an array or a torch tensor of uint8."""
+        return (bits & int(self)) > 0
+
+
 @dataclass(frozen=True, eq=False)
 class ObjectView:
     """What one frame showed of an object, in a box of the grid, and where the object moved since then."""
 
     offset: np.ndarray  #: (3,) int, index of the box's first voxel in the grid
-    #: (a, b, c) uint8: 1 visible surface of the object, 2 another surface, 4 free, 8 behind the surface of the
-    #: object, 16 behind another surface
-    bits: np.ndarray
+    bits: np.ndarray  #: (a, b, c) uint8, flags of `Seen`
     signed: np.ndarray  #: (a, b, c) int8, signed distance behind the measured surface (`encode_box`)
     key: str  #: key of the contents
     #: Rigid motion of the object in world metres since the frame.
@@ -216,9 +230,6 @@ class ObjectRecord:
     #: Rigid motion in world metres since `source`; the identity if `source` is None.
     motion: RigidTransform = field(default_factory=lambda: _NO_MOTION)
     completion_key: str | None = None  #: key of the segment that it was completed from
-    #: Ids of objects of the same hypothesis that were observed to move apart from it, so that they are not the
-    #: same object.
-    apart: frozenset[int] = frozenset()
     views: tuple[ObjectView, ...] = ()  #: what the frames so far showed of it, oldest first
 
     def __repr__(self) -> str:
@@ -420,3 +431,16 @@ class Hypothesis:
     def mask(self, label: int) -> np.ndarray:
         """(X, Y, Z) bool: the voxels of an object."""
         return self.labels == label
+
+
+def check_grid(name: str, hypothesis: Hypothesis, grid: VoxelGrid) -> None:
+    """Raise InputError if a hypothesis has another grid."""
+    if hypothesis.grid != grid:
+        found, expected = (
+            f"{g.shape} voxels of {g.voxel_size:g} m at {g.origin.tolist()}" for g in (hypothesis.grid, grid)
+        )
+        raise InputError(
+            f"grid of {name} is {found}, expected {expected}",
+            "all hypotheses of a run share the workspace of its clips",
+            "parts of one session: open the later part with later.in_world_of(first)",
+        )

@@ -26,8 +26,9 @@ from mstfilter.errors import InputError, describe_error, exhausted
 from mstfilter.files import atomic_folder
 from mstfilter.formats import open_recording
 from mstfilter.presets import PACKAGES
-from mstfilter.runs import RunFolder, RunProgress, code_version, filter_recording, measure_pause, open_source
+from mstfilter.runs import RunFolder, RunProgress, code_version, filter_recording
 from mstfilter.scene import Recording, scene_cache
+from mstfilter.scoring import measure_pause
 from mstfilter.study.results import FORECASTS, Job, JobOutcome, write_result
 
 _StepCallback = Callable[[int, int], None]
@@ -62,7 +63,7 @@ def _failure(error: BaseException) -> JobOutcome:
 def open_scene(source: Mapping[str, Any], recordings: str) -> Recording:
     """The recording of a scene; a simulated one is made if it is missing."""
     if "path" in source:
-        return open_source(Path(source["path"]), source["format"], source["options"], source["pauses"])
+        return open_recording(Path(source["path"]), source["format"], source["options"], source["pauses"])
     from mstfilter.simulation import cached_recording
 
     return open_recording(cached_recording(source["family"], source["seed"], Path(recordings), **source["set"]))
@@ -87,13 +88,14 @@ def _run(job: Job, step: _StepCallback) -> None:
     _check_code(job["code"])
     folder = Path(job["folder"])
     costs: list[dict[str, float]] = []
-    began, peaks = time.process_time(), StagePeaks()
+    began = time.process_time()
 
     def progress(p: RunProgress) -> None:
         nonlocal began
         if p.done:
-            costs.append({"seconds": p.seconds, "core_seconds": time.process_time() - began, **peaks.megabytes()})
-            peaks.begin()
+            spent = time.process_time() - began
+            costs.append({"seconds": p.seconds, "core_seconds": spent, "peak_mb": peak_megabytes()})
+        reset_peak()
         began = time.process_time()
         step(p.done, p.total)
 
@@ -108,7 +110,6 @@ def _run(job: Job, step: _StepCallback) -> None:
                 job["seed"],
                 allow_files=job["allow_files"],
                 progress=progress,
-                observer=peaks,
             )
         for t, cost in enumerate(costs):
             cost.update({f"seconds_{stage}": seconds for stage, seconds in run.seconds(t).items()})
@@ -120,41 +121,16 @@ def _run(job: Job, step: _StepCallback) -> None:
 
 def write_measures(run: RunFolder, recording: Recording) -> list[dict[str, Any]]:
     """The metrics of each pause of a run; the counts of its forecasts are written into its folder."""
-    measured = [measure_pause(run, recording, t) for t in range(run.n_pauses)]
+    measured = [
+        measure_pause(
+            recording, t, run.hypotheses(t), np.array(run.info(t)["weights"], dtype=float), run.questions(t)
+        )
+        for t in range(run.n_pauses)
+    ]
     counts = [one for _, one in measured if one is not None]
     if len(counts) == len(measured):
         np.savez_compressed(run.path / FORECASTS, counts=np.stack(counts))
     return [row for row, _ in measured]
-
-
-class StagePeaks:
-    """Peak memory of a step and of each of its stages; an observer of `ParticleFilter.step`.
-
-    >>> peaks = StagePeaks()
-    >>> state, info = filter.step(state, clip, observer=peaks)
-    >>> peaks.megabytes()["peak_mb"]
-    """
-
-    def __init__(self) -> None:
-        self.begin()
-
-    def begin(self) -> None:
-        """Start to measure a step."""
-        self._step, self._stages = 0.0, dict[str, float]()
-        self._by_stage = reset_peak()
-
-    def __call__(self, stage: str, begins: bool) -> None:
-        """A stage begins or ends."""
-        peak = peak_megabytes()
-        self._step = max(self._step, peak)
-        if not begins:
-            self._stages[stage] = max(peak, self._stages.get(stage, 0.0))
-        self._by_stage = reset_peak() and self._by_stage
-
-    def megabytes(self) -> dict[str, float]:
-        """``peak_mb`` of the step, and ``peak_mb_STAGE`` if the system can reset the peak (Linux)."""
-        stages = {f"peak_mb_{stage}": peak for stage, peak in self._stages.items()} if self._by_stage else {}
-        return {"peak_mb": max(self._step, peak_megabytes()), **stages}
 
 
 def reset_peak() -> bool:

@@ -21,10 +21,11 @@ from pathlib import Path
 from typing import Any
 
 from mstfilter.errors import InputError, naming
+from mstfilter.formats import open_recording
 from mstfilter.oracles import uses_truth
 from mstfilter.presets import REGISTRY, build_filter, describe_filter
 from mstfilter.registry import nested_components
-from mstfilter.runs import as_json, code_version, component_files, library_versions, open_source
+from mstfilter.runs import as_json, code_version, component_files, library_versions
 from mstfilter.scene import content_key
 from mstfilter.study.config import ArmRequest, SceneEntry, StudyConfig, expand_arms
 
@@ -151,7 +152,7 @@ def _scenes(entry: SceneEntry, folder: Path, allow_files: bool) -> Iterator[Stud
         for path in paths:
             source = {"path": str(Path(path).resolve()), "format": entry.format, "pauses": entry.pauses}
             source |= {"options": list(entry.options)}
-            recording = open_source(Path(path), entry.format, entry.options, entry.pauses, allow_files=allow_files)
+            recording = open_recording(Path(path), entry.format, entry.options, entry.pauses, allow_files=allow_files)
             # Metrics and oracles depend on the ground truth.
             key = content_key(recording.key, recording.truth_key).hex()
             yield StudyScene(Path(path).name, entry.group or "recordings", source, key)

@@ -24,7 +24,7 @@ import pytest
 
 from mstfilter.completion import Completer
 from mstfilter.errors import InputError, describe_error
-from mstfilter.fusion import Evidence
+from mstfilter.scene import Evidence
 from mstfilter.smc import (
     Codec,
     DensityTransition,

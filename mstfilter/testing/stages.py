@@ -1,4 +1,4 @@
-"""The contract of the stages of MST: boundaries, trees, cuts, completion, motions and the parts of fusion."""
+"""The contract of the stages of MST: boundaries, trees, cuts, completion, motions and the parts of the updates."""
 
 from __future__ import annotations
 
@@ -13,9 +13,10 @@ import numpy as np
 
 from mstfilter.completion import ClipCompleter, Completer, ObservedBox, observed_box
 from mstfilter.completion.completer import fault_of
+from mstfilter.crossover import Crossover, CrossoverUpdate, Structure
 from mstfilter.errors import InputWarning
-from mstfilter.fusion import Crossover, Division, FusionUpdate, PairOdds, PartitionUpdate, Projection, Structure
-from mstfilter.scene import Clip, Hypothesis, render_hypothesis
+from mstfilter.partition import PairOdds, PartitionUpdate
+from mstfilter.scene import Clip, Hypothesis, Projection, render_hypothesis
 from mstfilter.segmentation import BoundaryModel, CutSampler, CutValue, TreeBuilder, TreeCutProposal
 from mstfilter.smc import Component, Population, Proposal, Transition, child
 from mstfilter.testing.contract import RandomContract, prerequisite, reports_errors, same, skips_errors
@@ -42,15 +43,14 @@ STAGE_OWNERS: dict[type, Callable[[Any], Component]] = {
     MaskTracker: lambda stage: TrackingTransition(tracker=stage),
     MotionRule: lambda stage: TrackingTransition(rule=stage),
     Registration: lambda stage: TrackingTransition(rule=MstRule(registration=stage)),
-    Projection: lambda stage: FusionUpdate(free_space=stage),
-    Structure: lambda stage: FusionUpdate(crossover=Crossover(structure=stage)),
-    Division: lambda stage: FusionUpdate(division=stage),
+    Projection: lambda stage: CrossoverUpdate(free_space=stage),
+    Structure: lambda stage: CrossoverUpdate(crossover=Crossover(structure=stage)),
     PairOdds: lambda stage: PartitionUpdate(pairs=stage),
 }
 
 
 class StageContract(RandomContract):
-    """The contract of a stage of MST, which is tested in its place in the proposal, the tracking or the fusion."""
+    """The contract of a stage of MST, which is tested in its place in the proposal, the tracking or the update."""
 
     def example(self, rng: np.random.Generator, n: int) -> tuple[Population, Any]:
         """`n` hypotheses and a clip."""
@@ -68,9 +68,9 @@ class StageContract(RandomContract):
         elif isinstance(owner, Transition):
             found = owner.predict(rng, population, clip)
         else:
-            assert isinstance(owner, FusionUpdate | PartitionUpdate)
+            assert isinstance(owner, CrossoverUpdate | PartitionUpdate)
             found = owner.update(rng, population, population.take(np.arange(min(2, len(population)))), clip)
-            if isinstance(owner, FusionUpdate):
+            if isinstance(owner, CrossoverUpdate):
                 found = found.take(np.arange(0, len(found), 5))
         return found.realised()
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mstfilter.baselines.object_fusion import ObjectFusion, ObjectVolume
-from mstfilter.presets import build_filter, load_config
+from mstfilter.presets import preset
 from mstfilter.scene import Clip, Frame, Hypothesis, render
 from mstfilter.scoring import weighted_coverage
 from mstfilter.smc import Population
@@ -136,13 +136,10 @@ def test_what_is_seen_through_is_forgotten():
 
 def test_the_preset_follows_a_slide_and_ties_with_the_single_frame_at_first(tmp_path):
     recording = slide(tmp_path / "r", (0, 1, 2, 3, 4, 5, 6))
-    states = {}
-    for name in ("object_fusion", "single_frame"):
-        filter = build_filter(load_config(name))
-        state = filter.start(0)
-        for clip in recording.clips():
-            state, _ = filter.step(state, clip)
-            states.setdefault(name, []).append(state.population)
+    states = {
+        name: [state.population for state, _ in preset(name).iterate(recording.clips()[:pauses], 0)]
+        for name, pauses in (("object_fusion", 4), ("single_frame", 1))
+    }
     assert states["object_fusion"][0].particles[0].key == states["single_frame"][0].particles[0].key
     assert all(len(p) == 1 for p in states["object_fusion"])
     last = states["object_fusion"][-1].particles[0]

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from mstfilter.baselines.updates import SamplesOnly, TrackingOnly, Union
-from mstfilter.fusion import Division, Evidence, FreeSpace, FusionUpdate, NoFreeSpace
+from mstfilter.crossover import CrossoverUpdate
 from mstfilter.presets import build_filter, load_config
-from mstfilter.scene import Hypothesis
+from mstfilter.scene import FreeSpace, Hypothesis, NoFreeSpace
 from mstfilter.scoring import weighted_coverage
 from mstfilter.smc import Population
 from mstfilter.testing import UpdateContract, scene_example
@@ -22,49 +22,37 @@ def recording(tmp_path_factory):
     return slide(tmp_path_factory.mktemp("baselines") / "slide")
 
 
-def run(name, recording, seed=3, *overrides):
-    filter, populations = build_filter(load_config(name, overrides)), []
-    state = filter.start(seed)
-    for clip in recording.clips():
-        state, _ = filter.step(state, clip)
-        populations.append(state.population)
-    return populations
-
-
-@pytest.fixture(scope="module")
-def rules(recording):
-    return run("mst_rules", recording, 3, "proposal.completer=network")
+def run(name, recording, seed=3, *overrides, pauses=None):
+    """The populations after the first pauses."""
+    filter = build_filter(load_config(name, overrides))
+    return [state.population for state, _ in filter.iterate(recording.clips()[:pauses], seed)]
 
 
 def keys(population):
     return [h.key for h in population.particles]
 
 
-@pytest.mark.parametrize("name", ["samples_only", "tracking_only", "union"])
-def test_at_the_first_pause_filter_and_baselines_tie_exactly(recording, rules, name):
-    population = run(name, recording)[0]
-    assert keys(population) == keys(rules[0])
-    np.testing.assert_array_equal(population.log_weights, rules[0].log_weights)
-
-
-def test_at_the_first_pause_mst_has_its_samples(recording):
-    """Those of `samples_only` with as many samples and the same selection, up to the borders of segments."""
-    mst = run("mst", recording)[0]
-    samples = run("samples_only", recording, 3, "n_proposed=30", "resampler=systematic")[0]
-    for a, b in zip(mst.particles, samples.particles, strict=True):
+def test_at_the_first_pause_filter_and_baselines_tie_exactly(recording):
+    """The baselines exactly; `mst`, which completes in its update, up to the borders of segments."""
+    rules = run("mst_rules", recording, 3, "proposal.completer=network", pauses=1)[0]
+    for population in (run(name, recording, pauses=1)[0] for name in ("samples_only", "tracking_only", "union")):
+        assert keys(population) == keys(rules)
+        np.testing.assert_array_equal(population.log_weights, rules.log_weights)
+    for a, b in zip(run("mst", recording, pauses=1)[0].particles, rules.particles, strict=True):
         assert a.n_objects == b.n_objects and weighted_coverage(a.labels, b.labels) > 0.95
 
 
 def test_another_seed_breaks_the_tie(recording):
-    sampler = "proposal.sampler.temperature=8"  # so that samples differ at all on so plain a scene
-    assert keys(run("samples_only", recording, 3, sampler)[0]) != keys(run("samples_only", recording, 4, sampler)[0])
+    sampler = "proposal.sampler.temperature=8"  # otherwise samples are equal on such a plain scene
+    a, b = (run("samples_only", recording, seed, sampler, pauses=1)[0] for seed in (3, 4))
+    assert keys(a) != keys(b)
 
 
 def test_samples_are_those_that_the_filter_draws_at_the_same_pause(recording):
     """The proposal's stream is the same in both arms at every pause."""
-    seen = {}
+    seen, overrides = {}, ["proposal.sampler.temperature=8", "proposal.completer=network", "n_proposed=4"]
     for name in ("mst_rules", "samples_only"):
-        filter = build_filter(load_config(name, ["proposal.sampler.temperature=8", "proposal.completer=network"]))
+        filter = build_filter(load_config(name, overrides))
         recorder = ProposalRecorder(filter.proposal)
         replace(filter, proposal=recorder).run(recording.clips(), seed=5)
         seen[name] = recorder.drawn
@@ -116,49 +104,22 @@ def test_refinement_of_tracked_objects_is_a_field():
     assert cleared.notes["quality"][0] < 1
 
 
-def test_a_union_holds_both_populations_weighted_as_fusion_weighs():
+def test_a_union_holds_both_populations_weighted_as_the_crossover_weighs():
     predicted, proposed, clip = two()
     rng = np.random.default_rng(0)
-    fusion = FusionUpdate(quality_exponent=2.0, free_space=FreeSpace())
-    both = Union(fusion).update(rng, predicted, proposed, clip)
+    both = Union(quality_exponent=2.0).update(rng, predicted, proposed, clip)
     assert len(both) == 5
-    refined = [fusion.free_space.project(h, clip.after) for h in predicted.particles]
+    refined = [FreeSpace().project(h, clip.after) for h in predicted.particles]
     assert keys(both) == [h.key for h, _ in refined] + keys(proposed)
     q = np.array([q for _, q in refined])
     np.testing.assert_allclose(both.log_weights, np.log([0.5 * q[0] ** 2, 1.5 * q[1] ** 2, 1, 1, 1]), atol=1e-12)
     assert both.parents["previous"].tolist() == [0, 1, -1, -1, -1]
     assert both.parents["proposed"].tolist() == [-1, -1, 0, 1, 2]
-
-    class Objects(Evidence):
-        def log_score(self, hypotheses, clip):
-            return np.array([float(h.n_objects) for h in hypotheses])
-
-    judged = Union(FusionUpdate(quality_exponent=2.0, evidence=(Objects(),))).update(rng, predicted, proposed, clip)
-    n = np.array([h.n_objects for h in both.particles])
-    np.testing.assert_allclose(judged.log_weights - both.log_weights, n)
+    alone = Union(quality_exponent=2.0).update(rng, predicted, None, clip)
+    np.testing.assert_allclose(alone.log_weights, both.log_weights[:2])
 
 
-def test_a_union_takes_apart_what_fusion_takes_apart():
-    """All of fusion but its crossover: the left and the right half of the image are said to be different things."""
-
-    class Halves(Division):
-        def divide(self, clip):
-            motions = np.zeros(clip.after.depth.shape, np.int32)
-            motions[:, motions.shape[1] // 2 :] = 1
-            return motions
-
-    predicted, proposed, clip = two()
-    merged = np.where(predicted.particles[0].labels > 0, 1, 0).astype(np.uint16)
-    predicted = Population((Hypothesis.from_labels(merged, clip.grid),))
-    rng = np.random.default_rng(0)
-    plain = Union(FusionUpdate()).update(rng, predicted, proposed, clip)
-    parted = Union(FusionUpdate(division=Halves())).update(rng, predicted, proposed, clip)
-    assert plain.particles[0].n_objects == 1
-    assert parted.particles[0].n_objects == 2
-    assert len(parted) == len(plain)
-
-
-@pytest.mark.parametrize("update", [FusionUpdate(), SamplesOnly(), Union()])
+@pytest.mark.parametrize("update", [CrossoverUpdate(), SamplesOnly(), Union()])
 def test_with_an_empty_prediction_the_samples_come_back(update):
     """Hypotheses without objects know nothing: fusion of them with samples is the samples."""
     _, proposed, clip = two()
@@ -172,25 +133,24 @@ def test_with_an_empty_prediction_the_samples_come_back(update):
             assert any(h is p for p in proposed.particles)
 
 
-class TestTrackingOnly(UpdateContract):
+class OnScenes(UpdateContract):
+    def example(self, rng, n):
+        return scene_example(rng, n)
+
+
+class TestTrackingOnly(OnScenes):
     def make(self):
         return TrackingOnly()
 
-    def example(self, rng, n):
-        return scene_example(rng, n)
 
-
-class TestUnion(UpdateContract):
+class TestUnion(OnScenes):
     def make(self):
         return Union()
 
-    def example(self, rng, n):
-        return scene_example(rng, n)
 
-
-class TestSamplesOnly(UpdateContract):
+class TestSamplesOnly(OnScenes):
     def make(self):
         return SamplesOnly()
 
-    def example(self, rng, n):
-        return scene_example(rng, n)
+
+del OnScenes  # not a test by itself

@@ -273,7 +273,7 @@ def test_views_are_recalled_where_the_object_is_now():
     rule = Extrude()
     mask, empty = masks_of(before, frames[0])[0], np.zeros(frames[0].depth.shape, bool)
     rng = [np.random.default_rng(0)]
-    [(_, (view,))] = rule.complete_again(rng, frames[0], [(mask, ())], GRID)
+    (view,) = rule.complete_each(rng, frames[0], [mask], GRID, [()])[0].views
     voxels = view_surface(view, GRID)
     assert len(voxels) > 50 and (before[tuple(voxels.T)] == 1).mean() > 0.9
     moved = view.moved(RigidTransform.from_translation([0, 6 * GRID.voxel_size, 0]))
@@ -285,7 +285,7 @@ def test_views_are_recalled_where_the_object_is_now():
     assert (both.surface >= now.surface).all() and (both.free >= now.free).all()
     assert not (both.free & both.surface).any() and not (both.other_surface > now.other_surface).any()
     # The same view once more, from a motion that is wrong by a voxel, does not make the surface thicker.
-    [(_, (latest,))] = rule.complete_again(rng, frames[1], [(again, ())], GRID)
+    (latest,) = rule.complete_each(rng, frames[1], [again], GRID, [()])[0].views
     off = latest.moved(RigidTransform.from_translation([0, GRID.voxel_size, 0]))
     assert not (view_surface(off, GRID)[:, None] == np.argwhere(now.surface) + low).all(axis=2).any(axis=1).all()
     assert (recall(now, low, GRID, [off]).surface <= now.surface).all()
@@ -299,8 +299,8 @@ def test_views_are_recalled_where_the_object_is_now():
     assert (found.free <= first.free).all() and found.free.sum() > 0.8 * (first.free & (first.signed < -1)).sum() > 0
     # Out of sight it is completed from its views alone.
     dark = Frame(frames[1].rgb, np.full_like(frames[1].depth, np.nan), frames[1].camera)
-    [(hidden, known)] = rule.complete_again(rng, dark, [(empty, (moved,))], GRID)
-    assert known == (moved,) and iou(placed(hidden) >= 0.5, after == 1) > 0.5
+    [hidden] = rule.complete_each(rng, dark, [empty], GRID, [(moved,)])
+    assert hidden.views == (moved,) and iou(placed(hidden) >= 0.5, after == 1) > 0.5
     # What is measured as the surface of another object now is not its surface.
     _, other, seen, known = observed_again(frames[1], empty, (moved,), GRID, rule)
     assert known == (moved,) and other.other_surface.any() and not (seen.surface & other.other_surface).any()
@@ -310,5 +310,5 @@ def test_views_are_recalled_where_the_object_is_now():
     assert known == (moved,)
     for a, b in zip(surface_and_free(seen), surface_and_free(both), strict=True):
         np.testing.assert_array_equal(a, b)
-    [(_, known)] = rule.complete_again(rng, frames[1], [(again, (wrong, moved))], GRID)
+    known = rule.complete_each(rng, frames[1], [again], GRID, [(wrong, moved)])[0].views
     assert len(known) == 2 and known[0] is moved

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
@@ -90,20 +88,6 @@ def test_free_space_and_order(completer, frame):
         assert (placed(alone) >= 0.5).any()
 
 
-def test_draws(weights, frame):
-    """Each mask of a list has its own draw; the mode is one of the possible extents, and costs no randomness."""
-    masks = masks_of(STACK, frame)[:1]
-    drawing = NetworkCompleter(weights=weights, draw=True)
-    first = drawing.complete(np.random.default_rng(1), frame, masks * 2, GRID)
-    again = drawing.complete(np.random.default_rng(1), frame, masks, GRID)
-    assert not np.array_equal(first[0].probability, first[1].probability)
-    assert np.array_equal(first[0].probability, again[0].probability)
-    still = replace(drawing, spread=0.0).complete(np.random.default_rng(1), frame, masks, GRID)[0]
-    mode = NetworkCompleter(weights=weights).complete(np.random.default_rng(2), frame, masks, GRID)[0]
-    assert np.array_equal(still.probability, mode.probability)
-    assert drawing.stochastic and not NetworkCompleter(weights=weights).stochastic
-
-
 def test_divergence_of_normal_laws():
     """Against the average log ratio of densities over draws (100,000 draws, error below 0.03)."""
     torch.manual_seed(1)
@@ -128,11 +112,13 @@ def test_other_voxel_sizes(completer, size):
         fine, coarse = (completer.complete(rng, frame, [mask], grid)[0] for grid in (GRID, other))
         volumes = [(one.probability >= 0.5).sum() * g.voxel_size**3 for one, g in ((fine, GRID), (coarse, other))]
         assert volumes[1] == pytest.approx(volumes[0], rel=0.35)
-        [(same, views)] = completer.complete_again([rng], frame, [(mask, ())], other)
-        assert np.array_equal(same.probability, coarse.probability) and len(views) == 1
+        [same] = completer.complete_each([rng], frame, [mask], other, [()])
+        assert np.array_equal(same.probability, coarse.probability) and len(same.views) == 1
         blind = Frame(frame.rgb, np.full_like(frame.depth, np.nan), frame.camera)
-        [(hidden, known)] = completer.complete_again([rng], blind, [(np.zeros_like(mask), views)], other)
-        assert known == views and (hidden.probability >= 0.5).sum() * size**3 == pytest.approx(volumes[0], rel=0.5)
+        [hidden] = completer.complete_each([rng], blind, [np.zeros_like(mask)], other, [same.views])
+        assert hidden.views == same.views and (hidden.probability >= 0.5).sum() * size**3 == pytest.approx(
+            volumes[0], rel=0.5
+        )
 
 
 def test_empty_masks_and_large_objects(completer):
@@ -156,9 +142,9 @@ def test_objects_larger_than_all_crops_are_extruded_whole(completer, size):
     )
     seen = render(bar, grid, view)
     frame = Frame(np.zeros((*seen.depth.shape, 3), np.uint8), seen.depth, view)
-    [(now, views)] = completer.complete_again([rng], frame, [(seen.labels == 1, ())], grid)
+    [now] = completer.complete_each([rng], frame, [seen.labels == 1], grid, [()])
     blind = Frame(frame.rgb, np.full_like(seen.depth, np.nan), view)
-    [(later, _)] = completer.complete_again([rng], blind, [(np.zeros(seen.labels.shape, bool), views)], grid)
+    [later] = completer.complete_each([rng], blind, [np.zeros(seen.labels.shape, bool)], grid, [now.views])
     for one in (now, later):
         assert np.median(one.probability[one.probability >= 0.5]) == pytest.approx(0.8)
         full = np.zeros(grid.shape, bool)
@@ -173,7 +159,7 @@ def test_crops_do_not_depend_on_the_size_of_the_image(completer):
     for width in (320, 640, 1280):
         frames = [frame_of(boxes(long), width), frame_of(boxes(long, occluder), width)]
         masks = [masks_of(boxes(*shown), f)[0] for shown, f in (((long,), frames[0]), ((long, occluder), frames[1]))]
-        [(_, views)] = completer.complete_again([None], frames[0], [(masks[0], ())], GRID)
+        views = completer.complete_each([None], frames[0], [masks[0]], GRID, [()])[0].views
         low, now, seen, known = observed_again(frames[1], masks[1], views, GRID, completer)
         last = [low[0] + np.nonzero(one.surface.any(axis=(1, 2)))[0].max() for one in (seen, now)]
         assert known == views and last[0] > last[1] + 10
@@ -211,11 +197,8 @@ def test_robot_pixels_are_unknown(completer, frame):
 def test_a_grid_may_start_below_the_table(completer, frame, below):
     """The same completions as on a grid that starts at the table, and nothing below it."""
     low = VoxelGrid((-0.3, -0.3, -0.01 * below), 0.01, (60, 60, 30 + below))
-    rule = replace(completer, draw=False)
     masks, rngs = masks_of(STACK, frame), [np.random.default_rng(0)] * 2
-    for one, other in zip(
-        rule.complete_each(rngs, frame, masks, GRID), rule.complete_each(rngs, frame, masks, low), strict=True
-    ):
+    for one, other in zip(*(completer.complete_each(rngs, frame, masks, grid) for grid in (GRID, low)), strict=True):
         found = placed(other, low)
         assert not found[:, :, :below].any()
         # Readings on the border of two voxels can change sides by rounding.

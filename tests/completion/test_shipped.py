@@ -5,19 +5,20 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from mst_training.completion import shape_iou
+from mst_training.completion_data import CompletionSamples
+from mst_training.shapes import HELD_OUT, TRAINED
 from mstfilter.completion import NetworkCompleter
 from mstfilter.completion.crops import extruded
 from mstfilter.resources import models_folder
-from mstfilter.training import Samples, read_samples, write_samples
-from mstfilter.training.completion import shape_iou
-from mstfilter.training.shapes import HELD_OUT, TRAINED
 
 SEED = 99  # of no training
 
 
 @pytest.fixture(scope="module")
-def samples(tmp_path_factory) -> Samples:
-    return read_samples(write_samples(tmp_path_factory.mktemp("samples"), SEED, 3, kinds=TRAINED + HELD_OUT))
+def samples(tmp_path_factory) -> CompletionSamples:
+    files = CompletionSamples.write(tmp_path_factory.mktemp("samples"), SEED, 3, kinds=TRAINED + HELD_OUT)
+    return CompletionSamples.read(files)
 
 
 def test_better_than_extrusion_on_new_scenes(samples):

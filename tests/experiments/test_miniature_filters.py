@@ -5,8 +5,6 @@ A statistical bound of 4 standard errors fails a right filter with probability 6
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from miniature_filters import (
@@ -25,7 +23,6 @@ from miniature_filters import (
 from miniature_mst import (
     CutProposal,
     DepthFreeSpace,
-    LikelihoodEvidence,
     ScoredFusion,
     adapt_to_miniature,
     balanced_filter,
@@ -164,18 +161,6 @@ def test_presets_run_and_report_no_evidence(name):
         [h.labels for h in a.population.particles], [h.labels for h in b.population.particles]
     )
     assert state_weights(WORLD, a.population).sum() == pytest.approx(1)
-
-
-def test_evidence_becomes_the_likelihood_of_the_observation():
-    mst = mstfilter.preset("mst_rules")
-    scored = replace(mst, update=replace(mst.update, evidence=(LikelihoodEvidence(Miniature((2, 2))),), n_scored=99))
-    filter = adapt_to_miniature(scored, WORLD, 10)
-    _, observations = WORLD.simulate(np.random.default_rng(1), 2)
-    _, info = filter.step(filter.run(observations[:1], 0)[0], observations[1])
-    assert info.n_candidates == 40
-    assert len(info.notes["update"]["scores"]["LikelihoodEvidence"]) == 40
-    score = LikelihoodEvidence(WORLD).log_score(WORLD.states.hypotheses, observations[1])
-    np.testing.assert_array_equal(score, WORLD.log_likelihood(observations[1]))
 
 
 def test_scored_candidates_are_distinct_and_weighted_by_prediction_times_likelihood():

@@ -22,7 +22,7 @@ from miniature_partition import (
 )
 from miniature_world import Miniature, Observation
 
-from mstfilter.fusion import Cells, PairEvidence
+from mstfilter.partition import Cells, PairEvidence, Readings
 from mstfilter.scene import Occupancy
 from mstfilter.smc import Population
 from tests.experiments.test_miniature_world import ids
@@ -77,7 +77,8 @@ def test_the_table_is_asked_about_what_the_observation_and_the_latest_view_show(
     frame = type("Frame", (), {"observation": observation})()
     old = CellView(np.full(grid.shape, FREE))
     views = (old, CellView(np.where(np.arange(3)[:, None, None] == 0, OWN, 3) * np.ones(grid.shape, int)))
-    [(completion, (*_, view))] = completer.complete_again([], frame, [(np.array([[True, True, False]]), views)], grid)
+    [completion] = completer.complete_each([], frame, [np.array([[True, True, False]])], grid, [views])
+    view = completion.views[-1]
     now = np.array([[OWN, BEHIND], [FREE, OWN], [OTHER, HIDDEN]])[:, :, None]
     past = np.array([[OWN, OWN], [FREE, FREE], [FREE, FREE]])[:, :, None]
     expected = np.where(now == FREE, 0, completer.table[now, past])
@@ -89,14 +90,12 @@ def test_the_table_is_asked_about_what_the_observation_and_the_latest_view_show(
 def test_components_that_depend_on_each_other_cost_what_their_dependence_is():
     world = Miniature((4, 1))
     index = world.states.index_of_labels
-    cells = Cells(
-        pixels=np.arange(4),
-        of_reading=np.arange(4),
-        samples=np.ones((1, 4), int),
-        predictions=np.zeros((0, 4), int),
-        component=np.array([0, 0, 1, 1]),
-        pairs=np.array([[0, 1], [2, 3]]),
-    )
+    readings = Readings(np.arange(4), np.zeros((4, 3), int), (1, 4))
+
+    def cells_of(sample):
+        return Cells(readings, np.arange(4), np.array([sample]), np.zeros((0, 4), int))
+
+    cells = cells_of([1, 1, 2, 2])
     observation = Observation(np.zeros(4, int), np.ones(3, bool))
     together, apart = index(np.array([1, 1, 2, 2])), index(np.array([1, 2, 3, 4]))
     p = np.zeros(len(world.states))
@@ -104,7 +103,7 @@ def test_components_that_depend_on_each_other_cost_what_their_dependence_is():
     assert components_apart(world, p, cells, observation) == pytest.approx(0.5)
     p[[index(np.array([1, 1, 2, 3])), index(np.array([1, 2, 3, 3]))]] = 0.5
     assert components_apart(world, p / p.sum(), cells, observation) == pytest.approx(0)
-    one = replace(cells, component=np.zeros(4, int))
+    one = cells_of([1, 1, 1, 1])
     assert components_apart(world, world.prior, one, observation) == pytest.approx(0)
 
 

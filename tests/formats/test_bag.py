@@ -11,7 +11,7 @@ from mstfilter.errors import InputError, InputWarning
 from mstfilter.formats import open_recording
 from mstfilter.formats.bag import Bag, colour_image, depth_image
 from mstfilter.formats.folder import save_recording
-from mstfilter.scene.pauses import Ends
+from mstfilter.formats.pauses import Ends
 from tests.formats.bags import COLOUR, DEPTH, KINDS, Messages, scene_messages, topic_info, write
 from tests.formats.layouts import FPS, PAUSES, SHIFTS, K, video
 from tests.formats.test_layouts import WORLD, same_frames

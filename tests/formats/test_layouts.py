@@ -17,11 +17,10 @@ from mstfilter.formats import open_recording
 from mstfilter.formats.datasets import Bop, Dsr
 from mstfilter.formats.folder import save_recording
 from mstfilter.formats.image_folders import Redwood, Tum
+from mstfilter.formats.pauses import Ends, EveryNth
+from mstfilter.formats.sources import detect_format
 from mstfilter.formats.video import KnownWorld, _undistort, pair_stamps, undistortion_map
-from mstfilter.runs import open_source
-from mstfilter.runs.sources import detect_format
 from mstfilter.scene import Recording, read_depth, read_rgb, write_image
-from mstfilter.scene.pauses import Ends, EveryNth
 from tests.formats.layouts import (
     FPS,
     PAUSES,
@@ -250,14 +249,14 @@ def test_images_without_a_partner_are_omitted_by_time_and_refused_by_number(tmp_
 def test_rgb_and_depth_without_a_file_of_intrinsics(tmp_path):
     path = write_rgb_and_depth(tmp_path / "mine", intrinsics=None)
     with pytest.raises(InputError, match="intrinsics are missing") as caught:
-        open_source(path)
+        open_recording(path)
     assert "-o K=fx,fy,cx,cy" in caught.value.hints[0]
-    given = open_source(path, options=["K=131,131,79.5,59.5", "fps=10"])
+    given = open_recording(path, options=["K=131,131,79.5,59.5", "fps=10"])
     np.testing.assert_allclose(given.frames[0].camera.K, CAMERA.K)
     for wrong in ("{}", "[1, 2]", '{"fx": 1}', '{"K": "x"}', '{"fx": 0, "fy": 1, "cx": 2, "cy": 3}', "{"):
         (path / "intrinsics.json").write_text(wrong)
         with pytest.raises(InputError, match="intrinsics.json"):
-            open_source(path)
+            open_recording(path)
 
 
 def test_bop(tmp_path):

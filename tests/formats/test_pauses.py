@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from mstfilter.errors import InputError, InputWarning
+from mstfilter.formats.pauses import At, Ends, EveryNth, Listed, Still, grey_blocks, pauses_from_text
 from mstfilter.scene import Recording
-from mstfilter.scene.pauses import At, Ends, EveryNth, Listed, Still, grey_blocks, pauses_from_text
 from tests.formats.layouts import PAUSES, video
 from tests.scene.scenes import CAMERA, table_scene
 

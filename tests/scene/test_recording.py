@@ -10,8 +10,7 @@ import pytest
 
 from mstfilter.errors import InputError
 from mstfilter.formats import PairedImages, RecordingWriter, open_recording, save_recording
-from mstfilter.fusion.conflicts import check_grid
-from mstfilter.scene import Hypothesis, write_image
+from mstfilter.scene import Hypothesis, check_grid, write_image
 from mstfilter.scene.camera import Camera, look_at
 from mstfilter.scene.geometry import fit_support_plane, table_residual, workspace
 from mstfilter.scene.recording import Recording

@@ -338,6 +338,7 @@ def test_a_worker_that_dies_once_changes_nothing(tmp_path):
 
 def test_workers_need_a_script_that_is_not_imported(tmp_path):
     """On import, workers would import the module again, and wait for the import to end."""
+    pytest.importorskip("joblib")
     lines = (
         "from mstfilter.smc import bootstrap, linear_gaussian, run_many",
         "model = linear_gaussian([[0.9]], [[1]], [[1]], [[1]], [0], [[1]])",

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from mstfilter.fusion import Evidence
+from mstfilter.scene import Evidence
 from mstfilter.smc import (
     Codec,
     DensityTransition,

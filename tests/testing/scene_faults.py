@@ -13,7 +13,9 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from mstfilter.completion import Completer, Extrude
-from mstfilter.fusion import Division, Evidence, PairOdds, Projection, SpanningTree, Structure
+from mstfilter.crossover import SpanningTree, Structure
+from mstfilter.partition import PairOdds
+from mstfilter.scene import Evidence, Projection
 from mstfilter.segmentation import (
     BoundaryModel,
     ColourDepthBoundary,
@@ -80,8 +82,8 @@ class CompletesEach(Completes):
     def fill(self, rng, seen):
         return Extrude().fill(rng, seen)
 
-    def complete_each(self, rngs, frame, masks, grid):
-        found = super().complete_each(rngs, frame, masks, grid)
+    def complete_each(self, rngs, frame, masks, grid, views=None):
+        found = super().complete_each(rngs, frame, masks, grid, views)
         return [replace(one, probability=self.change(one.probability)) for one in found]
 
 
@@ -406,9 +408,6 @@ OTHERS: dict[str, tuple[type, str, Any, Change, str]] = {
     "projection percent": (Projection, "project", _Known(), lambda p: (p[0], 98.0), "expected a number from 0 to 1"),
     "projection nan": (Projection, "project", _Known(), lambda p: (p[0], np.nan), "expected a number from 0 to 1"),
     "projection none": (Projection, "project", _Known(), lambda p: None, "returns None"),
-    "division floats": (Division, "divide", _Known(), lambda d: d.astype(float), "expected integers"),
-    "division axes": (Division, "divide", _Known(), np.transpose, "axes exchanged"),
-    "division flat": (Division, "divide", _Known(), np.ravel, "flattened"),
     "pairs nan": (PairOdds, "log_odds", _Known(), lambda o: np.full_like(o, np.nan), "returns nan"),
     "pairs short": (PairOdds, "log_odds", _Known(), lambda o: o[:-1], "expected shape"),
     "pairs list": (PairOdds, "log_odds", _Known(), np.ndarray.tolist, "returns a list"),

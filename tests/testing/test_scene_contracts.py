@@ -13,7 +13,7 @@ import pytest
 from mstfilter import results
 from mstfilter.completion import Completer
 from mstfilter.errors import InputError, InputWarning
-from mstfilter.fusion import FusionUpdate
+from mstfilter.partition import PartitionUpdate
 from mstfilter.presets import REGISTRY
 from mstfilter.scene import component_key, scene_cache
 from mstfilter.segmentation import TreeCutProposal
@@ -36,7 +36,7 @@ def step(component: Any) -> None:
     population, clip = scene_example(np.random.default_rng(1), 4)
     rng = np.random.default_rng(0)
     if isinstance(component, faults.Evidence):
-        update = FusionUpdate(evidence=(component,))
+        update = PartitionUpdate(evidence=(component,))
         update.update(rng, population, population, clip).realised()
         return
     owner = next(use for interface, use in STAGE_OWNERS.items() if isinstance(component, interface))(component)

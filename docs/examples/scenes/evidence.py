@@ -1,7 +1,7 @@
 """A term of the score of candidates, for the update of `mst`.
 
 mstfilter check ./evidence.py:MyEvidence
-mstfilter run demo/recording 'update.evidence=["agreement", "./evidence.py:MyEvidence"]' --out runs/mine --replace
+mstfilter run demo/recording 'update.evidence=["./evidence.py:MyEvidence"]' --out runs/mine --replace
 """
 
 from __future__ import annotations
@@ -11,8 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mstfilter.fusion import Evidence
-from mstfilter.scene import Clip, Hypothesis
+from mstfilter.scene import Clip, Evidence, Hypothesis
 from mstfilter.testing import scene_example
 
 

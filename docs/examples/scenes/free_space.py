@@ -8,8 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from mstfilter.fusion import Projection
-from mstfilter.scene import Frame, Hypothesis, frame_geometry
+from mstfilter.scene import Frame, Hypothesis, Projection, frame_geometry
 
 
 @dataclass(frozen=True)

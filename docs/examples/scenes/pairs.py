@@ -10,13 +10,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mstfilter.fusion import Cells, PairOdds
+from mstfilter.partition import Cells, PairOdds
 from mstfilter.scene import Clip
 
 
 @dataclass(frozen=True)
 class MyPairs(PairOdds):
-    """By the samples and by colour; the past is not used. Fields need an annotation and a default.
+    """By the samples and by colour; predictions are not used. Fields need an annotation and a default.
 
     Parameters
     ----------
@@ -39,7 +39,7 @@ class MyPairs(PairOdds):
         predictions.
         """
         inside = cells.of_reading >= 0
-        cell, rgb = cells.of_reading[inside], clip.after.rgb.reshape(-1, 3)[cells.pixels[inside]] / 255
+        cell, rgb = cells.of_reading[inside], clip.after.rgb.reshape(-1, 3)[cells.readings.pixels[inside]] / 255
         n = cells.samples.shape[1]
         sums = np.stack([np.bincount(cell, rgb[:, k], n) for k in range(3)], axis=1)
         mean = sums / np.bincount(cell, minlength=n)[:, None]

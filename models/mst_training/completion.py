@@ -1,0 +1,195 @@
+"""Training of the completion network.
+
+>>> run_training(CompletionTraining(n_scenes=900, steps=40_000), "completion-model")
+
+The loss is the evidence lower bound of a conditional variational autoencoder: the log loss of the voxels that are
+not observed as free, and the divergence of the posterior of the latent variable from its prior. The log loss of a
+sample is divided by the number of voxels on or behind the visible surface, so that small objects count as much as
+large ones; the divisor depends on the input only, so the loss stays proper. At the end, scale and
+shift of the logits are fitted to the validation samples, over the voxels that are not free.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from mst_training.completion_data import MASK_KINDS, CompletionSamples
+from mst_training.loop import Training, calibration_error, fit_calibration
+from mst_training.scenes import Samples
+from mst_training.shapes import HELD_OUT
+from mstfilter.completion.crops import CHANNELS, LATTICE, channels, extruded
+from mstfilter.completion.unet import ARCHITECTURE, CompletionNet, LatentLaw, ShapePosterior
+
+
+@dataclass(frozen=True)
+class CompletionTraining(Training):
+    """Settings of the training of the completion network. A scene gives about 35 samples."""
+
+    latent: int = 16  #: dimension of the latent variable
+    #: Weight of the divergence in the loss. It is larger than one over the number of voxels, because the voxels of a
+    #: shape are far from independent: at 0.004 the posterior holds 22 nats, details that the prior cannot know.
+    divergence: float = 0.04
+
+    recipes: ClassVar[Mapping[str, Mapping[str, Any]]] = {
+        "cpu": {},
+        "gpu": {"n_scenes": 9000, "width": 32, "steps": 200_000, "batch": 64},
+        "smoke": {
+            **{"n_scenes": 6, "n_validation": 2, "n_test": 3},
+            **{"width": 8, "latent": 4, "steps": 150, "average": 0.97},
+        },
+    }
+    architecture: ClassVar[str] = ARCHITECTURE
+    samples: ClassVar[type[Samples]] = CompletionSamples
+    losses: ClassVar[tuple[str, ...]] = ("loss", "nats")
+
+    def networks(self) -> dict[str, nn.Module]:
+        net = CompletionNet(len(CHANNELS), self.width, self.latent)
+        return {"net": net, "posterior": ShapePosterior(self.width, self.latent)}
+
+    def batches(self, samples: CompletionSamples, first: int, last: int) -> Iterator[tuple[Tensor, ...]]:
+        """Batches in which each sample is turned and mirrored."""
+        for step, chosen in self.order(len(samples), first, last):
+            turns = np.random.default_rng([self.seed, 2, step]).integers(8, size=self.batch)
+            columns = (
+                [_turned(values[i], t) for i, t in zip(chosen, turns, strict=True)]
+                for values in (samples.bits, samples.signed, samples.truth)
+            )
+            yield tuple(torch.from_numpy(np.stack(column)) for column in columns)
+
+    def loss(
+        self, networks: Mapping[str, Any], step: int, batch: Sequence[Tensor]
+    ) -> tuple[Tensor, tuple[float, ...]]:
+        """Log loss a voxel on or behind the surface, with the weighted divergence in nats."""
+        bits, signed, truth = batch
+        device = bits.device
+        x = channels(bits, signed, _heights()).to(device)
+        noise = torch.randn((len(x), self.latent), generator=torch.Generator().manual_seed(step)).to(device)
+        with torch.autocast(device.type, dtype=torch.bfloat16, enabled=self.half_precision):
+            features, prior = networks["net"].encode(x)
+            law: LatentLaw = networks["posterior"](features, truth.float())
+            logits = networks["net"].decode(features, law.draw(noise))
+        unknown, own = (bits & 4) == 0, ((bits & 9) > 0).sum(dim=(1, 2, 3))
+        loss = functional.binary_cross_entropy_with_logits(logits.float(), truth.float(), reduction="none")
+        per_sample = ((loss * unknown).sum(dim=(1, 2, 3)) / (own + 50)).mean()
+        nats = law.divergence(prior).mean()
+        total = per_sample + self.divergence * min(1.0, step / 2000) * nats
+        return total, (float(per_sample.detach()), float(nats.detach()))
+
+    def validate(self, net: CompletionNet, samples: CompletionSamples, device: torch.device) -> dict[str, float]:
+        return evaluate(net, samples.take(np.arange(min(len(samples), 400))), device)
+
+    def finish(
+        self, net: CompletionNet, validation: CompletionSamples, test: CompletionSamples, device: torch.device
+    ) -> tuple[dict[str, Any], dict[str, float], list[dict[str, Any]]]:
+        logits, outcomes = [], []
+        for part, found in _logits(net, validation, device):
+            unknown = torch.from_numpy((validation.bits[part] & 4) == 0)
+            logits.append(found[unknown])
+            outcomes.append(torch.from_numpy(validation.truth[part])[unknown])
+        calibration = fit_calibration(torch.cat(logits), torch.cat(outcomes))
+        figures, rows = measure(net, calibration, test, device)
+        described = {
+            "lattice_m": LATTICE,
+            "network": {"channels": list(CHANNELS), "width": self.width, "latent": self.latent},
+            "calibration": {"scale": calibration[0], "shift": calibration[1]},
+        }
+        return described, figures, rows
+
+
+def _heights() -> Tensor:
+    return (torch.arange(32) + 0.5) * LATTICE
+
+
+def _turned(values: np.ndarray, symmetry: int) -> np.ndarray:
+    """One of the eight symmetries about the vertical axis."""
+    turned = np.rot90(values, symmetry % 4)
+    return turned[::-1] if symmetry >= 4 else turned
+
+
+def _logits(net: CompletionNet, samples: CompletionSamples, device: torch.device) -> Iterator[tuple[slice, Tensor]]:
+    """Logits of batches of samples, with the mode of the latent variable."""
+    with torch.inference_mode():
+        for start in range(0, len(samples), 32):
+            part = slice(start, min(start + 32, len(samples)))
+            bits, signed = torch.from_numpy(samples.bits[part]), torch.from_numpy(samples.signed[part])
+            features, prior = net.encode(channels(bits, signed, _heights()).to(device))
+            yield part, net.decode(features, prior.mean).cpu()
+
+
+def evaluate(net: CompletionNet, samples: CompletionSamples, device: torch.device) -> dict[str, float]:
+    """Mean IoU of the mode, and its log loss over voxels that are not free, before calibration."""
+    iou, loss, n = [], 0.0, 0
+    for part, logits in _logits(net, samples, device):
+        truth, unknown = torch.from_numpy(samples.truth[part]), torch.from_numpy((samples.bits[part] & 4) == 0)
+        iou.append(shape_iou(((logits > 0) & unknown).numpy(), truth.numpy()))
+        every = functional.binary_cross_entropy_with_logits(logits, truth.float(), reduction="none")
+        loss, n = loss + float((every * unknown).sum()), n + int(unknown.sum())
+    return {"iou": float(np.concatenate(iou).mean()), "log_loss": loss / max(n, 1)}
+
+
+def measure(
+    net: CompletionNet, calibration: tuple[float, float], samples: CompletionSamples, device: torch.device
+) -> tuple[dict[str, float], list[dict[str, Any]]]:
+    """Figures of the mode on test samples; a table of IoU and of volume over true volume by group, beside extrusion.
+
+    The calibration error and the log loss, in nats a voxel, are of the probabilities.
+    """
+    scale, shift = calibration
+    unknown, truth = (samples.bits & 4) == 0, samples.truth
+    p = np.zeros(truth.shape, np.float32)
+    for part, logits in _logits(net, samples, device):
+        p[part] = torch.sigmoid(scale * logits + shift).numpy() * unknown[part]
+    found = {"network": p >= 0.5, "extrude": extruded(samples.bits)}
+    iou = {name: shape_iou(shape, truth) for name, shape in found.items()}
+    true_volume = np.maximum(truth.sum(axis=(1, 2, 3)), 1)
+    volume = {name: shape.sum(axis=(1, 2, 3)) / true_volume for name, shape in found.items()}
+    rows = [
+        {
+            "group": name,
+            "n": int(of.sum()),
+            **{of_what: float(values[of].mean()) for of_what, values in iou.items()},
+            **{f"volume {of_what}": float(np.median(values[of])) for of_what, values in volume.items()},
+        }
+        for name, of in _groups(samples).items()
+        if of.any()
+    ]
+    question = unknown & (((samples.bits & 9) > 0) | (p > 0.02))
+    figures = {
+        "iou": float(iou["network"].mean()),
+        "iou_extrude": float(iou["extrude"].mean()),
+        "log_loss": float(_log_loss(p, truth, question).mean()),
+        "calibration_error": calibration_error(p[question], truth[question]),
+    }
+    return figures, rows
+
+
+def _groups(samples: CompletionSamples) -> dict[str, np.ndarray]:
+    """Samples (n,) bool by kind of mask, visible share of the object's silhouette, and kind of shape."""
+    groups = {"all": np.ones(len(samples), bool)}
+    groups |= {f"mask: {name}": samples.mask == k for k, name in enumerate(MASK_KINDS)}
+    for low, high in ((0.9, 1.01), (0.5, 0.9), (0.0, 0.5)):
+        name = f"visible {int(100 * low)} - {int(min(100 * high, 100))} %"
+        groups[name] = (samples.visible >= low) & (samples.visible < high)
+    groups |= {f"shape: {name}": samples.kind == name for name in sorted(set(samples.kind.tolist()))}
+    groups["shapes not trained on"] = np.isin(samples.kind, HELD_OUT)
+    return groups
+
+
+def shape_iou(found: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """IoU (n,) of shapes (n, X, Y, Z) bool."""
+    axes = (1, 2, 3)
+    return np.asarray((found & truth).sum(axis=axes) / np.maximum((found | truth).sum(axis=axes), 1))
+
+
+def _log_loss(p: np.ndarray, truth: np.ndarray, question: np.ndarray) -> np.ndarray:
+    """Mean log loss (n,) in nats of the voxels in question."""
+    p = np.clip(p, 1e-6, 1 - 1e-6)
+    loss = -np.log(np.where(truth, p, 1 - p))
+    return np.asarray((loss * question).sum(axis=(1, 2, 3)) / np.maximum(question.sum(axis=(1, 2, 3)), 1))

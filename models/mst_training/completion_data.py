@@ -1,0 +1,258 @@
+"""Samples for the completion network: what a camera sees of an object, and the space that the object fills.
+
+>>> samples = CompletionSamples.of_scene(seed=0, index=3)          # always the same
+
+A scene has 2 to 12 objects of the kinds in `mst_training.shapes`, side by side, stacked, leaning and hidden, at
+rest under physics. It is seen by three cameras with the noise of the simulated sensor and a small error of the
+camera's pose. The masks are those that a filter meets: the true masks with displaced borders, and the segments of
+sampled cuts of the segmentation tree, which also hold parts of objects, and several objects. Half of the samples also
+have one to three earlier views of the whole object (`mstfilter.completion.observed.recall`), like an object that was
+moved: from other cameras, with a small error of the motion since then, and some of them without some other objects.
+
+The true shape of a mask: each object with visible pixels in the mask contributes the voxels whose nearest visible
+point lies in the mask. So a whole object gets all its voxels, the masks of two halves share them, and a mask of two
+objects gets both.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from mst_training.scenes import HEIGHT, WIDTH, Samples, View, cast, displaced, draw_camera, on_table, put_away
+from mstfilter.completion import Completer, Extrude, ObservedBox, observed_box
+from mstfilter.completion.crops import EDGE, LATTICE, crop_box
+from mstfilter.completion.observed import decode_signed, encode_box, observed_again
+from mstfilter.scene import Camera, Frame, ObjectView, VoxelGrid, scene_cache
+from mstfilter.segmentation import MetropolisHastingsCuts, TreeCutProposal
+from mstfilter.simulation.sensor import DepthSensor
+from mstfilter.simulation.shapes import label_voxels
+from mstfilter.simulation.world import PhysicsWorld
+
+_GRID = VoxelGrid(np.array([-0.45, -0.45, 0.0]), LATTICE, (90, 90, 40))
+_N_VIEWS, _N_MASKS = 3, 14  # cameras of a scene, masks of a view
+_EARLIER = 0.5  # share of views with earlier frames
+_TAKEN_AWAY = 0.4  # share of earlier frames without some of the objects
+_MOTION_ERROR = (0.003, 0.02)  # metres and radians, standard deviations: the error of a tracked motion
+_PARENTS = 0.25  # share of the segments of a cut that are replaced by their parents
+_LEAST_PIXELS = 20
+_LEAST_SHARE = 0.1  # of the pixels of a mask, or of an object's visible pixels, below which an object counts as noise
+_WHOLE = 0.8  # of an object's visible pixels that a mask of the whole object has
+MASK_KINDS = ("whole", "part", "several")
+
+
+@dataclass(frozen=True, eq=False)
+class CompletionSamples(Samples):
+    """Samples of one or of many scenes."""
+
+    bits: np.ndarray  #: (n, 32, 32, 32) uint8, what is seen (`encode_box`)
+    signed: np.ndarray  #: (n, 32, 32, 32) int8
+    truth: np.ndarray  #: (n, 32, 32, 32) bool
+    kind: np.ndarray  #: (n,) str, kind of the shape with most pixels in the mask
+    mask: np.ndarray  #: (n,) uint8, index in `MASK_KINDS`
+    scene: np.ndarray  #: (n,) int32, number of the scene
+    visible: np.ndarray  #: (n,) float32, visible share of the object's silhouette (0 hidden, 1 nothing in front)
+
+    @classmethod
+    def of_world(cls, rng: np.random.Generator, world: PhysicsWorld, index: int) -> CompletionSamples | None:
+        parts = [part for _ in range(_N_VIEWS) if (part := _view_samples(rng, world, index)) is not None]
+        return cls.join(parts) if parts else None
+
+    def box(self, k: int) -> ObservedBox:
+        """What sample k shows, as a completer sees it."""
+        own, other, free, behind, hidden = (((self.bits[k] >> i) & 1).astype(bool) for i in range(5))
+        height = (np.arange(EDGE) + 0.5) * LATTICE
+        return ObservedBox(
+            own.astype(np.int32), own, other, free, behind, hidden, decode_signed(self.signed[k]), height
+        )
+
+
+def _view_samples(rng: np.random.Generator, world: PhysicsWorld, index: int) -> CompletionSamples | None:
+    """The samples of one camera; None if there are none."""
+    poses = world.poses()
+    inside = on_table(poses)
+    if not inside.any():
+        return None
+    camera = draw_camera(rng, poses[inside, :2, 3].mean(axis=0), (22, 68), (0.55, 1.05))
+    frame, instance = _frame(rng, world, camera)
+    truth = label_voxels(world.shapes, poses, _GRID)
+    earlier = _earlier_frames(rng, world)
+    alone = _silhouettes(world, camera, instance)
+    rows = []
+    for mask in _masks(rng, frame, instance):
+        found = _sample(rng, frame, instance, mask, truth, earlier)
+        if found is not None:
+            which, bits, signed, shape, k = found
+            rows.append((bits, signed, shape, world.shapes[k - 1].family, which, alone[k]))
+    if not rows:
+        return None
+    columns = [np.array(column) for column in zip(*rows, strict=True)]
+    bits, signed, shapes, kinds, masks, visible = columns
+    scene = np.full(len(bits), index, np.int32)
+    return CompletionSamples(bits, signed, shapes, kinds, masks.astype(np.uint8), scene, visible.astype(np.float32))
+
+
+class _Earlier(NamedTuple):
+    """A frame, its true instances (H, W), and the objects that were taken away."""
+
+    frame: Frame
+    instance: np.ndarray
+    gone: frozenset[int]
+
+
+def _earlier_frames(rng: np.random.Generator, world: PhysicsWorld) -> list[_Earlier]:
+    """Up to three frames of other cameras; for some, objects were taken away."""
+    state, poses, found = world.save(), world.poses(), []
+    inside = np.flatnonzero(on_table(poses))
+    for _ in range(int(rng.integers(1, 4)) if rng.random() < _EARLIER else 0):
+        camera = draw_camera(rng, poses[inside, :2, 3].mean(axis=0), (22, 68), (0.55, 1.05))
+        gone = inside[rng.random(len(inside)) < 0.5] if rng.random() < _TAKEN_AWAY else inside[:0]
+        for k in gone.tolist():
+            put_away(world, k)
+        world.forward()
+        found.append(_Earlier(*_frame(rng, world, camera), frozenset((gone + 1).tolist())))
+        world.restore(state)
+    return found
+
+
+def _frame(rng: np.random.Generator, world: PhysicsWorld, camera: Camera) -> tuple[Frame, np.ndarray]:
+    """An image with noise, with a small error of the camera's pose, and the true instances (H, W)."""
+    view = View.of(world, camera)
+    sensor = replace(DepthSensor(), edge_dropout=float(rng.uniform(0.05, 0.2)))
+    reading = sensor.read(rng, view.depth, view.slant)
+    # One colour an object, with shading: the tree sees edges of colour and of depth.
+    albedo = rng.uniform(0.1, 0.9, (256, 3))
+    light = 0.45 + 0.5 * np.clip(view.normal @ np.array([0.3, -0.4, 0.87]), 0, 1)
+    rgb = albedo[view.instance.ravel()] * light[:, None] + rng.normal(0.0, 0.02, (len(light), 3))
+    image = np.clip(255 * rgb, 0, 255).astype(np.uint8).reshape(HEIGHT, WIDTH, 3)
+    return Frame(image, reading, displaced(rng, camera)), view.instance
+
+
+def _silhouettes(world: PhysicsWorld, camera: Camera, instance: np.ndarray) -> dict[int, float]:
+    """Object -> visible share of its silhouette."""
+    seen = np.bincount(instance.ravel(), minlength=world.n_objects + 1)
+    state, shares = world.save(), {}
+    positions, rotations = world.positions(), world.rotations()
+    for k in np.flatnonzero(seen[1:] >= _LEAST_PIXELS).tolist():
+        for other in range(world.n_objects):
+            if other != k:
+                put_away(world, other)
+        world.place(k, positions[k], rotations[k])
+        world.forward()
+        geom, _, _ = cast(world, camera, (1,))
+        shares[k + 1] = float(seen[k + 1] / max((geom >= 0).sum(), 1))
+        world.restore(state)
+    return shares
+
+
+def _masks(rng: np.random.Generator, frame: Frame, instance: np.ndarray) -> list[np.ndarray]:
+    """True masks with displaced borders, and segments of sampled cuts."""
+    import cv2
+
+    true = []
+    for k in np.unique(instance[instance > 0]):
+        mask = (instance == k).astype(np.uint8)
+        change = int(rng.integers(-1, 2))
+        if change:
+            mask = (cv2.dilate if change > 0 else cv2.erode)(mask, np.ones((3, 3), np.uint8))
+        true.append(mask > 0)
+    proposal = TreeCutProposal()
+    tree, w = proposal.tree_of(frame)
+    segments = proposal.objects.segments(tree, frame, _GRID)
+    sampler = MetropolisHastingsCuts(temperature=float(rng.choice([1.0, 4.0])), burn_in=300, thinning=100)
+    cuts = sampler.sample(rng, tree, w, 3).cuts
+    nodes = np.unique(np.concatenate([cut[segments.is_object[cut]] for cut in cuts]))
+    # Some parents, so that there are enough masks of several objects.
+    parents = tree.parent[nodes]
+    up = (rng.random(len(nodes)) < _PARENTS) & segments.is_object[parents] & (parents != tree.root)
+    nodes = np.unique(np.where(up, parents, nodes))
+    drawn = [tree.mask(int(node)) & segments.object_pixels for node in rng.permutation(nodes)]
+    scene_cache.clear()
+    n_true = min(len(true), _N_MASKS // 3)
+    chosen = [true[k] for k in rng.permutation(len(true))[:n_true]]
+    return chosen + drawn[: _N_MASKS - n_true]
+
+
+def _sample(
+    rng: np.random.Generator,
+    frame: Frame,
+    instance: np.ndarray,
+    mask: np.ndarray,
+    truth: np.ndarray,
+    earlier: Sequence[_Earlier],
+) -> tuple[int, np.ndarray, np.ndarray, np.ndarray, int] | None:
+    """Kind of mask, bits, distances, true shape and main object of one mask; None if it shows no object."""
+    counts = np.bincount(instance[mask & frame.valid], minlength=256)
+    whole = np.bincount(instance[frame.valid], minlength=256)
+    counts[0] = 0
+    found = [k for k in np.flatnonzero(counts).tolist() if counts[k] >= _LEAST_SHARE * max(counts.sum(), whole[k])]
+    main = int(counts.argmax())
+    if counts[main] < _LEAST_PIXELS or main not in found:
+        return None
+    rule = _Crop()
+    whole_mask = all(counts[k] > _WHOLE * whole[k] for k in found)
+    views = [_view(rng, rule, one, found) for one in earlier] if whole_mask else []
+    known = [view for view in views if view is not None]
+    offset, now, seen, _ = observed_again(frame, mask, known, _GRID, rule, refute=False)
+    if not now.surface.any():
+        return None
+    box = tuple(slice(int(o), int(o) + n) for o, n in zip(offset, seen.surface.shape, strict=True))
+    shape = np.zeros(seen.surface.shape, bool)
+    for k in found:
+        shape |= _claimed(frame, instance == k, mask, truth[box] == k, offset)
+    index = 2 if len(found) > 1 else int(counts[main] < _WHOLE * whole[main])
+    bits, signed = (_padded(one) for one in encode_box(seen))
+    return index, bits, signed, _padded(shape), main
+
+
+class _Crop(Extrude):
+    """The crop of the network, with the rules of a completer."""
+
+    def box(self, voxels: np.ndarray, grid: VoxelGrid) -> tuple[np.ndarray, np.ndarray]:
+        low, high = crop_box(voxels, grid)
+        if (high - low).max() > EDGE:  # a larger object is cut off in training
+            middle = (low + high) // 2
+            low = np.maximum(np.append(middle[:2] - EDGE // 2, 0), 0)
+            high = np.minimum(low + EDGE, grid.shape)
+        return low, high
+
+
+def _padded(values: np.ndarray) -> np.ndarray:
+    full = np.zeros((EDGE,) * 3, values.dtype)
+    a, b, c = values.shape
+    full[:a, :b, :c] = values
+    return full
+
+
+def _view(rng: np.random.Generator, rule: Completer, earlier: _Earlier, found: Sequence[int]) -> ObjectView | None:
+    """A view of the objects `found`, with an error of their motion since then; None if not all of them are there."""
+    mask = np.isin(earlier.instance, found)
+    offset, seen = observed_box(earlier.frame, mask, _GRID, rule)
+    few = (mask & earlier.frame.valid).sum() < _LEAST_PIXELS
+    if few or not seen.surface.any() or earlier.gone.intersection(found):
+        return None
+    turn = Rotation.from_rotvec(rng.normal(0.0, _MOTION_ERROR[1], 3))
+    centre = _GRID.centre_of(np.argwhere(seen.surface) + offset).mean(axis=0)
+    shift = centre - turn.apply(centre) + rng.normal(0.0, _MOTION_ERROR[0], 3)
+    return ObjectView(offset, *encode_box(seen), "", RigidTransform.from_components(shift, turn))
+
+
+def _claimed(
+    frame: Frame, visible: np.ndarray, mask: np.ndarray, truth: np.ndarray, offset: np.ndarray
+) -> np.ndarray:
+    """The voxels of an object, (a, b, c) bool in the box at `offset`, whose nearest visible point is in the mask."""
+    pixels = np.flatnonzero(visible & frame.valid)
+    inside = mask.ravel()[pixels]
+    if inside.mean() > 0.95:
+        return truth
+    points = frame.points.reshape(-1, 3)[pixels]
+    voxels = np.argwhere(truth)
+    _, nearest = cKDTree(points).query(_GRID.centre_of(voxels + offset))
+    claimed = np.zeros_like(truth)
+    claimed[tuple(voxels[inside[nearest]].T)] = True
+    return claimed

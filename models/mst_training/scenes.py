@@ -1,0 +1,226 @@
+"""What the generators of training samples share: clutter at rest under physics, its cameras, and files of samples.
+
+>>> world = draw_scene(np.random.default_rng(0), TRAINED)
+>>> camera = draw_camera(rng, (0, 0), elevation=(22, 68), distance=(0.55, 1.05))
+>>> View.of(world, camera).instance
+>>> CompletionSamples.write(folder, seed=0, n_scenes=1000, workers=2)      # resumable
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, ClassVar, Self
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from mst_training.shapes import TRAINED, draw_kind, draw_training_shape
+from mstfilter.errors import InputError
+from mstfilter.files import atomic_path
+from mstfilter.processes import environment
+from mstfilter.reading import MAX_WEIGHTS, read_arrays
+from mstfilter.scene import Camera, look_at, scene_cache
+from mstfilter.simulation.arrangement import arrange_objects
+from mstfilter.simulation.families import SceneFamily
+from mstfilter.simulation.world import PhysicsWorld
+
+WIDTH, HEIGHT = 320, 240  # pixels of an image
+
+
+def draw_scene(rng: np.random.Generator, kinds: tuple[str, ...]) -> PhysicsWorld | None:
+    """Draw a scene of 2 to 12 objects of some kinds, at rest; None if the objects do not fit."""
+    n = int(rng.integers(2, 13))
+    shapes = [draw_training_shape(rng, draw_kind(rng, kinds)) for _ in range(n)]
+    world = PhysicsWorld(shapes, arm=False)
+    n_dropped = int(rng.integers(0, n // 2 + 1)) if rng.uniform() < 0.6 else 0
+    family = SceneFamily(
+        name="training",
+        n_objects_min=n,
+        n_objects_max=n,
+        n_twins=0,
+        contact=float(rng.uniform(0.3, 1.0)),
+        n_actions=0,
+    )
+    order = rng.permutation(n)
+    try:
+        # Dropped objects start far away; the others are arranged first.
+        first = PhysicsWorld([shapes[k] for k in order[n_dropped:]], arm=False)
+        arrange_objects(rng, first, replace(family, n_objects_min=n - n_dropped), (-1,) * (n - n_dropped))
+    except InputError:
+        return None
+    for k, position, rotation in zip(order[n_dropped:].tolist(), first.positions(), first.rotations(), strict=True):
+        world.place(k, position, rotation)
+    world.forward()
+    for k in order[:n_dropped].tolist():
+        near = world.positions()[order[n_dropped:]]
+        at = near[int(rng.integers(len(near))), :2] + rng.normal(0.0, 0.03, 2)
+        world.place(k, (*at, 0.12 + shapes[k].radius + rng.uniform(0.0, 0.1)), Rotation.random(rng=rng).as_matrix())
+        world.forward()
+        if not world.overlaps(k):
+            world.settle()
+        else:
+            put_away(world, k)
+    world.forward()
+    return world
+
+
+def put_away(world: PhysicsWorld, k: int) -> None:
+    """Put object k far beside the table."""
+    world.place(k, (10.0 + 2.0 * k, 0.0, 1.0), np.eye(3))
+
+
+def on_table(poses: np.ndarray) -> np.ndarray:
+    """Objects (n,) bool with poses (n, 4, 4) in the middle of the table."""
+    return np.asarray((np.abs(poses[:, :2, 3]) < 0.4).all(axis=1) & (poses[:, 2, 3] > 0))
+
+
+def draw_camera(
+    rng: np.random.Generator,
+    middle: ArrayLike,
+    elevation: tuple[float, float],
+    distance: tuple[float, float],
+    zoom: float = 1.0,
+) -> Camera:
+    """Draw a camera that looks at the table near `middle` (x, y), from an elevation in degrees and a distance in m.
+
+    The focal length is that of a Kinect times `zoom`.
+    """
+    target = np.append(middle, 0.05) + rng.normal(0.0, 0.03, 3)
+    azimuth, raised, far = rng.uniform(0, 2 * np.pi), np.deg2rad(rng.uniform(*elevation)), rng.uniform(*distance)
+    flat = np.cos(raised)
+    away = np.array([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(raised)])
+    focal = 525.0 * zoom
+    camera = Camera.from_intrinsics(focal, focal, 319.5, 239.5, 640, 480, look_at(target + far * away, target))
+    return camera.scaled(WIDTH / 640)
+
+
+def displaced(rng: np.random.Generator, camera: Camera) -> Camera:
+    """The camera with a small error of its pose, as of a calibration."""
+    shift, tilt = rng.normal(0.0, 0.0015, 3), Rotation.from_rotvec(rng.normal(0.0, 0.003, 3))
+    return camera.at(RigidTransform.from_components(shift, tilt) * camera.pose)
+
+
+def world_rays(camera: Camera) -> np.ndarray:
+    """Directions (n, 3) of all pixels in the world, of unit z-depth."""
+    return camera.rays().reshape(-1, 3) @ camera.pose.as_matrix()[:3, :3].T
+
+
+def cast(world: PhysicsWorld, camera: Camera, groups: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Geom (n,), z-depth (n,) and normal (n, 3) of every pixel of a camera (`PhysicsWorld.cast`)."""
+    return world.cast(np.array(camera.position), world_rays(camera), groups)
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """What a camera without noise sees of a scene; n is the number of pixels."""
+
+    camera: Camera
+    geom: np.ndarray  #: (n,) of `PhysicsWorld.cast`, -1 for none
+    points: np.ndarray  #: (n, 3) in the world; the camera's position where the ray hits nothing
+    normal: np.ndarray  #: (n, 3)
+    instance: np.ndarray  #: (H, W) uint8, object of every pixel, 0 for none
+    depth: np.ndarray  #: (H, W) float32 metres, NaN for none
+    slant: np.ndarray  #: (H, W) float32, cosine of the angle of incidence
+
+    @classmethod
+    def of(cls, world: PhysicsWorld, camera: Camera) -> Self:
+        """The view of all pixels of a camera."""
+        rays = world_rays(camera)
+        geom, z, normal = cast(world, camera, (0, 1))
+        hit = geom >= 0
+        instance = np.where(hit, world.geom_object[np.maximum(geom, 0)], 0).astype(np.uint8)
+        points = np.array(camera.position) + rays * np.where(hit, z, 0)[:, None]
+        cosine = np.abs((rays * normal).sum(axis=1)) / np.linalg.norm(rays, axis=1)
+        images = (instance, np.where(hit, z, np.nan).astype(np.float32), cosine.astype(np.float32))
+        return cls(camera, geom, points, normal, *(image.reshape(HEIGHT, WIDTH) for image in images))
+
+
+class Samples:
+    """Samples as a dataclass of arrays; the first axis of each is the sample.
+
+    A subclass defines the arrays, and how one scene gives samples.
+    """
+
+    __dataclass_fields__: ClassVar[dict[str, Any]]
+
+    @classmethod
+    def of_world(cls, rng: np.random.Generator, world: PhysicsWorld, index: int) -> Self | None:
+        """The samples of scene number `index`; None if it shows no object."""
+        raise NotImplementedError
+
+    @classmethod
+    def of_scene(cls, seed: int, index: int, kinds: tuple[str, ...] = TRAINED) -> Self:
+        """The samples of scene number `index`, which follow from the arguments alone."""
+        for attempt in range(20):
+            rng = np.random.default_rng([seed, index, attempt])
+            world = draw_scene(rng, kinds)
+            samples = None if world is None else cls.of_world(rng, world, index)
+            if samples is not None:
+                return samples
+        raise InputError(f"no scene could be made of the kinds {', '.join(kinds)}")
+
+    @classmethod
+    def write(
+        cls,
+        folder: str | Path,
+        seed: int,
+        n_scenes: int,
+        workers: int = 1,
+        kinds: tuple[str, ...] = TRAINED,
+        per_file: int = 10,
+    ) -> list[Path]:
+        """Write the samples of scenes 0 .. n - 1 to files of a folder; existing files are kept.
+
+        The files are the same for any number of workers.
+        """
+        jobs = [
+            (
+                Path(folder) / f"scenes-{start:06d}.npz",
+                cls,
+                seed,
+                range(start, min(start + per_file, n_scenes)),
+                kinds,
+            )
+            for start in range(0, n_scenes, per_file)
+        ]
+        if workers > 1:
+            with environment(), ProcessPoolExecutor(workers) as pool:
+                list(pool.map(_write_file, jobs))
+        else:
+            for job in jobs:
+                _write_file(job)
+        return [job[0] for job in jobs]
+
+    @classmethod
+    def read(cls, paths: Sequence[Path]) -> Self:
+        """The samples of files."""
+        return cls.join([cls(**read_arrays(path, "samples of a training", limit=MAX_WEIGHTS)) for path in paths])
+
+    def columns(self) -> dict[str, np.ndarray]:
+        """The arrays by name."""
+        return {name: getattr(self, name) for name in self.__dataclass_fields__}
+
+    def __len__(self) -> int:
+        return len(next(iter(self.columns().values())))
+
+    def take(self, index: np.ndarray) -> Self:
+        """Some samples."""
+        return type(self)(*(values[index] for values in self.columns().values()))
+
+    @classmethod
+    def join(cls, parts: Sequence[Self]) -> Self:
+        """All samples of several parts."""
+        return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in cls.__dataclass_fields__))
+
+
+def _write_file(job: tuple[Path, type[Samples], int, range, tuple[str, ...]]) -> None:
+    path, samples, seed, scenes, kinds = job
+    if not path.exists():
+        columns: dict[str, Any] = samples.join([samples.of_scene(seed, k, kinds) for k in scenes]).columns()
+        scene_cache.clear()
+        with atomic_path(path) as partial, partial.open("wb") as file:
+            np.savez_compressed(file, **columns)

@@ -1,0 +1,5 @@
+from mstfilter.belief.queries import Belief as Belief
+from mstfilter.belief.similarity import (
+    SameSegmentation as SameSegmentation,
+    WeightedCoverage as WeightedCoverage,
+)

@@ -1,0 +1,413 @@
+"""Queries of a weighted population of hypotheses, for planners: probabilities, entropies, expected information.
+
+>>> belief = Belief(state.population)
+>>> belief.occupancy()[tuple(belief.voxel([0.1, 0.0, 0.02]))]     # probability that the voxel is occupied
+>>> belief.same_object_at_pixels(camera, (310, 200), (340, 210))  # probability that two pixels show one object
+>>> belief.object_count()                                         # probability of 0, 1, 2, ... objects
+>>> max(cameras, key=belief.view_information)                     # the most informative camera
+>>> belief.estimate()                                             # the hypothesis of least expected loss
+>>> belief.push_map(tolerance=50)                                 # information of a push at each voxel
+
+Hypothesis i has labels L_i and the normalised weight w_i. Labels of different hypotheses are unrelated, so no query
+compares them, and renaming them changes no result. Probabilities of voxels also use how sure a hypothesis is of each
+(`Hypothesis.occupancy`); queries of segmentations and actions use the labels. Voxels are integer indices (x, y, z);
+`Belief.voxel` and `Belief.box` convert metres. Pixels are (column, row). A region is a bool array of the grid's
+shape, or voxels (..., 3). Entropy and information are in nats (divide by log 2 for bits).
+
+**Information.** Every action (look at a region, look from a camera, push) has one outcome under each hypothesis. Its
+expected information is the mutual information of hypothesis and outcome. Without noise this is the entropy of the
+weights summed over equal outcomes, at most `partition_entropy()`, which is at most log n. It measures only what the
+hypotheses disagree on; errors that all of them share do not appear. Outcomes that differ in one voxel are different.
+With `tolerance` (in voxels or pixels), outcomes that differ by much less than it count as equal (formula in
+`mstfilter.belief.information`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, TypeVar
+
+import numpy as np
+
+from mstfilter.belief.information import (
+    binary_entropy,
+    canonical_rows,
+    entropy,
+    hamming,
+    outcome_information,
+    partition_distance,
+)
+from mstfilter.errors import InputError, check_component, check_integer, check_number
+from mstfilter.lazy import late
+from mstfilter.scene import (
+    Camera,
+    CommonRefinement,
+    Hypothesis,
+    VoxelGrid,
+    check_grid,
+    common_refinement,
+    project,
+    render_hypothesis,
+)
+from mstfilter.scoring import least_loss
+from mstfilter.smc import Population, first_seen
+
+Action = TypeVar("Action")
+
+_DEPTH_STEP = 0.01  # voxels: depths are rounded to this step before they are compared
+
+
+@dataclass(frozen=True, eq=False)
+class Belief:
+    """A posterior over scenes, represented by weighted hypotheses.
+
+    Parameters
+    ----------
+    population : Population
+        Hypotheses on one grid with unnormalised log weights, such as ``state.population``. Equal hypotheses are
+        merged, and hypotheses of weight 0 are ignored.
+
+    """
+
+    population: Population
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.population, Population):
+            raise InputError(
+                f"Belief takes a Population, not a {type(self.population).__name__}", "Belief(state.population)"
+            )
+        particles = self.population.particles
+        if not all(isinstance(h, Hypothesis) for h in particles):
+            raise InputError("the particles of a belief must be hypotheses, not vectors or other objects")
+        for k, h in enumerate(particles):
+            check_grid(f"hypothesis {k}", h, self.grid)
+
+    def __repr__(self) -> str:
+        weights = ", ".join(f"{w:.3g}" for w in np.sort(self._mass)[::-1][:8]) + ", ..." * (len(self._mass) > 8)
+        head = f"Belief: {len(self)} hypotheses, {len(self._mass)} distinct"
+        head = "Belief: 1 hypothesis" if len(self) == 1 else head
+        return f"{head}\n  {self.grid.text}\n  weights {weights}"
+
+    _repr_html_ = late("mstfilter.report.display:to_html", "What a notebook shows.")
+
+    def __len__(self) -> int:
+        return len(self.population)
+
+    @property
+    def hypotheses(self) -> tuple[Hypothesis, ...]:
+        """The n particles."""
+        return tuple(self.population.particles)
+
+    @property
+    def weights(self) -> np.ndarray:
+        """(n,) weights w, sum 1."""
+        return self.population.weights
+
+    @property
+    def grid(self) -> VoxelGrid:
+        """The grid of all hypotheses."""
+        return self.population.particles[0].grid
+
+    @cached_property
+    def _merged(self) -> tuple[tuple[Hypothesis, ...], np.ndarray]:
+        """Distinct hypotheses of positive weight, and their weights."""
+        which = first_seen(h.key + (h.occupancy.key if h.occupancy else b"") for h in self.hypotheses)
+        mass = np.bincount(which, self.weights)
+        example = np.unique(which, return_index=True)[1]
+        kept = np.flatnonzero(mass > 0)
+        return tuple(self.hypotheses[int(example[k])] for k in kept), mass[kept]
+
+    @property
+    def _mass(self) -> np.ndarray:
+        return self._merged[1]
+
+    @cached_property
+    def _refined(self) -> CommonRefinement:
+        return common_refinement([h.labels for h in self._merged[0]])
+
+    # Voxels and regions ---------------------------------------------------------------------------------------
+
+    def voxel(self, points: Any) -> np.ndarray:
+        """Voxels (..., 3) that hold world points (..., 3) in metres. Raises InputError if a point is outside."""
+        points = np.asarray(points, dtype=np.float64)
+        if points.shape[-1:] != (3,):
+            raise InputError(f"points have shape {points.shape}, expected (..., 3) in metres")
+        index = self.grid.index_of(points)
+        outside = ~self.grid.contains(index)
+        if outside.any():
+            raise InputError(
+                f"point {points[outside][0].tolist()} m lies outside the grid "
+                f"(so do {outside.sum()} of {outside.size} points)",
+                _extent(self.grid),
+            )
+        return index
+
+    def box(self, lower: Any, upper: Any) -> np.ndarray:
+        """Voxels (X, Y, Z) bool with centres in the box between two corners (3,) in metres."""
+        lower, upper = np.asarray(lower, dtype=np.float64), np.asarray(upper, dtype=np.float64)
+        if lower.shape != (3,) or upper.shape != (3,):
+            raise InputError(f"corners of a box have shapes {lower.shape} and {upper.shape}, expected (3,) in metres")
+        centres = self.grid.centres()
+        inside = ((centres >= lower) & (centres <= upper)).all(axis=-1)
+        if not inside.any():
+            raise InputError(
+                f"the box from {lower.tolist()} to {upper.tolist()} m holds the centre of no voxel",
+                _extent(self.grid),
+            )
+        return inside
+
+    def _region(self, region: Any) -> tuple[np.ndarray, np.ndarray]:
+        """Cells with voxels in a region, and the number of these voxels; None is the whole grid."""
+        counts = self._refined.sizes
+        if region is not None:
+            inside = self._refined.cells.ravel()[_flat_region(self.grid, region)]
+            counts = np.bincount(inside, minlength=len(counts))
+        cells = np.flatnonzero(counts)
+        return cells, counts[cells]
+
+    # Probabilities --------------------------------------------------------------------------------------------
+
+    def occupancy(self) -> np.ndarray:
+        """Probability (X, Y, Z) that a voxel is occupied: ``p(v) = sum_i w_i o_i(v)``.
+
+        o_i(v) is the probability of hypothesis i that v belongs to its most probable object (`Hypothesis.shares`).
+        """
+        shares = [h.shares.probability for h in self._merged[0]]
+        return sum((w * p.astype(np.float64) for w, p in zip(self._mass, shares, strict=True)), np.zeros(()))
+
+    def occupancy_entropy(self) -> np.ndarray:
+        """Entropy (X, Y, Z) of "occupied or free": ``-p log p - (1 - p) log(1 - p)``, p the `occupancy`."""
+        return binary_entropy(self.occupancy())
+
+    def same_object(self, a: Any, b: Any) -> np.ndarray:
+        """Probability (...) that two voxels belong to the same object.
+
+        ``sum_i w_i [k_i(a) = k_i(b) > 0] min(o_i(a), o_i(b))``, with k_i the most probable object of a voxel in
+        hypothesis i and o_i its probability (`Hypothesis.shares`). An object is a level set of its probabilities: a
+        voxel is in it whenever a less probable one is. `a` and `b` (..., 3) are broadcast against each other. For a
+        = b the result is the occupancy, and for all voxels b it is the extent of the object at a.
+        """
+        at_a, at_b = np.broadcast_arrays(_flat_voxels(self.grid, a), _flat_voxels(self.grid, b))
+        found = np.zeros(at_a.shape)
+        for w, (owner, p) in zip(self._mass, self._flat_shares, strict=True):
+            found += w * ((owner[at_a] == owner[at_b]) & (owner[at_a] > 0)) * np.minimum(p[at_a], p[at_b])
+        return found
+
+    @cached_property
+    def _flat_shares(self) -> list[tuple[np.ndarray, np.ndarray]]:
+        shares = [h.shares for h in self._merged[0]]
+        return [(one.owner.ravel(), one.probability.ravel().astype(np.float64)) for one in shares]
+
+    def same_object_at_pixels(self, camera: Camera, a: Any, b: Any) -> np.ndarray:
+        """Probability (...) that two pixels show the same object: ``sum_i w_i [R_i(a) = R_i(b) > 0]``.
+
+        R_i = Project(h_i). `a` and `b` (..., 2) are pixels (column, row), broadcast against each other.
+        """
+        images = self._images(camera)
+        a, b = _rows_and_columns(camera, a), _rows_and_columns(camera, b)
+        same = [(image[a] == image[b]) & (image[a] > 0) for image in images]
+        return np.tensordot(self._mass, np.stack(same), axes=1)
+
+    def object_count(self, region: Any = None) -> np.ndarray:
+        """Probability (K + 1,) of k = 0 .. K objects: ``sum_i w_i [hypothesis i has k objects]``.
+
+        With a region, only objects with a voxel in it count.
+        """
+        count = np.cumsum(self._refined.objects_in(self._region(region)[0]))
+        return np.bincount(np.diff(count[self._refined.first]), self._mass)
+
+    # Boundaries and entropy -----------------------------------------------------------------------------------
+
+    def boundary_entropy(self) -> np.ndarray:
+        """Entropy (X, Y, Z) of the segmentation at a voxel: the largest of its six faces, at most log 2.
+
+        A face between v and v' has ``H(S | B) = P(B) h(P(S | B))`` with B: both voxels are occupied, S: by the same
+        object, ``h(p) = -p log p - (1 - p) log(1 - p)``. The entropy of occupancy, H(B), is not included
+        (`occupancy_entropy`): H(B, S) = H(B) + H(S | B).
+        """
+        largest = np.zeros(self.grid.shape)
+        for axis in range(3):
+            out, face = np.moveaxis(largest, axis, 0), self._entropy_of_faces(axis)
+            np.maximum(out[:-1], face, out=out[:-1])
+            np.maximum(out[1:], face, out=out[1:])
+        return largest
+
+    def _entropy_of_faces(self, axis: int) -> np.ndarray:
+        """H(S | B) of the faces between voxels and the next ones along an axis, which comes first."""
+        cells = np.moveaxis(self._refined.cells, axis, 0)
+        lower, upper = cells[:-1], cells[1:]
+        differ = (lower != upper) & (lower > 0) & (upper > 0)  # inside a cell, both are always one object
+        a, b = self._refined.objects[:, lower[differ]], self._refined.objects[:, upper[differ]]
+        both, same = self._mass @ ((a > 0) & (b > 0)), self._mass @ ((a > 0) & (a == b))
+        entropy = np.zeros(differ.shape)
+        entropy[differ] = both * binary_entropy(np.divide(same, both, out=np.zeros_like(same), where=both > 0))
+        return entropy
+
+    def partition_entropy(self, region: Any = None, tolerance: float = 0.0) -> float:
+        """Entropy of the segmentation of a region (default: the whole grid).
+
+        ``-sum_s P(s) log P(s)``, P(s) the weight of the hypotheses with segmentation s of the region. This is also
+        the information of the true segmentation of the region. Without region and tolerance it is an upper bound of
+        the information of every outcome that the labels determine. The distance for the tolerance is
+        `information.partition_distance`.
+        """
+        cells, sizes = self._region(region)
+        rows = canonical_rows(self._refined.objects[:, cells])
+        return outcome_information(self._mass, rows, partition_distance, sizes, tolerance)
+
+    # Expected information of actions --------------------------------------------------------------------------
+
+    def look_information(self, region: Any, tolerance: float = 0.0) -> float:
+        """Information of the occupancy of a region, occluded voxels included.
+
+        Outcome: ``{v in region: L_i(v) > 0}``. For one voxel of certain hypotheses this is `occupancy_entropy`.
+        """
+        cells, sizes = self._region(region)
+        return outcome_information(self._mass, self._refined.objects[:, cells] > 0, hamming, sizes, tolerance)
+
+    def view_information(self, camera: Camera, tolerance: float = 0.0) -> float:
+        """Information of an image from a camera; `tolerance` in pixels. ``camera.scaled(0.25)`` is faster.
+
+        The outcome is the depth image of the objects (rounded to a hundredth of a voxel, without the table).
+        """
+        step = _DEPTH_STEP * self.grid.voxel_size
+        check_component("camera", camera, Camera)
+        depths = (render_hypothesis(h, camera).depth.ravel() for h in self._merged[0])
+        pixels = np.stack([np.nan_to_num(np.round(d / step), nan=-1).astype(np.int32) for d in depths])
+        pixels = pixels[:, (pixels != pixels[0]).any(axis=0)]
+        return outcome_information(self._mass, pixels, hamming, np.ones(pixels.shape[1]), tolerance)
+
+    def push_information(self, region: Any, tolerance: float = 0.0) -> float:
+        """Information of a push at a voxel or a region, if the moved voxels are observed.
+
+        Outcome: ``{v: L_i(v) = L_i(u) > 0 for a u in region}``, all voxels of all objects with a voxel in the region.
+        Further objects that these objects push are left out.
+        """
+        moved = self._refined.objects_in(self._region(region)[0])[self._refined.objects]
+        return outcome_information(self._mass, moved, hamming, self._refined.sizes, tolerance)
+
+    def push_map(self, tolerance: float = 0.0) -> np.ndarray:
+        """`push_information` (X, Y, Z) of each voxel."""
+        check_number("tolerance", tolerance, at_least=0, unit="number of voxels")
+        refined, mass = self._refined, self._mass
+        overlap = refined.overlaps()
+        volume = overlap.diagonal()
+        distance = volume[:, None] + volume[None, :] - 2 * overlap
+        near = np.exp(-distance / tolerance) if tolerance else (distance == 0).astype(np.float64)
+        information = np.zeros(len(refined.sizes))
+        for w, row in zip(mass, refined.objects, strict=True):
+            same_outcome = sum(v * near[row, other] for v, other in zip(mass, refined.objects, strict=True))
+            information -= w * np.log(same_outcome)
+        return np.maximum(information, 0.0)[refined.cells]
+
+    def most_informative(
+        self, actions: Sequence[Action], information: Callable[[Action], float], at_least: float = 1e-9
+    ) -> Action | None:
+        """The action of largest expected information in nats, the first of equal ones.
+
+        None if no action has `at_least` nats: the hypotheses agree on all outcomes, so none can be preferred.
+        """
+        values = [information(action) for action in actions]
+        if np.isnan(values).any():
+            raise InputError(f"the information of action {int(np.isnan(values).argmax())} is NaN")
+        best = int(np.argmax(values)) if values else 0
+        return actions[best] if values and values[best] >= at_least else None
+
+    def best_push(self, tolerance: float = 0.0, where: Any = None, at_least: float = 1e-9) -> np.ndarray | None:
+        """Voxel (3,) at which a push has the largest information (`push_map`).
+
+        `where` is a region that the finger can reach; default: all voxels. None if no push has `at_least` nats.
+        """
+        information = self.push_map(tolerance).ravel()
+        reachable = np.arange(information.size) if where is None else _flat_region(self.grid, where)
+        if not len(reachable) or information[reachable].max() < at_least:
+            return None
+        best = reachable[int(np.argmax(information[reachable]))]
+        return np.array(np.unravel_index(best, self.grid.shape))
+
+    # Functions of the user ------------------------------------------------------------------------------------
+
+    def expect(self, function: Callable[[Hypothesis], Any]) -> Any:
+        """Expectation ``sum_i w_i f(h_i)`` of numbers or arrays, such as the probability that a path is free."""
+        pairs = zip(self.weights, self.hypotheses, strict=True)
+        return sum(w * np.asarray(function(h), dtype=np.float64) for w, h in pairs if w > 0)
+
+    def information(self, outcome: Callable[[Hypothesis], Hashable]) -> float:
+        """Information of an action with an outcome that the hypothesis determines.
+
+        ``H(O)``, ``P(O = o) = sum_i w_i [outcome(h_i) = o]``. The outcome must not contain labels, which differ
+        between hypotheses without a meaning.
+        """
+        outcomes = [(outcome(h), w) for w, h in zip(self.weights, self.hypotheses, strict=True) if w > 0]
+        try:
+            which = first_seen(o for o, _ in outcomes)
+        except TypeError as error:
+            raise InputError(f"outcomes cannot be compared ({error})", "for arrays: array.tobytes()") from error
+        return entropy(np.bincount(which, [w for _, w in outcomes]))
+
+    def estimate(self, loss: Callable[[Hypothesis, Hypothesis], float] | None = None) -> Hypothesis:
+        """The hypothesis of least expected loss: ``argmin_i sum_j w_j loss(h_i, h_j)``.
+
+        Default: the loss is 1 - quality (weighted coverage in the form ``objects``), so that the result is the best
+        single answer among the hypotheses if the true scene were distributed as they are.
+        """
+        hypotheses, mass = self._merged
+        if loss is None:
+            return hypotheses[least_loss([h.labels for h in hypotheses], mass)]
+        expected = [sum(w * loss(a, b) for b, w in zip(hypotheses, mass, strict=True)) for a in hypotheses]
+        return hypotheses[int(np.argmin(expected))]
+
+    def reweighted(self, log_likelihood: Callable[[Hypothesis], float]) -> Belief:
+        """The belief after an observation: adds ``log p(observation | h_i)`` to the log weights; -inf rules out."""
+        return Belief(self.population.reweighted(np.array([float(log_likelihood(h)) for h in self.hypotheses])))
+
+    def sample(self, rng: np.random.Generator, n: int = 1) -> tuple[Hypothesis, ...]:
+        """n independent draws, each ``h_i`` with probability ``w_i``."""
+        check_integer("number of samples", n)
+        return tuple(self.hypotheses[int(k)] for k in rng.choice(len(self), size=n, p=self.weights))
+
+    def _images(self, camera: Camera) -> list[np.ndarray]:
+        check_component("camera", camera, Camera)
+        return [project(h, camera) for h in self._merged[0]]
+
+
+def _check_indices(name: str, index: np.ndarray, shape: tuple[int, ...], hint: str) -> None:
+    """Raise InputError unless `index` (..., k) holds integers from 0 to below `shape` (k,)."""
+    if index.shape[-1:] != (len(shape),) or not np.issubdtype(index.dtype, np.integer):
+        raise InputError(
+            f"{name}s have type {index.dtype} and shape {index.shape}, expected integers (..., {len(shape)})", hint
+        )
+    outside = ((index < 0) | (index >= shape)).any(axis=-1)
+    if outside.any():
+        size = " x ".join(str(n) for n in shape)
+        raise InputError(f"{name} {index[outside][0].tolist()} lies outside the {size} {name}s", hint)
+
+
+def _flat_voxels(grid: VoxelGrid, voxels: Any) -> np.ndarray:
+    """Flat indices (...) of voxels (..., 3)."""
+    index = np.asarray(voxels)
+    _check_indices("voxel", index, grid.shape, "belief.voxel(points) finds the voxels of points in metres")
+    return np.ravel_multi_index(tuple(np.moveaxis(index, -1, 0)), grid.shape)
+
+
+def _flat_region(grid: VoxelGrid, region: Any) -> np.ndarray:
+    """Distinct flat indices (m,) of a region: a bool array of the grid's shape, or voxels (..., 3)."""
+    where = np.asarray(region)
+    if where.dtype != bool:
+        return np.unique(_flat_voxels(grid, where))
+    if where.shape != grid.shape:
+        raise InputError(f"region has shape {where.shape}, the grid is {grid.shape}")
+    return np.flatnonzero(where)
+
+
+def _rows_and_columns(camera: Camera, pixels: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Rows (...) and columns (...) of pixels (..., 2), which are (column, row)."""
+    index = np.asarray(pixels)
+    _check_indices("pixel", index, (camera.width, camera.height), "a pixel is (column, row)")
+    return index[..., 1], index[..., 0]
+
+
+def _extent(grid: VoxelGrid) -> str:
+    return f"the grid extends from {grid.origin.tolist()} to {grid.upper.tolist()} m"

@@ -1,0 +1,24 @@
+"""The published measurement update: every sample is crossed with every prediction (paper, section IV-D).
+
+>>> fused = CrossoverUpdate().update(rng, predicted, proposed, clip)     # candidates, with weights
+
+=============  =========================================================================================
+`update`       `CrossoverUpdate`: free-space projection, pairs of hypotheses, and their weights
+`cross`        `Crossover`: makes one hypothesis of two
+`conflicts`    the conflict graph of two hypotheses (networkx)
+`resolution`   painting orders and merge probabilities
+`mode_filter`  `ModeFilter`: smooths the result
+=============  =========================================================================================
+"""
+
+from mstfilter.lazy import attach
+
+__getattr__, __dir__, __all__ = attach(__name__, __file__)
+
+__interfaces__ = {"crossover": "Crossover", "structure": "Structure", "mode_filter": "ModeFilter"}
+__components__ = {
+    "update": {"crossover": "CrossoverUpdate"},
+    "crossover": {"conflict_graph": "Crossover"},
+    "structure": {"random_order": "RandomOrder", "spanning_tree": "SpanningTree"},
+    "mode_filter": {"majority": "ModeFilter"},
+}

@@ -1,0 +1,208 @@
+"""Pauses of a video: the rules that divide it into clips.
+
+>>> pauses_from_text("still"), pauses_from_text("0,40,85"), pauses_from_text("0s,4.2s")
+
+A clip goes from one pause to the next. At a pause nothing moves, and neither the robot nor a hand should be in the
+image. Only the recording folder of mstfilter stores the pauses. For other layouts they are found by one of the rules
+below.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import pairwise
+from numbers import Integral
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mstfilter.errors import InputError, check_integer, naming, suggestion
+from mstfilter.reading import read_text
+from mstfilter.scene import PauseRule, grey_blocks
+
+
+@dataclass(frozen=True)
+class Ends(PauseRule):
+    """First and last frame: one clip."""
+
+    def find(self, times: tuple[float, ...], read_rgb: Callable[[int], np.ndarray]) -> tuple[int, ...]:
+        return tuple(sorted({0, len(times) - 1}))
+
+
+@dataclass(frozen=True)
+class EveryNth(PauseRule):
+    """Every n-th frame is a pause: single images of a scene that was changed in between."""
+
+    n: int = 1
+
+    def __post_init__(self) -> None:
+        check_integer("n", self.n)
+
+    def find(self, times: tuple[float, ...], read_rgb: Callable[[int], np.ndarray]) -> tuple[int, ...]:
+        return tuple(range(0, len(times), self.n))
+
+
+@dataclass(frozen=True)
+class At(PauseRule):
+    """Frames by index from 0, negative ones from the end, or the frames nearest to seconds since the first."""
+
+    frames: tuple[int, ...] = ()
+    seconds: tuple[float, ...] = ()
+
+    def find(self, times: tuple[float, ...], read_rgb: Callable[[int], np.ndarray]) -> tuple[int, ...]:
+        n, since = len(times), np.asarray(times) - times[0]
+        if not self.frames and not self.seconds:
+            raise InputError("no pause is given", "give frames or seconds")
+        wrong = [i for i in self.frames if not (isinstance(i, Integral) and -n <= i < n)]
+        if wrong:
+            raise InputError(f"pause at frame {wrong[0]}: the video has {n} frames, 0 to {n - 1}")
+        late = [s for s in self.seconds if not -0.5 <= s <= since[-1] + 0.5]
+        if late:
+            raise InputError(f"pause at {late[0]:g} s: the video lasts from 0 to {since[-1]:.1f} s")
+        nearest = [int(np.abs(since - s).argmin()) for s in self.seconds]
+        return tuple(sorted({*(i % n for i in self.frames), *nearest}))
+
+
+@dataclass(frozen=True)
+class Listed(PauseRule):
+    """A text file of frame indices, or of seconds that end in ``s``; ``#`` starts a comment."""
+
+    file: str = "pauses.txt"
+
+    def find(self, times: tuple[float, ...], read_rgb: Callable[[int], np.ndarray]) -> tuple[int, ...]:
+        lines = read_text(Path(self.file), "a file of pauses").splitlines()
+        words = [word for line in lines for word in line.partition("#")[0].replace(",", " ").split()]
+        with naming(self.file):
+            rule = At(**_numbers(words))
+        return rule.find(times, read_rgb)
+
+
+def _numbers(words: list[str]) -> dict[str, Any]:
+    try:
+        return {
+            "frames": tuple(int(w) for w in words if not w.endswith("s")),
+            "seconds": tuple(float(w.removesuffix("s")) for w in words if w.endswith("s")),
+        }
+    except ValueError as error:
+        raise InputError(
+            f"pauses are {' '.join(words)!r}: {error}", "frame indices 0,40,85 or seconds 0s,4.2s"
+        ) from error
+
+
+def pauses_from_text(text: str) -> dict[str, Any]:
+    """The configuration of a rule from the text of a user: the name of a rule, numbers, or the path of a file."""
+    words = text.replace(",", " ").split()
+    numbers = words and ".py:" not in text and all(w[0].isdigit() or w[0] in "-." for w in words)
+    if numbers and (len(words) > 1 or not Path(text).is_file()):  # a long list is no path
+        return {"component": "at", **{k: v for k, v in _numbers(words).items() if v}}
+    named = text in _RULES or not Path(text).is_file()
+    return {"component": text} if named else {"component": "listed", "file": text}
+
+
+def pause_rule(text: str) -> PauseRule:
+    """The rule of a text: "still", "ends", "every", frames "0,40,85", seconds "0s,4.2s", or the path of a file."""
+    config = pauses_from_text(text)
+    name = str(config.pop("component"))
+    if name not in _RULES:
+        raise InputError(
+            f"there is no rule of pauses {name!r}",
+            *suggestion(name, _RULES),
+            "still, ends, every, frames 0,40,85, seconds 0s,4.2s, or the path of a file that lists them",
+        )
+    return _RULES[name](**config)
+
+
+_MAX_LEVELS = 4.0  # largest threshold of a block in units of `levels`, also if the block never rests
+
+
+def _changes(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """(...) absolute change of each block from a to b minus the median change."""
+    difference = b - a
+    return np.abs(difference - np.median(difference))
+
+
+@dataclass(frozen=True)
+class Still(PauseRule):
+    """Middle frames of the intervals in which the image does not change, for a camera that stands still.
+
+    Images are reduced to blocks of grey levels. There is motion between two images if more than a small share of the
+    blocks differ by more than their noise. A still interval is a run of frames in which none differs from the first,
+    so that slow motion adds up. Each interval of at least `hold_s` seconds gives one pause, its middle frame.
+    Changes that all blocks share (exposure, flicker) do not count. The noise of each block is measured in the video,
+    which must be at rest for a quarter of its time.
+
+    A robot that holds still in the image, or that moves by less than a grey level in a whole interval, is also taken
+    for a pause: check the pauses, and give them explicitly if they are wrong.
+
+    Parameters
+    ----------
+    hold_s : float
+        Shortest interval, in seconds.
+    share : float
+        Largest share of blocks that differ without motion.
+    levels : float
+        Change in grey levels (of 255) from which a block differs, or six times its noise if that is more.
+    region : tuple of 4 float
+        Part of the image that is used: left, top, right, bottom as shares of its width and height. It can exclude
+        people behind the table.
+    """
+
+    hold_s: float = 0.5
+    share: float = 0.001
+    levels: float = 3.0
+    region: tuple[float, ...] = (0.0, 0.0, 1.0, 1.0)
+
+    def __post_init__(self) -> None:
+        left, top, right, bottom = self.region if len(self.region) == 4 else (1, 1, 0, 0)
+        if not (0 <= left < right <= 1 and 0 <= top < bottom <= 1):
+            raise InputError(f"region is {self.region}, expected left, top, right, bottom from 0 to 1")
+
+    def find(self, times: tuple[float, ...], read_rgb: Callable[[int], np.ndarray]) -> tuple[int, ...]:
+        intervals = self.intervals(times, read_rgb)
+        if not intervals:
+            raise InputError(
+                f"no pause found: in {len(times)} frames ({times[-1] - times[0]:.1f} s) the image is never still for "
+                f"{self.hold_s:g} s",
+                "if the camera moves, give the pauses: --pauses 0,40,85 (frames) or 0s,4.2s",
+                "if people or shadows move, use a part of the image: -o pauses.region=0.2,0.1,0.8,0.9",
+                "accept shorter intervals: -o pauses.hold_s=0.2; or use the first and last frame: --pauses ends",
+                'in Python pauses=(0, 40, 85), pauses="ends" or a rule, pauses=Still(hold_s=0.2)',
+            )
+        return tuple((first + last) // 2 for first, last in intervals)
+
+    def intervals(
+        self, times: tuple[float, ...], read_rgb: Callable[[int], np.ndarray]
+    ) -> tuple[tuple[int, int], ...]:
+        """First and last frame of each still interval."""
+        images = [self._part(grey_blocks(read_rgb(index))) for index in range(len(times))]
+        if len({image.shape for image in images}) > 1:
+            raise InputError(f"images differ in size: {sorted({image.shape for image in images})} blocks")
+        if len(images) == 1:
+            return ((0, 0),)
+        limit, allowed = self._limit(images), self.share * images[0].size
+        runs, first = [], 0
+        for index in range(1, len(images) + 1):
+            if index < len(images) and (_changes(images[first], images[index]) > limit).sum() <= allowed:
+                continue
+            runs.append((first, index - 1))
+            first = index
+        return tuple((a, b) for a, b in runs if b > a and times[b] - times[a] >= self.hold_s - 1e-9)
+
+    def _part(self, blocks: np.ndarray) -> np.ndarray:
+        h, w = blocks.shape
+        left, top, right, bottom = self.region
+        return blocks[int(top * h) : int(np.ceil(bottom * h)), int(left * w) : int(np.ceil(right * w))]
+
+    def _limit(self, images: list[np.ndarray]) -> np.ndarray:
+        """Change (h, w) in grey levels from which a block differs: a multiple of its noise at rest."""
+        changes = np.stack([_changes(a, b) for a, b in pairwise(images)])
+        quarter = np.quantile(changes, 0.25, axis=0) / 0.3186  # the quartile of |x| for a standard normal x is 0.3186
+        overall = 1.4826 * np.quantile(np.median(changes, axis=(1, 2)), 0.25)
+        limit = np.clip(6 * np.maximum(quarter, overall), self.levels, None)
+        bounded: np.ndarray = np.minimum(limit, max(_MAX_LEVELS * self.levels, 6 * overall))
+        return bounded
+
+
+_RULES: dict[str, type[PauseRule]] = {"still": Still, "ends": Ends, "every": EveryNth, "at": At, "listed": Listed}

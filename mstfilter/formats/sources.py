@@ -1,0 +1,131 @@
+"""Opens recordings of any format.
+
+>>> open_recording("recordings/mine")
+>>> open_recording("session.mcap")
+>>> open_recording("rgbd_dataset", options=["K=525,525,319.5,239.5"], pauses="0s,4.2s")
+
+Options are fields of the format (``mstfilter list format`` shows them), as ``FIELD=VALUE``; commas make a list. The
+format ``./file.py:Class`` is a reader that the user wrote. Each format is a class of `mstfilter.formats`, and a rule
+of ``formats/pauses.py`` decides where the pauses are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from mstfilter import formats
+from mstfilter.errors import InputError
+from mstfilter.formats.pauses import pauses_from_text
+from mstfilter.formats.video import RecordingFormat
+from mstfilter.registry import Registry, settings
+from mstfilter.scene import Recording
+
+_REGISTRY = Registry(formats)
+
+
+def open_recording(
+    path: str | Path, format: str = "", options: Sequence[str] = (), pauses: str = "", *, allow_files: bool = True
+) -> Recording:
+    """A recording of any format.
+
+    Parameters
+    ----------
+    path : str or Path
+        File or folder.
+    format : str
+        Name of a format, or ``./file.py:Class``. Empty: detected.
+    options : sequence of str
+        ``FIELD=VALUE`` of the format.
+    pauses : str
+        Where a video is cut: see `mstfilter.formats.pauses.pauses_from_text`. Empty: the format's default.
+    allow_files : bool
+        Whether ``./file.py:Class`` is loaded.
+    """
+    path = Path(path)
+    fields = format_settings(options)
+    if pauses:
+        rule = pauses_from_text(pauses)
+        more = fields.get("pauses")
+        fields["pauses"] = {**rule, **more} if isinstance(more, dict) else rule
+    name = format or detect_format(path)
+    cls = _reader(name, allow_files)
+    if not path.exists():
+        raise InputError(f"recording does not exist: {path}")
+    reader: RecordingFormat = _REGISTRY.make(cls, fields, "", allow_files)
+    return reader.open(path)
+
+
+def _reader(name: str, allow_files: bool = False) -> type[RecordingFormat]:
+    cls = _REGISTRY.find_class("format", name, "format", allow_files)
+    if not issubclass(cls, RecordingFormat):
+        raise InputError(f"{name} is not a reader of recordings", "subclass mstfilter.formats.RecordingFormat")
+    return cls
+
+
+def detect_format(path: Path) -> str:
+    """The name of the format of a file or folder."""
+    if not path.exists():
+        raise InputError(f"recording folder or file does not exist: {path}")
+    names = _REGISTRY.known("format")
+    found = [name for name in names if _reader(name).detects(path)]
+    if len(found) == 1:
+        return found[0]
+    if found:
+        raise InputError(
+            f"{path} looks like {' and like '.join(found)}", f"choose one: --format {' or --format '.join(found)}"
+        )
+    if _is_colour_only(path):
+        raise InputError(
+            f"{path} holds colour images only: hypotheses in 3-D need a depth image for every colour image",
+            "record with an RGB-D camera, with depth aligned to colour; `mstfilter list format` shows the layouts",
+            "if you have estimated depth, make a recording in Python: mstfilter.Recording.from_arrays",
+        )
+    if path.is_dir() and (
+        not any(path.iterdir()) or any((path / n).exists() for n in ("camera.json", "rgb", "depth"))
+    ):
+        return "recording"  # its reader reports what is missing
+    raise InputError(
+        f"{path} has no known format",
+        f"known formats: {', '.join(names)}; `mstfilter list format` describes them",
+        "in Python, mstfilter.Recording.from_arrays makes a recording from arrays",
+    )
+
+
+def format_settings(options: Sequence[str]) -> dict[str, Any]:
+    """Fields of a format from ``FIELD=VALUE`` texts."""
+    return settings(_with_lists(text) for text in options)
+
+
+def _with_lists(text: str) -> str:
+    """``K=1,2,3`` as ``K=[1, 2, 3]``; words are quoted."""
+    path, equals, value = text.partition("=")
+    if not equals or "," not in value or value.strip()[:1] in "[{\"'":
+        return text
+    words = [word.strip() for word in value.split(",") if word.strip()]
+    return f"{path}=[{', '.join(map(_quoted, words))}]"
+
+
+def _quoted(word: str) -> str:
+    """A word as a TOML value; numbers with leading zeros are texts."""
+    try:
+        number = float(word)
+    except ValueError:
+        return repr(word)
+    if word.lstrip("+-").isdigit():
+        return word if str(int(word)) == word else repr(word)
+    return repr(number)
+
+
+_VIDEOS = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".gif")
+_IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
+
+
+def _is_colour_only(path: Path) -> bool:
+    """Whether a path is a video file, an image, or a folder of images without any name that contains "depth"."""
+    if path.is_file():
+        return path.suffix.lower() in (*_VIDEOS, *_IMAGES)
+    names = [p.relative_to(path).as_posix().lower() for p in (*path.glob("*"), *path.glob("*/*"))]
+    images = any(name.endswith(_IMAGES) or name.endswith(_VIDEOS) for name in names)
+    return images and not any("depth" in name for name in names)

@@ -1,0 +1,22 @@
+"""The default measurement update: the image is partitioned, and objects are completed from all their views.
+
+>>> update = PartitionUpdate(completer=NetworkCompleter())
+>>> fused = update.update(rng, predicted, proposed, clip)     # candidates, with weights
+
+=============  =========================================================================================
+`update`       `PartitionUpdate`: partitions of the image are drawn, shapes completed from all views
+`cells`        the common refinement of partitions, and draws of partitions by its pairs of cells
+`pairs`        how likely two cells belong to one object
+`association`  which segment of the image continues which predicted object
+=============  =========================================================================================
+"""
+
+from mstfilter.lazy import attach
+
+__getattr__, __dir__, __all__ = attach(__name__, __file__)
+
+__interfaces__ = {"pairs": "PairOdds"}
+__components__ = {
+    "update": {"partition": "PartitionUpdate"},
+    "pairs": {"shares": "PairEvidence"},
+}

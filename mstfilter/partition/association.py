@@ -1,0 +1,114 @@
+"""Associates the segments of an image partition with the objects of a prediction.
+
+>>> overlaps = Overlaps.of(segments, objects, 60)   # labels (m,) of the readings; 0 is none
+>>> for component in overlaps.components():         # of the conflict graph
+...     overlaps.tracks(component)                  # segment -> predicted objects that it continues
+
+A segment and a predicted object are *in conflict* if they share more than a tenth of the readings of the smaller one:
+an edge of the conflict graph (paper, section IV-D, where edges join objects that share voxels). An object to which
+no segment belongs mainly is in no conflict if it has very few readings: those are readings of other objects that lie
+at it. In each connected component, a predicted object is continued by at most one segment:
+
+- An object that overlaps one segment only, which overlaps no other object, is continued by it if they share more than
+  half of the readings.
+- Else it is continued by the segment that has more than 80 % of its readings. Only the segments count that mainly
+  show this object, if one of them has as much.
+- An object that is *split* into segments of which none has as much is continued by none of them. Its track ends, and
+  the segments are new objects.
+- A segment that continues several objects is their *merge*. A segment that continues none is a new object.
+
+An object without conflict is *occluded*: practically no reading belongs to it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import networkx as nx
+import numpy as np
+
+_CONFLICT = 0.1  # a segment and an object are in conflict if they share more than this share of the smaller one
+_SAME = 0.5  # share of an object's readings in the segment that continues it, if both have no other conflict
+_CONTAINED = 0.8  # the same, if they have other conflicts
+
+
+class Component(NamedTuple):
+    """A connected component of the conflict graph of segments and predicted objects."""
+
+    segments: list[int]  #: ascending labels
+    objects: list[int]  #: ascending labels; none if the segment is in conflict with no object
+
+
+@dataclass(frozen=True, eq=False)
+class Overlaps:
+    """The number of readings that each segment shares with each predicted object."""
+
+    shared: np.ndarray  #: (segments + 1, objects + 1) int; row 0 is no segment, column 0 is no object
+    least: float  #: readings of an object in conflict, at least, if it is the main object of no segment
+
+    @classmethod
+    def of(cls, segments: np.ndarray, objects: np.ndarray, least: float) -> Overlaps:
+        """From the segment and the predicted object (m,) of each reading. Readings of no segment do not count."""
+        inside = segments > 0
+        shared = np.zeros((int(segments.max(initial=0)) + 1, int(objects[inside].max(initial=0)) + 1), np.int64)
+        np.add.at(shared, (segments[inside], objects[inside]), 1)
+        return cls(shared, least)
+
+    @cached_property
+    def in_conflict(self) -> np.ndarray:
+        """Whether each segment is in conflict with each object, bool in the shape of `shared`."""
+        segments, objects = self.shared.sum(axis=1), self.shared.sum(axis=0)
+        conflict = self.shared > _CONFLICT * np.minimum.outer(segments, objects)
+        is_main = np.isin(np.arange(len(objects)), self.main_object)
+        conflict[:, ~is_main & (objects < self.least)] = False
+        conflict[0], conflict[:, 0] = False, False
+        return conflict
+
+    @cached_property
+    def main_object(self) -> np.ndarray:
+        """The predicted object (segments + 1,) with most readings of each segment; 0 for a segment without any."""
+        main = self.shared[:, 1:].argmax(axis=1) + 1 if self.shared.shape[1] > 1 else np.zeros(len(self.shared), int)
+        return np.where(self.shared[:, 1:].any(axis=1), main, 0)
+
+    @cached_property
+    def visible(self) -> set[int]:
+        """The predicted objects that are in conflict with a segment. All others are occluded."""
+        return set(np.flatnonzero(self.in_conflict.any(axis=0)).tolist())
+
+    def components(self) -> list[Component]:
+        """Connected components of the conflict graph, in the order of their first segment."""
+        graph = nx.Graph()
+        graph.add_nodes_from(("segment", a) for a in np.flatnonzero(self.shared.any(axis=1)).tolist())
+        graph.add_edges_from((("segment", a), ("object", b)) for a, b in np.argwhere(self.in_conflict).tolist())
+        found = []
+        for vertices in nx.connected_components(graph):
+            labels = [sorted(k for kind, k in vertices if kind == wanted) for wanted in ("segment", "object")]
+            found.append(Component(*labels))
+        return sorted(found)
+
+    def tracks(self, component: Component) -> dict[int, list[int]]:
+        """The predicted objects that each segment of a component continues, that with most readings first."""
+        continued: dict[int, list[int]] = {segment: [] for segment in component.segments}
+        for predicted in component.objects:
+            segment = self.continued_by(predicted, component)
+            if segment:
+                continued[segment].append(predicted)
+        return {a: sorted(objects, key=lambda k: -self.shared[a, k]) for a, objects in continued.items()}
+
+    def continued_by(self, predicted: int, component: Component) -> int:
+        """The segment of a component that continues a predicted object; 0 if there is none."""
+        no_other_conflict = len(component.segments) == len(component.objects) == 1
+        share = _SAME if no_other_conflict else _CONTAINED
+        mainly_it = self.main_object == predicted
+        return self._holder(predicted, mainly_it, share) or self._holder(predicted, np.ones_like(mainly_it), share)
+
+    def _holder(self, predicted: int, segments: np.ndarray, share: float) -> int:
+        """The segment in conflict with an object that has more than a share of its readings in `segments`; 0 is none.
+
+        `segments` (segments + 1,) bool selects segments.
+        """
+        readings = np.where(segments, self.shared[:, predicted], 0)
+        enough = self.in_conflict[:, predicted] & (readings > share * readings.sum())
+        return int(enough.argmax())

@@ -1,0 +1,249 @@
+"""Readings and cells of a depth image, and draws of partitions of the cells into objects.
+
+>>> readings = Readings.of(frame, grid)
+>>> cells = Cells.of(readings, samples, predictions)
+>>> log_odds = PairEvidence().log_odds(cells, weights, clip)      # (e,) of "one object" (`mstfilter.partition.pairs`)
+>>> labels = cells.draw(rng, log_odds, 20)                        # (20, K) object of each cell in each draw
+
+A sample partitions the readings by its segments, a prediction by the objects that lie at the readings. A cell is a
+set of readings that all these partitions treat alike: the cells are the common refinement of all partitions. Cells
+that some partition joins form a component.
+
+The alternatives of a component are the partitions that the samples and the predictions give it. A cell that a
+prediction does not explain joins a predicted object as each sample has it. The probabilities of the alternatives are
+those whose probabilities of pairs are nearest to the given ones (least cross entropy over the pairs of readings).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+from scipy.ndimage import distance_transform_edt
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+from scipy.special import expit
+
+from mstfilter.completion.observed import frame_points
+from mstfilter.scene import Frame, VoxelGrid, canonical, common_refinement, scaled_area
+from mstfilter.smc import Systematic
+
+_LEAST_READINGS = 60  # of a region in an image of 640 x 480 pixels, as `ObjectRule.min_points`
+_LEAST_SHARE, _TOLERANCE, _STEPS = 1e-9, 1e-3, 200
+
+
+@dataclass(frozen=True)
+class Readings:
+    """The depth readings of a frame inside the grid."""
+
+    pixels: np.ndarray  #: (m,) flat pixels
+    voxels: np.ndarray  #: (m, 3) voxels
+    shape: tuple[int, int]  #: of the image
+
+    @classmethod
+    def of(cls, frame: Frame, grid: VoxelGrid) -> Readings:
+        """Of a frame."""
+        return cls(*frame_points(frame, grid), frame.depth.shape)
+
+    @property
+    def smallest_region(self) -> float:
+        """Readings of the smallest region of this image that counts as one."""
+        return scaled_area(_LEAST_READINGS, self.shape[0] * self.shape[1])
+
+    def mask(self, chosen: np.ndarray) -> np.ndarray:
+        """Pixels (H, W) bool of the chosen readings (m,) bool."""
+        mask = np.zeros(self.shape, bool)
+        mask.ravel()[self.pixels[chosen]] = True
+        return mask
+
+    def labels(self, labels: np.ndarray, reach: float) -> np.ndarray:
+        """Label (m,) of each reading: of its voxel, or of the nearest object within `reach` voxels; 0 is none."""
+        occupied, (voxels, of_reading) = np.argwhere(labels), self._distinct
+        _, nearest = cKDTree(occupied).query(voxels, distance_upper_bound=reach + 1e-6)
+        found = np.append(labels[tuple(occupied.T)], 0).astype(np.int64)  # the last one is that of no neighbour
+        return found[nearest][of_reading]
+
+    @cached_property
+    def _distinct(self) -> tuple[np.ndarray, np.ndarray]:
+        """The voxels (k, 3) with readings, and that of each reading (m,)."""
+        voxels, of_reading = np.unique(self.voxels, axis=0, return_inverse=True)
+        return voxels, of_reading.ravel()
+
+
+class Alternatives(NamedTuple):
+    """The partitions among which one is drawn for a component."""
+
+    cells: np.ndarray  #: (k,) cells of the component
+    partitions: np.ndarray  #: (p, k) object of each cell in each partition, 1, 2, ...
+
+
+@dataclass(frozen=True, eq=False)
+class Cells:
+    """The common refinement of samples and predictions."""
+
+    readings: Readings
+    of_reading: np.ndarray  #: (m,) cell of each reading, -1 for readings of no object
+    samples: np.ndarray  #: (s, K) label of each cell in each sample
+    predictions: np.ndarray  #: (n, K) label of each cell in each prediction, 0 is none
+
+    @classmethod
+    def of(cls, readings: Readings, samples: Sequence[np.ndarray], predictions: Sequence[np.ndarray]) -> Cells:
+        """From labels (m,) of the readings in each sample and each prediction; 0 is no object.
+
+        Readings that most samples give to no object belong to no cell.
+        """
+        kept = np.mean([labels > 0 for labels in samples], axis=0) >= 0.5
+        segments = [labels[kept] for labels in samples]
+        in_segments = common_refinement(segments).cells
+        objects = [_extended(in_segments, labels[kept]) for labels in predictions]
+        exact = common_refinement([in_segments, *objects]).cells
+        cell = _without_slivers(exact, readings, kept)
+        of_reading = np.full(len(kept), -1)
+        of_reading[kept] = np.unique(cell, return_inverse=True)[1]
+        example = _examples(cell, exact)
+        labels = np.stack([*segments, *objects])[:, example]
+        return cls(readings, of_reading, labels[: len(segments)], labels[len(segments) :])
+
+    @cached_property
+    def sizes(self) -> np.ndarray:
+        """Readings (K,) of each cell."""
+        return np.bincount(self.of_reading[self.of_reading >= 0], minlength=self.samples.shape[1])
+
+    @cached_property
+    def component(self) -> np.ndarray:
+        """Component (K,) of each cell: cells that a sample or a prediction gives to one object have the same."""
+        labels = np.concatenate([self.samples, self.predictions])
+        same = (labels[:, :, None] == labels[:, None]) & (labels[:, :, None] > 0)
+        return np.asarray(connected_components(same.any(axis=0), directed=False)[1])
+
+    @cached_property
+    def pairs(self) -> np.ndarray:
+        """Pairs (e, 2) of cells of one component."""
+        return np.argwhere(np.triu(self.component[:, None] == self.component, 1))
+
+    def counts(self, image: np.ndarray) -> np.ndarray:
+        """Readings (K, m) of each cell with each label of an image (H, W) int."""
+        inside = self.of_reading >= 0
+        found = np.zeros((len(self.sizes), int(image.max()) + 1), np.int64)
+        np.add.at(found, (self.of_reading[inside], image.ravel()[self.readings.pixels[inside]]), 1)
+        return found
+
+    def alternatives(self) -> list[Alternatives]:
+        """The distinct partitions of each component."""
+        found = []
+        for c in range(int(self.component.max(initial=-1)) + 1):
+            cells = np.flatnonzero(self.component == c)
+            rows = self._partitions_of(cells)
+            named = np.array([canonical(np.unique(row, return_inverse=True)[1] + 1) for row in rows])
+            found.append(Alternatives(cells, np.unique(named, axis=0).astype(np.int64)))
+        return found
+
+    def _partitions_of(self, cells: np.ndarray) -> list[np.ndarray]:
+        """Partitions (k,) of some cells (k,) by the samples, and by the predictions, completed by each sample."""
+        labels = self.samples[:, cells]
+        samples = np.unique(np.where(labels > 0, labels, -1 - np.arange(len(cells))), axis=0)
+        rows = [*samples]
+        for prediction in np.unique(self.predictions[:, cells], axis=0):
+            if prediction.all():
+                rows.append(prediction)
+            else:
+                rows += [_filled(prediction, sample, self.sizes[cells]) for sample in samples]
+        return rows
+
+    def probabilities(self, log_odds: np.ndarray, component: Alternatives) -> np.ndarray:
+        """Probabilities (p,) of the partitions of a component, from the log odds (e,) of all pairs."""
+        cells, partitions = component
+        if len(partitions) == 1:
+            return np.ones(1)
+        inside = self.component[self.pairs[:, 0]] == self.component[cells[0]]
+        place = np.searchsorted(cells, self.pairs[inside])
+        joined = (partitions[:, place[:, 0]] == partitions[:, place[:, 1]]).astype(float)
+        weights = self.sizes[self.pairs[inside]].prod(axis=1).astype(float)
+        return _fitted_mixture(joined, expit(log_odds[inside]), weights / weights.sum())
+
+    def draw(self, rng: np.random.Generator, log_odds: np.ndarray, n: int) -> np.ndarray:
+        """n partitions (n, K). Components are independent.
+
+        In each, the alternatives are drawn by systematic selection: as often as their probabilities say, up to
+        rounding.
+        """
+        drawn = np.zeros((n, self.samples.shape[1]), np.int64)
+        used = 0
+        for component in self.alternatives():
+            log_weights = np.log(np.maximum(self.probabilities(log_odds, component), 1e-300))
+            chosen = rng.permutation(Systematic().select(rng, log_weights, n)[0])
+            drawn[:, component.cells] = component.partitions[chosen] + used
+            used += int(component.partitions.max())
+        return drawn
+
+    def to_readings(self, of_cells: np.ndarray) -> np.ndarray:
+        """Labels (..., m) of the readings, from labels (..., K) of the cells; 0 for readings of no cell."""
+        padded = np.pad(of_cells, [(0, 0)] * (of_cells.ndim - 1) + [(0, 1)])  # the last column is no cell
+        return np.asarray(padded[..., self.of_reading])
+
+
+def _extended(cells: np.ndarray, labels: np.ndarray) -> np.ndarray:
+    """Labels (m,) of a prediction, with the most frequent label of the cell (m,) where there is none.
+
+    This holds for cells of which the prediction explains at least half.
+    """
+    table = np.zeros((int(cells.max(initial=-1)) + 1, int(labels.max(initial=0)) + 1), np.int64)
+    np.add.at(table, (cells, labels), 1)
+    unexplained, table[:, 0] = table[:, 0].copy(), 0
+    usual = np.where(table.sum(axis=1) >= unexplained, table.argmax(axis=1), 0)
+    return np.where(labels > 0, labels, usual[cells])
+
+
+def _without_slivers(cell: np.ndarray, readings: Readings, kept: np.ndarray) -> np.ndarray:
+    """Cells of the kept readings, after those of small cells have joined the nearest large cell, if one is near."""
+    pixels, least = readings.pixels[kept], readings.smallest_region
+    large = np.bincount(cell, minlength=1)[cell] >= least
+    if not large.any():
+        return cell
+    image = np.full(readings.shape, -1)
+    image.ravel()[pixels[large]] = cell[large]
+    distance, nearest = distance_transform_edt(image < 0, return_indices=True)
+    return np.where(distance.ravel()[pixels] <= np.sqrt(least), image[tuple(nearest)].ravel()[pixels], cell)
+
+
+def _examples(cell: np.ndarray, exact: np.ndarray) -> np.ndarray:
+    """A reading (K,) of each cell (m,) that has not joined it from a sliver: its labels are those of the cell."""
+    own = np.flatnonzero(cell == exact)
+    return own[np.unique(cell[own], return_index=True)[1]]
+
+
+def _filled(prediction: np.ndarray, sample: np.ndarray, sizes: np.ndarray) -> np.ndarray:
+    """A prediction (k,) of cells of these sizes (k,), with objects for the cells that it does not explain.
+
+    Such a cell joins the predicted object with most readings in its segment of the sample (k,). Without one, the
+    segment is an object.
+    """
+    filled = prediction.copy()
+    for segment in np.unique(sample[prediction == 0]):
+        inside = sample == segment
+        readings = np.bincount(prediction[inside], sizes[inside])
+        readings[0] = 0
+        new = prediction.max() + 1 + np.flatnonzero(inside)[0]
+        filled[inside & (prediction == 0)] = readings.argmax() or new
+    return filled
+
+
+def _fitted_mixture(joined: np.ndarray, same: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """The mixture (p,) of partitions that forecasts pairs best.
+
+    It has the least cross entropy between the probabilities `same` (e,) that the objects of a pair are one and the
+    total probability of the partitions that join the pair, `joined` (p, e); pairs count by `weights` (e,). The
+    problem is convex; this is expectation maximisation for the proportions of a mixture.
+    """
+    q = np.full(len(joined), 1 / len(joined))
+    for _ in range(_STEPS):
+        together = np.clip(q @ joined, _LEAST_SHARE, 1 - _LEAST_SHARE)
+        factor = joined @ (weights * same / together) + (1 - joined) @ (weights * (1 - same) / (1 - together))
+        q = q * factor
+        q /= q.sum()
+        if np.abs(factor - 1)[q > _LEAST_SHARE].max() < _TOLERANCE:
+            break
+    return q

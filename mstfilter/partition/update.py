@@ -1,0 +1,304 @@
+"""The measurement update: partitions of the image are drawn, and every object is completed from all its views.
+
+>>> update = PartitionUpdate(completer=NetworkCompleter())
+>>> fused = update.update(rng, predicted, proposed, clip)       # a candidate for each predicted hypothesis
+
+It takes the place of section IV-D of the paper. There, a sample of the image and a prediction are two sets of voxels,
+which are crossed. Here, both are partitions of the depth readings of the last frame, and the voxels of an object are
+estimated anew from all that was seen of it.
+
+1. **Free-space projection** (as in the paper). Q_j is the share of the voxels of prediction j that the frame does not
+   observe as free. Prediction j *holds* with probability Q_j^lambda.
+2. **Partitions.** A sample partitions the readings by its segments, a prediction by the objects that lie at the
+   readings. All of them together say how likely two readings belong to one object. Partitions of the image are drawn
+   by these odds (`mstfilter.partition.cells`), so segments of different samples can occur in one partition. The
+   paper crosses each sample with each prediction.
+3. **Association.** Each partition is combined with a prediction j, drawn in proportion to w_j Q_j^lambda. Segments
+   and predicted objects form a *conflict graph*. In each of its *components*, segments continue predicted objects
+   (`mstfilter.partition.association`). The paper draws which conflicts end in a merge; here the partition decides.
+4. **Occluded objects.** A predicted object without conflict, to which practically no reading belongs, stays with
+   probability (Q_j q)^lambda; q is the share of its own voxels that the frame does not observe as free.
+5. **Completion.** An object keeps its views: what earlier frames showed of it (`mstfilter.scene.ObjectView`). It is
+   completed from its readings in this frame and from the views of the objects that it continues. Evidence is
+   remembered, guesses are not: no voxel that was guessed at an earlier pause is carried on.
+
+At the first pause the candidates are the samples: every segment is a new object. An object that no frame has shown is
+in no hypothesis.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import islice, zip_longest
+from typing import Annotated, ClassVar, NamedTuple
+
+import numpy as np
+
+from mstfilter.completion import ClipCompleter, Completer, Completion, Extrude, arbitrate, occupancy_of
+from mstfilter.fields import Bounds, NonNegativeFloat, NonNegativeInt, Share
+from mstfilter.partition.association import Overlaps
+from mstfilter.partition.cells import Cells, Readings
+from mstfilter.partition.pairs import PairEvidence, PairOdds
+from mstfilter.scene import (
+    Clip,
+    Evidence,
+    FreeSpace,
+    Hypothesis,
+    ObjectRecord,
+    ObjectView,
+    Projection,
+    check_grid,
+    log_quality,
+    scored,
+)
+from mstfilter.smc import Population, Systematic, Update, child
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """A predicted hypothesis and what the last frame says about it."""
+
+    hypothesis: Hypothesis
+    refined: Hypothesis  #: without the voxels that the frame observes as free
+    weight: float  #: w_j, normalised
+    holds: float  #: probability that it holds, Q^lambda
+    objects: np.ndarray  #: (m,) its object at each reading, 0 is none
+
+    def shares_left(self) -> dict[int, float]:
+        """The share q of each object's voxels that the frame does not observe as free, by label."""
+        left = Counter(self.hypothesis.labels[self.refined.labels > 0].tolist())
+        return {label: left[label] / n for label, n in self.hypothesis.volumes().items()}
+
+    def remaining(self, record: ObjectRecord, threshold: float) -> Completion:
+        """What free space leaves of an object. Its voxels have at least the probability `threshold`."""
+        crop, left = self.hypothesis.crop(record.label), self.refined.shares.probability
+        p = crop.occupied if crop.probability is None else np.maximum(crop.probability, threshold * crop.occupied)
+        p = np.where(left[crop.box] > 0, p, 0).astype(np.float32)
+        return Completion(crop.offset, p, np.zeros(p.shape, np.int32), record.completion_key or "")
+
+
+class SceneObject(NamedTuple):
+    """An object of a candidate, before its completion."""
+
+    readings: np.ndarray  #: (m,) bool, its readings in the last frame
+    tracks: tuple[ObjectRecord, ...] = ()  #: the predicted objects that it continues, that with most readings first
+    occluded: Completion | None = None  #: what is left of the voxels of an occluded object; None for a segment
+
+
+@dataclass(frozen=True)
+class PartitionUpdate(Update):
+    """Partition of the readings, and completion from all views.
+
+    Parameters
+    ----------
+    completer : Completer
+        Completes the objects. That of the proposal is then of no use, and may be `SurfaceOnly`.
+    free_space : Projection
+        Gives the share Q of a prediction that the frame does not observe as free, and the voxels that are left.
+    pairs : PairOdds
+        The log odds that two cells belong to one object.
+    occupied_log_odds : float
+        Added to the log odds of every voxel that the completer is not certain about, since the network is calibrated
+        for its own training scenes. It was fitted in `experiments/partition_fit`.
+    evidence : tuple of Evidence
+        Terms whose sum is the log weight of a candidate. Without them all candidates have equal weights, as they are
+        drawn from what they approximate.
+    quality_exponent : float
+        lambda. With 0 every prediction holds, and every occluded object stays.
+    n_candidates : int
+        Candidates after the first pause; 0 means one for each predicted hypothesis, or four if there is evidence.
+    reach : float
+        Voxels between a reading and the predicted object that explains it, at most.
+    n_views : int
+        Views that an object keeps, at most: the latest ones.
+    threshold : float
+        Smallest probability of an occupied voxel.
+    """
+
+    completer: Completer = field(default_factory=Extrude)
+    free_space: Projection = FreeSpace()  # noqa: RUF009 (frozen)
+    pairs: PairOdds = PairEvidence()  # noqa: RUF009 (frozen)
+    occupied_log_odds: Annotated[float, Bounds()] = 0.6
+    evidence: tuple[Evidence, ...] = ()
+    quality_exponent: NonNegativeFloat = 3.0
+    n_candidates: NonNegativeInt = 0
+    reach: NonNegativeFloat = 1.5
+    n_views: NonNegativeInt = 4
+    threshold: Share = 0.5
+
+    properly_weighted: ClassVar[bool] = False
+
+    def update(
+        self, rng: np.random.Generator, predicted: Population | None, proposed: Population | None, observation: Clip
+    ) -> Population:
+        """Candidates. Without a proposal, the predictions after free-space projection."""
+        _check_grids(predicted, proposed, observation)
+        readings = Readings.of(observation.after, observation.grid)
+        if predicted is None:
+            assert proposed is not None
+            candidates = [_new_objects(segments) for segments in _segments(proposed, readings)]
+            built = self._complete(rng, candidates, readings, observation)
+            return self._weigh(built, observation, proposed.log_weights, proposed.parents, {})
+        projected = self._project(predicted, observation)
+        if proposed is None:
+            return projected
+        predictions = self._predictions(predicted, projected, readings)
+        n = self.n_candidates or (4 if self.evidence else 1) * len(predicted)
+        drawn = Systematic().select(child(rng, "predicted"), projected.log_weights, n)[0]
+        partitions = self._draw_partitions(child(rng, "partition"), predictions, proposed, readings, observation, n)
+        candidates = [
+            self._associate(child(rng, "hidden", c), segments, predictions[j], readings)
+            for c, (segments, j) in enumerate(zip(partitions, drawn.tolist(), strict=True))
+        ]
+        built = self._complete(rng, candidates, readings, observation)
+        parents = {"previous": predicted.parents.get("previous", np.full(len(predicted), -1))[drawn]}
+        return self._weigh(built, observation, np.zeros(n), parents, projected.notes)
+
+    # 1. Free-space projection -----------------------------------------------------------------------------------
+
+    def _project(self, predicted: Population, clip: Clip) -> Population:
+        """The predictions without the voxels that the frame observes as free, weighted by w_j Q_j^lambda."""
+        refined, quality = self.free_space.refine(predicted.particles, clip)
+        log_weights = predicted.log_weights + self.quality_exponent * log_quality(quality)
+        return Population(refined, log_weights, predicted.parents, {"quality": quality.tolist()})
+
+    def _predictions(self, predicted: Population, projected: Population, readings: Readings) -> list[Prediction]:
+        """What the last frame says about each prediction."""
+        holds = np.exp(self.quality_exponent * log_quality(np.array(projected.notes["quality"])))
+        columns = predicted.particles, projected.particles, predicted.weights.tolist(), holds.tolist()
+        return [
+            Prediction(hypothesis, refined, weight, p, readings.labels(hypothesis.labels, self.reach))
+            for hypothesis, refined, weight, p in zip(*columns, strict=True)
+        ]
+
+    # 2. Partitions of the image ---------------------------------------------------------------------------------
+
+    def _draw_partitions(
+        self,
+        rng: np.random.Generator,
+        predictions: Sequence[Prediction],
+        proposed: Population,
+        readings: Readings,
+        clip: Clip,
+        n: int,
+    ) -> np.ndarray:
+        """n partitions of the readings: the segment (n, m) of each reading, 0 is none."""
+        cells = Cells.of(readings, _segments(proposed, readings), [one.objects for one in predictions])
+        weights = np.array([one.weight * one.holds for one in predictions])
+        return cells.to_readings(cells.draw(rng, self.pairs.log_odds(cells, weights, clip), n))
+
+    # 3. Association, 4. occluded objects ------------------------------------------------------------------------
+
+    def _associate(
+        self, rng: np.random.Generator, segments: np.ndarray, prediction: Prediction, readings: Readings
+    ) -> list[SceneObject]:
+        """The objects of a candidate: the segments (m,) of a partition, and occluded objects of a prediction."""
+        overlaps = Overlaps.of(segments, prediction.objects, readings.smallest_region)
+        record_of = {record.label: record for record in prediction.hypothesis.objects}
+        visible = [
+            SceneObject(segments == segment, tuple(record_of[k] for k in tracks))
+            for component in overlaps.components()
+            for segment, tracks in overlaps.tracks(component).items()
+        ]
+        return visible + self._occluded(rng, prediction, overlaps)
+
+    def _occluded(self, rng: np.random.Generator, prediction: Prediction, overlaps: Overlaps) -> list[SceneObject]:
+        """The occluded objects of a prediction that stay, each with probability (Q q)^lambda."""
+        q = prediction.shares_left()
+        no_readings = np.zeros(len(prediction.objects), bool)
+        return [
+            SceneObject(no_readings, (record,), prediction.remaining(record, self.threshold))
+            for record in prediction.hypothesis.objects
+            if record.label not in overlaps.visible
+            and rng.random() < prediction.holds * q[record.label] ** self.quality_exponent
+        ]
+
+    # 5. Completion ----------------------------------------------------------------------------------------------
+
+    def _complete(
+        self, rng: np.random.Generator, candidates: Sequence[Sequence[SceneObject]], readings: Readings, clip: Clip
+    ) -> tuple[Hypothesis, ...]:
+        """The hypotheses of the candidates. The objects of all candidates are completed together."""
+        objects = [one for candidate in candidates for one in candidate]
+        completed = iter(self._completions(rng, objects, readings, clip))
+        return tuple(self._hypothesis(one, list(islice(completed, len(one))), clip) for one in candidates)
+
+    def _completions(
+        self, rng: np.random.Generator, objects: Sequence[SceneObject], readings: Readings, clip: Clip
+    ) -> list[Completion]:
+        """Each object, completed from its readings and from the views of its tracks.
+
+        An object without readings and views keeps what is left of its predicted voxels.
+        """
+        completer = self.completer.at(clip) if isinstance(self.completer, ClipCompleter) else self.completer
+        views = [self._latest(*(track.views for track in one.tracks)) for one in objects]
+        seen = [k for k, one in enumerate(objects) if one.readings.any() or views[k]]
+        streams = [child(rng, "completion", k) for k in seen]
+        masks = [readings.mask(objects[k].readings) for k in seen]
+        found = completer.complete_each(streams, clip.after, masks, clip.grid, [views[k] for k in seen])
+        completed = {k: one.shifted(self.occupied_log_odds) for k, one in zip(seen, found, strict=True)}
+        completed |= {k: one.occluded for k, one in enumerate(objects) if k not in completed and one.occluded}
+        return [completed[k] for k in range(len(objects))]
+
+    def _hypothesis(
+        self, objects: Sequence[SceneObject], completions: Sequence[Completion], clip: Clip
+    ) -> Hypothesis:
+        """A candidate. An object whose voxels all belong to other objects is dropped."""
+        labels = arbitrate(completions, clip.grid, self.threshold)
+        present = set(np.unique(labels).tolist())
+        records = [
+            self._record(label, *one, clip.index)
+            for label, one in enumerate(zip(objects, completions, strict=True), start=1)
+            if label in present
+        ]
+        return Hypothesis(labels, clip.grid, tuple(records), occupancy_of(completions, labels, clip.grid))
+
+    def _record(self, label: int, one: SceneObject, completion: Completion, birth: int) -> ObjectRecord:
+        """The record of an object: that of the first object that it continues, or a new one."""
+        key, views = completion.key, self._latest(completion.views)
+        if not one.tracks:
+            return ObjectRecord.born(label, birth, key, views)
+        return replace(one.tracks[0].changed(), label=label, completion_key=key, views=views)
+
+    def _latest(self, *histories: tuple[ObjectView, ...]) -> tuple[ObjectView, ...]:
+        """The latest views of several objects, each with its oldest view first."""
+        newest = (view for level in zip_longest(*map(reversed, histories)) for view in level if view is not None)
+        return tuple(islice(newest, self.n_views))[::-1]
+
+    # Weights ----------------------------------------------------------------------------------------------------
+
+    def _weigh(
+        self,
+        built: tuple[Hypothesis, ...],
+        clip: Clip,
+        log_weights: np.ndarray,
+        parents: Mapping[str, np.ndarray],
+        notes: Mapping[str, object],
+    ) -> Population:
+        """The candidates, weighted by evidence."""
+        total, scores = scored(self.evidence, built, clip)
+        return Population(built, log_weights + total, parents, {**notes, "scores": scores})
+
+
+def _check_grids(predicted: Population | None, proposed: Population | None, clip: Clip) -> None:
+    """Raise InputError unless all hypotheses are on the grid of the clip."""
+    for name, population in (("predicted", predicted), ("proposed", proposed)):
+        for k, hypothesis in enumerate(population.particles if population else ()):
+            check_grid(f"{name} hypothesis {k}", hypothesis, clip.grid)
+
+
+def _segments(proposed: Population, readings: Readings) -> list[np.ndarray]:
+    """The segment (m,) of each reading in each sample, 0 is none.
+
+    A reading belongs to the segment of its voxel, or of the nearest within a voxel: at the borders of objects,
+    pixels of one object have readings of another.
+    """
+    found = {id(h): readings.labels(h.labels, 1.0) for h in {id(h): h for h in proposed.particles}.values()}
+    return [found[id(h)] for h in proposed.particles]
+
+
+def _new_objects(segments: np.ndarray) -> list[SceneObject]:
+    """The segments (m,) of a partition as objects that continue none."""
+    return [SceneObject(segments == k) for k in np.unique(segments[segments > 0])]

@@ -1,0 +1,169 @@
+"""What a frame says about hypotheses: the space that it observes as free, and scores.
+
+>>> refined, quality = FreeSpace().project(hypothesis, frame)           # one hypothesis, one frame
+>>> refined, quality = FreeSpace().refine(hypotheses, clip)             # several, at the end of a clip
+>>> log_score = evidence.log_score(hypotheses, clip)                    # (n,) nats, larger is better
+
+Free-space projection is the first step of the measurement update (paper, section IV-D). The quality of a prediction
+is Q = 1 - (occupied voxels that are cleared) / (occupied voxels). An update adds lambda log Q to its log weight;
+lambda is `quality_exponent`. So a prediction with objects in free space loses voxels and weight.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass, is_dataclass, replace
+from numbers import Real
+from typing import Annotated, Any
+
+import numpy as np
+
+from mstfilter.errors import InputError
+from mstfilter.fields import Bounds, NonNegativeFloat
+from mstfilter.results import Checked, check_array, check_list, check_pair, check_type, describe_value, returns
+from mstfilter.scene.arrays import component_key, read_only
+from mstfilter.scene.cache import memo
+from mstfilter.scene.frame import Clip, Frame, depth_sigma
+from mstfilter.scene.geometry import frame_geometry
+from mstfilter.scene.voxels import Hypothesis, VoxelGrid
+
+_SMALLEST_QUALITY = 1e-3
+
+
+def _check_projected(self: Projection, found: tuple[Any, float], hypothesis: Any, frame: Frame) -> tuple[Any, float]:
+    check_pair(found, "a hypothesis", "a share")
+    projected, share = found
+    check_type(projected, type(hypothesis), f"a {type(hypothesis).__name__}")
+    if not isinstance(share, Real) or not 0 <= share <= 1 + 1e-9:
+        raise InputError(f"returns the share {describe_value(share)}, expected a number from 0 to 1")
+    return projected, float(share)
+
+
+def _check_refined(self: Projection, found: Any, hypotheses: Sequence[Any], clip: Clip) -> Any:
+    check_pair(found, "hypotheses", "shares")
+    n = len(hypotheses)
+    return tuple(check_list(found[0], n, object, "hypotheses")), check_array(found[1], (n,), "iuf", 0, 1)
+
+
+class Projection(Checked, ABC):
+    """Projects a hypothesis onto the set of hypotheses that agree with a frame."""
+
+    @returns(_check_projected)
+    @abstractmethod
+    def project(self, hypothesis: Any, frame: Frame) -> tuple[Any, float]:
+        """The nearest hypothesis that agrees with a frame, and the share of voxels that it keeps, in [0, 1]."""
+
+    @returns(_check_refined)
+    def refine(self, hypotheses: Sequence[Any], clip: Clip) -> tuple[tuple[Any, ...], np.ndarray]:
+        """Project hypotheses about the end of a clip onto its last frame; also returns the shares of voxels (n,)."""
+        pairs = [self.project(hypothesis, clip.after) for hypothesis in hypotheses]
+        return tuple(h for h, _ in pairs), np.array([q for _, q in pairs])
+
+
+@dataclass(frozen=True)
+class NoFreeSpace(Projection):
+    """Leaves every hypothesis unchanged, with quality 1."""
+
+    def project(self, hypothesis: Any, frame: Frame) -> tuple[Any, float]:
+        return hypothesis, 1.0
+
+
+@dataclass(frozen=True)
+class FreeSpace(Projection):
+    """Clears voxels that the depth image observes as free.
+
+    A voxel is free if its centre lies in front of the measured surface by more than the sum of two margins: for the
+    extent of the voxel, and for the noise of the sensor at that range (`mstfilter.scene.depth_sigma`). Voxels without
+    a measurement (no reading, the robot, outside the image, behind a surface) are unknown and stay. A voxel with a
+    measured point inside stays.
+
+    With several cameras (`Frame.views`) a voxel is free if one of them observes it as free and none has a measured
+    point in it.
+
+    Parameters
+    ----------
+    margin_voxels : float
+        Margin for the extent of a voxel, in voxels.
+    margin_sigmas : float
+        Margin for the noise, in standard deviations of a depth reading at that range.
+    table_height : float
+        Voxels with centres below this height (metres above the table) are cleared as well, whatever was measured.
+    """
+
+    margin_voxels: NonNegativeFloat = 0.5
+    margin_sigmas: NonNegativeFloat = 3.0
+    table_height: Annotated[float, Bounds()] = 0.0
+
+    def known_free(self, frame: Frame, grid: VoxelGrid) -> np.ndarray:
+        """Voxels (X, Y, Z) bool that a frame observes as free. Cached by content."""
+        key = (frame.key, grid.key, component_key(self))
+        return memo("known_free", key, lambda: read_only(self._known_free(frame, grid)))
+
+    def _known_free(self, frame: Frame, grid: VoxelGrid) -> np.ndarray:
+        free, hit = np.zeros(grid.shape, bool), np.zeros(grid.shape, bool)
+        for view in frame.all_views:
+            geometry = frame_geometry(view, grid)
+            # The noise is that of the reading, so it is computed at the range of the measured surface.
+            noise = depth_sigma(geometry.z - geometry.signed)
+            margin = self.margin_voxels * grid.voxel_size + self.margin_sigmas * noise
+            with np.errstate(invalid="ignore"):
+                free |= geometry.signed < -margin
+            points = grid.index_of(view.points[view.valid])
+            hit[tuple(points[grid.contains(points)].T)] = True
+        free &= ~hit
+        below = grid.origin[2] + (np.arange(grid.shape[2]) + 0.5) * grid.voxel_size < self.table_height
+        free[:, :, below] = True
+        return free
+
+    def project(self, hypothesis: Any, frame: Frame) -> tuple[Any, float]:
+        """Clear voxels that the frame observes as free. A hypothesis without voxels has quality 1.
+
+        `hypothesis` is a `Hypothesis`, or any dataclass with ``labels`` (X, Y, Z), 0 is free, and their ``grid``.
+        """
+        occupied = hypothesis.labels != 0
+        hit = occupied & self.known_free(frame, hypothesis.grid)
+        n_hit = int(hit.sum())
+        if isinstance(hypothesis, Hypothesis) and hypothesis.occupancy is not None:
+            hit = (hypothesis.occupancy.probability > 0) & self.known_free(frame, hypothesis.grid)
+        if not hit.any():
+            return hypothesis, 1.0
+        labels = np.where(hit, 0, hypothesis.labels).astype(hypothesis.labels.dtype)
+        quality = 1.0 - n_hit / max(int(occupied.sum()), 1)
+        if isinstance(hypothesis, Hypothesis):
+            return hypothesis.without(hit), quality
+        if not is_dataclass(hypothesis) or isinstance(hypothesis, type):
+            raise InputError(
+                f"a particle is a {type(hypothesis).__name__}, and free space cannot clear it",
+                "it takes a Hypothesis, or a dataclass with fields labels and grid",
+            )
+        return replace(hypothesis, labels=labels), quality
+
+
+def log_quality(quality: np.ndarray) -> np.ndarray:
+    """log max(Q, 1e-3) (n,) of qualities Q (n,), so that a prediction that loses all voxels has positive weight."""
+    return np.log(np.maximum(quality, _SMALLEST_QUALITY))
+
+
+class Evidence(Checked, ABC):
+    """One term of the score of a candidate.
+
+    The documentation of a term states which data it uses, so that users see which data are counted twice.
+    """
+
+    @returns(lambda self, found, hypotheses, clip: check_array(found, (len(hypotheses),)).astype(np.float64))
+    @abstractmethod
+    def log_score(self, hypotheses: Sequence[Hypothesis], clip: Clip) -> np.ndarray:
+        """Log score (n,) of hypotheses about the end of a clip, in nats, finite, up to a common constant."""
+
+
+def scored(
+    evidence: Sequence[Evidence], hypotheses: tuple[Hypothesis, ...], clip: Clip
+) -> tuple[np.ndarray, dict[str, list[float]]]:
+    """The sum (n,) of all terms of evidence in nats, and the score of each term by name."""
+    total, scores = np.zeros(len(hypotheses)), {}
+    for k, term in enumerate(evidence):
+        name, score = type(term).__name__, term.log_score(hypotheses, clip)
+        scores[f"{name} {k}" if name in scores else name] = score.round(3).tolist()
+        total += score
+    return total, scores

@@ -1,0 +1,94 @@
+"""Partitions of voxels or pixels: renumbered labels, and the common refinement of several.
+
+In the common refinement of several segmentations, a cell holds the voxels (or pixels) that belong to the same object
+in every segmentation. There are far fewer cells than voxels.
+
+>>> both = common_refinement([np.array([0, 1, 1, 2]), np.array([0, 7, 7, 7])])
+>>> both.cells, both.sizes
+(array([0, 1, 1, 2]), array([1, 2, 1]))
+>>> both.objects                       # numbered over both segmentations
+array([[0, 1, 2],
+       [0, 3, 3]])
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+
+def canonical(labels: np.ndarray) -> np.ndarray:
+    """The same segmentation with labels numbered 1, 2, ... by their first voxel; 0 is free."""
+    flat = np.asarray(labels).ravel()
+    present, first = np.unique(flat, return_index=True)
+    order = np.argsort(np.where(present == 0, -1, first), kind="stable")
+    table = np.zeros(int(flat.max(initial=0)) + 1, np.uint16)
+    table[present[order]] = np.arange(len(present)) + (0 if present[0] == 0 else 1)
+    return table[flat].reshape(np.shape(labels))
+
+
+@dataclass(frozen=True, eq=False)
+class CommonRefinement:
+    """Cells of several segmentations, and the objects that they belong to."""
+
+    #: Int array of the segmentations' shape: the cell of every position. Cell 0 is free in all segmentations and
+    #: may be empty.
+    cells: np.ndarray
+    #: (n, k) int, object of each of k cells in each of n segmentations; 0 is free. Objects are numbered from 1 over
+    #: all segmentations, so different segmentations have different objects.
+    objects: np.ndarray
+    sizes: np.ndarray  #: (k,) int, positions in each cell
+    first: np.ndarray  #: (n + 1,) int, segmentation i has the objects first[i] + 1 .. first[i + 1]
+
+    @property
+    def n_objects(self) -> int:
+        return int(self.first[-1])
+
+    def objects_in(self, cells: np.ndarray) -> np.ndarray:
+        """Whether each object (n_objects + 1,) has one of these cells; False for 0, free."""
+        present = np.zeros(self.n_objects + 1, bool)
+        present[self.objects[:, cells]] = True
+        present[0] = False
+        return present
+
+    def overlaps(self) -> np.ndarray:
+        """Positions (n_objects + 1, n_objects + 1) that two objects share; row and column 0 (free) are 0."""
+        total = self.n_objects + 1
+        shared = np.zeros((total, total))
+        sizes = np.broadcast_to(self.sizes, self.objects.shape).ravel()
+        for row, below, above in zip(self.objects, self.first, self.first[1:], strict=False):
+            codes = np.where(row > 0, row - below, 0) * total + self.objects
+            counts = np.bincount(codes.ravel(), sizes, (above - below + 1) * total).reshape(-1, total)
+            shared[below + 1 : above + 1, 1:] = counts[1:, 1:]
+        return shared
+
+
+def common_refinement(segmentations: Sequence[np.ndarray]) -> CommonRefinement:
+    """The common refinement of n label arrays of one shape, 0 is free."""
+    occupied = np.logical_or.reduce([labels != 0 for labels in segmentations])
+    count = int(occupied.sum())
+    cell = np.zeros(count, np.int64)
+    numbered = []
+    first = np.zeros(len(segmentations) + 1, np.int64)
+    for i, labels in enumerate(segmentations):
+        present, compact = _renumbered(labels[occupied])
+        numbered.append(np.where(compact > 0, compact + first[i], 0))
+        first[i + 1] = first[i] + present
+        cell = _renumbered(cell * (present + 1) + compact + 1)[1] - 1  # + 1: no code is 0, the free one
+    k = int(cell.max(initial=-1)) + 2
+    cells = np.zeros(occupied.shape, np.int64)
+    cells[occupied] = cell + 1
+    example = np.zeros(k, np.int64)
+    example[cell + 1] = np.arange(count)
+    objects = np.zeros((len(segmentations), k), np.int64)
+    for row, numbers in zip(objects, numbered, strict=True):
+        row[1:] = numbers[example[1:]]
+    return CommonRefinement(cells, objects, np.bincount(cells.ravel(), minlength=k), first)
+
+
+def _renumbered(codes: np.ndarray) -> tuple[int, np.ndarray]:
+    """The number of distinct codes other than 0, and the codes renumbered 1, 2, ... in ascending order; 0 stays."""
+    present, index = np.unique(np.append(codes, 0), return_inverse=True)
+    return len(present) - 1, index[:-1]

@@ -1,0 +1,280 @@
+"""Scores of hypotheses, or of label volumes, at the pauses of a recording against the ground truth.
+
+>>> rows = score_pauses(RunFolder.open("runs/mine").estimates(), read_truth(Path("recordings/mine/voxels.npz")))
+>>> rows[0].form, rows[0].mean, rows[0].best, rows[0].one_blob
+
+There is one row for each pause and form of weighted coverage (`mstfilter.scoring.quality`). It has the mean over the
+hypotheses, the weighted mean, the maximum, and the values of the hypothesis of largest weight and of the one of least
+expected loss. It also has two floors: the occupied voxels of the same hypotheses as one blob, and as connected
+components. If the ground truth has instance images but no volumes, hypotheses are rendered and compared in the image;
+pixels of the robot (255) are ignored. For a recording with volumes, rows also have the scores of the weighted set:
+Brier score, log loss and that of the base rate, calibration error and energy score (`score_belief`), the same for all
+forms.
+
+`measure_pause` gives all metrics of a pause, for the tables of a study.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mstfilter.errors import InputError
+from mstfilter.files import reading, write_csv, writing
+from mstfilter.reading import read_arrays
+from mstfilter.scene import Camera, Hypothesis, Recording, VoxelGrid, as_labels, render
+from mstfilter.scoring.log_loss import score_belief
+from mstfilter.scoring.metrics import diversity, least_loss, pause_metrics
+from mstfilter.scoring.quality import FORMS, connected_components, object_status, one_blob, weighted_coverage
+from mstfilter.scoring.questions import Questions, ask
+
+_ROBOT = 255
+
+
+@dataclass(frozen=True, eq=False)
+class PauseEstimate:
+    """Hypotheses at one pause.
+
+    Parameters
+    ----------
+    hypotheses : sequence of Hypothesis or of (X, Y, Z) arrays
+        A `Hypothesis` also says how sure it is of each voxel.
+    weights : (n,) array
+        Their sum is 1.
+    frame : int, optional
+        Frame of the recording at this pause.
+    grid : VoxelGrid, optional
+        Grid of arrays.
+    """
+
+    hypotheses: Sequence[Hypothesis | np.ndarray]
+    weights: np.ndarray
+    frame: int | None = None
+    grid: VoxelGrid | None = None
+
+    @property
+    def labels(self) -> list[np.ndarray]:
+        """Labels (X, Y, Z) of each hypothesis."""
+        return [one.labels if isinstance(one, Hypothesis) else one for one in self.hypotheses]
+
+
+@dataclass(frozen=True, eq=False)
+class PauseTruth:
+    """True labels at one pause: volumes, or an image with its camera.
+
+    Parameters
+    ----------
+    labels : (X, Y, Z) array, or (H, W) if `camera` is given
+        0: no object.
+    frame : int, optional
+        Frame of the recording.
+    grid : VoxelGrid, optional
+        Grid of a volume.
+    camera : Camera, optional
+        Camera of an image.
+    questions : Questions, optional
+        Questions about a volume.
+    """
+
+    labels: np.ndarray
+    frame: int | None = None
+    grid: VoxelGrid | None = None
+    camera: Camera | None = None
+    questions: Questions | None = None
+
+
+@dataclass(frozen=True)
+class PauseScore:
+    """Quality at one pause in one form of weighted coverage."""
+
+    pause: int
+    where: str
+    form: str
+    n: int
+    mean: float
+    weighted: float
+    best: float
+    top: float
+    estimate: float
+    one_blob: float
+    components: float
+    brier: float = float("nan")
+    log_loss: float = float("nan")
+    calibration_error: float = float("nan")
+    energy: float = float("nan")
+    base_rate: float = float("nan")
+
+
+def read_estimates(path: Path) -> list[PauseEstimate]:
+    """Label volumes of a file as estimates: .npz with ``labels`` as voxels.npz has them, or .npy."""
+    volumes, frames, grid = _read_volumes(path, "label volumes")
+    return [PauseEstimate([one], np.ones(1), frame, grid) for one, frame in zip(volumes, frames, strict=True)]
+
+
+def read_truth(source: Path | Recording) -> list[PauseTruth]:
+    """Ground truth of a recording (its volumes, else its instance images), or of a .npz or .npy file of volumes."""
+    if isinstance(source, Path):
+        volumes, frames, grid = _read_volumes(source, "true volumes")
+        return [PauseTruth(one, frame, grid) for one, frame in zip(volumes, frames, strict=True)]
+    found = []
+    for t, index in enumerate(source.pauses):
+        volume, image = source.truth(t), source.instance(index)
+        if volume is not None:
+            found.append(PauseTruth(volume, index, source.grid, questions=ask(source, t)))
+        elif image is not None:
+            found.append(PauseTruth(image, index, None, source.frames[index].camera))
+    if not found:
+        raise InputError(
+            f"recording {source.name} has no ground truth: neither volumes (voxels.npz) nor instance images",
+            "give volumes as .npz: labels (S, X, Y, Z), frame (S,), origin (3,), voxel_size",
+        )
+    return found
+
+
+def _read_volumes(path: Path, what: str) -> tuple[np.ndarray, list[int | None], VoxelGrid | None]:
+    """Labels (S, X, Y, Z), the frame of each or None, and the grid or None."""
+    if not path.exists():
+        raise InputError(f"{what}: file does not exist: {path}")
+    hint = "expected .npz with an array `labels` (S, X, Y, Z), or .npy"
+    data = read_arrays(path, what, hint)
+    with reading(path, what, hint):
+        data = {"labels": data[""]} if "" in data else data
+        if "particles/labels" in data:
+            raise InputError(f"{path} holds the hypotheses of one pause of a run", "give the run folder")
+        labels = data["labels"]
+        labels = as_labels(labels, f"{path}: labels")
+        labels = labels[None] if labels.ndim == 3 else labels
+        if labels.ndim != 4 or len(labels) == 0:
+            raise InputError(f"{path}: labels have shape {labels.shape}, expected (S, X, Y, Z), one volume a pause")
+        frames: list[int | None] = [int(f) for f in data["frame"]] if "frame" in data else [None] * len(labels)
+        if len(frames) != len(labels):
+            raise InputError(f"{path}: there are {len(labels)} label grids for {len(frames)} frames")
+        grid = None
+        if "origin" in data and "voxel_size" in data:
+            grid = VoxelGrid(data["origin"], float(data["voxel_size"]), labels.shape[1:])
+    return labels, frames, grid
+
+
+def measure_pause(
+    recording: Recording,
+    t: int,
+    hypotheses: Sequence[Hypothesis],
+    weights: np.ndarray,
+    questions: Questions | None = None,
+) -> tuple[dict[str, Any], np.ndarray | None]:
+    """Metrics of weighted hypotheses at pause `t` of a recording, and the counts of their forecasts.
+
+    Parameters
+    ----------
+    weights : (n,) float
+        Sum 1.
+    questions : Questions, optional
+        Those of the pause, if they are known already.
+
+    Returns
+    -------
+    row : dict
+        Metrics of `mstfilter.scoring.metrics` and `score_belief`; without ground truth only those that need none.
+        ``qualities`` and ``energy_noise`` are lists, which tables leave out.
+    counts : (r, 1001, 7) int32, or None without ground truth
+        As in `BeliefScore`.
+    """
+    labels = [h.labels for h in hypotheses]
+    row: dict[str, Any] = {"pause": t, "time_s": recording.times[recording.pauses[t]], "n": len(labels)}
+    row["n_objects"] = float(np.mean([h.n_objects for h in hypotheses]))
+    truth = recording.truth(t)
+    if truth is None:
+        return {**row, "diversity": diversity(labels)}, None
+    known = all(recording.instance(p) is not None for p in recording.pauses[: t + 1])
+    status = object_status(recording, t) if known else {}
+    found, q = pause_metrics(labels, weights, truth, status)
+    belief = score_belief(questions or ask(recording, t), hypotheses, weights, truth, status)
+    return {**row, **found, **belief.row, "qualities": q.tolist()}, belief.counts
+
+
+def score_pauses(estimates: Sequence[PauseEstimate], truths: Sequence[PauseTruth]) -> list[PauseScore]:
+    """Scores of all pauses that have both; pauses are matched by frame if both have frames, else by order."""
+    by_frame = {t.frame: t for t in truths}
+    named = None not in by_frame and all(e.frame is not None for e in estimates)
+    if not named and len(estimates) != len(truths):
+        raise InputError(
+            f"there are {len(estimates)} pauses with hypotheses and {len(truths)} with truth, and no frame numbers",
+            "add an array `frame` (S,) to the .npz files",
+        )
+    rows = []
+    for pause, estimate in enumerate(estimates):
+        truth = by_frame.get(estimate.frame) if named else truths[pause]
+        if truth is not None:
+            rows += _score_pause(pause, estimate, truth)
+    if not rows:
+        raise InputError(
+            f"no pause has both: hypotheses are at frames {[e.frame for e in estimates]}, truth at {list(by_frame)}",
+            "check that they belong to the same recording",
+        )
+    return rows
+
+
+def _score_pause(pause: int, estimate: PauseEstimate, truth: PauseTruth) -> list[PauseScore]:
+    seen, true = _comparable(pause, estimate, truth)
+    labels, w = estimate.labels, np.asarray(estimate.weights, dtype=float)
+    found = [seen(one) for one in labels]
+    floors = [[seen(floor(one).astype(np.uint16)) for one in labels] for floor in (one_blob, connected_components)]
+    belief = {}
+    if truth.questions is not None:
+        scores = score_belief(truth.questions, estimate.hypotheses, w, true)
+        belief = {name: scores.row[name] for name in ("brier", "log_loss", "calibration_error", "energy")}
+        belief["base_rate"] = scores.base_rate_loss
+    best_guess, where = least_loss(found, w), "volume" if truth.camera is None else "image"
+    rows = []
+    for form in FORMS:
+        q = np.array([weighted_coverage(one, true, form) for one in found])
+        low = [float(w @ [weighted_coverage(one, true, form) for one in floor]) for floor in floors]
+        values = float(q.mean()), float(w @ q), float(q.max()), float(q[w.argmax()]), float(q[best_guess])
+        rows.append(PauseScore(pause, where, form, len(q), *values, *low, **belief))
+    return rows
+
+
+def _comparable(
+    pause: int, estimate: PauseEstimate, truth: PauseTruth
+) -> tuple[Callable[[np.ndarray], np.ndarray], np.ndarray]:
+    """What of a label volume is compared with the truth, as a function, and the truth in the same form."""
+    grid, camera = estimate.grid, truth.camera
+    if camera is None:
+        if grid is not None and truth.grid is not None and not _same_grid(grid, truth.grid):
+            raise InputError(
+                f"pause {pause}: hypotheses are on a grid {_grid_text(grid)}, truth on {_grid_text(truth.grid)}",
+                "run the filter on the recording that has the ground truth, or give it the same workspace",
+            )
+        return lambda labels: labels, truth.labels
+    if grid is None:
+        raise InputError("label volumes without a grid cannot be projected", "add origin and voxel_size to the .npz")
+    known = truth.labels != _ROBOT
+    return lambda labels: render(labels, grid, camera).labels[known], truth.labels[known]
+
+
+def _same_grid(a: VoxelGrid, b: VoxelGrid) -> bool:
+    return (
+        a.shape == b.shape and np.allclose(a.origin, b.origin, atol=1e-6) and abs(a.voxel_size - b.voxel_size) < 1e-9
+    )
+
+
+def _grid_text(grid: VoxelGrid) -> str:
+    return f"{' x '.join(map(str, grid.shape))} at {np.round(grid.origin, 4).tolist()} of {grid.voxel_size:g} m"
+
+
+def write_scores(path: Path, rows: Sequence[PauseScore]) -> None:
+    """Write scores as a CSV table.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be written.
+    """
+    if not path.parent.is_dir():
+        raise InputError(f"cannot write {path}: its folder does not exist")
+    with writing(str(path)):
+        write_csv(path, [asdict(row) for row in rows], float_format=".6f")

@@ -1,0 +1,164 @@
+"""Which format it is, its options, and a reader of the user's own."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from mstfilter.errors import InputError
+from mstfilter.formats.image_folders import PairedImages
+from mstfilter.formats.sources import detect_format, format_settings, open_recording
+from mstfilter.presets import REGISTRY
+from mstfilter.scene import Recording, render, write_image
+from tests.formats import layouts
+from tests.scene.scenes import CAMERA, GRID, table_scene
+from tests.scene.test_recording import write
+
+WRITERS = {
+    "tum": layouts.write_tum,
+    "bop": layouts.write_bop,
+    "redwood": layouts.write_redwood,
+    "dsr": layouts.write_dsr,
+    "recording": write,
+}
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_formats_are_detected(tmp_path, name):
+    """Each by exactly one reader; every registered format has a test here or among the bags and pairs."""
+    path = WRITERS[name](tmp_path / "data")
+    assert detect_format(path) == name
+    assert set(REGISTRY.known("format")) == {*WRITERS, "bag", "pairs"}
+
+
+def test_unknown_and_ambiguous(tmp_path):
+    (tmp_path / "notes").mkdir()
+    (tmp_path / "notes" / "a.txt").write_text("x")
+    (tmp_path / "data.bin").write_bytes(b"x")
+    for name in ("notes", "data.bin"):
+        with pytest.raises(InputError, match="has no known format") as caught:
+            open_recording(tmp_path / name)
+        assert "tum, bop, redwood, dsr, bag" in caught.value.hints[0]
+    path = layouts.write_redwood(layouts.write_tum(tmp_path / "both") / "x").rename(tmp_path / "both2")
+    for part in ("rgb.txt", "depth.txt"):
+        (path / part).write_text("0 a.png\n")
+    with pytest.raises(InputError, match="looks like tum and like redwood"):
+        open_recording(path)
+    assert len(open_recording(path, "redwood", ["fps=10"])) == len(layouts.SHIFTS)
+    with pytest.raises(InputError, match="there is no format 'tom'"):
+        open_recording(path, "tom")
+    with pytest.raises(InputError, match="does not exist"):
+        open_recording(tmp_path / "none")
+
+
+def test_options_as_text():
+    assert format_settings(
+        ["K=525,525,319.5,239.5", "world.workspace=-1,-1,0,1,1,.5", "frames=a,007,8", "moving=false"]
+    ) == {
+        "K": [525, 525, 319.5, 239.5],
+        "world": {"workspace": [-1, -1, 0, 1, 1, 0.5]},
+        "frames": ["a", "007", 8],
+        "moving": False,
+    }
+
+
+@pytest.mark.parametrize(("option", "background"), [("background=0", (0,)), ("background=0,1", (0, 1))])
+def test_a_single_number_is_a_list_of_one(tmp_path, option, background):
+    reader = REGISTRY.make(PairedImages, format_settings([option]))
+    assert reader.background == background
+    with pytest.raises(InputError, match="background is"):
+        REGISTRY.make(PairedImages, format_settings(["background=x"]))
+
+
+def test_options_reach_the_reader(tmp_path):
+    path = layouts.write_tum(tmp_path / "tum")
+    options = ["K=131,131,79.5,59.5", "world.workspace=-0.3,-0.3,0,0.3,0.3,0.2", "world.voxel_size=0.02"]
+    recording = open_recording(path, options=options, pauses="0,8,16")
+    assert recording.pauses == (0, 8, 16)
+    assert recording.grid.shape == (30, 30, 10)
+    assert open_recording(path, options=options, pauses="0s,0.52s").pauses == (0, 5)
+    assert open_recording(path, options=[*options, "pauses.hold_s=0.6"], pauses="still").pauses == (13,)
+    assert open_recording(path, options=[*options, "pauses.hold_s=0.6"]).pauses == (13,)
+    for wrong, message in (
+        (["K=1,2,x,4"], "K is"),
+        (["k=1,2,3,4"], "no field 'k'"),
+        (["pauses=never"], "no pauses 'never'"),
+        (["depth_scale"], "path=value"),
+    ):
+        with pytest.raises(InputError, match=message):
+            open_recording(path, options=wrong)
+
+
+def test_a_reader_of_ones_own(tmp_path):
+    """A layout of the user's own: one class in a file, named like any component."""
+    rgb, depth, _ = layouts.video((0, 2))
+    np.savez(tmp_path / "mine.npz", rgb=rgb, depth=depth.astype(np.float32))
+    (tmp_path / "mine.py").write_text(
+        "from dataclasses import dataclass\n"
+        "import numpy as np\n"
+        "from mstfilter.formats import RecordingFormat\n"
+        "from mstfilter.scene.recording import Recording\n"
+        "@dataclass(frozen=True)\n"
+        "class Mine(RecordingFormat):\n"
+        "    '''Arrays in one file.'''\n"
+        "    f: float = 1.0\n"
+        "    @classmethod\n"
+        "    def detects(cls, path):\n"
+        "        return path.suffix == '.npz'\n"
+        "    def open(self, path):\n"
+        "        data = np.load(path)\n"
+        "        K = np.array([[self.f, 0, 79.5], [0, self.f, 59.5], [0, 0, 1]])\n"
+        "        return Recording.from_arrays(data['rgb'], data['depth'], K, name='mine')\n"
+    )
+    recording = open_recording(tmp_path / "mine.npz", f"{tmp_path}/mine.py:Mine", ["f=131"])
+    assert (recording.name, len(recording)) == ("mine", 2)
+    with pytest.raises(InputError, match="which is not loaded here"):
+        open_recording(tmp_path / "mine.npz", f"{tmp_path}/mine.py:Mine", allow_files=False)
+
+
+@pytest.mark.parametrize("layout", ["video.mp4", "image.png", "rgb/000.png", "frames/0.jpg"])
+def test_colour_alone_is_one_error(layout, tmp_path):
+    file = tmp_path / "data" / layout
+    file.parent.mkdir(parents=True)
+    file.write_bytes(b"")
+    path = file if "/" not in layout else tmp_path / "data"
+    with pytest.raises(InputError, match="holds colour images only: hypotheses in 3-D need a depth image") as caught:
+        open_recording(path)
+    assert "RGB-D camera" in caught.value.hints[0]
+    with pytest.raises(InputError, match="depth is None"):
+        Recording.from_arrays(np.zeros((4, 5, 3), np.uint8), None, np.eye(3))
+
+
+def test_label_images_beside_pairs_are_true_instances(tmp_path):
+    """The label of the table is no object, unless the labels that are none are given."""
+    rgb, depth, labels = table_scene(noise=np.random.default_rng(0))
+    objects = render(labels, GRID, CAMERA).labels
+    write_image(tmp_path / "a_rgb.png", rgb)
+    write_image(tmp_path / "a_depth.png", np.rint(1000 * depth).astype(np.uint16))
+    write_image(tmp_path / "a_label.png", np.where(np.arange(160) < 5, 0, objects + 1).astype(np.uint8))
+    info = {"K": [131, 131, 79.5, 59.5], "depth_scale_m": 0.001}
+    (tmp_path / "info.json").write_text(json.dumps(info))
+    expected = np.where((objects > 0) & (np.arange(160) >= 5), objects + 1, 0)
+    np.testing.assert_array_equal(open_recording(tmp_path).instance(0), expected)
+    assert set(np.unique(open_recording(tmp_path, options=["background=0,3"]).instance(0))) == {0, 1, 2}
+    write_image(tmp_path / "a_label.png", objects[:50].astype(np.uint8))
+    with pytest.raises(InputError, match=r"a_label.png has shape \(50, 160\)"):
+        open_recording(tmp_path).instance(0)
+    (tmp_path / "a_label.png").unlink()
+    assert open_recording(tmp_path).instance(0) is None
+    (tmp_path / "info.json").write_text('{"depth_scale_m": 0.001}')
+    with pytest.raises(InputError, match="'K' is missing"):
+        open_recording(tmp_path)
+
+
+def test_a_missing_entry_is_named(tmp_path):
+    layouts.write_bop(tmp_path / "bop")
+    (tmp_path / "bop" / "scene_camera.json").write_text('{"1": {"depth_scale": 1.0}}')
+    with pytest.raises(InputError, match="'cam_K' is missing"):
+        open_recording(tmp_path / "bop")
+    layouts.write_redwood(tmp_path / "redwood")
+    (tmp_path / "redwood" / "intrinsic.json").write_text("{}")
+    with pytest.raises(InputError, match="'intrinsic_matrix' is missing"):
+        open_recording(tmp_path / "redwood")

@@ -1,0 +1,71 @@
+"""Which segment continues which predicted object: by cases, and properties of all of them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings, strategies as st
+from hypothesis.extra import numpy as hnp
+
+from mstfilter.partition import Overlaps
+
+
+def tracks_of(segments, objects, least):
+    overlaps = Overlaps.of(np.array(segments), np.array(objects), least)
+    return {a: tracks for component in overlaps.components() for a, tracks in overlaps.tracks(component).items()}
+
+
+@pytest.mark.parametrize(
+    ("segments", "objects", "continued"),
+    [
+        ([1] * 60 + [2] * 240, [1] * 100 + [2] * 200, {1: [1], 2: [2]}),  # the second comes to stand before the first
+        ([1] * 20 + [2] * 280, [1] * 100 + [2] * 200, {1: [1], 2: [2]}),
+        ([1] * 15 + [2] * 285, [1] * 100 + [2] * 200, {1: [1], 2: [2]}),  # a track has one segment
+        ([1] * 15 + [2] * 285 + [3] * 100, [1] * 100 + [2] * 300, {1: [1], 2: [], 3: []}),
+        ([1] * 60 + [2] * 40, [1] * 100, {1: [], 2: []}),  # an object is split
+        ([1] * 90 + [2] * 10, [1] * 100, {1: [1], 2: []}),
+        ([1] * 300, [1] * 100 + [2] * 200, {1: [2, 1]}),  # two objects are merged
+        ([1] * 300, [1] * 10 + [2] * 290, {1: [2]}),  # the first is occluded: readings of the second lie near it
+        ([1] * 10 + [2] * 290, [1] * 10 + [2] * 290, {1: [1], 2: [2]}),
+        ([1] * 100, [0] * 100, {1: []}),
+        ([1] * 51 + [0] * 49, [1] * 100, {1: [1]}),  # readings of no segment do not count
+        ([1] * 100, [1] * 6 + [0] * 94, {1: [1]}),
+    ],
+)
+def test_which_objects_a_segment_continues(segments, objects, continued):
+    objects = objects + [0] * (len(segments) - len(objects))
+    assert tracks_of(segments, objects, 20) == continued
+    visible = Overlaps.of(np.array(segments), np.array(objects), 20).visible
+    assert (1 in visible) == (objects.count(1) > 0 and continued != {1: [2]})
+
+
+labels = hnp.arrays(np.int64, 60, elements=st.integers(0, 4))
+
+
+@settings(max_examples=100, deadline=None)
+@given(labels, labels)
+def test_components_and_tracks_by_brute_force(segments, objects):
+    overlaps = Overlaps.of(segments, objects, 4)
+    pairs = [(a, b) for a in range(1, 5) for b in range(1, 5)]
+    shared = {(a, b): int(((segments == a) & (objects == b)).sum()) for a, b in pairs}
+    inside = {b: int(((segments > 0) & (objects == b)).sum()) for b in range(1, 5)}
+    conflicts = {(a, b) for a, b in pairs if shared[a, b] > 0.1 * min((segments == a).sum(), inside[b])}
+    main = {
+        max(range(1, 5), key=lambda b: (shared[a, b], -b)) for a in range(1, 5) if any(shared[a, b] for b in inside)
+    }
+    conflicts = {(a, b) for a, b in conflicts if b in main or inside[b] >= 4}
+    assert set(map(tuple, np.argwhere(overlaps.in_conflict).tolist())) == conflicts
+    assert overlaps.visible == {b for _, b in conflicts}
+    components = overlaps.components()
+    assert sorted(a for one in components for a in one.segments) == sorted(set(segments.tolist()) - {0})
+    assert [one.segments[0] for one in components] == sorted(one.segments[0] for one in components)
+    where = {(kind, k): n for n, one in enumerate(components) for kind in (0, 1) for k in one[kind]}
+    assert all(where[0, a] == where[1, b] for a, b in conflicts)
+    tracks = tracks_of(segments, objects, 4)
+    continued = [b for found in tracks.values() for b in found]
+    assert len(continued) == len(set(continued)), "an object is continued by one segment at most"
+    for a, found in tracks.items():
+        assert all((a, b) in conflicts for b in found)
+        assert [shared[a, b] for b in found] == sorted((shared[a, b] for b in found), reverse=True)
+    whole = {b for a, b in conflicts if shared[a, b] > 0.8 * inside[b]}
+    assert whole <= set(continued), "an object of which a segment has more than 80 % is continued"

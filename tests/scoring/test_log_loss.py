@@ -1,0 +1,278 @@
+"""Scores of a weighted set: identities, what hedging by noise gains, and the true posterior among other forecasts."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+from miniature_filters import exact_filter
+from miniature_world import Miniature
+
+from mstfilter.errors import InputError
+from mstfilter.forecasts import ForecastTable, energy_score, is_negative_type
+from mstfilter.scoring import (
+    CATEGORIES,
+    LOG_LOSS,
+    NOISE_RATES,
+    FittedForecasts,
+    Questions,
+    answer_distances,
+    draw_questions,
+    forecast_table,
+    leave_one_out,
+    score_belief,
+    weighted_coverage,
+)
+
+
+def scene(seed, shape=(16, 12, 8)):
+    """Two boxes at random places, and the questions about them and their surroundings."""
+    rng = np.random.default_rng(seed)
+    labels = np.zeros(shape, np.uint16)
+    at = rng.integers(1, 4, 2)
+    labels[at[0] : at[0] + 6, at[1] : at[1] + 6, :5] = 1
+    labels[at[0] + 6 : at[0] + 11, at[1] : at[1] + 5, :4] = 2
+    where = np.zeros(shape, bool)
+    where[:14, :10, :7] = True
+    return labels, draw_questions(where, 4000, rng)
+
+
+def guesses(truth, rng, n=5, reach=2):
+    """Hypotheses: the true objects, each shifted, one in three merged."""
+    found = []
+    for _ in range(n):
+        guess = np.zeros_like(truth)
+        for k in (1, 2):
+            shift = rng.integers(-reach, reach + 1, 2)
+            guess[np.roll(truth == k, tuple(shift), (0, 1))] = k
+        found.append(np.where(guess > 0, 1, 0).astype(np.uint16) if rng.random() < 1 / 3 else guess)
+    return found
+
+
+def test_with_the_pair_distance_the_energy_score_is_the_brier_score():
+    rng = np.random.default_rng(0)
+    truth, questions = scene(0)
+    labels, weights = guesses(truth, rng), rng.dirichlet(np.ones(5))
+    y = questions.outcomes(truth)
+    answers = questions.answers(labels)
+    energy = energy_score((answers != y).mean(axis=1), answer_distances(answers), weights)
+    brier = np.mean((questions.forecasts(labels, weights) - y) ** 2)
+    assert abs(energy - brier) < 1e-12
+    assert score_belief(questions, labels, weights, truth).row["brier"] == pytest.approx(brier, abs=1e-9)
+
+
+def test_counts_hold_the_forecasts_of_every_category():
+    truth, questions = scene(1)
+    labels = guesses(truth, np.random.default_rng(1))
+    score = score_belief(questions, labels, np.full(5, 0.2), truth, {1: "visible", 2: "hidden"})
+    assert (score.counts.sum(axis=(1, 2)) == len(questions)).all()
+    a, b = (truth.flat[k] for k in (questions.first, questions.second))
+    total = dict(zip(CATEGORIES, score.counts[0].sum(axis=0), strict=True))
+    assert total["free"] == ((a == 0) | (b == 0)).sum()
+    assert total["same visible"] == ((a == 1) & (b == 1)).sum()
+    assert total["different hidden"] == ((a > 0) & (b > 0) & (a != b)).sum()
+    for k, rate in enumerate(NOISE_RATES):
+        p = questions.forecasts(labels, np.full(5, 0.2), NOISE_RATES)[k]
+        table, direct = forecast_table(score.counts[k]), ForecastTable.of(p, questions.outcomes(truth))
+        assert table.brier == pytest.approx(direct.brier, abs=1e-3), rate
+    same = forecast_table(score.counts[0], CATEGORIES[:3])
+    assert same.no.sum() == 0 and same.yes.sum() == questions.outcomes(truth).sum()
+
+
+def test_without_questions_scores_are_unknown():
+    truth, _ = scene(0)
+    empty = Questions(truth.shape, np.zeros(0, int), np.zeros(0, int))
+    score = score_belief(empty, [truth], np.ones(1), truth)
+    assert np.isnan(score.row["brier"]) and not score.counts.any()
+    assert leave_one_out({"one": score.counts, "two": score.counts}) == {}
+    with pytest.raises(InputError, match="1 hypotheses and 2 weights"):
+        score_belief(empty, [truth], np.ones(2) / 2, truth)
+
+
+def noisy_copies(labels, rate, rng):
+    """Labels of which every voxel takes that of a random neighbour with probability `rate`."""
+    padded = np.pad(labels, 1, mode="edge")
+    inner = (slice(1, -1),) * 3
+    moved = [np.roll(padded, s, axis)[inner] for axis in range(3) for s in (-1, 1)]
+    drawn = np.choose(rng.integers(6, size=labels.shape), moved)
+    return np.where(rng.random(labels.shape) < rate, drawn, labels).astype(np.uint16)
+
+
+def test_hedging_by_noise_lowers_the_energy_score_and_does_not_lower_the_recalibrated_log_loss():
+    """Ten noisy copies of one hypothesis against the hypothesis itself, on twelve scenes."""
+    plain, hedged, energies = {}, {}, []
+    for seed in range(12):
+        rng = np.random.default_rng(100 + seed)
+        truth, questions = scene(seed)
+        (guess,) = guesses(truth, rng, 1)
+        copies = [noisy_copies(guess, 0.3, rng) for _ in range(10)]
+        one = score_belief(questions, [guess], np.ones(1), truth)
+        ten = score_belief(questions, copies, np.full(10, 0.1), truth)
+        plain[seed], hedged[seed] = one.counts, ten.counts
+        energies.append((one.row["energy"], ten.row["energy"]))
+    energies = np.array(energies)
+    assert (energies[:, 1] < energies[:, 0]).all()  # the raw score rewards the noise in every scene
+    assert energies[:, 1].mean() < 0.85 * energies[:, 0].mean()
+    losses = [
+        np.mean([fit.log_loss(counts[scene]) for scene, fit in leave_one_out(counts).items()])
+        for counts in (plain, hedged)
+    ]
+    # The hypothesis without noise is read with the noise that is best for it: the copies know nothing more.
+    assert losses[0] < losses[1] + 0.01
+    assert leave_one_out(plain)[0].rate > 0
+
+
+def test_leave_one_out_uses_the_other_scenes_only():
+    counts = {}
+    for seed in range(4):
+        truth, questions = scene(seed)
+        labels = guesses(truth, np.random.default_rng(seed))
+        counts[seed] = score_belief(questions, labels, np.full(5, 0.2), truth).counts
+    fits = leave_one_out(counts)
+    for seed in counts:
+        rest = FittedForecasts.fit(sum(counts[k].astype(int) for k in counts if k != seed))
+        assert fits[seed].rate == rest.rate
+        assert fits[seed].log_loss(counts[seed]) == rest.log_loss(counts[seed])
+    row = fits[0].row(counts[0])
+    parts = [forecast_table(counts[0][0], names).n for names in (CATEGORIES[:3], CATEGORIES[3:6], ("free",))]
+    split = [row[f"{LOG_LOSS}_{name}"] for name in ("same", "different", "free")]
+    known = [(n, x) for n, x in zip(parts, split, strict=True) if n]
+    assert row[LOG_LOSS] == pytest.approx(sum(n * x for n, x in known) / sum(parts))
+
+
+# A world that can be enumerated: which of four voxels in a row belong together, free voxels included.
+
+
+def partitions(n):
+    """All labellings of n voxels, 0 for free, objects numbered by their first voxel."""
+    found = []
+    for row in itertools.product(range(n + 1), repeat=n):
+        order = list(dict.fromkeys(k for k in row if k))
+        if order == sorted(order) and order == list(range(1, len(order) + 1)):
+            found.append(np.array(row, np.uint16).reshape(n, 1, 1))
+    return found
+
+
+def test_the_posterior_has_the_least_expected_scores():
+    """Over 1,000 other weightings of all 52 labellings of four voxels, some with noise, none does better."""
+    rng = np.random.default_rng(7)
+    worlds = partitions(4)
+    assert len(worlds) == 52
+    first, second = np.triu_indices(4, 1)
+    questions = Questions((4, 1, 1), first, second)
+    answers = questions.answers(worlds).astype(float)
+    roots = np.sqrt(answer_distances(answers > 0))
+    assert is_negative_type(roots) and is_negative_type(roots**2)
+    posterior = rng.dirichlet(np.full(52, 0.2))
+
+    def scores(weights):
+        p = np.clip(weights @ answers, 1e-12, 1 - 1e-12)
+        loss = -(posterior @ (answers * np.log(p) + (1 - answers) * np.log(1 - p))).mean()
+        energy = posterior @ roots @ weights - 0.5 * weights @ roots @ weights
+        return loss, energy
+
+    best = scores(posterior)
+    for k in range(1000):
+        other = rng.dirichlet(np.full(52, 0.2))
+        share = rng.choice([1.0, 0.5, 0.1, 0.01])
+        forecast = (1 - share) * posterior + share * (other if k % 2 else np.full(52, 1 / 52))
+        assert all(a >= b - 1e-12 for a, b in zip(scores(forecast), best, strict=True))
+
+
+def test_the_exact_posterior_of_the_miniature_world_has_the_least_expected_scores():
+    """All 877 states of a table of six cells after three pushes, with the law of questions that the studies use: in
+    question is what lies on or behind a depth reading, now or before, and is not seen free now. 1,000 other
+    weightings, and the posterior's own states with noise at the border."""
+    rng = np.random.default_rng(2)
+    world = Miniature(shape=(3, 2))
+    states = world.states
+    _, observations = world.simulate(rng, T=3)
+    posterior = exact_filter(world, observations).posterior[-1]
+    depth = np.array([observation.depth for observation in observations])
+    behind = np.arange(2) >= depth[..., None]
+    where = (behind.any(axis=0) & behind[-1])[..., None]
+    assert where.sum() >= 4
+    questions = draw_questions(where, 2000, rng)
+    labels = [h.labels for h in states.hypotheses]
+    answers = questions.answers(labels).astype(float)
+    chance = posterior @ answers  # that the answer to each question is yes
+
+    def loss(p):
+        p = np.clip(p, 1e-12, 1 - 1e-12)
+        return -(chance * np.log(p) + (1 - chance) * np.log(1 - p)).mean()
+
+    def energy(weights, own, to_truth):
+        return weights @ to_truth @ posterior - 0.5 * weights @ own @ weights
+
+    roots = np.sqrt(answer_distances(answers > 0))
+    best = loss(chance), energy(posterior, roots, roots)
+    likely = np.argsort(-posterior)[:60]
+    for k in range(1000):
+        chosen = likely if k % 2 else np.arange(len(posterior))
+        other = np.zeros(len(posterior))
+        other[chosen] = rng.dirichlet(np.full(len(chosen), 0.2))
+        weights = posterior + rng.choice([1.0, 0.3, 0.1, 0.01]) * (other - posterior)
+        assert loss(weights @ answers) >= best[0] - 1e-12
+        assert energy(weights, roots, roots) >= best[1] - 1e-12
+    for rate in (0.1, 0.2, 0.4):
+        noisy = questions.answers(labels, rate, rng)
+        both = np.sqrt(answer_distances(np.concatenate([noisy, answers > 0])))
+        n = len(noisy)
+        assert loss(posterior @ noisy) > best[0] + 1e-6
+        assert energy(posterior, both[:n, :n], both[:n, n:]) > best[1] + 1e-6
+
+
+def test_questions_drawn_by_the_truth_are_improper():
+    """Four voxels in a row, three partitions: with equally many questions about each true object, another forecast
+    than the honest one has the lower expected Brier score."""
+    worlds = [np.array(row, np.uint16).reshape(4, 1, 1) for row in ([1, 1, 1, 2], [1, 1, 2, 2], [1, 2, 2, 2])]
+    first, second = np.triu_indices(4, 1)
+    questions = Questions((4, 1, 1), first, second)
+    answers = questions.answers(worlds).astype(float)
+    honest = np.full(3, 1 / 3)
+
+    def expected(p, by_truth):
+        total = 0.0
+        for weight, world, y in zip(honest, worlds, answers, strict=True):
+            sizes = np.bincount(world.ravel())[world.ravel()]
+            chance = 1 / (sizes[first] * sizes[second]) if by_truth else np.ones(6)
+            total += weight * (chance / chance.sum()) @ (p - y) ** 2
+        return total
+
+    p = honest @ answers
+    rng = np.random.default_rng(0)
+    others = np.clip(p + rng.normal(0, 0.1, (500, 6)), 0, 1)
+    assert min(expected(other, True) for other in others) < expected(p, True) - 1e-3
+    assert min(expected(other, False) for other in others) >= expected(p, False)
+
+
+def test_which_distances_of_partitions_are_of_negative_type():
+    """Variation of information and matched overlaps are not, on partitions of three to five voxels; the share of
+    pairs that differ, and its root, are."""
+
+    def information_distance(a, b):
+        joint = np.zeros((a.max() + 1, b.max() + 1))
+        np.add.at(joint, (a, b), 1 / len(a))
+        entropy = lambda p: -(p[p > 0] * np.log(p[p > 0])).sum()  # noqa: E731
+        return 2 * entropy(joint) - entropy(joint.sum(axis=0)) - entropy(joint.sum(axis=1))
+
+    def coverage_distance(a, b):
+        return 1 - weighted_coverage(a, b)
+
+    proper, improper = [], {"variation of information": [], "weighted coverage": []}
+    for n in (3, 4):
+        worlds = [one.ravel().astype(int) for one in partitions(n)]
+        first, second = np.triu_indices(n, 1)
+        questions = Questions((n,), first, second)
+        pairs = answer_distances(questions.answers(worlds))
+        proper += [is_negative_type(pairs), is_negative_type(np.sqrt(pairs))]
+        for name, distance in (
+            ("variation of information", information_distance),
+            ("weighted coverage", coverage_distance),
+        ):
+            rows = [[distance(a, b) for b in worlds] for a in worlds]
+            D = np.array(rows) * (1 - np.eye(len(worlds)))
+            improper[name].append(is_negative_type((D + D.T) / 2))
+    assert all(proper)
+    assert not any(found[-1] for found in improper.values()), improper

@@ -1,0 +1,74 @@
+"""The package without any library but numpy and scipy: the filter works, the command line says what is missing."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+from tests.conftest import REPOSITORY
+
+BLOCK = """
+import sys
+
+class Blocked:
+    allowed = sys.stdlib_module_names | {"numpy", "scipy", "mstfilter"}
+
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] not in self.allowed and not name.startswith("_"):
+            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
+
+sys.meta_path.insert(0, Blocked())
+"""
+COMMAND = "from mstfilter.cli import main; main(sys.argv[1:])"
+
+
+def light(program, *arguments):
+    """A fresh interpreter in which all imports but those of numpy and scipy fail."""
+    command = [sys.executable, "-P", "-c", f"{BLOCK}sys.path.insert(0, {str(REPOSITORY)!r})\n{program}", *arguments]
+    return subprocess.run(command, capture_output=True, text=True, timeout=600)
+
+
+def test_filters_and_resampling():
+    done = light(
+        "import numpy as np\n"
+        "from mstfilter.smc import *\n"
+        "from mstfilter.presets import REGISTRY\n"
+        "model = linear_gaussian(np.eye(1), np.eye(1), np.eye(1), np.eye(1), np.zeros(1), np.eye(1))\n"
+        "for name in REGISTRY.known('resampler'):\n"
+        "    scheme = REGISTRY.find_class('resampler', name)()\n"
+        "    state, infos = bootstrap(model, n=20, resampler=scheme).run(np.ones((3, 1)), seed=0)\n"
+        "    assert np.isfinite(state.population.weights).all()\n"
+        "print('done')"
+    )
+    assert done.stdout == "done\n", done.stderr
+
+
+@pytest.mark.parametrize(
+    "arguments, says",
+    [
+        ([], "Without typer, only `list`, --help and --version"),
+        (["--help"], "pip install mstfilter"),
+        (["--version"], "mstfilter 0."),
+        (["list"], "not available: pip install opencv-python-headless"),
+        (["list", "resamplers"], "systematic          One uniform"),
+        (["list", "presets"], "mst                 MST, the default"),
+    ],
+)
+def test_the_command_line_answers(arguments, says):
+    done = light(COMMAND, *arguments)
+    assert done.returncode == 0 and says in done.stdout, done.stderr
+
+
+@pytest.mark.parametrize("arguments", [["simulate", "demo", "out"], ["run", "recording"], ["check", "update.union"]])
+def test_other_commands_say_what_they_need(arguments, tmp_path):
+    done = light(COMMAND, *arguments)
+    message = f"error: mstfilter {arguments[0]} needs typer, which cannot be imported: No module named 'typer'"
+    assert (done.returncode, done.stderr) == (2, f"{message}\nhint: pip install typer\n")
+
+
+def test_a_component_says_which_library_it_needs():
+    done = light("from mstfilter.presets import REGISTRY; REGISTRY.find_class('update', 'partition')")
+    assert "MissingLibraryError: update: component 'partition' needs networkx" in done.stderr
+    assert done.stderr.endswith("hint: pip install networkx\n")
