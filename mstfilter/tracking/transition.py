@@ -305,17 +305,11 @@ class TrackingTransition(Transition):
             # The key of a stream is the content of the hypothesis, so the order of hypotheses has no effect.
             stream = child(rng, "choose", _number(hypothesis.key), occurrences[hypothesis.key])
             occurrences[hypothesis.key] += 1
-            motions, scores = {}, {}
-            for record in hypothesis.objects:
-                segment = segments.get(record.label)
-                kind, candidates = ("invisible", ()) if segment is None else cache[segment.key]
-                chosen = IDENTITY
-                if candidates:
-                    chosen = self.rule.choose(child(stream, "object", record.label), candidates)
-                    if not (kind == "lost" and chosen.kind == "identity"):
-                        kind = chosen.kind
-                counts[kind] += 1
-                motions[record.label], scores[record.label] = chosen.T, chosen.score
+            labels = [record.label for record in hypothesis.objects]
+            chosen = {label: self._choose(stream, label, segments, cache) for label in labels}
+            counts.update(kind for kind, _ in chosen.values())
+            motions = {label: motion.T for label, (_, motion) in chosen.items()}
+            scores = {label: motion.score for label, (_, motion) in chosen.items()}
             moved.append(self.warp.move(hypothesis, motions, scores))
         notes = {
             "motions": dict(sorted(counts.items())),
@@ -326,6 +320,20 @@ class TrackingTransition(Transition):
             "objects_dropped": sum(len(m.dropped) for m in moved),
         }
         return _successor(population, tuple(m.hypothesis for m in moved), notes)
+
+    def _choose(
+        self,
+        stream: np.random.Generator,
+        label: int,
+        segments: dict[int, Segment],
+        cache: dict[bytes, tuple[str, tuple[Candidate, ...]]],
+    ) -> tuple[str, Candidate]:
+        """Kind (see `predict`) and motion of an object of one particle, whose random stream is `stream`."""
+        kind, candidates = cache[segments[label].key] if label in segments else ("invisible", ())
+        if not candidates:
+            return kind, IDENTITY
+        chosen = self.rule.choose(child(stream, "object", label), candidates)
+        return (kind if kind == "lost" and chosen.kind == "identity" else chosen.kind), chosen
 
     def _track_all(
         self, rng: np.random.Generator, clip: Clip, segments: list[dict[int, Segment]]
