@@ -15,7 +15,6 @@ from typing import ClassVar
 import numpy as np
 
 from mstfilter.crossover import CrossoverUpdate
-from mstfilter.errors import InputError
 from mstfilter.scene import Clip, FreeSpace, Projection, log_quality
 from mstfilter.smc import Population, Update, union
 
@@ -68,10 +67,6 @@ class Union(Update):
 
     properly_weighted: ClassVar[bool] = False
     draws: ClassVar[bool] = False
-
-    def __post_init__(self) -> None:
-        if not isinstance(self.fusion, CrossoverUpdate):
-            raise InputError(f"union.fusion is a {type(self.fusion).__name__}, expected a CrossoverUpdate")
 
     def update(
         self, rng: np.random.Generator, predicted: Population | None, proposed: Population | None, observation: Clip

@@ -34,7 +34,7 @@ _SAME = 0.5  # share of an object's readings in the segment that continues it, i
 _CONTAINED = 0.8  # the same, if they have other conflicts
 
 
-class Component(NamedTuple):
+class ConflictComponent(NamedTuple):
     """A connected component of the conflict graph of segments and predicted objects."""
 
     segments: list[int]  #: ascending labels
@@ -77,7 +77,7 @@ class Overlaps:
         """The predicted objects that are in conflict with a segment. All others are occluded."""
         return set(np.flatnonzero(self.in_conflict.any(axis=0)).tolist())
 
-    def components(self) -> list[Component]:
+    def components(self) -> list[ConflictComponent]:
         """Connected components of the conflict graph, in the order of their first segment."""
         graph = nx.Graph()
         graph.add_nodes_from(("segment", a) for a in np.flatnonzero(self.shared.any(axis=1)).tolist())
@@ -85,10 +85,10 @@ class Overlaps:
         found = []
         for vertices in nx.connected_components(graph):
             labels = [sorted(k for kind, k in vertices if kind == wanted) for wanted in ("segment", "object")]
-            found.append(Component(*labels))
+            found.append(ConflictComponent(*labels))
         return sorted(found)
 
-    def tracks(self, component: Component) -> dict[int, list[int]]:
+    def tracks(self, component: ConflictComponent) -> dict[int, list[int]]:
         """The predicted objects that each segment of a component continues, that with most readings first."""
         continued: dict[int, list[int]] = {segment: [] for segment in component.segments}
         for predicted in component.objects:
@@ -97,7 +97,7 @@ class Overlaps:
                 continued[segment].append(predicted)
         return {a: sorted(objects, key=lambda k: -self.shared[a, k]) for a, objects in continued.items()}
 
-    def continued_by(self, predicted: int, component: Component) -> int:
+    def continued_by(self, predicted: int, component: ConflictComponent) -> int:
         """The segment of a component that continues a predicted object; 0 if there is none."""
         no_other_conflict = len(component.segments) == len(component.objects) == 1
         share = _SAME if no_other_conflict else _CONTAINED

@@ -39,8 +39,7 @@ import numpy as np
 from mstfilter.completion import ClipCompleter, Completer, Completion, Extrude, arbitrate, occupancy_of
 from mstfilter.fields import Bounds, NonNegativeFloat, NonNegativeInt, Share
 from mstfilter.partition.association import Overlaps
-from mstfilter.partition.cells import Cells, Readings
-from mstfilter.partition.pairs import PairEvidence, PairOdds
+from mstfilter.partition.cells import Cells, PairEvidence, PairOdds, Readings
 from mstfilter.scene import (
     Clip,
     Evidence,

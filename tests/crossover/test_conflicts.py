@@ -12,7 +12,7 @@ from hypothesis.extra import numpy as hnp
 from scipy import stats
 
 from mstfilter.crossover import ConflictGraph, Crossover, RandomOrder, SpanningTree, conflict_graph, merge_probability
-from mstfilter.crossover.resolution import MERGE_RULES, random_spanning_tree
+from mstfilter.crossover.conflicts import MERGE_RULES, random_spanning_tree
 from mstfilter.errors import InputError
 
 labels = hnp.arrays(np.uint16, (4, 3, 5), elements=st.sampled_from([0, 0, 1, 2, 3, 9]))
