@@ -50,7 +50,6 @@ from mstfilter.scene import (
     Projection,
     check_grid,
     log_quality,
-    scored,
 )
 from mstfilter.smc import Population, Systematic, Update, child
 
@@ -290,7 +289,11 @@ class PartitionUpdate(Update):
         notes: Mapping[str, object],
     ) -> Population:
         """The candidates, weighted by evidence."""
-        total, scores = scored(self.evidence, built, clip)
+        total, scores = np.zeros(len(built)), {}
+        for k, term in enumerate(self.evidence):
+            name, score = type(term).__name__, term.log_score(built, clip)
+            scores[f"{name} {k}" if name in scores else name] = score.round(3).tolist()
+            total += score
         return Population(built, log_weights + total, parents, {**notes, "scores": scores})
 
 

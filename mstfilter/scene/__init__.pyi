@@ -23,7 +23,6 @@ from mstfilter.scene.evidence import (
     NoFreeSpace as NoFreeSpace,
     Projection as Projection,
     log_quality as log_quality,
-    scored as scored,
 )
 from mstfilter.scene.frame import (
     Clip as Clip,

@@ -13,9 +13,9 @@ from scipy.spatial.transform import RigidTransform
 from mstfilter.crossover import Crossover, CrossoverUpdate, ModeFilter, RandomOrder, SpanningTree
 from mstfilter.errors import InputError
 from mstfilter.presets import REGISTRY, load_config
-from mstfilter.scene import Clip, Crop, Frame, Hypothesis, NoFreeSpace, Occupancy, Projection, VoxelGrid
+from mstfilter.scene import Clip, Crop, Frame, FreeSpace, Hypothesis, NoFreeSpace, Occupancy, Projection, VoxelGrid
 from mstfilter.scoring import weighted_coverage
-from mstfilter.smc import Population
+from mstfilter.smc import Population, ProjectOnto
 from tests.scene.scenes import CAMERA, GRID, table_scene
 
 SMALL = VoxelGrid((0, 0, 0), 0.01, (5, 4, 3))
@@ -154,6 +154,21 @@ def test_without_prediction_the_samples_pass():
     fused = CrossoverUpdate(eta=1).update(np.random.default_rng(0), Population((nothing,)), proposed, clip())
     for candidate, sample in zip(fused.particles, proposed.particles, strict=True):
         assert candidate is sample
+
+
+def test_without_a_proposal_it_is_the_manifold_filter():
+    """Predictions are projected onto free space, and weighted by Q^lambda; one that loses all keeps a weight."""
+    predicted, _ = populations()
+    nowhere = np.zeros(GRID.shape, np.uint16)
+    nowhere[30, 5, 20] = 1
+    both = Population((predicted.particles[0], Hypothesis.from_labels(nowhere, GRID)), None, predicted.parents)
+    fused = CrossoverUpdate(quality_exponent=2.0).update(np.random.default_rng(0), both, None, clip())
+    onto = ProjectOnto(lambda particles, y: FreeSpace().refine(particles, y)[0])
+    wanted = onto.update(np.random.default_rng(0), both, None, clip()).particles
+    assert [h.key for h in fused.particles] == [h.key for h in wanted]
+    assert fused.notes["quality"] == [1.0, 0.0]
+    np.testing.assert_allclose(np.diff(fused.log_weights), [2 * np.log(1e-3)])
+    np.testing.assert_array_equal(fused.parents["previous"], [1, 0])
 
 
 def test_the_authors_real_particles(shared_data):
