@@ -15,9 +15,12 @@ estimated anew from all that was seen of it.
    paper crosses each sample with each prediction.
 3. **Association.** Each partition is combined with a prediction j, drawn in proportion to w_j Q_j^lambda. Segments
    and predicted objects form a *conflict graph*. In each of its *components*, segments continue predicted objects
-   (`mstfilter.partition.association`). The paper draws which conflicts end in a merge; here the partition decides.
+   (`mstfilter.partition.association`). An object that is split into several segments is continued by the one with
+   more than 80 % of its readings, or by none; the other segments are new objects. The paper draws which conflicts end
+   in a merge; here the partition decides.
 4. **Occluded objects.** A predicted object without conflict, to which practically no reading belongs, stays with
-   probability (Q_j q)^lambda; q is the share of its own voxels that the frame does not observe as free.
+   probability (Q_j q)^lambda; q is the share of its own voxels that the frame does not observe as free. It is
+   completed from its views alone, and removed if the frame refutes all of them.
 5. **Completion.** An object keeps its views: what earlier frames showed of it (`mstfilter.scene.ObjectView`). It is
    completed from its readings in this frame and from the views of the objects that it continues. Evidence is
    remembered, guesses are not: no voxel that was guessed at an earlier pause is carried on.
