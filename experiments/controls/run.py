@@ -42,7 +42,7 @@ MOVED = 0.9  # an object whose own IoU before and after lies below has moved
 FILTERS = {
     "mst": [],
     "flow": [f"transition.rule.{v}" for v in ("use_icp=false", "use_sift=false", "n_refine=0", "search_above=-1")],
-    "frozen": ["transition=identity", "update.division=none"],
+    "frozen": ["transition=identity"],
 }
 ORDERS = ("in order", "shuffled", "ends")
 CHAINS = [(name, order) for name in ("mst", "flow") for order in ORDERS] + [("frozen", "in order")]

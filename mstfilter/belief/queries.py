@@ -46,7 +46,7 @@ from mstfilter.scene import (
     CommonRefinement,
     Hypothesis,
     VoxelGrid,
-    check_grid,
+    check_grids,
     common_refinement,
     project,
     render_hypothesis,
@@ -81,8 +81,7 @@ class Belief:
         particles = self.population.particles
         if not all(isinstance(h, Hypothesis) for h in particles):
             raise InputError("the particles of a belief must be hypotheses, not vectors or other objects")
-        for k, h in enumerate(particles):
-            check_grid(f"hypothesis {k}", h, self.grid)
+        check_grids("", particles, self.grid)
 
     def __repr__(self) -> str:
         weights = ", ".join(f"{w:.3g}" for w in np.sort(self._mass)[::-1][:8]) + ", ..." * (len(self._mass) > 8)

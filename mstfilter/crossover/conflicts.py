@@ -130,13 +130,13 @@ class OccupiedVoxels:
         present = np.flatnonzero(sizes[1:]) + 1
         return present, sizes[present], first[present]
 
-    def overlaps(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Proposed label, predicted label and common voxels (m,) of each overlapping pair, labels ascending."""
+    def overlaps(self) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray]:
+        """Proposed and predicted labels (m,) of the overlapping pairs, ascending, and their common voxels (m,)."""
         proposed, predicted = self.labels
         both = (proposed != 0) & (predicted != 0)
         pair = proposed[both].astype(np.int64) * (MAX_LABEL + 1) + predicted[both]
         found, common = np.unique(pair, return_counts=True)
-        return *np.divmod(found, MAX_LABEL + 1), common
+        return np.divmod(found, MAX_LABEL + 1), common
 
 
 def conflict_graph(proposed: np.ndarray, predicted: np.ndarray) -> ConflictGraph:
@@ -152,8 +152,8 @@ def graph_of(voxels: OccupiedVoxels) -> ConflictGraph:
     order = np.lexsort((side, first))
     number = np.zeros((2, MAX_LABEL + 1), np.int64)
     number[side[order], label[order]] = np.arange(len(order))
-    proposed, predicted, common = voxels.overlaps()
-    edges = np.stack([number[PROPOSED, proposed], number[PREDICTED, predicted]], axis=1)
+    pairs, common = voxels.overlaps()
+    edges = np.stack([number[which][labels] for which, labels in zip(SIDES, pairs, strict=True)], axis=1)
     return ConflictGraph(side[order], label[order], size[order], edges, common)
 
 

@@ -58,6 +58,7 @@ from mstfilter.scene import (
     Projection,
     as_labels,
     check_grid,
+    check_grids,
     log_quality,
 )
 from mstfilter.smc import Candidates, Population, Update, child, key_of, union
@@ -156,9 +157,8 @@ class CrossoverUpdate(Update):
 
     def _crossed(self, rng: np.random.Generator, predicted: Population, proposed: Population) -> Population:
         """Candidates of all pairs of a sample and a refined prediction."""
-        for name, population in (("predicted", predicted), ("proposed", proposed)):
-            for k, hypothesis in enumerate(population.particles):
-                check_grid(f"{name} hypothesis {k}", hypothesis, predicted.particles[0].grid)
+        check_grids("predicted", predicted.particles, predicted.particles[0].grid)
+        check_grids("proposed", proposed.particles, predicted.particles[0].grid)
         i, j = _pairs(child(rng, "order"), len(proposed), len(predicted), self.eta)
         key = key_of(rng)
 

@@ -51,7 +51,7 @@ from mstfilter.scene import (
     ObjectRecord,
     ObjectView,
     Projection,
-    check_grid,
+    check_grids,
     log_quality,
 )
 from mstfilter.smc import Population, Systematic, Update, child
@@ -148,7 +148,8 @@ class PartitionUpdate(Update):
         self, rng: np.random.Generator, predicted: Population | None, proposed: Population | None, observation: Clip
     ) -> Population:
         """Candidates. Without a proposal, the predictions after free-space projection."""
-        _check_grids(predicted, proposed, observation)
+        check_grids("predicted", () if predicted is None else predicted.particles, observation.grid)
+        check_grids("proposed", () if proposed is None else proposed.particles, observation.grid)
         readings = Readings.of(observation.after, observation.grid)
         if predicted is None:
             assert proposed is not None
@@ -298,13 +299,6 @@ class PartitionUpdate(Update):
             scores[f"{name} {k}" if name in scores else name] = score.round(3).tolist()
             total += score
         return Population(built, log_weights + total, parents, {**notes, "scores": scores})
-
-
-def _check_grids(predicted: Population | None, proposed: Population | None, clip: Clip) -> None:
-    """Raise InputError unless all hypotheses are on the grid of the clip."""
-    for name, population in (("predicted", predicted), ("proposed", proposed)):
-        for k, hypothesis in enumerate(population.particles if population else ()):
-            check_grid(f"{name} hypothesis {k}", hypothesis, clip.grid)
 
 
 def _segments(proposed: Population, readings: Readings) -> list[np.ndarray]:

@@ -85,5 +85,6 @@ from mstfilter.scene.voxels import (
     VoxelGrid as VoxelGrid,
     as_labels as as_labels,
     check_grid as check_grid,
+    check_grids as check_grids,
     occupied_box as occupied_box,
 )
