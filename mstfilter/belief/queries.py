@@ -349,8 +349,8 @@ class Belief:
     def estimate(self, loss: Callable[[Hypothesis, Hypothesis], float] | None = None) -> Hypothesis:
         """The hypothesis of least expected loss: ``argmin_i sum_j w_j loss(h_i, h_j)``.
 
-        Default: the loss is 1 - quality (weighted coverage in the form ``objects``), so that the result is the best
-        single answer among the hypotheses if the true scene were distributed as they are.
+        Default: the loss is 1 - quality (weighted coverage in the form ``objects``). The result is then the best
+        single answer among the hypotheses, if the true scene is distributed as they are.
         """
         hypotheses, mass = self._merged
         if loss is None:

@@ -3,16 +3,16 @@
 >>> fused = CrossoverUpdate().update(rng, predicted, proposed, clip)
 
 1. The projection onto free space clears voxels of every predicted hypothesis j, which keeps a share Q_j of them.
-2. Every sample i and every predicted hypothesis j make `eta` candidates by crossover. With weights w_i and w_j of the
-   parents and lambda = `quality_exponent`, the weight of a candidate,
+2. Every sample i and every predicted hypothesis j make `eta` candidates by crossover. The weight of a candidate,
 
        log w = log w_i + log w_j + lambda log Q_j     (section IV-E),
 
-   depends on its parents only. So candidates are resampled first, and only those that are chosen are built.
+   depends on its parents only; w_i and w_j are their weights, lambda is `quality_exponent`. So candidates are
+   resampled first, and only those that are chosen are built.
 
-Without a proposal, the update is the projection with its weights: if only a thin set of states agrees with an
-observation, hardly any prediction lies in it, so every particle is projected into it (the manifold filter of Koval,
-Pollard and Srinivasa 2015; for vectors `mstfilter.smc.ProjectOnto`).
+Without a proposal, the update is the projection with its weights. If only a thin set of states agrees with an
+observation, hardly any prediction lies in it, so every particle is projected into it. This is the manifold filter of
+Koval, Pollard and Srinivasa (2015; for vectors `mstfilter.smc.ProjectOnto`).
 
 One crossover (figure 5):
 

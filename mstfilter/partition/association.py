@@ -10,8 +10,8 @@ a segment is the one with which it shares most readings. An object that is the m
 few readings is in no conflict: these are readings of other objects that lie near it. In each connected component, a
 predicted object is continued by at most one segment:
 
-- by the segment that has more than 80 % of its readings, of those readings that lie in segments with this main object
-  (so readings at which another object now occludes it do not count);
+- by the segment that has more than 80 % of those of its readings that lie in segments with this main object (readings
+  at which another object now occludes it do not count);
 - without such a segment, by the one that has more than 80 % of all its readings.
 
 If a segment and an object are in conflict with each other only, more than 50 % is enough. It follows:

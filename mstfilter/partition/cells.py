@@ -246,9 +246,10 @@ def _filled(prediction: np.ndarray, sample: np.ndarray, sizes: np.ndarray) -> np
 def _fitted_mixture(joined: np.ndarray, same: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """The mixture (p,) of partitions that forecasts pairs best.
 
-    It has the least cross entropy between the probabilities `same` (e,) that the objects of a pair are one and the
-    total probability of the partitions that join the pair, `joined` (p, e); pairs count by `weights` (e,). The
-    problem is convex; this is expectation maximisation for the proportions of a mixture.
+    `same` (e,) are the probabilities that the cells of a pair belong to one object, `joined` (p, e) says which
+    partitions join the pair. The mixture has the least cross entropy between `same` and the total probability of the
+    partitions that join the pair; pairs count by `weights` (e,). The problem is convex; this is expectation
+    maximisation for the proportions of a mixture.
     """
     q = np.full(len(joined), 1 / len(joined))
     for _ in range(_STEPS):
